@@ -16,8 +16,9 @@ What must hold, with the configuration's own times (no number of this file's):
 
     speed      no reference is ever faster than its speed limit, and no joint (its true speed, not the measured one)
                faster than that by more than a tenth: a joint that is commanded to move at its limit catches up with it
-    stop       a fault that releases switches the drives off; one that holds brings the reference to rest within
-               speed limit / deceleration; half a second later nothing moves at a twentieth of its limit
+    stop       a fault that releases switches the drives off, one of a joint that joint's; the other references come to
+               rest within speed limit / deceleration and a tenth of a second; half a second later nothing moves at a
+               twentieth of its limit
     code       a fault that lasts long enough is reported by its own code and joint, a shorter one is not reported at all
     link       a command sent after the last bad byte is acknowledged, and telemetry read, within 20 ms of it
     known      afterwards the host's last acknowledged and rejected numbers are the board's
@@ -42,6 +43,7 @@ from armsight.sim.joints import JointPlant, PotFault
 PERIODS = (4, 16)  # ticks
 CATCHING_UP, STANDING = 1.1, 0.05  # of the speed limit
 LINK_TICKS = 20
+SETTLE_S = 0.1
 KINDS = ("flip", "drop", "burst", "stall", "pot", "dip", "cut", "tick", "jump")
 POT_CODES = {
     PotFault.OPEN: Fault.POT_OPEN,
@@ -192,7 +194,8 @@ class Campaign:
             state = self.board.status.state
             if state == BoardState.ENABLED and not self.board.status.faults:
                 break
-            self.board.command(Command.ENABLE if state == BoardState.DISABLED else Command.CLEAR_FAULTS)
+            clean = not self.board.status.faults and state in (BoardState.DISABLED, BoardState.HOLDING)
+            self.board.command(Command.ENABLE if clean else Command.CLEAR_FAULTS)
             self.board.receive(0.02)
             self.take_up()
         else:
@@ -389,7 +392,8 @@ class Campaign:
             self.violate(f"{fault.name} of joint {joint} is reported as {first}")
         else:
             self.out.reported[fault.name] += 1
-        if fault not in HELD and self.outputs["drives_on"]:
+        released = not self.outputs["drives_on"] if joint is None else not self.outputs["duty"][joint]
+        if fault not in HELD and not released:
             self.violate(f"{fault.name} leaves the drives on")
 
     def expect_rest(self):
@@ -430,5 +434,6 @@ class Limits:
 
 def limits():
     joint = lab_configuration()["joint"][0]
-    stop_s = float(joint["speed_limit_rad_s"] / joint["deceleration_rad_s2"]) + 0.002
+    # Beside the braking itself the deceleration has to come and to go.
+    stop_s = float(joint["speed_limit_rad_s"] / joint["deceleration_rad_s2"]) + SETTLE_S
     return Limits(float(joint["speed_limit_rad_s"]), stop_s)

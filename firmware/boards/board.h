@@ -12,17 +12,19 @@ typedef struct board_description {
     uint32_t baud;    /* bits a second on the wire, 8N1: the telemetry's rate follows from it */
 
     /* Tick. Fill in everything but the command: tick, overrun, stop_pressed (the button), supply_mv, counts,
-     * current_ma. */
+     * current_ma. taken_over is the wire's. */
     void (*sense)(core_inputs *inputs);
 
-    /* Tick. Put the duties to the motors; with drives_on 0 switch their drivers off. */
+    /* Tick. Put the duties to the motors. With drives_on 0 and windings_shorted not 0 keep the bridges awake at duty 0:
+     * both ends of a winding low, the motor brakes itself. With both 0 switch the drivers off. Release the brakes, where
+     * there are any, while brakes_open is not 0. */
     void (*drive)(const core_outputs *outputs);
 
     /* Tick, once each time it ran to its end. */
     void (*feed_watchdog)(void);
 
-    /* Before the first tick. Return whether the watchdog restarted the board. */
-    bool (*watchdog_reset)(void);
+    /* Before the first tick. Return why the board started, RESET_.... */
+    uint32_t (*reset_cause)(void);
 
     /* Main loop. Take up to room bytes that came from the host and return how many. *overrun: add the bytes for which
      * there was no room since the last call. */

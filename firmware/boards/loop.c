@@ -5,8 +5,10 @@
 
 #include "config.h"
 #include "core.h"
+#include "number.h"
 
 #define CHUNK 128u
+#define HUNG_TICKS 1000u /* a main loop that does not come round for so long hangs: the watchdog shall have it */
 
 /* Return what config_load says of the two stored copies, which it leaves in loop->copies. */
 static uint32_t load(board_loop *loop, core_config *config)
@@ -22,7 +24,7 @@ void loop_start(board_loop *loop, const board_description *board)
     memset(loop, 0, sizeof *loop); /* a compound literal may take its size of stack */
     loop->board = board;
     const uint32_t source = load(loop, &config);
-    core_init(&loop->core, &config, source, board->watchdog_reset());
+    core_init(&loop->core, &config, source, board->reset_cause());
     wire_init(&loop->wire, &(wire_setup){board->name, board->baud, source, &loop->core.config});
 }
 
@@ -32,7 +34,8 @@ void loop_tick(board_loop *loop)
     wire_before_tick(&loop->wire, &loop->inputs);
     core_tick(&loop->core, &loop->inputs, &loop->outputs);
     loop->board->drive(&loop->outputs);
-    if (loop->outputs.feed_watchdog != 0u) {
+    loop->unpolled_ticks = number_count(loop->unpolled_ticks);
+    if (loop->outputs.feed_watchdog != 0u && loop->unpolled_ticks < HUNG_TICKS) {
         loop->board->feed_watchdog();
     }
     wire_after_tick(&loop->wire, &loop->inputs, &loop->outputs);
@@ -63,6 +66,7 @@ void loop_poll(board_loop *loop)
 {
     uint8_t bytes[CHUNK];
     uint32_t length;
+    loop->unpolled_ticks = 0u;
     do {
         uint32_t overrun = 0u;
         length = loop->board->receive(bytes, CHUNK, &overrun);

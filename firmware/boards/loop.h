@@ -11,6 +11,7 @@ typedef struct board_loop {
     core_inputs inputs;
     core_outputs outputs;
     wire_state wire;
+    volatile uint32_t unpolled_ticks; /* since the main loop came round */
     config_copy copies[2]; /* main loop's scratch */
 } board_loop;
 

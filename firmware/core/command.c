@@ -1,5 +1,7 @@
 #include "command.h"
 
+#include "governor.h"
+#include "motor.h"
 #include "number.h"
 #include "pid.h"
 #include "pot.h"
@@ -14,20 +16,26 @@ static void start_joint(joint_state *joint, const joint_config *config)
     pid_reset(&joint->pid, angle_rad);
     joint->pid.speed_rad_s = speed_rad_s; /* the filter runs on: a coasting joint is braked from the first tick */
     setpoint_hold(&joint->setpoint, angle_rad);
+    governor_hold(&joint->reference, angle_rad);
+    motor_start(&joint->motor, angle_rad);
+    joint->released = 0u;
     pot_watch(&joint->pot, angle_rad);
     joint->low_rad = angle_rad < config->soft_min_rad ? angle_rad : config->soft_min_rad;
     joint->high_rad = angle_rad > config->soft_max_rad ? angle_rad : config->soft_max_rad;
     joint->gravity_duty = 0.0f;
+    joint->gravity_asked = 0.0f;
     joint->duty_cap = config->duty_limit;
     joint->following_ticks = 0u;
     joint->stall_ticks = 0u;
+    joint->overload_ticks = 0u;
     joint->stall_mark_rad = angle_rad;
     joint->held_back = 0u;
 }
 
 static uint32_t enable(core_state *core, bool inward)
 {
-    if (core->state != STATE_DISABLED) {
+    const bool held = core->state == STATE_HOLDING;
+    if (core->state != STATE_DISABLED && !(held && core->faults == 0u)) {
         return REJECTION_WRONG_STATE;
     }
     for (uint32_t i = 0u; i < JOINTS; i++) {
@@ -40,10 +48,13 @@ static uint32_t enable(core_state *core, bool inward)
         }
     }
     for (uint32_t i = 0u; i < JOINTS; i++) {
-        start_joint(&core->joint[i], &core->config.joint[i]);
+        if (!held || core->joint[i].released != 0u) { /* what is held stays where it is held */
+            start_joint(&core->joint[i], &core->config.joint[i]);
+        }
     }
     core->state = STATE_ENABLED;
     core->silent_ticks = 0u;
+    core->brake_ticks = held ? 0u : core->config.brake_release_ticks;
     return REJECTION_NONE;
 }
 
@@ -51,6 +62,15 @@ static uint32_t disable(core_state *core)
 {
     if (core->state == STATE_STOPPED) {
         return REJECTION_WRONG_STATE;
+    }
+    if (safety_drives_on(core) && core->config.brake_engage_ticks != 0u) {
+        for (uint32_t i = 0u; i < JOINTS; i++) {
+            setpoint_hold(&core->joint[i].setpoint, core->joint[i].reference.position_rad);
+            governor_hold(&core->joint[i].reference, core->joint[i].reference.position_rad);
+        }
+        core->closing = 1u;
+        core->brake_ticks = core->config.brake_engage_ticks;
+        return REJECTION_NONE;
     }
     core->state = core->faults != 0u ? STATE_FAULTED : STATE_DISABLED;
     return REJECTION_NONE;
@@ -67,10 +87,7 @@ static uint32_t clear_faults(core_state *core)
     safety_forget(core);
     if (core->state == STATE_FAULTED) {
         core->state = STATE_DISABLED;
-    } else if (core->state == STATE_HOLDING) {
-        core->state = STATE_ENABLED; /* the arm is held already; letting go of it would drop it */
-        core->silent_ticks = 0u;
-    }
+    } /* a held arm stays held, until it is enabled */
     return REJECTION_NONE;
 }
 
@@ -116,12 +133,13 @@ static void move_joint(joint_state *joint, const joint_config *config, const mov
         held_back |= LIMITED_SPEED;
     }
     joint->held_back = held_back;
-    joint->gravity_duty = move->gravity_duty[i];
+    joint->gravity_asked = move->gravity_duty[i];
 }
 
 static uint32_t take_move(core_state *core, const move_command *move)
 {
-    const uint32_t rejection = core->state == STATE_ENABLED ? check_move(move) : REJECTION_WRONG_STATE;
+    const bool ready = core->state == STATE_ENABLED && core->closing == 0u;
+    const uint32_t rejection = ready ? check_move(move) : REJECTION_WRONG_STATE;
     if (rejection != REJECTION_NONE) {
         return rejection;
     }
@@ -146,6 +164,7 @@ static uint32_t take_gains(core_state *core, const gain_set *gains)
         pid_change_gains(&core->joint[i].pid, &core->config.joint[i].gains, &gains->joint[i]);
         core->config.joint[i].gains = gains->joint[i];
     }
+    safety_changed_config(core, false);
     return REJECTION_NONE;
 }
 

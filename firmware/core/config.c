@@ -8,18 +8,19 @@
 _Static_assert(sizeof(pot_config) == 2u * (POT_NODES + 3u) + 4u * (POT_NODES + 4u), "pot_config has a hole");
 _Static_assert(offsetof(config_copy, crc) == sizeof(config_copy) - sizeof(uint32_t), "config_copy has a hole");
 
-uint32_t config_crc(const void *bytes, uint32_t length)
+uint32_t config_crc_on(uint32_t crc, const void *bytes, uint32_t length)
 {
     const uint8_t *byte = bytes;
-    uint32_t crc = 0xFFFFFFFFu;
     for (uint32_t i = 0u; i < length; i++) {
         crc ^= byte[i];
         for (uint32_t bit = 0u; bit < 8u; bit++) {
             crc = (crc >> 1) ^ ((crc & 1u) != 0u ? 0xEDB88320u : 0u);
         }
     }
-    return ~crc;
+    return crc;
 }
+
+uint32_t config_crc(const void *bytes, uint32_t length) { return ~config_crc_on(0xFFFFFFFFu, bytes, length); }
 
 static const joint_config factory_joint = {
     .gains = {.kp_per_rad = 1.0f, .derivative_filter_s = 0.005f, .anti_windup_per_s = 10.0f},
@@ -32,12 +33,16 @@ static const joint_config factory_joint = {
             .jump_rad = 0.02f,
             .frozen_rad = 0.1f,
             .inverted_rad = 0.1f},
+    .motor = {.constant_v_s = 1.0f, .apart_rad = 0.03f},
     .soft_min_rad = -2.4f,
     .soft_max_rad = 2.4f,
     .speed_limit_rad_s = 0.5f,
     .deceleration_rad_s2 = 5.0f,
+    .acceleration_rad_s2 = 5.0f,
+    .jerk_rad_s3 = 500.0f,
     .duty_limit = 0.2f,
     .duty_slew_per_s = 5.0f,
+    .gravity_slew_per_s = 2.0f,
     .current_cut_per_a_s = 5.0f,
     .following_rad = 0.3f,
     .stall_duty = 0.19f,
@@ -53,10 +58,12 @@ void config_factory(core_config *config)
     }
     config->supply_min_mv = 10000u;
     config->supply_max_mv = 14000u;
+    config->supply_nominal_mv = 12000u;
     config->supply_ticks = 5u;
     config->pot_ticks = 5u;
     config->following_ticks = 50u;
     config->stall_ticks = 500u;
+    config->overload_ticks = 500u;
     config->silence_ticks = 100u;
     config->silence_reaction = REACTION_HOLD;
 }
@@ -84,17 +91,38 @@ static bool pot_is_valid(const pot_config *pot)
            number_within(pot->frozen_rad, 1e-3f, 1.0f) && number_within(pot->inverted_rad, 1e-3f, 1.0f);
 }
 
+static bool motor_is_valid(const motor_config *motor)
+{
+    return number_within(motor->resistance_ohm, 0.0f, 1000.0f) && number_within(motor->constant_v_s, 1e-3f, 1e3f) &&
+           number_within(motor->apart_rad, 1e-3f, 1.0f);
+}
+
+/* Return whether the numbers fit each other: a stall shows below the duty's limit, the table reaches the soft limits. */
+static bool joint_is_consistent(const joint_config *joint)
+{
+    const pot_config *pot = &joint->pot;
+    const float first = (float)pot->direction * pot->angle_rad[0];
+    const float last = (float)pot->direction * pot->angle_rad[pot->node_count - 1u];
+    const float low = first < last ? first : last;
+    const float high = first < last ? last : first;
+    return joint->stall_duty <= joint->duty_limit && joint->soft_min_rad >= low && joint->soft_max_rad <= high &&
+           pot->short_counts < pot->counts[0] && pot->counts[pot->node_count - 1u] < pot->open_counts &&
+           joint->speed_limit_rad_s * TICK_S < pot->jump_rad;
+}
+
 static bool joint_is_valid(const joint_config *joint)
 {
-    return pid_gains_in_range(&joint->gains) && pot_is_valid(&joint->pot) &&
+    return pid_gains_in_range(&joint->gains) && pot_is_valid(&joint->pot) && motor_is_valid(&joint->motor) &&
            number_within(joint->soft_min_rad, -13.0f, 13.0f) && number_within(joint->soft_max_rad, -13.0f, 13.0f) &&
            joint->soft_min_rad < joint->soft_max_rad && number_within(joint->speed_limit_rad_s, 0.01f, 20.0f) &&
-           number_within(joint->deceleration_rad_s2, 0.1f, 1000.0f) && number_within(joint->duty_limit, 0.0f, 1.0f) &&
+           number_within(joint->deceleration_rad_s2, 0.1f, 1000.0f) &&
+           number_within(joint->acceleration_rad_s2, 0.1f, 1000.0f) && number_within(joint->jerk_rad_s3, 1.0f, 1e6f) &&
+           number_within(joint->gravity_slew_per_s, 0.1f, 1000.0f) && number_within(joint->duty_limit, 0.0f, 1.0f) &&
            number_within(joint->duty_slew_per_s, 0.1f, 1000.0f) &&
            number_within(joint->current_cut_per_a_s, 0.0f, 1000.0f) &&
            number_within(joint->following_rad, 1e-3f, 13.0f) && number_within(joint->stall_duty, 0.01f, 1.0f) &&
            number_within(joint->stall_rad, 1e-4f, 1.0f) &&
-           (joint->motor_direction == 1 || joint->motor_direction == -1);
+           (joint->motor_direction == 1 || joint->motor_direction == -1) && joint_is_consistent(joint);
 }
 
 static bool ticks_within(uint32_t ticks, uint32_t least, uint32_t most) { return ticks >= least && ticks <= most; }
@@ -106,7 +134,9 @@ bool config_is_valid(const core_config *config)
             return false;
         }
     }
-    return config->supply_min_mv < config->supply_max_mv && ticks_within(config->supply_ticks, 1u, 1000u) &&
+    return config->supply_min_mv < config->supply_max_mv && ticks_within(config->supply_nominal_mv, 1000u, 100000u) &&
+           ticks_within(config->overload_ticks, 1u, 10000u) && ticks_within(config->brake_release_ticks, 0u, 1000u) &&
+           ticks_within(config->brake_engage_ticks, 0u, 1000u) && ticks_within(config->supply_ticks, 1u, 1000u) &&
            ticks_within(config->pot_ticks, 1u, 100u) && ticks_within(config->following_ticks, 1u, 10000u) &&
            ticks_within(config->stall_ticks, 1u, 10000u) && ticks_within(config->silence_ticks, 2u, 60000u) &&
            (config->silence_reaction == REACTION_HOLD || config->silence_reaction == REACTION_RELEASE);

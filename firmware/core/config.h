@@ -8,15 +8,18 @@
 #include "types.h"
 
 #define CONFIG_MAGIC 0x31435341u /* "ASC1" as bytes in memory */
-#define CONFIG_VERSION 1u        /* goes up whenever core_config changes its layout or meaning */
+#define CONFIG_VERSION 2u        /* goes up whenever core_config changes its layout or meaning */
 
 /* Return the CRC-32 (IEEE 802.3, as zlib's) of length bytes. */
 uint32_t config_crc(const void *bytes, uint32_t length);
 
+/* Return a CRC (0xFFFFFFFF at first, inverted at last) after length more bytes. Any context. */
+uint32_t config_crc_on(uint32_t crc, const void *bytes, uint32_t length);
+
 /* Fill in values that keep an unknown arm harmless: weak, slow, and with a fault that rejects enabling. */
 void config_factory(core_config *config);
 
-/* Return whether every value is in the range types.h names. */
+/* Return whether every value is in the range types.h names, and fits the others. */
 bool config_is_valid(const core_config *config);
 
 /* Make a copy to store: config with its serial number, version and CRC. */

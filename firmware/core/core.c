@@ -2,6 +2,8 @@
 
 #include "command.h"
 #include "config.h"
+#include "governor.h"
+#include "motor.h"
 #include "number.h"
 #include "pid.h"
 #include "pot.h"
@@ -9,8 +11,9 @@
 #include "setpoint.h"
 
 #define GUARD 0xA5C3965Au
+#define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up */
 
-void core_init(core_state *core, const core_config *config, uint32_t source, bool watchdog_reset)
+void core_init(core_state *core, const core_config *config, uint32_t source, uint32_t reset)
 {
     *core = (core_state){.guard_head = GUARD, .first_joint = NO_JOINT, .guard_tail = GUARD};
     const bool usable = source != CONFIG_FACTORY && config_is_valid(config);
@@ -21,9 +24,13 @@ void core_init(core_state *core, const core_config *config, uint32_t source, boo
         core->permanent = 1u << FAULT_CONFIG;
         safety_raise(core, FAULT_CONFIG, NO_JOINT);
     }
-    if (watchdog_reset) {
-        safety_raise(core, FAULT_WATCHDOG, NO_JOINT);
+    if (reset != RESET_POWER) {
+        safety_raise(core, reset == RESET_CRASH ? FAULT_CRASH : FAULT_WATCHDOG, NO_JOINT);
     }
+    for (uint32_t i = 0u; i < JOINTS; i++) {
+        core->start_gains.joint[i] = core->config.joint[i].gains;
+    }
+    safety_changed_config(core, false);
 }
 
 /* Read a potentiometer into the joint. */
@@ -43,28 +50,56 @@ static void measure(core_state *core, uint32_t i, uint32_t counts)
     }
 }
 
+/* Bring a reference that has nearly come to rest to it: the path ends where it is. */
+static void settle(joint_state *joint)
+{
+    setpoint_hold(&joint->setpoint, joint->reference.position_rad);
+    governor_hold(&joint->reference, joint->reference.position_rad);
+}
+
 /* Move a joint's reference by one tick; returns whether it is at rest. */
 static bool advance(joint_state *joint, const joint_config *config, bool slowing)
 {
     bool resting = false;
+    float path_rad_s2 = 0.0f;
     if (slowing) {
-        resting = setpoint_slow(&joint->setpoint, config->deceleration_rad_s2);
+        const float before_rad_s = joint->setpoint.speed_rad_s;
+        resting = setpoint_slow(&joint->setpoint, joint->stop_rad_s2);
+        path_rad_s2 = (joint->setpoint.speed_rad_s - before_rad_s) / TICK_S;
         joint->held_back = 0u;
     } else {
         setpoint_advance(&joint->setpoint);
+        path_rad_s2 = setpoint_acceleration(&joint->setpoint);
         joint->limited |= joint->held_back;
     }
     if (setpoint_clamp(&joint->setpoint, joint->low_rad, joint->high_rad)) {
         joint->limited |= LIMITED_SOFT;
+        path_rad_s2 = 0.0f;
+    }
+    const governor_limits limits = {.speed_rad_s = config->speed_limit_rad_s,
+                                    .acceleration_rad_s2 = config->acceleration_rad_s2,
+                                    .deceleration_rad_s2 = config->deceleration_rad_s2,
+                                    .jerk_rad_s3 = config->jerk_rad_s3,
+                                    .low_rad = joint->low_rad,
+                                    .high_rad = joint->high_rad};
+    joint->limited |= governor_step(&joint->reference, &joint->setpoint, path_rad_s2, &limits);
+    if (resting && number_size(joint->reference.speed_rad_s) < 0.01f * config->speed_limit_rad_s) {
+        settle(joint);
+    } else {
+        resting = false;
     }
     /* Limits that were widened for a joint outside close in behind it. */
-    joint->low_rad = number_clamp(joint->setpoint.position_rad, joint->low_rad, config->soft_min_rad);
-    joint->high_rad = number_clamp(joint->setpoint.position_rad, config->soft_max_rad, joint->high_rad);
+    joint->low_rad = number_clamp(joint->reference.position_rad, joint->low_rad, config->soft_min_rad);
+    joint->high_rad = number_clamp(joint->reference.position_rad, config->soft_max_rad, joint->high_rad);
     return resting;
 }
 
 static void advance_arm(core_state *core)
 {
+    if (core->state == STATE_ENABLED && core->brake_ticks != 0u) { /* brakes open or close: the references wait */
+        core->brake_ticks -= core->closing == 0u ? 1u : 0u;
+        return;
+    }
     const bool slowing = core->state == STATE_STOPPING;
     bool resting = true;
     for (uint32_t i = 0u; i < JOINTS; i++) {
@@ -76,13 +111,29 @@ static void advance_arm(core_state *core)
     }
 }
 
-static void control(joint_state *joint, const joint_config *config, uint32_t current_ma)
+/* Return the duty of kp and kv that moves a free joint at its speed limit and a little more: what back-EMF and damping
+ * take there. Without a known motor nothing bounds it. */
+static float spring_limit(const joint_config *config, float nominal_v)
 {
-    const float over_a = ((float)current_ma - (float)config->current_limit_ma) * 0.001f;
+    if (config->motor.resistance_ohm <= 0.0f) {
+        return FLT_MAX;
+    }
+    const float per_rad_s = config->gains.kd_s_per_rad + config->motor.constant_v_s / nominal_v;
+    return SPARE_SPEED * config->speed_limit_rad_s * per_rad_s;
+}
+
+static void control(joint_state *joint, const joint_config *config, float nominal_v, float current_a)
+{
+    const float over_a = number_size(current_a) - (float)config->current_limit_ma * 0.001f;
+    const float gravity_step = config->gravity_slew_per_s * TICK_S;
+    joint->gravity_duty +=
+        number_clamp(joint->gravity_asked - joint->gravity_duty, -gravity_step, gravity_step);
     joint->duty_cap =
         number_clamp(joint->duty_cap - config->current_cut_per_a_s * over_a * TICK_S, 0.0f, config->duty_limit);
-    const pid_demand demand = {.reference_rad = joint->setpoint.position_rad,
-                               .reference_rad_s = joint->setpoint.speed_rad_s,
+    const pid_demand demand = {.reference_rad = joint->reference.position_rad,
+                               .reference_rad_s = joint->reference.speed_rad_s,
+                               .reference_rad_s2 = joint->reference.acceleration_rad_s2,
+                               .spring_limit = spring_limit(config, nominal_v),
                                .gravity_duty = joint->gravity_duty,
                                .duty_limit = config->duty_limit,
                                .duty_cap = joint->duty_cap,
@@ -90,14 +141,40 @@ static void control(joint_state *joint, const joint_config *config, uint32_t cur
     (void)pid_step(&joint->pid, &config->gains, &demand, &joint->limited);
 }
 
+/* Return a motor's current in its joint's direction, A. */
+static float joint_current(const core_state *core, const core_inputs *inputs, uint32_t i)
+{
+    return (float)(core->config.joint[i].motor_direction * inputs->current_ma[i]) * 0.001f;
+}
+
 /* Drive every joint, watch what comes of it. */
 static void drive(core_state *core, const core_inputs *inputs)
 {
+    const float supply_v = (float)inputs->supply_mv * 0.001f;
+    const float nominal_v = (float)core->config.supply_nominal_mv * 0.001f;
     advance_arm(core);
     for (uint32_t i = 0u; i < JOINTS; i++) {
-        control(&core->joint[i], &core->config.joint[i], inputs->current_ma[i]);
-        safety_watch_joint(core, i, inputs->counts[i]);
+        joint_state *joint = &core->joint[i];
+        const float current_a = joint_current(core, inputs, i);
+        if (joint->released == 0u) {
+            control(joint, &core->config.joint[i], nominal_v, current_a);
+            safety_watch_joint(core, i, inputs->counts[i], supply_v, current_a);
+        }
+        if (!number_finite(joint->pid.duty) || !number_finite(joint->pid.integral_duty)) {
+            safety_raise(core, FAULT_ARITHMETIC, i);
+        }
     }
+}
+
+/* Return what a joint's duty is to be on the present supply: gains are those of the nominal one. */
+static float duty_out(const core_state *core, const joint_state *joint, uint32_t supply_mv)
+{
+    if (!safety_drives_on(core) || joint->released != 0u) {
+        return 0.0f;
+    }
+    const uint32_t least_mv = core->config.supply_nominal_mv / 2u; /* a sensor of the supply may fail too */
+    const float scale = (float)core->config.supply_nominal_mv / (float)(supply_mv > least_mv ? supply_mv : least_mv);
+    return number_clamp(joint->pid.duty * scale, -1.0f, 1.0f);
 }
 
 /* Let the references rest where the joints are, so that nothing is left of the last motion. */
@@ -106,6 +183,8 @@ static void rest(core_state *core)
     for (uint32_t i = 0u; i < JOINTS; i++) {
         joint_state *joint = &core->joint[i];
         setpoint_hold(&joint->setpoint, joint->pot.angle_rad);
+        governor_hold(&joint->reference, joint->pot.angle_rad);
+        joint->released = 0u;
         joint->pid.integral_duty = 0.0f;
         joint->pid.duty = 0.0f;
         joint->pid.error_rad = 0.0f;
@@ -114,11 +193,28 @@ static void rest(core_state *core)
     }
 }
 
+/* On the way to disabled: let the brakes close before the drives go off. */
+static void close_brakes(core_state *core)
+{
+    if (core->closing == 0u || !safety_drives_on(core)) {
+        core->closing = 0u;
+        return;
+    }
+    if (core->brake_ticks != 0u) {
+        core->brake_ticks--;
+        return;
+    }
+    core->closing = 0u;
+    core->state = core->faults != 0u ? STATE_FAULTED : STATE_DISABLED;
+}
+
 /* Write every field of the outputs. */
 static void report(const core_state *core, core_outputs *outputs)
 {
     outputs->tick = core->tick;
     outputs->drives_on = safety_drives_on(core) ? 1u : 0u;
+    outputs->windings_shorted = core->shorted;
+    outputs->brakes_open = safety_drives_on(core) && core->closing == 0u ? 1u : 0u;
     outputs->feed_watchdog = 1u;
     outputs->state = core->state;
     outputs->faults = core->faults;
@@ -133,11 +229,11 @@ static void report(const core_state *core, core_outputs *outputs)
         const joint_state *joint = &core->joint[i];
         outputs->joint_faults[i] = core->joint_faults[i];
         outputs->limited[i] = joint->limited;
-        outputs->duty[i] = (float)core->config.joint[i].motor_direction * joint->pid.duty;
+        outputs->duty[i] = (float)core->config.joint[i].motor_direction * joint->motor.duty;
         outputs->angle_rad[i] = joint->pot.angle_rad;
         outputs->speed_rad_s[i] = joint->pid.speed_rad_s;
-        outputs->reference_rad[i] = joint->setpoint.position_rad;
-        outputs->reference_rad_s[i] = joint->setpoint.speed_rad_s;
+        outputs->reference_rad[i] = joint->reference.position_rad;
+        outputs->reference_rad_s[i] = joint->reference.speed_rad_s;
     }
 }
 
@@ -151,6 +247,15 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
     for (uint32_t i = 0u; i < JOINTS; i++) {
         core->joint[i].limited = 0u;
         measure(core, i, inputs->counts[i]);
+        const float current_a = joint_current(core, inputs, i);
+        const bool chopped = number_size(current_a) * 1000.0f > (float)core->config.joint[i].current_limit_ma;
+        if (chopped) { /* a driver that limits the current does not put the duty out */
+            motor_pause(&core->joint[i].motor, core->joint[i].pot.angle_rad);
+        } else if (safety_drives_on(core)) {
+            motor_measure(&core->joint[i].motor, &core->config.joint[i].motor, (float)inputs->supply_mv * 0.001f,
+                          current_a, core->joint[i].pot.angle_rad,
+                          core->joint[i].reference.position_rad);
+        }
     }
     safety_watch_arm(core, inputs);
     core->tick = inputs->tick;
@@ -162,8 +267,14 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
     if (safety_drives_on(core)) {
         drive(core, inputs);
     }
-    if (!safety_drives_on(core)) {
+    close_brakes(core);
+    if (safety_drives_on(core)) {
+        core->shorted = 1u;
+    } else {
         rest(core);
+    }
+    for (uint32_t i = 0u; i < JOINTS; i++) {
+        core->joint[i].motor.duty = duty_out(core, &core->joint[i], inputs->supply_mv);
     }
     report(core, outputs);
 }

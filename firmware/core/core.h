@@ -10,9 +10,9 @@
  *
  * config: a valid one is copied; an invalid one is replaced by the factory's values and rejects enabling.
  * source: what config_load returned; CONFIG_FACTORY rejects enabling too.
- * watchdog_reset: the board was restarted by its watchdog; latches a fault that can be cleared.
+ * reset: RESET_...; all but RESET_POWER latch a fault that can be cleared.
  */
-void core_init(core_state *core, const core_config *config, uint32_t source, bool watchdog_reset);
+void core_init(core_state *core, const core_config *config, uint32_t source, uint32_t reset);
 
 /* Run one tick of 1 ms. Timer interrupt or a task of the highest priority; not reentrant. Everything in outputs is
  * written. Where the state's guard words are gone nothing can be trusted: drives off, and the watchdog is not fed. */

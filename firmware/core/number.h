@@ -21,6 +21,9 @@ static inline float number_clamp(float x, float low, float high) { return x < lo
 /* Return the size of x. */
 static inline float number_size(float x) { return x < 0.0f ? -x : x; }
 
+/* Return the square root of x, 0 or more: one instruction, rounded as IEEE 754 says. */
+static inline float number_root(float x) { return __builtin_sqrtf(x); }
+
 /* Return count + 1, or count where it would wrap. */
 static inline uint32_t number_count(uint32_t count) { return count == UINT32_MAX ? count : count + 1u; }
 

@@ -2,6 +2,8 @@
 
 #include "number.h"
 
+#define CREEP_RAD_S 0.005f /* from here on dry friction is compensated by half and more */
+
 void pid_reset(pid_state *pid, float measured_rad)
 {
     *pid = (pid_state){.measured_rad = measured_rad};
@@ -30,17 +32,25 @@ static float limited_duty(const pid_state *pid, const pid_demand *demand, float 
     return reached;
 }
 
+/* Return a direction, -1 to 1, without a jump where it changes. */
+static float direction_of(float speed_rad_s) { return speed_rad_s / (number_size(speed_rad_s) + CREEP_RAD_S); }
+
 float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *demand, uint32_t *limited)
 {
     const float error_rad = demand->reference_rad - pid->measured_rad;
-    const float asked = gains->kp_per_rad * error_rad + pid->integral_duty - gains->kd_s_per_rad * pid->speed_rad_s +
-                        gains->kv_s_per_rad * demand->reference_rad_s + demand->gravity_duty;
+    /* However far the reference is away: the joint is not driven to it faster than its speed limit. */
+    const float requested = gains->kp_per_rad * error_rad + gains->kv_s_per_rad * demand->reference_rad_s;
+    const float spring = number_clamp(requested, -demand->spring_limit, demand->spring_limit);
+    const float gathered_rad = spring == requested ? error_rad : 0.0f; /* nor does the integral make it faster */
+    const float forward = gains->ka_s2_per_rad * demand->reference_rad_s2 +
+                          gains->kf_duty * direction_of(demand->reference_rad_s) + demand->gravity_duty;
+    const float asked = spring + pid->integral_duty - gains->kd_s_per_rad * pid->speed_rad_s + forward;
     const float duty = limited_duty(pid, demand, asked, limited);
     float integral = pid->integral_duty;
     if (gains->ki_per_rad_s > 0.0f) {
         /* Back-calculation: what a limit took away is taken from the integral as well. */
         const float pull = gains->anti_windup_per_s * (duty - asked);
-        integral += TICK_S * (gains->ki_per_rad_s * error_rad + pull);
+        integral += TICK_S * (gains->ki_per_rad_s * gathered_rad + pull);
     } else {
         /* Nothing feeds the integral: what a change of gains left in it fades. */
         integral -= TICK_S * gains->anti_windup_per_s * integral;
@@ -52,6 +62,7 @@ float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *deman
     pid->duty = duty;
     pid->error_rad = error_rad;
     pid->reference_rad_s = demand->reference_rad_s;
+    pid->reference_rad_s2 = demand->reference_rad_s2;
     return duty;
 }
 
@@ -59,13 +70,16 @@ void pid_change_gains(pid_state *pid, const joint_gains *before, const joint_gai
 {
     pid->integral_duty += (before->kp_per_rad - after->kp_per_rad) * pid->error_rad -
                           (before->kd_s_per_rad - after->kd_s_per_rad) * pid->speed_rad_s +
-                          (before->kv_s_per_rad - after->kv_s_per_rad) * pid->reference_rad_s;
+                          (before->kv_s_per_rad - after->kv_s_per_rad) * pid->reference_rad_s +
+                           (before->ka_s2_per_rad - after->ka_s2_per_rad) * pid->reference_rad_s2 +
+                           (before->kf_duty - after->kf_duty) * direction_of(pid->reference_rad_s);
 }
 
 bool pid_gains_finite(const joint_gains *gains)
 {
     return number_finite(gains->kp_per_rad) && number_finite(gains->ki_per_rad_s) &&
            number_finite(gains->kd_s_per_rad) && number_finite(gains->kv_s_per_rad) &&
+           number_finite(gains->ka_s2_per_rad) && number_finite(gains->kf_duty) &&
            number_finite(gains->derivative_filter_s) && number_finite(gains->anti_windup_per_s);
 }
 
@@ -73,6 +87,7 @@ bool pid_gains_in_range(const joint_gains *gains)
 {
     return number_within(gains->kp_per_rad, 0.0f, 100.0f) && number_within(gains->ki_per_rad_s, 0.0f, 1000.0f) &&
            number_within(gains->kd_s_per_rad, 0.0f, 100.0f) && number_within(gains->kv_s_per_rad, 0.0f, 100.0f) &&
+           number_within(gains->ka_s2_per_rad, 0.0f, 10.0f) && number_within(gains->kf_duty, 0.0f, 1.0f) &&
            number_within(gains->derivative_filter_s, 0.0f, 1.0f) &&
            number_within(gains->anti_windup_per_s, 0.0f, 1000.0f);
 }

@@ -72,5 +72,7 @@ bool pot_is_inverted(pot_state *pot, const pot_config *config, float error_rad, 
         pot->towards = towards;
         pot->farthest_rad = along_rad;
     }
-    return pot->farthest_rad - along_rad > config->inverted_rad;
+    /* A joint that follows its reference downwards is driven upwards all the way: it must be away from it, too. */
+    return pot->farthest_rad - along_rad > config->inverted_rad &&
+           number_size(error_rad) > 0.5f * config->inverted_rad;
 }

@@ -1,7 +1,16 @@
 #include "safety.h"
 
+#include "config.h"
+#include "governor.h"
+#include "motor.h"
 #include "number.h"
+#include "pid.h"
 #include "pot.h"
+#include "setpoint.h"
+
+#define LOST_TICKS 100u   /* so many ticks lost of late are no accident */
+#define CRC_BYTES 2u      /* of the configuration looked at in a tick: all of it in less than a second */
+#define OVERCURRENT_TICKS 20u
 
 #define FAULT_NAME(name, code, reaction, text) [code] = #name,
 #define FAULT_TEXT(name, code, reaction, text) [code] = text,
@@ -29,6 +38,37 @@ bool safety_drives_on(const core_state *core)
     return core->state == STATE_ENABLED || core->state == STATE_STOPPING || core->state == STATE_HOLDING;
 }
 
+/* Begin to slow all references down in the same time, so that the arm stays on its path: the joint that needs longest
+ * brakes as hard as it may, the others less. */
+static void stop_along_path(core_state *core)
+{
+    float longest_s = TICK_S;
+    for (uint32_t i = 0u; i < JOINTS; i++) {
+        const float takes_s =
+            number_size(core->joint[i].reference.speed_rad_s) / core->config.joint[i].deceleration_rad_s2;
+        longest_s = takes_s > longest_s ? takes_s : longest_s;
+    }
+    for (uint32_t i = 0u; i < JOINTS; i++) {
+        joint_state *joint = &core->joint[i];
+        joint->stop_rad_s2 = number_size(joint->reference.speed_rad_s) / longest_s;
+        setpoint_hold(&joint->setpoint, joint->reference.position_rad);
+        joint->setpoint.speed_rad_s = joint->reference.speed_rad_s;
+    }
+}
+
+/* Hold a joint where it is, wherever it was to be. */
+static void yield(joint_state *joint)
+{
+    setpoint_hold(&joint->setpoint, joint->pot.angle_rad);
+    governor_hold(&joint->reference, joint->pot.angle_rad);
+}
+
+static uint32_t reaction_to(const core_state *core, uint32_t fault)
+{
+    const uint32_t reaction = fault_reactions[fault];
+    return reaction == REACTION_CHOSEN ? core->config.silence_reaction : reaction;
+}
+
 void safety_raise(core_state *core, uint32_t fault, uint32_t joint)
 {
     const uint32_t bit = 1u << fault;
@@ -41,17 +81,22 @@ void safety_raise(core_state *core, uint32_t fault, uint32_t joint)
         core->first_fault = fault;
         core->first_joint = joint;
     }
-    uint32_t reaction = fault_reactions[fault];
-    if (reaction == REACTION_CHOSEN) {
-        reaction = core->config.silence_reaction;
-    }
     if (core->state == STATE_STOPPED) {
         return;
     }
+    const uint32_t reaction = reaction_to(core, fault);
     if (reaction == REACTION_RELEASE || !safety_drives_on(core)) {
         core->state = STATE_FAULTED;
-    } else if (core->state == STATE_ENABLED) {
+        return;
+    }
+    if (core->state == STATE_ENABLED) {
         core->state = STATE_STOPPING;
+        stop_along_path(core);
+    }
+    if (joint < JOINTS && reaction == REACTION_JOINT) {
+        core->joint[joint].released = 1u;
+    } else if (joint < JOINTS && reaction == REACTION_YIELD) {
+        yield(&core->joint[joint]);
     }
 }
 
@@ -77,10 +122,53 @@ static void watch_supply(core_state *core, uint32_t supply_mv)
     }
 }
 
+/* Watch the tick timer. What was lost fades by one in ten ticks. */
+static void watch_ticks(core_state *core, uint32_t tick)
+{
+    const uint32_t lost = core->started != 0u ? tick - core->tick - 1u : 0u;
+    if (lost != 0u) {
+        safety_raise(core, FAULT_TICK_MISSED, NO_JOINT);
+        core->missed += 10u * (lost < LOST_TICKS ? lost : LOST_TICKS);
+    } else if (core->missed != 0u) {
+        core->missed--;
+    }
+    if (core->missed > 10u * LOST_TICKS) {
+        safety_raise(core, FAULT_TICKS_LOST, NO_JOINT);
+        core->missed = 10u * LOST_TICKS;
+    }
+}
+
+/* Watch the configuration in use: a few bytes a tick, the whole about once a second. */
+static void watch_memory(core_state *core)
+{
+    const uint32_t left = (uint32_t)sizeof core->config - core->crc_at;
+    const uint32_t bytes = left < CRC_BYTES ? left : CRC_BYTES;
+    core->crc = config_crc_on(core->crc, (const uint8_t *)&core->config + core->crc_at, bytes);
+    core->crc_at += bytes;
+    if (core->crc_at < sizeof core->config) {
+        return;
+    }
+    if (core->crc_known != 0u && core->crc != core->crc_right) {
+        core->permanent |= 1u << FAULT_MEMORY;
+    }
+    core->crc_right = core->crc;
+    core->crc_known = 1u;
+    safety_changed_config(core, true);
+}
+
+void safety_changed_config(core_state *core, bool known)
+{
+    core->crc_known = known ? core->crc_known : 0u;
+    core->crc = 0xFFFFFFFFu;
+    core->crc_at = 0u;
+}
+
 void safety_watch_arm(core_state *core, const core_inputs *inputs)
 {
-    if (core->started != 0u && inputs->tick != core->tick + 1u) {
-        safety_raise(core, FAULT_TICK_MISSED, NO_JOINT);
+    watch_ticks(core, inputs->tick);
+    watch_memory(core);
+    if (inputs->taken_over != 0u && core->state == STATE_ENABLED) {
+        safety_raise(core, FAULT_TAKEN_OVER, NO_JOINT);
     }
     if (inputs->overrun != 0u) {
         safety_raise(core, FAULT_TICK_OVERRUN, NO_JOINT);
@@ -115,15 +203,64 @@ static uint32_t joint_stands(joint_state *joint, const joint_config *config)
     return joint->stall_ticks;
 }
 
-void safety_watch_joint(core_state *core, uint32_t joint, uint32_t counts)
+/* Watch a joint that is held to its limits and away from its reference. */
+static void watch_load(core_state *core, uint32_t joint)
+{
+    const joint_config *config = &core->config.joint[joint];
+    joint_state *state = &core->joint[joint];
+    const bool full = (state->limited & (LIMITED_DUTY | LIMITED_CURRENT)) != 0u;
+    const bool behind = number_size(state->pid.error_rad) > 0.5f * config->following_rad;
+    state->overload_ticks = in_a_row(state->overload_ticks, full && behind);
+    if (state->overload_ticks >= core->config.overload_ticks) {
+        safety_raise(core, FAULT_OVERLOAD, joint);
+        state->overload_ticks = 0u;
+    }
+}
+
+/* Watch the motor: as a witness of the motion, and for itself. */
+static void watch_motor(core_state *core, uint32_t joint, float supply_v, float current_a)
+{
+    const joint_config *config = &core->config.joint[joint];
+    joint_state *state = &core->joint[joint];
+    const uint32_t fault = motor_disagrees(&state->motor, &config->motor, supply_v, current_a);
+    if (fault != FAULT_NONE) {
+        safety_raise(core, fault, joint);
+        return;
+    }
+    if (motor_swings(&state->motor, state->reference.speed_rad_s, config->speed_limit_rad_s)) {
+        safety_raise(core, FAULT_OSCILLATION, joint);
+        pid_change_gains(&state->pid, &config->gains, &core->start_gains.joint[joint]);
+        core->config.joint[joint].gains = core->start_gains.joint[joint];
+        safety_changed_config(core, false);
+        state->motor.swings = 0u;
+    }
+    if (motor_is_fast(&state->motor, state->pid.speed_rad_s, config->speed_limit_rad_s)) {
+        safety_raise(core, FAULT_OVERSPEED, joint);
+    }
+    const bool hot = number_size(current_a) > 0.002f * (float)config->current_limit_ma;
+    state->motor.current_ticks = in_a_row(state->motor.current_ticks, hot);
+    if (state->motor.current_ticks >= OVERCURRENT_TICKS) {
+        safety_raise(core, FAULT_OVERCURRENT, joint);
+    }
+}
+
+void safety_watch_joint(core_state *core, uint32_t joint, uint32_t counts, float supply_v, float current_a)
 {
     const joint_config *config = &core->config.joint[joint];
     joint_state *state = &core->joint[joint];
     const pid_state *pid = &state->pid;
-    if (pot_is_inverted(&state->pot, &config->pot, pid->error_rad, pid->duty)) {
-        safety_raise(core, FAULT_POT_INVERTED, joint);
+    if (state->released != 0u) {
+        return;
     }
-    if (pot_is_frozen(&state->pot, &config->pot, counts, state->setpoint.position_rad)) {
+    watch_motor(core, joint, supply_v, current_a);
+    watch_load(core, joint);
+    if (pot_is_inverted(&state->pot, &config->pot, pid->error_rad, pid->duty)) {
+        /* Where the motor is no witness, an inversion cannot be distinguished from a push: take the worse. */
+        const bool witnessed = config->motor.resistance_ohm > 0.0f;
+        safety_raise(core, witnessed ? FAULT_PUSHED : FAULT_POT_INVERTED, joint);
+        pot_watch(&state->pot, state->reference.position_rad);
+    }
+    if (pot_is_frozen(&state->pot, &config->pot, counts, state->reference.position_rad)) {
         safety_raise(core, FAULT_POT_FROZEN, joint);
     }
     if (joint_stands(state, config) >= core->config.stall_ticks) {

@@ -61,6 +61,19 @@ void setpoint_advance(setpoint_state *setpoint)
     setpoint->speed_rad_s = (first + s * (2.0f * square + s * 3.0f * cube)) / duration_s;
 }
 
+float setpoint_acceleration(const setpoint_state *setpoint)
+{
+    if (setpoint->elapsed >= setpoint->ticks) {
+        return 0.0f;
+    }
+    const float duration_s = (float)setpoint->ticks * TICK_S;
+    const float s = (float)setpoint->elapsed / (float)setpoint->ticks;
+    const float distance = (setpoint->to_rad - setpoint->from_rad) / duration_s;
+    const float square = 3.0f * distance - 2.0f * setpoint->from_rad_s - setpoint->to_rad_s;
+    const float cube = setpoint->from_rad_s + setpoint->to_rad_s - 2.0f * distance;
+    return (2.0f * square + s * 6.0f * cube) / duration_s;
+}
+
 bool setpoint_slow(setpoint_state *setpoint, float deceleration_rad_s2)
 {
     const float step = deceleration_rad_s2 * TICK_S;

@@ -17,6 +17,9 @@ bool setpoint_aim(setpoint_state *setpoint, float to_rad, float to_rad_s, uint32
 /* Advance by one tick: along the cubic, and beyond its end straight on at its last speed. */
 void setpoint_advance(setpoint_state *setpoint);
 
+/* Return the acceleration (rad/s^2) with which it passes its present point. */
+float setpoint_acceleration(const setpoint_state *setpoint);
+
 /* Advance by one tick while slowing down by deceleration_rad_s2. Returns whether it has come to rest. */
 bool setpoint_slow(setpoint_state *setpoint, float deceleration_rad_s2);
 

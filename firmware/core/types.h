@@ -18,27 +18,42 @@
 
 /* X(name, code, reaction, text): the faults. A fault latches; docs/reference/firmware.md says when each comes. */
 #define FAULT_LIST(X)                                                                                 \
-    X(POT_OPEN, 1, RELEASE, "potentiometer open: the reading is above its band")                      \
-    X(POT_SHORT, 2, RELEASE, "potentiometer short: the reading is below its band")                    \
-    X(POT_FROZEN, 3, RELEASE, "potentiometer frozen: the reading stands still while the arm is commanded to move") \
-    X(POT_JUMP, 4, RELEASE, "potentiometer jump: the reading moved faster than the joint can")        \
-    X(POT_INVERTED, 5, RELEASE, "inverted: the joint moves away from its command")                    \
-    X(FOLLOWING, 6, RELEASE, "following error: the joint is too far from its reference")              \
-    X(STALL, 7, RELEASE, "stall: the motor is driven hard and the joint does not rotate")             \
+    X(POT_OPEN, 1, JOINT, "potentiometer open: the reading is above its band")                        \
+    X(POT_SHORT, 2, JOINT, "potentiometer short: the reading is below its band")                      \
+    X(POT_FROZEN, 3, JOINT, "potentiometer frozen: the reading stands still while the motor rotates") \
+    X(POT_JUMP, 4, JOINT, "potentiometer jump: the reading moved faster than the joint can")          \
+    X(POT_INVERTED, 5, JOINT, "inverted: the reading moves against the motor")                        \
+    X(FOLLOWING, 6, YIELD, "following error: the joint is too far from its reference")                \
+    X(STALL, 7, YIELD, "stall: the motor is driven hard and the joint does not rotate")               \
     X(HOST_SILENT, 8, CHOSEN, "host silent: no motion command within the time set")                   \
     X(SUPPLY_LOW, 9, RELEASE, "supply too low")                                                       \
     X(SUPPLY_HIGH, 10, RELEASE, "supply too high")                                                    \
     X(TICK_MISSED, 11, HOLD, "tick missed: the control loop lost time")                               \
     X(TICK_OVERRUN, 12, HOLD, "tick overrun: the control loop took longer than its period")           \
     X(WATCHDOG, 13, RELEASE, "restarted by the watchdog")                                             \
-    X(CONFIG, 14, RELEASE, "no valid configuration: factory values are in use")
+    X(CONFIG, 14, RELEASE, "no valid configuration: factory values are in use")                       \
+    X(POT_SLIP, 15, JOINT, "potentiometer slips: the reading stays behind the motor")                 \
+    X(POT_DRIFT, 16, JOINT, "potentiometer drifts: the reading moves by itself")                      \
+    X(POT_SCALE, 17, JOINT, "potentiometer scale: the reading moves too far or not far enough")       \
+    X(POT_LAG, 18, JOINT, "potentiometer lags: the reading follows the motor late")                   \
+    X(OVERLOAD, 19, YIELD, "overload: the duty is at its limit and the joint does not follow")        \
+    X(PUSHED, 20, YIELD, "pushed: something moves the joint against its motor")                       \
+    X(OVERSPEED, 21, HOLD, "overspeed: the joint is faster than its limit")                           \
+    X(OSCILLATION, 22, HOLD, "oscillation: the joint swings about its reference; the stored gains are in use again") \
+    X(CURRENT_SENSOR, 23, JOINT, "current: no current where the voltage must drive one; its sensor or a lead is broken") \
+    X(OVERCURRENT, 24, JOINT, "overcurrent: the motor current stays beyond twice its limit")          \
+    X(ARITHMETIC, 25, RELEASE, "arithmetic: a duty was no number")                                    \
+    X(MEMORY, 26, RELEASE, "memory: the configuration in use has changed by itself")                  \
+    X(TICKS_LOST, 27, RELEASE, "ticks lost: the control loop loses time again and again")             \
+    X(TAKEN_OVER, 28, HOLD, "taken over: another host said hello while the arm was driven")           \
+    X(CRASH, 29, RELEASE, "restarted after a crash of the firmware")
 
 /* X(name, code, text): the states. */
 #define STATE_LIST(X)                                                     \
     X(DISABLED, 0, "disabled: drives off")                                \
     X(ENABLED, 1, "enabled: follows the host")                            \
     X(STOPPING, 2, "stopping: a fault slows the arm down to rest")        \
-    X(HOLDING, 3, "holding: a fault stands, the arm is held at rest")     \
+    X(HOLDING, 3, "holding: the arm is held at rest until it is enabled") \
     X(FAULTED, 4, "faulted: a fault stands, drives off")                  \
     X(STOPPED, 5, "emergency stop: drives off until it is cleared")
 
@@ -54,7 +69,8 @@
     X(UNKNOWN_COMMAND, 8, "unknown command")                                           \
     X(NO_HELLO, 9, "no hello of the board's own version came: only STOP is acknowledged")    \
     X(TOO_MANY, 10, "too many commands at once")                                       \
-    X(CONFIG_BROKEN, 11, "the configuration came incomplete, or could not be stored")
+    X(CONFIG_BROKEN, 11, "the configuration came incomplete, or could not be stored")    \
+    X(NOT_OWNER, 12, "another host has the session: say hello again")
 
 #define FAULT_CODE(name, code, reaction, text) FAULT_##name = (code),
 #define STATE_CODE(name, code, text) STATE_##name = (code),
@@ -66,8 +82,13 @@ enum { REJECTION_NONE = 0, REJECTION_LIST(REJECTION_CODE) REJECTION_COUNT };
 #undef STATE_CODE
 #undef REJECTION_CODE
 
-/* What a fault does to a moving arm. CHOSEN is the configuration's silence_reaction. */
-enum { REACTION_HOLD = 1, REACTION_RELEASE = 2, REACTION_CHOSEN = 3 };
+/* What a fault does to a moving arm: HOLD stops it along its path and holds it. YIELD does so too, but the joint lets
+ * itself be moved to where it is. JOINT shorts the windings of the joint and stops the others along their path. RELEASE
+ * shorts the windings of all. CHOSEN is the configuration's silence_reaction. */
+enum { REACTION_HOLD = 1, REACTION_RELEASE = 2, REACTION_CHOSEN = 3, REACTION_YIELD = 4, REACTION_JOINT = 5 };
+
+/* Why the board started. */
+enum { RESET_POWER = 0, RESET_WATCHDOG = 1, RESET_CRASH = 2 };
 
 /* What a command asks for. */
 enum {
@@ -88,6 +109,7 @@ enum {
     LIMITED_CURRENT = 4,
     LIMITED_SOFT = 8,
     LIMITED_SPEED = 16,
+    LIMITED_ACCELERATION = 32,
 };
 
 /* Where a configuration came from. */
@@ -99,6 +121,8 @@ typedef struct joint_gains {
     float ki_per_rad_s;        /* duty per second and rad of error, 0 to 1000 */
     float kd_s_per_rad;        /* duty per rad/s of measured speed, 0 to 100: damps */
     float kv_s_per_rad;        /* duty per rad/s of reference speed, 0 to 100: feed-forward */
+    float ka_s2_per_rad;       /* duty per rad/s^2 of reference acceleration, 0 to 10: feed-forward */
+    float kf_duty;             /* duty that dry friction takes, 0 to 1: feed-forward, with the reference's direction */
     float derivative_filter_s; /* time constant of the speed filter, 0 to 1: longer is smoother and later */
     float anti_windup_per_s;   /* how fast the integral gives way to a limit, 0 to 1000: 1/time constant */
 } joint_gains;
@@ -118,19 +142,30 @@ typedef struct pot_config {
     int32_t direction;           /* 1 or -1, multiplies the table's angle */
     float jump_rad;              /* largest change the joint can make in one tick, 1e-4 to 1 */
     float frozen_rad;            /* reference travel over which the counts must change, 1e-3 to 1 */
-    float inverted_rad;          /* travel away from the command that proves an inversion, 1e-3 to 1 */
+    float inverted_rad;          /* travel away from the command that is a push or an inversion, 1e-3 to 1 */
 } pot_config;
+
+/* The motor of one joint, at the joint: by these two the board knows its speed without the potentiometer. */
+typedef struct motor_config {
+    float resistance_ohm; /* 0 to 1000; 0: the motor is not watched */
+    float constant_v_s;   /* 0.001 to 1000: V s/rad, gear included */
+    float apart_rad;      /* 1e-3 to 1: how far motor and potentiometer may be apart: noise and backlash */
+} motor_config;
 
 /* The configuration of one joint. */
 typedef struct joint_config {
     joint_gains gains;
     pot_config pot;
+    motor_config motor;
     float soft_min_rad;        /* -13 to 13, below soft_max_rad */
     float soft_max_rad;        /* -13 to 13 */
     float speed_limit_rad_s;   /* 0.01 to 20: bounds the reference's speed */
     float deceleration_rad_s2; /* 0.1 to 1000: how a stop slows the reference down */
+    float acceleration_rad_s2; /* 0.1 to 1000: bounds the reference's acceleration */
+    float jerk_rad_s3;         /* 1 to 1e6: bounds how fast the reference's acceleration changes */
     float duty_limit;          /* 0 to 1 */
     float duty_slew_per_s;     /* 0.1 to 1000: largest change of duty */
+    float gravity_slew_per_s;  /* 0.1 to 1000: largest change of the host's gravity duty */
     float current_cut_per_a_s; /* 0 to 1000: duty taken away per second and ampere beyond the limit */
     float following_rad;       /* 1e-3 to 13: largest distance from the reference */
     float stall_duty;          /* 0.01 to 1: from here on the motor must rotate the joint */
@@ -144,10 +179,14 @@ typedef struct core_config {
     joint_config joint[JOINTS];
     uint32_t supply_min_mv;
     uint32_t supply_max_mv;
+    uint32_t supply_nominal_mv; /* duties and gains are those at this supply; 1000 to 100000 */
     uint32_t supply_ticks;     /* 1 to 1000: a supply fault must last as long */
     uint32_t pot_ticks;        /* 1 to 100: so must an open, short or jumping potentiometer */
     uint32_t following_ticks;  /* 1 to 10000: and a following error */
     uint32_t stall_ticks;      /* 1 to 10000: and a stall */
+    uint32_t overload_ticks;   /* 1 to 10000: and an overload */
+    uint32_t brake_release_ticks; /* 0 to 1000: how long brakes take to open; the reference waits */
+    uint32_t brake_engage_ticks;  /* 0 to 1000: how long they take to close; the drives hold meanwhile */
     uint32_t silence_ticks;    /* 2 to 60000: longest time without a motion command */
     uint32_t silence_reaction; /* REACTION_HOLD or REACTION_RELEASE */
 } core_config;
@@ -182,16 +221,19 @@ typedef struct core_inputs {
     uint32_t tick;               /* the board's tick timer: one more each time, it may wrap */
     uint32_t overrun;            /* not 0: the last tick had not ended when this one was due */
     uint32_t stop_pressed;       /* not 0: an emergency stop is asked for, by button or by message */
+    uint32_t taken_over;         /* not 0: another host began a session */
     uint32_t supply_mv;          /* motor supply */
     uint32_t counts[JOINTS];     /* potentiometers, 0 to 65535 */
-    uint32_t current_ma[JOINTS]; /* size of the motor currents; 0 where a board does not measure them */
+    int32_t current_ma[JOINTS];  /* motor currents, positive where a positive duty drives them; 0 where not measured */
     core_command command;        /* COMMAND_NONE where none came since the last tick */
 } core_inputs;
 
 /* What a tick gives. */
 typedef struct core_outputs {
     uint32_t tick;                /* the input's */
-    uint32_t drives_on;           /* 0: switch the motor drivers off */
+    uint32_t drives_on;           /* 0: the motors are not driven */
+    uint32_t windings_shorted;    /* not 0 with drives_on 0: keep the bridges awake at duty 0, so that motors brake */
+    uint32_t brakes_open;         /* not 0: release the brakes, where there are any */
     uint32_t feed_watchdog;       /* not 0: the tick ran to its end, the watchdog may be fed */
     uint32_t state;               /* STATE_... */
     uint32_t faults;              /* latched faults, bit number = code */
@@ -219,12 +261,15 @@ typedef struct pid_state {
     float duty;            /* last tick's, for the slew limit */
     float error_rad;       /* last tick's, for a bumpless change of gains */
     float reference_rad_s; /* likewise */
+    float reference_rad_s2; /* likewise */
 } pid_state;
 
 /* What the controller of one joint is to reach and within which limits. */
 typedef struct pid_demand {
     float reference_rad;
     float reference_rad_s;
+    float reference_rad_s2;
+    float spring_limit;    /* largest duty of kp and kv together: what moves a free joint at its speed limit */
     float gravity_duty;
     float duty_limit;      /* 0 to 1 */
     float duty_cap;        /* 0 to duty_limit: what the current limit leaves */
@@ -243,6 +288,45 @@ typedef struct setpoint_state {
     uint32_t elapsed;  /* ticks since its beginning */
 } setpoint_state;
 
+/* The reference within its limits: the path a setpoint asks for, followed as fast as acceleration and jerk allow. */
+typedef struct governor_state {
+    float position_rad;
+    float speed_rad_s;
+    float acceleration_rad_s2;
+} governor_state;
+
+#define MOTOR_SAMPLES 32u /* of a joint's last 128 ms */
+
+/* What is remembered of one motor, watched by its own voltage and current. */
+typedef struct motor_state {
+    float duty;              /* put out in the last tick, direction of the joint */
+    float speed_rad_s;       /* by the back-EMF */
+    float travel_rad;        /* since the joint was enabled */
+    float gap_rad;           /* travel of the reading less that of the motor; fades */
+    float band_rad;          /* how much of it the motor's uncertain numbers explain; fades */
+    float last_rad;          /* the reading of the last tick */
+    float resistance_scale;  /* learnt: over the configuration's */
+    float constant_scale;
+    float variance_rr;       /* of both scales */
+    float variance_rk;
+    float variance_kk;
+    float window_v;          /* sums since the window began: applied voltage, */
+    float window_ir_v;       /* what the configured resistance takes of it, */
+    float window_rad;        /* the reading at its beginning */
+    uint32_t window_ticks;
+    uint32_t sampled;        /* samples taken */
+    float sample_read_rad[MOTOR_SAMPLES];
+    float sample_motor_rad[MOTOR_SAMPLES];
+    float sample_reference_rad[MOTOR_SAMPLES];
+    float agreed_rad;        /* the motor's way on which the reading went along */
+    int32_t swing_side;      /* which side of the reference's speed the motor's was on last */
+    uint32_t swing_ticks;    /* since it changed */
+    uint32_t swings;         /* changes in quick succession */
+    uint32_t fast_ticks;     /* faster than the limit, in a row */
+    uint32_t current_ticks;  /* beyond twice the current limit, in a row */
+    uint32_t driven_ticks;   /* since the windings were closed */
+} motor_state;
+
 /* What is remembered of one potentiometer. */
 typedef struct pot_state {
     uint32_t valid;        /* not 0 once a reading was within its band */
@@ -258,13 +342,19 @@ typedef struct pot_state {
 typedef struct joint_state {
     pid_state pid;
     setpoint_state setpoint;
+    governor_state reference;
     pot_state pot;
-    float gravity_duty;
+    motor_state motor;
+    uint32_t released;       /* not 0: a fault took it out of the drive, its windings are shorted */
+    float gravity_duty;      /* in use; it follows gravity_asked */
+    float gravity_asked;
+    float stop_rad_s2;       /* deceleration on the way to a stop along the path */
     float duty_cap;          /* what the current limit leaves of the duty limit */
     float low_rad;           /* soft limits, widened to the joint's position while it is brought back in */
     float high_rad;
     uint32_t following_ticks;
     uint32_t stall_ticks;
+    uint32_t overload_ticks;
     float stall_mark_rad;    /* where the joint was when stall_ticks began */
     uint32_t held_back;      /* LIMITED_SOFT and LIMITED_SPEED of the last motion command */
     uint32_t limited;        /* LIMITED_... of this tick */
@@ -280,6 +370,15 @@ typedef struct core_state {
     uint32_t tick;
     uint32_t silent_ticks;
     uint32_t supply_bad_ticks;
+    uint32_t missed;         /* ticks lost of late; fades */
+    uint32_t shorted;        /* not 0: windings stay shorted while the drives are off */
+    uint32_t closing;        /* not 0: the brakes close, the drives go off once they are */
+    uint32_t brake_ticks;    /* until the brakes are open, or closed */
+    gain_set start_gains;    /* those it started with: an oscillation goes back to them */
+    uint32_t crc;            /* of the configuration, as far as this round has come */
+    uint32_t crc_at;         /* bytes */
+    uint32_t crc_right;      /* of the whole, if crc_known */
+    uint32_t crc_known;
     uint32_t standing;       /* faults whose cause stands in this tick */
     uint32_t faults;
     uint32_t joint_faults[JOINTS];

@@ -28,10 +28,14 @@ static bool is_newer(const wire_state *wire, uint32_t sequence)
     return wire->sequence_known == 0u || (ahead != 0u && ahead < 0x80000000u);
 }
 
-bool command_admit(wire_state *wire, uint32_t sequence)
+bool command_admit(wire_state *wire, const mavlink_message_t *message, uint32_t sequence, uint32_t session)
 {
     if (wire->greeted == 0u) {
         command_reject(wire, sequence, REJECTION_NO_HELLO);
+        return false;
+    }
+    if (session != wire->session || message->sysid != wire->owner) {
+        command_reject(wire, sequence, REJECTION_NOT_OWNER);
         return false;
     }
     if (!is_newer(wire, sequence)) {
@@ -99,12 +103,24 @@ void command_deliver(wire_state *wire)
     }
 }
 
+/* Begin a session for the host that said hello. Its number comes of what the converters read: nobody who recorded an
+ * earlier one knows it. */
+static void begin_session(wire_state *wire, const mavlink_message_t *message, uint32_t nonce)
+{
+    uint32_t crc = config_crc_on(wire->session ^ nonce, &wire->report, sizeof wire->report);
+    crc = config_crc_on(crc, &wire->counters, sizeof wire->counters);
+    wire->session = crc != 0u ? crc : 1u;
+    wire->owner = message->sysid;
+    wire->sequence_known = 0u;
+    atomic_fetch_add(&wire->shared.sessions, 1u);
+}
+
 static void take_hello(wire_state *wire, const mavlink_message_t *message)
 {
     mavlink_hello_t hello;
     mavlink_msg_hello_decode(message, &hello);
     wire->greeted = hello.dialect_version == ARMSIGHT_DIALECT_VERSION && hello.config_version == CONFIG_VERSION;
-    wire->sequence_known = 0u;
+    begin_session(wire, message, hello.nonce);
     drop(wire, COMMAND_NONE);
     mavlink_welcome_t welcome = {
         .dialect_version = ARMSIGHT_DIALECT_VERSION,
@@ -115,6 +131,7 @@ static void take_hello(wire_state *wire, const mavlink_message_t *message)
         .baud = wire->setup.baud,
         .config_source = wire->setup.config_source,
         .joints = JOINTS,
+        .session = wire->session,
         .firmware = FIRMWARE_VERSION,
     };
     for (uint32_t i = 0u; i < sizeof welcome.board && wire->setup.board[i] != '\0'; i++) {
@@ -130,7 +147,7 @@ static void take_move(wire_state *wire, const mavlink_message_t *message)
 {
     mavlink_move_t move;
     mavlink_msg_move_decode(message, &move);
-    const bool admitted = command_admit(wire, move.sequence);
+    const bool admitted = command_admit(wire, message, move.sequence, move.session);
     core_command *command = admitted ? command_append(wire, COMMAND_MOVE, move.sequence) : NULL;
     if (command == NULL) {
         return;
@@ -145,7 +162,7 @@ static void take_command(wire_state *wire, const mavlink_message_t *message)
 {
     mavlink_command_t command;
     mavlink_msg_command_decode(message, &command);
-    if (!command_admit(wire, command.sequence)) {
+    if (!command_admit(wire, message, command.sequence, command.session)) {
         return;
     }
     if (command.kind < COMMAND_ENABLE || command.kind > COMMAND_CLEAR_STOP) {
@@ -159,7 +176,7 @@ static void take_gains(wire_state *wire, const mavlink_message_t *message)
 {
     mavlink_gains_t gains;
     mavlink_msg_gains_decode(message, &gains);
-    const bool admitted = command_admit(wire, gains.sequence);
+    const bool admitted = command_admit(wire, message, gains.sequence, gains.session);
     core_command *command = admitted ? command_append(wire, COMMAND_GAINS, gains.sequence) : NULL;
     if (command != NULL) {
         memcpy(&command->gains, gains.gains, sizeof command->gains);

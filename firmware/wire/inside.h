@@ -14,8 +14,9 @@ static inline uint32_t wire_tick(const wire_state *wire) { return wire->report.o
 /* Execute a message whose checksum is right. */
 void message_take(wire_state *wire, const mavlink_message_t *message);
 
-/* Return whether a command may be taken, by its number and by who sent it; rejects or drops it otherwise. */
-bool command_admit(wire_state *wire, uint32_t sequence);
+/* Return whether a command may be taken, by its number, its session and the system that sent it; rejects or drops it
+ * otherwise. */
+bool command_admit(wire_state *wire, const mavlink_message_t *message, uint32_t sequence, uint32_t session);
 
 /* Return the slot at the queue's end for a command of this kind; NULL, and rejects it, where there is none. */
 core_command *command_append(wire_state *wire, uint32_t kind, uint32_t sequence);

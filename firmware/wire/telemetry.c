@@ -121,7 +121,7 @@ static void write_status(wire_state *wire)
         .config_stored = wire->counters.config_stored,
     };
     for (uint32_t joint = 0u; joint < JOINTS; joint++) {
-        status.joint_faults[joint] = (uint16_t)outputs->joint_faults[joint];
+        status.joint_faults[joint] = outputs->joint_faults[joint];
     }
     mavlink_message_t message;
     mavlink_msg_board_status_encode_status(WIRE_SYSTEM, WIRE_COMPONENT, &wire->output.framing, &message, &status);

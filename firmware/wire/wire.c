@@ -153,6 +153,9 @@ void wire_before_tick(wire_state *wire, core_inputs *inputs)
         shared->stops_taken = stops;
         inputs->stop_pressed = 1u;
     }
+    const uint32_t sessions = atomic_load(&shared->sessions);
+    inputs->taken_over = sessions - shared->sessions_taken;
+    shared->sessions_taken = sessions;
     if (atomic_load(&shared->mail_full) != 0u) {
         inputs->command = shared->mail;
         atomic_store(&shared->mail_full, 0u);

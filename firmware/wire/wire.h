@@ -99,6 +99,8 @@ typedef struct wire_shared {
     _Atomic uint32_t mail_full;
     _Atomic uint32_t stops;        /* STOPs that came */
     uint32_t stops_taken;          /* the tick's */
+    _Atomic uint32_t sessions;     /* HELLOs that came */
+    uint32_t sessions_taken;       /* the tick's */
     wire_report report;            /* the tick's: read again if report_count has changed meanwhile */
     _Atomic uint32_t report_count; /* how many there were */
 } wire_shared;
@@ -116,6 +118,8 @@ typedef struct wire_state {
     wire_fate fate;
     wire_report report;       /* the newest one, the main loop's */
     uint32_t reports_read;
+    uint32_t session;         /* its commands carry it */
+    uint32_t owner;           /* MAVLink system of the host that has it */
     uint32_t greeted;         /* not 0: a HELLO of this version came */
     uint32_t sequence_known;  /* not 0: newest_sequence is one */
     uint32_t newest_sequence; /* of the commands that came since the last HELLO */

@@ -16,7 +16,7 @@ def declare(library: Library) -> Library:
     flag, real, word, pointer = ctypes.c_bool, ctypes.c_float, ctypes.c_uint32, ctypes.c_void_p
     signatures = {
         "host_size": (word, [ctypes.c_char_p]),
-        "core_init": (None, [pointer, pointer, word, flag]),
+        "core_init": (None, [pointer, pointer, word, word]),
         "core_tick": (None, [pointer, pointer, pointer]),
         "pid_reset": (None, [pointer, real]),
         "pid_measure": (None, [pointer, pointer, real]),
@@ -50,8 +50,9 @@ def lab_config(library: Library):
     config = c.core_config()
     library.config_factory(ctypes.byref(config))
     for joint in config.joint:
-        joint.gains = c.joint_gains(4.0, 8.0, 0.1, 0.2, 0.005, 20.0)
+        joint.gains = c.joint_gains(4.0, 8.0, 0.1, 0.2, 0.0, 0.0, 0.005, 20.0)
         joint.speed_limit_rad_s, joint.deceleration_rad_s2 = 2.0, 10.0
+        joint.acceleration_rad_s2, joint.jerk_rad_s3 = 1000.0, 1e6
         joint.duty_limit, joint.duty_slew_per_s, joint.stall_duty = 0.8, 50.0, 0.5
     config.stall_ticks, config.following_ticks = 200, 20
     return config
@@ -64,7 +65,9 @@ class LabArm:
         self.library = library
         self.config = config or lab_config(library)
         self.core, self.inputs, self.outputs = c.core_state(), c.core_inputs(), c.core_outputs()
-        library.core_init(ctypes.byref(self.core), ctypes.byref(self.config), source, watchdog)
+        library.core_init(
+            ctypes.byref(self.core), ctypes.byref(self.config), source, c.RESET_WATCHDOG if watchdog else c.RESET_POWER
+        )
         self.angle_rad = [angle_rad] * c.JOINTS
         self.speed_rad_s = [0.0] * c.JOINTS
         self.inputs.supply_mv = 12000

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 from firmware_build import FIRMWARE
 
-HEADERS = ("core/types.h", "boards/pil/frame.h")
+HEADERS = ("core/types.h", "core/config.h", "boards/pil/frame.h")
 BASIC = {
     "float": ctypes.c_float,
     "uint32_t": ctypes.c_uint32,
@@ -16,7 +16,7 @@ BASIC = {
 }
 HEADER = "".join((FIRMWARE / path).read_text(encoding="utf-8") for path in HEADERS)
 HEADER = re.sub(r"/\*.*?\*/", "", HEADER, flags=re.DOTALL)
-NUMBERS = {name: int(value, 0) for name, value in re.findall(r"#define (\w+) (\d\w*)u *\n", HEADER)}
+NUMBERS = {name: int(value, 0) for name, value in re.findall(r"#define (\w+) +(\d\w*)u *\n", HEADER)}
 
 
 def _listed(which: str) -> dict[str, int]:
@@ -41,7 +41,7 @@ def _records() -> dict[str, type[ctypes.Structure]]:
 
 
 FAULTS, STATES, REJECTIONS = _listed("FAULT"), _listed("STATE"), _listed("REJECTION")
-REACTIONS = dict(re.findall(r"X\((\w+), \d+, (RELEASE|HOLD|CHOSEN),", HEADER))
+REACTIONS = dict(re.findall(r"X\((\w+), \d+, (RELEASE|HOLD|CHOSEN|YIELD|JOINT),", HEADER))
 RECORDS = _records()
 
 #: Records by name (``c.core_inputs``), numbers by name (``c.JOINTS``, ``c.COMMAND_MOVE``, ``c.FAULT_STALL``).

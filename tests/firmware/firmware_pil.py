@@ -67,6 +67,7 @@ class Host:
         self.back.robust_parsing = True
         self.sequence = 0
         self.heard: list = []
+        self._session: int | None = None
 
     def pack(self, kind: str, *fields) -> bytes:
         """A message as bytes, the next in the count of the frames."""
@@ -74,9 +75,21 @@ class Host:
         self.out.seq = (self.out.seq + 1) % 256
         return data
 
-    def hello(self, *, dialect=None, config=1, nonce=7) -> bytes:
+    def hello(self, *, dialect=None, config=c.CONFIG_VERSION, nonce=7) -> bytes:
         version = self.dialect.ARMSIGHT_DIALECT_VERSION if dialect is None else dialect
+        self._session = None
         return self.pack("hello", version, config, nonce)
+
+    @property
+    def session(self) -> int:
+        """The session the board gave after the last hello; 0 before."""
+        if self._session is None and self.board is not None:
+            peek = self.dialect.MAVLink(None)
+            peek.robust_parsing = True
+            came = [*self.heard, *(peek.parse_buffer(bytes(self.board.sent)) or [])]
+            welcomes = [message for message in came if message.get_type() == "WELCOME"]
+            self._session = welcomes[-1].session if welcomes else None
+        return self._session or 0
 
     def next(self) -> int:
         self.sequence += 1
@@ -84,10 +97,10 @@ class Host:
 
     def move(self, position_rad=0.0, *, ticks=4, sequence=None, speed_rad_s=0.0) -> bytes:
         sequence = self.next() if sequence is None else sequence
-        return self.pack("move", sequence, ticks, [position_rad] * 6, [speed_rad_s] * 6, [0.0] * 6)
+        return self.pack("move", sequence, self.session, ticks, [position_rad] * 6, [speed_rad_s] * 6, [0.0] * 6)
 
     def command(self, kind: int, *, sequence=None) -> bytes:
-        return self.pack("command", self.next() if sequence is None else sequence, kind)
+        return self.pack("command", self.next() if sequence is None else sequence, self.session, kind)
 
     def stop(self) -> bytes:
         return self.pack("stop", self.next())
@@ -104,7 +117,7 @@ class Host:
 
     def store(self, config, *, crc=None) -> bytes:
         crc = zlib.crc32(bytes(config)) if crc is None else crc
-        return self.pack("config_store", self.next(), crc)
+        return self.pack("config_store", self.next(), crc, self.session)
 
     def listen(self) -> list:
         """The messages that came since the last call."""

@@ -20,7 +20,7 @@ INTERRUPT_BYTES = 26 * 4
 #: The board's functions with which the main loop and the tick begin.
 MAIN, TICK = "loop_poll", "loop_tick"
 _INDIRECT = "__indirect_call"
-_HOOKS = "sense|drive|feed_watchdog|watchdog_reset|receive|send|read_copy|write_copy"
+_HOOKS = "sense|drive|feed_watchdog|reset_cause|receive|send|read_copy|write_copy"
 _HOOK = re.compile(rf"\.(?:{_HOOKS}) = (\w+)")
 _NODE = re.compile(r'node: \{ title: "([^"]+)" label: "[^"]*?(?:\\n(\d+) bytes \((\w+)[^"]*)?"')
 _EDGE = re.compile(r'edge: \{ sourcename: "([^"]+)" targetname: "([^"]+)"')

@@ -25,6 +25,31 @@ static const uint32_t kinds[] = {
 };
 
 static mavlink_status_t framing;
+static uint32_t session; /* of the last WELCOME */
+
+#define SAID_BYTES 1024u
+#define WELCOME_BYTES 78u /* header and payload, with the session at its end */
+#define SESSION_AT 74u
+
+static uint8_t said[SAID_BYTES]; /* what went out since the last greeting */
+static uint32_t said_count;
+
+/* Look for a WELCOME in what went out, wherever it begins: a restart may have cut the message before it. */
+static void hear(const uint8_t *bytes, uint32_t length)
+{
+    const uint32_t room = SAID_BYTES - said_count;
+    const uint32_t taken = length < room ? length : room;
+    memcpy(&said[said_count], bytes, taken);
+    said_count += taken;
+    for (uint32_t i = 0u; i + WELCOME_BYTES <= said_count; i++) {
+        const uint32_t kind = said[i + 7u] | (uint32_t)said[i + 8u] << 8 | (uint32_t)said[i + 9u] << 16;
+        const uint32_t whole = said[i + 1u] + 10u; /* zeros at its end are left out */
+        if (said[i] == MAVLINK_STX && kind == MAVLINK_MSG_ID_WELCOME && whole <= WELCOME_BYTES && whole > SESSION_AT) {
+            session = 0u;
+            memcpy(&session, &said[i + SESSION_AT], whole - SESSION_AT);
+        }
+    }
+}
 
 static void require(int truth, const char *what)
 {
@@ -44,6 +69,7 @@ static void tick(const uint8_t *bytes, uint32_t length)
     pil_tick();
     request->tick++;
     request->restart = RESTART_NONE;
+    hear(pil_answer_frame.bytes, pil_answer_frame.length);
     const core_outputs *outputs = &pil_answer_frame.outputs;
     require(pil_answer_frame.magic == FRAME_ANSWER && pil_answer_frame.length <= LINE_BYTES + 1u, "too much goes out");
     require(outputs->state < STATE_COUNT && outputs->first_fault < FAULT_COUNT, "no such state or fault");
@@ -90,7 +116,12 @@ static void say(uint32_t kind, const void *content, uint32_t length)
 static void greet(void)
 {
     const mavlink_hello_t hello = {.dialect_version = ARMSIGHT_DIALECT_VERSION, .config_version = CONFIG_VERSION};
+    said_count = 0u;
+    session = 0u;
     say(MAVLINK_MSG_ID_HELLO, &hello, sizeof hello);
+    for (uint32_t i = 0u; i < USABLE_TICKS && session == 0u; i++) { /* what waits to go out goes first */
+        tick(nothing, 0u);
+    }
 }
 
 /* Store a configuration with which the arm can be enabled. */
@@ -106,7 +137,7 @@ static void store(void)
         memcpy(part.bytes, (const uint8_t *)&config + offset, part.length);
         say(MAVLINK_MSG_ID_CONFIG_PART, &part, sizeof part);
     }
-    const mavlink_config_store_t store = {.sequence = 1u, .crc = config_crc(&config, sizeof config)};
+    const mavlink_config_store_t store = {.sequence = 1u, .crc = config_crc(&config, sizeof config), .session = session};
     say(MAVLINK_MSG_ID_CONFIG_STORE, &store, sizeof store);
     tick(nothing, 0u);
 }
@@ -114,11 +145,11 @@ static void store(void)
 /* Greet, give one command, and see it acknowledged or rejected. */
 static void require_usable(void)
 {
-    const mavlink_command_t command = {.sequence = 1u, .kind = COMMAND_DISABLE};
     for (uint32_t i = 0u; i < USABLE_TICKS; i++) {
         tick(nothing, 0u);
     }
     greet();
+    const mavlink_command_t command = {.sequence = 1u, .session = session, .kind = COMMAND_DISABLE};
     const uint32_t before = pil_answer_frame.outputs.acknowledged_count + pil_answer_frame.outputs.rejected_count;
     say(MAVLINK_MSG_ID_COMMAND, &command, sizeof command);
     tick(nothing, 0u);

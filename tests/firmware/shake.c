@@ -43,7 +43,7 @@ static void prepare(core_inputs *inputs, uint32_t tick)
     inputs->supply_mv = draw() % 300u == 0u ? draw() : 12000u;
     for (uint32_t i = 0; i < JOINTS; i++) {
         inputs->counts[i] = draw() % 200u == 0u ? draw() % 65536u : inputs->counts[i] + draw() % 9u - 4u;
-        inputs->current_ma[i] = draw() % 2000u;
+        inputs->current_ma[i] = (int32_t)(draw() % 4000u) - 2000;
     }
     if (draw() % 3u == 0u) {
         fill(&inputs->command, sizeof inputs->command);
@@ -54,11 +54,10 @@ static void prepare(core_inputs *inputs, uint32_t tick)
     inputs->command.kind = draw() % 9u;
 }
 
-static int sound(const core_outputs *outputs, const core_state *core)
+static int sound(const core_outputs *outputs)
 {
     for (uint32_t i = 0; i < JOINTS; i++) {
-        const float limit = core->config.joint[i].duty_limit;
-        if (!number_within(outputs->duty[i], -limit, limit) || !number_finite(outputs->angle_rad[i]) ||
+        if (!number_within(outputs->duty[i], -1.0f, 1.0f) || !number_finite(outputs->angle_rad[i]) ||
             !number_finite(outputs->speed_rad_s[i]) || !number_finite(outputs->reference_rad[i]) ||
             !number_finite(outputs->reference_rad_s[i])) {
             return 0;
@@ -90,7 +89,7 @@ static int run(uint32_t round)
     for (uint32_t tick = 0; tick < 2000u; tick++) {
         prepare(&inputs, tick);
         core_tick(&core, &inputs, &outputs);
-        if (!sound(&outputs, &core)) {
+        if (!sound(&outputs)) {
             return 0;
         }
     }

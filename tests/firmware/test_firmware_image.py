@@ -64,7 +64,7 @@ def test_a_run_takes_no_more_stack_than_the_bound(tmp_path, name):
 def requests():
     """Frames that carry one message of each kind a host sends, greeted, and some noise."""
     host = Host(None)
-    said = [host.hello(), host.move(), host.command(c.COMMAND_DISABLE), host.pack("gains", host.next(), [0.1] * 36)]
+    said = [host.hello(), host.move(), host.command(c.COMMAND_DISABLE), host.pack("gains", host.next(), 0, [0.1] * 48)]
     said += [
         host.pack("config_part", 0, 100, 200, [0] * 200),
         host.store(b""),

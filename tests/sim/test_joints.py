@@ -40,7 +40,7 @@ def test_the_current_is_what_drives_it():
     torque = joints.DRY_N_M + joints.VISCOUS_N_M_S * plant.qd
     expected_ma = torque / joints.CONSTANT_V_S * 1e3
     assert np.abs(plant.sense().current_ma - expected_ma).max() < 2  # whole mA of the tick's end
-    assert plant.sense().current_ma.dtype == np.uint32
+    assert plant.sense().current_ma.dtype == np.int32
 
 
 def test_a_motor_without_drive_coasts_and_a_shorted_one_brakes():

@@ -9,7 +9,7 @@
 #define FRAME_REQUEST 0x51525341u /* "ASRQ" as bytes in memory */
 #define FRAME_ANSWER 0x4E415341u  /* "ASAN" */
 #define FRAME_REJECTED 0x4F4E5341u /* "ASNO": magic or version is another, or it is too long; no tick was run */
-#define FRAME_VERSION 1u          /* goes up whenever a frame changes */
+#define FRAME_VERSION 2u          /* goes up whenever a frame changes */
 #define FRAME_BYTES 512u          /* most bytes of the wire either way in one tick */
 
 /* What a request may do before its tick. */
@@ -24,7 +24,7 @@ typedef struct pil_request {
     uint32_t stop_pressed;       /* the button */
     uint32_t supply_mv;
     uint32_t counts[JOINTS];
-    uint32_t current_ma[JOINTS];
+    int32_t current_ma[JOINTS];
     uint32_t length;             /* bytes of the wire that came in since the last tick */
     uint8_t bytes[FRAME_BYTES];
 } pil_request;

@@ -33,7 +33,7 @@ static void drive(const core_outputs *outputs) { pil_answer_frame.outputs = *out
 
 static void feed_watchdog(void) { unfed_ticks = 0u; }
 
-static bool watchdog_reset(void) { return by_watchdog; }
+static uint32_t reset_cause(void) { return by_watchdog ? RESET_WATCHDOG : RESET_POWER; }
 
 static uint32_t receive(uint8_t *bytes, uint32_t room, uint32_t *overrun)
 {
@@ -69,7 +69,7 @@ static const board_description board = {
     .sense = sense,
     .drive = drive,
     .feed_watchdog = feed_watchdog,
-    .watchdog_reset = watchdog_reset,
+    .reset_cause = reset_cause,
     .receive = receive,
     .send = send,
     .read_copy = read_copy,

@@ -75,7 +75,7 @@ void adc_read(core_inputs *inputs)
         }
     }
     for (uint32_t joint = 0u; joint < JOINTS; joint++) {
-        inputs->current_ma[joint] = sum[joint] * CURRENT_FULL_MA >> 16;
+        inputs->current_ma[joint] = (int32_t)(sum[joint] * CURRENT_FULL_MA >> 16);
         inputs->counts[joint] = running ? sum[JOINTS + 1u + joint] : OPEN_COUNTS;
     }
     inputs->supply_mv = (uint32_t)((uint64_t)sum[JOINTS] * SUPPLY_FULL_MV >> 16);

@@ -27,12 +27,14 @@ static void sense(core_inputs *inputs)
 
 static void drive(const core_outputs *outputs)
 {
-    if (outputs->drives_on != 0u) {
+    if (outputs->drives_on != 0u || outputs->windings_shorted != 0u) {
         drives_write(outputs->duty);
     } else {
         drives_off();
     }
 }
+
+static uint32_t reset_cause(void) { return watchdog_was_here() ? RESET_WATCHDOG : RESET_POWER; }
 
 static const board_description nucleo = {
     .name = "nucleo-f446re",
@@ -40,7 +42,7 @@ static const board_description nucleo = {
     .sense = sense,
     .drive = drive,
     .feed_watchdog = watchdog_feed,
-    .watchdog_reset = watchdog_was_here,
+    .reset_cause = reset_cause,
     .receive = uart_receive,
     .send = uart_send,
     .read_copy = flash_read,

@@ -1,20 +1,24 @@
-"""Six independent joints, each a DC motor with a gear and a potentiometer: the simplest arm a board can drive.
+"""Six joints, each a DC motor with a gear and a potentiometer under gravity: an arm a board can drive without a table.
 
 In: duties. Out: counts, currents and the supply, as the board's converters read them. The motor (its inductance left
 out, its time constant being far below a millisecond) drives the joint with the torque ``K (u V - K w) / R``; against it
-stand viscous and dry friction and, at the end stops, the stop itself. K is the motor's constant times the gear's ratio,
-V s/rad and N m/A at once. Each millisecond is four backward Euler steps, with dry friction solved in the step itself, so
+stand gravity, viscous and dry friction, the acceleration of the joint before it, a hand that pushes and, at the end stops,
+the stop itself. K is the motor's constant times the gear's ratio, V s/rad and N m/A at once. The potentiometer sits
+behind the gear's backlash. Each millisecond is four backward Euler steps, with dry friction solved in the step itself, so
 that a joint at rest rests. Nothing but + - * / is used, so that every computer computes the same motion.
+
+What a joint is made of is a :class:`JointModel`; :func:`drawn_model` draws one that is not as its data sheet says.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array
+from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.kernels import kernel
 from armsight.robot.boards.link import Sensed
@@ -23,8 +27,9 @@ JOINTS = 6
 _SUBSTEPS = 4
 _TICK_S = 0.001
 #: One joint of a small arm on 12 V: 5 rad/s at full duty, 30 ms to get there, 2 A and 4.8 N m when held.
-RESISTANCE_OHM, CONSTANT_V_S = 6.0, 2.4
+RESISTANCE_OHM, CONSTANT_V_S, SUPPLY_V = 6.0, 2.4, 12.0
 INERTIA_KG_M2, VISCOUS_N_M_S, DRY_N_M = 0.03, 0.02, 0.2
+STALL_N_M = CONSTANT_V_S * SUPPLY_V / RESISTANCE_OHM
 STOP_RAD = 2.55
 #: Potentiometers: counts at 0 rad and per rad (the factory's table), noise, and the converter's step.
 ZERO_COUNTS, COUNTS_PER_RAD = 32767.5, (62258 - 3277) / 5.2
@@ -32,66 +37,207 @@ NOISE_COUNTS, STEP_COUNTS = 4.0, 4
 
 
 class PotFault(IntEnum):
-    """What can be wrong with a potentiometer or its motor's leads."""
+    """What can be wrong with a potentiometer or its motor's leads; ``size`` is that of :meth:`JointPlant.break_pot`."""
 
     NONE = 0
     OPEN = 1
     SHORT = 2
+    #: The converter's reading stands still, to the count.
     FROZEN = 3
+    #: The reading is off by ``size`` rad at once.
     JUMP = 4
     INVERTED = 5
+    #: The wiper stands still; the converter's noise goes on.
+    STUCK = 6
+    #: The shaft slips: the wiper goes half the way until it is ``size`` rad behind, and goes along from there on.
+    SLIP = 7
+    #: The reading drifts by ``size`` rad/s.
+    DRIFT = 8
+    #: The reading moves ``size`` times as far as the joint.
+    SCALED = 9
+    #: The reading follows with a time constant of ``size`` s.
+    LAG = 10
 
 
-#: How far a jumping potentiometer jumps: 0.35 rad.
-_JUMP_COUNTS = 4000
+_USUAL_SIZE = {
+    PotFault.JUMP: 0.35,
+    PotFault.SLIP: 0.3,
+    PotFault.DRIFT: 0.36,
+    PotFault.SCALED: 0.5,
+    PotFault.LAG: 0.2,
+}
 
 
-@kernel("f8[::1], f8[::1], f8[::1], b1, f8, b1[::1]")
-def _move(q: Array, qd: Array, duty: Array, drives_on: bool, supply_v: float, blocked: NDArray[np.bool_]) -> None:
-    """Move the joints by one tick, in-place: q, qd (6,) rad, rad/s."""
+@dataclass(frozen=True, eq=False)
+class JointModel(Record):
+    """What six joints are made of.
+
+    Attributes:
+        resistance_ohm: (6,) of the windings.
+        constant_v_s: (6,) motor constants at the joint, V s/rad and N m/A.
+        inertia_kg_m2: (6,) at the joint.
+        viscous_n_m_s: (6,) friction that grows with speed, N m s/rad.
+        dry_n_m: (6,) dry friction, N m.
+        gravity_n_m: (6,) gravity's torque at 0 rad, N m; it falls with the angle's cosine.
+        backlash_rad: (6,) between the motor and the joint with its potentiometer, from stop to stop.
+        coupling: (6,) share of a joint's inertia that the acceleration of the joint before it acts on.
+        noise_counts: (6,) standard deviation of a reading.
+        current_noise_ma: (6,) standard deviation of a current's reading.
+        current_gain: (6,) a current's reading over the current.
+        brake_n_m: (6,) what a closed brake holds, N m; 0 where there is none.
+    """
+
+    resistance_ohm: Array
+    constant_v_s: Array
+    inertia_kg_m2: Array
+    viscous_n_m_s: Array
+    dry_n_m: Array
+    gravity_n_m: Array
+    backlash_rad: Array
+    coupling: Array
+    noise_counts: Array
+    current_noise_ma: Array
+    current_gain: Array
+    brake_n_m: Array
+
+    def packed(self) -> Array:
+        """Return all attributes as rows (12, 6)."""
+        return np.array([getattr(self, name) for name in self.__dataclass_fields__])
+
+
+def plain_model() -> JointModel:
+    """Return the joints of the data sheet: no load, no backlash."""
+    rows = (RESISTANCE_OHM, CONSTANT_V_S, INERTIA_KG_M2, VISCOUS_N_M_S, DRY_N_M, 0, 0, 0, NOISE_COUNTS, 0, 1, 0)
+    return JointModel(*(np.full(JOINTS, float(value)) for value in rows))
+
+
+def drawn_model(seed: int, *, load: float = 0.6, inertia: float = 6.0, spread: float = 0.15) -> JointModel:
+    """Return joints as they come out of a workshop.
+
+    Args:
+        seed: of all that is drawn.
+        load: greatest gravity load with payload, of the stall torque, either way.
+        inertia: greatest inertia, of the data sheet's; the least is half of it.
+        spread: how far resistance and motor constant are off the data sheet, at most.
+    """
+    rng = np.random.default_rng([seed, 20])
+    off = rng.uniform(1 - spread, 1 + spread, (2, JOINTS))
+    return JointModel(
+        resistance_ohm=RESISTANCE_OHM * off[0],
+        constant_v_s=CONSTANT_V_S * off[1],
+        inertia_kg_m2=INERTIA_KG_M2 * 0.5 * (2 * inertia) ** rng.uniform(0, 1, JOINTS),
+        viscous_n_m_s=VISCOUS_N_M_S * rng.uniform(0.5, 2, JOINTS),
+        dry_n_m=DRY_N_M * rng.uniform(0.5, 1.5, JOINTS),
+        gravity_n_m=load * STALL_N_M * rng.uniform(-1, 1, JOINTS),
+        backlash_rad=rng.uniform(0, 0.01, JOINTS),
+        coupling=rng.uniform(0, 0.2, JOINTS),
+        noise_counts=rng.uniform(3, 20, JOINTS),
+        current_noise_ma=rng.uniform(5, 30, JOINTS),
+        current_gain=rng.uniform(0.97, 1.03, JOINTS),
+        brake_n_m=np.zeros(JOINTS),
+    )
+
+
+@kernel("f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], b1, b1, f8, b1[::1]")
+def _move(
+    q: Array,
+    qd: Array,
+    link: Array,
+    qdd: Array,
+    model: Array,
+    hand: Array,
+    duty: Array,
+    awake: bool,
+    braked: bool,
+    supply_v: float,
+    blocked: NDArray[np.bool_],
+) -> None:
+    """Move the joints by one tick, in-place: motors q, qd, qdd (6,) rad, rad/s, rad/s^2, and what they drive, link (6,)."""
     h = _TICK_S / _SUBSTEPS
-    conductance = CONSTANT_V_S / RESISTANCE_OHM if drives_on else 0.0
-    inertia = INERTIA_KG_M2 + h * (VISCOUS_N_M_S + conductance * CONSTANT_V_S)
-    grip = h * DRY_N_M / inertia
+    before = 0.0
     for i in range(JOINTS):
-        push = h * conductance * duty[i] * supply_v
+        own, constant = model[2, i], model[1, i]
+        conductance = constant / model[0, i] if awake else 0.0
+        dry = model[4, i] + (model[11, i] if braked else 0.0)
+        inertia = own + h * (model[3, i] + conductance * constant)
+        grip = h * dry / inertia
+        x = link[i] * link[i]
+        cosine = 1 - x / 2 * (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))))
+        load = hand[i] - model[5, i] * cosine - model[7, i] * own * before
+        push = h * (conductance * duty[i] * supply_v + load)
+        start = qd[i]
         for _ in range(_SUBSTEPS):
-            free = (INERTIA_KG_M2 * qd[i] + push) / inertia
+            free = (own * qd[i] + push) / inertia
             qd[i] = 0.0 if blocked[i] or abs(free) <= grip else (free - grip if free > 0 else free + grip)
             q[i] += h * qd[i]
             if abs(q[i]) >= STOP_RAD:
                 q[i] = STOP_RAD if q[i] > 0 else -STOP_RAD
                 qd[i] = 0.0
+        before = qdd[i]
+        qdd[i] = (qd[i] - start) / _TICK_S
+        half = 0.5 * model[6, i]
+        link[i] = min(max(link[i], q[i] - half), q[i] + half)
 
 
-@kernel("f8[::1], u8[::1], i8[::1], i8[::1], u4[::1]")
+@kernel
+def _normal(s: np.uint64) -> tuple[np.uint64, float]:
+    """Return the next state of a xorshift generator and a nearly normal number: the sum of four uniform ones."""
+    total = np.int64(0)
+    for _ in range(4):
+        s ^= s << np.uint64(13)
+        s ^= s >> np.uint64(7)
+        s ^= s << np.uint64(17)
+        total += np.int64((s >> np.uint64(40)) & np.uint64(0xFFFF)) - 32768
+    # Four uniform numbers of +-32768 have a standard deviation of 32768 sqrt(4/3).
+    return s, total / 37837.2
+
+
+@kernel("f8[::1], f8[::1], f8[:, ::1], u8[::1], i8[::1], f8[:, ::1], u4[::1], i4[::1]")
 def _read(
-    q: Array, noise: NDArray[np.uint64], fault: NDArray[np.int64], kept: NDArray[np.int64], counts: NDArray[np.uint32]
+    link: Array,
+    current_a: Array,
+    model: Array,
+    noise: NDArray[np.uint64],
+    fault: NDArray[np.int64],
+    broken: Array,
+    counts: NDArray[np.uint32],
+    current_ma: NDArray[np.int32],
 ) -> None:
-    """Write what the converters read into ``counts`` (6,); ``noise`` (6,) are the states of xorshift generators."""
+    """Write what the converters read into ``counts`` and ``current_ma`` (6,).
+
+    ``noise`` (6,) are generators' states; ``broken`` (3, 6): true counts when a potentiometer broke, the fault's size in
+    counts (a factor, ticks for some), and what it remembers.
+    """
     for i in range(JOINTS):
-        total = np.int64(0)
-        for _ in range(4):  # the sum of four uniform numbers is near enough to a normal one
-            s = noise[i]
-            s ^= s << np.uint64(13)
-            s ^= s >> np.uint64(7)
-            s ^= s << np.uint64(17)
-            noise[i] = s
-            total += np.int64((s >> np.uint64(40)) & np.uint64(0xFFFF)) - 32768
-        # Four uniform numbers of +-32768 have a standard deviation of 32768 sqrt(4/3).
-        true = ZERO_COUNTS + COUNTS_PER_RAD * q[i] + NOISE_COUNTS * total / 37837.2
-        reading = np.int64(np.floor(true / STEP_COUNTS)) * STEP_COUNTS
-        if fault[i] == 1:
+        s, normal = _normal(noise[i])
+        true = ZERO_COUNTS + COUNTS_PER_RAD * link[i]
+        kind, kept, size = fault[i], broken[0, i], broken[1, i]
+        if kind == 4:
+            true += size
+        elif kind == 5:
+            true = 2 * kept - true
+        elif kind == 6:
+            true = kept
+        elif kind == 7:
+            true -= min(max(0.5 * (true - kept), -size), size)
+        elif kind == 8:
+            broken[2, i] += size * _TICK_S
+            true += broken[2, i]
+        elif kind == 9:
+            true = kept + size * (true - kept)
+        elif kind == 10:
+            broken[2, i] += (true - broken[2, i]) / size
+            true = broken[2, i]
+        reading = np.int64(np.floor((true + model[8, i] * normal) / STEP_COUNTS)) * STEP_COUNTS
+        if kind == 1:
             reading = np.int64(65535)
-        elif fault[i] == 2:
+        elif kind == 2:
             reading = np.int64(0)
-        elif fault[i] == 3:
-            reading = kept[i]
-        elif fault[i] == 4:
-            reading += _JUMP_COUNTS if kept[i] < 32768 else -_JUMP_COUNTS
-        elif fault[i] == 5:
-            reading = 2 * kept[i] - reading
+        elif kind == 3:
+            reading = np.int64(counts[i])
         counts[i] = np.uint32(0 if reading < 0 else 65535 if reading > 65535 else reading)
+        noise[i], normal = _normal(s)
+        current_ma[i] = np.int32(np.floor(1e3 * model[10, i] * current_a[i] + model[9, i] * normal + 0.5))
 
 
 class JointPlant:
@@ -99,43 +245,72 @@ class JointPlant:
 
     Args:
         q: (6,) where the joints are at first, rad.
-        seed: of the potentiometers' noise.
+        seed: of the converters' noise.
+        model: what they are made of; the data sheet's without.
 
     Attributes:
-        q: (6,) true angles, rad.
-        qd: (6,) true speeds, rad/s.
+        q: (6,) true angles of the motors, rad, at the joint.
+        qd: (6,) their speeds, rad/s.
+        link: (6,) true angles of the joints, rad: the motors' but for backlash.
+        hand_n_m: (6,) torque with which a hand pushes, N m.
         supply_mv: motor supply, mV.
         stop_pressed: whether the emergency stop is pressed.
         blocked: (6,) joints that something holds fast.
     """
 
-    def __init__(self, q: Array | None = None, *, seed: int = 1) -> None:
+    def __init__(self, q: Array | None = None, *, seed: int = 1, model: JointModel | None = None) -> None:
         start = np.zeros(JOINTS) if q is None else np.array(q, dtype=float)
         if start.shape != (JOINTS,) or not (np.abs(start) <= STOP_RAD).all():
             raise InputError(f"q must be six angles within the stops at +-{STOP_RAD} rad; {start} was given")
-        self.q, self.qd = start, np.zeros(JOINTS)
-        self.supply_mv = 12000
+        self.q, self.qd, self.link = start, np.zeros(JOINTS), start.copy()
+        self.model = plain_model() if model is None else model
+        self._model = self.model.packed()
+        self.hand_n_m = np.zeros(JOINTS)
+        self.supply_mv = round(1e3 * SUPPLY_V)
         self.stop_pressed = False
         self.blocked = np.zeros(JOINTS, dtype=bool)
+        self._qdd, self._current_a = np.zeros(JOINTS), np.zeros(JOINTS)
         self._noise = np.random.default_rng(seed).integers(1, 1 << 63, JOINTS, dtype=np.uint64)
-        self._fault, self._kept = np.zeros(JOINTS, np.int64), np.zeros(JOINTS, np.int64)
-        self._counts, self._current_ma = np.zeros(JOINTS, np.uint32), np.zeros(JOINTS, np.uint32)
+        self._fault, self._broken = np.zeros(JOINTS, np.int64), np.zeros((3, JOINTS))
+        self._counts, self._current_ma = np.zeros(JOINTS, np.uint32), np.zeros(JOINTS, np.int32)
 
-    def break_pot(self, joint: int, fault: PotFault) -> None:
-        """Break a potentiometer (0 to 5) from its next reading on; :attr:`PotFault.NONE` repairs it."""
-        self._fault[joint], self._kept[joint] = fault, self._counts[joint]
+    def break_pot(self, joint: int, fault: PotFault, size: float | None = None) -> None:
+        """Break a potentiometer (0 to 5) from its next reading on; :attr:`PotFault.NONE` repairs it.
+
+        Args:
+            joint: whose.
+            fault: how.
+            size: how much, as :class:`PotFault` says; a usual one without.
+        """
+        given = _USUAL_SIZE.get(fault, 0.0) if size is None else size
+        unit = {PotFault.SCALED: 1.0, PotFault.LAG: 1 / _TICK_S}.get(fault, COUNTS_PER_RAD)
+        true = ZERO_COUNTS + COUNTS_PER_RAD * self.link[joint]
+        if fault == PotFault.JUMP and size is None and true > ZERO_COUNTS:
+            unit = -unit  # towards the middle, where there is room
+        self._fault[joint] = fault
+        self._broken[:, joint] = true, given * unit, true if fault == PotFault.LAG else 0.0
 
     def sense(self) -> Sensed:
         """Return what the converters read now."""
-        _read(self.q, self._noise, self._fault, self._kept, self._counts)
+        _read(
+            self.link,
+            self._current_a,
+            self._model,
+            self._noise,
+            self._fault,
+            self._broken,
+            self._counts,
+            self._current_ma,
+        )
         return Sensed(self._counts.copy(), self._current_ma.copy(), self.supply_mv, self.stop_pressed)
 
-    def step(self, duty: Array, drives_on: bool) -> None:
+    def step(self, duty: Array, awake: bool, braked: bool = False) -> None:
         """Let 1 ms pass with these duties (6,)."""
         supply_v = self.supply_mv * 1e-3
         duty = np.asarray(duty, dtype=float)
-        _move(self.q, self.qd, duty, drives_on, supply_v, self.blocked)
-        if drives_on:
-            self._current_ma[:] = np.abs(duty * supply_v - CONSTANT_V_S * self.qd) * (1e3 / RESISTANCE_OHM)
+        state = (self.q, self.qd, self.link, self._qdd)
+        _move(*state, self._model, self.hand_n_m, duty, awake, braked, supply_v, self.blocked)
+        if awake:
+            self._current_a[:] = (duty * supply_v - self._model[1] * self.qd) / self._model[0]
         else:
-            self._current_ma[:] = 0
+            self._current_a[:] = 0

@@ -101,10 +101,10 @@ def test_monitor_shows_faults(armsight, monkeypatch):
 def test_gains_are_printed_and_changed(armsight):
     said = armsight("board", "gains", *HOST, "--json")
     before = said.lines[0]
-    assert before["kp_per_rad"] == [4.0] * 6
+    assert before["kp_per_rad"] == [10.0] * 6
     changes = ("--set", "3:kp_per_rad=7.5", "--set", "all:ki_per_rad_s=0")
     after = armsight("board", "gains", *HOST, *changes, "--store", "--json").lines[0]
-    assert after["kp_per_rad"] == [4.0, 4.0, 7.5, 4.0, 4.0, 4.0]
+    assert after["kp_per_rad"] == [10.0, 10.0, 7.5, 10.0, 10.0, 10.0]
     assert after["ki_per_rad_s"] == [0.0] * 6
     assert after["kd_s_per_rad"] == before["kd_s_per_rad"]
     table = armsight("board", "gains", *HOST, *changes).out.splitlines()

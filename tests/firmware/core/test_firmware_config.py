@@ -123,31 +123,44 @@ WRONG = {
     "gains.ki_per_rad_s": [-1, 1001, NAN],
     "gains.kd_s_per_rad": [-1, 101, NAN],
     "gains.kv_s_per_rad": [-1, 101, NAN],
+    "gains.ka_s2_per_rad": [-0.1, 11, NAN],
+    "gains.kf_duty": [-0.1, 1.1, NAN],
     "gains.derivative_filter_s": [-0.001, 1.1, NAN],
     "gains.anti_windup_per_s": [-1, 1001, NAN],
     "pot.node_count": [0, 1, 10],
     "pot.counts.1": [3277, 0],
-    "pot.short_counts": [64500, 65000],
+    "pot.short_counts": [64500, 65000, 3277],
+    "pot.open_counts": [62258, 900],
     "pot.angle_rad.0": [2.6, 14, NAN],
     "pot.angle_rad.1": [-13.5, NAN, INF],
     "pot.direction": [0, 2, -2],
     "pot.jump_rad": [0, 1.1, NAN],
     "pot.frozen_rad": [0, 1.1, NAN],
     "pot.inverted_rad": [0, 1.1, NAN],
-    "soft_min_rad": [2.4, -13.1, NAN],
-    "soft_max_rad": [-2.4, 13.1, NAN],
-    "speed_limit_rad_s": [0, 20.1, NAN],
+    "motor.resistance_ohm": [-1, 1001, NAN],
+    "motor.constant_v_s": [0, 1001, NAN],
+    "motor.apart_rad": [0, 1.1, NAN],
+    "soft_min_rad": [2.4, -13.1, -2.7, NAN],
+    "soft_max_rad": [-2.4, 13.1, 2.7, NAN],
+    "speed_limit_rad_s": [0, 20.0, 20.1, NAN],
     "deceleration_rad_s2": [0, 1001, NAN],
-    "duty_limit": [-0.1, 1.01, NAN],
+    "acceleration_rad_s2": [0, 1001, NAN],
+    "jerk_rad_s3": [0, 2e6, NAN],
+    "gravity_slew_per_s": [0, 1001, NAN],
+    "duty_limit": [-0.1, 0.4, 1.01, NAN],
     "duty_slew_per_s": [0, 1001, NAN],
     "current_cut_per_a_s": [-1, 1001, NAN],
     "following_rad": [0, 14, NAN],
-    "stall_duty": [0, 1.01, NAN],
+    "stall_duty": [0, 0.81, 1.01, NAN],
     "stall_rad": [0, 1.01, NAN],
     "motor_direction": [0, 3],
 }
 WRONG_ARM = {
     "supply_min_mv": [14000],
+    "supply_nominal_mv": [999, 100001],
+    "overload_ticks": [0, 10001],
+    "brake_release_ticks": [1001],
+    "brake_engage_ticks": [1001],
     "supply_ticks": [0, 1001],
     "pot_ticks": [0, 101],
     "following_ticks": [0, 10001],
@@ -181,7 +194,7 @@ def test_a_value_outside_its_range_makes_the_configuration_invalid(library, path
 
 def test_every_value_has_its_range_tried(library):
     """A field added to the configuration must be added here."""
-    leaves = {name for name, _ in c.joint_config._fields_ if name not in ("gains", "pot", "current_limit_ma")}
+    leaves = {name for name, _ in c.joint_config._fields_ if name not in ("gains", "pot", "motor", "current_limit_ma")}
     leaves |= {f"gains.{name}" for name, _ in c.joint_gains._fields_}
     assert leaves <= set(WRONG)
     assert {name for name, _ in c.core_config._fields_} - {"joint", "supply_max_mv"} == set(WRONG_ARM)

@@ -48,9 +48,9 @@ class Law:
 class Pid:
     """One joint's controller in the firmware."""
 
-    def __init__(self, library, *gains, limit=1.0, slew=1000.0, cap=None):
-        self.library, self.state, self.gains = library, c.pid_state(), c.joint_gains(*gains)
-        self.demand = c.pid_demand(0, 0, 0, limit, limit if cap is None else cap, slew)
+    def __init__(self, library, *gains, limit=1.0, slew=1000.0, cap=None, spring=1e9):
+        self.library, self.state, self.gains = library, c.pid_state(), c.joint_gains(*gains[:4], 0.0, 0.0, *gains[4:])
+        self.demand = c.pid_demand(0, 0, 0, spring, 0, limit, limit if cap is None else cap, slew)
         self.limited = 0
         library.pid_reset(ctypes.byref(self.state), 0.0)
 
@@ -64,7 +64,7 @@ class Pid:
         return duty
 
     def change(self, *gains):
-        after = c.joint_gains(*gains)
+        after = c.joint_gains(*gains[:4], 0.0, 0.0, *gains[4:])
         self.library.pid_change_gains(ctypes.byref(self.state), ctypes.byref(self.gains), ctypes.byref(after))
         self.gains = after
 
@@ -159,6 +159,22 @@ def test_the_integral_of_a_constant_error_grows_by_its_gain(library):
 
 def test_feed_forward_and_gravity_are_added(library):
     assert Pid(library, 0, 0, 0, 0.25, 0, 0).step(0.0, rate=2.0, gravity=-0.125) == 0.375
+
+
+def test_acceleration_and_dry_friction_are_fed_forward(library):
+    pid = Pid(library, 0, 0, 0, 0, 0, 0)
+    pid.gains.ka_s2_per_rad, pid.gains.kf_duty, pid.demand.reference_rad_s2 = 0.02, 0.1, 5.0
+    assert pid.step(0.0, rate=100.0) == pytest.approx(0.2, abs=1e-5)
+    pid.demand.reference_rad_s2 = 0.0
+    assert pid.step(0.0, rate=-0.005) == pytest.approx(-0.05, abs=1e-6)  # half of it at the creeping speed
+    assert pid.step(0.0) == 0.0
+
+
+def test_however_far_the_reference_the_spring_drives_no_harder_than_it_may(library):
+    pid = Pid(library, 5.0, 0, 0, 0.1, 0, 0, spring=0.25)
+    assert pid.step(1.0, rate=2.0, gravity=0.125) == 0.375
+    assert pid.step(-1.0, rate=2.0) == -0.25
+    assert pid.step(0.02, rate=0.5) == pytest.approx(0.15, abs=1e-6)
 
 
 def test_against_its_limit_the_integral_rests_where_the_law_says(library):

@@ -3,7 +3,7 @@
 import ctypes
 
 import pytest
-from firmware_arm import JOINTS, LabArm, read_as, supply
+from firmware_arm import JOINTS, LabArm, lab_config, read_as, supply
 from firmware_layout import STATES, c
 
 NAN = float("nan")
@@ -73,14 +73,15 @@ def test_outside_its_soft_limits_the_arm_only_moves_back_in(library, outside_rad
     for _ in range(20):
         arm.move(0.98 * outside_rad, ticks=20)
         arm.tick(19)
-    assert arm.outputs.reference_rad[0] == pytest.approx(0.98 * outside_rad, abs=1e-6)
+    assert arm.outputs.reference_rad[0] == pytest.approx(0.98 * outside_rad, abs=1e-4)
     arm.move(outside_rad)
     arm.tick(50)
-    assert abs(arm.outputs.reference_rad[0]) <= 0.98 * abs(outside_rad) + 1e-6  # the door has closed behind it
+    assert abs(arm.outputs.reference_rad[0]) <= 0.98 * abs(outside_rad) + 1e-4  # the door has closed behind it
     for share in [0.9] * 20 + [1.0] * 20:
         arm.move(share * outside_rad, ticks=20)
         arm.tick(19)
-    assert abs(arm.outputs.reference_rad[0]) == ctypes.c_float(2.4).value
+    assert abs(arm.outputs.reference_rad[0]) == pytest.approx(2.4, abs=1e-5)
+    assert abs(arm.outputs.reference_rad[0]) <= ctypes.c_float(2.4).value
     assert arm.outputs.faults == 0
 
 
@@ -126,7 +127,13 @@ def test_a_held_arm_is_not_dropped_by_clearing(moving):
     assert moving.outputs.state == c.STATE_HOLDING
     moving.command(c.COMMAND_CLEAR_FAULTS)
     assert not moving.outputs.limited[0] & c.LIMITED_SPEED
-    assert (moving.outputs.state, moving.outputs.drives_on) == (c.STATE_ENABLED, 1)
+    held = [*moving.outputs.reference_rad]
+    assert (moving.outputs.state, moving.outputs.drives_on) == (c.STATE_HOLDING, 1)
+    moving.move(0.1)
+    assert not moving.acknowledged()
+    moving.command(c.COMMAND_ENABLE)
+    assert moving.outputs.state == c.STATE_ENABLED
+    assert [*moving.outputs.reference_rad] == held
     moving.move(0.1)
     assert moving.acknowledged()
 
@@ -143,9 +150,56 @@ def test_while_it_slows_down_a_fault_cannot_be_cleared_and_a_worse_one_releases(
     assert moving.outputs.state == c.STATE_STOPPING
     moving.spoil = read_as(0, 65535)
     moving.tick(5)
-    assert moving.outputs.state == c.STATE_FAULTED
+    assert moving.outputs.state == c.STATE_STOPPING  # that joint is let go of, its windings shorted
+    assert (moving.outputs.duty[0], moving.outputs.drives_on) == (0.0, 1)
+    moving.spoil = supply(0)
+    moving.tick(5)
+    assert (moving.outputs.state, moving.outputs.windings_shorted) == (c.STATE_FAULTED, 1)
     assert moving.outputs.first_fault == c.FAULT_HOST_SILENT
-    assert moving.outputs.faults == 1 << c.FAULT_HOST_SILENT | 1 << c.FAULT_TICK_OVERRUN | 1 << c.FAULT_POT_OPEN
+    codes = (c.FAULT_HOST_SILENT, c.FAULT_TICK_OVERRUN, c.FAULT_POT_OPEN, c.FAULT_SUPPLY_LOW)
+    assert moving.outputs.faults == sum(1 << code for code in codes)
+
+
+def test_a_stop_after_a_fault_stays_on_the_path_and_all_joints_come_to_rest_together(moving):
+    rates = [1.5, -0.75, 0.3, 0.6, -1.2, 0.9]
+    move = moving.inputs.command.move
+    for i in JOINTS:
+        move.position_rad[i], move.speed_rad_s[i] = moving.outputs.reference_rad[i] + 0.3 * rates[i], rates[i]
+    move.duration_ticks = 300
+    moving.command(c.COMMAND_MOVE)
+    while moving.outputs.state == c.STATE_ENABLED:
+        moving.tick()
+    start, rates = [*moving.outputs.reference_rad], [*moving.outputs.reference_rad_s]
+    moving.tick(60)
+    shares = [(moving.outputs.reference_rad[i] - start[i]) / rates[i] for i in JOINTS]
+    assert max(shares) - min(shares) < 1e-2 * max(shares)
+    while moving.outputs.state == c.STATE_STOPPING:
+        moving.tick()
+    assert [*moving.outputs.reference_rad_s] == [0.0] * 6
+
+
+def test_brakes_open_before_the_arm_moves_and_close_before_it_is_let_go(library):
+    config = lab_config(library)
+    config.brake_release_ticks, config.brake_engage_ticks = 30, 40
+    arm = LabArm(library, config)
+    assert arm.tick().brakes_open == 0
+    out = arm.enable()
+    assert (out.brakes_open, out.drives_on) == (1, 1)
+    start = out.reference_rad[0]
+    arm.move(0.5)
+    assert arm.tick(27).reference_rad[0] == start
+    assert arm.tick(20).reference_rad[0] > start
+    out = arm.command(c.COMMAND_DISABLE)
+    assert (out.brakes_open, out.drives_on) == (0, 1)
+    arm.move(0.6)
+    assert not arm.acknowledged()
+    assert arm.tick(30).drives_on == 1
+    out = arm.tick(20)
+    assert (out.state, out.drives_on, out.windings_shorted) == (c.STATE_DISABLED, 0, 1)
+
+
+def test_a_board_that_has_driven_nothing_yet_lets_the_arm_be_moved_by_hand(arm):
+    assert (arm.tick(5).windings_shorted, arm.outputs.drives_on) == (0, 0)
 
 
 def into(arm, state):

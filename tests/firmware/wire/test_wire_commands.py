@@ -23,13 +23,13 @@ def test_every_hello_is_answered_with_who_the_board_is(fresh):
     board.tick(host.hello(nonce=4711))
     board.tick()
     welcome = host.newest("WELCOME")
-    assert (welcome.dialect_version, welcome.config_version, welcome.nonce) == (2, 1, 4711)
+    assert (welcome.dialect_version, welcome.config_version, welcome.nonce) == (3, 2, 4711)
     assert (welcome.board, welcome.joints, welcome.baud) == ("pil", c.JOINTS, 921600)
     assert (welcome.ticks_per_s, welcome.config_source) == (c.TICKS_PER_S, c.CONFIG_FACTORY)
     assert welcome.firmware == version("armsight")
 
 
-@pytest.mark.parametrize("other", [{"dialect": 3}, {"config": 2}, {"dialect": 1}])
+@pytest.mark.parametrize("other", [{"dialect": 4}, {"config": 1}, {"dialect": 2}])
 def test_a_host_of_another_version_learns_who_the_board_is_and_may_only_stop_it(working, other):
     board, host = working
     board.run(2, host.hello(nonce=9, **other))
@@ -51,7 +51,7 @@ def test_nothing_is_acknowledged_before_a_hello(fresh, message):
     sent = {
         "move": host.move,
         "command": lambda: host.command(c.COMMAND_DISABLE),
-        "gains": lambda: host.pack("gains", host.next(), [0.0] * 36),
+        "gains": lambda: host.pack("gains", host.next(), host.session, [0.0] * 48),
         "store": lambda: host.store(b""),
     }[message]()
     board.run(30, sent)
@@ -89,7 +89,8 @@ def test_numbers_go_round(working):
 def test_a_hello_begins_the_numbers_anew(working):
     board, host = working
     board.run(2, host.command(c.COMMAND_DISABLE, sequence=900))
-    board.run(2, host.hello() + host.command(c.COMMAND_DISABLE, sequence=1))
+    board.run(3, host.hello())
+    board.run(2, host.command(c.COMMAND_DISABLE, sequence=1))
     assert board.answer.outputs.acknowledged_sequence == 1
 
 
@@ -158,13 +159,13 @@ def test_a_rejection_of_the_core_is_reported_with_its_reason(working):
 
 def test_gains_come_whole(working):
     board, host = working
-    gains = [float(k % 6 == 4) * 0.01 + (k % 6 != 4) * (1.0 + 0.1 * k) for k in range(36)]
-    board.run(4, host.pack("gains", host.next(), gains))
+    gains = [0.01 if k % 8 in (5, 6) else 1.0 + 0.1 * k for k in range(48)]
+    board.run(4, host.pack("gains", host.next(), host.session, gains))
     assert board.answer.outputs.acknowledged_sequence == host.sequence
     board.run(12, host.pack("config_read", 0))
     part = host.newest("CONFIG_PART")
     config = c.core_config.from_buffer_copy(bytes(part.bytes).ljust(2000, b"\0"))
-    assert list(bytes(config.joint[0].gains)) == list(bytes(c.joint_gains(*gains[:6])))
+    assert list(bytes(config.joint[0].gains)) == list(bytes(c.joint_gains(*gains[:8])))
 
 
 def test_a_ping_comes_back_with_the_tick(working):
@@ -185,7 +186,7 @@ def test_what_the_board_itself_sends_does_nothing_when_it_comes_back(working):
 
 
 def test_the_dialects_version_is_the_one_the_board_knows():
-    assert firmware.dialect().ARMSIGHT_DIALECT_VERSION == 2
+    assert firmware.dialect().ARMSIGHT_DIALECT_VERSION == 3
 
 
 def test_a_new_host_does_not_find_the_last_ones_commands(working):
@@ -195,6 +196,50 @@ def test_a_new_host_does_not_find_the_last_ones_commands(working):
     board.run(30)
     assert board.answer.outputs.acknowledged_count == 0
     assert later.newest("BOARD_STATUS").stale_commands == 2
+
+
+def test_a_second_host_moves_nothing_and_the_first_one_hears_of_it(working):
+    board, host = working
+    board.run(2, host.command(c.COMMAND_ENABLE))
+    board.run(2, host.move(0.1))
+    second = Host(board)
+    board.run(2, second.move(0.3, sequence=500))  # without a hello, or with a guess at the session
+    assert board.answer.outputs.acknowledged_sequence == host.sequence
+    host.listen()
+    board.run(4, second.hello())
+    assert (board.answer.outputs.first_fault, board.answer.outputs.drives_on) == (c.FAULT_TAKEN_OVER, 1)
+    assert host.session != second.session
+    before = board.answer.outputs.acknowledged_count
+    board.run(30, host.move(0.2))
+    assert board.answer.outputs.acknowledged_count == before
+    assert fate(host)[2] == c.REJECTION_NOT_OWNER
+    assert host.newest("BOARD_STATUS").first_fault == c.FAULT_TAKEN_OVER
+
+
+def test_a_recording_played_back_moves_nothing(working):
+    board, host = working
+    recorded = [host.hello()]
+    board.run(3, recorded[0])
+    for data in (host.command(c.COMMAND_ENABLE), host.move(0.2), host.command(c.COMMAND_DISABLE)):
+        recorded.append(data)
+        board.run(4, data)
+    assert board.answer.outputs.acknowledged_count == 3
+    for data in recorded:
+        board.run(4, data)
+    assert (board.answer.outputs.acknowledged_count, board.answer.outputs.drives_on) == (3, 0)
+    board.run(30)
+    assert fate(host)[2] == c.REJECTION_NOT_OWNER
+
+
+def test_another_system_has_no_part_in_the_session(working):
+    board, host = working
+    other = Host(board)
+    other.out.srcSystem, other._session = 42, host.session
+    board.run(30, other.command(c.COMMAND_ENABLE, sequence=77))
+    assert board.answer.outputs.drives_on == 0
+    assert fate(host) == (0, 77, c.REJECTION_NOT_OWNER)
+    board.run(2, other.stop())  # the stop is everybody's
+    assert board.answer.outputs.state == c.STATE_STOPPED
 
 
 def test_a_lab_configuration_is_what_the_working_board_has(working):

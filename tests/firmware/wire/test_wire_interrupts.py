@@ -34,7 +34,8 @@ class Interrupted:
         except InputError as missing:
             pytest.skip(str(missing))
         self.uc, self.elf = self.emulator.uc, read_elf(firmware.image())
-        self.host = Host(None)
+        self.sent = bytearray()
+        self.host = Host(self)
         self.number, self.said = 0, {}
         self.answer_at = self.elf.symbols["pil_answer_frame"]
         self.greet()
@@ -56,6 +57,7 @@ class Interrupted:
 
     def keep(self, answer) -> None:
         self.said[answer.outputs.tick] = answer.outputs
+        self.sent += bytes(answer.bytes[: answer.length])
 
     def greet(self) -> None:
         library = ctypes.CDLL(str(firmware.host_library()))

@@ -9,7 +9,7 @@ from firmware_wire import BITS_PER_BYTE, BareWire, declare_wire
 
 #: On the wire, with MAVLink's header and checksum and no zeros left out.
 FRAME = 12
-BYTES = {"ANGLES": 28 + FRAME, "JOINTS": 106 + FRAME, "BOARD_STATUS": 80 + FRAME}
+BYTES = {"ANGLES": 28 + FRAME, "JOINTS": 106 + FRAME, "BOARD_STATUS": 92 + FRAME}
 
 
 def load_bytes_per_s(periods) -> float:
@@ -32,7 +32,7 @@ def test_the_lengths_are_the_dialects(fresh):
         (230_400, 4, 40, 20),
         (115_200, 9, 90, 36),
         (57_600, 17, 170, 68),
-        (9_600, 98, 980, 392),
+        (9_600, 102, 1020, 408),
         (900, 1000, 10000, 4000),
     ],
 )

@@ -7,8 +7,8 @@ from board_rigs import ScriptedLink, Speaker, hold, host_board, keep_on
 from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import BoardState, Command, ConfigSource, Fault, Limited, Rejection
-from armsight.robot.boards.configuration import gains_array, lab_configuration
+from armsight.robot.boards.codes import FAULT_TEXTS, BoardState, Command, ConfigSource, Fault, Limited, Rejection
+from armsight.robot.boards.configuration import CONFIG, gains_array, lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.opening import open_emulator
 from armsight.sim.joints import JointPlant, PotFault
@@ -23,7 +23,7 @@ def talking(speaker, **welcome):
         if data[7] == 0x28 and data[8] == 0xA0:  # HELLO, message 41000
             return speaker.welcome(**welcome) + speaker.status() + speaker.joints()
         reaction = (250).to_bytes(4, "little") + (2).to_bytes(4, "little")
-        return speaker.config_part(912, reaction) if data[7] == 0x36 else b""
+        return speaker.config_part(CONFIG.itemsize - 8, reaction) if data[7] == 0x36 else b""
 
     return answer
 
@@ -158,8 +158,9 @@ def test_numbers_go_on_behind_those_of_an_earlier_host():
         last = board.send(hold(ZERO))
     board.receive(0.02)
     other = Board.connect(link)
-    assert other.send(hold(ZERO)) == last + 1
-    other.receive(0.02)
+    assert [str(fault) for fault in other.status.faults] == [FAULT_TEXTS[Fault.TAKEN_OVER]]
+    assert other.command(Command.CLEAR_FAULTS) == last + 1
+    other.receive(0.05)
     assert other.status.acknowledged_sequence == last + 1
 
 
@@ -200,7 +201,7 @@ def test_gains_are_taken_whole_or_rejected_by_name():
         board.set_gains(gains)
     with pytest.raises(DeviceError, match="a number is outside its range"):
         board.confirm(board.set_gains(gains, checked=False))
-    with pytest.raises(InputError, match=r"of shape \(6,\)"):
+    with pytest.raises(InputError, match=r"of shape \(8,\)"):
         board.set_gains(gains[0])
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from armsight import firmware
 from armsight.robot.boards import codes, configuration, frames
-from armsight.robot.boards.configuration import CONFIG, GAINS, JOINT, POT
+from armsight.robot.boards.configuration import CONFIG, GAINS, JOINT, MOTOR, POT
 
 FIRMWARE = Path(__file__).resolve().parents[3] / "firmware"
 NUMBERS = {"JOINTS": 6, "POT_NODES": 9, "FRAME_BYTES": 512}
@@ -24,6 +24,7 @@ TYPES, FRAMES, CONFIG_H = header("core", "types.h"), header("boards", "pil", "fr
 RECORDS = {
     "joint_gains": GAINS,
     "pot_config": POT,
+    "motor_config": MOTOR,
     "joint_config": JOINT,
     "core_config": CONFIG,
     "core_outputs": frames.OUTPUTS,
@@ -101,14 +102,20 @@ def test_numbers_are_the_headers():
 
 def test_what_a_tick_packs_and_reads_is_laid_out_alike():
     rng = np.random.default_rng(0)
-    numbers, said = rng.integers(0, 2**32, 20).tolist(), rng.bytes(512)
+    numbers, said = rng.integers(0, 2**31, 20).tolist(), rng.bytes(512)
     request = np.frombuffer(frames.REQUEST_FIELDS.pack(*numbers, said), frames.REQUEST)[0]
     assert np.hstack([request[name] for name in frames.REQUEST.names[:-1]]).tolist() == numbers
     assert request["bytes"].tobytes() == said
     packed = rng.bytes(frames.ANSWER.itemsize)
     answer = np.frombuffer(packed, frames.ANSWER)[0]
     outputs = answer["outputs"]
-    reported = [answer["magic"], answer["version"], answer["tick"], outputs["drives_on"], answer["length"]]
+    reported = [
+        answer["magic"],
+        answer["version"],
+        answer["tick"],
+        *(outputs[name] for name in ("drives_on", "windings_shorted", "brakes_open")),
+    ]
+    reported.append(answer["length"])
     assert list(frames.ANSWER_FIELDS.unpack_from(packed)) == reported
     assert packed[frames.DUTY_AT : frames.DUTY_AT + 24] == outputs["duty"].tobytes()
     assert packed[frames.BYTES_AT :] == answer["bytes"].tobytes()

@@ -111,6 +111,9 @@ def test_every_range_is_held_on_both_sides(is_valid, path):
         (("joint", "pot", "angle_rad"), -2.6, "joint 2: the angles of the potentiometer's table"),
         (("joint", "pot", "short_counts"), 65000, "joint 2: short_counts must be below open_counts"),
         (("joint", "gains", "ki_per_rad_s"), 1001, "joint 2: ki_per_rad_s is 1001; 0 to 1000 is allowed"),
+        (("joint", "soft_max_rad"), 2.7, "joint 2: the soft limits must lie within the potentiometer's table"),
+        (("joint", "stall_duty"), 0.9, "joint 2: stall_duty must not be beyond duty_limit"),
+        (("joint", "speed_limit_rad_s"), 20.0, "joint 2: jump_rad must be further than the joint moves in a tick"),
         (("silence_reaction",), 3, "silence_reaction is 3; 1 .hold. or 2 .release. is allowed"),
         (("supply_min_mv",), 15000, "supply_min_mv must be below supply_max_mv"),
         (("pot_ticks",), 0, "pot_ticks is 0; 1 to 100 is allowed"),
@@ -130,6 +133,6 @@ def test_something_else_is_no_configuration():
 
 def test_gains_keep_their_order():
     config = lab_configuration()
-    config["joint"]["gains"][4] = (1, 2, 3, 4, 0.5, 6)
-    assert gains_array(config)[4].tolist() == [1, 2, 3, 4, 0.5, 6]
-    assert check_gains(gains_array(config)).shape == (6, 6)
+    config["joint"]["gains"][4] = (1, 2, 3, 4, 5, 0.25, 0.5, 6)
+    assert gains_array(config)[4].tolist() == [1, 2, 3, 4, 5, 0.25, 0.5, 6]
+    assert check_gains(gains_array(config)).shape == (6, 8)

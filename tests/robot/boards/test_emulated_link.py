@@ -8,7 +8,7 @@ from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import BoardState, Fault
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.frames import ANSWER, ANSWER_MAGIC, REQUEST, REQUEST_MAGIC
+from armsight.robot.boards.frames import ANSWER, ANSWER_MAGIC, REQUEST, REQUEST_MAGIC, VERSION
 from armsight.robot.boards.opening import EMULATORS, configured, open_board, open_emulator
 from armsight.sim.joints import JointPlant
 
@@ -23,7 +23,7 @@ class RecordingEmulator:
         frame = np.frombuffer(request, REQUEST)[0]
         self.requests.append(frame)
         answer = np.zeros((), ANSWER)
-        answer["magic"], answer["version"], answer["tick"] = ANSWER_MAGIC, 1, frame["tick"]
+        answer["magic"], answer["version"], answer["tick"] = ANSWER_MAGIC, VERSION, frame["tick"]
         for name, value in self.changed.items():
             answer[name] = value
         return answer.tobytes()
@@ -38,7 +38,7 @@ def test_requests_carry_what_is_sensed():
     link = EmulatedLink(emulator, plant)
     link.step(2)
     first, second = emulator.requests
-    assert (first["magic"], first["version"], first["tick"], second["tick"]) == (REQUEST_MAGIC, 1, 1, 2)
+    assert (first["magic"], first["version"], first["tick"], second["tick"]) == (REQUEST_MAGIC, VERSION, 1, 2)
     assert (first["supply_mv"], first["stop_pressed"]) == (11500, 1)
     assert np.abs(first["counts"].astype(int) - 32768).max() < 40
     assert link.t_s == pytest.approx(0.002)
@@ -99,11 +99,11 @@ def test_a_whole_board_runs_in_a_world_that_owns_the_time():
     assert board.status.state == BoardState.ENABLED
 
 
-@pytest.mark.parametrize("changed", [{"magic": 0}, {"version": 2}, {"tick": 9}])
+@pytest.mark.parametrize("changed", [{"magic": 0}, {"version": 1}, {"tick": 9}])
 def test_an_answer_of_another_image_is_rejected(changed):
     link = EmulatedLink(RecordingEmulator(**changed), JointPlant())
     with pytest.raises(
-        DeviceError, match="did not answer tick 1 with a frame of version 1: its image and this armsight"
+        DeviceError, match="did not answer tick 1 with a frame of version 2: its image and this armsight"
     ):
         link.step()
 

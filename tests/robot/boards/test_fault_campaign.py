@@ -74,7 +74,7 @@ def overdrives(frame):
         ({"answer": never_releases}, "dip", "leaves the drives on"),
         ({"request": blind_to_supply}, "dip", "SUPPLY_LOW of joint None is reported as None"),
         ({"answer": forgets_numbers}, "flip", "as acknowledged last, the core"),
-        ({"answer": overdrives}, "jump", "of its limit"),
+        ({"answer": overdrives}, "jump", "before the next one strikes"),
     ],
 )
 def test_a_firmware_with_a_mistake_is_found(campaign, monkeypatch, change, kind, found):

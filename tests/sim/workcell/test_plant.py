@@ -22,10 +22,10 @@ def plant(name: str = "nominal", seed: int = 0, **changes) -> ArmPlant:
     return ArmPlant(MODEL, sample_arm(MODEL, given, seed), seed)
 
 
-def run(arm: ArmPlant, duty, ticks: int, drives_on: bool = True) -> np.ndarray:
+def run(arm: ArmPlant, duty, ticks: int, braked: bool = False) -> np.ndarray:
     """Run on with one duty and return (ticks, 12) shafts and links."""
     for _ in range(ticks):
-        arm.step(np.asarray(duty, dtype=float), drives_on)
+        arm.step(np.asarray(duty, dtype=float), not braked, braked)
     return arm.path[-ticks:]
 
 
@@ -93,7 +93,7 @@ def test_a_motor_takes_the_current_that_its_winding_lets_through():
     duty = gravity_duty(MODEL, arm.parts, motors, MODEL.home) + 0.01  # friction takes the rest: nothing moves
     path = run(arm, duty, 50)
     assert np.abs(path[-1] - path[-2]).max() < 1e-8
-    assert np.abs(arm.sense().current_ma - np.abs(duty) * SUPPLY_V / motors.resistance_ohm * 1e3).max() <= 0.5 + 1e-2
+    assert np.abs(arm.sense().current_ma - duty * SUPPLY_V / motors.resistance_ohm * 1e3).max() <= 0.5 + 1e-2
     run(arm, np.ones(6), 1)
     assert arm.sense().current_ma.tolist() == np.rint(1e3 * motors.current_max_a).tolist()
 
@@ -122,7 +122,7 @@ def test_dry_friction_holds_what_is_weaker():
 
 def test_brakes_hold_the_arm():
     arm = plant("worn")
-    path = run(arm, OFF, 1000, drives_on=False)
+    path = run(arm, OFF, 1000, braked=True)
     assert np.abs(path[-1] - path[0]).max() < 2e-6
 
 

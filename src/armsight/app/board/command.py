@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from armsight.app.board.config import config_group
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
 from armsight.errors import InputError
 
@@ -367,3 +368,6 @@ def _open_any(name: str, baud: int | None, calibration: Path | None = None) -> M
     from armsight.sim.joints import JointPlant
 
     return open_motion_board(name, None if is_real(name) else JointPlant(), baud=baud, calibration=calibration)
+
+
+command.add_command(config_group(_board, _JSON, _open))

@@ -240,14 +240,18 @@ def host_loss(test_rig: BoardTestRig) -> None:
 
 
 def sensor_faults(test_rig: BoardTestRig) -> None:
-    """Break a potentiometer in motion in each way, then the supply: each is reported by its name, and the drives go off."""
+    """Break a potentiometer in motion in each way, then the supply: each is reported by its name, and lets go."""
     plant = test_rig.plant
     if plant is None:
         return
     for joint, (broken, fault) in enumerate(_POT_FAULTS.items()):
+        if broken == PotFault.INVERTED:  # a mistake of the wiring: so from the beginning
+            plant.break_pot(joint, broken)
+            test_rig.readings(0.1)
         test_rig.enable()
         test_rig.swing(0.4)
-        plant.break_pot(joint, broken)
+        if broken != PotFault.INVERTED:
+            plant.break_pot(joint, broken)
         test_rig.swing(0.5)
         _expect_fault(test_rig, fault, joint)
         plant.break_pot(joint, PotFault.NONE)
@@ -284,7 +288,7 @@ def e_stop(test_rig: BoardTestRig) -> None:
 def gain_change(test_rig: BoardTestRig) -> None:
     """Change the gains in motion: taken whole without a jump of the duty, or rejected whole."""
     gains = gains_array(test_rig.board.configuration())
-    changed = gains * [1.5, 0.5, 1.2, 1.0, 1.0, 1.0]
+    changed = gains * [1.5, 0.5, 1.2, 1.0, 1.0, 1.0, 1.0, 1.0]
     test_rig.enable()
     test_rig.swing(0.35)
     before = test_rig.board.joints.duty
@@ -409,7 +413,11 @@ def _expect_fault(test_rig: BoardTestRig, fault: Fault, joint: int | None) -> No
     test_rig.expect(
         first is not None and (first.fault, first.joint) == (fault, joint), f"{fault.name} is reported as: {reported}"
     )
-    test_rig.expect(not status.drives_on, f"{fault.name} leaves the drives on")
+    if joint is None:
+        test_rig.expect(not status.drives_on, f"{fault.name} leaves the drives on")
+    else:
+        driven = bool(test_rig.board.joints.duty[joint])
+        test_rig.expect(not driven, f"{fault.name} leaves the drive of joint {joint + 1} on")
 
 
 def _stops(test_rig: BoardTestRig) -> list[Callable[[bool], None]]:

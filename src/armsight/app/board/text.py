@@ -98,19 +98,19 @@ def status_text(board: MotionBoard, states: JointStates) -> str:
 
 
 def gains_json(values: Array) -> dict[str, Any]:
-    """Return gains (6, 6) as JSON has them: a list of six joints for each gain."""
+    """Return gains (6, 8) as JSON has them: a list of six joints for each gain."""
     return {name: [float(np.float32(each)) for each in values[:, k]] for k, name in enumerate(GAIN_RANGES)}
 
 
 def gains_text(values: Array) -> str:
-    """Return gains (6, 6) as a table."""
+    """Return gains (6, 8) as a table."""
     lines = ["joint" + "".join(f"{name:>21}" for name in GAIN_RANGES)]
     lines += [f"{joint + 1:5}" + "".join(f"{value:21.6g}" for value in row) for joint, row in enumerate(values)]
     return "\n".join(lines)
 
 
 def changed_gains(values: Array, changes: Sequence[str]) -> Array:
-    """Return gains (6, 6) with changes of the form ``JOINT:NAME=VALUE``; JOINT is 1 to 6 or ``all``.
+    """Return gains (6, 8) with changes of the form ``JOINT:NAME=VALUE``; JOINT is 1 to 6 or ``all``.
 
     Raises:
         InputError: a change is not of this form.
@@ -131,7 +131,7 @@ def changed_gains(values: Array, changes: Sequence[str]) -> Array:
 
 
 def with_gains(config: Configuration, values: Array) -> Configuration:
-    """Return a configuration with other gains (6, 6)."""
+    """Return a configuration with other gains (6, 8)."""
     changed = config.copy()
     for k, name in enumerate(GAIN_RANGES):
         changed["joint"]["gains"][name] = values[:, k]

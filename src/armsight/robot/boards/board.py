@@ -182,6 +182,7 @@ class Session:
                 " no command"
             )
         self.ticks_per_s, self._tick = welcome.ticks_per_s, message.tick
+        self.wire.session = message.session
 
     def _first_telemetry(self) -> None:
         for _ in range(_TELEMETRY_STEPS):
@@ -296,7 +297,7 @@ class Board:
         """Send a gain set and return its number.
 
         Args:
-            gains: (6, 6) a row per joint of kp, ki, kd, kv, derivative filter, anti-windup.
+            gains: (6, 8) a row per joint of kp, ki, kd, kv, ka, kf, derivative filter, anti-windup.
             checked: False leaves it to the board alone to reject what is out of range.
 
         Raises:

@@ -37,6 +37,21 @@ class Fault(IntEnum):
     TICK_OVERRUN = 12
     WATCHDOG = 13
     CONFIG = 14
+    POT_SLIP = 15
+    POT_DRIFT = 16
+    POT_SCALE = 17
+    POT_LAG = 18
+    OVERLOAD = 19
+    PUSHED = 20
+    OVERSPEED = 21
+    OSCILLATION = 22
+    CURRENT_SENSOR = 23
+    OVERCURRENT = 24
+    ARITHMETIC = 25
+    MEMORY = 26
+    TICKS_LOST = 27
+    TAKEN_OVER = 28
+    CRASH = 29
 
 
 class Alarm(IntEnum):
@@ -65,6 +80,7 @@ class Rejection(IntEnum):
     NO_HELLO = 9
     TOO_MANY = 10
     CONFIG_BROKEN = 11
+    NOT_OWNER = 12
 
 
 class Limited(IntFlag):
@@ -75,6 +91,7 @@ class Limited(IntFlag):
     CURRENT = 4
     SOFT = 8
     SPEED = 16
+    ACCELERATION = 32
 
 
 class Command(IntEnum):
@@ -106,16 +123,16 @@ STATE_TEXTS: Mapping[BoardState, str] = {
     BoardState.DISABLED: "disabled: drives off",
     BoardState.ENABLED: "enabled: follows the host",
     BoardState.STOPPING: "stopping: a fault slows the arm down to rest",
-    BoardState.HOLDING: "holding: a fault stands, the arm is held at rest",
+    BoardState.HOLDING: "holding: the arm is held at rest until it is enabled",
     BoardState.FAULTED: "faulted: a fault stands, drives off",
     BoardState.STOPPED: "emergency stop: drives off until it is cleared",
 }
 FAULT_TEXTS: Mapping[Fault, str] = {
     Fault.POT_OPEN: "potentiometer open: the reading is above its band",
     Fault.POT_SHORT: "potentiometer short: the reading is below its band",
-    Fault.POT_FROZEN: "potentiometer frozen: the reading stands still while the arm is commanded to move",
+    Fault.POT_FROZEN: "potentiometer frozen: the reading stands still while the motor rotates",
     Fault.POT_JUMP: "potentiometer jump: the reading moved faster than the joint can",
-    Fault.POT_INVERTED: "inverted: the joint moves away from its command",
+    Fault.POT_INVERTED: "inverted: the reading moves against the motor",
     Fault.FOLLOWING: "following error: the joint is too far from its reference",
     Fault.STALL: "stall: the motor is driven hard and the joint does not rotate",
     Fault.HOST_SILENT: "host silent: no motion command within the time set",
@@ -125,6 +142,21 @@ FAULT_TEXTS: Mapping[Fault, str] = {
     Fault.TICK_OVERRUN: "tick overrun: the control loop took longer than its period",
     Fault.WATCHDOG: "restarted by the watchdog",
     Fault.CONFIG: "no valid configuration: factory values are in use",
+    Fault.POT_SLIP: "potentiometer slips: the reading stays behind the motor",
+    Fault.POT_DRIFT: "potentiometer drifts: the reading moves by itself",
+    Fault.POT_SCALE: "potentiometer scale: the reading moves too far or not far enough",
+    Fault.POT_LAG: "potentiometer lags: the reading follows the motor late",
+    Fault.OVERLOAD: "overload: the duty is at its limit and the joint does not follow",
+    Fault.PUSHED: "pushed: something moves the joint against its motor",
+    Fault.OVERSPEED: "overspeed: the joint is faster than its limit",
+    Fault.OSCILLATION: "oscillation: the joint swings about its reference; the stored gains are in use again",
+    Fault.CURRENT_SENSOR: "current: no current where the voltage must drive one; its sensor or a lead is broken",
+    Fault.OVERCURRENT: "overcurrent: the motor current stays beyond twice its limit",
+    Fault.ARITHMETIC: "arithmetic: a duty was no number",
+    Fault.MEMORY: "memory: the configuration in use has changed by itself",
+    Fault.TICKS_LOST: "ticks lost: the control loop loses time again and again",
+    Fault.TAKEN_OVER: "taken over: another host said hello while the arm was driven",
+    Fault.CRASH: "restarted after a crash of the firmware",
 }
 ALARM_TEXTS: Mapping[Alarm, str] = {
     Alarm.VOLTAGE: "supply outside the servo's limits",
@@ -147,6 +179,7 @@ REJECTION_TEXTS: Mapping[Rejection, str] = {
     Rejection.NO_HELLO: "no hello of the board's own version came: only STOP is acknowledged",
     Rejection.TOO_MANY: "too many commands at once",
     Rejection.CONFIG_BROKEN: "the configuration came incomplete, or could not be stored",
+    Rejection.NOT_OWNER: "another host has the session: say hello again",
 }
 
 

@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.robot.boards.codes import Reaction
+from armsight.robot.boards.tuning import MotorFigures, tuned_gains
 
 Configuration = NDArray[np.void]
 JOINTS, POT_NODES = 6, 9
 #: Layout of the configuration this armsight knows: ``firmware/core/config.h``.
-CONFIG_VERSION = 1
+CONFIG_VERSION = 2
 
 GAINS = np.dtype(
     [
@@ -31,6 +32,8 @@ GAINS = np.dtype(
         ("ki_per_rad_s", "<f4"),
         ("kd_s_per_rad", "<f4"),
         ("kv_s_per_rad", "<f4"),
+        ("ka_s2_per_rad", "<f4"),
+        ("kf_duty", "<f4"),
         ("derivative_filter_s", "<f4"),
         ("anti_windup_per_s", "<f4"),
     ]
@@ -48,16 +51,21 @@ POT = np.dtype(
         ("inverted_rad", "<f4"),
     ]
 )
+MOTOR = np.dtype([("resistance_ohm", "<f4"), ("constant_v_s", "<f4"), ("apart_rad", "<f4")])
 JOINT = np.dtype(
     [
         ("gains", GAINS),
         ("pot", POT),
+        ("motor", MOTOR),
         ("soft_min_rad", "<f4"),
         ("soft_max_rad", "<f4"),
         ("speed_limit_rad_s", "<f4"),
         ("deceleration_rad_s2", "<f4"),
+        ("acceleration_rad_s2", "<f4"),
+        ("jerk_rad_s3", "<f4"),
         ("duty_limit", "<f4"),
         ("duty_slew_per_s", "<f4"),
+        ("gravity_slew_per_s", "<f4"),
         ("current_cut_per_a_s", "<f4"),
         ("following_rad", "<f4"),
         ("stall_duty", "<f4"),
@@ -71,10 +79,14 @@ CONFIG = np.dtype(
         ("joint", JOINT, JOINTS),
         ("supply_min_mv", "<u4"),
         ("supply_max_mv", "<u4"),
+        ("supply_nominal_mv", "<u4"),
         ("supply_ticks", "<u4"),
         ("pot_ticks", "<u4"),
         ("following_ticks", "<u4"),
         ("stall_ticks", "<u4"),
+        ("overload_ticks", "<u4"),
+        ("brake_release_ticks", "<u4"),
+        ("brake_engage_ticks", "<u4"),
         ("silence_ticks", "<u4"),
         ("silence_reaction", "<u4"),
     ]
@@ -86,6 +98,8 @@ GAIN_RANGES = {
     "ki_per_rad_s": (0.0, 1000.0),
     "kd_s_per_rad": (0.0, 100.0),
     "kv_s_per_rad": (0.0, 100.0),
+    "ka_s2_per_rad": (0.0, 10.0),
+    "kf_duty": (0.0, 1.0),
     "derivative_filter_s": (0.0, 1.0),
     "anti_windup_per_s": (0.0, 1000.0),
 }
@@ -95,41 +109,70 @@ _POT_RANGES = {
     "frozen_rad": (1e-3, 1.0),
     "inverted_rad": (1e-3, 1.0),
 }
+_MOTOR_RANGES = {
+    "resistance_ohm": (0.0, 1000.0),
+    "constant_v_s": (1e-3, 1e3),
+    "apart_rad": (1e-3, 1.0),
+}
 _JOINT_RANGES = {
     "soft_min_rad": (-13.0, 13.0),
     "soft_max_rad": (-13.0, 13.0),
     "speed_limit_rad_s": (0.01, 20.0),
     "deceleration_rad_s2": (0.1, 1000.0),
+    "acceleration_rad_s2": (0.1, 1000.0),
+    "jerk_rad_s3": (1.0, 1e6),
     "duty_limit": (0.0, 1.0),
     "duty_slew_per_s": (0.1, 1000.0),
+    "gravity_slew_per_s": (0.1, 1000.0),
     "current_cut_per_a_s": (0.0, 1000.0),
     "following_rad": (1e-3, 13.0),
     "stall_duty": (0.01, 1.0),
     "stall_rad": (1e-4, 1.0),
 }
 _ARM_RANGES = {
+    "supply_nominal_mv": (1000, 100000),
     "supply_ticks": (1, 1000),
     "pot_ticks": (1, 100),
     "following_ticks": (1, 10000),
     "stall_ticks": (1, 10000),
+    "overload_ticks": (1, 10000),
+    "brake_release_ticks": (0, 1000),
+    "brake_engage_ticks": (0, 1000),
     "silence_ticks": (2, 60000),
 }
+
+
+#: All of them by name; no name stands for two things.
+RANGES: Mapping[str, tuple[float, float]] = {
+    **GAIN_RANGES,
+    **_POT_RANGES,
+    **_MOTOR_RANGES,
+    **_JOINT_RANGES,
+    **_ARM_RANGES,
+}
+
+#: The simulated arm's motors (:mod:`armsight.sim.joints`), and how stiffly they are driven.
+_LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S = MotorFigures(6.0, 2.4, 0.03, 0.02, 0.2), 12.0, 40.0
 
 
 def lab_configuration() -> Configuration:
     """Return a configuration for the simulated arm: firm gains, +-2.4 rad, 2 rad/s, 12 V, host silent after 100 ms."""
     config = np.zeros((), CONFIG)
     joint = config["joint"]
-    joint["gains"] = np.array((4.0, 8.0, 0.1, 0.2, 0.005, 20.0), GAINS)
+    joint["gains"] = np.array(tuple(tuned_gains(_LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S)), GAINS)
+    joint["motor"] = np.array((_LAB_MOTOR.resistance_ohm, _LAB_MOTOR.constant_v_s, 0.03), MOTOR)
     pot = joint["pot"]
     pot["node_count"], pot["short_counts"], pot["open_counts"], pot["direction"] = 2, 1000, 64500, 1
     pot["counts"][:, :2], pot["angle_rad"][:, :2] = (3277, 62258), (-2.6, 2.6)
-    pot["jump_rad"], pot["frozen_rad"], pot["inverted_rad"] = 0.02, 0.02, 0.04
+    pot["jump_rad"], pot["frozen_rad"], pot["inverted_rad"] = 0.02, 0.02, 0.15
     values = {
         "soft_min_rad": -2.4,
         "soft_max_rad": 2.4,
         "speed_limit_rad_s": 2.0,
         "deceleration_rad_s2": 10.0,
+        "acceleration_rad_s2": 10.0,
+        "jerk_rad_s3": 1000.0,
+        "gravity_slew_per_s": 5.0,
         "duty_limit": 0.8,
         "duty_slew_per_s": 50.0,
         "current_cut_per_a_s": 5.0,
@@ -142,19 +185,20 @@ def lab_configuration() -> Configuration:
     for name, value in values.items():
         joint[name] = value
     config["supply_min_mv"], config["supply_max_mv"], config["supply_ticks"] = 10000, 14000, 5
+    config["supply_nominal_mv"], config["overload_ticks"] = round(1e3 * _LAB_SUPPLY_V), 200
     config["pot_ticks"], config["following_ticks"], config["stall_ticks"] = 5, 20, 200
     config["silence_ticks"], config["silence_reaction"] = 100, Reaction.HOLD
     return config
 
 
 def gains_array(config: Configuration) -> Array:
-    """Return the gains of a configuration: (6, 6), a row per joint: kp, ki, kd, kv, derivative filter, anti-windup."""
+    """Return a configuration's gains: (6, 8), a row per joint: kp, ki, kd, kv, ka, kf, derivative filter, anti-windup."""
     gains = config["joint"]["gains"]
     return np.stack([gains[name].astype(float) for name in GAIN_RANGES], axis=1)
 
 
 def check_gains(gains: Array) -> Array:
-    """Return a gain set as an array (6, 6), a row per joint; an error names the gain and the joint.
+    """Return a gain set as an array (6, 8), a row per joint; an error names the gain and the joint.
 
     Raises:
         InputError: the shape, a number that is not finite, or one outside its range.
@@ -162,7 +206,7 @@ def check_gains(gains: Array) -> Array:
     values = np.asarray(gains, dtype=float)
     if values.shape != (JOINTS, len(GAIN_RANGES)):
         raise InputError(
-            f"gains are of shape {values.shape}; (6, 6) is needed: a row per joint of {', '.join(GAIN_RANGES)}"
+            f"gains are of shape {values.shape}; (6, 8) is needed: a row per joint of {', '.join(GAIN_RANGES)}"
         )
     for column, (name, (low, high)) in enumerate(GAIN_RANGES.items()):
         for joint in range(JOINTS):
@@ -190,7 +234,7 @@ def _problems(config: Configuration) -> Iterator[str]:
     joints = config["joint"]
     check_gains(gains_array(config))
     for j in range(JOINTS):
-        for values, ranges in ((joints[j], _JOINT_RANGES), (joints[j]["pot"], _POT_RANGES)):
+        for values, ranges in _ranged(joints[j]):
             yield from (f"joint {j + 1}: {text}" for text in _outside(values, ranges))
         yield from (f"joint {j + 1}: {text}" for text in _joint_problems(joints[j]))
     yield from _outside(config, _ARM_RANGES)
@@ -198,6 +242,10 @@ def _problems(config: Configuration) -> Iterator[str]:
         yield "supply_min_mv must be below supply_max_mv"
     if config["silence_reaction"] not in tuple(Reaction):
         yield f"silence_reaction is {config['silence_reaction']}; 1 (hold) or 2 (release) is allowed"
+
+
+def _ranged(joint: Configuration) -> tuple[tuple[Configuration, Mapping[str, tuple[float, float]]], ...]:
+    return (joint, _JOINT_RANGES), (joint["pot"], _POT_RANGES), (joint["motor"], _MOTOR_RANGES)
 
 
 def _outside(values: Configuration, ranges: Mapping[str, tuple[float, float]]) -> Iterator[str]:
@@ -221,3 +269,12 @@ def _joint_problems(joint: Configuration) -> Iterator[str]:
     for name, value in (("direction", pot["direction"]), ("motor_direction", joint["motor_direction"])):
         if value not in (1, -1):
             yield f"{name} is {value}; 1 or -1 is allowed"
+    table = int(pot["direction"]) * pot["angle_rad"][:n]
+    if joint["soft_min_rad"] < table.min() or joint["soft_max_rad"] > table.max():
+        yield "the soft limits must lie within the potentiometer's table"
+    if not pot["short_counts"] < pot["counts"][0] or not pot["counts"][n - 1] < pot["open_counts"]:
+        yield "the potentiometer's table must lie between short_counts and open_counts"
+    if joint["stall_duty"] > joint["duty_limit"]:
+        yield "stall_duty must not be beyond duty_limit"
+    if np.float32(joint["speed_limit_rad_s"]) * np.float32(1e-3) >= pot["jump_rad"]:
+        yield "jump_rad must be further than the joint moves in a tick at its speed limit"

@@ -81,7 +81,7 @@ class EmulatedLink:
         self._to_board, self._to_host = bytearray(), bytearray()
         self._overrun, self._restart = False, 0
         self._duty: Array = np.zeros(JOINTS)
-        self._drives_on = False
+        self._awake, self._braked = False, True
         self._closed = False
         self._reply = bytes(ANSWER.itemsize)
 
@@ -132,7 +132,7 @@ class EmulatedLink:
             self._ticks += 1
             self._arriving()
             self._plant.sense()
-            self._plant.step(self._duty, self._drives_on)
+            self._plant.step(self._duty, self._awake, self._braked)
 
     def close(self) -> None:
         """End the emulation."""
@@ -177,8 +177,8 @@ class EmulatedLink:
     def _tick(self) -> None:
         self._ticks += 1
         reply = self._emulator.tick(self._request())
-        fields = ANSWER_FIELDS.unpack_from(reply) if len(reply) == ANSWER.itemsize else (0, 0, 0, 0, 0)
-        magic, version, tick, drives_on, length = fields
+        fields = ANSWER_FIELDS.unpack_from(reply) if len(reply) == ANSWER.itemsize else (0,) * 7
+        magic, version, tick, drives_on, shorted, brakes_open, length = fields
         if magic != ANSWER_MAGIC or version != VERSION or tick != self._ticks % _WRAP:
             raise DeviceError(
                 f"the emulated board did not answer tick {self._ticks} with a frame of version {VERSION}: its image and"
@@ -187,8 +187,9 @@ class EmulatedLink:
         self._reply = reply
         if self._watch is not None:
             self._watch(reply)
-        self._duty, self._drives_on = np.frombuffer(reply, _FLOAT, JOINTS, DUTY_AT), drives_on != 0
-        self._plant.step(self._duty, self._drives_on)
+        self._duty = np.frombuffer(reply, _FLOAT, JOINTS, DUTY_AT)
+        self._awake, self._braked = bool(drives_on or shorted), not brakes_open
+        self._plant.step(self._duty, self._awake, self._braked)
         if length:
             said = reply[BYTES_AT : BYTES_AT + length]
             self._to_host += said if self._faults is None else self._faults.to_host(self._ticks, said)

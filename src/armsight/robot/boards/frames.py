@@ -10,7 +10,7 @@ import struct
 import numpy as np
 
 JOINTS = 6
-REQUEST_MAGIC, ANSWER_MAGIC, VERSION = 0x51525341, 0x4E415341, 1
+REQUEST_MAGIC, ANSWER_MAGIC, VERSION = 0x51525341, 0x4E415341, 2
 #: What a request may do before its tick.
 RESTART_POWER, RESTART_WATCHDOG = 1, 2
 #: Most bytes of the wire either way in one tick.
@@ -26,7 +26,7 @@ REQUEST = np.dtype(
         ("stop_pressed", "<u4"),
         ("supply_mv", "<u4"),
         ("counts", "<u4", JOINTS),
-        ("current_ma", "<u4", JOINTS),
+        ("current_ma", "<i4", JOINTS),
         ("length", "<u4"),
         ("bytes", "u1", WIRE_BYTES),
     ]
@@ -35,6 +35,8 @@ OUTPUTS = np.dtype(
     [
         ("tick", "<u4"),
         ("drives_on", "<u4"),
+        ("windings_shorted", "<u4"),
+        ("brakes_open", "<u4"),
         ("feed_watchdog", "<u4"),
         ("state", "<u4"),
         ("faults", "<u4"),
@@ -74,9 +76,10 @@ def _at(frame: np.dtype[np.void], name: str) -> int:
 
 
 #: The same frames for the tick itself, where a structured array costs more than the rest: a request whole, its arrays one
-#: after the other, and of an answer what every tick needs: magic, version, tick, whether the drives are on, how many bytes.
-REQUEST_FIELDS = struct.Struct(f"<7I{JOINTS}I{JOINTS}II{WIRE_BYTES}s")
+#: after the other, and of an answer what every tick needs: magic, version, tick, whether the
+#: drives are on, the windings shorted and the brakes open, how many bytes.
+REQUEST_FIELDS = struct.Struct(f"<7I{JOINTS}I{JOINTS}iI{WIRE_BYTES}s")
 _DRIVES_AT, _LENGTH_AT = _at(ANSWER, "outputs") + _at(OUTPUTS, "drives_on"), _at(ANSWER, "length")
-ANSWER_FIELDS = struct.Struct(f"<3I{_DRIVES_AT - 12}xI{_LENGTH_AT - _DRIVES_AT - 4}xI")
+ANSWER_FIELDS = struct.Struct(f"<3I{_DRIVES_AT - 12}x3I{_LENGTH_AT - _DRIVES_AT - 12}xI")
 #: Where an answer has the duties, six little-endian floats, and what is said.
 DUTY_AT, BYTES_AT = _at(ANSWER, "outputs") + _at(OUTPUTS, "duty"), _at(ANSWER, "bytes")

@@ -19,13 +19,13 @@ class Sensed(NamedTuple):
 
     Attributes:
         counts: (6,) potentiometers, 16-bit fractions of their supply, uint32.
-        current_ma: (6,) size of the motor currents, mA, uint32.
+        current_ma: (6,) motor currents, mA, positive where a positive duty drives them, int32.
         supply_mv: motor supply, mV.
         stop_pressed: whether the emergency stop button is pressed.
     """
 
     counts: NDArray[np.uint32]
-    current_ma: NDArray[np.uint32]
+    current_ma: NDArray[np.int32]
     supply_mv: int = 24000
     stop_pressed: bool = False
 
@@ -37,8 +37,14 @@ class Plant(Protocol):
         """Return what the converters read now."""
         ...
 
-    def step(self, duty: Array, drives_on: bool) -> None:
-        """Let 1 ms pass with these duties (6,), -1 to 1, held; with ``drives_on`` False the drivers are switched off."""
+    def step(self, duty: Array, awake: bool, braked: bool = False) -> None:
+        """Let 1 ms pass with these duties (6,), -1 to 1, held.
+
+        Args:
+            duty: zeros brake the motors, by their own windings.
+            awake: False: the drivers are switched off, and the motors' circuits are open.
+            braked: whether the board closes the brakes, where there are any.
+        """
         ...
 
 

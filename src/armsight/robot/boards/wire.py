@@ -45,6 +45,7 @@ class Wire:
     """Sends and receives the dialect's messages over a link.
 
     Attributes:
+        session: whose commands it sends; WELCOME gives it.
         heard: whether any byte came at all.
         broken: parts of what came that are no message.
         lost: messages that are missing in the count of the frames.
@@ -58,6 +59,7 @@ class Wire:
         self._mav.robust_parsing = True
         self._close = link.close
         self.heard = False
+        self.session = 0
         self.broken = self.lost = 0
         self._count: int | None = None
 
@@ -69,19 +71,19 @@ class Wire:
         self, sequence: int, ticks: int, q_ref: list[float], qd_ref: list[float], gravity_duty: list[float]
     ) -> None:
         """Send a motion command: joint angles (6,), rad, and speeds (6,), rad/s, to be reached after so many ticks."""
-        self._mav.move_send(sequence, ticks, q_ref, qd_ref, gravity_duty)
+        self._mav.move_send(sequence, self.session, ticks, q_ref, qd_ref, gravity_duty)
 
     def command(self, sequence: int, kind: int) -> None:
         """Send a command without arguments: enable, disable, clear."""
-        self._mav.command_send(sequence, kind)
+        self._mav.command_send(sequence, self.session, kind)
 
     def stop(self, sequence: int) -> None:
         """Send the emergency stop."""
         self._mav.stop_send(sequence)
 
     def gains(self, sequence: int, gains: list[float]) -> None:
-        """Send a gain set: six joints of kp, ki, kd, kv, derivative filter, anti-windup (36,)."""
-        self._mav.gains_send(sequence, gains)
+        """Send a gain set: six joints of kp, ki, kd, kv, ka, kf, derivative filter, anti-windup (48,)."""
+        self._mav.gains_send(sequence, self.session, gains)
 
     def config_read(self, offset: int) -> None:
         """Ask for the part of the configuration in use that begins at this byte."""
@@ -93,7 +95,7 @@ class Wire:
 
     def config_store(self, sequence: int, crc: int) -> None:
         """Ask the board to check and store the configuration that the parts made up."""
-        self._mav.config_store_send(sequence, crc)
+        self._mav.config_store_send(sequence, crc, self.session)
 
     def receive(self, wait_s: float) -> list[Message]:
         """Let ``wait_s`` pass, s, and return the complete messages that came."""

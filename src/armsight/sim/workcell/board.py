@@ -15,7 +15,7 @@ from armsight.robot.arm import Arm
 from armsight.robot.boards.codes import Reaction
 from armsight.robot.boards.configuration import CONFIG, Configuration, check_configuration
 from armsight.sim.workcell.arm import pot_travel
-from armsight.sim.workcell.motors import Motors, Solids, gravity_torque, inertia
+from armsight.sim.workcell.motors import SUPPLY_V, Motors, Solids, gravity_torque, inertia
 from armsight.sim.workcell.plant import COUNTS, HIGH_SHARE, LOW_SHARE
 
 #: Natural frequency, rad/s, of each joint's loop; its damping; integral gain per proportional gain, 1/s; filter of the
@@ -23,6 +23,8 @@ from armsight.sim.workcell.plant import COUNTS, HIGH_SHARE, LOW_SHARE
 #: integral frees it, and a loop that is closed on vision meanwhile winds up and hunts.
 NATURAL_RAD_S = np.array([50.0, 70.0, 80.0, 85.0, 90.0, 90.0])
 DAMPING, INTEGRAL_PER_S, FILTER_S = 1.0, 8.0, 0.004
+_ACCELERATION_SPARE, _JERK_S = 2.0, 0.01  # likewise; time from none to all of it
+_BRAKE_TICKS = 20
 _SPEED_SPARE = 1.2  # of the reference's limit over the arm's own
 
 
@@ -43,6 +45,7 @@ def configuration(model: Arm, parts: Solids, motors: Motors) -> Configuration:
     gains["ki_per_rad_s"] = INTEGRAL_PER_S * gains["kp_per_rad"]
     gains["kd_s_per_rad"] = np.maximum(2 * DAMPING * NATURAL_RAD_S * inertia_kg_m2 - damping, 0.0) / motors.stall_nm
     gains["kv_s_per_rad"] = damping / motors.stall_nm + gains["kd_s_per_rad"]
+    gains["ka_s2_per_rad"] = inertia_kg_m2 / motors.stall_nm
     gains["derivative_filter_s"], gains["anti_windup_per_s"] = FILTER_S, 20.0
     pot = joint["pot"]
     pot["node_count"], pot["direction"] = 2, 1
@@ -54,12 +57,21 @@ def configuration(model: Arm, parts: Solids, motors: Motors) -> Configuration:
     joint["soft_min_rad"], joint["soft_max_rad"] = model.q_min, model.q_max
     joint["speed_limit_rad_s"] = _SPEED_SPARE * model.qd_max
     joint["deceleration_rad_s2"] = model.qdd_max
+    joint["acceleration_rad_s2"] = _ACCELERATION_SPARE * model.qdd_max
+    joint["jerk_rad_s3"] = joint["acceleration_rad_s2"] / _JERK_S
+    joint["gravity_slew_per_s"] = 5.0
+    motor = joint["motor"]
+    motor["resistance_ohm"] = motors.resistance_ohm
+    motor["constant_v_s"] = motors.gear_ratio * motors.torque_constant
+    motor["apart_rad"] = 0.03
     # A narrower slew limit would cut the noise unevenly in motion, which brakes.
     joint["duty_limit"], joint["duty_slew_per_s"], joint["current_cut_per_a_s"] = 1.0, 1000.0, 20.0
     joint["current_limit_ma"] = np.rint(900.0 * motors.current_max_a)
     joint["following_rad"], joint["stall_duty"], joint["stall_rad"] = 0.15, 0.9, 0.005
     joint["motor_direction"] = 1
     config["supply_min_mv"], config["supply_max_mv"], config["supply_ticks"] = 20000, 28000, 5
+    config["supply_nominal_mv"], config["overload_ticks"] = round(1e3 * SUPPLY_V), 300
+    config["brake_release_ticks"] = config["brake_engage_ticks"] = _BRAKE_TICKS
     config["pot_ticks"], config["following_ticks"], config["stall_ticks"] = 5, 50, 300
     config["silence_ticks"], config["silence_reaction"] = 100, Reaction.HOLD
     check_configuration(config)

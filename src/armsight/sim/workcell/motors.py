@@ -165,7 +165,7 @@ class Motors(Record):
         coulomb_nm: (6,) dry friction of motor and gear, N m.
         viscous: (6,) friction that grows with speed, N m s/rad.
         bearing_nm: (6,) dry friction of the link's own bearing, N m.
-        brake_nm: (6,) what the brake holds, N m; closed while the drivers are off.
+        brake_nm: (6,) what the brake holds, N m; closed until the board opens it.
         needed_nm: (6,) torque that the joint needs, N m: of gravity and of its greatest acceleration.
         gravity_nm: (6,) greatest gravity torque, N m.
     """

@@ -1,7 +1,7 @@
 """The arm at the board's motors: duties go in, the converters' readings come out, and the truth is kept apart.
 
-:class:`ArmPlant` fulfils :class:`armsight.robot.boards.link.Plant`. Steps are 1 ms. Brakes hold the shafts while the
-drivers are off.
+:class:`ArmPlant` fulfils :class:`armsight.robot.boards.link.Plant`. Steps are 1 ms. Brakes hold the shafts until the
+board opens them.
 
 The arm is a MuJoCo model made of its true table (:func:`mjcf`): twelve degrees of freedom, six gear shafts and six links,
 each pair joined by backlash and a spring. A motor rotates its shaft; the potentiometer sits on the shaft, so it sees
@@ -251,7 +251,7 @@ class ArmPlant:
         self._mj_step = mujoco.mj_step
         self._model = mujoco.MjModel.from_xml_string(text)
         self._data = mujoco.MjData(self._model)
-        self._drives_on = False
+        self._switched = False, True
         self._qpos, self._ctrl, self._force = self._data.qpos, self._data.ctrl, self._data.actuator_force
         self._newton_metre_per_a = self.motors.gear_ratio * self.motors.torque_constant
         self._qpos[:] = np.tile(model.home, 2)
@@ -272,19 +272,19 @@ class ArmPlant:
 
     def sense(self) -> Sensed:
         """Return what the converters read now."""
-        amperes = np.abs(self._force) / self._newton_metre_per_a
+        amperes = self._force / self._newton_metre_per_a
         return Sensed(
             self.pots.read(self._qpos[:6]),
-            np.rint(1e3 * amperes).astype(np.uint32),
+            np.rint(1e3 * amperes).astype(np.int32),
             self.supply_mv,
             self.stop_pressed,
         )
 
-    def step(self, duty: Array, drives_on: bool) -> None:
-        """Let 1 ms pass with these duties (6,), -1 to 1, held; with ``drives_on`` False the brakes are closed."""
-        if drives_on != self._drives_on:
-            self._switch(drives_on)
-        self._ctrl[:] = duty if drives_on else 0.0
+    def step(self, duty: Array, awake: bool, braked: bool = False) -> None:
+        """Let 1 ms pass with these duties (6,), -1 to 1, held, the motors' circuits closed, the brakes open or closed."""
+        if (awake, braked) != self._switched:
+            self._switch(awake, braked)
+        self._ctrl[:] = duty if awake else 0.0
         self._mj_step(self._model, self._data, nstep=SUBSTEPS)
         self._ticks += 1
         if self._ticks == len(self._path):
@@ -292,8 +292,8 @@ class ArmPlant:
         self._path[self._ticks] = self._qpos
         self.stepped()
 
-    def _switch(self, drives_on: bool) -> None:
-        """Open the brakes and close the motors' circuits, or the other way round."""
-        self._drives_on = drives_on
-        self._model.dof_frictionloss[:6] = self.motors.coulomb_nm if drives_on else self.motors.brake_nm
-        self._model.actuator_biasprm[:, 2] = -self.motors.emf_damping if drives_on else 0.0
+    def _switch(self, awake: bool, braked: bool) -> None:
+        """Open or close the motors' circuits and the brakes."""
+        self._switched = awake, braked
+        self._model.dof_frictionloss[:6] = self.motors.brake_nm if braked else self.motors.coulomb_nm
+        self._model.actuator_biasprm[:, 2] = -self.motors.emf_damping if awake else 0.0

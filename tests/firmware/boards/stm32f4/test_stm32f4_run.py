@@ -25,7 +25,7 @@ SUPPLY_MV = 16 * SUPPLY_LEVEL * 69300 >> 16
 
 
 def sealed(config, serial: int) -> bytes:
-    copy = c.config_copy(0x31435341, 1, serial, config, 0)
+    copy = c.config_copy(0x31435341, c.CONFIG_VERSION, serial, config, 0)
     return bytes(copy)[:-4] + zlib.crc32(bytes(copy)[:-4]).to_bytes(4, "little")
 
 
@@ -72,11 +72,11 @@ class Nucleo:
         expected = self.arm.outputs
         duties = np.array(expected.duty, np.float32)
         steps = np.floor(np.abs(duties) * np.float32(4500) + np.float32(0.5)).astype(int)
-        assert self.chip.output("PC9") == float(expected.drives_on)
+        assert self.chip.output("PC9") == float(bool(expected.drives_on or expected.windings_shorted))
         assert [self.chip.output(pin) for pin in PWM_PINS] == [
             step / 4500 * expected.drives_on for step in steps.tolist()
         ]
-        if expected.drives_on:
+        if expected.drives_on or expected.windings_shorted:
             assert [self.chip.output(pin) for pin in DIRECTION_PINS] == (duties < 0.0).astype(float).tolist()
         assert self.chip.wrongs == []
 
@@ -87,25 +87,30 @@ class Nucleo:
 
     def hello(self) -> None:
         version = dialect().ARMSIGHT_DIALECT_VERSION
-        self.send(dialect().MAVLink_hello_message(version, 1, 77))
+        self.send(dialect().MAVLink_hello_message(version, c.CONFIG_VERSION, 77))
         self.run(2)
 
     def command(self, kind: int) -> None:
         self.sequence += 1
-        self.send(dialect().MAVLink_command_message(self.sequence, kind))
+        self.send(dialect().MAVLink_command_message(self.sequence, self.session, kind))
         self.arm.inputs.command.kind, self.arm.inputs.command.sequence = kind, self.sequence
         self.run()
 
     def move(self, position_rad: float, ticks: int) -> None:
         self.sequence += 1
         positions = [position_rad * (-1) ** i for i in range(c.JOINTS)]
-        self.send(dialect().MAVLink_move_message(self.sequence, ticks, positions, [0.0] * 6, [0.01] * 6))
+        self.send(dialect().MAVLink_move_message(self.sequence, self.session, ticks, positions, [0.0] * 6, [0.01] * 6))
         command = self.arm.inputs.command
         command.kind, command.sequence, command.move.duration_ticks = c.COMMAND_MOVE, self.sequence, ticks
         for i in range(c.JOINTS):
             command.move.position_rad[i] = positions[i]
             command.move.gravity_duty[i] = 0.01
         self.run()
+
+    @property
+    def session(self) -> int:
+        """The session that the last hello began."""
+        return self.said["WELCOME"][-1].session
 
     @property
     def status(self):
@@ -191,7 +196,7 @@ def test_a_dead_converter_releases_the_arm(moving):
     moving.chip.scans = lambda count: None
     for _ in range(moving.config.pot_ticks + 2):
         moving.emulator.millisecond()
-    assert moving.chip.output("PC9") == 0.0
+    assert moving.chip.output("PC9") == 1.0  # awake at no duty: the windings are shorted
     assert [moving.chip.output(pin) for pin in PWM_PINS] == [0.0] * 6
     assert moving.chip.wrongs == []
 
@@ -211,7 +216,7 @@ def test_a_tick_that_takes_too_long_is_reported_and_its_millisecond_counted(movi
     assert moving.status.state == c.STATE_HOLDING
     moving.command(c.COMMAND_CLEAR_FAULTS)  # rejected as long as a cause stands: reported once, it does not
     moving.run(10)
-    assert (moving.status.state, moving.status.faults) == (c.STATE_ENABLED, 0)
+    assert (moving.status.state, moving.status.faults) == (c.STATE_HOLDING, 0)
 
 
 def test_the_watchdog_is_fed_once_a_tick_and_not_by_a_broken_core(moving):
@@ -249,7 +254,7 @@ def test_a_configuration_from_the_wire_is_stored_beside_the_newest(nucleo):
         padded = list(part.ljust(200, b"\0"))
         nucleo.send(dialect().MAVLink_config_part_message(offset, len(raw), len(part), padded))
         nucleo.run(3)
-    nucleo.send(dialect().MAVLink_config_store_message(1, zlib.crc32(raw)))
+    nucleo.send(dialect().MAVLink_config_store_message(1, zlib.crc32(raw), nucleo.session))
     nucleo.run(30)
     assert nucleo.status.config_stored == 1
     size = ctypes.sizeof(c.config_copy)

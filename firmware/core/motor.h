@@ -1,0 +1,32 @@
+/* One motor as a second witness of its joint's motion: its back-EMF, (u V - i R) / K, gives the speed without the
+ * potentiometer. It shares nothing with the control law but the reading of the angle. All functions: tick context. */
+#ifndef ARMSIGHT_MOTOR_H
+#define ARMSIGHT_MOTOR_H
+
+#include <stdbool.h>
+
+#include "types.h"
+
+/* Begin to watch a joint that reads angle_rad. */
+void motor_start(motor_state *motor, float angle_rad);
+
+/* Let a tick pass in which the voltage at the motor is not known. */
+void motor_pause(motor_state *motor, float angle_rad);
+
+/* Take what a tick measured: supply (V), current (A, the joint's direction) and reading, while the windings are closed.
+ * What R and K really are is learnt as long as motor and reading agree. */
+void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad,
+                   float reference_rad);
+
+/* Return the fault by which motor and reading are apart further than noise, backlash and the motor's uncertain numbers
+ * explain; FAULT_NONE where they are not. */
+uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v, float current_a);
+
+/* Return whether the motor swings about a reference that moves at reference_rad_s. */
+bool motor_swings(motor_state *motor, float reference_rad_s, float speed_limit_rad_s);
+
+/* Return whether the joint has been faster than its limit (rad/s) long enough to be sure; fast_rad_s is what the reading
+ * says of it. */
+bool motor_is_fast(motor_state *motor, float reading_rad_s, float speed_limit_rad_s);
+
+#endif

@@ -1,0 +1,172 @@
+"""``board.toml``: a board's whole configuration as a file that people edit, with units in the names and ranges beside them.
+
+In: a :data:`~armsight.robot.boards.configuration.Configuration`. Out: TOML text, and back, to the last bit::
+
+    version = 2                  # layout of the configuration
+    board = "nucleo-f446re"      # the board it belongs to
+
+    [arm]
+    supply_min_mv = 10000
+
+    [joint.1]
+    soft_max_rad = 2.4           # -13 to 13
+
+    [joint.1.gains]
+    [joint.1.pot]
+    [joint.1.motor]
+
+Every value must be there, once; a name that is not known is named with the one it was perhaps meant to be.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.errors import InputError
+from armsight.robot.boards.configuration import (
+    CONFIG,
+    CONFIG_VERSION,
+    JOINTS,
+    POT_NODES,
+    RANGES,
+    Configuration,
+    check_configuration,
+)
+
+#: Parts of a joint that are tables of their own.
+_PARTS = ("gains", "pot", "motor")
+_TABLES = ("counts", "angle_rad")  # of a potentiometer: as long as its node_count, which they replace
+
+
+def entries(config: Configuration) -> Iterator[tuple[str, Any]]:
+    """Yield every value of a configuration with its path, such as ``joint.3.pot.jump_rad``; tables as lists."""
+    for name in CONFIG.names or ():
+        if name != "joint":
+            yield f"arm.{name}", config[name].item()
+    for j in range(JOINTS):
+        yield from _of(config["joint"][j], f"joint.{j + 1}", config["joint"][j]["pot"])
+
+
+def _of(record: Configuration, path: str, pot: Configuration) -> Iterator[tuple[str, Any]]:
+    plain = [name for name in record.dtype.names or () if name not in (*_PARTS, "node_count")]
+    for name in plain:
+        value = record[name]
+        if name in _TABLES:
+            yield f"{path}.{name}", [_number(each) for each in value[: int(pot["node_count"])]]
+        else:
+            yield f"{path}.{name}", _number(value)
+    for part in _PARTS:
+        if part in (record.dtype.names or ()):
+            yield from _of(record[part], f"{path}.{part}", pot)
+
+
+def _number(value: Any) -> float | int:  # noqa: ANN401 - a numpy scalar
+    """Return a number whose text is the shortest that is read back as the same bits."""
+    return float(str(value)) if value.dtype.kind == "f" else int(value)
+
+
+def configuration_text(config: Configuration, board: str) -> str:
+    """Write a configuration of the board of this name as the text of a ``board.toml``."""
+    lines = [f"version = {CONFIG_VERSION}  # layout of the configuration", f'board = "{board}"', ""]
+    table = ""
+    for path, value in entries(config):
+        here, _, name = path.rpartition(".")
+        if here != table:
+            lines += [""] * bool(table) + [f"[{here}]"]
+            table = here
+        low, high = RANGES.get(name, (None, None))
+        lines.append(f"{name} = {value}" + (f"  # {low:g} to {high:g}" if low is not None and high is not None else ""))
+    return "\n".join(lines) + "\n"
+
+
+def read_configuration(path: Path) -> tuple[Configuration, str]:
+    """Read a ``board.toml``; returns the configuration and the board's name.
+
+    Raises:
+        InputError: it cannot be read, or names the file and the value that is missing, unknown, or out of range.
+    """
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: no board.toml: {error}") from None
+    if data.get("version") != CONFIG_VERSION or not isinstance(data.get("board"), str):
+        raise InputError(
+            f"{path}: version is {data.get('version')!r} and board {data.get('board')!r}; version {CONFIG_VERSION} and a"
+            " board's name are needed: `armsight board config get` writes such a file"
+        )
+    given = dict(_flat({name: value for name, value in data.items() if name not in ("version", "board")}))
+    config = np.zeros((), CONFIG)
+    config["joint"]["pot"]["node_count"] = 2
+    known = dict(entries(config))
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"; is it {near[0]}?" if near else ""
+            raise InputError(f"{path}: nothing is called {name}{hint}")
+    for name in known:
+        if name not in given:
+            raise InputError(f"{path}: {name} is missing")
+        try:
+            put(config, name, given[name])
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+    try:
+        check_configuration(config)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return config, data["board"]
+
+
+def _flat(data: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in data.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{path}{name}.")
+        else:
+            yield f"{path}{name}", value
+
+
+def put(config: Configuration, path: str, value: object) -> None:
+    """Put a value, a number or a potentiometer's table, into a configuration, in-place.
+
+    Raises:
+        InputError: there is no such path, or the value is of another kind.
+    """
+    record, names = config, path.split(".")
+    if names[0] == "arm":
+        names = names[1:]
+    elif names[0] == "joint" and len(names) > 2 and names[1] in map(str, range(1, JOINTS + 1)):
+        record, names = config["joint"][int(names[1]) - 1], names[2:]
+    else:
+        raise InputError(f"nothing is called {path}; such names are arm.silence_ticks and joint.3.pot.jump_rad")
+    for name in names[:-1]:
+        if name not in _PARTS or name not in (record.dtype.names or ()):
+            raise InputError(f"nothing is called {path}")
+        record = record[name]
+    name = names[-1]
+    if name not in (record.dtype.names or ()) or name in ("node_count", "joint", *_PARTS):
+        raise InputError(f"nothing is called {path}")
+    whole = record.dtype[name].base.kind != "f"
+    if name in _TABLES:
+        if not isinstance(value, list) or not 2 <= len(value) <= POT_NODES:
+            raise InputError(f"{path} is {value}; a list of 2 to {POT_NODES} numbers is needed")
+        numbers = [_checked(path, each, whole) for each in value]
+        record[name] = numbers + [0] * (POT_NODES - len(numbers))
+        record["node_count"] = len(numbers)
+    else:
+        limits = np.iinfo(record.dtype[name]) if whole else None
+        number = _checked(path, value, whole)
+        if limits is not None and not limits.min <= number <= limits.max:
+            raise InputError(f"{path} is {number}; {limits.min} to {limits.max} is allowed")
+        record[name] = number
+
+
+def _checked(path: str, value: object, whole: bool) -> float | int:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or (whole and not isinstance(value, int)):
+        raise InputError(f"{path} is {value!r}; {'a whole number' if whole else 'a number'} is needed")
+    return value

@@ -1,0 +1,80 @@
+"""Gains of a joint from what its motor is, by a rule with two inputs: bandwidth and damping.
+
+With the torque ``K (u V - K w) / R`` and ``J``, ``B`` and ``C`` the inertia, viscous and dry friction at the joint, the
+stall torque is ``S = K V / R`` and the motor damps itself by ``D = K^2 / R + B``. The loop
+``J q'' + (D + S kd) q' + S kp q = S kp r`` is given the natural frequency and the damping asked for; the feed-forward gives
+what the motion itself takes, so that nothing is left to the error: ``kv = D / S + kd``, ``ka = J / S``, ``kf = C / S``.
+(Åström and Murray, "Feedback Systems", 2008, sections 10.2 and 10.5.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.errors import InputError
+
+#: The integral takes over an error at this share of the bandwidth; the speed's filter is so much faster than the loop.
+_INTEGRAL_SHARE, _FILTER_SHARE = 0.2, 0.15
+#: Dry friction is compensated by a little less than it is, so that it never drives.
+_FRICTION_SHARE = 0.9
+ANTI_WINDUP_PER_S = 20.0
+
+
+@dataclass(frozen=True)
+class MotorFigures:
+    """A motor with its gear, at the joint.
+
+    Attributes:
+        resistance_ohm: of the winding.
+        constant_v_s: motor constant, V s/rad and N m/A.
+        inertia_kg_m2: of rotor, gear and what it moves.
+        viscous_n_m_s: friction that grows with speed, N m s/rad.
+        dry_n_m: dry friction, N m.
+    """
+
+    resistance_ohm: float
+    constant_v_s: float
+    inertia_kg_m2: float
+    viscous_n_m_s: float
+    dry_n_m: float
+
+
+def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 1.0) -> Array:
+    """Return the gains of a joint by the rule above.
+
+    Args:
+        motor: its motor.
+        supply_v: nominal supply, V.
+        bandwidth_rad_s: natural frequency of the loop, rad/s.
+        damping: of the loop, of critical.
+
+    Returns:
+        (8,) kp, ki, kd, kv, ka, kf, derivative filter, anti-windup.
+
+    Raises:
+        InputError: a number is not positive.
+    """
+    needed = {"supply_v": supply_v, "bandwidth_rad_s": bandwidth_rad_s, "damping": damping}
+    needed |= {name: getattr(motor, name) for name in ("resistance_ohm", "constant_v_s", "inertia_kg_m2")}
+    for name, value in needed.items():
+        if not value > 0:
+            raise InputError(f"{name} is {value:g}; it must be positive")
+    stall = motor.constant_v_s * supply_v / motor.resistance_ohm
+    own = motor.constant_v_s**2 / motor.resistance_ohm + motor.viscous_n_m_s
+    kp = motor.inertia_kg_m2 * bandwidth_rad_s**2 / stall
+    kd = max(2 * damping * bandwidth_rad_s * motor.inertia_kg_m2 - own, 0.0) / stall
+    return np.array(
+        [
+            kp,
+            _INTEGRAL_SHARE * bandwidth_rad_s * kp,
+            kd,
+            own / stall + kd,
+            motor.inertia_kg_m2 / stall,
+            _FRICTION_SHARE * motor.dry_n_m / stall,
+            _FILTER_SHARE / bandwidth_rad_s,
+            ANTI_WINDUP_PER_S,
+        ]
+    )

@@ -1,0 +1,74 @@
+"""The motor as a witness: on drawn arms under load a healthy potentiometer is left alone, a broken one is named."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armsight.robot.boards.codes import BoardState, Fault
+from armsight.sim.joints import PotFault
+
+PATH = Path(__file__).resolve().parents[3] / "benchmarks" / "board_arms.py"
+SEEDS = range(900, 904)
+
+
+@pytest.fixture(scope="module")
+def arms():
+    """The benchmark's module."""
+    spec = importlib.util.spec_from_file_location("board_arms", PATH)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def swinging(arms, library, seed):
+    """An arm in motion, without a fault."""
+    arm = arms.Arm(library, seed)
+    arm.enable()
+    arm.swing(1200)
+    assert arm.first == (None, None)
+    return arm
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_healthy_arm_under_load_has_no_fault(arms, library, seed):
+    arm = swinging(arms, library, seed)
+    arm.rest(400)
+    assert arm.first == (None, None)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_stuck_potentiometer_is_named_and_the_other_joints_are_held(arms, library, seed):
+    arm = swinging(arms, library, seed)
+    joint = int(np.argmax(np.abs(arm.plant.qd)))
+    arm.plant.break_pot(joint, PotFault.STUCK)
+    arm.swing(1000)
+    assert arm.first == (Fault.POT_FROZEN, joint)
+    out = arm.out[0]
+    assert (out["duty"][joint], out["drives_on"]) == (0.0, 1)
+    arm.tick(600)
+    out = arm.out[0]
+    assert out["state"] == BoardState.HOLDING
+    others = np.arange(6) != joint
+    assert np.abs(arm.plant.link - out["reference_rad"])[others].max() < 0.05
+
+
+def test_an_inverted_potentiometer_is_named_from_the_first_motion(arms, library):
+    arm = arms.Arm(library, 910)
+    arm.plant.break_pot(2, PotFault.INVERTED)
+    arm.enable()
+    arm.swing(1000)
+    assert arm.first == (Fault.POT_INVERTED, 2)
+
+
+def test_a_motor_whose_resistance_is_not_known_is_not_watched(arms, library):
+    arm = swinging(arms, library, 900)
+    for joint in arm.core.config.joint:
+        joint.motor.resistance_ohm = 0.0
+    arm.core.crc, arm.core.crc_at, arm.core.crc_known = 0xFFFFFFFF, 0, 0
+    arm.plant.break_pot(1, PotFault.DRIFT, 0.1)
+    arm.swing(400)
+    assert arm.first == (None, None)

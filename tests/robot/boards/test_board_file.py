@@ -1,0 +1,57 @@
+"""board.toml: what is written is read back to the bit, and what is wrong is named."""
+
+import pytest
+
+from armsight.errors import InputError
+from armsight.robot.boards.board_file import configuration_text, put, read_configuration
+from armsight.robot.boards.configuration import lab_configuration
+
+
+def written(tmp_path, *changes):
+    """A board.toml of the lab's configuration with pieces of its text replaced."""
+    text = configuration_text(lab_configuration(), "pil")
+    for before, after in changes:
+        assert before in text
+        text = text.replace(before, after, 1)
+    path = tmp_path / "board.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_what_is_written_is_read_back_to_the_bit(tmp_path):
+    config = lab_configuration()
+    config["joint"]["gains"]["kp_per_rad"] = [1 / 3, 2 / 7, 0.1, 1e-7, 3.3333333, 99.99999]
+    pot = config["joint"]["pot"][2]
+    pot["node_count"], pot["counts"][:3], pot["angle_rad"][:3] = 3, (3000, 30000, 62000), (-2.61, 0.123, 2.7)
+    path = tmp_path / "board.toml"
+    path.write_text(configuration_text(config, "pil"), encoding="utf-8")
+    back, board = read_configuration(path)
+    assert (back.tobytes(), board) == (config.tobytes(), "pil")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("supply_min_mv = 10000", "supply_min_v = 10"), "nothing is called arm.supply_min_v; is it arm.supply_min_mv"),
+        (("[joint.2]", "[joint.1]"), "no board.toml: .*joint"),
+        (("soft_max_rad = 2.4", "soft_max_rad = 24.0"), "joint 1: soft_max_rad is 24; -13 to 13 is allowed"),
+        (("soft_max_rad = 2.4", "soft_max_rad = '2.4'"), "joint.1.soft_max_rad is '2.4'; a number is needed"),
+        (("silence_ticks = 100", "silence_ticks = 100.5"), "arm.silence_ticks is 100.5; a whole number is needed"),
+        (("silence_ticks = 100", ""), "arm.silence_ticks is missing"),
+        (("version = 2", "version = 1"), "version is 1"),
+        (("counts = [3277, 62258]", "counts = [3277]"), r"counts is \[3277\]; a list of 2 to 9 numbers is needed"),
+        (("motor_direction = 1", "motor_direction = 0"), "joint 1: motor_direction is 0"),
+    ],
+)
+def test_what_is_wrong_is_named_with_the_file(tmp_path, change, said):
+    path = written(tmp_path, change)
+    with pytest.raises(InputError, match=rf"board\.toml.*{said}"):
+        read_configuration(path)
+
+
+@pytest.mark.parametrize(
+    "path", ["joint.7.soft_max_rad", "joint.1.pot", "arm.joint", "soft_max_rad", "joint.1.pot.node_count"]
+)
+def test_a_value_is_put_only_where_there_is_one(path):
+    with pytest.raises(InputError, match="nothing is called"):
+        put(lab_configuration(), path, 1)

@@ -1,0 +1,40 @@
+"""Gains by the rule: the loop has the poles that were asked for, and a motion within them leaves no error."""
+
+import numpy as np
+import pytest
+
+from armsight.errors import InputError
+from armsight.robot.boards.tuning import MotorFigures, tuned_gains
+
+MOTOR = MotorFigures(resistance_ohm=6.0, constant_v_s=2.4, inertia_kg_m2=0.03, viscous_n_m_s=0.02, dry_n_m=0.2)
+STALL, OWN = 2.4 * 12.0 / 6.0, 2.4**2 / 6.0 + 0.02
+
+
+@pytest.mark.parametrize(("bandwidth", "damping"), [(30.0, 1.0), (60.0, 0.7), (45.0, 1.3)])
+def test_the_loop_has_the_bandwidth_and_damping_asked_for(bandwidth, damping):
+    kp, _, kd, *_ = tuned_gains(MOTOR, 12.0, bandwidth, damping)
+    poles = np.roots([0.03, OWN + STALL * kd, STALL * kp])
+    assert np.sqrt(np.prod(poles).real) == pytest.approx(bandwidth)
+    assert -poles.sum().real / (2 * bandwidth) == pytest.approx(damping)
+
+
+def test_feed_forward_is_what_the_motion_takes():
+    _, _, kd, kv, ka, kf, *_ = tuned_gains(MOTOR, 12.0, 40.0)
+    speed, acceleration = 1.2, -3.0
+    torque = 0.03 * acceleration + OWN * speed
+    assert STALL * (kv * speed + ka * acceleration - kd * speed) == pytest.approx(torque)
+    assert 0 < STALL * kf < 0.2
+
+
+def test_a_motor_that_damps_itself_enough_gets_no_derivative():
+    kp, _, kd, kv, *_ = tuned_gains(MOTOR, 12.0, 10.0)
+    assert (kd, kv) == (0.0, pytest.approx(OWN / STALL))
+    assert kp == pytest.approx(0.03 * 100 / STALL)
+
+
+@pytest.mark.parametrize("what", ["supply_v", "bandwidth_rad_s", "inertia_kg_m2"])
+def test_a_number_that_is_not_positive_is_rejected_by_name(what):
+    given = {"supply_v": 12.0, "bandwidth_rad_s": 40.0}
+    motor = MOTOR if what in given else MotorFigures(6.0, 2.4, 0.0, 0.02, 0.2)
+    with pytest.raises(InputError, match=f"{what} is 0; it must be positive"):
+        tuned_gains(motor, **{name: 0.0 if name == what else value for name, value in given.items()})
