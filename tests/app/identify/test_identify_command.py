@@ -189,8 +189,11 @@ def test_poses_to_validate_with_that_cannot_be_of_the_arm_are_explained(tmp_path
     [
         (lambda lines: [], "no rows"),
         (lambda lines: lines[:1], "no rows"),
-        (lambda lines: [lines[0].replace("q6_rad", "elbow"), *lines[1:]], "column q6_rad is missing"),
-        (lambda lines: [lines[0] + ",q7_rad", *(line + ",0" for line in lines[1:])], "six joints"),
+        (lambda lines: [lines[0].replace("q6_rad", "elbow"), *lines[1:]], "5 joint angles a row, six_r has 6 joints"),
+        (
+            lambda lines: [lines[0] + ",q7_rad", *(line + ",0" for line in lines[1:])],
+            "7 joint angles a row, six_r has 6 joints",
+        ),
         (lambda lines: [line.replace("p1_", "p2_") for line in lines], "no point 1"),
         (
             lambda lines: [

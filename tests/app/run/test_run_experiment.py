@@ -89,7 +89,7 @@ def test_other_faults_are_left_to_a_person(made):
     again = left_silent(board, link)
     plant.break_pot(2, PotFault.OPEN)
     again.receive(0.2)
-    with pytest.raises(DeviceError, match=r"the board is not ready: faulted.*joint 3: potentiometer open") as caught:
+    with pytest.raises(DeviceError, match=r"the board is not ready: holding.*joint 3: potentiometer open") as caught:
         enable(again)
     assert "\n" not in str(caught.value)
     again.receive(0.05)
@@ -111,9 +111,7 @@ def test_an_emergency_stop_is_not_undone(made):
 def stands(q):
     """A board whose joints stand somewhere, with the lab's limits."""
     states = SimpleNamespace(q=q, t_s=np.ones(len(q)))
-    limits = np.zeros(6, [("soft_min_rad", "f4"), ("soft_max_rad", "f4")])
-    limits["soft_min_rad"], limits["soft_max_rad"] = -2.4, 2.4
-    return SimpleNamespace(receive=lambda wait_s: states, configuration=lambda: {"joint": limits})
+    return SimpleNamespace(receive=lambda wait_s: states, soft_limits=lambda: (np.full(6, -2.4), np.full(6, 2.4)))
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ def test_a_full_disk_is_one_line_and_keeps_what_fits(small_disk):
     assert said.endswith(f"what was written before is in {disk}")
     assert json.loads((disk / "summary.json").read_text())["ended_by"] == "left camera: gone"
     assert list(csv.reader((disk / "poses.csv").read_text().splitlines()))
-    assert {path.name for path in disk.iterdir()} == {"summary.json", "poses.csv", "detections.csv"}
+    assert {path.name for path in disk.iterdir()} == {"summary.json", "poses.csv"}
 
 
 FOUND = HealthFinding("rig", "a camera is rotated", 1.5, 0.05, 0.001, "deg", "calibrate again")
@@ -138,9 +138,7 @@ def test_an_interrupt_while_writing_waits_until_what_was_measured_is_there(tmp_p
     monkeypatch.setattr(run_folder, "write_columns", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_run(finished(), tmp_path)
-    assert {"detections.csv", "joints.csv", "joints.parquet", "poses.csv", "summary.json"} == {
-        path.name for path in tmp_path.iterdir()
-    }
+    assert {"joints.csv", "joints.parquet", "poses.csv", "summary.json"} == {path.name for path in tmp_path.iterdir()}
 
 
 def test_the_message_about_what_ended_a_run_names_the_folder(tmp_path):

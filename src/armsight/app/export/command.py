@@ -33,13 +33,18 @@ def command(run: str, form: str, output: Path, as_json: bool) -> None:
     from armsight.app.export.tables import write_csv, write_parquet, write_tum
     from armsight.app.replay.recorded import read_run, run_file
     from armsight.errors import InputError
+    from armsight.files import check_folder, check_writable
 
-    file = run_file(run)
-    if file is None:
-        raise InputError(f"{run}: no run.mcap there; give the folder of a run, or a file .mcap")
+    if form == "mcap":
+        check_writable(output, apart_from=(run,))
+    else:
+        check_folder(output)
     output = output.expanduser()
     if output.exists() and (output.is_file() or any(output.iterdir())):
         raise InputError(f"{output}: is there already; give a new name")
+    file = run_file(run)
+    if file is None:
+        raise InputError(f"{run}: no run.mcap there; give the folder of a run, or a file .mcap")
     if form in ("mcap", "ros2"):
         files = {"mcap": write_mcap, "ros2": write_ros2}[form](file, output)
     else:

@@ -95,15 +95,17 @@ def command(**given: object) -> None:
     from armsight.app.progress import steps
     from armsight.app.report.page import put_files, writable_folder
     from armsight.app.report.plotting import require_matplotlib
+    from armsight.files import check_folder
 
     folder = None
     if options.output is not None:
         require_matplotlib()
-        folder = writable_folder(options.output, "no report")
+        folder = check_folder(options.output, problem="no report can be written here")
     with steps() as progress:
         run = calibrate(options, progress)
         if folder is not None:
             progress("writing")
+            writable_folder(folder, "no report")
             write_handeye_report(run, folder)
             files = {"handeye.json": json.dumps(as_json(run), indent=1).encode() + b"\n"}
             if run.plan is not None:
