@@ -93,7 +93,7 @@ def test_other_faults_are_left_to_a_person(made):
         enable(again)
     assert "\n" not in str(caught.value)
     again.receive(0.05)
-    assert again.status.state is BoardState.FAULTED  # nothing was cleared
+    assert again.status.state is BoardState.HOLDING  # nothing was cleared
     assert {each.fault for each in again.status.faults} >= {Fault.HOST_SILENT, Fault.POT_OPEN}
 
 

@@ -37,9 +37,9 @@ def command(
 ) -> None:
     """Measure many recordings, on all cores or on a cluster; started again it goes on where it was.
 
-    Quote the GLOB: ``'archive/**/*.mcap'``, ``'s3://bucket/**/*.bag'``. A recording that fails is a row with its reason. identify
-    takes tables of poses (armsight identify -h), check folders of runs (armsight check -h), measure and replay recordings
-    (armsight replay -h).
+    Quote the GLOB: ``'archive/**/*.mcap'``, ``'s3://bucket/**/*.bag'``. A recording that fails is a row with its
+    reason. identify takes tables of poses (armsight identify -h), check folders of runs (armsight check -h),
+    measure and replay recordings (armsight replay -h).
     """
     from armsight.app.batch.run import Batch, run_batch
     from armsight.app.batch.work import BatchOptions
