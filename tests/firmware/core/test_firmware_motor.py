@@ -72,3 +72,47 @@ def test_a_motor_whose_resistance_is_not_known_is_not_watched(arms, library):
     arm.plant.break_pot(1, PotFault.DRIFT, 0.1)
     arm.swing(400)
     assert arm.first == (None, None)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(
+    ("kind", "size"), [(PotFault.JUMP, 0.4), (PotFault.SLIP, 0.3), (PotFault.DRIFT, 0.3), (PotFault.INVERTED, 0.0)]
+)
+def test_a_potentiometer_that_breaks_in_motion_is_noticed_at_its_joint(arms, library, kind, size, seed):
+    arm = swinging(arms, library, seed)
+    joint = int(np.argmax(np.abs(arm.plant.qd)))
+    arm.plant.break_pot(joint, kind, size)
+    arm.swing(2000)
+    assert arm.first[1] == joint
+    if kind is PotFault.JUMP:
+        assert arm.first[0] is Fault.POT_JUMP
+
+
+@pytest.mark.parametrize(("kind", "size"), [(PotFault.SCALED, 1.6), (PotFault.SCALED, 0.4), (PotFault.LAG, 0.15)])
+def test_a_potentiometer_that_was_wrong_from_the_beginning_is_noticed_at_its_joint(arms, library, kind, size):
+    for seed in (920, 921, 922):
+        arm = arms.Arm(library, seed)
+        arm.plant.break_pot(2, kind, size)
+        arm.enable()
+        arm.swing(4000)
+        assert arm.first[1] == 2
+
+
+@pytest.mark.parametrize("size", [0.2, -0.2])
+def test_a_reading_that_drifts_at_rest_is_noticed(arms, library, size):
+    for seed in SEEDS:
+        arm = swinging(arms, library, seed)
+        arm.rest(600)
+        arm.plant.break_pot(1, PotFault.DRIFT, size)
+        arm.rest(4000)
+        assert arm.first[1] == 1
+
+
+def test_gains_that_make_a_joint_swing_are_noticed(arms, library):
+    arm = arms.Arm(library, 930)
+    for joint in arm.core.config.joint:
+        joint.gains.kp_per_rad, joint.gains.kd_s_per_rad = 60.0, 3.0
+    arm.core.crc, arm.core.crc_at, arm.core.crc_known = 0xFFFFFFFF, 0, 0
+    arm.enable()
+    arm.swing(3000)
+    assert arm.first[0] is Fault.OSCILLATION
