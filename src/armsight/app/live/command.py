@@ -79,7 +79,10 @@ def command(
 
     from armsight.app.live.server import LiveServer
     from armsight.app.live.session import LiveSession, SessionOptions
+    from armsight.vision.sources.usb import parsed_usb
 
+    if source is not None and source.startswith("usb:"):
+        parsed_usb(source.removeprefix("usb:"))  # cameras may come later, their names may not
     options = SessionOptions(
         output, source, rig, target, calibration_board, board, arm, motion, rate, 1e-3 * sync_ms, seed
     )

@@ -61,6 +61,9 @@ def replay(request: Request, say: Callable[[str], None]) -> Replayed:
     Raises:
         InputError: not a recording, or it does not hold what the request needs.
     """
+    name = str(request.recording)
+    if ":" not in name and not Path(name.split(",")[0]).exists():
+        raise InputError(f"{name}: no such file or folder; expected a run's folder, its run.mcap or a bag")
     file = run_file(request.recording)
     recorded = None if file is None else read_run(file)
     if recorded is not None and recorded.has_estimator:
