@@ -35,9 +35,10 @@ $(VENV)/.armsight: pyproject.toml setup.py $(shell find firmware -type f)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[all]"
 	touch $@
 
-$(VENV)/.armsight-test: $(VENV)/.armsight
+$(VENV)/.armsight-test: pyproject.toml setup.py $(shell find firmware -type f)
+	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test]"
-	touch $@
+	touch $(VENV)/.armsight $@
 
 $(VENV)/.opencv4: $(VENV)/.armsight-test
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --upgrade --target $(VENV)/opencv4 "opencv-python-headless<5"

@@ -114,7 +114,7 @@ def test_only_a_few_recordings_are_handed_out_at_a_time(monkeypatch):
 def test_a_recording_that_fails_is_a_row_with_its_reason(tmp_path):
     done = work(str(tmp_path / "none.bag"), BatchOptions("measure", target="chessboard:9x6:25mm"))
     assert done.recording["status"] == "failed"
-    assert "no such recording" in done.recording["reason"]
+    assert "no such file or folder" in done.recording["reason"]
     assert done.shots == []
 
 

@@ -93,7 +93,7 @@ def test_cameras(page, session):
     until(lambda: page.execute_script("return Math.min(...armsight.frames)") > 1)
     until(lambda: state(page, "cameras.views[0].quality"))
     assert state(page, "cameras.views[0].size_px") == [640, 360]
-    assert page.execute_script("return document.getElementById('view0').width") == 640
+    until(lambda: page.execute_script("return document.getElementById('view0').width") == 640)
     click(page, "find-left")
     until(lambda: "LEFT" in (state(page, "cameras.finding_left") or ""))
     click(page, "person-cover_right")  # the cable of the left camera was in the other port
@@ -121,7 +121,7 @@ def test_calibrate(page, session):
     click(page, "k-run")
     shots = until(lambda: len(state(page, "calibrate.shots")) >= 6 and state(page, "calibrate.shots"))
     assert shots[0] == "01"
-    assert {each["kind"] for each in page.execute_script("return drawn")} >= {"next"}
+    until(lambda: {each["kind"] for each in page.execute_script("return drawn")} >= {"next"})
     click(page, "k-finish")
     until(lambda: state(page, "calibrate.rig"))
     rig, truth = StereoRig.load(session.folder / "rig.json"), session._simulated.workcell.truth.rig
@@ -129,7 +129,7 @@ def test_calibrate(page, session):
     assert rig.left.intrinsics[0] == pytest.approx(truth.left.intrinsics[0], rel=5e-3)
     progress = state(page, "calibrate.progress")
     assert progress[-1]["heldout_mm"] > 0
-    assert "armsight calibrate" in page.find_element("id", "command").text
+    until(lambda: "armsight calibrate" in page.find_element("id", "command").text)
     assert len(list((session.folder / "calibration").glob("left*.png"))) >= 6
 
 
@@ -185,7 +185,7 @@ def test_stop_and_two_pages(page, session, server, browsers):
     assert answer["stopped"]
     assert answer["state"].startswith("emergency stop")
     until(lambda: state(page, "arm.stopped"))
-    assert page.execute_script("return document.getElementById('a-run').disabled")
+    until(lambda: page.execute_script("return document.getElementById('a-run').disabled"))
     click(page, "a-clear")
     until(lambda: not state(page, "arm.stopped"))
     other = browsers(server.address)
