@@ -131,7 +131,9 @@ def test_another_arm_or_estimator_changes_the_answers_and_compare_shows_it(armsi
 def test_what_a_run_does_not_hold_is_named(armsight, run, tmp_path):
     assert_rejected(armsight("replay", run, "--rig", "r.json"), "needs the images of every shot")
     assert_rejected(armsight("replay", tmp_path), "give --target")
-    assert_rejected(armsight("replay", tmp_path / "none.bag", "--target", "chessboard:9x6:25mm"), "no such file or folder")
+    assert_rejected(
+        armsight("replay", tmp_path / "none.bag", "--target", "chessboard:9x6:25mm"), "no such file or folder"
+    )
     assert_rejected(armsight("replay", run, "--compare", tmp_path), "no poses.csv or live.csv")
     assert list(tmp_path.iterdir()) == []
 
