@@ -140,7 +140,9 @@ def test_a_cable_pulled_in_motion_is_reported_and_the_arm_stops_by_itself(cable)
     outputs = cable.link.answer["outputs"]
     assert outputs["state"] == BoardState.HOLDING
     assert outputs["first_fault"] == Fault.HOST_SILENT
-    assert np.abs(cable.plant.qd).max() < 0.05  # the converter's noise moves a held joint a little
+    held = cable.plant.q.copy()
+    cable.link.step(300)
+    assert np.abs(cable.plant.q - held).max() < 0.3 * 0.01  # 0.01 rad/s in the mean
 
 
 def test_the_self_test_of_a_real_board_keeps_its_drives_off(cable):

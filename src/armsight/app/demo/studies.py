@@ -266,7 +266,7 @@ def _circle(workcell: Workcell, setup: Setup, rig: StereoRig, outcome: RunResult
         log,
         KalmanEstimator(setup.arm, prior=PRIOR, delay=outcome.delay, learns_delay=False),
     )
-    loop.mounting = outcome.handeye.mounting
+    loop.mounting, loop.delay_s, loop.shutters = outcome.handeye.mounting, outcome.delay.delay_s, outcome.shutters
     servo = PoseServo(setup.arm, timing(setup, outcome.delay))
     kinds = [motion.kind for motion in plan.motions]
     first = max(kinds.index("line") - 1, 0)  # the motion to its start

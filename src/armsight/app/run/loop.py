@@ -399,11 +399,11 @@ class Loop:
         Ts = np.array([live.T_base_tool for live in near]) @ self.mounting.T_tool_body
         xi = log_se3(inverse(Ts[np.argmin(np.abs(tau))]) @ Ts)
         X = (tau[:, None] / _MOTION_S) ** np.arange(4)
-        fit = np.linalg.pinv(X) / (_MOTION_S ** np.arange(4))[:, None]
-        _, twist, half, _ = fit @ xi
-        scatter = xi - X @ (np.linalg.pinv(X) @ xi)
-        variance = (scatter**2).sum(axis=0) / (len(near) - 4) / _SCATTER_SHARE**2
-        return Motion(twist, 2.0 * half, np.diag(variance) * float(fit[1] @ fit[1]), True)
+        fit = np.linalg.pinv(X)
+        coefficients = fit @ xi
+        variance = ((xi - X @ coefficients) ** 2).sum(axis=0) / (len(near) - 4) / _SCATTER_SHARE**2
+        twist, acceleration = coefficients[1] / _MOTION_S, 2.0 * coefficients[2] / _MOTION_S**2
+        return Motion(twist, acceleration, np.diag(variance) * float(fit[1] @ fit[1]) / _MOTION_S**2, True)
 
     def _publish(self) -> None:
         """Publish the shot that was measured in this iteration, and before it a mounting that is new."""
