@@ -17,7 +17,7 @@ from armsight.data import PoseEstimate, Shot
 from armsight.geometry.pose import inverse, log_se3
 from armsight.vision.markers.targets import Composite
 from armsight.vision.measure import measure
-from camera_scene import Scene, scene
+from camera_scene import scene, smallest_px
 from marker_report import Report
 
 PRESETS = ("industrial", "webcam-good-light", "webcam-poor-light", "cheap-webcam")
@@ -54,13 +54,6 @@ def nearest(found: np.ndarray, true: np.ndarray) -> np.ndarray:
     return out
 
 
-def smallest_px(view: Scene) -> float:
-    """Return the smaller diameter of the smallest disc of both images, px."""
-    shapes = np.vstack(view.shapes)
-    half, root = (shapes[:, 0] + shapes[:, 2]) / 2, np.hypot((shapes[:, 0] - shapes[:, 2]) / 2, shapes[:, 1])
-    return float(2 * np.sqrt((half - root).min()))
-
-
 def section(seed: int, report: Report) -> None:
     for preset in PRESETS:
         for kind in ("nine", "four"):
@@ -69,11 +62,12 @@ def section(seed: int, report: Report) -> None:
 
 def one(preset: str, kind: str, first: int, report: Report) -> None:
     nees, ours, peers, extra, peer_extra, spent = [], [], [], [], [], 0.0
-    missed, wrong, shots = 0, 0, 0
-    for k in range(SHOTS):
-        view = scene(first + k, preset, kind=kind)
-        if smallest_px(view) < LEAST_PX:
+    missed, wrong, shots, k = 0, 0, 0, -1
+    while shots < SHOTS:
+        k += 1
+        if smallest_px(first + k, kind) < LEAST_PX:
             continue
+        view = scene(first + k, preset, kind=kind)
         shots += 1
         target = Composite("body", (), view.target)
         begun = time.process_time()
@@ -91,8 +85,6 @@ def one(preset: str, kind: str, first: int, report: Report) -> None:
             peers.append(nearest(blobs, true))
             extra.append(len(discs) - len(true))
             peer_extra.append(len(blobs) - len(true))
-    if not shots:
-        return
     mine, theirs = np.vstack(ours), np.vstack(peers)
 
     def rms(gaps: np.ndarray) -> float:

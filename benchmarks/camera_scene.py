@@ -82,6 +82,29 @@ def random_pose(
             return T
 
 
+def placed(
+    seed: int,
+    kind: str = "nine",
+    distance_m: float | None = None,
+    size: tuple[int, int] = (1280, 720),
+) -> tuple[StereoRig, DiscTarget, tuple[Pattern, ...], np.ndarray, np.random.Generator]:
+    """Return rig, target, patterns and T_left_body (4, 4) of a scene, and the generator that its backgrounds come from."""
+    rng = np.random.default_rng([seed, 1])
+    rig = example_rig(size, 900 / 1280 * size[0])
+    target, patterns = body(kind)
+    distance = rng.uniform(0.5, 1.2) if distance_m is None else distance_m
+    return rig, target, patterns, random_pose(rig, patterns, distance, rng), rng
+
+
+def smallest_px(seed: int, kind: str) -> float:
+    """Return the smaller diameter of the smallest disc of both images of a scene, px; nothing is rendered."""
+    rig, target, _, T, _ = placed(seed, kind)
+    at = (T, inverse(rig.T_left_right) @ T)
+    shapes = np.vstack([ellipses(camera, target, A)[1] for camera, A in zip(rig.cameras, at, strict=True)])
+    half, root = (shapes[:, 0] + shapes[:, 2]) / 2, np.hypot((shapes[:, 0] - shapes[:, 2]) / 2, shapes[:, 1])
+    return float(2 * np.sqrt((half - root).min()))
+
+
 def scene(
     seed: int,
     preset: str | CameraPipeline,
@@ -105,15 +128,12 @@ def scene(
             what it does to the image; both cameras expose at the same time.
     """
     pipeline = preset if isinstance(preset, CameraPipeline) else CameraPipeline.load(preset)
-    rng = np.random.default_rng([seed, 1])
-    rig = example_rig(size, 900 / 1280 * size[0])
-    target, patterns = body(kind)
-    distance = rng.uniform(0.5, 1.2) if distance_m is None else distance_m
-    T = random_pose(rig, patterns, distance, rng)
+    rig, target, patterns, T, rng = placed(seed, kind, distance_m, size)
     posed = PosedBody(patterns, T, np.zeros(6) if twist is None else twist)
-    views = (posed, posed.seen_from(inverse(rig.T_left_right)))
     images, uv, shapes = [], [], []
-    for side, (camera, view) in enumerate(zip(rig.cameras, views, strict=True)):
+    for side, (camera, view) in enumerate(
+        zip(rig.cameras, (posed, posed.seen_from(inverse(rig.T_left_right))), strict=True)
+    ):
         behind = BACKGROUNDS[background](size, rng)
         light = radiance(camera, [view], behind, psf_sigma_px=pipeline.psf_sigma_px, shutter=pipeline.shutter(size[1]))
         device = SimulatedCamera(pipeline, size, 2 * seed + side)

@@ -470,11 +470,11 @@ def look(
             found.contrast[m, side] = abs(theta[6])
             work.rims[count, :] = work.rim
             count += 1
-    times, common = common_noise(count, work.rims)
+    common_noise(count, work)
     count = 0
     for m in range(len(scene.radii)):
         if found.codes[m, side] == SEEN:
-            widen(found.cov_uv[m, side], work.rims[count], times, common)
+            widen(found.uv[m, side], found.cov_uv[m, side], work.rims[count], work.shared)
             count += 1
 
 

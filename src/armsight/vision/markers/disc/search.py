@@ -428,7 +428,7 @@ def find(
             shape_of(starts[good], shape[good])
             work.rims[good, :] = work.rim
             good += 1
-    times, common = common_noise(good, work.rims)
+    common_noise(good, work)
     for i in range(good):
-        widen(cov[i], work.rims[i], times, common)
+        widen(starts[i, :2], cov[i], work.rims[i], work.shared)
     return good, n
