@@ -143,3 +143,44 @@ def _homography_squares(uv: Array, where: NDArray[np.bool_]) -> Array:
     for side in range(2):
         out[:, side] = (H[:2, side] - (p[:, :2] / p[:, 2:]) * H[2, side]) / p[:, 2:]
     return out
+
+
+#: Degree of the polynomial that a grid's image may deviate by from a plane's, least corners, and what the fits' own noise
+#: counts for, in degrees of freedom.
+_DEGREE, _LEAST_CORNERS, _OWN_NOISE = 4, 30, 10.0
+
+
+def scatter(uv: Array, cov_uv: Array, kept: NDArray[np.bool_], columns: int) -> float:
+    """Return by how much the scatter of a grid's corners exceeds their covariance, or falls short of it.
+
+    A corner's residuals do not say how noise that is correlated between pixels moves it, nor do those that a sharpened edge
+    leaves and that move nothing. The neighbours on a plane do: chi-square over its degrees of freedom of a homography and a
+    polynomial of degree four for the lens, fitted to the corners. Deviations of the print count, too.
+
+    Args:
+        uv: (N, 2) corners row by row, px.
+        cov_uv: (N, 2, 2) their covariance, px^2.
+        kept: (N,) which are good.
+        columns: of the grid.
+
+    Returns:
+        The factor; 1 of fewer than 30 corners.
+    """
+    number = np.flatnonzero(kept)
+    if len(number) < _LEAST_CORNERS:
+        return 1.0
+    xy = np.column_stack([number % columns, number // columns]).astype(float)
+    xy = 2 * (xy - xy.min(axis=0)) / np.maximum(np.ptp(xy, axis=0), 1.0) - 1
+    if min(np.ptp(xy, axis=0)) < 1.0:
+        return 1.0
+    H = cv2.findHomography(xy, uv[number])[0]
+    if H is None:
+        return 1.0
+    gap = uv[number] - cv2.perspectiveTransform(xy[None], H)[0]
+    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+    basis = np.column_stack([xy[:, 0] ** i * xy[:, 1] ** j for i, j in powers])
+    weight = 1.0 / np.sqrt(np.trace(cov_uv[number], axis1=1, axis2=2))
+    shape, _, rank, _ = np.linalg.lstsq(weight[:, None] * basis, weight[:, None] * gap, rcond=None)
+    gap = gap - basis @ shape
+    chi_square = float(np.einsum("ni,nij,nj->", gap, np.linalg.inv(cov_uv[number]), gap))
+    return (chi_square + _OWN_NOISE) / (2 * len(number) - 2 * int(rank) + _OWN_NOISE)

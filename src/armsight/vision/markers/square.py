@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Record
+from armsight.data import Array, Ids, Record
 from armsight.geometry.matrix import dot
 from armsight.kernels import kernel
 from armsight.vision.markers.normal import edge, edge_noise, factor, invert, normal_equations, solve
@@ -173,15 +173,13 @@ def _assemble(n: int, q: Array, prior: Array, J: Array, r: Array, A: Array, g: A
         g[FIELD] = 0.0
 
 
-@kernel("i8, f8[::1, :], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1]")
-def fit_pattern(n: int, px: Array, grid: Array, prior: Array, q: Array, inverse: Array) -> float:
-    """Minimise from q by Levenberg-Marquardt; fill ``inverse`` (18, 18); return the noise variance, -1 if unsettled."""
-    J, r, A, L = (
-        np.empty((PARAMETERS, n)),
-        np.empty(n),
-        np.empty((PARAMETERS, PARAMETERS)),
-        np.zeros((PARAMETERS, PARAMETERS)),
-    )
+@kernel("i8, f8[::1, :], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1]")
+def fit_pattern(n: int, px: Array, grid: Array, prior: Array, q: Array, inverse: Array, J: Array, r: Array) -> float:
+    """Minimise from q by Levenberg-Marquardt; return the noise variance, -1 if unsettled.
+
+    ``inverse`` (18, 18), J (18, n) and r (n,), derivatives and residuals, are filled.
+    """
+    A, L = np.empty((PARAMETERS, PARAMETERS)), np.zeros((PARAMETERS, PARAMETERS))
     g, step, trial = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty(PARAMETERS)
     cost, damping = _evaluate(n, px, grid, prior, q, J, r), _LAMBDA
     _assemble(n, q, prior, J, r, A, g)
@@ -291,9 +289,10 @@ def _fit_from(
     """Fit one marker's field over the homography of given corners, starting at a blur in px."""
     size = len(cells)
     H: Array = cv2.getPerspectiveTransform(corners.astype(np.float32), _CORNERS.astype(np.float32)).astype(np.float64)
-    px = _gather(image, corners, H, size, diagonal is not None, pixels)
-    if px is None or px.shape[1] < 3 * PARAMETERS:
+    gathered = _gather(image, corners, H, size, diagonal is not None, pixels)
+    if gathered is None or gathered[0].shape[1] < 3 * PARAMETERS:
         return _bad(corners, "too small or too near the image border")
+    px, at = gathered
     low, high = np.percentile(px[0], (5, 95))
     q, prior, inverse = np.zeros(PARAMETERS), np.zeros((FIELD + 3, 2)), np.empty((PARAMETERS, PARAMETERS))
     q[FIELD], q[FIELD + 1], q[FIELD + 3] = blur * blur, 0.5 * (high - low), 0.5 * (high + low)
@@ -303,13 +302,53 @@ def _fit_from(
     prior[FIELD + 2, 1] = (_PRIOR_NOISE / (_BLEED_SHARE * max(q[FIELD + 1], 1.0))) ** 2
     grid = np.pad(cells.astype(np.float64), 2, constant_values=1.0)
     grid[np.ix_((0, 1, -2, -1), (0, 1, -2, -1))] = 1.0 if diagonal is None else diagonal
-    variance = fit_pattern(px.shape[1], px, grid, prior, q, inverse)
+    J, r = np.empty((PARAMETERS, px.shape[1])), np.empty(px.shape[1])
+    variance = fit_pattern(px.shape[1], px, grid, prior, q, inverse, J, r)
     if variance < 0.0:
         return _bad(corners, "no convergence")
     if not np.sqrt(variance) <= MISFIT_MAX * q[FIELD + 1]:
         return _bad(corners, "the pattern does not fit")
-    uv, cov = _corners(q, variance * inverse[:FIELD, :FIELD], np.asarray(np.linalg.inv(H), np.float64))
+    uv, by_field = _corners(q, np.asarray(np.linalg.inv(H), np.float64))
+    cov_field = variance * inverse[:FIELD, :FIELD]
+    cov, middle = by_field @ cov_field @ by_field.transpose(0, 2, 1), by_field.mean(axis=0)
+    # The corners of one fit have errors in common. Whoever takes them as independent finds the middle as it is then.
+    together = 4.0 * np.trace(middle @ cov_field @ middle.T) / np.trace(cov.mean(axis=0))
+    cov *= max(1.0, float(together)) * correlated(at, r, middle @ inverse[:FIELD] @ J)
     return SquareFit(uv, cov, None)
+
+
+#: Neighbours of pixels, px, between which noise is looked at.
+_NEIGHBOURS = 4
+
+
+def correlated(at: Ids, residuals: Array, gains: Array) -> float:
+    """Return by how much the variance of a fit's result grows because the noise of neighbouring pixels is correlated.
+
+    Args:
+        at: (N, 2) columns and rows of the pixels.
+        residuals: (N,) of the fit.
+        gains: (K, N) derivative of K results by the pixels' grey levels.
+
+    Returns:
+        The mean over the results, one at least. The noise's autocovariance is that of the residuals, over up to four
+        pixels; gains and residuals are correlated by FFT.
+    """
+    x, y = at.T - at.min(axis=0)[:, None]
+    shape = (int(y.max()) + 1 + _NEIGHBOURS, int(x.max()) + 1 + _NEIGHBOURS)
+
+    def lags(values: Array) -> Array:
+        """Return the autocorrelation of values (N,) on the pixels up to a few pixels."""
+        plane = np.zeros(shape)
+        plane[y, x] = values
+        power = np.abs(np.fft.rfft2(plane)) ** 2
+        near = np.arange(-_NEIGHBOURS, _NEIGHBOURS + 1)
+        return np.asarray(np.fft.irfft2(power, shape)[np.ix_(near, near)])
+
+    pairs = lags(np.ones(len(residuals)))
+    rho = np.where(pairs > 0.5, lags(residuals) / np.maximum(pairs, 0.5), 0.0)
+    rho /= max(float(rho[_NEIGHBOURS, _NEIGHBOURS]), 1e-12)
+    factors = [float((rho * by).sum() / by[_NEIGHBOURS, _NEIGHBOURS]) for by in map(lags, gains)]
+    return max(1.0, float(np.mean(factors)))
 
 
 def _bad(corners: Array, problem: str) -> SquareFit:
@@ -317,8 +356,10 @@ def _bad(corners: Array, problem: str) -> SquareFit:
     return SquareFit(corners, np.zeros((4, 2, 2)), problem)
 
 
-def _gather(image: NDArray[np.uint8], corners: Array, H: Array, size: int, whole: bool, pixels: int) -> Array | None:
-    """Collect the pixels of a marker and its margin, (8, n) as in ``fit_pattern``."""
+def _gather(
+    image: NDArray[np.uint8], corners: Array, H: Array, size: int, whole: bool, pixels: int
+) -> tuple[Array, Ids] | None:
+    """Collect the pixels of a marker and its margin, (8, n) as in ``fit_pattern``, and their columns and rows (n, 2)."""
     cell = float(np.sqrt(abs(cv2.contourArea(corners.astype(np.float32))))) / size
     margin = np.clip(1.0 - MARGIN_GAP_PX / max(cell, 1e-9), *MARGIN_CELLS)
     reach = 1.0 + 2.0 * float(margin) / size
@@ -340,13 +381,14 @@ def _gather(image: NDArray[np.uint8], corners: Array, H: Array, size: int, whole
     steep = np.linalg.norm(slope, axis=2)
     width = np.abs(slope).max(axis=2) / steep
     cosine = (slope[0] * slope[1]).sum(axis=1) / steep.prod(axis=0)
-    return np.concatenate([image[v[chosen], u[chosen]][None], xy[:, chosen], 1.0 / steep, width, cosine[None]])
+    px = np.concatenate([image[v[chosen], u[chosen]][None], xy[:, chosen], 1.0 / steep, width, cosine[None]])
+    return px, np.column_stack([u[chosen], v[chosen]])
 
 
-def _corners(q: Array, cov: Array, H: Array) -> tuple[Array, Array]:
-    """Return the corners (4, 2) and their covariance (4, 2, 2) from the field and its covariance; H: marker to image."""
+def _corners(q: Array, H: Array) -> tuple[Array, Array]:
+    """Return the corners (4, 2) and their derivatives (4, 2, FIELD) by the field; H: marker to image."""
     phi = np.empty((FIELD, 2))
-    uv, cov_uv = np.empty((4, 2)), np.empty((4, 2, 2))
+    uv, by_field = np.empty((4, 2)), np.empty((4, 2, FIELD))
     for i, corner in enumerate(_CORNERS):
         at = corner.copy()
         for _ in range(10):  # the point that the field maps onto the corner; the field is small, so this converges
@@ -354,6 +396,5 @@ def _corners(q: Array, cov: Array, H: Array) -> tuple[Array, Array]:
             at = corner - q[:FIELD] @ phi
         x, y, w = H @ np.array([at[0], at[1], 1.0])
         uv[i] = x / w, y / w
-        J = (H[:2, :2] - uv[i][:, None] * H[2, :2]) / w @ -phi.T
-        cov_uv[i] = J @ cov @ J.T
-    return uv, cov_uv
+        by_field[i] = (H[:2, :2] - uv[i][:, None] * H[2, :2]) / w @ -phi.T
+    return uv, by_field

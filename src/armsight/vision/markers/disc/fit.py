@@ -455,8 +455,8 @@ def rim_noise(variance: float, work: FitBuffers) -> tuple[float, float, int]:
     return off, chance, count
 
 
-#: Relative slopes of light over discs, 1/px: how much an image's mean may be (vignetting of 40 % has 2e-3 in the corner), and
-#: the least by which discs of one image differ.
+#: Relative slopes of light over discs, 1/px: how much an image's mean may be (vignetting of 40 % has 2e-3 in the corner),
+#: and the least by which discs of one image differ.
 _SLOPE_MEAN, _SLOPE_APART = 1e-3, 1.5e-4
 
 
@@ -465,10 +465,10 @@ def common_noise(n: int, work: FitBuffers) -> None:
     """Fill ``work.shared`` with what the first n discs of ``work.rims`` have in common.
 
     These are the factor of the variance of centres by correlated noise, one at least; the mean square of the sectors'
-    deviations beyond white noise, px^2; the mean of the relative slope of light over a disc, u and v, 1/px, n / 2 times
+    deviations beyond white noise, px^2; the mean of the relative slope of light over a disc, u and v, 1/px; n / 2 times
     its variance (an error of the mean moves all centres alike: it does not average out in three of the six degrees of
-    freedom of a pose), and the variance of a disc's own about it (empirical Bayes, Morris 1983). All follow from medians, so that a few
-    discs that are none do not count.
+    freedom of a pose); and the variance of a disc's own slope about it (empirical Bayes, Morris 1983). All follow from
+    medians, so that a few discs that are none do not count.
     """
     rims, shared = work.rims, work.shared
     shared[0], shared[1], shared[2], shared[3] = 1.0, 0.0, 0.0, 0.0
