@@ -199,6 +199,14 @@ def test_left_and_right_exchanged_is_reported(few, armsight, tmp_path):
     assert any("are left and right exchanged" in weak for weak in said.lines[0]["weaknesses"])
 
 
+def test_a_video_is_named_with_what_to_do(armsight, tmp_path):
+    for side in ("left", "right"):
+        (tmp_path / f"{side}.mp4").write_bytes(b"")
+    videos = ("--left", tmp_path / "left.mp4", "--right", tmp_path / "right.mp4")
+    said = armsight("calibrate", *videos, *CHESS, "-o", tmp_path / "rig.json")
+    assert_rejected(said, "left.mp4", "is a video", "armsight record")
+
+
 @pytest.mark.parametrize(
     "spec",
     ["chessboard", "chessboard:9x6", "chessboard:9x6:25", "chessboard:9:25mm", "chessboard:0x6:25mm", "quilt:9x6:25mm",

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from armsight.errors import InputError
-from armsight.vision.sources import open_source
+from armsight.vision.sources import notes_of, open_source
 
 pytestmark = pytest.mark.opencv
 
@@ -65,6 +65,18 @@ def test_frames_are_paired_by_time_and_those_without_a_partner_named(film, pictu
     alone = [shot for shot in found if shot.problem]
     assert alone[0].problem == f"{right} has no frame for {left}'s at 0.033 s: its next is at 0.067 s"
     assert alone[0].t_s == pytest.approx(1 / 30)
+
+
+def test_files_of_different_rates_are_said(film, picture):
+    images = [picture("left", k) for k in range(4)]
+    left, slower, same = (
+        film("left.avi", images, fps=30),
+        film("slow.avi", images, fps=25),
+        film("same.avi", images, fps=30),
+    )
+    (note,) = notes_of(open_source(f"video:{left},{slower}"))
+    assert note.startswith(f"{left} has 30 frames a second and {slower} 25:")
+    assert notes_of(open_source(f"video:{left},{same}")) == ()
 
 
 def test_a_side_by_side_file_is_split_in_the_middle(film, picture, read_back):

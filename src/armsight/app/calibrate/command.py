@@ -13,6 +13,8 @@ from armsight.errors import InputError
 from armsight.files import check_folder, check_outputs
 from armsight.vision.calibrate import FOLDS, MODELS
 
+_VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
+
 
 @click.command("calibrate")
 @click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
@@ -89,6 +91,12 @@ def command(
     from armsight.vision.sources import PairsSource
 
     source = None if left is None or right is None else PairsSource.open(left, right)
+    video = next((f for f in (source.files if source is not None else ()) if f.suffix.lower() in _VIDEOS), None)
+    if video is not None:
+        raise InputError(
+            f"{video}: is a video, and calibrate takes images: `armsight record video:LEFT,RIGHT -o DIR` stores them. Use "
+            "boards that stand still; `armsight measure --skew find --save-rig` then finds the skew of the cameras"
+        )
     alone = (files_of(left_intrinsics), files_of(right_intrinsics))
     inputs = points if source is None else (*source.files, *alone[0], *alone[1])
     board_file = None if source is None else output.parent / f"{output.stem}.board.toml"

@@ -17,14 +17,29 @@ from armsight.data import Image, Shot
 from armsight.errors import InputError
 from armsight.vision.sources.capture import QuietCapture, open_capture
 
+#: Two rates that differ by more than this share are said.
+_RATES = 0.01
+
 
 class VideoSource:
-    """Two video files, or one side-by-side file."""
+    """Two video files, or one side-by-side file.
+
+    Attributes:
+        notes: what is odd about the files: different rates.
+    """
 
     count: int | None = None  # what a container promises is an estimate
 
     def __init__(self, files: Sequence[_File]) -> None:
         self._files = list(files)
+        first, last = self._files[0], self._files[-1]
+        rates = [1 / file.period_s for file in (first, last)]
+        self.notes: tuple[str, ...] = ()
+        if min(rates) > 0 and abs(rates[0] - rates[1]) > _RATES * max(rates):
+            self.notes = (
+                f"{first.path} has {rates[0]:.4g} frames a second and {last.path} {rates[1]:.4g}: only those of nearly the "
+                "same time are paired, up to half a frame apart; set both cameras to one rate, or use what stands still",
+            )
         self._shots = 0
         self._ended = False
 
