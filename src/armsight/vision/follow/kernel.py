@@ -470,11 +470,11 @@ def look(
             found.contrast[m, side] = abs(theta[6])
             work.rims[count, :] = work.rim
             count += 1
-    common_noise(count, work)
+    times, common = common_noise(count, work.rims)
     count = 0
     for m in range(len(scene.radii)):
         if found.codes[m, side] == SEEN:
-            widen(found.uv[m, side], found.cov_uv[m, side], work.rims[count], work.shared)
+            widen(found.cov_uv[m, side], work.rims[count], times, common)
             count += 1
 
 

@@ -21,6 +21,7 @@ from armsight.data import Array, Record
 from armsight.kernels import kernel
 from armsight.vision.markers.disc.fit import (
     REASONS,
+    SURROUND,
     UNKNOWNS,
     FitBuffers,
     common_noise,
@@ -258,7 +259,7 @@ def _fit_each(image: Grey, theta: Array, cov: Array, shape: Array, codes: NDArra
             for a in range(UNKNOWNS):
                 work.at[a] = theta[i, a]
             work.at[0], work.at[1] = theta[i, 0] - np.rint(theta[i, 0]), theta[i, 1] - np.rint(theta[i, 1])
-            square = linearise(n, 0.0, work)
+            square = linearise(n, SURROUND, 0.0, work)
             normal_equations(n, work)
             if not factor(work.H, work.L, work.scale):
                 codes[i] = 2
@@ -272,11 +273,11 @@ def _fit_each(image: Grey, theta: Array, cov: Array, shape: Array, codes: NDArra
         if codes[i] == 0:
             work.rims[count, :] = work.rim
             count += 1
-    common_noise(count, work)
+    times, common = common_noise(count, work.rims)
     count = 0
     for i in range(len(theta)):
         if codes[i] == 0:
-            widen(theta[i, :2], cov[i], work.rims[count], work.shared)
+            widen(cov[i], work.rims[count], times, common)
             count += 1
 
 

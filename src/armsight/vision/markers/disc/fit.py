@@ -2,18 +2,17 @@
 
 A disc's image is modelled as
 
-    I(x) = B + C Phi(d(x) / s) + g (x - c) (1 - Phi) + h (x - c) Phi
+    I(x) = B + C Phi(d(x) / s) + g (x - c) k(x)
 
 with d the distance inside the rim of the ellipse (x - c)^T M (x - c) = 1 (to first order, Sampson 1982), Phi the normal
-distribution that models the blur of the edge by lens and pixel, B the surround's level, C the contrast, g a gradient of
-the surround and h one of the disc: paint, uneven light, vignetting and veiling glare slope both in any proportion. The
-first ten, c, M, s, C, B, g, are fitted. A slope h that no single disc shows, of vignetting say, moves the centres of all
-discs of an image alike, by 0.001 to 0.01 px, and does not average out. So h is estimated in one last step, the model being
-nearly linear in it, and what the discs of the image say about the light together is the prior of each.
+distribution that models the blur of the edge by lens and pixel, B the surround's level, C the contrast and g a
+gradient. There are ten unknowns: c, M, s, C, B, g. A surround that is uneven itself leaves the disc flat (k = 1 - Phi),
+uneven light slopes disc and surround in proportion to their levels, veiling glare slopes both alike (k = 1).
 
 The method is Gauss-Newton: a first step on a third of the rows, then all rows until the centre converges. Where the
-surround is textured, its own variance reduces the weight of its pixels. The residuals of the fit reject look-alikes:
-those of the rim, and those of the inside.
+surround is textured, its own variance reduces the weight of its pixels; where the disc has a gradient (a score test),
+the kinds of gradient are averaged by their likelihood. The residuals of the fit reject look-alikes: those of the rim,
+those of the inside, and gradients that the model lacks.
 
 The file follows the fit: the work space, the model and its derivatives, the normal equations, the choice of pixels
 (those near the rim determine the position; of the rows that cross flat areas, which determine only levels and gradient,
@@ -42,6 +41,9 @@ UNKNOWNS = 10
 #: Floats in a cache line.
 _LINE = 16
 
+#: Kinds of gradient; GLARE is light that is added to disc and surround alike.
+LIGHT, SURROUND, GLARE = 0, 1, 2
+
 F = np.float32
 _E0, _E1, _E2, _E3, _E4, _E5 = (F(x) for x in (1.0, -1 / 16, 1 / 512, -1 / 24576, 1 / 1572864, -1 / 125829120))
 _P = F(0.2316419)
@@ -54,7 +56,7 @@ Floats = NDArray[np.float32]
 
 @kernel_types(
     "f4[::1], f4[::1], f4[::1], f4[:, ::1], f4[::1], f4[::1], f4[::1], f8[:, ::1], f8[::1], f8[:, ::1], "
-    "f8[::1], f8[::1], f4[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1]"
+    "f8[::1], f8[::1], f4[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1]"
 )
 class FitBuffers(NamedTuple):
     """The buffers of a fit; one set for each thread.
@@ -75,11 +77,12 @@ class FitBuffers(NamedTuple):
         at: (10,) parameters, the centre relative to the pixels' origin.
         shapes: (4, 5) ellipses.
         sectors: (2, 16) of the rim.
+        trial: (10,) trial parameters.
+        start: (10,) parameters at the start.
         products: (2, 13) of a gradient inside.
         sums: (12, 12) products of the rows of J.
-        rim: (10,) what the last fit shows of noise and light: see :func:`rim_noise` and :func:`slope_inside`.
-        rims: (MOST_DISCS, 10) the same for each disc of an image.
-        shared: (6,) what the discs of an image have in common, see :func:`common_noise`.
+        rim: (3,) what the rim of the last fit shows of the noise, see :func:`rim_noise`.
+        rims: (MOST_DISCS, 3) the same for each disc of an image.
     """
 
     px: Floats
@@ -97,11 +100,12 @@ class FitBuffers(NamedTuple):
     at: Floats
     shapes: Array
     sectors: Array
+    trial: Array
+    start: Array
     products: Array
     sums: Array
     rim: Array
     rims: Array
-    shared: Array
 
 
 def _aligned(rows: int, columns: int) -> Floats:
@@ -119,17 +123,18 @@ def workspace() -> FitBuffers:
     return FitBuffers(
         px, py, level, J, J[n], left, inside,
         np.empty((n, n)), np.empty(n), np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n, np.float32),
-        np.empty((4, 5)), np.empty((2, 16)), np.empty((2, 13)), np.empty((n + 2, n + 2)),
-        np.empty(10), np.empty((MOST_DISCS, 10)), np.empty(6),
+        np.empty((4, 5)), np.empty((2, 16)), np.empty(n), np.empty(n), np.empty((2, 13)), np.empty((n + 2, n + 2)),
+        np.empty(3), np.empty((MOST_DISCS, 3)),
     )  # fmt: skip
 
 
 @kernel(fastmath=True)
-def linearise(n: int, texture: float, work: FitBuffers) -> float:
+def linearise(n: int, slope: int, texture: float, work: FitBuffers) -> float:
     """Fill whitened residual, J and share of disc of the first n pixels at ``work.at``.
 
     Args:
         n: number of pixels.
+        slope: kind of gradient: LIGHT, SURROUND, GLARE.
         texture: variance of the surround beyond the noise's, over that; below zero: that of the disc, for shot noise.
         work: the pixels, and buffers.
 
@@ -141,6 +146,9 @@ def linearise(n: int, texture: float, work: FitBuffers) -> float:
     i_blur = _ONE / blur
     square = _ZERO
     v_texture, v_disc = F(max(texture, 0.0)), F(max(-texture, 0.0))
+    most = max(abs(base), abs(base + contrast), _ONE)
+    k_out = base / most if slope == LIGHT else _ONE
+    k_in = (base + contrast) / most if slope == LIGHT else (_ONE if slope == GLARE else _ZERO)
     for i in range(n):
         u, v = px[i] - cx, py[i] - cy
         mu, mv = m11 * u + m12 * v, m12 * u + m22 * v
@@ -162,8 +170,9 @@ def linearise(n: int, texture: float, work: FitBuffers) -> float:
         share = _HALF + np.copysign(_HALF - tail, z)
         rest = _ONE - share
         w = _ONE / np.sqrt(_ONE + v_texture * rest * rest + v_disc * share)
+        k = k_in * share + k_out * rest
         inside[i] = share
-        left = w * (level[i] - base - rest * (gx * u + gy * v) - contrast * share)
+        left = w * (level[i] - base - k * (gx * u + gy * v) - contrast * share)
         residual[i] = left
         square += left * left
         steep = w * contrast * density * i_blur
@@ -176,8 +185,8 @@ def linearise(n: int, texture: float, work: FitBuffers) -> float:
         J[5, i] = -steep * z
         J[6, i] = w * share
         J[7, i] = w
-        J[8, i] = w * rest * u
-        J[9, i] = w * rest * v
+        J[8, i] = w * k * u
+        J[9, i] = w * k * v
     return float(square)
 
 
@@ -415,8 +424,8 @@ def _odd_harmonics() -> Array:
 
 
 _ODD = _odd_harmonics()
-#: Medians of chi-square of six degrees, over six, and of two, over two.
-_CHI6_MEDIAN, _CHI2_MEDIAN = 0.8914, 0.6931
+#: Median of chi-square of six degrees, over six.
+_CHI6_MEDIAN = 0.8914
 #: From so many discs on, what their rims have in common is the image's noise.
 _LEAST_RIMS = 3
 
@@ -455,71 +464,34 @@ def rim_noise(variance: float, work: FitBuffers) -> tuple[float, float, int]:
     return off, chance, count
 
 
-#: Relative slopes of light over discs, 1/px: how much an image's mean may be (vignetting of 40 % has 2e-3 in the corner),
-#: and the least by which discs of one image differ.
-_SLOPE_MEAN, _SLOPE_APART = 1e-3, 1.5e-4
+@kernel
+def common_noise(n: int, rims: Array) -> tuple[float, float]:
+    """Return what the rims (N, 3) of an image's first n discs have in common, see :func:`rim_noise`.
+
+    Returns:
+        The factor of the variance of centres by correlated noise, one at least; the mean square of the sectors' deviations
+        beyond white noise, px^2. Both are medians, so that a few discs that are none do not count.
+    """
+    if n < _LEAST_RIMS:
+        return 1.0, 0.0
+    power, off = np.sort(rims[:n, 0].copy()), np.sort(rims[:n, 1].copy())
+    factor = 0.5 * (power[(n - 1) // 2] + power[n // 2]) / _CHI6_MEDIAN
+    return max(factor, 1.0), max(0.5 * (off[(n - 1) // 2] + off[n // 2]), 0.0)
 
 
 @kernel
-def common_noise(n: int, work: FitBuffers) -> None:
-    """Fill ``work.shared`` with what the first n discs of ``work.rims`` have in common.
+def widen(cov: Array, rim_of_disc: Array, factor: float, common_px2: float) -> None:
+    """Enlarge a centre's covariance (2, 2) by the image's noise, and by how far its own rim (3,) deviates beyond that.
 
-    These are the factor of the variance of centres by correlated noise, one at least; the mean square of the sectors'
-    deviations beyond white noise, px^2; the mean of the relative slope of light over a disc, u and v, 1/px; n / 2 times
-    its variance (an error of the mean moves all centres alike: it does not average out in three of the six degrees of
-    freedom of a pose); and the variance of a disc's own slope about it (empirical Bayes, Morris 1983). All follow from
-    medians, so that a few discs that are none do not count.
+    A rim that deviates significantly, because a little of it is covered perhaps, may have shifted the centre as much.
     """
-    rims, shared = work.rims, work.shared
-    shared[0], shared[1], shared[2], shared[3] = 1.0, 0.0, 0.0, 0.0
-    shared[4], shared[5] = _SLOPE_MEAN * _SLOPE_MEAN, _SLOPE_APART * _SLOPE_APART
-    if n == 0:
-        return
-    if n >= _LEAST_RIMS:
-        power, off = np.sort(rims[:n, 0].copy()), np.sort(rims[:n, 1].copy())
-        shared[0] = max(0.5 * (power[(n - 1) // 2] + power[n // 2]) / _CHI6_MEDIAN, 1.0)
-        shared[1] = max(0.5 * (off[(n - 1) // 2] + off[n // 2]), 0.0)
-    weight, own = np.empty(n), np.empty(n)
-    for _ in range(2):
-        total = 0.0
-        for i in range(n):
-            weight[i] = 1.0 / (shared[0] * rims[i, 5] + shared[5])
-            total += weight[i]
-        variance, prior = 0.5 * np.pi / total, _SLOPE_MEAN * _SLOPE_MEAN
-        shared[4] = max(0.5 * n, 1.0) * prior * variance / (prior + variance)
-        for axis in range(2):
-            order, below = np.argsort(rims[:n, 3 + axis]), 0.0
-            for i in order:
-                below += weight[i]
-                if below >= 0.5 * total:
-                    shared[2 + axis] = rims[i, 3 + axis] * prior / (prior + variance)
-                    break
-        for i in range(n):
-            gap = (rims[i, 3] - shared[2]) ** 2 + (rims[i, 4] - shared[3]) ** 2
-            own[i] = 0.5 * gap / _CHI2_MEDIAN - shared[0] * rims[i, 5]
-        if n >= _LEAST_RIMS:
-            shared[5] = max(np.sort(own)[n // 2], _SLOPE_APART * _SLOPE_APART)
-
-
-@kernel
-def widen(centre: Array, cov: Array, rim_of_disc: Array, shared: Array) -> None:
-    """Correct a centre (2,) by the light's slope, and enlarge its covariance (2, 2) by the image's noise.
-
-    The slope over a disc is the mean of its own, with its variance, and of the image's, see :func:`common_noise`. A rim
-    that deviates significantly, because a little of it is covered perhaps, may have shifted the centre as much.
-    """
-    factor, own = shared[0], rim_of_disc[1] - shared[1]
-    own = own if own > _RIM_CHANCE * rim_of_disc[2] * factor else 0.0
-    gain = shared[5] / (shared[5] + factor * rim_of_disc[5])
-    slope_u = shared[2] + gain * (rim_of_disc[3] - shared[2])
-    slope_v = shared[3] + gain * (rim_of_disc[4] - shared[3])
-    variance = gain * factor * rim_of_disc[5] + (1.0 - gain) ** 2 * shared[4]
-    D = rim_of_disc[6:10].reshape(2, 2)
     for a in range(2):
-        centre[a] -= D[0, a] * slope_u + D[1, a] * slope_v
         for b in range(2):
-            cov[a, b] = factor * cov[a, b] + variance * (D[0, a] * D[0, b] + D[1, a] * D[1, b])
-        cov[a, a] += own
+            cov[a, b] *= factor
+    own = rim_of_disc[1] - common_px2
+    if own > _RIM_CHANCE * rim_of_disc[2] * factor:
+        cov[0, 0] += own
+        cov[1, 1] += own
 
 
 @kernel
@@ -589,31 +561,10 @@ def _inside_products(n: int, cx: np.float32, cy: np.float32, work: FitBuffers, o
     out[0, 11], out[0, 12], out[1, 11], out[1, 12] = uu, uv, uv, vv
 
 
-#: Least grey level of a disc for relative slopes.
-_LEAST_LEVEL = 8.0
-
-
 @kernel
-def slope_inside(n: int, theta: Array, x0: float, y0: float, work: FitBuffers, cov: Array) -> float:
-    """Estimate a gradient h inside the disc beside the ten unknowns, and what it does to the centre.
-
-    One step of the twelve unknowns (Schur complement of the two that are new); the model is nearly linear in them.
-    ``work.rim`` is filled from 3 on: h over the disc's level, 1/px (2); its variance where residuals have variance one; by
-    how much the centre moves back for each of it, px (2, 2).
-
-    Args:
-        n: pixels.
-        theta: (10,) the converged parameters.
-        x0: the pixels' origin.
-        y0: see x0.
-        work: the pixels, linearised, with the last step in ``work.x``.
-        cov: (2, 2) the centre's covariance without such a gradient, where residuals have variance one; filled.
-
-    Returns:
-        By how much the gradient decreases the sum of the squared residuals.
-    """
-    g, L, scale, x, out, shown = work.g, work.L, work.scale, work.x, work.products, work.rim
-    D = np.empty((2, 2))
+def slope_inside(n: int, theta: Array, x0: float, y0: float, work: FitBuffers) -> float:
+    """Return by how much a gradient inside the disc would lower chi-square, in units of the noise's variance."""
+    g, L, scale, x, out = work.g, work.L, work.scale, work.x, work.products
     _inside_products(n, F(theta[0] - x0), F(theta[1] - y0), work, out)
     s0, s1 = out[0, 10], out[1, 10]
     k00, k01, k11 = out[0, 11], out[0, 12], out[1, 12]
@@ -623,28 +574,25 @@ def slope_inside(n: int, theta: Array, x0: float, y0: float, work: FitBuffers, c
         s1 -= out[1, a] * x[a]
     g[:] = out[0, :UNKNOWNS]
     solve(L, scale, g, x)
-    D[0, 0], D[0, 1] = x[0], x[1]
     for a in range(UNKNOWNS):
         k00 -= out[0, a] * x[a]
         k01 -= out[1, a] * x[a]
     g[:] = out[1, :UNKNOWNS]
     solve(L, scale, g, x)
-    D[1, 0], D[1, 1] = x[0], x[1]
     for a in range(UNKNOWNS):
         k11 -= out[1, a] * x[a]
-    of_centre(work, cov)
     det = k00 * k11 - k01 * k01
-    shown[3:] = 0.0
-    shown[5] = 1.0
     if not det > 0.0:
         return 0.0
-    h_u, h_v = (k11 * s0 - k01 * s1) / det, (k00 * s1 - k01 * s0) / det
-    level = max(theta[7] + theta[6], _LEAST_LEVEL)
-    shown[3], shown[4], shown[5] = h_u / level, h_v / level, 0.5 * (k00 + k11) / (det * level * level)
-    for a in range(2):
-        for b in range(2):
-            shown[6 + 2 * a + b] = D[a, b] * level
-    return float(s0 * h_u + s1 * h_v)
+    return float((k11 * s0 * s0 - 2 * k01 * s0 * s1 + k00 * s1 * s1) / det)
+
+
+@kernel
+def slope_outside(theta: Array, work: FitBuffers) -> float:
+    """Return by how much chi-square would rise without the surround's gradient, in units of the noise's variance."""
+    L, a, b = work.L, theta[8] / work.scale[8], theta[9] / work.scale[9]
+    # The last corner of the factor is that of the last two unknowns' information, the others marginalised.
+    return float((a / L[8, 8] + b * L[9, 8]) ** 2 + (b / L[9, 9]) ** 2)
 
 
 _STEPS = 8
@@ -656,6 +604,10 @@ _SMALL_STEP_PX, _SMALL_STEP_SIGMAS = 0.02, 1.0
 _BLUR_LEAST_PX = 0.2
 #: A step of the centre after which the residuals away from the rim give the surround's variance, px.
 _WEIGH_PX = 0.3
+#: Chi-square of two degrees from which a disc or its surround may have a gradient: chance exceeds it in 1% and 10%.
+_SLOPE_INSIDE, _SLOPE_OUTSIDE = 9.2, 4.6
+#: How likely each kind of gradient is where there is one (LIGHT, SURROUND, GLARE).
+_KINDS = (0.6, 0.3, 0.1)
 
 #: Why a candidate is not a disc: code -> text. 0 is a disc.
 REASONS = {
@@ -691,7 +643,9 @@ _LEAST_SNR = 3.0
 
 
 @kernel
-def _step(n: int, theta: Array, x0: float, y0: float, texture: float, work: FitBuffers) -> tuple[float, float]:
+def _step(
+    n: int, theta: Array, x0: float, y0: float, slope: int, texture: float, work: FitBuffers
+) -> tuple[float, float]:
     """Make one Gauss-Newton step on the first n pixels.
 
     Returns:
@@ -701,7 +655,7 @@ def _step(n: int, theta: Array, x0: float, y0: float, texture: float, work: FitB
     for a in range(UNKNOWNS):
         at[a] = theta[a]
     at[0], at[1] = theta[0] - x0, theta[1] - y0
-    square = linearise(n, texture, work)
+    square = linearise(n, slope, texture, work)
     normal_equations(n, work)
     if not factor(H, L, scale):
         return -1.0, square
@@ -724,17 +678,17 @@ def _step(n: int, theta: Array, x0: float, y0: float, texture: float, work: FitB
 
 @kernel
 def _minimise(
-    n: int, theta: Array, x0: float, y0: float, noise_sigma: float,
+    n: int, theta: Array, x0: float, y0: float, slope: int, noise_sigma: float, weigh: bool, texture: float,
     work: FitBuffers,
 ) -> tuple[float, float]:  # fmt: skip
     """Step until the centre converges; return the sum of squared residuals, -1 without a minimum, and the texture.
 
-    Where surround or disc varies more than the other, its weight is reduced.
+    ``weigh``: where surround or disc varies more than the other, reduce its weight; ``texture``: how it is reduced before.
     """
     flat, H = work.sectors[0], work.H
-    texture, weighed = 0.0, False
+    weighed = not weigh
     for _ in range(_STEPS):
-        shift, square = _step(n, theta, x0, y0, texture, work)
+        shift, square = _step(n, theta, x0, y0, slope, texture, work)
         if shift < 0.0:
             return -1.0, 0.0
         if shift < _WEIGH_PX and not weighed:
@@ -755,6 +709,50 @@ def _minimise(
         if shift < _SMALL_STEP_PX or shift * shift * (H[0, 0] + H[1, 1]) * n < _SMALL_STEP_SIGMAS**2 * 2 * square:
             return square, texture
     return -1.0, 0.0
+
+
+@kernel
+def _average(
+    n: int, theta: Array, x0: float, y0: float, noise_sigma: float, square: float, texture: float, cov: Array,
+    work: FitBuffers,
+) -> None:  # fmt: skip
+    """Replace centre and covariance by the mean over the kinds of gradient, weighted by likelihood (model averaging).
+
+    The result of SURROUND, its sum of squares included, is the input. A kind that is not distinguishable from another
+    moves the centre by up to its own standard deviation: the spread between the kinds is part of the covariance.
+    """
+    trial, start = work.trial, work.start
+    start[:] = theta
+    results, block, least = np.zeros((3, 7)), np.empty((2, 2)), square
+    results[SURROUND, 0], results[SURROUND, 1], results[SURROUND, 2] = square, theta[0], theta[1]
+    results[SURROUND, 3], results[SURROUND, 4], results[SURROUND, 5] = cov[0, 0], cov[0, 1], cov[1, 1]
+    for kind in (LIGHT, GLARE):
+        trial[:] = start
+        square, _ = _minimise(n, trial, x0, y0, kind, noise_sigma, False, texture, work)
+        results[kind, 0] = np.inf
+        if square >= 0.0:
+            of_centre(work, block)
+            variance = square / (n - UNKNOWNS)
+            results[kind, 0], results[kind, 1], results[kind, 2] = square, trial[0], trial[1]
+            results[kind, 3], results[kind, 4], results[kind, 5] = block[0, 0], block[0, 1], block[1, 1]
+            results[kind, 3:6] *= variance
+            least = min(least, square)
+    total = 0.0
+    for kind in range(3):
+        results[kind, 6] = _KINDS[kind] * np.exp(-0.5 * (results[kind, 0] - least) * (n - UNKNOWNS) / least)
+        total += results[kind, 6]
+    theta[0], theta[1] = 0.0, 0.0
+    for kind in range(3):
+        theta[0] += results[kind, 6] / total * results[kind, 1]
+        theta[1] += results[kind, 6] / total * results[kind, 2]
+    cov[:, :] = 0.0
+    for kind in range(3):
+        w, u, v = results[kind, 6] / total, results[kind, 1] - theta[0], results[kind, 2] - theta[1]
+        if w > 0.0:
+            cov[0, 0] += w * (results[kind, 3] + u * u)
+            cov[0, 1] += w * (results[kind, 4] + u * v)
+            cov[1, 1] += w * (results[kind, 5] + v * v)
+    cov[1, 0] = cov[0, 1]
 
 
 @kernel
@@ -779,9 +777,9 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if n < 4 * UNKNOWNS:
         return 7
     x0, y0 = np.rint(theta[0]), np.rint(theta[1])
-    if _step(sample, theta, x0, y0, 0.0, work)[0] < 0.0:
+    if _step(sample, theta, x0, y0, SURROUND, 0.0, work)[0] < 0.0:
         return 2
-    square, texture = _minimise(n, theta, x0, y0, noise_sigma, work)
+    square, texture = _minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, 0.0, work)
     if square < 0.0:
         return 2
     # Clipped pixels have no noise and do not count for it.
@@ -808,9 +806,11 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     v_in = sectors[0, 0] * (1.0 + max(-texture, 0.0))
     if sectors[0, 2] > 10.0 and np.sqrt(max(v_in - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
         return 8
-    square -= slope_inside(n, theta, x0, y0, work, cov)
-    variance = square / max(n - clipped(n, work) - UNKNOWNS - 2, UNKNOWNS)
-    work.rim[5] *= variance
+    uneven = texture <= 0.0 and (
+        slope_inside(n, theta, x0, y0, work) > _SLOPE_INSIDE * variance
+        or slope_outside(theta, work) > _SLOPE_OUTSIDE * variance
+    )
+    of_centre(work, cov)
     if texture > 0.0:
         variance *= texture_factor(n, theta[5], texture, work)
         if variance * (cov[0, 0] + cov[1, 1]) > 2.0 * _MOST_SIGMA_PX * _MOST_SIGMA_PX:
@@ -818,6 +818,8 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     for a in range(2):
         for b in range(2):
             cov[a, b] *= variance
+    if uneven:
+        _average(n, theta, x0, y0, noise_sigma, square, texture, cov, work)
     return 0
 
 

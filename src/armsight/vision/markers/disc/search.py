@@ -428,7 +428,7 @@ def find(
             shape_of(starts[good], shape[good])
             work.rims[good, :] = work.rim
             good += 1
-    common_noise(good, work)
+    times, common = common_noise(good, work.rims)
     for i in range(good):
-        widen(starts[i, :2], cov[i], work.rims[i], work.shared)
+        widen(cov[i], work.rims[i], times, common)
     return good, n
