@@ -18,7 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from armsight.app.calibrate.assessment import assess, graded_metrics
+from armsight.app.calibrate.assessment import advice, assess, graded_metrics
 from armsight.app.calibrate.run import provenance
 from armsight.app.live.capture import LiveShot
 from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, NextPose, guessed_camera, guessed_rig
@@ -99,6 +99,7 @@ class CalibrationState:
         distance_m: at this distance, m.
         good: whether it is good enough.
         missing: what is missing, line by line.
+        advice: what is weak in the written calibration, and what to do about it.
         rig: the written rig file; None before.
         command: the command line that does the same with the stored shots.
         drawn: what to draw over the views.
@@ -121,6 +122,7 @@ class CalibrationState:
     distance_m: float = 0.8
     good: bool = False
     missing: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
     rig: str | None = None
     command: str = ""
     drawn: tuple[Drawn, ...] = ()
@@ -182,12 +184,13 @@ class CalibrationStep:
         self._instruction, self._edge_px, self._rig_path = "", None, None
         self._progress: list[Progress] = []
         self._missing_shots: int | None = None
-        self._good, self._missing = False, ("no shot yet",)
+        self._good, self._missing, self._weak = False, ("no shot yet",), ()
 
     _fitting: str | None
     _edge_px: float | None
     _rig_path: Path | None
     _missing: tuple[str, ...]
+    _weak: tuple[str, ...]
 
     @property
     def state(self) -> CalibrationState:
@@ -459,7 +462,7 @@ class CalibrationStep:
         """Return what is missing until the calibration is good enough, line by line."""
         lines = []
         if len(result.pairs) < LEAST_SHOTS:
-            lines.append(f"{LEAST_SHOTS - len(result.pairs)} more shots, so that the held-out errors mean something")
+            lines.append(f"{_shots(LEAST_SHOTS - len(result.pairs))} more, so that the held-out errors mean something")
         if error_m > self.aim.error_m:
             lines.append(
                 f"predicted error {1e3 * error_m:.2g} mm, {1e3 * self.aim.error_m:g} mm is the aim: more shots"
@@ -487,7 +490,7 @@ class CalibrationStep:
             return
         with self._lock:
             self._learned(result)
-            self._rig_path, self._fitting = path, None
+            self._rig_path, self._fitting, self._weak = path, None, tuple(advice(result))
         assessment = assess(result)
         self._say(Note("good" if assessment.grade == "good" else "hint", f"{assessment.headline} {assessment.meaning}"))
         self.changed(rig, path)
@@ -523,6 +526,7 @@ class CalibrationStep:
             self.aim.distance_m,
             self._good,
             self._missing,
+            self._weak,
             None if self._rig_path is None else str(self._rig_path),
             self._command(),
             self._drawings(newest) if self._running else (),
@@ -559,6 +563,10 @@ class CalibrationStep:
                 if found.problem is None:
                     drawn.append(Drawn(side, "seen", tuple(polyline(uv[None]) for uv in found.uv)))
         return tuple(drawn)
+
+
+def _shots(count: int) -> str:
+    return "1 shot" if count == 1 else f"{count} shots"
 
 
 def _in_views(rig: StereoRig, p_left: Array) -> tuple[Array, Array]:

@@ -194,6 +194,47 @@ class RunMotions:
 
 
 @dataclass(frozen=True)
+class UseSecondBody:
+    """Measure a second body too, and each relative to the other; an empty ``target`` ends it."""
+
+    target: str
+
+
+@dataclass(frozen=True)
+class TakePose:
+    """Take the pose in which the arm rests now for the hand-eye calibration."""
+
+
+@dataclass(frozen=True)
+class GuideHandEye:
+    """Let the arm visit the poses of the hand-eye calibration by itself."""
+
+
+@dataclass(frozen=True)
+class ClearHandEye:
+    """Forget the hand-eye calibration and its poses."""
+
+
+@dataclass(frozen=True)
+class Identify:
+    """Identify the arm from the poses of the hand-eye calibration."""
+
+
+@dataclass(frozen=True)
+class UseArm:
+    """Use another model of the arm: a name, a TOML or a URDF file, such as the corrected one."""
+
+    arm: str
+
+
+@dataclass(frozen=True)
+class UseMotion:
+    """Use the motions of another file."""
+
+    path: str
+
+
+@dataclass(frozen=True)
 class Hold:
     """Bring the arm to rest and hold it."""
 
@@ -232,6 +273,13 @@ Command = (
     | RecordPoses
     | OpenArm
     | RunMotions
+    | UseSecondBody
+    | TakePose
+    | GuideHandEye
+    | ClearHandEye
+    | Identify
+    | UseArm
+    | UseMotion
     | Hold
     | ClearStop
     | PersonAction
