@@ -492,7 +492,10 @@ class CalibrationStep:
             self._learned(result)
             self._rig_path, self._fitting, self._weak = path, None, tuple(advice(result))
         assessment = assess(result)
-        self._say(Note("good" if assessment.grade == "good" else "hint", f"{assessment.headline} {assessment.meaning}"))
+        text = (
+            f"{assessment.headline} {1e3 * result.heldout.rigid_rms_m:.2g} mm RMS on held-out pairs; written to {path}"
+        )
+        self._say(Note("good" if assessment.grade == "good" else "hint", text))
         self.changed(rig, path)
 
     def _command(self) -> str:

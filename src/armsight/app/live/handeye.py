@@ -24,14 +24,14 @@ from armsight.errors import ArmsightError, CalibrationError, InputError
 from armsight.files import write_text
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
-from armsight.loop.handeye.handeye import HandEye, Poses, information
+from armsight.loop.handeye.handeye import SHARES, HandEye, Poses, information
 from armsight.robot.arm import Arm
 from armsight.vision.rig import StereoRig
 
 #: Poses before the first fit; the fewest of a calibration that is called good; the most that are asked for.
 FIRST_FIT, LEAST_POSES, MOST_POSES = 6, 12, 30
 #: Another pose that lowers the predicted error by less than this share is not worth taking.
-LITTLE = 0.03
+LITTLE = 0.02
 #: A pose is another one if a joint is so far from all that were taken, rad.
 _OTHER_RAD = float(np.radians(3.0))
 _CANDIDATES, _MARGIN_PX = 60, 60.0
@@ -180,22 +180,25 @@ class HandEyeGuide:
         """Calibrate from the poses so far, write it, and choose the next pose; too few poses are no error."""
         with self._lock:
             visited, missed, arm = list(self._visited), tuple(self._missed), self._arm
-        run: HandEyeRun | None = None
         missing: tuple[str, ...] = ()
-        if len(visited) >= FIRST_FIT:
-            try:
-                run = handeye_of(arm, visited, missed)
-            except (CalibrationError, np.linalg.LinAlgError) as error:
-                missing = (f"the poses cannot be fitted yet: {error}",)
-        with self._lock:
-            if arm is not self._arm:
-                return
-            if run is not None:
-                self._learn(run)
-            self._choose()
-            self._assess(missing)
-        if run is not None:
-            self._write(run)
+        for shares in (SHARES[:1], SHARES):  # the other attributions take long, and only once it is good
+            run: HandEyeRun | None = None
+            if len(visited) >= FIRST_FIT:
+                try:
+                    run = handeye_of(arm, visited, missed, shares)
+                except (CalibrationError, np.linalg.LinAlgError) as error:
+                    missing = (f"the poses cannot be fitted yet: {error}",)
+            with self._lock:
+                if arm is not self._arm:
+                    return
+                if run is not None:
+                    self._learn(run)
+                self._choose()
+                self._assess(missing)
+            if not self._good:
+                break
+        if self.run is not None:
+            self._write(self.run)
 
     def _learn(self, run: HandEyeRun) -> None:
         """Take in a fit."""

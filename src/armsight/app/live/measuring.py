@@ -436,6 +436,8 @@ class MeasureStep:
                 pose = shown_pose(result, self._zero)
                 dropped = tuple(f"{each.point}: {each.reason}" for each in result.dropped)
                 drawn = self._drawings(result)
+                if self._second is not None:
+                    drawn = (*drawn, *self._second.drawings(self.rig, live.number))
                 body = transform(result.T_left_body, self._target.body.points)
                 distance = self._distance(result)
             else:
@@ -569,6 +571,14 @@ class _Second:
     def prepare(self, rig: StereoRig | None) -> None:
         """Get ready for a rig."""
         self.measure, self.newest = None if rig is None else _measuring(rig, self.target), None
+
+    def drawings(self, rig: StereoRig, number: int) -> tuple[Drawn, ...]:
+        """Return its points as both cameras see them, if they are of the shot of a number or of its neighbour."""
+        if self.newest is None or abs(self.newest[0] - number) > 1 or isinstance(self.newest[1], Missed):
+            return ()
+        points = transform(self.newest[1].T_left_body, self.target.body.points)
+        views = rig.left.project(points), rig.right.project(transform(inverse(rig.T_left_right), points))
+        return tuple(Drawn(side, "second", tuple(polyline(p[None]) for p in uv)) for side, uv in enumerate(views))
 
     def shown(self, rig: StereoRig, first: tuple[LiveShot, PoseEstimate | Missed]) -> RelativeShown | None:
         """Return it relative to the first body, as people read it; None before both were measured in one shot."""

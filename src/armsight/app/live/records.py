@@ -50,7 +50,7 @@ class Drawn:
 
     Attributes:
         side: 0 left, 1 right.
-        kind: next (the outline to be reached), seen (what was found), body, dropped.
+        kind: next (the outline to be reached), seen (what was found), body, second, axis0, axis1, axis2.
         lines: polylines of (column, row), raw pixels; a line of one point is a dot.
         label: a word beside the first point; may be empty.
     """
