@@ -88,6 +88,16 @@ def test_a_stop_goes_before_a_thread_that_never_lets_go():
     assert fake.together == 1
 
 
+def test_a_long_wait_is_made_of_short_ones():
+    waited = []
+    board = StoppableBoard(fake := FakeBoard())
+    fake.receive = lambda wait_s: waited.append(wait_s) or JointStates(np.array([float(len(waited))]), np.zeros((1, 6)))
+    assert board.receive(0.0).t_s.tolist() == [1.0]
+    assert board.receive(0.0101).t_s.tolist() == [2.0, 3.0, 4.0]
+    assert sum(waited) == pytest.approx(0.0101)
+    assert max(waited) < 0.005
+
+
 def test_a_stop_is_sent_while_another_call_waits_for_an_answer():
     board = StoppableBoard(fake := FakeBoard())
     thread = threading.Thread(target=lambda: board.confirm(1))

@@ -728,8 +728,9 @@ class ArmStep:
         status = board.status
         segment = None if loop is None else loop.segment
         state, faults = _state_text(board), tuple(str(fault) for fault in status.faults)
-        if status.state is BoardState.HOLDING and all(each.fault is Fault.HOST_SILENT for each in status.faults):
-            state, faults = "held at rest by the board since the last motion", ()
+        if all(each.fault is Fault.HOST_SILENT for each in status.faults):  # as after every motion
+            state = "held at rest by the board since the last motion" if status.state is BoardState.HOLDING else state
+            faults = ()
         return replace(
             plain,
             board=board.welcome.board,

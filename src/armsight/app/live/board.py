@@ -7,6 +7,7 @@ beside: it waits for an image, searches one, or fits a calibration.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -24,6 +25,8 @@ from armsight.robot.boards.reports import BoardStatus, JointReport, Welcome
 ANSWER_S, _ASK_S = 1.0, 0.002
 #: A call that lasts longer, such as one that waits for an acknowledgement, does not keep a stop from being sent, s.
 _PATIENCE_S = 0.1
+#: A longer wait for readings is made of waits of this length, s, between which a stop comes.
+_SLICE_S = 0.004
 #: States in which a board with another controller, which knows no emergency stop, follows no command any more.
 _ENDED = (BoardState.STOPPED, BoardState.DISABLED, BoardState.FAULTED)
 
@@ -111,15 +114,14 @@ class StoppableBoard:
 
     def receive(self, wait_s: float = 0.0) -> JointStates:
         """Let ``wait_s`` pass and return all readings since the last call, those too that came during a stop."""
-        with self._held() as board:
-            states = board.receive(wait_s)
-            kept, self._kept = self._kept, []
-        if not kept:
-            return states
-        return JointStates(
-            np.concatenate([*(each.t_s for each in kept), states.t_s]),
-            np.concatenate([*(each.q for each in kept), states.q]),
-        )
+        parts: list[JointStates] = []
+        for part_s in (*[_SLICE_S] * max(math.ceil(wait_s / _SLICE_S - 1e-9) - 1, 0), None):
+            with self._held() as board:
+                rest_s = wait_s - _SLICE_S * len(parts) if part_s is None else part_s
+                states = board.receive(max(rest_s, 0.0))
+                kept, self._kept = self._kept, []
+            parts.append(_joined([*kept, states]))
+        return _joined(parts)
 
     def stop(self) -> None:
         """Stop in an emergency, from any thread, and wait until the board says that it did, ``ANSWER_S`` at most."""
@@ -131,11 +133,10 @@ class StoppableBoard:
                 self._board.stop()
                 end = time.monotonic() + ANSWER_S
                 while not self.rests and time.monotonic() < end:
+                    held = held or self._lock.acquire(timeout=_ASK_S)
                     if held:
                         states = self._board.receive(_ASK_S)
                         self._kept += [states] if len(states.t_s) else []
-                    else:
-                        time.sleep(_ASK_S)
             finally:
                 if held:
                     self._lock.release()
@@ -157,3 +158,10 @@ class StoppableBoard:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _joined(parts: list[JointStates]) -> JointStates:
+    """Return batches of readings as one."""
+    if len(parts) == 1:
+        return parts[0]
+    return JointStates(np.concatenate([each.t_s for each in parts]), np.concatenate([each.q for each in parts]))
