@@ -2,7 +2,7 @@
 
 python live.py stop 100      stops by the page's button in a headless browser, while the workcell's views run at 15 Hz
 python live.py moving 40     the same while the simulated loop moves the arm, searches images, and fits calibrations
-python live.py loop 4        image to command in one run, by turns without and with a page that looks on; the ratio
+python live.py loop 4        image to command in one run, alternately without and with a page that looks on; the ratio
 python live.py first 3       from the first page to a written calibration by a person who follows the page: shots and error
 python live.py cost          processor's share of two 1280x720 views, first picture, memory over ten thousand frames
 python live.py guided 10     guided against random shots, ten seeds: projected points, hands that miss the outline
@@ -98,6 +98,9 @@ def stop(count: int, *, moving: bool) -> None:
         until(lambda: not session.sections()["overview"].moving)
         session.execute(records.ClearStop())
         until(lambda: not session.arm.state.stopped)
+        if session.arm.state.away:
+            session.execute(records.GoToStart())
+            until(lambda: not session.arm.state.away and not session.sections()["overview"].moving, 300.0)
     rate = (shown(driver) - frames) / (time.monotonic() - began)
     took = np.array(driver.execute_script("return armsight.stopMs"))
     p50, p99 = np.percentile(took, (50, 99))
@@ -124,7 +127,7 @@ with connect(f"ws://{at}/live", origin=f"http://{at}", max_size=2**24) as page:
 
 
 def loop(blocks: int) -> None:
-    """Compare the control loop's times with and without a page, by turns in one run: the load of the machine is alike."""
+    """Compare the control loop's times without and with a page, alternately in one run: the load is alike."""
     session, server, driver = at_the_page("1280x720@30")
     driver.quit()
     session.execute(records.GuideHandEye())

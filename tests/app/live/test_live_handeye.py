@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from armsight.app.live import handeye
-from armsight.app.live.handeye import LEAST_POSES, MOST_POSES, HandEyeGuide
+from armsight.app.live.handeye import LEAST_POSES, MOST_POSES, HandEyeGuide, likely_joint_errors
 from armsight.app.run.calibrate import VisitedPose, handeye_poses
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, pose
@@ -60,3 +60,12 @@ def test_the_same_pose_again_is_rejected(calibrated):
     again = guide.run
     with pytest.raises(InputError, match="like this one was taken"):
         guide.add(VisitedPose(again.q[3], again.Ts_left_body[3], again.covs[3], np.zeros(6)))
+
+
+def test_a_singular_arm_does_not_explain_a_millimetre_by_degrees():
+    arm, q = ARM, ARM.home
+    T = arm.forward(q) @ exp_se3(np.array([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0]))
+    assert np.degrees(np.abs(likely_joint_errors(arm, q, T))).max() < 0.8
+    bent = q + np.radians([5, -20, 30, 10, 20, 5])
+    errors = np.radians([0.2, -0.1, 0.3, 0.1, -0.2, 0.1])
+    assert likely_joint_errors(arm, bent, arm.forward(bent + errors)) == pytest.approx(errors, abs=1e-3)

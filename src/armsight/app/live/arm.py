@@ -20,16 +20,24 @@ import numpy as np
 
 from armsight.app.live.board import StoppableBoard
 from armsight.app.live.capture import CameraCapture
-from armsight.app.live.handeye import MOST_POSES, HandEyeGuide, HandEyeState
+from armsight.app.live.handeye import HandEyeGuide, HandEyeState, likely_joint_errors, visit_poses
 from armsight.app.live.identification import IdentifyState, IdentifyStep
 from armsight.app.live.measuring import MeasureStep
 from armsight.app.live.quality import Note
 from armsight.app.live.simulated import SimulatedCameras
 from armsight.app.report.plotting import require_matplotlib
 from armsight.app.run.angles import LoggedAngles, read_angles
-from armsight.app.run.calibrate import VisitedPose, handeye_poses, visit
+from armsight.app.run.calibrate import VisitedPose, handeye_poses
 from armsight.app.run.controllers import Planned
-from armsight.app.run.experiment import RunResult, require_start, run_experiment, run_visits
+from armsight.app.run.experiment import (
+    START_RAD,
+    RunResult,
+    passed,
+    require_range,
+    require_start,
+    run_experiment,
+    run_visits,
+)
 from armsight.app.run.folder import Finished, finish, make_room
 from armsight.app.run.loop import Loop
 from armsight.app.run.motion_file import MotionPlan, read_motions
@@ -38,7 +46,7 @@ from armsight.app.run.setup import HostClock, Setup, require_joints, setup_of
 from armsight.data import Array, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import read_text, write_text
-from armsight.geometry.pose import inverse, log_se3
+from armsight.geometry.pose import inverse
 from armsight.loop.estimators import Mounting
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
@@ -55,10 +63,8 @@ _IDLE_S, _ASK_S = 0.004, 0.002
 #: A pose of the hand-eye calibration is the mean of so long, s; joints, rad, and body, m, that move more do not rest.
 _REST_S, _REST_RAD, _REST_M = 0.6, float(np.radians(0.3)), 1.5e-3
 _FEWEST_SEEN = 2
-#: Sigma of what joints cannot explain of a measured pose, m and rad; sigma of the error of a joint, rad.
-_EXPLAINED, _JOINT_RAD = (3e-4, 5e-4), float(np.radians(1.0))
-_HANDEYE_POSES = {False: 30, True: 14}
-_CHART = 400
+_HANDEYE_POSES, _CHART = {False: 30, True: 14}, 400
+_SLOWLY = 0.25  # share of the arm's limits on the way to the start
 
 
 @dataclass(frozen=True)
@@ -125,6 +131,7 @@ class ArmState:
         handeye: the guided hand-eye calibration.
         identify: the identification.
         motion_file: the file of the motions.
+        away: whether the arm is elsewhere than where the motions start.
         results: the results of the last run, line by line.
         folder: of the last run.
         scene: (N, 3) the arm's joints in the left camera's frame, m; empty before the hand-eye calibration.
@@ -149,6 +156,7 @@ class ArmState:
     handeye: HandEyeState = field(default_factory=HandEyeState)
     identify: IdentifyState = field(default_factory=IdentifyState)
     motion_file: str = ""
+    away: bool = False
     results: tuple[str, ...] = ()
     folder: str | None = None
     scene: tuple[tuple[float, ...], ...] = ()
@@ -200,20 +208,16 @@ class ArmStep:
         self._loop: Loop | None = None
         self._seen = 0
         self._chart: deque[tuple[float, float, bool]] = deque(maxlen=_CHART)
-        self._results, self._run_folder = (), None
+        self._results, self._run_folder, self._start = (), None, None
 
     _results: tuple[str, ...]
     _run_folder: Path | None
+    _start: Array | None
 
     @property
     def busy(self) -> bool:
         """Whether a motion runs."""
         return self._running is not None
-
-    @property
-    def owns_cameras(self) -> bool:
-        """Whether the thread reads the cameras: those of the workcell, whose time passes on the board."""
-        return self._simulated is not None and self._board is not None
 
     @staticmethod
     def check_board(name: str | None, source: str) -> None:
@@ -261,6 +265,10 @@ class ArmStep:
                 board.close()
                 raise
             self._board = board
+        try:
+            self._start = read_motions(options.arm, options.motion).start
+        except InputError as error:
+            self._say(Note("warn", f"{error}: name a file with motions of this arm"))
         self._thread = threading.Thread(target=self._work, name="arm", daemon=True)
         self._thread.start()
 
@@ -306,6 +314,16 @@ class ArmStep:
         self._require_ready()
         self._hold = None
         self._requested = self._visit
+
+    def go_to_start(self) -> None:
+        """Move the arm slowly to where the motions start.
+
+        Raises:
+            InputError: as for :meth:`run`.
+        """
+        self._require_ready()
+        self._hold = None
+        self._requested = self._to_start
 
     def take_pose(self) -> None:
         """Take the pose in which the arm rests now for the hand-eye calibration.
@@ -372,7 +390,7 @@ class ArmStep:
         """
         self._require_rest()
         plan = read_motions(self.options.arm, path)
-        self.options = replace(self.options, motion=Path(path))
+        self.options, self._start = replace(self.options, motion=Path(path)), plan.start
         self._say(Note("good", f"motions: {', '.join(each.name for each in plan.motions)} ({path})"))
 
     def clear_stop(self) -> None:
@@ -471,6 +489,8 @@ class ArmStep:
         try:
             shot = poll()
         except DeviceError as error:
+            if self.capture.problem != str(error):
+                self._say(Note("error", str(error)))
             self.capture.problem = str(error)
             if self._running is not None:
                 raise
@@ -528,7 +548,7 @@ class ArmStep:
                 setup,
                 rig,
                 plan,
-                lambda loop: self._visits(loop, setup, plan.start),
+                lambda loop: visit_poses(loop, self.handeye, plan.start, self._progress),
                 progress=self._progress,
                 begun=self._begun,
             )
@@ -541,27 +561,30 @@ class ArmStep:
             mm = 1e3 * run.found.held_out.rms()[0]
             self._say(Note("good", f"hand-eye: {len(run.q)} poses, held out {mm:.2f} mm RMS"))
 
-    def _visits(self, loop: Loop, setup: Setup, start: Array) -> None:
-        """Go from pose to pose, each chosen by those before, and back to the start."""
-        q, guide = start, self.handeye
-        for number in range(1, MOST_POSES + 1):
-            goal = guide.next_q
-            if goal is None:
-                break
-            self._running = f"hand-eye: pose {number}"
-            found = visit(loop, setup.arm, q, goal, setup.gravity, f"hand-eye {number}")
-            q = goal
-            if isinstance(found, Missed):
-                guide.miss(goal, found.reason)
-            else:
-                guide.add(found)
-            loop.compute(guide.fit)
-        self._running = "to the start"
-        back = point_to_point(setup.arm, q, start)
-        segment = RunSegment("calibration", "to the start", "joints", False, trajectory=back)
-        loop.run(Planned(back, loop.t_s, setup.gravity), back.duration_s + 0.3, segment, watch=False)
+    def _to_start(self) -> None:
+        """Move slowly from where the arm is to the start."""
 
-    def _moving(self, work: Callable[[Setup, StereoRig, MotionPlan, Array], RunResult]) -> RunResult | None:
+        def work(setup: Setup, rig: StereoRig, plan: MotionPlan, targets: Array) -> RunResult:
+            q = setup.board.receive(_REST_S).q.mean(axis=0)
+            slow = replace(setup.arm, qd_max=_SLOWLY * setup.arm.qd_max, qdd_max=_SLOWLY * setup.arm.qdd_max)
+            here = np.clip(q, *setup.board.soft_limits())
+            way = point_to_point(slow, np.clip(here, slow.q_min, slow.q_max), plan.start)
+            require_range(setup, passed(way))
+
+            def move(loop: Loop) -> None:
+                self._running = "to the start"
+                segment = RunSegment("calibration", "to the start", "joints", False, trajectory=way)
+                loop.run(Planned(way, loop.t_s, setup.gravity), way.duration_s + 0.3, segment, watch=False)
+
+            return run_visits(setup, rig, plan, move, progress=self._progress, begun=self._begun, look=False)
+
+        outcome = self._moving(work, at_start=False)
+        if outcome is not None and outcome.ended_text is not None:
+            self._say(Note("warn", f"the way to the start has ended early: {outcome.ended_text}"))
+
+    def _moving(
+        self, work: Callable[[Setup, StereoRig, MotionPlan, Array], RunResult], *, at_start: bool = True
+    ) -> RunResult | None:
         """Do something that moves the arm, once all is there that it needs; None where it could not begin."""
         measuring = self._measuring
         self._requested, self._running, self._seen = None, "preparing", 0
@@ -573,7 +596,8 @@ class ArmStep:
             assert isinstance(target, Composite)
             setup = self._setup(target)
             plan, targets = self._plan()
-            require_start(setup, plan, targets)
+            if at_start:
+                require_start(setup, plan, targets)
             return work(setup, rig, plan, targets)
         except ArmsightError as error:
             self._say(Note("error", str(error)))
@@ -741,6 +765,7 @@ class ArmStep:
             lacks=board.abilities.missing,
             faults=faults,
             running=self._running,
+            away=q is not None and self._start is not None and bool(np.abs(q - self._start).max() > START_RAD),
             phase="" if segment is None else segment.phase,
             motion="" if segment is None else segment.motion,
             error_mm=tuple((round(t, 3), round(e, 4), c) for t, e, c in list(self._chart)),
@@ -773,18 +798,6 @@ class ArmStep:
             return (), scene
         T = mounting.pose_measurement(newest[1], newest[0].shot.t_s or 0.0).T_base_tool
         return tuple(float(x) for x in np.degrees(likely_joint_errors(arm, q, T))), scene
-
-
-def likely_joint_errors(arm: Arm, q: Array, T_base_tool: Array) -> Array:
-    """Return the errors of joint readings q (n,), rad, that most likely explain a measured pose (4, 4) of the tool.
-
-    The maximum a posteriori with a prior about zero: near a singular pose an exact inverse explains a fraction of a
-    millimetre by tens of degrees.
-    """
-    weights = np.repeat(1.0 / np.square(_EXPLAINED), 3)
-    J, xi = arm.jacobian(q, "tool"), log_se3(inverse(arm.forward(q)) @ T_base_tool)
-    JW = J.T * weights
-    return np.asarray(np.linalg.solve(JW @ J + np.eye(len(q)) / _JOINT_RAD**2, JW @ xi))
 
 
 def _state_text(board: StoppableBoard) -> str:

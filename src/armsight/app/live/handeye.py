@@ -17,15 +17,19 @@ from pathlib import Path
 import numpy as np
 
 from armsight.app.live.quality import Note
-from armsight.app.run.calibrate import HandEyeRun, VisitedPose, handeye_of, handeye_poses
+from armsight.app.run.calibrate import HandEyeRun, VisitedPose, handeye_of, handeye_poses, visit
+from armsight.app.run.controllers import Planned
 from armsight.app.run.folder import write_handeye
-from armsight.data import Array
+from armsight.app.run.loop import Loop
+from armsight.app.run.record import RunSegment
+from armsight.data import Array, Missed
 from armsight.errors import ArmsightError, CalibrationError, InputError
 from armsight.files import write_text
-from armsight.geometry.pose import inverse, transform
+from armsight.geometry.pose import inverse, log_se3, transform
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.handeye import SHARES, HandEye, Poses, information
 from armsight.robot.arm import Arm
+from armsight.robot.trajectories import point_to_point
 from armsight.vision.rig import StereoRig
 
 #: Poses before the first fit; the fewest of a calibration that is called good; the most that are asked for.
@@ -35,6 +39,8 @@ LITTLE = 0.02
 #: A pose is another one if a joint is so far from all that were taken, rad.
 _OTHER_RAD = float(np.radians(3.0))
 _CANDIDATES, _MARGIN_PX = 60, 60.0
+#: Sigma of what joints cannot explain of a measured pose, m and rad; sigma of the error of a joint, rad.
+_EXPLAINED, _JOINT_RAD = (3e-4, 5e-4), float(np.radians(1.0))
 
 
 @dataclass(frozen=True)
@@ -320,3 +326,46 @@ def _errors_after_m(run: HandEyeRun, Ts_base_flange: Array) -> Array:
         one = Poses(T[None], seen[None], cov[None], False, np.zeros(3))
         after.append(np.linalg.inv(known + information(one, found.T_base_still, found.T_flange_held, sigma)))
     return _errors_m(run, np.array(after))
+
+
+def visit_poses(loop: Loop, guide: HandEyeGuide, start: Array, progress: Callable[[str], None]) -> None:
+    """Move an arm from pose to pose, each chosen by those before, until the calibration is good; and back to the start.
+
+    Args:
+        loop: runs the motions.
+        guide: chooses the poses and takes them.
+        start: (n,) joint angles at which the arm stands, rad.
+        progress: called with a line about what is being done.
+
+    Raises:
+        DeviceError: the board or a camera failed.
+    """
+    q, setup = start, loop.setup
+    for number in range(1, MOST_POSES + 1):
+        goal = guide.next_q
+        if goal is None:
+            break
+        progress(f"hand-eye: pose {number}")
+        found = visit(loop, setup.arm, q, goal, setup.gravity, f"hand-eye {number}")
+        q = goal
+        if isinstance(found, Missed):
+            guide.miss(goal, found.reason)
+        else:
+            guide.add(found)
+        loop.compute(guide.fit)
+    progress("to the start")
+    back = point_to_point(setup.arm, q, start)
+    segment = RunSegment("calibration", "to the start", "joints", False, trajectory=back)
+    loop.run(Planned(back, loop.t_s, setup.gravity), back.duration_s + 0.3, segment, watch=False)
+
+
+def likely_joint_errors(arm: Arm, q: Array, T_base_tool: Array) -> Array:
+    """Return the errors of joint readings q (n,), rad, that most likely explain a measured pose (4, 4) of the tool.
+
+    The maximum a posteriori with a prior about zero: near a singular pose an exact inverse explains a fraction of a
+    millimetre by tens of degrees.
+    """
+    weights = np.repeat(1.0 / np.square(_EXPLAINED), 3)
+    J, xi = arm.jacobian(q, "tool"), log_se3(inverse(arm.forward(q)) @ T_base_tool)
+    JW = J.T * weights
+    return np.asarray(np.linalg.solve(JW @ J + np.eye(len(q)) / _JOINT_RAD**2, JW @ xi))

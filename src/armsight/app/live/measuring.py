@@ -6,6 +6,8 @@ measure``. The sigma is split into precision (the noise of this shot) and what t
 
 from __future__ import annotations
 
+import contextlib
+import os
 import threading
 import time
 from collections import Counter, deque
@@ -196,7 +198,7 @@ class MeasureStep:
         self._second: _Second | None = None
         self._file: TextIO | None = None
         self._mcap: LazyMcap | None = None
-        self._file_path, self._rows = Path(), 0
+        self._file_path, self._rows, self._whole = Path(), 0, 0
         self._clear()
 
     def _clear(self) -> None:
@@ -361,7 +363,7 @@ class MeasureStep:
             except OSError as error:
                 self._close_file()
                 raise InputError(f"{path}: cannot be written: {error.strerror}") from None
-            self._file_path, self._rows = path, 0
+            self._file_path, self._rows, self._whole = path, 0, len(csv_text([]).encode())
             published = Published(self.rig, self._target.body, None, properties(self.rig, None, command="live"))
             self._mcap = LazyMcap(self.folder, published, self._said, path.with_suffix(".mcap").name)
 
@@ -378,11 +380,13 @@ class MeasureStep:
         try:
             self._file.write(row)
             self._file.flush()
-            self._rows += 1
+            self._rows, self._whole = self._rows + 1, self._whole + len(row.encode())
             if self._mcap is not None:
                 self._mcap.put(ShotDatum(live.shot, result, time.monotonic()))
         except OSError as error:
             self._close_file()
+            with contextlib.suppress(OSError):  # a row that is there in part goes
+                os.truncate(self._file_path, self._whole)
             why = f"the recording has ended: {error.strerror}; {self._rows} poses are in {self._file_path}"
             self._say(Note("error", why))
 

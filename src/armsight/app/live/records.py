@@ -211,6 +211,11 @@ class GuideHandEye:
 
 
 @dataclass(frozen=True)
+class GoToStart:
+    """Move the arm slowly to where the motions start, as after a stop."""
+
+
+@dataclass(frozen=True)
 class ClearHandEye:
     """Forget the hand-eye calibration and its poses."""
 
@@ -276,6 +281,7 @@ Command = (
     | UseSecondBody
     | TakePose
     | GuideHandEye
+    | GoToStart
     | ClearHandEye
     | Identify
     | UseArm

@@ -371,7 +371,7 @@ class LiveSession:
             ArmsightError: it cannot be done now; nothing has changed.
         """
         self._actions()[type(command)](command)
-        if isinstance(command, records.RunMotions | records.GuideHandEye):
+        if isinstance(command, records.RunMotions | records.GuideHandEye | records.GoToStart):
             self._held = ""
 
     def _actions(self) -> dict[type[Command], Callable[..., None]]:
@@ -402,6 +402,7 @@ class LiveSession:
             records.UseSecondBody: lambda c: measuring.use_second(c.target),
             records.TakePose: lambda c: arm.take_pose(),
             records.GuideHandEye: lambda c: arm.guide_handeye(),
+            records.GoToStart: lambda c: arm.go_to_start(),
             records.ClearHandEye: lambda c: self._clear_handeye(),
             records.Identify: lambda c: arm.identify_arm(),
             records.UseArm: lambda c: arm.use_arm(c.arm),

@@ -89,7 +89,7 @@ def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
             f"{np.degrees(plan.start[joint]):.1f}: bring the arm to the start, or give start_deg; if it is there, "
             f"--arm {setup.arm.name} does not match the board's potentiometers (armsight board monitor)"
         )
-    _require_range(setup, np.vstack([targets, *(passed(m.trajectory) for m in plan.motions)]))
+    require_range(setup, np.vstack([targets, *(passed(m.trajectory) for m in plan.motions)]))
 
 
 def passed(way: Trajectory) -> Array:
@@ -97,7 +97,7 @@ def passed(way: Trajectory) -> Array:
     return way.at(np.linspace(0.0, way.duration_s, _CHECKED)).q
 
 
-def _require_range(setup: Setup, q: Array) -> None:
+def require_range(setup: Setup, q: Array) -> None:
     """Reject joint angles (N, n), rad, beyond the board's own limits: it would stop the joint on the way."""
     low, high = setup.board.soft_limits()
     beyond = np.maximum(q.max(axis=0) - high, low - q.min(axis=0))
@@ -219,15 +219,25 @@ def run_visits(
     *,
     progress: Progress,
     begun: Callable[[Loop], None] = lambda loop: None,
+    look: bool = True,
 ) -> RunResult:
     """Move the arm by ``work`` alone, which is given the loop; all else as :func:`run_experiment`.
+
+    Args:
+        setup: the devices.
+        rig: the calibrated cameras.
+        plan: the arm stands at its start.
+        work: moves the arm.
+        progress: called with a line about what is being done.
+        begun: called with the loop before the drives are switched on.
+        look: whether the body must be seen before.
 
     Returns:
         What was measured, also where something ended it early.
     """
     outcome = RunResult(setup.target.body)
     with steady(in_time=setup.clock is not None):
-        _run(setup, rig, plan, outcome, progress, begun, Fanout(), work)
+        _run(setup, rig, plan, outcome, progress, begun, Fanout(), work, look=look)
     return outcome
 
 
@@ -240,6 +250,8 @@ def _run(
     begun: Callable[[Loop], None],
     publisher: Publisher,
     work: Callable[[Loop], None],
+    *,
+    look: bool = True,
 ) -> None:
     """Switch the drives on, look, and do the work; what ends it early is stored in the outcome, and the arm is stopped."""
     loop: Loop | None = None
@@ -253,7 +265,8 @@ def _run(
         loop = Loop.open(setup, follower, outcome.log, first, publisher)
         begun(loop)
         enable(setup.board)
-        _require_seen(loop, setup, plan)
+        if look:
+            _require_seen(loop, setup, plan)
         work(loop)
     except (ArmsightError, KeyboardInterrupt) as error:
         outcome.interrupted = isinstance(error, KeyboardInterrupt)
