@@ -139,12 +139,13 @@ def arm_step(tmp_path, board, measuring=None):
     [
         ("nonsense", "usb:0,1", "no board 'nonsense'; there are"),
         ("poses:", "usb:0,1", "no board 'poses:'"),
+        ("poses:nothing.csv", "usb:0,1", "nothing.csv"),
         ("emulated:unicorn", "usb:0,1", "go together: --source sim:"),
     ],
 )
 def test_a_board_that_cannot_be_right_is_rejected(name, source, says):
     with pytest.raises(InputError, match=says):
-        ArmStep.check_board(name, source)
+        ArmStep.check_board(name, source, MODELS["six_r"])
 
 
 def test_logged_joint_angles_stand_beside_the_shot_they_belong_to(tmp_path):

@@ -216,17 +216,20 @@ class ArmStep:
 
     @property
     def busy(self) -> bool:
-        """Whether a motion runs."""
-        return self._running is not None
+        """Whether a motion runs, or is about to."""
+        return self._running is not None or self._requested is not None
 
     @staticmethod
-    def check_board(name: str | None, source: str) -> None:
+    def check_board(name: str | None, source: str, arm: Arm) -> None:
         """Reject the name of a board that cannot be right.
 
         Raises:
-            InputError: the message names those there are.
+            InputError: the message names those there are, or what is wrong with the file of joint angles.
         """
-        if name is None or is_real(name) or (name.startswith(LOGGED) and name != LOGGED):
+        if name is None or is_real(name):
+            return
+        if name.startswith(LOGGED) and name != LOGGED:
+            read_angles(name.removeprefix(LOGGED), arm)
             return
         if emulator_name(name) and not source.startswith("sim:"):
             raise InputError(f"--board {name}: the emulated board and the workcell go together: --source sim:")
@@ -288,7 +291,7 @@ class ArmStep:
 
     def hold(self, why: str) -> None:
         """Bring the arm to rest and hold it, if it moves."""
-        if self._running is not None:
+        if self.busy:
             self._hold = why
 
     def run(self, *, closed: bool) -> None:
@@ -405,7 +408,7 @@ class ArmStep:
         self._board.clear_stop()
 
     def _require_rest(self) -> None:
-        if self._running is not None or self._requested is not None:
+        if self.busy:
             raise InputError("a motion runs already: hold or stop it first")
 
     def _require_ready(self) -> None:
@@ -587,7 +590,8 @@ class ArmStep:
     ) -> RunResult | None:
         """Do something that moves the arm, once all is there that it needs; None where it could not begin."""
         measuring = self._measuring
-        self._requested, self._running, self._seen = None, "preparing", 0
+        self._running, self._seen = "preparing", 0
+        self._requested = None
         rig, spec = measuring.rig, measuring.target_spec
         assert rig is not None
         assert spec is not None

@@ -261,7 +261,7 @@ class LiveSession:
         self._found = [] if simulated else find_cameras()
         self.source = options.source if options.source is not None else _best_source(self._found)
         arm = open_arm(options.arm)
-        ArmStep.check_board(options.board, self.source)
+        ArmStep.check_board(options.board, self.source, arm)
         if simulated and options.board is not None and not options.board.startswith(EMULATED):
             raise InputError(f"--board {options.board}: {SIM} has the emulated board; leave out --board")
         self._simulated = self._workcell(options) if simulated else None
