@@ -127,25 +127,23 @@ with connect(f"ws://{at}/live", origin=f"http://{at}", max_size=2**24) as page:
 
 
 def loop(blocks: int) -> None:
-    """Compare the control loop's times without and with a page, alternately in one run: the load is alike."""
+    """Compare the control loop's times without and with a page, alternately in blocks of 60 shots: the load is alike."""
     session, server, driver = at_the_page("1280x720@30")
     driver.quit()
     session.execute(records.GuideHandEye())
-    until(lambda: session.arm.handeye.run is not None and session.arm.state.handeye.poses >= 8, 600.0)
+    until(lambda: session.arm.state.handeye.good and not session.sections()["overview"].moving, 900.0)
     times = {False: [], True: []}
     for block in range(2 * blocks):
         page = None
         if block % 2:
             page = subprocess.Popen([sys.executable, "-c", _PAGE, f"127.0.0.1:{server.port}"])
             until(lambda: server._clients)
-        while not session.sections()["overview"].moving or session.arm._loop is None:
-            if not session.sections()["overview"].moving:
-                session.execute(records.RunMotions(closed=True))
-            time.sleep(0.5)
-        seen, end = len(session.arm._loop.log.latency_s), time.monotonic() + 15.0
-        log = session.arm._loop.log
-        while time.monotonic() < end:
+        while (running := session.arm._loop) is None or not running.log.latency_s:
+            if not session.arm.busy:
+                session.execute(records.GoToStart() if session.arm.state.away else records.RunMotions())
             time.sleep(0.2)
+        log, seen = running.log, len(running.log.latency_s)
+        until(lambda log=log, seen=seen: len(log.latency_s) >= seen + 60 or session.arm._loop is None, 300.0)
         times[bool(block % 2)] += list(log.latency_s[seen:])
         if page is not None:
             page.terminate()
