@@ -543,9 +543,9 @@ class ArmStep:
 
     def _visit(self) -> None:
         """Visit the poses of the guided hand-eye calibration."""
-        self.handeye.clear()
 
         def work(setup: Setup, rig: StereoRig, plan: MotionPlan, targets: Array) -> RunResult:
+            self.handeye.clear()
             self.handeye.begin(np.vstack([plan.start, targets]), setup.board.soft_limits(), rig)
             return run_visits(
                 setup,

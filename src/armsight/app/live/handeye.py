@@ -195,8 +195,8 @@ class HandEyeGuide:
                 except (CalibrationError, np.linalg.LinAlgError) as error:
                     missing = (f"the poses cannot be fitted yet: {error}",)
             with self._lock:
-                if arm is not self._arm:
-                    return
+                if arm is not self._arm or len(self._visited) < len(visited):
+                    return  # another arm, or all was cleared meanwhile
                 if run is not None:
                     self._learn(run)
                 self._choose()

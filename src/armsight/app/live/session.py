@@ -427,7 +427,8 @@ class LiveSession:
             raise InputError("the workcell and real cameras are chosen when the session starts: --source")
         self.capture.close()
         self.source, self.capture = source, CameraCapture(self._open, self._camera_failed)
-        self.arm.capture = self.capture
+        self.arm.capture, self.arm.options = self.capture, replace(self.arm.options, source=source)
+        self._left_known = False
         self.capture.start()
         self.measuring.source = source
         self._looks = None
