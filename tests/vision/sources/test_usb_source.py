@@ -37,7 +37,8 @@ class FakeCapture:
             cv2.CAP_PROP_FPS: 30.0,
             cv2.CAP_PROP_FOURCC: float(cv2.VideoWriter.fourcc(*"YUYV")),
             cv2.CAP_PROP_AUTO_EXPOSURE: 3.0,
-            cv2.CAP_PROP_EXPOSURE: 156.0,
+            cv2.CAP_PROP_EXPOSURE: 156,
+            cv2.CAP_PROP_GAIN: 0.0,
         }
         self.queue, self.next, self.stamp = [], None, 0.0
         self.dead = self.undecodable = False
@@ -161,13 +162,14 @@ def test_cameras_of_rates_that_never_meet_are_reported(usb_pair):
 
 
 def test_all_settings_arrive_at_both_cameras(usb_pair):
-    usb_pair.open("@1280x720@60,exposure=5ms,format=MJPG")
+    usb_pair.open("@1280x720@60,exposure=5ms,gain=20,format=MJPG")
     for capture in usb_pair.captures:
         assert capture.props[cv2.CAP_PROP_FOURCC] == cv2.VideoWriter.fourcc(*"MJPG")
         assert capture.props[cv2.CAP_PROP_FRAME_WIDTH] == 1280
         assert capture.props[cv2.CAP_PROP_FRAME_HEIGHT] == 720
         assert capture.props[cv2.CAP_PROP_FPS] == 60
         assert capture.props[cv2.CAP_PROP_AUTO_EXPOSURE] == 1
+        assert capture.props[cv2.CAP_PROP_GAIN] == 20
         assert capture.props[cv2.CAP_PROP_EXPOSURE] == 50  # V4L2 counts in 0.1 ms
 
 
@@ -187,6 +189,7 @@ def test_what_is_not_asked_for_stays(usb_pair):
         ("@60", cv2.CAP_PROP_FPS, "did not take 60 frames per second, it says 30"),
         (",exposure=5ms", cv2.CAP_PROP_AUTO_EXPOSURE, "did not take manual exposure (1), it says 3"),
         (",exposure=5ms", cv2.CAP_PROP_EXPOSURE, "did not take exposure 50 (x 0.1 ms), it says 156"),
+        (",gain=20", cv2.CAP_PROP_GAIN, "did not take gain 20, it says 0"),
     ],
 )
 def test_a_setting_not_taken_is_named_and_both_cameras_let_go(usb_pair, tail, stubborn, said):
@@ -247,7 +250,7 @@ def test_a_frame_of_another_size_is_reported(usb_pair):
 @pytest.mark.parametrize(
     "rest",
     ["", "0", "0,", ",1", "0,1@", "0,1@640x480@", "0,1@640x480x3", "0,1,2", "0,1,exposure=5",
-     "0,1,exposure=5ms=6", "0,1,gain=3", "0,1,format=MJPEG", "0,1@30@640x480"],
+     "0,1,exposure=5ms=6", "0,1,gain=x", "0,1,format=MJPEG", "0,1@30@640x480"],
 )  # fmt: skip
 def test_a_text_of_another_form_is_reported(rest):
     opened = []

@@ -19,7 +19,13 @@ _HERE = ("127.0.0.1", "localhost", "::1")
 @click.option("--rig", type=click.Path(path_type=Path), help="A calibrated rig; begins with measuring.")
 @click.option("--target", help="The body that is measured: a body file or a board.")
 @click.option("--calibration-board", metavar="SPEC", help="The calibration board, such as chessboard:9x6:25mm.")
-@click.option("--board", help="The arm's controller: serial:PORT (docs/howto/board.md).")
+@click.option(
+    "--board",
+    help="The arm's controller: serial:PORT, feetech:PORT, ar4:PORT; poses:FILE where another program moves it.",
+)
+@click.option(
+    "--calibration", type=click.Path(path_type=Path), help="LeRobot's calibration file of the servo bus, with feetech:."
+)
 @click.option(
     "--arm", default="six_r", show_default=True, help="The arm: a name (armsight arm list), a .toml or a .urdf file."
 )
@@ -55,6 +61,7 @@ def command(
     target: str | None,
     calibration_board: str | None,
     board: str | None,
+    calibration: Path | None,
     arm: str,
     motion: Path | None,
     rate: float,
@@ -84,7 +91,7 @@ def command(
     if source is not None and source.startswith("usb:"):
         parsed_usb(source.removeprefix("usb:"))  # cameras may come later, their names may not
     options = SessionOptions(
-        output, source, rig, target, calibration_board, board, arm, motion, rate, 1e-3 * sync_ms, seed
+        output, source, rig, target, calibration_board, board, arm, motion, rate, 1e-3 * sync_ms, seed, calibration
     )
     session = LiveSession(options)
     server = LiveServer(session, host, port, None if host in _HERE else secrets.token_urlsafe(18))

@@ -304,7 +304,7 @@ class WorkcellSource:
                 newest = k
         shot = None
         if newest >= self._next:
-            self._next = newest + 1
+            self._next, self._over_s = newest + 1, np.inf  # an emergency stop may let time pass while this waits
             shot = self._shot(newest)
             self._over_s = self._over(self._next)
         return shot

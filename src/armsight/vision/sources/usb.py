@@ -21,13 +21,13 @@ from armsight.data import Image, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.vision.sources.capture import open_capture
 from armsight.vision.sources.timing import Rhythm, allowed_skew
+from armsight.vision.sources.v4l2 import EXPOSURE_UNIT_MS
 
 STALL_S = 5.0  # without a frame for that long a camera has stalled
-_EXPOSURE_UNIT_MS = 0.1  # of V4L2's exposure_time_absolute
 _MANUAL, _AUTO = 1, 3  # of V4L2's auto_exposure: manual mode, aperture priority mode
 _QUEUE = 4  # frames OpenCV's V4L2 lets the driver queue
 _CATCH_UP = 30  # grabs after which two cameras that never come close in time are given up
-_FORM = "usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,format=MJPG]"
+_FORM = "usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,gain=20][,format=MJPG]"
 
 #: OpenCV's property -> its name and value in messages and the value to set; in the order in which they must be set.
 Settings = dict[int, tuple[str, float]]
@@ -166,7 +166,7 @@ class UsbSource:
 
 
 def open_usb(rest: str, capture: Callable[[str], Capture] | None = None) -> UsbSource:
-    """Open ``LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,format=MJPG]``.
+    """Open ``LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,gain=20][,format=MJPG]``.
 
     Args:
         rest: two devices, a number N for /dev/videoN or a path, and the settings for both.
@@ -197,8 +197,9 @@ def parsed_usb(rest: str) -> tuple[list[str], Settings]:
     named = dict(part.split("=") for part in form[6].split(",")[1:]) if form else {}
     asked = named.pop("exposure", None)
     exposure = re.fullmatch(r"auto|(\d+(?:\.\d+)?)ms", asked or "auto")
-    fourcc = named.pop("format", "MJPG")
-    if form is None or exposure is None or len(fourcc) != 4 or named:
+    fourcc, gain = named.pop("format", "MJPG"), named.pop("gain", "")
+    good_gain = re.fullmatch(r"(\d+(?:\.\d+)?)?", gain)
+    if form is None or exposure is None or len(fourcc) != 4 or good_gain is None or named:
         raise InputError(f"usb:{rest}: expected {_FORM}")
     left, right, width, height, fps = form.groups()[:5]
     devices = [f"/dev/video{device}" if device.isdecimal() else device for device in (left, right)]
@@ -212,10 +213,12 @@ def parsed_usb(rest: str) -> tuple[list[str], Settings]:
         settings[cv2.CAP_PROP_FPS] = (f"{fps} frames per second", float(fps))
     if exposure[1]:
         settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"manual exposure ({_MANUAL})", _MANUAL)
-        units = round(float(exposure[1]) / _EXPOSURE_UNIT_MS)
-        settings[cv2.CAP_PROP_EXPOSURE] = (f"exposure {units} (x {_EXPOSURE_UNIT_MS} ms)", units)
+        units = round(float(exposure[1]) / EXPOSURE_UNIT_MS)
+        settings[cv2.CAP_PROP_EXPOSURE] = (f"exposure {units} (x {EXPOSURE_UNIT_MS} ms)", units)
     elif asked:
         settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"automatic exposure ({_AUTO})", _AUTO)
+    if gain:
+        settings[cv2.CAP_PROP_GAIN] = (f"gain {gain}", float(gain))
     return devices, settings
 
 
