@@ -74,6 +74,8 @@ def evaluated(folder: Path, side_m: float, topics: str) -> Evaluated:
 MOST = 120
 #: Median of chi-squared with three degrees of freedom: a few wrong corners do not move it.
 CHI2_MEDIAN = 2.366
+#: Median of absolute deviations -> standard deviation of a normal distribution.
+MAD = 1.4826
 
 
 def _cameras(path: Path) -> tuple[Camera, Camera]:
@@ -200,11 +202,10 @@ def _adjusted(cameras, corners, names, order, T_lr, T_tags, T_shots, used):
     fit = least_squares(residuals, x, jac_sparsity=sparsity(), x_scale="jac", max_nfev=15)
     x = fit.x
     r = residuals(x)[:-6] * scale
-    free = r.size - count + 6
-    sigma_px = float(np.sqrt(np.sum(r**2) / max(free, 1)))
     J = fit.jac.toarray() if hasattr(fit.jac, "toarray") else fit.jac
-    H = J.T @ J
-    cov = np.linalg.pinv(H, hermitian=True) * (sigma_px / scale) ** 2
+    unscaled = np.linalg.pinv(J.T @ J, hermitian=True)
+    sigma_px = _sigma_px(r.reshape(-1, 4, 2), J[:-6].reshape(-1, 4, 2, count), unscaled)
+    cov = unscaled * (sigma_px / scale) ** 2
     lr = T_lr @ exp_se3(x[:6])
     Tt = T_tags @ exp_se3(x[6 : 6 + 6 * n_tags].reshape(-1, 6))
     parameters = sum(c.parameters.size for c in cameras)
@@ -219,6 +220,29 @@ def _adjusted(cameras, corners, names, order, T_lr, T_tags, T_shots, used):
     blocks = np.array([cov[6 + 6 * k : 12 + 6 * k, 6 + 6 * k : 12 + 6 * k] for k in range(n_tags)])
     by_centre = np.array([T[:3, :3] @ block[:3, :3] @ T[:3, :3].T for T, block in zip(Tt, blocks, strict=True)])
     return rig, body, by_centre, sigma_px
+
+
+def _sigma_px(r: Array, J: Array, cov: Array) -> float:
+    """Return the sigma of a pixel that four corners of a tag, taken as independent, need.
+
+    What moves all four corners together (blur, lens, the time between the cameras) is not averaged out over them. So the
+    residuals (N, 4, 2) of the fit are split into the mean of each tag and the deviations from it; each share is sized by
+    its median, as a few wrong corners shall not count, and divided by what the fit leaves of it: trace of (I - H) over
+    the share, with the hat matrix H = J cov J^T of the fit (N, 4, 2, parameters). The mean, times two, is as large as a
+    deviation where the corners are independent; the larger one is taken.
+    """
+    means = r.mean(axis=1, keepdims=True)
+    J_mean = 2.0 * J.mean(axis=1)  # of the normalised sum over four corners
+    taken_all = np.einsum("ncap,pq,ncaq->", J, cov, J, optimize=True)
+    taken_mean = np.einsum("nap,pq,naq->", J_mean, cov, J_mean, optimize=True)
+    left_mean = 1.0 - taken_mean / (2 * len(r))
+    left_deviation = 1.0 - (taken_all - taken_mean) / (6 * len(r))
+    common = 2.0 * MAD * float(np.median(np.abs(means))) / np.sqrt(left_mean)
+    # of four deviations from their mean three are free
+    alone = MAD * float(np.median(np.abs(r - means))) * np.sqrt(4 / 3) / np.sqrt(left_deviation)
+    print(f"    corners: {alone:.3f} px each, {common:.3f} px of what all four share; left by the fit {left_mean:.2f}, "
+          f"{left_deviation:.2f}; RMS {np.sqrt(np.mean(r**2)):.3f} px")  # fmt: skip
+    return max(common, alone)
 
 
 def _left_out(rig: StereoRig, body: Body, cov_tags: Array, shot: SeenShot, side_m: float) -> list[float]:

@@ -69,6 +69,7 @@ class SessionOptions:
         rate_hz: rate of the cameras, Hz.
         sync_s: standard deviation of the time between the two exposures of a shot, s.
         seed: of a simulated workcell.
+        streams: what every measured shot is published to.
     """
 
     folder: Path
@@ -82,6 +83,7 @@ class SessionOptions:
     rate_hz: float = 30.0
     sync_s: float = 1e-3
     seed: int = 0
+    streams: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -216,7 +218,7 @@ class LiveSession:
         arm = open_arm(options.arm)
         self._simulated = self._workcell(options) if simulated else None
         spec = options.calibration_board or (CHESSBOARD if simulated else _DEFAULT_BOARD)
-        self.measuring = MeasureStep(self.folder, "usb:LEFT,RIGHT" if simulated else self.source, self.say)
+        self.measuring = MeasureStep(self.folder, "usb:LEFT,RIGHT" if simulated else self.source, self.say, options.streams)
         self.capture = CameraCapture(self._open, self._camera_failed)
         self.calibration = self._calibration(spec, CalibrationAim())
         self.body = BodyStep(self.folder, self.say)

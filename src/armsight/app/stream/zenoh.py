@@ -78,7 +78,7 @@ class Ros2Sink(Sink):
         config.insert_json5("mode", '"client"')
         config.insert_json5("connect/endpoints", f'["tcp/{host}:{port}"]')
         config.insert_json5("scouting/multicast/enabled", "false")
-        config.insert_json5("connect/timeout_ms", "2000")
+        config.insert_json5("connect/timeout_ms", "1000")
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError:
