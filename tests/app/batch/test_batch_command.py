@@ -124,7 +124,7 @@ def test_recordings_are_found_in_any_store(tmp_path):
     memory = fsspec.filesystem("memory")
     memory.pipe("/a/x.bag", b"1")
     memory.pipe("/a/b/y.bag", b"2")
-    assert found_recordings(["memory://a/**/*.bag"]) == ["memory:///a/b/y.bag", "memory:///a/x.bag"]
+    assert list(found_recordings(["memory://a/**/*.bag"])) == ["memory:///a/b/y.bag", "memory:///a/x.bag"]
     assert (
         "damaged"
         in work("memory:///a/x.bag", BatchOptions("measure", target="chessboard:9x6:25mm")).recording["reason"]

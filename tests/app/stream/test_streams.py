@@ -201,9 +201,9 @@ def test_ros2_messages_over_zenoh_are_decoded_by_the_definitions_of_ros(monkeypa
     """Keys, tokens and attachments as rmw_zenoh has them; the hash is that of ROS's own std_msgs/String."""
     zenoh = pytest.importorskip("zenoh")
     from rosbags.typesys import Stores, get_typestore
+    from test_run_mcap import BODY, measured, published
 
     from armsight.app.stream.zenoh import open_ros2
-    from test_run_mcap import BODY, measured, published
 
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
     with socket.create_server(("127.0.0.1", 0)) as free:

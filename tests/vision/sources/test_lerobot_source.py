@@ -39,7 +39,13 @@ def dataset(tmp_path):
         )
         features = {key: {"dtype": "video", "shape": [48, 64, 3]} for key in KEYS}
         features["observation.state"] = {"dtype": "float32", "shape": [2], "names": ["shoulder", "elbow"]}
-        info = {"codebase_version": version, "fps": FPS, "chunks_size": 1000, "video_path": template, "features": features}
+        info = {
+            "codebase_version": version,
+            "fps": FPS,
+            "chunks_size": 1000,
+            "video_path": template,
+            "features": features,
+        }
         (tmp_path / "meta").mkdir()
         (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
         rows = [(k / FPS, e, k, [0.1 * k, float(e)]) for e in range(2) for k in range(5)]
@@ -50,7 +56,7 @@ def dataset(tmp_path):
         for c, key in enumerate(KEYS):
             levels = [[100 * c + 50 * e + 10 * k for k in range(5)] for e in range(2)]
             if v3:
-                video(tmp_path / template.format(video_key=key, chunk_index=0, file_index=0), sum(levels, []))
+                video(tmp_path / template.format(video_key=key, chunk_index=0, file_index=0), levels[0] + levels[1])
                 continue
             for e in range(2):
                 video(tmp_path / template.format(video_key=key, episode_chunk=0, episode_index=e), levels[e])

@@ -83,7 +83,9 @@ class FakeCapture:
             int(self.props[cv2.CAP_PROP_FRAME_WIDTH]),
             int(self.props[cv2.CAP_PROP_FRAME_HEIGHT]),
         )
-        if self.jpeg and not self.props.get(cv2.CAP_PROP_CONVERT_RGB, 1.0):  # OpenCV hands out the driver's buffer as one row
+        if self.jpeg and not self.props.get(
+            cv2.CAP_PROP_CONVERT_RGB, 1.0
+        ):  # OpenCV hands out the driver's buffer as one row
             return True, np.frombuffer(self.jpeg, np.uint8).reshape(1, -1)
         return True, np.zeros((height, width, 3), np.uint8)
 

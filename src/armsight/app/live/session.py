@@ -218,7 +218,9 @@ class LiveSession:
         arm = open_arm(options.arm)
         self._simulated = self._workcell(options) if simulated else None
         spec = options.calibration_board or (CHESSBOARD if simulated else _DEFAULT_BOARD)
-        self.measuring = MeasureStep(self.folder, "usb:LEFT,RIGHT" if simulated else self.source, self.say, options.streams)
+        self.measuring = MeasureStep(
+            self.folder, "usb:LEFT,RIGHT" if simulated else self.source, self.say, options.streams
+        )
         self.capture = CameraCapture(self._open, self._camera_failed)
         self.calibration = self._calibration(spec, CalibrationAim())
         self.body = BodyStep(self.folder, self.say)

@@ -1,7 +1,8 @@
 """ROS 2 messages over zenoh, as ROS 2 nodes with ``RMW_IMPLEMENTATION=rmw_zenoh_cpp`` receive them; ROS is not needed here.
 
-``ros2:[HOST:]PORT`` connects to the zenoh router of a ROS 2 system of Jazzy or later (``ros2 run rmw_zenoh_cpp rmw_zenohd``, port
-7447); ``ROS_DOMAIN_ID`` is the domain. Messages are those of ``ros.py``, and the data themselves as JSON in std_msgs/String.
+``ros2:[HOST:]PORT`` connects to the zenoh router of a ROS 2 of Jazzy or later (``ros2 run rmw_zenoh_cpp rmw_zenohd``,
+port 7447); ``ROS_DOMAIN_ID`` is the domain. Messages are those of ``ros.py``, and the data themselves as JSON in
+std_msgs/String.
 
 Keys, tokens and attachments as docs/design.md of rmw_zenoh defines them: a message is put to
 ``DOMAIN/TOPIC/TYPE/HASH`` as CDR, with its sequence number, time stamp and the publisher's identity; tokens

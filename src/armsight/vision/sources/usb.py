@@ -6,8 +6,8 @@ clock), and where a driver has none, the time after the grab. Drivers queue fram
 cameras start: so old frames are passed over, and whichever camera is more than half a frame period behind is grabbed
 again until the two belong together.
 
-Of cameras that send MJPEG the frames are taken from OpenCV as they came and decoded here, by the same decoder: a shot has both
-the pixels and the cameras' own bytes, which a recording stores unchanged.
+Of cameras that send MJPEG the frames are taken from OpenCV as they came and decoded here, by the same decoder: a shot has
+both the pixels and the cameras' own bytes, which a recording stores unchanged.
 """
 
 from __future__ import annotations
@@ -241,7 +241,7 @@ def parsed_usb(rest: str) -> tuple[list[str], Settings]:
 
 
 def _one_jpeg(buffer: bytes) -> bytes | None:
-    """Return the JPEG at the beginning of a driver's buffer, behind which an older one may stand; None if it is cut short."""
+    """Return the JPEG at the beginning of a driver's buffer, which an older one may follow; None if it is cut short."""
     at = 2
     while buffer[at : at + 1] == b"\xff" and buffer[at + 1 : at + 2] != b"\xda":  # segments, each with its length
         at += 2 + int.from_bytes(buffer[at + 2 : at + 4], "big")
