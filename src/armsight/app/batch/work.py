@@ -123,7 +123,7 @@ def _by_command(path: str, options: BatchOptions) -> tuple[Row, list[Row]]:
     printed = io.StringIO()
     quiet = contextlib.redirect_stderr(io.StringIO())
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(printed), quiet:
-        command.main([*arguments, "-o", str(Path(folder) / "out"), "--json"], standalone_mode=False)
+        command.main([*arguments, "--json"], standalone_mode=False)
     return {"result": json.dumps(json.loads(printed.getvalue()), sort_keys=True)}, []
 
 

@@ -136,9 +136,10 @@ class UsbCamera:
         encoded: bytes | None = None
         if image.shape[:2] != self._shape and image.size == max(image.shape):  # one row or column: bytes as they came
             encoded = _one_jpeg(np.asarray(image, np.uint8).tobytes())
-            image = None if encoded is None else cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
-            if image is None:
+            decoded = None if encoded is None else cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+            if decoded is None:
                 return None
+            image = decoded
         if image.shape[:2] != self._shape:
             (height, width), (h, w) = self._shape, image.shape[:2]
             raise DeviceError(f"{self.device}: sends frames of {w}x{h} px, agreed on {width}x{height}")
