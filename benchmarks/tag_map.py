@@ -3,8 +3,8 @@
 In: a folder of the TagSLAM examples (bag, cameras.yaml). The intrinsics are the authors'; the relative pose of the cameras
 and the poses of the tags are fitted on the even shots, robustly. Evaluated on the odd ones: from all tags but one, the pose
 (``measure_seen``) predicts where that one is; the residual to its triangulated corners is divided by its predicted sigma,
-in which are the noise of pose and triangulation, and the map and the relative pose of the cameras with all their covariances: both
-the prediction and the triangulated corners depend on them, so most of what is wrong with them cancels.
+in which are the noise of pose and triangulation, and the map and the relative pose of the cameras with all their
+covariances: prediction and triangulated corners both depend on them, so most of what is wrong with them cancels.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from armsight.vision.triangulate import triangulate
 
 @dataclass(frozen=True)
 class FittedMap:
-    """Poses of the tags (M, 4, 4), and the covariance (6 + 6 M, 6 + 6 M) of the cameras' relative pose and of them, in order."""
+    """Poses of the tags (M, 4, 4), and the covariance (6 + 6 M, 6 + 6 M) of the cameras' relative pose and of them."""
 
     Ts: Array
     cov: Array
