@@ -81,7 +81,7 @@ class Ros2Sink(Sink):
         config.insert_json5("scouting/multicast/enabled", "false")
         config.insert_json5("connect/timeout_ms", "1000")
         try:
-            self._session = zenoh.open(config)
+            self._session: Any = zenoh.open(config)
         except zenoh.ZError:
             raise InputError(
                 f"--stream ros2:{host}:{port}: no zenoh router answers there; start it: ros2 run rmw_zenoh_cpp rmw_zenohd"
