@@ -42,6 +42,7 @@ class FakeCapture:
         }
         self.queue, self.next, self.stamp = [], None, 0.0
         self.dead = self.undecodable = False
+        self.jpeg = None
         self.released = 0
 
     def set(self, prop, value):
@@ -83,6 +84,10 @@ class FakeCapture:
             int(self.props[cv2.CAP_PROP_FRAME_WIDTH]),
             int(self.props[cv2.CAP_PROP_FRAME_HEIGHT]),
         )
+        if self.jpeg and not self.props.get(
+            cv2.CAP_PROP_CONVERT_RGB, 1.0
+        ):  # OpenCV hands out the driver's buffer as one row
+            return True, np.frombuffer(self.jpeg, np.uint8).reshape(1, -1)
         return True, np.zeros((height, width, 3), np.uint8)
 
     def release(self):
@@ -272,3 +277,19 @@ def test_real_devices_that_are_not_there_or_no_cameras(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(DeviceError, match="cannot be opened: not a camera, or in use by another program"):
         open_source(f"usb:{tmp_path}/file,98")
+
+
+def test_the_jpeg_of_a_camera_is_kept_as_it_came(usb_pair):
+    """OpenCV hands out the driver's buffer, behind the frame the rest of an older and longer one."""
+    scene = np.random.default_rng(8).integers(0, 255, (480, 640, 3), np.uint8)
+    frames = [cv2.imencode(".jpg", scene[:, ::step])[1].tobytes() for step in (1, -1)]
+    source = usb_pair.open(",format=MJPG")
+    for capture, frame in zip(usb_pair.captures, frames, strict=True):
+        capture.jpeg = frame + b"\x00\x12" + frames[0][5000:]
+    shot = source.read()
+    assert shot.encoded == tuple(frames)
+    np.testing.assert_array_equal(shot.left, cv2.imdecode(np.frombuffer(frames[0], np.uint8), cv2.IMREAD_COLOR))
+    usb_pair.captures[1].jpeg = frames[1][:4000]  # a frame that was cut short on the bus
+    cut = source.read()
+    assert cut.left is None
+    assert "cam1: the frame cannot be decoded" in cut.problem

@@ -54,6 +54,7 @@ _HERE = ("127.0.0.1", "localhost", "::1")
     "--port", type=click.IntRange(0, 65535), default=8722, show_default=True, help="Port; 0 takes a free one."
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the simulated workcell.")
+@click.option("--stream", multiple=True, metavar="STREAM", help="Publish every shot measured: see armsight measure -h.")
 @click.option("--json", "as_json", is_flag=True, help="Print the address as one JSON object.")
 def command(
     source: str | None,
@@ -70,6 +71,7 @@ def command(
     host: str,
     port: int,
     seed: int,
+    stream: tuple[str, ...],
     as_json: bool,
 ) -> None:
     """Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.
@@ -86,12 +88,27 @@ def command(
 
     from armsight.app.live.server import LiveServer
     from armsight.app.live.session import LiveSession, SessionOptions
+    from armsight.app.stream.datum import Published
+    from armsight.app.stream.streams import open_streams
     from armsight.vision.sources.usb import parsed_usb
 
     if source is not None and source.startswith("usb:"):
         parsed_usb(source.removeprefix("usb:"))  # cameras may come later, their names may not
+    open_streams(stream, Published(), lambda line: click.echo(line, err=True)).close()  # a mistake is said now
     options = SessionOptions(
-        output, source, rig, target, calibration_board, board, arm, motion, rate, 1e-3 * sync_ms, seed, calibration
+        output,
+        source,
+        rig,
+        target,
+        calibration_board,
+        board,
+        arm,
+        motion,
+        rate,
+        1e-3 * sync_ms,
+        seed,
+        calibration,
+        stream,
     )
     session = LiveSession(options)
     server = LiveServer(session, host, port, None if host in _HERE else secrets.token_urlsafe(18))

@@ -24,6 +24,7 @@ from armsight.app.live.records import Drawn, polyline
 from armsight.app.measure.poses import csv_text, shot_pose
 from armsight.app.stream.datum import Published, ShotDatum
 from armsight.app.stream.mcap_file import LazyMcap, properties
+from armsight.app.stream.streams import open_streams
 from armsight.data import Array, Missed, PoseEstimate
 from armsight.errors import InputError
 from armsight.geometry.pose import adjoint, inverse, transform
@@ -174,6 +175,7 @@ class MeasureStep:
         folder: of the session; recordings go there.
         source: spec of the cameras, for the command line shown.
         say: called with a note for the person.
+        streams: what every shot is published to: see ``armsight measure -h``.
 
     Attributes:
         rig: the rig; None before there is one.
@@ -182,7 +184,7 @@ class MeasureStep:
         newest: the newest shot with its pose; None before.
     """
 
-    def __init__(self, folder: Path, source: str, say: Callable[[Note], None]) -> None:
+    def __init__(self, folder: Path, source: str, say: Callable[[Note], None], streams: tuple[str, ...] = ()) -> None:
         self.folder, self.source, self._say = folder, source, say
         self.rig: StereoRig | None = None
         self.rig_path: Path | None = None
@@ -199,6 +201,7 @@ class MeasureStep:
         self._file: TextIO | None = None
         self._mcap: LazyMcap | None = None
         self._file_path, self._rows, self._whole = Path(), 0, 0
+        self._specs, self._streams = streams, open_streams((), Published(), self._said)
         self._clear()
 
     def _clear(self) -> None:
@@ -248,6 +251,7 @@ class MeasureStep:
     def _prepare(self) -> None:
         """Get ready for rig and target."""
         self._clear()
+        self._streams.close()
         self._measure = None
         if self._second is not None:
             self._second.prepare(self.rig)
@@ -256,6 +260,10 @@ class MeasureStep:
         rig, target = self.rig, open_target(self.target_spec)
         self._target, self._measure = target, _measuring(rig, target)
         self._monitor = HealthMonitor(rig, target.body, _SYNC_S)
+        try:
+            self._streams = open_streams(self._specs, Published(rig, target.body), self._said)
+        except InputError as error:
+            self._say(Note("error", str(error)))
 
     def look(self, live: LiveShot) -> None:
         """Measure a live shot. Called from one thread."""
@@ -285,6 +293,7 @@ class MeasureStep:
             self._latency.append(1e3 * (now - live.arrived_s))
             self.newest = live, result
             self._write(live, result)
+            self._streams.put(ShotDatum(live.shot, result, now))
             if now - self._health_s > 1.0:
                 self._health_s = now
                 self._health = tuple(found.line() for found in self._monitor.findings())
@@ -402,9 +411,10 @@ class MeasureStep:
                 return
 
     def close(self) -> None:
-        """Close the recording."""
+        """Close the recording and the streams."""
         with self._lock:
             self._close_file()
+            self._streams.close()
 
     def _pose(self) -> PoseEstimate:
         newest = self.newest

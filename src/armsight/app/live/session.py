@@ -72,6 +72,7 @@ class SessionOptions:
         sync_s: standard deviation of the time between the two exposures of a shot, s.
         seed: of a simulated workcell.
         servo_calibration: LeRobot's calibration file of a servo bus.
+        streams: what every measured shot is published to.
     """
 
     folder: Path
@@ -86,6 +87,7 @@ class SessionOptions:
     sync_s: float = 1e-3
     seed: int = 0
     servo_calibration: Path | None = None
+    streams: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -266,7 +268,9 @@ class LiveSession:
             raise InputError(f"--board {options.board}: {SIM} has the emulated board; leave out --board")
         self._simulated = self._workcell(options) if simulated else None
         spec = options.calibration_board or (CHESSBOARD if simulated else _DEFAULT_BOARD)
-        self.measuring = MeasureStep(self.folder, "usb:LEFT,RIGHT" if simulated else self.source, self.say)
+        self.measuring = MeasureStep(
+            self.folder, "usb:LEFT,RIGHT" if simulated else self.source, self.say, options.streams
+        )
         self.capture = CameraCapture(self._open, self._camera_failed)
         self.calibration = self._calibration(spec, CalibrationAim())
         self.body = BodyStep(self.folder, self.say)
