@@ -41,7 +41,7 @@ def measured(rig, body, T_start, uv):
     return PoseEstimate(fit.T_left_body, noise + gain @ rig.cov @ gain.T, noise, 0.0, 0.0, 1.0, points)
 
 
-def watched_body(seed, *, rotated=None, scale=1.0, at_s=0.0, seconds=12.0):
+def watched_body(seed, *, rotated=None, scale=1.0, skew_s=0.0, at_s=0.0, seconds=12.0):
     """Watch a body that moves and rests; yield the monitor, the time, the true pose, and what it returned for each shot."""
     rng = np.random.default_rng(seed)
     cov = np.diag(SIGMAS**2)
@@ -55,12 +55,17 @@ def watched_body(seed, *, rotated=None, scale=1.0, at_s=0.0, seconds=12.0):
     points = BODY.points + 2e-5 * rng.normal(size=BODY.points.shape)
     monitor = HealthMonitor(given, body, SYNC_S)
     rates, phases = rng.uniform(0.05, 0.2, 6), rng.uniform(0, 2 * np.pi, 6)
+
+    def body_at(t):
+        u = np.sin(2 * np.pi * rates * min(t, 0.6 * seconds) + phases)  # it rests at the end
+        return pose(exp_so3(0.3 * u[3:]), np.array([0.1, 0.0, 0.9]) + np.array([0.12, 0.08, 0.12]) * u[:3])
+
     for k in range(round(seconds * RATE_HZ)):
         t = k / RATE_HZ
-        u = np.sin(2 * np.pi * rates * min(t, 0.6 * seconds) + phases)  # it rests at the end
-        T = pose(exp_so3(0.3 * u[3:]), np.array([0.1, 0.0, 0.9]) + np.array([0.12, 0.08, 0.12]) * u[:3])
+        T, late = body_at(t), body_at(t + skew_s * (t >= at_s))
         true = moved if t >= at_s else TRUE
-        uv = both_pixels(true, points @ T[:3, :3].T + T[:3, 3])
+        uv, uv_late = (both_pixels(true, points @ each[:3, :3].T + each[:3, 3]) for each in (T, late))
+        uv[:, 1] = uv_late[:, 1]
         estimate = measured(given, body, T, uv + SIGMA_PX * rng.normal(size=uv.shape))
         yield monitor, t, T, estimate, monitor.measured(estimate, t)
 

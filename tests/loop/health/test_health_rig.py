@@ -66,8 +66,9 @@ def test_the_estimate_is_what_dense_least_squares_gives():
     watch._close_stay()
     found, size = watch._estimated(watch._test), watch._size
     sums, L, F = watch._test, watch.prior, watch._by_fault
-    wide = np.diag(np.array([0.1, 0.1, 1, 1, 1, 1]) ** 2.0)
-    prior = np.linalg.inv(np.block([[L @ L.T, np.zeros((size, 6))], [np.zeros((6, size)), wide]]))
+    wide = np.diag(np.array([0.1, 0.1, 1, 1, 1, 1, 0.1]) ** 2.0)
+    L = L + 1e-9 * np.eye(size)  # the skew's prior is none
+    prior = np.linalg.inv(np.block([[L @ L.T, np.zeros((size, 7))], [np.zeros((7, size)), wide]]))
     G = np.hstack([np.eye(size), F])
     both = np.linalg.solve(G.T @ sums.H @ G + prior, G.T @ sums.b)
     assert found.f == pytest.approx(both[size:], rel=1e-3, abs=1e-6)

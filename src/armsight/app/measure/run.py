@@ -165,9 +165,9 @@ def measure_shots(
     if save_rig is not None and moved is not None:
         replace(stereo, shutters=moved).save(save_rig)
     health = monitor.findings()
-    if skewed and any(each.cause == "rig" for each in health):
-        # Of a moving body a skew looks like cameras that moved against each other.
-        health = (*skewed, *(each for each in health if each.cause != "rig"))
+    if skewed and any(each.cause in ("rig", "time") for each in health):
+        # Of a moving body a skew looks like cameras that moved against each other; all shots together size it best.
+        health = (*skewed, *(each for each in health if each.cause not in ("rig", "time")))
     else:  # a skew that changes no pose by more than its sigma
         for late in skewed:
             click.echo(f"note: {late.what}; {late.advice}", err=True)

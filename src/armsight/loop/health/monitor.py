@@ -93,7 +93,7 @@ class HealthMonitor:
     @property
     def trust(self) -> Trust:
         """How far a loop may rely on the measured poses now."""
-        if self.moved is not None or (self._rig is not None and self._rig.suspected is not None):
+        if self.moved is not None or (self._rig is not None and self._rig.wrong_at_rest):
             return Trust.NONE
         return Trust.DOUBTED if self._newest_s - self._doubted_s < DOUBT_S else Trust.FULL
 
