@@ -366,7 +366,8 @@ class Loop:
                 outcome = self.estimator.vision(measurement)
                 T_base_rig, T_base_tool = self.mounting.T_base_rig, measurement.T_base_tool
                 self.log.outcomes.append(outcome)
-        self.log.poses.append((shot.name, np.nan if shot.t_s is None else shot.t_s, result))
+        stamped_s = np.nan if shot.t_s is None else shot.t_s - self.estimator.clock_offset_s(shot.t_s)
+        self.log.poses.append((shot.name, stamped_s, result))
         self._datum = ShotDatum(
             shot,
             result,
@@ -391,7 +392,7 @@ class Loop:
         """Return the motion of the body about the exposure of a shot that is stamped ``t_s``; None where it is unknown."""
         if self.mounting is None or self.delay_s is None:
             return None
-        exposed_s = t_s - self.delay_s
+        exposed_s = t_s - self.delay_s - self.estimator.clock_offset_s(t_s)
         near = [live for live in self.log.live[-_MOTION_NEWEST:] if abs(live.t_s - exposed_s) <= _MOTION_S]
         if len(near) < 8:
             return None

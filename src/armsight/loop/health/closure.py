@@ -226,6 +226,9 @@ class ClosureWatch:
         self._delta *= innovation.kept
         e = innovation.z + innovation.by_state @ self._delta
         self._delta += innovation.gain @ innovation.z
+        if (clock := innovation.clock) is not None:
+            e = e - clock.offset_s * innovation.by_state[:, self._parts.delay]
+            self._delta += 0.0 if clock.change is None else clock.change
         block = self._block = self._block or _Block(innovation.t_s, self._parts.size)
         block.count += 1
         block.kept *= float(innovation.kept[self._parts.pose])

@@ -9,6 +9,8 @@ import numpy as np
 from armsight.data import Body, PoseEstimate
 from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement
 from armsight.loop.estimators.armerror import layout
+from armsight.loop.estimators.clock import ClockFollower
+from armsight.loop.health.clock import clock_findings
 from armsight.loop.health.closure import ClosureWatch
 from armsight.loop.health.fixed import BaseMotion, FixedWatch
 from armsight.loop.health.host import HostWatch
@@ -39,6 +41,7 @@ class HealthMonitor:
         self._newest_s, self._doubted_s = 0.0, -np.inf
         self._poses: list[tuple[PoseEstimate, float | None]] = []
         self._innovations: list[Innovation] = []
+        self._clock: ClockFollower | None = None
 
     def received(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
         """Do as :meth:`measured` without the tests, which :meth:`work` makes: a command is waiting for the pose.
@@ -80,7 +83,7 @@ class HealthMonitor:
         """Watch from now on, by what an estimator makes of the poses, whether rig, body and joints stay as they are."""
         self._fixed = FixedWatch(arm.T_base_0, layout(arm.joints).size)
         self._closure = ClosureWatch(estimator.sigmas, arm.joint_names)
-        self._innovations = []
+        self._innovations, self._clock = [], estimator.clock
         estimator.on_innovation = self._note
 
     def _note(self, innovation: Innovation) -> None:
@@ -117,4 +120,5 @@ class HealthMonitor:
         slow = () if self._closure is None else self._closure.findings()
         # The closure knows more causes than the innovations within a second, and sizes them better.
         fast = () if self._fixed is None or slow else self._fixed.findings()
-        return (*(() if self._rig is None else self._rig.findings()), *slow, *fast, *self._host.findings())
+        late = () if self._clock is None else clock_findings(self._clock, self._newest_s)
+        return (*(() if self._rig is None else self._rig.findings()), *slow, *fast, *late, *self._host.findings())

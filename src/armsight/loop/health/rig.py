@@ -289,6 +289,7 @@ class RigWatch:
         f = np.linalg.solve(S, s)
         # What the model leaves unexplained widens the noise (Birge ratio); it never narrows it.
         excess = max((square - float(s @ f)) / max(sums.freedom, 1.0), 1.0)
+
         def explained(rows: Ids) -> float:
             return float(s[rows] @ np.linalg.solve(S[np.ix_(rows, rows)], s[rows])) / excess
 
@@ -326,7 +327,9 @@ class RigWatch:
         began_s, change = self._since()
         since_s = began_s if self._timed else None
         parts = self._to_blame(change)
-        return tuple(_FINDINGS[part](change, since_s, len(parts) == 1 and not self._needed(change, part)) for part in parts)
+        return tuple(
+            _FINDINGS[part](change, since_s, len(parts) == 1 and not self._needed(change, part)) for part in parts
+        )
 
     def _needed(self, change: RigChange, part: Part) -> bool:
         """Return whether the other parts do not explain what was found."""
