@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import click
@@ -25,6 +26,7 @@ from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines
+from armsight.loop.health.landmarks import LandmarkWatch
 from armsight.vision.detections import SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.disc.target import DiscTarget
@@ -68,6 +70,7 @@ def measure_shots(
     right: str | None,
     source: str | None,
     detections: Path | None,
+    fixed: Sequence[str],
     skew: str | None,
     readout: str | None,
     save_rig: Path | None,
@@ -85,6 +88,7 @@ def measure_shots(
         right: glob of the right images.
         source: a source's spec, where the images are not given by globs.
         detections: a file of detections, where there are no images.
+        fixed: bodies in view that do not move.
         skew: time by which the right camera is later, with its unit, or ``find``.
         readout: time from the first row to the last, with its unit, or ``find``.
         save_rig: file for the rig with the skew and readout that were found or given.
@@ -102,6 +106,9 @@ def measure_shots(
     requested: Requested | Shutters | None = requested_shutters(skew, readout)
     if requested is not None and detections is not None:
         raise InputError("--skew and --readout need images with times: detections have none")
+    if fixed and detections is not None:
+        raise InputError("--fixed needs images: --detections has the markers of the target alone")
+    landmarks = _Landmarks(fixed, target)
     if save_rig is not None:
         if requested is None:
             raise InputError("--save-rig writes what --skew or --readout find: give --skew find")
@@ -155,7 +162,7 @@ def measure_shots(
         monitor = HealthMonitor(stereo, body, _SYNC_S)
         publisher = stack.enter_context(contextlib.closing(_streams(streams, stereo, body)))
         try:
-            _run(results, total, body, records, as_json, view, monitor, publisher)
+            _run(landmarks.watched(stereo, results), total, body, records, as_json, view, monitor, publisher)
         except KeyboardInterrupt:
             kept = f", kept in {output}" if output is not None and records else ""
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
@@ -164,7 +171,9 @@ def measure_shots(
     moved = next((r.shutters for r in records if r.shutters is not None), None)
     if save_rig is not None and moved is not None:
         replace(stereo, shutters=moved).save(save_rig)
-    health = monitor.findings()
+    health = (*monitor.findings(), *landmarks.watch.findings())
+    for name in landmarks.watch.never_seen:
+        click.echo(f"note: the fixed body {name} was seen too rarely to say anything", err=True)
     if skewed and any(each.cause in ("rig", "time") for each in health):
         # Of a moving body a skew looks like cameras that moved against each other; all shots together size it best.
         health = (*skewed, *(each for each in health if each.cause not in ("rig", "time")))
@@ -176,6 +185,38 @@ def measure_shots(
     if as_json and health:
         click.echo(json.dumps({"health": [found.to_json() for found in health]}))
     return health
+
+
+class _Landmarks:
+    """Fixed bodies that are measured beside the target.
+
+    Args:
+        specs: of the bodies.
+        target: of the target.
+
+    Raises:
+        InputError: a body cannot be opened, or is given twice.
+    """
+
+    def __init__(self, specs: Sequence[str], target: str) -> None:
+        self._targets = [open_target(spec) for spec in specs]
+        names = [each.body.name for each in self._targets]
+        twice = [spec for k, spec in enumerate(specs) if spec == target or spec in specs[:k]]
+        if twice:
+            raise InputError(f"--fixed {twice[0]}: given twice; a fixed body is another one than --target")
+        self.watch = LandmarkWatch(names)
+
+    def watched(self, rig: StereoRig, results: Iterator[Result]) -> Iterator[Result]:
+        """Yield the results; measure the fixed bodies in their shots meanwhile."""
+        measures = [
+            Follower(rig, each).measure if follows(each) else partial(measure, rig, each) for each in self._targets
+        ]
+        for result in results:
+            shot = result[0]
+            for row, measured in enumerate(each(shot) for each in measures if shot.left is not None):
+                if isinstance(measured, PoseEstimate):
+                    self.watch.take(row, measured, shot.t_s)
+            yield result
 
 
 def _opened(left: str | None, right: str | None, source: str | None) -> Source:

@@ -70,7 +70,7 @@ class Innovation(Record):
         kept: (K,) share of the state that was kept since the measurement before.
         gain: (K, 6) what of z was added to the state; zero where the measurement was rejected.
         outcome: what became of it.
-        clock: what is known of an error of the camera's clock that the filter does not know of; None where none is followed.
+        clock: what is known of an error of the camera's clock; None where nothing is.
     """
 
     t_s: float

@@ -8,8 +8,8 @@ Model of a shot's residuals, in standard deviations:
     r = A dT + B x + S e + D f + n,    x ~ N(0, rig.cov),  e ~ N(0, tolerance),  n ~ N(0, s^2)
 
 with dT the pose, which is eliminated shot by shot; x the calibration's own error and e the shape of the body, which all
-shots share; f the seven numbers, zero while all is well. The information of the shots is summed, weighted down with age, and
-f is estimated with x and e eliminated (generalised least squares); chi-square of f against zero is the test. The part of r
+shots share; f the seven numbers, zero while all is well. The information of the shots is summed, weighted down with age; f
+is estimated with x and e eliminated (generalised least squares); chi-square of f against zero is the test. The part of r
 that needs no body is the epipolar distance; the rest says what the body's known shape does. Size of body and length of
 baseline have the same effect: which of them is wrong cannot be distinguished. The skew shows in the detections of the right
 camera by the body's motion between the shots; each shot has a skew of its own besides, of a known standard deviation.
@@ -50,6 +50,8 @@ TEST_S, TEST_SHOTS, FORGET_TESTS = 1.0, 60, 30.0
 _KEPT = 600
 #: A prior so wide that it decides nothing: m, rad, scale, s.
 _WIDE = np.array([0.1, 0.1, 1.0, 1.0, 1.0, 1.0, 0.1])
+#: A change matters that moves a pose by so many of its claimed sigmas, in any direction.
+_MATTERS = 2.0
 #: A part of the seven counts as necessary beyond this chance.
 _NECESSARY = 1e-4
 _ROTATIONS, _SCALED, _SKEWED = slice(2, 5), 5, 6
@@ -129,7 +131,7 @@ class RigWatch:
         self._row_of[self._points] = np.arange(len(self._points))
         self._last = (-np.inf, np.eye(4))
         self._began: Array | None = None
-        self._effect = (np.zeros((3, len(_WIDE))), 0.0)
+        self._effect = (np.zeros((6, len(_WIDE))), np.eye(6))
         self._test, self._window = ResidualSums(self._size, 0.0), ResidualSums(self._size, 0.0)
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
         self._timed = False
@@ -155,7 +157,7 @@ class RigWatch:
         if found is None:
             return np.zeros((6, 6))
         sums, by_fault = found
-        self._effect = (by_fault[:3], float(np.trace(estimate.cov[:3, :3])))
+        self._effect = (by_fault, estimate.cov)
         self._sum(sums, estimate.T_left_body, now_s)
         if self.suspected is None:
             return np.zeros((6, 6))
@@ -271,10 +273,10 @@ class RigWatch:
         return self.suspected is not None and self._to_blame(self.suspected) != ["time"]
 
     def _matters(self, change: RigChange, part: slice) -> bool:
-        """Return whether a part of the seven numbers moves the newest pose by more than the claimed sigma of its position."""
-        by_fault, variance = self._effect
+        """Return whether a part of the seven numbers moves the newest pose by so many of its sigmas."""
+        by_fault, cov = self._effect
         shift = by_fault[:, part] @ change.f[part]
-        return float(shift @ shift) > variance
+        return float(shift @ np.linalg.solve(cov, shift)) > _MATTERS**2
 
     def _estimated(self, sums: ResidualSums) -> RigChange:
         """Return the seven numbers from sums, everything else eliminated."""
@@ -408,8 +410,8 @@ def _skew_finding(change: RigChange, since_s: float | None, alone: bool) -> Heal
     unsure = "; a rotation of one camera cannot be excluded" if alone else ""
     return HealthFinding(
         "time",
-        f"the right camera exposes {abs(size):.2f} ms {'later' if size > 0 else 'earlier'} than it is said to, compared with "
-        f"the left one{unsure}",
+        f"the right camera exposes {abs(size):.2f} ms {'later' if size > 0 else 'earlier'} than is known, against the left "
+        f"one{unsure}",
         since_s,
         size,
         sigma,
