@@ -115,9 +115,9 @@ def body_run(case: Case, seed: int) -> dict:
     told_s, squares, mm = np.nan, [], []
     begin_s = case.options.get("at_s", 0.0)
     for monitor, t_s, T, _, given in faults.watched_body(seed, seconds=BODY_S, **case.options):
-        if np.isnan(told_s) and monitor._rig.suspected is not None:
+        if np.isnan(told_s) and monitor._rig.alarm:
             told_s = t_s
-        if np.isnan(told_s) or t_s > told_s + SETTLED_S:
+        if t_s > (begin_s if np.isnan(told_s) else told_s) + SETTLED_S:
             off = log_se3(inverse(given.T_left_body) @ T)
             squares.append(off @ np.linalg.solve(given.cov, off))
             mm.append(1e3 * np.linalg.norm(off[:3]))

@@ -33,7 +33,7 @@ def watched(seed, count, *, cameras=None, bodies=None, seconds=8.0):
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_nothing_is_found_where_nothing_moves(count):
     for seed in range(5):
-        assert watched(seed, count, seconds=20.0).findings() == ()
+        assert watched(seed, count, seconds=10.0).findings() == ()
 
 
 @pytest.mark.parametrize("count", [2, 3])
@@ -71,4 +71,4 @@ def test_what_looks_alike_is_not_decided():
 
 
 def test_a_body_that_was_not_seen_is_named():
-    assert watched(15, 2, seconds=0.5).never_seen == ("post 0", "post 1")
+    assert watched(15, 2, seconds=0.3).never_seen == ("post 0", "post 1")

@@ -8,7 +8,6 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import click
@@ -26,12 +25,11 @@ from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines
-from armsight.loop.health.landmarks import LandmarkWatch
 from armsight.vision.detections import SeenShot, read_detections
-from armsight.vision.follow.follower import Follower, follows
+from armsight.vision.follow.follower import Follower, follows, measurer
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
-from armsight.vision.markers.targets import open_body, open_target
+from armsight.vision.markers.targets import open_body, open_fixed, open_target
 from armsight.vision.measure import measure, measure_seen, size_problem
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.shutter import LOOSE_PX
@@ -108,7 +106,7 @@ def measure_shots(
         raise InputError("--skew and --readout need images with times: detections have none")
     if fixed and detections is not None:
         raise InputError("--fixed needs images: --detections has the markers of the target alone")
-    landmarks = _Landmarks(fixed, target)
+    fixed_targets = open_fixed(fixed, target)
     if save_rig is not None:
         if requested is None:
             raise InputError("--save-rig writes what --skew or --readout find: give --skew find")
@@ -162,7 +160,16 @@ def measure_shots(
         monitor = HealthMonitor(stereo, body, _SYNC_S)
         publisher = stack.enter_context(contextlib.closing(_streams(streams, stereo, body)))
         try:
-            _run(landmarks.watched(stereo, results), total, body, records, as_json, view, monitor, publisher)
+            _run(
+                _watched(stereo, fixed_targets, results, monitor),
+                total,
+                body,
+                records,
+                as_json,
+                view,
+                monitor,
+                publisher,
+            )
         except KeyboardInterrupt:
             kept = f", kept in {output}" if output is not None and records else ""
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
@@ -171,8 +178,8 @@ def measure_shots(
     moved = next((r.shutters for r in records if r.shutters is not None), None)
     if save_rig is not None and moved is not None:
         replace(stereo, shutters=moved).save(save_rig)
-    health = (*monitor.findings(), *landmarks.watch.findings())
-    for name in landmarks.watch.never_seen:
+    health = monitor.findings()
+    for name in monitor.fixed_never_seen:
         click.echo(f"note: the fixed body {name} was seen too rarely to say anything", err=True)
     if skewed and any(each.cause in ("rig", "time") for each in health):
         # Of a moving body a skew looks like cameras that moved against each other; all shots together size it best.
@@ -187,36 +194,18 @@ def measure_shots(
     return health
 
 
-class _Landmarks:
-    """Fixed bodies that are measured beside the target.
-
-    Args:
-        specs: of the bodies.
-        target: of the target.
-
-    Raises:
-        InputError: a body cannot be opened, or is given twice.
-    """
-
-    def __init__(self, specs: Sequence[str], target: str) -> None:
-        self._targets = [open_target(spec) for spec in specs]
-        names = [each.body.name for each in self._targets]
-        twice = [spec for k, spec in enumerate(specs) if spec == target or spec in specs[:k]]
-        if twice:
-            raise InputError(f"--fixed {twice[0]}: given twice; a fixed body is another one than --target")
-        self.watch = LandmarkWatch(names)
-
-    def watched(self, rig: StereoRig, results: Iterator[Result]) -> Iterator[Result]:
-        """Yield the results; measure the fixed bodies in their shots meanwhile."""
-        measures = [
-            Follower(rig, each).measure if follows(each) else partial(measure, rig, each) for each in self._targets
-        ]
-        for result in results:
-            shot = result[0]
-            for row, measured in enumerate(each(shot) for each in measures if shot.left is not None):
-                if isinstance(measured, PoseEstimate):
-                    self.watch.take(row, measured, shot.t_s)
-            yield result
+def _watched(
+    rig: StereoRig, fixed: Sequence[Target], results: Iterator[Result], monitor: HealthMonitor
+) -> Iterator[Result]:
+    """Yield the results; measure the fixed bodies in their shots meanwhile, for a monitor."""
+    monitor.watch_fixed([each.body.name for each in fixed])
+    measures = [measurer(rig, each) for each in fixed]
+    for result in results:
+        shot = result[0]
+        for row, measured in enumerate(each(shot) for each in measures if shot.left is not None):
+            if isinstance(measured, PoseEstimate):
+                monitor.fixed_measured(row, measured, shot.t_s)
+        yield result
 
 
 def _opened(left: str | None, right: str | None, source: str | None) -> Source:

@@ -231,6 +231,8 @@ def _run(
         _require_seen(loop, setup, plan)
         _prepare(loop, setup, plan, targets, outcome, progress)
         _passes(loop, setup, plan, outcome, progress, cover, close_loop)
+        for name in loop.health.fixed_never_seen:
+            progress(f"the fixed body {name} was seen too rarely to say anything")
     except (ArmsightError, KeyboardInterrupt) as error:
         outcome.interrupted = isinstance(error, KeyboardInterrupt)
         outcome.ended_by = error if isinstance(error, ArmsightError) else None

@@ -320,7 +320,10 @@ class ClosureWatch:
         begin_s = (self._t[finest.begin - 1] + self._t[finest.begin]) / 2
         change = Change(finest.suspect, begin_s, finest.size, finest.cov, finest.chi_square, effect, alike)
         shift = change.size if change.motion is None else change.motion.motion[:3]
-        if float(np.linalg.norm(shift)) > (_LEAST_RAD if change.motion is None else _LEAST_M):
+        # Once something was reported, what explains it best replaces it, also where it is smaller than is reported first.
+        if self.change is not None or float(np.linalg.norm(shift)) > (
+            _LEAST_RAD if change.motion is None else _LEAST_M
+        ):
             self.change = change
 
     def _refined(self, found: _Tested, begins: Array) -> _Tested:

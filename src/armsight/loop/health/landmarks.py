@@ -23,7 +23,7 @@ from armsight.geometry.pose import adjoint, inverse, log_se3
 from armsight.loop.health.record import FALSE_ALARMS_PER_MINUTE, HealthFinding
 
 #: Poses of a mean.
-_SHOTS = 10
+_SHOTS = 5
 #: Of the noise of one pose this share of the variance stays in each mean (where a disc lies in its pixels), and of the
 #: calibration's covariance this share differs between two places of a body that hardly moved.
 _STAYS, _DIFFERS = 0.1, 2.5e-3

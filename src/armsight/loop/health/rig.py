@@ -58,6 +58,8 @@ _ROTATIONS, _SCALED, _SKEWED = slice(2, 5), 5, 6
 #: What may be wrong, and its part of the seven numbers.
 _PARTS: dict[Part, slice] = {"rig": slice(0, 5), "body": slice(5, 6), "time": slice(6, 7)}
 _ALARM = alarm_limit(len(_WIDE), 1.0 / TEST_S)
+#: Chi-square from which on a change that matters widens the poses: chance exceeds it in one of fifty tests.
+_SUSPECTED = float(chdtri(len(_WIDE), 0.02))
 
 
 class ResidualSums:
@@ -111,7 +113,9 @@ class RigWatch:
     Attributes:
         prior: (K, K) square root of the covariance of all parameters: the rig's, scale and points of the body, skew. The
             skew's is zero: what is not known of it is one of the seven numbers.
-        suspected: the change that the newest test found: significant, and moving the pose by more than its sigma; or None.
+        suspected: the change that the newest test found, where it matters and is more likely than not; it widens poses.
+        alarm: whether the newest test found one that is certain.
+        alarmed: whether any did.
     """
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float) -> None:
@@ -135,7 +139,7 @@ class RigWatch:
         self._test, self._window = ResidualSums(self._size, 0.0), ResidualSums(self._size, 0.0)
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
         self._timed = False
-        self._alarmed = False
+        self.alarm = self.alarmed = False
         self.suspected: RigChange | None = None
 
     def take(self, estimate: PoseEstimate, t_s: float | None) -> Array:
@@ -264,13 +268,15 @@ class RigWatch:
         self._test = ResidualSums(self._size, 0.0)
         change = self._estimated(self._window)
         alarm = change.chi_square > _ALARM and self._matters(change, slice(None))
-        self.suspected = change if alarm else None
-        self._alarmed = self._alarmed or alarm
+        self.suspected = (
+            change if alarm or (change.chi_square > _SUSPECTED and self._matters(change, slice(None))) else None
+        )
+        self.alarm, self.alarmed = alarm, self.alarmed or alarm
 
     @property
     def wrong_at_rest(self) -> bool:
         """Whether what is suspected makes poses wrong also where nothing moves."""
-        return self.suspected is not None and self._to_blame(self.suspected) != ["time"]
+        return self.alarm and self.suspected is not None and self._to_blame(self.suspected) != ["time"]
 
     def _matters(self, change: RigChange, part: slice) -> bool:
         """Return whether a part of the seven numbers moves the newest pose by so many of its sigmas."""
@@ -324,7 +330,7 @@ class RigWatch:
         """Return what was found so far: nothing where no test gave an alarm."""
         self._close_stay()
         self._decide()
-        if not self._alarmed:
+        if not self.alarmed:
             return ()
         began_s, change = self._since()
         since_s = began_s if self._timed else None
