@@ -486,6 +486,7 @@ class Loop:
         """Let a controller command the joints, period by period, until ``over`` returns True."""
         begin_s = self.t_s
         self.segment = replace(segment, begin_s=begin_s)
+        self._due = 0.0
         self._watch.forget()
         self._search = None
         try:
@@ -540,6 +541,8 @@ class Loop:
         if self.setup.clock is None:
             return PERIOD_S
         now = time.monotonic()
+        if self._due > 0.0:
+            self.health.period_began(self.t_s, now - self._due - PERIOD_S)
         self._due = max(self._due + PERIOD_S, now + _LEAST_WAIT_S)
         return self._due - now
 

@@ -82,6 +82,10 @@ class HealthMonitor:
         if self._rig is not None:
             self._suspected = self._rig.take(pose, t_s)
 
+    def period_began(self, t_s: float, late_s: float) -> None:
+        """Take by how much, s, a period of the control loop began late, at a time, s."""
+        self._host.began(t_s, late_s)
+
     def watch_fixed(self, names: Sequence[str]) -> None:
         """Watch bodies in view that do not move, from now on."""
         self._landmarks = LandmarkWatch(names)
