@@ -46,6 +46,8 @@ _LEAST_S = 0.025
 _LEAST_POINTS, _APART_S = 4, 0.5
 #: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
 TEST_S, TEST_SHOTS, FORGET_TESTS = 1.0, 60, 30.0
+#: In so many tests after an alarm what was before the change is dropped; it began at most so many tests before the alarm.
+_FRESH, _BEFORE = 6, 3
 #: Tests that are kept, to find since when.
 _KEPT = 600
 #: A prior so wide that it decides nothing: m, rad, scale, s.
@@ -140,6 +142,7 @@ class RigWatch:
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
         self._timed = False
         self.alarm = self.alarmed = False
+        self._alarms = 0  # in a row
         self.suspected: RigChange | None = None
 
     def take(self, estimate: PoseEstimate, t_s: float | None) -> Array:
@@ -268,10 +271,21 @@ class RigWatch:
         self._test = ResidualSums(self._size, 0.0)
         change = self._estimated(self._window)
         alarm = change.chi_square > _ALARM and self._matters(change, slice(None))
+        self._alarms = self._alarms + 1 if alarm else 0
+        if 0 < self._alarms <= _FRESH:
+            change = self._begun(change)
         self.suspected = (
             change if alarm or (change.chi_square > _SUSPECTED and self._matters(change, slice(None))) else None
         )
         self.alarm, self.alarmed = alarm, self.alarmed or alarm
+
+    def _begun(self, change: RigChange) -> RigChange:
+        """Return the change estimated from its beginning on; drop what was before."""
+        count = self._alarms + _BEFORE
+        if len(self._history) <= count:
+            return change
+        self._window, change = self._split(list(self._history)[-count:])
+        return change
 
     @property
     def wrong_at_rest(self) -> bool:
@@ -313,16 +327,23 @@ class RigWatch:
 
         It is the beginning that leaves least unexplained: with the seven numbers zero before it, and estimated after it.
         """
+        sums, change = self._split(list(self._history))
+        return sums.begin_s, change
+
+    def _split(self, tests: Sequence[ResidualSums]) -> tuple[ResidualSums, RigChange]:
+        """Return the sums of the tests after the beginning of a change, and the change estimated from them."""
         after, found, least = ResidualSums(self._size, 0.0), None, np.inf
         before = ResidualSums(self._size, 0.0)
-        for sums in self._history:
+        for sums in tests:
             before.add(sums, 1.0)
-        for sums in reversed(self._history):
+        for sums in reversed(tests):
             after.add(sums, 1.0)
             before.add(sums, -1.0)
             change, none = self._estimated(after), self._estimated(before)
             if change.left + none.left + none.gained < least:
-                least, found = change.left + none.left + none.gained, (sums.begin_s, change)
+                least = change.left + none.left + none.gained
+                found = ResidualSums(self._size, sums.begin_s), change
+                found[0].add(after, 1.0)
         assert found is not None
         return found
 
