@@ -1,4 +1,4 @@
-"""Faults of cameras, body, mounting, joints and clocks: how soon they are told, as what, how well sized, and what is given
+"""Faults of cameras, body, mounting, joints and clocks: how soon they are named, as what, how well sized, and what is given
 out afterwards.
 
 python health.py                         light simulation (projected points, an arm with errors), 20 seeds a case
@@ -8,7 +8,7 @@ python health.py --results rows.jsonl    each run is a line there; those that st
 python health.py rendered knock          one rendered run of a fault in the workcell (worn arm), about two minutes each
 
 A run of a camera or a body takes about 1 s of computing, one of an arm 5 s. Delays count from when the fault displaces the
-measured pose by twice its claimed sigma. NEES is that of what is given out, in motion and at rest, once the fault was told.
+measured pose by twice its claimed sigma. NEES is that of what is given out once the fault was named.
 """
 
 import argparse
@@ -37,7 +37,7 @@ KNOCK_S = 26.0
 #: Duration of a light simulation of cameras and of an arm, s; when an arm is known and when its fault begins, s.
 BODY_S, ARM_S = 20.0, 50.0
 faults.LEARNED_S, faults.AT_S = 10.0, 20.0
-#: After a fault was told, s: its covariance is tested from then on.
+#: After a fault was named, s: its covariance is tested from then on.
 SETTLED_S = 1.0
 #: A tool moves about so fast, m/s, and a joint moves it by about so much, m/rad: for when a fault matters.
 SPEED_M_S, LEVER_M = 0.25, 0.4
@@ -59,8 +59,8 @@ def body_cases() -> Iterator[Case]:
     yield Case("nothing wrong (cameras)")
     for share in (0.5, 1.0, 2.0):
         for k, axis in enumerate("xyz"):
-            turned = {"rotated": share * 0.05 * DEG * np.eye(3)[k]}
-            yield Case(f"right camera rotated by {0.05 * share:g} deg ({axis})", turned, "rig", 0.05 * share)
+            rotated = {"rotated": share * 0.05 * DEG * np.eye(3)[k]}
+            yield Case(f"right camera rotated by {0.05 * share:g} deg ({axis})", rotated, "rig", 0.05 * share)
         late = {"rotated": share * 0.05 * DEG * np.eye(3)[1], "at_s": 5.0}
         yield Case(f"right camera rotated by {0.05 * share:g} deg (y) after 5 s", late, "rig", 0.05 * share)
         scale = 1.0 + 0.01 * share
@@ -102,8 +102,8 @@ def arm_cases() -> Iterator[Case]:
         for joint, size in ((2, 0.5), (4, 1.0)):
             slipped = {"joint": joint, "slip_rad": share * size * DEG}
             yield Case(f"joint {joint + 1} slips by {size} deg{at}", slipped, "joint", share * size, lambda t: 1.0)
-        grown = {"joint": 1, "more_rad": share * 0.5 * DEG}
-        yield Case(f"backlash of joint 2 grows by 0.5 deg{at}", grown, "joint", 0.5 * share, lambda t: 1.0)
+        wider = {"joint": 1, "more_rad": share * 0.5 * DEG}
+        yield Case(f"backlash of joint 2 grows by 0.5 deg{at}", wider, "joint", 0.5 * share, lambda t: 1.0)
         yield Case(
             f"stamps drift by 300 ppm{at}", {"late": runs}, "time", 1e3 * runs(30.0), lambda t, f=runs: SPEED_M_S * f(t)
         )
@@ -112,40 +112,40 @@ def arm_cases() -> Iterator[Case]:
 
 def body_run(case: Case, seed: int) -> dict:
     """Run a case of cameras and body."""
-    told_s, squares, mm = np.nan, [], []
+    named_s, squares, mm = np.nan, [], []
     begin_s = case.options.get("at_s", 0.0)
     for monitor, t_s, T, _, given in faults.watched_body(seed, seconds=BODY_S, **case.options):
-        if np.isnan(told_s) and monitor._rig.alarm:
-            told_s = t_s
-        if t_s > (begin_s if np.isnan(told_s) else told_s) + SETTLED_S:
+        if np.isnan(named_s) and monitor._rig.alarm:
+            named_s = t_s
+        if t_s > (begin_s if np.isnan(named_s) else named_s) + SETTLED_S:
             off = log_se3(inverse(given.T_left_body) @ T)
             squares.append(off @ np.linalg.solve(given.cov, off))
             mm.append(1e3 * np.linalg.norm(off[:3]))
-    return told(case, seed, monitor.findings(), told_s - begin_s, squares, mm)
+    return row_of(case, seed, monitor.findings(), named_s - begin_s, squares, mm)
 
 
 def arm_run(case: Case, seed: int) -> dict:
     """Run a case of an arm."""
     moved = faults.watched_arm(seed, seconds=ARM_S, **case.options)
     track, begin_s = moved.tracked, faults.AT_S
-    told_s = np.nan if moved.found_s is None else moved.found_s
+    named_s = np.nan if moved.found_s is None else moved.found_s
     sigma = np.sqrt(np.einsum("nii->n", track.covs[:, :3, :3]))
     usual = float(np.median(sigma[(track.t_s > begin_s - 2.0) & (track.t_s < begin_s)]))
     ages = np.arange(0.0, ARM_S - begin_s, 0.05)
     matters = ages[[case.shift(t) > 2.0 * usual for t in ages]]
     matters_s = begin_s + (float(matters[0]) if len(matters) else np.nan if case.cause else 0.0)
     rows = np.arange(len(track))[::50]
-    rows = rows[track.t_s[rows] > (begin_s if np.isnan(told_s) else told_s + SETTLED_S)]
+    rows = rows[track.t_s[rows] > (begin_s if np.isnan(named_s) else named_s + SETTLED_S)]
     off = log_se3(inverse(track.Ts_base_tool[rows]) @ moved.Ts_true[rows])
     squares = np.einsum("ni,ni->n", off, np.linalg.solve(track.covs[rows], off[..., None])[..., 0])
     mm = 1e3 * np.linalg.norm(off[:, :3], axis=1)
-    late_s = told_s - (matters_s if np.isfinite(matters_s) else begin_s)
-    row = told(case, seed, moved.monitor.findings(), late_s, squares, mm)
+    late_s = named_s - (matters_s if np.isfinite(matters_s) else begin_s)
+    row = row_of(case, seed, moved.monitor.findings(), late_s, squares, mm)
     row["strongest"] = moved.monitor._closure.strongest
     return row
 
 
-def told(case: Case, seed: int, found: tuple, late_s: float, squares: list, mm: list) -> dict:
+def row_of(case: Case, seed: int, found: tuple, late_s: float, squares: list, mm: list) -> dict:
     """Return the row of a run."""
     right = [each for each in found if each.cause == case.cause]
     sized = right and case.size and right[0].sigma
@@ -167,7 +167,7 @@ _ROW = "{:48s} {:>7s} {:>7s} {:>9s} {:>8s} {:>7s} {:>7s} {:>7s} {:>7s}"
 def main(words: list[str], seeds: range, results: Path | None) -> None:
     """Make the runs that are not in the results yet, and print a line of each case."""
     done = [json.loads(line) for line in results.read_text().splitlines()] if results and results.exists() else []
-    print(_ROW.format("", "told", "right", "median, s", "worst, s", "sigmas", "worst", "NEES", "worst"))
+    print(_ROW.format("", "found", "right", "median, s", "worst, s", "sigmas", "worst", "NEES", "worst"))
     for make, cases in ((body_run, body_cases()), (arm_run, arm_cases())):
         for case in cases:
             if words and not any(word in case.name for word in words):
@@ -183,7 +183,7 @@ def main(words: list[str], seeds: range, results: Path | None) -> None:
 
 
 def show(case: Case, rows: list[dict]) -> None:
-    """Print a line of a case, and what was told in the runs in which it is wrong."""
+    """Print a line of a case, and what was found in the runs in which it is wrong."""
 
     def both(key: str, mean: Callable) -> tuple[str, str]:
         values = [row[key] for row in rows if row[key] is not None]

@@ -390,7 +390,7 @@ def test_a_rig_whose_camera_moved_is_named_and_the_exit_code_says_so(rendered, t
     assert "do not trust this result: rig: " in said.err
 
 
-def test_a_fixed_body_that_moves_is_told(rendered, armsight, tmp_path):
+def test_a_fixed_body_that_moves_is_named(rendered, armsight, tmp_path):
     post = tmp_path / "post.toml"
     shutil.copy(rendered.plate, post)
     given = [rendered.rig, "--target", rendered.plate, "--source", rendered.folder / "arm", "--fixed"]

@@ -1,4 +1,4 @@
-"""Fixed bodies in view: cameras that moved together, bodies that are not fixed, and what cannot be told apart."""
+"""Fixed bodies in view: cameras that moved together, bodies that are not fixed, and what looks alike."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def test_nothing_is_found_where_nothing_moves(count):
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_cameras_that_moved_together_are_told_and_sized(count):
+def test_cameras_that_moved_together_are_named_and_sized(count):
     watch = watched(10, count, cameras=CAMERAS)
     (found,) = watch.findings()
     assert found.cause == "fixed"
@@ -56,7 +56,7 @@ def test_a_body_that_is_not_fixed_is_named_as_another_stands(count):
     assert abs(found.size - 1.0) < 4 * found.sigma
 
 
-def test_a_body_that_moves_beside_cameras_that_move_is_told_by_two_that_agree():
+def test_a_body_that_moves_beside_cameras_that_move_is_named_by_two_that_agree():
     cameras, other = watched(12, 3, cameras=CAMERAS, bodies={2: np.array([0, 2e-3, 0, 0, 0, 0])}).findings()
     assert "as 2 fixed bodies show" in cameras.what
     assert "post 2 is not fixed" in other.what
@@ -67,7 +67,7 @@ def test_what_looks_alike_is_not_decided():
     assert "with one alone the two look alike" in alone.what
     shifts = {0: np.array([1e-3, 0, 0, 0, 0, 0]), 1: np.array([0, 1e-3, 0, 0, 0, 0.01])}
     (both,) = watched(14, 2, bodies=shifts).findings()
-    assert "cannot be told apart" in both.what
+    assert "cannot be distinguished" in both.what
 
 
 def test_a_body_that_was_not_seen_is_named():

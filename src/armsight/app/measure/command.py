@@ -31,7 +31,7 @@ from armsight.errors import InputError
     "--fixed",
     multiple=True,
     metavar="BODY",
-    help="A body in view that does not move; may be repeated. Cameras that move are told by it.",
+    help="A body in view that does not move; may be repeated. It shows cameras that move.",
 )
 @click.option(
     "--skew", metavar="TIME", help="The right camera exposes later by this, such as 5ms, or find (recordings)."

@@ -75,7 +75,7 @@ class RunPlan:
     "--fixed",
     multiple=True,
     metavar="BODY",
-    help="A body in view that does not move; may be repeated. Cameras that move are told by it.",
+    help="A body in view that does not move; may be repeated. It shows cameras that move.",
 )
 @click.option(
     "--arm",

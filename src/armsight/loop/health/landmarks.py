@@ -7,7 +7,7 @@ same for all bodies,
     m = -Ad(T_left_body) xi
 
 A body that still stands where it stood proves that the cameras do; then those that moved are not fixed. Bodies that all
-moved agree on m (chi-square of their differences), or they do not. With a single body the two cannot be told apart.
+moved agree on m (chi-square of their differences), or they do not. With a single body the two look alike.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from armsight.loop.health.record import FALSE_ALARMS_PER_MINUTE, HealthFinding
 #: Poses of a mean.
 _SHOTS = 5
 #: Of the noise of one pose this share of the variance stays in each mean (where a disc lies in its pixels), and of the
-#: calibration's covariance this share differs between two places of a body that hardly moved.
+#: calibration's covariance this share differs between two positions of a body that hardly moved.
 _STAYS, _DIFFERS = 0.1, 2.5e-3
 #: A body that moved by less, m, is not reported.
 _LEAST_M = 1e-4
@@ -147,7 +147,7 @@ class LandmarkWatch:
         what = (
             f"the fixed bodies {names} all moved, each by another motion: which are not fixed, or whether the cameras"
         )
-        return (_finding(max(known, key=lambda each: each.shift_m), f"{what} moved as well, cannot be told apart"),)
+        return (_finding(max(known, key=lambda each: each.shift_m), f"{what} moved as well, cannot be distinguished"),)
 
 
 def _common(marks: Sequence[_Landmark]) -> tuple[Array, Array] | None:
@@ -189,5 +189,5 @@ def _finding(mark: _Landmark, what: str) -> HealthFinding:
     xi, cov, since_s = mark.newest
     along = xi[:3] / max(mark.shift_m, 1e-12)
     sigma_mm = 1e3 * float(np.sqrt(along @ cov[:3, :3] @ along))
-    advice = "fasten what moved, or leave the body out of --fixed; more fixed bodies tell more"
+    advice = "fasten what moved, or leave the body out of --fixed; more fixed bodies say more"
     return HealthFinding("fixed", what, since_s, 1e3 * mark.shift_m, sigma_mm, "mm", advice)
