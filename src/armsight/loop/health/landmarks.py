@@ -55,7 +55,7 @@ class _Landmark:
         assert self.newest is not None
         assert self.T_left_body is not None
         to_left = adjoint(self.T_left_body)
-        return -to_left @ self.newest[0], np.linalg.inv(to_left @ self.newest[1] @ to_left.T)
+        return -to_left @ self.newest[0], np.asarray(np.linalg.inv(to_left @ self.newest[1] @ to_left.T), dtype=float)
 
     @property
     def shift_m(self) -> float:
