@@ -28,6 +28,12 @@ from armsight.errors import InputError
     help="Detections instead of images; bag:FILE for tags in a bag.",
 )
 @click.option(
+    "--fixed",
+    multiple=True,
+    metavar="BODY",
+    help="A body in view that does not move; may be repeated. It shows cameras that move.",
+)
+@click.option(
     "--skew", metavar="TIME", help="The right camera exposes later by this, such as 5ms, or find (recordings)."
 )
 @click.option(
@@ -55,6 +61,7 @@ def command(
     right: str | None,
     source: str | None,
     detections: Path | None,
+    fixed: tuple[str, ...],
     skew: str | None,
     readout: str | None,
     save_rig: Path | None,
@@ -87,6 +94,7 @@ def command(
         right=right,
         source=source,
         detections=detections,
+        fixed=fixed,
         skew=skew,
         readout=readout,
         save_rig=save_rig,

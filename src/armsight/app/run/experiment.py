@@ -268,6 +268,8 @@ def _run(
         if look:
             _require_seen(loop, setup, plan)
         work(loop)
+        for name in loop.health.fixed_never_seen:
+            progress(f"the fixed body {name} was seen too rarely to say anything")
     except (ArmsightError, KeyboardInterrupt) as error:
         outcome.interrupted = isinstance(error, KeyboardInterrupt)
         outcome.ended_by = error if isinstance(error, ArmsightError) else None
