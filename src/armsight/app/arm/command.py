@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from armsight.errors import InputError
-from armsight.files import check_suffix, check_writable
+from armsight.files import check_suffix, check_writable, read_text, write_text
 
 if TYPE_CHECKING:
     from armsight.data import Array
@@ -163,10 +163,13 @@ def urdf(arm_name: str, tool_link: str | None, output: Path) -> None:
     "--output",
     metavar="OUT",
     type=click.Path(path_type=Path),
-    help="Write FILE's arm: .urdf, or .yaml as the maker's driver reads it.",
+    help="Write FILE's arm: .urdf, or .yaml as the maker's driver reads it; one that exists is kept as OUT.old.",
 )
+@click.option("--yes", is_flag=True, help="Do not ask before OUT is replaced.")
 @_JSON
-def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | None, as_json: bool) -> None:
+def calibrated(
+    arm_name: str, tool_link: str | None, file: str, output: Path | None, yes: bool, as_json: bool
+) -> None:
     """Print how far a single arm's calibrated table puts the tool from that of its kind, ARM; convert it.
 
     FILE is the calibration of a Universal Robots arm or of an xArm (.yaml), a corrected.toml of `armsight identify`, or
@@ -185,6 +188,8 @@ def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | N
     yaml = file.lower().endswith((".yaml", ".yml"))
     arm = read_calibration(file, nominal) if yaml else open_arm(file)
     left = (0.0, 0.0)
+    if output is not None and output.exists():
+        _keep(output, yes)
     if output is not None and output.suffix == ".yaml":
         left = write_calibration(arm, nominal, output)
     elif output is not None:
@@ -229,7 +234,6 @@ def plan(arm_name: str, tool_link: str | None, around: Path, poses: int, cycles:
 
     from armsight.app.arm.evaluate import plan_report, seen_angles
     from armsight.app.check.plan import seen_by
-    from armsight.files import write_text
     from armsight.robot.arm_file import open_arm
 
     arm = open_arm(arm_name, tool_link=tool_link)
@@ -275,6 +279,20 @@ def report(run: Path, arm_name: str | None, compare: tuple[Path, ...], output: P
     click.echo(json.dumps(found.to_json()) if as_json else text(found, others))
     if output is not None and not as_json:
         click.echo(f"\nwritten: {output}/report.html, report.pdf, report.json")
+
+
+def _keep(output: Path, yes: bool) -> None:
+    """Keep a file that is to be replaced as OUT.old, after asking.
+
+    Raises:
+        InputError: OUT.old exists, or cannot be written.
+    """
+    old = output.with_name(f"{output.name}.old")
+    if old.exists():
+        raise InputError(f"{old}: exists; what was kept is never written over: move it away")
+    if not yes:
+        click.confirm(f"replace {output}? It is kept as {old}", abort=True, err=True)
+    write_text(old, read_text(output))
 
 
 def _no_options(texts: tuple[str, ...]) -> tuple[str, ...]:

@@ -110,10 +110,17 @@ class RestPoses(Record):
 
     def rows(self, rows: NDArray[np.bool_]) -> RestPoses:
         """Return some of the rests."""
-        parts = (
-            getattr(self, name)[rows] for name in ("t_s", "T_seen", "T_ref", "cov", "q", "q_ref", "approach", "shots")
+        return RestPoses(
+            self.t_s[rows],
+            self.T_seen[rows],
+            self.T_ref[rows],
+            self.cov[rows],
+            self.q[rows],
+            self.q_ref[rows],
+            self.approach[rows],
+            self.shots[rows],
+            self.noise,
         )
-        return RestPoses(*parts, self.noise)
 
     def visits(self) -> tuple[NDArray[np.int64], int]:
         """Return which pose each rest was at (N,), and how many there are."""
@@ -166,24 +173,25 @@ def rests_of(folder: Path, arm: Arm) -> RestPoses:
     noise, rows = noise_of(segments), list[tuple[Any, ...]]()
     for segment in (each for each in segments if each.kind == "rest"):
         end_s, begin_s = float(segment.reference.t_s[-1]), float(segment.reference.t_s[0])
-        shots = np.flatnonzero((seen.t_s > max(end_s - WINDOW_S, begin_s)) & (seen.t_s <= end_s))
+        looked = np.flatnonzero((seen.t_s > max(end_s - WINDOW_S, begin_s)) & (seen.t_s <= end_s))
         read = (track.t_s > end_s - WINDOW_S) & (track.t_s <= end_s)
-        if len(shots) < _SHOTS or not read.any():
+        if len(looked) < _SHOTS or not read.any():
             continue
-        T = mean_pose(seen.Ts_base_tool[shots])
-        R, variance = T[:3, :3], (sigmas[shots] ** 2).mean(axis=0)
+        T = mean_pose(seen.Ts_base_tool[looked])
+        R, variance = T[:3, :3], (sigmas[looked] ** 2).mean(axis=0)
         cov = np.zeros((6, 6))
         for part in (slice(0, 3), slice(3, 6)):
             cov[part, part] = R.T @ np.diag(variance[part]) @ R
         q_ref = track.q_ref[np.flatnonzero(read)[-1]]
-        came = _came(track.q_ref[track.t_s <= begin_s][-_BEFORE:], q_ref)
-        rows.append((end_s, T, arm.forward(q_ref), cov, track.q[read].mean(axis=0), q_ref, came, len(shots)))
+        side = _came(track.q_ref[track.t_s <= begin_s][-_BEFORE:], q_ref)
+        rows.append((end_s, T, arm.forward(q_ref), cov, track.q[read].mean(axis=0), q_ref, side, len(looked)))
     if len(rows) < MIN_RESTS:
         raise InputError(
             f"{folder}: {len(rows)} rests were seen in open loop, {MIN_RESTS} at least are needed: armsight arm plan "
             "writes the motions of such a recording"
         )
-    return RestPoses(*(np.array(part) for part in zip(*rows, strict=True)), noise)
+    t_s, T_seen, T_ref, cov, q, q_ref, came, shots = (np.array(part) for part in zip(*rows, strict=True))
+    return RestPoses(t_s, T_seen, T_ref, cov, q, q_ref, came, shots, noise)
 
 
 def _came(q_ref: Array, q: Array) -> Array:
@@ -487,7 +495,7 @@ def _least_squares(A: Array, y: Array) -> tuple[list[float], list[float]]:
     return x.tolist(), np.sqrt(np.diag(cov)).tolist()
 
 
-def _one_side(rests: RestPoses, which: Array) -> float | None:
+def _one_side(rests: RestPoses, which: NDArray[np.int64]) -> float | None:
     """Return the mean repeatability of poses that were approached from one side three times and more, mm."""
     found = []
     for rows in rests.groups(which, by_side=True):
@@ -498,7 +506,7 @@ def _one_side(rests: RestPoses, which: Array) -> float | None:
     return 1e3 * float(np.mean(found)) if found else None
 
 
-def _both_sides(rests: RestPoses, which: Array) -> tuple[float, float] | None:
+def _both_sides(rests: RestPoses, which: NDArray[np.int64]) -> tuple[float, float] | None:
     """Return mean and largest distance, mm, between a pose approached from one side and from the opposite one."""
     apart = []
     for rows in rests.groups(which, by_side=False):
@@ -550,7 +558,7 @@ def _latencies(folder: Path, arm: Arm) -> list[float | None]:
 
 
 def plan_report(
-    arm: Arm, around: Array, visible: Callable[[Array], Array], *, poses: int, cycles: int, seed: int = 0
+    arm: Arm, around: Array, visible: Callable[[Array], NDArray[np.bool_]], *, poses: int, cycles: int, seed: int = 0
 ) -> str:
     """Return the motions of the recording that a report needs, as a motion file.
 

@@ -106,8 +106,8 @@ def remarks(report: ArmReport) -> list[str]:
     return [
         *lines,
         "Zero: true angle less reading; of the first and the last joint it cannot be told from where base and tool are.",
-        "Backlash: behind the joint's sensor. Sides: reading from above less from below, at the same command. Droop: reading "
-        "less command for a metre of the gravity load's lever.",
+        "Backlash: behind the joint's sensor. Sides: reading from above less from below, at the same command. Droop: "
+        "reading less command for a metre of the gravity load's lever.",
         "A share may be negative where others make up for it; all sum to 100 %.",
         "Drift has no temperature beside it: runs do not record any." if report.drift_mm_per_h else "",
     ]

@@ -317,6 +317,8 @@ def offsets(
     angles = None if further is None else changed.parsed_degrees(further)
     if identified is not None and nominal is not None:
         angles = changed.further_of(open_arm(identified), open_arm(nominal))
+    if name.startswith("ar4:") and ar4_offsets is None:
+        raise InputError(f"{name}: an AR4 keeps no zeros; its driver's joint_offsets file does: --ar4-offsets mk3.yaml")
     if not name.startswith("feetech:") or ar4_offsets is not None:
         _zeros(name, baud, ar4_offsets, angles, restore, keep, yes, as_json)
         return
@@ -347,7 +349,7 @@ def _zeros(
     yes: bool,
     as_json: bool,
 ) -> None:
-    """Print or correct zeros that are angles: of a file of the AR4's driver, or of the potentiometers' tables on our board."""
+    """Print or correct zeros that are angles: of a file of the AR4's driver, or of the potentiometers on our board."""
     import numpy as np
 
     from armsight.app.board import offsets as changed

@@ -118,7 +118,9 @@ def ar4_changes(path: Path, further_rad: Array) -> tuple[str, list[ZeroChange]]:
 
     text = _AR4_LINE.sub(corrected, read_text(path))
     if sorted(each.name for each in changes) != [f"joint_{k}" for k in range(1, len(SENSE) + 1)]:
-        raise InputError(f"{path}: no joint_offsets of ar4_ros_driver: joint_1: to joint_6: are needed, once each, degrees")
+        raise InputError(
+            f"{path}: no joint_offsets of ar4_ros_driver: joint_1: to joint_6: are needed, once each, degrees"
+        )
     return text, changes
 
 

@@ -137,17 +137,28 @@ def _motion_text(demo: Demo, workcell: Workcell) -> str:
     """Return the motions of a demo as a motion file: poses, a line, a circle; another arm's are of the workcell's poses."""
     if demo.model == DEFAULT_ARM:
         return _MOTIONS[demo.quick].read_text(encoding="utf-8")
-    model, poses = workcell.model, workcell.poses
-    rest = "" if workcell.link is not None else f"rest_s = {_REST_S}\n"
+    return motion_text(workcell.model, workcell.poses, quick=demo.quick, slow=workcell.link is None)
+
+
+def motion_text(model: Arm, poses: Array, *, quick: bool, slow: bool) -> str:
+    """Return motions of an arm before the workcell's cameras as a motion file: poses, a line, a circle.
+
+    Args:
+        model: the arm.
+        poses: (5, n) joint angles of the poses, rad.
+        quick: one pose alone.
+        slow: whether its controller takes long to come to rest.
+    """
+    rest = f"rest_s = {_REST_S}\n" if slow else ""
     first, second = (model.forward(q)[:3, 3] for q in poses[:2])
     step = 1e3 * _LINE * (second - first)
     center = 1e3 * (first + np.array([0.0, 0.0, -_RADIUS * model.size_m])) + step
     axis = np.round(np.cross(second - first, [0.0, 0.0, 1.0]) / np.linalg.norm(second - first), 3)
     motions = [
         f'kind = "joints"\nname = "pose {n}"\nq_deg = {np.degrees(q).round(2).tolist()}\n{rest}'
-        for n, q in enumerate(poses[: 1 if demo.quick else len(poses)], start=1)
+        for n, q in enumerate(poses[: 1 if quick else len(poses)], start=1)
     ]
-    if not demo.quick:
+    if not quick:
         motions.append(
             f'kind = "joints"\nname = "line\'s start"\nq_deg = {np.degrees(poses[0]).round(2).tolist()}\n{rest}'
         )
@@ -155,7 +166,7 @@ def _motion_text(demo: Demo, workcell: Workcell) -> str:
         f'kind = "line"\nname = "line"\nby_mm = {step.round(1).tolist()}\n{rest}',
         f'kind = "circle"\nname = "circle"\ncenter_mm = {center.round(1).tolist()}\naxis = {axis.tolist()}\n{rest}',
     ]
-    if not demo.quick:
+    if not quick:
         motions.append(f'kind = "home"\nname = "park"\n{rest}')
     start = f"start_deg = {np.degrees(model.home).round(4).tolist()}\n"
     return start + "".join(f"\n[[motion]]\n{motion}" for motion in motions)

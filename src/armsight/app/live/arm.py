@@ -196,7 +196,12 @@ class ArmStep:
             return
         if self._simulated is not None:
             self.capture.pause()
-            self._board = self._simulated.workcell.board
+            board = self._simulated.workcell.board
+            if not isinstance(board, Board):
+                raise InputError(
+                    f"{board.welcome.board} keeps its own controller; the page moves arms with our firmware"
+                )
+            self._board = board
         elif self.options.board is None:
             raise InputError("no board was named: start with --board serial:/dev/ttyACM0 (docs/howto/board.md)")
         else:

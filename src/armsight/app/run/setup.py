@@ -219,10 +219,10 @@ def planned_for(arm: Arm, board: str) -> Arm:
     """Return an arm whose motions its board of this name follows; in the workcell it stands where the cameras see it."""
     if not board.startswith(EMULATED):
         return slowed(arm, board)
-    from armsight.sim.workcell.controlled import CONTROLLED
+    from armsight.sim.workcell.controlled import CONTROLLED, standing
 
     own = CONTROLLED.get(arm.name)
-    return arm if own is None else slowed(own.stands(arm), own.board)
+    return standing(arm) if own is None else slowed(standing(arm), own.board)
 
 
 @contextlib.contextmanager

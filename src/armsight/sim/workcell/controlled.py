@@ -106,18 +106,11 @@ class Controlled:
 
     Attributes:
         board: how its board's name begins, such as ``feetech:``.
-        home_deg: where it stands before the cameras; its tool looks at them.
-        open: returns the arm and its board, drives on, at home, from the true table, the arm's home, how far it is from
-            nominal, and a seed.
+        open: returns the arm and its board, drives on, at home, from the true table, how far it is from nominal, and a seed.
     """
 
     board: str
-    home_deg: tuple[float, ...]
     open: Callable[[Arm, Imperfections, int], tuple[ControlledArm, MotionBoard]]
-
-    def stands(self, arm: Arm) -> Arm:
-        """Return an arm whose home is where it stands before the cameras."""
-        return replace(arm, home=np.radians(self.home_deg))
 
 
 def _so101(true: Arm, given: Imperfections, seed: int) -> tuple[ControlledArm, MotionBoard]:
@@ -161,6 +154,22 @@ def _ar4(true: Arm, given: Imperfections, seed: int) -> tuple[ControlledArm, Mot
 
 #: Name of an arm's model -> its controller.
 CONTROLLED: Mapping[str, Controlled] = {
-    "so101": Controlled(FEETECH, (0.0, -20.0, 20.0, 0.0, 0.0), _so101),
-    "ar4": Controlled(AR4, (0.0, 10.0, -50.0, 0.0, 40.0, 0.0), _ar4),
+    "so101": Controlled(FEETECH, _so101),
+    "ar4": Controlled(AR4, _ar4),
 }
+_UR = (0.0, -105.0, -108.0, 23.0, 73.0, 80.0)
+#: Name of an arm's model -> joint angles at which it stands before the cameras, degrees: its tool looks at them, away from
+#: its base, and no joint is near a limit or a singularity. Another stands at its own home.
+STANDS: Mapping[str, tuple[float, ...]] = {
+    "so101": (0.0, -20.0, 20.0, 0.0, 0.0),
+    "ar4": (0.0, 10.0, -50.0, 0.0, 40.0, 0.0),
+    "xarm6": (0.0, 20.0, -44.0, -8.0, -72.0, -15.0),
+    "puma560": (0.0, 102.0, 13.0, -38.0, -40.0, -44.0),
+    "irb120": (0.0, 21.0, 36.0, 2.0, -64.0, 105.0),
+    **dict.fromkeys(("ur3", "ur5", "ur10", "ur3e", "ur5e", "ur10e"), _UR),
+}
+
+
+def standing(arm: Arm) -> Arm:
+    """Return an arm whose home is where it stands before the workcell's cameras."""
+    return replace(arm, home=np.radians(STANDS[arm.name])) if arm.name in STANDS else arm

@@ -43,7 +43,7 @@ from armsight.sim.workcell.cameras import (
     open_rig,
     rig_pose,
 )
-from armsight.sim.workcell.controlled import CONTROLLED, Controlled, ControlledArm
+from armsight.sim.workcell.controlled import CONTROLLED, Controlled, ControlledArm, standing
 from armsight.sim.workcell.images import LENS, WorkcellCamera, picture
 from armsight.sim.workcell.motors import chosen, solids
 from armsight.sim.workcell.plant import TICK_S, ArmPlant
@@ -68,7 +68,9 @@ _POSES = (
     ((-0.24, 0.02, 0.15), (-14.0, 4.0, 20.0)),
 )
 _POSES_SHARES = (1.0, 0.75, 0.5, 0.35)  # of the shifts that are tried with another arm, until it reaches all five
-_POSES_SIZE_M = 1.06  # of the arm that these shifts were chosen for; ahead, left and up of the tool are x, y and z there
+_POSES_SIZE_M = (
+    1.06  # of the arm that these shifts were chosen for; ahead, left and up of the tool are x, y and z there
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +155,38 @@ def _ahead(T_base_tool: Array) -> Array:
     level /= np.linalg.norm(level)
     up = np.array([0.0, 0.0, 1.0])
     return np.column_stack([level, np.cross(up, level), up])
+
+
+def workcell_poses(model: Arm, *, default: bool) -> Array:
+    """Return the joint angles (5, n) of five poses before the cameras, rad.
+
+    Args:
+        model: the arm, at whose home the tool looks at the cameras.
+        default: whether it is the arm that the workcell was drawn for; another's shifts follow its size and its reach.
+
+    Raises:
+        InputError: the arm does not reach one.
+    """
+    T_home = model.forward(model.home)
+    if default:
+        return _five(model, T_home, np.eye(3))
+    axes = model.size_m / _POSES_SIZE_M * _ahead(T_home)
+    for share in _POSES_SHARES[:-1]:
+        with contextlib.suppress(InputError):
+            return _five(model, T_home, share * axes)
+    return _five(model, T_home, _POSES_SHARES[-1] * axes)
+
+
+def _five(model: Arm, T_home: Array, axes: Array) -> Array:
+    """Return the joint angles (5, n) of the five poses, their shifts along axes (3, 3), as columns."""
+    found = []
+    for n, (shift, rotation) in enumerate(_POSES, start=1):
+        T = pose(T_home[:3, :3] @ exp_so3(np.radians(rotation)), T_home[:3, 3] + axes @ np.array(shift))
+        solutions = model.inverse(T, near=model.home)
+        if solutions.best is None:
+            raise InputError(f"{model.name} does not reach pose {n} of the workcell: {solutions.reason}")
+        found.append(solutions.best)
+    return np.array(found)
 
 
 def _driven(
@@ -245,10 +279,11 @@ class Workcell:
         (timing, pipeline), amounts = open_cameras(cameras), imperfections(arm)
         built_to = model if model is not None else open_arm(DEFAULT_ARM)
         true_rig = open_rig(rig, timing.image_size_px, baseline_m)
-        own = CONTROLLED.get(built_to.name)
+        own, built_to = CONTROLLED.get(built_to.name), standing(built_to)
+        assumed = None if assumed is None else replace(assumed, home=built_to.home)
         if own is not None:
-            built_to = slowed(own.stands(built_to), own.board)
-            assumed = None if assumed is None else slowed(own.stands(assumed), own.board)
+            built_to = slowed(built_to, own.board)
+            assumed = None if assumed is None else slowed(assumed, own.board)
         if distance_m is None:
             distance_m = DISTANCE_M if own is None else NEAR_M
         psf_sigma_px = LENS.psf_sigma_px if pipeline is None else pipeline.psf_sigma_px
@@ -300,25 +335,7 @@ class Workcell:
         Raises:
             InputError: the arm does not reach one.
         """
-        T_home = self.model.forward(self.model.home)
-        if self._default:
-            return self._five(T_home, np.eye(3))
-        axes = self.model.size_m / _POSES_SIZE_M * _ahead(T_home)
-        for share in _POSES_SHARES[:-1]:
-            with contextlib.suppress(InputError):
-                return self._five(T_home, share * axes)
-        return self._five(T_home, _POSES_SHARES[-1] * axes)
-
-    def _five(self, T_home: Array, axes: Array) -> Array:
-        """Return the joint angles (5, n) of the five poses, their shifts along axes (3, 3), as columns."""
-        found = []
-        for n, (shift, rotation) in enumerate(_POSES, start=1):
-            T = pose(T_home[:3, :3] @ exp_so3(np.radians(rotation)), T_home[:3, 3] + axes @ np.array(shift))
-            solutions = self.model.inverse(T, near=self.model.home)
-            if solutions.best is None:
-                raise InputError(f"{self.model.name} does not reach pose {n} of the workcell: {solutions.reason}")
-            found.append(solutions.best)
-        return np.array(found)
+        return workcell_poses(self.model, default=self._default)
 
     def chessboard_shots(self, count: int) -> Iterator[Shot]:
         """Show a chessboard in many poses, as a person would who calibrates, past the arm; no time passes.

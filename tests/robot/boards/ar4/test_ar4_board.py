@@ -225,3 +225,18 @@ def test_disturbed_readings_are_not_taken_for_angles():
     states = board.receive(4.0)
     assert board.broken_messages > 0
     assert np.degrees(np.ptp(states.q, axis=0)).max() < 10.0  # without a checksum a digit is not found
+
+
+@pytest.mark.parametrize("steps", [-2, -1, 1, 2])
+def test_a_goal_within_the_firmwares_dead_steps_is_reached_from_beyond_it(homed, steps):
+    board, device = homed
+    device.mechanics = Ar4Mechanics((0.0,) * 6, (0.0,) * 6, 0.0)
+    q = follow(board, np.radians([3.0, 10.0, -15.0, 5.0, 20.0, 5.0]), 1.0)
+    begin = device.true_deg
+    step_deg = 1.0 / board.model.steps_per_deg[1]
+    goal = q + np.radians([0.0, steps * step_deg, 0.0, 0.0, 0.0, 0.0])
+    for _ in range(60):
+        board.send(JointCommand(goal, REST, REST, 0.02))
+        board.receive(0.02)
+    assert (device.true_deg - begin)[1] == pytest.approx(steps * step_deg, abs=0.6 * step_deg)
+    np.testing.assert_allclose(np.delete(device.true_deg - begin, 1), 0.0, atol=0.03)

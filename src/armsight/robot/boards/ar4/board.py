@@ -322,7 +322,9 @@ class Ar4Board:
             self._beyond_s = now
         if now < self._beyond_s + _BEYOND_S:
             low, high = self.soft_limits()
-            limits = np.sort([self.model.reported_deg(np.degrees(low)), self.model.reported_deg(np.degrees(high))], axis=0)
+            limits = np.sort(
+                [self.model.reported_deg(np.degrees(low)), self.model.reported_deg(np.degrees(high))], axis=0
+            )
             goal = np.clip(goal + self._beyond, *limits)
         self._link.write(lines.move_to(goal.tolist()))
         self._written_s = now
