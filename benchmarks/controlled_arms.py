@@ -43,6 +43,9 @@ from armsight.sim.workcell.workcell import NEAR_M, workcell_poses  # noqa: E402
 from views import both_pixels  # noqa: E402
 
 CAMERAS, POSES, PRESET = "1280x720@30", 15, "worn"
+#: Errors of the rig, of independent ones of a calibration with 30 pairs: vision is then off by about 0.1 mm, as in rendered
+#: runs, where errors of centre and rotation make up for each other.
+RIG_SHARE = 0.3
 MOUNT = pose(np.diag([-1.0, 1.0, -1.0]), np.array([0.003, -0.004, 0.035]))
 
 
@@ -58,8 +61,8 @@ class LightCell:
         self.timing, self.target = open_cameras(CAMERAS)[0], body_target()
         self.rig = open_rig("parallel", self.timing.image_size_px, 0.2)
         self.T_base_rig = rig_pose(self.model, self.rig, MOUNT, seed, NEAR_M)
-        cov = np.diag(SIGMAS**2)
-        self.given = replace(self.rig.perturbed(SIGMAS * self.rng.normal(size=len(SIGMAS))), cov=cov, sigma_px=0.0)
+        off = RIG_SHARE * SIGMAS
+        self.given = replace(self.rig.perturbed(off * self.rng.normal(size=len(off))), cov=np.diag(off**2), sigma_px=0.0)
         self.points = self.target.body.points + 2e-5 * self.rng.normal(size=self.target.body.points.shape)
         self.next, self.way = int(self.arm.t_s * self.timing.rate_hz) + 1, "followed"
         self.setup = Setup(
@@ -187,7 +190,7 @@ def report(name, seed, poses=20, cycles=4):
     text = plan_report(cell.model, around, lambda Ts: np.ones(len(Ts), bool), poses=poses, cycles=cycles)
     plan = cell.plan(text)
     found = cell.run(plan, close_loop=False)
-    found.kept = []  # there are no images
+    found.kept, found.picture = [], None  # there are no images
     make_room(folder)
     (folder / "motion.toml").write_text(text)
     of_run = {"nominal_arm": name, "board": cell.board.welcome.board}

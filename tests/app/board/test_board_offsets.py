@@ -153,7 +153,7 @@ AR4 = """# measured in May
 joint_1: 170.0
 joint_2: -42.0
 joint_3: -89.0  # new switch
-joint_4: -180
+joint_4: -180.0
 joint_5: -105.0
 joint_6: -180.0
 """

@@ -32,7 +32,7 @@ from armsight.geometry.pose import mean_pose
 from armsight.loop.identify.backlash import joint_backlashes
 from armsight.loop.identify.identify import Identified, identify
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.model import gravity_levers
+from armsight.loop.identify.model import SENSOR, gravity_levers
 from armsight.loop.iso9283.poses import MIN_POSES, repeatability
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
@@ -42,8 +42,9 @@ VERSION = 1
 #: Fewest rests, and shots of one; a joint was elsewhere from this on, rad; commands that are looked at before a rest.
 MIN_RESTS, _SHOTS, _AWAY_RAD, _BEFORE = 12, 2, np.radians(0.3), 20_000
 _SIGMAS = tuple(f"sigma_{name}" for name in ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"))
-#: Delays of the joints that are tried, s, and how much a joint must move in a motion to show its delay, rad.
-_DELAYS_S, _MOVED_RAD = np.arange(0.0, 1.2, 0.002), np.radians(2.0)
+#: Delays of the joints that are tried, s; how much a joint must move in a motion to show its delay, rad; how much of the
+#: rest after it counts, s; and so many motions at most.
+_DELAYS_S, _MOVED_RAD, _AFTER_S, _MOTIONS = np.arange(0.0, 1.2, 0.005), np.radians(2.0), 0.5, 60
 #: Poses that are at most this far apart by their commands, rad, are one pose.
 _SAME_RAD = 1e-6
 #: Kinds of parameters -> the part of the error that they make, and what would take it away.
@@ -54,7 +55,9 @@ _PARTS = {
     "backlash": (("backlash", "gravity_backlash"), "approach from one side, or take the backlash out of the gears"),
     "compliance": (("compliance",), "correct the compliance under gravity (corrected.toml)"),
 }
-CONTROLLER, FRAMES, REST = "controller", "base and tool", "rest"
+CONTROLLER, REST = "controller", "rest"
+#: Harmonics of a sensor beyond the second are left to ``armsight identify``: the recording is too short to choose among them.
+_PRIORS = {"ripple": 0.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +213,7 @@ class JointFigures:
 
     Attributes:
         name: of the joint.
-        zero_deg: true angle less reading, and its sigma; None of the first and the last joint: theirs are base and tool.
+        zero_deg: true angle less reading, mean over the rests, and its sigma; None of the first and the last joint: theirs are base and tool.
         backlash_deg: behind the sensor, stop to stop, and its sigma.
         backlash_how: what showed it, or why it does not show.
         hysteresis_deg: of the reading against the command: from above less from below, mean, and its sigma.
@@ -356,7 +359,7 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
     rests, summary = rests_of(folder, arm), _summary(folder)
     progress("identifying the arm")
     measured = rests.measured()
-    found = identify(arm, measured, progress=progress)
+    found = identify(arm, measured, priors=_PRIORS, progress=progress)
     progress("evaluating")
     kept = rests.rows(found.solution.used)
     notes = [f"{len(found.left_out)} rests were left out as mistakes"] if len(found.left_out) else []
@@ -462,10 +465,7 @@ def _joint(
     """Return the figures of one joint."""
     names, deg = found.model.names, float(np.degrees(1.0))
     free = {n for n, f in zip(names, found.solution.free, strict=True) if f}
-    zero = once = None
-    if f"offset{i + 1}" in free:
-        value, sigma = found.value(f"offset{i + 1}")
-        zero = (deg * (value - float(arm.offset[i])) * float(arm.direction[i]), deg * sigma)
+    zero, once = _zero(arm, i, rests, found), None
     waves = [f"wave{i + 1}_{phase}1" for phase in ("sin", "cos")]
     if any(wave in free for wave in waves):
         both = np.array([found.value(wave) for wave in waves if wave in free])
@@ -481,6 +481,24 @@ def _joint(
     droop = (deg * fitted[-1], deg * sigmas[-1]) if loaded else None
     most = None if droop is None else droop[0] * float(lever[np.argmax(np.abs(lever))])
     return JointFigures(name, zero, play, str(backlash["how"]), hysteresis, droop, most, once, latency)
+
+
+def _zero(arm: Arm, i: int, rests: RestPoses, found: Identified) -> tuple[float, float] | None:
+    """Return by how much a joint really is further than it reads, deg, on the mean over the rests, and its sigma.
+
+    The sensor's curve has a mean over these poses, which hardly differs from another zero: the two count together.
+    """
+    model, solution = found.model, found.solution
+    weight = np.zeros(len(solution.x))
+    if not solution.free[model.names.index(f"offset{i + 1}")]:
+        return None
+    weight[model.names.index(f"offset{i + 1}")] = arm.direction[i]
+    phi = model.feature_values(rests.q, rests.approach).mean(axis=0)
+    for k, feature in enumerate(model.features):
+        if feature.joint == i and feature.kind in SENSOR:
+            weight[model.sources_at + k] = phi[k]
+    value = float(weight @ (solution.x - model.nominal()))
+    return float(np.degrees(value)), float(np.degrees(np.sqrt(weight @ solution.cov @ weight)))
 
 
 #: A joint whose gravity load has a lever below this at all poses carries none, m.
@@ -540,21 +558,33 @@ def _slope(t: Array, y: Array) -> tuple[float, float]:
 
 
 def _latencies(folder: Path, arm: Arm) -> list[float | None]:
-    """Return the delay from command to reading of each joint in the motions, s: the shift that leaves the least."""
+    """Return the delay from command to reading of each joint in the motions, s: the shift that leaves the least.
+
+    Every motion counts with the beginning of its rest, and without its mean: a joint may rest off its command.
+    """
     track = joint_track(folder, arm.joints)
+    ends = np.flatnonzero(np.diff(track.moving.astype(int)))
+    spans = [
+        np.flatnonzero((track.t_s > track.t_s[a]) & (track.t_s < min(track.t_s[b] + _AFTER_S, track.t_s[c])))
+        for a, b, c in zip(ends[::2], ends[1::2], np.append(ends[2::2], len(track.t_s) - 1), strict=False)
+    ]
     found: list[float | None] = []
     for i in range(arm.joints):
-        t, q, ref = track.t_s, track.q[:, i], track.q_ref[:, i]
-        speed = np.abs(np.gradient(ref, t))
-        rows = np.flatnonzero(track.moving & (speed > 0.02))
-        if not len(rows) or np.ptp(ref[rows]) < _MOVED_RAD:
+        moved = [rows for rows in spans if len(rows) and np.ptp(track.q_ref[rows, i]) > _MOVED_RAD]
+        moved = [rows for rows in moved if np.isfinite(_left(track, i, rows, _DELAYS_S[-1]))][:_MOTIONS]
+        if not moved:
             found.append(None)
             continue
-        rows = rows[:: max(1, len(rows) // 4000)]
-        left = [float(np.std(q[rows] - np.interp(t[rows] - delay, t, ref))) for delay in _DELAYS_S]
+        left = [sum(_left(track, i, rows, delay) for rows in moved) for delay in _DELAYS_S]
         best = int(np.argmin(left))
-        found.append(float(_DELAYS_S[best]) if 0 < best < len(_DELAYS_S) - 1 else None)
+        found.append(float(_DELAYS_S[best]) if best < len(_DELAYS_S) - 1 else None)
     return found
+
+
+def _left(track: JointTrack, i: int, rows: NDArray[np.int64], delay_s: float) -> float:
+    """Return what is left of a joint's readings less its delayed commands, less their mean, squares summed."""
+    off = track.q[rows, i] - np.interp(track.t_s[rows] - delay_s, track.t_s, track.q_ref[:, i])
+    return float(((off - off.mean()) ** 2).sum())
 
 
 def plan_report(
