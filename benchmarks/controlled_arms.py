@@ -3,7 +3,7 @@
     python benchmarks/controlled_arms.py so101 0 1 2      light: projected discs with noise instead of rendered images
     python benchmarks/controlled_arms.py ar4 0 1 2
     python benchmarks/controlled_arms.py lost 0 1 2       an AR4 whose joint slips by 1 degree while the loop is closed
-    python benchmarks/controlled_arms.py report ar4 0     a recording of `armsight arm plan`, and what `armsight arm report` finds of
+    python benchmarks/controlled_arms.py report ar4 0     a recording of `arm plan`, and what `arm report` finds of
                                                the injected zeros and backlash
 
 `armsight demo --model so101` is the same with rendered images. Rest errors are of the true tool against its reference, in
@@ -62,7 +62,9 @@ class LightCell:
         self.rig = open_rig("parallel", self.timing.image_size_px, 0.2)
         self.T_base_rig = rig_pose(self.model, self.rig, MOUNT, seed, NEAR_M)
         off = RIG_SHARE * SIGMAS
-        self.given = replace(self.rig.perturbed(off * self.rng.normal(size=len(off))), cov=np.diag(off**2), sigma_px=0.0)
+        self.given = replace(
+            self.rig.perturbed(off * self.rng.normal(size=len(off))), cov=np.diag(off**2), sigma_px=0.0
+        )
         self.points = self.target.body.points + 2e-5 * self.rng.normal(size=self.target.body.points.shape)
         self.next, self.way = int(self.arm.t_s * self.timing.rate_hz) + 1, "followed"
         self.setup = Setup(

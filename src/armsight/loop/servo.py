@@ -36,7 +36,7 @@ RATE_SHARE = 0.1
 #: At rest a joint is taken through its backlash, with this time constant, s, for an error of the tool that lasts and of
 #: which the joint would have to make up so much, m: less is vision's noise.
 CROSS_S, CROSS_M = 0.3, 3e-5
-#: How fast the servo learns by how much joints rest from their commands, s: as the load changes, between one pose and the next.
+#: How fast the servo learns by how much joints rest off their commands, s; that changes with the load from pose to pose.
 DROOP_S = 0.2
 #: In motion the correction comes to what the estimator asks for with this time constant, s, or vision's period if longer:
 #: that is no feedback, as it hardly depends on the correction, but backlash that changes sides with every twitch would
@@ -107,7 +107,7 @@ class JointLoops:
     """Controllers of the joints that armsight cannot tune, and which do not reach what they are commanded.
 
     Attributes:
-        step_rad: a joint does not come nearer to where it is wanted than about half of this.
+        step_rad: a joint does not come nearer to where it should be than about half of this.
         rest_rad_s: a joint at rest is measured slower than this.
     """
 
@@ -258,7 +258,7 @@ class PoseServo:
         return self._joints(aim, behind(here, there)) * min(self.timing.period_s / CROSS_S, 1.0)
 
     def _held(self, aim: Aim, change: Array) -> Array:
-        """Return the change (n,), none where the joints' controllers cannot make it: integrated on, it would make them hunt."""
+        """Return the change (n,), none where the joints' controllers cannot make it: they would hunt."""
         assert self._joint_loops is not None
         requested = np.abs(self._joints(aim, self._lasting)).max()
         return np.zeros_like(change) if requested < 0.5 * self._joint_loops.step_rad else change

@@ -1,4 +1,4 @@
-"""``armsight arm plan`` and ``arm report``: injected zeros, droop and drift are found, parts sum up, bad input is one line."""
+"""``armsight arm plan`` and ``arm report``: injected zeros, droop and drift are found, parts sum up, mistakes are named."""
 
 import json
 
@@ -27,7 +27,7 @@ def everywhere(Ts):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """The folder of a run with the motions that were planned, made of a table that is off, sensors that droop, and noise."""
+    """The folder of a run with the motions that were planned, with zeros that are off, joints that droop, and noise."""
     folder, rng = tmp_path_factory.mktemp("run"), np.random.default_rng(3)
     around = ARM.home + np.vstack([np.zeros(5), rng.uniform(-1.0, 1.0, (12, 5))])
     (folder / "motion.toml").write_text(plan_report(ARM, around, everywhere, poses=9, cycles=6))
@@ -62,7 +62,9 @@ def test_zeros_droop_and_drift_are_found_within_three_sigma(report):
         value, sigma = report.joints[k].zero_deg
         assert abs(value - ZERO_DEG[k]) < 3 * sigma < 0.1
         slope, sigma = report.joints[k].droop_deg_per_m
-        assert abs(slope - DROOP_DEG_PER_M) < 3 * sigma + 1e-3
+        assert (
+            abs(slope - DROOP_DEG_PER_M) < 3 * sigma + 0.01 * DROOP_DEG_PER_M
+        )  # the lever at the reading is a little another
     rate, sigma = report.drift_mm_per_h
     assert abs(rate - DRIFT_MM_PER_H) < 3 * sigma < DRIFT_MM_PER_H
     assert report.cycles >= 6

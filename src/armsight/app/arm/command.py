@@ -167,9 +167,7 @@ def urdf(arm_name: str, tool_link: str | None, output: Path) -> None:
 )
 @click.option("--yes", is_flag=True, help="Do not ask before OUT is replaced.")
 @_JSON
-def calibrated(
-    arm_name: str, tool_link: str | None, file: str, output: Path | None, yes: bool, as_json: bool
-) -> None:
+def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | None, yes: bool, as_json: bool) -> None:
     """Print how far a single arm's calibrated table puts the tool from that of its kind, ARM; convert it.
 
     FILE is the calibration of a Universal Robots arm or of an xArm (.yaml), a corrected.toml of `armsight identify`, or

@@ -56,7 +56,7 @@ _PARTS = {
     "compliance": (("compliance",), "correct the compliance under gravity (corrected.toml)"),
 }
 CONTROLLER, REST = "controller", "rest"
-#: Harmonics of a sensor beyond the second are left to ``armsight identify``: the recording is too short to choose among them.
+#: Harmonics of a sensor beyond the second are left to ``armsight identify``: the recording is too short for them.
 _PRIORS = {"ripple": 0.0}
 
 
@@ -213,13 +213,14 @@ class JointFigures:
 
     Attributes:
         name: of the joint.
-        zero_deg: true angle less reading, mean over the rests, and its sigma; None of the first and the last joint: theirs are base and tool.
+        zero_deg: true angle less reading, mean over the rests, and its sigma; None of the first and the last joint, whose
+            zeros are base and tool.
         backlash_deg: behind the sensor, stop to stop, and its sigma.
         backlash_how: what showed it, or why it does not show.
         hysteresis_deg: of the reading against the command: from above less from below, mean, and its sigma.
         droop_deg_per_m: reading less command for a metre of the gravity load's lever, and its sigma.
         droop_deg: that at the greatest lever of these poses.
-        once_per_turn_deg: amplitude of the sensor's error once per revolution, and its sigma.
+        once_per_revolution_deg: amplitude of the sensor's error once per revolution, and its sigma.
         latency_s: from command to reading in motion.
     """
 
@@ -230,7 +231,7 @@ class JointFigures:
     hysteresis_deg: tuple[float, float] | None
     droop_deg_per_m: tuple[float, float] | None
     droop_deg: float | None
-    once_per_turn_deg: tuple[float, float] | None
+    once_per_revolution_deg: tuple[float, float] | None
     latency_s: float | None
 
 
@@ -470,9 +471,7 @@ def _joint(
     if any(wave in free for wave in waves):
         both = np.array([found.value(wave) for wave in waves if wave in free])
         once = (deg * float(np.linalg.norm(both[:, 0])), deg * float(np.linalg.norm(both[:, 1])))
-    play = (
-        None if not np.isfinite(backlash["value_rad"]) else (deg * backlash["value_rad"], deg * backlash["sigma_rad"])
-    )
+    gap = None if not np.isfinite(backlash["value_rad"]) else (deg * backlash["value_rad"], deg * backlash["sigma_rad"])
     lag, side = rests.q[:, i] - rests.q_ref[:, i], rests.approach[:, i]
     loaded = float(np.abs(lever).max()) > _LEVER_M
     columns = [np.ones(len(lag)), *([side] if side.any() else []), *([lever] if loaded else [])]
@@ -480,7 +479,7 @@ def _joint(
     hysteresis = (-2 * deg * fitted[1], 2 * deg * sigmas[1]) if side.any() else None
     droop = (deg * fitted[-1], deg * sigmas[-1]) if loaded else None
     most = None if droop is None else droop[0] * float(lever[np.argmax(np.abs(lever))])
-    return JointFigures(name, zero, play, str(backlash["how"]), hysteresis, droop, most, once, latency)
+    return JointFigures(name, zero, gap, str(backlash["how"]), hysteresis, droop, most, once, latency)
 
 
 def _zero(arm: Arm, i: int, rests: RestPoses, found: Identified) -> tuple[float, float] | None:

@@ -78,7 +78,7 @@ def tables(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> list[Text
         "sides, deg",
         "droop, deg/m",
         "most, deg",
-        "once per turn, deg",
+        "once per rev., deg",
         "latency, s",
     )
     found.append(TextTable("Joints; sigma after ±", head, tuple(_joint_row(joint) for joint in report.joints)))
@@ -93,7 +93,7 @@ def _joint_row(j: JointFigures) -> tuple[str, ...]:
         _pair(j.hysteresis_deg),
         _pair(j.droop_deg_per_m, 2),
         "–" if j.droop_deg is None else f"{j.droop_deg:.2f}",
-        _pair(j.once_per_turn_deg),
+        _pair(j.once_per_revolution_deg),
         "–" if j.latency_s is None else f"{j.latency_s:.3f}",
     )
 
@@ -105,7 +105,7 @@ def remarks(report: ArmReport) -> list[str]:
     lines += [f"backlash of {j.name}: {j.backlash_how}" for j in report.joints if j.backlash_deg is None]
     return [
         *lines,
-        "Zero: true angle less reading; of the first and the last joint it cannot be told from where base and tool are.",
+        "Zero: true angle less reading; that of the first and of the last joint looks like another base and another tool.",
         "Backlash: behind the joint's sensor. Sides: reading from above less from below, at the same command. Droop: "
         "reading less command for a metre of the gravity load's lever.",
         "A share may be negative where others make up for it; all sum to 100 %.",

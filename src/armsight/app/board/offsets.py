@@ -125,7 +125,7 @@ def ar4_changes(path: Path, further_rad: Array) -> tuple[str, list[ZeroChange]]:
 
 
 def pot_changes(config: Configuration, further_rad: Array) -> list[ZeroChange]:
-    """Turn the potentiometers' tables of a configuration by the angles (6,), rad, by which joints really are further.
+    """Shift the potentiometers' tables of a configuration by the angles (6,), rad, by which joints really are further.
 
     Returns:
         The changes, by the first node of each.

@@ -31,7 +31,7 @@ from armsight.app.messages import UNTRUSTED
     "--model",
     default="six_r",
     show_default=True,
-    help="The arm that is simulated: so101 and ar4 with emulated controllers of their own, or six joints with our firmware.",
+    help="The simulated arm's model: so101 and ar4 with controllers of their own, or six joints with our firmware.",
 )
 @click.option(
     "--cameras",

@@ -201,7 +201,7 @@ def _first_guess_s(arm: Arm, q: Array, path: Path) -> float:
 
 
 def position_first(J: Array, V: Array, inverted: Callable[[Array], Array]) -> tuple[Array, float]:
-    """Return the joints' speeds for a velocity of the tool: its position first, its orientation as far as that leaves it free.
+    """Return the joints' speeds for a velocity of the tool: its position first, then its orientation as far as possible.
 
     For arms of fewer than six joints, which cannot have both: the second level is solved in the null space of the first
     (Nakamura, Hanafusa and Yoshikawa, 1987).

@@ -25,9 +25,9 @@ from armsight.sim.example_rig import example_rig
 from armsight.sim.render.optics import Radiance, noise_start, noise_strip
 from armsight.sim.render.render import Shutter, outline
 from armsight.sim.render.scene import Pattern, PosedBody, plate
+from armsight.sim.workcell.controlled import ControlledArm
 from armsight.sim.workcell.images import ArmSeen, WorkcellCamera
 from armsight.sim.workcell.motors import row_frames
-from armsight.sim.workcell.controlled import ControlledArm
 from armsight.sim.workcell.plant import TICK_S, ArmPlant
 from armsight.sim.workcell.raycast import arm_capsules, capsule_boxes
 from armsight.vision.rig import StereoRig

@@ -106,7 +106,7 @@ class Controlled:
 
     Attributes:
         board: how its board's name begins, such as ``feetech:``.
-        open: returns the arm and its board, drives on, at home, from the true table, how far it is from nominal, and a seed.
+        open: returns arm and board, drives on, at home, from the true table, how far it is from nominal, and a seed.
     """
 
     board: str

@@ -26,8 +26,8 @@ from armsight.sim.render.faces import Exposure, paint_faces, palette
 from armsight.sim.render.optics import Optics, Radiance, Sensor, Window, exposed_window, part_taps, shaded, spread
 from armsight.sim.render.render import OUTLINE, Shutter, corner_rays, outline
 from armsight.sim.render.scene import Pattern, PosedBody
-from armsight.sim.workcell.motors import Solids, row_frames
 from armsight.sim.workcell.controlled import ControlledArm
+from armsight.sim.workcell.motors import Solids, row_frames
 from armsight.sim.workcell.plant import ArmPlant
 from armsight.sim.workcell.raycast import (
     AMBIENT,

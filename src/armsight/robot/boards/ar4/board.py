@@ -47,7 +47,7 @@ MOST_SPEED_RAD_S, LATENCY_S = float(np.radians(20.0)), 0.7
 _BEYOND_S, _BEYOND_AGAIN_S, _STILL_RAD_S = 0.25, 1.0, 0.02
 #: A motor step of the joints with the finest ones, rad.
 STEP_RAD = float(np.radians(1 / 50.0))
-#: A step of 0.1 degree at 30 degrees/s^2 takes 2 sqrt(0.1 / 30) s, and a goal waits for its turn.
+#: A step of 0.1 degree at 30 degrees/s^2 takes 2 sqrt(0.1 / 30) s, and a goal waits until it is sent.
 _RESPONSE_S = 0.15
 #: A goal further from the present position than this is a mistake, not a step of a motion.
 MOST_STEP_RAD = float(np.radians(20.0))
@@ -99,6 +99,7 @@ class Ar4Board:
         self._goal_speed: Array = np.zeros(JOINTS)
         self._written_s = self._beyond_s = -np.inf
         self._beyond = np.zeros(JOINTS)  # degrees beyond a goal from which it is approached
+        self._arrived: Array | None = None  # the goal at which the joints came to rest, degrees of the encoders
 
     @classmethod
     def connect(
@@ -312,20 +313,25 @@ class Ar4Board:
         self._enabled = True
 
     def _write_goal(self) -> None:
-        """Write the goal; one within the steps that the firmware leaves alone is reached from beyond it."""
+        """Write the goal; what the host changes at rest by no more than the dead steps is reached from beyond it.
+
+        A joint that has just arrived is left where it is, up to those steps short: going beyond would take it through its
+        backlash.
+        """
         now, goal = self._now(), self.model.reported_deg(np.degrees(self._goal))
-        off = np.rint((goal - self._reported) * self.model.steps_per_deg)
-        near = (np.abs(off) >= 1) & (np.abs(off) <= DEAD_STEPS)
         still = max(np.abs(self._goal_speed).max(), np.abs(self._speed_rad_s).max()) < _STILL_RAD_S
-        if near.any() and still and now >= self._beyond_s + _BEYOND_AGAIN_S:
-            self._beyond = np.where(near, np.sign(off) * (DEAD_STEPS + 1), 0.0) / self.model.steps_per_deg
-            self._beyond_s = now
+        if not still or self._arrived is None:
+            self._arrived = goal if still else None
+        elif now >= self._beyond_s + _BEYOND_AGAIN_S:
+            off = np.rint((goal - self._reported) * self.model.steps_per_deg)
+            changed = np.abs(goal - self._arrived) * self.model.steps_per_deg >= 0.5
+            near = changed & (np.abs(off) >= 1) & (np.abs(off) <= DEAD_STEPS + 1)
+            if near.any():
+                self._beyond = np.where(near, np.sign(off) * (DEAD_STEPS + 1), 0.0) / self.model.steps_per_deg
+                self._beyond_s = now
         if now < self._beyond_s + _BEYOND_S:
-            low, high = self.soft_limits()
-            limits = np.sort(
-                [self.model.reported_deg(np.degrees(low)), self.model.reported_deg(np.degrees(high))], axis=0
-            )
-            goal = np.clip(goal + self._beyond, *limits)
+            ends = [self.model.reported_deg(np.degrees(end)) for end in self.soft_limits()]
+            goal = np.clip(goal + self._beyond, np.minimum(*ends), np.maximum(*ends))
         self._link.write(lines.move_to(goal.tolist()))
         self._written_s = now
 
