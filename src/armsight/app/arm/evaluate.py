@@ -3,12 +3,13 @@
 :func:`plan_report` writes the motions of the recording. :func:`evaluate_arm` evaluates its rests in open loop: where vision
 saw the tool, what the joints' own sensors read, and what was commanded. The error of a rest, seen less commanded, is split
 
-    error = base and tool + controller + sum of the arm's error sources + rest,
+    error = base and tool + controller + the arm's error sources + rest,
 
 the controller's part being what readings and commands put apart by the nominal table, the sources those that an
-identification (``loop.identify``) selects by poses left out. Each part's share is its inner product with the error over the
-error's square: shares sum to 1, and one that others make up for is negative. What a remedy brings is the RMS error without
-its part. All after base and tool were fitted, as no arm knows where its base is.
+identification (``loop.identify``) selects by poses left out. The parts are taken one after the other, each beyond what
+those before it explain, so that what two could explain is counted once: their shares of the mean square error sum to 1.
+What a remedy leaves is the RMS error where it alone is taken. All after base and tool were fitted, as no arm knows where
+its base is.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ from armsight.loop.iso9283.poses import MIN_POSES, repeatability
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
 
+#: Directions of parameters that differ by less than this share are one.
+_RANK = 1e-3
 #: Version of report.json.
 VERSION = 1
 #: Fewest rests, and shots of one; a joint was elsewhere from this on, rad; commands that are looked at before a rest.
@@ -47,13 +50,17 @@ _SIGMAS = tuple(f"sigma_{name}" for name in ("x_m", "y_m", "z_m", "rx_rad", "ry_
 _DELAYS_S, _MOVED_RAD, _AFTER_S, _MOTIONS = np.arange(0.0, 1.2, 0.005), np.radians(2.0), 0.5, 60
 #: Poses that are at most this far apart by their commands, rad, are one pose.
 _SAME_RAD = 1e-6
-#: Kinds of parameters -> the part of the error that they make, and what would take it away.
+#: Part of the error -> the kinds of parameters that make it, those that its remedy corrects as well, and the remedy.
 _PARTS = {
-    "zeros": (("offset",), "set the zeros of the joints (armsight board offsets, or corrected.toml)"),
-    "lengths and angles": (("d", "a", "alpha", "beta"), "use the identified table (armsight identify)"),
-    "sensors' curves": (("gain", "wave", "ripple"), "correct the sensors' curves (zeros.toml of armsight identify)"),
-    "backlash": (("backlash", "gravity_backlash"), "approach from one side, or take the backlash out of the gears"),
-    "compliance": (("compliance",), "correct the compliance under gravity (corrected.toml)"),
+    "zeros": (("offset",), (), "set the zeros of the joints (armsight board offsets, or corrected.toml)"),
+    "lengths and angles": (("d", "a", "alpha", "beta"), ("offset",), "use the identified table (armsight identify)"),
+    "sensors' curves": (
+        ("gain", "wave", "ripple"),
+        ("offset",),
+        "correct the sensors' curves (zeros.toml of armsight identify)",
+    ),
+    "backlash": (("backlash", "gravity_backlash"), (), "approach from one side, or take the backlash out of the gears"),
+    "compliance": (("compliance",), (), "correct the compliance under gravity (corrected.toml)"),
 }
 CONTROLLER, REST = "controller", "rest"
 #: Harmonics of a sensor beyond the second are left to ``armsight identify``: the recording is too short for them.
@@ -240,9 +247,9 @@ class ErrorPart:
     """A part of the error.
 
     Attributes:
-        share: of the mean square error; all sum to 1.
-        rms_mm: of the part itself.
-        without_mm: RMS error of the arm without it.
+        share: of the mean square error, beyond what the parts before it explain; all sum to 1.
+        rms_mm: of that.
+        without_mm: RMS error that its remedy alone would leave.
         remedy: what would take it away; empty where nothing does.
     """
 
@@ -431,26 +438,36 @@ def _split(arm: Arm, rests: RestPoses, found: Identified, measured: Measured) ->
         return np.asarray(flat - placed @ (placed.T @ flat))
 
     error = free(rests.T_seen[:, :3, 3] - rests.T_ref[:, :3, 3])
-    parts = {
-        CONTROLLER: (
-            free(arm.forward(rests.q)[:, :3, 3] - rests.T_ref[:, :3, 3]),
-            "command what is missing: close the loop",
-        )
-    }
-    for name, (of, remedy) in _PARTS.items():
-        columns = np.isin(kinds, of)
-        parts[name] = (free(J[:, columns] @ (x - found.nominal)[columns]), remedy)
-    parts[REST] = (error - sum(part for part, _ in parts.values()), "")
-    square = float(error @ error)
+    square = max(float(error @ error), 1e-30)
 
     def rms(values: Array) -> float:
         return 1e3 * float(np.sqrt((values**2).sum() / len(rests)))
 
-    shown = {
-        name: ErrorPart(float(part @ error) / max(square, 1e-30), rms(part), rms(error - part), remedy)
-        for name, (part, remedy) in parts.items()
-    }
+    controller = free(arm.forward(rests.q)[:, :3, 3] - rests.T_ref[:, :3, 3])
+    left, basis = error - controller, np.zeros((len(error), 0))
+    share = 1.0 - float(left @ left) / square
+    shown = {CONTROLLER: ErrorPart(share, rms(controller), rms(left), "command what is missing: close the loop")}
+    for name, (of, needs, remedy) in _PARTS.items():
+        columns = J[:, np.isin(kinds, of) & found.solution.free]
+        new = _basis(columns - placed @ (placed.T @ columns), basis)
+        taken, basis = new @ (new.T @ left), np.column_stack([basis, new])
+        left = left - taken
+        columns = J[:, np.isin(kinds, (*of, *needs)) & found.solution.free]
+        alone = _basis(columns - placed @ (placed.T @ columns), np.zeros((len(error), 0)))
+        remedied = error - alone @ (alone.T @ error) if new.size else error
+        shown[name] = ErrorPart(float(taken @ taken) / square, rms(taken), rms(remedied), remedy)
+    shown[REST] = ErrorPart(float(left @ left) / square, rms(left), rms(error), "")
     return np.asarray(error.reshape(-1, 3)), shown
+
+
+def _basis(columns: Array, beyond: Array) -> Array:
+    """Return an orthonormal basis (N, r) of columns (N, k) beyond what a basis (N, m) spans."""
+    sizes = np.linalg.norm(columns, axis=0)
+    columns = columns[:, sizes > 1e-9] / sizes[sizes > 1e-9]
+    for _ in range(2):  # twice is enough against rounding
+        columns = columns - beyond @ (beyond.T @ columns)
+    U, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(U[:, s > _RANK])
 
 
 def _joint(

@@ -54,11 +54,11 @@ def tables(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> list[Text
         )
     ]
     found = [TextTable("What the arm does", ("", report.arm, *others), tuple(rows))]
-    parts = sorted(report.parts.items(), key=lambda item: -item[1].share)
+    parts = report.parts.items()
     found.append(
         TextTable(
             f"What explains the {report.placed_mm:.2f} mm, and what each remedy would leave",
-            ("", "share", "itself, mm", "left without it, mm", "remedy"),
+            ("", "share", "itself, mm", "left by the remedy, mm", "remedy"),
             tuple(
                 (
                     name,
@@ -108,7 +108,7 @@ def remarks(report: ArmReport) -> list[str]:
         "Zero: true angle less reading; that of the first and of the last joint looks like another base and another tool.",
         "Backlash: behind the joint's sensor. Sides: reading from above less from below, at the same command. Droop: "
         "reading less command for a metre of the gravity load's lever.",
-        "A share may be negative where others make up for it; all sum to 100 %.",
+        "Each part of the error is what it explains beyond those above it; beside it stands what its remedy alone leaves.",
         "Drift has no temperature beside it: runs do not record any." if report.drift_mm_per_h else "",
     ]
 
@@ -133,10 +133,10 @@ def _map_figure(report: ArmReport) -> Figure:
 
 
 def _parts_figure(report: ArmReport) -> Figure:
-    """Plot the parts of the error: shares, and what is left without each."""
+    """Plot the parts of the error: shares, and what each remedy would leave."""
     figure = new_figure(3.2)
     left, right = figure.subplots(1, 2)
-    names = sorted(report.parts, key=lambda name: report.parts[name].share)
+    names = list(report.parts)[::-1]
     rows = np.arange(len(names))
     left.barh(rows, [100 * report.parts[name].share for name in names], color=BLUE, height=0.65)
     left.set_yticks(rows, names)
@@ -144,7 +144,7 @@ def _parts_figure(report: ArmReport) -> Figure:
     right.barh(rows, [report.parts[name].without_mm for name in names], color=ORANGE, height=0.65)
     right.axvline(report.placed_mm, color=MUTED, linewidth=1)
     right.set_yticks(rows, [""] * len(rows))
-    right.set_xlabel("RMS error without it, mm (line: as it is)")
+    right.set_xlabel("RMS error with its remedy alone, mm (line: as it is)")
     return figure
 
 
@@ -181,7 +181,7 @@ def _drift_figure(report: ArmReport) -> Figure:
 
 
 _FIGURES: dict[str, tuple[str, Callable[[ArmReport], Figure]]] = {
-    "parts": ("What explains the error, and what it would be without each part.", _parts_figure),
+    "parts": ("What explains the error, and what each remedy alone would leave.", _parts_figure),
     "map": ("The error over the workspace after base and tool were fitted, enlarged.", _map_figure),
     "joints": ("What each joint lacks of its command by its own sensor, against the gravity load.", _joints_figure),
     "drift": ("The pose that came most often.", _drift_figure),
