@@ -279,8 +279,10 @@ class Workcell:
         (timing, pipeline), amounts = open_cameras(cameras), imperfections(arm)
         built_to = model if model is not None else open_arm(DEFAULT_ARM)
         true_rig = open_rig(rig, timing.image_size_px, baseline_m)
-        own, built_to = CONTROLLED.get(built_to.name), standing(built_to)
-        assumed = None if assumed is None else replace(assumed, home=built_to.home)
+        own, nominal_home = CONTROLLED.get(built_to.name), built_to.home
+        built_to = standing(built_to)
+        if assumed is not None and built_to.home is not nominal_home:
+            assumed = replace(assumed, home=built_to.home)
         if own is not None:
             built_to = slowed(built_to, own.board)
             assumed = None if assumed is None else slowed(assumed, own.board)
