@@ -31,6 +31,7 @@ SHAPE = (320, 400)
 
 def discs(columns, rows, radius, staggered):
     """Return the pattern of a grid of dark discs, pitch one unit."""
+
     def pattern(x, y):
         v = np.clip(np.rint(y), 0, rows - 1)  # discs are smaller than half a row: no other row's can cover the point
         first, pitch = (v % 2, 2) if staggered else (0, 1)

@@ -14,6 +14,7 @@ from armsight.app.board.flash import FLASHED, PROGRAMMERS
 from armsight.errors import InputError
 
 if TYPE_CHECKING:
+    from armsight.data import Array
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.contract import MotionBoard
 
@@ -270,6 +271,12 @@ def release(name: str, baud: int | None, as_json: bool) -> None:
 )
 @click.option("--restore", metavar="FILE", type=click.Path(path_type=Path), help="Write back what --keep has kept.")
 @click.option(
+    "--ar4-offsets",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Correct the joint_offsets file of ar4_ros_driver, such as mk3.yaml; no board is opened.",
+)
+@click.option(
     "--keep",
     metavar="FILE",
     type=click.Path(path_type=Path),
@@ -287,14 +294,16 @@ def offsets(
     nominal: str | None,
     further: str | None,
     restore: Path | None,
+    ar4_offsets: Path | None,
     keep: Path,
     yes: bool,
     as_json: bool,
 ) -> None:
-    """Print the homing offsets of a servo bus (register 31), or correct them, after asking.
+    """Print the zeros where an arm keeps them, or correct them, after asking; the old ones are kept in a file first.
 
-    The old offsets are kept in a file first. LeRobot's calibration, where given, gets the same new offsets. The torque must
-    be off (`armsight board release`).
+    feetech:PORT: the homing offsets of the servos (register 31); LeRobot's calibration, where given, gets the same. A board
+    with armsight's firmware: the tables of its potentiometers. --ar4-offsets: a file of ar4_ros_driver. The drives must be
+    off (`armsight board release`).
     """
     import numpy as np
 
@@ -308,8 +317,11 @@ def offsets(
     angles = None if further is None else changed.parsed_degrees(further)
     if identified is not None and nominal is not None:
         angles = changed.further_of(open_arm(identified), open_arm(nominal))
-    if not name.startswith("feetech:"):
-        raise InputError(f"{name} has no homing offsets in its servos; feetech:PORT has")
+    if name.startswith("ar4:") and ar4_offsets is None:
+        raise InputError(f"{name}: an AR4 keeps no zeros; its driver's joint_offsets file does: --ar4-offsets mk3.yaml")
+    if not name.startswith("feetech:") or ar4_offsets is not None:
+        _zeros(name, baud, ar4_offsets, angles, restore, keep, yes, as_json)
+        return
     with _open_any(name, baud, calibration) as board:
         assert isinstance(board, FeetechBoard)
         if restore is not None:
@@ -325,6 +337,58 @@ def offsets(
     click.echo(json.dumps(changed.changes_json(changes, bool(given))) if as_json else changed.changes_text(changes))
     if given:
         click.echo(f"written; the old offsets are in {keep}", err=True)
+
+
+def _zeros(
+    name: str,
+    baud: int | None,
+    file: Path | None,
+    angles: Array | None,
+    restore: Path | None,
+    keep: Path,
+    yes: bool,
+    as_json: bool,
+) -> None:
+    """Print or correct zeros that are angles: of a file of the AR4's driver, or of the potentiometers on our board."""
+    import numpy as np
+
+    from armsight.app.board import offsets as changed
+    from armsight.files import check_outputs, check_writable, read_text, write_text
+    from armsight.robot.boards.board_file import configuration_text, read_configuration
+
+    def asked(changes: list[changed.ZeroChange]) -> None:
+        if not yes:
+            click.echo(changed.zeros_text(changes), err=True)
+            click.confirm("write the new zeros?", abort=True, err=True)
+
+    written = angles is not None or restore is not None
+    none = np.zeros(6) if angles is None else angles
+    if file is not None:
+        check_outputs([keep], [file, restore])
+        check_writable(file)
+        text, changes = changed.ar4_changes(file if restore is None else restore, none)
+        if restore is not None:
+            new = {each.name: each.new_deg for each in changes}
+            changes = [each._replace(new_deg=new[each.name]) for each in changed.ar4_changes(file, none)[1]]
+        if written:
+            asked(changes)
+            changed.keep_old(keep, read_text(file))
+            write_text(file, text)
+    else:
+        with _open(name, baud) as board:
+            before = configuration_text(board.configuration(), board.welcome.board)
+            config = board.configuration() if restore is None else read_configuration(restore)[0]
+            changes = changed.pot_changes(config, none)
+            if restore is not None:
+                old = changed.pot_changes(board.configuration(), none)
+                changes = [a._replace(old_deg=b.old_deg) for a, b in zip(changes, old, strict=True)]
+            if written:
+                asked(changes)
+                changed.keep_old(keep, before)
+                board.store(config)
+    click.echo(json.dumps(changed.zeros_json(changes, written)) if as_json else changed.zeros_text(changes))
+    if written:
+        click.echo(f"written; what was there before is in {keep}", err=True)
 
 
 @command.command()

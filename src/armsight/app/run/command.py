@@ -161,17 +161,16 @@ def command(
     from armsight.app.run.folder import make_room, open_folder
     from armsight.app.run.motion_file import DEFAULT_MOTION
     from armsight.app.run.record import require_pyarrow
-    from armsight.app.run.setup import Devices, open_devices
+    from armsight.app.run.setup import Devices, open_devices, planned_for
     from armsight.app.run.summary import print_summary
     from armsight.robot.arm_file import open_arm
-    from armsight.robot.boards.opening import slowed
     from armsight.vision.follow.follower import follows
     from armsight.vision.markers.targets import open_fixed, open_target
     from armsight.vision.rig import StereoRig
 
     require_matplotlib()
     require_pyarrow()
-    arm = slowed(open_arm(arm_spec), board_spec)
+    arm = planned_for(open_arm(arm_spec), board_spec)
     rig, target = StereoRig.load(rig_path), open_target(target_spec)
     fixed_targets = open_fixed(fixed, target_spec)
     if not follows(target):

@@ -28,7 +28,7 @@ from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, Prior
 from armsight.loop.health import HealthFinding
 from armsight.loop.health.fixed import BaseMotion
-from armsight.loop.servo import LoopTiming, PoseServo
+from armsight.loop.servo import JointLoops, LoopTiming, PoseServo
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.trajectories import Trajectory, point_to_point
@@ -362,7 +362,7 @@ def _passes(
     if not close_loop:
         return
     _to_start(loop, setup, plan)
-    servo = PoseServo(setup.arm, timing(setup, outcome.delay))
+    servo = PoseServo(setup.arm, timing(setup, outcome.delay), joint_loops(setup))
     begin = loop.t_s
     try:
         drive(loop, plan, closed_on(servo, lambda: loop.health.trust, setup.gravity), closed=True, progress=progress)
@@ -383,4 +383,11 @@ def _to_start(loop: Loop, setup: Setup, plan: MotionPlan) -> None:
 
 def timing(setup: Setup, delay: Delay) -> LoopTiming:
     """Return the timing of the loop with the measured delay; the servo's gain follows from it."""
-    return LoopTiming(PERIOD_S, 1.0 / setup.rate_hz, max(delay.delay_s, 0.0) + _OWN_S)
+    latency_s, response_s = max(delay.delay_s, 0.0) + _OWN_S, setup.board.abilities.response_s
+    return LoopTiming(PERIOD_S, 1.0 / setup.rate_hz, latency_s, response_s)
+
+
+def joint_loops(setup: Setup) -> JointLoops | None:
+    """Return what the servo must know of the joints' own controllers; None where they are ours, with an integral."""
+    abilities = setup.board.abilities
+    return JointLoops(abilities.step_rad, abilities.rest_rad_s) if abilities.own_controller else None
