@@ -174,7 +174,7 @@ def lab_configuration() -> Configuration:
         "jerk_rad_s3": 1000.0,
         "gravity_slew_per_s": 5.0,
         "duty_limit": 0.8,
-        "duty_slew_per_s": 50.0,
+        "duty_slew_per_s": 200.0,
         "current_cut_per_a_s": 5.0,
         "following_rad": 0.3,
         "stall_duty": 0.5,
