@@ -184,7 +184,7 @@ static void cascade_tick(core_state *core, const core_inputs *inputs, core_outpu
         }
         const double own = (double)gains->kv_s_per_rad - (double)gains->kd_s_per_rad; /* the motor damps itself by it */
         const double inertia = (double)gains->ka_s2_per_rad;
-        const double bandwidth_rad_s = 0.15 / (double)gains->derivative_filter_s; /* tuning.py's */
+        const double bandwidth_rad_s = 0.25 / (double)gains->derivative_filter_s; /* tuning.py's */
         const double p = 2.0 * bandwidth_rad_s * inertia - own;
         const double rate = (double)outputs->reference_rad_s[i];
         const double asked_rad_s = rate + cascade_share * bandwidth_rad_s *

@@ -46,7 +46,7 @@ from armsight.sim.joints import (  # noqa: E402
     drawn_model,
 )
 
-STIFFNESS_N_M, PERIOD_TICKS = 50.0, 4
+STIFFNESS_N_M, PERIOD_TICKS = 40.0, 4
 #: Arrays of a plant: their names in board_arms.c and here.
 PLANT_ARRAYS = {
     "q": "q",

@@ -152,7 +152,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
 }
 
 #: The simulated arm's motors (:mod:`armsight.sim.joints`), and how stiffly they are driven.
-_LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S = MotorFigures(6.0, 2.4, 0.03, 0.02, 0.2), 12.0, 40.0
+_LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S = MotorFigures(6.0, 2.4, 0.03, 0.02, 0.2), 12.0, 36.0
 
 
 def lab_configuration() -> Configuration:
@@ -174,7 +174,7 @@ def lab_configuration() -> Configuration:
         "jerk_rad_s3": 1000.0,
         "gravity_slew_per_s": 5.0,
         "duty_limit": 0.8,
-        "duty_slew_per_s": 200.0,
+        "duty_slew_per_s": 500.0,
         "current_cut_per_a_s": 5.0,
         "following_rad": 0.3,
         "stall_duty": 0.5,

@@ -20,8 +20,8 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError
 
-#: The integral's pole, and the corner of the speed's filter over the bandwidth: 1 / 0.15.
-_INTEGRAL_SHARE, _FILTER_SHARE = 0.5, 0.15
+#: The integral's pole, and the corner of the speed's filter over the bandwidth: 1 / 0.25.
+_INTEGRAL_SHARE, _FILTER_SHARE = 0.6, 0.25
 #: Dry friction is compensated by a little less than it is, so that it never drives.
 _FRICTION_SHARE = 0.9
 ANTI_WINDUP_PER_S = 20.0
@@ -46,7 +46,7 @@ class MotorFigures:
     dry_n_m: float
 
 
-def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 1.0) -> Array:
+def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 0.8) -> Array:
     """Return the gains of a joint by the rule above.
 
     Args:
