@@ -47,6 +47,7 @@ from armsight.sim.joints import (  # noqa: E402
 )
 
 STIFFNESS_N_M, PERIOD_TICKS = 40.0, 4
+NAMED_TICKS = 200  # from a fault to its final name
 #: Arrays of a plant: their names in board_arms.c and here.
 PLANT_ARRAYS = {
     "q": "q",
@@ -254,14 +255,16 @@ class Table:
 
     def add(self, kind, arm, expected, joint=None, late_ms=None):
         self.cases[kind] += 1
+        if joint is not None and arm.first[0] is not None:
+            self.off[kind].append(abs(arm.plant.link[joint] - float(arm.out[0]["angle_rad"][joint])))
+        if expected and arm.first[0] is not None:
+            arm.tick(NAMED_TICKS)
         fault = arm.first[0]
         self.codes[kind][fault.name if fault else "-"] += 1
         if not expected:
             self.false[kind] += fault is not None
         elif fault is None:
             self.missed[kind] += 1
-        if joint is not None and fault is not None:
-            self.off[kind].append(abs(arm.plant.link[joint] - float(arm.out[0]["angle_rad"][joint])))
         if late_ms is not None:
             self.late_ms[kind].append(late_ms)
         self.fast[kind] = max(self.fast[kind], arm.fastest)

@@ -9,7 +9,7 @@
 #include "setpoint.h"
 
 /* Begin to drive a joint from where it is, at rest, with limits that let it move in but never further out. */
-static void start_joint(joint_state *joint, const joint_config *config)
+static void start_joint(joint_state *joint, const joint_config *config, uint32_t i)
 {
     const float angle_rad = joint->pot.angle_rad;
     const float speed_rad_s = joint->pid.speed_rad_s;
@@ -17,8 +17,9 @@ static void start_joint(joint_state *joint, const joint_config *config)
     joint->pid.speed_rad_s = speed_rad_s; /* the filter runs on: a coasting joint is braked from the first tick */
     setpoint_hold(&joint->setpoint, angle_rad);
     governor_hold(&joint->reference, angle_rad);
-    motor_start(&joint->motor, angle_rad);
+    motor_start(&joint->motor, angle_rad, i);
     joint->released = 0u;
+    joint->suspect = FAULT_NONE;
     pot_watch(&joint->pot, angle_rad);
     joint->low_rad = angle_rad < config->soft_min_rad ? angle_rad : config->soft_min_rad;
     joint->high_rad = angle_rad > config->soft_max_rad ? angle_rad : config->soft_max_rad;
@@ -49,7 +50,7 @@ static uint32_t enable(core_state *core, bool inward)
     }
     for (uint32_t i = 0u; i < JOINTS; i++) {
         if (!held || core->joint[i].released != 0u) { /* what is held stays where it is held */
-            start_joint(&core->joint[i], &core->config.joint[i]);
+            start_joint(&core->joint[i], &core->config.joint[i], i);
         }
     }
     core->state = STATE_ENABLED;

@@ -133,6 +133,8 @@ static void control(joint_state *joint, const joint_config *config, float nomina
     const pid_demand demand = {.reference_rad = joint->reference.position_rad,
                                .reference_rad_s = joint->reference.speed_rad_s,
                                .reference_rad_s2 = joint->reference.acceleration_rad_s2,
+                               .damped_rad_s = motor_witness(&joint->motor, &config->motor, joint->pid.speed_rad_s,
+                                                             config->speed_limit_rad_s),
                                .spring_limit = spring_limit(config, nominal_v),
                                .gravity_duty = joint->gravity_duty,
                                .duty_limit = config->duty_limit,
@@ -158,8 +160,8 @@ static void drive(core_state *core, const core_inputs *inputs)
         const float current_a = joint_current(core, inputs, i);
         if (joint->released == 0u) {
             control(joint, &core->config.joint[i], nominal_v, current_a);
-            safety_watch_joint(core, i, inputs->counts[i], supply_v, current_a);
         }
+        safety_watch_joint(core, i, inputs->counts[i], supply_v, current_a);
         if (!number_finite(joint->pid.duty) || !number_finite(joint->pid.integral_duty)) {
             safety_raise(core, FAULT_ARITHMETIC, i);
         }
@@ -253,8 +255,7 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
             motor_pause(&core->joint[i].motor, core->joint[i].pot.angle_rad);
         } else if (safety_drives_on(core)) {
             motor_measure(&core->joint[i].motor, &core->config.joint[i].motor, (float)inputs->supply_mv * 0.001f,
-                          current_a, core->joint[i].pot.angle_rad,
-                          core->joint[i].reference.position_rad);
+                          current_a, core->joint[i].pot.angle_rad);
         }
     }
     safety_watch_arm(core, inputs);

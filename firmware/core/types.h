@@ -269,6 +269,7 @@ typedef struct pid_demand {
     float reference_rad;
     float reference_rad_s;
     float reference_rad_s2;
+    float damped_rad_s;    /* the speed that is damped: the measured one, or the motor's where the reading is wrong */
     float spring_limit;    /* largest duty of kp and kv together: what moves a free joint at its speed limit */
     float gravity_duty;
     float duty_limit;      /* 0 to 1 */
@@ -295,12 +296,13 @@ typedef struct governor_state {
     float acceleration_rad_s2;
 } governor_state;
 
-#define MOTOR_SAMPLES 32u /* of a joint's last 128 ms */
+#define MOTOR_SAMPLES 32u /* of a joint's last 256 ms */
 
 /* What is remembered of one motor, watched by its own voltage and current. */
 typedef struct motor_state {
     float duty;              /* put out in the last tick, direction of the joint */
     float speed_rad_s;       /* by the back-EMF */
+    float unsure_rad_s;      /* how far that may be off */
     float travel_rad;        /* since the joint was enabled */
     float gap_rad;           /* travel of the reading less that of the motor; fades */
     float band_rad;          /* how much of it the motor's uncertain numbers explain; fades */
@@ -317,7 +319,6 @@ typedef struct motor_state {
     uint32_t sampled;        /* samples taken */
     float sample_read_rad[MOTOR_SAMPLES];
     float sample_motor_rad[MOTOR_SAMPLES];
-    float sample_reference_rad[MOTOR_SAMPLES];
     float agreed_rad;        /* the motor's way on which the reading went along */
     int32_t swing_side;      /* which side of the reference's speed the motor's was on last */
     uint32_t swing_ticks;    /* since it changed */
@@ -325,6 +326,7 @@ typedef struct motor_state {
     uint32_t fast_ticks;     /* faster than the limit, in a row */
     uint32_t current_ticks;  /* beyond twice the current limit, in a row */
     uint32_t driven_ticks;   /* since the windings were closed */
+    uint32_t phase;          /* when it is sampled */
 } motor_state;
 
 /* What is remembered of one potentiometer. */
@@ -346,6 +348,8 @@ typedef struct joint_state {
     pot_state pot;
     motor_state motor;
     uint32_t released;       /* not 0: a fault took it out of the drive, its windings are shorted */
+    uint32_t suspect;        /* the fault by which motor and reading disagreed, until it has its name */
+    uint32_t suspect_ticks;  /* since then */
     float gravity_duty;      /* in use; it follows gravity_asked */
     float gravity_asked;
     float stop_rad_s2;       /* deceleration on the way to a stop along the path */
