@@ -74,6 +74,8 @@ static void sense(arm_loop *arm)
     }
 }
 
+static double link_rad_s[JOINTS];
+
 static void step(arm_loop *arm)
 {
     const double *model = arm->model;
@@ -104,8 +106,9 @@ static void step(arm_loop *arm)
         }
         before = arm->qdd[i];
         arm->qdd[i] = (arm->qd[i] - start) / TICK;
-        const double half = 0.5 * model[6u * JOINTS + i];
+        const double half = 0.5 * model[6u * JOINTS + i], link = arm->link[i];
         arm->link[i] = fmin(fmax(arm->link[i], arm->q[i] - half), arm->q[i] + half);
+        link_rad_s[i] = (arm->link[i] - link) / TICK;
         arm->current_a[i] = awake ? (duty * supply_v - constant * arm->qd[i]) / model[i] : 0.0;
     }
 }
@@ -126,7 +129,7 @@ uint32_t arm_run(arm_loop *arm, uint32_t ticks)
         step(arm);
         if (arm->outputs->state == STATE_ENABLED) {
             for (uint32_t i = 0u; i < JOINTS; i++) {
-                arm->fastest_rad_s = fmax(arm->fastest_rad_s, fabs(arm->qd[i]));
+                arm->fastest_rad_s = fmax(arm->fastest_rad_s, fabs(link_rad_s[i]));
                 arm->apart_rad = fmax(arm->apart_rad, fabs(arm->link[i] - (double)arm->outputs->reference_rad[i]));
             }
         }

@@ -130,6 +130,12 @@ static void control(joint_state *joint, const joint_config *config, float nomina
         number_clamp(joint->gravity_asked - joint->gravity_duty, -gravity_step, gravity_step);
     joint->duty_cap =
         number_clamp(joint->duty_cap - config->current_cut_per_a_s * over_a * TICK_S, 0.0f, config->duty_limit);
+    float duty_cap = joint->duty_cap;
+    const float free_duty = config->speed_limit_rad_s * config->motor.constant_v_s / nominal_v;
+    if (motor_races(&joint->motor, config->speed_limit_rad_s) && duty_cap > free_duty) {
+        duty_cap = free_duty; /* it drives a free motor at its limit, and brakes a faster one */
+        joint->limited |= LIMITED_SPEED;
+    }
     const pid_demand demand = {.reference_rad = joint->reference.position_rad,
                                .reference_rad_s = joint->reference.speed_rad_s,
                                .reference_rad_s2 = joint->reference.acceleration_rad_s2,
@@ -138,7 +144,7 @@ static void control(joint_state *joint, const joint_config *config, float nomina
                                .spring_limit = spring_limit(config, nominal_v),
                                .gravity_duty = joint->gravity_duty,
                                .duty_limit = config->duty_limit,
-                               .duty_cap = joint->duty_cap,
+                               .duty_cap = duty_cap,
                                .duty_slew_per_s = config->duty_slew_per_s};
     (void)pid_step(&joint->pid, &config->gains, &demand, &joint->limited);
 }

@@ -15,6 +15,7 @@
 #define SAMPLE_TICKS 8u
 #define AGREED 3.0f           /* of apart_rad: so much way together proves that the wiring was right */
 #define UNKNOWN_RAD_S 1000.0f
+#define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
 #define WITNESS 0.1f          /* of the speed limit: so much faster than the reading it must be to be believed */
 #define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
 
@@ -120,10 +121,17 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     motor->band_rad = keep * motor->band_rad +
                       (motor->unsure_rad_s < UNKNOWN_RAD_S ? motor->unsure_rad_s * TICK_S : 0.0f);
     motor->travel_rad += motor->speed_rad_s * TICK_S;
+    const float seen_a = number_size(current_a);
+    motor->current_a = seen_a > keep * motor->current_a ? seen_a : keep * motor->current_a;
     if ((motor->driven_ticks + motor->phase) % SAMPLE_TICKS == 0u || motor->unsure_rad_s == UNKNOWN_RAD_S) {
         sample(motor, config, ir_v, emf_v, angle_rad);
     }
     window(motor, config, voltage_v, ir_v, angle_rad);
+}
+
+bool motor_races(const motor_state *motor, float speed_limit_rad_s)
+{
+    return number_size(motor->speed_rad_s) - motor->unsure_rad_s > speed_limit_rad_s;
 }
 
 float motor_witness(const motor_state *motor, const motor_config *config, float reading_rad_s, float speed_limit_rad_s)
@@ -133,13 +141,13 @@ float motor_witness(const motor_state *motor, const motor_config *config, float 
     return known && sure_rad_s > number_size(reading_rad_s) ? motor->speed_rad_s : reading_rad_s;
 }
 
-uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v, float current_a)
+uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v)
 {
     if (config->resistance_ohm <= 0.0f || number_size(motor->gap_rad) <= config->apart_rad + motor->band_rad) {
         return FAULT_NONE;
     }
     const float across_v = number_size(motor->duty) * supply_v;
-    if (number_size(current_a) * config->resistance_ohm < 0.02f * across_v) {
+    if (motor->current_a * config->resistance_ohm < DEAD_SHARE * across_v) {
         return FAULT_CURRENT_SENSOR;
     }
     /* What it looks like so far, by the last 32 ms. */
@@ -224,14 +232,14 @@ uint32_t motor_names(const motor_state *motor, const motor_config *config, uint3
     const float by_share = left_of(s.yy, s.my, s.mm, &share) + noise;
     const float by_drift = left_of(s.zz, s.zk, s.kk, &drift) + noise;
     const float least = by_share < by_drift ? by_share : by_drift;
+    if (by_share < by_drift && share < -0.3f) {
+        return FAULT_POT_INVERTED;
+    }
     if (left_by_lag(&s, &rate) + noise < LAG_SHARE * least && rate > 0.0f) {
         return FAULT_POT_LAG;
     }
     if (by_drift < by_share) {
         return number_size(drift) * (float)count > 4.0f * NAME_NOISE_RAD ? FAULT_POT_DRIFT : suspect;
-    }
-    if (share < -0.3f) {
-        return FAULT_POT_INVERTED;
     }
     if (share < 0.15f) {
         return FAULT_POT_FROZEN;

@@ -20,9 +20,12 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
 /* Return the joint's speed: the reading's, or the motor's where that is faster beyond all its uncertainty. */
 float motor_witness(const motor_state *motor, const motor_config *config, float reading_rad_s, float speed_limit_rad_s);
 
+/* Return whether the motor is surely faster than the joint's limit. */
+bool motor_races(const motor_state *motor, float speed_limit_rad_s);
+
 /* Return the fault by which motor and reading are apart further than noise, backlash and the motor's uncertain numbers
  * explain, as it looks at first; FAULT_NONE where they are not. */
-uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v, float current_a);
+uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v);
 
 /* Return the fault by what motor and reading did in the last 192 ms; suspect where that does not show it. A motor that was
  * let go of changes its speed by itself: only then a reading that drifts can be distinguished from one that slips. */

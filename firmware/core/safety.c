@@ -223,7 +223,7 @@ static void watch_motor(core_state *core, uint32_t joint, float supply_v, float 
 {
     const joint_config *config = &core->config.joint[joint];
     joint_state *state = &core->joint[joint];
-    const uint32_t fault = motor_disagrees(&state->motor, &config->motor, supply_v, current_a);
+    const uint32_t fault = motor_disagrees(&state->motor, &config->motor, supply_v);
     if (fault != FAULT_NONE) {
         safety_raise(core, fault, joint);
         state->suspect = fault == FAULT_CURRENT_SENSOR ? FAULT_NONE : fault;

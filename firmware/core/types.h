@@ -304,6 +304,7 @@ typedef struct motor_state {
     float speed_rad_s;       /* by the back-EMF */
     float unsure_rad_s;      /* how far that may be off */
     float travel_rad;        /* since the joint was enabled */
+    float current_a;         /* the largest of late */
     float gap_rad;           /* travel of the reading less that of the motor; fades */
     float band_rad;          /* how much of it the motor's uncertain numbers explain; fades */
     float last_rad;          /* the reading of the last tick */
