@@ -68,8 +68,7 @@ static bool advance(joint_state *joint, const joint_config *config, bool slowing
         path_rad_s2 = (joint->setpoint.speed_rad_s - before_rad_s) / TICK_S;
         joint->held_back = 0u;
     } else {
-        setpoint_advance(&joint->setpoint);
-        path_rad_s2 = setpoint_acceleration(&joint->setpoint);
+        path_rad_s2 = setpoint_advance(&joint->setpoint);
         joint->limited |= joint->held_back;
     }
     if (setpoint_clamp(&joint->setpoint, joint->low_rad, joint->high_rad)) {
@@ -174,15 +173,16 @@ static void drive(core_state *core, const core_inputs *inputs)
     }
 }
 
-/* Return what a joint's duty is to be on the present supply: gains are those of the nominal one. */
-static float duty_out(const core_state *core, const joint_state *joint, uint32_t supply_mv)
+/* Put out the joints' duties, for the present supply: gains are those of the nominal one. */
+static void put_out(core_state *core, uint32_t supply_mv)
 {
-    if (!safety_drives_on(core) || joint->released != 0u) {
-        return 0.0f;
-    }
     const uint32_t least_mv = core->config.supply_nominal_mv / 2u; /* a sensor of the supply may fail too */
     const float scale = (float)core->config.supply_nominal_mv / (float)(supply_mv > least_mv ? supply_mv : least_mv);
-    return number_clamp(joint->pid.duty * scale, -1.0f, 1.0f);
+    const bool on = safety_drives_on(core);
+    for (uint32_t i = 0u; i < JOINTS; i++) {
+        joint_state *joint = &core->joint[i];
+        joint->motor.duty = on && joint->released == 0u ? number_clamp(joint->pid.duty * scale, -1.0f, 1.0f) : 0.0f;
+    }
 }
 
 /* Let the references rest where the joints are, so that nothing is left of the last motion. */
@@ -280,8 +280,6 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
     } else {
         rest(core);
     }
-    for (uint32_t i = 0u; i < JOINTS; i++) {
-        core->joint[i].motor.duty = duty_out(core, &core->joint[i], inputs->supply_mv);
-    }
+    put_out(core, inputs->supply_mv);
     report(core, outputs);
 }
