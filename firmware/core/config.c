@@ -58,6 +58,7 @@ void config_factory(core_config *config)
     for (uint32_t joint = 0u; joint < JOINTS; joint++) {
         config->joint[joint] = factory_joint;
     }
+    config->joint_count = JOINTS;
     config->supply_min_mv = 10000u;
     config->supply_max_mv = 14000u;
     config->supply_nominal_mv = 12000u;
@@ -131,7 +132,10 @@ static bool ticks_within(uint32_t ticks, uint32_t least, uint32_t most) { return
 
 bool config_is_valid(const core_config *config)
 {
-    for (uint32_t joint = 0u; joint < JOINTS; joint++) {
+    if (config->joint_count < 1u || config->joint_count > JOINTS) {
+        return false;
+    }
+    for (uint32_t joint = 0u; joint < config->joint_count; joint++) {
         if (!joint_is_valid(&config->joint[joint])) {
             return false;
         }

@@ -101,7 +101,7 @@ static void advance_arm(core_state *core)
     }
     const bool slowing = core->state == STATE_STOPPING;
     bool resting = true;
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         const bool joint_rests = advance(&core->joint[i], &core->config.joint[i], slowing);
         resting = resting && joint_rests;
     }
@@ -160,7 +160,7 @@ static void drive(core_state *core, const core_inputs *inputs)
     const float supply_v = (float)inputs->supply_mv * 0.001f;
     const float nominal_v = (float)core->config.supply_nominal_mv * 0.001f;
     advance_arm(core);
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         joint_state *joint = &core->joint[i];
         const float current_a = joint_current(core, inputs, i);
         if (joint->released == 0u) {
@@ -179,7 +179,7 @@ static void put_out(core_state *core, uint32_t supply_mv)
     const uint32_t least_mv = core->config.supply_nominal_mv / 2u; /* a sensor of the supply may fail too */
     const float scale = (float)core->config.supply_nominal_mv / (float)(supply_mv > least_mv ? supply_mv : least_mv);
     const bool on = safety_drives_on(core);
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         joint_state *joint = &core->joint[i];
         joint->motor.duty = on && joint->released == 0u ? number_clamp(joint->pid.duty * scale, -1.0f, 1.0f) : 0.0f;
     }
@@ -188,7 +188,7 @@ static void put_out(core_state *core, uint32_t supply_mv)
 /* Let the references rest where the joints are, so that nothing is left of the last motion. */
 static void rest(core_state *core)
 {
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         joint_state *joint = &core->joint[i];
         setpoint_hold(&joint->setpoint, joint->pot.angle_rad);
         governor_hold(&joint->reference, joint->pot.angle_rad);
@@ -233,7 +233,7 @@ static void report(const core_state *core, core_outputs *outputs)
     outputs->rejected_sequence = core->rejected_sequence;
     outputs->rejected_count = core->rejected_count;
     outputs->rejection = core->rejection;
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < JOINTS; i++) { /* of joints that are not there all is 0 */
         const joint_state *joint = &core->joint[i];
         outputs->joint_faults[i] = core->joint_faults[i];
         outputs->limited[i] = joint->limited;
@@ -252,14 +252,15 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
         return;
     }
     core->standing = 0u;
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    const bool driven = safety_drives_on(core);
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         core->joint[i].limited = 0u;
         measure(core, i, inputs->counts[i]);
         const float current_a = joint_current(core, inputs, i);
         const bool chopped = number_size(current_a) * 1000.0f > (float)core->config.joint[i].current_limit_ma;
         if (chopped) { /* a driver that limits the current does not put the duty out */
             motor_pause(&core->joint[i].motor, core->joint[i].pot.angle_rad);
-        } else if (safety_drives_on(core)) {
+        } else if (driven) {
             motor_measure(&core->joint[i].motor, &core->config.joint[i].motor, (float)inputs->supply_mv * 0.001f,
                           current_a, core->joint[i].pot.angle_rad);
         }

@@ -44,12 +44,12 @@ bool safety_drives_on(const core_state *core)
 static void stop_along_path(core_state *core)
 {
     float longest_s = TICK_S;
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         const float takes_s =
             number_size(core->joint[i].reference.speed_rad_s) / core->config.joint[i].deceleration_rad_s2;
         longest_s = takes_s > longest_s ? takes_s : longest_s;
     }
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         joint_state *joint = &core->joint[i];
         joint->stop_rad_s2 = number_size(joint->reference.speed_rad_s) / longest_s;
         setpoint_hold(&joint->setpoint, joint->reference.position_rad);

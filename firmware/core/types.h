@@ -176,7 +176,8 @@ typedef struct joint_config {
 
 /* The configuration of the arm. Times are in ticks of 1 ms. */
 typedef struct core_config {
-    joint_config joint[JOINTS];
+    joint_config joint[JOINTS]; /* the first joint_count are used, the others are not looked at */
+    uint32_t joint_count;       /* 1 to JOINTS */
     uint32_t supply_min_mv;
     uint32_t supply_max_mv;
     uint32_t supply_nominal_mv; /* duties and gains are those at this supply; 1000 to 100000 */
@@ -269,12 +270,12 @@ typedef struct pid_demand {
     float reference_rad;
     float reference_rad_s;
     float reference_rad_s2;
-    float damped_rad_s;    /* the speed that is damped: the measured one, or the motor's where the reading is wrong */
     float spring_limit;    /* largest duty of kp and kv together: what moves a free joint at its speed limit */
     float gravity_duty;
     float duty_limit;      /* 0 to 1 */
     float duty_cap;        /* 0 to duty_limit: what the current limit leaves */
     float duty_slew_per_s;
+    float damped_rad_s;    /* the speed that is damped: the measured one, or the motor's where the reading is wrong */
 } pid_demand;
 
 /* The reference of one joint: a cubic from one point to the next, then straight on. */

@@ -108,6 +108,41 @@ def test_a_reading_that_drifts_at_rest_is_noticed(arms, library, size):
         assert arm.first[1] == 1
 
 
+def test_a_drift_is_distinguished_from_a_slip_once_the_joint_was_let_go_of(arms, library):
+    for seed, kind, size, code in (
+        (941, PotFault.DRIFT, 0.5, Fault.POT_DRIFT),
+        (942, PotFault.DRIFT, -0.5, Fault.POT_DRIFT),
+        (943, PotFault.SLIP, 0.4, Fault.POT_SLIP),
+    ):
+        arm = swinging(arms, library, seed)
+        joint = int(np.argmax(np.abs(arm.plant.qd)))
+        arm.plant.break_pot(joint, kind, size)
+        arm.swing(2000)
+        at_first = arm.first
+        arm.tick(arms.NAMED_TICKS)
+        assert (at_first[1], arm.first) == (joint, (code, joint))
+        assert arm.out[0]["joint_faults"][joint] == arm.out[0]["faults"] == 1 << code
+
+
+def test_the_arm_that_runs_in_c_is_the_plant_of_sim(arms, library):
+    arm, twin = (arms.Arm(library, 950) for _ in range(2))
+    for each in (arm, twin):
+        each.plant.break_pot(1, PotFault.LAG, 0.05)
+        each.plant.break_pot(2, PotFault.SLIP, 0.1)
+        each.plant.hand_n_m[3] = 1.5
+        each.tick(5)
+        each.command(arms.c.COMMAND_ENABLE)
+    for _ in range(300):
+        sensed, out = twin.plant.sense(), twin.out[0]
+        twin.inputs.tick += 1
+        twin.inputs.counts[:], twin.inputs.current_ma[:] = sensed.counts.tolist(), sensed.current_ma.tolist()
+        library.core_tick(twin.loop.core, twin.loop.inputs, twin.loop.outputs)
+        twin.plant.step(out["duty"], bool(out["drives_on"] or out["windings_shorted"]), not out["brakes_open"])
+    arm.tick(300)
+    assert arm.plant.q.tobytes() == twin.plant.q.tobytes()
+    assert bytes(arm.outputs) == bytes(twin.outputs)
+
+
 def test_gains_that_make_a_joint_swing_are_noticed(arms, library):
     arm = arms.Arm(library, 930)
     for joint in arm.core.config.joint:

@@ -24,7 +24,7 @@ from armsight.robot.boards.tuning import MotorFigures, tuned_gains
 Configuration = NDArray[np.void]
 JOINTS, POT_NODES = 6, 9
 #: Layout of the configuration this armsight knows: ``firmware/core/config.h``.
-CONFIG_VERSION = 2
+CONFIG_VERSION = 3
 
 GAINS = np.dtype(
     [
@@ -77,6 +77,7 @@ JOINT = np.dtype(
 CONFIG = np.dtype(
     [
         ("joint", JOINT, JOINTS),
+        ("joint_count", "<u4"),
         ("supply_min_mv", "<u4"),
         ("supply_max_mv", "<u4"),
         ("supply_nominal_mv", "<u4"),
@@ -130,6 +131,7 @@ _JOINT_RANGES = {
     "stall_rad": (1e-4, 1.0),
 }
 _ARM_RANGES = {
+    "joint_count": (1, JOINTS),
     "supply_nominal_mv": (1000, 100000),
     "supply_ticks": (1, 1000),
     "pot_ticks": (1, 100),
@@ -184,6 +186,7 @@ def lab_configuration() -> Configuration:
     }
     for name, value in values.items():
         joint[name] = value
+    config["joint_count"] = JOINTS
     config["supply_min_mv"], config["supply_max_mv"], config["supply_ticks"] = 10000, 14000, 5
     config["supply_nominal_mv"], config["overload_ticks"] = round(1e3 * _LAB_SUPPLY_V), 200
     config["pot_ticks"], config["following_ticks"], config["stall_ticks"] = 5, 20, 200
@@ -197,8 +200,9 @@ def gains_array(config: Configuration) -> Array:
     return np.stack([gains[name].astype(float) for name in GAIN_RANGES], axis=1)
 
 
-def check_gains(gains: Array) -> Array:
-    """Return a gain set as an array (6, 8), a row per joint; an error names the gain and the joint.
+def check_gains(gains: Array, count: int = JOINTS) -> Array:
+    """Return a gain set as an array (6, 8), a row per joint, of which the first ``count`` are checked; an error names the gain and
+    the joint.
 
     Raises:
         InputError: the shape, a number that is not finite, or one outside its range.
@@ -209,7 +213,7 @@ def check_gains(gains: Array) -> Array:
             f"gains are of shape {values.shape}; (6, 8) is needed: a row per joint of {', '.join(GAIN_RANGES)}"
         )
     for column, (name, (low, high)) in enumerate(GAIN_RANGES.items()):
-        for joint in range(JOINTS):
+        for joint in range(count):
             if not low <= values[joint, column] <= high:
                 raise InputError(
                     f"joint {joint + 1}: {name} is {values[joint, column]:g}; {low:g} to {high:g} is allowed;"
@@ -231,13 +235,13 @@ def check_configuration(config: Configuration) -> None:
 
 
 def _problems(config: Configuration) -> Iterator[str]:
-    joints = config["joint"]
-    check_gains(gains_array(config))
-    for j in range(JOINTS):
+    yield from _outside(config, _ARM_RANGES)
+    joints, count = config["joint"], min(int(config["joint_count"]), JOINTS)
+    check_gains(gains_array(config), count)
+    for j in range(count):
         for values, ranges in _ranged(joints[j]):
             yield from (f"joint {j + 1}: {text}" for text in _outside(values, ranges))
         yield from (f"joint {j + 1}: {text}" for text in _joint_problems(joints[j]))
-    yield from _outside(config, _ARM_RANGES)
     if config["supply_min_mv"] >= config["supply_max_mv"]:
         yield "supply_min_mv must be below supply_max_mv"
     if config["silence_reaction"] not in tuple(Reaction):
