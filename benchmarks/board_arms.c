@@ -11,6 +11,7 @@
 #define ZERO_COUNTS 32767.5
 #define COUNTS_PER_RAD ((62258 - 3277) / 5.2)
 #define STEP_COUNTS 4
+#define SPEED_TICKS 8u /* over which a joint's speed is taken: less shows how the converter's noise shakes it */
 
 typedef struct arm_loop {
     double *q, *qd, *link, *qdd, *model, *hand, *current_a, *broken;
@@ -26,6 +27,7 @@ typedef struct arm_loop {
     double fastest_rad_s; /* while it is enabled: of any joint, */
     double apart_rad;     /* from its reference */
     uint32_t supply_mv, ticks, sequence, unused;
+    double way[SPEED_TICKS][JOINTS]; /* where the joints were of late */
 } arm_loop;
 
 uint32_t arm_run(arm_loop *arm, uint32_t ticks);
@@ -74,7 +76,7 @@ static void sense(arm_loop *arm)
     }
 }
 
-static double link_rad_s[JOINTS];
+
 
 static void step(arm_loop *arm)
 {
@@ -106,9 +108,9 @@ static void step(arm_loop *arm)
         }
         before = arm->qdd[i];
         arm->qdd[i] = (arm->qd[i] - start) / TICK;
-        const double half = 0.5 * model[6u * JOINTS + i], link = arm->link[i];
+        const double half = 0.5 * model[6u * JOINTS + i];
         arm->link[i] = fmin(fmax(arm->link[i], arm->q[i] - half), arm->q[i] + half);
-        link_rad_s[i] = (arm->link[i] - link) / TICK;
+        arm->way[arm->ticks % SPEED_TICKS][i] = arm->link[i];
         arm->current_a[i] = awake ? (duty * supply_v - constant * arm->qd[i]) / model[i] : 0.0;
     }
 }
@@ -129,7 +131,9 @@ uint32_t arm_run(arm_loop *arm, uint32_t ticks)
         step(arm);
         if (arm->outputs->state == STATE_ENABLED) {
             for (uint32_t i = 0u; i < JOINTS; i++) {
-                arm->fastest_rad_s = fmax(arm->fastest_rad_s, fabs(link_rad_s[i]));
+                const double before = arm->way[(arm->ticks + 1u) % SPEED_TICKS][i];
+                const double speed = fabs(arm->link[i] - before) / (TICK * (SPEED_TICKS - 1u));
+                arm->fastest_rad_s = arm->ticks > SPEED_TICKS ? fmax(arm->fastest_rad_s, speed) : 0.0;
                 arm->apart_rad = fmax(arm->apart_rad, fabs(arm->link[i] - (double)arm->outputs->reference_rad[i]));
             }
         }

@@ -102,6 +102,7 @@ class Loop(ctypes.Structure):
         ("fastest_rad_s", ctypes.c_double),
         ("apart_rad", ctypes.c_double),
         *((name, ctypes.c_uint32) for name in ("supply_mv", "ticks", "sequence", "unused")),
+        ("way", ctypes.c_double * 48),
     ]
 
 

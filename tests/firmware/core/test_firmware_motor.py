@@ -146,7 +146,7 @@ def test_the_arm_that_runs_in_c_is_the_plant_of_sim(arms, library):
 def test_gains_that_make_a_joint_swing_are_noticed(arms, library):
     arm = arms.Arm(library, 930)
     for joint in arm.core.config.joint:
-        joint.gains.kp_per_rad, joint.gains.kd_s_per_rad = 60.0, 3.0
+        joint.gains.kp_per_rad, joint.gains.kd_s_per_rad = 60.0, 6.0
     arm.core.crc, arm.core.crc_at, arm.core.crc_known = 0xFFFFFFFF, 0, 0
     arm.enable()
     arm.swing(3000)
