@@ -11,6 +11,7 @@
 #include "setpoint.h"
 
 #define GUARD 0xA5C3965Au
+#define BEYOND 3.0f       /* so much more is a speed damped beyond its limit */
 #define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up */
 
 void core_init(core_state *core, const core_config *config, uint32_t source, uint32_t reset)
@@ -135,11 +136,14 @@ static void control(joint_state *joint, const joint_config *config, float nomina
         duty_cap = free_duty; /* it drives a free motor at its limit, and brakes a faster one */
         joint->limited |= LIMITED_SPEED;
     }
+    const float seen_rad_s =
+        motor_witness(&joint->motor, &config->motor, joint->pid.speed_rad_s, config->speed_limit_rad_s);
+    const float beyond_rad_s = number_size(seen_rad_s) - config->speed_limit_rad_s;
+    const float more_rad_s = beyond_rad_s > 0.0f ? BEYOND * beyond_rad_s : 0.0f;
     const pid_demand demand = {.reference_rad = joint->reference.position_rad,
                                .reference_rad_s = joint->reference.speed_rad_s,
                                .reference_rad_s2 = joint->reference.acceleration_rad_s2,
-                               .damped_rad_s = motor_witness(&joint->motor, &config->motor, joint->pid.speed_rad_s,
-                                                             config->speed_limit_rad_s),
+                               .damped_rad_s = seen_rad_s + (seen_rad_s > 0.0f ? more_rad_s : -more_rad_s),
                                .spring_limit = spring_limit(config, nominal_v),
                                .gravity_duty = joint->gravity_duty,
                                .duty_limit = config->duty_limit,

@@ -90,6 +90,14 @@ enum { REACTION_HOLD = 1, REACTION_RELEASE = 2, REACTION_CHOSEN = 3, REACTION_YI
 /* Why the board started. */
 enum { RESET_POWER = 0, RESET_WATCHDOG = 1, RESET_CRASH = 2 };
 
+/* Where a crash came from; all 0 where there was none. */
+typedef struct crash_record {
+    uint32_t exception; /* its number: 3 hard fault, 4 memory, 5 bus, 6 usage, 16 and more an unexpected interrupt */
+    uint32_t pc;        /* the instruction */
+    uint32_t lr;        /* who had called it */
+    uint32_t cfsr;      /* the processor's configurable fault status */
+} crash_record;
+
 /* What a command asks for. */
 enum {
     COMMAND_NONE = 0,

@@ -23,7 +23,7 @@ def test_every_hello_is_answered_with_who_the_board_is(fresh):
     board.tick(host.hello(nonce=4711))
     board.tick()
     welcome = host.newest("WELCOME")
-    assert (welcome.dialect_version, welcome.config_version, welcome.nonce) == (3, c.CONFIG_VERSION, 4711)
+    assert (welcome.dialect_version, welcome.config_version, welcome.nonce) == (4, c.CONFIG_VERSION, 4711)
     assert (welcome.board, welcome.joints, welcome.baud) == ("pil", c.JOINTS, 921600)
     assert (welcome.ticks_per_s, welcome.config_source) == (c.TICKS_PER_S, c.CONFIG_FACTORY)
     assert welcome.firmware == version("armsight")
