@@ -11,7 +11,7 @@
 #include "setpoint.h"
 
 #define GUARD 0xA5C3965Au
-#define BEYOND 3.0f       /* so much more is a speed damped beyond its limit */
+#define BEYOND 2.0f       /* so much more is a speed damped beyond its limit */
 #define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up */
 
 void core_init(core_state *core, const core_config *config, uint32_t source, uint32_t reset)

@@ -67,5 +67,5 @@ def test_a_file_of_an_arm_with_fewer_joints_has_only_these(tmp_path):
     path.write_text(text, encoding="utf-8")
     assert read_configuration(path)[0].tobytes() == config.tobytes()
     path.write_text(text.replace("joint_count = 4", "joint_count = 5"), encoding="utf-8")
-    with pytest.raises(InputError, match=r"joint\.5\.gains\.kp_per_rad is missing"):
+    with pytest.raises(InputError, match=r"joint\.5\.soft_min_rad is missing"):
         read_configuration(path)
