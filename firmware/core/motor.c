@@ -169,7 +169,7 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
 
 #define NAME_SAMPLES 24u    /* of the last 192 ms: most of them after the joint was let go of */
 #define NAME_NOISE_RAD 0.002f
-#define LAG_SHARE 0.3f      /* of what the others leave unexplained: a lag has one number more to fit with */
+#define LAG_SHARE 0.5f      /* of what the others leave unexplained: a lag has one number more to fit with */
 
 /* Sums over the samples: reading y, motor m, their difference z, the sample's number k, the way between them x. */
 typedef struct name_sums {
