@@ -17,9 +17,9 @@ import ctypes
 import dataclasses
 
 import numpy as np
-from board_arms import Arm, arm_configuration, c, compiled, opened
 
 from armsight.sim.joints import SUPPLY_V, drawn_model, plain_model
+from board_arms import Arm, arm_configuration, compiled, opened
 
 TARGETS = (1.6, 0.35, 0.4)
 CASCADE_SHARE = 0.5  # of the bandwidth: the position loop around the speed loop
@@ -83,7 +83,9 @@ def sine(arm):
 def load_step(arm):
     """Time, s, until each joint stays within 5 mrad of its reference."""
     here = np.tile(np.array(arm.out[0]["reference_rad"], dtype=float), (500, 1))
-    arm.plant.hand_n_m[:] = np.where(arm.model.gravity_n_m > 0, 1.0, -1.0)  # it unloads: the motor's full torque is free
+    arm.plant.hand_n_m[:] = np.where(
+        arm.model.gravity_n_m > 0, 1.0, -1.0
+    )  # it unloads: the motor's full torque is free
     passed, trace = arm.follow(here, np.zeros_like(here), traced=True)
     arm.plant.hand_n_m[:] = 0
     if passed < 2000:
@@ -98,9 +100,7 @@ def creep(arm):
     here = np.array(arm.out[0]["reference_rad"], dtype=float) + 0.02 * t * np.ones(6)
     passed, trace = arm.follow(here, np.full_like(here, 0.02), traced=True)
     off = 1e3 * (trace[:, 0] - trace[:, 1])[1000:]
-    return (
-        (np.sqrt((off**2).mean(axis=0)), np.abs(off).max(axis=0)) if passed == 3000 else (np.full(6, np.inf),) * 2
-    )
+    return (np.sqrt((off**2).mean(axis=0)), np.abs(off).max(axis=0)) if passed == 3000 else (np.full(6, np.inf),) * 2
 
 
 def main():

@@ -169,6 +169,7 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
 
 #define NAME_SAMPLES 24u    /* of the last 192 ms: most of them after the joint was let go of */
 #define NAME_NOISE_RAD 0.002f
+#define JUMP_SHARE 0.7f
 #define LAG_SHARE 0.5f      /* of what the others leave unexplained: a lag has one number more to fit with */
 
 /* Sums over the samples: reading y, motor m, their difference z, the sample's number k, the way between them x. */
@@ -217,11 +218,32 @@ static float left_by_lag(const name_sums *s, float *rate)
     return left_of(yy, yx, xx, rate);
 }
 
+/* Return whether most of what lies between reading and motor opened from one sample to the next. */
+static bool jumped(const motor_state *motor, uint32_t count)
+{
+    float low = 0.0f, high = 0.0f, largest = 0.0f, last = 0.0f;
+    const uint32_t first = (motor->sampled - count) % MOTOR_SAMPLES;
+    for (uint32_t i = 1u; i < count; i++) {
+        const uint32_t at = (motor->sampled - count + i) % MOTOR_SAMPLES;
+        const float z = motor->sample_read_rad[at] - motor->sample_motor_rad[at] - motor->sample_read_rad[first] +
+                        motor->sample_motor_rad[first];
+        const float step = number_size(z - last);
+        low = z < low ? z : low;
+        high = z > high ? z : high;
+        largest = step > largest ? step : largest;
+        last = z;
+    }
+    return largest > 10.0f * NAME_NOISE_RAD && largest > JUMP_SHARE * (high - low);
+}
+
 uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect)
 {
     const uint32_t count = motor->sampled < NAME_SAMPLES ? motor->sampled : NAME_SAMPLES;
     if (count < NAME_SAMPLES / 2u) {
         return suspect;
+    }
+    if (jumped(motor, count)) {
+        return FAULT_POT_JUMP;
     }
     const name_sums s = sums_of(motor, count);
     const float noise = (float)count * NAME_NOISE_RAD * NAME_NOISE_RAD;

@@ -201,8 +201,7 @@ def gains_array(config: Configuration) -> Array:
 
 
 def check_gains(gains: Array, count: int = JOINTS) -> Array:
-    """Return a gain set as an array (6, 8), a row per joint, of which the first ``count`` are checked; an error names the gain and
-    the joint.
+    """Return a gain set (6, 8), a row per joint; an error names the gain and the joint, of the first ``count`` joints.
 
     Raises:
         InputError: the shape, a number that is not finite, or one outside its range.
