@@ -132,7 +132,7 @@ static void control(joint_state *joint, const joint_config *config, float nomina
         number_clamp(joint->duty_cap - config->current_cut_per_a_s * over_a * TICK_S, 0.0f, config->duty_limit);
     float duty_cap = joint->duty_cap;
     const float free_duty = config->speed_limit_rad_s * config->motor.constant_v_s / nominal_v;
-    if (motor_races(&joint->motor, config->speed_limit_rad_s) && duty_cap > free_duty) {
+    if (motor_races(&joint->motor, &config->motor, config->speed_limit_rad_s) && duty_cap > free_duty) {
         duty_cap = free_duty; /* it drives a free motor at its limit, and brakes a faster one */
         joint->limited |= LIMITED_SPEED;
     }

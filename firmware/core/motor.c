@@ -16,7 +16,7 @@
 #define AGREED 3.0f           /* of apart_rad: so much way together proves that the wiring was right */
 #define UNKNOWN_RAD_S 1000.0f
 #define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
-#define WITNESS 0.1f          /* of the speed limit: so much faster than the reading it must be to be believed */
+#define WITNESS 0.1f          /* of the speed limit: so much faster than the reading it must be to count */
 #define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
 
 void motor_start(motor_state *motor, float angle_rad, uint32_t phase)
@@ -129,16 +129,24 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     window(motor, config, voltage_v, ir_v, angle_rad);
 }
 
-bool motor_races(const motor_state *motor, float speed_limit_rad_s)
+/* Return whether the motor's speed is known: not where no current is seen, as then its sensor may be broken. */
+static bool speed_is_known(const motor_state *motor, const motor_config *config)
 {
-    return number_size(motor->speed_rad_s) - motor->unsure_rad_s > speed_limit_rad_s;
+    return config->resistance_ohm > 0.0f && motor->driven_ticks > SETTLE_TICKS &&
+           motor->current_a * config->resistance_ohm >
+               DEAD_SHARE * config->constant_v_s * number_size(motor->speed_rad_s);
+}
+
+bool motor_races(const motor_state *motor, const motor_config *config, float speed_limit_rad_s)
+{
+    return speed_is_known(motor, config) && number_size(motor->speed_rad_s) - motor->unsure_rad_s > speed_limit_rad_s;
 }
 
 float motor_witness(const motor_state *motor, const motor_config *config, float reading_rad_s, float speed_limit_rad_s)
 {
     const float sure_rad_s = number_size(motor->speed_rad_s) - motor->unsure_rad_s - WITNESS * speed_limit_rad_s;
-    const bool known = config->resistance_ohm > 0.0f && motor->driven_ticks > SETTLE_TICKS;
-    return known && sure_rad_s > number_size(reading_rad_s) ? motor->speed_rad_s : reading_rad_s;
+    const bool faster = sure_rad_s > number_size(reading_rad_s);
+    return faster && speed_is_known(motor, config) ? motor->speed_rad_s : reading_rad_s;
 }
 
 uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v)
@@ -155,16 +163,17 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
     const uint32_t at = (motor->sampled - back) % MOTOR_SAMPLES;
     const float motor_rad = motor->travel_rad - motor->sample_motor_rad[at];
     const float read_rad = motor->last_rad - motor->sample_read_rad[at];
-    if (number_size(read_rad) > number_size(motor_rad)) {
-        return FAULT_POT_DRIFT;
-    }
+    const bool agreed = motor->agreed_rad > AGREED * config->apart_rad;
     if (number_size(read_rad) < 0.25f * number_size(motor_rad)) {
         return FAULT_POT_FROZEN;
     }
-    if (read_rad * motor_rad < 0.0f) {
+    if (!agreed && read_rad * motor_rad < 0.0f) {
         return FAULT_POT_INVERTED;
     }
-    return motor->agreed_rad > AGREED * config->apart_rad ? FAULT_POT_SLIP : FAULT_POT_SCALE;
+    if (read_rad * motor_rad < 0.0f || number_size(read_rad) > number_size(motor_rad)) {
+        return FAULT_POT_DRIFT;
+    }
+    return agreed ? FAULT_POT_SLIP : FAULT_POT_SCALE;
 }
 
 #define NAME_SAMPLES 24u    /* of the last 192 ms: most of them after the joint was let go of */
@@ -275,8 +284,12 @@ uint32_t motor_names(const motor_state *motor, const motor_config *config, uint3
 #define SWING_RAD_S 0.3f  /* as far from the reference's speed at least */
 #define SWING_SHARE 0.2f  /* of the speed limit */
 
-bool motor_swings(motor_state *motor, float reference_rad_s, float speed_limit_rad_s)
+bool motor_swings(motor_state *motor, const motor_config *config, float reference_rad_s, float speed_limit_rad_s)
 {
+    if (!speed_is_known(motor, config)) {
+        motor->swings = 0u;
+        return false;
+    }
     const float share_rad_s = SWING_SHARE * speed_limit_rad_s;
     const float far_rad_s = share_rad_s > SWING_RAD_S ? share_rad_s : SWING_RAD_S;
     const float off_rad_s = motor->speed_rad_s - reference_rad_s;

@@ -21,7 +21,7 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
 float motor_witness(const motor_state *motor, const motor_config *config, float reading_rad_s, float speed_limit_rad_s);
 
 /* Return whether the motor is surely faster than the joint's limit. */
-bool motor_races(const motor_state *motor, float speed_limit_rad_s);
+bool motor_races(const motor_state *motor, const motor_config *config, float speed_limit_rad_s);
 
 /* Return the fault by which motor and reading are apart further than noise, backlash and the motor's uncertain numbers
  * explain, as it looks at first; FAULT_NONE where they are not. */
@@ -32,7 +32,7 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
 uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect);
 
 /* Return whether the motor swings about a reference that moves at reference_rad_s. */
-bool motor_swings(motor_state *motor, float reference_rad_s, float speed_limit_rad_s);
+bool motor_swings(motor_state *motor, const motor_config *config, float reference_rad_s, float speed_limit_rad_s);
 
 /* Return whether the joint has been faster than its limit (rad/s) long enough to be sure; fast_rad_s is what the reading
  * says of it. */

@@ -230,7 +230,7 @@ static void watch_motor(core_state *core, uint32_t joint, float supply_v, float 
         state->suspect_ticks = 0u;
         return;
     }
-    if (motor_swings(&state->motor, state->reference.speed_rad_s, config->speed_limit_rad_s)) {
+    if (motor_swings(&state->motor, &config->motor, state->reference.speed_rad_s, config->speed_limit_rad_s)) {
         safety_raise(core, FAULT_OSCILLATION, joint);
         pid_change_gains(&state->pid, &config->gains, &core->start_gains.joint[joint]);
         core->config.joint[joint].gains = core->start_gains.joint[joint];

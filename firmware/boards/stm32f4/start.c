@@ -40,7 +40,7 @@ void reset(void)
 /* What is kept of a crash until the board has started again: in RAM that memory_start leaves alone. */
 typedef struct kept_crash {
     crash_record record;
-    uint32_t check; /* tells it from what RAM holds at power-up */
+    uint32_t check; /* at power-up RAM holds anything */
 } kept_crash;
 
 __attribute__((section(".kept"))) static kept_crash kept;

@@ -83,6 +83,7 @@ def test_a_potentiometer_that_breaks_in_motion_is_noticed_at_its_joint(arms, lib
     joint = int(np.argmax(np.abs(arm.plant.qd)))
     arm.plant.break_pot(joint, kind, size)
     arm.swing(2000)
+    arm.tick(arms.NAMED_TICKS)
     assert arm.first[1] == joint
     if kind is PotFault.JUMP:
         assert arm.first[0] is Fault.POT_JUMP
@@ -95,7 +96,9 @@ def test_a_potentiometer_that_was_wrong_from_the_beginning_is_noticed_at_its_joi
         arm.plant.break_pot(2, kind, size)
         arm.enable()
         arm.swing(4000)
+        arm.tick(arms.NAMED_TICKS)
         assert arm.first[1] == 2
+        assert arm.first[0] is not Fault.POT_FROZEN
 
 
 @pytest.mark.parametrize("size", [0.2, -0.2])
@@ -105,6 +108,7 @@ def test_a_reading_that_drifts_at_rest_is_noticed(arms, library, size):
         arm.rest(600)
         arm.plant.break_pot(1, PotFault.DRIFT, size)
         arm.rest(4000)
+        arm.tick(arms.NAMED_TICKS)
         assert arm.first[1] == 1
 
 
@@ -141,6 +145,22 @@ def test_the_arm_that_runs_in_c_is_the_plant_of_sim(arms, library):
     arm.tick(300)
     assert arm.plant.q.tobytes() == twin.plant.q.tobytes()
     assert bytes(arm.outputs) == bytes(twin.outputs)
+
+
+def test_a_current_that_is_never_there_is_the_sensors_fault(arms, library):
+    arm = arms.Arm(library, 901)
+    arm.plant._model[[9, 10]] = 0.0
+    arm.enable()
+    arm.swing(1000)
+    assert arm.first[0] is Fault.CURRENT_SENSOR
+
+
+def test_a_jump_too_small_for_the_reading_alone_is_named_by_its_step(arms, library):
+    arm = swinging(arms, library, 902)
+    arm.plant.break_pot(4, PotFault.JUMP, 0.085)
+    arm.swing(400)
+    arm.tick(arms.NAMED_TICKS)
+    assert arm.first == (Fault.POT_JUMP, 4)
 
 
 def test_gains_that_make_a_joint_swing_are_noticed(arms, library):

@@ -245,7 +245,7 @@ def test_a_fault_switches_the_drives_off_and_lets_the_watchdog_run_out(booted, v
     assert chip.wrongs == []
 
 
-def test_where_it_crashed_is_kept_over_the_reset_and_told_once(booted):
+def test_where_it_crashed_is_kept_over_the_reset_and_reported_once(booted):
     stack, pc, lr = booted.word(FLASH) - 256, 0x0800C2A4, 0x0800C100
     booted.uc.mem_write(stack, struct.pack("<8I", 0, 0, 0, 0, 0, lr, pc, 0))
     booted.chip["SCB.CFSR"] = 0x82  # a data access without a memory there
