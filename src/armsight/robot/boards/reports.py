@@ -41,7 +41,7 @@ class Welcome:
     ticks_per_s: int
     baud: int
     config_source: ConfigSource | None
-    crash: tuple[int, int, int, int] | None = None
+    crash: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def welcome_of(message: Message) -> Welcome:
         ticks_per_s=message.ticks_per_s,
         baud=message.baud,
         config_source=ConfigSource(message.config_source),
-        crash=(*map(int, message.crash),) if any(message.crash) else None,
+        crash=tuple(map(int, message.crash)) if any(message.crash) else None,
     )
 
 
