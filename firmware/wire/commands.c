@@ -134,6 +134,11 @@ static void take_hello(wire_state *wire, const mavlink_message_t *message)
         .session = wire->session,
         .firmware = FIRMWARE_VERSION,
     };
+    const crash_record *crash = &wire->setup.crash;
+    welcome.crash[0] = crash->exception;
+    welcome.crash[1] = crash->pc;
+    welcome.crash[2] = crash->lr;
+    welcome.crash[3] = crash->cfsr;
     for (uint32_t i = 0u; i < sizeof welcome.board && wire->setup.board[i] != '\0'; i++) {
         welcome.board[i] = wire->setup.board[i];
     }

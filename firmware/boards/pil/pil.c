@@ -63,6 +63,8 @@ static bool write_copy(uint32_t which, const config_copy *copy)
     return true;
 }
 
+static void crash(crash_record *record) { *record = (crash_record){0}; }
+
 static const board_description board = {
     .name = "pil",
     .baud = BAUD,
@@ -70,6 +72,7 @@ static const board_description board = {
     .drive = drive,
     .feed_watchdog = feed_watchdog,
     .reset_cause = reset_cause,
+    .crash = crash,
     .receive = receive,
     .send = send,
     .read_copy = read_copy,

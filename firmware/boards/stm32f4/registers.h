@@ -190,6 +190,7 @@ typedef struct systick_registers {
 #define SCB_ICSR (*(word *)0xE000ED04u)
 #define SCB_ICSR_PENDSVSET BIT(28)
 #define SCB_VTOR (*(word *)0xE000ED08u)
+#define SCB_CFSR (*(word *)0xE000ED28u)
 #define SCB_SHPR3 (*(word *)0xE000ED20u)
 #define SCB_CPACR (*(word *)0xE000ED88u)
 #define SCB_CPACR_FPU FIELD(0xF, 20)

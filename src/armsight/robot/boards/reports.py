@@ -33,6 +33,7 @@ class Welcome:
         ticks_per_s: how many ticks its clock has a second; 0 where it has none and the host stamps its readings.
         baud: bits a second on its wire.
         config_source: where its configuration came from; None where it has none of ours.
+        crash: where the firmware crashed before it started: exception, pc, lr and CFSR; None where it did not.
     """
 
     board: str
@@ -40,6 +41,7 @@ class Welcome:
     ticks_per_s: int
     baud: int
     config_source: ConfigSource | None
+    crash: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -168,6 +170,7 @@ def welcome_of(message: Message) -> Welcome:
         ticks_per_s=message.ticks_per_s,
         baud=message.baud,
         config_source=ConfigSource(message.config_source),
+        crash=tuple(map(int, message.crash)) if any(message.crash) else None,
     )
 
 

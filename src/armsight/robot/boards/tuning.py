@@ -1,10 +1,14 @@
 """Gains of a joint from what its motor is, by a rule with two inputs: bandwidth and damping.
 
 With the torque ``K (u V - K w) / R`` and ``J``, ``B`` and ``C`` the inertia, viscous and dry friction at the joint, the
-stall torque is ``S = K V / R`` and the motor damps itself by ``D = K^2 / R + B``. The loop
-``J q'' + (D + S kd) q' + S kp q = S kp r`` is given the natural frequency and the damping asked for; the feed-forward gives
-what the motion itself takes, so that nothing is left to the error: ``kv = D / S + kd``, ``ka = J / S``, ``kf = C / S``.
-(Åström and Murray, "Feedback Systems", 2008, sections 10.2 and 10.5.)
+stall torque is ``S = K V / R`` and the motor damps itself by ``D = K^2 / R + B``. With the integral the loop is of third
+order, ``J q''' + (D + S kd) q'' + S kp q' + S ki q = ...``; its poles are placed at ``(s^2 + 2 z w s + w^2) (s + a w)``:
+
+    kd = ((2 z + a) w J - D) / S,  kp = (1 + 2 z a) w^2 J / S,  ki = a w^3 J / S
+
+The feed-forward gives what the motion itself takes, so that nothing is left to the error: ``kv = D / S + kd``,
+``ka = J / S``, ``kf = C / S``. (Åström and Murray, "Feedback Systems", 2008, sections 10.2 and 10.5; Ellis, "Control System
+Design Guide", 2012, chapter 6.)
 """
 
 from __future__ import annotations
@@ -16,8 +20,8 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError
 
-#: The integral takes over an error at this share of the bandwidth; the speed's filter is so much faster than the loop.
-_INTEGRAL_SHARE, _FILTER_SHARE = 0.2, 0.15
+#: The integral's pole, and the corner of the speed's filter over the bandwidth: 1 / 0.25.
+_INTEGRAL_SHARE, _FILTER_SHARE = 0.6, 0.25
 #: Dry friction is compensated by a little less than it is, so that it never drives.
 _FRICTION_SHARE = 0.9
 ANTI_WINDUP_PER_S = 20.0
@@ -42,14 +46,14 @@ class MotorFigures:
     dry_n_m: float
 
 
-def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 1.0) -> Array:
+def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 0.8) -> Array:
     """Return the gains of a joint by the rule above.
 
     Args:
         motor: its motor.
         supply_v: nominal supply, V.
-        bandwidth_rad_s: natural frequency of the loop, rad/s.
-        damping: of the loop, of critical.
+        bandwidth_rad_s: natural frequency of the loop's pair of poles, rad/s.
+        damping: of the pair, of critical.
 
     Returns:
         (8,) kp, ki, kd, kv, ka, kf, derivative filter, anti-windup.
@@ -64,15 +68,16 @@ def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, da
             raise InputError(f"{name} is {value:g}; it must be positive")
     stall = motor.constant_v_s * supply_v / motor.resistance_ohm
     own = motor.constant_v_s**2 / motor.resistance_ohm + motor.viscous_n_m_s
-    kp = motor.inertia_kg_m2 * bandwidth_rad_s**2 / stall
-    kd = max(2 * damping * bandwidth_rad_s * motor.inertia_kg_m2 - own, 0.0) / stall
+    per_rad_s2 = motor.inertia_kg_m2 / stall
+    w, share = bandwidth_rad_s, _INTEGRAL_SHARE
+    kd = max((2 * damping + share) * w * per_rad_s2 - own / stall, 0.0)
     return np.array(
         [
-            kp,
-            _INTEGRAL_SHARE * bandwidth_rad_s * kp,
+            (1 + 2 * damping * share) * w**2 * per_rad_s2,
+            share * w**3 * per_rad_s2,
             kd,
             own / stall + kd,
-            motor.inertia_kg_m2 / stall,
+            per_rad_s2,
             _FRICTION_SHARE * motor.dry_n_m / stall,
             _FILTER_SHARE / bandwidth_rad_s,
             ANTI_WINDUP_PER_S,
