@@ -36,6 +36,14 @@ static void drive(const core_outputs *outputs)
 
 static uint32_t reset_cause(void) { return watchdog_was_here() ? RESET_WATCHDOG : RESET_POWER; }
 
+static void restart(void)
+{
+    drives_off();
+    SCB_AIRCR = SCB_AIRCR_RESET;
+    for (;;) { /* it takes a few clocks */
+    }
+}
+
 static const board_description nucleo = {
     .name = "nucleo-f446re",
     .baud = UART_BAUD,
@@ -47,6 +55,7 @@ static const board_description nucleo = {
     .send = uart_send,
     .read_copy = flash_read,
     .write_copy = flash_write,
+    .restart = restart,
 };
 
 void systick_interrupt(void)
