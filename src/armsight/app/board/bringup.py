@@ -57,6 +57,8 @@ _JOG_RAD, _JOG_DUTY, _JOG_DUTY_PER_S, _JOG_MOST_RAD = 0.010, 0.6, 0.15, 0.05
 _DEAD_DUTY, _DEAD_A = 0.25, 0.02
 #: A swing: amplitudes, rad, and frequencies, Hz, that add up, and how far a joint may get away from where it began.
 _SWING_RAD, _SWING_HZ, _SWING_MOST_RAD = (0.12, 0.04), (0.5, 2.0), 0.26
+#: A duty on top of it that no motion follows: it tells resistance from back-EMF where friction is all the load.
+_DITHER_DUTY, _DITHER_HZ = 0.07, 8.0
 _FIRST_SWING_S, _SWING_S, _GROW_S = 3.0, 5.0, 0.5
 _VERIFY_RAD, _VERIFY_HZ, _VERIFY_S, _VERIFY_MOST_RAD = 0.035, 0.5, 4.0, 0.01
 _GENTLE_RAD_S = 15.0  # bandwidth of the second swing
@@ -652,7 +654,9 @@ class Bringup:
             q_ref, qd_ref = start.copy(), np.zeros(JOINTS)
             q_ref[joint], qd_ref[joint] = _swing_at((k + 1) * _PERIOD_S, seconds)
             q_ref[joint] += start[joint]
-            readings = self._move(q_ref, qd_ref, np.zeros(JOINTS))
+            dither = np.zeros(JOINTS)
+            dither[joint] = _DITHER_DUTY * np.sin(2 * np.pi * _DITHER_HZ * k * _PERIOD_S)
+            readings = self._move(q_ref, qd_ref, dither)
             if len(readings.t_s) and abs(self._q(readings)[-1, joint] - start[joint]) > _SWING_MOST_RAD:
                 raise _Problem(f"joint {joint + 1}: it swings further than it is to: is its load loose?")
         return self._collected()
@@ -752,6 +756,7 @@ def _put_free(joint: Configuration, found: JointFound) -> None:
 def _put_gentle(joint: Configuration, found: JointFound) -> None:
     """Put gains that move any joint a little: full duty at 30 degrees."""
     joint["gains"] = np.array((2.0, 2.0, 0.0, 0.0, 0.0, 0.5 * (found.breakaway_duty or 0.0), 0.005, 20.0), GAINS)
+    joint["acceleration_rad_s2"], joint["jerk_rad_s3"] = 30.0, 3000.0
 
 
 def _swing_at(t_s: float, seconds: float) -> tuple[float, float]:

@@ -17,6 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
@@ -130,13 +131,13 @@ def _smooth(values: Array, step_s: float, *, derivative: bool = False) -> Array:
     return smoothed
 
 
-def _sure(speed: Array, step_s: float) -> Array:
+def _sure(speed: Array, step_s: float) -> NDArray[np.bool_]:
     """Return where (n,) the sign of the speed has been certain for long enough that no smoothing reaches a reversal."""
     slow = np.abs(speed) < _SURE * np.abs(speed).max()
     reach = round(3 * _SMOOTH_S / step_s)
     near = np.convolve(slow, np.ones(2 * reach + 1), mode="same") > 0.5
     near[: 2 * reach] = near[-2 * reach :] = True
-    return ~near
+    return np.asarray(~near)
 
 
 def _integral(t: Array, values: Array) -> Array:
@@ -146,7 +147,7 @@ def _integral(t: Array, values: Array) -> Array:
 
 
 def _fit_flux(
-    t: Array, volts: Array, amperes: Array, q: Array, speed: Array, sure: Array
+    t: Array, volts: Array, amperes: Array, q: Array, speed: Array, sure: NDArray[np.bool_]
 ) -> tuple[tuple[float, float, float], tuple[float, float]]:
     """Return resistance, constant and half the backlash, and the standard deviations of the first two."""
     drift = np.vander(t / t[-1] - 0.5, 4)
@@ -165,7 +166,7 @@ def _fit_flux(
     return (resistance, constant, half), (float(alike * sigma[0]), float(alike * sigma[1]))
 
 
-def _fit_torque(torque: Array, q: Array, speed: Array, step_s: float, sure: Array) -> tuple[float, float, float, float]:
+def _fit_torque(torque: Array, q: Array, speed: Array, step_s: float, sure: NDArray[np.bool_]) -> tuple[float, float, float, float]:
     """Return inertia, viscous and dry friction, and gravity's greatest torque."""
     off = _smooth(q - q.mean(), step_s)
     columns = [_smooth(speed, step_s, derivative=True), speed, np.sign(speed), np.cos(off), np.sin(off)]
@@ -179,7 +180,7 @@ def _fit_torque(torque: Array, q: Array, speed: Array, step_s: float, sure: Arra
     return inertia, viscous, dry, float(np.hypot(cosine, sine))
 
 
-def _signed(t: Array, volts: Array, amperes: Array, q: Array, speed: Array, sure: Array) -> Array:
+def _signed(t: Array, volts: Array, amperes: Array, q: Array, speed: Array, sure: NDArray[np.bool_]) -> Array:
     """Return currents with the signs that a motor's equation gives them, from a sensor that knows their size only."""
     signed = np.abs(amperes) * np.sign(volts)
     for _ in range(4):

@@ -69,6 +69,7 @@ class WorkshopPlant:
 
     Attributes:
         wiring: may be changed at any time.
+        load_n_m: (6,) torque on the joints beside gravity and the hand.
         hold: joint and angle, rad, that the hand brings it to; None: it lets go.
         drives_s: for how long the drives were on.
         t_s: how much time has passed.
@@ -78,6 +79,7 @@ class WorkshopPlant:
     def __init__(self, plant: JointPlant, wiring: Wiring, bend_counts: Array | None = None) -> None:
         self.plant, self.wiring = plant, wiring
         self._bend = np.zeros(JOINTS) if bend_counts is None else bend_counts
+        self.load_n_m = np.zeros(JOINTS)
         self._target = 0.0
         self.t_s = self.drives_s = 0.0
         self.far_rad = np.zeros(JOINTS)
@@ -118,7 +120,7 @@ class WorkshopPlant:
 
     def _push(self) -> None:
         """Let the hand push its joint to where it brings it, at its own speed."""
-        self.plant.hand_n_m[:] = 0.0
+        self.plant.hand_n_m[:] = self.load_n_m
         if self.hold is None:
             self._target = np.nan
             return
@@ -127,7 +129,7 @@ class WorkshopPlant:
             self._target = float(self.plant.q[joint])
         self._target += float(np.clip(goal - self._target, -_HAND_RAD_S * 1e-3, _HAND_RAD_S * 1e-3))
         pull = 120.0 * (self._target - self.plant.q[joint]) - 4.0 * self.plant.qd[joint]
-        self.plant.hand_n_m[joint] = float(np.clip(pull, -25.0, 25.0))
+        self.plant.hand_n_m[joint] += float(np.clip(pull, -25.0, 25.0))
 
     @property
     def arrived(self) -> bool:
