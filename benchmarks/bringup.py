@@ -47,7 +47,11 @@ def miswired(kind, wiring, joint, other):
     if kind == "open potentiometer":
         return replace(wiring, open_potentiometers=frozenset({joint})), (f"joint {a}: its potentiometer is open",)
     low = min(a, b)
-    return replace(wiring, potentiometers=swapped(joint, other)), (f"joint {low}:", "potentiometers of joints", "swapped")
+    return replace(wiring, potentiometers=swapped(joint, other)), (
+        f"joint {low}:",
+        "potentiometers of joints",
+        "swapped",
+    )
 
 
 KINDS = {1: "swapped motors", 3: "dead motor", 5: "open potentiometer", 7: "swapped potentiometers"}
@@ -120,7 +124,9 @@ def main():
                 wrong += 1
                 continue
         found = bringup.found
-        right = bool(person.problems) and all(word in person.problems[0] for word in words) if kind else not person.problems
+        right = (
+            bool(person.problems) and all(word in person.problems[0] for word in words) if kind else not person.problems
+        )
         named += right
         r = np.array([each.resistance_ohm or np.nan for each in found.joints]) / model.resistance_ohm - 1
         k = np.array([each.constant_v_s or np.nan for each in found.joints]) / model.constant_v_s - 1
@@ -147,11 +153,15 @@ def main():
     print(f"problems named as they must, none where there is none: {named} of {given.arms}; ended by an error {wrong}")
     for name, values, most in (("R", all_r, 0.05), ("K", all_k, 0.05)):
         flat = np.abs(np.concatenate(values))
-        print(f"{name}: {100 * np.nanmedian(flat):.1f} % median, {100 * np.nanmax(flat):.1f} % at most; within 5 %: {(flat <= most).sum()} of {6 * given.arms} joints")
+        print(
+            f"{name}: {100 * np.nanmedian(flat):.1f} % median, {100 * np.nanmax(flat):.1f} % at most; within 5 %: {(flat <= most).sum()} of {6 * given.arms} joints"
+        )
     for name, values, most in (("sine mrad", sines, 1.6), ("creep mrad", creeps, 0.4), ("load step s", backs, 0.35)):
         flat = np.concatenate(values) if values else np.zeros(0)
         if len(flat):
-            print(f"{name}: {np.median(flat):.2f} median, {flat.max():.2f} at most; within {most}: {(flat <= most).sum()} of {len(flat)} joints")
+            print(
+                f"{name}: {np.median(flat):.2f} median, {flat.max():.2f} at most; within {most}: {(flat <= most).sum()} of {len(flat)} joints"
+            )
 
 
 if __name__ == "__main__":

@@ -193,12 +193,12 @@ static void say(wire_state *wire, uint32_t severity, const text *said)
 {
     const uint32_t piece = MAVLINK_MSG_STATUSTEXT_FIELD_TEXT_LEN;
     mavlink_statustext_t status = {.severity = (uint8_t)severity};
-    if (said->length >= piece) { /* a whole piece has no zero at its end: another follows it */
+    if (said->length > piece) {
         wire->common.texts = (uint16_t)(wire->common.texts + 1u);
         wire->common.texts = wire->common.texts != 0u ? wire->common.texts : (uint16_t)1u;
         status.id = wire->common.texts;
     }
-    for (uint32_t at = 0u; at <= said->length; at += piece) {
+    for (uint32_t at = 0u; at < said->length; at += piece) {
         const uint32_t left = said->length - at;
         memset(status.text, 0, piece);
         memcpy(status.text, &said->bytes[at], left < piece ? left : piece);
@@ -212,6 +212,9 @@ static void say(wire_state *wire, uint32_t severity, const text *said)
 static void say_rejection(wire_state *wire, uint32_t rejection)
 {
     text said = {.length = 0u};
+    if (wire->common.tools == 0u) {
+        return;
+    }
     append(&said, "rejected: ");
     append(&said, rejection_text(rejection));
     say(wire, MAV_SEVERITY_WARNING, &said);
@@ -338,6 +341,12 @@ static void write_sensed(wire_state *wire)
     telemetry_put(wire, &message);
 }
 
+/* Return whether the session's owner has left: the drives are off, and nothing has come from it for long. */
+static bool owner_left(const wire_state *wire)
+{
+    return wire->report.outputs.drives_on == 0u && wire_tick(wire) - wire->common.owner_tick > OWNER_TICKS;
+}
+
 void common_write(wire_state *wire)
 {
     wire_common *common = &wire->common;
@@ -346,14 +355,18 @@ void common_write(wire_state *wire)
         common->sensed_tick = tick;
         write_sensed(wire);
     }
-    if (tick - common->second_tick >= SECOND_TICKS && telemetry_has_room(wire)) {
+    const bool listened = common->tools != 0u || wire->greeted == 0u || owner_left(wire);
+    if (listened && tick - common->second_tick >= SECOND_TICKS && telemetry_has_room(wire)) {
         common->second_tick = tick;
         write_heartbeat(wire);
         write_sys_status(wire);
     }
     common->restart = wire->report.outputs.drives_on == 0u ? common->restart : 0u;
-    say_stop(wire);
-    if (telemetry_has_room(wire) && !say_new_fault(wire) && common->listed < PARAMS) {
+    if (common->tools != 0u) {
+        say_stop(wire);
+    }
+    const bool said = common->tools != 0u && telemetry_has_room(wire) && say_new_fault(wire);
+    if (!said && telemetry_has_room(wire) && common->listed < PARAMS) {
         put_param(wire, common->listed);
         common->listed++;
     }
@@ -410,14 +423,18 @@ void common_begin_session(wire_state *wire)
 {
     wire->common.waits = WAITS_NOT;
     wire->common.sensed_period = 0u;
+    wire->common.tools = 0u;
     wire->common.owner_tick = wire_tick(wire);
 }
 
-/* Return whether who sent this may change anything: nobody else has the session, or who had it has left. */
-static bool may_change(const wire_state *wire, const mavlink_message_t *message)
+/* Return whether who sent this may change anything: there is no session, or it is its own, or one whose owner has left;
+ * that one ends, and who had it must say hello again. */
+static bool may_change(wire_state *wire, const mavlink_message_t *message)
 {
-    const bool left = wire->report.outputs.drives_on == 0u && wire_tick(wire) - wire->common.owner_tick > OWNER_TICKS;
-    return wire->greeted == 0u || message->sysid == wire->owner || left;
+    if (wire->greeted != 0u && message->sysid != wire->owner && owner_left(wire)) {
+        wire->greeted = 0u;
+    }
+    return wire->greeted == 0u || message->sysid == wire->owner;
 }
 
 static bool is_for_us(uint32_t system, uint32_t component)
@@ -651,11 +668,24 @@ static void take_timesync(wire_state *wire, const mavlink_message_t *message)
     telemetry_put(wire, &answer);
 }
 
+/* A tool listens: it hears of all faults that stand. */
+static void take_heartbeat(wire_state *wire)
+{
+    if (wire->common.tools == 0u) {
+        memset(wire->common.said_faults, 0, sizeof wire->common.said_faults);
+        wire->common.said_state = STATE_COUNT;
+        wire->common.tools = 1u;
+    }
+}
+
 void common_init(wire_state *wire) { wire->common.listed = PARAMS; }
 
 bool common_take(wire_state *wire, const mavlink_message_t *message)
 {
     switch (message->msgid) {
+    case MAVLINK_MSG_ID_HEARTBEAT:
+        take_heartbeat(wire);
+        return true;
     case MAVLINK_MSG_ID_COMMAND_LONG:
         take_command_long(wire, message);
         return true;

@@ -102,6 +102,7 @@ typedef struct wire_common {
     uint32_t sensed_tick;   /* when the last one went out */
     uint32_t second_tick;   /* and the last HEARTBEAT */
     uint32_t owner_tick;    /* when the session's owner was heard last */
+    uint32_t tools;         /* not 0: a HEARTBEAT came since the last HELLO: they listen */
     uint32_t said_faults[JOINTS + 1u]; /* as text, of each joint and of none */
     uint32_t said_state;
     uint32_t listed;        /* parameters sent of a list */

@@ -166,7 +166,9 @@ def _fit_flux(
     return (resistance, constant, half), (float(alike * sigma[0]), float(alike * sigma[1]))
 
 
-def _fit_torque(torque: Array, q: Array, speed: Array, step_s: float, sure: NDArray[np.bool_]) -> tuple[float, float, float, float]:
+def _fit_torque(
+    torque: Array, q: Array, speed: Array, step_s: float, sure: NDArray[np.bool_]
+) -> tuple[float, float, float, float]:
     """Return inertia, viscous and dry friction, and gravity's greatest torque."""
     off = _smooth(q - q.mean(), step_s)
     columns = [_smooth(speed, step_s, derivative=True), speed, np.sign(speed), np.cos(off), np.sin(off)]

@@ -128,7 +128,7 @@ class WorkshopPlant:
         if np.isnan(self._target):
             self._target = float(self.plant.q[joint])
         self._target += float(np.clip(goal - self._target, -_HAND_RAD_S * 1e-3, _HAND_RAD_S * 1e-3))
-        pull = 120.0 * (self._target - self.plant.q[joint]) - 4.0 * self.plant.qd[joint]
+        pull = 400.0 * (self._target - self.plant.q[joint]) - 8.0 * self.plant.qd[joint]
         self.plant.hand_n_m[joint] += float(np.clip(pull, -25.0, 25.0))
 
     @property
