@@ -3,10 +3,11 @@
     python benchmarks/bringup.py                 seeds 101 to 110
     python benchmarks/bringup.py 3 --seed 201    three other ones
 
-Each arm is drawn (:func:`armsight.sim.boards.workshop.drawn_workshop`: constants off by 15 %, gravity up to 60 % of the stall
-torque, inertia 0.5 to 6 times, 3 to 20 counts of noise, backlash, currents read 3 % wrong, potentiometers bent by up to
-100 counts, signs as they come) and brought up by a person who reads a protractor to 0.17 degrees. The second, fourth,
-sixth and eighth have swapped motors, a dead motor, an open potentiometer, swapped potentiometers; once named, each is mended.
+Each arm is drawn (:func:`armsight.sim.boards.workshop.drawn_workshop`: constants off by 15 %, gravity up to 60 % of the
+stall torque, inertia 0.5 to 6 times, 3 to 20 counts of noise, backlash, currents read 3 % wrong, potentiometers bent by up
+to 100 counts, signs as they come) and brought up by a person who reads a protractor to 0.17 degrees. The second, fourth,
+sixth and eighth have swapped motors, a dead motor, an open potentiometer, swapped potentiometers; once named, each
+is mended.
 Then the arm that was stored follows a sine of 0.5 rad at 0.4 Hz, takes a load step of 1 N m, and creeps at 0.02 rad/s, all
 joints at once and without gravity feed-forward; errors are of the true joint against the command.
 """
@@ -135,7 +136,7 @@ def main():
         all_r.append(r)
         all_k.append(k)
         print(
-            f"seed {seed}, {kind or 'wired rightly'}: R {100 * np.abs(r).max():.1f} %, K {100 * np.abs(k).max():.1f} % at most,"
+            f"seed {seed}, {kind or 'wired rightly'}: R {100 * np.abs(r).max():.1f} %, K {100 * np.abs(k).max():.1f} %,"
             f" signs {'right' if signs == expected else f'{signs} for {expected}'}, {found.arm_time_s:.0f} s of arm time,"
             f" drives on {plant.drives_s:.0f} s; {'as it must' if right else 'WRONG'}: {person.problems or 'no problem'}"
         )
@@ -154,13 +155,15 @@ def main():
     for name, values, most in (("R", all_r, 0.05), ("K", all_k, 0.05)):
         flat = np.abs(np.concatenate(values))
         print(
-            f"{name}: {100 * np.nanmedian(flat):.1f} % median, {100 * np.nanmax(flat):.1f} % at most; within 5 %: {(flat <= most).sum()} of {6 * given.arms} joints"
+            f"{name}: {100 * np.nanmedian(flat):.1f} % median, {100 * np.nanmax(flat):.1f} % at most;"
+            f" within 5 %: {(flat <= most).sum()} of {6 * given.arms} joints"
         )
     for name, values, most in (("sine mrad", sines, 1.6), ("creep mrad", creeps, 0.4), ("load step s", backs, 0.35)):
         flat = np.concatenate(values) if values else np.zeros(0)
         if len(flat):
             print(
-                f"{name}: {np.median(flat):.2f} median, {flat.max():.2f} at most; within {most}: {(flat <= most).sum()} of {len(flat)} joints"
+                f"{name}: {np.median(flat):.2f} median, {flat.max():.2f} at most;"
+                f" within {most}: {(flat <= most).sum()} of {len(flat)} joints"
             )
 
 

@@ -1,4 +1,4 @@
-/* MAVLink's common messages, for tools that know no other: ground stations, mavutil. docs/reference/mavlink.md.
+/* MAVLink's common messages, for tools that know no other: mavutil, ground control. docs/reference/mavlink.md.
  *
  * They reach the core as the dialect's own commands do, but with numbers of their own, of which the session's owner
  * hears nothing. One of them waits for the core's answer at a time; a tool repeats what got none. */
@@ -103,7 +103,7 @@ static const param_kind *kind_of(uint32_t param)
 }
 
 /* Return where a parameter lies in core_config, bytes. */
-static uint32_t place_of(uint32_t param)
+static uint32_t offset_of(uint32_t param)
 {
     const uint32_t of_joint =
         param < JOINTS * PARAMS_OF_JOINT ? param / PARAMS_OF_JOINT * (uint32_t)sizeof(joint_config) : 0u;
@@ -149,9 +149,9 @@ static float param_value(const wire_state *wire, uint32_t param)
 {
     uint8_t bytes[4];
     if (wire->common.params_staged != 0u && !is_gain(param)) {
-        memcpy(bytes, (const uint8_t *)&wire->staged.config + place_of(param), sizeof bytes);
+        memcpy(bytes, (const uint8_t *)&wire->staged.config + offset_of(param), sizeof bytes);
     } else {
-        settings_copy(wire, place_of(param), bytes, sizeof bytes);
+        settings_copy(wire, offset_of(param), bytes, sizeof bytes);
     }
     float value;
     uint32_t word;
@@ -240,12 +240,12 @@ static bool say_new_fault(wire_state *wire)
     uint32_t of_joints = 0u;
     for (uint32_t joint = 0u; joint <= JOINTS; joint++) {
         const uint32_t faults = joint < JOINTS ? outputs->joint_faults[joint] : outputs->faults & ~of_joints;
-        uint32_t *told = &wire->common.said_faults[joint];
+        uint32_t *said = &wire->common.said_faults[joint];
         of_joints |= faults;
-        *told &= faults;
+        *said &= faults;
         for (uint32_t fault = 1u; fault < FAULT_COUNT; fault++) {
-            if ((faults & ~*told & (1u << fault)) != 0u) {
-                *told |= 1u << fault;
+            if ((faults & ~*said & (1u << fault)) != 0u) {
+                *said |= 1u << fault;
                 say_fault(wire, fault, joint);
                 return true;
             }
@@ -473,7 +473,7 @@ static void store(wire_state *wire)
         settings_copy(wire, 0u, &staged->config, sizeof staged->config);
     }
     for (uint32_t joint = 0u; joint < JOINTS; joint++) {
-        settings_copy(wire, place_of(joint * PARAMS_OF_JOINT), &staged->config.joint[joint].gains, sizeof(joint_gains));
+        settings_copy(wire, offset_of(joint * PARAMS_OF_JOINT), &staged->config.joint[joint].gains, sizeof(joint_gains));
     }
     staged->crc = config_crc(&staged->config, sizeof staged->config);
     wire->common.params_staged = 1u;
@@ -573,7 +573,7 @@ static bool set_limit(wire_state *wire, uint32_t param, float value)
         wire->common.params_staged = 1u;
     }
     uint8_t before[4];
-    uint8_t *at = (uint8_t *)config + place_of(param);
+    uint8_t *at = (uint8_t *)config + offset_of(param);
     memcpy(before, at, sizeof before);
     if (kind_of(param)->is_word != 0u) {
         if (!number_within(value, 0.0f, MOST_WORD) || (float)(uint32_t)value != value) {
@@ -599,7 +599,7 @@ static void set_gain(wire_state *wire, uint32_t param, float value)
         return;
     }
     for (uint32_t joint = 0u; joint < JOINTS; joint++) {
-        settings_copy(wire, place_of(joint * PARAMS_OF_JOINT), &command->gains.joint[joint], sizeof(joint_gains));
+        settings_copy(wire, offset_of(joint * PARAMS_OF_JOINT), &command->gains.joint[joint], sizeof(joint_gains));
     }
     joint_gains *gains = &command->gains.joint[param / PARAMS_OF_JOINT];
     memcpy((uint8_t *)gains + param % PARAMS_OF_JOINT * sizeof value, &value, sizeof value);

@@ -57,7 +57,7 @@ _JOG_RAD, _JOG_DUTY, _JOG_DUTY_PER_S, _JOG_MOST_RAD = 0.010, 0.6, 0.15, 0.05
 _DEAD_DUTY, _DEAD_A = 0.25, 0.02
 #: A swing: amplitudes, rad, and frequencies, Hz, that add up, and how far a joint may get away from where it began.
 _SWING_RAD, _SWING_HZ, _SWING_MOST_RAD = (0.12, 0.04), (0.5, 2.0), 0.26
-#: A duty on top of it that no motion follows: it tells resistance from back-EMF where friction is all the load.
+#: A duty on top of it that no motion follows: it separates resistance from back-EMF where friction is all the load.
 _DITHER_DUTY, _DITHER_HZ = 0.07, 8.0
 _FIRST_SWING_S, _SWING_S, _GROW_S = 3.0, 5.0, 0.5
 _VERIFY_RAD, _VERIFY_HZ, _VERIFY_S, _VERIFY_MOST_RAD = 0.035, 0.5, 4.0, 0.01
@@ -524,9 +524,9 @@ class Bringup:
         if spots:
             around = [(max(first - 3, 0), min(last + 3, len(counts) - 1)) for first, last in spots]
             where = [np.degrees(found.angles(counts[list(ends), joint])) for ends in around]
-            places = ", ".join(f"{min(each):.1f} to {max(each):.1f} deg" for each in where)
+            spans = ", ".join(f"{min(each):.1f} to {max(each):.1f} deg" for each in where)
             found.range_counts = None
-            raise _Problem(f"{name}: its potentiometer has a dead spot at {places}. Clean or replace it.")
+            raise _Problem(f"{name}: its potentiometer has a dead spot at {spans}. Clean or replace it.")
 
     def _motors(self) -> None:
         todo = [j for j in self._joints if self._again or not self.found.joints[j].done("motors")]

@@ -93,7 +93,7 @@ def fit_swing(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) 
 
 
 def dead_spots(counts: Array, noise_counts: float, low: float, high: float) -> list[tuple[int, int]]:
-    """Return where a potentiometer that was moved by hand lost contact: first and last reading of each place.
+    """Return where a potentiometer that was moved by hand lost contact: first and last reading of each spot.
 
     Args:
         counts: (n,) readings of an even movement, a few milliseconds apart.

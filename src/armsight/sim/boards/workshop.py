@@ -48,7 +48,7 @@ class Wiring:
     dead_spot: tuple[int, float, float] | None = None
 
     def mended(self) -> Wiring:
-        """Return the wiring with all plugs in their places; signs are no mistake."""
+        """Return the wiring with all plugs where they belong; signs are no mistake."""
         return Wiring(motor_signs=self.motor_signs, potentiometer_signs=self.potentiometer_signs)
 
 
