@@ -1,6 +1,6 @@
 """``armsight board bringup``: from a board, motors and potentiometers that nobody knows to an arm that follows.
 
-In: a board with factory values, and a :class:`Person` who moves joints, reads angles and answers. Out: a configuration that
+In: a board with factory values, and a :class:`Operator` who moves joints, reads angles and answers. Out: a configuration that
 is stored on the board and written as ``board.toml``, what was found as ``bringup.json``, and a page of figures. The steps:
 
     readings         every potentiometer at rest: its noise; an open or short one by name
@@ -65,7 +65,7 @@ _GENTLE_RAD_S = 15.0  # bandwidth of the second swing
 _TRACE = 400  # points of a figure's line
 
 
-class Person(Protocol):
+class Operator(Protocol):
     """Who answers."""
 
     def say(self, line: str) -> None:
@@ -81,7 +81,7 @@ class Person(Protocol):
         ...
 
 
-class _Problem(Exception):
+class _Mistake(Exception):
     """Something a person must mend: named, with what to do."""
 
 
@@ -239,7 +239,7 @@ class Bringup:
     def __init__(
         self,
         board: Board,
-        person: Person,
+        person: Operator,
         folder: Path,
         joints: Sequence[int] = range(JOINTS),
         *,
@@ -328,7 +328,7 @@ class Bringup:
             try:
                 action(joint)
                 return
-            except _Problem as problem:
+            except _Mistake as problem:
                 self._off()
                 self.found.joints[joint].problems.append(str(problem))
                 answer = self._wait("problem", joint, f"{problem} [r]epeat, [s]kip, [q]uit")
@@ -376,7 +376,7 @@ class Bringup:
         status = self._board.status
         if status.faults:
             fault = status.first_fault or status.faults[0]
-            raise _Problem(f"the board stopped: {fault}.")
+            raise _Mistake(f"the board stopped: {fault}.")
         return readings
 
     def _q(self, readings: SensorReadings) -> Array:
@@ -454,15 +454,15 @@ class Bringup:
         middle = float(np.median(counts))
         name = f"joint {joint + 1}: its potentiometer"
         if middle > _OPEN_COUNTS:
-            raise _Problem(f"{name} is open: it reads {middle:.0f} of 65535. Is its plug in, and its wiper connected?")
+            raise _Mistake(f"{name} is open: it reads {middle:.0f} of 65535. Is its plug in, and its wiper connected?")
         if middle < _SHORT_COUNTS:
-            raise _Problem(
+            raise _Mistake(
                 f"{name} is shorted to ground: it reads {middle:.0f}. Look for a bridge or a lead without supply."
             )
         noise = 1.4826 * float(np.median(np.abs(counts - middle)))
         noise = max(noise, float(np.std(counts[np.abs(counts - middle) <= 6 * max(noise, 4.0)])), 1.0)
         if noise > _MOST_NOISE_COUNTS:
-            raise _Problem(
+            raise _Mistake(
                 f"{name} is noisy: {noise:.0f} counts at rest. Is its lead beside the motor's, its ground good?"
             )
         self.found.joints[joint].noise_counts = round(noise, 2)
@@ -505,19 +505,19 @@ class Bringup:
         way = np.array([np.ptp(each[np.isfinite(each)]) if np.isfinite(each).sum() > 10 else 0.0 for each in good.T])
         other = int(np.argmax(way))
         if way[joint] < _HAND_COUNTS < way[other]:
-            raise _Problem(
+            raise _Mistake(
                 f"{name}: moving it moves the reading of joint {other + 1}: the potentiometers of joints {joint + 1} and"
                 f" {other + 1} are swapped. Swap their plugs."
             )
         if way[joint] < _HAND_COUNTS:
-            raise _Problem(f"{name}: its reading does not follow the hand. Does its potentiometer's shaft go along?")
+            raise _Mistake(f"{name}: its reading does not follow the hand. Does its potentiometer's shaft go along?")
         spots = dead_spots(counts[:, joint], found.noise_counts or 10.0, _SHORT_COUNTS, _OPEN_COUNTS)
         if len(marks) < 2 or len(marks) > POT_NODES - 2:
-            raise _Problem(f"{name}: {len(marks)} angles were measured; 2 to {POT_NODES - 2} are needed.")
+            raise _Mistake(f"{name}: {len(marks)} angles were measured; 2 to {POT_NODES - 2} are needed.")
         ordered = np.array(sorted(marks))
         rises = np.diff(ordered[:, 1])
         if not ((rises > 0).all() or (rises < 0).all()) or (np.diff(ordered[:, 0]) < 100).any():
-            raise _Problem(
+            raise _Mistake(
                 f"{name}: the angles measured do not rise or fall with the reading: {_pairs(ordered)}. Measure again."
             )
         found.marks, found.range_counts = marks, [float(np.nanmin(good[:, joint])), float(np.nanmax(good[:, joint]))]
@@ -526,7 +526,7 @@ class Bringup:
             where = [np.degrees(found.angles(counts[list(ends), joint])) for ends in around]
             spans = ", ".join(f"{min(each):.1f} to {max(each):.1f} deg" for each in where)
             found.range_counts = None
-            raise _Problem(f"{name}: its potentiometer has a dead spot at {spans}. Clean or replace it.")
+            raise _Mistake(f"{name}: its potentiometer has a dead spot at {spans}. Clean or replace it.")
 
     def _motors(self) -> None:
         todo = [j for j in self._joints if self._again or not self.found.joints[j].done("motors")]
@@ -556,7 +556,7 @@ class Bringup:
         self._board.confirm(self._board.command(Command.DISABLE))
         directions = [np.sign(each) for each in ways if each]
         if len(set(directions)) != 1:
-            raise _Problem(
+            raise _Mistake(
                 f"joint {joint + 1}: it moves the same way whichever way its motor is driven. Support its load."
             )
         self.found.joints[joint].motor_direction = int(directions[0])
@@ -594,21 +594,21 @@ class Bringup:
         """Return how far the joint moved in thresholds; 0 where it is held on this side only."""
         name, other = f"joint {joint + 1}", int(np.argmax(np.abs(moved)))
         if abs(moved[other]) >= 1 and other != joint:
-            raise _Problem(
+            raise _Mistake(
                 f"{name}: its motor output moves joint {other + 1}: the motors of joints {joint + 1} and {other + 1} are"
                 " swapped. Swap their leads."
             )
         if abs(moved[joint]) >= 1 and current_a < 0.25 * _DEAD_A:
-            raise _Problem(f"{name}: it moves, but no current is measured. Look at its current sensor's lead.")
+            raise _Mistake(f"{name}: it moves, but no current is measured. Look at its current sensor's lead.")
         if abs(moved[joint]) >= 1:
             return float(moved[joint])
         if current_a < _DEAD_A:
-            raise _Problem(
+            raise _Mistake(
                 f"{name}: its motor is dead: no current at {duty:.0%} duty. Is its lead broken or out, or its driver off?"
             )
         if not last:
             return 0.0  # an end stop, or a load, may hold it on this side
-        raise _Problem(
+        raise _Mistake(
             f"{name}: its motor draws {current_a:.2f} A at {duty:.0%} duty and nothing moves. Is the joint blocked, or the"
             " motor loose on its gear?"
         )
@@ -627,7 +627,7 @@ class Bringup:
     def _swing(self, joint: int) -> None:
         degrees = np.degrees(sum(_SWING_RAD))
         if not self._yes(f"joint {joint + 1} will swing by {degrees:.0f} degrees either way. Is it free to? [y/n]"):
-            raise _Problem(f"joint {joint + 1}: it was not allowed to swing.")
+            raise _Mistake(f"joint {joint + 1}: it was not allowed to swing.")
         found = self.found.joints[joint]
         self._board.enable(inward=True)
         gains = gains_array(self._board.configuration())
@@ -658,7 +658,7 @@ class Bringup:
             dither[joint] = _DITHER_DUTY * np.sin(2 * np.pi * _DITHER_HZ * k * _PERIOD_S)
             readings = self._move(q_ref, qd_ref, dither)
             if len(readings.t_s) and abs(self._q(readings)[-1, joint] - start[joint]) > _SWING_MOST_RAD:
-                raise _Problem(f"joint {joint + 1}: it swings further than it is to: is its load loose?")
+                raise _Mistake(f"joint {joint + 1}: it swings further than it is to: is its load loose?")
         return self._collected()
 
     def _identify(self, joint: int, readings: SensorReadings) -> MotorFigures:
@@ -670,7 +670,7 @@ class Bringup:
         try:
             fit = fit_swing(readings.t_s[keep], volts, sign * readings.current_a[keep, joint], angles)
         except InputError as error:
-            raise _Problem(f"joint {joint + 1}: {error}.") from None
+            raise _Mistake(f"joint {joint + 1}: {error}.") from None
         motor = fit.motor
         found.resistance_ohm, found.constant_v_s = motor.resistance_ohm, motor.constant_v_s
         found.inertia_kg_m2, found.viscous_n_m_s = motor.inertia_kg_m2, motor.viscous_n_m_s
@@ -714,7 +714,7 @@ class Bringup:
             error = np.interp(readings.t_s[last], at[:, 0], at[:, j + 1]) - q[:, j]
             rms = float(np.sqrt(max(np.mean(error**2) - self.found.joints[j].noise_rad ** 2, 0.0)))
             if rms > _VERIFY_MOST_RAD:
-                raise _Problem(
+                raise _Mistake(
                     f"joint {j + 1}: it follows a small swing with an error of {np.degrees(rms):.2f} degrees RMS."
                 )
             self.found.joints[j].following_rms_rad = rms

@@ -18,7 +18,7 @@ from armsight.app.board.flash import FLASHED, PROGRAMMERS
 from armsight.errors import InputError
 
 if TYPE_CHECKING:
-    from armsight.app.board.bringup import Person
+    from armsight.app.board.bringup import Operator
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.contract import MotionBoard
 
@@ -259,7 +259,7 @@ def bringup(
 
     require_matplotlib()
     if name.startswith(SERIAL):
-        person: Person = _TerminalPerson(echo)
+        person: Operator = _TerminalPerson(echo)
         board = open_board(name, baud=BAUD if baud is None else baud)
     else:
         plant, _ = drawn_workshop(seed)
