@@ -1,7 +1,7 @@
 """``armsight board bringup``: from a board, motors and potentiometers that nobody knows to an arm that follows.
 
-In: a board with factory values, and a :class:`Operator` who moves joints, reads angles and answers. Out: a configuration that
-is stored on the board and written as ``board.toml``, what was found as ``bringup.json``, and a page of figures. The steps:
+In: a board with factory values, and an :class:`Operator` who moves joints, reads angles and answers. Out: a configuration,
+stored on the board and written as ``board.toml``, what was found as ``bringup.json``, and a page of figures. The steps:
 
     readings         every potentiometer at rest: its noise; an open or short one by name
     potentiometers   each joint moved by hand: the table of its potentiometer, direction, range, dead spots
