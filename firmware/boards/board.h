@@ -41,6 +41,9 @@ typedef struct board_description {
 
     /* Main loop, drives off. Store a copy (may take long); returns whether it reads back as written. */
     bool (*write_copy)(uint32_t which, const config_copy *copy);
+
+    /* Main loop, drives off. Start anew, as after switching on. */
+    void (*restart)(void);
 } board_description;
 
 #endif

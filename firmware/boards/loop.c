@@ -87,4 +87,7 @@ void loop_poll(board_loop *loop)
             break;
         }
     }
+    if (wire_to_restart(&loop->wire) && loop->outputs.drives_on == 0u) {
+        loop->board->restart();
+    }
 }

@@ -21,7 +21,7 @@ INTERRUPT_BYTES = 26 * 4
 #: the deepest point of what is running: a board's handlers are called *_interrupt.
 MAIN, TICK, HANDLER = "loop_poll", "loop_tick", "_interrupt"
 _INDIRECT = "__indirect_call"
-_HOOKS = "sense|drive|feed_watchdog|reset_cause|crash|receive|send|read_copy|write_copy"
+_HOOKS = "sense|drive|feed_watchdog|reset_cause|crash|receive|send|read_copy|write_copy|restart"
 _HOOK = re.compile(rf"\.(?:{_HOOKS}) = (\w+)")
 _NODE = re.compile(r'node: \{ title: "([^"]+)" label: "[^"]*?(?:\\n(\d+) bytes \((\w+)[^"]*)?"')
 _EDGE = re.compile(r'edge: \{ sourcename: "([^"]+)" targetname: "([^"]+)"')

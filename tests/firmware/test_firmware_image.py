@@ -72,7 +72,7 @@ def requests():
     said += [
         host.pack("config_part", 0, 100, 200, [0] * 200),
         host.store(b""),
-        host.pack("ping", 1, 0),
+        host.pack("timesync", 0, 1),
         b"\xfd\xff" * 90,
     ]
     said += [host.pack("config_read", 0), host.stop()]

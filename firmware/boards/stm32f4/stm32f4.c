@@ -44,6 +44,14 @@ static uint32_t reset_cause(void)
 
 static void crash(crash_record *record) { *record = last_crash; }
 
+static void restart(void)
+{
+    drives_off();
+    SCB_AIRCR = SCB_AIRCR_RESET;
+    for (;;) { /* it takes a few clocks */
+    }
+}
+
 static const board_description nucleo = {
     .name = "nucleo-f446re",
     .baud = UART_BAUD,
@@ -56,6 +64,7 @@ static const board_description nucleo = {
     .send = uart_send,
     .read_copy = flash_read,
     .write_copy = flash_write,
+    .restart = restart,
 };
 
 void systick_interrupt(void)

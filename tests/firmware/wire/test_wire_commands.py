@@ -61,7 +61,7 @@ def test_nothing_is_acknowledged_before_a_hello(fresh, message):
 
 def test_what_asks_for_no_command_is_not_answered_before_a_hello(fresh):
     board, host = fresh
-    board.run(30, host.pack("ping", 1, 0) + host.pack("config_read", 0))
+    board.run(30, host.pack("config_read", 0))
     assert host.listen() == []
 
 
@@ -168,12 +168,12 @@ def test_gains_come_whole(working):
     assert list(bytes(config.joint[0].gains)) == list(bytes(c.joint_gains(*gains[:8])))
 
 
-def test_a_ping_comes_back_with_the_tick(working):
+def test_a_timesync_comes_back_with_the_tick(working):
     board, host = working
-    board.tick(host.pack("ping", 123456789012345, 0))
+    board.tick(host.pack("timesync", 0, 123456789012345))
     board.run(3)
-    ping = host.newest("PING")
-    assert (ping.host_us, ping.tick) == (123456789012345, board.request.tick - 5)
+    sync = host.newest("TIMESYNC")
+    assert (sync.ts1, sync.tc1) == (123456789012345, (board.request.tick - 5) * 1_000_000)
 
 
 def test_what_the_board_itself_sends_does_nothing_when_it_comes_back(working):

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import queue
+import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +18,7 @@ from armsight.app.board.flash import FLASHED, PROGRAMMERS
 from armsight.errors import InputError
 
 if TYPE_CHECKING:
+    from armsight.app.board.bringup import Operator
     from armsight.data import Array
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.contract import MotionBoard
@@ -22,6 +27,8 @@ _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _DEFAULT = "emulated:unicorn"
 #: How long an emulated board is watched where nobody says how long.
 _WATCH_S = 2.0
+#: Steps of a bring-up, as ``bringup`` has them, which is not imported for a help text.
+STEPS = ("readings", "potentiometers", "motors", "swing", "verify", "store")
 
 
 def _board(action: Callable[..., Any]) -> Callable[..., Any]:
@@ -196,6 +203,76 @@ def selftest_(name: str, baud: int | None, drives: bool, as_json: bool) -> int:
         for problem in found.problems:
             click.echo(f"{scenario}: {problem}", err=True)
     return 0 if result.passed else 1
+
+
+@command.command()
+@_board
+@click.option(
+    "-o",
+    "--output",
+    "folder",
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    default=Path("bringup"),
+    show_default=True,
+    help="Folder of board.toml, report.html, and bringup.json, where what was found is kept.",
+)
+@click.option("--step", "steps", multiple=True, type=click.Choice(STEPS), help="Only this step; may be repeated.")
+@click.option("--joint", "joints", multiple=True, type=click.IntRange(1, 6), help="Only this joint; may be repeated.")
+@click.option("--again", is_flag=True, help="Do also what was found before.")
+@click.option(
+    "--current",
+    "most_current_a",
+    type=click.FloatRange(0.05, 30),
+    default=2.0,
+    show_default=True,
+    help="What a motor may draw, A.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of an emulated board's arm.")
+@_JSON
+def bringup(
+    name: str,
+    baud: int | None,
+    folder: Path,
+    steps: tuple[str, ...],
+    joints: tuple[int, ...],
+    again: bool,
+    most_current_a: float,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Bring up an arm of unknown motors and potentiometers, step by step, and store its configuration.
+
+    Each joint is moved by hand, each motor driven by a pulse of at most 3 degrees, and then, after a yes, by a swing of 10.
+    What was found is kept: the same command goes on where it ended. On an emulated board an arm and a person are drawn.
+    """
+    from armsight.app.board.bringup import Bringup, found_json
+    from armsight.app.report.page import writable_folder
+    from armsight.app.report.plotting import require_matplotlib
+    from armsight.robot.boards.board import Board
+    from armsight.robot.boards.emulated import EmulatedLink
+    from armsight.robot.boards.opening import SERIAL, emulator_name, open_board, open_emulator
+    from armsight.robot.boards.serial import BAUD
+    from armsight.sim.boards.workshop import WorkshopPerson, drawn_workshop
+
+    def echo(line: str) -> None:
+        click.echo(line, err=True)
+
+    require_matplotlib()
+    if name.startswith(SERIAL):
+        person: Operator = _TerminalPerson(echo)
+        board = open_board(name, baud=BAUD if baud is None else baud)
+    else:
+        plant, _ = drawn_workshop(seed)
+        person = WorkshopPerson(plant, seed=seed, say=echo)
+        board = Board.connect(EmulatedLink(open_emulator(emulator_name(name)), plant), name="the emulated board")
+    with board:
+        writable_folder(folder, "nothing of a bring-up")
+        chosen = [joint - 1 for joint in sorted(set(joints))] or range(6)
+        session = Bringup(board, person, folder, chosen, again=again, most_current_a=most_current_a)
+        session.run(steps or STEPS)
+    if as_json:
+        click.echo(json.dumps(found_json(session.found)))
 
 
 @command.command()
@@ -414,6 +491,38 @@ def emulate(arm: str, seconds: float | None, as_json: bool) -> None:
     with serve(device, baud) as port:
         click.echo(json.dumps({"board": f"{kind}:{port.name}"}) if as_json else f"{kind}:{port.name}")
         threading.Event().wait(seconds)
+
+
+class _TerminalPerson:
+    """A person at this terminal: lines come from stdin while the board's time goes on.
+
+    Args:
+        echo: prints a line.
+    """
+
+    def __init__(self, echo: Callable[[str], None]) -> None:
+        self._echo = echo
+        self._lines: queue.Queue[str] = queue.Queue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        for line in sys.stdin:
+            self._lines.put(line.rstrip("\n"))
+        self._lines.put("q")
+
+    def say(self, line: str) -> None:
+        """Print a line."""
+        self._echo(line)
+
+    def ask(self, kind: str, joint: int | None, text: str) -> None:
+        """Print a question."""
+        self._echo(f"{text}: ")
+
+    def answer(self) -> str | None:
+        """Return the next line, if there is one."""
+        with contextlib.suppress(queue.Empty):
+            return self._lines.get_nowait()
+        return None
 
 
 def _open(name: str, baud: int | None) -> Board:

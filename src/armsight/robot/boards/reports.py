@@ -130,6 +130,23 @@ class JointReport(Record):
     temperature_c: Array | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class SensorReadings(Record):
+    """What a board's converters read over some time.
+
+    Attributes:
+        t_s: (n,) when, s on the board's clock.
+        counts: (n, 6) potentiometers, 16-bit fractions of their supply.
+        current_a: (n, 6) motor currents, A, positive where a positive duty drives them.
+        duty: (n, 6) to the motors while this was read, -1 to 1.
+    """
+
+    t_s: Array
+    counts: Array
+    current_a: Array
+    duty: Array
+
+
 def plain_status(
     t_s: float, state: BoardState, faults: tuple[JointFault, ...], supply_v: float, sent: int
 ) -> BoardStatus:
@@ -210,6 +227,16 @@ def joints_of(message: Message, t_s: float) -> JointReport:
         reference_rad_s=np.array(message.reference_rad_s),
         duty=np.array(message.duty),
         limited=tuple(Limited(bits) for bits in message.limited),
+    )
+
+
+def readings_of(messages: list[Message], times_s: list[float]) -> SensorReadings:
+    """Return what SENSED messages say."""
+    return SensorReadings(
+        t_s=np.array(times_s),
+        counts=np.array([each.counts for each in messages], dtype=float).reshape(-1, 6),
+        current_a=1e-3 * np.array([each.current_ma for each in messages], dtype=float).reshape(-1, 6),
+        duty=np.array([each.duty for each in messages], dtype=float).reshape(-1, 6),
     )
 
 

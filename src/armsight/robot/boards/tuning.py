@@ -83,3 +83,44 @@ def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, da
             ANTI_WINDUP_PER_S,
         ]
     )
+
+
+#: Standard deviation of the duty that a potentiometer's noise may cause, and between which bandwidths one is looked for.
+_DUTY_NOISE, _LEAST_RAD_S, _MOST_RAD_S = 0.08, 5, 40
+_TICK_S = 1e-3
+#: Shares of the duty: all that motion and load may take, and of what the load leaves, what steady motion may take.
+_USED, _MOVING = 0.9, 0.7
+_MOST_SPEED_RAD_S, _MOST_RAD_S2 = 2.0, 10.0
+
+
+def quiet_bandwidth(motor: MotorFigures, supply_v: float, noise_rad: float) -> float:
+    """Return the greatest bandwidth, rad/s, at which a potentiometer's noise hardly moves the duty.
+
+    Args:
+        motor: its motor.
+        supply_v: nominal supply, V.
+        noise_rad: standard deviation of a reading.
+    """
+    for bandwidth in range(_MOST_RAD_S, _LEAST_RAD_S, -1):
+        kp, _, kd, *_, filter_s, _ = tuned_gains(motor, supply_v, bandwidth)
+        share = _TICK_S / (filter_s + _TICK_S)
+        speed_noise = noise_rad * share / _TICK_S * np.sqrt(2 / (2 - share))
+        if np.hypot(kp * noise_rad, kd * speed_noise) <= _DUTY_NOISE:
+            return float(bandwidth)
+    return float(_LEAST_RAD_S)
+
+
+def motion_limits(motor: MotorFigures, supply_v: float, gravity_n_m: float) -> tuple[float, float]:
+    """Return the greatest speed, rad/s, and acceleration, rad/s^2, that a motor reaches with duty to spare.
+
+    Args:
+        motor: its motor.
+        supply_v: nominal supply, V.
+        gravity_n_m: greatest torque of gravity.
+    """
+    stall = motor.constant_v_s * supply_v / motor.resistance_ohm
+    free_rad_s = supply_v / motor.constant_v_s
+    load = min((gravity_n_m + motor.dry_n_m) / stall, _MOVING)
+    speed = min(max(_MOVING * (_USED - load) * free_rad_s, 0.05), _MOST_SPEED_RAD_S)
+    spare = max(_USED - load - speed / free_rad_s, 0.05)
+    return speed, min(max(0.8 * spare * stall / motor.inertia_kg_m2, 0.5), _MOST_RAD_S2)
