@@ -21,7 +21,7 @@ def project(H, xy):
 
 
 def pixels(count, samples, blur_px, pad):
-    """Return the sparse matrix (count, (count + 2 pad) samples) that blurs samples along an axis and averages each pixel's."""
+    """Return the sparse matrix (count, (count + 2 pad) samples) that blurs an axis's samples and averages each pixel's."""
     reach = int(4 * blur_px * samples + 0.5)
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (blur_px * samples)) ** 2) if blur_px else np.ones(1)
     taps = np.convolve(taps / taps.sum(), np.full(samples, 1.0 / samples)).astype(np.float32)
