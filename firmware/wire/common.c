@@ -47,7 +47,7 @@ enum {
 #define PREARM_CHECK (1u << 28)
 
 /* What the answer of the core is for. */
-enum { WAITS_NOT = 0, WAITS_COMMAND = 1, WAITS_DISARM = 2, WAITS_CLEAR = 3, WAITS_PARAM = 4 };
+enum { WAITS_NOT = 0, WAITS_COMMAND = 1, WAITS_DISARM = 2, WAITS_TO_CLEAR = 3, WAITS_CLEAR = 4, WAITS_PARAM = 5 };
 
 /* ---- parameters ---- */
 
@@ -194,8 +194,7 @@ static void say(wire_state *wire, uint32_t severity, const text *said)
     const uint32_t piece = MAVLINK_MSG_STATUSTEXT_FIELD_TEXT_LEN;
     mavlink_statustext_t status = {.severity = (uint8_t)severity};
     if (said->length > piece) {
-        wire->common.texts = (uint16_t)(wire->common.texts + 1u);
-        wire->common.texts = wire->common.texts != 0u ? wire->common.texts : (uint16_t)1u;
+        wire->common.texts = (uint16_t)(wire->common.texts % UINT16_MAX + 1u); /* 0 is a text in one piece */
         status.id = wire->common.texts;
     }
     for (uint32_t at = 0u; at < said->length; at += piece) {
@@ -222,9 +221,9 @@ static void say_rejection(wire_state *wire, uint32_t rejection)
 
 static void say_fault(wire_state *wire, uint32_t fault, uint32_t joint)
 {
-    char number[2] = {(char)('1' + joint), '\0'};
     text said = {.length = 0u};
     if (joint < JOINTS) {
+        const char number[2] = {(char)('1' + joint), '\0'};
         append(&said, "joint ");
         append(&said, number);
         append(&said, ": ");
@@ -347,10 +346,21 @@ static bool owner_left(const wire_state *wire)
     return wire->report.outputs.drives_on == 0u && wire_tick(wire) - wire->common.owner_tick > OWNER_TICKS;
 }
 
+/* Hand the core a command whose answer is waited for; NULL where the queue is full, which was answered. */
+static core_command *ask_core(wire_state *wire, uint32_t kind, uint32_t waits)
+{
+    wire->common.sequence = SEQUENCES | ((wire->common.sequence + 1u) & ~SEQUENCES);
+    wire->common.waits = waits;
+    return command_append(wire, kind, wire->common.sequence);
+}
+
 void common_write(wire_state *wire)
 {
     wire_common *common = &wire->common;
     const uint32_t tick = wire_tick(wire);
+    if (common->waits == WAITS_TO_CLEAR) {
+        (void)ask_core(wire, COMMAND_CLEAR_FAULTS, WAITS_CLEAR);
+    }
     if (common->sensed_period != 0u && tick - common->sensed_tick >= common->sensed_period && telemetry_has_room(wire)) {
         common->sensed_tick = tick;
         write_sensed(wire);
@@ -386,14 +396,6 @@ static void acknowledge(wire_state *wire, uint32_t result, uint32_t rejection)
     telemetry_put(wire, &message);
 }
 
-/* Hand the core a command whose answer is waited for; NULL where the queue is full, which was answered. */
-static core_command *ask_core(wire_state *wire, uint32_t kind, uint32_t waits)
-{
-    wire->common.sequence = SEQUENCES | ((wire->common.sequence + 1u) & ~SEQUENCES);
-    wire->common.waits = waits;
-    return command_append(wire, kind, wire->common.sequence);
-}
-
 bool common_answered(wire_state *wire, uint32_t sequence, uint32_t rejection)
 {
     wire_common *common = &wire->common;
@@ -406,7 +408,7 @@ bool common_answered(wire_state *wire, uint32_t sequence, uint32_t rejection)
         say_rejection(wire, rejection);
     }
     if (waits == WAITS_DISARM && rejection == REJECTION_NONE && wire->report.outputs.faults != 0u) {
-        (void)ask_core(wire, COMMAND_CLEAR_FAULTS, WAITS_CLEAR); /* a tool has no other way to clear them */
+        common->waits = WAITS_TO_CLEAR; /* a tool has no other way to clear them */
     } else if (waits == WAITS_PARAM) {
         put_param(wire, common->param);
     } else if (waits == WAITS_CLEAR) {
