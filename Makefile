@@ -4,6 +4,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 # The environment's Python with OpenCV 4, which lies in a folder of its own, before the newer one.
 OPENCV4 := PYTHONPATH=$(abspath $(VENV)/opencv4) $(BIN)/python
+# A file is one worker's; files in their order, which begins with the longest.
+PARALLEL := -n auto --maxprocesses=4 --dist=loadfile --no-loadscope-reorder
 
 .PHONY: demo test lint docs bench clean
 
@@ -12,9 +14,9 @@ demo: $(VENV)/.armsight  ## the whole experiment in the simulated workcell, held
 
 test: $(VENV)/.armsight-test $(VENV)/.opencv4 lint  ## everything that must hold
 	$(BIN)/python -m armsight.kernels.build
-	$(BIN)/python -m pytest -n auto --maxprocesses=4 --dist=loadfile
+	$(BIN)/python -m pytest $(PARALLEL)
 	$(OPENCV4) -c "import cv2; assert cv2.__version__.startswith('4.'), cv2.__version__"
-	$(OPENCV4) -m pytest -n auto --maxprocesses=4 --dist=loadfile -m opencv $$(grep -rl --include="test_*.py" "pytest.mark.opencv" tests)
+	$(OPENCV4) -m pytest $(PARALLEL) -m opencv $$(grep -rl --include="test_*.py" "pytest.mark.opencv" tests)
 
 lint: $(VENV)/.armsight-test
 	$(BIN)/ruff check .
@@ -32,7 +34,7 @@ bench: $(VENV)/.armsight-test  ## every figure, peers beside; real recordings ar
 # The firmware is built with the package, with zig from PyPI; ARMSIGHT_FIRMWARE_COMPILER=gcc asks for arm-none-eabi-gcc.
 $(VENV)/.armsight: pyproject.toml setup.py $(shell find firmware -type f)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[all]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[sim,record]"
 	touch $@
 
 $(VENV)/.armsight-test: pyproject.toml setup.py $(shell find firmware -type f)

@@ -159,7 +159,7 @@ def metric_2():
                 use = stack_use(board)
                 print(
                     f"{'':9}stack {use.total_bytes} bytes at most (-fstack-usage): main loop {use.main.stack_bytes},"
-                    f" tick {use.tick.stack_bytes}, and the interrupt's own frame"
+                    f" tick {use.tick.stack_bytes}, {len(use.nested)} other interrupts, and a frame for each"
                 )
 
 

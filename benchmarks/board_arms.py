@@ -13,9 +13,11 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import functools
 import math
 import os
 import sys
+import tempfile
 from collections import Counter, defaultdict
 from pathlib import Path
 
@@ -28,7 +30,8 @@ from firmware_arm import declare  # noqa: E402
 from firmware_layout import c  # noqa: E402
 
 from armsight import firmware  # noqa: E402
-from armsight.robot.boards.codes import BoardState, Fault  # noqa: E402
+from armsight.firmware import build  # noqa: E402
+from armsight.robot.boards.codes import Fault  # noqa: E402
 from armsight.robot.boards.configuration import GAINS, lab_configuration  # noqa: E402
 from armsight.robot.boards.frames import OUTPUTS  # noqa: E402
 from armsight.robot.boards.tuning import MotorFigures, tuned_gains  # noqa: E402
@@ -43,11 +46,24 @@ from armsight.sim.joints import (  # noqa: E402
     drawn_model,
 )
 
-STIFFNESS_N_M, PERIOD_TICKS = 50.0, 4
-INPUTS = np.dtype(
-    [(name, "<u4") for name in ("tick", "overrun", "stop_pressed", "taken_over", "supply_mv")]
-    + [("counts", "<u4", 6), ("current_ma", "<i4", 6)]
-)
+STIFFNESS_N_M, PERIOD_TICKS = 40.0, 4
+NAMED_TICKS = 200  # from a fault to its final name
+#: Arrays of a plant: their names in board_arms.c and here.
+PLANT_ARRAYS = {
+    "q": "q",
+    "qd": "qd",
+    "link": "link",
+    "qdd": "_qdd",
+    "model": "_model",
+    "hand": "hand_n_m",
+    "current_a": "_current_a",
+    "broken": "_broken",
+    "fault": "_fault",
+    "noise": "_noise",
+    "counts": "_counts",
+    "current_ma": "_current_ma",
+    "blocked": "blocked",
+}
 POT_NAMES = {
     PotFault.STUCK: (Fault.POT_FROZEN,),
     PotFault.FROZEN: (Fault.POT_FROZEN,),
@@ -78,19 +94,46 @@ def arm_configuration(model, rng):
     return config
 
 
+class Loop(ctypes.Structure):
+    """``arm_loop`` of board_arms.c."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in (*PLANT_ARRAYS, "core_tick", "core", "inputs", "outputs")),
+        ("fastest_rad_s", ctypes.c_double),
+        ("apart_rad", ctypes.c_double),
+        *((name, ctypes.c_uint32) for name in ("supply_mv", "ticks", "sequence", "unused")),
+        ("way", ctypes.c_double * 48),
+    ]
+
+
+@functools.cache
+def compiled():
+    """board_arms.c as a library."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "board_arms.so"
+        source = str(Path(__file__).with_suffix(".c").resolve())
+        build.compile_c(build.open_compiler().host, made, [source], "-O2", "-shared", "-fPIC", "-Icore", "-lm")
+        library = ctypes.CDLL(str(made))
+    word, pointer = ctypes.c_uint32, ctypes.c_void_p
+    library.arm_run.argtypes, library.arm_run.restype = [pointer, word], word
+    library.arm_follow.argtypes, library.arm_follow.restype = [pointer, pointer, word, word, word, pointer], word
+    return library
+
+
 class Arm:
     """An arm, the core that drives it and a host that swings it."""
 
-    def __init__(self, library, seed, *, load=0.6):
+    def __init__(self, library, seed, *, load=0.6, model=None, config=None, supply_v=None, start=None):
         self.rng = np.random.default_rng([seed, 7])
         self.library = library
-        self.model = drawn_model(seed, load=load)
-        self.plant = JointPlant(seed=seed + 1, model=self.model)
-        supply_v = self.rng.uniform(9.6, 14.0)
+        self.model = drawn_model(seed, load=load) if model is None else model
+        self.plant = JointPlant(start, seed=seed + 1, model=self.model)
         need_v = np.abs(self.model.gravity_n_m) / self.model.constant_v_s * self.model.resistance_ohm
-        supply_v = min(max(supply_v, float(need_v.max()) / 0.8), 14.0)  # a supply that can hold the load at all
+        if supply_v is None:
+            supply_v = self.rng.uniform(9.6, 14.0)
+            supply_v = min(max(supply_v, float(need_v.max()) / 0.8), 14.0)  # one that can hold the load at all
         self.plant.supply_mv = round(supply_v * 1e3)
-        self.config = arm_configuration(self.model, self.rng)
+        self.config = arm_configuration(self.model, self.rng) if config is None else config
         # What is left of the supply moves the joints: half of it is asked for.
         spare = (supply_v - need_v - self.model.dry_n_m / self.model.constant_v_s * self.model.resistance_ohm) / (
             self.model.constant_v_s
@@ -101,41 +144,59 @@ class Arm:
         self.core, self.inputs, self.outputs = c.core_state(), c.core_inputs(), c.core_outputs()
         raw = (ctypes.c_char * self.config.nbytes).from_buffer_copy(self.config.tobytes())
         library.core_init(ctypes.byref(self.core), raw, 0, 0)
-        self._in = np.frombuffer(self.inputs, INPUTS, 1)[0:1]
         self.out = np.frombuffer(self.outputs, OUTPUTS)[0:1]
-        self._args = tuple(map(ctypes.byref, (self.core, self.inputs, self.outputs)))
-        self.sequence, self.ticks, self.t_s = 0, 0, 0.0
+        arrays = (getattr(self.plant, name).ctypes.data for name in PLANT_ARRAYS.values())
+        core_tick = ctypes.cast(library.core_tick, ctypes.c_void_p).value
+        self.loop = Loop(*arrays, core_tick, *map(ctypes.addressof, (self.core, self.inputs, self.outputs)))
+        self.t_s = 0.0
         self.gravity = np.zeros(6)
-        self.fastest = 0.0  # of the limit, while no fault stands
-        self.apart = 0.0  # of the references, likewise
+
+    @property
+    def ticks(self):
+        return int(self.loop.ticks)
+
+    @property
+    def fastest(self):
+        """Of the limit, while it was enabled."""
+        return self.loop.fastest_rad_s / float(self.config["joint"]["speed_limit_rad_s"][0])
+
+    @property
+    def apart(self):
+        """From the references, likewise."""
+        return self.loop.apart_rad
 
     def tick(self, ticks=1):
-        out, plant = self.out, self.plant
-        for _ in range(ticks):
-            sensed = plant.sense()
-            self.ticks += 1
-            self._in["tick"], self._in["supply_mv"] = self.ticks, sensed.supply_mv
-            self._in["counts"], self._in["current_ma"] = sensed.counts, sensed.current_ma
-            self.library.core_tick(*self._args)
-            self.inputs.command.kind = 0
-            o = out[0]
-            plant.step(o["duty"], bool(o["drives_on"] or o["windings_shorted"]), not o["brakes_open"])
-            if o["state"] == BoardState.ENABLED:
-                self.fastest = max(self.fastest, float(np.abs(plant.qd).max()) / 2.0)
-                self.apart = max(self.apart, float(np.abs(plant.link - o["reference_rad"]).max()))
-        return out[0]
+        self.loop.supply_mv = self.plant.supply_mv
+        compiled().arm_run(ctypes.byref(self.loop), ticks)
+        return self.out[0]
 
     def command(self, kind):
-        self.sequence += 1
-        self.inputs.command.kind, self.inputs.command.sequence = kind, self.sequence
+        self.loop.sequence += 1
+        self.inputs.command.kind, self.inputs.command.sequence = kind, self.loop.sequence
         return self.tick()
 
+    def follow(self, positions, speeds, period=PERIOD_TICKS, *, stop_at_fault=True, traced=False):
+        """Send points (n, 6), one each period; returns the ticks that passed, and where joints and references were."""
+        points = np.zeros((len(positions), 3, 6))
+        points[:, 0], points[:, 1], points[:, 2] = positions, speeds, self.gravity
+        trace = np.zeros((len(points) * period, 2, 6)) if traced else None
+        self.loop.supply_mv = self.plant.supply_mv
+        passed = compiled().arm_follow(
+            ctypes.byref(self.loop),
+            points.ctypes.data,
+            len(points),
+            period,
+            stop_at_fault,
+            trace.ctypes.data if traced else None,
+        )
+        return (passed, trace[:passed]) if traced else passed
+
     def move(self, position_rad, speed_rad_s, ticks):
+        """Send one set point and run the tick that takes it."""
         move = self.inputs.command.move
         move.position_rad[:], move.speed_rad_s[:] = list(position_rad), list(speed_rad_s)
-        move.gravity_duty[:] = list(self.gravity)
-        move.duration_ticks = ticks
-        return self.command(c.COMMAND_MOVE)
+        move.gravity_duty[:], move.duration_ticks = list(self.gravity), ticks
+        self.command(c.COMMAND_MOVE)
 
     def enable(self):
         """Enable while something holds the arm, which lets it go within 0.3 s."""
@@ -152,33 +213,26 @@ class Arm:
         self.plant.hand_n_m[:] = 0
 
     def target(self, t_s):
-        """A swing that begins smoothly from where the arm was enabled."""
+        """A swing that begins smoothly from where the arm was enabled; t_s (n, 1)."""
         w = 2 * math.pi * self.hz
-        grow = 1.0 if t_s > 1.0 else t_s * t_s * (3 - 2 * t_s)
+        grow = np.where(t_s > 1.0, 1.0, t_s * t_s * (3 - 2 * t_s))
         return self.start + grow * self.speed_rad_s / w * (np.sin(w * t_s + self.phase) - np.sin(self.phase))
 
     def swing(self, ticks, *, stop_at_fault=True):
         """Swing; returns the ticks that passed until a fault, or None."""
-        for k in range(0, ticks, PERIOD_TICKS):
-            self.t_s += PERIOD_TICKS * 1e-3
-            here, later = self.target(self.t_s), self.target(self.t_s + 1e-3)
-            self.move(here, (later - here) * 1e3, PERIOD_TICKS)
-            for i in range(PERIOD_TICKS):
-                if stop_at_fault and self.out[0]["faults"]:
-                    return k + i
-                if i + 1 < PERIOD_TICKS:
-                    self.tick()
-        return None
+        if stop_at_fault and self.out[0]["faults"]:
+            return 0
+        at = self.t_s + 1e-3 * PERIOD_TICKS * np.arange(1, max(ticks // PERIOD_TICKS, 1) + 1)[:, None]
+        self.t_s = float(at[-1, 0])
+        here = self.target(at)
+        passed = self.follow(here, (self.target(at + 1e-3) - here) * 1e3, stop_at_fault=stop_at_fault)
+        return passed if self.out[0]["faults"] else None
 
     def rest(self, ticks):
         """Stay; returns likewise."""
-        here = np.array(self.out[0]["reference_rad"], dtype=float)
-        for k in range(0, ticks, PERIOD_TICKS):
-            self.move(here, np.zeros(6), PERIOD_TICKS)
-            self.tick(PERIOD_TICKS - 1)
-            if self.out[0]["faults"]:
-                return k
-        return None
+        here = np.tile(np.array(self.out[0]["reference_rad"], dtype=float), (ticks // PERIOD_TICKS, 1))
+        passed = self.follow(here, np.zeros_like(here))
+        return passed if self.out[0]["faults"] else None
 
     @property
     def first(self):
@@ -202,14 +256,16 @@ class Table:
 
     def add(self, kind, arm, expected, joint=None, late_ms=None):
         self.cases[kind] += 1
+        if joint is not None and arm.first[0] is not None:
+            self.off[kind].append(abs(arm.plant.link[joint] - float(arm.out[0]["angle_rad"][joint])))
+        if expected and arm.first[0] is not None:
+            arm.tick(NAMED_TICKS)
         fault = arm.first[0]
         self.codes[kind][fault.name if fault else "-"] += 1
         if not expected:
             self.false[kind] += fault is not None
         elif fault is None:
             self.missed[kind] += 1
-        if joint is not None and fault is not None:
-            self.off[kind].append(abs(arm.plant.link[joint] - float(arm.out[0]["angle_rad"][joint])))
         if late_ms is not None:
             self.late_ms[kind].append(late_ms)
         self.fast[kind] = max(self.fast[kind], arm.fastest)
@@ -255,9 +311,8 @@ def pushed(library, seed, table):
 
 
 def soft_limit(library, seed, table):
-    arm = Arm(library, seed, load=0.4)
-    start = arm.rng.uniform(1.6, 2.2)
-    arm.plant.q[:], arm.plant.link[:] = start, start
+    start = np.random.default_rng([seed, 8]).uniform(1.6, 2.2)
+    arm = Arm(library, seed, load=0.4, start=np.full(6, start))
     arm.enable()
     arm.rest(600)
     for _ in range(150):

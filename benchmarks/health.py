@@ -1,102 +1,201 @@
-"""Faults of rig, body and mounting: how soon they are found, how well sized, and how often nothing is taken for a fault.
+"""Faults of cameras, body, mounting, joints and clocks: how soon they are named, as what, how well sized, and what is given
+out afterwards.
 
-python health.py             light simulation (projected points, an arm with errors), 20 seeds a case: about half an hour
-python health.py 5           five seeds
-python health.py 5 arms      of the arm's cases alone
-python health.py rendered    one rendered run of each fault in the workcell (worn arm): about eight minutes
+python health.py                         light simulation (projected points, an arm with errors), 20 seeds a case
+python health.py --seeds 2100:2105       of these seeds alone
+python health.py bump slip               of the cases alone whose names contain one of these words
+python health.py --results rows.jsonl    each run is a line there; those that stand in it are not made again
+python health.py rendered knock          one rendered run of a fault in the workcell (worn arm), about two minutes each
+
+A run of a camera or a body takes about 1 s of computing, one of an arm 5 s. Delays count from when the fault displaces the
+measured pose by twice its claimed sigma. NEES is that of what is given out once the fault was named.
 """
 
-import sys
+import argparse
+import json
 import tempfile
 import time
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from sys import path
 
 import numpy as np
 
 TESTS = Path(__file__).resolve().parent.parent / "tests"
-sys.path[:0] = [str(TESTS), str(TESTS / "loop"), str(TESTS / "loop" / "health")]
+path[:0] = [str(TESTS), str(TESTS / "loop"), str(TESTS / "loop" / "health")]
 
 import faults  # noqa: E402
 
 import armsight.app.demo.demo as demo  # noqa: E402
-from armsight.geometry.pose import exp_se3, inverse  # noqa: E402
+from armsight.geometry.pose import exp_se3, inverse, log_se3  # noqa: E402
 from armsight.loop.estimators import Mounting  # noqa: E402
 
-#: Case -> the fault of the cameras or the body; and the size that is to be found.
-BODIES = {
-    "nothing wrong": ({}, 0.0),
-    "right camera rotated by 0.05 deg (x)": ({"rotated": np.radians([0.05, 0.0, 0.0])}, 0.05),
-    "right camera rotated by 0.05 deg (y)": ({"rotated": np.radians([0.0, 0.05, 0.0])}, 0.05),
-    "right camera rotated by 0.05 deg (z)": ({"rotated": np.radians([0.0, 0.0, 0.05])}, 0.05),
-    "the same (y), after 5 s": ({"rotated": np.radians([0.0, 0.05, 0.0]), "at_s": 5.0}, 0.05),
-    "body file 1 % too large": ({"scale": 1.01}, 100 * (1 / 1.01 - 1)),
-}
 DEG = float(np.radians(1.0))
 #: When the rig is knocked in a rendered run, s: in the motions with potentiometers alone.
 KNOCK_S = 26.0
-#: Case -> motion (6,) of the rig, t seconds after its beginning, [m; rad].
-MOTIONS = {
-    "knocked by 10 mm and 0.8 deg": lambda t: np.array([0.01, 0.0, 0.0, 0.0, 0.8 * DEG, 0.0]),
-    "bumped by 2 mm": lambda t: np.array([0.002, 0.0, 0.0, 0.0, 0.0, 0.0]),
-    "bumped by 0.5 mm": lambda t: np.array([0.0005, 0.0, 0.0, 0.0, 0.0, 0.0]),
-    "drifts by 1 mm and 0.1 deg a minute": lambda t: np.array([0.001, 0.0, 0.0, 0.0, 0.1 * DEG, 0.0]) * t / 60,
-    "drifts by 10 mm and 1 deg a minute": lambda t: np.array([0.01, 0.0, 0.0, 0.0, 1.0 * DEG, 0.0]) * t / 60,
-}
-#: Case -> options of the fault, the cause that is to be named and the size that is to be found, mm or deg.
-ARMS = {
-    "rig stands still": ({}, "", 0.0),
-    "rig knocked by 10 mm and 0.8 deg": ({"motion": MOTIONS["knocked by 10 mm and 0.8 deg"]}, "fixed", 0.0),
-    "rig bumped by 2 mm": ({"motion": MOTIONS["bumped by 2 mm"]}, "fixed", 2.0),
-    "rig bumped by 0.5 mm": ({"motion": MOTIONS["bumped by 0.5 mm"]}, "fixed", 0.5),
-    "rig drifts by 1 mm, 0.1 deg a minute": ({"motion": MOTIONS["drifts by 1 mm and 0.1 deg a minute"]}, "fixed", 0.0),
-    "rig drifts by 10 mm, 1 deg a minute": ({"motion": MOTIONS["drifts by 10 mm and 1 deg a minute"]}, "fixed", 0.0),
-    "body slips on the tool by 1 mm": ({"slip": np.array([0.001, 0, 0, 0, 0, 0.3 * DEG])}, "body", 1.0),
-    "joint 3 slips by 0.5 deg": ({"joint": 2, "slip_rad": 0.5 * DEG}, "joint", 0.5),
-    "joint 5 slips by 1 deg": ({"joint": 4, "slip_rad": DEG}, "joint", 1.0),
-    "backlash of joint 2 grows by 0.5 deg": ({"joint": 1, "more_rad": 0.5 * DEG}, "joint", 0.5),
-}
-#: Duration of a light simulation of an arm, s.
-ARM_S = 50.0
-_ROW = "{:38s} {:>7s} {:>7s} {:>10s} {:>8s} {:>17s}"
+#: Duration of a light simulation of cameras and of an arm, s; when an arm is known and when its fault begins, s.
+BODY_S, ARM_S = 20.0, 50.0
+faults.LEARNED_S, faults.AT_S = 10.0, 20.0
+#: After a fault was named, s: its covariance is tested from then on.
+SETTLED_S = 1.0
+#: A tool moves about so fast, m/s, and a joint moves it by about so much, m/rad: for when a fault matters.
+SPEED_M_S, LEVER_M = 0.25, 0.4
 
 
-def main(seeds: int, bodies: bool) -> None:
-    """Run the light simulations, those of rig and body too or the arm's alone, and print."""
-    print(_ROW.format("", "found", "cause", "median, s", "worst, s", "size, RMS sigmas"))
-    for name, (fault, size) in BODIES.items() if bodies else ():
-        rows = []
-        for seed in range(1000, 1000 + seeds):
-            late_s = np.nan
-            for monitor, t_s, *_ in faults.watched_body(seed, seconds=20.0, **fault):
-                if np.isnan(late_s) and monitor._rig.suspected is not None:
-                    late_s = t_s - fault.get("at_s", 0.0)
-            found = monitor.findings()
-            off = (found[0].size - size) / found[0].sigma if found and size else np.nan
-            rows.append((late_s, off, len(found), bool(found)))
-        show(name, np.array(rows))
-    faults.LEARNED_S, faults.AT_S = 10.0, 20.0
-    for name, (fault, cause, size) in ARMS.items():
-        rows = []
-        for seed in range(2100, 2100 + seeds):
-            moved = faults.watched_arm(seed, seconds=ARM_S, **fault)
-            found = moved.monitor.findings()
-            named = found and found[0].cause == cause
-            off = (abs(found[0].size) - size) / found[0].sigma if size and named and found[0].sigma else np.nan
-            late_s = np.nan if moved.found_s is None else moved.found_s - faults.AT_S
-            rows.append((late_s, off, len(found), bool(named)))
-        show(name, np.array(rows))
+@dataclass(frozen=True)
+class Case:
+    """A fault: options of the simulation, the cause that is to be named, its size and unit, displacement in m after t s."""
+
+    name: str
+    options: dict = field(default_factory=dict)
+    cause: str = ""
+    size: float = 0.0
+    shift: Callable[[float], float] = lambda t: 0.0
 
 
-def show(name: str, rows: np.ndarray) -> None:
-    """Print a line of a case: rows (N, 4) of delay, s, size error, sigmas, findings, whether the cause is right."""
-    found = rows[:, 2] > 0
-    late = rows[found, 0]
-    size = rows[found, 1][np.isfinite(rows[found, 1])]
-    texts = [f"{np.nanmedian(late):.1f}", f"{np.nanmax(late):.1f}"] if np.isfinite(late).any() else ["-", "-"]
-    sigmas = f"{np.sqrt(np.mean(size**2)):.2f}" if len(size) else "-"
-    causes = f"{rows[:, 3].sum():.0f}/{len(rows)}" if found.any() else "-"
-    print(_ROW.format(name, f"{found.sum()}/{len(rows)}", causes, *texts, sigmas), flush=True)
+def body_cases() -> Iterator[Case]:
+    """Cases of cameras and body: as in the table, half and twice."""
+    yield Case("nothing wrong (cameras)")
+    for share in (0.5, 1.0, 2.0):
+        for k, axis in enumerate("xyz"):
+            rotated = {"rotated": share * 0.05 * DEG * np.eye(3)[k]}
+            yield Case(f"right camera rotated by {0.05 * share:g} deg ({axis})", rotated, "rig", 0.05 * share)
+        late = {"rotated": share * 0.05 * DEG * np.eye(3)[1], "at_s": 5.0}
+        yield Case(f"right camera rotated by {0.05 * share:g} deg (y) after 5 s", late, "rig", 0.05 * share)
+        scale = 1.0 + 0.01 * share
+        yield Case(f"body file {share:g} % too large", {"scale": scale}, "body", 100 * (1 / scale - 1))
+        yield Case(f"right camera {share:g} ms late", {"skew_s": 1e-3 * share}, "time", share)
+
+
+def arm_cases() -> Iterator[Case]:
+    """Cases of an arm: as in the table, half and twice."""
+    yield Case("nothing wrong (arm)")
+    for share in (0.5, 1.0, 2.0):
+        at = f", {share:g} x"
+
+        def jump(shift_mm: float, rotation_deg: float, share: float = share) -> dict:
+            motion = share * np.array([1e-3 * shift_mm, 0.0, 0.0, 0.0, rotation_deg * DEG, 0.0])
+            return {"motion": lambda t: motion}
+
+        def drift(shift_mm: float, rotation_deg: float, share: float = share) -> dict:
+            speed = share * np.array([1e-3 * shift_mm, 0.0, 0.0, 0.0, rotation_deg * DEG, 0.0]) / 60.0
+            return {"motion": lambda t: speed * t}
+
+        def wanders(t: float, share: float = share) -> float:
+            return 5e-3 * share * (1.0 - np.cos(2 * np.pi * t / 30.0))
+
+        def runs(t: float, share: float = share) -> float:
+            return 3e-4 * share * t
+
+        slip = {"slip": share * np.array([0.001, 0, 0, 0, 0, 0.3 * DEG])}
+        yield Case(f"rig knocked by 10 mm and 0.8 deg{at}", jump(10, 0.8), "fixed", 0.0, lambda t: 1.0)
+        yield Case(f"rig bumped by 2 mm{at}", jump(2, 0), "fixed", 2.0 * share, lambda t: 1.0)
+        yield Case(f"rig bumped by 0.5 mm{at}", jump(0.5, 0), "fixed", 0.5 * share, lambda t: 1.0)
+        yield Case(
+            f"rig drifts by 1 mm, 0.1 deg a minute{at}", drift(1, 0.1), "fixed", 0.0, lambda t, s=share: 3e-5 * s * t
+        )
+        yield Case(
+            f"rig drifts by 10 mm, 1 deg a minute{at}", drift(10, 1), "fixed", 0.0, lambda t, s=share: 3e-4 * s * t
+        )
+        yield Case(f"body slips on the tool by 1 mm{at}", slip, "body", share, lambda t: 1.0)
+        for joint, size in ((2, 0.5), (4, 1.0)):
+            slipped = {"joint": joint, "slip_rad": share * size * DEG}
+            yield Case(f"joint {joint + 1} slips by {size} deg{at}", slipped, "joint", share * size, lambda t: 1.0)
+        wider = {"joint": 1, "more_rad": share * 0.5 * DEG}
+        yield Case(f"backlash of joint 2 grows by 0.5 deg{at}", wider, "joint", 0.5 * share, lambda t: 1.0)
+        yield Case(
+            f"stamps drift by 300 ppm{at}", {"late": runs}, "time", 1e3 * runs(30.0), lambda t, f=runs: SPEED_M_S * f(t)
+        )
+        yield Case(f"delay wanders by 10 ms{at}", {"late": wanders}, "time", 0.0, lambda t, f=wanders: SPEED_M_S * f(t))
+
+
+def body_run(case: Case, seed: int) -> dict:
+    """Run a case of cameras and body."""
+    named_s, squares, mm = np.nan, [], []
+    begin_s = case.options.get("at_s", 0.0)
+    for monitor, t_s, T, _, given in faults.watched_body(seed, seconds=BODY_S, **case.options):
+        if np.isnan(named_s) and monitor._rig.alarm:
+            named_s = t_s
+        if t_s > (begin_s if np.isnan(named_s) else named_s) + SETTLED_S:
+            off = log_se3(inverse(given.T_left_body) @ T)
+            squares.append(off @ np.linalg.solve(given.cov, off))
+            mm.append(1e3 * np.linalg.norm(off[:3]))
+    return row_of(case, seed, monitor.findings(), named_s - begin_s, squares, mm)
+
+
+def arm_run(case: Case, seed: int) -> dict:
+    """Run a case of an arm."""
+    moved = faults.watched_arm(seed, seconds=ARM_S, **case.options)
+    track, begin_s = moved.tracked, faults.AT_S
+    named_s = np.nan if moved.found_s is None else moved.found_s
+    sigma = np.sqrt(np.einsum("nii->n", track.covs[:, :3, :3]))
+    usual = float(np.median(sigma[(track.t_s > begin_s - 2.0) & (track.t_s < begin_s)]))
+    ages = np.arange(0.0, ARM_S - begin_s, 0.05)
+    matters = ages[[case.shift(t) > 2.0 * usual for t in ages]]
+    matters_s = begin_s + (float(matters[0]) if len(matters) else np.nan if case.cause else 0.0)
+    rows = np.arange(len(track))[::50]
+    rows = rows[track.t_s[rows] > (begin_s if np.isnan(named_s) else named_s + SETTLED_S)]
+    off = log_se3(inverse(track.Ts_base_tool[rows]) @ moved.Ts_true[rows])
+    squares = np.einsum("ni,ni->n", off, np.linalg.solve(track.covs[rows], off[..., None])[..., 0])
+    mm = 1e3 * np.linalg.norm(off[:, :3], axis=1)
+    late_s = named_s - (matters_s if np.isfinite(matters_s) else begin_s)
+    row = row_of(case, seed, moved.monitor.findings(), late_s, squares, mm)
+    row["strongest"] = moved.monitor._closure.strongest
+    return row
+
+
+def row_of(case: Case, seed: int, found: tuple, late_s: float, squares: list, mm: list) -> dict:
+    """Return the row of a run."""
+    right = [each for each in found if each.cause == case.cause]
+    sized = right and case.size and right[0].sigma
+    return {
+        "case": case.name,
+        "seed": seed,
+        "found": [f"{each.cause} {each.size:.3f} +- {each.sigma:.3f} {each.unit}" for each in found],
+        "right": bool(right) and len(found) == 1 if case.cause else not found,
+        "late_s": None if np.isnan(late_s) else late_s,
+        "size_sigmas": (abs(right[0].size) - abs(case.size)) / right[0].sigma if sized else None,
+        "nees": float(np.mean(squares)) if len(squares) else None,
+        "mm": float(np.sqrt(np.mean(np.square(mm)))) if len(mm) else None,
+    }
+
+
+_ROW = "{:48s} {:>7s} {:>7s} {:>9s} {:>8s} {:>7s} {:>7s} {:>7s} {:>7s}"
+
+
+def main(words: list[str], seeds: range, results: Path | None) -> None:
+    """Make the runs that are not in the results yet, and print a line of each case."""
+    done = [json.loads(line) for line in results.read_text().splitlines()] if results and results.exists() else []
+    print(_ROW.format("", "found", "right", "median, s", "worst, s", "sigmas", "worst", "NEES", "worst"))
+    for make, cases in ((body_run, body_cases()), (arm_run, arm_cases())):
+        for case in cases:
+            if words and not any(word in case.name for word in words):
+                continue
+            for seed in seeds:
+                if any(row["case"] == case.name and row["seed"] == seed for row in done):
+                    continue
+                done.append(make(case, seed))
+                if results:
+                    with results.open("a") as file:
+                        file.write(json.dumps(done[-1]) + "\n")
+            show(case, [row for row in done if row["case"] == case.name and row["seed"] in seeds])
+
+
+def show(case: Case, rows: list[dict]) -> None:
+    """Print a line of a case, and what was found in the runs in which it is wrong."""
+
+    def both(key: str, mean: Callable) -> tuple[str, str]:
+        values = [row[key] for row in rows if row[key] is not None]
+        return (f"{mean(values):.1f}", f"{max(values, key=abs):.1f}") if values else ("-", "-")
+
+    found, right = (sum(bool(row[key]) for row in rows) for key in ("found", "right"))
+    sigmas = both("size_sigmas", lambda values: np.sqrt(np.mean(np.square(values))))
+    counts = f"{found}/{len(rows)}", f"{right}/{len(rows)}"
+    print(_ROW.format(case.name, *counts, *both("late_s", np.median), *sigmas, *both("nees", np.mean)), flush=True)
+    for row in rows:
+        if not row["right"] and (row["found"] or not case.cause):
+            print(f"    seed {row['seed']}: {'; '.join(row['found'])}", flush=True)
 
 
 def rendered(case: str) -> None:
@@ -115,7 +214,7 @@ def rendered(case: str) -> None:
 
     def moved(mounting, pose, t_s):
         if case in ("knock", "bump") and t_s >= KNOCK_S:
-            motion = MOTIONS["bumped by 2 mm" if case == "bump" else "knocked by 10 mm and 0.8 deg"](0.0)
+            motion = np.array([0.002, 0, 0, 0, 0, 0] if case == "bump" else [0.01, 0, 0, 0, 0.8 * DEG, 0])
             pose = replace(pose, T_left_body=inverse(exp_se3(motion)) @ pose.T_left_body)
         return carry(mounting, pose, t_s)
 
@@ -136,8 +235,13 @@ def rendered(case: str) -> None:
 
 
 if __name__ == "__main__":
-    if "rendered" in sys.argv:
-        for each in sys.argv[2:] or ("none", "rig", "body", "knock", "bump"):
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("words", nargs="*")
+    parser.add_argument("--seeds", default="2100:2120")
+    parser.add_argument("--results", type=Path)
+    given = parser.parse_args()
+    if given.words[:1] == ["rendered"]:
+        for each in given.words[1:] or ("none", "rig", "body", "knock", "bump"):
             rendered(each)
     else:
-        main(int(sys.argv[1]) if len(sys.argv) > 1 else 20, "arms" not in sys.argv)
+        main(given.words, range(*map(int, given.seeds.split(":"))), given.results)

@@ -1,12 +1,16 @@
 """The live page: how soon it stops, what it costs, whether its memory is flat, and what the guide saves.
 
 python live.py stop 100      stops by the page's button in a headless browser, while the workcell's views run at 15 Hz
+python live.py moving 40     the same while the simulated loop moves the arm, searches images, and fits calibrations
+python live.py loop 4        image to command in one run, alternately without and with a page that looks on; the ratio
+python live.py first 3       from the first page to a written calibration by a person who follows the page: shots and error
 python live.py cost          processor's share of two 1280x720 views, first picture, memory over ten thousand frames
 python live.py guided 10     guided against random shots, ten seeds: projected points, hands that miss the outline
 """
 
 import resource
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -22,11 +26,13 @@ from armsight.data import Detections, Shot
 from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.sim.example_rig import board_poses, example_rig
 from armsight.sim.render.scene import chessboard
+from armsight.sim.workcell.workcell import Workcell
 from armsight.vision.bundle import Observations
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.heldout import pair_errors
 from armsight.vision.markers.board import open_board
 from armsight.vision.match import join
+from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 
 
@@ -57,9 +63,12 @@ def shown(driver):
     return driver.execute_script("return window.armsight ? Math.min(...armsight.frames) : 0")
 
 
-def stop(count: int) -> None:
-    """Measure stops in the browser, from the key to the state of the board."""
-    session = LiveSession(SessionOptions(Path(tempfile.mkdtemp()) / "live", "sim:1280x720@15"))
+def at_the_page(cameras, seed=0):
+    """Return a session of the workcell with its true cameras as the rig, a server, and a browser that shows the page."""
+    folder = Path(tempfile.mkdtemp())
+    with Workcell.open(arm="worn", cameras=cameras, seed=seed) as workcell:
+        workcell.truth.rig.save(folder / "rig.json")
+    session = LiveSession(SessionOptions(folder / "live", f"sim:{cameras}", rig=folder / "rig.json", seed=seed))
     session.start()
     server = LiveServer(session, port=0)
     server.start()
@@ -67,22 +76,127 @@ def stop(count: int) -> None:
     until(lambda: shown(driver) > 2)
     session.execute(records.OpenArm())
     until(lambda: session.arm.state.q_deg)
-    frames, began = shown(driver), time.monotonic()
+    return session, server, driver
+
+
+def stop(count: int, *, moving: bool) -> None:
+    """Measure stops in the browser, from the key to the state of the board."""
+    session, server, driver = at_the_page("1280x720@15")
+    frames, began, rng, phases = shown(driver), time.monotonic(), np.random.default_rng(0), {}
     for n in range(count):
+        if moving:
+            session.execute(records.GuideHandEye() if n % 2 else records.RunMotions())
+            until(lambda: session.arm.state.drives_on)
+            time.sleep(rng.uniform(0.2, 6.0))
+            phase = session.arm.state.running or "between"
+            phases[phase.split(":")[0]] = phases.get(phase.split(":")[0], 0) + 1
         driver.execute_script("stop()")
         until(lambda n=n: driver.execute_script("return armsight.stopMs.length") > n)
+        answer = driver.execute_script("return armsight.stopAnswer")
+        if not answer["stopped"]:
+            raise SystemExit(f"not stopped: {answer}")
+        until(lambda: not session.sections()["overview"].moving)
         session.execute(records.ClearStop())
         until(lambda: not session.arm.state.stopped)
+        if session.arm.state.away:
+            session.execute(records.GoToStart())
+            until(lambda: not session.arm.state.away and not session.sections()["overview"].moving, 300.0)
     rate = (shown(driver) - frames) / (time.monotonic() - began)
     took = np.array(driver.execute_script("return armsight.stopMs"))
     p50, p99 = np.percentile(took, (50, 99))
-    print(
-        f"stop, key to the board's state, {count} stops: p50 {p50:.1f} ms, p99 {p99:.1f} ms, most {took.max():.1f} ms"
-    )
-    print(f"views shown meanwhile: {rate:.1f} a second of each side")
+    how = "the loop moves the arm" if moving else "the arm at rest"
+    print(f"stop, {how}, key to board, {count} stops: p50 {p50:.1f} ms, p99 {p99:.1f} ms, most {took.max():.1f} ms")
+    print(f"views shown meanwhile: {rate:.1f} a second of each side; stopped while: {phases}")
     driver.quit()
     server.close()
     session.close()
+
+
+#: Looks on as a page does: takes every image and state, says that it showed them.
+_PAGE = """
+import json, sys
+from websockets.sync.client import connect
+at = sys.argv[1]
+with connect(f"ws://{at}/live", origin=f"http://{at}", max_size=2**24) as page:
+    while True:
+        message = page.recv()
+        if isinstance(message, bytes):
+            page.send(json.dumps({"shown": [message[0], int.from_bytes(message[1:5], "little")]}))
+        page.send("alive")
+"""
+
+
+def loop(blocks: int) -> None:
+    """Compare the control loop's times without and with a page, alternately in blocks of 60 shots: the load is alike."""
+    session, server, driver = at_the_page("1280x720@30")
+    driver.quit()
+    session.execute(records.GuideHandEye())
+    until(lambda: session.arm.state.handeye.good and not session.sections()["overview"].moving, 900.0)
+    times = {False: [], True: []}
+    for block in range(2 * blocks):
+        page = None
+        if block % 2:
+            page = subprocess.Popen([sys.executable, "-c", _PAGE, f"127.0.0.1:{server.port}"])
+            until(lambda: server._clients)
+        while (running := session.arm._loop) is None or not running.log.latency_s:
+            if not session.arm.busy:
+                session.execute(records.GoToStart() if session.arm.state.away else records.RunMotions())
+            time.sleep(0.2)
+        log, seen = running.log, len(running.log.latency_s)
+        until(lambda log=log, seen=seen: len(log.latency_s) >= seen + 60 or session.arm._loop is None, 300.0)
+        times[bool(block % 2)] += list(log.latency_s[seen:])
+        if page is not None:
+            page.terminate()
+            page.wait()
+            until(lambda: not server._clients)
+    for with_page, label in ((False, "without a page"), (True, "with a page")):
+        p50, p99 = 1e3 * np.percentile(times[with_page], (50, 99))
+        print(f"image to command {label}: p50 {p50:.2f} ms, p99 {p99:.2f} ms, {len(times[with_page])} shots")
+    ratio = [np.percentile(times[True], q) / np.percentile(times[False], q) for q in (50, 99)]
+    print(f"with over without: p50 {ratio[0]:.2f}, p99 {ratio[1]:.2f}")
+    server.close()
+    session.close()
+
+
+def first(seeds: int) -> None:
+    """Go from the first page to a written calibration as a person does who does what the page says, by its buttons."""
+    for seed in range(seeds):
+        folder = Path(tempfile.mkdtemp())
+        session = LiveSession(SessionOptions(folder / "live", "sim:1280x720@15", seed=seed))
+        session.start()
+        server = LiveServer(session, port=0)
+        server.start()
+        driver = browser(server.address)
+        until(lambda d=driver: shown(d) > 2)
+        began = time.monotonic()
+
+        def press(name, driver=driver):
+            there = f"const e = document.getElementById('{name}'); return e && !e.disabled && !e.hidden"
+            until(lambda: driver.execute_script(there))
+            driver.execute_script(f"document.getElementById('{name}').click()")
+
+        for name in ("next-step", "next-step", "k-run"):
+            press(name)
+            time.sleep(1.0)
+        until(lambda s=session: s.calibration.state.good, 900.0)
+        press("k-finish")
+        until(lambda s=session: s.calibration.state.rig, 300.0)
+        shots, minutes = len(session.calibration.state.shots), (time.monotonic() - began) / 60
+        true, rig = session._simulated.workcell.truth.rig, StereoRig.load(session.folder / "rig.json")
+        points = working_points(true, 0.8)
+        p_right = transform(inverse(true.T_left_right), points)
+        uv = np.stack([true.left.project(points), true.right.project(p_right)], axis=1)
+        found, _, _ = optimal_points(rig, uv, np.tile(np.eye(2), (len(uv), 2, 1, 1)))
+        error_mm = 1e3 * float(np.sqrt(((found - points) ** 2).sum(axis=1).mean()))
+        last = session.calibration.state.progress[-1]
+        print(
+            f"seed {seed}: {shots} shots, {minutes:.1f} minutes; predicted {last.predicted_mm:.3f} mm, true error in the "
+            f"volume {error_mm:.3f} mm, held out {last.heldout_mm:.3f} mm",
+            flush=True,
+        )
+        driver.quit()
+        server.close()
+        session.close()
 
 
 class Pictures:
@@ -230,4 +344,11 @@ def guided(seeds: int) -> None:
 
 if __name__ == "__main__":
     what, number = [*sys.argv[1:], "cost", "10"][:2] if len(sys.argv) == 1 else [*sys.argv[1:], "10"][:2]
-    {"stop": lambda: stop(int(number)), "cost": cost, "guided": lambda: guided(int(number))}[what]()
+    {
+        "stop": lambda: stop(int(number), moving=False),
+        "moving": lambda: stop(int(number), moving=True),
+        "loop": lambda: loop(int(number)),
+        "first": lambda: first(int(number)),
+        "cost": cost,
+        "guided": lambda: guided(int(number)),
+    }[what]()

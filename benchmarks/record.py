@@ -1,6 +1,6 @@
 """Figures of recordings: containers, cost of run.mcap, the real bags of tags, kill -9, batches by 1, 2 and 4 processes.
 
-    python benchmarks/record.py containers|cost|bags|killed|batch ... [--data DIR]
+    python benchmarks/record.py containers|cost|beside|bags|killed|batch ... [--data DIR]
 
 Each figure prints what it measured against its target; the exit code is 1 where one is missed. The map of tags of figure
 ``bags`` is fitted on even shots and evaluated on odd ones.
@@ -8,6 +8,7 @@ Each figure prints what it measured against its target; the exit code is 1 where
 
 from __future__ import annotations
 
+import gc
 import itertools
 import os
 import signal
@@ -143,6 +144,66 @@ def cost() -> None:
                 print(f"        without images {path.stat().st_size / count / 1e3:.1f} kB a shot")
 
 
+def beside(blocks: int = 40, shots: int = 60) -> None:
+    """3. A loop at 60 Hz in real time, recorded in every other second: image to command, side by side in one run."""
+    from armsight.app.run.loop import SWITCH_S
+    from armsight.loop.estimators import Delay, KalmanEstimator
+    from armsight.vision.follow.follower import Follower
+    from disc_images import exposed
+    from marker_follow import path
+    from marker_plate import LENS, light_of, parallel_rig, views
+    from marker_report import disc_target, opened
+
+    rng, rig, target = np.random.default_rng(3), parallel_rig(LENS, 3.0), disc_target()
+    way = path(shots)
+    way = way[::2] + way[::-2]  # there and back
+    pairs, files = [], []
+    for T in way:
+        lights = (light_of(c, target, at) for c, at in zip(rig.cameras, views(rig, T), strict=True))
+        pairs.append(tuple(exposed(light, 2.0, 0.0, rng) for light in lights))
+        files.append(tuple(cv2.imencode(".jpg", image)[1].tobytes() for image in pairs[-1]))
+    arm, follower = open_arm("six_r"), Follower(rig, opened(target))
+    estimator = KalmanEstimator(arm, delay=Delay(0.02, 0.01))
+    latency: dict[bool, list[float]] = {False: [], True: []}
+    period_s, interval = 1 / 60, sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_S)
+    gc.disable()
+    with tempfile.TemporaryDirectory() as folder:
+        sink = McapSink(Path(folder) / "run.mcap", Published(rig, opened(target).body, arm, properties(rig, None, arm)))
+        sink.start()
+        began = time.monotonic()
+        for k in range(-len(pairs), blocks * len(pairs)):  # the first round warms up
+            recorded = (k // len(pairs)) % 2 == 0
+            due_s = began + (k + len(pairs)) * period_s
+            for batch in range(4):  # joint readings arrive in between, as from a board
+                time.sleep(max(0.0, due_s + (batch - 4) * 0.004 - time.monotonic()))
+                t_s = due_s + (batch - 4) * 0.004 + 0.001 * np.arange(4)
+                states = JointStates(t_s, 0.1 + 1e-4 * rng.normal(size=(4, 6)))
+                estimator.joints(states)
+                estimate = estimator.estimate()
+                if recorded:
+                    sink.put(JointsDatum(states, estimate.T_base_tool, estimate.cov, estimate.vision_age_s))
+            time.sleep(max(0.0, due_s - time.monotonic()))
+            begun = time.perf_counter()
+            shot = Shot(f"{k:06d}", *pairs[k % len(pairs)], due_s, None, files[k % len(pairs)])
+            result = follower.measure(shot)
+            if k >= 0:
+                latency[recorded].append(time.perf_counter() - begun)
+            if recorded:
+                sink.put(ShotDatum(shot, result, time.monotonic(), 1e-4, "used"))
+        sink.close()
+    gc.enable()
+    sys.setswitchinterval(interval)
+    off, on = (1e3 * np.percentile(latency[each], (50, 99)) for each in (False, True))
+    print(f"        without: p50 {off[0]:.3f}, p99 {off[1]:.3f} ms; beside the recording: {on[0]:.3f}, {on[1]:.3f} ms; "
+          f"{len(latency[True])} shots each, {sink.dropped} dropped")  # fmt: skip
+    # p99 of a subset scatters: the same ratio between the halves of the shots without recording shows by how much
+    halves = [float(np.percentile(latency[False][half::2], 99)) for half in range(2)]
+    change = on[1] / off[1] - 1
+    report("p99 from image to command", f"{100 * change:+.1f} % (target 5; two halves without it differ by "
+           f"{100 * abs(halves[0] / halves[1] - 1):.1f} %)", abs(change) <= 0.05)  # fmt: skip
+
+
 #: Recordings: calibration by their author, side of the tags, m, pairs of topics.
 BAGS = {
     "tagslam_2": (0.16, ""),
@@ -241,7 +302,7 @@ def batch(count: int = 100) -> None:
         report("two processes against one", f"{faster:.2f} times (target 1.8; wants two idle cores)", faster >= 1.8)
 
 
-FIGURES = {"containers": containers, "cost": cost, "bags": bags, "killed": killed, "batch": batch}
+FIGURES = {"containers": containers, "cost": cost, "beside": beside, "bags": bags, "killed": killed, "batch": batch}
 
 if __name__ == "__main__":
     for figure in sys.argv[1:] or FIGURES:

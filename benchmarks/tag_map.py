@@ -3,7 +3,8 @@
 In: a folder of the TagSLAM examples (bag, cameras.yaml). The intrinsics are the authors'; the relative pose of the cameras
 and the poses of the tags are fitted on the even shots, robustly. Evaluated on the odd ones: from all tags but one, the pose
 (``measure_seen``) predicts where that one is; the residual to its triangulated corners is divided by its predicted sigma,
-in which are the pose, the triangulation and the map.
+in which are the noise of pose and triangulation, and the map and the relative pose of the cameras with all their
+covariances: prediction and triangulated corners both depend on them, so most of what is wrong with them cancels.
 """
 
 from __future__ import annotations
@@ -33,6 +34,14 @@ from armsight.vision.triangulate import triangulate
 
 
 @dataclass(frozen=True)
+class FittedMap:
+    """Poses of the tags (M, 4, 4), and the covariance (6 + 6 M, 6 + 6 M) of the cameras' relative pose and of them."""
+
+    Ts: Array
+    cov: Array
+
+
+@dataclass(frozen=True)
 class Evaluated:
     """How well a recording was measured: see the module."""
 
@@ -55,12 +64,12 @@ def evaluated(folder: Path, side_m: float, topics: str) -> Evaluated:
     shots, notes = read_tags(spec, flat)
     rich = [shot for shot in shots[::2] if all(len(_tags_of(shot, side)) > 1 for side in range(2))]
     fitted = rich[:: max(1, len(rich) // MOST)]
-    rig, body, cov_tags, sigma_px = _fitted(fitted, cameras, corners, names)
+    rig, body, fitted_map, sigma_px = _fitted(fitted, cameras, corners, names)
     done = [measure_seen(rig, body, _of(body, flat, shot)) for shot in shots]
     missed = [each for each in done if isinstance(each, Missed)]
     squares = []
     for shot in shots[1::2]:
-        squares += _left_out(rig, body, cov_tags, _of(body, flat, shot), side_m)
+        squares += _left_out(rig, body, fitted_map, _of(body, flat, shot), corners)
     middle = float(np.median(squares)) if squares else np.nan
     ratio = float(np.sqrt(middle / CHI2_MEDIAN)) if squares else np.nan
     text = (
@@ -74,6 +83,8 @@ def evaluated(folder: Path, side_m: float, topics: str) -> Evaluated:
 MOST = 120
 #: Median of chi-squared with three degrees of freedom: a few wrong corners do not move it.
 CHI2_MEDIAN = 2.366
+#: Median of absolute deviations -> standard deviation of a normal distribution.
+MAD = 1.4826
 
 
 def _cameras(path: Path) -> tuple[Camera, Camera]:
@@ -109,8 +120,8 @@ def _tags_of(shot: SeenShot, side: int) -> dict[int, Array]:
 
 def _fitted(
     shots: list[SeenShot], cameras: tuple[Camera, Camera], corners: Array, names: tuple[str, ...]
-) -> tuple[StereoRig, Body, Array, float]:
-    """Fit relative pose, tags and shots; return rig, body, covariance of each tag's pose (M, 6, 6), sigma of a pixel."""
+) -> tuple[StereoRig, Body, FittedMap, float]:
+    """Fit relative pose, tags and shots; return rig, body, map, sigma of a pixel."""
     views = []  # shot, tag, side, uv, pose of the tag in that camera
     for k, shot in enumerate(shots):
         for side, camera in enumerate(cameras):
@@ -200,11 +211,10 @@ def _adjusted(cameras, corners, names, order, T_lr, T_tags, T_shots, used):
     fit = least_squares(residuals, x, jac_sparsity=sparsity(), x_scale="jac", max_nfev=15)
     x = fit.x
     r = residuals(x)[:-6] * scale
-    free = r.size - count + 6
-    sigma_px = float(np.sqrt(np.sum(r**2) / max(free, 1)))
     J = fit.jac.toarray() if hasattr(fit.jac, "toarray") else fit.jac
-    H = J.T @ J
-    cov = np.linalg.pinv(H, hermitian=True) * (sigma_px / scale) ** 2
+    unscaled = np.linalg.pinv(J.T @ J, hermitian=True)
+    sigma_px = _sigma_px(r.reshape(-1, 4, 2), J[:-6].reshape(-1, 4, 2, count), unscaled)
+    cov = unscaled * (sigma_px / scale) ** 2
     lr = T_lr @ exp_se3(x[:6])
     Tt = T_tags @ exp_se3(x[6 : 6 + 6 * n_tags].reshape(-1, 6))
     parameters = sum(c.parameters.size for c in cameras)
@@ -216,32 +226,71 @@ def _adjusted(cameras, corners, names, order, T_lr, T_tags, T_shots, used):
         tuple(names[4 * t + i] for t in order for i in range(4)),
         np.concatenate([transform(T, corners) for T in Tt]),
     )
-    blocks = np.array([cov[6 + 6 * k : 12 + 6 * k, 6 + 6 * k : 12 + 6 * k] for k in range(n_tags)])
-    by_centre = np.array([T[:3, :3] @ block[:3, :3] @ T[:3, :3].T for T, block in zip(Tt, blocks, strict=True)])
-    return rig, body, by_centre, sigma_px
+    return rig, body, FittedMap(Tt, cov[: 6 + 6 * n_tags, : 6 + 6 * n_tags]), sigma_px
 
 
-def _left_out(rig: StereoRig, body: Body, cov_tags: Array, shot: SeenShot, side_m: float) -> list[float]:
+def _sigma_px(r: Array, J: Array, cov: Array) -> float:
+    """Return the sigma of a pixel that four corners of a tag, taken as independent, need.
+
+    What moves all four corners together (blur, lens, the time between the cameras) is not averaged out over them. So the
+    residuals (N, 4, 2) of the fit are split into the mean of each tag and the deviations from it; each share is sized by
+    its median, as a few wrong corners shall not count, and divided by what the fit leaves of it: trace of (I - H) over
+    the share, with the hat matrix H = J cov J^T of the fit (N, 4, 2, parameters). The mean, times two, is as large as a
+    deviation where the corners are independent; the larger one is taken.
+    """
+    means = r.mean(axis=1, keepdims=True)
+    J_mean = 2.0 * J.mean(axis=1)  # of the normalised sum over four corners
+    taken_all = np.einsum("ncap,pq,ncaq->", J, cov, J, optimize=True)
+    taken_mean = np.einsum("nap,pq,naq->", J_mean, cov, J_mean, optimize=True)
+    left_mean = 1.0 - taken_mean / (2 * len(r))
+    left_deviation = 1.0 - (taken_all - taken_mean) / (6 * len(r))
+    common = 2.0 * MAD * float(np.median(np.abs(means))) / np.sqrt(left_mean)
+    # of four deviations from their mean three are free
+    alone = MAD * float(np.median(np.abs(r - means))) * np.sqrt(4 / 3) / np.sqrt(left_deviation)
+    print(f"    corners: {alone:.3f} px each, {common:.3f} px of what all four share; left by the fit {left_mean:.2f}, "
+          f"{left_deviation:.2f}; RMS {np.sqrt(np.mean(r**2)):.3f} px")  # fmt: skip
+    return max(common, alone)
+
+
+def _left_out(rig: StereoRig, body: Body, fitted: FittedMap, shot: SeenShot, corners: Array) -> list[float]:
     """Return r^T C^-1 r of the centre of each tag that both cameras saw, predicted from the other tags."""
     both = sorted(set(_tags_of(shot, 0)) & set(_tags_of(shot, 1)))
     found = []
     for tag in both if len(both) > 1 else ():
-        rest = _without(shot, tag)
-        estimate = measure_seen(rig, body, rest)
+        estimate = measure_seen(rig, body, _without(shot, tag))
         alone = plain(_only(shot, tag))
         if isinstance(estimate, Missed) or alone is None:
             continue
         points = triangulate(rig, body, gate(rig, body, alone))
-        if len(points.ids) != 4:
+        if len(points.ids) != 4 or not len(estimate.points.ids):
             continue
-        centre, cov_seen = points.p_left.mean(axis=0), points.cov.mean(axis=0) / 4
+        T, R = estimate.T_left_body, estimate.T_left_body[:3, :3]
         p_body = body.points[4 * tag : 4 * tag + 4].mean(axis=0)
-        T = estimate.T_left_body
-        J = T[:3, :3] @ np.hstack([np.eye(3), -skew(p_body)])
-        by_map = T[:3, :3] @ cov_tags[tag] @ T[:3, :3].T
-        r = centre - transform(T, p_body)
-        found.append(float(r @ np.linalg.solve(cov_seen + J @ estimate.cov @ J.T + by_map, r)))
+        r = points.p_left.mean(axis=0) - transform(T, p_body)
+        J = R @ np.hstack([np.eye(3), -skew(p_body)])
+        noise = points.cov.mean(axis=0) / 4 + J @ estimate.cov_noise @ J.T
+        # What the relative pose of the cameras and the tags of the map move: the triangulated corners, and by them the pose
+        # (the weighted fit of the body to its points), and where the map has the tag.
+        seen = estimate.points
+        A = np.array([R @ np.hstack([np.eye(3), -skew(body.points[i])]) for i in seen.ids])
+        W = np.linalg.inv(seen.cov)
+        K = np.linalg.solve(np.einsum("nia,nij,njb->ab", A, W, A), np.einsum("nia,nij->anj", A, W).reshape(6, -1))
+        K = K.reshape(6, -1, 3)
+        by = np.zeros((3, len(fitted.cov)))
+        by[:, :6] = points.calibration[:, :, -6:].mean(axis=0) - J @ np.einsum(
+            "anj,njp->ap", K, seen.calibration[:, :, -6:]
+        )
+        for row, i in enumerate(seen.ids):
+            at = 6 + 6 * (i // 4)
+            by[:, at : at + 6] += J @ K[:, row] @ R @ _by_tag(fitted.Ts[i // 4], corners[i % 4])
+        by[:, 6 + 6 * tag : 12 + 6 * tag] -= R @ _by_tag(fitted.Ts[tag], np.zeros(3))
+        found.append(float(r @ np.linalg.solve(noise + by @ fitted.cov @ by.T, r)))
     return found
+
+
+def _by_tag(T: Array, corner: Array) -> Array:
+    """Return the derivative (3, 6) of a corner in the map by the tag's pose."""
+    return T[:3, :3] @ np.hstack([np.eye(3), -skew(corner)])
 
 
 def _without(shot: SeenShot, tag: int) -> SeenShot:

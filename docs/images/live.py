@@ -16,6 +16,7 @@ from selenium import webdriver
 from armsight.app.live import records
 from armsight.app.live.server import LiveServer
 from armsight.app.live.session import LiveSession, SessionOptions
+from armsight.sim.workcell.workcell import CHESSBOARD
 
 LOOKS = {"light": (1400, 1020, "light", 1.0), "dark": (1400, 1020, "dark", 1.0), "phone": (390, 844, "light", 2.0)}
 
@@ -74,17 +75,35 @@ def main(folder: Path | None) -> None:
         until(lambda: session.calibration.state.good)
         session.execute(records.FinishCalibration())
         until(lambda: session.measuring.rig)
-        for step in ("body", "measure", "health"):
-            session.execute(records.GoTo(step))
-            until(lambda: session.measuring.state.pose)
-            take(step)
+        take("calibrated")
+        session.execute(records.GoTo("body"))
+        until(lambda: session.body.state.grade)
+        take("body")
+        session.execute(records.GoTo("measure"))
+        session.execute(records.UseSecondBody(CHESSBOARD))
+        session.execute(records.PersonAction("board"))
+        until(lambda: (second := session.measuring.state.second) and second.reason is None)
+        take("measure")
+        session.execute(records.PersonAction("no_board"))
+        session.execute(records.UseSecondBody(""))
         session.execute(records.GoTo("arm"))
+        take("arm_before")
         session.execute(records.OpenArm())
+        until(lambda: session.arm.state.q_deg)
+        session.execute(records.GuideHandEye())
+        until(lambda: session.arm.state.handeye.poses > 8)
+        take("handeye")
+        until(lambda: not session.sections()["overview"].moving)
+        session.execute(records.Identify())
+        until(lambda: session.arm.state.identify.headline)
+        take("identified")
         session.execute(records.RunMotions())
-        until(lambda: len(session.arm.state.error_mm) > 250)
+        until(lambda: len(session.arm.state.error_mm) > 300)
         take("arm")
         session.stop()
         take("stopped")
+        session.execute(records.GoTo("health"))
+        take("health")
     driver.quit()
     server.close()
     session.close()

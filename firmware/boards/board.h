@@ -26,6 +26,9 @@ typedef struct board_description {
     /* Before the first tick. Return why the board started, RESET_.... */
     uint32_t (*reset_cause)(void);
 
+    /* Before the first tick, once. Fill in what is kept of the crash that the board started after; 0 without. */
+    void (*crash)(crash_record *crash);
+
     /* Main loop. Take up to room bytes that came from the host and return how many. *overrun: add the bytes for which
      * there was no room since the last call. */
     uint32_t (*receive)(uint8_t *bytes, uint32_t room, uint32_t *overrun);
@@ -38,6 +41,9 @@ typedef struct board_description {
 
     /* Main loop, drives off. Store a copy (may take long); returns whether it reads back as written. */
     bool (*write_copy)(uint32_t which, const config_copy *copy);
+
+    /* Main loop, drives off. Start anew, as after switching on. */
+    void (*restart)(void);
 } board_description;
 
 #endif

@@ -25,7 +25,9 @@ void loop_start(board_loop *loop, const board_description *board)
     loop->board = board;
     const uint32_t source = load(loop, &config);
     core_init(&loop->core, &config, source, board->reset_cause());
-    wire_init(&loop->wire, &(wire_setup){board->name, board->baud, source, &loop->core.config});
+    wire_setup setup = {board->name, board->baud, source, &loop->core.config, {0}};
+    board->crash(&setup.crash);
+    wire_init(&loop->wire, &setup);
 }
 
 void loop_tick(board_loop *loop)
@@ -84,5 +86,8 @@ void loop_poll(board_loop *loop)
         if (taken != length) {
             break;
         }
+    }
+    if (wire_to_restart(&loop->wire) && loop->outputs.drives_on == 0u) {
+        loop->board->restart();
     }
 }

@@ -9,7 +9,7 @@
 #include "setpoint.h"
 
 /* Begin to drive a joint from where it is, at rest, with limits that let it move in but never further out. */
-static void start_joint(joint_state *joint, const joint_config *config)
+static void start_joint(joint_state *joint, const joint_config *config, uint32_t i)
 {
     const float angle_rad = joint->pot.angle_rad;
     const float speed_rad_s = joint->pid.speed_rad_s;
@@ -17,8 +17,9 @@ static void start_joint(joint_state *joint, const joint_config *config)
     joint->pid.speed_rad_s = speed_rad_s; /* the filter runs on: a coasting joint is braked from the first tick */
     setpoint_hold(&joint->setpoint, angle_rad);
     governor_hold(&joint->reference, angle_rad);
-    motor_start(&joint->motor, angle_rad);
+    motor_start(&joint->motor, angle_rad, i);
     joint->released = 0u;
+    joint->suspect = FAULT_NONE;
     pot_watch(&joint->pot, angle_rad);
     joint->low_rad = angle_rad < config->soft_min_rad ? angle_rad : config->soft_min_rad;
     joint->high_rad = angle_rad > config->soft_max_rad ? angle_rad : config->soft_max_rad;
@@ -38,7 +39,7 @@ static uint32_t enable(core_state *core, bool inward)
     if (core->state != STATE_DISABLED && !(held && core->faults == 0u)) {
         return REJECTION_WRONG_STATE;
     }
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         const joint_config *config = &core->config.joint[i];
         if (!pot_is_read(&core->joint[i].pot)) {
             return REJECTION_POT_UNREAD;
@@ -47,9 +48,9 @@ static uint32_t enable(core_state *core, bool inward)
             return REJECTION_OUTSIDE_LIMITS;
         }
     }
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         if (!held || core->joint[i].released != 0u) { /* what is held stays where it is held */
-            start_joint(&core->joint[i], &core->config.joint[i]);
+            start_joint(&core->joint[i], &core->config.joint[i], i);
         }
     }
     core->state = STATE_ENABLED;
@@ -64,7 +65,7 @@ static uint32_t disable(core_state *core)
         return REJECTION_WRONG_STATE;
     }
     if (safety_drives_on(core) && core->config.brake_engage_ticks != 0u) {
-        for (uint32_t i = 0u; i < JOINTS; i++) {
+        for (uint32_t i = 0u; i < core->config.joint_count; i++) {
             setpoint_hold(&core->joint[i].setpoint, core->joint[i].reference.position_rad);
             governor_hold(&core->joint[i].reference, core->joint[i].reference.position_rad);
         }
@@ -103,11 +104,11 @@ static uint32_t clear_stop(core_state *core, bool pressed)
     return REJECTION_NONE;
 }
 
-static uint32_t check_move(const move_command *move)
+static uint32_t check_move(const core_state *core, const move_command *move)
 {
     const bool lasts = move->duration_ticks >= 1u && move->duration_ticks <= 10000u;
     uint32_t rejection = lasts ? REJECTION_NONE : REJECTION_OUT_OF_RANGE;
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         if (!number_finite(move->position_rad[i]) || !number_finite(move->speed_rad_s[i]) ||
             !number_finite(move->gravity_duty[i])) {
             return REJECTION_NOT_FINITE;
@@ -139,11 +140,11 @@ static void move_joint(joint_state *joint, const joint_config *config, const mov
 static uint32_t take_move(core_state *core, const move_command *move)
 {
     const bool ready = core->state == STATE_ENABLED && core->closing == 0u;
-    const uint32_t rejection = ready ? check_move(move) : REJECTION_WRONG_STATE;
+    const uint32_t rejection = ready ? check_move(core, move) : REJECTION_WRONG_STATE;
     if (rejection != REJECTION_NONE) {
         return rejection;
     }
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         move_joint(&core->joint[i], &core->config.joint[i], move, i);
     }
     core->silent_ticks = 0u;
@@ -152,7 +153,7 @@ static uint32_t take_move(core_state *core, const move_command *move)
 
 static uint32_t take_gains(core_state *core, const gain_set *gains)
 {
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         if (!pid_gains_finite(&gains->joint[i])) {
             return REJECTION_NOT_FINITE;
         }
@@ -160,7 +161,7 @@ static uint32_t take_gains(core_state *core, const gain_set *gains)
             return REJECTION_OUT_OF_RANGE;
         }
     }
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         pid_change_gains(&core->joint[i].pid, &core->config.joint[i].gains, &gains->joint[i]);
         core->config.joint[i].gains = gains->joint[i];
     }

@@ -10,12 +10,14 @@ _Static_assert(offsetof(config_copy, crc) == sizeof(config_copy) - sizeof(uint32
 
 uint32_t config_crc_on(uint32_t crc, const void *bytes, uint32_t length)
 {
+    static const uint32_t of_nibble[16] = {
+        0x00000000u, 0x1DB71064u, 0x3B6E20C8u, 0x26D930ACu, 0x76DC4190u, 0x6B6B51F4u, 0x4DB26158u, 0x5005713Cu,
+        0xEDB88320u, 0xF00F9344u, 0xD6D6A3E8u, 0xCB61B38Cu, 0x9B64C2B0u, 0x86D3D2D4u, 0xA00AE278u, 0xBDBDF21Cu};
     const uint8_t *byte = bytes;
     for (uint32_t i = 0u; i < length; i++) {
         crc ^= byte[i];
-        for (uint32_t bit = 0u; bit < 8u; bit++) {
-            crc = (crc >> 1) ^ ((crc & 1u) != 0u ? 0xEDB88320u : 0u);
-        }
+        crc = (crc >> 4) ^ of_nibble[crc & 15u];
+        crc = (crc >> 4) ^ of_nibble[crc & 15u];
     }
     return crc;
 }
@@ -56,6 +58,7 @@ void config_factory(core_config *config)
     for (uint32_t joint = 0u; joint < JOINTS; joint++) {
         config->joint[joint] = factory_joint;
     }
+    config->joint_count = JOINTS;
     config->supply_min_mv = 10000u;
     config->supply_max_mv = 14000u;
     config->supply_nominal_mv = 12000u;
@@ -129,7 +132,10 @@ static bool ticks_within(uint32_t ticks, uint32_t least, uint32_t most) { return
 
 bool config_is_valid(const core_config *config)
 {
-    for (uint32_t joint = 0u; joint < JOINTS; joint++) {
+    if (config->joint_count < 1u || config->joint_count > JOINTS) {
+        return false;
+    }
+    for (uint32_t joint = 0u; joint < config->joint_count; joint++) {
         if (!joint_is_valid(&config->joint[joint])) {
             return false;
         }

@@ -11,6 +11,7 @@
 #include "setpoint.h"
 
 #define GUARD 0xA5C3965Au
+#define BEYOND 2.0f       /* so much more is a speed damped beyond its limit */
 #define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up */
 
 void core_init(core_state *core, const core_config *config, uint32_t source, uint32_t reset)
@@ -68,8 +69,7 @@ static bool advance(joint_state *joint, const joint_config *config, bool slowing
         path_rad_s2 = (joint->setpoint.speed_rad_s - before_rad_s) / TICK_S;
         joint->held_back = 0u;
     } else {
-        setpoint_advance(&joint->setpoint);
-        path_rad_s2 = setpoint_acceleration(&joint->setpoint);
+        path_rad_s2 = setpoint_advance(&joint->setpoint);
         joint->limited |= joint->held_back;
     }
     if (setpoint_clamp(&joint->setpoint, joint->low_rad, joint->high_rad)) {
@@ -102,7 +102,7 @@ static void advance_arm(core_state *core)
     }
     const bool slowing = core->state == STATE_STOPPING;
     bool resting = true;
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         const bool joint_rests = advance(&core->joint[i], &core->config.joint[i], slowing);
         resting = resting && joint_rests;
     }
@@ -130,13 +130,24 @@ static void control(joint_state *joint, const joint_config *config, float nomina
         number_clamp(joint->gravity_asked - joint->gravity_duty, -gravity_step, gravity_step);
     joint->duty_cap =
         number_clamp(joint->duty_cap - config->current_cut_per_a_s * over_a * TICK_S, 0.0f, config->duty_limit);
+    float duty_cap = joint->duty_cap;
+    const float free_duty = config->speed_limit_rad_s * config->motor.constant_v_s / nominal_v;
+    if (motor_races(&joint->motor, &config->motor, config->speed_limit_rad_s) && duty_cap > free_duty) {
+        duty_cap = free_duty; /* it drives a free motor at its limit, and brakes a faster one */
+        joint->limited |= LIMITED_SPEED;
+    }
+    const float seen_rad_s =
+        motor_witness(&joint->motor, &config->motor, joint->pid.speed_rad_s, config->speed_limit_rad_s);
+    const float beyond_rad_s = number_size(seen_rad_s) - config->speed_limit_rad_s;
+    const float more_rad_s = beyond_rad_s > 0.0f ? BEYOND * beyond_rad_s : 0.0f;
     const pid_demand demand = {.reference_rad = joint->reference.position_rad,
                                .reference_rad_s = joint->reference.speed_rad_s,
                                .reference_rad_s2 = joint->reference.acceleration_rad_s2,
+                               .damped_rad_s = seen_rad_s + (seen_rad_s > 0.0f ? more_rad_s : -more_rad_s),
                                .spring_limit = spring_limit(config, nominal_v),
                                .gravity_duty = joint->gravity_duty,
                                .duty_limit = config->duty_limit,
-                               .duty_cap = joint->duty_cap,
+                               .duty_cap = duty_cap,
                                .duty_slew_per_s = config->duty_slew_per_s};
     (void)pid_step(&joint->pid, &config->gains, &demand, &joint->limited);
 }
@@ -153,34 +164,35 @@ static void drive(core_state *core, const core_inputs *inputs)
     const float supply_v = (float)inputs->supply_mv * 0.001f;
     const float nominal_v = (float)core->config.supply_nominal_mv * 0.001f;
     advance_arm(core);
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         joint_state *joint = &core->joint[i];
         const float current_a = joint_current(core, inputs, i);
         if (joint->released == 0u) {
             control(joint, &core->config.joint[i], nominal_v, current_a);
-            safety_watch_joint(core, i, inputs->counts[i], supply_v, current_a);
         }
+        safety_watch_joint(core, i, inputs->counts[i], supply_v, current_a);
         if (!number_finite(joint->pid.duty) || !number_finite(joint->pid.integral_duty)) {
             safety_raise(core, FAULT_ARITHMETIC, i);
         }
     }
 }
 
-/* Return what a joint's duty is to be on the present supply: gains are those of the nominal one. */
-static float duty_out(const core_state *core, const joint_state *joint, uint32_t supply_mv)
+/* Put out the joints' duties, for the present supply: gains are those of the nominal one. */
+static void put_out(core_state *core, uint32_t supply_mv)
 {
-    if (!safety_drives_on(core) || joint->released != 0u) {
-        return 0.0f;
-    }
     const uint32_t least_mv = core->config.supply_nominal_mv / 2u; /* a sensor of the supply may fail too */
     const float scale = (float)core->config.supply_nominal_mv / (float)(supply_mv > least_mv ? supply_mv : least_mv);
-    return number_clamp(joint->pid.duty * scale, -1.0f, 1.0f);
+    const bool on = safety_drives_on(core);
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
+        joint_state *joint = &core->joint[i];
+        joint->motor.duty = on && joint->released == 0u ? number_clamp(joint->pid.duty * scale, -1.0f, 1.0f) : 0.0f;
+    }
 }
 
 /* Let the references rest where the joints are, so that nothing is left of the last motion. */
 static void rest(core_state *core)
 {
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         joint_state *joint = &core->joint[i];
         setpoint_hold(&joint->setpoint, joint->pot.angle_rad);
         governor_hold(&joint->reference, joint->pot.angle_rad);
@@ -225,7 +237,7 @@ static void report(const core_state *core, core_outputs *outputs)
     outputs->rejected_sequence = core->rejected_sequence;
     outputs->rejected_count = core->rejected_count;
     outputs->rejection = core->rejection;
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < JOINTS; i++) { /* of joints that are not there all is 0 */
         const joint_state *joint = &core->joint[i];
         outputs->joint_faults[i] = core->joint_faults[i];
         outputs->limited[i] = joint->limited;
@@ -244,17 +256,17 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
         return;
     }
     core->standing = 0u;
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    const bool driven = safety_drives_on(core);
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         core->joint[i].limited = 0u;
         measure(core, i, inputs->counts[i]);
         const float current_a = joint_current(core, inputs, i);
         const bool chopped = number_size(current_a) * 1000.0f > (float)core->config.joint[i].current_limit_ma;
         if (chopped) { /* a driver that limits the current does not put the duty out */
             motor_pause(&core->joint[i].motor, core->joint[i].pot.angle_rad);
-        } else if (safety_drives_on(core)) {
+        } else if (driven) {
             motor_measure(&core->joint[i].motor, &core->config.joint[i].motor, (float)inputs->supply_mv * 0.001f,
-                          current_a, core->joint[i].pot.angle_rad,
-                          core->joint[i].reference.position_rad);
+                          current_a, core->joint[i].pot.angle_rad);
         }
     }
     safety_watch_arm(core, inputs);
@@ -273,8 +285,6 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
     } else {
         rest(core);
     }
-    for (uint32_t i = 0u; i < JOINTS; i++) {
-        core->joint[i].motor.duty = duty_out(core, &core->joint[i], inputs->supply_mv);
-    }
+    put_out(core, inputs->supply_mv);
     report(core, outputs);
 }

@@ -18,7 +18,16 @@ static float stopping_speed(float distance_rad, float deceleration_rad_s2)
     return number_root(late_rad_s * late_rad_s + 2.0f * deceleration_rad_s2 * distance_rad) - late_rad_s;
 }
 
-static float distance_to(float from_rad, float to_rad) { return to_rad > from_rad ? to_rad - from_rad : 0.0f; }
+/* Return that speed towards a limit distance_rad away, at most fastest_rad_s; far from the limit no root is needed. */
+static float limit_speed(float distance_rad, float deceleration_rad_s2, float fastest_rad_s)
+{
+    const float late_rad_s = deceleration_rad_s2 * TRACK_S;
+    if (2.0f * deceleration_rad_s2 * distance_rad >= fastest_rad_s * (fastest_rad_s + 2.0f * late_rad_s)) {
+        return fastest_rad_s;
+    }
+    const float speed_rad_s = stopping_speed(distance_rad > 0.0f ? distance_rad : 0.0f, deceleration_rad_s2);
+    return speed_rad_s < fastest_rad_s ? speed_rad_s : fastest_rad_s;
+}
 
 uint32_t governor_step(governor_state *reference, const setpoint_state *path, float path_rad_s2,
                        const governor_limits *limits)
@@ -28,10 +37,9 @@ uint32_t governor_step(governor_state *reference, const setpoint_state *path, fl
     const float back_rad_s = stopping_speed(number_size(error_rad), limits->acceleration_rad_s2);
     const float asked_rad_s = path->speed_rad_s + (error_rad < 0.0f ? -back_rad_s : back_rad_s);
     const float fastest = limits->speed_rad_s;
-    const float up = stopping_speed(distance_to(reference->position_rad, limits->high_rad), limits->deceleration_rad_s2);
-    const float down = stopping_speed(distance_to(limits->low_rad, reference->position_rad), limits->deceleration_rad_s2);
-    const float requested_rad_s =
-        number_clamp(asked_rad_s, -(down < fastest ? down : fastest), up < fastest ? up : fastest);
+    const float up = limit_speed(limits->high_rad - reference->position_rad, limits->deceleration_rad_s2, fastest);
+    const float down = limit_speed(reference->position_rad - limits->low_rad, limits->deceleration_rad_s2, fastest);
+    const float requested_rad_s = number_clamp(asked_rad_s, -down, up);
     float requested_rad_s2 = (requested_rad_s - reference->speed_rad_s) / ANSWER_S;
     if (requested_rad_s == asked_rad_s) {
         requested_rad_s2 += path_rad_s2;

@@ -10,23 +10,28 @@
 #define SCALE_HIGH 1.25f
 #define WINDOW_TICKS 32u      /* over which R and K are learnt */
 #define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
+#define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
 #define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
-#define SAMPLE_TICKS 4u
-#define PARTED 0.85f          /* of a gap: where it began to open */
-#define STEADY 0.4f           /* of a gap in its first half: it opens steadily, not faster and faster */
+#define SAMPLE_TICKS 8u
 #define AGREED 3.0f           /* of apart_rad: so much way together proves that the wiring was right */
+#define UNKNOWN_RAD_S 1000.0f
+#define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
+#define WITNESS 0.1f          /* of the speed limit: so much faster than the reading it must be to count */
 #define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
 
-void motor_start(motor_state *motor, float angle_rad)
+void motor_start(motor_state *motor, float angle_rad, uint32_t phase)
 {
     const float duty = motor->duty;
     *motor = (motor_state){.duty = duty,
                            .last_rad = angle_rad,
                            .window_rad = angle_rad,
+                           .window_ticks = phase,
                            .resistance_scale = 1.0f,
                            .constant_scale = 1.0f,
                            .variance_rr = PRIOR_VARIANCE,
-                           .variance_kk = PRIOR_VARIANCE};
+                           .variance_kk = PRIOR_VARIANCE,
+                           .unsure_rad_s = UNKNOWN_RAD_S,
+                           .phase = phase};
 }
 
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
@@ -42,13 +47,17 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
     const float off_v = motor->window_v / ticks - motor->resistance_scale * ir_v - motor->constant_scale * kw_v;
     if (off_v * off_v <= SURPRISE * variance) {
         const float way_rad = number_size(angle_rad - motor->window_rad);
-        motor->agreed_rad += way_rad > 4.0f * WINDOW_NOISE_RAD ? way_rad : 0.0f;
+        const bool moved = way_rad > WINDOW_WAY_RAD;
+        motor->agreed_rad += moved ? way_rad : 0.0f;
         motor->resistance_scale =
             number_clamp(motor->resistance_scale + gain_r * off_v / variance, SCALE_LOW, SCALE_HIGH);
-        motor->constant_scale = number_clamp(motor->constant_scale + gain_k * off_v / variance, SCALE_LOW, SCALE_HIGH);
+        if (moved) { /* else the constant is only taken into account (Schmidt's form) */
+            motor->constant_scale =
+                number_clamp(motor->constant_scale + gain_k * off_v / variance, SCALE_LOW, SCALE_HIGH);
+            motor->variance_kk += WANDER_VARIANCE - gain_k * gain_k / variance;
+        }
         motor->variance_rr += WANDER_VARIANCE - gain_r * gain_r / variance;
         motor->variance_rk -= gain_r * gain_k / variance;
-        motor->variance_kk += WANDER_VARIANCE - gain_k * gain_k / variance;
     }
 }
 
@@ -68,31 +77,33 @@ static void window(motor_state *motor, const motor_config *config, float voltage
     if (motor->window_ticks < WINDOW_TICKS) {
         return;
     }
-    if (number_size(motor->gap_rad) < 0.5f * config->apart_rad) {
+    if (number_size(motor->gap_rad) < 0.5f * (config->apart_rad + motor->band_rad)) {
         learn(motor, config, angle_rad);
     }
     window_begin(motor, angle_rad);
 }
 
-static void sample(motor_state *motor, float angle_rad, float reference_rad)
-{
-    if (motor->driven_ticks % SAMPLE_TICKS == 0u) {
-        const uint32_t at = motor->sampled % MOTOR_SAMPLES;
-        motor->sample_read_rad[at] = angle_rad;
-        motor->sample_motor_rad[at] = motor->travel_rad;
-        motor->sample_reference_rad[at] = reference_rad;
-        motor->sampled++;
-    }
-}
-
+/* Let the unknown duration of a pause make the motor's speed unknown. */
 void motor_pause(motor_state *motor, float angle_rad)
 {
     motor->last_rad = angle_rad;
+    motor->unsure_rad_s = UNKNOWN_RAD_S;
     window_begin(motor, angle_rad);
 }
 
-void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad,
-                   float reference_rad)
+/* What changes slowly: how uncertain the speed is, and the samples. */
+static void sample(motor_state *motor, const motor_config *config, float ir_v, float emf_v, float angle_rad)
+{
+    const float variance = motor->variance_rr * ir_v * ir_v + 2.0f * motor->variance_rk * ir_v * emf_v +
+                           motor->variance_kk * emf_v * emf_v;
+    motor->unsure_rad_s = SIGMAS * number_root(variance > 0.0f ? variance : 0.0f) / config->constant_v_s;
+    const uint32_t at = motor->sampled % MOTOR_SAMPLES;
+    motor->sample_read_rad[at] = angle_rad;
+    motor->sample_motor_rad[at] = motor->travel_rad;
+    motor->sampled++;
+}
+
+void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad)
 {
     const float moved_rad = angle_rad - motor->last_rad;
     motor->last_rad = angle_rad;
@@ -105,134 +116,167 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     const float ir_v = current_a * config->resistance_ohm;
     const float emf_v = voltage_v - motor->resistance_scale * ir_v;
     motor->speed_rad_s = emf_v / (motor->constant_scale * config->constant_v_s);
-    const float variance = motor->variance_rr * ir_v * ir_v + 2.0f * motor->variance_rk * ir_v * emf_v +
-                           motor->variance_kk * emf_v * emf_v;
-    const float unsure_rad_s = SIGMAS * number_root(variance > 0.0f ? variance : 0.0f) / config->constant_v_s;
     const float keep = 1.0f - TICK_S / FADE_S;
     motor->gap_rad = keep * motor->gap_rad + moved_rad - motor->speed_rad_s * TICK_S;
-    motor->band_rad = keep * motor->band_rad + unsure_rad_s * TICK_S;
+    motor->band_rad = keep * motor->band_rad +
+                      (motor->unsure_rad_s < UNKNOWN_RAD_S ? motor->unsure_rad_s * TICK_S : 0.0f);
     motor->travel_rad += motor->speed_rad_s * TICK_S;
-    sample(motor, angle_rad, reference_rad);
+    const float seen_a = number_size(current_a);
+    motor->current_a = seen_a > keep * motor->current_a ? seen_a : keep * motor->current_a;
+    if ((motor->driven_ticks + motor->phase) % SAMPLE_TICKS == 0u || motor->unsure_rad_s == UNKNOWN_RAD_S) {
+        sample(motor, config, ir_v, emf_v, angle_rad);
+    }
     window(motor, config, voltage_v, ir_v, angle_rad);
 }
 
-/* A joint's last milliseconds, since motor and reading parted. */
-typedef struct parting {
-    uint32_t samples;
-    float read_rad;      /* how far each went */
-    float motor_rad;
-    float reference_rad;
-    float early_share;   /* the reading's part of the motor's way in the first half, */
-    float late_share;    /* in the second */
-    float early_gap;     /* the first half's part of the gap */
-} parting;
-
-static float share(float part, float whole) { return number_size(whole) < 1e-3f ? 0.0f : part / whole; }
-
-/* Return the sample from which on most of the gap opened. */
-static uint32_t parted_at(const motor_state *motor, uint32_t known)
+/* Return whether the motor's speed is known: not where no current is seen, as then its sensor may be broken. */
+static bool speed_is_known(const motor_state *motor, const motor_config *config)
 {
-    const float apart = motor->last_rad - motor->travel_rad;
-    float most = 0.0f;
-    for (uint32_t back = 1u; back <= known; back++) {
-        const uint32_t at = (motor->sampled - back) % MOTOR_SAMPLES;
-        const float off = number_size(apart - (motor->sample_read_rad[at] - motor->sample_motor_rad[at]));
-        most = off > most ? off : most;
-    }
-    for (uint32_t back = 1u; back < known; back++) {
-        const uint32_t at = (motor->sampled - back) % MOTOR_SAMPLES;
-        const float off = number_size(apart - (motor->sample_read_rad[at] - motor->sample_motor_rad[at]));
-        if (off >= PARTED * most) {
-            return back;
-        }
-    }
-    return known;
+    return config->resistance_ohm > 0.0f && motor->driven_ticks > SETTLE_TICKS &&
+           motor->current_a * config->resistance_ohm >
+               DEAD_SHARE * config->constant_v_s * number_size(motor->speed_rad_s);
 }
 
-static parting parted(const motor_state *motor)
+bool motor_races(const motor_state *motor, const motor_config *config, float speed_limit_rad_s)
 {
-    const uint32_t known = motor->sampled < MOTOR_SAMPLES ? motor->sampled : MOTOR_SAMPLES;
-    parting found = {.samples = parted_at(motor, known)};
-    const uint32_t first = (motor->sampled - found.samples) % MOTOR_SAMPLES;
-    const uint32_t half = (motor->sampled - (found.samples + 1u) / 2u) % MOTOR_SAMPLES;
-    const uint32_t newest = (motor->sampled - 1u) % MOTOR_SAMPLES;
-    const float early_read_rad = motor->sample_read_rad[half] - motor->sample_read_rad[first];
-    const float early_motor_rad = motor->sample_motor_rad[half] - motor->sample_motor_rad[first];
-    found.read_rad = motor->last_rad - motor->sample_read_rad[first];
-    found.motor_rad = motor->travel_rad - motor->sample_motor_rad[first];
-    found.reference_rad = motor->sample_reference_rad[newest] - motor->sample_reference_rad[first];
-    found.early_share = share(early_read_rad, early_motor_rad);
-    found.late_share = share(found.read_rad - early_read_rad, found.motor_rad - early_motor_rad);
-    found.early_gap = share(early_read_rad - early_motor_rad, found.read_rad - found.motor_rad);
-    return found;
+    return speed_is_known(motor, config) && number_size(motor->speed_rad_s) - motor->unsure_rad_s > speed_limit_rad_s;
 }
 
-/* Name a fault that showed while the reference rested: what opens steadily drifts; a reading that stands still lets the
- * joint creep faster and faster. */
-static uint32_t name_resting(const parting *was, bool agreed)
+float motor_witness(const motor_state *motor, const motor_config *config, float reading_rad_s, float speed_limit_rad_s)
 {
-    const float follows = share(was->read_rad, was->motor_rad);
-    if (!agreed && follows < -0.6f) {
-        return FAULT_POT_INVERTED;
-    }
-    return was->early_gap > STEADY ? FAULT_POT_DRIFT : FAULT_POT_FROZEN;
+    const float sure_rad_s = number_size(motor->speed_rad_s) - motor->unsure_rad_s - WITNESS * speed_limit_rad_s;
+    const bool faster = sure_rad_s > number_size(reading_rad_s);
+    return faster && speed_is_known(motor, config) ? motor->speed_rad_s : reading_rad_s;
 }
 
-/* Name a fault of a potentiometer that was good: it stuck, slips or drifts. The loop makes a reading that drifts or slips
- * go along with the reference all the same. */
-static uint32_t name_broken(const parting *was)
-{
-    const float gap_rad = number_size(was->read_rad - was->motor_rad);
-    const float follows = share(was->read_rad, was->motor_rad);
-    if (follows < -0.6f && number_size(was->motor_rad) > 0.35f * gap_rad) {
-        return FAULT_POT_INVERTED;
-    }
-    if (number_size(was->read_rad) < 0.35f * number_size(was->reference_rad)) {
-        return FAULT_POT_FROZEN;
-    }
-    const bool still = number_size(was->motor_rad) < 0.35f * gap_rad;
-    return still || follows < 0.2f || follows > 1.0f ? FAULT_POT_DRIFT : FAULT_POT_SLIP;
-}
-
-/* Name a fault that was there when the joint was enabled. */
-static uint32_t name_wrong(const parting *was)
-{
-    const float follows = share(was->read_rad, was->motor_rad);
-    if (follows < -0.3f) {
-        return FAULT_POT_INVERTED;
-    }
-    if (follows > 1.0f) {
-        return FAULT_POT_SCALE;
-    }
-    if (was->late_share > was->early_share + 0.25f) {
-        return FAULT_POT_LAG;
-    }
-    return follows < 0.15f ? FAULT_POT_FROZEN : FAULT_POT_SCALE;
-}
-
-static uint32_t name(const motor_state *motor, const motor_config *config)
-{
-    const parting was = parted(motor);
-    if (was.samples <= 2u && number_size(was.motor_rad) < 0.5f * number_size(was.read_rad - was.motor_rad)) {
-        return FAULT_POT_JUMP;
-    }
-    const bool agreed = motor->agreed_rad > AGREED * config->apart_rad;
-    if (number_size(was.reference_rad) < 0.25f * number_size(was.read_rad - was.motor_rad)) {
-        return name_resting(&was, agreed);
-    }
-    return agreed ? name_broken(&was) : name_wrong(&was);
-}
-
-uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v, float current_a)
+uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v)
 {
     if (config->resistance_ohm <= 0.0f || number_size(motor->gap_rad) <= config->apart_rad + motor->band_rad) {
         return FAULT_NONE;
     }
     const float across_v = number_size(motor->duty) * supply_v;
-    if (number_size(current_a) * config->resistance_ohm < 0.02f * across_v) {
+    if (motor->current_a * config->resistance_ohm < DEAD_SHARE * across_v) {
         return FAULT_CURRENT_SENSOR;
     }
-    return name(motor, config);
+    /* What it looks like so far, by the last 32 ms. */
+    const uint32_t back = motor->sampled < 4u ? motor->sampled : 4u;
+    const uint32_t at = (motor->sampled - back) % MOTOR_SAMPLES;
+    const float motor_rad = motor->travel_rad - motor->sample_motor_rad[at];
+    const float read_rad = motor->last_rad - motor->sample_read_rad[at];
+    const bool agreed = motor->agreed_rad > AGREED * config->apart_rad;
+    if (number_size(read_rad) < 0.25f * number_size(motor_rad)) {
+        return FAULT_POT_FROZEN;
+    }
+    if (!agreed && read_rad * motor_rad < 0.0f) {
+        return FAULT_POT_INVERTED;
+    }
+    if (read_rad * motor_rad < 0.0f || number_size(read_rad) > number_size(motor_rad)) {
+        return FAULT_POT_DRIFT;
+    }
+    return agreed ? FAULT_POT_SLIP : FAULT_POT_SCALE;
+}
+
+#define NAME_SAMPLES 24u    /* of the last 192 ms: most of them after the joint was let go of */
+#define NAME_NOISE_RAD 0.002f
+#define JUMP_SHARE 0.7f
+#define LAG_SHARE 0.5f      /* of what the others leave unexplained: a lag has one number more to fit with */
+
+/* Sums over the samples: reading y, motor m, their difference z, the sample's number k, the way between them x. */
+typedef struct name_sums {
+    float y, m, z, k, x;
+    float yy, mm, zz, kk, xx;
+    float my, zk, yk, yx, kx;
+} name_sums;
+
+/* Return what is left of squares yy once a regressor with squares xx is fitted; *slope is its factor. */
+static float left_of(float yy, float xy, float xx, float *slope)
+{
+    *slope = xx > 0.0f ? xy / xx : 0.0f;
+    return yy - *slope * xy;
+}
+
+static name_sums sums_of(const motor_state *motor, uint32_t count)
+{
+    name_sums s = {0};
+    const uint32_t first = (motor->sampled - count) % MOTOR_SAMPLES;
+    float x = 0.0f;
+    for (uint32_t i = 0u; i < count; i++) {
+        const uint32_t at = (motor->sampled - count + i) % MOTOR_SAMPLES;
+        const float y = motor->sample_read_rad[at] - motor->sample_read_rad[first];
+        const float m = motor->sample_motor_rad[at] - motor->sample_motor_rad[first];
+        const float z = y - m;
+        const float k = (float)i;
+        x -= z;
+        s.y += y; s.m += m; s.z += z; s.k += k; s.x += x;
+        s.yy += y * y; s.mm += m * m; s.zz += z * z; s.kk += k * k; s.xx += x * x;
+        s.my += m * y; s.zk += z * k; s.yk += y * k; s.yx += y * x; s.kx += k * x;
+    }
+    const float n = (float)count; /* about their means */
+    s.yy -= s.y * s.y / n; s.mm -= s.m * s.m / n; s.zz -= s.z * s.z / n; s.kk -= s.k * s.k / n; s.xx -= s.x * s.x / n;
+    s.my -= s.m * s.y / n; s.zk -= s.z * s.k / n; s.yk -= s.y * s.k / n; s.yx -= s.y * s.x / n; s.kx -= s.k * s.x / n;
+    return s;
+}
+
+/* Return what is left of the reading if it follows late: y = a k + x T/lag by least squares; x alone is what lag adds. */
+static float left_by_lag(const name_sums *s, float *rate)
+{
+    float unused;
+    const float yy = left_of(s->yy, s->yk, s->kk, &unused);
+    const float yx = s->yx - s->yk * s->kx / s->kk;
+    const float xx = s->xx - s->kx * s->kx / s->kk;
+    return left_of(yy, yx, xx, rate);
+}
+
+/* Return whether most of what lies between reading and motor opened from one sample to the next. */
+static bool jumped(const motor_state *motor, uint32_t count)
+{
+    float low = 0.0f, high = 0.0f, largest = 0.0f, last = 0.0f;
+    const uint32_t first = (motor->sampled - count) % MOTOR_SAMPLES;
+    for (uint32_t i = 1u; i < count; i++) {
+        const uint32_t at = (motor->sampled - count + i) % MOTOR_SAMPLES;
+        const float z = motor->sample_read_rad[at] - motor->sample_motor_rad[at] - motor->sample_read_rad[first] +
+                        motor->sample_motor_rad[first];
+        const float step = number_size(z - last);
+        low = z < low ? z : low;
+        high = z > high ? z : high;
+        largest = step > largest ? step : largest;
+        last = z;
+    }
+    return largest > 10.0f * NAME_NOISE_RAD && largest > JUMP_SHARE * (high - low);
+}
+
+uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect)
+{
+    const uint32_t count = motor->sampled < NAME_SAMPLES ? motor->sampled : NAME_SAMPLES;
+    if (count < NAME_SAMPLES / 2u) {
+        return suspect;
+    }
+    if (jumped(motor, count)) {
+        return FAULT_POT_JUMP;
+    }
+    const name_sums s = sums_of(motor, count);
+    const float noise = (float)count * NAME_NOISE_RAD * NAME_NOISE_RAD;
+    if (s.mm < 4.0f * noise) { /* the motor rests */
+        return s.yy > 4.0f * noise ? FAULT_POT_DRIFT : suspect;
+    }
+    float share, drift, rate;
+    const float by_share = left_of(s.yy, s.my, s.mm, &share) + noise;
+    const float by_drift = left_of(s.zz, s.zk, s.kk, &drift) + noise;
+    const float least = by_share < by_drift ? by_share : by_drift;
+    if (by_share < by_drift && share < -0.3f) {
+        return FAULT_POT_INVERTED;
+    }
+    if (left_by_lag(&s, &rate) + noise < LAG_SHARE * least && rate > 0.0f) {
+        return FAULT_POT_LAG;
+    }
+    if (by_drift < by_share) {
+        return number_size(drift) * (float)count > 4.0f * NAME_NOISE_RAD ? FAULT_POT_DRIFT : suspect;
+    }
+    if (share < 0.15f) {
+        return FAULT_POT_FROZEN;
+    }
+    const bool agreed = motor->agreed_rad > AGREED * config->apart_rad;
+    return agreed && share < 1.0f ? FAULT_POT_SLIP : FAULT_POT_SCALE;
 }
 
 #define SWING_TICKS 60u   /* a swing of 8 Hz and faster changes its side as often */
@@ -240,8 +284,12 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
 #define SWING_RAD_S 0.3f  /* as far from the reference's speed at least */
 #define SWING_SHARE 0.2f  /* of the speed limit */
 
-bool motor_swings(motor_state *motor, float reference_rad_s, float speed_limit_rad_s)
+bool motor_swings(motor_state *motor, const motor_config *config, float reference_rad_s, float speed_limit_rad_s)
 {
+    if (!speed_is_known(motor, config)) {
+        motor->swings = 0u;
+        return false;
+    }
     const float share_rad_s = SWING_SHARE * speed_limit_rad_s;
     const float far_rad_s = share_rad_s > SWING_RAD_S ? share_rad_s : SWING_RAD_S;
     const float off_rad_s = motor->speed_rad_s - reference_rad_s;

@@ -7,23 +7,32 @@
 
 #include "types.h"
 
-/* Begin to watch a joint that reads angle_rad. */
-void motor_start(motor_state *motor, float angle_rad);
+/* Begin to watch a joint that reads angle_rad; phase differs from joint to joint, so that not all are sampled at once. */
+void motor_start(motor_state *motor, float angle_rad, uint32_t phase);
 
 /* Let a tick pass in which the voltage at the motor is not known. */
 void motor_pause(motor_state *motor, float angle_rad);
 
 /* Take what a tick measured: supply (V), current (A, the joint's direction) and reading, while the windings are closed.
  * What R and K really are is learnt as long as motor and reading agree. */
-void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad,
-                   float reference_rad);
+void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad);
+
+/* Return the joint's speed: the reading's, or the motor's where that is faster beyond all its uncertainty. */
+float motor_witness(const motor_state *motor, const motor_config *config, float reading_rad_s, float speed_limit_rad_s);
+
+/* Return whether the motor is surely faster than the joint's limit. */
+bool motor_races(const motor_state *motor, const motor_config *config, float speed_limit_rad_s);
 
 /* Return the fault by which motor and reading are apart further than noise, backlash and the motor's uncertain numbers
- * explain; FAULT_NONE where they are not. */
-uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v, float current_a);
+ * explain, as it looks at first; FAULT_NONE where they are not. */
+uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v);
+
+/* Return the fault by what motor and reading did in the last 192 ms; suspect where that does not show it. A motor that was
+ * let go of changes its speed by itself: only then a reading that drifts can be distinguished from one that slips. */
+uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect);
 
 /* Return whether the motor swings about a reference that moves at reference_rad_s. */
-bool motor_swings(motor_state *motor, float reference_rad_s, float speed_limit_rad_s);
+bool motor_swings(motor_state *motor, const motor_config *config, float reference_rad_s, float speed_limit_rad_s);
 
 /* Return whether the joint has been faster than its limit (rad/s) long enough to be sure; fast_rad_s is what the reading
  * says of it. */

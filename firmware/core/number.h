@@ -18,8 +18,8 @@ static inline bool number_within(float x, float low, float high) { return x >= l
 /* Return x held within [low, high]; low <= high. */
 static inline float number_clamp(float x, float low, float high) { return x < low ? low : (x > high ? high : x); }
 
-/* Return the size of x. */
-static inline float number_size(float x) { return x < 0.0f ? -x : x; }
+/* Return the size of x: one instruction. */
+static inline float number_size(float x) { return __builtin_fabsf(x); }
 
 /* Return the square root of x, 0 or more: one instruction, rounded as IEEE 754 says. */
 static inline float number_root(float x) { return __builtin_sqrtf(x); }

@@ -44,7 +44,7 @@ float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *deman
     const float gathered_rad = spring == requested ? error_rad : 0.0f; /* nor does the integral make it faster */
     const float forward = gains->ka_s2_per_rad * demand->reference_rad_s2 +
                           gains->kf_duty * direction_of(demand->reference_rad_s) + demand->gravity_duty;
-    const float asked = spring + pid->integral_duty - gains->kd_s_per_rad * pid->speed_rad_s + forward;
+    const float asked = spring + pid->integral_duty - gains->kd_s_per_rad * demand->damped_rad_s + forward;
     const float duty = limited_duty(pid, demand, asked, limited);
     float integral = pid->integral_duty;
     if (gains->ki_per_rad_s > 0.0f) {

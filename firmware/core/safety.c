@@ -11,6 +11,7 @@
 #define LOST_TICKS 100u   /* so many ticks lost of late are no accident */
 #define CRC_BYTES 2u      /* of the configuration looked at in a tick: all of it in less than a second */
 #define OVERCURRENT_TICKS 20u
+#define NAME_TICKS 160u   /* after which a joint let go of has shown which fault it has */
 
 #define FAULT_NAME(name, code, reaction, text) [code] = #name,
 #define FAULT_TEXT(name, code, reaction, text) [code] = text,
@@ -43,12 +44,12 @@ bool safety_drives_on(const core_state *core)
 static void stop_along_path(core_state *core)
 {
     float longest_s = TICK_S;
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         const float takes_s =
             number_size(core->joint[i].reference.speed_rad_s) / core->config.joint[i].deceleration_rad_s2;
         longest_s = takes_s > longest_s ? takes_s : longest_s;
     }
-    for (uint32_t i = 0u; i < JOINTS; i++) {
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         joint_state *joint = &core->joint[i];
         joint->stop_rad_s2 = number_size(joint->reference.speed_rad_s) / longest_s;
         setpoint_hold(&joint->setpoint, joint->reference.position_rad);
@@ -222,12 +223,14 @@ static void watch_motor(core_state *core, uint32_t joint, float supply_v, float 
 {
     const joint_config *config = &core->config.joint[joint];
     joint_state *state = &core->joint[joint];
-    const uint32_t fault = motor_disagrees(&state->motor, &config->motor, supply_v, current_a);
+    const uint32_t fault = motor_disagrees(&state->motor, &config->motor, supply_v);
     if (fault != FAULT_NONE) {
         safety_raise(core, fault, joint);
+        state->suspect = fault == FAULT_CURRENT_SENSOR ? FAULT_NONE : fault;
+        state->suspect_ticks = 0u;
         return;
     }
-    if (motor_swings(&state->motor, state->reference.speed_rad_s, config->speed_limit_rad_s)) {
+    if (motor_swings(&state->motor, &config->motor, state->reference.speed_rad_s, config->speed_limit_rad_s)) {
         safety_raise(core, FAULT_OSCILLATION, joint);
         pid_change_gains(&state->pid, &config->gains, &core->start_gains.joint[joint]);
         core->config.joint[joint].gains = core->start_gains.joint[joint];
@@ -244,12 +247,36 @@ static void watch_motor(core_state *core, uint32_t joint, float supply_v, float 
     }
 }
 
+/* Give a fault of a joint that was let go of its right name, once the motion since then shows it. */
+static void name_suspect(core_state *core, uint32_t joint)
+{
+    joint_state *state = &core->joint[joint];
+    if (state->suspect == FAULT_NONE || ++state->suspect_ticks < NAME_TICKS) {
+        return;
+    }
+    const uint32_t suspect = state->suspect;
+    const uint32_t fault = motor_names(&state->motor, &core->config.joint[joint].motor, suspect);
+    state->suspect = FAULT_NONE;
+    core->joint_faults[joint] &= ~(1u << suspect);
+    core->joint_faults[joint] |= 1u << fault;
+    uint32_t joints = 0u;
+    for (uint32_t i = 0u; i < JOINTS; i++) {
+        joints |= core->joint_faults[i];
+    }
+    core->faults &= joints | ~(1u << suspect);
+    core->faults |= 1u << fault;
+    if (core->first_fault == suspect && core->first_joint == joint) {
+        core->first_fault = fault;
+    }
+}
+
 void safety_watch_joint(core_state *core, uint32_t joint, uint32_t counts, float supply_v, float current_a)
 {
     const joint_config *config = &core->config.joint[joint];
     joint_state *state = &core->joint[joint];
     const pid_state *pid = &state->pid;
     if (state->released != 0u) {
+        name_suspect(core, joint);
         return;
     }
     watch_motor(core, joint, supply_v, current_a);

@@ -41,16 +41,17 @@ bool setpoint_aim(setpoint_state *setpoint, float to_rad, float to_rad_s, uint32
     return lengthened;
 }
 
-void setpoint_advance(setpoint_state *setpoint)
+float setpoint_advance(setpoint_state *setpoint)
 {
     setpoint->elapsed = number_count(setpoint->elapsed);
     if (setpoint->elapsed >= setpoint->ticks) {
         const float beyond_s = (float)(setpoint->elapsed - setpoint->ticks) * TICK_S;
         setpoint->position_rad = setpoint->to_rad + setpoint->to_rad_s * beyond_s;
         setpoint->speed_rad_s = setpoint->to_rad_s;
-        return;
+        return 0.0f;
     }
     const float duration_s = (float)setpoint->ticks * TICK_S;
+    const float per_s = 1.0f / duration_s;
     const float s = (float)setpoint->elapsed / (float)setpoint->ticks;
     const float distance = setpoint->to_rad - setpoint->from_rad;
     const float first = setpoint->from_rad_s * duration_s;
@@ -58,20 +59,8 @@ void setpoint_advance(setpoint_state *setpoint)
     const float square = 3.0f * distance - 2.0f * first - last;
     const float cube = first + last - 2.0f * distance;
     setpoint->position_rad = setpoint->from_rad + s * (first + s * (square + s * cube));
-    setpoint->speed_rad_s = (first + s * (2.0f * square + s * 3.0f * cube)) / duration_s;
-}
-
-float setpoint_acceleration(const setpoint_state *setpoint)
-{
-    if (setpoint->elapsed >= setpoint->ticks) {
-        return 0.0f;
-    }
-    const float duration_s = (float)setpoint->ticks * TICK_S;
-    const float s = (float)setpoint->elapsed / (float)setpoint->ticks;
-    const float distance = (setpoint->to_rad - setpoint->from_rad) / duration_s;
-    const float square = 3.0f * distance - 2.0f * setpoint->from_rad_s - setpoint->to_rad_s;
-    const float cube = setpoint->from_rad_s + setpoint->to_rad_s - 2.0f * distance;
-    return (2.0f * square + s * 6.0f * cube) / duration_s;
+    setpoint->speed_rad_s = (first + s * (2.0f * square + s * 3.0f * cube)) * per_s;
+    return (2.0f * square + s * 6.0f * cube) * per_s * per_s;
 }
 
 bool setpoint_slow(setpoint_state *setpoint, float deceleration_rad_s2)

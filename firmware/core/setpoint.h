@@ -14,11 +14,9 @@ void setpoint_hold(setpoint_state *setpoint, float position_rad);
  * |to_rad_s| and the present speed must be within the limit. Returns whether it takes longer than asked for. */
 bool setpoint_aim(setpoint_state *setpoint, float to_rad, float to_rad_s, uint32_t ticks, float speed_limit_rad_s);
 
-/* Advance by one tick: along the cubic, and beyond its end straight on at its last speed. */
-void setpoint_advance(setpoint_state *setpoint);
-
-/* Return the acceleration (rad/s^2) with which it passes its present point. */
-float setpoint_acceleration(const setpoint_state *setpoint);
+/* Advance by one tick: along the cubic, and beyond its end straight on at its last speed. Returns the acceleration
+ * (rad/s^2) with which it passes the new point. */
+float setpoint_advance(setpoint_state *setpoint);
 
 /* Advance by one tick while slowing down by deceleration_rad_s2. Returns whether it has come to rest. */
 bool setpoint_slow(setpoint_state *setpoint, float deceleration_rad_s2);

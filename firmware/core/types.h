@@ -90,6 +90,14 @@ enum { REACTION_HOLD = 1, REACTION_RELEASE = 2, REACTION_CHOSEN = 3, REACTION_YI
 /* Why the board started. */
 enum { RESET_POWER = 0, RESET_WATCHDOG = 1, RESET_CRASH = 2 };
 
+/* Where a crash came from; all 0 where there was none. */
+typedef struct crash_record {
+    uint32_t exception; /* its number: 3 hard fault, 4 memory, 5 bus, 6 usage, 16 and more an unexpected interrupt */
+    uint32_t pc;        /* the instruction */
+    uint32_t lr;        /* who had called it */
+    uint32_t cfsr;      /* the processor's configurable fault status */
+} crash_record;
+
 /* What a command asks for. */
 enum {
     COMMAND_NONE = 0,
@@ -176,7 +184,8 @@ typedef struct joint_config {
 
 /* The configuration of the arm. Times are in ticks of 1 ms. */
 typedef struct core_config {
-    joint_config joint[JOINTS];
+    joint_config joint[JOINTS]; /* the first joint_count are used, the others are not looked at */
+    uint32_t joint_count;       /* 1 to JOINTS */
     uint32_t supply_min_mv;
     uint32_t supply_max_mv;
     uint32_t supply_nominal_mv; /* duties and gains are those at this supply; 1000 to 100000 */
@@ -274,6 +283,7 @@ typedef struct pid_demand {
     float duty_limit;      /* 0 to 1 */
     float duty_cap;        /* 0 to duty_limit: what the current limit leaves */
     float duty_slew_per_s;
+    float damped_rad_s;    /* the speed that is damped: the measured one, or the motor's where the reading is wrong */
 } pid_demand;
 
 /* The reference of one joint: a cubic from one point to the next, then straight on. */
@@ -295,13 +305,15 @@ typedef struct governor_state {
     float acceleration_rad_s2;
 } governor_state;
 
-#define MOTOR_SAMPLES 32u /* of a joint's last 128 ms */
+#define MOTOR_SAMPLES 32u /* of a joint's last 256 ms */
 
 /* What is remembered of one motor, watched by its own voltage and current. */
 typedef struct motor_state {
     float duty;              /* put out in the last tick, direction of the joint */
     float speed_rad_s;       /* by the back-EMF */
+    float unsure_rad_s;      /* how far that may be off */
     float travel_rad;        /* since the joint was enabled */
+    float current_a;         /* the largest of late */
     float gap_rad;           /* travel of the reading less that of the motor; fades */
     float band_rad;          /* how much of it the motor's uncertain numbers explain; fades */
     float last_rad;          /* the reading of the last tick */
@@ -317,7 +329,6 @@ typedef struct motor_state {
     uint32_t sampled;        /* samples taken */
     float sample_read_rad[MOTOR_SAMPLES];
     float sample_motor_rad[MOTOR_SAMPLES];
-    float sample_reference_rad[MOTOR_SAMPLES];
     float agreed_rad;        /* the motor's way on which the reading went along */
     int32_t swing_side;      /* which side of the reference's speed the motor's was on last */
     uint32_t swing_ticks;    /* since it changed */
@@ -325,6 +336,7 @@ typedef struct motor_state {
     uint32_t fast_ticks;     /* faster than the limit, in a row */
     uint32_t current_ticks;  /* beyond twice the current limit, in a row */
     uint32_t driven_ticks;   /* since the windings were closed */
+    uint32_t phase;          /* when it is sampled */
 } motor_state;
 
 /* What is remembered of one potentiometer. */
@@ -346,6 +358,8 @@ typedef struct joint_state {
     pot_state pot;
     motor_state motor;
     uint32_t released;       /* not 0: a fault took it out of the drive, its windings are shorted */
+    uint32_t suspect;        /* the fault by which motor and reading disagreed, until it has its name */
+    uint32_t suspect_ticks;  /* since then */
     float gravity_duty;      /* in use; it follows gravity_asked */
     float gravity_asked;
     float stop_rad_s2;       /* deceleration on the way to a stop along the path */

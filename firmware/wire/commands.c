@@ -1,6 +1,7 @@
 #include <stddef.h>
 #include <string.h>
 
+#include "common.h"
 #include "config.h"
 #include "inside.h"
 
@@ -8,6 +9,9 @@ _Static_assert(sizeof(gain_set) == sizeof(((mavlink_gains_t *)NULL)->gains), "GA
 
 void command_reject(wire_state *wire, uint32_t sequence, uint32_t rejection)
 {
+    if (common_answered(wire, sequence, rejection)) {
+        return;
+    }
     wire->fate.rejected_sequence = sequence;
     wire->fate.rejected_count++;
     wire->fate.rejection = rejection;
@@ -16,6 +20,9 @@ void command_reject(wire_state *wire, uint32_t sequence, uint32_t rejection)
 
 void command_acknowledge(wire_state *wire, uint32_t sequence)
 {
+    if (common_answered(wire, sequence, REJECTION_NONE)) {
+        return;
+    }
     wire->fate.acknowledged_sequence = sequence;
     wire->fate.acknowledged_count++;
     wire->status_due = 1u;
@@ -112,6 +119,7 @@ static void begin_session(wire_state *wire, const mavlink_message_t *message, ui
     wire->session = crc != 0u ? crc : 1u;
     wire->owner = message->sysid;
     wire->sequence_known = 0u;
+    common_begin_session(wire);
     atomic_fetch_add(&wire->shared.sessions, 1u);
 }
 
@@ -134,6 +142,11 @@ static void take_hello(wire_state *wire, const mavlink_message_t *message)
         .session = wire->session,
         .firmware = FIRMWARE_VERSION,
     };
+    const crash_record *crash = &wire->setup.crash;
+    welcome.crash[0] = crash->exception;
+    welcome.crash[1] = crash->pc;
+    welcome.crash[2] = crash->lr;
+    welcome.crash[3] = crash->cfsr;
     for (uint32_t i = 0u; i < sizeof welcome.board && wire->setup.board[i] != '\0'; i++) {
         welcome.board[i] = wire->setup.board[i];
     }
@@ -183,12 +196,18 @@ static void take_gains(wire_state *wire, const mavlink_message_t *message)
     }
 }
 
+void command_stop(wire_state *wire)
+{
+    drop(wire, COMMAND_NONE);
+    common_forget(wire);
+    atomic_fetch_add(&wire->shared.stops, 1u);
+}
+
 /* A stop is taken whatever its number and whoever sent it; what waited before it is dropped. */
 static void take_stop(wire_state *wire, const mavlink_message_t *message)
 {
     const uint32_t sequence = mavlink_msg_stop_get_sequence(message);
-    drop(wire, COMMAND_NONE);
-    atomic_fetch_add(&wire->shared.stops, 1u);
+    command_stop(wire);
     if (is_newer(wire, sequence)) {
         wire->sequence_known = wire->greeted;
         wire->newest_sequence = sequence;
@@ -200,6 +219,12 @@ static void take_stop(wire_state *wire, const mavlink_message_t *message)
 
 void message_take(wire_state *wire, const mavlink_message_t *message)
 {
+    if (message->sysid == wire->owner) {
+        wire->common.owner_tick = wire_tick(wire);
+    }
+    if (common_take(wire, message)) {
+        return;
+    }
     switch (message->msgid) {
     case MAVLINK_MSG_ID_HELLO:
         take_hello(wire, message);

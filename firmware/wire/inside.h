@@ -25,17 +25,26 @@ core_command *command_append(wire_state *wire, uint32_t kind, uint32_t sequence)
 void command_reject(wire_state *wire, uint32_t sequence, uint32_t rejection);
 void command_acknowledge(wire_state *wire, uint32_t sequence);
 
+/* Stop in an emergency: what waits is dropped. */
+void command_stop(wire_state *wire);
+
 /* Mail the oldest waiting command if the mailbox is empty and what became of the last one is known. */
 void command_deliver(wire_state *wire);
 
-/* Take a message that is no command: about the configuration, or a PING. */
+/* Take a message that is no command: about the configuration. */
 void settings_take(wire_state *wire, const mavlink_message_t *message);
+
+/* Copy so many bytes from this one on of the configuration in use. */
+void settings_copy(const wire_state *wire, uint32_t offset, void *to, uint32_t length);
 
 /* Check the configuration that came in parts, and hand it to the board. */
 void settings_store(wire_state *wire, uint32_t sequence);
 
 /* Write a message behind what waits to go out; where there is no room it is lost, and its number missing says so. */
 void telemetry_put(wire_state *wire, const mavlink_message_t *message);
+
+/* Return whether what waits to go out leaves telemetry worth writing. */
+bool telemetry_has_room(const wire_state *wire);
 
 /* Take over the newest report, and what became of the commands in it. Returns whether there was one. */
 bool telemetry_fetch(wire_state *wire);

@@ -46,6 +46,15 @@ static void take_store(wire_state *wire, const mavlink_message_t *message)
     }
 }
 
+void settings_copy(const wire_state *wire, uint32_t offset, void *to, uint32_t length)
+{
+    uint32_t number;
+    do { /* a tick that came between may have changed the gains */
+        number = atomic_load(&wire->shared.report_count);
+        memcpy(to, (const uint8_t *)wire->setup.config + offset, length);
+    } while (number != atomic_load(&wire->shared.report_count));
+}
+
 /* Answer with a part of the configuration in use; an empty one beyond its end. */
 static void take_read(wire_state *wire, const mavlink_message_t *message)
 {
@@ -53,11 +62,7 @@ static void take_read(wire_state *wire, const mavlink_message_t *message)
     const uint32_t left = offset < sizeof(core_config) ? (uint32_t)sizeof(core_config) - offset : 0u;
     const uint32_t length = left < WIRE_PART_BYTES ? left : WIRE_PART_BYTES;
     mavlink_config_part_t part = {.offset = offset, .total = sizeof(core_config), .length = (uint8_t)length};
-    uint32_t number;
-    do { /* a tick that came between may have changed the gains */
-        number = atomic_load(&wire->shared.report_count);
-        memcpy(part.bytes, (const uint8_t *)wire->setup.config + (length == 0u ? 0u : offset), length);
-    } while (number != atomic_load(&wire->shared.report_count));
+    settings_copy(wire, length == 0u ? 0u : offset, part.bytes, length);
     mavlink_message_t answer;
     mavlink_msg_config_part_encode_status(WIRE_SYSTEM, WIRE_COMPONENT, &wire->output.framing, &answer, &part);
     telemetry_put(wire, &answer);
@@ -71,18 +76,9 @@ static void take_part(wire_state *wire, const mavlink_message_t *message)
     const bool fits = part.total == sizeof(core_config) && part.length <= WIRE_PART_BYTES &&
                       part.offset <= sizeof(core_config) && part.length <= sizeof(core_config) - part.offset;
     if (fits && wire->staged.storing == 0u) {
+        wire->common.params_staged = 0u;
         memcpy((uint8_t *)&wire->staged.config + part.offset, part.bytes, part.length);
     }
-}
-
-static void take_ping(wire_state *wire, const mavlink_message_t *message)
-{
-    mavlink_ping_t ping;
-    mavlink_msg_ping_decode(message, &ping);
-    ping.tick = wire_tick(wire);
-    mavlink_message_t answer;
-    mavlink_msg_ping_encode_status(WIRE_SYSTEM, WIRE_COMPONENT, &wire->output.framing, &answer, &ping);
-    telemetry_put(wire, &answer);
 }
 
 void settings_take(wire_state *wire, const mavlink_message_t *message)
@@ -95,7 +91,5 @@ void settings_take(wire_state *wire, const mavlink_message_t *message)
         take_read(wire, message);
     } else if (message->msgid == MAVLINK_MSG_ID_CONFIG_PART) {
         take_part(wire, message);
-    } else if (message->msgid == MAVLINK_MSG_ID_PING) {
-        take_ping(wire, message);
     } /* anything else is the board's own, come back from a looped wire */
 }

@@ -1,6 +1,7 @@
 #include <stddef.h>
 #include <string.h>
 
+#include "common.h"
 #include "inside.h"
 
 #define FRAME(name) (MAVLINK_MSG_ID_##name##_LEN + MAVLINK_NUM_NON_PAYLOAD_BYTES)
@@ -48,6 +49,17 @@ void telemetry_put(wire_state *wire, const mavlink_message_t *message)
     ring->written += length;
 }
 
+bool telemetry_has_room(const wire_state *wire)
+{
+    const uint32_t waiting = wire->output.written - wire->output.taken;
+    return waiting <= BACKLOG_BYTES && waiting <= wire->setup.baud / BACKLOG_PER_BAUD;
+}
+
+bool wire_to_restart(const wire_state *wire)
+{
+    return wire->common.restart != 0u && wire->output.written == wire->output.taken;
+}
+
 uint32_t wire_output(const wire_state *wire, const uint8_t **bytes)
 {
     const wire_ring *ring = &wire->output;
@@ -83,12 +95,14 @@ bool telemetry_fetch(wire_state *wire)
         wire->stop_waits = 0u;
         command_acknowledge(wire, wire->stop_sequence);
     }
-    if (outputs->acknowledged_count != acknowledged) {
+    if (outputs->acknowledged_count != acknowledged &&
+        !common_answered(wire, outputs->acknowledged_sequence, REJECTION_NONE)) {
         wire->fate.acknowledged_count += outputs->acknowledged_count - acknowledged;
         wire->fate.acknowledged_sequence = outputs->acknowledged_sequence;
         wire->status_due |= wire->mailed_kind != COMMAND_MOVE;
     }
-    if (outputs->rejected_count != rejected) {
+    if (outputs->rejected_count != rejected &&
+        !common_answered(wire, outputs->rejected_sequence, outputs->rejection)) {
         wire->fate.rejected_count += outputs->rejected_count - rejected;
         wire->fate.rejected_sequence = outputs->rejected_sequence;
         wire->fate.rejection = outputs->rejection;
@@ -158,13 +172,6 @@ static void write_angles(wire_state *wire)
     wire->angles_tick = outputs->tick;
 }
 
-/* Return whether what waits to go out leaves telemetry worth writing. */
-static bool has_room(const wire_state *wire)
-{
-    const uint32_t waiting = wire->output.written - wire->output.taken;
-    return waiting <= BACKLOG_BYTES && waiting <= wire->setup.baud / BACKLOG_PER_BAUD;
-}
-
 /* Return whether it is time for a BOARD_STATUS. A host of another version learns why its commands are rejected, and no
  * more. */
 static bool status_is_due(const wire_state *wire)
@@ -179,16 +186,17 @@ static bool status_is_due(const wire_state *wire)
 void telemetry_write(wire_state *wire)
 {
     const uint32_t tick = wire_tick(wire);
-    if (status_is_due(wire) && has_room(wire)) {
+    common_write(wire);
+    if (status_is_due(wire) && telemetry_has_room(wire)) {
         write_status(wire);
     }
     if (wire->greeted == 0u) {
         return;
     }
-    if (tick - wire->joints_tick >= wire->periods.joints && has_room(wire)) {
+    if (tick - wire->joints_tick >= wire->periods.joints && telemetry_has_room(wire)) {
         write_joints(wire);
     }
-    if (tick - wire->angles_tick >= wire->periods.angles && has_room(wire)) {
+    if (tick - wire->angles_tick >= wire->periods.angles && telemetry_has_room(wire)) {
         write_angles(wire);
     }
 }

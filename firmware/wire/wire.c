@@ -3,6 +3,7 @@
 #include <stddef.h>
 #include <string.h>
 
+#include "common.h"
 #include "inside.h"
 
 #define BITS_PER_BYTE 10u /* 8N1: a start and a stop bit */
@@ -13,6 +14,7 @@ void wire_init(wire_state *wire, const wire_setup *setup)
     wire->setup = *setup;
     wire->periods = wire_periods_at(setup->baud);
     wire->report.outputs.first_joint = NO_JOINT;
+    common_init(wire);
 }
 
 /* Begin to look for the next message. */
@@ -167,6 +169,9 @@ void wire_before_tick(wire_state *wire, core_inputs *inputs)
 void wire_after_tick(wire_state *wire, const core_inputs *inputs, const core_outputs *outputs)
 {
     wire_shared *shared = &wire->shared;
+    memcpy(shared->report.last_duty, shared->report.outputs.duty, sizeof shared->report.last_duty);
+    memcpy(shared->report.counts, inputs->counts, sizeof shared->report.counts);
+    memcpy(shared->report.current_ma, inputs->current_ma, sizeof shared->report.current_ma);
     shared->report.outputs = *outputs;
     shared->report.supply_mv = inputs->supply_mv;
     atomic_fetch_add(&shared->report_count, 1u);

@@ -26,6 +26,7 @@ typedef struct wire_setup {
     uint32_t baud;             /* bits a second, 8N1 */
     uint32_t config_source;    /* CONFIG_NEWEST, CONFIG_OLDER or CONFIG_FACTORY */
     const core_config *config; /* in use; the tick may change its gains */
+    crash_record crash;        /* that the board started after */
 } wire_setup;
 
 /* How often each kind of telemetry goes out, in ticks. */
@@ -58,6 +59,9 @@ typedef struct wire_fate {
 typedef struct wire_report {
     core_outputs outputs;
     uint32_t supply_mv;
+    uint32_t counts[JOINTS];
+    int32_t current_ma[JOINTS];
+    float last_duty[JOINTS]; /* of the tick before: on while counts and currents were measured */
 } wire_report;
 
 /* What comes in: a message being put together. */
@@ -93,6 +97,27 @@ typedef struct wire_staged {
     uint32_t storing;  /* not 0: handed to the board */
 } wire_staged;
 
+/* What tools ask for by MAVLink's common messages. */
+typedef struct wire_common {
+    uint32_t sensed_period; /* of SENSED, ticks; 0: none */
+    uint32_t sensed_tick;   /* when the last one went out */
+    uint32_t second_tick;   /* and the last HEARTBEAT */
+    uint32_t owner_tick;    /* when the session's owner was heard last */
+    uint32_t tools;         /* not 0: a HEARTBEAT came since the last HELLO: they listen */
+    uint32_t said_faults[JOINTS + 1u]; /* as text, of each joint and of none */
+    uint32_t said_state;
+    uint32_t listed;        /* parameters sent of a list */
+    uint32_t params_staged; /* not 0: staged.config has the limits that were set */
+    uint32_t waits;         /* not 0: the core's answer is waited for */
+    uint32_t sequence;      /* of the command it is to */
+    uint32_t param;         /* which it sets */
+    uint32_t restart;       /* not 0: the board is to start anew */
+    uint16_t command;       /* MAV_CMD_ it answers */
+    uint16_t texts;         /* said in pieces; it wraps */
+    uint8_t system;         /* who asked */
+    uint8_t component;
+} wire_common;
+
 /* What the tick and the main loop share. */
 typedef struct wire_shared {
     core_command mail;             /* the main loop's while mail_full is 0, the tick's otherwise */
@@ -114,6 +139,7 @@ typedef struct wire_state {
     wire_ring output;
     wire_queue queue;
     wire_staged staged;
+    wire_common common;
     wire_shared shared;
     wire_fate fate;
     wire_report report;       /* the newest one, the main loop's */
@@ -150,6 +176,9 @@ void wire_poll(wire_state *wire);
  * wire_poll. */
 const core_config *wire_to_store(const wire_state *wire);
 void wire_stored(wire_state *wire, bool done);
+
+/* Return whether the board is to start anew, once what waits has gone out. Main loop, after wire_poll. */
+bool wire_to_restart(const wire_state *wire);
 
 /* Point *bytes to what waits to go out and return how much of it lies there in one piece; wire_sent then takes
  * how many were sent. Main loop. */

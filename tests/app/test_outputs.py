@@ -24,6 +24,7 @@ FILE_WRITERS = {
     "check plan": ("--arm", "arm.toml"),
     "identify plan": ("--arm", "six_r"),
     "arm calibrated": ("six_r", "arm.toml"),
+    "arm plan": ("six_r", "--around", "run"),
     "rig update": (".",),
 }
 FOLDER_WRITERS = {
@@ -32,6 +33,7 @@ FOLDER_WRITERS = {
     "dense match": ("rig.json", "left1.png", "right1.png"),
     "dense evaluate": (".",),
     "check": ("poses.csv",),
+    "arm report": (".",),
     "record": ("usb:97,98",),
     "demo": ("--arm", "no such arm"),
     "handeye": ("--robot", "poses.csv", "--eye", "in-hand", "--seen", "poses.csv"),
@@ -45,6 +47,7 @@ SUFFIXES = {
     "check plan": ".toml",
     "identify plan": ".csv",
     "arm calibrated": ".urdf",
+    "arm plan": ".toml",
     "body draw": ".pdf",
 }
 ELSEWHERE = {"identify", "live", "run", "board config get", "board build", "board flash"}

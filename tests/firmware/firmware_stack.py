@@ -17,10 +17,11 @@ from armsight.firmware import build
 
 #: What the processor pushes for an interrupt: 8 words, 17 of the floating-point unit, 1 to align (ARMv7-M, B1.5.7).
 INTERRUPT_BYTES = 26 * 4
-#: The board's functions with which the main loop and the tick begin.
-MAIN, TICK = "loop_poll", "loop_tick"
+#: The board's functions with which the main loop and the tick begin, and its other interrupts, each of which may come at
+#: the deepest point of what is running: a board's handlers are called *_interrupt.
+MAIN, TICK, HANDLER = "loop_poll", "loop_tick", "_interrupt"
 _INDIRECT = "__indirect_call"
-_HOOKS = "sense|drive|feed_watchdog|reset_cause|receive|send|read_copy|write_copy"
+_HOOKS = "sense|drive|feed_watchdog|reset_cause|crash|receive|send|read_copy|write_copy|restart"
 _HOOK = re.compile(rf"\.(?:{_HOOKS}) = (\w+)")
 _NODE = re.compile(r'node: \{ title: "([^"]+)" label: "[^"]*?(?:\\n(\d+) bytes \((\w+)[^"]*)?"')
 _EDGE = re.compile(r'edge: \{ sourcename: "([^"]+)" targetname: "([^"]+)"')
@@ -45,16 +46,18 @@ class StackUse:
 
     Attributes:
         main: of the main loop.
-        tick: of the tick's interrupt, which comes on top of it.
+        tick: of the tick's interrupt, from its handler on, which comes on top of it.
+        nested: of each interrupt that may come on top of that.
     """
 
     main: Chain
     tick: Chain
+    nested: tuple[Chain, ...]
 
     @property
     def total_bytes(self) -> int:
-        """The tick at the main loop's deepest point."""
-        return self.main.stack_bytes + INTERRUPT_BYTES + self.tick.stack_bytes
+        """The tick at the main loop's deepest point, and all other interrupts at the tick's."""
+        return self.main.stack_bytes + sum(INTERRUPT_BYTES + each.stack_bytes for each in (self.tick, *self.nested))
 
 
 def stack_use(board: str) -> StackUse:
@@ -71,7 +74,11 @@ def stack_use(board: str) -> StackUse:
     for called in calls.values():
         if _INDIRECT in called:
             called |= hooks
-    return StackUse(_deepest(MAIN, frames, calls, ()), _deepest(TICK, frames, calls, ()))
+    main, ticked = _deepest(MAIN, frames, calls, ()), _deepest(TICK, frames, calls, ())
+    handlers = [_deepest(name, frames, calls, ()) for name in frames if name.endswith(HANDLER)]
+    ticks = [chain for chain in handlers if TICK in chain.functions]
+    others = [chain for chain in handlers if TICK not in chain.functions and "fault" not in chain.functions[0]]
+    return StackUse(main, max([ticked, *ticks], key=lambda chain: chain.stack_bytes), tuple(others))
 
 
 def _hooks(board: str) -> set[str]:

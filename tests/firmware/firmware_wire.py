@@ -17,6 +17,7 @@ class Setup(ctypes.Structure):
         ("baud", ctypes.c_uint32),
         ("config_source", ctypes.c_uint32),
         ("config", ctypes.c_void_p),
+        ("crash", ctypes.c_uint32 * 4),
     )
 
 

@@ -18,6 +18,7 @@ static uint32_t bytes_read;   /* of the request's */
 static uint32_t line_credit;  /* what the wire still carries of this tick, in baud */
 static uint32_t unfed_ticks;
 static bool by_watchdog;
+static bool restart_asked;
 
 static void sense(core_inputs *inputs)
 {
@@ -63,6 +64,9 @@ static bool write_copy(uint32_t which, const config_copy *copy)
     return true;
 }
 
+static void crash(crash_record *record) { *record = (crash_record){0}; }
+static void ask_restart(void) { restart_asked = true; }
+
 static const board_description board = {
     .name = "pil",
     .baud = BAUD,
@@ -70,10 +74,12 @@ static const board_description board = {
     .drive = drive,
     .feed_watchdog = feed_watchdog,
     .reset_cause = reset_cause,
+    .crash = crash,
     .receive = receive,
     .send = send,
     .read_copy = read_copy,
     .write_copy = write_copy,
+    .restart = ask_restart,
 };
 
 _Static_assert((BAUD + BAUD_PER_BYTE) / BAUD_PER_BYTE < FRAME_BYTES, "an answer has room for what a tick carries");
@@ -81,6 +87,7 @@ _Static_assert((BAUD + BAUD_PER_BYTE) / BAUD_PER_BYTE < FRAME_BYTES, "an answer 
 static void restart(bool watchdog)
 {
     by_watchdog = watchdog;
+    restart_asked = false;
     unfed_ticks = 0u;
     line_credit = 0u;
     loop_start(&loop, &board);
@@ -100,8 +107,8 @@ bool pil_begin(void)
     if (!known) {
         return false;
     }
-    if (request->restart != RESTART_NONE || unfed_ticks == WATCHDOG_TICKS) {
-        restart(request->restart != RESTART_POWER);
+    if (restart_asked || request->restart != RESTART_NONE || unfed_ticks == WATCHDOG_TICKS) {
+        restart(!restart_asked && request->restart != RESTART_POWER);
     }
     bytes_read = 0u;
     line_credit = line_credit % BAUD_PER_BYTE + BAUD; /* a byte's part carries over, idle time does not */

@@ -189,7 +189,10 @@ typedef struct systick_registers {
 #define IRQ_PVD 1u
 #define SCB_ICSR (*(word *)0xE000ED04u)
 #define SCB_ICSR_PENDSVSET BIT(28)
+#define SCB_AIRCR (*(word *)0xE000ED0Cu)
+#define SCB_AIRCR_RESET (FIELD(0x5FA, 16) | BIT(2)) /* key, SYSRESETREQ */
 #define SCB_VTOR (*(word *)0xE000ED08u)
+#define SCB_CFSR (*(word *)0xE000ED28u)
 #define SCB_SHPR3 (*(word *)0xE000ED20u)
 #define SCB_CPACR (*(word *)0xE000ED88u)
 #define SCB_CPACR_FPU FIELD(0xF, 20)

@@ -6,6 +6,8 @@
 #include "registers.h"
 
 #define INTERRUPTS 97 /* of the STM32F446 */
+#define CRASH_MAGIC 0x43524153u
+#define FRAME_BYTES 32u /* what the processor puts on the stack: r0 to r3, r12, lr, pc, xpsr */
 
 typedef void (*handler)(void);
 
@@ -15,7 +17,7 @@ typedef struct vector_table {
     handler interrupt[INTERRUPTS];
 } vector_table;
 
-extern uint32_t main_stack_top[]; /* of stm32f446re.ld */
+extern uint32_t main_stack_begin[], main_stack_top[]; /* of stm32f446re.ld */
 
 extern const vector_table vectors;
 
@@ -35,9 +37,37 @@ void reset(void)
     board_main();
 }
 
-void fault_stop(void)
+/* What is kept of a crash until the board has started again: in RAM that memory_start leaves alone. */
+typedef struct kept_crash {
+    crash_record record;
+    uint32_t check; /* at power-up RAM holds anything */
+} kept_crash;
+
+__attribute__((section(".kept"))) static kept_crash kept;
+
+static uint32_t check_of(const crash_record *record)
+{
+    return CRASH_MAGIC ^ record->exception ^ record->pc ^ record->lr ^ record->cfsr;
+}
+
+bool crash_was_here(crash_record *record)
+{
+    const bool was = kept.check == check_of(&kept.record);
+    *record = was ? kept.record : (crash_record){0};
+    kept.check = ~check_of(&kept.record);
+    return was;
+}
+
+void fault_stop(const uint32_t *frame, uint32_t exception)
 {
     drives_off();
+    const uintptr_t at = (uintptr_t)frame;
+    const bool readable = at >= (uintptr_t)main_stack_begin && at + FRAME_BYTES <= (uintptr_t)main_stack_top;
+    kept.record.exception = exception & 0x1FFu;
+    kept.record.pc = readable ? frame[6] : 0u;
+    kept.record.lr = readable ? frame[5] : 0u;
+    kept.record.cfsr = SCB_CFSR;
+    kept.check = check_of(&kept.record);
     for (;;) {
     }
 }
@@ -46,7 +76,9 @@ void fault_stop(void)
 __attribute__((naked)) void fault(void)
 {
     __asm__ volatile("cpsid i\n"
-                   "ldr r0, =main_stack_top\n"
-                   "mov sp, r0\n"
+                   "mov r0, sp\n"
+                   "mrs r1, ipsr\n"
+                   "ldr r2, =main_stack_top\n"
+                   "mov sp, r2\n"
                    "b fault_stop\n");
 }

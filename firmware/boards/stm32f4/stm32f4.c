@@ -14,6 +14,7 @@ static volatile uint32_t ticks;
 static volatile uint32_t overruns;
 static volatile uint32_t running;
 static uint32_t overruns_reported;
+static crash_record last_crash;
 
 static void sense(core_inputs *inputs)
 {
@@ -34,7 +35,22 @@ static void drive(const core_outputs *outputs)
     }
 }
 
-static uint32_t reset_cause(void) { return watchdog_was_here() ? RESET_WATCHDOG : RESET_POWER; }
+static uint32_t reset_cause(void)
+{
+    const bool crashed = crash_was_here(&last_crash);
+    const bool watchdog = watchdog_was_here();
+    return crashed ? RESET_CRASH : watchdog ? RESET_WATCHDOG : RESET_POWER;
+}
+
+static void crash(crash_record *record) { *record = last_crash; }
+
+static void restart(void)
+{
+    drives_off();
+    SCB_AIRCR = SCB_AIRCR_RESET;
+    for (;;) { /* it takes a few clocks */
+    }
+}
 
 static const board_description nucleo = {
     .name = "nucleo-f446re",
@@ -43,10 +59,12 @@ static const board_description nucleo = {
     .drive = drive,
     .feed_watchdog = watchdog_feed,
     .reset_cause = reset_cause,
+    .crash = crash,
     .receive = uart_receive,
     .send = uart_send,
     .read_copy = flash_read,
     .write_copy = flash_write,
+    .restart = restart,
 };
 
 void systick_interrupt(void)

@@ -25,6 +25,7 @@ from armsight.loop.health.record import Trust
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Joints, Trajectory
 from armsight.robot.trajectories.lookahead import behind
+from armsight.robot.trajectories.resolved_rate import position_first
 
 #: A tool less well known than this is not corrected: sigma of its worst direction, m.
 MAX_SIGMA_M = 1e-3
@@ -35,6 +36,8 @@ RATE_SHARE = 0.1
 #: At rest a joint is taken through its backlash, with this time constant, s, for an error of the tool that lasts and of
 #: which the joint would have to make up so much, m: less is vision's noise.
 CROSS_S, CROSS_M = 0.3, 3e-5
+#: How fast the servo learns by how much joints rest off their commands, s; that changes with the load from pose to pose.
+DROOP_S = 0.2
 #: In motion the correction comes to what the estimator asks for with this time constant, s, or vision's period if longer:
 #: that is no feedback, as it hardly depends on the correction, but backlash that changes sides with every twitch would
 #: keep it twitching.
@@ -99,6 +102,19 @@ class LoopTiming:
         return float(d**d / (d + 1) ** (d + 1))
 
 
+@dataclass(frozen=True)
+class JointLoops:
+    """Controllers of the joints that armsight cannot tune, and which do not reach what they are commanded.
+
+    Attributes:
+        step_rad: a joint does not come nearer to where it should be than about half of this.
+        rest_rad_s: a joint at rest is measured slower than this.
+    """
+
+    step_rad: float
+    rest_rad_s: float
+
+
 @dataclass(frozen=True, eq=False)
 class Aim(Record):
     """The reference of the next command, as far as no measurement changes it: computed while an image is on its way.
@@ -149,10 +165,13 @@ class PoseServo:
     Args:
         arm: the arm, as its table says it is; motions are planned with it.
         timing: of the loop.
+        joints: controllers of the joints that leave an error of their own; None where they have an integral.
     """
 
-    def __init__(self, arm: Arm, timing: LoopTiming) -> None:
-        self.timing = timing
+    def __init__(self, arm: Arm, timing: LoopTiming, joints: JointLoops | None = None) -> None:
+        self.timing, self._joint_loops = timing, joints
+        self._rest_rad_s = REST_RAD_S if joints is None else joints.rest_rad_s
+        self._droop = np.zeros(arm.joints)
         self._arm, self._scale = arm, np.array([arm.size_m] * 3 + [1.0, 1.0, 1.0])
         self._follow = min(timing.period_s / max(FOLLOW_S, timing.vision_period_s), 1.0)
         self._correction = np.zeros(arm.joints)
@@ -195,6 +214,9 @@ class PoseServo:
             change = self._joints(aim, push)
         if mode is Mode.VISION and resting:
             change += self._crossing(estimator, aim, error)
+            if self._joint_loops is not None:
+                change = self._held(aim, change)
+                self._droops(estimate, aim)
         return self._command(aim, change, mode, error)
 
     def _mode(self, estimate: ArmEstimate, trust: Trust) -> Mode:
@@ -214,15 +236,17 @@ class PoseServo:
     def _missing(self, estimator: Estimator, aim: Aim) -> Array:
         """Return how far the tool would be behind (2, 6) now and ahead with this correction."""
         q, qd = np.stack([aim.goal.q, aim.ahead.q]), np.stack([aim.goal.qd, aim.ahead.qd])
-        return behind(aim.Ts_base_tool, estimator.tool(q + self._correction, qd))
+        return behind(aim.Ts_base_tool, estimator.tool(q + self._correction + self._droop, qd))
 
     def _joints(self, aim: Aim, error: Array) -> Array:
         """Return the joint angles (n,) that make up for an error of the tool (6,).
 
         What a singular arm cannot do is not asked of it: damping alone would let the integral wind up in that direction.
+        Fewer than six joints correct the position first.
         """
-        able = _within(0.0, (aim.s - UNCORRECTED_BELOW) / (CORRECTED_ABOVE - UNCORRECTED_BELOW), 1.0)
-        return np.asarray((able / np.maximum(aim.s, UNCORRECTED_BELOW) * ((error / self._scale) @ aim.U)) @ aim.Vt)
+        if self._arm.joints < 6:
+            return position_first(aim.jacobian / self._scale[:, None], error / self._scale, _corrected)[0]
+        return np.asarray((_corrected(aim.s) * ((error / self._scale) @ aim.U)) @ aim.Vt)
 
     def _crossing(self, estimator: Estimator, aim: Aim, error: Array) -> Array:
         """Return a step (n,) through the backlash of joints that rest on its wrong side for what is to be corrected."""
@@ -233,10 +257,21 @@ class PoseServo:
         here, there = estimator.tool(np.stack([aim.goal.q, aim.goal.q]) + self._correction, sides, pressed=True)
         return self._joints(aim, behind(here, there)) * min(self.timing.period_s / CROSS_S, 1.0)
 
+    def _held(self, aim: Aim, change: Array) -> Array:
+        """Return the change (n,), none where the joints' controllers cannot make it: they would hunt."""
+        assert self._joint_loops is not None
+        requested = np.abs(self._joints(aim, self._lasting)).max()
+        return np.zeros_like(change) if requested < 0.5 * self._joint_loops.step_rad else change
+
+    def _droops(self, estimate: ArmEstimate, aim: Aim) -> None:
+        """Learn how far the joints rest from what they are commanded, as far as their own sensors show it."""
+        off = estimate.q - aim.goal.q - self._correction
+        self._droop += min(self.timing.period_s / DROOP_S, 1.0) * (off - self._droop)
+
     def _resting(self, estimate: ArmEstimate, aim: Aim) -> bool:
         """Return whether the arm has been at rest for as long as the newest measurement is old."""
         requested = max(np.abs(aim.goal.qd).max(), np.abs(aim.ahead.qd).max())
-        still = bool(requested < STANDING_RAD_S and np.abs(estimate.qd).max() < REST_RAD_S)
+        still = bool(requested < STANDING_RAD_S and np.abs(estimate.qd).max() < self._rest_rad_s)
         self._rest_s = self._rest_s + self.timing.period_s if still else 0.0
         if not still:
             self._lasting = np.zeros(6)
@@ -266,6 +301,12 @@ class PoseServo:
             )
         command = JointCommand(q_ref, np.where(held, 0.0, qd_ref), aim.duty, period_s)
         return ServoStep(command, mode, correction, error, said)
+
+
+def _corrected(s: Array) -> Array:
+    """Return the inverses of singular values (k,) of what is corrected, 0 where a direction is not."""
+    able = _within(0.0, (s - UNCORRECTED_BELOW) / (CORRECTED_ABOVE - UNCORRECTED_BELOW), 1.0)
+    return np.asarray(able / np.maximum(s, UNCORRECTED_BELOW))
 
 
 def _within(low: Array | float, x: Array, high: Array | float) -> Array:

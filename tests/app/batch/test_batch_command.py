@@ -1,13 +1,14 @@
 """armsight batch: one row a shot and one a recording, the same by one and by two workers, and on again where it was."""
 
 import json
+from pathlib import Path
 
 import pytest
 
 pytest.importorskip("distributed")
 pytest.importorskip("mcap")
 
-from armsight.app.batch.run import Batch, found_recordings, run_batch
+from armsight.app.batch.run import Batch, _keys, found_recordings, run_batch
 from armsight.app.batch.work import BatchOptions, Done, work
 from armsight.errors import InputError
 from cli_runs import assert_rejected
@@ -118,13 +119,36 @@ def test_a_recording_that_fails_is_a_row_with_its_reason(tmp_path):
     assert done.shots == []
 
 
+def test_check_and_identify_take_the_data_of_their_commands(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "check")
+    from test_check_command import file_of, rows_of
+
+    (tmp_path / "run").mkdir()
+    file_of(tmp_path / "run" / "check.csv", rows_of())
+    checked = work(str(tmp_path / "run"), BatchOptions("check"))
+    assert checked.recording["status"] == "ok"
+    assert set(json.loads(checked.recording["result"])["poses"]) == {f"P{k}" for k in range(1, 6)}
+    failed = work(str(tmp_path / "run" / "check.csv"), BatchOptions("identify", arm="six_r"))
+    assert "no joint angles; columns q1_rad" in failed.recording["reason"]
+
+
+def test_another_rig_file_of_the_same_name_is_another_batch(tmp_path):
+    (tmp_path / "rig.json").write_text("{}")
+    options = BatchOptions("measure", str(tmp_path / "rig.json"))
+    first = _keys({"a.bag": "1 2"}, options)
+    assert _keys({"a.bag": "1 2"}, options) == first
+    assert _keys({"a.bag": "1 3"}, options) != first
+    (tmp_path / "rig.json").write_text("{ }")
+    assert _keys({"a.bag": "1 2"}, options) != first
+
+
 def test_recordings_are_found_in_any_store(tmp_path):
     import fsspec
 
     memory = fsspec.filesystem("memory")
     memory.pipe("/a/x.bag", b"1")
     memory.pipe("/a/b/y.bag", b"2")
-    assert found_recordings(["memory://a/**/*.bag"]) == ["memory:///a/b/y.bag", "memory:///a/x.bag"]
+    assert list(found_recordings(["memory://a/**/*.bag"])) == ["memory:///a/b/y.bag", "memory:///a/x.bag"]
     assert (
         "damaged"
         in work("memory:///a/x.bag", BatchOptions("measure", target="chessboard:9x6:25mm")).recording["reason"]
@@ -137,5 +161,6 @@ def test_recordings_are_found_in_any_store(tmp_path):
 def test_mistakes_are_one_line(armsight, tmp_path):
     bad = ("batch", "measure", tmp_path / "*.bag", "-o", tmp_path / "out", "--target", "chessboard:9x6:25mm")
     assert_rejected(armsight(*bad), "no such recording")
+    assert_rejected(armsight("batch", "identify", "*.csv", "-o", tmp_path / "out"), "needs the nominal arm: give --arm")
     assert_rejected(armsight(*bad, "--workers", 2, "--scheduler", "tcp://127.0.0.1:1"), "give one of the two")
     assert list(tmp_path.iterdir()) == []

@@ -101,10 +101,12 @@ def test_monitor_shows_faults(armsight, monkeypatch):
 def test_gains_are_printed_and_changed(armsight):
     said = armsight("board", "gains", *HOST, "--json")
     before = said.lines[0]
-    assert before["kp_per_rad"] == [10.0] * 6
+    own = before["kp_per_rad"]
+    assert len(own) == 6
+    assert all(each > 0 for each in own)
     changes = ("--set", "3:kp_per_rad=7.5", "--set", "all:ki_per_rad_s=0")
     after = armsight("board", "gains", *HOST, *changes, "--store", "--json").lines[0]
-    assert after["kp_per_rad"] == [10.0, 10.0, 7.5, 10.0, 10.0, 10.0]
+    assert after["kp_per_rad"] == [*own[:2], 7.5, *own[3:]]
     assert after["ki_per_rad_s"] == [0.0] * 6
     assert after["kd_s_per_rad"] == before["kd_s_per_rad"]
     table = armsight("board", "gains", *HOST, *changes).out.splitlines()

@@ -6,9 +6,10 @@ import sys
 import numpy as np
 import pytest
 
-from armsight.app.board.offsets import further_of
+from armsight.app.board.offsets import further_of, pot_changes
 from armsight.errors import DeviceError, InputError
 from armsight.robot.arm_file import open_arm
+from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.feetech import bus as feetech
 from armsight.robot.boards.feetech.bus import ServoBus
 from armsight.robot.boards.feetech.calibration import NAMES, uncalibrated
@@ -101,7 +102,7 @@ def test_mistakes_are_one_line_and_nothing_is_written(armsight, arm, tmp_path):
         "shoulder_pan (id 1): its offset would be -2105; the register holds -2047 to 2047",
     )
     assert_rejected(armsight("board", "offsets", *options, "--identified", "six_r"), "give one of --identified")
-    assert_rejected(armsight("board", "offsets", "--board", "emulated:host"), "has no homing offsets in its servos")
+    assert_rejected(armsight("board", "offsets", "--board", "ar4:/dev/none"), "an AR4 keeps no zeros")
     keep.write_text("{}")
     assert_rejected(
         armsight("board", "offsets", *options, "--further", FURTHER, "--keep", keep), "exists; old offsets are never"
@@ -146,3 +147,48 @@ def test_an_identified_arm_gives_the_correction():
     assert further_of(identified, nominal) == pytest.approx(further)
     with pytest.raises(InputError, match="are different arms"):
         further_of(replace(nominal, direction=-nominal.direction), nominal)
+
+
+AR4 = """# measured in May
+joint_1: 170.0
+joint_2: -42.0
+joint_3: -89.0  # new switch
+joint_4: -180.0
+joint_5: -105.0
+joint_6: -180.0
+"""
+
+
+def test_the_ar4_drivers_offsets_are_corrected_in_their_file_and_the_old_file_is_kept(armsight, tmp_path):
+    file, keep = tmp_path / "mk3.yaml", tmp_path / "old.yaml"
+    file.write_text(AR4)
+    options = ("board", "offsets", "--ar4-offsets", file, "--keep", keep, "--yes")
+    assert json.loads(armsight(*options[:4], "--json").out)["joints"][0] == {
+        "name": "joint_1",
+        "old_deg": 170.0,
+        "new_deg": 170.0,
+    }
+    assert not keep.exists()
+    said = armsight(*options, "--further", "1,0.5,-0.25,0,0,2")
+    assert said.code == 0, said.err
+    assert keep.read_text() == AR4
+    assert "joint_1: 169.0\n" in file.read_text()  # its sense is the opposite of the maker's table
+    assert "joint_3: -89.25  # new switch\n" in file.read_text()
+    assert "joint_6: -178.0\n" in file.read_text()
+    assert armsight(*options[:5], tmp_path / "again.yaml", "--yes", "--restore", keep).code == 0
+    assert file.read_text() == AR4
+    assert_rejected(armsight(*options, "--further", "1,2,3"), "6 corrections are needed")
+    file.write_text("joint_1: 1.0\n")
+    assert_rejected(armsight(*options[:4]), "no joint_offsets of ar4_ros_driver")
+
+
+def test_the_potentiometers_of_our_board_are_shifted_by_what_was_found():
+    config = lab_configuration()
+    before = config["joint"]["pot"]["angle_rad"].copy()
+    count = int(config["joint"][1]["pot"]["node_count"])
+    further = np.radians([0.0, 1.5, 0.0, -0.5, 0.0, 0.0])
+    changes = pot_changes(config, further)
+    np.testing.assert_allclose(
+        config["joint"]["pot"]["angle_rad"][1, :count] - before[1, :count], further[1], atol=1e-6
+    )
+    assert changes[3].new_deg - changes[3].old_deg == pytest.approx(-0.5, abs=1e-5)

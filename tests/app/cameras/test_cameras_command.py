@@ -65,6 +65,7 @@ class Driver:
             cameras.ENUM_FMT: self.formats,
             cameras.ENUM_FRAMESIZES: self.sizes,
             cameras.ENUM_FRAMEINTERVALS: self.rates,
+            cameras.QUERYCTRL: self.controls,
         }[request](asked)
         if answer is None:
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
@@ -73,6 +74,12 @@ class Driver:
 
     def query(self, _):
         return buffer(self.node)
+
+    def controls(self, asked):
+        """Exposure from 0.3 to 204.7 ms; a gain that is disabled."""
+        (number,) = struct.unpack_from("=I", asked)
+        low, high, flags = {0x009A0902: (3, 2047, 0), 0x00980913: (0, 255, 1)}[number]
+        return struct.pack("=2I32s4iI8x", number, 1, b"", low, high, 1, low, flags)
 
     def formats(self, asked):
         index, kind = struct.unpack_from("=2I", asked)
@@ -164,6 +171,7 @@ def test_cameras_are_found_with_their_stable_paths(computer):
         "uvcvideo",
         "usb-0000:00:14.0-2",
         EXPECTED,
+        exposure_ms=(0.3, 204.7),
     )
     assert [path.rsplit("/", 2)[1] for path in second.stable] == ["by-id", "by-path"]
     assert (closed.device, closed.name, closed.formats) == (f"{computer}/video10", "HD Webcam C525: HD Webcam", ())

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from armsight.app.live import calibration
+from armsight.app.live.calibration import quick_look
 from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, error_weights, guessed_rig, working_points
 from armsight.data import Detections
 from armsight.geometry.pose import inverse, transform
@@ -92,3 +94,13 @@ def test_shots_that_are_missing_are_counted(five):
     assert guide.shots_missing(knowledge, five.rig, CalibrationAim(1.01 * knowledge.error_m)) == 0
     assert guide.shots_missing(knowledge, five.rig, CalibrationAim(1e-7)) is None
     assert 1 <= guide.shots_missing(knowledge, five.rig, CalibrationAim(0.6 * knowledge.error_m)) <= 6
+
+
+def test_a_board_that_opencv_overlooks_is_found_and_none_is_found_quickly(monkeypatch):
+
+    squares = (np.indices((7, 10)).sum(axis=0) % 2).astype(np.uint8)
+    image = np.full((360, 640), 200, np.uint8)
+    image[60:270, 150:450] = np.kron(40 + 180 * squares, np.ones((30, 30), np.uint8))
+    monkeypatch.setattr(calibration.cv2, "checkChessboard", lambda *_: False)
+    assert quick_look(BOARD, image, thorough=False).problem is None
+    assert "not in view" in quick_look(BOARD, np.full((360, 640), 200, np.uint8), thorough=False).problem

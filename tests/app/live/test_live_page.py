@@ -2,6 +2,7 @@
 
 import shutil
 import time
+import urllib.request
 
 import pytest
 
@@ -113,6 +114,11 @@ def test_board(page, session):
     page.execute_script("document.getElementById('b-bar').value = '50'")
     click(page, "use-board")
     until(lambda: any("cannot be right" in each.text for each in page.find_elements("css selector", "#events li")))
+    assert state(page, "board.measured_mm") is None
+    click(page, "draw-board")
+    link = until(lambda: page.find_elements("css selector", "#b-pdf a"))[0].get_attribute("href")
+    with urllib.request.urlopen(link, timeout=10) as answer:
+        assert answer.read(5) == b"%PDF-"
     assert scaled_spec("chessboard:9x6:30mm", 1.01) == "chessboard:9x6:30.3mm"
 
 
@@ -148,6 +154,15 @@ def test_body_and_measure(page, session):
     until(lambda: state(page, "measure.relative") and abs(state(page, "measure.pose.position_mm[0]")) < 1.0)
     click(page, "m-mark")
     until(lambda: state(page, "measure.distance_mm"))
+    click(page, "m-second")  # the board, as the input proposes
+    click(page, "person-board")
+    apart = until(lambda: state(page, "measure.second.distance_mm"))
+    assert 50.0 < apart[0] < 2000.0
+    assert apart[1] < 5.0
+    click(page, "person-no_board")
+    click(page, "m-second")
+    until(lambda: state(page, "measure.second") is None)
+    until(lambda: state(page, "measure.pose"))
     click(page, "m-record")
     until(lambda: "2 poses" in (state(page, "measure.recording") or ""))
     click(page, "m-record")
@@ -213,6 +228,14 @@ def test_the_arm_is_held_when_the_page_that_commands_is_closed(session, server, 
         click(other, "take")
     click(other, "step-arm")
     until(lambda: other.execute_script("return you.commands"))
+    click(other, "e-guide")
+    until(lambda: "hand-eye: pose" in (state(other, "arm.running") or ""))
+    until(lambda: other.find_element("id", "stopped").text == "or the space key")
+    other.find_element("tag name", "body").send_keys(" ")  # while it moves
+    until(lambda: other.execute_script("return armsight.stopAnswer && armsight.stopAnswer.stopped"))
+    until(lambda: any("stopped by a person: emergency stop" in event.text for event in session.events()))
+    click(other, "a-clear")
+    until(lambda: not state(other, "arm.stopped"))
     click(other, "a-run-open")
     until(lambda: "hand-eye: pose" in (state(other, "arm.running") or ""))
     with pytest.raises(InputError, match="the arm moves"):
@@ -221,4 +244,5 @@ def test_the_arm_is_held_when_the_page_that_commands_is_closed(session, server, 
     until(lambda: any("the arm is held: the page" in event.text for event in session.events()))
     until(lambda: not session.arm.busy)
     until(lambda: session.arm.state.state.startswith("held at rest"))
+    assert "the page" in session.sections()["overview"].held
     until(lambda: (session.folder / "run" / "summary.json").exists())

@@ -1,8 +1,11 @@
 """The server: who may connect and command, the stop, the newest image alone, and pages that misbehave."""
 
 import json
+import os
 import socket
 import struct
+import subprocess
+import sys
 import threading
 import time
 import urllib.error
@@ -246,3 +249,15 @@ def test_a_port_in_use_is_one_line(serving):
     other = LiveServer(FakeSession(), port=server.port)
     with pytest.raises(InputError, match=f"port {server.port} is in use.*--port"):
         other.start()
+
+
+def test_no_screen_is_needed():
+    """On a computer without X nothing may be imported that wants one."""
+    graphical = ("tkinter", "PyQt5", "PyQt6", "PySide2", "PySide6", "wx", "gi", "matplotlib.pyplot")
+    code = (
+        "import sys, armsight.app.live.session, armsight.app.live.server; "
+        f"print([name for name in {graphical} if name in sys.modules])"
+    )
+    bare = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    found = subprocess.run([sys.executable, "-c", code], env=bare, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"

@@ -388,3 +388,22 @@ def test_a_rig_whose_camera_moved_is_named_and_the_exit_code_says_so(rendered, t
     assert found.keys() == {"cause", "what", "since_s", "size", "sigma", "unit", "advice"}
     assert abs(found["size"] - 0.3) < 4 * found["sigma"]
     assert "do not trust this result: rig: " in said.err
+
+
+def test_a_fixed_body_that_moves_is_named(rendered, armsight, tmp_path):
+    post = tmp_path / "post.toml"
+    shutil.copy(rendered.plate, post)
+    given = [rendered.rig, "--target", rendered.plate, "--source", rendered.folder / "arm", "--fixed"]
+    said = armsight("measure", *given, post, "--json")
+    (found,) = said.lines[-1]["health"]
+    assert said.code == 3, said.err
+    assert found["cause"] == "fixed"
+    assert "with one alone the two look alike" in found["what"]
+
+
+def test_fixed_bodies_that_cannot_be_watched(rendered, armsight, tmp_path):
+    given = ["measure", rendered.rig, "--target", rendered.plate, "--source", rendered.folder / "arm", "--fixed"]
+    assert_rejected(armsight(*given, rendered.plate), "given twice")
+    assert_rejected(armsight(*given, tmp_path / "none.toml"), "none.toml")
+    seen = [*given[:4], "--detections", "d.csv", "--fixed", rendered.plate]
+    assert_rejected(armsight(*seen), "--fixed needs images")

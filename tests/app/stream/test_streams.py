@@ -195,3 +195,55 @@ def test_a_missing_package_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "foxglove", None)
     with pytest.raises(InputError, match="armsight\\[stream\\]"):
         open_streams(["foxglove:0"], Published(), pytest.fail)
+
+
+def test_ros2_messages_over_zenoh_are_decoded_by_the_definitions_of_ros(monkeypatch):
+    """Keys, tokens and attachments as rmw_zenoh has them; the hash is that of ROS's own std_msgs/String."""
+    zenoh = pytest.importorskip("zenoh")
+    from rosbags.typesys import Stores, get_typestore
+    from test_run_mcap import BODY, measured, published
+
+    from armsight.app.stream.zenoh import open_ros2
+
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    config = zenoh.Config()
+    for key, value in (
+        ("mode", '"router"'),
+        ("listen/endpoints", f'["tcp/127.0.0.1:{port}"]'),
+        ("scouting/multicast/enabled", "false"),
+    ):
+        config.insert_json5(key, value)
+    shot = ShotDatum(Shot("s0", None, None, 2.5, None, (b"\xff\xd8l\xff\xd9", b"\xff\xd8r\xff\xd9")), measured(), 2.52)
+    with zenoh.open(config) as router:
+        got, tokens = {}, []
+        router.declare_subscriber("7/**", lambda s: got.setdefault(str(s.key_expr), s))
+        router.liveliness().declare_subscriber("@ros2_lv/7/**", lambda s: tokens.append(str(s.key_expr)))
+        sink = open_ros2(str(port), published())
+        sink.start()
+        publish_until(sink, lambda: any("/armsight/shot/" in key for key in got), shot)
+        sink.close()
+        assert sink.problem is None
+    store = get_typestore(Stores.ROS2_JAZZY)
+    decoded = {}
+    for key, sample in got.items():
+        _, *topic, mangled, hashed = key.split("/")
+        kind = mangled.replace("::dds_::", "/").replace("::", "/").removesuffix("_")
+        assert hashed == store.hash_rihs01(kind)
+        decoded["/".join(topic)] = store.deserialize_cdr(sample.payload.to_bytes(), kind)
+        number, stamp_ns, length, _ = struct.unpack("<qqB16s", sample.attachment.to_bytes())
+        assert (number, stamp_ns, length) == (1, 2_500_000_000, 16)
+        token = f"/MP/%/%/armsight/{'%' + '%'.join(topic)}/{mangled}/{hashed}/::,10:,:,:,,"
+        assert any(each.endswith(token) for each in tokens)
+    string = next(key for key in got if key.startswith("7/armsight/shot/"))
+    assert string.endswith(
+        "std_msgs::msg::dds_::String_/RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+    )
+    assert json.loads(decoded["armsight/shot"].data) == json.loads(json.dumps(shot.to_json(BODY)))
+    assert decoded["odometry"].pose.pose.position.x == shot.result.T_left_body[0, 3]
+    assert bytes(decoded["right/image_raw/compressed"].data) == shot.shot.encoded[1]
+    assert decoded["right/camera_info"].header.stamp == decoded["right/image_raw/compressed"].header.stamp
+    assert any("/NN/%/%/armsight" in each for each in tokens)
+    with pytest.raises(InputError, match="no zenoh router answers there; start it: ros2 run"):
+        open_ros2(str(port), published())

@@ -156,6 +156,7 @@ WRONG = {
     "motor_direction": [0, 3],
 }
 WRONG_ARM = {
+    "joint_count": [0, 7],
     "supply_min_mv": [14000],
     "supply_nominal_mv": [999, 100001],
     "overload_ticks": [0, 10001],

@@ -83,6 +83,7 @@ def test_a_potentiometer_that_breaks_in_motion_is_noticed_at_its_joint(arms, lib
     joint = int(np.argmax(np.abs(arm.plant.qd)))
     arm.plant.break_pot(joint, kind, size)
     arm.swing(2000)
+    arm.tick(arms.NAMED_TICKS)
     assert arm.first[1] == joint
     if kind is PotFault.JUMP:
         assert arm.first[0] is Fault.POT_JUMP
@@ -95,7 +96,9 @@ def test_a_potentiometer_that_was_wrong_from_the_beginning_is_noticed_at_its_joi
         arm.plant.break_pot(2, kind, size)
         arm.enable()
         arm.swing(4000)
+        arm.tick(arms.NAMED_TICKS)
         assert arm.first[1] == 2
+        assert arm.first[0] is not Fault.POT_FROZEN
 
 
 @pytest.mark.parametrize("size", [0.2, -0.2])
@@ -105,13 +108,65 @@ def test_a_reading_that_drifts_at_rest_is_noticed(arms, library, size):
         arm.rest(600)
         arm.plant.break_pot(1, PotFault.DRIFT, size)
         arm.rest(4000)
+        arm.tick(arms.NAMED_TICKS)
         assert arm.first[1] == 1
+
+
+def test_a_drift_is_distinguished_from_a_slip_once_the_joint_was_let_go_of(arms, library):
+    for seed, kind, size, code in (
+        (941, PotFault.DRIFT, 0.5, Fault.POT_DRIFT),
+        (942, PotFault.DRIFT, -0.5, Fault.POT_DRIFT),
+        (943, PotFault.SLIP, 0.4, Fault.POT_SLIP),
+    ):
+        arm = swinging(arms, library, seed)
+        joint = int(np.argmax(np.abs(arm.plant.qd)))
+        arm.plant.break_pot(joint, kind, size)
+        arm.swing(2000)
+        at_first = arm.first
+        arm.tick(arms.NAMED_TICKS)
+        assert (at_first[1], arm.first) == (joint, (code, joint))
+        assert arm.out[0]["joint_faults"][joint] == arm.out[0]["faults"] == 1 << code
+
+
+def test_the_arm_that_runs_in_c_is_the_plant_of_sim(arms, library):
+    arm, twin = (arms.Arm(library, 950) for _ in range(2))
+    for each in (arm, twin):
+        each.plant.break_pot(1, PotFault.LAG, 0.05)
+        each.plant.break_pot(2, PotFault.SLIP, 0.1)
+        each.plant.hand_n_m[3] = 1.5
+        each.tick(5)
+        each.command(arms.c.COMMAND_ENABLE)
+    for _ in range(300):
+        sensed, out = twin.plant.sense(), twin.out[0]
+        twin.inputs.tick += 1
+        twin.inputs.counts[:], twin.inputs.current_ma[:] = sensed.counts.tolist(), sensed.current_ma.tolist()
+        library.core_tick(twin.loop.core, twin.loop.inputs, twin.loop.outputs)
+        twin.plant.step(out["duty"], bool(out["drives_on"] or out["windings_shorted"]), not out["brakes_open"])
+    arm.tick(300)
+    assert arm.plant.q.tobytes() == twin.plant.q.tobytes()
+    assert bytes(arm.outputs) == bytes(twin.outputs)
+
+
+def test_a_current_that_is_never_there_is_the_sensors_fault(arms, library):
+    arm = arms.Arm(library, 901)
+    arm.plant._model[[9, 10]] = 0.0
+    arm.enable()
+    arm.swing(1000)
+    assert arm.first[0] is Fault.CURRENT_SENSOR
+
+
+def test_a_jump_too_small_for_the_reading_alone_is_named_by_its_step(arms, library):
+    arm = swinging(arms, library, 902)
+    arm.plant.break_pot(4, PotFault.JUMP, 0.085)
+    arm.swing(400)
+    arm.tick(arms.NAMED_TICKS)
+    assert arm.first == (Fault.POT_JUMP, 4)
 
 
 def test_gains_that_make_a_joint_swing_are_noticed(arms, library):
     arm = arms.Arm(library, 930)
     for joint in arm.core.config.joint:
-        joint.gains.kp_per_rad, joint.gains.kd_s_per_rad = 60.0, 3.0
+        joint.gains.kp_per_rad, joint.gains.kd_s_per_rad = 60.0, 6.0
     arm.core.crc, arm.core.crc_at, arm.core.crc_known = 0xFFFFFFFF, 0, 0
     arm.enable()
     arm.swing(3000)

@@ -59,6 +59,7 @@ class Pid:
         limited = ctypes.c_uint32()
         state, gains = ctypes.byref(self.state), ctypes.byref(self.gains)
         self.library.pid_measure(state, gains, measured)
+        self.demand.damped_rad_s = self.state.speed_rad_s
         duty = self.library.pid_step(state, gains, ctypes.byref(self.demand), ctypes.byref(limited))
         self.limited = limited.value
         return duty

@@ -268,3 +268,17 @@ def test_disabling_works_in_every_state_but_the_stop(arm, state):
     assert arm.outputs.drives_on == 0
     if state in ("STOPPING", "HOLDING", "FAULTED"):
         assert arm.outputs.state == c.STATE_FAULTED
+
+
+def test_joints_that_are_not_there_are_not_looked_at(library):
+    config = lab_config(library)
+    config.joint_count = 3
+    for joint in (3, 4, 5):
+        config.joint[joint] = c.joint_config()
+    arm = LabArm(library, config)
+    arm.spoil = lambda arm: arm.inputs.counts.__setitem__(slice(3, 6), [0, 65535, 0])
+    arm.enable()
+    out = arm.wander(300)
+    assert (out.state, out.faults) == (c.STATE_ENABLED, 0)
+    assert all(out.duty[joint] != 0 for joint in range(3))
+    assert not any(out.duty[joint] or out.angle_rad[joint] or out.reference_rad[joint] for joint in (3, 4, 5))

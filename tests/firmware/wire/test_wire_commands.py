@@ -23,13 +23,13 @@ def test_every_hello_is_answered_with_who_the_board_is(fresh):
     board.tick(host.hello(nonce=4711))
     board.tick()
     welcome = host.newest("WELCOME")
-    assert (welcome.dialect_version, welcome.config_version, welcome.nonce) == (3, 2, 4711)
+    assert (welcome.dialect_version, welcome.config_version, welcome.nonce) == (4, c.CONFIG_VERSION, 4711)
     assert (welcome.board, welcome.joints, welcome.baud) == ("pil", c.JOINTS, 921600)
     assert (welcome.ticks_per_s, welcome.config_source) == (c.TICKS_PER_S, c.CONFIG_FACTORY)
     assert welcome.firmware == version("armsight")
 
 
-@pytest.mark.parametrize("other", [{"dialect": 4}, {"config": 1}, {"dialect": 2}])
+@pytest.mark.parametrize("other", [{"dialect": 5}, {"config": 1}, {"dialect": 2}])
 def test_a_host_of_another_version_learns_who_the_board_is_and_may_only_stop_it(working, other):
     board, host = working
     board.run(2, host.hello(nonce=9, **other))
@@ -61,7 +61,7 @@ def test_nothing_is_acknowledged_before_a_hello(fresh, message):
 
 def test_what_asks_for_no_command_is_not_answered_before_a_hello(fresh):
     board, host = fresh
-    board.run(30, host.pack("ping", 1, 0) + host.pack("config_read", 0))
+    board.run(30, host.pack("config_read", 0))
     assert host.listen() == []
 
 
@@ -168,12 +168,12 @@ def test_gains_come_whole(working):
     assert list(bytes(config.joint[0].gains)) == list(bytes(c.joint_gains(*gains[:8])))
 
 
-def test_a_ping_comes_back_with_the_tick(working):
+def test_a_timesync_comes_back_with_the_tick(working):
     board, host = working
-    board.tick(host.pack("ping", 123456789012345, 0))
+    board.tick(host.pack("timesync", 0, 123456789012345))
     board.run(3)
-    ping = host.newest("PING")
-    assert (ping.host_us, ping.tick) == (123456789012345, board.request.tick - 5)
+    sync = host.newest("TIMESYNC")
+    assert (sync.ts1, sync.tc1) == (123456789012345, (board.request.tick - 5) * 1_000_000)
 
 
 def test_what_the_board_itself_sends_does_nothing_when_it_comes_back(working):
@@ -186,7 +186,7 @@ def test_what_the_board_itself_sends_does_nothing_when_it_comes_back(working):
 
 
 def test_the_dialects_version_is_the_one_the_board_knows():
-    assert firmware.dialect().ARMSIGHT_DIALECT_VERSION == 3
+    assert firmware.dialect().ARMSIGHT_DIALECT_VERSION == 4
 
 
 def test_a_new_host_does_not_find_the_last_ones_commands(working):

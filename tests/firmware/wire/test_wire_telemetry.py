@@ -104,7 +104,7 @@ def test_a_flood_of_rejected_commands_leaves_room_for_the_angles(working):
 def test_a_flood_of_questions_does_not_choke_the_wire(working):
     board, host = working
     for _ in range(100):
-        board.run(1, host.pack("ping", 1, 0) * 3)
+        board.run(1, host.pack("timesync", 0, 1) * 3)
     for _ in range(20):
         board.run(1, host.pack("config_read", 0) * 4)
     board.run(50)

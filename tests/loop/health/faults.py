@@ -41,7 +41,7 @@ def measured(rig, body, T_start, uv):
     return PoseEstimate(fit.T_left_body, noise + gain @ rig.cov @ gain.T, noise, 0.0, 0.0, 1.0, points)
 
 
-def watched_body(seed, *, rotated=None, scale=1.0, at_s=0.0, seconds=12.0):
+def watched_body(seed, *, rotated=None, scale=1.0, skew_s=0.0, at_s=0.0, seconds=12.0):
     """Watch a body that moves and rests; yield the monitor, the time, the true pose, and what it returned for each shot."""
     rng = np.random.default_rng(seed)
     cov = np.diag(SIGMAS**2)
@@ -55,12 +55,17 @@ def watched_body(seed, *, rotated=None, scale=1.0, at_s=0.0, seconds=12.0):
     points = BODY.points + 2e-5 * rng.normal(size=BODY.points.shape)
     monitor = HealthMonitor(given, body, SYNC_S)
     rates, phases = rng.uniform(0.05, 0.2, 6), rng.uniform(0, 2 * np.pi, 6)
+
+    def body_at(t):
+        u = np.sin(2 * np.pi * rates * min(t, 0.6 * seconds) + phases)  # it rests at the end
+        return pose(exp_so3(0.3 * u[3:]), np.array([0.1, 0.0, 0.9]) + np.array([0.12, 0.08, 0.12]) * u[:3])
+
     for k in range(round(seconds * RATE_HZ)):
         t = k / RATE_HZ
-        u = np.sin(2 * np.pi * rates * min(t, 0.6 * seconds) + phases)  # it rests at the end
-        T = pose(exp_so3(0.3 * u[3:]), np.array([0.1, 0.0, 0.9]) + np.array([0.12, 0.08, 0.12]) * u[:3])
+        T, late = body_at(t), body_at(t + skew_s * (t >= at_s))
         true = moved if t >= at_s else TRUE
-        uv = both_pixels(true, points @ T[:3, :3].T + T[:3, 3])
+        uv, uv_late = (both_pixels(true, points @ each[:3, :3].T + each[:3, 3]) for each in (T, late))
+        uv[:, 1] = uv_late[:, 1]
         estimate = measured(given, body, T, uv + SIGMA_PX * rng.normal(size=uv.shape))
         yield monitor, t, T, estimate, monitor.measured(estimate, t)
 
@@ -77,9 +82,10 @@ LEARNED_S, AT_S = 5.0, 6.5
 class Moved:
     """An estimator whose cameras move at a time, which it does not know; it is watched once it has learned the arm."""
 
-    def __init__(self, estimator, T_base_rig, motion, slip=None):
+    def __init__(self, estimator, T_base_rig, motion, slip=None, late=None):
         self.estimator, self.motion, self.T_base_rig = estimator, motion, T_base_rig
         self.slip = slip  # of the body on the tool (6,), [m; rad]
+        self.late = late  # by how much the stamps are late, s, at seconds after AT_S
         self.monitor = HealthMonitor(example_rig(), body_target().body, 0.0)
         self.found_s = None
 
@@ -102,6 +108,8 @@ class Moved:
         if t_s >= AT_S:
             D = T @ np.linalg.inv(small(self.motion(t_s - AT_S))) @ np.linalg.inv(T)
             measurement = replace(measurement, T_base_tool=D @ measurement.T_base_tool)
+            if self.late is not None:
+                measurement = replace(measurement, t_s=t_s + self.late(t_s - AT_S))
             if self.slip is not None:
                 measurement = replace(measurement, T_base_tool=measurement.T_base_tool @ small(self.slip))
         outcome = self.estimator.vision(self.monitor.widened(measurement))
@@ -123,7 +131,7 @@ def closed_loop(seed, motion=lambda t_s: np.zeros(6), *, closes=True, seconds=24
     rng = np.random.default_rng(seed)
     true, said = mounts(rng)
     mount = true, Mounting(true[0], true[1], said.cov)
-    moved = Moved(KalmanEstimator(ARM, delay=Delay(0.0, 2e-4)), true[0], motion)
+    moved = Moved(KalmanEstimator(ARM, delay=Delay(0.0, 2e-4), learns_delay=False), true[0], motion)
     workcell = Workcell(rng, worn(rng), moved, mount=mount)
     workcell.advance(None, 300)
     servo, goals = PoseServo(ARM, LoopTiming(0.016, 1 / 60, 0.061)), [MIDDLE]
@@ -158,17 +166,20 @@ class SlippingArm:
         return np.concatenate([before, self.arm.tool(shaft[at:])])
 
 
-def watched_arm(seed, motion=lambda t_s: np.zeros(6), seconds=9.0, *, slip=None, joint=0, slip_rad=0.0, more_rad=0.0):
-    """Run an arm with errors; return the estimator with its monitor.
+def watched_arm(
+    seed, motion=lambda t_s: np.zeros(6), seconds=9.0, *, slip=None, joint=0, slip_rad=0.0, more_rad=0.0, late=None
+):
+    """Run an arm with errors; return the estimator with its monitor, its track and the true poses.
 
     The faults, at AT_S: a motion of the rig, a slip of the body on the tool (6,), [m; rad], a slip of a joint's
-    potentiometer or more backlash of it, rad.
+    potentiometer or more backlash of it, rad; stamps that are late, s.
     """
     rng = np.random.default_rng(seed)
     mount = mounts(rng)
-    moved = Moved(KalmanEstimator(ARM, delay=Delay(0.0, 1e-4)), mount[1].T_base_rig, motion, slip)
+    estimator = KalmanEstimator(ARM, delay=Delay(0.0, 1e-4), learns_delay=False)
+    moved = Moved(estimator, mount[1].T_base_rig, motion, slip, late)
     arm = worn(rng)
     if slip_rad or more_rad:
         arm = SlippingArm(arm, joint, slip_rad, more_rad)
-    run(rng, moved, arm, legs(rng, seconds), mount=mount)
+    moved.tracked, moved.Ts_true = run(rng, moved, arm, legs(rng, seconds), mount=mount)
     return moved

@@ -7,7 +7,7 @@ import pytest
 from faults import BODY, SIGMAS, SYNC_S, TRUE, ended, watched_body
 
 from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.health import HealthMonitor
+from armsight.loop.health import HealthMonitor, Trust
 from armsight.loop.health.rig import RigWatch
 
 
@@ -30,6 +30,15 @@ def test_a_body_file_of_another_size_is_found_and_the_baseline_named_with_it(sca
     assert (found.cause, found.unit) == ("body", "%")
     assert abs(found.size - 100 * (1 / scale - 1)) < 4 * found.sigma
     assert "cannot be distinguished" in found.what
+
+
+def test_a_camera_that_exposes_late_is_named_as_time_and_poses_at_rest_stay_trusted():
+    *_, (monitor, *_) = watched_body(1, skew_s=2e-3, seconds=8.0)
+    (found,) = monitor.findings()
+    assert (found.cause, found.unit) == ("time", "ms")
+    assert abs(found.size - 2.0) < 4 * found.sigma
+    assert found.sigma < 0.1
+    assert monitor.trust is Trust.FULL
 
 
 def test_a_camera_that_moves_during_a_run_is_found_with_the_time():
@@ -66,8 +75,9 @@ def test_the_estimate_is_what_dense_least_squares_gives():
     watch._close_stay()
     found, size = watch._estimated(watch._test), watch._size
     sums, L, F = watch._test, watch.prior, watch._by_fault
-    wide = np.diag(np.array([0.1, 0.1, 1, 1, 1, 1]) ** 2.0)
-    prior = np.linalg.inv(np.block([[L @ L.T, np.zeros((size, 6))], [np.zeros((6, size)), wide]]))
+    wide = np.diag(np.array([0.1, 0.1, 1, 1, 1, 1, 0.1]) ** 2.0)
+    L = L + 1e-9 * np.eye(size)  # the skew's prior is none
+    prior = np.linalg.inv(np.block([[L @ L.T, np.zeros((size, 7))], [np.zeros((7, size)), wide]]))
     G = np.hstack([np.eye(size), F])
     both = np.linalg.solve(G.T @ sums.H @ G + prior, G.T @ sums.b)
     assert found.f == pytest.approx(both[size:], rel=1e-3, abs=1e-6)

@@ -1,4 +1,4 @@
-"""Images that are delivered twice: found and counted; not found where each is new."""
+"""Images that are delivered twice, and a computer that stalls: found and counted; not found where all is well."""
 
 import pytest
 from faults import watched_body
@@ -21,3 +21,18 @@ def test_shots_that_repeat_the_one_before_are_counted(every):
     assert (found.cause, found.unit) == ("host", "%")
     assert found.size == pytest.approx(25.0)
     assert "15 of 60 shots" in found.what
+
+
+@pytest.mark.parametrize(
+    ("late_s", "every", "said"), [(0.03, 50, True), (0.03, 400, False), (0.15, 900, True), (0.01, 1, False)]
+)
+def test_a_computer_that_stalls_is_named(late_s, every, said):
+    watch = HostWatch()
+    for n in range(1000):
+        watch.began(0.004 * n, late_s if n % every == every - 1 else 0.001)
+    found = watch.findings()
+    assert bool(found) is said
+    if said:
+        assert found[0].cause == "host"
+        assert found[0].size == pytest.approx(1e3 * late_s)
+        assert found[0].since_s == pytest.approx(0.004 * (every - 1))

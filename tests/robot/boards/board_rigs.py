@@ -9,7 +9,7 @@ import tty
 from armsight.data import JointCommand
 from armsight.errors import DeviceError
 from armsight.firmware import dialect
-from armsight.robot.boards.configuration import CONFIG
+from armsight.robot.boards.configuration import CONFIG, CONFIG_VERSION
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.opening import configured, open_emulator
 from armsight.sim.joints import JointPlant
@@ -70,7 +70,7 @@ class Speaker:
         getattr(self.mav, f"{kind}_send")(*fields)
         return self.packed[0]
 
-    def welcome(self, *, dialect_version=None, config_version=2, tick=0):
+    def welcome(self, *, dialect_version=None, config_version=CONFIG_VERSION, tick=0):
         ours = dialect().ARMSIGHT_DIALECT_VERSION if dialect_version is None else dialect_version
         return self.say("welcome", ours, config_version, 1, tick, 1000, 921600, 0, 6, b"stm32f4", b"9.9.9", 77)
 

@@ -38,7 +38,7 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path):
         (("soft_max_rad = 2.4", "soft_max_rad = '2.4'"), "joint.1.soft_max_rad is '2.4'; a number is needed"),
         (("silence_ticks = 100", "silence_ticks = 100.5"), "arm.silence_ticks is 100.5; a whole number is needed"),
         (("silence_ticks = 100", ""), "arm.silence_ticks is missing"),
-        (("version = 2", "version = 1"), "version is 1"),
+        (("version = 3", "version = 1"), "version is 1"),
         (("counts = [3277, 62258]", "counts = [3277]"), r"counts is \[3277\]; a list of 2 to 9 numbers is needed"),
         (("motor_direction = 1", "motor_direction = 0"), "joint 1: motor_direction is 0"),
     ],
@@ -55,3 +55,17 @@ def test_what_is_wrong_is_named_with_the_file(tmp_path, change, said):
 def test_a_value_is_put_only_where_there_is_one(path):
     with pytest.raises(InputError, match="nothing is called"):
         put(lab_configuration(), path, 1)
+
+
+def test_a_file_of_an_arm_with_fewer_joints_has_only_these(tmp_path):
+    config = lab_configuration()
+    config["joint_count"] = 4
+    config["joint"][4:] = 0
+    text = configuration_text(config, "pil")
+    assert ("[joint.4]" in text, "[joint.5]" in text) == (True, False)
+    path = tmp_path / "board.toml"
+    path.write_text(text, encoding="utf-8")
+    assert read_configuration(path)[0].tobytes() == config.tobytes()
+    path.write_text(text.replace("joint_count = 4", "joint_count = 5"), encoding="utf-8")
+    with pytest.raises(InputError, match=r"joint\.5\.soft_min_rad is missing"):
+        read_configuration(path)

@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
+from scipy.sparse import csr_array
 
 
 def view(size_px, tilt, tilt_axis, rotation, centre, distance=12.0):
@@ -20,20 +20,29 @@ def project(H, xy):
     return p[:, :2] / p[:, 2:]
 
 
+def pixels(count, samples, blur_px, pad):
+    """Return the sparse matrix (count, (count + 2 pad) samples) that blurs an axis's samples and averages each pixel's."""
+    reach = int(4 * blur_px * samples + 0.5)
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (blur_px * samples)) ** 2) if blur_px else np.ones(1)
+    taps = np.convolve(taps / taps.sum(), np.full(samples, 1.0 / samples)).astype(np.float32)
+    columns = (np.arange(count)[:, None] + pad) * samples - reach + np.arange(len(taps))
+    rows = np.repeat(np.arange(count), len(taps))
+    return csr_array((np.tile(taps, count), (rows, columns.ravel())), shape=(count, (count + 2 * pad) * samples))
+
+
 def paint(pattern, H, shape, blur_px, samples=16):
     """Return (h, w) the mean of ``pattern(x, y)`` over each pixel, blurred; pattern gives -1 (dark) to 1 (bright)."""
     h, w = shape
     pad = int(np.ceil(4 * blur_px)) + 1
     v = (np.arange((h + 2 * pad) * samples) + 0.5) / samples - 0.5 - pad
     u = (np.arange((w + 2 * pad) * samples) + 0.5) / samples - 0.5 - pad
-    U, V = np.meshgrid(u, v)
     G = np.linalg.inv(H)
-    d = G[2, 0] * U + G[2, 1] * V + G[2, 2]
-    fine = pattern((G[0, 0] * U + G[0, 1] * V + G[0, 2]) / d, (G[1, 0] * U + G[1, 1] * V + G[1, 2]) / d)
-    for axis in (0, 1):
-        fine = gaussian_filter1d(fine.astype(np.float32), blur_px * samples, axis=axis, truncate=4.0)
-    coarse = fine.reshape(h + 2 * pad, samples, w + 2 * pad, samples).mean(axis=(1, 3))
-    return coarse[pad:-pad, pad:-pad].astype(np.float64)
+    across, lines = pixels(w, samples, blur_px, pad), []
+    for V in np.array_split(v[:, None], h):
+        d = G[2, 0] * u + G[2, 1] * V + G[2, 2]
+        fine = pattern((G[0, 0] * u + G[0, 1] * V + G[0, 2]) / d, (G[1, 0] * u + G[1, 1] * V + G[1, 2]) / d)
+        lines.append(across @ fine.astype(np.float32).T)
+    return (pixels(h, samples, blur_px, pad) @ np.concatenate(lines, axis=1).T).astype(np.float64)
 
 
 def expose(painted, contrast, noise, rng, middle=128.0):

@@ -31,13 +31,12 @@ SHAPE = (320, 400)
 
 def discs(columns, rows, radius, staggered):
     """Return the pattern of a grid of dark discs, pitch one unit."""
-    centres = [(2 * x + y % 2 if staggered else x, y) for y in range(rows) for x in range(columns)]
 
     def pattern(x, y):
-        out = np.ones(x.shape)
-        for u, v in centres:
-            out[(x - u) ** 2 + (y - v) ** 2 < radius * radius] = -1.0
-        return out
+        v = np.clip(np.rint(y), 0, rows - 1)  # discs are smaller than half a row: no other row's can cover the point
+        first, pitch = (v % 2, 2) if staggered else (0, 1)
+        u = first + pitch * np.clip(np.rint((x - first) / pitch), 0, columns - 1)
+        return np.where((x - u) ** 2 + (y - v) ** 2 < radius * radius, -1.0, 1.0)
 
     return pattern
 

@@ -37,10 +37,12 @@ class FakeCapture:
             cv2.CAP_PROP_FPS: 30.0,
             cv2.CAP_PROP_FOURCC: float(cv2.VideoWriter.fourcc(*"YUYV")),
             cv2.CAP_PROP_AUTO_EXPOSURE: 3.0,
-            cv2.CAP_PROP_EXPOSURE: 156.0,
+            cv2.CAP_PROP_EXPOSURE: 156,
+            cv2.CAP_PROP_GAIN: 0.0,
         }
         self.queue, self.next, self.stamp = [], None, 0.0
         self.dead = self.undecodable = False
+        self.jpeg = None
         self.released = 0
 
     def set(self, prop, value):
@@ -82,6 +84,10 @@ class FakeCapture:
             int(self.props[cv2.CAP_PROP_FRAME_WIDTH]),
             int(self.props[cv2.CAP_PROP_FRAME_HEIGHT]),
         )
+        if self.jpeg and not self.props.get(
+            cv2.CAP_PROP_CONVERT_RGB, 1.0
+        ):  # OpenCV hands out the driver's buffer as one row
+            return True, np.frombuffer(self.jpeg, np.uint8).reshape(1, -1)
         return True, np.zeros((height, width, 3), np.uint8)
 
     def release(self):
@@ -161,13 +167,14 @@ def test_cameras_of_rates_that_never_meet_are_reported(usb_pair):
 
 
 def test_all_settings_arrive_at_both_cameras(usb_pair):
-    usb_pair.open("@1280x720@60,exposure=5ms,format=MJPG")
+    usb_pair.open("@1280x720@60,exposure=5ms,gain=20,format=MJPG")
     for capture in usb_pair.captures:
         assert capture.props[cv2.CAP_PROP_FOURCC] == cv2.VideoWriter.fourcc(*"MJPG")
         assert capture.props[cv2.CAP_PROP_FRAME_WIDTH] == 1280
         assert capture.props[cv2.CAP_PROP_FRAME_HEIGHT] == 720
         assert capture.props[cv2.CAP_PROP_FPS] == 60
         assert capture.props[cv2.CAP_PROP_AUTO_EXPOSURE] == 1
+        assert capture.props[cv2.CAP_PROP_GAIN] == 20
         assert capture.props[cv2.CAP_PROP_EXPOSURE] == 50  # V4L2 counts in 0.1 ms
 
 
@@ -187,6 +194,7 @@ def test_what_is_not_asked_for_stays(usb_pair):
         ("@60", cv2.CAP_PROP_FPS, "did not take 60 frames per second, it says 30"),
         (",exposure=5ms", cv2.CAP_PROP_AUTO_EXPOSURE, "did not take manual exposure (1), it says 3"),
         (",exposure=5ms", cv2.CAP_PROP_EXPOSURE, "did not take exposure 50 (x 0.1 ms), it says 156"),
+        (",gain=20", cv2.CAP_PROP_GAIN, "did not take gain 20, it says 0"),
     ],
 )
 def test_a_setting_not_taken_is_named_and_both_cameras_let_go(usb_pair, tail, stubborn, said):
@@ -247,7 +255,7 @@ def test_a_frame_of_another_size_is_reported(usb_pair):
 @pytest.mark.parametrize(
     "rest",
     ["", "0", "0,", ",1", "0,1@", "0,1@640x480@", "0,1@640x480x3", "0,1,2", "0,1,exposure=5",
-     "0,1,exposure=5ms=6", "0,1,gain=3", "0,1,format=MJPEG", "0,1@30@640x480"],
+     "0,1,exposure=5ms=6", "0,1,gain=x", "0,1,format=MJPEG", "0,1@30@640x480"],
 )  # fmt: skip
 def test_a_text_of_another_form_is_reported(rest):
     opened = []
@@ -269,3 +277,19 @@ def test_real_devices_that_are_not_there_or_no_cameras(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(DeviceError, match="cannot be opened: not a camera, or in use by another program"):
         open_source(f"usb:{tmp_path}/file,98")
+
+
+def test_the_jpeg_of_a_camera_is_kept_as_it_came(usb_pair):
+    """OpenCV hands out the driver's buffer, behind the frame the rest of an older and longer one."""
+    scene = np.random.default_rng(8).integers(0, 255, (480, 640, 3), np.uint8)
+    frames = [cv2.imencode(".jpg", scene[:, ::step])[1].tobytes() for step in (1, -1)]
+    source = usb_pair.open(",format=MJPG")
+    for capture, frame in zip(usb_pair.captures, frames, strict=True):
+        capture.jpeg = frame + b"\x00\x12" + frames[0][5000:]
+    shot = source.read()
+    assert shot.encoded == tuple(frames)
+    np.testing.assert_array_equal(shot.left, cv2.imdecode(np.frombuffer(frames[0], np.uint8), cv2.IMREAD_COLOR))
+    usb_pair.captures[1].jpeg = frames[1][:4000]  # a frame that was cut short on the bus
+    cut = source.read()
+    assert cut.left is None
+    assert "cam1: the frame cannot be decoded" in cut.problem

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from armsight.errors import InputError
-from armsight.files import check_suffix, check_writable
+from armsight.files import check_suffix, check_writable, read_text, write_text
 
 if TYPE_CHECKING:
     from armsight.data import Array
@@ -163,10 +163,11 @@ def urdf(arm_name: str, tool_link: str | None, output: Path) -> None:
     "--output",
     metavar="OUT",
     type=click.Path(path_type=Path),
-    help="Write FILE's arm: .urdf, or .yaml as the maker's driver reads it.",
+    help="Write FILE's arm: .urdf, or .yaml as the maker's driver reads it; one that exists is kept as OUT.old.",
 )
+@click.option("--yes", is_flag=True, help="Do not ask before OUT is replaced.")
 @_JSON
-def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | None, as_json: bool) -> None:
+def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | None, yes: bool, as_json: bool) -> None:
     """Print how far a single arm's calibrated table puts the tool from that of its kind, ARM; convert it.
 
     FILE is the calibration of a Universal Robots arm or of an xArm (.yaml), a corrected.toml of `armsight identify`, or
@@ -185,6 +186,8 @@ def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | N
     yaml = file.lower().endswith((".yaml", ".yml"))
     arm = read_calibration(file, nominal) if yaml else open_arm(file)
     left = (0.0, 0.0)
+    if output is not None and output.exists():
+        _keep(output, yes)
     if output is not None and output.suffix == ".yaml":
         left = write_calibration(arm, nominal, output)
     elif output is not None:
@@ -198,6 +201,96 @@ def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | N
     found = difference(nominal, arm)
     answer = description.difference_json if as_json else description.difference_text
     click.echo(json.dumps(answer(nominal, arm, found)) if as_json else answer(nominal, arm, found))
+
+
+@command.command()
+@_arm_argument
+@click.option(
+    "--around",
+    required=True,
+    metavar="RUN",
+    type=click.Path(path_type=Path),
+    help="An earlier run of this arm before these cameras, such as with the default motion: where the body was seen.",
+)
+@click.option(
+    "--poses", type=click.IntRange(8, 500), default=40, show_default=True, help="Poses, each from both sides."
+)
+@click.option(
+    "--cycles", type=click.IntRange(0, 1000), default=30, show_default=True, help="How often five poses come again."
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the choice.")
+@click.option(
+    "-o", "--output", required=True, metavar="FILE.toml", type=click.Path(path_type=Path), help="The motions to write."
+)
+def plan(arm_name: str, tool_link: str | None, around: Path, poses: int, cycles: int, seed: int, output: Path) -> None:
+    """Plan the recording of `arm report`: motions for `armsight run --open-loop --motion FILE.toml`.
+
+    Poses all over where the body is seen, each from both sides of every joint, and five of them again and again.
+    """
+    check_suffix(output, ".toml", "a plan of motions")
+    check_writable(output, apart_from=(arm_name, around))
+
+    from armsight.app.arm.evaluate import plan_report, seen_angles
+    from armsight.app.check.plan import seen_by
+    from armsight.robot.arm_file import open_arm
+
+    arm = open_arm(arm_name, tool_link=tool_link)
+    q = seen_angles(around, arm)
+    write_text(output, plan_report(arm, q, seen_by(around), poses=poses, cycles=cycles, seed=seed))
+    click.echo(str(output))
+
+
+@command.command()
+@click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+@click.option("--arm", "arm_name", metavar="ARM", help="The nominal arm; by default the one that the run names.")
+@click.option(
+    "--compare", multiple=True, metavar="FILE.json", type=click.Path(path_type=Path), help="Another arm's report.json."
+)
+@click.option(
+    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Folder for report.html, .pdf and .json."
+)
+@_JSON
+def report(run: Path, arm_name: str | None, compare: tuple[Path, ...], output: Path | None, as_json: bool) -> None:
+    """Report what an arm does, what explains its error, and what each remedy would bring.
+
+    RUN is a folder of `armsight run` or `demo`, best with the motions of `armsight arm plan`; its rests in open loop count.
+    """
+    from armsight.app.arm.evaluate import evaluate_arm, nominal_arm
+    from armsight.app.arm.report import FILES, read_report, text, write_report
+    from armsight.app.progress import steps
+    from armsight.app.report.page import writable_folder
+    from armsight.app.report.plotting import require_matplotlib
+    from armsight.files import check_folder
+
+    if output is not None:
+        require_matplotlib()
+        check_folder(output, problem="no report can be written here")
+        if (output / "summary.json").exists():
+            raise InputError(f"{output}: holds a run, whose report would be written over; choose another folder")
+        check_folder(output, holding=FILES, apart_from=(run, *compare))
+    arm = nominal_arm(run, arm_name)
+    others = {path.parent.name or path.stem: read_report(path) for path in compare}
+    with steps() as progress:
+        found = evaluate_arm(run, arm, progress=progress)
+        if output is not None:
+            write_report(found, others, writable_folder(output, "no report"))
+    click.echo(json.dumps(found.to_json()) if as_json else text(found, others))
+    if output is not None and not as_json:
+        click.echo(f"\nwritten: {output}/report.html, report.pdf, report.json")
+
+
+def _keep(output: Path, yes: bool) -> None:
+    """Keep a file that is to be replaced as OUT.old, after asking.
+
+    Raises:
+        InputError: OUT.old exists, or cannot be written.
+    """
+    old = output.with_name(f"{output.name}.old")
+    if old.exists():
+        raise InputError(f"{old}: exists; what was kept is never written over: move it away")
+    if not yes:
+        click.confirm(f"replace {output}? It is kept as {old}", abort=True, err=True)
+    write_text(old, read_text(output))
 
 
 def _no_options(texts: tuple[str, ...]) -> tuple[str, ...]:

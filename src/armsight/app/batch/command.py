@@ -47,6 +47,8 @@ def command(
 
     if workers is not None and scheduler is not None:
         raise InputError("--workers and --scheduler: a cluster has its own workers; give one of the two")
+    if operation == "identify" and arm is None:
+        raise InputError("batch identify needs the nominal arm: give --arm, a name, .toml or .urdf")
     options = BatchOptions(operation, _absolute(rig), _absolute(target), _absolute(arm), estimator)
     batch = Batch(recordings, output.expanduser(), options, workers, scheduler)
     done = run_batch(batch, lambda line: click.echo(line, err=True))

@@ -84,39 +84,42 @@ def require_dask() -> None:
     del distributed, fsspec
 
 
-def found_recordings(patterns: Sequence[str]) -> list[str]:
-    """Return the recordings that patterns match, sorted; local ones as absolute paths.
+def found_recordings(patterns: Sequence[str]) -> dict[str, str]:
+    """Return the recordings that patterns match, sorted, local ones as absolute paths; and the state of each.
+
+    The state, size and time, comes with the search: asking a store for each of 100,000 files would take hours.
 
     Raises:
         InputError: a pattern matches nothing, or its store cannot be read.
     """
     import fsspec
 
-    found: set[str] = set()
+    found: dict[str, str] = {}
     for pattern in patterns:
         try:
             fs, path = fsspec.core.url_to_fs(os.path.expanduser(pattern))
-            names = fs.glob(path)
+            names: dict[str, dict[str, Any]] = fs.glob(path, detail=True)
         except (OSError, ValueError, ImportError) as error:
             raise InputError(f"{pattern}: cannot be searched: {error}") from None
         if not names:
             raise InputError(f"{pattern}: no such recording; quote the pattern to keep the shell off it")
-        found.update(names if "://" not in pattern else (fs.unstrip_protocol(name) for name in names))
-    return sorted(found)
+        for name, about in names.items():
+            changed = next(
+                (about[key] for key in ("mtime", "LastModified", "last_modified", "ETag") if key in about), None
+            )
+            found[name if "://" not in pattern else fs.unstrip_protocol(name)] = f"{about.get('size')} {changed}"
+    return dict(sorted(found.items()))
 
 
-def _key(path: str, options: BatchOptions) -> str:
-    """Return a name that changes with a recording's path, size and time, the options and the version."""
-    try:
-        import fsspec
-
-        fs, name = fsspec.core.url_to_fs(path)
-        about = fs.info(name)
-        state = [about.get("size"), str(about.get("mtime", about.get("LastModified", about.get("ETag"))))]
-    except OSError:
-        state = []
-    text = json.dumps([path, state, options.to_json(), __version__])
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
+def _keys(paths: dict[str, str], options: BatchOptions) -> dict[str, str]:
+    """Return for each recording a name that changes with its state, the options, the files they name and the version."""
+    files = [Path(name) for name in (options.rig, options.target, options.arm) if name is not None]
+    contents = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files if file.is_file()]
+    common = json.dumps([options.to_json(), contents, __version__])
+    return {
+        path: hashlib.sha256(json.dumps([path, state, common]).encode()).hexdigest()[:32]
+        for path, state in paths.items()
+    }
 
 
 def run_batch(batch: Batch, say: Callable[[str], None]) -> BatchDone:
@@ -137,7 +140,7 @@ def run_batch(batch: Batch, say: Callable[[str], None]) -> BatchDone:
         parts.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{parts}: cannot be written: {error.strerror}") from None
-    keys = {path: _key(path, batch.options) for path in paths}
+    keys = _keys(paths, batch.options)
     left = [path for path in paths if not (parts / keys[path]).is_file()]
     about = {"version": __version__, "options": batch.options.to_json(), "recordings": list(batch.recordings)}
     write_text(batch.output / ABOUT, json.dumps(about, indent=1) + "\n")

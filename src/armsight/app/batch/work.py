@@ -122,8 +122,8 @@ def _by_command(path: str, options: BatchOptions) -> tuple[Row, list[Row]]:
     command = importlib.import_module(f"armsight.app.{options.operation}.command").command
     printed = io.StringIO()
     quiet = contextlib.redirect_stderr(io.StringIO())
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(printed), quiet:
-        command.main([*arguments, "-o", str(Path(folder) / "out"), "--json"], standalone_mode=False)
+    with contextlib.redirect_stdout(printed), quiet:
+        command.main([*arguments, "--json"], standalone_mode=False)
     return {"result": json.dumps(json.loads(printed.getvalue()), sort_keys=True)}, []
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import queue
+import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +18,8 @@ from armsight.app.board.flash import FLASHED, PROGRAMMERS
 from armsight.errors import InputError
 
 if TYPE_CHECKING:
+    from armsight.app.board.bringup import Operator
+    from armsight.data import Array
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.contract import MotionBoard
 
@@ -21,6 +27,8 @@ _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _DEFAULT = "emulated:unicorn"
 #: How long an emulated board is watched where nobody says how long.
 _WATCH_S = 2.0
+#: Steps of a bring-up, as ``bringup`` has them, which is not imported for a help text.
+STEPS = ("readings", "potentiometers", "motors", "swing", "verify", "store")
 
 
 def _board(action: Callable[..., Any]) -> Callable[..., Any]:
@@ -200,6 +208,76 @@ def selftest_(name: str, baud: int | None, drives: bool, as_json: bool) -> int:
 @command.command()
 @_board
 @click.option(
+    "-o",
+    "--output",
+    "folder",
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    default=Path("bringup"),
+    show_default=True,
+    help="Folder of board.toml, report.html, and bringup.json, where what was found is kept.",
+)
+@click.option("--step", "steps", multiple=True, type=click.Choice(STEPS), help="Only this step; may be repeated.")
+@click.option("--joint", "joints", multiple=True, type=click.IntRange(1, 6), help="Only this joint; may be repeated.")
+@click.option("--again", is_flag=True, help="Do also what was found before.")
+@click.option(
+    "--current",
+    "most_current_a",
+    type=click.FloatRange(0.05, 30),
+    default=2.0,
+    show_default=True,
+    help="What a motor may draw, A.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of an emulated board's arm.")
+@_JSON
+def bringup(
+    name: str,
+    baud: int | None,
+    folder: Path,
+    steps: tuple[str, ...],
+    joints: tuple[int, ...],
+    again: bool,
+    most_current_a: float,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Bring up an arm of unknown motors and potentiometers, step by step, and store its configuration.
+
+    Each joint is moved by hand, each motor driven by a pulse of at most 3 degrees, and then, after a yes, by a swing of 10.
+    What was found is kept: the same command goes on where it ended. On an emulated board an arm and a person are drawn.
+    """
+    from armsight.app.board.bringup import Bringup, found_json
+    from armsight.app.report.page import writable_folder
+    from armsight.app.report.plotting import require_matplotlib
+    from armsight.robot.boards.board import Board
+    from armsight.robot.boards.emulated import EmulatedLink
+    from armsight.robot.boards.opening import SERIAL, emulator_name, open_board, open_emulator
+    from armsight.robot.boards.serial import BAUD
+    from armsight.sim.boards.workshop import WorkshopPerson, drawn_workshop
+
+    def echo(line: str) -> None:
+        click.echo(line, err=True)
+
+    require_matplotlib()
+    if name.startswith(SERIAL):
+        person: Operator = _TerminalPerson(echo)
+        board = open_board(name, baud=BAUD if baud is None else baud)
+    else:
+        plant, _ = drawn_workshop(seed)
+        person = WorkshopPerson(plant, seed=seed, say=echo)
+        board = Board.connect(EmulatedLink(open_emulator(emulator_name(name)), plant), name="the emulated board")
+    with board:
+        writable_folder(folder, "nothing of a bring-up")
+        chosen = [joint - 1 for joint in sorted(set(joints))] or range(6)
+        session = Bringup(board, person, folder, chosen, again=again, most_current_a=most_current_a)
+        session.run(steps or STEPS)
+    if as_json:
+        click.echo(json.dumps(found_json(session.found)))
+
+
+@command.command()
+@_board
+@click.option(
     "--at-once", type=click.Choice(["1", "2", "3", "6"]), default="6", show_default=True, help="Joints at a time."
 )
 @click.option("--yes", is_flag=True, help="Do not ask.")
@@ -270,6 +348,12 @@ def release(name: str, baud: int | None, as_json: bool) -> None:
 )
 @click.option("--restore", metavar="FILE", type=click.Path(path_type=Path), help="Write back what --keep has kept.")
 @click.option(
+    "--ar4-offsets",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Correct the joint_offsets file of ar4_ros_driver, such as mk3.yaml; no board is opened.",
+)
+@click.option(
     "--keep",
     metavar="FILE",
     type=click.Path(path_type=Path),
@@ -287,14 +371,16 @@ def offsets(
     nominal: str | None,
     further: str | None,
     restore: Path | None,
+    ar4_offsets: Path | None,
     keep: Path,
     yes: bool,
     as_json: bool,
 ) -> None:
-    """Print the homing offsets of a servo bus (register 31), or correct them, after asking.
+    """Print the zeros where an arm keeps them, or correct them, after asking; the old ones are kept in a file first.
 
-    The old offsets are kept in a file first. LeRobot's calibration, where given, gets the same new offsets. The torque must
-    be off (`armsight board release`).
+    feetech:PORT: the homing offsets of the servos (register 31); LeRobot's calibration, where given, gets the same. A board
+    with armsight's firmware: the tables of its potentiometers. --ar4-offsets: a file of ar4_ros_driver. The drives must be
+    off (`armsight board release`).
     """
     import numpy as np
 
@@ -308,8 +394,11 @@ def offsets(
     angles = None if further is None else changed.parsed_degrees(further)
     if identified is not None and nominal is not None:
         angles = changed.further_of(open_arm(identified), open_arm(nominal))
-    if not name.startswith("feetech:"):
-        raise InputError(f"{name} has no homing offsets in its servos; feetech:PORT has")
+    if name.startswith("ar4:") and ar4_offsets is None:
+        raise InputError(f"{name}: an AR4 keeps no zeros; its driver's joint_offsets file does: --ar4-offsets mk3.yaml")
+    if not name.startswith("feetech:") or ar4_offsets is not None:
+        _zeros(name, baud, ar4_offsets, angles, restore, keep, yes, as_json)
+        return
     with _open_any(name, baud, calibration) as board:
         assert isinstance(board, FeetechBoard)
         if restore is not None:
@@ -325,6 +414,58 @@ def offsets(
     click.echo(json.dumps(changed.changes_json(changes, bool(given))) if as_json else changed.changes_text(changes))
     if given:
         click.echo(f"written; the old offsets are in {keep}", err=True)
+
+
+def _zeros(
+    name: str,
+    baud: int | None,
+    file: Path | None,
+    angles: Array | None,
+    restore: Path | None,
+    keep: Path,
+    yes: bool,
+    as_json: bool,
+) -> None:
+    """Print or correct zeros that are angles: of a file of the AR4's driver, or of the potentiometers on our board."""
+    import numpy as np
+
+    from armsight.app.board import offsets as changed
+    from armsight.files import check_outputs, check_writable, read_text, write_text
+    from armsight.robot.boards.board_file import configuration_text, read_configuration
+
+    def asked(changes: list[changed.ZeroChange]) -> None:
+        if not yes:
+            click.echo(changed.zeros_text(changes), err=True)
+            click.confirm("write the new zeros?", abort=True, err=True)
+
+    written = angles is not None or restore is not None
+    none = np.zeros(6) if angles is None else angles
+    if file is not None:
+        check_outputs([keep], [file, restore])
+        check_writable(file)
+        text, changes = changed.ar4_changes(file if restore is None else restore, none)
+        if restore is not None:
+            new = {each.name: each.new_deg for each in changes}
+            changes = [each._replace(new_deg=new[each.name]) for each in changed.ar4_changes(file, none)[1]]
+        if written:
+            asked(changes)
+            changed.keep_old(keep, read_text(file))
+            write_text(file, text)
+    else:
+        with _open(name, baud) as board:
+            before = configuration_text(board.configuration(), board.welcome.board)
+            config = board.configuration() if restore is None else read_configuration(restore)[0]
+            changes = changed.pot_changes(config, none)
+            if restore is not None:
+                old = changed.pot_changes(board.configuration(), none)
+                changes = [a._replace(old_deg=b.old_deg) for a, b in zip(changes, old, strict=True)]
+            if written:
+                asked(changes)
+                changed.keep_old(keep, before)
+                board.store(config)
+    click.echo(json.dumps(changed.zeros_json(changes, written)) if as_json else changed.zeros_text(changes))
+    if written:
+        click.echo(f"written; what was there before is in {keep}", err=True)
 
 
 @command.command()
@@ -350,6 +491,38 @@ def emulate(arm: str, seconds: float | None, as_json: bool) -> None:
     with serve(device, baud) as port:
         click.echo(json.dumps({"board": f"{kind}:{port.name}"}) if as_json else f"{kind}:{port.name}")
         threading.Event().wait(seconds)
+
+
+class _TerminalPerson:
+    """A person at this terminal: lines come from stdin while the board's time goes on.
+
+    Args:
+        echo: prints a line.
+    """
+
+    def __init__(self, echo: Callable[[str], None]) -> None:
+        self._echo = echo
+        self._lines: queue.Queue[str] = queue.Queue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        for line in sys.stdin:
+            self._lines.put(line.rstrip("\n"))
+        self._lines.put("q")
+
+    def say(self, line: str) -> None:
+        """Print a line."""
+        self._echo(line)
+
+    def ask(self, kind: str, joint: int | None, text: str) -> None:
+        """Print a question."""
+        self._echo(f"{text}: ")
+
+    def answer(self) -> str | None:
+        """Return the next line, if there is one."""
+        with contextlib.suppress(queue.Empty):
+            return self._lines.get_nowait()
+        return None
 
 
 def _open(name: str, baud: int | None) -> Board:

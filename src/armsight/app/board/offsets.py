@@ -1,14 +1,16 @@
-"""``armsight board offsets``: the homing offsets of a servo bus, corrected by what ``armsight identify`` found.
+"""``armsight board offsets``: the zeros where an arm keeps them, corrected by what ``armsight identify`` found.
 
-In: a bus, LeRobot's calibration file, and an identified arm or angles. Out: register 31 of each servo, LeRobot's file with
-the same offsets, and a file of the old ones, written first; ``--restore`` writes that back.
+In: an identified arm or angles, and where the zeros are: register 31 of the servos of a bus, and LeRobot's calibration file
+beside it; the ``joint_offsets`` file of ar4_ros_driver; the tables of the potentiometers on a board with our firmware. Out:
+the same with other zeros, and a file of the old ones, written first; ``--restore`` writes that back.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,10 +18,15 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import check_outputs, check_writable, read_text, write_text
 from armsight.robot.arm import Arm
+from armsight.robot.boards.ar4.models import SENSE
+from armsight.robot.boards.configuration import Configuration, check_configuration
 from armsight.robot.boards.feetech.board import FeetechBoard
 from armsight.robot.boards.feetech.calibration import read_calibration, write_offsets
 from armsight.robot.boards.feetech.offsets import OffsetChange, corrected_offsets, require_released, write_changes
 from armsight.robot.boards.feetech.registers import MOST_OFFSET, RAD_PER_COUNT
+
+#: A line of a joint_offsets file of ar4_ros_driver.
+_AR4_LINE = re.compile(r"(?m)^(?P<head>joint_(?P<joint>[1-6])[ \t]*:[ \t]*)(?P<value>[+-]?\d+(?:\.\d*)?)")
 
 
 def further_of(identified: Arm, nominal: Arm) -> Array:
@@ -74,6 +81,96 @@ def restored_changes(board: FeetechBoard, path: Path) -> list[OffsetChange]:
     return changes
 
 
+class ZeroChange(NamedTuple):
+    """The zero of a joint, where it is an angle.
+
+    Attributes:
+        name: of the joint.
+        old_deg: as it is: what is added to the AR4's reported position, or the angle of a potentiometer's first node.
+        new_deg: as it is to be.
+    """
+
+    name: str
+    old_deg: float
+    new_deg: float
+
+
+def ar4_changes(path: Path, further_rad: Array) -> tuple[str, list[ZeroChange]]:
+    """Return the text of a ``joint_offsets`` file of ar4_ros_driver with other offsets, and the changes.
+
+    The driver's joint is at ``reported + offset``, in degrees; its joint 1 has the opposite sense of armsight's ``ar4``.
+
+    Args:
+        path: the file: joint_1: 170.0 and so on.
+        further_rad: (6,) true angle less reported one of each joint of ``ar4``, rad.
+
+    Raises:
+        InputError: it is no such file, or another number of angles.
+    """
+    further_deg = _checked(further_rad, len(SENSE)) * SENSE
+    changes: list[ZeroChange] = []
+
+    def corrected(found: re.Match[str]) -> str:
+        joint, old = int(found["joint"]), float(found["value"])
+        new = round(old + float(np.degrees(further_deg[joint - 1])), 4)
+        changes.append(ZeroChange(f"joint_{joint}", old, new))
+        return f"{found['head']}{new!r}"
+
+    text = _AR4_LINE.sub(corrected, read_text(path))
+    if sorted(each.name for each in changes) != [f"joint_{k}" for k in range(1, len(SENSE) + 1)]:
+        raise InputError(
+            f"{path}: no joint_offsets of ar4_ros_driver: joint_1: to joint_6: are needed, once each, degrees"
+        )
+    return text, changes
+
+
+def pot_changes(config: Configuration, further_rad: Array) -> list[ZeroChange]:
+    """Shift the potentiometers' tables of a configuration by the angles (6,), rad, by which joints really are further.
+
+    Returns:
+        The changes, by the first node of each.
+    """
+    further, changes = _checked(further_rad, len(config["joint"])), []
+    for k, joint in enumerate(config["joint"]):
+        pot, count = joint["pot"], int(joint["pot"]["node_count"])
+        old = float(np.degrees(pot["angle_rad"][0]))
+        pot["angle_rad"][:count] += further[k]
+        changes.append(ZeroChange(f"joint {k + 1}", old, float(np.degrees(pot["angle_rad"][0]))))
+    check_configuration(config)
+    return changes
+
+
+def _checked(further_rad: Array, count: int) -> Array:
+    further = np.asarray(further_rad, float)
+    if further.shape != (count,) or not np.isfinite(further).all():
+        raise InputError(f"{count} corrections are needed, one a joint")
+    return further
+
+
+def keep_old(keep: Path, text: str) -> None:
+    """Write what was there before into a new file.
+
+    Raises:
+        InputError: it exists, or cannot be written.
+    """
+    check_writable(keep)
+    if keep.exists():
+        raise InputError(f"{keep}: exists; old offsets are never written over: name another file with --keep")
+    write_text(keep, text)
+
+
+def zeros_json(changes: list[ZeroChange], written: bool) -> dict[str, Any]:
+    """Return changes of angles as JSON has them."""
+    return {"written": written, "joints": [each._asdict() for each in changes]}
+
+
+def zeros_text(changes: list[ZeroChange]) -> str:
+    """Return changes of angles as a table."""
+    lines = [f"{'joint':16}{'old, deg':>12}{'new, deg':>12}{'change':>14}"]
+    lines += [f"{c.name:16}{c.old_deg:12.4f}{c.new_deg:12.4f}{c.new_deg - c.old_deg:10.4f} deg" for c in changes]
+    return "\n".join(lines)
+
+
 def apply(board: FeetechBoard, changes: list[OffsetChange], keep: Path, calibration: Path | None) -> None:
     """Keep the old offsets in a file, write the new ones to the servos, and to LeRobot's file where there is one.
 
@@ -88,14 +185,11 @@ def apply(board: FeetechBoard, changes: list[OffsetChange], keep: Path, calibrat
         DeviceError: a servo does not keep its offset; the old ones are back.
     """
     check_outputs([keep], [calibration])
-    check_writable(keep)
-    if keep.exists():
-        raise InputError(f"{keep}: exists; old offsets are never written over: name another file with --keep")
     if calibration is not None:
         read_calibration(calibration)
         check_writable(calibration)
     old = {"homing_offsets": {str(each.id): each.old for each in changes}, "names": [each.name for each in changes]}
-    write_text(keep, json.dumps(old, indent=1) + "\n")
+    keep_old(keep, json.dumps(old, indent=1) + "\n")
     write_changes(board.bus, changes)
     if calibration is not None:
         write_offsets(calibration, calibration, {each.id: each.new for each in changes})

@@ -73,7 +73,7 @@ def plan_test(
     Raises:
         InputError: no cube is within reach, or the run's files cannot be used.
     """
-    allowed = everywhere if visible_in is None else _seen_by(visible_in)
+    allowed = everywhere if visible_in is None else seen_by(visible_in)
     paths = {"line": partial(_line, arm), "circle": partial(_circle, arm)}
     done = paths.get(name)
     too_fast: list[CheckPlan] = []  # cubes whose poses would do, but not the path
@@ -111,7 +111,7 @@ def _goes(arm: Arm, path: Callable[[], Trajectory], allowed: Allowed) -> bool:
     return bool(inside and allowed(arm.forward(q)).all())
 
 
-def _seen_by(run: Path) -> Allowed:
+def seen_by(run: Path) -> Allowed:
     """Return a function: whether both cameras of a run see all of its body at poses (N, 4, 4) of the tool."""
     rig, body = StereoRig.load(run / "rig.json"), open_target(str(run / "body.toml")).body.points
     file = run / "handeye.json"

@@ -28,9 +28,14 @@ from armsight.app.messages import UNTRUSTED
     help="The simulated arm: nominal, used, worn, or a TOML file (docs/howto/workcell.md).",
 )
 @click.option(
-    "--cameras",
-    default="1280x720@60",
+    "--model",
+    default="six_r",
     show_default=True,
+    help="The simulated arm's model: so101 and ar4 with controllers of their own, or six joints with our firmware.",
+)
+@click.option(
+    "--cameras",
+    show_default="1280x720@60; @30 for so101 and ar4",
     help="[NAME:]WIDTHxHEIGHT@HZ or NAME: webcams, a camera preset such as webcam-good-light, or its TOML file "
     "(docs/concepts/camera.md).",
 )
@@ -58,7 +63,8 @@ def command(
     output: Path,
     seed: int,
     arm: str,
-    cameras: str,
+    model: str,
+    cameras: str | None,
     board: str,
     layout: str,
     nominal_arm: str | None,
@@ -86,7 +92,7 @@ def command(
     require_matplotlib()
     require_pyarrow()
     nominal = None if nominal_arm is None else open_arm(nominal_arm)
-    demo = Demo(output, arm, cameras, seed, emulator, layout, quick, nominal, nominal_arm)
+    demo = Demo(output, arm, cameras, seed, emulator, layout, model, quick, nominal, nominal_arm)
     try:
         with steps() as progress:
             summary = run_demo(demo, progress=progress)

@@ -31,12 +31,19 @@ from armsight.geometry.pose import inverse
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
 from armsight.sim.workcell.cameras import camera_name, open_cameras
-from armsight.sim.workcell.workcell import Workcell
+from armsight.sim.workcell.controlled import CONTROLLED
+from armsight.sim.workcell.workcell import DEFAULT_ARM, Workcell
 from armsight.vision.calibrate.result import Calibration
 
 #: Pairs of the calibration target, hand-eye poses, shots for each value of a study: by default, and with --quick.
 _AMOUNTS = {False: (40, 30, 8), True: (30, 15, 0)}
 _MOTIONS = {False: DEFAULT_MOTION, True: QUICK}
+#: Cameras of an arm with our firmware, and of one that keeps its own controller and is slower.
+_CAMERAS, _SLOW_CAMERAS = "1280x720@60", "1280x720@30"
+#: Rests of an arm with its own controller, s: from a command to its state it takes a tenth of a second and more.
+_REST_S = 5.0
+#: How far the line of another arm goes, of the way between its outermost poses, and its circle's radius, of its size.
+_LINE, _RADIUS = 0.7, 0.1
 
 
 @dataclass(frozen=True)
@@ -46,10 +53,11 @@ class Demo:
     Attributes:
         folder: the folder of the run.
         arm: the simulated arm: nominal, used, worn, or a TOML file.
-        cameras: as the workcell names them, such as 1280x720@60 or webcam-good-light.
+        cameras: as the workcell names them, such as 1280x720@60 or webcam-good-light; None for what suits the arm.
         seed: of everything that is random.
         emulator: what runs the firmware: unicorn, qemu or host.
         layout: of the cameras: parallel or verging.
+        model: the arm that is simulated, by its name: six_r, another of six joints, so101 or ar4.
         quick: fewer calibration shots and motions, and no studies.
         nominal_arm: the arm model that the estimators and the controller have; by default the table the arm was built to.
         nominal_arm_name: its name in the summary; by default the arm's own.
@@ -57,10 +65,11 @@ class Demo:
 
     folder: Path
     arm: str = "worn"
-    cameras: str = "1280x720@60"
+    cameras: str | None = None
     seed: int = 0
     emulator: str = "unicorn"
     layout: str = "parallel"
+    model: str = DEFAULT_ARM
     quick: bool = False
     nominal_arm: Arm | None = None
     nominal_arm_name: str | None = None
@@ -80,14 +89,16 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
     pairs, handeyes, study_shots = _AMOUNTS[demo.quick]
     open_folder(demo.folder)
     progress("building the workcell")
-    with _workcell(demo, demo.cameras) as workcell:
-        plan = read_motions(workcell.model, _MOTIONS[demo.quick])
+    cameras = demo.cameras or (_SLOW_CAMERAS if demo.model in CONTROLLED else _CAMERAS)
+    with _workcell(demo, cameras) as workcell:
+        motion = _motion_text(demo, workcell)
         make_room(demo.folder)
+        write_text(demo.folder / "motion.toml", motion)
+        plan = read_motions(workcell.model, demo.folder / "motion.toml")
         progress("rendering the calibration target")
         calibration = calibrated(workcell.chessboard_spec, workcell.chessboard_shots(pairs), progress)
         calibration.rig.save(demo.folder / "rig.json")
         write_text(demo.folder / "body.toml", workcell.body_text)
-        write_text(demo.folder / "motion.toml", _MOTIONS[demo.quick].read_text(encoding="utf-8"))
         poses = np.vstack([workcell.model.home, workcell.poses])
         targets = handeye_poses(workcell.model, poses, handeyes, demo.seed)
         setup = setup_of(workcell)
@@ -99,7 +110,8 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
             )
         studies: list[Study] = []
         try:
-            studies = _studies(demo, workcell, calibration, outcome, plan, study_shots, progress)
+            if demo.model == DEFAULT_ARM:
+                studies = _studies(demo, cameras, workcell, calibration, outcome, plan, study_shots, progress)
         except (ArmsightError, KeyboardInterrupt) as error:  # the run itself is complete, and is written
             outcome.interrupted = isinstance(error, KeyboardInterrupt)
             outcome.ended_by = error if isinstance(error, ArmsightError) else None
@@ -108,9 +120,9 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
             "seed": demo.seed,
             "arm": demo.arm,
             "nominal_arm": demo.nominal_arm_name or workcell.model.name,
-            "cameras": demo.cameras,
+            "cameras": cameras,
             "board": workcell.board.welcome.board,
-            "emulator": demo.emulator,
+            "emulator": demo.emulator if workcell.link is not None else "own controller",
         }
         truth = _truth(workcell, outcome)
         with ThreadPoolExecutor(1) as beside:
@@ -121,17 +133,57 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
             return finish(finished, demo.folder)
 
 
+def _motion_text(demo: Demo, workcell: Workcell) -> str:
+    """Return the motions of a demo as a motion file: poses, a line, a circle; another arm's are of the workcell's poses."""
+    if demo.model == DEFAULT_ARM:
+        return _MOTIONS[demo.quick].read_text(encoding="utf-8")
+    return motion_text(workcell.model, workcell.poses, quick=demo.quick, slow=workcell.link is None)
+
+
+def motion_text(model: Arm, poses: Array, *, quick: bool, slow: bool) -> str:
+    """Return motions of an arm before the workcell's cameras as a motion file: poses, a line, a circle.
+
+    Args:
+        model: the arm.
+        poses: (5, n) joint angles of the poses, rad.
+        quick: one pose alone.
+        slow: whether its controller takes long to come to rest.
+    """
+    rest = f"rest_s = {_REST_S}\n" if slow else ""
+    first, second = (model.forward(q)[:3, 3] for q in poses[:2])
+    step = 1e3 * _LINE * (second - first)
+    center = 1e3 * (first + np.array([0.0, 0.0, -_RADIUS * model.size_m])) + step
+    axis = np.round(np.cross(second - first, [0.0, 0.0, 1.0]) / np.linalg.norm(second - first), 3)
+    motions = [
+        f'kind = "joints"\nname = "pose {n}"\nq_deg = {np.degrees(q).round(2).tolist()}\n{rest}'
+        for n, q in enumerate(poses[: 1 if quick else len(poses)], start=1)
+    ]
+    if not quick:
+        motions.append(
+            f'kind = "joints"\nname = "line\'s start"\nq_deg = {np.degrees(poses[0]).round(2).tolist()}\n{rest}'
+        )
+    motions += [
+        f'kind = "line"\nname = "line"\nby_mm = {step.round(1).tolist()}\n{rest}',
+        f'kind = "circle"\nname = "circle"\ncenter_mm = {center.round(1).tolist()}\naxis = {axis.tolist()}\n{rest}',
+    ]
+    if not quick:
+        motions.append(f'kind = "home"\nname = "park"\n{rest}')
+    start = f"start_deg = {np.degrees(model.home).round(4).tolist()}\n"
+    return start + "".join(f"\n[[motion]]\n{motion}" for motion in motions)
+
+
 def _workcell(demo: Demo, cameras: str, like: Workcell | None = None) -> Workcell:
     """Return the workcell of a demo; ``like`` is one that differs in the rate of the cameras alone."""
     nominal = demo.nominal_arm
     if nominal is not None:  # an identified tool is that of the measured body; the motions are of the built-in tool
-        nominal = replace(nominal, T_flange_tool=open_arm("six_r").T_flange_tool)
+        nominal = replace(nominal, T_flange_tool=open_arm(demo.model).T_flange_tool)
     return Workcell.open(
         arm=demo.arm,
         cameras=cameras,
         seed=demo.seed,
         emulator=demo.emulator,
         rig=demo.layout,
+        model=open_arm(demo.model),
         assumed=nominal,
         like=like,
     )
@@ -158,6 +210,7 @@ def cameras_at(cameras: str, rate_hz: float) -> str:
 
 def _studies(
     demo: Demo,
+    cameras: str,
     workcell: Workcell,
     calibration: Calibration,
     outcome: RunResult,
@@ -170,7 +223,7 @@ def _studies(
         return []
 
     def at_rate(rate_hz: float) -> Workcell:
-        return _workcell(demo, cameras_at(demo.cameras, rate_hz), workcell)
+        return _workcell(demo, cameras_at(cameras, rate_hz), workcell)
 
     found = vision_studies(seed=demo.seed, shots=shots, progress=progress)
     return [*found, rate_study(at_rate, setup_of, calibration.rig, outcome, plan, progress)]

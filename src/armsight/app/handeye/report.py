@@ -8,10 +8,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from armsight.app.handeye.result import HandEyeAnswer, blunders, headline, names, open_direction, plan_text, text, whose
-from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files
-from armsight.app.report.page import text as escaped
+from armsight.app.handeye.result import (
+    HandEyeAnswer,
+    blunders,
+    headline,
+    names,
+    plan_table,
+    statements,
+    transforms_table,
+)
+from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files, text
 from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png
+from armsight.app.report.table import html_table
 from armsight.geometry.pose import inverse, log_se3, mean_pose, transform
 
 if TYPE_CHECKING:
@@ -33,6 +41,7 @@ def errors_figure(run: HandEyeAnswer) -> Figure:
     axes[2].set_yscale("log")
     axes[2].set_title("residual over its sigma; red: a blunder, left out of the fit")
     axes[2].set_xlabel("row")
+    axes[2].xaxis.get_major_locator().set_params(integer=True)
     return figure
 
 
@@ -123,17 +132,17 @@ def write_handeye_report(run: HandEyeAnswer, folder: Path) -> None:
     with drawing():
         images = {name: png(plot(run)) for name, (plot, _, _) in FIGURES.items()}
     result = (
-        f'<div class="assessment"><p class="headline">{escaped(headline(run))}</p></div>\n'
-        + bullets([whose(run), open_direction(run), *run.recording.notes])
-        + f"<pre>{escaped(text(run))}</pre>\n"
+        f'<div class="assessment"><p class="headline">{text(headline(run))}</p></div>\n'
+        + html_table(transforms_table(run))
+        + bullets([*statements(run), *run.recording.notes])
     )
     sections = {"result": ("Result", result)}
     for name, (_, title, caption) in FIGURES.items():
         image = picture(images[name], title)
-        sections[name] = (title, f"<figure>{image}<figcaption><p>{escaped(caption)}</p></figcaption></figure>\n")
+        sections[name] = (title, f"<figure>{image}<figcaption><p>{text(caption)}</p></figcaption></figure>\n")
     sections["blunders"] = ("Blunders", bullets(blunders(run) or ["none"]))
     if run.plan is not None:
-        sections["plan"] = ("Poses to take next", f"<pre>{escaped(plan_text(run.plan))}</pre>\n")
+        sections["plan"] = ("Poses to take next", html_table(plan_table(run.plan)))
     sub = f"{run.recording.robot.path.name} · {len(run.found.used)} poses · eye {run.found.eye.replace('_', ' ')}"
     page = html_page("armsight: hand-eye calibration", "Hand-eye calibration", sub, sections)
     files = {f"report-{name}.png": data for name, data in images.items()}

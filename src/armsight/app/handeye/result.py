@@ -105,8 +105,8 @@ def open_direction(run: HandEyeAnswer) -> str:
     )
 
 
-def text(run: HandEyeAnswer) -> str:
-    """Return what people read."""
+def transforms_table(run: HandEyeAnswer) -> TextTable:
+    """Return both transforms with their sigmas as a table."""
     found = run.found
     sigma = np.sqrt(np.diag(found.cov))
     rows = []
@@ -117,8 +117,12 @@ def text(run: HandEyeAnswer) -> str:
         cells += [f"{v:.3f} ± {np.degrees(e):.3f}" for v, e in zip(angles, s[3:], strict=True)]
         rows.append((name, *cells))
     head = ("", "x, mm", "y, mm", "z, mm", "rx, deg", "ry, deg", "rz, deg")
-    lines = [headline(run), "", plain_text(TextTable("angles: xyz about fixed axes; ± sigma", head, tuple(rows))), ""]
-    lines += [whose(run), open_direction(run)]
+    return TextTable("angles: xyz about fixed axes; ± sigma", head, tuple(rows))
+
+
+def statements(run: HandEyeAnswer) -> list[str]:
+    """Return what is said beside the transforms, a line each."""
+    found, lines = run.found, [whose(run), open_direction(run)]
     if run.offset_s is not None:
         lines.append(
             f"clock offset {1e3 * run.offset_s:.2f} ± {1e3 * run.sigma_offset_s:.2f} ms, to be added to the camera's times"
@@ -127,10 +131,16 @@ def text(run: HandEyeAnswer) -> str:
         lines.append(
             f"the target's lengths are {found.scale:.5f} ± {found.sigma_scale:.5f} of those given: correct --target's size"
         )
+    return lines
+
+
+def text(run: HandEyeAnswer) -> str:
+    """Return what people read."""
+    lines = [headline(run), "", plain_text(transforms_table(run)), "", *statements(run)]
     out = blunders(run)
     lines += [f"blunders, left out: {len(out)}", *(f"  {line}" for line in out[:10])] if out else ["no blunders"]
     if run.plan is not None:
-        lines += ["", plan_text(run.plan)]
+        lines += ["", plain_text(plan_table(run.plan))]
     return "\n".join(lines)
 
 
@@ -139,8 +149,8 @@ def _along(T: Array, sigma: Array) -> Array:
     return np.asarray(np.sqrt(np.square(T[:3, :3]) @ np.square(sigma[:3])))
 
 
-def plan_text(plan: PosePlan) -> str:
-    """Return the next poses as a table."""
+def plan_table(plan: PosePlan) -> TextTable:
+    """Return the next poses as a table for people."""
     rows = []
     for k, (T, m, rad) in enumerate(zip(plan.Ts_base_flange, plan.sigma_m, plan.sigma_rad, strict=True), 1):
         p, angles = 1e3 * T[:3, 3], Rotation.from_matrix(np.array(T[:3, :3])).as_euler("xyz", degrees=True)
@@ -151,7 +161,7 @@ def plan_text(plan: PosePlan) -> str:
         f"poses of the flange to take next (sigma along the worst axis now {1e3 * plan.before[0]:.2f} mm, "
         f"{np.degrees(plan.before[1]):.3f} deg); check that your arm reaches them freely"
     )
-    return plain_text(TextTable(title, head, tuple(rows)))
+    return TextTable(title, head, tuple(rows))
 
 
 def plan_csv(plan: PosePlan) -> str:

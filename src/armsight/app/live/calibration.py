@@ -18,7 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from armsight.app.calibrate.assessment import assess, graded_metrics
+from armsight.app.calibrate.assessment import advice, assess, graded_metrics
 from armsight.app.calibrate.run import provenance
 from armsight.app.live.capture import LiveShot
 from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, NextPose, guessed_camera, guessed_rig
@@ -53,7 +53,8 @@ FIRST_FIT, LEAST_SHOTS, _FOLDS = 4, 8, 5
 _QUICK_MODELS = ("brown5",)
 #: Columns and rows of the cells in which coverage is counted.
 CELLS = (8, 5)
-_QUICK_SIDE_PX = 640
+#: Longest side of the images in which a board is looked for quickly, and how often it is searched thoroughly, s.
+_QUICK_SIDE_PX, _QUICKER_SIDE_PX, _THOROUGH_S = 640, 360, 2.0
 _DRAWN_STILL = 0.15
 _GONE_S = 1.0
 
@@ -99,6 +100,7 @@ class CalibrationState:
         distance_m: at this distance, m.
         good: whether it is good enough.
         missing: what is missing, line by line.
+        advice: what is weak in the written calibration, and what to do about it.
         rig: the written rig file; None before.
         command: the command line that does the same with the stored shots.
         drawn: what to draw over the views.
@@ -121,6 +123,7 @@ class CalibrationState:
     distance_m: float = 0.8
     good: bool = False
     missing: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
     rig: str | None = None
     command: str = ""
     drawn: tuple[Drawn, ...] = ()
@@ -135,14 +138,20 @@ class _Seen(Record):
     at_s: float
 
 
-def quick_look(board: CalibrationBoard, image: np.ndarray) -> Detections:
-    """Detect a board; where it is clearly not in view, faster than a thorough search."""
-    if isinstance(board, Chessboard):
-        scale = min(1.0, _QUICK_SIDE_PX / max(image.shape))
-        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        if not cv2.checkChessboard(small, (board.columns, board.rows)):
-            return Detections.none(f"{board.body.name} is not in view")
+def quick_look(board: CalibrationBoard, image: np.ndarray, *, thorough: bool = True) -> Detections:
+    """Detect a board; a thorough search of the whole image where nothing of it is seen takes long, and may be left out."""
+    if isinstance(board, Chessboard) and not thorough:
+        small = _shrunk(image, _QUICK_SIDE_PX)
+        if not cv2.checkChessboard(small, (board.columns, board.rows)):  # it overlooks boards that are there
+            smaller = board.detect(_shrunk(image, _QUICKER_SIDE_PX))
+            if smaller.problem is not None:
+                return Detections.none(f"{board.body.name} is not in view")
     return board.detect(image)
+
+
+def _shrunk(image: np.ndarray, side_px: int) -> np.ndarray:
+    scale = min(1.0, side_px / max(image.shape))
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
 class CalibrationStep:
@@ -178,16 +187,18 @@ class CalibrationStep:
         self._state = CalibrationState(spec, aim_mm=1e3 * aim.error_m, distance_m=aim.distance_m)
         self._running, self._fitting, self._again, self._forced = False, None, False, False
         self._first = 0  # number of the pose before the first fit
+        self._thorough_s = 0.0
         self._must_move, self._rest_s = False, 0.0  # since when the board has not moved on, s
         self._instruction, self._edge_px, self._rig_path = "", None, None
         self._progress: list[Progress] = []
         self._missing_shots: int | None = None
-        self._good, self._missing = False, ("no shot yet",)
+        self._good, self._missing, self._weak = False, ("no shot yet",), ()
 
     _fitting: str | None
     _edge_px: float | None
     _rig_path: Path | None
     _missing: tuple[str, ...]
+    _weak: tuple[str, ...]
 
     @property
     def state(self) -> CalibrationState:
@@ -266,8 +277,14 @@ class CalibrationStep:
         if not self._running or shot.left is None or shot.right is None:
             return
         images = grey(shot.left), grey(shot.right)
-        left = quick_look(self.board, images[0])
-        right = quick_look(self.board, images[1])
+        late = live.arrived_s - self._thorough_s > _THOROUGH_S
+        if late:
+            self._thorough_s = live.arrived_s
+        last = self._recent[-1] if self._recent else None
+        were = (False, False) if last is None else (last.left.problem is None, last.right.problem is None)
+        left, right = (
+            quick_look(self.board, image, thorough=late or was) for image, was in zip(images, were, strict=True)
+        )
         with self._lock:
             self._sizes = tuple((image.shape[1], image.shape[0]) for image in images)  # type: ignore[assignment]
             seen = _Seen(left, right, live.arrived_s)
@@ -459,7 +476,7 @@ class CalibrationStep:
         """Return what is missing until the calibration is good enough, line by line."""
         lines = []
         if len(result.pairs) < LEAST_SHOTS:
-            lines.append(f"{LEAST_SHOTS - len(result.pairs)} more shots, so that the held-out errors mean something")
+            lines.append(f"{_more(LEAST_SHOTS - len(result.pairs))}, so that the held-out errors mean something")
         if error_m > self.aim.error_m:
             lines.append(
                 f"predicted error {1e3 * error_m:.2g} mm, {1e3 * self.aim.error_m:g} mm is the aim: more shots"
@@ -487,9 +504,12 @@ class CalibrationStep:
             return
         with self._lock:
             self._learned(result)
-            self._rig_path, self._fitting = path, None
+            self._rig_path, self._fitting, self._weak = path, None, tuple(advice(result))
         assessment = assess(result)
-        self._say(Note("good" if assessment.grade == "good" else "hint", f"{assessment.headline} {assessment.meaning}"))
+        text = (
+            f"{assessment.headline} {1e3 * result.heldout.rigid_rms_m:.2g} mm RMS on held-out pairs; written to {path}"
+        )
+        self._say(Note("good" if assessment.grade == "good" else "hint", text))
         self.changed(rig, path)
 
     def _command(self) -> str:
@@ -523,6 +543,7 @@ class CalibrationStep:
             self.aim.distance_m,
             self._good,
             self._missing,
+            self._weak,
             None if self._rig_path is None else str(self._rig_path),
             self._command(),
             self._drawings(newest) if self._running else (),
@@ -559,6 +580,10 @@ class CalibrationStep:
                 if found.problem is None:
                     drawn.append(Drawn(side, "seen", tuple(polyline(uv[None]) for uv in found.uv)))
         return tuple(drawn)
+
+
+def _more(count: int) -> str:
+    return "1 more shot" if count == 1 else f"{count} more shots"
 
 
 def _in_views(rig: StereoRig, p_left: Array) -> tuple[Array, Array]:

@@ -166,6 +166,9 @@ class CameraCapture:
             except ArmsightError as error:
                 self._failed(str(error))
                 return
+            except Exception as error:  # noqa: BLE001 - nobody else watches this thread
+                self._failed(f"reading the cameras failed: {type(error).__name__}: {error}")
+                return
             if shot is None:
                 self._failed("the recording has ended; it is shown again")
                 return

@@ -19,7 +19,13 @@ _HERE = ("127.0.0.1", "localhost", "::1")
 @click.option("--rig", type=click.Path(path_type=Path), help="A calibrated rig; begins with measuring.")
 @click.option("--target", help="The body that is measured: a body file or a board.")
 @click.option("--calibration-board", metavar="SPEC", help="The calibration board, such as chessboard:9x6:25mm.")
-@click.option("--board", help="The arm's controller: serial:PORT (docs/howto/board.md).")
+@click.option(
+    "--board",
+    help="The arm's controller: serial:PORT, feetech:PORT, ar4:PORT; poses:FILE where another program moves it.",
+)
+@click.option(
+    "--calibration", type=click.Path(path_type=Path), help="LeRobot's calibration file of the servo bus, with feetech:."
+)
 @click.option(
     "--arm", default="six_r", show_default=True, help="The arm: a name (armsight arm list), a .toml or a .urdf file."
 )
@@ -48,6 +54,7 @@ _HERE = ("127.0.0.1", "localhost", "::1")
     "--port", type=click.IntRange(0, 65535), default=8722, show_default=True, help="Port; 0 takes a free one."
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the simulated workcell.")
+@click.option("--stream", multiple=True, metavar="STREAM", help="Publish every shot measured: see armsight measure -h.")
 @click.option("--json", "as_json", is_flag=True, help="Print the address as one JSON object.")
 def command(
     source: str | None,
@@ -55,6 +62,7 @@ def command(
     target: str | None,
     calibration_board: str | None,
     board: str | None,
+    calibration: Path | None,
     arm: str,
     motion: Path | None,
     rate: float,
@@ -63,6 +71,7 @@ def command(
     host: str,
     port: int,
     seed: int,
+    stream: tuple[str, ...],
     as_json: bool,
 ) -> None:
     """Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.
@@ -79,12 +88,27 @@ def command(
 
     from armsight.app.live.server import LiveServer
     from armsight.app.live.session import LiveSession, SessionOptions
+    from armsight.app.stream.datum import Published
+    from armsight.app.stream.streams import open_streams
     from armsight.vision.sources.usb import parsed_usb
 
     if source is not None and source.startswith("usb:"):
         parsed_usb(source.removeprefix("usb:"))  # cameras may come later, their names may not
+    open_streams(stream, Published(), lambda line: click.echo(line, err=True)).close()  # a mistake is said now
     options = SessionOptions(
-        output, source, rig, target, calibration_board, board, arm, motion, rate, 1e-3 * sync_ms, seed
+        output,
+        source,
+        rig,
+        target,
+        calibration_board,
+        board,
+        arm,
+        motion,
+        rate,
+        1e-3 * sync_ms,
+        seed,
+        calibration,
+        stream,
     )
     session = LiveSession(options)
     server = LiveServer(session, host, port, None if host in _HERE else secrets.token_urlsafe(18))

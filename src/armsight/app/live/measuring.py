@@ -6,6 +6,8 @@ measure``. The sigma is split into precision (the noise of this shot) and what t
 
 from __future__ import annotations
 
+import contextlib
+import os
 import threading
 import time
 from collections import Counter, deque
@@ -22,13 +24,15 @@ from armsight.app.live.records import Drawn, polyline
 from armsight.app.measure.poses import csv_text, shot_pose
 from armsight.app.stream.datum import Published, ShotDatum
 from armsight.app.stream.mcap_file import LazyMcap, properties
+from armsight.app.stream.streams import open_streams
 from armsight.data import Array, Missed, PoseEstimate
 from armsight.errors import InputError
-from armsight.geometry.pose import inverse, transform
-from armsight.geometry.rotation import euler_zyx
-from armsight.loop.handeye.pivot import MIN_POSES, calibrate_pivot
+from armsight.geometry.pose import adjoint, inverse, transform
+from armsight.geometry.rotation import euler_zyx, skew
+from armsight.loop.handeye.pivot import MIN_POSES, Pivot, calibrate_pivot
 from armsight.loop.health import HealthMonitor
 from armsight.vision.follow.follower import Follower, follows
+from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_target
 from armsight.vision.measure import measure
 from armsight.vision.rig import StereoRig
@@ -38,6 +42,8 @@ _SYNC_S = 1e-3
 #: Poses of the path and of the chart that are kept, and latencies for the percentiles.
 _TRAIL, _LATENCIES = 240, 600
 _AXIS_M = 0.05
+#: Newest poses that are kept for a mean.
+_RECENT = 12
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,29 @@ class PoseShown:
     misfit: float
     points: int
     ellipsoid_mm: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class RelativeShown:
+    """The pose of a second body in the first one's frame.
+
+    Attributes:
+        target: the second body.
+        reason: why it was missed; None where it is measured.
+        position_mm: (3,) its position.
+        euler_zyx_deg: (3,) angles about z, y, x.
+        sigma_mm: (3,) one sigma along the first body's axes; what the calibration does to both alike cancels.
+        sigma_deg: (3,) one sigma of the rotation about these axes.
+        distance_mm: distance of the origins, and its sigma.
+    """
+
+    target: str
+    reason: str | None = None
+    position_mm: tuple[float, ...] = ()
+    euler_zyx_deg: tuple[float, ...] = ()
+    sigma_mm: tuple[float, ...] = ()
+    sigma_deg: tuple[float, ...] = ()
+    distance_mm: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -104,6 +133,9 @@ class MeasureState:
         relative: whether poses are relative to a zero.
         distance_mm: distance from the mark, and its sigma, mm; None without a mark.
         pivot: state of the pivot calibration, one line.
+        pivoting: whether poses for it are collected.
+        tip_mm: (3,) where the tip is now, left camera's frame or relative to the zero, and one sigma of it; None before.
+        second: the second body relative to this one; None without.
         recording: the file that is written, and how many rows; None while nothing is.
         health: what no longer holds.
         scene: for a view in space.
@@ -126,6 +158,9 @@ class MeasureState:
     relative: bool = False
     distance_mm: tuple[float, float] | None = None
     pivot: str = ""
+    pivoting: bool = False
+    tip_mm: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    second: RelativeShown | None = None
     recording: str | None = None
     health: tuple[str, ...] = ()
     scene: Scene | None = None
@@ -140,6 +175,7 @@ class MeasureStep:
         folder: of the session; recordings go there.
         source: spec of the cameras, for the command line shown.
         say: called with a note for the person.
+        streams: what every shot is published to: see ``armsight measure -h``.
 
     Attributes:
         rig: the rig; None before there is one.
@@ -148,7 +184,7 @@ class MeasureStep:
         newest: the newest shot with its pose; None before.
     """
 
-    def __init__(self, folder: Path, source: str, say: Callable[[Note], None]) -> None:
+    def __init__(self, folder: Path, source: str, say: Callable[[Note], None], streams: tuple[str, ...] = ()) -> None:
         self.folder, self.source, self._say = folder, source, say
         self.rig: StereoRig | None = None
         self.rig_path: Path | None = None
@@ -160,10 +196,12 @@ class MeasureStep:
         self._zero: Array | None = None
         self._mark: tuple[Array, Array] | None = None
         self._pivot_poses: list[Array] | None = None
-        self._pivot_text = ""
+        self._pivot_text, self._tip = "", None
+        self._second: _Second | None = None
         self._file: TextIO | None = None
         self._mcap: LazyMcap | None = None
-        self._file_path, self._rows = Path(), 0
+        self._file_path, self._rows, self._whole = Path(), 0, 0
+        self._specs, self._streams = streams, open_streams((), Published(), self._said)
         self._clear()
 
     def _clear(self) -> None:
@@ -173,9 +211,11 @@ class MeasureStep:
         self._latency: deque[float] = deque(maxlen=_LATENCIES)
         self._missed: Counter[str] = Counter()
         self._measured, self._health_s, self._health = 0, 0.0, ()
+        self._recent: deque[tuple[float, PoseEstimate]] = deque(maxlen=_RECENT)
         self.newest = None
 
     _health: tuple[str, ...]
+    _tip: Pivot | None
 
     def use_rig(self, rig: StereoRig, path: Path) -> None:
         """Measure with a rig from now on."""
@@ -194,20 +234,36 @@ class MeasureStep:
             self.target_spec = spec
             self._prepare()
 
+    def use_second(self, spec: str) -> None:
+        """Measure a second target too; none where ``spec`` is empty.
+
+        Raises:
+            InputError: it cannot be opened, or it is the first one.
+        """
+        if spec and spec == self.target_spec:
+            raise InputError(f"{spec} is measured already: the second body must be another one")
+        second = _Second(spec, open_target(spec)) if spec else None
+        with self._lock:
+            self._second = second
+            if second is not None:
+                second.prepare(self.rig)
+
     def _prepare(self) -> None:
         """Get ready for rig and target."""
         self._clear()
+        self._streams.close()
         self._measure = None
+        if self._second is not None:
+            self._second.prepare(self.rig)
         if self.rig is None or self.target_spec is None:
             return
         rig, target = self.rig, open_target(self.target_spec)
-        self._target = target
-        if follows(target):
-            follower = Follower(rig, target)
-            self._measure = lambda live: follower.measure(live.shot)
-        else:
-            self._measure = lambda live: measure(rig, target, live.shot)
+        self._target, self._measure = target, _measuring(rig, target)
         self._monitor = HealthMonitor(rig, target.body, _SYNC_S)
+        try:
+            self._streams = open_streams(self._specs, Published(rig, target.body), self._said)
+        except InputError as error:
+            self._say(Note("error", str(error)))
 
     def look(self, live: LiveShot) -> None:
         """Measure a live shot. Called from one thread."""
@@ -215,6 +271,8 @@ class MeasureStep:
             work = self._measure
         if work is not None:
             self.take(live, work(live))
+        if (second := self._second) is not None and second.measure is not None:
+            second.newest = live.number, second.measure(live)
 
     def take(self, live: LiveShot, result: PoseEstimate | Missed) -> None:
         """Take in what was measured in a shot, here or in a control loop."""
@@ -225,6 +283,7 @@ class MeasureStep:
             if isinstance(result, PoseEstimate):
                 result = self._monitor.measured(result, live.shot.t_s)
                 self._trail.append(result.T_left_body[:3, 3])
+                self._recent.append((now, result))
                 self._measured += 1
                 if self._pivot_poses is not None:
                     self._pivot_poses.append(result.T_left_body)
@@ -234,9 +293,24 @@ class MeasureStep:
             self._latency.append(1e3 * (now - live.arrived_s))
             self.newest = live, result
             self._write(live, result)
+            self._streams.put(ShotDatum(live.shot, result, now))
             if now - self._health_s > 1.0:
                 self._health_s = now
                 self._health = tuple(found.line() for found in self._monitor.findings())
+
+    def lately(self, within_s: float) -> list[PoseEstimate]:
+        """Return the newest poses of the last so many seconds, oldest first."""
+        now = time.monotonic()
+        with self._lock:
+            return [pose for at, pose in self._recent if now - at < within_s]
+
+    @property
+    def why_missed(self) -> str:
+        """Why no pose is measured now; empty where one is."""
+        newest = self.newest
+        if newest is None:
+            return self._lacking() or "no pose is measured yet"
+        return f"no pose is measured now: {newest[1].reason}" if isinstance(newest[1], Missed) else ""
 
     def zero(self) -> None:
         """Show poses relative to the present one from now on."""
@@ -267,7 +341,7 @@ class MeasureStep:
             poses, self._pivot_poses = self._pivot_poses, None
         if len(poses) < MIN_POSES:
             raise InputError(f"{len(poses)} poses are too few for a pivot calibration; 30 and more are advised")
-        found = calibrate_pivot(np.array(poses))
+        found = self._tip = calibrate_pivot(np.array(poses))
         tip, sigma = 1e3 * found.p_body, 1e3 * float(np.sqrt(np.trace(found.cov[:3, :3])))
         held = 1e3 * float(np.sqrt(np.nanmean(found.held_out_m**2)))
         at = ", ".join(f"{x:.2f}" for x in tip)
@@ -298,7 +372,7 @@ class MeasureStep:
             except OSError as error:
                 self._close_file()
                 raise InputError(f"{path}: cannot be written: {error.strerror}") from None
-            self._file_path, self._rows = path, 0
+            self._file_path, self._rows, self._whole = path, 0, len(csv_text([]).encode())
             published = Published(self.rig, self._target.body, None, properties(self.rig, None, command="live"))
             self._mcap = LazyMcap(self.folder, published, self._said, path.with_suffix(".mcap").name)
 
@@ -315,11 +389,13 @@ class MeasureStep:
         try:
             self._file.write(row)
             self._file.flush()
-            self._rows += 1
+            self._rows, self._whole = self._rows + 1, self._whole + len(row.encode())
             if self._mcap is not None:
                 self._mcap.put(ShotDatum(live.shot, result, time.monotonic()))
         except OSError as error:
             self._close_file()
+            with contextlib.suppress(OSError):  # a row that is there in part goes
+                os.truncate(self._file_path, self._whole)
             why = f"the recording has ended: {error.strerror}; {self._rows} poses are in {self._file_path}"
             self._say(Note("error", why))
 
@@ -335,18 +411,16 @@ class MeasureStep:
                 return
 
     def close(self) -> None:
-        """Close the recording."""
+        """Close the recording and the streams."""
         with self._lock:
             self._close_file()
+            self._streams.close()
 
     def _pose(self) -> PoseEstimate:
         newest = self.newest
-        if newest is None:
-            raise InputError(self._lacking() or "no pose is measured yet")
-        result = newest[1]
-        if isinstance(result, Missed):
-            raise InputError(f"no pose is measured now: {result.reason}")
-        return result
+        if newest is None or isinstance(newest[1], Missed):
+            raise InputError(self.why_missed)
+        return newest[1]
 
     def _lacking(self) -> str:
         if self.rig is None:
@@ -376,6 +450,8 @@ class MeasureStep:
                 pose = shown_pose(result, self._zero)
                 dropped = tuple(f"{each.point}: {each.reason}" for each in result.dropped)
                 drawn = self._drawings(result)
+                if self._second is not None:
+                    drawn = (*drawn, *self._second.drawings(self.rig, live.number))
                 body = transform(result.T_left_body, self._target.body.points)
                 distance = self._distance(result)
             else:
@@ -384,7 +460,11 @@ class MeasureStep:
         span = self._times[-1] - self._times[0] if len(self._times) > 2 else 0.0
         pivot = self._pivot_text
         if self._pivot_poses is not None:
-            pivot = f"collecting: {len(self._pivot_poses)} poses; rotate the body about the tip by 30 degrees, all ways"
+            far = 0.0 if not self._pivot_poses else _most_rotated_deg(np.array(self._pivot_poses))
+            pivot = (
+                f"{len(self._pivot_poses)} poses, rotated by up to {far:.0f} degrees: keep the tip where it is, and "
+            )
+            pivot += "rotate the body about it by 30 degrees, all ways"
         return MeasureState(
             str(self.rig_path),
             self.target_spec,
@@ -401,6 +481,9 @@ class MeasureStep:
             self._zero is not None,
             distance,
             pivot,
+            self._pivot_poses is not None,
+            None if newest is None else self._tip_now(newest[1]),
+            None if self._second is None or newest is None else self._second.shown(self.rig, newest),
             None if self._file is None else f"{self._file_path.name}: {self._rows} poses",
             self._health,
             self._scene(body),
@@ -419,6 +502,16 @@ class MeasureStep:
         both = cov + R @ pose.cov_noise[:3, :3] @ R.T
         along = away / size if size > 0 else np.array([0.0, 0.0, 1.0])
         return 1e3 * size, 1e3 * float(np.sqrt(along @ both @ along))
+
+    def _tip_now(self, pose: PoseEstimate | Missed) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+        """Return where the tip is, and one sigma of it, mm."""
+        if self._tip is None or isinstance(pose, Missed):
+            return None
+        p, R = self._tip.p_body, pose.T_left_body[:3, :3]
+        T = pose.T_left_body if self._zero is None else self._zero @ pose.T_left_body
+        J = R @ np.hstack([np.eye(3), -skew(p)])
+        cov = J @ pose.cov @ J.T + R @ self._tip.cov[:3, :3] @ R.T
+        return _mm(transform(T, p)), _mm(np.sqrt(np.diag(cov)))
 
     def _scene(self, body: Array) -> Scene:
         assert self.rig is not None
@@ -470,3 +563,94 @@ def shown_pose(pose: PoseEstimate, T_zero_left: Array | None) -> PoseShown:
 
 def _mm(values: Array) -> tuple[float, ...]:
     return tuple(float(1e3 * x) for x in values)
+
+
+def _measuring(rig: StereoRig, target: Target) -> Callable[[LiveShot], PoseEstimate | Missed]:
+    """Return what measures a target in live shots."""
+    if follows(target):
+        follower = Follower(rig, target)
+        return lambda live: follower.measure(live.shot)
+    return lambda live: measure(rig, target, live.shot)
+
+
+@dataclass(eq=False)
+class _Second:
+    """A second body: what it is, and how it was measured last."""
+
+    spec: str
+    target: Target
+    measure: Callable[[LiveShot], PoseEstimate | Missed] | None = None
+    newest: tuple[int, PoseEstimate | Missed] | None = None
+
+    def prepare(self, rig: StereoRig | None) -> None:
+        """Get ready for a rig."""
+        self.measure, self.newest = None if rig is None else _measuring(rig, self.target), None
+
+    def drawings(self, rig: StereoRig, number: int) -> tuple[Drawn, ...]:
+        """Return its points as both cameras see them, if they are of the shot of a number or of its neighbour."""
+        if self.newest is None or abs(self.newest[0] - number) > 1 or isinstance(self.newest[1], Missed):
+            return ()
+        points = transform(self.newest[1].T_left_body, self.target.body.points)
+        views = rig.left.project(points), rig.right.project(transform(inverse(rig.T_left_right), points))
+        return tuple(Drawn(side, "second", tuple(polyline(p[None]) for p in uv)) for side, uv in enumerate(views))
+
+    def shown(self, rig: StereoRig, first: tuple[LiveShot, PoseEstimate | Missed]) -> RelativeShown | None:
+        """Return it relative to the first body, as people read it; None before both were measured in one shot."""
+        live, pose = first
+        if self.newest is None or isinstance(pose, Missed):
+            return RelativeShown(self.spec, "no shot yet" if self.newest is None else "the first body is not seen")
+        number, other = self.newest
+        if isinstance(other, Missed):
+            return RelativeShown(self.spec, other.reason)
+        if abs(number - live.number) > 1:
+            return RelativeShown(self.spec, "not measured while the arm moves")
+        T, cov = relative_pose(rig, pose, other)
+        R, t = T[:3, :3], T[:3, 3]
+        size = float(np.linalg.norm(t))
+        u = R.T @ t / max(size, 1e-12)
+        return RelativeShown(
+            self.spec,
+            None,
+            _mm(t),
+            tuple(float(x) for x in np.degrees(euler_zyx(R)[0])),
+            _mm(np.sqrt(np.diag(R @ cov[:3, :3] @ R.T))),
+            tuple(float(x) for x in np.degrees(np.sqrt(np.diag(R @ cov[3:, 3:] @ R.T)))),
+            (1e3 * size, 1e3 * float(np.sqrt(u @ cov[:3, :3] @ u))),
+        )
+
+
+def relative_pose(rig: StereoRig, first: PoseEstimate, second: PoseEstimate) -> tuple[Array, Array]:
+    """Return the pose of a second body in the first one's frame, and its covariance.
+
+    The noise of both adds up; the calibration moves both bodies, and what it does to both alike cancels: its covariance
+    passes through the difference of the derivatives.
+
+    Args:
+        rig: the calibrated cameras.
+        first: pose of the first body.
+        second: pose of the second body in the same shot.
+
+    Returns:
+        (4, 4) T_first_second, m, and (6, 6) covariance of the right tangent [m; rad].
+    """
+    T = inverse(first.T_left_body) @ second.T_left_body
+    Ad = adjoint(inverse(T))
+    D = by_rig(second) - Ad @ by_rig(first)
+    return T, second.cov_noise + Ad @ first.cov_noise @ Ad.T + D @ rig.cov @ D.T
+
+
+def by_rig(pose: PoseEstimate) -> Array:
+    """Return the derivative (6, P) of a pose (right tangent) by the rig's parameters, of the points both cameras saw."""
+    points, R = pose.points, pose.T_left_body[:3, :3]
+    p_body = transform(inverse(pose.T_left_body), points.p_left)
+    J = np.concatenate([np.tile(R, (len(p_body), 1, 1)), np.array([-R @ skew(p) for p in p_body])], axis=2)
+    WJ = np.linalg.solve(points.cov, J)
+    return np.asarray(
+        np.linalg.solve(np.einsum("nki,nkj->ij", WJ, J), np.einsum("nki,nkp->ip", WJ, points.calibration))
+    )
+
+
+def _most_rotated_deg(Ts: Array) -> float:
+    """Return the largest angle between the first pose and another, degrees."""
+    cosines = (np.einsum("ij,nij->n", Ts[0, :3, :3], Ts[:, :3, :3]) - 1.0) / 2.0
+    return float(np.degrees(np.arccos(np.clip(cosines.min(), -1.0, 1.0))))

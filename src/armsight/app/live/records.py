@@ -50,7 +50,7 @@ class Drawn:
 
     Attributes:
         side: 0 left, 1 right.
-        kind: next (the outline to be reached), seen (what was found), body, dropped.
+        kind: next (the outline to be reached), seen (what was found), body, second, axis0, axis1, axis2.
         lines: polylines of (column, row), raw pixels; a line of one point is a dot.
         label: a word beside the first point; may be empty.
     """
@@ -194,6 +194,52 @@ class RunMotions:
 
 
 @dataclass(frozen=True)
+class UseSecondBody:
+    """Measure a second body too, and each relative to the other; an empty ``target`` ends it."""
+
+    target: str
+
+
+@dataclass(frozen=True)
+class TakePose:
+    """Take the pose in which the arm rests now for the hand-eye calibration."""
+
+
+@dataclass(frozen=True)
+class GuideHandEye:
+    """Let the arm visit the poses of the hand-eye calibration by itself."""
+
+
+@dataclass(frozen=True)
+class GoToStart:
+    """Move the arm slowly to where the motions start, as after a stop."""
+
+
+@dataclass(frozen=True)
+class ClearHandEye:
+    """Forget the hand-eye calibration and its poses."""
+
+
+@dataclass(frozen=True)
+class Identify:
+    """Identify the arm from the poses of the hand-eye calibration."""
+
+
+@dataclass(frozen=True)
+class UseArm:
+    """Use another model of the arm: a name, a TOML or a URDF file, such as the corrected one."""
+
+    arm: str
+
+
+@dataclass(frozen=True)
+class UseMotion:
+    """Use the motions of another file."""
+
+    path: str
+
+
+@dataclass(frozen=True)
 class Hold:
     """Bring the arm to rest and hold it."""
 
@@ -232,6 +278,14 @@ Command = (
     | RecordPoses
     | OpenArm
     | RunMotions
+    | UseSecondBody
+    | TakePose
+    | GuideHandEye
+    | GoToStart
+    | ClearHandEye
+    | Identify
+    | UseArm
+    | UseMotion
     | Hold
     | ClearStop
     | PersonAction

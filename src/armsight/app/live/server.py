@@ -63,6 +63,8 @@ _CSP = (
     "connect-src 'self'{sockets}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 PAGE = "page.html"
+#: Drawings in the folder of the session that a page can open.
+DRAWINGS = ("/board.pdf", "/body.pdf")
 
 
 @dataclass
@@ -191,7 +193,22 @@ class LiveServer:
             return None
         if url.path == "/":
             return self._html(connection, host)
+        if url.path in DRAWINGS:
+            return self._drawing(connection, url.path)
         return _text(connection, HTTPStatus.NOT_FOUND, "there is only /\n")
+
+    def _drawing(self, connection: ServerConnection, path: str) -> Response:
+        """Answer with a drawing, to be printed from the computer that shows the page."""
+        try:
+            data = (self.session.folder / path.removeprefix("/")).read_bytes()
+        except OSError:
+            return _text(connection, HTTPStatus.NOT_FOUND, "it is not drawn yet\n")
+        response = _text(connection, HTTPStatus.OK, "")
+        response.body = data
+        for name, value in (("Content-Type", "application/pdf"), ("Content-Length", str(len(data)))):
+            del response.headers[name]
+            response.headers[name] = value
+        return response
 
     def _named(self, host: str) -> bool:
         """Whether a Host header is one of ours: a foreign name on our address is another page's (DNS rebinding)."""

@@ -31,6 +31,7 @@ from armsight.data import Record, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import check_folder, write_text
 from armsight.robot.arm_file import open_arm
+from armsight.robot.boards.opening import EMULATED, slowed
 from armsight.sim.workcell.workcell import CHESSBOARD
 from armsight.vision.image import grey
 from armsight.vision.markers.board import open_board
@@ -51,6 +52,7 @@ _QUALITY_S, _LATE_S = 0.5, 0.5
 _COVERED, _NOT_COVERED = 0.45, 0.75
 _SLOW = 0.8  # share of the requested rate below which cameras are slow
 _BAR_MM = 100.0  # the bar on a drawing
+_BEHIND = 1.5  # intervals between shots that a pose may take
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,8 @@ class SessionOptions:
         rate_hz: rate of the cameras, Hz.
         sync_s: standard deviation of the time between the two exposures of a shot, s.
         seed: of a simulated workcell.
+        servo_calibration: LeRobot's calibration file of a servo bus.
+        streams: what every measured shot is published to.
     """
 
     folder: Path
@@ -82,6 +86,8 @@ class SessionOptions:
     rate_hz: float = 30.0
     sync_s: float = 1e-3
     seed: int = 0
+    servo_calibration: Path | None = None
+    streams: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -100,12 +106,45 @@ class ViewState:
 
 
 @dataclass(frozen=True)
+class FoundCamera:
+    """An attached camera.
+
+    Attributes:
+        device: its path.
+        name: its name.
+        problem: why it does not answer; empty where it does.
+        modes: sizes and rates it delivers, such as 1280x720@30, the largest first.
+        exposure_ms: the shortest and the longest exposure its driver takes, ms; None where it takes none.
+        gain: the smallest and the largest gain its driver takes; None where it takes none.
+    """
+
+    device: str
+    name: str
+    problem: str = ""
+    modes: tuple[str, ...] = ()
+    exposure_ms: tuple[float, float] | None = None
+    gain: tuple[float, float] | None = None
+
+    @classmethod
+    def of(cls, camera: VideoDevice) -> FoundCamera:
+        """Return a camera as it is shown."""
+        sizes = {
+            (size.width_px * size.height_px, f"{size.width_px}x{size.height_px}@{fps:g}")
+            for form in camera.formats
+            for size in form.sizes
+            for fps in size.fps
+        }
+        modes = tuple(name for _, name in sorted(sizes, key=lambda each: (-each[0], each[1])))
+        return cls(camera.device, camera.name, camera.problem or "", modes, camera.exposure_ms, camera.gain)
+
+
+@dataclass(frozen=True)
 class CamerasState:
     """The cameras.
 
     Attributes:
         source: what is open.
-        found: the attached cameras: device and name, and why one does not answer.
+        found: the attached cameras.
         problem: why there are no images now; None while there are.
         rate_hz: shots a second.
         age_ms: age of the newest shot, ms.
@@ -113,12 +152,13 @@ class CamerasState:
         notes: what concerns both.
         finding_left: what a person should do to find out which camera is left; empty while nobody asks.
         swapped: whether left and right are exchanged.
+        left_known: whether a person said which camera is left.
         simulated: what the simulated person can do; empty with real cameras.
         command: the command line that records the same.
     """
 
     source: str
-    found: tuple[tuple[str, str, str], ...] = ()
+    found: tuple[FoundCamera, ...] = ()
     problem: str | None = None
     rate_hz: float | None = None
     age_ms: float | None = None
@@ -126,6 +166,7 @@ class CamerasState:
     notes: tuple[Note, ...] = ()
     finding_left: str = ""
     swapped: bool = False
+    left_known: bool = False
     simulated: tuple[str, ...] = ()
     command: str = ""
 
@@ -139,6 +180,7 @@ class BoardChoice:
         size_mm: its extent from the first to the last point, mm.
         points: number of its points.
         drawing: the PDF; None before it is drawn.
+        measured_mm: measured length of the bar on the print, mm; None where nobody measured it.
         command: the command line that draws it.
     """
 
@@ -146,6 +188,7 @@ class BoardChoice:
     size_mm: tuple[float, float]
     points: int
     drawing: str | None
+    measured_mm: float | None
     command: str
 
 
@@ -160,6 +203,8 @@ class HealthState:
         missed: misses by reason.
         findings: what no longer holds since the calibration.
         slowest_ms: the longest interval between shots lately, ms.
+        notes: what is slow or late.
+        command: the command line that does the same.
     """
 
     latency_ms: tuple[float, float] | None
@@ -168,6 +213,8 @@ class HealthState:
     missed: tuple[tuple[str, int], ...]
     findings: tuple[str, ...]
     slowest_ms: float
+    notes: tuple[Note, ...]
+    command: str
 
 
 @dataclass(frozen=True)
@@ -179,12 +226,14 @@ class Overview:
         steps: all steps.
         folder: of the session.
         moving: whether the arm moves by this session.
+        held: why the arm was held, until it is moved again; empty where it was not.
     """
 
     step: str
     steps: tuple[str, ...]
     folder: str
     moving: bool
+    held: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,9 +263,14 @@ class LiveSession:
         self._found = [] if simulated else find_cameras()
         self.source = options.source if options.source is not None else _best_source(self._found)
         arm = open_arm(options.arm)
+        ArmStep.check_board(options.board, self.source, arm)
+        if simulated and options.board is not None and not options.board.startswith(EMULATED):
+            raise InputError(f"--board {options.board}: {SIM} has the emulated board; leave out --board")
         self._simulated = self._workcell(options) if simulated else None
         spec = options.calibration_board or (CHESSBOARD if simulated else _DEFAULT_BOARD)
-        self.measuring = MeasureStep(self.folder, "usb:LEFT,RIGHT" if simulated else self.source, self.say)
+        self.measuring = MeasureStep(
+            self.folder, "usb:LEFT,RIGHT" if simulated else self.source, self.say, options.streams
+        )
         self.capture = CameraCapture(self._open, self._camera_failed)
         self.calibration = self._calibration(spec, CalibrationAim())
         self.body = BodyStep(self.folder, self.say)
@@ -224,22 +278,34 @@ class LiveSession:
         board = options.board or ("emulated:" if simulated else None)
         self.arm = ArmStep(
             self.folder,
-            ArmOptions(arm, options.arm, board, motion, options.rate_hz, options.sync_s, self.source),
+            ArmOptions(
+                slowed(arm, board or ""),
+                options.arm,
+                board,
+                motion,
+                options.rate_hz,
+                options.sync_s,
+                self.source,
+                options.servo_calibration,
+            ),
             self.capture,
             self.measuring,
             self._simulated,
             self.say,
         )
-        self._step, self._drawing = "cameras", None
+        self._held = ""
+        self._step, self._drawing, self._bar_mm = "cameras", None, None
         self._views = (ViewState(), ViewState())
         self._notes: tuple[Note, ...] = ()
         self._looks: tuple[_Look, _Look] | None = None
         self._covering: tuple[float, float] | None = None
+        self._left_known = options.rig is not None or simulated
         self._closing = threading.Event()
         self._eye = threading.Thread(target=self._see, name="eye", daemon=True)
         self._begin()
 
     _drawing: str | None
+    _bar_mm: float | None
 
     def _workcell(self, options: SessionOptions) -> SimulatedCameras:
         assert options.source is not None
@@ -288,6 +354,7 @@ class LiveSession:
         """Bring the arm to rest and hold it, if it moves."""
         if self.arm.busy:
             self.arm.hold(why)
+            self._held = why
             self.say(Note("warn", f"the arm is held: {why}"))
 
     def say(self, note: Note) -> None:
@@ -308,6 +375,8 @@ class LiveSession:
             ArmsightError: it cannot be done now; nothing has changed.
         """
         self._actions()[type(command)](command)
+        if isinstance(command, records.RunMotions | records.GuideHandEye | records.GoToStart):
+            self._held = ""
 
     def _actions(self) -> dict[type[Command], Callable[..., None]]:
         """Return what each command does."""
@@ -334,6 +403,14 @@ class LiveSession:
             records.RecordPoses: lambda c: measuring.record(),
             records.OpenArm: lambda c: arm.open(),
             records.RunMotions: lambda c: arm.run(closed=c.closed),
+            records.UseSecondBody: lambda c: measuring.use_second(c.target),
+            records.TakePose: lambda c: arm.take_pose(),
+            records.GuideHandEye: lambda c: arm.guide_handeye(),
+            records.GoToStart: lambda c: arm.go_to_start(),
+            records.ClearHandEye: lambda c: self._clear_handeye(),
+            records.Identify: lambda c: arm.identify_arm(),
+            records.UseArm: lambda c: arm.use_arm(c.arm),
+            records.UseMotion: lambda c: arm.use_motion(c.path),
             records.Hold: lambda c: self.hold("a person requested it"),
             records.ClearStop: lambda c: arm.clear_stop(),
             records.PersonAction: lambda c: self._person(c.action),
@@ -354,7 +431,8 @@ class LiveSession:
             raise InputError("the workcell and real cameras are chosen when the session starts: --source")
         self.capture.close()
         self.source, self.capture = source, CameraCapture(self._open, self._camera_failed)
-        self.arm.capture = self.capture
+        self.arm.capture, self.arm.options = self.capture, replace(self.arm.options, source=source)
+        self._left_known = False
         self.capture.start()
         self.measuring.source = source
         self._looks = None
@@ -369,7 +447,7 @@ class LiveSession:
     def _swap(self) -> None:
         self._require_rest()
         self.capture.swapped = not self.capture.swapped
-        self._covering = None
+        self._covering, self._left_known = None, True
         self.say(
             Note("good", "left and right are exchanged" if self.capture.swapped else "left and right as they came")
         )
@@ -384,6 +462,7 @@ class LiveSession:
         if measured_mm:
             spec = scaled_spec(spec, measured_mm / _BAR_MM)
             board = open_board(spec)
+        self._bar_mm = measured_mm or None
         aim = self.calibration.aim
         self.calibration.close()
         self.calibration = self._calibration(spec, aim)
@@ -433,6 +512,10 @@ class LiveSession:
         if target is None:
             raise InputError("no body yet: choose one first")
         self.body.draw(target, "body", paper)
+
+    def _clear_handeye(self) -> None:
+        self._require_rest()
+        self.arm.handeye.clear()
 
     def _person(self, action: str) -> None:
         if self._simulated is None:
@@ -532,7 +615,7 @@ class LiveSession:
         """Return what is wrong with two USB cameras by what was requested of them."""
         notes = []
         if "exposure=" not in self.source or "exposure=auto" in self.source:
-            notes.append(Note("hint", "automatic exposure is on: add ,exposure=5ms to the source for measuring"))
+            notes.append(Note("hint", "automatic exposure is on: set an exposure for measuring, such as 5 ms"))
         requested = [
             float(value)
             for name, value in parsed_usb(self.source.removeprefix("usb:"))[1].values()
@@ -550,7 +633,7 @@ class LiveSession:
         now = [view.quality.mean if view.quality is not None else 0.0 for view in self._views]
         share = [value / max(then, 1.0) for value, then in zip(now, before, strict=True)]
         if share[0] < _COVERED and share[1] > _NOT_COVERED:
-            self._covering = None
+            self._covering, self._left_known = None, True
             self.say(Note("good", "the left view is the left camera's"))
         elif share[1] < _COVERED and share[0] > _NOT_COVERED:
             self._swap()
@@ -571,7 +654,7 @@ class LiveSession:
         """Return the state, section by section: records of this package."""
         measure = self.measuring.state
         return {
-            "overview": Overview(self._step, records.STEPS, str(self.folder), self.arm.busy),
+            "overview": Overview(self._step, records.STEPS, str(self.folder), self.arm.busy, self._held),
             "cameras": self._cameras(),
             "board": self._board(),
             "calibrate": self.calibration.state,
@@ -586,7 +669,7 @@ class LiveSession:
         finding = ""
         if self._covering is not None:
             finding = "Cover the lens of the LEFT camera with a hand."
-        found = tuple((camera.device, camera.name, camera.problem or "") for camera in self._found)
+        found = tuple(FoundCamera.of(camera) for camera in self._found)
         return CamerasState(
             self.source,
             found,
@@ -597,6 +680,7 @@ class LiveSession:
             self._notes,
             finding,
             self.capture.swapped,
+            self._left_known,
             ACTIONS if self._simulated is not None else (),
             "armsight demo"
             if self._simulated is not None
@@ -608,13 +692,31 @@ class LiveSession:
         size = 1e3 * np.ptp(board.body.points, axis=0)
         drawing = None if self._drawing is None or not Path(self._drawing).exists() else self._drawing
         command = f"armsight body draw {spec} -o {self.folder}/board.pdf"
-        return BoardChoice(spec, (float(size[0]), float(size[1])), len(board.body.points), drawing, command)
+        return BoardChoice(
+            spec, (float(size[0]), float(size[1])), len(board.body.points), drawing, self._bar_mm, command
+        )
 
     def _health(self, measure: MeasureState) -> HealthState:
         latency, of = measure.latency_ms, "from an image's arrival to its pose"
         if (loop := self.arm.latency_s) is not None:
             latency, of = (1e3 * loop[0], 1e3 * loop[1]), "from an image to its command in the loop"
-        return HealthState(latency, of, measure.measured, measure.missed, measure.health, 1e3 * self.capture.slowest_s)
+        notes, rate = [], self.capture.rate_hz
+        if self.capture.problem is not None:
+            notes.append(Note("error", self.capture.problem))
+        if latency is not None and rate is not None and latency[0] > _BEHIND * 1e3 / rate:
+            text = (
+                f"a pose takes {latency[0]:.0f} ms, a shot comes every {1e3 / rate:.0f} ms: this computer is too busy"
+            )
+            notes.append(Note("warn", f"{text}, or the images are too large"))
+        if (run := self.arm.state.folder) is not None:
+            command = f"armsight check {run}; armsight rig update {run} -o rig2.json"
+        else:
+            command = f"armsight measure {measure.rig or 'rig.json'} --target {measure.target or 'body.toml'} --source "
+            command += self.measuring.source
+        slowest_ms = 1e3 * self.capture.slowest_s
+        return HealthState(
+            latency, of, measure.measured, measure.missed, measure.health, slowest_ms, tuple(notes), command
+        )
 
 
 #: Sections of :meth:`LiveSession.sections` and their records.

@@ -25,7 +25,7 @@ from armsight.vision.pnp import body_poses
 ACTIONS = ("cover_left", "cover_right", "uncover", "unplug", "plug", "board", "no_board")
 #: A hand comes so near to an outline, m and rad; moves so fast, s per pose; and trembles, m and rad.
 _HAND, _MOVE_S, _TREMOR = (0.012, np.radians(3.0)), 1.2, (1e-4, np.radians(0.02))
-_FILL = (0.5, 0.8)
+_FILL, _TRIES = (0.4, 0.8), 30  # of the image's height; poses among which one beside the arm is looked for
 _PACE_HZ = 15.0
 
 
@@ -65,14 +65,16 @@ class Person:
         elif action in ("unplug", "plug"):
             self.unplugged = action == "unplug"
         else:
-            self.holds = action == "board"
+            self.holds, self._to, self._shown = action == "board", None, None
 
     def reach(self, outline_uv: tuple[Array, Array] | None) -> None:
         """Move the board to where its points (M, 2) are drawn in both views; somewhere in view where nothing is drawn."""
         rig = self._workcell.truth.rig
         if outline_uv is None:
             if self._to is None:
-                self._move(board_poses(self._rng, rig, self._pattern, 1, fill=_FILL, tilt_deg=15.0)[0])
+                poses = board_poses(self._rng, rig, self._pattern, _TRIES, fill=_FILL, tilt_deg=15.0)
+                beside = [T for T in poses if self._workcell.source.clear(self._pattern, T)]
+                self._move(beside[0] if beside else poses[0])
             return
         if self._shown is not None and np.abs(self._shown - outline_uv[0]).max() < 1.0:
             return

@@ -28,6 +28,12 @@ from armsight.errors import InputError
     help="Detections instead of images; bag:FILE for tags in a bag.",
 )
 @click.option(
+    "--fixed",
+    multiple=True,
+    metavar="BODY",
+    help="A body in view that does not move; may be repeated. It shows cameras that move.",
+)
+@click.option(
     "--skew", metavar="TIME", help="The right camera exposes later by this, such as 5ms, or find (recordings)."
 )
 @click.option(
@@ -44,7 +50,7 @@ from armsight.errors import InputError
     "--stream",
     multiple=True,
     metavar="STREAM",
-    help="Publish each pose: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT or igtl:PORT; may be repeated.",
+    help="Publish each pose: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT, igtl:PORT or ros2:PORT; may be repeated.",
 )
 @click.option("--view", "view_dir", metavar="DIR", type=click.Path(path_type=Path), help="Write annotated pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
@@ -55,6 +61,7 @@ def command(
     right: str | None,
     source: str | None,
     detections: Path | None,
+    fixed: tuple[str, ...],
     skew: str | None,
     readout: str | None,
     save_rig: Path | None,
@@ -87,6 +94,7 @@ def command(
         right=right,
         source=source,
         detections=detections,
+        fixed=fixed,
         skew=skew,
         readout=readout,
         save_rig=save_rig,

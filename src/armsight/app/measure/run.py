@@ -26,10 +26,10 @@ from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines
 from armsight.vision.detections import SeenShot, read_detections
-from armsight.vision.follow.follower import Follower, follows
+from armsight.vision.follow.follower import Follower, follows, measurer
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
-from armsight.vision.markers.targets import open_body, open_target
+from armsight.vision.markers.targets import open_body, open_fixed, open_target
 from armsight.vision.measure import measure, measure_seen, size_problem
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.shutter import LOOSE_PX
@@ -68,6 +68,7 @@ def measure_shots(
     right: str | None,
     source: str | None,
     detections: Path | None,
+    fixed: Sequence[str],
     skew: str | None,
     readout: str | None,
     save_rig: Path | None,
@@ -85,6 +86,7 @@ def measure_shots(
         right: glob of the right images.
         source: a source's spec, where the images are not given by globs.
         detections: a file of detections, where there are no images.
+        fixed: bodies in view that do not move.
         skew: time by which the right camera is later, with its unit, or ``find``.
         readout: time from the first row to the last, with its unit, or ``find``.
         save_rig: file for the rig with the skew and readout that were found or given.
@@ -102,6 +104,9 @@ def measure_shots(
     requested: Requested | Shutters | None = requested_shutters(skew, readout)
     if requested is not None and detections is not None:
         raise InputError("--skew and --readout need images with times: detections have none")
+    if fixed and detections is not None:
+        raise InputError("--fixed needs images: --detections has the markers of the target alone")
+    fixed_targets = open_fixed(fixed, target)
     if save_rig is not None:
         if requested is None:
             raise InputError("--save-rig writes what --skew or --readout find: give --skew find")
@@ -155,7 +160,16 @@ def measure_shots(
         monitor = HealthMonitor(stereo, body, _SYNC_S)
         publisher = stack.enter_context(contextlib.closing(_streams(streams, stereo, body)))
         try:
-            _run(results, total, body, records, as_json, view, monitor, publisher)
+            _run(
+                _watched(stereo, fixed_targets, results, monitor),
+                total,
+                body,
+                records,
+                as_json,
+                view,
+                monitor,
+                publisher,
+            )
         except KeyboardInterrupt:
             kept = f", kept in {output}" if output is not None and records else ""
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
@@ -165,9 +179,11 @@ def measure_shots(
     if save_rig is not None and moved is not None:
         replace(stereo, shutters=moved).save(save_rig)
     health = monitor.findings()
-    if skewed and any(each.cause == "rig" for each in health):
-        # Of a moving body a skew looks like cameras that moved against each other.
-        health = (*skewed, *(each for each in health if each.cause != "rig"))
+    for name in monitor.fixed_never_seen:
+        click.echo(f"note: the fixed body {name} was seen too rarely to say anything", err=True)
+    if skewed and any(each.cause in ("rig", "time") for each in health):
+        # Of a moving body a skew looks like cameras that moved against each other; all shots together size it best.
+        health = (*skewed, *(each for each in health if each.cause not in ("rig", "time")))
     else:  # a skew that changes no pose by more than its sigma
         for late in skewed:
             click.echo(f"note: {late.what}; {late.advice}", err=True)
@@ -176,6 +192,20 @@ def measure_shots(
     if as_json and health:
         click.echo(json.dumps({"health": [found.to_json() for found in health]}))
     return health
+
+
+def _watched(
+    rig: StereoRig, fixed: Sequence[Target], results: Iterator[Result], monitor: HealthMonitor
+) -> Iterator[Result]:
+    """Yield the results; measure the fixed bodies in their shots meanwhile, for a monitor."""
+    monitor.watch_fixed([each.body.name for each in fixed])
+    measures = [measurer(rig, each) for each in fixed]
+    for result in results:
+        shot = result[0]
+        for row, measured in enumerate(each(shot) for each in measures if shot.left is not None):
+            if isinstance(measured, PoseEstimate):
+                monitor.fixed_measured(row, measured, shot.t_s)
+        yield result
 
 
 def _opened(left: str | None, right: str | None, source: str | None) -> Source:

@@ -31,7 +31,7 @@ def command(
 
     \b
     SOURCE is one of
-      usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,format=MJPG]
+      usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,gain=20][,format=MJPG]
       url:URL_LEFT,URL_RIGHT              MJPEG over HTTP, or RTSP
       video:LEFT.mp4,RIGHT.mp4            or one side-by-side file
       folder:DIR                          or just DIR

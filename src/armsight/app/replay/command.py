@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections import Counter
 from pathlib import Path
 
 import click
+
+#: Reasons of missed shots that are printed, the most frequent ones.
+_REASONS = 3
 
 
 @click.command("replay")
@@ -56,15 +60,20 @@ def command(
     request = Request(recording, rig, target, arm, estimator, rate, stream)
     replayed = replay(request, lambda line: click.echo(line, err=True))
     measured = sum(pose.ok for pose in replayed.poses)
+    reasons = Counter(pose.reason for pose in replayed.poses if not pose.ok)
     answer: dict[str, object] = {
         "recording": recording,
         "shots": len(replayed.poses),
         "measured": measured,
+        "missed": dict(reasons),
         "estimates": len(replayed.live),
         "differences": replayed.differences,
         "same": None if replayed.differences is None else not any(replayed.differences.values()),
     }
     lines = [f"{measured} of {len(replayed.poses)} shots measured, {len(replayed.live)} estimates"]
+    lines += [f"  missed {count}: {reason}" for reason, count in reasons.most_common(_REASONS)]
+    if len(reasons) > _REASONS:
+        lines.append(f"  and {len(reasons) - _REASONS} other reasons: poses.csv has that of each shot")
     if replayed.differences is not None:
         lines.append(
             "the estimates are those of the run, to the last digit"

@@ -6,7 +6,7 @@ In: shots of a calibration target, or a :class:`~armsight.app.run.loop.Loop` tha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.delay import MIN_MEASUREMENTS, estimate_delay
 from armsight.loop.estimators import Delay, Mounting, Prior
-from armsight.loop.handeye.handeye import HandEye, calibrate_handeye
+from armsight.loop.handeye.handeye import SHARES, HandEye, Share, calibrate_handeye
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import point_to_point
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
@@ -123,6 +123,31 @@ class HandEyeRun(Record):
     missed: tuple[str, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class VisitedPose(Record):
+    """A pose of an arm at rest.
+
+    Attributes:
+        q: (n,) potentiometer readings, rad.
+        T_left_body: (4, 4) measured pose of the body in the left camera's frame.
+        cov: (6, 6) its covariance, right tangent [m; rad].
+        approach: (n,) direction each joint came from: 1 with rising angle, -1 with falling angle, 0 unmoved.
+    """
+
+    q: Array
+    T_left_body: Array
+    cov: Array
+    approach: Array
+
+    @classmethod
+    def of(cls, q: Array, seen: Sequence[PoseEstimate], moved: Array) -> VisitedPose:
+        """Return the mean of the poses ``seen`` at readings q (n,), rad, reached by a motion of the joints (n,), rad."""
+        cov = np.mean([r.cov - r.cov_noise for r in seen], axis=0)
+        cov = cov + np.mean([r.cov_noise for r in seen], axis=0) / len(seen)
+        approach = np.sign(np.where(np.abs(moved) > np.radians(0.5), moved, 0.0))
+        return cls(q, mean_pose(np.array([r.T_left_body for r in seen])), cov, approach)
+
+
 def find_mounting(
     loop: Loop, arm: Arm, q_start: Array, targets: Array, gravity: Callable[[Array], Array], progress: Progress
 ) -> HandEyeRun:
@@ -140,44 +165,78 @@ def find_mounting(
         CalibrationError: too few poses were seen.
         DeviceError: the board or a camera failed.
     """
-    q_seen, Ts, covs, approach, missed = [], [], [], [], []
-    q_from, look_s = q_start, max(LOOK_S, 3.0 / loop.setup.rate_hz)
+    visited: list[VisitedPose] = []
+    missed: list[str] = []
+    q_from = q_start
     for n, q_to in enumerate(targets):
         progress(f"hand-eye: pose {n + 1} of {len(targets)}")
-        way = point_to_point(arm, q_from, q_to)
-        segment = RunSegment("calibration", f"hand-eye {n + 1}", "joints", False, trajectory=way)
-        settle_s = SETTLE_S + 2.0 * loop.setup.board.abilities.latency_s
-        loop.run(Planned(way, loop.t_s, gravity), way.duration_s + settle_s, segment, watch=False)
-        poses_before = len(loop.log.poses)
-        joints_before = len(loop.log.joints)
-        stands = Planned(way, loop.t_s - way.duration_s, gravity)
-        loop.run_until_seen(stands, look_s, RunSegment("calibration", "", "", False))
-        results = [result for _, _, result in loop.log.poses[poses_before:]]
-        good = [r for r in results if isinstance(r, PoseEstimate)]
-        if good:
-            q_seen.append(np.concatenate([s.q for s in loop.log.joints[joints_before:]]).mean(axis=0))
-            Ts.append(mean_pose(np.array([r.T_left_body for r in good])))
-            covs.append(
-                np.mean([r.cov - r.cov_noise for r in good], axis=0)
-                + np.mean([r.cov_noise for r in good], axis=0) / len(good)
-            )
-            approach.append(np.sign(np.where(np.abs(q_to - q_from) > np.radians(0.5), q_to - q_from, 0.0)))
+        found = visit(loop, arm, q_from, q_to, gravity, f"hand-eye {n + 1}")
+        if isinstance(found, Missed):
+            missed.append(found.reason)
         else:
-            missed.append(
-                f"hand-eye {n + 1}: " + (str(getattr(results[-1], "reason", "")) if results else "no shot came")
-            )
+            visited.append(found)
         q_from = q_to
-    if len(q_seen) < 12:
+    if len(visited) < 12:
         raise CalibrationError(
-            f"the body was seen at {len(q_seen)} of {len(targets)} poses of the arm; 12 at least are needed: "
+            f"the body was seen at {len(visited)} of {len(targets)} poses of the arm; 12 at least are needed: "
             + (missed[0] if missed else "move it into the view of both cameras")
         )
     progress("hand-eye: calibrating")
-    q, Ts_left_body, cov = np.array(q_seen), np.array(Ts), np.array(covs)
-    Ts_base_flange = arm.forward(q) @ inverse(arm.T_flange_tool)
-    found = loop.compute(lambda: calibrate_handeye(Ts_base_flange, Ts_left_body, cov))
+    return loop.compute(lambda: handeye_of(arm, visited, tuple(missed)))
+
+
+def visit(
+    loop: Loop, arm: Arm, q_from: Array, q_to: Array, gravity: Callable[[Array], Array], name: str
+) -> VisitedPose | Missed:
+    """Move to a pose, and measure the body at rest.
+
+    Args:
+        loop: runs the motion.
+        arm: the nominal arm.
+        q_from: (n,) joint angles at which the arm stands, rad.
+        q_to: (n,) joint angles to go to, rad.
+        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
+        name: of the pose, in the log.
+
+    Raises:
+        DeviceError: the board or a camera failed.
+    """
+    way = point_to_point(arm, q_from, q_to)
+    segment = RunSegment("calibration", name, "joints", False, trajectory=way)
+    settle_s = SETTLE_S + 2.0 * loop.setup.board.abilities.latency_s
+    loop.run(Planned(way, loop.t_s, gravity), way.duration_s + settle_s, segment, watch=False)
+    poses_before = len(loop.log.poses)
+    joints_before = len(loop.log.joints)
+    stands = Planned(way, loop.t_s - way.duration_s, gravity)
+    look_s = max(LOOK_S, 3.0 / loop.setup.rate_hz)
+    loop.run_until_seen(stands, look_s, RunSegment("calibration", "", "", False))
+    results = [result for _, _, result in loop.log.poses[poses_before:]]
+    good = [r for r in results if isinstance(r, PoseEstimate)]
+    if not good:
+        return Missed(f"{name}: " + (str(getattr(results[-1], "reason", "")) if results else "no shot came"))
+    q = np.concatenate([s.q for s in loop.log.joints[joints_before:]]).mean(axis=0)
+    return VisitedPose.of(q, good, q_to - q_from)
+
+
+def handeye_of(
+    arm: Arm, visited: Sequence[VisitedPose], missed: tuple[str, ...], shares: tuple[Share, ...] = SHARES
+) -> HandEyeRun:
+    """Calibrate hand and eye.
+
+    Args:
+        arm: the nominal arm.
+        visited: four poses at least.
+        missed: poses at which the body was not measured, and why.
+        shares: what the arm's error may be attributed to; fewer take less time.
+
+    Raises:
+        CalibrationError: the motions leave a direction open.
+    """
+    q = np.array([each.q for each in visited])
+    Ts_left_body, cov = np.array([each.T_left_body for each in visited]), np.array([each.cov for each in visited])
+    found = calibrate_handeye(arm.forward(q) @ inverse(arm.T_flange_tool), Ts_left_body, cov, shares=shares)
     mounting = replace(Mounting.of(found, arm), cov=np.zeros((12, 12)))
-    return HandEyeRun(mounting, found, q, Ts_left_body, cov, np.array(approach), tuple(missed))
+    return HandEyeRun(mounting, found, q, Ts_left_body, cov, np.array([each.approach for each in visited]), missed)
 
 
 def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: Callable[[Array], Array]) -> Delay:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -72,6 +72,12 @@ class RunPlan:
 @click.option("--rig", "rig_path", required=True, type=click.Path(path_type=Path), help="The calibrated rig, rig.json.")
 @click.option("--target", "target_spec", required=True, help="The body on the tool: a body file of discs.")
 @click.option(
+    "--fixed",
+    multiple=True,
+    metavar="BODY",
+    help="A body in view that does not move; may be repeated. It shows cameras that move.",
+)
+@click.option(
     "--arm",
     "arm_spec",
     default="six_r",
@@ -101,7 +107,7 @@ class RunPlan:
     "--stream",
     multiple=True,
     metavar="STREAM",
-    help="Publish meanwhile: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT or igtl:PORT; may be repeated.",
+    help="Publish meanwhile: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT, igtl:PORT or ros2:PORT; may be repeated.",
 )
 @click.option("--open-loop", is_flag=True, help="Control by the potentiometers alone; do not close the loop on vision.")
 @click.option(
@@ -120,6 +126,7 @@ def command(
     calibration: Path | None,
     rig_path: Path,
     target_spec: str,
+    fixed: tuple[str, ...],
     arm_spec: str,
     motion: Path | None,
     rate: float,
@@ -138,8 +145,8 @@ def command(
     name of the shot or by time, for shots of a recording. Exit code 3: the result must not be trusted.
     """
     if board_spec.startswith(_POSES):
-        if motion is not None or open_loop:
-            raise InputError(f"--board {board_spec} commands no motion: leave out --motion and --open-loop")
+        if motion is not None or open_loop or fixed:
+            raise InputError(f"--board {board_spec} commands no motion: leave out --motion, --open-loop and --fixed")
         _run_logged(
             source_spec, Path(board_spec.removeprefix(_POSES)), rig_path, target_spec, arm_spec, output, as_json
         )
@@ -154,18 +161,18 @@ def command(
     from armsight.app.run.folder import make_room, open_folder
     from armsight.app.run.motion_file import DEFAULT_MOTION
     from armsight.app.run.record import require_pyarrow
-    from armsight.app.run.setup import Devices, open_devices
+    from armsight.app.run.setup import Devices, open_devices, planned_for
     from armsight.app.run.summary import print_summary
     from armsight.robot.arm_file import open_arm
-    from armsight.robot.boards.opening import slowed
     from armsight.vision.follow.follower import follows
-    from armsight.vision.markers.targets import open_target
+    from armsight.vision.markers.targets import open_fixed, open_target
     from armsight.vision.rig import StereoRig
 
     require_matplotlib()
     require_pyarrow()
-    arm = slowed(open_arm(arm_spec), board_spec)
+    arm = planned_for(open_arm(arm_spec), board_spec)
     rig, target = StereoRig.load(rig_path), open_target(target_spec)
+    fixed_targets = open_fixed(fixed, target_spec)
     if not follows(target):
         raise InputError(
             f"{target_spec}: {target.body.name} cannot be followed: a body of three discs or more is needed"
@@ -181,6 +188,7 @@ def command(
     with steps() as progress:
         progress("opening the devices")
         with open_devices(devices) as setup:
+            setup = replace(setup, fixed=fixed_targets)
             require_start(setup, motions, targets)
             make_room(output)
             for name, text in files.items():

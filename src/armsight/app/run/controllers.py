@@ -66,7 +66,7 @@ class Sweep:
         self.duration_s, self._middle = duration_s, q_middle
         lifts = np.abs(arm.jacobian(q_middle)[2])  # of the tool by each joint, m/rad
         self._reach = reach_rad * (lifts > LOADED_M)
-        self._rates = 2 * np.pi * np.array([0.9, 0.7, 1.1, 1.3, 0.8, 1.0])
+        self._rates = 2 * np.pi * np.array([0.9, 0.7, 1.1, 1.3, 0.8, 1.0, 1.2])[: arm.joints]
 
     def at(self, t_s: float | Array) -> Joints:
         """Return angles, speeds and accelerations of the joints ``t_s`` seconds after the start."""
@@ -120,7 +120,7 @@ class Closed:
         return step.command, step.mode.name.lower()
 
 
-#: Longest rest in open loop, s: there is no correction that has to settle.
+#: Longest rest in open loop, s, beyond what the board lags: there is no correction that has to settle.
 OPEN_REST_S = 0.5
 #: Makes a controller from a trajectory and the time at which it begins, board's clock, s.
 Control = Callable[[Trajectory, float], Controller]
@@ -149,6 +149,7 @@ def drive(
         DeviceError: the board or a camera failed.
     """
     phase = "closed_loop" if closed else "open_loop"
+    open_s = OPEN_REST_S + 2.0 * loop.setup.board.abilities.latency_s
     for motion in plan.motions:
         progress(f"{'loop closed on vision' if closed else 'potentiometers alone'}: {motion.name}")
         controller = control(Tabled(motion.trajectory), loop.t_s)
@@ -156,7 +157,7 @@ def drive(
         started(motion.name, motion.kind, motion.trajectory.duration_s)
         loop.run(controller, motion.trajectory.duration_s, segment)
         rest = RunSegment("rest", motion.name, motion.kind, closed, trajectory=motion.trajectory)
-        loop.run(controller, motion.rest_s if closed else min(motion.rest_s, OPEN_REST_S), rest)
+        loop.run(controller, motion.rest_s if closed else min(motion.rest_s, open_s), rest)
 
 
 def planned(gravity: Callable[[Array], Array]) -> Control:

@@ -28,7 +28,7 @@ from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, Prior
 from armsight.loop.health import HealthFinding
 from armsight.loop.health.fixed import BaseMotion
-from armsight.loop.servo import LoopTiming, PoseServo
+from armsight.loop.servo import JointLoops, LoopTiming, PoseServo
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.trajectories import Trajectory, point_to_point
@@ -89,7 +89,7 @@ def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
             f"{np.degrees(plan.start[joint]):.1f}: bring the arm to the start, or give start_deg; if it is there, "
             f"--arm {setup.arm.name} does not match the board's potentiometers (armsight board monitor)"
         )
-    _require_range(setup, np.vstack([targets, *(passed(m.trajectory) for m in plan.motions)]))
+    require_range(setup, np.vstack([targets, *(passed(m.trajectory) for m in plan.motions)]))
 
 
 def passed(way: Trajectory) -> Array:
@@ -97,7 +97,7 @@ def passed(way: Trajectory) -> Array:
     return way.at(np.linspace(0.0, way.duration_s, _CHECKED)).q
 
 
-def _require_range(setup: Setup, q: Array) -> None:
+def require_range(setup: Setup, q: Array) -> None:
     """Reject joint angles (N, n), rad, beyond the board's own limits: it would stop the joint on the way."""
     low, high = setup.board.soft_limits()
     beyond = np.maximum(q.max(axis=0) - high, low - q.min(axis=0))
@@ -181,6 +181,7 @@ def run_experiment(
     close_loop: bool = True,
     begun: Callable[[Loop], None] = lambda loop: None,
     publisher: Publisher | None = None,
+    handeye: HandEyeRun | None = None,
 ) -> RunResult:
     """Run the experiment.
 
@@ -194,13 +195,49 @@ def run_experiment(
         close_loop: whether the motions are made a second time with the loop closed.
         begun: called with the loop before the drives are switched on.
         publisher: is given everything that is measured; it returns at once.
+        handeye: a hand-eye calibration of this set-up; None to make one by visiting the targets.
 
     Returns:
         All that was measured, also where something ended the run early.
     """
+    outcome, given = RunResult(setup.target.body, handeye=handeye), publisher or Fanout()
+
+    def work(loop: Loop) -> None:
+        _prepare(loop, setup, plan, targets, outcome, progress)
+        _passes(loop, setup, plan, outcome, progress, cover, close_loop)
+
+    with steady(in_time=setup.clock is not None):
+        _run(setup, rig, plan, outcome, progress, begun, given, work)
+    return outcome
+
+
+def run_visits(
+    setup: Setup,
+    rig: StereoRig,
+    plan: MotionPlan,
+    work: Callable[[Loop], None],
+    *,
+    progress: Progress,
+    begun: Callable[[Loop], None] = lambda loop: None,
+    look: bool = True,
+) -> RunResult:
+    """Move the arm by ``work`` alone, which is given the loop; all else as :func:`run_experiment`.
+
+    Args:
+        setup: the devices.
+        rig: the calibrated cameras.
+        plan: the arm stands at its start.
+        work: moves the arm.
+        progress: called with a line about what is being done.
+        begun: called with the loop before the drives are switched on.
+        look: whether the body must be seen before.
+
+    Returns:
+        What was measured, also where something ended it early.
+    """
     outcome = RunResult(setup.target.body)
     with steady(in_time=setup.clock is not None):
-        _run(setup, rig, plan, targets, outcome, progress, cover, close_loop, begun, publisher or Fanout())
+        _run(setup, rig, plan, outcome, progress, begun, Fanout(), work, look=look)
     return outcome
 
 
@@ -208,15 +245,15 @@ def _run(
     setup: Setup,
     rig: StereoRig,
     plan: MotionPlan,
-    targets: Array,
     outcome: RunResult,
     progress: Progress,
-    cover: Callable[[float, float], None] | None,
-    close_loop: bool,
     begun: Callable[[Loop], None],
     publisher: Publisher,
+    work: Callable[[Loop], None],
+    *,
+    look: bool = True,
 ) -> None:
-    """Run the experiment; what ends it early is stored in the outcome, and the arm is stopped."""
+    """Switch the drives on, look, and do the work; what ends it early is stored in the outcome, and the arm is stopped."""
     loop: Loop | None = None
     try:
         progress("preparing to follow the body")
@@ -228,9 +265,11 @@ def _run(
         loop = Loop.open(setup, follower, outcome.log, first, publisher)
         begun(loop)
         enable(setup.board)
-        _require_seen(loop, setup, plan)
-        _prepare(loop, setup, plan, targets, outcome, progress)
-        _passes(loop, setup, plan, outcome, progress, cover, close_loop)
+        if look:
+            _require_seen(loop, setup, plan)
+        work(loop)
+        for name in loop.health.fixed_never_seen:
+            progress(f"the fixed body {name} was seen too rarely to say anything")
     except (ArmsightError, KeyboardInterrupt) as error:
         outcome.interrupted = isinstance(error, KeyboardInterrupt)
         outcome.ended_by = error if isinstance(error, ArmsightError) else None
@@ -274,11 +313,14 @@ def _prepare(
 ) -> None:
     """Calibrate hand and eye, and measure the delay of the images; the arm ends at the plan's start."""
     arm, gravity = setup.arm, setup.gravity
-    outcome.handeye = find_mounting(loop, arm, plan.start, targets, gravity, progress)
+    stands = plan.start
+    if outcome.handeye is None:
+        outcome.handeye = find_mounting(loop, arm, plan.start, targets, gravity, progress)
+        stands = targets[-1]
     loop.mounting = outcome.handeye.mounting
     progress("measuring the delay of the images: a sweep of the joints")
     middle = plan.motions[0].trajectory.at(plan.motions[0].trajectory.duration_s).q
-    outcome.delay = find_delay(loop, arm, targets[-1], middle, gravity)
+    outcome.delay = find_delay(loop, arm, stands, middle, gravity)
     outcome.shutters = loop.shutters
     back = point_to_point(arm, middle, plan.start)
     there = RunSegment("calibration", "to the start", "joints", False, trajectory=back)
@@ -320,7 +362,7 @@ def _passes(
     if not close_loop:
         return
     _to_start(loop, setup, plan)
-    servo = PoseServo(setup.arm, timing(setup, outcome.delay))
+    servo = PoseServo(setup.arm, timing(setup, outcome.delay), joint_loops(setup))
     begin = loop.t_s
     try:
         drive(loop, plan, closed_on(servo, lambda: loop.health.trust, setup.gravity), closed=True, progress=progress)
@@ -341,4 +383,11 @@ def _to_start(loop: Loop, setup: Setup, plan: MotionPlan) -> None:
 
 def timing(setup: Setup, delay: Delay) -> LoopTiming:
     """Return the timing of the loop with the measured delay; the servo's gain follows from it."""
-    return LoopTiming(PERIOD_S, 1.0 / setup.rate_hz, max(delay.delay_s, 0.0) + _OWN_S)
+    latency_s, response_s = max(delay.delay_s, 0.0) + _OWN_S, setup.board.abilities.response_s
+    return LoopTiming(PERIOD_S, 1.0 / setup.rate_hz, latency_s, response_s)
+
+
+def joint_loops(setup: Setup) -> JointLoops | None:
+    """Return what the servo must know of the joints' own controllers; None where they are ours, with an integral."""
+    abilities = setup.board.abilities
+    return JointLoops(abilities.step_rad, abilities.rest_rad_s) if abilities.own_controller else None

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.report.page import PAGE, bullets, html_page, picture, table, text
-from armsight.app.report.plotting import drawing, new_figure, png
+from armsight.app.report.page import PAGE, bullets, html_page, picture, text
+from armsight.app.report.plotting import BLUE, drawing, new_figure, png
 from armsight.app.run.angles import LoggedAngles
 from armsight.app.run.calibrate import HandEyeRun
 from armsight.app.run.folder import write_handeye
@@ -206,28 +206,33 @@ def _rounded(value: float) -> str:
 
 def _page(result: LoggedRun, summary: dict[str, Any]) -> str:
     with drawing():
-        figure = new_figure(3.0)
+        figure = new_figure(3.6)
         top, bottom = figure.subplots(2, 1, sharex=True)
         at = np.arange(len(result.names))
-        top.bar(at, result.error_mm)
-        top.set_ylabel("mm")
-        bottom.bar(at, result.error_deg)
-        bottom.set_ylabel("deg")
+        top.bar(at, result.error_mm, color=BLUE)
+        top.set_title("distance of the body, mm")
+        bottom.bar(at, result.error_deg, color=BLUE)
+        bottom.set_title("angle, deg")
         bottom.set_xlabel("pose")
+        bottom.xaxis.get_major_locator().set_params(integer=True)
         data = png(figure)
-    rows = [[text(key), text(value)] for key, value in summary.items() if not isinstance(value, list)]
-    weak = bullets(result.weak) if result.weak else ""
-    missed = bullets([*result.run.missed, *(f"{name}: no joint angles" for name in result.unpaired)])
+    *lines, _, following = summary_lines(summary, Path())
+    said = f'<div class="assessment"><p class="headline">{text(lines[1])}</p></div>\n'
+    said += bullets([*result.weak, lines[0], *lines[2:], f"board {summary['board']}", following])
+    outliers = [f"{name}: an outlier" for name in summary["outliers"]]
+    missed = [*result.run.missed, *(f"{name}: no joint angles" for name in result.unpaired), *outliers]
+    shown = picture(data, "error of each pose, mm and degrees")
     return html_page(
         "armsight run",
         f"{summary['arm']}: logged poses",
         "The arm was moved by another program; each pose is predicted by a fit to the others.",
         {
+            "result": ("Result", said),
             "errors": (
                 "Error of each pose left out of the fit",
-                weak + picture(data, "error of each pose, mm and degrees"),
+                f"<figure>{shown}<figcaption><p>Good: no pose stands out, and nothing drifts from the first to the last."
+                "</p></figcaption></figure>\n",
             ),
-            "summary": ("Summary", table(["", "value"], rows)),
-            "missed": ("Shots that were not used", missed),
+            "missed": ("Shots that were not used", bullets(missed or ["none"])),
         },
     )

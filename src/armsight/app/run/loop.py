@@ -34,7 +34,7 @@ from armsight.loop.estimators.smoothing import Interval
 from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health import HealthMonitor
 from armsight.robot.boards.codes import BoardState
-from armsight.vision.follow.follower import Follower
+from armsight.vision.follow.follower import Follower, measurer
 from armsight.vision.rig import Shutters
 from armsight.vision.shutter import Motion, TimedShot, measure_with_motion
 
@@ -164,6 +164,7 @@ _WRITE_EVERY_S = 0.1  # interval that is computed at once, after a command was s
 #: newest so many. Their errors are correlated for longer than that: the scatter about the cubic shows this share of them.
 _MOTION_S, _MOTION_NEWEST, _SCATTER_SHARE = 0.03, 100, 0.25
 _STOP_S = 0.3  # in which an interrupted motion comes to rest
+_FIXED_EVERY_S = 0.2  # in which fixed bodies are measured
 _LEAST_WAIT_S = 0.001  # for the board, even when the loop is late: a lost board is detected by a timeout
 
 
@@ -220,6 +221,11 @@ class Loop:
         self._frames = FrameClock()
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s)
         self._skew = Skew(follower.rig, setup.sync_s)
+        self.health.watch_fixed([each.body.name for each in setup.fixed])
+        self._measure_fixed = [measurer(follower.rig, each) for each in setup.fixed]
+        self._fixed_pool = ThreadPoolExecutor(1)
+        self._fixed_work: Future[None] | None = None
+        self._fixed_s = -np.inf
         # Of the fused track: the time up to which its intervals are noted, the time up to which it is computed, the noted
         # intervals that are not computed yet, and the first batch of readings that is not noted completely.
         self._noted_s = self._written_s = -np.inf
@@ -366,7 +372,8 @@ class Loop:
                 outcome = self.estimator.vision(measurement)
                 T_base_rig, T_base_tool = self.mounting.T_base_rig, measurement.T_base_tool
                 self.log.outcomes.append(outcome)
-        self.log.poses.append((shot.name, np.nan if shot.t_s is None else shot.t_s, result))
+        stamped_s = np.nan if shot.t_s is None else shot.t_s - self.estimator.clock_offset_s(shot.t_s)
+        self.log.poses.append((shot.name, stamped_s, result))
         self._datum = ShotDatum(
             shot,
             result,
@@ -391,7 +398,7 @@ class Loop:
         """Return the motion of the body about the exposure of a shot that is stamped ``t_s``; None where it is unknown."""
         if self.mounting is None or self.delay_s is None:
             return None
-        exposed_s = t_s - self.delay_s
+        exposed_s = t_s - self.delay_s - self.estimator.clock_offset_s(t_s)
         near = [live for live in self.log.live[-_MOTION_NEWEST:] if abs(live.t_s - exposed_s) <= _MOTION_S]
         if len(near) < 8:
             return None
@@ -479,6 +486,7 @@ class Loop:
         """Let a controller command the joints, period by period, until ``over`` returns True."""
         begin_s = self.t_s
         self.segment = replace(segment, begin_s=begin_s)
+        self._due = 0.0
         self._watch.forget()
         self._search = None
         try:
@@ -501,17 +509,40 @@ class Loop:
                         times_s = self.log.latency_s if self.follower.way == "followed" else self.log.search_s
                         times_s.append(time.perf_counter() - began)
                     self.on_shot(shot, result)
+                    self._look_at_fixed(shot)
                     self.health.work()
                 if self._noted_s - self._written_s >= _WRITE_EVERY_S:
                     self._write()
         finally:
             self.log.segments.append(replace(segment, begin_s=begin_s, end_s=self.t_s))
 
+    def _look_at_fixed(self, shot: Shot) -> None:
+        """Measure the fixed bodies in a shot, if it is time; on hardware in a thread."""
+        if not self._measure_fixed or self.t_s - self._fixed_s < _FIXED_EVERY_S:
+            return
+        if self._fixed_work is not None:
+            if not self._fixed_work.done():
+                return
+            self._fixed_work.result()
+        self._fixed_s = self.t_s
+
+        def look() -> None:
+            for row, measure in enumerate(self._measure_fixed):
+                if isinstance(measured := measure(shot), PoseEstimate):
+                    self.health.fixed_measured(row, measured, shot.t_s)
+
+        if self.setup.clock is None:
+            look()
+        else:
+            self._fixed_work = self._fixed_pool.submit(look)
+
     def _rest_of_period(self) -> float:
         """Return how long to wait for the next iteration, s: what the last one has left of its period."""
         if self.setup.clock is None:
             return PERIOD_S
         now = time.monotonic()
+        if self._due > 0.0:
+            self.health.period_began(self.t_s, now - self._due - PERIOD_S)
         self._due = max(self._due + PERIOD_S, now + _LEAST_WAIT_S)
         return self._due - now
 

@@ -20,6 +20,9 @@ from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3, from_euler_zyx
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Trajectory, circle, line, point_to_point
+from armsight.robot.trajectories.circle import TOO_SMALL, ArcPath
+from armsight.robot.trajectories.line import LinePath
+from armsight.robot.trajectories.resolved_rate import resolved_rate
 
 #: Five poses and home again, a straight line, a circle.
 DEFAULT_MOTION = Path(__file__).with_name("default_motion.toml")
@@ -27,9 +30,10 @@ DEFAULT_MOTION = Path(__file__).with_name("default_motion.toml")
 QUICK = Path(__file__).with_name("quick_motion.toml")
 _REST_S = 2.0
 _MOST = 1e9  # of any number; NaN is not below it
+_EACH = -1  # as many values as the arm has joints
 #: Kind -> its own keys with the number of values of each, and the keys that are required.
 _KINDS: dict[str, tuple[dict[str, int], tuple[str, ...]]] = {
-    "joints": ({"q_deg": 6}, ("q_deg",)),
+    "joints": ({"q_deg": _EACH}, ("q_deg",)),
     "home": ({}, ()),
     "line": ({"by_mm": 3, "rotation_deg": 3, "to_mm": 3, "euler_zyx_deg": 3}, ()),
     "circle": ({"center_mm": 3, "axis": 3, "angle_deg": 1}, ("center_mm", "axis")),
@@ -113,7 +117,8 @@ def _motion(where: str, arm: Arm, q: Array, entry: dict[str, Any], names: list[s
     for key in needed:
         if key not in entry:
             raise InputError(f"{where} ({kind}): {key} is missing")
-    values = {key: _numbers(where, entry[key], key, size) for key, size in known.items() if size and key in entry}
+    sizes = {key: arm.joints if size == _EACH else size for key, size in known.items()}
+    values = {key: _numbers(where, entry[key], key, size) for key, size in sizes.items() if size and key in entry}
     name = entry.get("name", f"{kind} {number}")
     if not isinstance(name, str) or not name or name in names:
         raise InputError(f"{where}: name is {name!r}; every motion needs a name of its own")
@@ -135,10 +140,24 @@ def _planned(
     if kind in ("joints", "home"):
         goal = arm.home if kind == "home" else np.radians(values["q_deg"])
         return point_to_point(arm, q, goal, duration_s=duration_s)
+    T = arm.forward(q)
     if kind == "line":
-        return line(arm, q, _line_goal(where, arm.forward(q), values), duration_s=duration_s)
+        goal = _line_goal(where, T, values)
+        if arm.joints < 6:  # the position on the line, the orientation as near as the joints can
+            return resolved_rate(arm, q, LinePath.between(T, goal), duration_s=duration_s)
+        return line(arm, q, goal, duration_s=duration_s)
     angle = float(np.radians(values["angle_deg"][0])) if "angle_deg" in values else 2 * np.pi
+    if arm.joints < 6:
+        return resolved_rate(arm, q, _arc(T, 1e-3 * values["center_mm"], values["axis"], angle), duration_s=duration_s)
     return circle(arm, q, 1e-3 * values["center_mm"], values["axis"], angle, duration_s=duration_s)
+
+
+def _arc(T_base_tool: Array, center_base: Array, axis: Array, angle_rad: float) -> ArcPath:
+    """Return the circle about an axis through a point, the tool's orientation kept."""
+    length, from_center = float(np.linalg.norm(axis)), T_base_tool[:3, 3] - center_base
+    if not np.linalg.norm(np.cross(axis, from_center)) > TOO_SMALL * max(length, TOO_SMALL):
+        raise InputError("axis is zero, or the tool is on the circle's axis: there is no circle to travel")
+    return ArcPath(T_base_tool, center_base, axis / length * angle_rad, np.zeros(3))
 
 
 def _line_goal(where: str, T_base_tool: Array, values: dict[str, Array]) -> Array:

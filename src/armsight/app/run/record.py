@@ -250,7 +250,8 @@ class Log:
         joints: readings of the potentiometers, batch by batch.
         fused: the estimated tool track, smoothed with measurements up to RECORD_LAG_S later, batch by batch.
         live: the estimate at the newest reading, iteration by iteration: what the loop uses.
-        poses: name, time stamp and pose of each shot (the cameras' skew in its covariance), or why there is none.
+        poses: name, time stamp (what a clock that was followed was off removed) and pose of each shot (the cameras' skew in
+            its covariance), or why there is none.
         outcomes: what the estimator did with each pose measurement: used, or rejected for which reason.
         commands: time and content of each command.
         modes: the basis of each command: planned, vision, bridged.

@@ -21,7 +21,8 @@ from armsight.data import Array, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.robot.arm import Arm
 from armsight.robot.boards.contract import MotionBoard
-from armsight.robot.boards.opening import EMULATED, emulator_name, open_motion_board
+from armsight.robot.boards.opening import EMULATED, emulator_name, open_motion_board, slowed
+from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import Composite
 from armsight.vision.sources import Source, open_source
 
@@ -98,6 +99,7 @@ class Setup:
         sync_s: standard deviation of the time between the two exposures of a shot, s.
         clock: converts times of the computer, which stamps the shots, to the board's; None in lock-step simulation, where
             shots are on the board's clock and time passes only in ``board.receive``.
+        fixed: bodies in view that do not move.
     """
 
     arm: Arm
@@ -108,6 +110,7 @@ class Setup:
     rate_hz: float
     sync_s: float
     clock: HostClock | None = None
+    fixed: tuple[Target, ...] = ()
 
 
 class LiveShots:
@@ -213,6 +216,16 @@ def require_joints(board: MotionBoard, name: str, arm: Arm) -> None:
             f"--board {name} has {board.abilities.joints} joints, --arm {arm.name} {len(arm.a)}: give the arm that is at"
             " the board (armsight arm list)"
         )
+
+
+def planned_for(arm: Arm, board: str) -> Arm:
+    """Return an arm whose motions its board of this name follows; in the workcell it stands where the cameras see it."""
+    if not board.startswith(EMULATED):
+        return slowed(arm, board)
+    from armsight.sim.workcell.controlled import CONTROLLED, standing
+
+    own = CONTROLLED.get(arm.name)
+    return standing(arm) if own is None else slowed(standing(arm), own.board)
 
 
 @contextlib.contextmanager

@@ -2,7 +2,7 @@
 
 Beside the messages of ``foxglove.py`` it holds every datum as JSON with all digits, on ``/armsight/shot``,
 ``/armsight/joints`` and ``/armsight/event``, from which ``armsight replay`` reads; and, as metadata, the rig file and the
-versions. A chunk is written out at least every half a second: if the process is killed, no more than that is missing.
+versions. What waits is written out at least every half a second: if the process is killed, no more than that is missing.
 
 foxglove-schemas-protobuf with mcap-protobuf-support is used, not foxglove-sdk: together 4 MB of Python against a binary of
 54 MB, for the same schemas.
@@ -22,6 +22,7 @@ import numpy as np
 from armsight import __version__
 from armsight.app.stream.datum import Datum, EventDatum, JointsDatum, NoteDatum, Published, ShotDatum, json_text
 from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove
+from armsight.app.stream.mcap_writer import McapWriter
 from armsight.app.stream.sink import Sink
 from armsight.data import Shot
 from armsight.errors import InputError
@@ -39,7 +40,6 @@ TOPICS: dict[type, str] = {
     JointsDatum: "/armsight/joints",
     EventDatum: "/armsight/event",
 }
-_CHUNK = 1 << 20
 #: A shot that is younger by its own stamp was stamped by a live camera, s.
 _LIVE_S = 10.0
 _SCHEMA = json.dumps({"type": "object"}).encode()
@@ -58,8 +58,6 @@ class McapSink(Sink):
 
     def __init__(self, path: Path, published: Published) -> None:
         require_foxglove("run.mcap", "record")
-        from mcap.writer import CompressionType, Writer
-
         super().__init__()
         self.path = path
         self._published, self._messages = published, Messages(published)
@@ -67,12 +65,9 @@ class McapSink(Sink):
             self._file: IO[bytes] = path.open("xb")
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror}") from None
-        # Images are compressed already: LZ4 passes over them fastest.
-        self._writer = Writer(self._file, chunk_size=_CHUNK, compression=CompressionType.LZ4)
-        self._writer.start(profile="", library="armsight")
+        self._writer = McapWriter(self._file, "armsight")
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
-        self._written = 0
         self._writer.add_metadata(METADATA, dict(published.properties))
         self._file.flush()
 
@@ -83,25 +78,24 @@ class McapSink(Sink):
             log_ns = nanoseconds(datum.arrival_s)
         stamp_ns = nanoseconds(datum.time_s)
         for topic, message in self._messages.of(datum):
-            self._add(self._channel(topic, message), log_ns, stamp_ns, message.SerializeToString())
+            self._writer.add_message(self._channel(topic, message), log_ns, stamp_ns, message.SerializeToString())
         if not isinstance(datum, NoteDatum):
             content: Mapping[str, Any] = (
                 datum.content if isinstance(datum, EventDatum) else datum.to_json(self._published.body)
             )
             channel = self._json_channel(TOPICS[type(datum)])
-            self._add(channel, log_ns, stamp_ns, json_text(content))
-
-    def _add(self, channel: int, log_ns: int, stamp_ns: int, data: bytes) -> None:
-        self._writer.add_message(channel, log_ns, data, stamp_ns)
+            self._writer.add_message(channel, log_ns, stamp_ns, json_text(content))
 
     def _channel(self, topic: str, message: Any) -> int:  # noqa: ANN401 - a protobuf message
         if topic not in self._channels:
-            from mcap_protobuf.schema import register_schema
+            from mcap_protobuf.schema import build_file_descriptor_set
 
             name = type(message).DESCRIPTOR.full_name
             if name not in self._schemas:
-                self._schemas[name] = register_schema(self._writer, type(message))
-            self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[name])
+                text = build_file_descriptor_set(type(message)).SerializeToString()
+                self._schemas[name] = self._writer.register_schema(name, "protobuf", text)
+            images = name == "foxglove.CompressedImage"
+            self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[name], images=images)
         return self._channels[topic]
 
     def _json_channel(self, topic: str) -> int:
@@ -112,9 +106,7 @@ class McapSink(Sink):
 
     def tick(self) -> None:
         """Write the chunk out: what is in it survives the end of the process."""
-        # The library ends a chunk by its size alone, and has no public way to end one by time.
-        self._writer._Writer__finalize_chunk()
-        self._file.flush()
+        self._writer.flush()
 
     def finish(self) -> None:
         """Write the index and close the file."""

@@ -9,6 +9,7 @@ from armsight.app.stream.igtl import open_igtl
 from armsight.app.stream.network import open_json_tcp, open_json_udp
 from armsight.app.stream.sink import Sink
 from armsight.app.stream.websocket import open_foxglove
+from armsight.app.stream.zenoh import open_ros2
 from armsight.errors import InputError
 
 #: Kind -> what opens the rest of the text; another kind is one line here.
@@ -17,6 +18,7 @@ STREAMS: dict[str, Callable[[str, Published], Sink]] = {
     "json+tcp": open_json_tcp,
     "json+udp": open_json_udp,
     "igtl": open_igtl,
+    "ros2": open_ros2,
 }
 
 

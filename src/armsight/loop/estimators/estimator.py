@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from armsight.data import Array, JointStates, Record
 
@@ -31,6 +31,20 @@ class PoseMeasurement(Record):
     T_base_tool: Array
     cov_noise: Array
     cov_common: Array
+
+
+class ClockEffect(NamedTuple):
+    """What an error of the camera's clock did to an innovation, as far as it is known.
+
+    Attributes:
+        offset_s: by how much the stamp was later than the filter took it to be, s.
+        in_z: (6,) what that made of the innovation, [m; rad]; the filter has adapted to it in part.
+        change: (K,) what was added to the filter's state as stamps were corrected; None where they are not.
+    """
+
+    offset_s: float
+    in_z: Array
+    change: Array | None
 
 
 class Outcome(Enum):
@@ -56,6 +70,7 @@ class Innovation(Record):
         kept: (K,) share of the state that was kept since the measurement before.
         gain: (K, 6) what of z was added to the state; zero where the measurement was rejected.
         outcome: what became of it.
+        clock: what is known of an error of the camera's clock; None where nothing is.
     """
 
     t_s: float
@@ -66,6 +81,7 @@ class Innovation(Record):
     kept: Array
     gain: Array
     outcome: Outcome
+    clock: ClockEffect | None = None
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from scipy.special import chdtri
 from armsight.data import Array, JointStates
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import Prior
+from armsight.loop.estimators.clock import ClockFollower
 from armsight.loop.estimators.errormodel import (
     LEARNING,
     ErrorModel,
@@ -59,10 +60,11 @@ class KalmanEstimator:
         arm: the arm, as its table says it is.
         prior: how far it may be off.
         delay: how late the camera's stamps are.
-        learns_delay: whether the delay is corrected, as far as its sigma allows. If not, only its sigma is used, and what
-            the model misses of the backlash cannot be taken for delay.
+        learns_delay: whether the delay is corrected, as far as its sigma allows. If not, its sigma is used, and what the
+            model misses of the backlash cannot be taken for delay; a clock that goes wrong is followed.
 
     Attributes:
+        clock: follows the camera's clock; None where the delay is learned.
         on_innovation: called with what became of each pose measurement that came in order of time.
     """
 
@@ -82,6 +84,7 @@ class KalmanEstimator:
         self._opened = opened(joints)
         self._states = [ErrorState(-np.inf, np.zeros(at.size), np.diag(self._model.sigmas**2), nowhere, None)]
         self.on_innovation: Callable[[Innovation], None] | None = None
+        self.clock = None if learns_delay else ClockFollower(at.size, at.delay, delay.sigma_s)
         self._waiting: list[PoseMeasurement] = []
         self._outliers: list[Array] = []
         self._backlash_set = True  # whether the readings have the newest estimate of the backlash
@@ -133,7 +136,7 @@ class KalmanEstimator:
         ):
             return Outcome.TOO_LATE
         later = self._states[row:]
-        after, outcome = self._take(before, pose_measurement, None if later else self.on_innovation)
+        after, outcome = self._take(before, pose_measurement, None if later else self._report)
         if after is None:
             return outcome
         self._states[row:] = [after]
@@ -219,7 +222,7 @@ class KalmanEstimator:
             now.unseen[0, 0],
             replace(
                 self._delay,
-                delay_s=self._delay.delay_s + float(x[self._at.delay]),
+                delay_s=self._delay_s(self.span_s[1], x),
                 sigma_s=float(sigma[self._at.delay]),
             ),
         )
@@ -237,13 +240,29 @@ class KalmanEstimator:
 
     def _seen_s(self, pose_measurement: PoseMeasurement, state: ErrorState) -> float:
         """Return the time of a measurement, s, by a state's estimate of the delay."""
-        return pose_measurement.t_s - self._delay.delay_s - float(state.x[self._at.delay])
+        return pose_measurement.t_s - self._delay_s(pose_measurement.t_s - self._delay.delay_s, state.x)
+
+    def clock_offset_s(self, t_s: float) -> float:
+        """Return by how much later than the delay says the camera's stamps are about a time, s; 0 while that is right."""
+        return 0.0 if self.clock is None else self.clock.offset_s(t_s)
+
+    def _delay_s(self, t_s: float, x: Array) -> float:
+        """Return how late stamps are about a time, s, by a state's vector."""
+        return self._delay.delay_s + float(x[self._at.delay]) + self.clock_offset_s(t_s)
+
+    def _report(self, innovation: Innovation) -> Array | None:
+        """Report what became of a measurement; return (size,) what a clock that is followed adds to the state, or None."""
+        used = innovation.outcome is not Outcome.OUTLIER
+        effect = self.clock.take(innovation) if used and self.clock is not None else None
+        if self.on_innovation is not None:
+            self.on_innovation(replace(innovation, clock=effect))
+        return None if effect is None else effect.change
 
     def _take(
         self,
         before: ErrorState,
         pose_measurement: PoseMeasurement,
-        report: Callable[[Innovation], None] | None = None,
+        report: Callable[[Innovation], Array | None] | None = None,
     ) -> tuple[ErrorState | None, Outcome]:
         """Return the state after a measurement, None where it is an outlier; report how it came about."""
         t_s = max(self._seen_s(pose_measurement, before), before.t_s)
@@ -271,7 +290,11 @@ class KalmanEstimator:
             PHt = P @ H.T
         x, P, K = self._update(x, P, joints, pose_measurement, first, PHt)
         if report is not None:
-            report(Innovation(t_s, pose_measurement.T_base_tool, z, S, H, step.kept[0], K, outcome))
+            change = report(Innovation(t_s, pose_measurement.T_base_tool, z, S, H, step.kept[0], K, outcome))
+            if change is not None and self.clock is not None:
+                x = x + change
+                by_delay = P[:, self._at.delay] / P[self._at.delay, self._at.delay]
+                P += (self.clock.sigma_s**2 - P[self._at.delay, self._at.delay]) * np.outer(by_delay, by_delay)
         return ErrorState(t_s, x, P, joints, pose_measurement), outcome
 
     def _innovation(self, x: Array, joints: Smoothed, pose_measurement: PoseMeasurement) -> tuple[Array, Array, Array]:

@@ -226,6 +226,9 @@ class ClosureWatch:
         self._delta *= innovation.kept
         e = innovation.z + innovation.by_state @ self._delta
         self._delta += innovation.gain @ innovation.z
+        if (clock := innovation.clock) is not None:
+            e = e - clock.offset_s * innovation.by_state[:, self._parts.delay]
+            self._delta += 0.0 if clock.change is None else clock.change
         block = self._block = self._block or _Block(innovation.t_s, self._parts.size)
         block.count += 1
         block.kept *= float(innovation.kept[self._parts.pose])
@@ -317,7 +320,10 @@ class ClosureWatch:
         begin_s = (self._t[finest.begin - 1] + self._t[finest.begin]) / 2
         change = Change(finest.suspect, begin_s, finest.size, finest.cov, finest.chi_square, effect, alike)
         shift = change.size if change.motion is None else change.motion.motion[:3]
-        if float(np.linalg.norm(shift)) > (_LEAST_RAD if change.motion is None else _LEAST_M):
+        # Once something was reported, what explains it best replaces it, also where it is smaller than is reported first.
+        if self.change is not None or float(np.linalg.norm(shift)) > (
+            _LEAST_RAD if change.motion is None else _LEAST_M
+        ):
             self.change = change
 
     def _refined(self, found: _Tested, begins: Array) -> _Tested:

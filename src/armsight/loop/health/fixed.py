@@ -102,7 +102,7 @@ class FixedWatch:
 
     def _add(self, innovation: Innovation) -> None:
         """Add an innovation to the sums of all beginnings."""
-        t_s, z = innovation.t_s, innovation.z
+        t_s, z = innovation.t_s, innovation.z if innovation.clock is None else innovation.z - innovation.clock.in_z
         passed = t_s - self._last_s
         if not passed > 0.0:
             return

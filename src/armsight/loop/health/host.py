@@ -1,7 +1,8 @@
-"""Shots that repeat the one before: a camera driver or a computer that delivers an old image as a new one.
+"""The computer: images that it delivers twice, and stalls of the control loop.
 
-In: measured poses with their detections. Out: a finding once so many shots repeat the one before to the last digit. The
-noise of a camera differs from image to image, so two images never have the same detections by chance.
+In: measured poses with their detections, and how late the periods of the loop begin. Out: a finding once so many shots
+repeat the one before to the last digit (the noise of a camera differs from image to image, so two images never have the
+same detections by chance), and once periods began so late that commands were missed.
 """
 
 from __future__ import annotations
@@ -13,15 +14,28 @@ from armsight.loop.health.record import HealthFinding
 
 #: So many repeated shots, and this share of all, are reported.
 _LEAST, _SHARE = 3, 0.01
+#: A period that begins so late, s, is a stall; so many are reported if they are this share of all periods, or a single one
+#: of so long, s: a board that hears nothing for so long stops its arm.
+_STALL_S, _STALLS, _STALLED_SHARE, _LONG_S = 0.02, 5, 0.01, 0.1
 
 
 class HostWatch:
-    """Watches for repeated images."""
+    """Watches for repeated images and stalls."""
 
     def __init__(self) -> None:
         self._last: tuple[Ids, Array] | None = None
         self._shots = self._repeated = 0
         self._first_s: float | None = None
+        self._stalls = self._periods = 0
+        self._longest_s, self._stalled_s = 0.0, 0.0
+
+    def began(self, t_s: float, late_s: float) -> None:
+        """Take by how much, s, a period of the control loop began late, at a time, s."""
+        self._periods += 1
+        if late_s > _STALL_S:
+            self._stalled_s = self._stalled_s if self._stalls else t_s
+            self._stalls += 1
+            self._longest_s = max(self._longest_s, late_s)
 
     def take(self, estimate: PoseEstimate, t_s: float) -> None:
         """Take a measured pose with the time of its shot, s, in order of time."""
@@ -36,6 +50,27 @@ class HostWatch:
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
+        return (*self._repetition(), *self._stalling())
+
+    def _stalling(self) -> tuple[HealthFinding, ...]:
+        """Return the finding of stalls, if there were."""
+        if self._stalls < max(_STALLS, _STALLED_SHARE * self._periods) and self._longest_s < _LONG_S:
+            return ()
+        times = "once" if self._stalls == 1 else f"{self._stalls} times"
+        return (
+            HealthFinding(
+                "host",
+                f"the computer stalled {times}, for {1e3 * self._longest_s:.0f} ms at most: commands were late",
+                self._stalled_s,
+                1e3 * self._longest_s,
+                0.0,
+                "ms",
+                "end other programs on this computer, or give the run a higher priority (chrt, nice)",
+            ),
+        )
+
+    def _repetition(self) -> tuple[HealthFinding, ...]:
+        """Return the finding of repeated shots, if there were."""
         if self._repeated < max(_LEAST, _SHARE * self._shots):
             return ()
         share = self._repeated / self._shots

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,12 @@ import numpy as np
 from armsight.data import Body, PoseEstimate
 from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement
 from armsight.loop.estimators.armerror import layout
+from armsight.loop.estimators.clock import ClockFollower
+from armsight.loop.health.clock import clock_findings
 from armsight.loop.health.closure import ClosureWatch
 from armsight.loop.health.fixed import BaseMotion, FixedWatch
 from armsight.loop.health.host import HostWatch
+from armsight.loop.health.landmarks import LandmarkWatch
 from armsight.loop.health.record import HealthFinding, Trust
 from armsight.loop.health.rig import RigWatch
 from armsight.robot.arm import Arm
@@ -33,12 +37,14 @@ class HealthMonitor:
     def __init__(self, rig: StereoRig, body: Body, sync_s: float) -> None:
         self._rig = RigWatch(rig, body, sync_s) if rig.cov.any() else None
         self._host = HostWatch()
+        self._landmarks: LandmarkWatch | None = None
         self._fixed: FixedWatch | None = None
         self._closure: ClosureWatch | None = None
         self._suspected = np.zeros((6, 6))  # what the newest tested shot adds to the covariance of a pose
         self._newest_s, self._doubted_s = 0.0, -np.inf
         self._poses: list[tuple[PoseEstimate, float | None]] = []
         self._innovations: list[Innovation] = []
+        self._clock: ClockFollower | None = None
 
     def received(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
         """Do as :meth:`measured` without the tests, which :meth:`work` makes: a command is waiting for the pose.
@@ -76,11 +82,29 @@ class HealthMonitor:
         if self._rig is not None:
             self._suspected = self._rig.take(pose, t_s)
 
+    def period_began(self, t_s: float, late_s: float) -> None:
+        """Take by how much, s, a period of the control loop began late, at a time, s."""
+        self._host.began(t_s, late_s)
+
+    def watch_fixed(self, names: Sequence[str]) -> None:
+        """Watch bodies in view that do not move, from now on."""
+        self._landmarks = LandmarkWatch(names)
+
+    def fixed_measured(self, row: int, pose: PoseEstimate, t_s: float | None) -> None:
+        """Take the measured pose of the fixed body of a row, in order of time, s (None: the shots have no times)."""
+        assert self._landmarks is not None
+        self._landmarks.take(row, pose, t_s)
+
+    @property
+    def fixed_never_seen(self) -> tuple[str, ...]:
+        """Names of the fixed bodies that were seen too rarely to say anything."""
+        return () if self._landmarks is None else self._landmarks.never_seen
+
     def follow(self, estimator: KalmanEstimator, arm: Arm) -> None:
         """Watch from now on, by what an estimator makes of the poses, whether rig, body and joints stay as they are."""
         self._fixed = FixedWatch(arm.T_base_0, layout(arm.joints).size)
         self._closure = ClosureWatch(estimator.sigmas, arm.joint_names)
-        self._innovations = []
+        self._innovations, self._clock = [], estimator.clock
         estimator.on_innovation = self._note
 
     def _note(self, innovation: Innovation) -> None:
@@ -93,7 +117,8 @@ class HealthMonitor:
     @property
     def trust(self) -> Trust:
         """How far a loop may rely on the measured poses now."""
-        if self.moved is not None or (self._rig is not None and self._rig.suspected is not None):
+        cameras_moved = self._landmarks is not None and self._landmarks.cameras_moved
+        if self.moved is not None or cameras_moved or (self._rig is not None and self._rig.wrong_at_rest):
             return Trust.NONE
         return Trust.DOUBTED if self._newest_s - self._doubted_s < DOUBT_S else Trust.FULL
 
@@ -117,4 +142,13 @@ class HealthMonitor:
         slow = () if self._closure is None else self._closure.findings()
         # The closure knows more causes than the innovations within a second, and sizes them better.
         fast = () if self._fixed is None or slow else self._fixed.findings()
-        return (*(() if self._rig is None else self._rig.findings()), *slow, *fast, *self._host.findings())
+        late = () if self._clock is None else clock_findings(self._clock, self._newest_s)
+        seen = () if self._landmarks is None else self._landmarks.findings()
+        return (
+            *(() if self._rig is None else self._rig.findings()),
+            *slow,
+            *fast,
+            *seen,
+            *late,
+            *self._host.findings(),
+        )

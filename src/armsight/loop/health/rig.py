@@ -1,16 +1,18 @@
-"""Cameras that moved against each other, and a body of another size: found in the residuals of the measured poses.
+"""Cameras that moved against each other or expose late, a body of another size: found in the residuals of measured poses.
 
-In: measured poses with the detections they came from. Out: an estimate of six numbers that a calibration fixes: the five
+In: measured poses with the detections they came from. Out: an estimate of seven numbers that a calibration fixes: the five
 degrees of freedom of the right camera's pose in the left one that do not change the scale (rotation, and translation across
-the baseline), and the scale of body over baseline. Model of a shot's residuals, in standard deviations:
+the baseline), the scale of body over baseline, and the skew: by how much the right camera exposes later than is known.
+Model of a shot's residuals, in standard deviations:
 
     r = A dT + B x + S e + D f + n,    x ~ N(0, rig.cov),  e ~ N(0, tolerance),  n ~ N(0, s^2)
 
 with dT the pose, which is eliminated shot by shot; x the calibration's own error and e the shape of the body, which all
-shots share; f the six numbers, zero while all is well. The information of the shots is summed, weighted down with age, and
-f is estimated with x and e eliminated (generalised least squares); chi-square of f against zero is the test. The part of r
+shots share; f the seven numbers, zero while all is well. The information of the shots is summed, weighted down with age; f
+is estimated with x and e eliminated (generalised least squares); chi-square of f against zero is the test. The part of r
 that needs no body is the epipolar distance; the rest says what the body's known shape does. Size of body and length of
-baseline have the same effect: which of them is wrong cannot be distinguished.
+baseline have the same effect: which of them is wrong cannot be distinguished. The skew shows in the detections of the right
+camera by the body's motion between the shots; each shot has a skew of its own besides, of a known standard deviation.
 """
 
 from __future__ import annotations
@@ -18,15 +20,18 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtri
 
-from armsight.data import Array, Body, PoseEstimate, Record
+from armsight.data import Array, Body, Ids, PoseEstimate, Record
 from armsight.loop.health.record import HealthFinding, alarm_limit
 from armsight.vision.posefit import PixelObservations, fit_pose, whitened
 from armsight.vision.rig import StereoRig
+
+Part = Literal["rig", "body", "time"]
 
 #: Tolerance of a body that was built and measured with care: of each point, m, and of its scale.
 SHAPE_M, SCALE = 5e-5, 3e-4
@@ -37,18 +42,26 @@ MOST_POINTS = 24
 _SAME = 0.01
 #: While nothing is suspected, shots closer in time than this are left out, s: they would cost time and add little.
 _LEAST_S = 0.025
-#: Fewer points than this say nothing of six numbers; shots further apart in time than this give no speed, s.
+#: Fewer points than this say nothing of these numbers; shots further apart in time than this give no speed, s.
 _LEAST_POINTS, _APART_S = 4, 0.5
 #: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
 TEST_S, TEST_SHOTS, FORGET_TESTS = 1.0, 60, 30.0
+#: In so many tests after an alarm what was before the change is dropped; it began at most so many tests before the alarm.
+_FRESH, _BEFORE = 6, 3
 #: Tests that are kept, to find since when.
 _KEPT = 600
-#: A prior so wide that it decides nothing: m, rad, scale.
-_WIDE = np.array([0.1, 0.1, 1.0, 1.0, 1.0, 1.0])
-#: A part of the six counts as necessary beyond this chance.
+#: A prior so wide that it decides nothing: m, rad, scale, s.
+_WIDE = np.array([0.1, 0.1, 1.0, 1.0, 1.0, 1.0, 0.1])
+#: A change matters that moves a pose by so many of its claimed sigmas, in any direction.
+_MATTERS = 2.0
+#: A part of the seven counts as necessary beyond this chance.
 _NECESSARY = 1e-4
-_ROTATIONS, _SCALED = slice(2, 5), 5
-_ALARM = alarm_limit(6, 1.0 / TEST_S)
+_ROTATIONS, _SCALED, _SKEWED = slice(2, 5), 5, 6
+#: What may be wrong, and its part of the seven numbers.
+_PARTS: dict[Part, slice] = {"rig": slice(0, 5), "body": slice(5, 6), "time": slice(6, 7)}
+_ALARM = alarm_limit(len(_WIDE), 1.0 / TEST_S)
+#: Chi-square from which on a change that matters widens the poses: chance exceeds it in one of fifty tests.
+_SUSPECTED = float(chdtri(len(_WIDE), 0.02))
 
 
 class ResidualSums:
@@ -68,24 +81,25 @@ class ResidualSums:
 
 @dataclass(frozen=True, eq=False)
 class RigChange(Record):
-    """An estimate of the six numbers.
+    """An estimate of the seven numbers.
 
     Attributes:
-        f: (6,) translation of the right camera across the baseline (2), m, its rotation about its own axes (3), rad, both
-            as tangents of T_left_right on the right; size of the body over that of its file, less 1.
-        cov: (6, 6) its covariance.
-        chi_square: of all six against zero.
-        rig_alone: the same of the first five alone, with the body right.
-        scale_alone: of the last alone, with the pose of the cameras right.
-        gained: sum of squares that the six explain.
+        f: (7,) translation of the right camera across the baseline (2), m, its rotation about its own axes (3), rad, both
+            as tangents of T_left_right on the right; size of the body over that of its file, less 1; by how much the right
+            camera exposes later than is known, s.
+        cov: (7, 7) its covariance.
+        chi_square: of all against zero.
+        alone: the same of each part alone, with the others right.
+        without: the same of the others.
+        gained: sum of squares that the seven explain.
         left: sum of squares that nothing explains.
     """
 
     f: Array
     cov: Array
     chi_square: float
-    rig_alone: float
-    scale_alone: float
+    alone: dict[Part, float]
+    without: dict[Part, float]
     gained: float
     left: float
 
@@ -99,19 +113,22 @@ class RigWatch:
         sync_s: standard deviation of the time between the two exposures of a shot, s.
 
     Attributes:
-        prior: (K, K) square root of the covariance of all parameters: the rig's, scale and points of the body.
-        suspected: the change that the newest test found: significant, and moving the pose by more than its sigma; or None.
+        prior: (K, K) square root of the covariance of all parameters: the rig's, scale and points of the body, skew. The
+            skew's is zero: what is not known of it is one of the seven numbers.
+        suspected: the change that the newest test found, where it matters and is more likely than not; it widens poses.
+        alarm: whether the newest test found one that is certain.
+        alarmed: whether any did.
     """
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float) -> None:
         self._rig, self._body, self._sync_s = rig, body, sync_s
         self._points = np.unique(np.linspace(0, len(body.points) - 1, MOST_POINTS).astype(int))
         count, shape = rig.parameter_count, 3 * len(self._points)
-        self._size = count + 1 + shape
+        self._size = count + 1 + shape + 1
         self.prior = np.zeros((self._size, self._size))
         values, vectors = np.linalg.eigh(rig.cov)
         self.prior[:count, :count] = vectors * np.sqrt(np.maximum(values, 0.0))
-        rest = np.arange(count, self._size)
+        rest = np.arange(count, self._size - 1)
         self.prior[rest, rest] = np.append(SCALE, np.full(shape, SHAPE_M))
         self._by_fault = _fault_directions(rig, self._size)
         self._stay: ResidualSums | None = None
@@ -120,11 +137,12 @@ class RigWatch:
         self._row_of[self._points] = np.arange(len(self._points))
         self._last = (-np.inf, np.eye(4))
         self._began: Array | None = None
-        self._effect = (np.zeros((3, 6)), 0.0)
+        self._effect = (np.zeros((6, len(_WIDE))), np.eye(6))
         self._test, self._window = ResidualSums(self._size, 0.0), ResidualSums(self._size, 0.0)
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
         self._timed = False
-        self._alarmed = False
+        self.alarm = self.alarmed = False
+        self._alarms = 0  # in a row
         self.suspected: RigChange | None = None
 
     def take(self, estimate: PoseEstimate, t_s: float | None) -> Array:
@@ -146,7 +164,7 @@ class RigWatch:
         if found is None:
             return np.zeros((6, 6))
         sums, by_fault = found
-        self._effect = (by_fault[:3], float(np.trace(estimate.cov[:3, :3])))
+        self._effect = (by_fault, estimate.cov)
         self._sum(sums, estimate.T_left_body, now_s)
         if self.suspected is None:
             return np.zeros((6, 6))
@@ -172,7 +190,7 @@ class RigWatch:
         return self._test, stays
 
     def _residuals(self, estimate: PoseEstimate, now_s: float) -> tuple[ResidualSums, Array] | None:
-        """Return the sums of one shot, its pose eliminated, and the derivative (6, 6) of the pose by the six numbers."""
+        """Return the sums of one shot, its pose eliminated, and the derivative (6, 7) of the pose by the seven numbers."""
         seen, rig, points = estimate.points.seen, self._rig, self._body.points
         good = np.zeros(len(points), bool)
         good[estimate.points.ids] = True
@@ -195,27 +213,30 @@ class RigWatch:
         rest[:, count] = (by_point @ points[ids][:, :, None]).ravel()
         columns = count + 1 + 3 * np.repeat(self._row_of[ids], 2)
         rest[np.arange(n)[:, None], columns[:, None] + np.arange(3)] = A[:, :3]
+        # What the body's motion of a second does to the right image: one of a later exposure.
+        late = A @ self._velocity(estimate.T_left_body, now_s)
+        late.reshape(-1, 2, 2)[:, 0] = 0.0  # of the right camera alone
+        rest[:, self._size - 1] = late
         rest[:, -1] = (W @ fit.residuals_px[:, :, None]).ravel()
         gain = np.linalg.solve(A.T @ A, A.T @ rest)
         rest -= A @ gain
-        late = A @ self._skew(estimate.T_left_body, now_s)
-        late.reshape(-1, 2, 2)[:, 0] = 0.0  # of the right camera alone
+        late *= self._sync_s
         along, k2 = late @ rest, float(late @ late) - float((A.T @ late) @ np.linalg.solve(A.T @ A, A.T @ late))
-        # The skew, of variance 1, is eliminated (Sherman and Morrison).
+        # The shot's own skew, of variance 1, is eliminated (Sherman and Morrison).
         whole = rest.T @ rest - np.outer(along, along) / (1.0 + k2)
         sums = ResidualSums(self._size, now_s)
         sums.H, sums.b, sums.square, sums.freedom = whole[:-1, :-1], whole[:-1, -1], float(whole[-1, -1]), n - 6.0
         return sums, -gain[:, :-1] @ self._by_fault
 
-    def _skew(self, T: Array, now_s: float) -> Array:
-        """Return how far the body moves (6,) in one sigma of the time between the exposures; zero where it is unknown."""
+    def _velocity(self, T: Array, now_s: float) -> Array:
+        """Return the velocity (6,) of the body between the shot before and this one, 1/s; zero where it is unknown."""
         before_s, before = self._last
         if not self._timed or not 0.0 < now_s - before_s < _APART_S:
             return np.zeros(6)
         R = before[:3, :3].T @ T[:3, :3]  # by a small angle
         rotation = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-        shift = before[:3, :3].T @ (T[:3, 3] - before[:3, 3])
-        return np.asarray(np.concatenate([shift, rotation]) * (self._sync_s / (now_s - before_s)))
+        shift = T[:3, :3].T @ (T[:3, 3] - before[:3, 3])
+        return np.asarray(np.concatenate([shift, rotation]) / (now_s - before_s))
 
     def _sum(self, sums: ResidualSums, T: Array, now_s: float) -> None:
         """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
@@ -249,50 +270,80 @@ class RigWatch:
         self._window.add(self._test, 1.0)
         self._test = ResidualSums(self._size, 0.0)
         change = self._estimated(self._window)
-        alarm = change.chi_square > _ALARM and self._matters(change, slice(0, 6))
-        self.suspected = change if alarm else None
-        self._alarmed = self._alarmed or alarm
+        alarm = change.chi_square > _ALARM and self._matters(change, slice(None))
+        self._alarms = self._alarms + 1 if alarm else 0
+        if 0 < self._alarms <= _FRESH:
+            change = self._begun(change)
+        self.suspected = (
+            change if alarm or (change.chi_square > _SUSPECTED and self._matters(change, slice(None))) else None
+        )
+        self.alarm, self.alarmed = alarm, self.alarmed or alarm
+
+    def _begun(self, change: RigChange) -> RigChange:
+        """Return the change estimated from its beginning on; drop what was before."""
+        count = self._alarms + _BEFORE
+        if len(self._history) <= count:
+            return change
+        self._window, change = self._split(list(self._history)[-count:])
+        return change
+
+    @property
+    def wrong_at_rest(self) -> bool:
+        """Whether what is suspected makes poses wrong also where nothing moves."""
+        return self.alarm and self.suspected is not None and self._to_blame(self.suspected) != ["time"]
 
     def _matters(self, change: RigChange, part: slice) -> bool:
-        """Return whether a part of the six numbers moves the newest pose by more than the claimed sigma of its position."""
-        by_fault, variance = self._effect
+        """Return whether a part of the seven numbers moves the newest pose by so many of its sigmas."""
+        by_fault, cov = self._effect
         shift = by_fault[:, part] @ change.f[part]
-        return float(shift @ shift) > variance
+        return float(shift @ np.linalg.solve(cov, shift)) > _MATTERS**2
 
     def _estimated(self, sums: ResidualSums) -> RigChange:
-        """Return the six numbers from sums, everything else eliminated."""
+        """Return the seven numbers from sums, everything else eliminated."""
         L, F = self.prior, self._by_fault * _WIDE
         LH = L.T @ sums.H
         inner = cho_factor(LH @ L + np.eye(self._size))
         across, right = LH @ F, L.T @ sums.b
         solved, from_right = cho_solve(inner, across), cho_solve(inner, right)
-        S = F.T @ sums.H @ F - across.T @ solved + np.eye(6)
+        S = F.T @ sums.H @ F - across.T @ solved + np.eye(len(_WIDE))
         s = F.T @ sums.b - solved.T @ right
         square = sums.square - float(right @ from_right)
         f = np.linalg.solve(S, s)
         # What the model leaves unexplained widens the noise (Birge ratio); it never narrows it.
         excess = max((square - float(s @ f)) / max(sums.freedom, 1.0), 1.0)
-        alone = [float(s[part] @ np.linalg.solve(S[part, part], s[part])) for part in (slice(0, 5), slice(5, 6))]
+
+        def explained(rows: Ids) -> float:
+            return float(s[rows] @ np.linalg.solve(S[np.ix_(rows, rows)], s[rows])) / excess
+
+        every = np.arange(len(_WIDE))
+        alone = {part: explained(every[rows]) for part, rows in _PARTS.items()}
+        without = {part: explained(np.delete(every, rows)) for part, rows in _PARTS.items()}
         cov = excess * np.linalg.inv(S) * np.outer(_WIDE, _WIDE)
         gained = float(s @ f)
-        chi_squares = (gained / excess, alone[0] / excess, alone[1] / excess)
-        return RigChange(_WIDE * f, cov, *chi_squares, gained, square - gained)
+        return RigChange(_WIDE * f, cov, gained / excess, alone, without, gained, square - gained)
 
     def _since(self) -> tuple[float, RigChange]:
         """Return since when there is a change, on the clock of the shots, and the change estimated from then on.
 
-        It is the beginning that leaves least unexplained: with the six numbers zero before it, and estimated after it.
+        It is the beginning that leaves least unexplained: with the seven numbers zero before it, and estimated after it.
         """
+        sums, change = self._split(list(self._history))
+        return sums.begin_s, change
+
+    def _split(self, tests: Sequence[ResidualSums]) -> tuple[ResidualSums, RigChange]:
+        """Return the sums of the tests after the beginning of a change, and the change estimated from them."""
         after, found, least = ResidualSums(self._size, 0.0), None, np.inf
         before = ResidualSums(self._size, 0.0)
-        for sums in self._history:
+        for sums in tests:
             before.add(sums, 1.0)
-        for sums in reversed(self._history):
+        for sums in reversed(tests):
             after.add(sums, 1.0)
             before.add(sums, -1.0)
             change, none = self._estimated(after), self._estimated(before)
             if change.left + none.left + none.gained < least:
-                least, found = change.left + none.left + none.gained, (sums.begin_s, change)
+                least = change.left + none.left + none.gained
+                found = ResidualSums(self._size, sums.begin_s), change
+                found[0].add(after, 1.0)
         assert found is not None
         return found
 
@@ -300,19 +351,24 @@ class RigWatch:
         """Return what was found so far: nothing where no test gave an alarm."""
         self._close_stay()
         self._decide()
-        if not self._alarmed:
+        if not self.alarmed:
             return ()
         began_s, change = self._since()
         since_s = began_s if self._timed else None
-        rig_more, scale_more = change.chi_square - change.scale_alone, change.chi_square - change.rig_alone
-        rig_needed = rig_more > chdtri(5, _NECESSARY) and self._matters(change, slice(0, 5))
-        scale_needed = scale_more > chdtri(1, _NECESSARY) and self._matters(change, slice(5, 6))
-        found = []
-        if rig_needed or (not scale_needed and change.rig_alone >= change.scale_alone):
-            found.append(_rig_finding(change, since_s, alone=not rig_needed))
-        if scale_needed or (not rig_needed and change.scale_alone > change.rig_alone):
-            found.append(_scale_finding(change, since_s, alone=not scale_needed))
-        return tuple(found)
+        parts = self._to_blame(change)
+        return tuple(
+            _FINDINGS[part](change, since_s, len(parts) == 1 and not self._needed(change, part)) for part in parts
+        )
+
+    def _needed(self, change: RigChange, part: Part) -> bool:
+        """Return whether the other parts do not explain what was found."""
+        rows = _PARTS[part]
+        more = change.chi_square - change.without[part]
+        return more > chdtri(rows.stop - rows.start, _NECESSARY) and self._matters(change, rows)
+
+    def _to_blame(self, change: RigChange) -> list[Part]:
+        """Return the parts that are needed to explain a change; where none is, the one that explains most alone."""
+        return [part for part in _PARTS if self._needed(change, part)] or [max(_PARTS, key=change.alone.__getitem__)]
 
 
 def free_directions(rig: StereoRig) -> Array:
@@ -325,10 +381,10 @@ def free_directions(rig: StereoRig) -> Array:
 
 
 def _fault_directions(rig: StereoRig, size: int) -> Array:
-    """Return (size, 6) what a unit of each of the six numbers changes of the parameters."""
-    by_fault = np.zeros((size, 6))
+    """Return (size, 7) what a unit of each of the seven numbers changes of the parameters."""
+    by_fault = np.zeros((size, len(_WIDE)))
     by_fault[: rig.parameter_count, :5] = free_directions(rig)
-    by_fault[rig.parameter_count, _SCALED] = 1.0
+    by_fault[rig.parameter_count, _SCALED] = by_fault[-1, _SKEWED] = 1.0
     return by_fault
 
 
@@ -339,7 +395,7 @@ def _differ(T: Array, other: Array) -> bool:
     return apart > _SAME * abs(float(T[2, 3])) or cosine < np.cos(_SAME)
 
 
-def _rig_finding(change: RigChange, since_s: float | None, *, alone: bool) -> HealthFinding:
+def _rig_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:
     """Return the finding of cameras that moved against each other."""
     rotation = change.f[_ROTATIONS]
     size = float(np.linalg.norm(rotation))
@@ -359,7 +415,7 @@ def _rig_finding(change: RigChange, since_s: float | None, *, alone: bool) -> He
     )
 
 
-def _scale_finding(change: RigChange, since_s: float | None, *, alone: bool) -> HealthFinding:
+def _scale_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:
     """Return the finding of a body of another size, or a baseline of another length."""
     size, sigma = 100.0 * float(change.f[_SCALED]), 100.0 * float(np.sqrt(change.cov[_SCALED, _SCALED]))
     unsure = "; a rotation of one camera cannot be excluded" if alone else ""
@@ -373,3 +429,22 @@ def _scale_finding(change: RigChange, since_s: float | None, *, alone: bool) -> 
         "%",
         "measure the distances on the body with calipers; if they agree with its file, calibrate the rig again",
     )
+
+
+def _skew_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:
+    """Return the finding of cameras that do not expose when they are said to."""
+    size, sigma = 1e3 * float(change.f[_SKEWED]), 1e3 * float(np.sqrt(change.cov[_SKEWED, _SKEWED]))
+    unsure = "; a rotation of one camera cannot be excluded" if alone else ""
+    return HealthFinding(
+        "time",
+        f"the right camera exposes {abs(size):.2f} ms {'later' if size > 0 else 'earlier'} than is known, against the left "
+        f"one{unsure}",
+        since_s,
+        size,
+        sigma,
+        "ms",
+        "trigger both cameras together; in a recording --skew find moves the detections to one time",
+    )
+
+
+_FINDINGS = {"rig": _rig_finding, "body": _scale_finding, "time": _skew_finding}

@@ -131,6 +131,8 @@ PLENTY = 10
 #: A bearing's friction holds a link inside its backlash against gravity with up to about this lever, m: some per cent of
 #: the lever of such arms' links, as a bearing's friction is some per cent of its load. Over half of it the backlash closes.
 FRICTION_M = 2e-3
+#: Against gravity, of an arm that stands upright.
+UP = np.array([0.0, 0.0, 1.0])
 #: Kinds that make up the curve of a joint's sensor: functions of its reading.
 SENSOR = ("gain", "wave", "ripple")
 #: Beyond the range of readings that the poses have shown, a sensor's curve fades over so much, rad. Over more, a fast
@@ -246,6 +248,16 @@ def _gravity_lever(arm: Arm, levers: Array, joint: int) -> Array:
         np.cumsum(mass[::-1])[::-1] - 0.5 * mass
     )  # carried by a link's vector: half of its own mass, and all after it
     return np.asarray(levers[:, joint, joint:] @ beyond / mass.sum())
+
+
+def gravity_levers(arm: Arm, q: Array, up_base: Array = UP) -> Array:
+    """Return the levers (N, n), m, of the gravity load beyond each joint at joint angles (N, n), rad.
+
+    For links that are rods of one mass per metre; positive where the load pulls to larger angles. ``up_base`` is the unit
+    vector against gravity, base.
+    """
+    levers = _levers(arm, q, up_base)
+    return np.stack([_gravity_lever(arm, levers, joint) for joint in range(arm.joints)], axis=1)
 
 
 def _side(lever: Array, approach: Array | None, joint: int) -> Array:

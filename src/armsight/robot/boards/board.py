@@ -32,7 +32,16 @@ from armsight.robot.boards.configuration import (
 )
 from armsight.robot.boards.contract import Abilities
 from armsight.robot.boards.link import Link
-from armsight.robot.boards.reports import BoardStatus, JointReport, Welcome, joints_of, status_of, welcome_of
+from armsight.robot.boards.reports import (
+    BoardStatus,
+    JointReport,
+    SensorReadings,
+    Welcome,
+    joints_of,
+    readings_of,
+    status_of,
+    welcome_of,
+)
 from armsight.robot.boards.wire import Message, Wire
 
 #: A board that sends nothing for so long is gone: its slowest message comes every few hundredths of a second.
@@ -72,6 +81,8 @@ class Session:
         self._reaction = ""
         self._greeting: Message | None = None
         self._parts: dict[int, bytes] = {}
+        self._sensed: list[tuple[Message, float]] = []
+        self._answers: dict[int, int] = {}
 
     def open(self) -> None:
         """Say hello and wait for the first telemetry.
@@ -95,6 +106,29 @@ class Session:
         """Return the readings since the last call: time, s, and six angles, rad, each."""
         taken, self._angles = self._angles, []
         return taken
+
+    def take_sensed(self) -> SensorReadings:
+        """Return what the converters read since the last call, where the board was asked for it."""
+        taken, self._sensed = self._sensed, []
+        return readings_of([message for message, _ in taken], [t_s for _, t_s in taken])
+
+    def command_long(self, kind: int, param1: float, param2: float = 0.0) -> None:
+        """Send one of MAVLink's own commands until the board answers it.
+
+        Raises:
+            DeviceError: it rejects it, or does not answer.
+        """
+        self._answers.clear()
+        for _ in range(_HELLOS):
+            with self.reached() as wire:
+                wire.command_long(kind, param1, param2)
+            for _ in range(_STEPS):
+                self.pump(STEP_S)
+                if (result := self._answers.get(kind)) is not None:
+                    if result:
+                        raise DeviceError(f"{self.name} rejected MAVLink command {kind} with result {result}")
+                    return
+        raise DeviceError(f"{self.name} does not answer MAVLink command {kind}")
 
     def pump(self, wait_s: float) -> None:
         """Let ``wait_s`` pass and take the messages that come."""
@@ -133,6 +167,10 @@ class Session:
             self._take_status(status_of(message, self._time_s(message.tick)))
         elif kind == "WELCOME":
             self._greeting = message
+        elif kind == "SENSED":
+            self._sensed.append((message, self._time_s(message.tick)))
+        elif kind == "COMMAND_ACK":
+            self._answers[message.command] = message.result
         elif kind == "CONFIG_PART":
             self._parts[message.offset] = bytes(message.bytes[: message.length])
 
@@ -206,6 +244,8 @@ _LONGEST_TICKS = 10000
 _STOPS = 3
 _STORE_S = 3.0  # a flash memory takes its time
 _PART = 200  # bytes of a CONFIG_PART
+_SET_MESSAGE_INTERVAL, _REBOOT = 511, 246  # MAV_CMD_
+_SLOW_ANGLES_US = 20000
 
 
 class Board:
@@ -343,6 +383,38 @@ class Board:
         taken = self._session.take_angles()
         t_s = np.array([t for t, _ in taken])
         return JointStates(t_s, np.array([q for _, q in taken], dtype=float).reshape(-1, JOINTS))
+
+    def watch_sensors(self, every_s: float) -> None:
+        """Let the board report so often what its converters read; 0 ends it. :meth:`sensed` returns it.
+
+        Raises:
+            DeviceError: it does not answer.
+        """
+        ask = self._session.command_long
+        ask(_SET_MESSAGE_INTERVAL, dialect().MAVLINK_MSG_ID_SENSED, 1e6 * every_s)
+        # Both at full rate would fill the wire.
+        ask(_SET_MESSAGE_INTERVAL, dialect().MAVLINK_MSG_ID_ANGLES, _SLOW_ANGLES_US if every_s else 0)
+
+    def sensed(self, wait_s: float = 0.0) -> SensorReadings:
+        """Let ``wait_s`` pass and return what the converters read since the last call.
+
+        Raises:
+            DeviceError: the board is gone or has restarted.
+        """
+        self._session.pump(wait_s)
+        self._session.take_angles()
+        return self._session.take_sensed()
+
+    def restart(self) -> None:
+        """Start the board anew, with the drives off, and say hello again: what was stored is in use from now on.
+
+        Raises:
+            DeviceError: the drives are on, or it does not come back.
+        """
+        self._session.command_long(_REBOOT, 1)
+        session = Session(self._link, self._session.name)
+        session.open()
+        self._session, self.welcome, self._sequence = session, session.welcome, 0
 
     def soft_limits(self) -> tuple[Array, Array]:
         """Return the soft limits (6,) of its configuration, rad."""

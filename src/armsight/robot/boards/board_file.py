@@ -49,7 +49,7 @@ def entries(config: Configuration) -> Iterator[tuple[str, Any]]:
     for name in CONFIG.names or ():
         if name != "joint":
             yield f"arm.{name}", config[name].item()
-    for j in range(JOINTS):
+    for j in range(int(config["joint_count"])):
         yield from _of(config["joint"][j], f"joint.{j + 1}", config["joint"][j]["pot"])
 
 
@@ -102,7 +102,10 @@ def read_configuration(path: Path) -> tuple[Configuration, str]:
         )
     given = dict(_flat({name: value for name, value in data.items() if name not in ("version", "board")}))
     config = np.zeros((), CONFIG)
-    config["joint"]["pot"]["node_count"] = 2
+    count = given.get("arm.joint_count")
+    if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= JOINTS:
+        raise InputError(f"{path}: arm.joint_count is {count!r}; 1 to {JOINTS} is needed: the joints the arm has")
+    config["joint_count"], config["joint"]["pot"]["node_count"][:count] = count, 2
     known = dict(entries(config))
     for name in given:
         if name not in known:

@@ -24,7 +24,7 @@ from armsight.robot.boards.tuning import MotorFigures, tuned_gains
 Configuration = NDArray[np.void]
 JOINTS, POT_NODES = 6, 9
 #: Layout of the configuration this armsight knows: ``firmware/core/config.h``.
-CONFIG_VERSION = 2
+CONFIG_VERSION = 3
 
 GAINS = np.dtype(
     [
@@ -77,6 +77,7 @@ JOINT = np.dtype(
 CONFIG = np.dtype(
     [
         ("joint", JOINT, JOINTS),
+        ("joint_count", "<u4"),
         ("supply_min_mv", "<u4"),
         ("supply_max_mv", "<u4"),
         ("supply_nominal_mv", "<u4"),
@@ -130,6 +131,7 @@ _JOINT_RANGES = {
     "stall_rad": (1e-4, 1.0),
 }
 _ARM_RANGES = {
+    "joint_count": (1, JOINTS),
     "supply_nominal_mv": (1000, 100000),
     "supply_ticks": (1, 1000),
     "pot_ticks": (1, 100),
@@ -152,7 +154,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
 }
 
 #: The simulated arm's motors (:mod:`armsight.sim.joints`), and how stiffly they are driven.
-_LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S = MotorFigures(6.0, 2.4, 0.03, 0.02, 0.2), 12.0, 40.0
+_LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S = MotorFigures(6.0, 2.4, 0.03, 0.02, 0.2), 12.0, 36.0
 
 
 def lab_configuration() -> Configuration:
@@ -174,7 +176,7 @@ def lab_configuration() -> Configuration:
         "jerk_rad_s3": 1000.0,
         "gravity_slew_per_s": 5.0,
         "duty_limit": 0.8,
-        "duty_slew_per_s": 50.0,
+        "duty_slew_per_s": 500.0,
         "current_cut_per_a_s": 5.0,
         "following_rad": 0.3,
         "stall_duty": 0.5,
@@ -184,6 +186,7 @@ def lab_configuration() -> Configuration:
     }
     for name, value in values.items():
         joint[name] = value
+    config["joint_count"] = JOINTS
     config["supply_min_mv"], config["supply_max_mv"], config["supply_ticks"] = 10000, 14000, 5
     config["supply_nominal_mv"], config["overload_ticks"] = round(1e3 * _LAB_SUPPLY_V), 200
     config["pot_ticks"], config["following_ticks"], config["stall_ticks"] = 5, 20, 200
@@ -197,8 +200,8 @@ def gains_array(config: Configuration) -> Array:
     return np.stack([gains[name].astype(float) for name in GAIN_RANGES], axis=1)
 
 
-def check_gains(gains: Array) -> Array:
-    """Return a gain set as an array (6, 8), a row per joint; an error names the gain and the joint.
+def check_gains(gains: Array, count: int = JOINTS) -> Array:
+    """Return a gain set (6, 8), a row per joint; an error names the gain and the joint, of the first ``count`` joints.
 
     Raises:
         InputError: the shape, a number that is not finite, or one outside its range.
@@ -209,7 +212,7 @@ def check_gains(gains: Array) -> Array:
             f"gains are of shape {values.shape}; (6, 8) is needed: a row per joint of {', '.join(GAIN_RANGES)}"
         )
     for column, (name, (low, high)) in enumerate(GAIN_RANGES.items()):
-        for joint in range(JOINTS):
+        for joint in range(count):
             if not low <= values[joint, column] <= high:
                 raise InputError(
                     f"joint {joint + 1}: {name} is {values[joint, column]:g}; {low:g} to {high:g} is allowed;"
@@ -231,13 +234,13 @@ def check_configuration(config: Configuration) -> None:
 
 
 def _problems(config: Configuration) -> Iterator[str]:
-    joints = config["joint"]
-    check_gains(gains_array(config))
-    for j in range(JOINTS):
+    yield from _outside(config, _ARM_RANGES)
+    joints, count = config["joint"], min(int(config["joint_count"]), JOINTS)
+    check_gains(gains_array(config), count)
+    for j in range(count):
         for values, ranges in _ranged(joints[j]):
             yield from (f"joint {j + 1}: {text}" for text in _outside(values, ranges))
         yield from (f"joint {j + 1}: {text}" for text in _joint_problems(joints[j]))
-    yield from _outside(config, _ARM_RANGES)
     if config["supply_min_mv"] >= config["supply_max_mv"]:
         yield "supply_min_mv must be below supply_max_mv"
     if config["silence_reaction"] not in tuple(Reaction):

@@ -33,6 +33,7 @@ class Welcome:
         ticks_per_s: how many ticks its clock has a second; 0 where it has none and the host stamps its readings.
         baud: bits a second on its wire.
         config_source: where its configuration came from; None where it has none of ours.
+        crash: where the firmware crashed before it started: exception, pc, lr and CFSR; None where it did not.
     """
 
     board: str
@@ -40,6 +41,7 @@ class Welcome:
     ticks_per_s: int
     baud: int
     config_source: ConfigSource | None
+    crash: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,23 @@ class JointReport(Record):
     temperature_c: Array | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class SensorReadings(Record):
+    """What a board's converters read over some time.
+
+    Attributes:
+        t_s: (n,) when, s on the board's clock.
+        counts: (n, 6) potentiometers, 16-bit fractions of their supply.
+        current_a: (n, 6) motor currents, A, positive where a positive duty drives them.
+        duty: (n, 6) to the motors while this was read, -1 to 1.
+    """
+
+    t_s: Array
+    counts: Array
+    current_a: Array
+    duty: Array
+
+
 def plain_status(
     t_s: float, state: BoardState, faults: tuple[JointFault, ...], supply_v: float, sent: int
 ) -> BoardStatus:
@@ -168,6 +187,7 @@ def welcome_of(message: Message) -> Welcome:
         ticks_per_s=message.ticks_per_s,
         baud=message.baud,
         config_source=ConfigSource(message.config_source),
+        crash=tuple(map(int, message.crash)) if any(message.crash) else None,
     )
 
 
@@ -207,6 +227,16 @@ def joints_of(message: Message, t_s: float) -> JointReport:
         reference_rad_s=np.array(message.reference_rad_s),
         duty=np.array(message.duty),
         limited=tuple(Limited(bits) for bits in message.limited),
+    )
+
+
+def readings_of(messages: list[Message], times_s: list[float]) -> SensorReadings:
+    """Return what SENSED messages say."""
+    return SensorReadings(
+        t_s=np.array(times_s),
+        counts=np.array([each.counts for each in messages], dtype=float).reshape(-1, 6),
+        current_a=1e-3 * np.array([each.current_ma for each in messages], dtype=float).reshape(-1, 6),
+        duty=np.array([each.duty for each in messages], dtype=float).reshape(-1, 6),
     )
 
 

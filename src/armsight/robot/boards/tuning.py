@@ -1,10 +1,14 @@
 """Gains of a joint from what its motor is, by a rule with two inputs: bandwidth and damping.
 
 With the torque ``K (u V - K w) / R`` and ``J``, ``B`` and ``C`` the inertia, viscous and dry friction at the joint, the
-stall torque is ``S = K V / R`` and the motor damps itself by ``D = K^2 / R + B``. The loop
-``J q'' + (D + S kd) q' + S kp q = S kp r`` is given the natural frequency and the damping asked for; the feed-forward gives
-what the motion itself takes, so that nothing is left to the error: ``kv = D / S + kd``, ``ka = J / S``, ``kf = C / S``.
-(Åström and Murray, "Feedback Systems", 2008, sections 10.2 and 10.5.)
+stall torque is ``S = K V / R`` and the motor damps itself by ``D = K^2 / R + B``. With the integral the loop is of third
+order, ``J q''' + (D + S kd) q'' + S kp q' + S ki q = ...``; its poles are placed at ``(s^2 + 2 z w s + w^2) (s + a w)``:
+
+    kd = ((2 z + a) w J - D) / S,  kp = (1 + 2 z a) w^2 J / S,  ki = a w^3 J / S
+
+The feed-forward gives what the motion itself takes, so that nothing is left to the error: ``kv = D / S + kd``,
+``ka = J / S``, ``kf = C / S``. (Åström and Murray, "Feedback Systems", 2008, sections 10.2 and 10.5; Ellis, "Control System
+Design Guide", 2012, chapter 6.)
 """
 
 from __future__ import annotations
@@ -16,8 +20,8 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError
 
-#: The integral takes over an error at this share of the bandwidth; the speed's filter is so much faster than the loop.
-_INTEGRAL_SHARE, _FILTER_SHARE = 0.2, 0.15
+#: The integral's pole, and the corner of the speed's filter over the bandwidth: 1 / 0.25.
+_INTEGRAL_SHARE, _FILTER_SHARE = 0.6, 0.25
 #: Dry friction is compensated by a little less than it is, so that it never drives.
 _FRICTION_SHARE = 0.9
 ANTI_WINDUP_PER_S = 20.0
@@ -42,14 +46,14 @@ class MotorFigures:
     dry_n_m: float
 
 
-def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 1.0) -> Array:
+def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 0.8) -> Array:
     """Return the gains of a joint by the rule above.
 
     Args:
         motor: its motor.
         supply_v: nominal supply, V.
-        bandwidth_rad_s: natural frequency of the loop, rad/s.
-        damping: of the loop, of critical.
+        bandwidth_rad_s: natural frequency of the loop's pair of poles, rad/s.
+        damping: of the pair, of critical.
 
     Returns:
         (8,) kp, ki, kd, kv, ka, kf, derivative filter, anti-windup.
@@ -64,17 +68,59 @@ def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, da
             raise InputError(f"{name} is {value:g}; it must be positive")
     stall = motor.constant_v_s * supply_v / motor.resistance_ohm
     own = motor.constant_v_s**2 / motor.resistance_ohm + motor.viscous_n_m_s
-    kp = motor.inertia_kg_m2 * bandwidth_rad_s**2 / stall
-    kd = max(2 * damping * bandwidth_rad_s * motor.inertia_kg_m2 - own, 0.0) / stall
+    per_rad_s2 = motor.inertia_kg_m2 / stall
+    w, share = bandwidth_rad_s, _INTEGRAL_SHARE
+    kd = max((2 * damping + share) * w * per_rad_s2 - own / stall, 0.0)
     return np.array(
         [
-            kp,
-            _INTEGRAL_SHARE * bandwidth_rad_s * kp,
+            (1 + 2 * damping * share) * w**2 * per_rad_s2,
+            share * w**3 * per_rad_s2,
             kd,
             own / stall + kd,
-            motor.inertia_kg_m2 / stall,
+            per_rad_s2,
             _FRICTION_SHARE * motor.dry_n_m / stall,
             _FILTER_SHARE / bandwidth_rad_s,
             ANTI_WINDUP_PER_S,
         ]
     )
+
+
+#: Standard deviation of the duty that a potentiometer's noise may cause, and between which bandwidths one is looked for.
+_DUTY_NOISE, _LEAST_RAD_S, _MOST_RAD_S = 0.08, 5, 40
+_TICK_S = 1e-3
+#: Shares of the duty: all that motion and load may take, and of what the load leaves, what steady motion may take.
+_USED, _MOVING = 0.9, 0.7
+_MOST_SPEED_RAD_S, _MOST_RAD_S2 = 2.0, 10.0
+
+
+def quiet_bandwidth(motor: MotorFigures, supply_v: float, noise_rad: float) -> float:
+    """Return the greatest bandwidth, rad/s, at which a potentiometer's noise hardly moves the duty.
+
+    Args:
+        motor: its motor.
+        supply_v: nominal supply, V.
+        noise_rad: standard deviation of a reading.
+    """
+    for bandwidth in range(_MOST_RAD_S, _LEAST_RAD_S, -1):
+        kp, _, kd, *_, filter_s, _ = tuned_gains(motor, supply_v, bandwidth)
+        share = _TICK_S / (filter_s + _TICK_S)
+        speed_noise = noise_rad * share / _TICK_S * np.sqrt(2 / (2 - share))
+        if np.hypot(kp * noise_rad, kd * speed_noise) <= _DUTY_NOISE:
+            return float(bandwidth)
+    return float(_LEAST_RAD_S)
+
+
+def motion_limits(motor: MotorFigures, supply_v: float, gravity_n_m: float) -> tuple[float, float]:
+    """Return the greatest speed, rad/s, and acceleration, rad/s^2, that a motor reaches with duty to spare.
+
+    Args:
+        motor: its motor.
+        supply_v: nominal supply, V.
+        gravity_n_m: greatest torque of gravity.
+    """
+    stall = motor.constant_v_s * supply_v / motor.resistance_ohm
+    free_rad_s = supply_v / motor.constant_v_s
+    load = min((gravity_n_m + motor.dry_n_m) / stall, _MOVING)
+    speed = min(max(_MOVING * (_USED - load) * free_rad_s, 0.05), _MOST_SPEED_RAD_S)
+    spare = max(_USED - load - speed / free_rad_s, 0.05)
+    return speed, min(max(0.8 * spare * stall / motor.inertia_kg_m2, 0.5), _MOST_RAD_S2)

@@ -18,6 +18,8 @@ _MARKERS = (0xFD, 0xFE)  # MAVLink 2, and 1, which the parser knows as well
 _HEAD = struct.Struct("<BBBBBBBHB")  # of MAVLink 2: marker, length, flags twice, number, system, component, kind
 _CHECK = struct.Struct("<H")
 _FRAME = _HEAD.size + _CHECK.size
+#: The board's MAVLink system and component.
+BOARD_SYSTEM, BOARD_COMPONENT = 1, 1
 
 
 class Message(Protocol):
@@ -96,6 +98,10 @@ class Wire:
     def config_store(self, sequence: int, crc: int) -> None:
         """Ask the board to check and store the configuration that the parts made up."""
         self._mav.config_store_send(sequence, crc, self.session)
+
+    def command_long(self, kind: int, param1: float, param2: float = 0.0) -> None:
+        """Send one of MAVLink's own commands (MAV_CMD_) to the board."""
+        self._mav.command_long_send(BOARD_SYSTEM, BOARD_COMPONENT, kind, 0, param1, param2, 0, 0, 0, 0, 0)
 
     def receive(self, wait_s: float) -> list[Message]:
         """Let ``wait_s`` pass, s, and return the complete messages that came."""

@@ -3,11 +3,13 @@
 qd = J# (V_ref + K e), e being how far the tool is behind its reference (Whitney, "Resolved motion rate control of
 manipulators and human prostheses", 1969). J# is the inverse, damped where the smallest singular value is small (Nakamura
 and Hanafusa, 1986; here with a damping that sets in smoothly): the tool then leaves the path a little, and the joint speeds
-stay bounded, so this tracker passes singularities at which exact motions are rejected.
+stay bounded, so this tracker passes singularities at which exact motions are rejected. Fewer than six joints move the
+position along the path and the orientation as near to its reference as that leaves it (:func:`position_first`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -46,6 +48,8 @@ LONGEST_S = 300.0
 ALONG = 1e-5
 #: Rounds of slowing down until the limits hold.
 ROUNDS = 12
+#: A singular value below this is none.
+_RANK = 1e-9
 #: How the share of the way moves, in units of its duration: limits of speed, acceleration and jerk.
 SHAPE = (1.6, 8.0, 80.0)
 
@@ -196,8 +200,39 @@ def _first_guess_s(arm: Arm, q: Array, path: Path) -> float:
     return max(slowest, 1e-2)
 
 
+def position_first(J: Array, V: Array, inverted: Callable[[Array], Array]) -> tuple[Array, float]:
+    """Return the joints' speeds for a velocity of the tool: its position first, then its orientation as far as possible.
+
+    For arms of fewer than six joints, which cannot have both: the second level is solved in the null space of the first
+    (Nakamura, Hanafusa and Yoshikawa, 1987).
+
+    Args:
+        J: (6, n) Jacobian, linear rows first, over the arm's size.
+        V: (6,) velocity of the tool, its linear part over the arm's size.
+        inverted: returns what stands for the inverses of singular values (k,), 0 where a direction is not to be used.
+
+    Returns:
+        (n,) the speeds, and the smallest singular value of the position's rows.
+    """
+    U, s, Vt = np.linalg.svd(J[:3], full_matrices=False)
+    qd = (inverted(s) * (V[:3] @ U)) @ Vt
+    used = Vt[s > _RANK]
+    free = J[3:] - (J[3:] @ used.T) @ used
+    U_free, s_free, Vt_free = np.linalg.svd(free, full_matrices=False)
+    qd += (inverted(np.where(s_free > _RANK, s_free, 0.0)) * ((V[3:] - J[3:] @ qd) @ U_free)) @ Vt_free
+    return qd, float(s[-1])
+
+
+def _damped(s: Array) -> Array:
+    """Return the damped inverses of singular values (k,): 0 of 0."""
+    soft = np.maximum(0.0, 1 - (s / SOFT) ** 2)
+    return np.asarray(s / np.maximum(s**2 + (DAMPING * soft) ** 2, 1e-12))
+
+
 def _speeds(J: Array, V: Array, scale: Array) -> tuple[Array, float]:
     """Return joint speeds (n,) for a tool velocity (6,), damped, and the smallest singular value."""
+    if J.shape[1] < 6:
+        return position_first(J / scale[:, None], V / scale, _damped)
     U, s, Vt = np.linalg.svd(J / scale[:, None], full_matrices=False)
     soft = max(0.0, 1 - (s[-1] / SOFT) ** 2)
     return (s / (s**2 + (DAMPING * soft) ** 2) * ((V / scale) @ U)) @ Vt, float(s[-1])

@@ -93,6 +93,11 @@ class Ar4Teensy:
         """(6,) true joint angles."""
         return np.asarray(SENSE * self._joint)
 
+    @property
+    def truth(self) -> tuple[Array, Array]:
+        """(6,) true angles of the motors, where the encoders sit, and of the joints, rad."""
+        return np.radians(SENSE * self._motor), np.radians(SENSE * self._joint)
+
     def lose(self, joint: int, degrees: float) -> None:
         """Let a joint slip against its motor, as a belt does: the encoder does not see it."""
         degrees *= float(SENSE[joint])

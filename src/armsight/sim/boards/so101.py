@@ -219,6 +219,11 @@ class So101Bus:
         q = np.radians([5.0, -40.0, 60.0, 20.0, 0.0, 10.0]) if q is None else q
         return cls(So101Servos(mechanics or So101Mechanics(), load, q), **options)  # type: ignore[arg-type]
 
+    @property
+    def truth(self) -> tuple[Array, Array]:
+        """(5,) angles of the arm's shafts as its sensors have them, and its true joint angles, rad."""
+        return self.servos.shaft[: SERVOS - 1], self.servos.true_q[: SERVOS - 1]
+
     def write(self, data: bytes) -> None:
         """Take bytes from the host."""
         if self.powered:

@@ -21,7 +21,7 @@ from armsight.files import read_text
 from armsight.robot.arm import Arm
 
 #: Rows of the table whose amounts say more than where base and tool are.
-_LENGTHS, _OFFSETS, _TWISTS, _ZEROS = slice(0, 5), slice(1, 5), slice(0, 5), slice(1, 5)
+_LENGTHS, _OFFSETS, _TWISTS, _ZEROS = slice(0, -1), slice(1, -1), slice(0, -1), slice(1, -1)
 _SINES = 3  # of which a potentiometer's linearity error is made
 _CYCLES = (2.0, 9.0)  # how often they swing over its travel
 
@@ -157,9 +157,9 @@ class TrueArm(Record):
 
     Attributes:
         arm: the true table; limits, home and names are the nominal one's.
-        backlash_rad: (6,) backlash of each joint, from stop to stop.
-        pot_offset_rad: (6,) offset error of each potentiometer, rad.
-        pot_sines: (6, 3, 3) amplitude, rad; cycles over the travel; phase, rad: each potentiometer's linearity error.
+        backlash_rad: (n,) backlash of each joint, from stop to stop.
+        pot_offset_rad: (n,) offset error of each potentiometer, rad.
+        pot_sines: (n, 3, 3) amplitude, rad; cycles over the travel; phase, rad: each potentiometer's linearity error.
         imperfections: what it was sampled from.
     """
 
@@ -178,25 +178,25 @@ def sample_arm(model: Arm, given: Imperfections, seed: int) -> TrueArm:
         given: how far from it the arm is.
         seed: the same gives the same arm.
     """
-    rng = np.random.default_rng([seed, 1])
+    rng, n = np.random.default_rng([seed, 1]), model.joints
 
     def about(amount: float, rows: slice) -> Array:
-        out = np.zeros(6)
-        size = rng.uniform(0.5, 1.5, 6) * rng.choice([-1.0, 1.0], 6)
+        out = np.zeros(n)
+        size = rng.uniform(0.5, 1.5, n) * rng.choice([-1.0, 1.0], n)
         out[rows] = amount * size[rows]
         return out
 
     a, d = model.a + about(given.length_m, _LENGTHS), model.d + about(given.length_m, _OFFSETS)
     alpha, offset = model.alpha + about(given.angle_rad, _TWISTS), model.offset + about(given.zero_rad, _ZEROS)
-    backlash = rng.uniform(*given.backlash_rad, 6)
+    backlash = rng.uniform(*given.backlash_rad, n)
     pot_offset = about(given.pot_offset_rad, _ZEROS)
-    share = rng.dirichlet(np.full(_SINES, 2.0), 6)
+    share = rng.dirichlet(np.full(_SINES, 2.0), n)
     travel = pot_travel(model)
     sines = np.stack(
         [
             given.pot_linearity * np.ptp(travel, axis=1)[:, None] * share,
-            rng.uniform(*_CYCLES, (6, _SINES)),
-            rng.uniform(0, 2 * np.pi, (6, _SINES)),
+            rng.uniform(*_CYCLES, (n, _SINES)),
+            rng.uniform(0, 2 * np.pi, (n, _SINES)),
         ],
         axis=2,
     )
@@ -205,6 +205,6 @@ def sample_arm(model: Arm, given: Imperfections, seed: int) -> TrueArm:
 
 
 def pot_travel(model: Arm) -> Array:
-    """Return the joint angles (6, 2), rad, at the two ends of each potentiometer's used travel."""
+    """Return the joint angles (n, 2), rad, at the two ends of each potentiometer's used travel."""
     margin = np.deg2rad(10.0)
     return np.stack([model.q_min - margin, model.q_max + margin], axis=1)

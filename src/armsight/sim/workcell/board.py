@@ -69,6 +69,7 @@ def configuration(model: Arm, parts: Solids, motors: Motors) -> Configuration:
     joint["current_limit_ma"] = np.rint(900.0 * motors.current_max_a)
     joint["following_rad"], joint["stall_duty"], joint["stall_rad"] = 0.15, 0.9, 0.005
     joint["motor_direction"] = 1
+    config["joint_count"] = len(joint)
     config["supply_min_mv"], config["supply_max_mv"], config["supply_ticks"] = 20000, 28000, 5
     config["supply_nominal_mv"], config["overload_ticks"] = round(1e3 * SUPPLY_V), 300
     config["brake_release_ticks"] = config["brake_engage_ticks"] = _BRAKE_TICKS

@@ -25,6 +25,7 @@ from armsight.sim.example_rig import example_rig
 from armsight.sim.render.optics import Radiance, noise_start, noise_strip
 from armsight.sim.render.render import Shutter, outline
 from armsight.sim.render.scene import Pattern, PosedBody, plate
+from armsight.sim.workcell.controlled import ControlledArm
 from armsight.sim.workcell.images import ArmSeen, WorkcellCamera
 from armsight.sim.workcell.motors import row_frames
 from armsight.sim.workcell.plant import TICK_S, ArmPlant
@@ -238,7 +239,7 @@ class WorkcellSource:
 
     def __init__(
         self,
-        plant: ArmPlant,
+        plant: ArmPlant | ControlledArm,
         cameras: tuple[WorkcellCamera, WorkcellCamera],
         timing: CameraTiming,
         body: tuple[tuple[Pattern, ...], Array],
@@ -304,7 +305,7 @@ class WorkcellSource:
                 newest = k
         shot = None
         if newest >= self._next:
-            self._next = newest + 1
+            self._next, self._over_s = newest + 1, np.inf  # an emergency stop may let time pass while this waits
             shot = self._shot(newest)
             self._over_s = self._over(self._next)
         return shot
@@ -327,7 +328,7 @@ class WorkcellSource:
             pattern: what is held.
             T_left_body: (4, 4) where, m, left camera's frame.
         """
-        q = self._plant.path[-1, 6:]
+        q = self._plant.path[-1, self._plant.arm.joints :]
         p_body = (self._plant.arm.forward(q) @ self._T_tool_body)[:3, 3]
         edge = np.column_stack([outline(pattern), np.zeros(len(outline(pattern)))])
         for camera in self._cameras:
@@ -429,12 +430,13 @@ class WorkcellSource:
         return [device.expose(light, t_s, first + k) for k in range(_SETTLED)][-1]
 
     def _q(self, t_s: Array) -> Array:
-        """Return the links' true angles (N, 6) at times (N,), by a cubic through the four nearest milliseconds."""
+        """Return the links' true angles (N, n) at times (N,), by a cubic through the four nearest milliseconds."""
         path = self._plant.path
         at = np.clip(t_s / TICK_S, 0.0, len(path) - 1.0)
         first = np.clip(np.floor(at).astype(int) - 1, 0, max(len(path) - 4, 0))
         x = (at - first)[:, None]
-        p = [path[np.minimum(first + k, len(path) - 1), 6:] for k in range(4)]
+        links = slice(self._plant.arm.joints, None)
+        p = [path[np.minimum(first + k, len(path) - 1), links] for k in range(4)]
         weights = (
             -(x - 1) * (x - 2) * (x - 3) / 6,
             x * (x - 2) * (x - 3) / 2,

@@ -26,6 +26,7 @@ from armsight.sim.render.faces import Exposure, paint_faces, palette
 from armsight.sim.render.optics import Optics, Radiance, Sensor, Window, exposed_window, part_taps, shaded, spread
 from armsight.sim.render.render import OUTLINE, Shutter, corner_rays, outline
 from armsight.sim.render.scene import Pattern, PosedBody
+from armsight.sim.workcell.controlled import ControlledArm
 from armsight.sim.workcell.motors import Solids, row_frames
 from armsight.sim.workcell.plant import ArmPlant
 from armsight.sim.workcell.raycast import (
@@ -200,7 +201,7 @@ class ArmSeen(Record):
 
     Attributes:
         parts: what it is made of.
-        Ts_base_link: (7, 4, 4) row frames.
+        Ts_base_link: (n + 1, 4, 4) row frames.
     """
 
     parts: Solids
@@ -424,7 +425,7 @@ _SAME = 3  # grey levels
 
 def picture(
     size_px: tuple[int, int],
-    plant: ArmPlant,
+    plant: ArmPlant | ControlledArm,
     body: tuple[tuple[Pattern, ...], Array],
     rig: tuple[Array, StereoRig],
     seed: int,
@@ -450,7 +451,7 @@ def picture(
     T_base_eye = pose(np.column_stack([x, np.cross(z, x), z]), _EYE)
     more = _rig_boxes(*rig)
     eye = WorkcellCamera(camera, T_base_eye, plant.parts, seed, sensor=Sensor(read_noise=0.0), more=more)
-    q = plant.path[-1, 6:]
+    q = plant.path[-1, plant.arm.joints :]
     arm = ArmSeen(plant.parts, row_frames(plant.arm, q))
     posed = PosedBody(body[0], inverse(T_base_eye) @ plant.arm.forward(q) @ body[1])
     grey = eye.image(arm, [posed], Shutter(), np.zeros(width * height, np.float32), 0)

@@ -29,7 +29,7 @@ GRAVITY_M_S2 = 9.81
 #: Radii of the links, share of the arm's whole length; of a joint's housing, share of its link's; density, kg/m^3.
 _RADII = np.array([0.052, 0.040, 0.034, 0.029, 0.026, 0.022])
 _HOUSING, _DENSITY = 1.2, 900.0
-#: Mass of the tool and the body on it, share of the arm; radius of a ball of their inertia, share of link 6's radius.
+#: Mass of the tool and the body on it, share of the arm; radius of a ball of their inertia, share of the last link's.
 _TOOL_SHARE, _TOOL_RADIUS = 0.03, 2.0
 _SHORTEST_M = 1e-3
 
@@ -39,7 +39,7 @@ class Solids(Record):
     """Capsules that move with an arm's links.
 
     Attributes:
-        link: (K,) 0 for the base, 1 to 6.
+        link: (K,) 0 for the base, 1 to n.
         ends: (K, 2, 3) their axes' ends, m, row frame of the link.
         radius: (K,) m.
         mass: (K,) kg.
@@ -57,29 +57,31 @@ def solids(arm: Arm) -> Solids:
     """Return what an arm is made of: a capsule along each d and a, housings about its joints, last the load at its tool."""
     rows = rows_of(arm.table)
     whole = float(np.abs(rows[:, :2]).sum())
-    radii = _RADII * whole
-    parts: list[tuple[int, Array, Array, float, bool]] = [
-        (0, np.zeros(3), np.array([0.0, 0.0, 0.02 * whole]), 1.5 * radii[0], True)
-    ]
+    last = len(rows) - 1
+    radii = np.interp(np.linspace(0.0, 5.0, last + 1), np.arange(6), _RADII) * whole
+    first = arm.T_base_0[:3, 3]
+    if np.linalg.norm(first) < 0.02 * whole:
+        first = np.array([0.0, 0.0, 0.02 * whole])
+    parts: list[tuple[int, Array, Array, float, bool]] = [(0, np.zeros(3), first, 1.5 * radii[0], True)]
     for i, (a, d) in enumerate(rows[:, :2]):
         foot, knee, hand = np.zeros(3), np.array([0.0, 0.0, d]), np.array([a, 0.0, d])
-        if i == 5:  # the round end stays behind the tool's plate
+        if i == last:  # the round end stays behind the tool's plate
             knee[2] = np.sign(d) * max(abs(d) - radii[i], 0.0)
         if abs(d) > _SHORTEST_M:
             parts.append((i + 1, foot, knee, radii[i], False))
         if abs(a) > _SHORTEST_M:
             parts.append((i + 1, knee, hand, radii[i], False))
-        if 0 < i < 5 or max(abs(a), abs(d)) <= _SHORTEST_M:
+        if 0 < i < last or max(abs(a), abs(d)) <= _SHORTEST_M:
             axle = np.array([0.0, 0.0, radii[i]])
             parts.append((i + 1, -axle, axle, _HOUSING * radii[i], True))
     link, foot, hand, radius, housing = (np.array(column) for column in zip(*parts, strict=True))
     length = np.linalg.norm(hand - foot, axis=1)
     mass = _DENSITY * np.pi * radius**2 * (length + 4 / 3 * radius)
-    tool = np.array([[rows[5, 0], 0.0, rows[5, 1]]])
+    tool = np.array([[rows[last, 0], 0.0, rows[last, 1]]])
     return Solids(
-        np.append(link, 6),
+        np.append(link, last + 1),
         np.append(np.stack([foot, hand], axis=1), np.stack([tool, tool], axis=1), axis=0),
-        np.append(radius, _TOOL_RADIUS * radii[5]),
+        np.append(radius, _TOOL_RADIUS * radii[last]),
         np.append(mass, _TOOL_SHARE * mass[link > 0].sum()),
         np.append(housing, True),
     )
@@ -87,10 +89,10 @@ def solids(arm: Arm) -> Solids:
 
 @kernel("const f8[::1], const f8[::1], f8[:, :, ::1]")
 def _row_frames(table: Array, q: Array, Ts: Array) -> None:
-    """Write the row frames at joint angles q (6,) into Ts (7, 4, 4)."""
+    """Write the row frames at joint angles q (n,) into Ts (n + 1, 4, 4)."""
     Ts[0] = np.eye(4)
     F = first_frame(table)
-    for i in range(6):
+    for i in range(q.size):
         s, c = sincos(table[6 * i + 5] * q[i] + table[6 * i + 4])
         F = after_rotation(table, i, c, s, F)
         store(F, Ts[i + 1])
@@ -101,15 +103,15 @@ def _row_frames(table: Array, q: Array, Ts: Array) -> None:
 
 
 def row_frames(arm: Arm, q: Array) -> Array:
-    """Return where the row frames (7, 4, 4) are in the base, m, at joint angles (6,), rad."""
-    Ts = np.empty((7, 4, 4))
+    """Return where the row frames (n + 1, 4, 4) are in the base, m, at joint angles (n,), rad."""
+    Ts = np.empty((arm.joints + 1, 4, 4))
     _row_frames(arm.table, np.ascontiguousarray(q), Ts)
     return Ts
 
 
 @kernel("f8[:, :, ::1], const i8[::1], f8[:, ::1], const f8[::1], f8[::1]")
 def _gravity(Ts: Array, link: Ids, centre: Array, mass: Array, out: Array) -> None:
-    """Add the gravity torque of solids at centre (K, 3) of their row frames about the joints' axes, N m, to out (6,)."""
+    """Add the gravity torque of solids at centre (K, 3) of their row frames about the joints' axes, N m, to out (n,)."""
     for k in range(link.size):
         T = Ts[link[k]]
         x = T[0, 0] * centre[k, 0] + T[0, 1] * centre[k, 1] + T[0, 2] * centre[k, 2] + T[0, 3]
@@ -121,17 +123,17 @@ def _gravity(Ts: Array, link: Ids, centre: Array, mass: Array, out: Array) -> No
 
 
 def gravity_torque(arm: Arm, parts: Solids, q: Array) -> Array:
-    """Return the torque (6,), N m, with which gravity acts on the joints through an arm's solids at angles q (6,), rad."""
-    out = np.zeros(6)
+    """Return the torque (n,), N m, with which gravity acts on the joints through an arm's solids at angles q (n,), rad."""
+    out = np.zeros(arm.joints)
     _gravity(row_frames(arm, q), parts.link, parts.ends.mean(axis=1), parts.mass, out)
     return np.asarray(arm.direction * out)
 
 
 def inertia(arm: Arm, parts: Solids, q: Array) -> Array:
-    """Return the inertia (6,), kg m^2, of all that each joint rotates, as points, at angles q (6,), rad."""
-    Ts, out = row_frames(arm, q), np.zeros(6)
+    """Return the inertia (n,), kg m^2, of all that each joint rotates, as points, at angles q (n,), rad."""
+    Ts, out = row_frames(arm, q), np.zeros(arm.joints)
     centres = transform(Ts[parts.link], parts.ends.mean(axis=1))
-    for i in range(6):
+    for i in range(arm.joints):
         beyond = parts.link > i
         r = centres[beyond] - Ts[i + 1, :3, 3]
         off_axis = (r**2).sum(axis=1) - (r @ Ts[i + 1, :3, 2]) ** 2

@@ -430,7 +430,7 @@ def arm_capsules(parts: Solids, Ts_base_link: Array, T_base_camera: Array) -> tu
 
     Args:
         parts: what the arm is made of.
-        Ts_base_link: (7, 4, 4) row frames.
+        Ts_base_link: (n + 1, 4, 4) row frames.
         T_base_camera: (4, 4) where the camera is, m.
     """
     shown = np.flatnonzero(parts.link > 0)[:-1]

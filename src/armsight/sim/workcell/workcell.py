@@ -8,9 +8,10 @@ documentation's page on the workcell.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import contextlib
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import NamedTuple, Self
 
@@ -22,14 +23,15 @@ from armsight.geometry.pose import exp_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
-from armsight.robot.boards.board import Board
+from armsight.robot.boards.configuration import JOINTS
+from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.opening import configured, open_emulator
+from armsight.robot.boards.opening import configured, open_emulator, slowed
 from armsight.sim.camera.stages import CameraPipeline
 from armsight.sim.example_rig import board_poses
 from armsight.sim.render.optics import Sensor
 from armsight.sim.render.scene import chessboard
-from armsight.sim.workcell.arm import imperfections, sample_arm
+from armsight.sim.workcell.arm import Imperfections, imperfections, sample_arm
 from armsight.sim.workcell.board import configuration, gravity_duty
 from armsight.sim.workcell.body import body_patterns, body_target, body_text
 from armsight.sim.workcell.cameras import (
@@ -41,12 +43,17 @@ from armsight.sim.workcell.cameras import (
     open_rig,
     rig_pose,
 )
+from armsight.sim.workcell.controlled import CONTROLLED, Controlled, ControlledArm, standing
 from armsight.sim.workcell.images import LENS, WorkcellCamera, picture
-from armsight.sim.workcell.motors import Motors, Solids, chosen, solids
+from armsight.sim.workcell.motors import chosen, solids
 from armsight.sim.workcell.plant import TICK_S, ArmPlant
 from armsight.vision.markers.targets import Composite
 from armsight.vision.rig import StereoRig
 
+#: The arm that the workcell was drawn for.
+DEFAULT_ARM = "six_r"
+#: Where the cameras stand before a small arm, m.
+NEAR_M = 0.6
 #: The chessboard that is shown to the cameras.
 CHESSBOARD = "chessboard:9x6:30mm"
 _CHESSBOARD_FILL = (0.35, 1.0)  # of the image's height
@@ -60,6 +67,10 @@ _POSES = (
     ((-0.18, 0.17, -0.12), (14.0, 12.0, -28.0)),
     ((-0.24, 0.02, 0.15), (-14.0, 4.0, 20.0)),
 )
+_POSES_SHARES = (1.0, 0.75, 0.5, 0.35)  # of the shifts that are tried with another arm, until it reaches all five
+_POSES_SIZE_M = (
+    1.06  # of the arm that these shifts were chosen for; ahead, left and up of the tool are x, y and z there
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +83,8 @@ class WorkcellTruth(Record):
         T_base_rig: (4, 4) where the left camera is, m.
         T_tool_body: (4, 4) where the body is on the tool, m.
         t_s: (N,) every millisecond since the beginning, s.
-        q: (N, 6) true joint angles, rad: of the links, behind backlash and twist.
-        shaft: (N, 6) true angles of the gears' shafts, where the potentiometers sit, rad.
+        q: (N, n) true joint angles, rad: of the links, behind backlash and twist.
+        shaft: (N, n) true angles of the gears' shafts, where the potentiometers sit, rad.
         shot_t_s: name of each shot handed out -> middle of its left exposure, s.
     """
 
@@ -96,12 +107,9 @@ class _Parts(NamedTuple):
     """What a workcell is made of.
 
     Attributes:
-        built_to: the table that the arm was built to.
         model: the table that it is assumed to have.
         timing: of the cameras.
         seed: of all that is sampled.
-        solids: what the nominal arm is made of, and ``motors`` what drives it.
-        motors: see ``solids``.
         plant: the arm.
         rig: the true cameras.
         T_base_rig: (4, 4) where the left camera is, m.
@@ -109,29 +117,30 @@ class _Parts(NamedTuple):
         cameras: left and right.
         room: what must be the same for another workcell to use these cameras.
         pipeline: what lies between light and file; None for white noise.
-        link: to the board.
+        link: to the board with our firmware; None where the arm keeps its own controller.
         board: configured.
+        gravity: returns the duty (n,) that compensates the nominal arm's gravity load at joint angles (n,), rad.
+        default: whether it is the arm that the workcell was drawn for.
     """
 
-    built_to: Arm
     model: Arm
     timing: CameraTiming
     seed: int
-    solids: Solids
-    motors: Motors
-    plant: ArmPlant
+    plant: ArmPlant | ControlledArm
     rig: StereoRig
     T_base_rig: Array
     T_tool_body: Array
     cameras: tuple[WorkcellCamera, WorkcellCamera]
     room: tuple[object, ...]
     pipeline: CameraPipeline | None
-    link: EmulatedLink
-    board: Board
+    link: EmulatedLink | None
+    board: MotionBoard
+    gravity: Callable[[Array], Array]
+    default: bool
 
 
 def _standing(
-    rig: StereoRig, T_base_rig: Array, plant: ArmPlant, seed: int, sensor: Sensor, psf_sigma_px: float
+    rig: StereoRig, T_base_rig: Array, plant: ArmPlant | ControlledArm, seed: int, sensor: Sensor, psf_sigma_px: float
 ) -> tuple[WorkcellCamera, WorkcellCamera]:
     """Return a rig's cameras where they stand; each casts what stands still before it, in a thread of its own."""
     stand = partial(WorkcellCamera, foot=plant.parts, seed=seed, sensor=sensor, psf_sigma_px=psf_sigma_px)
@@ -140,13 +149,74 @@ def _standing(
     return left, right
 
 
+def _ahead(T_base_tool: Array) -> Array:
+    """Return axes (3, 3) of the base, as columns: level ahead as the tool looks, to its left, up."""
+    level = T_base_tool[:3, 2] * np.array([1.0, 1.0, 0.0])
+    level /= np.linalg.norm(level)
+    up = np.array([0.0, 0.0, 1.0])
+    return np.column_stack([level, np.cross(up, level), up])
+
+
+def workcell_poses(model: Arm, *, default: bool) -> Array:
+    """Return the joint angles (5, n) of five poses before the cameras, rad.
+
+    Args:
+        model: the arm, at whose home the tool looks at the cameras.
+        default: whether it is the arm that the workcell was drawn for; another's shifts follow its size and its reach.
+
+    Raises:
+        InputError: the arm does not reach one.
+    """
+    T_home = model.forward(model.home)
+    if default:
+        return _five(model, T_home, np.eye(3))
+    axes = model.size_m / _POSES_SIZE_M * _ahead(T_home)
+    for share in _POSES_SHARES[:-1]:
+        with contextlib.suppress(InputError):
+            return _five(model, T_home, share * axes)
+    return _five(model, T_home, _POSES_SHARES[-1] * axes)
+
+
+def _five(model: Arm, T_home: Array, axes: Array) -> Array:
+    """Return the joint angles (5, n) of the five poses, their shifts along axes (3, 3), as columns."""
+    found = []
+    for n, (shift, rotation) in enumerate(_POSES, start=1):
+        T = pose(T_home[:3, :3] @ exp_so3(np.radians(rotation)), T_home[:3, 3] + axes @ np.array(shift))
+        solutions = model.inverse(T, near=model.home)
+        if solutions.best is None:
+            raise InputError(f"{model.name} does not reach pose {n} of the workcell: {solutions.reason}")
+        found.append(solutions.best)
+    return np.array(found)
+
+
+def _driven(
+    model: Arm, amounts: Imperfections, seed: int, emulator: str, own: Controlled | None
+) -> tuple[ArmPlant | ControlledArm, EmulatedLink | None, MotionBoard, Callable[[Array], Array]]:
+    """Return an arm that was built to a model, the wire to our board if it has one, the board, and the gravity's duty."""
+    if own is not None:  # its zeros are off in its controller
+        true = sample_arm(model, replace(amounts, zero_rad=0.0), seed).arm
+        arm, own_board = own.open(true, amounts, seed)
+        return arm, None, own_board, np.zeros_like
+    if model.joints != JOINTS:
+        raise InputError(
+            f"{model.name} has {model.joints} joints; the workcell takes arms of {JOINTS} with our firmware, and "
+            f"{', '.join(CONTROLLED)} with their own controllers"
+        )
+    links = solids(model)
+    motors = chosen(model, links)  # as the drawing has them: friction as usual
+    plant = ArmPlant(model, sample_arm(model, amounts, seed), seed)
+    link = EmulatedLink(open_emulator(emulator), plant)
+    board = configured(link, configuration(model, links, motors))
+    return plant, link, board, partial(gravity_duty, model, links, motors)
+
+
 class Workcell:
     """An arm, its board, two cameras and a body; :meth:`open` builds one.
 
     Attributes:
         model: the arm as it is assumed to be: all that an estimator may know of it.
-        link: the wire to the board, and all of its inside; see EmulatedLink.
-        board: the board, configured, its drives off; the arm is at home, held by brakes.
+        link: the wire to our board, and all of its inside, see EmulatedLink; None where the arm keeps its own controller.
+        board: the board, configured, its drives off; the arm is at home, held by brakes. A controller of its own holds it.
         source: the cameras.
         target: the body on the tool, as it is looked for.
         body_text: its body file.
@@ -156,8 +226,8 @@ class Workcell:
 
     def __init__(self, parts: _Parts) -> None:
         """Put the parts together; :meth:`open` makes them."""
-        self._built_to, self.model, self.timing, self._seed = parts.built_to, parts.model, parts.timing, parts.seed
-        self._solids, self._motors, self.plant = parts.solids, parts.motors, parts.plant
+        self.model, self.timing, self._seed = parts.model, parts.timing, parts.seed
+        self.plant, self.gravity_duty, self._default = parts.plant, parts.gravity, parts.default
         self._rig, self._room, self._cameras = parts.rig, parts.room, parts.cameras
         self._T_tool_body, self._T_base_rig = parts.T_tool_body, parts.T_base_rig
         self.link, self.board = parts.link, parts.board
@@ -178,7 +248,7 @@ class Workcell:
         rig: str = "parallel",
         model: Arm | None = None,
         assumed: Arm | None = None,
-        distance_m: float = DISTANCE_M,
+        distance_m: float | None = None,
         baseline_m: float = BASELINE_M,
         noise: float = 2.0,
         like: Workcell | None = None,
@@ -193,7 +263,7 @@ class Workcell:
             rig: parallel or verging.
             model: the table that the arm was built to; ``six_r`` by default.
             assumed: the table that it is assumed to have, as an identification found; ``model`` by default.
-            distance_m: from the cameras to the body of the arm at home.
+            distance_m: from the cameras to the body of the arm at home; by default what suits its size.
             baseline_m: between the cameras.
             noise: of the sensors, grey levels; a preset has its own.
             like: a workcell of the same arm, seed, rig and noise: what its cameras see of the room is not cast anew.
@@ -207,10 +277,17 @@ class Workcell:
         if not 0 <= noise <= 50:
             raise InputError(f"noise is {noise}; it must be 0 to 50 grey levels")
         (timing, pipeline), amounts = open_cameras(cameras), imperfections(arm)
-        built_to = model if model is not None else open_arm("six_r")
-        true_rig, links = open_rig(rig, timing.image_size_px, baseline_m), solids(built_to)
-        motors = chosen(built_to, links)  # as the drawing has them: friction as usual
-        plant = ArmPlant(built_to, sample_arm(built_to, amounts, seed), seed)
+        built_to = model if model is not None else open_arm(DEFAULT_ARM)
+        true_rig = open_rig(rig, timing.image_size_px, baseline_m)
+        own, nominal_home = CONTROLLED.get(built_to.name), built_to.home
+        built_to = standing(built_to)
+        if assumed is not None and built_to.home is not nominal_home:
+            assumed = replace(assumed, home=built_to.home)
+        if own is not None:
+            built_to = slowed(built_to, own.board)
+            assumed = None if assumed is None else slowed(assumed, own.board)
+        if distance_m is None:
+            distance_m = DISTANCE_M if own is None else NEAR_M
         psf_sigma_px = LENS.psf_sigma_px if pipeline is None else pipeline.psf_sigma_px
         room = (
             arm,
@@ -229,47 +306,38 @@ class Workcell:
         mount = pose(np.diag([-1.0, 1.0, -1.0]), _MOUNT_M) @ pose(exp_so3(_MOUNT_RAD), np.zeros(3))
         off = np.random.default_rng([seed, 9]).normal(0, 1, 6) * np.repeat((0.002, np.radians(1.0)), 3)
         T_base_rig = rig_pose(built_to, true_rig, mount, seed, distance_m)
+        plant, link, board, gravity = _driven(built_to, amounts, seed, emulator, own)
         sensor = Sensor(read_noise=noise)
         seen = like._cameras if like is not None else _standing(true_rig, T_base_rig, plant, seed, sensor, psf_sigma_px)
-        link = EmulatedLink(open_emulator(emulator), plant)
-        board = configured(link, configuration(built_to, links, motors))
         known = assumed if assumed is not None else built_to
         T_tool_body = mount @ exp_se3(off)
-        parts = (built_to, known, timing, seed, links, motors, plant, true_rig, T_base_rig, T_tool_body, seen, room)
-        return cls(_Parts(*parts, pipeline, link, board))
+        parts = (known, timing, seed, plant, true_rig, T_base_rig, T_tool_body, seen, room)
+        return cls(_Parts(*parts, pipeline, link, board, gravity, built_to.name == DEFAULT_ARM))
 
     @property
     def t_s(self) -> float:
         """The time now, s, on the board's clock too."""
-        return self.link.t_s
+        return self.plant.t_s if self.link is None else self.link.t_s
 
     def advance(self, dt_s: float) -> None:
         """Let time pass, to the nearest millisecond."""
-        self.link.step(round(dt_s / TICK_S))
+        if isinstance(self.plant, ControlledArm):
+            self.plant.advance(dt_s)
+        elif self.link is not None:
+            self.link.step(round(dt_s / TICK_S))
 
     def poll(self) -> Shot | None:
         """Return the newest shot that has come by now and was not handed out; no time passes."""
         return self.source.poll()
 
-    def gravity_duty(self, q: Array) -> Array:
-        """Return the duty (6,) that compensates the nominal arm's gravity load at joint angles q (6,), rad."""
-        return gravity_duty(self._built_to, self._solids, self._motors, q)
-
     @cached_property
     def poses(self) -> Array:
-        """(5, 6) the joint angles of the workcell's five poses, rad, as the nominal table has them; body in view.
+        """(5, n) the joint angles of the workcell's five poses, rad, as the nominal table has them; body in view.
 
         Raises:
             InputError: the arm does not reach one.
         """
-        T_home, found = self.model.forward(self.model.home), []
-        for n, (shift, rotation) in enumerate(_POSES, start=1):
-            T = pose(T_home[:3, :3] @ exp_so3(np.radians(rotation)), T_home[:3, 3] + np.array(shift))
-            solutions = self.model.inverse(T, near=self.model.home)
-            if solutions.best is None:
-                raise InputError(f"{self.model.name} does not reach pose {n} of the workcell: {solutions.reason}")
-            found.append(solutions.best)
-        return np.array(found)
+        return workcell_poses(self.model, default=self._default)
 
     def chessboard_shots(self, count: int) -> Iterator[Shot]:
         """Show a chessboard in many poses, as a person would who calibrates, past the arm; no time passes.
@@ -305,8 +373,8 @@ class Workcell:
             self._T_base_rig,
             self._T_tool_body,
             np.asarray(np.arange(len(path)) * TICK_S, dtype=np.float64),
-            path[:, 6:],
-            path[:, :6],
+            path[:, self.plant.arm.joints :],
+            path[:, : self.plant.arm.joints],
             taken,
         )
 

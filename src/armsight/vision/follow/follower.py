@@ -9,7 +9,9 @@ errors of the last predictions, and everything from pixels to covariance is one 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, TypeGuard
 
 import numpy as np
@@ -87,6 +89,11 @@ class BodyTrack(Record):
         T = np.empty((4, 4))
         moved(self.T_left_body, self.twist * (t_s - self.t_s), T)
         return T
+
+
+def measurer(rig: StereoRig, target: Target) -> Callable[[Shot], PoseEstimate | Missed]:
+    """Return what measures a target shot by shot: a follower where it can be followed, else :func:`measure`."""
+    return Follower(rig, target).measure if follows(target) else partial(measure, rig, target)
 
 
 Way = Literal["followed", "searched", "lost"]

@@ -109,6 +109,18 @@ def open_target(spec: str) -> Target:
     return load_board_file(spec) if _is_board_file(spec) else load_body_toml(spec)
 
 
+def open_fixed(specs: Sequence[str], target: str) -> tuple[Target, ...]:
+    """Make the targets that do not move, beside the one that is measured.
+
+    Raises:
+        InputError: as :func:`open_target`, or one is given twice.
+    """
+    twice = [spec for k, spec in enumerate(specs) if spec == target or spec in specs[:k]]
+    if twice:
+        raise InputError(f"--fixed {twice[0]}: given twice; a fixed body is another one than --target")
+    return tuple(open_target(spec) for spec in specs)
+
+
 def _is_board_file(path: str) -> bool:
     """Say whether a TOML file describes a board as calibrated; one that is no TOML is left to the body files' reader."""
     try:

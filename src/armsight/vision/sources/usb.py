@@ -5,6 +5,9 @@ image is decoded. The time stamp is the driver's, taken when the frame arrived (
 clock), and where a driver has none, the time after the grab. Drivers queue frames, and not the same number while two
 cameras start: so old frames are passed over, and whichever camera is more than half a frame period behind is grabbed
 again until the two belong together.
+
+Of cameras that send MJPEG the frames are taken from OpenCV as they came and decoded here, by the same decoder: a shot has
+both the pixels and the cameras' own bytes, which a recording stores unchanged.
 """
 
 from __future__ import annotations
@@ -16,18 +19,20 @@ from collections.abc import Callable
 from typing import Protocol
 
 import cv2
+import numpy as np
 
 from armsight.data import Image, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.vision.sources.capture import open_capture
 from armsight.vision.sources.timing import Rhythm, allowed_skew
+from armsight.vision.sources.v4l2 import EXPOSURE_UNIT_MS
 
 STALL_S = 5.0  # without a frame for that long a camera has stalled
-_EXPOSURE_UNIT_MS = 0.1  # of V4L2's exposure_time_absolute
 _MANUAL, _AUTO = 1, 3  # of V4L2's auto_exposure: manual mode, aperture priority mode
 _QUEUE = 4  # frames OpenCV's V4L2 lets the driver queue
 _CATCH_UP = 30  # grabs after which two cameras that never come close in time are given up
-_FORM = "usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,format=MJPG]"
+_FORM = "usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,gain=20][,format=MJPG]"
+_MJPG = cv2.VideoWriter.fourcc(*"MJPG")
 
 #: OpenCV's property -> its name and value in messages and the value to set; in the order in which they must be set.
 Settings = dict[int, tuple[str, float]]
@@ -82,6 +87,9 @@ class UsbCamera:
                     f"{device}: did not take {name}, it says {said}; `armsight cameras` lists what it can do"
                 )
         shape = (int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)))
+        # A driver that cannot hand out the bytes says so, and OpenCV decodes as before.
+        if capture.get(cv2.CAP_PROP_FOURCC) == _MJPG:
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         return UsbCamera(device, capture, shape)
 
     def grab(self, stall_s: float) -> None:
@@ -113,8 +121,11 @@ class UsbCamera:
         self.rhythm.tick(self.t_s)
         return now - self.t_s
 
-    def image(self) -> Image | None:
+    def image(self) -> tuple[Image, bytes | None] | None:
         """Decode the grabbed frame; None if that fails.
+
+        Returns:
+            The image, and the JPEG that the camera sent; None where it sent none.
 
         Raises:
             DeviceError: it is not of the size agreed on.
@@ -122,10 +133,17 @@ class UsbCamera:
         ok, image = self.capture.retrieve()
         if not ok or image is None or image.size == 0:
             return None
+        encoded: bytes | None = None
+        if image.shape[:2] != self._shape and image.size == max(image.shape):  # one row or column: bytes as they came
+            encoded = _one_jpeg(np.asarray(image, np.uint8).tobytes())
+            decoded = None if encoded is None else cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+            if decoded is None:
+                return None
+            image = decoded
         if image.shape[:2] != self._shape:
             (height, width), (h, w) = self._shape, image.shape[:2]
             raise DeviceError(f"{self.device}: sends frames of {w}x{h} px, agreed on {width}x{height}")
-        return image
+        return image, encoded
 
 
 class UsbSource:
@@ -153,11 +171,15 @@ class UsbSource:
             )
         name, t_s = f"{self._shots:06d}", (left.t_s + right.t_s) / 2
         self._shots += 1
-        images = [left.image(), right.image()]
-        for camera, image in zip((left, right), images, strict=True):
+        images = []
+        for camera in (left, right):
+            image = camera.image()
             if image is None:
                 return Shot(name, None, None, t_s, f"{camera.device}: the frame cannot be decoded")
-        return Shot(name, images[0], images[1], t_s)
+            images.append(image)
+        (left_image, left_jpeg), (right_image, right_jpeg) = images
+        encoded = None if left_jpeg is None or right_jpeg is None else (left_jpeg, right_jpeg)
+        return Shot(name, left_image, right_image, t_s, None, encoded)
 
     def close(self) -> None:
         """Release both cameras."""
@@ -166,7 +188,7 @@ class UsbSource:
 
 
 def open_usb(rest: str, capture: Callable[[str], Capture] | None = None) -> UsbSource:
-    """Open ``LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,format=MJPG]``.
+    """Open ``LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,gain=20][,format=MJPG]``.
 
     Args:
         rest: two devices, a number N for /dev/videoN or a path, and the settings for both.
@@ -197,8 +219,9 @@ def parsed_usb(rest: str) -> tuple[list[str], Settings]:
     named = dict(part.split("=") for part in form[6].split(",")[1:]) if form else {}
     asked = named.pop("exposure", None)
     exposure = re.fullmatch(r"auto|(\d+(?:\.\d+)?)ms", asked or "auto")
-    fourcc = named.pop("format", "MJPG")
-    if form is None or exposure is None or len(fourcc) != 4 or named:
+    fourcc, gain = named.pop("format", "MJPG"), named.pop("gain", "")
+    good_gain = re.fullmatch(r"(\d+(?:\.\d+)?)?", gain)
+    if form is None or exposure is None or len(fourcc) != 4 or good_gain is None or named:
         raise InputError(f"usb:{rest}: expected {_FORM}")
     left, right, width, height, fps = form.groups()[:5]
     devices = [f"/dev/video{device}" if device.isdecimal() else device for device in (left, right)]
@@ -212,11 +235,22 @@ def parsed_usb(rest: str) -> tuple[list[str], Settings]:
         settings[cv2.CAP_PROP_FPS] = (f"{fps} frames per second", float(fps))
     if exposure[1]:
         settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"manual exposure ({_MANUAL})", _MANUAL)
-        units = round(float(exposure[1]) / _EXPOSURE_UNIT_MS)
-        settings[cv2.CAP_PROP_EXPOSURE] = (f"exposure {units} (x {_EXPOSURE_UNIT_MS} ms)", units)
+        units = round(float(exposure[1]) / EXPOSURE_UNIT_MS)
+        settings[cv2.CAP_PROP_EXPOSURE] = (f"exposure {units} (x {EXPOSURE_UNIT_MS} ms)", units)
     elif asked:
         settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"automatic exposure ({_AUTO})", _AUTO)
+    if gain:
+        settings[cv2.CAP_PROP_GAIN] = (f"gain {gain}", float(gain))
     return devices, settings
+
+
+def _one_jpeg(buffer: bytes) -> bytes | None:
+    """Return the JPEG at the beginning of a driver's buffer, which an older one may follow; None if it is cut short."""
+    at = 2
+    while buffer[at : at + 1] == b"\xff" and buffer[at + 1 : at + 2] != b"\xda":  # segments, each with its length
+        at += 2 + int.from_bytes(buffer[at + 2 : at + 4], "big")
+    end = buffer.find(b"\xff\xd9", at)  # within compressed data no such pair can stand
+    return buffer[: end + 2] if buffer[:2] == b"\xff\xd8" and end >= 0 else None
 
 
 def _v4l2(device: str) -> Capture:

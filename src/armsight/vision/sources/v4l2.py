@@ -18,6 +18,9 @@ from armsight.vision.sources.pairs import natural_key
 
 #: request number -> how many bytes; videodev2.h's _IOWR('V', n, struct ...).
 QUERYCAP, ENUM_FMT, ENUM_FRAMESIZES, ENUM_FRAMEINTERVALS = 0x80685600, 0xC0405602, 0xC02C564A, 0xC034564B
+QUERYCTRL = 0xC0445624
+#: Controls by their numbers in v4l2-controls.h, a flag of a control, and the unit of exposure_time_absolute, ms.
+_EXPOSURE, _GAIN, _DISABLED, EXPOSURE_UNIT_MS = 0x009A0902, 0x00980913, 0x0001, 0.1
 _CAPTURE, _DEVICE_CAPS = 0x00000001, 0x80000000
 _VIDEO_CAPTURE = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
 _DISCRETE = 1  # V4L2_FRMSIZE_TYPE_DISCRETE, V4L2_FRMIVAL_TYPE_DISCRETE
@@ -47,7 +50,10 @@ class Format:
 
 @dataclasses.dataclass(frozen=True)
 class VideoDevice:
-    """One attached camera; ``problem`` is the reason why it did not answer."""
+    """One attached camera; ``problem`` is the reason why it did not answer.
+
+    ``exposure_ms`` and ``gain`` are the smallest and the largest value that its driver takes, None where it takes none.
+    """
 
     device: str
     name: str
@@ -56,6 +62,8 @@ class VideoDevice:
     bus: str = ""
     formats: tuple[Format, ...] = ()
     problem: str | None = None
+    exposure_ms: tuple[float, float] | None = None
+    gain: tuple[float, float] | None = None
 
 
 def capability(buffer: bytes) -> tuple[str, str, str, bool]:
@@ -101,6 +109,16 @@ def describe(device: int, ioctl: Ioctl) -> tuple[Format, ...]:
     return tuple(formats)
 
 
+def control_range(device: int, ioctl: Ioctl, control: int, unit: float = 1.0) -> tuple[float, float] | None:
+    """Ask an open device for the smallest and the largest value of a control; None where it has none, or it is disabled."""
+    try:
+        answer = ioctl(device, QUERYCTRL, struct.pack("=I64x", control))
+    except OSError:
+        return None
+    low, high, _, _, flags = struct.unpack_from("=40x4iI", answer)
+    return None if flags & _DISABLED else (round(low * unit, 6), round(high * unit, 6))
+
+
 def find_cameras(sys: Path = Path("/sys/class/video4linux"), dev: Path = Path("/dev")) -> list[VideoDevice]:
     """List the attached cameras; devices that deliver no images (metadata, output) are left out."""
     cameras = []
@@ -119,8 +137,10 @@ def find_cameras(sys: Path = Path("/sys/class/video4linux"), dev: Path = Path("/
         try:
             driver, card, bus, captures = capability(_ioctl(handle, QUERYCAP, bytes(104)))
             if captures:
-                formats = describe(handle, _ioctl)
-                cameras.append(dataclasses.replace(entry, name=card, driver=driver, bus=bus, formats=formats))
+                entry = dataclasses.replace(entry, name=card, driver=driver, bus=bus, formats=describe(handle, _ioctl))
+                exposure_ms = control_range(handle, _ioctl, _EXPOSURE, EXPOSURE_UNIT_MS)
+                gain = control_range(handle, _ioctl, _GAIN)
+                cameras.append(dataclasses.replace(entry, exposure_ms=exposure_ms, gain=gain))
         except OSError as error:
             cameras.append(dataclasses.replace(entry, problem=_why(error)))
         finally:

@@ -49,7 +49,7 @@ PERIPHERALS = {
     "DBGMCU": (0xE0042000, {"APB1_FZ": 0x8, "APB2_FZ": 0xC}, None),
     "SYSTICK": (0xE000E010, {"CSR": 0x0, "RVR": 0x4, "CVR": 0x8}, None),
     "NVIC": (0xE000E100, {"ISER0": 0x0}, None),
-    "SCB": (0xE000ED00, {"ICSR": 0x4, "VTOR": 0x8, "SHPR3": 0x20, "CPACR": 0x88, "FPCCR": 0x234}, None),
+    "SCB": (0xE000ED00, {"ICSR": 0x4, "VTOR": 0x8, "SHPR3": 0x20, "CFSR": 0x28, "CPACR": 0x88, "FPCCR": 0x234}, None),
 }
 
 #: What a register holds after a reset, where that is not 0.

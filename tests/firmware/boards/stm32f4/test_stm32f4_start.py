@@ -245,6 +245,20 @@ def test_a_fault_switches_the_drives_off_and_lets_the_watchdog_run_out(booted, v
     assert chip.wrongs == []
 
 
+def test_where_it_crashed_is_kept_over_the_reset_and_reported_once(booted):
+    stack, pc, lr = booted.word(FLASH) - 256, 0x0800C2A4, 0x0800C100
+    booted.uc.mem_write(stack, struct.pack("<8I", 0, 0, 0, 0, 0, lr, pc, 0))
+    booted.chip["SCB.CFSR"] = 0x82  # a data access without a memory there
+    booted.uc.reg_write(UC_ARM_REG_SP, stack)
+    booted.run_into(4, instructions=3000)
+    booted.power_up("memory_start")
+    record = RAM + 64
+    assert booted.call("crash_was_here", record) == 1
+    assert struct.unpack("<3I", booted.uc.mem_read(record + 4, 12)) == (pc, lr, 0x82)
+    assert booted.call("crash_was_here", record) == 0
+    assert bytes(booted.uc.mem_read(record, 16)) == bytes(16)
+
+
 def test_a_restart_by_the_watchdog_is_reported_once(emulator):
     emulator.chip["RCC.CSR"] = 1 << 29 | 1 << 26
     emulator.power_up("watchdog_was_here")

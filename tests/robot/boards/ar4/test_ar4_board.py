@@ -225,3 +225,22 @@ def test_disturbed_readings_are_not_taken_for_angles():
     states = board.receive(4.0)
     assert board.broken_messages > 0
     assert np.degrees(np.ptp(states.q, axis=0)).max() < 10.0  # without a checksum a digit is not found
+
+
+@pytest.mark.parametrize("steps", [-2, -1, 1, 2])
+def test_a_goal_that_changes_at_rest_within_the_dead_steps_is_reached_from_beyond_it(homed, steps):
+    board, device = homed
+    device.mechanics = Ar4Mechanics((0.0,) * 6, (0.0,) * 6, 0.0)
+    arrived = np.radians([3.0, 10.0, -15.0, 5.0, 20.0, 5.0])
+    q, zero = follow(board, arrived, 1.0), device.true_deg
+    board.receive(1.0)
+    np.testing.assert_array_equal(device.true_deg, zero)  # one that has arrived is left alone
+    step_deg = 1.0 / board.model.steps_per_deg[1]
+    goal = arrived + np.radians([0.0, steps * step_deg, 0.0, 0.0, 0.0, 0.0])
+    for _ in range(60):
+        board.send(JointCommand(goal, REST, REST, 0.02))
+        board.receive(0.02)
+    moved = device.true_deg - zero
+    assert moved[1] == pytest.approx(np.degrees(goal - q)[1], abs=1.1 * step_deg)
+    assert moved[1] * steps > 0 or abs(np.degrees(goal - q)[1]) < 1.1 * step_deg
+    np.testing.assert_allclose(np.delete(moved, 1), 0.0, atol=0.03)

@@ -21,6 +21,7 @@ from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.ar4 import lines
 from armsight.robot.boards.ar4.lines import JOINTS, Ar4Start, Ar4Stopped, Ar4Text, Ar4Values, Heading, LineReader
 from armsight.robot.boards.ar4.models import (
+    DEAD_STEPS,
     HOMING_GROUPS,
     MODELS,
     MOST_ACCELERATION_DEG_S2,
@@ -41,6 +42,13 @@ RATE_HZ = 50.0
 #: Steppers slow down towards every goal as if it were the last: they follow goals that move with v at a distance of
 #: v^2 / (2 a). At 20 degrees/s and 30 degrees/s^2 that is 6.7 degrees, or 0.33 s, and as much again from and to rest.
 MOST_SPEED_RAD_S, LATENCY_S = float(np.radians(20.0)), 0.7
+#: The firmware leaves goals within DEAD_STEPS alone. A joint at rest goes beyond such a goal by one step more, and from
+#: there to it: for so long, s, not again before so long, s; at rest goal and joint are slower than this, rad/s.
+_BEYOND_S, _BEYOND_AGAIN_S, _STILL_RAD_S = 0.25, 1.0, 0.02
+#: A motor step of the joints with the finest ones, rad.
+STEP_RAD = float(np.radians(1 / 50.0))
+#: A step of 0.1 degree at 30 degrees/s^2 takes 2 sqrt(0.1 / 30) s, and a goal waits until it is sent.
+_RESPONSE_S = 0.15
 #: A goal further from the present position than this is a mistake, not a step of a motion.
 MOST_STEP_RAD = float(np.radians(20.0))
 _ANSWER_S, _START_S, _TRIES = 0.2, 0.6, 4
@@ -54,6 +62,9 @@ ABILITIES = Abilities(
     JOINTS,
     RATE_HZ,
     LATENCY_S,
+    _RESPONSE_S,
+    STEP_RAD,
+    0.055,
     MOST_SPEED_RAD_S,
     float(np.radians(MOST_ACCELERATION_DEG_S2)),
     takes_duty=False,
@@ -86,7 +97,9 @@ class Ar4Board:
         self._speed_rad_s: Array = np.zeros(JOINTS)
         self._goal: Array = np.zeros(JOINTS)
         self._goal_speed: Array = np.zeros(JOINTS)
-        self._written_s = -np.inf
+        self._written_s = self._beyond_s = -np.inf
+        self._beyond = np.zeros(JOINTS)  # degrees beyond a goal from which it is approached
+        self._arrived: Array | None = None  # the goal at which the joints came to rest, degrees of the encoders
 
     @classmethod
     def connect(
@@ -300,8 +313,27 @@ class Ar4Board:
         self._enabled = True
 
     def _write_goal(self) -> None:
-        self._link.write(lines.move_to(self.model.reported_deg(np.degrees(self._goal)).tolist()))
-        self._written_s = self._now()
+        """Write the goal; what the host changes at rest by no more than the dead steps is reached from beyond it.
+
+        A joint that has just arrived is left where it is, up to those steps short: going beyond would take it through its
+        backlash.
+        """
+        now, goal = self._now(), self.model.reported_deg(np.degrees(self._goal))
+        still = max(np.abs(self._goal_speed).max(), np.abs(self._speed_rad_s).max()) < _STILL_RAD_S
+        if not still or self._arrived is None:
+            self._arrived = goal if still else None
+        elif now >= self._beyond_s + _BEYOND_AGAIN_S:
+            off = np.rint((goal - self._reported) * self.model.steps_per_deg)
+            changed = np.abs(goal - self._arrived) * self.model.steps_per_deg >= 0.5
+            near = changed & (np.abs(off) >= 1) & (np.abs(off) <= DEAD_STEPS + 1)
+            if near.any():
+                self._beyond = np.where(near, np.sign(off) * (DEAD_STEPS + 1), 0.0) / self.model.steps_per_deg
+                self._beyond_s = now
+        if now < self._beyond_s + _BEYOND_S:
+            ends = [self.model.reported_deg(np.degrees(end)) for end in self.soft_limits()]
+            goal = np.clip(goal + self._beyond, np.minimum(*ends), np.maximum(*ends))
+        self._link.write(lines.move_to(goal.tolist()))
+        self._written_s = now
 
     def _read(self) -> None:
         """Read the positions; a reading that no joint can have is a disturbed one."""

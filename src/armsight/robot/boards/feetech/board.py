@@ -44,10 +44,21 @@ MOST_STEP_RAD = float(np.radians(20.0))
 _GOAL_SPEED, _ACCELERATION = 1700, 164
 #: What they follow with LATENCY_S, rad/s and rad/s^2.
 _MOST_SPEED, _MOST_ACCELERATION = 1.5, 10.0
+#: A count that comes and goes between two readings looks like a speed of up to this, rad/s.
+_REST_RAD_S = 0.35
 #: The torque goes off so many times: a disturbed byte must not swallow it.
 _STOPS = 3
 ABILITIES = Abilities(
-    len(NAMES), RATE_HZ, LATENCY_S, _MOST_SPEED, _MOST_ACCELERATION, takes_duty=False, own_controller=True
+    len(NAMES),
+    RATE_HZ,
+    LATENCY_S,
+    LATENCY_S,
+    RAD_PER_COUNT,
+    _REST_RAD_S,
+    _MOST_SPEED,
+    _MOST_ACCELERATION,
+    takes_duty=False,
+    own_controller=True,
 )
 
 
@@ -58,14 +69,17 @@ class FeetechBoard:
         bus: the servos, each of which answers.
         calibration: which counts are which angles.
         enabled: whether the torque of all is on.
+        begin_s: when its own time begins, on the bus's clock, s; now by default.
     """
 
-    def __init__(self, bus: ServoBus, calibration: ServoCalibration, *, enabled: bool) -> None:
+    def __init__(
+        self, bus: ServoBus, calibration: ServoCalibration, *, enabled: bool, begin_s: float | None = None
+    ) -> None:
         self._bus, self.calibration = bus, calibration
         count = len(calibration.ids)
         self.abilities = replace(ABILITIES, joints=count)
         self.welcome = Welcome("feetech: " + ", ".join(calibration.names), "STS3215", 0, bus.baud, None)
-        self._begin_s = bus.now()
+        self._begin_s = bus.now() if begin_s is None else begin_s
         self._sent = 0
         self._enabled = enabled
         self._states = bus.states(calibration.ids)
@@ -79,12 +93,15 @@ class FeetechBoard:
         return self._bus
 
     @classmethod
-    def connect(cls, bus: ServoBus, calibration: ServoCalibration | None = None) -> Self:
+    def connect(
+        cls, bus: ServoBus, calibration: ServoCalibration | None = None, *, begin_s: float | None = None
+    ) -> Self:
         """Meet the servos of an arm; nothing is written.
 
         Args:
             bus: closed where this raises.
             calibration: which counts are which angles; without, 0 rad is count 2048.
+            begin_s: when its own time begins, on the bus's clock, s; now by default.
 
         Raises:
             DeviceError: one does not answer, is of another model, is not a position servo, or has another homing offset
@@ -101,7 +118,7 @@ class FeetechBoard:
                 calibration = uncalibrated(*limits)
             elif calibration.offsets is not None:
                 _same_offsets(bus, calibration)
-            return cls(bus, calibration, enabled=all(bus.read(id, TORQUE) == 1 for id in ids))
+            return cls(bus, calibration, enabled=all(bus.read(id, TORQUE) == 1 for id in ids), begin_s=begin_s)
         except BaseException:
             bus.close()
             raise

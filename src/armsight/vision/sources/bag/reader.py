@@ -207,9 +207,13 @@ class _RosFile:
             try:
                 return (self._store.deserialize_cdr if self._is_cdr else self._store.deserialize_ros1)(data, kind)
             except Exception as error:  # noqa: BLE001 - as above
-                raise InputError(f"{self._path}: a message of type {_plain(kind)} cannot be decoded: {error}") from None
+                raise InputError(_undecodable(self._path, _plain(kind), error)) from None
 
         return decode
+
+
+def _undecodable(path: str | Path, kind: str, error: Exception) -> str:
+    return f"{path}: a message of type {kind} cannot be decoded: {' '.join(str(error).split())}"
 
 
 def _ros_problem(path: str | Path, error: Exception) -> str:
@@ -312,7 +316,7 @@ class _McapFiles:
                 raise
             except Exception as error:  # noqa: BLE001 - whatever a library finds wrong with one message
                 name = schema.name if schema else channel.message_encoding
-                raise InputError(f"{self._path}: a message of type {name} cannot be decoded: {error}") from None
+                raise InputError(_undecodable(self._path, _plain(name), error)) from None
 
         return decode
 

@@ -1,0 +1,697 @@
+"""What a run shows of an arm, for ``armsight arm report``: a folder of ``armsight run`` in, numbers out; and its motions.
+
+:func:`plan_report` writes the motions of the recording. :func:`evaluate_arm` evaluates its rests in open loop: where vision
+saw the tool, what the joints' own sensors read, and what was commanded. The error of a rest, seen less commanded, is split
+
+    error = base and tool + controller + the arm's error sources + rest,
+
+the controller's part being what readings and commands put apart by the nominal table, the sources those that an
+identification (``loop.identify``) selects by poses left out. The parts are taken one after the other, each beyond what
+those before it explain, so that what two could explain is counted once: their shares of the mean square error sum to 1.
+What a remedy leaves is the RMS error where it alone is taken. All after base and tool were fitted, as no arm knows where
+its base is.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.app.check.run_folder import WINDOW_S, Noise, noise_of, segments_of
+from armsight.app.run.record import read_track
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.files import finite_json, read_table, read_text
+from armsight.geometry.pose import mean_pose
+from armsight.loop.identify.backlash import joint_backlashes
+from armsight.loop.identify.identify import Identified, identify
+from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.model import SENSOR, gravity_levers
+from armsight.loop.iso9283.poses import MIN_POSES, repeatability
+from armsight.robot.arm import Arm
+from armsight.robot.arm_file import open_arm
+
+#: Directions of parameters that differ by less than this share are one.
+_RANK = 1e-3
+#: Version of report.json.
+VERSION = 1
+#: Fewest rests, and shots of one; a joint was elsewhere from this on, rad; commands that are looked at before a rest.
+MIN_RESTS, _SHOTS, _AWAY_RAD, _BEFORE = 12, 2, np.radians(0.3), 20_000
+_SIGMAS = tuple(f"sigma_{name}" for name in ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"))
+#: Delays of the joints that are tried, s; how much a joint must move in a motion to show its delay, rad; how much of the
+#: rest after it counts, s; and so many motions at most.
+_DELAYS_S, _MOVED_RAD, _AFTER_S, _MOTIONS = np.arange(0.0, 1.2, 0.005), np.radians(2.0), 0.5, 60
+#: Poses that are at most this far apart by their commands, rad, are one pose.
+_SAME_RAD = 1e-6
+#: Part of the error -> the kinds of parameters that make it, those that its remedy corrects as well, and the remedy.
+_PARTS = {
+    "zeros": (("offset",), (), "set the zeros of the joints (armsight board offsets, or corrected.toml)"),
+    "lengths and angles": (("d", "a", "alpha", "beta"), ("offset",), "use the identified table (armsight identify)"),
+    "sensors' curves": (
+        ("gain", "wave", "ripple"),
+        ("offset",),
+        "correct the sensors' curves (zeros.toml of armsight identify)",
+    ),
+    "backlash": (("backlash", "gravity_backlash"), (), "approach from one side, or take the backlash out of the gears"),
+    "compliance": (("compliance",), (), "correct the compliance under gravity (corrected.toml)"),
+}
+CONTROLLER, REST = "controller", "rest"
+#: Harmonics of a sensor beyond the second are left to ``armsight identify``: the recording is too short for them.
+_PRIORS = {"ripple": 0.0}
+
+
+@dataclass(frozen=True, eq=False)
+class JointTrack(Record):
+    """Readings and commands of the joints.
+
+    Attributes:
+        t_s: (N,) board's clock, s.
+        q: (N, n) readings, rad.
+        q_ref: (N, n) commands, rad.
+        moving: (N,) whether a motion was under way in open loop.
+    """
+
+    t_s: Array
+    q: Array
+    q_ref: Array
+    moving: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class RestPoses(Record):
+    """The rests of a run in open loop that vision saw.
+
+    Attributes:
+        t_s: (N,) their ends, board's clock, s.
+        T_seen: (N, 4, 4) mean poses of the tool at their ends, in the base of the run.
+        T_ref: (N, 4, 4) commanded ones.
+        cov: (N, 6, 6) covariances of what was seen, right tangents [m; rad].
+        q: (N, n) mean readings, rad.
+        q_ref: (N, n) commands, rad.
+        approach: (N, n) from which side each joint came: 1 with rising angle, -1 with falling, 0 unmoved.
+        shots: (N,) how many each was seen in.
+        noise: of one shot.
+    """
+
+    t_s: Array
+    T_seen: Array
+    T_ref: Array
+    cov: Array
+    q: Array
+    q_ref: Array
+    approach: Array
+    shots: NDArray[np.int64]
+    noise: Noise
+
+    def __len__(self) -> int:
+        """Return N."""
+        return len(self.t_s)
+
+    def measured(self) -> Measured:
+        """Return what an identification is given."""
+        return Measured(self.q, self.T_seen[:, None, :3, 3], self.T_seen[:, :3, :3].copy(), self.cov, self.approach)
+
+    def rows(self, rows: NDArray[np.bool_]) -> RestPoses:
+        """Return some of the rests."""
+        return RestPoses(
+            self.t_s[rows],
+            self.T_seen[rows],
+            self.T_ref[rows],
+            self.cov[rows],
+            self.q[rows],
+            self.q_ref[rows],
+            self.approach[rows],
+            self.shots[rows],
+            self.noise,
+        )
+
+    def visits(self) -> tuple[NDArray[np.int64], int]:
+        """Return which pose each rest was at (N,), and how many there are."""
+        _, which = np.unique(np.round(self.q_ref / _SAME_RAD), axis=0, return_inverse=True)
+        return np.asarray(which.ravel(), np.int64), int(which.max()) + 1
+
+    def groups(self, which: NDArray[np.int64], *, by_side: bool) -> list[NDArray[np.int64]]:
+        """Return the rows of each pose, of each with the sides it was approached from where asked for."""
+        key = np.column_stack([which, self.approach]) if by_side else which[:, None]
+        _, group = np.unique(key, axis=0, return_inverse=True)
+        return [np.flatnonzero(group.ravel() == k) for k in range(int(group.max()) + 1)]
+
+
+def joint_track(folder: Path, joints: int) -> JointTrack:
+    """Read joints.csv of a run.
+
+    Raises:
+        InputError: missing, or of an arm of another number of joints.
+    """
+    path = folder / "joints.csv"
+    table = read_table(path)
+    names = ["t_s", *(f"q{i + 1}_rad" for i in range(joints)), *(f"q{i + 1}_ref_rad" for i in range(joints))]
+    header = table[0] if table else []
+    if any(name not in header for name in names) or f"q{joints + 1}_rad" in header:
+        raise InputError(f"{path}: is not of an arm of {joints} joints: give the arm of the run with --arm")
+    at = [header.index(name) for name in names]
+    try:
+        values = np.array([[float(row[k]) for k in at] for row in table[1:]])
+    except (ValueError, IndexError):
+        raise InputError(f"{path}: numbers are needed in {', '.join(names)}") from None
+    if len(values) < _SHOTS:
+        raise InputError(f"{path}: no readings")
+    t_s = values[:, 0]
+    moving = np.zeros(len(t_s), bool)
+    for segment in segments_of(folder, closed=False):
+        if segment.kind != "rest":
+            moving |= (t_s > segment.reference.t_s[0]) & (t_s <= segment.reference.t_s[-1])
+    return JointTrack(t_s, values[:, 1 : joints + 1], values[:, joints + 1 :], moving)
+
+
+def rests_of(folder: Path, arm: Arm) -> RestPoses:
+    """Read the rests of a run's motions in open loop.
+
+    Raises:
+        InputError: no run, another arm's, or too few rests in view.
+    """
+    segments = segments_of(folder, closed=False)
+    track = joint_track(folder, arm.joints)
+    seen, sigmas = read_track(folder / "vision.csv", _SIGMAS)
+    noise, rows = noise_of(segments), list[tuple[Any, ...]]()
+    for segment in (each for each in segments if each.kind == "rest"):
+        end_s, begin_s = float(segment.reference.t_s[-1]), float(segment.reference.t_s[0])
+        looked = np.flatnonzero((seen.t_s > max(end_s - WINDOW_S, begin_s)) & (seen.t_s <= end_s))
+        read = (track.t_s > end_s - WINDOW_S) & (track.t_s <= end_s)
+        if len(looked) < _SHOTS or not read.any():
+            continue
+        T = mean_pose(seen.Ts_base_tool[looked])
+        R, variance = T[:3, :3], (sigmas[looked] ** 2).mean(axis=0)
+        cov = np.zeros((6, 6))
+        for part in (slice(0, 3), slice(3, 6)):
+            cov[part, part] = R.T @ np.diag(variance[part]) @ R
+        q_ref = track.q_ref[np.flatnonzero(read)[-1]]
+        side = _came(track.q_ref[track.t_s <= begin_s][-_BEFORE:], q_ref)
+        rows.append((end_s, T, arm.forward(q_ref), cov, track.q[read].mean(axis=0), q_ref, side, len(looked)))
+    if len(rows) < MIN_RESTS:
+        raise InputError(
+            f"{folder}: {len(rows)} rests were seen in open loop, {MIN_RESTS} at least are needed: armsight arm plan "
+            "writes the motions of such a recording"
+        )
+    t_s, T_seen, T_ref, cov, q, q_ref, came, shots = (np.array(part) for part in zip(*rows, strict=True))
+    return RestPoses(t_s, T_seen, T_ref, cov, q, q_ref, came, shots, noise)
+
+
+def _came(q_ref: Array, q: Array) -> Array:
+    """Return from which side each joint came to q (n,), rad, by its commands (N, n) before."""
+    sides = np.zeros(len(q))
+    for i in range(len(q)):
+        away = np.flatnonzero(np.abs(q_ref[:, i] - q[i]) > _AWAY_RAD)
+        if len(away):
+            sides[i] = np.sign(q[i] - q_ref[away[-1], i])
+    return sides
+
+
+@dataclass(frozen=True)
+class JointFigures:
+    """What a run shows of one joint; None where it does not.
+
+    Attributes:
+        name: of the joint.
+        zero_deg: true angle less reading, mean over the rests, and its sigma; None of the first and the last joint, whose
+            zeros are base and tool.
+        backlash_deg: behind the sensor, stop to stop, and its sigma.
+        backlash_how: what showed it, or why it does not show.
+        hysteresis_deg: of the reading against the command: from above less from below, mean, and its sigma.
+        droop_deg_per_m: reading less command for a metre of the gravity load's lever, and its sigma.
+        droop_deg: that at the greatest lever of these poses.
+        once_per_revolution_deg: amplitude of the sensor's error once per revolution, and its sigma.
+        latency_s: from command to reading in motion.
+    """
+
+    name: str
+    zero_deg: tuple[float, float] | None
+    backlash_deg: tuple[float, float] | None
+    backlash_how: str
+    hysteresis_deg: tuple[float, float] | None
+    droop_deg_per_m: tuple[float, float] | None
+    droop_deg: float | None
+    once_per_revolution_deg: tuple[float, float] | None
+    latency_s: float | None
+
+
+@dataclass(frozen=True)
+class ErrorPart:
+    """A part of the error.
+
+    Attributes:
+        share: of the mean square error, beyond what the parts before it explain; all sum to 1.
+        rms_mm: of that.
+        without_mm: RMS error that its remedy alone would leave.
+        remedy: what would take it away; empty where nothing does.
+    """
+
+    share: float
+    rms_mm: float
+    without_mm: float
+    remedy: str
+
+
+@dataclass(frozen=True, eq=False)
+class ArmReport(Record):
+    """An arm in numbers.
+
+    Attributes:
+        arm: its model.
+        board: its controller, as the run names it.
+        poses: number of different poses.
+        rests: number of rests that were seen.
+        hours: from the first rest to the last.
+        accuracy_mm: RMS and largest distance from the command in the frames of the run.
+        placed_mm: RMS distance from the command after base and tool were fitted to these poses.
+        one_side_mm: repeatability RP (ISO 9283) of poses approached from the same side; None where none was three times.
+        both_sides_mm: mean and largest distance between a pose from one side and from the other; None likewise.
+        drift_mm_per_h: drift of the pose that came most often, and its sigma; None likewise.
+        cycles: how often that pose came.
+        latency_s: median of the joints'; None where no joint moved enough.
+        joints: of each joint.
+        parts: of the error, by name.
+        noise_mm: of vision at rest, one shot.
+        health: what the run's health monitor found, as text.
+        notes: what could not be evaluated, and why.
+        at: (N, 3) commanded positions of the rests, m, and ``off`` the errors there after base and tool were fitted.
+        off: (N, 3) see ``at``, m.
+        lever: (N, n) levers of the gravity load, m; ``lag`` readings less commands there.
+        lag: (N, n) see ``lever``, rad.
+        drift: (C, 2) time, h, and distance from the first visit, mm, of the pose that came most often.
+    """
+
+    arm: str
+    board: str
+    poses: int
+    rests: int
+    hours: float
+    accuracy_mm: tuple[float, float]
+    placed_mm: float
+    one_side_mm: float | None
+    both_sides_mm: tuple[float, float] | None
+    drift_mm_per_h: tuple[float, float] | None
+    cycles: int
+    latency_s: float | None
+    joints: tuple[JointFigures, ...]
+    parts: dict[str, ErrorPart]
+    noise_mm: float
+    health: tuple[str, ...]
+    notes: tuple[str, ...]
+    at: Array
+    off: Array
+    lever: Array
+    lag: Array
+    drift: Array
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the object of report.json: pairs are a value and its sigma, or as the key says."""
+        shown: dict[str, Any] = {"version": VERSION, "kind": "arm report"}
+        for name in (
+            "arm",
+            "board",
+            "poses",
+            "rests",
+            "hours",
+            "placed_mm",
+            "one_side_mm",
+            "cycles",
+            "latency_s",
+            "noise_mm",
+        ):
+            shown[name] = getattr(self, name)
+        shown["accuracy_rms_mm"], shown["accuracy_max_mm"] = self.accuracy_mm
+        shown["both_sides_mean_mm"], shown["both_sides_max_mm"] = self.both_sides_mm or (None, None)
+        shown["drift_mm_per_h"], shown["drift_sigma_mm_per_h"] = self.drift_mm_per_h or (None, None)
+        shown["joints"] = [_with_sigmas(asdict(joint)) for joint in self.joints]
+        shown["parts"] = {name: asdict(part) for name, part in self.parts.items()}
+        shown["health"], shown["notes"] = list(self.health), list(self.notes)
+        shown["map"] = [
+            {"at_m": p, "error_mm": e} for p, e in zip(self.at.tolist(), (1e3 * self.off).tolist(), strict=True)
+        ]
+        known: dict[str, Any] = finite_json(shown)
+        return known
+
+
+def _with_sigmas(values: dict[str, Any]) -> dict[str, Any]:
+    """Return values whose pairs stand as NAME and sigma_NAME."""
+    shown: dict[str, Any] = {}
+    for name, value in values.items():
+        pair = isinstance(value, tuple)
+        shown[name] = value[0] if pair else value
+        if pair:
+            shown[f"sigma_{name}"] = value[1]
+    return shown
+
+
+def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = lambda line: None) -> ArmReport:
+    """Evaluate a run.
+
+    Args:
+        folder: of ``armsight run`` or ``demo``.
+        arm: the nominal arm of it.
+        progress: called with what is being done.
+
+    Raises:
+        InputError: no run, another arm's, or too few rests in view.
+        CalibrationError: poses too alike for an identification.
+    """
+    progress("reading the run")
+    rests, summary = rests_of(folder, arm), _summary(folder)
+    progress("identifying the arm")
+    measured = rests.measured()
+    found = identify(arm, measured, priors=_PRIORS, progress=progress)
+    progress("evaluating")
+    kept = rests.rows(found.solution.used)
+    notes = [f"{len(found.left_out)} rests were left out as mistakes"] if len(found.left_out) else []
+    off, parts = _split(arm, kept, found, measured.rows(found.solution.used))
+    lever = gravity_levers(arm, kept.q)
+    seen_off = rests.T_seen[:, :3, 3] - rests.T_ref[:, :3, 3]
+    distance = np.linalg.norm(seen_off, axis=1)
+    which, visits = rests.visits()
+    drift, per_h = _drift(kept)
+    latencies, joints = _latencies(folder, arm), []
+    backlash = joint_backlashes(found, measured)
+    for i, name in enumerate(arm.joint_names):
+        joints.append(_joint(arm, i, name, kept, found, lever[:, i], backlash[i]._asdict(), latencies[i]))
+    known = [each for each in latencies if each is not None]
+    one, both = _one_side(rests, which), _both_sides(rests, which)
+    if one is None:
+        notes.append(f"no pose was approached {MIN_POSES} times from one side: no repeatability")
+    if both is None:
+        notes.append("no pose was approached from both sides")
+    return ArmReport(
+        arm.name,
+        str(summary.get("board", "unknown")),
+        visits,
+        len(rests),
+        float(np.ptp(rests.t_s)) / 3600.0,
+        (1e3 * float(np.sqrt((distance**2).mean())), 1e3 * float(distance.max())),
+        1e3 * float(np.sqrt((off**2).sum(axis=1).mean())),
+        one,
+        both,
+        per_h,
+        len(drift),
+        float(np.median(known)) if known else None,
+        tuple(joints),
+        parts,
+        1e3 * float(np.sqrt(np.trace(rests.noise.own))),
+        tuple(str(each.get("what")) for each in summary.get("health", [])),
+        tuple(notes),
+        kept.T_ref[:, :3, 3],
+        off,
+        lever,
+        kept.q - kept.q_ref,
+        drift,
+    )
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    """Return summary.json of a run, empty where there is none."""
+    path = folder / "summary.json"
+    try:
+        found = json.loads(read_text(path)) if path.is_file() else {}
+    except ValueError as error:
+        raise InputError(f"{path}: not JSON: {error}") from None
+    return found if isinstance(found, dict) else {}
+
+
+def _split(arm: Arm, rests: RestPoses, found: Identified, measured: Measured) -> tuple[Array, dict[str, ErrorPart]]:
+    """Return the errors (N, 3), m, after base and tool were fitted, and their parts."""
+    model, x = found.model, found.solution.x
+    _, J = model.linearised(x, measured, model.feature_values(measured.q, measured.approach))
+    R = rests.T_seen[:, :3, :3]
+    J = np.einsum("nij,njp->nip", R, J[:, :3]).reshape(-1, len(x))  # into the base's axes; predicted less measured
+    kinds = np.array([p.kind for p in model.parameters])
+    placed = np.linalg.qr(J[:, np.isin(kinds, ("base", "tool"))])[0]
+
+    def free(values: Array) -> Array:
+        """Take out what another base and tool would do."""
+        flat = values.reshape(-1)
+        return np.asarray(flat - placed @ (placed.T @ flat))
+
+    error = free(rests.T_seen[:, :3, 3] - rests.T_ref[:, :3, 3])
+    square = max(float(error @ error), 1e-30)
+
+    def rms(values: Array) -> float:
+        return 1e3 * float(np.sqrt((values**2).sum() / len(rests)))
+
+    controller = free(arm.forward(rests.q)[:, :3, 3] - rests.T_ref[:, :3, 3])
+    left, basis = error - controller, np.zeros((len(error), 0))
+    share = 1.0 - float(left @ left) / square
+    shown = {CONTROLLER: ErrorPart(share, rms(controller), rms(left), "command what is missing: close the loop")}
+    for name, (of, needs, remedy) in _PARTS.items():
+        columns = J[:, np.isin(kinds, of) & found.solution.free]
+        new = _basis(columns - placed @ (placed.T @ columns), basis)
+        taken, basis = new @ (new.T @ left), np.column_stack([basis, new])
+        left = left - taken
+        columns = J[:, np.isin(kinds, (*of, *needs)) & found.solution.free]
+        alone = _basis(columns - placed @ (placed.T @ columns), np.zeros((len(error), 0)))
+        remedied = error - alone @ (alone.T @ error) if new.size else error
+        shown[name] = ErrorPart(float(taken @ taken) / square, rms(taken), rms(remedied), remedy)
+    shown[REST] = ErrorPart(float(left @ left) / square, rms(left), rms(error), "")
+    return np.asarray(error.reshape(-1, 3)), shown
+
+
+def _basis(columns: Array, beyond: Array) -> Array:
+    """Return an orthonormal basis (N, r) of columns (N, k) beyond what a basis (N, m) spans."""
+    sizes = np.linalg.norm(columns, axis=0)
+    columns = columns[:, sizes > 1e-9] / sizes[sizes > 1e-9]
+    for _ in range(2):  # twice is enough against rounding
+        columns = columns - beyond @ (beyond.T @ columns)
+    U, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(U[:, s > _RANK])
+
+
+def _joint(
+    arm: Arm,
+    i: int,
+    name: str,
+    rests: RestPoses,
+    found: Identified,
+    lever: Array,
+    backlash: dict[str, Any],
+    latency: float | None,
+) -> JointFigures:
+    """Return the figures of one joint."""
+    names, deg = found.model.names, float(np.degrees(1.0))
+    free = {n for n, f in zip(names, found.solution.free, strict=True) if f}
+    zero, once = _zero(arm, i, rests, found), None
+    waves = [f"wave{i + 1}_{phase}1" for phase in ("sin", "cos")]
+    if any(wave in free for wave in waves):
+        both = np.array([found.value(wave) for wave in waves if wave in free])
+        once = (deg * float(np.linalg.norm(both[:, 0])), deg * float(np.linalg.norm(both[:, 1])))
+    gap = None if not np.isfinite(backlash["value_rad"]) else (deg * backlash["value_rad"], deg * backlash["sigma_rad"])
+    lag, side = rests.q[:, i] - rests.q_ref[:, i], rests.approach[:, i]
+    loaded = float(np.abs(lever).max()) > _LEVER_M
+    columns = [np.ones(len(lag)), *([side] if side.any() else []), *([lever] if loaded else [])]
+    fitted, sigmas = _least_squares(np.column_stack(columns), lag)
+    hysteresis = (-2 * deg * fitted[1], 2 * deg * sigmas[1]) if side.any() else None
+    droop = (deg * fitted[-1], deg * sigmas[-1]) if loaded else None
+    most = None if droop is None else droop[0] * float(lever[np.argmax(np.abs(lever))])
+    return JointFigures(name, zero, gap, str(backlash["how"]), hysteresis, droop, most, once, latency)
+
+
+def _zero(arm: Arm, i: int, rests: RestPoses, found: Identified) -> tuple[float, float] | None:
+    """Return by how much a joint really is further than it reads, deg, on the mean over the rests, and its sigma.
+
+    The sensor's curve has a mean over these poses, which hardly differs from another zero: the two count together.
+    """
+    model, solution = found.model, found.solution
+    weight = np.zeros(len(solution.x))
+    if not solution.free[model.names.index(f"offset{i + 1}")]:
+        return None
+    weight[model.names.index(f"offset{i + 1}")] = arm.direction[i]
+    phi = model.feature_values(rests.q, rests.approach).mean(axis=0)
+    for k, feature in enumerate(model.features):
+        if feature.joint == i and feature.kind in SENSOR:
+            weight[model.sources_at + k] = phi[k]
+    value = float(weight @ (solution.x - model.nominal()))
+    return float(np.degrees(value)), float(np.degrees(np.sqrt(weight @ solution.cov @ weight)))
+
+
+#: A joint whose gravity load has a lever below this at all poses carries none, m.
+_LEVER_M = 0.02
+
+
+def _least_squares(A: Array, y: Array) -> tuple[list[float], list[float]]:
+    """Return the coefficients of a fit and their sigmas, by the scatter of what is left."""
+    x, *_ = np.linalg.lstsq(A, y, rcond=None)
+    left = y - A @ x
+    cov = np.linalg.pinv(A.T @ A) * float(left @ left) / max(len(y) - A.shape[1], 1)
+    return x.tolist(), np.sqrt(np.diag(cov)).tolist()
+
+
+def _one_side(rests: RestPoses, which: NDArray[np.int64]) -> float | None:
+    """Return the mean repeatability of poses that were approached from one side three times and more, mm."""
+    found = []
+    for rows in rests.groups(which, by_side=True):
+        if len(rows) >= MIN_POSES:
+            noise = np.array([rests.noise.own / n for n in rests.shots[rows]])
+            metric = repeatability(rests.T_seen[rows, :3, 3], noise)
+            found.append(metric.raw if metric.clean is None else metric.clean)
+    return 1e3 * float(np.mean(found)) if found else None
+
+
+def _both_sides(rests: RestPoses, which: NDArray[np.int64]) -> tuple[float, float] | None:
+    """Return mean and largest distance, mm, between a pose approached from one side and from the opposite one."""
+    apart = []
+    for rows in rests.groups(which, by_side=False):
+        sides = rests.approach[rows]
+        for k in range(len(rows)):
+            opposite = [m for m in range(k) if (sides[m] == -sides[k]).all() and sides[k].any()]
+            apart += [rests.T_seen[rows[k], :3, 3] - rests.T_seen[rows[m], :3, 3] for m in opposite]
+    if not apart:
+        return None
+    distance = 1e3 * np.linalg.norm(apart, axis=1)
+    return float(distance.mean()), float(distance.max())
+
+
+def _drift(rests: RestPoses) -> tuple[Array, tuple[float, float] | None]:
+    """Return times, h, and distances from the first visit, mm, of the pose that came most often, and its drift, mm/h."""
+    which, _ = rests.visits()
+    rows = max(rests.groups(which, by_side=True), key=len)
+    hours, p = (rests.t_s[rows] - rests.t_s[rows[0]]) / 3600.0, rests.T_seen[rows, :3, 3]
+    track = np.column_stack([hours, 1e3 * np.linalg.norm(p - p[0], axis=1)])
+    if len(rows) < 2 * MIN_POSES or hours[-1] <= 0:
+        return track, None
+    slopes, sigmas = zip(*(_slope(hours, 1e3 * p[:, k]) for k in range(3)), strict=True)
+    rate = float(np.linalg.norm(slopes))
+    along = np.array(slopes) / max(rate, 1e-12)
+    return track, (rate, float(np.sqrt((along**2 * np.square(sigmas)).sum())))
+
+
+def _slope(t: Array, y: Array) -> tuple[float, float]:
+    fitted, sigmas = _least_squares(np.column_stack([np.ones(len(t)), t]), y)
+    return fitted[1], sigmas[1]
+
+
+def _latencies(folder: Path, arm: Arm) -> list[float | None]:
+    """Return the delay from command to reading of each joint in the motions, s: the shift that leaves the least.
+
+    Every motion counts with the beginning of its rest, and without its mean: a joint may rest off its command.
+    """
+    track = joint_track(folder, arm.joints)
+    ends = np.flatnonzero(np.diff(track.moving.astype(int)))
+    spans = [
+        np.flatnonzero((track.t_s > track.t_s[a]) & (track.t_s < min(track.t_s[b] + _AFTER_S, track.t_s[c])))
+        for a, b, c in zip(ends[::2], ends[1::2], np.append(ends[2::2], len(track.t_s) - 1), strict=False)
+    ]
+    found: list[float | None] = []
+    for i in range(arm.joints):
+        moved = [rows for rows in spans if len(rows) and np.ptp(track.q_ref[rows, i]) > _MOVED_RAD]
+        moved = [rows for rows in moved if np.isfinite(_left(track, i, rows, _DELAYS_S[-1]))][:_MOTIONS]
+        if not moved:
+            found.append(None)
+            continue
+        left = [sum(_left(track, i, rows, delay) for rows in moved) for delay in _DELAYS_S]
+        best = int(np.argmin(left))
+        found.append(float(_DELAYS_S[best]) if best < len(_DELAYS_S) - 1 else None)
+    return found
+
+
+def _left(track: JointTrack, i: int, rows: NDArray[np.int64], delay_s: float) -> float:
+    """Return what is left of a joint's readings less its delayed commands, less their mean, squares summed."""
+    off = track.q[rows, i] - np.interp(track.t_s[rows] - delay_s, track.t_s, track.q_ref[:, i])
+    return float(((off - off.mean()) ** 2).sum())
+
+
+def plan_report(
+    arm: Arm, around: Array, visible: Callable[[Array], NDArray[np.bool_]], *, poses: int, cycles: int, seed: int = 0
+) -> str:
+    """Return the motions of the recording that a report needs, as a motion file.
+
+    Poses all over where the body is seen, each from two opposite sides of all joints, and five of them again and again.
+
+    Args:
+        arm: the nominal arm, as slow as its board.
+        around: (M, n) joint angles at which the body was seen, rad; the arm stands at the first to begin with.
+        visible: returns whether the body is seen at poses (N, 4, 4) of the tool.
+        poses: how many poses from both sides.
+        cycles: how often five of them come again.
+        seed: of the choice.
+
+    Raises:
+        InputError: too few poses are in view.
+    """
+    rng, found = np.random.default_rng([seed, 40]), list[tuple[Array, Array]]()
+    low, high = arm.q_min + 2 * _ASIDE_RAD, arm.q_max - 2 * _ASIDE_RAD
+    for _ in range(_TRIES * poses):
+        if len(found) == poses:
+            break
+        q = rng.dirichlet(np.full(len(around), 0.3)) @ around
+        side = rng.choice([-1.0, 1.0], arm.joints)
+        both = np.stack([q, q - _ASIDE_RAD * side, q + _ASIDE_RAD * side])
+        if (q > low).all() and (q < high).all() and visible(arm.forward(both)).all():
+            found.append((q, side))
+    if len(found) < max(poses // 2, _LEAST_POSES):
+        raise InputError(f"the body is seen at {len(found)} of {poses} poses: bring the cameras further from the arm")
+    text = f"# armsight arm plan: {arm.name}, {len(found)} poses from both sides, {cycles} cycles of five.\n"
+    text += f"start_deg = {np.degrees(around[0]).round(4).tolist()}\n"
+    every = max(1, round(len(found) / max(cycles, 1)))
+    done = 0
+    for n, (q, side) in enumerate(found, start=1):
+        for sign, word in ((1.0, "one side"), (-1.0, "the other")):
+            text += _motion(f"W{n} aside, {word}", q - sign * _ASIDE_RAD * side, 0.0)
+            text += _motion(f"W{n} from {word}", q, _REST_S)
+        if n % every == 0 or n == len(found):
+            due = round(cycles * n / len(found))
+            for cycle in range(done + 1, due + 1):
+                for k, (pose, _) in enumerate(found[:5], start=1):
+                    text += _motion(f"P{k} cycle {cycle}", pose, _REST_S)
+            done = due
+    return text
+
+
+#: How far a joint goes aside before it comes to a pose, rad; rest at a pose, s; candidates for a pose; fewest poses.
+_ASIDE_RAD, _REST_S, _TRIES, _LEAST_POSES = np.radians(3.0), 1.0, 60, 8
+
+
+def _motion(name: str, q: Array, rest_s: float) -> str:
+    return f'\n[[motion]]\nkind = "joints"\nname = "{name}"\nq_deg = {np.degrees(q).round(4).tolist()}\nrest_s = {rest_s}\n'
+
+
+def nominal_arm(folder: Path, name: str | None) -> Arm:
+    """Return the nominal arm of a run: the one of this name, or the one that the run names.
+
+    Raises:
+        InputError: the run names none that is known.
+    """
+    if name is not None:
+        return open_arm(name)
+    summary = _summary(folder)
+    named = str(summary.get("nominal_arm", summary.get("arm", "")))
+    if not named:
+        raise InputError(f"{folder}: the run does not name its arm: give --arm")
+    return open_arm(named)
+
+
+def seen_angles(folder: Path, arm: Arm) -> Array:
+    """Return the joint angles (M, n) at which a run saw the body, rad: where its motions start, then its hand-eye poses.
+
+    Raises:
+        InputError: no run with a hand-eye calibration, or another arm's.
+    """
+    path = folder / "handeye_poses.csv"
+    table = read_table(path)
+    names = [f"q{i + 1}_rad" for i in range(arm.joints)]
+    header = table[0] if table else []
+    if any(name not in header for name in names) or f"q{arm.joints + 1}_rad" in header:
+        raise InputError(f"{path}: is not of an arm of {arm.joints} joints")
+    at = [header.index(name) for name in names]
+    try:
+        seen = np.array([[float(row[k]) for k in at] for row in table[1:]])
+    except (ValueError, IndexError):
+        raise InputError(f"{path}: numbers are needed in {', '.join(names)}") from None
+    try:
+        start = tomllib.loads(read_text(folder / "motion.toml")).get("start_deg", np.degrees(arm.home).tolist())
+        return np.vstack([np.radians(np.array(start, float)), seen])
+    except (tomllib.TOMLDecodeError, ValueError):
+        raise InputError(f"{folder / 'motion.toml'}: is not of an arm of {arm.joints} joints") from None

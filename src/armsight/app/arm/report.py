@@ -1,0 +1,271 @@
+"""The report of an arm for its owner: one page, the same as a PDF, and one JSON that others can compare.
+
+In: an :class:`~armsight.app.arm.evaluate.ArmReport`, and reports of other arms. Out: report.html, report.pdf, report.json.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from armsight.app.arm.evaluate import VERSION, ArmReport, JointFigures
+from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files
+from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, arrows, drawing, new_figure, png
+from armsight.app.report.table import TextTable, html_table, plain_text
+from armsight.errors import InputError
+from armsight.files import read_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FILES = (PAGE, "report.pdf", "report.json")
+
+
+def _pair(value: tuple[float, float] | None, digits: int = 3) -> str:
+    return "–" if value is None else f"{value[0]:.{digits}f} ± {value[1]:.{digits}f}"
+
+
+def _one(value: float | None, unit: str, digits: int = 3) -> str:
+    return "–" if value is None else f"{value:.{digits}f} {unit}"
+
+
+def tables(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> list[TextTable]:
+    """Return the tables of a report; ``others`` are the JSON objects of other arms by their names."""
+    mine = report.to_json()
+    columns = [mine, *others.values()]
+    rows = [
+        (title, *(_one(each.get(key), unit) for each in columns))
+        for title, key, unit in (
+            ("distance from the command, RMS", "accuracy_rms_mm", "mm"),
+            ("  largest", "accuracy_max_mm", "mm"),
+            ("  RMS, base and tool fitted", "placed_mm", "mm"),
+            ("repeatability RP, from one side", "one_side_mm", "mm"),
+            ("from both sides, mean distance", "both_sides_mean_mm", "mm"),
+            ("  largest", "both_sides_max_mm", "mm"),
+            ("drift", "drift_mm_per_h", "mm/h"),
+            ("  sigma", "drift_sigma_mm_per_h", "mm/h"),
+            ("command to motion", "latency_s", "s"),
+            ("noise of vision, one shot", "noise_mm", "mm"),
+        )
+    ]
+    found = [TextTable("What the arm does", ("", report.arm, *others), tuple(rows))]
+    parts = report.parts.items()
+    found.append(
+        TextTable(
+            f"What explains the {report.placed_mm:.2f} mm, and what each remedy would leave",
+            ("", "share", "itself, mm", "left by the remedy, mm", "remedy"),
+            tuple(
+                (
+                    name,
+                    f"{100 * p.share:.0f} %",
+                    f"{p.rms_mm:.3f}",
+                    f"{p.without_mm:.3f}" if p.remedy else "–",
+                    p.remedy,
+                )
+                for name, p in parts
+            ),
+        )
+    )
+    head = (
+        "",
+        "zero, deg",
+        "backlash, deg",
+        "sides, deg",
+        "droop, deg/m",
+        "most, deg",
+        "once per rev., deg",
+        "latency, s",
+    )
+    found.append(TextTable("Joints; sigma after ±", head, tuple(_joint_row(joint) for joint in report.joints)))
+    return found
+
+
+def _joint_row(j: JointFigures) -> tuple[str, ...]:
+    return (
+        j.name,
+        _pair(j.zero_deg),
+        _pair(j.backlash_deg),
+        _pair(j.hysteresis_deg),
+        _pair(j.droop_deg_per_m, 2),
+        "–" if j.droop_deg is None else f"{j.droop_deg:.2f}",
+        _pair(j.once_per_revolution_deg),
+        "–" if j.latency_s is None else f"{j.latency_s:.3f}",
+    )
+
+
+def remarks(report: ArmReport) -> list[str]:
+    """Return what a reader must know beside the tables."""
+    lines = [f"do not trust this recording: {line}" for line in report.health]
+    lines += [*report.notes]
+    lines += [f"backlash of {j.name}: {j.backlash_how}" for j in report.joints if j.backlash_deg is None]
+    return [
+        *lines,
+        "Zero: true angle less reading; that of the first and of the last joint looks like another base and another tool.",
+        "Backlash: behind the joint's sensor. Sides: reading from above less from below, at the same command. Droop: "
+        "reading less command for a metre of the gravity load's lever.",
+        "Each part of the error is what it explains beyond those above it; beside it stands what its remedy alone leaves.",
+        "Drift has no temperature beside it: runs do not record any." if report.drift_mm_per_h else "",
+    ]
+
+
+def _map_figure(report: ArmReport) -> Figure:
+    """Plot the error over the workspace, from above and from the side."""
+    figure = new_figure(4.6)
+    size = 1e3 * np.linalg.norm(report.off, axis=1)
+    enlarged = 0.08 * float(np.ptp(report.at[:, :2], axis=0).max()) / max(float(np.quantile(size, 0.9)) / 1e3, 1e-9)
+    for axes, (i, k), title in zip(
+        figure.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side"), strict=True
+    ):
+        shown = axes.scatter(report.at[:, i], report.at[:, k], c=size, s=18, cmap="viridis", vmin=0)
+        axes.margins(0.15)
+        axes.set_aspect("equal", adjustable="datalim")
+        arrows(axes, report.at[:, [i, k]], 1e3 * report.off[:, [i, k]], enlarged / 1e3, INK, 0.003, "mm", 0.05)
+        axes.set_xlabel("x, m")
+        axes.set_ylabel(f"{'xyz'[k]}, m")
+        axes.set_title(f"error, {title}")
+    figure.colorbar(shown, ax=figure.axes, label="mm", shrink=0.8)
+    return figure
+
+
+def _parts_figure(report: ArmReport) -> Figure:
+    """Plot the parts of the error: shares, and what each remedy would leave."""
+    figure = new_figure(3.2)
+    left, right = figure.subplots(1, 2)
+    names = list(report.parts)[::-1]
+    rows = np.arange(len(names))
+    left.barh(rows, [100 * report.parts[name].share for name in names], color=BLUE, height=0.65)
+    left.set_yticks(rows, names)
+    left.set_xlabel("share of the mean square error, %")
+    right.barh(rows, [report.parts[name].without_mm for name in names], color=ORANGE, height=0.65)
+    right.axvline(report.placed_mm, color=MUTED, linewidth=1)
+    right.set_yticks(rows, [""] * len(rows))
+    right.set_xlabel("RMS error with its remedy alone, mm (line: as it is)")
+    return figure
+
+
+def _joints_figure(report: ArmReport) -> Figure:
+    """Plot readings less commands against the gravity load's lever of each joint."""
+    count = len(report.joints)
+    figure = new_figure(4.6)
+    for i, axes in enumerate(figure.subplots(2, -(-count // 2)).ravel()):
+        if i >= count:
+            axes.set_axis_off()
+            continue
+        axes.scatter(1e3 * report.lever[:, i], np.degrees(report.lag[:, i]), s=8, color=BLUE)
+        slope = report.joints[i].droop_deg_per_m
+        if slope is not None:
+            middle = report.lever[:, i].mean()
+            ends = np.array([report.lever[:, i].min(), report.lever[:, i].max()])
+            mean = float(np.degrees(report.lag[:, i].mean()))
+            axes.plot(1e3 * ends, mean + slope[0] * (ends - middle), color=RED, linewidth=1)
+        axes.set_title(report.joints[i].name)
+        axes.set_xlabel("lever of the load, mm")
+        axes.set_ylabel("reading less command, deg")
+    return figure
+
+
+def _drift_figure(report: ArmReport) -> Figure:
+    """Plot how far the pose that came most often went from where it was first."""
+    figure = new_figure(2.8)
+    axes = figure.subplots()
+    axes.plot(60 * report.drift[:, 0], report.drift[:, 1], color=BLUE, marker="o", markersize=3)
+    axes.set_xlabel("min")
+    axes.set_ylabel("mm from the first visit")
+    axes.set_title(f"one pose, {report.cycles} times")
+    return figure
+
+
+_FIGURES: dict[str, tuple[str, Callable[[ArmReport], Figure]]] = {
+    "parts": ("What explains the error, and what each remedy alone would leave.", _parts_figure),
+    "map": ("The error over the workspace after base and tool were fitted, enlarged.", _map_figure),
+    "joints": ("What each joint lacks of its command by its own sensor, against the gravity load.", _joints_figure),
+    "drift": ("The pose that came most often.", _drift_figure),
+}
+
+
+def write_report(report: ArmReport, others: Mapping[str, dict[str, Any]], folder: Path) -> None:
+    """Write page, PDF and JSON into a folder, all or none.
+
+    Raises:
+        InputError: matplotlib is missing, or the folder cannot be written to.
+    """
+    shown, said = tables(report, others), [line for line in remarks(report) if line]
+    heading = f"{report.arm}: {report.placed_mm:.2f} mm RMS"
+    sub = f"{report.poses} poses, {report.rests} rests in {60 * report.hours:.0f} min; controller: {report.board}"
+    with drawing():
+        figures = {name: draw(report) for name, (_, draw) in _FIGURES.items()}
+        pdf = _pdf([_text_page(heading, sub, shown, said), *figures.values()])
+        images = {name: png(figure) for name, figure in figures.items()}
+    plots = "".join(
+        f"<figure>{picture(images[name], caption)}<figcaption>{caption}</figcaption></figure>\n"
+        for name, (caption, _) in _FIGURES.items()
+    )
+    sections = {
+        "figures": ("In numbers", "".join(map(html_table, shown))),
+        "notes": ("Notes", bullets(said)),
+        "plots": ("Figures", plots),
+    }
+    page = html_page(f"armsight: {report.arm}", heading, sub, sections)
+    document = json.dumps(report.to_json(), indent=1, allow_nan=False) + "\n"
+    put_files(folder, {PAGE: page.encode(), "report.pdf": pdf, "report.json": document.encode()})
+
+
+def text(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> str:
+    """Return a report for the terminal."""
+    lines = [plain_text(table) for table in tables(report, others)]
+    return "\n\n".join([*lines, "\n".join(line for line in remarks(report) if line)])
+
+
+def _text_page(heading: str, sub: str, shown: Sequence[TextTable], said: Sequence[str]) -> Figure:
+    """Return a page of text for the PDF."""
+    figure = new_figure(13.0)
+    figure.set_layout_engine(None)
+    lines = "\n\n".join([*(plain_text(table) for table in shown), "\n".join(_folded(line) for line in said)])
+    figure.text(0.04, 0.97, heading, fontsize=16, va="top", weight="bold")
+    figure.text(0.04, 0.945, sub, fontsize=9, va="top", color=MUTED)
+    figure.text(0.04, 0.915, lines, fontsize=6.2, va="top", family="monospace", linespacing=1.35)
+    return figure
+
+
+def _folded(line: str, width: int = 150) -> str:
+    """Return a line broken between words."""
+    rows = [""]
+    for word in line.split():
+        if len(rows[-1]) + len(word) >= width:
+            rows.append("")
+        rows[-1] += ("" if not rows[-1] else " ") + word
+    return "\n  ".join(rows)
+
+
+def _pdf(figures: Sequence[Figure]) -> bytes:
+    """Return figures as the pages of a PDF: the same figures, the same bytes."""
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    data = io.BytesIO()
+    nothing: dict[str, Any] = {"CreationDate": None, "Creator": "armsight", "Producer": None}
+    with PdfPages(data, metadata=nothing) as book:
+        for figure in figures:
+            book.savefig(figure)
+    return data.getvalue()
+
+
+def read_report(path: Path) -> dict[str, Any]:
+    """Read the report.json of another arm.
+
+    Raises:
+        InputError: it is none, or of another version.
+    """
+    try:
+        found = json.loads(read_text(path))
+    except ValueError as error:
+        raise InputError(f"{path}: not JSON: {error}") from None
+    if not isinstance(found, dict) or found.get("kind") != "arm report":
+        raise InputError(f"{path}: no report of an arm; armsight arm report RUN -o DIR writes DIR/report.json")
+    if found.get("version") != VERSION:
+        raise InputError(f"{path}: is of version {found.get('version')}; this armsight reads {VERSION}")
+    return found

@@ -1,0 +1,852 @@
+"""``armsight board bringup``: from a board, motors and potentiometers that nobody knows to an arm that follows.
+
+In: a board with factory values, and an :class:`Operator` who moves joints, reads angles and answers. Out: a configuration,
+stored on the board and written as ``board.toml``, what was found as ``bringup.json``, and a page of figures. The steps:
+
+    readings         every potentiometer at rest: its noise; an open or short one by name
+    potentiometers   each joint moved by hand: the table of its potentiometer, direction, range, dead spots
+    motors           each motor by a pulse of at most 3 degrees: which joint it moves, which way, from which duty on
+    swing            each joint by 10 degrees, after a yes: R, K, inertia, friction, backlash
+    verify           all joints by 2 degrees with the gains computed of it
+    store            the configuration and the files
+
+What a step found is kept in ``bringup.json`` at once. While a step runs, a silent host makes the board release the motors.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from armsight.app.board.command import STEPS
+from armsight.app.report.page import PAGE, html_page, picture, put_files, table, text
+from armsight.app.report.plotting import BLUE, MUTED, ORANGE, drawing, new_figure, png
+from armsight.data import Array, JointCommand
+from armsight.errors import ArmsightError, DeviceError, InputError
+from armsight.files import read_text, write_text
+from armsight.robot.boards.board import Board
+from armsight.robot.boards.board_file import configuration_text
+from armsight.robot.boards.codes import Command, Reaction
+from armsight.robot.boards.configuration import (
+    CONFIG_VERSION,
+    GAIN_RANGES,
+    GAINS,
+    JOINTS,
+    POT_NODES,
+    Configuration,
+    gains_array,
+    lab_configuration,
+)
+from armsight.robot.boards.identification import dead_spots, fit_swing
+from armsight.robot.boards.reports import SensorReadings
+from armsight.robot.boards.tuning import MotorFigures, motion_limits, quiet_bandwidth, tuned_gains
+
+FOUND_FILE, CONFIG_FILE = "bringup.json", "board.toml"
+_EVERY_S, _PERIOD_S = 0.002, 0.01
+_SHORT_COUNTS, _OPEN_COUNTS = 300, 65000
+_MOST_NOISE_COUNTS = 200.0
+_HAND_COUNTS = 1500.0  # a hand that moves a joint changes its reading by more
+_MARGIN_RAD = 0.05
+_JOG_RAD, _JOG_DUTY, _JOG_DUTY_PER_S, _JOG_MOST_RAD = 0.010, 0.6, 0.15, 0.05
+_DEAD_DUTY, _DEAD_A = 0.25, 0.02
+#: A swing: amplitudes, rad, and frequencies, Hz, that add up, and how far a joint may get away from where it began.
+_SWING_RAD, _SWING_HZ, _SWING_MOST_RAD = (0.12, 0.04), (0.5, 2.0), 0.26
+#: A duty on top of it that no motion follows: it separates resistance from back-EMF where friction is all the load.
+_DITHER_DUTY, _DITHER_HZ = 0.07, 8.0
+_FIRST_SWING_S, _SWING_S, _GROW_S = 3.0, 5.0, 0.5
+_VERIFY_RAD, _VERIFY_HZ, _VERIFY_S, _VERIFY_MOST_RAD = 0.035, 0.5, 4.0, 0.01
+_GENTLE_RAD_S = 15.0  # bandwidth of the second swing
+_TRACE = 400  # points of a figure's line
+
+
+class Operator(Protocol):
+    """Who answers."""
+
+    def say(self, line: str) -> None:
+        """Hear a line."""
+        ...
+
+    def ask(self, kind: str, joint: int | None, text: str) -> None:
+        """Hear a question: ``yes``, ``mark`` (an angle in degrees, or nothing at the end), ``problem`` (r, s or q)."""
+        ...
+
+    def answer(self) -> str | None:
+        """Return the answer, None while there is none."""
+        ...
+
+
+class _Mistake(Exception):
+    """Something a person must mend: named, with what to do."""
+
+
+class _Quit(Exception):
+    """The person has had enough."""
+
+
+@dataclass
+class JointFound:
+    """What was found of a joint; None where it was not yet.
+
+    Attributes:
+        noise_counts: standard deviation of its potentiometer at rest.
+        marks: pairs of counts and angle, rad.
+        range_counts: least and greatest reading of the movement by hand.
+        motor_direction: 1 or -1.
+        breakaway_duty: from which duty on the motor moved the joint.
+        resistance_ohm: of the motor, with the current sensor as it reads.
+        constant_v_s: motor constant at the joint, V s/rad.
+        inertia_kg_m2: at the joint.
+        viscous_n_m_s: viscous friction, N m s/rad.
+        dry_n_m: dry friction, N m.
+        backlash_rad: from stop to stop.
+        gravity_n_m: greatest torque of gravity.
+        fit_rms_v: by how much the fit misses the motor's voltage.
+        following_rms_rad: error of the small swing that verified the gains.
+        problems: what was named, in order.
+        traces: lines of figures by name.
+    """
+
+    noise_counts: float | None = None
+    marks: list[list[float]] = field(default_factory=list)
+    range_counts: list[float] | None = None
+    motor_direction: int | None = None
+    breakaway_duty: float | None = None
+    resistance_ohm: float | None = None
+    constant_v_s: float | None = None
+    inertia_kg_m2: float | None = None
+    viscous_n_m_s: float | None = None
+    dry_n_m: float | None = None
+    backlash_rad: float | None = None
+    gravity_n_m: float | None = None
+    fit_rms_v: float | None = None
+    following_rms_rad: float | None = None
+    problems: list[str] = field(default_factory=list)
+    traces: dict[str, list[float]] = field(default_factory=dict)
+
+    @property
+    def motor(self) -> MotorFigures | None:
+        """Its motor, where it was identified."""
+        values = (self.resistance_ohm, self.constant_v_s, self.inertia_kg_m2, self.viscous_n_m_s, self.dry_n_m)
+        return None if None in values else MotorFigures(*values)  # type: ignore[arg-type]
+
+    def done(self, step: str) -> bool:
+        """Return whether a step has found what it looks for."""
+        looked_for = {
+            "readings": self.noise_counts,
+            "potentiometers": self.range_counts,
+            "motors": self.motor_direction,
+            "swing": self.resistance_ohm,
+            "verify": self.following_rms_rad,
+        }
+        return looked_for.get(step) is not None
+
+    def pot_table(self) -> tuple[list[int], list[float], int]:
+        """Return counts and angles, rad, of the potentiometer's table, and its direction; ends are extrapolated."""
+        if self.range_counts is None or len(self.marks) < 2:
+            return [2000, 63500], [-2.6, 2.6], 1
+        marks = np.array(sorted(self.marks))
+        counts, angles = marks[:, 0], marks[:, 1]
+        direction = 1 if angles[-1] > angles[0] else -1
+        low, high = self.range_counts
+        if low < counts[0] - 50:
+            slope = (angles[1] - angles[0]) / (counts[1] - counts[0])
+            counts, angles = np.r_[low, counts], np.r_[angles[0] + slope * (low - counts[0]), angles]
+        if high > counts[-1] + 50:
+            slope = (angles[-1] - angles[-2]) / (counts[-1] - counts[-2])
+            counts, angles = np.r_[counts, high], np.r_[angles, angles[-1] + slope * (high - counts[-1])]
+        return [round(float(c)) for c in counts], [float(direction * a) for a in angles], direction
+
+    def angles(self, counts: Array) -> Array:
+        """Return joint angles (n,), rad, of counts (n,), straight on beyond the table's ends as on the board."""
+        at, angle, direction = self.pot_table()
+        node = np.clip(np.searchsorted(at, counts), 1, len(at) - 1)
+        c, a = np.array(at, dtype=float), np.array(angle)
+        along = (counts - c[node - 1]) / (c[node] - c[node - 1])
+        return np.asarray(direction * (a[node - 1] + along * (a[node] - a[node - 1])), dtype=float)
+
+    @property
+    def rad_per_count(self) -> float:
+        """Mean slope of the table."""
+        counts, angles, _ = self.pot_table()
+        return (angles[-1] - angles[0]) / (counts[-1] - counts[0])
+
+    @property
+    def noise_rad(self) -> float:
+        """Noise of a reading."""
+        return (self.noise_counts or 10.0) * self.rad_per_count
+
+
+@dataclass
+class Found:
+    """What a bring-up found.
+
+    Attributes:
+        board: the board's name.
+        joints: of each joint.
+        supply_v: of the motors.
+        arm_time_s: time on the board's clock, over all runs.
+        verified: whether the small swing went well with what is stored.
+    """
+
+    board: str
+    joints: list[JointFound]
+    supply_v: float = 12.0
+    arm_time_s: float = 0.0
+    verified: bool = False
+
+    @classmethod
+    def read(cls, path: Path) -> Found:
+        """Read what an earlier run kept.
+
+        Raises:
+            InputError: it is no such file.
+        """
+        try:
+            data = json.loads(read_text(path))
+            names = {each.name for each in fields(JointFound)}
+            if data.pop("version") != CONFIG_VERSION or len(data["joints"]) != JOINTS:
+                raise ValueError("it is of another version")
+            joints = [JointFound(**{k: v for k, v in each.items() if k in names}) for each in data.pop("joints")]
+            return cls(joints=joints, **data)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(
+                f"{path}: not what a bring-up kept ({error}): remove it, or name another folder with -o"
+            ) from None
+
+    def write(self, path: Path) -> None:
+        """Keep it."""
+        write_text(path, json.dumps({"version": CONFIG_VERSION, **asdict(self)}, indent=1) + "\n")
+
+
+class Bringup:
+    """A bring-up of one board.
+
+    Args:
+        board: the board, its drives off.
+        person: who answers.
+        folder: where everything is written.
+        joints: which, from 0.
+        again: do also what an earlier run has found.
+        most_current_a: what a motor may draw.
+    """
+
+    def __init__(
+        self,
+        board: Board,
+        person: Operator,
+        folder: Path,
+        joints: Sequence[int] = range(JOINTS),
+        *,
+        again: bool = False,
+        most_current_a: float = 2.0,
+    ) -> None:
+        self._board, self._person, self._folder = board, person, folder
+        self._joints, self._again, self._current_a = list(joints), again, most_current_a
+        path = folder / FOUND_FILE
+        name = board.welcome.board
+        self.found = Found.read(path) if path.exists() else Found(name, [JointFound() for _ in range(JOINTS)])
+        if self.found.board != name:
+            raise InputError(f"{path} is of board {self.found.board}; this one is {name}: name another folder with -o")
+        self._skipped: set[tuple[str, int]] = set()
+        self._motion: list[SensorReadings] = []
+
+    def run(self, steps: Sequence[str] = STEPS) -> None:
+        """Do the steps, in their order; what was found is kept whatever happens.
+
+        Raises:
+            DeviceError: the board is gone; its motors are off.
+            InputError: a folder that cannot be written.
+        """
+        doing: dict[str, Callable[[], None]] = {
+            "readings": self._readings,
+            "potentiometers": lambda: self._each("potentiometers", self._potentiometer),
+            "motors": self._motors,
+            "swing": self._swings,
+            "verify": self._verify,
+            "store": self._store,
+        }
+        try:
+            self._board.watch_sensors(_EVERY_S)
+            self.found.supply_v = round(self._board.status.supply_v, 1)
+            for step in STEPS:
+                if step in steps:
+                    self._person.say(f"== {step}")
+                    doing[step]()
+                    self._keep()
+        except _Quit:
+            self._person.say("ended; what was found is kept")
+        except DeviceError as error:
+            raise DeviceError(
+                f"{error}; what was found is kept in {self._folder}: the same command goes on there"
+            ) from None
+        finally:
+            self._off()
+            self._keep()
+
+    # ---- talking ----
+
+    def _keep(self) -> None:
+        self.found.write(self._folder / FOUND_FILE)
+
+    def _wait(self, kind: str, joint: int | None, said: str) -> str:
+        """Ask, and let the board's time pass until there is an answer; readings meanwhile are kept in ``_motion``."""
+        self._person.ask(kind, joint, said)
+        while (answer := self._person.answer()) is None:
+            self._take(self._board.sensed(0.02))
+        return answer.strip().lower()
+
+    def _yes(self, question: str) -> bool:
+        return self._wait("yes", None, question).startswith("y")
+
+    def _take(self, readings: SensorReadings) -> None:
+        if len(readings.t_s):
+            self._motion.append(readings)
+            self.found.arm_time_s += float(readings.t_s[-1] - readings.t_s[0]) + _EVERY_S
+
+    def _each(self, step: str, action: Callable[[int], None]) -> None:
+        """Do a step for each joint; a problem is named, and the joint done again or skipped."""
+        for joint in self._joints:
+            found = self.found.joints[joint]
+            if found.done(step) and not self._again:
+                self._person.say(f"joint {joint + 1}: found before (--again does it again)")
+                continue
+            missing = [each for each in STEPS[: STEPS.index(step)] if not found.done(each)]
+            if missing:
+                self._person.say(f"joint {joint + 1}: left out, as {missing[0]} found nothing")
+                continue
+            self._mended(step, joint, action)
+            self._keep()
+
+    def _mended(self, step: str, joint: int, action: Callable[[int], None]) -> None:
+        while True:
+            try:
+                action(joint)
+                return
+            except _Mistake as problem:
+                self._off()
+                self.found.joints[joint].problems.append(str(problem))
+                answer = self._wait("problem", joint, f"{problem} [r]epeat, [s]kip, [q]uit")
+            if answer.startswith("q"):
+                raise _Quit
+            if not answer.startswith("r"):
+                self._skipped.add((step, joint))
+                return
+
+    # ---- the board ----
+
+    def _off(self) -> None:
+        """Switch the drives off, and clear what a step left; a board that is gone does so by itself."""
+        with contextlib.suppress(ArmsightError):
+            if self._board.status.drives_on or self._board.status.faults:
+                self._board.confirm(self._board.command(Command.DISABLE))
+                self._board.confirm(self._board.command(Command.CLEAR_FAULTS))
+
+    def _use(self, config: Configuration) -> None:
+        """Store a configuration and start the board with it."""
+        self._off()
+        self._board.store(config)
+        self._board.restart()
+        self._board.watch_sensors(_EVERY_S)
+        self._board.sensed(0.05)
+
+    def _collect(self, seconds: float) -> SensorReadings:
+        """Return what the converters read in the next seconds."""
+        self._motion.clear()
+        for _ in range(max(1, round(seconds / 0.02))):
+            self._take(self._board.sensed(0.02))
+        return self._collected()
+
+    def _collected(self) -> SensorReadings:
+        parts, self._motion = self._motion, []
+        if not parts:
+            raise DeviceError("the board reports no sensor readings")
+        return SensorReadings(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(SensorReadings)))
+
+    def _move(self, q_ref: Array, qd_ref: Array, duty: Array) -> SensorReadings:
+        """Command a step of ``_PERIOD_S`` and return what was read in it."""
+        self._board.send(JointCommand(q_ref, qd_ref, duty, _PERIOD_S))
+        readings = self._board.sensed(_PERIOD_S)
+        self._take(readings)
+        status = self._board.status
+        if status.faults:
+            fault = status.first_fault or status.faults[0]
+            raise _Mistake(f"the board stopped: {fault}.")
+        return readings
+
+    def _q(self, readings: SensorReadings) -> Array:
+        """Return the joints' angles (n, 6) of readings."""
+        return np.stack([self.found.joints[j].angles(readings.counts[:, j]) for j in range(JOINTS)], axis=1)
+
+    # ---- configurations ----
+
+    def configuration(self, *, gains: bool, reaction: Reaction) -> Configuration:
+        """Return the configuration of what is known; without ``gains`` joints are not controlled and nothing is watched."""
+        config = lab_configuration()
+        supply = self.found.supply_v
+        config["supply_nominal_mv"] = round(1e3 * supply)
+        config["supply_min_mv"], config["supply_max_mv"] = round(800 * supply), round(1200 * supply)
+        config["silence_reaction"] = reaction
+        for joint, found in zip(config["joint"], self.found.joints, strict=True):
+            self._put_pot(joint, found)
+            joint["motor_direction"] = found.motor_direction or 1
+            joint["current_limit_ma"] = round(1e3 * self._current_a)
+            if gains and found.motor is not None:
+                self._put_motor(joint, found, found.motor)
+            else:
+                _put_free(joint, found)
+        return config
+
+    def _put_pot(self, joint: Configuration, found: JointFound) -> None:
+        pot = joint["pot"]
+        counts, angles, direction = found.pot_table()
+        pot["node_count"], pot["direction"] = len(counts), direction
+        pot["counts"] = counts + [0] * (POT_NODES - len(counts))
+        pot["angle_rad"] = angles + [0.0] * (POT_NODES - len(angles))
+        # A joint without a table may have an open input: it shall not keep the others from being driven.
+        pot["short_counts"], pot["open_counts"] = (
+            (0, 65535)
+            if found.range_counts is None
+            else (
+                max(1, min(1000, counts[0] // 2)),
+                min(65000, (counts[-1] + 65535) // 2 + 1),
+            )
+        )
+        ends = sorted((direction * angles[0], direction * angles[-1]))
+        joint["soft_min_rad"], joint["soft_max_rad"] = ends[0] + _MARGIN_RAD, ends[1] - _MARGIN_RAD
+        pot["jump_rad"] = max(0.02, 12 * found.noise_rad)
+
+    def _put_motor(self, joint: Configuration, found: JointFound, motor: MotorFigures) -> None:
+        """Put gains, limits and the motor's numbers."""
+        supply, gravity = self.found.supply_v, found.gravity_n_m or 0.0
+        joint["gains"] = np.array(tuple(tuned_gains(motor, supply, self._bandwidth(found, motor))), GAINS)
+        joint["motor"]["resistance_ohm"], joint["motor"]["constant_v_s"] = motor.resistance_ohm, motor.constant_v_s
+        joint["motor"]["apart_rad"] = max(0.03, 10 * found.noise_rad + 1.5 * (found.backlash_rad or 0.0))
+        speed, acceleration = motion_limits(motor, supply, gravity)
+        speed = min(speed, 0.9e3 * float(joint["pot"]["jump_rad"]))
+        for name, value in {
+            "speed_limit_rad_s": speed,
+            "acceleration_rad_s2": acceleration,
+            "deceleration_rad_s2": acceleration,
+            "jerk_rad_s3": 100 * acceleration,
+            "duty_limit": 1.0,
+            "stall_duty": 0.9,
+        }.items():
+            joint[name] = value
+        joint["current_limit_ma"] = round(1e3 * min(self._current_a, 0.95 * supply / motor.resistance_ohm))
+
+    def _bandwidth(self, found: JointFound, motor: MotorFigures) -> float:
+        return quiet_bandwidth(motor, self.found.supply_v, found.noise_rad)
+
+    # ---- the steps ----
+
+    def _readings(self) -> None:
+        self._person.say("leave the arm alone for a second")
+        self._each("readings", self._reading)
+
+    def _reading(self, joint: int) -> None:
+        counts = self._collect(0.5).counts[:, joint]
+        middle = float(np.median(counts))
+        name = f"joint {joint + 1}: its potentiometer"
+        if middle > _OPEN_COUNTS:
+            raise _Mistake(f"{name} is open: it reads {middle:.0f} of 65535. Is its plug in, and its wiper connected?")
+        if middle < _SHORT_COUNTS:
+            raise _Mistake(
+                f"{name} is shorted to ground: it reads {middle:.0f}. Look for a bridge or a lead without supply."
+            )
+        noise = 1.4826 * float(np.median(np.abs(counts - middle)))
+        noise = max(noise, float(np.std(counts[np.abs(counts - middle) <= 6 * max(noise, 4.0)])), 1.0)
+        if noise > _MOST_NOISE_COUNTS:
+            raise _Mistake(
+                f"{name} is noisy: {noise:.0f} counts at rest. Is its lead beside the motor's, its ground good?"
+            )
+        self.found.joints[joint].noise_counts = round(noise, 2)
+        self._person.say(f"joint {joint + 1}: {middle:.0f} counts, noise {noise:.1f}")
+
+    def _potentiometer(self, joint: int) -> None:
+        person, found = self._person, self.found.joints[joint]
+        person.say(
+            f"joint {joint + 1}: move it slowly by hand from one end of its range to the other, and stop at 3 to"
+            f" {POT_NODES - 2} angles that you can measure; then leave it where it stays by itself"
+        )
+        self._collect(0.1)
+        every: list[SensorReadings] = []
+        marks: list[list[float]] = []
+        while True:
+            answer = self._wait("mark", joint, f"joint {joint + 1}: angle in degrees, or nothing at the other end")
+            if not answer:
+                break
+            try:
+                angle = float(np.radians(float(answer)))
+            except ValueError:
+                person.say(f"{answer!r} is no angle in degrees")
+                continue
+            self._motion.extend(every)
+            every = [self._collected()]
+            here = self._collect(0.1)
+            marks.append([float(np.median(here.counts[:, joint])), angle])
+        self._motion[:0] = every
+        self._check_hand(joint, self._collected().counts, marks)
+        counts, angles, direction = found.pot_table()
+        person.say(
+            f"joint {joint + 1}: {np.degrees(angles[0]):.1f} to {np.degrees(angles[-1]):.1f} deg over {counts[0]} to"
+            f" {counts[-1]} counts, direction {direction}"
+        )
+
+    def _check_hand(self, joint: int, counts: Array, marks: list[list[float]]) -> None:
+        """Look at a movement by hand, and keep its table."""
+        found, name = self.found.joints[joint], f"joint {joint + 1}"
+        good = np.where((counts > _SHORT_COUNTS) & (counts < _OPEN_COUNTS), counts, np.nan)
+        way = np.array([np.ptp(each[np.isfinite(each)]) if np.isfinite(each).sum() > 10 else 0.0 for each in good.T])
+        other = int(np.argmax(way))
+        if way[joint] < _HAND_COUNTS < way[other]:
+            raise _Mistake(
+                f"{name}: moving it moves the reading of joint {other + 1}: the potentiometers of joints {joint + 1} and"
+                f" {other + 1} are swapped. Swap their plugs."
+            )
+        if way[joint] < _HAND_COUNTS:
+            raise _Mistake(f"{name}: its reading does not follow the hand. Does its potentiometer's shaft go along?")
+        spots = dead_spots(counts[:, joint], found.noise_counts or 10.0, _SHORT_COUNTS, _OPEN_COUNTS)
+        if len(marks) < 2 or len(marks) > POT_NODES - 2:
+            raise _Mistake(f"{name}: {len(marks)} angles were measured; 2 to {POT_NODES - 2} are needed.")
+        ordered = np.array(sorted(marks))
+        rises = np.diff(ordered[:, 1])
+        if not ((rises > 0).all() or (rises < 0).all()) or (np.diff(ordered[:, 0]) < 100).any():
+            raise _Mistake(
+                f"{name}: the angles measured do not rise or fall with the reading: {_pairs(ordered)}. Measure again."
+            )
+        found.marks, found.range_counts = marks, [float(np.nanmin(good[:, joint])), float(np.nanmax(good[:, joint]))]
+        if spots:
+            around = [(max(first - 3, 0), min(last + 3, len(counts) - 1)) for first, last in spots]
+            where = [np.degrees(found.angles(counts[list(ends), joint])) for ends in around]
+            spans = ", ".join(f"{min(each):.1f} to {max(each):.1f} deg" for each in where)
+            found.range_counts = None
+            raise _Mistake(f"{name}: its potentiometer has a dead spot at {spans}. Clean or replace it.")
+
+    def _motors(self) -> None:
+        todo = [j for j in self._joints if self._again or not self.found.joints[j].done("motors")]
+        if todo and not self._yes(
+            "the drives go on; each motor moves its joint by at most 3 degrees. Is the arm supported? [y/n]"
+        ):
+            return
+        if todo:
+            self._use(self.configuration(gains=False, reaction=Reaction.RELEASE))
+        self._each("motors", self._jog)
+        self._off()
+
+    def _jog(self, joint: int) -> None:
+        """Raise a motor's duty until a joint moves, once each way."""
+        self._board.enable(inward=True)
+        ways: list[float] = []
+        breakaway = 0.0
+        for sign in (1.0, -1.0):
+            start = self._q(self._hold_still(0.3)).mean(axis=0)
+            enough = np.array([max(_JOG_RAD, 4 * each.noise_rad) for each in self.found.joints])
+            moved, duty, readings = self._ramp(joint, sign, start, enough)
+            current = float(np.abs(np.median(readings.current_a[-25:, joint])))
+            ways.append(self._check_jog(joint, moved / enough, duty, current, last=sign < 0 and not any(ways)) * sign)
+            if ways[-1]:
+                self.found.joints[joint].breakaway_duty = breakaway = round(duty, 4)
+        self._hold_still(0.2)
+        self._board.confirm(self._board.command(Command.DISABLE))
+        directions = [np.sign(each) for each in ways if each]
+        if len(set(directions)) != 1:
+            raise _Mistake(
+                f"joint {joint + 1}: it moves the same way whichever way its motor is driven. Support its load."
+            )
+        self.found.joints[joint].motor_direction = int(directions[0])
+        self._person.say(f"joint {joint + 1}: moves from {breakaway:.0%} duty on, motor direction {int(directions[0])}")
+
+    def _hold_still(self, seconds: float) -> SensorReadings:
+        """Leave the motors at duty 0."""
+        here = self._board.joints.reference_rad
+        self._motion.clear()
+        for _ in range(round(seconds / _PERIOD_S)):
+            self._move(here, np.zeros(JOINTS), np.zeros(JOINTS))
+        return self._collected()
+
+    def _ramp(self, joint: int, sign: float, start: Array, enough: Array) -> tuple[Array, float, SensorReadings]:
+        """Raise the duty until something moved; returns by how much all joints did, the duty, and the readings."""
+        here, zeros = self._board.joints.reference_rad, np.zeros(JOINTS)
+        duty, moved = 0.0, np.zeros(JOINTS)
+        direction = self.found.joints[joint].motor_direction or 1  # the board multiplies it
+        while duty < _JOG_DUTY:
+            duty += _JOG_DUTY_PER_S * _PERIOD_S
+            given = zeros.copy()
+            given[joint] = sign * direction * duty
+            readings = self._move(here, zeros, given)
+            if len(readings.t_s):
+                moved = np.median(self._q(readings), axis=0) - start
+            if (np.abs(moved) > enough).any():
+                break
+            if duty >= _DEAD_DUTY and np.abs(np.median(readings.current_a[:, joint])) < _DEAD_A:
+                break
+        readings = self._collected()
+        self._move(here, zeros, zeros)
+        return moved, duty, readings
+
+    def _check_jog(self, joint: int, moved: Array, duty: float, current_a: float, *, last: bool) -> float:
+        """Return how far the joint moved in thresholds; 0 where it is held on this side only."""
+        name, other = f"joint {joint + 1}", int(np.argmax(np.abs(moved)))
+        if abs(moved[other]) >= 1 and other != joint:
+            raise _Mistake(
+                f"{name}: its motor output moves joint {other + 1}: the motors of joints {joint + 1} and {other + 1} are"
+                " swapped. Swap their leads."
+            )
+        if abs(moved[joint]) >= 1 and current_a < 0.25 * _DEAD_A:
+            raise _Mistake(f"{name}: it moves, but no current is measured. Look at its current sensor's lead.")
+        if abs(moved[joint]) >= 1:
+            return float(moved[joint])
+        if current_a < _DEAD_A:
+            raise _Mistake(
+                f"{name}: its motor is dead: no current at {duty:.0%} duty. Is its lead broken or out, or its driver off?"
+            )
+        if not last:
+            return 0.0  # an end stop, or a load, may hold it on this side
+        raise _Mistake(
+            f"{name}: its motor draws {current_a:.2f} A at {duty:.0%} duty and nothing moves. Is the joint blocked, or the"
+            " motor loose on its gear?"
+        )
+
+    def _swings(self) -> None:
+        ready = [j for j in self._joints if self.found.joints[j].done("motors")]
+        todo = [j for j in ready if self._again or not self.found.joints[j].done("swing")]
+        if todo:
+            config = self.configuration(gains=False, reaction=Reaction.RELEASE)
+            for j in ready:
+                _put_gentle(config["joint"][j], self.found.joints[j])
+            self._use(config)
+        self._each("swing", self._swing)
+        self._off()
+
+    def _swing(self, joint: int) -> None:
+        degrees = np.degrees(sum(_SWING_RAD))
+        if not self._yes(f"joint {joint + 1} will swing by {degrees:.0f} degrees either way. Is it free to? [y/n]"):
+            raise _Mistake(f"joint {joint + 1}: it was not allowed to swing.")
+        found = self.found.joints[joint]
+        self._board.enable(inward=True)
+        gains = gains_array(self._board.configuration())
+        first = self._identify(joint, self._swung(joint, _FIRST_SWING_S))
+        better = gains.copy()
+        gentle = min(_GENTLE_RAD_S, self._bandwidth(found, first))
+        better[joint] = tuned_gains(first, self.found.supply_v, gentle)
+        self._board.confirm(self._board.set_gains(better))
+        readings = self._swung(joint, _SWING_S)
+        self._board.confirm(self._board.command(Command.DISABLE))
+        self._board.confirm(self._board.set_gains(gains))
+        motor = self._identify(joint, readings)
+        self._person.say(
+            f"joint {joint + 1}: R {motor.resistance_ohm:.2f} ohm, K {motor.constant_v_s:.3f} V s/rad, inertia"
+            f" {1e3 * motor.inertia_kg_m2:.1f} g m^2, friction {motor.dry_n_m:.2f} N m,"
+            f" backlash {1e3 * (found.backlash_rad or 0):.1f} mrad"
+        )
+
+    def _swung(self, joint: int, seconds: float) -> SensorReadings:
+        """Swing a joint about where it is."""
+        start = self._board.joints.reference_rad.copy()
+        self._motion.clear()
+        for k in range(round(seconds / _PERIOD_S)):
+            q_ref, qd_ref = start.copy(), np.zeros(JOINTS)
+            q_ref[joint], qd_ref[joint] = _swing_at((k + 1) * _PERIOD_S, seconds)
+            q_ref[joint] += start[joint]
+            dither = np.zeros(JOINTS)
+            dither[joint] = _DITHER_DUTY * np.sin(2 * np.pi * _DITHER_HZ * k * _PERIOD_S)
+            readings = self._move(q_ref, qd_ref, dither)
+            if len(readings.t_s) and abs(self._q(readings)[-1, joint] - start[joint]) > _SWING_MOST_RAD:
+                raise _Mistake(f"joint {joint + 1}: it swings further than it is to: is its load loose?")
+        return self._collected()
+
+    def _identify(self, joint: int, readings: SensorReadings) -> MotorFigures:
+        found = self.found.joints[joint]
+        keep = readings.t_s > readings.t_s[0] + _GROW_S
+        sign = float(found.motor_direction or 1)
+        volts = sign * readings.duty[keep, joint] * self.found.supply_v
+        angles = found.angles(readings.counts[keep, joint])
+        try:
+            fit = fit_swing(readings.t_s[keep], volts, sign * readings.current_a[keep, joint], angles)
+        except InputError as error:
+            raise _Mistake(f"joint {joint + 1}: {error}.") from None
+        motor = fit.motor
+        found.resistance_ohm, found.constant_v_s = motor.resistance_ohm, motor.constant_v_s
+        found.inertia_kg_m2, found.viscous_n_m_s = motor.inertia_kg_m2, motor.viscous_n_m_s
+        found.dry_n_m, found.backlash_rad, found.gravity_n_m = motor.dry_n_m, fit.backlash_rad, fit.gravity_n_m
+        found.fit_rms_v = float(np.sqrt(np.mean((fit.voltage_v - fit.predicted_v) ** 2)))
+        found.traces |= _traces(
+            swing_t_s=fit.t_s, swing_voltage_v=fit.voltage_v, swing_predicted_v=fit.predicted_v, swing_rad=angles
+        )
+        return motor
+
+    def _verify(self) -> None:
+        ready = [j for j in self._joints if self.found.joints[j].done("swing")]
+        if not ready:
+            self._person.say("left out: no joint was identified")
+            return
+        self._use(self.configuration(gains=True, reaction=Reaction.RELEASE))
+        self._mended("verify", ready[0], lambda _: self._follow(ready))
+        self._off()
+
+    def _follow(self, joints: list[int]) -> None:
+        """Swing joints a little and look at how they follow."""
+        self._board.enable(inward=True)
+        start = self._board.joints.reference_rad.copy()
+        self._motion.clear()
+        refs: list[Array] = []
+        for k in range(round(_VERIFY_S / _PERIOD_S)):
+            angle = 2 * np.pi * _VERIFY_HZ * (k + 1) * _PERIOD_S
+            offset = np.zeros(JOINTS)
+            speed = np.zeros(JOINTS)
+            offset[joints] = 0.5 * _VERIFY_RAD * (1 - np.cos(angle))
+            speed[joints] = 0.5 * _VERIFY_RAD * np.sin(angle) * 2 * np.pi * _VERIFY_HZ
+            self._move(start + offset, speed, np.zeros(JOINTS))
+            refs.append(np.r_[self._board.joints.t_s, self._board.joints.reference_rad])
+        readings = self._collected()
+        self._board.confirm(self._board.command(Command.DISABLE))
+        at = np.array(refs)
+        at = at[np.concatenate([[True], np.diff(at[:, 0]) > 0])]
+        last = (readings.t_s > readings.t_s[0] + 1.0) & (readings.t_s < at[-1, 0])
+        q = self._q(readings)[last]
+        for j in joints:
+            error = np.interp(readings.t_s[last], at[:, 0], at[:, j + 1]) - q[:, j]
+            rms = float(np.sqrt(max(np.mean(error**2) - self.found.joints[j].noise_rad ** 2, 0.0)))
+            if rms > _VERIFY_MOST_RAD:
+                raise _Mistake(
+                    f"joint {j + 1}: it follows a small swing with an error of {np.degrees(rms):.2f} degrees RMS."
+                )
+            self.found.joints[j].following_rms_rad = rms
+            self.found.joints[j].traces |= _traces(
+                verify_t_s=readings.t_s[last] - readings.t_s[0], verify_error_rad=error
+            )
+            self._person.say(f"joint {j + 1}: follows to {1e3 * rms:.1f} mrad RMS")
+        self.found.verified = True
+
+    def _store(self) -> None:
+        if not any(each.done("swing") for each in self.found.joints):
+            self._person.say("nothing is stored: no joint was identified")
+            return
+        config = self.configuration(gains=True, reaction=Reaction.HOLD)
+        self._use(config)
+        write_text(self._folder / CONFIG_FILE, configuration_text(config, self.found.board))
+        page = report(self.found, gains_array(config))
+        put_files(self._folder, {PAGE: page.encode()})
+        missing = [str(j + 1) for j, each in enumerate(self.found.joints) if not each.done("swing")]
+        if missing:
+            self._person.say(f"joints {', '.join(missing)} were not identified: they are stored without gains")
+        self._person.say(f"stored, and written to {self._folder / CONFIG_FILE}; figures: {self._folder / PAGE}")
+
+
+def _put_free(joint: Configuration, found: JointFound) -> None:
+    """Put gains of zero, and let nothing be watched that needs to know the motor."""
+    joint["gains"] = np.array((0, 0, 0, 0, 0, 0, 0.005, 20), GAINS)
+    joint["motor"]["resistance_ohm"] = 0.0
+    for name, value in {
+        "duty_limit": 1.0,
+        "stall_duty": 1.0,
+        "following_rad": 13.0,
+        "gravity_slew_per_s": 1000.0,
+    }.items():
+        joint[name] = value
+    joint["pot"]["frozen_rad"] = joint["pot"]["inverted_rad"] = 1.0
+
+
+def _put_gentle(joint: Configuration, found: JointFound) -> None:
+    """Put gains that move any joint a little: full duty at 30 degrees."""
+    joint["gains"] = np.array((2.0, 2.0, 0.0, 0.0, 0.0, 0.5 * (found.breakaway_duty or 0.0), 0.005, 20.0), GAINS)
+    joint["acceleration_rad_s2"], joint["jerk_rad_s3"] = 30.0, 3000.0
+
+
+def _swing_at(t_s: float, seconds: float) -> tuple[float, float]:
+    """Return angle and speed of a swing that begins and ends smoothly."""
+
+    def angle(t: float) -> float:
+        grow = float(np.clip(min(t, seconds - t) / _GROW_S, 0.0, 1.0))
+        swing = sum(a * np.sin(2 * np.pi * f * t) for a, f in zip(_SWING_RAD, _SWING_HZ, strict=True))
+        return float(grow * grow * (3 - 2 * grow) * swing)
+
+    return angle(t_s), (angle(t_s + 1e-4) - angle(t_s - 1e-4)) / 2e-4
+
+
+def _traces(**lines: Array) -> dict[str, list[float]]:
+    """Return lines with as many points as a figure needs."""
+    return {name: [round(float(v), 5) for v in each[:: max(1, len(each) // _TRACE)]] for name, each in lines.items()}
+
+
+def _pairs(marks: Array) -> str:
+    return ", ".join(f"{np.degrees(angle):.1f} deg at {counts:.0f}" for counts, angle in marks)
+
+
+# ---- the page ----
+
+_NUMBERS: tuple[tuple[str, str, float, str], ...] = (
+    ("noise_counts", "noise, counts", 1, ".1f"),
+    ("motor_direction", "motor direction", 1, ".0f"),
+    ("breakaway_duty", "moves from duty, %", 100, ".1f"),
+    ("resistance_ohm", "R, ohm", 1, ".2f"),
+    ("constant_v_s", "K, V s/rad", 1, ".3f"),
+    ("inertia_kg_m2", "inertia, g m&sup2;", 1e3, ".1f"),
+    ("dry_n_m", "dry friction, N m", 1, ".3f"),
+    ("backlash_rad", "backlash, mrad", 1e3, ".1f"),
+    ("gravity_n_m", "gravity at most, N m", 1, ".2f"),
+    ("following_rms_rad", "follows to, mrad RMS", 1e3, ".2f"),
+)
+
+
+def report(found: Found, gains: Array) -> str:
+    """Return the page of figures.
+
+    Raises:
+        InputError: matplotlib is not installed.
+    """
+    rows = []
+    for j, each in enumerate(found.joints):
+        values = [(getattr(each, name), scale, form) for name, _, scale, form in _NUMBERS]
+        rows.append([f"joint {j + 1}", *("" if v is None else format(v * s, f) for v, s, f in values)])
+    gain_rows = [[f"joint {j + 1}", *(f"{value:.4g}" for value in row)] for j, row in enumerate(gains)]
+    problems = [[f"joint {j + 1}", text(line)] for j, each in enumerate(found.joints) for line in each.problems]
+    sections = {
+        "joints": ("Joints", table(["", *(title for _, title, _, _ in _NUMBERS)], rows, "numbers")),
+        "gains": ("Gains", table(["", *GAIN_RANGES], gain_rows, "numbers")),
+        "figures": ("Figures", _figures(found)),
+    }
+    if problems:
+        sections["problems"] = ("Problems on the way", table(["", "named"], problems, "prose"))
+    sub = f"board {found.board}, {found.supply_v:g} V, {found.arm_time_s:.0f} s of the board's time"
+    return html_page("Bring-up", "Bring-up of the arm's board", sub, sections)
+
+
+def _figures(found: Found) -> str:
+    """Return a row of plots for every joint: table, motor voltage of the swing, error of the small swing."""
+    shown = [(j, each) for j, each in enumerate(found.joints) if each.range_counts is not None]
+    if not shown:
+        return "<p>Nothing to show.</p>"
+    with drawing():
+        figure = new_figure(2.1 * len(shown))
+        axes = figure.subplots(len(shown), 3, squeeze=False)
+        for (j, each), (left, middle, right) in zip(shown, axes, strict=True):
+            counts, angles, direction = each.pot_table()
+            left.plot(counts, np.degrees(direction * np.array(angles)), color=BLUE)
+            marks = np.array(each.marks)
+            left.plot(marks[:, 0], np.degrees(marks[:, 1]), "o", color=ORANGE, ms=3)
+            left.set(title=f"joint {j + 1}: potentiometer", xlabel="counts", ylabel="deg")
+            lines = each.traces
+            if "swing_t_s" in lines:
+                middle.plot(lines["swing_t_s"], lines["swing_voltage_v"], color=MUTED, lw=1.5, label="put out")
+                middle.plot(lines["swing_t_s"], lines["swing_predicted_v"], color=BLUE, lw=0.8, label="R i + K w")
+                middle.legend(loc="upper right", fontsize=7)
+            middle.set(title="motor voltage of the swing", xlabel="s", ylabel="V")
+            if "verify_t_s" in lines:
+                right.plot(lines["verify_t_s"], 1e3 * np.array(lines["verify_error_rad"]), color=BLUE, lw=0.8)
+            right.set(title="error of the small swing, with noise", xlabel="s", ylabel="mrad")
+        return picture(png(figure), "For every joint: potentiometer table, motor voltage, following error")
+
+
+def found_json(found: Found) -> dict[str, Any]:
+    """Return what was found as JSON has it, without the figures' lines."""
+    record = asdict(found)
+    for each in record["joints"]:
+        del each["traces"]
+    return record

@@ -1,0 +1,151 @@
+"""Offset and rate of the camera's clock against the joints', followed beside the filter.
+
+In: what the filter did with each pose measurement. Out: by how much the stamps are later than the delay says, and how fast
+that changes, with covariance. The filter itself does not estimate the delay: what its model lacks of the backlash would be
+taken for delay. Instead this is the second stage of Friedland's filter ("Treatment of bias in recursive filtering", 1969).
+A bias b = (offset now, rate) that the filter does not know of leaves V b in its state, and G b in its innovations,
+
+    V = kept V,    G = H V,    V = V - K G,    V = (1, 0) in the row of the delay
+
+so that z = G b + noise: a Kalman filter of two states. Nothing is corrected until an offset is certain and matters; from
+then on stamps and state are corrected after every measurement. What the innovations do not confirm widens the covariance: a
+clock may jump, or wander.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import chdtri
+
+from armsight.data import Array
+from armsight.loop.estimators.estimator import ClockEffect, Innovation, Outcome
+
+#: Standard deviation of the rate before anything is measured; two crystals differ by less, computers' stamps by more.
+RATE = 2e-4
+#: Random walks of the offset, s per root of a second, and of the rate, 1 per root of a second.
+_WALK, _RATE_WALK = 3e-5, 3e-6
+#: What the model of the backlash lacks looks like an offset of up to this, s: found on simulated sweeps.
+SYSTEMATIC_S = 1.5e-4
+#: An offset of more than so many seconds is corrected from then on, where chi-square of offset and rate is larger than the
+#: limit for so long, s; where the offset changes by other than its rate, where it is beyond so many sigmas.
+_LEAST_S, _CERTAIN, _STAYS_S, _CERTAIN_SIGMAS = 5e-4, 30.0, 0.5, 3.0
+#: From this chi-square on an offset is said to who watches the innovations: below, it is noise.
+_SAID = 14.0
+#: A measurement that an offset leaves less likely than this says nothing of it: something else is wrong.
+_GATE = float(chdtri(6, 1e-3))
+#: Residuals are compared over about this time, s. Beyond so many sigmas the offset changes by other than its rate: it is
+#: taken to walk by that much from then on, less and less with this time constant, s.
+_WINDOW_S, _SURPRISING, _CALM_S = 2.0, 3.0, 10.0
+#: Innovations whose mean square exceeds their covariance widen it: mean over about this time, s.
+_EXCESS_S = 4.0
+
+
+class ClockFollower:
+    """Follows offset and rate of the camera's clock.
+
+    Args:
+        size: of the filter's state.
+        delay: row of the delay in it.
+        sigma_s: standard deviation of the delay at the beginning, s.
+
+    Attributes:
+        since_s: time of the measurement from which on stamps are corrected, s; None while they are not.
+    """
+
+    def __init__(self, size: int, delay: int, sigma_s: float) -> None:
+        self._V, self._delay = np.zeros((size, 2)), delay
+        self._V[delay, 0] = 1.0
+        self._b, self._M = np.zeros(2), np.diag([sigma_s**2, RATE**2])
+        self._corrected, self._t_s = np.zeros(2), np.nan
+        self._score = self._information = 0.0
+        self._excess, self._unrest = 1.0, 0.0
+        self._certain_s = np.inf  # since when the offset is
+        self.since_s: float | None = None
+
+    def offset_s(self, t_s: float) -> float:
+        """Return by how much later than its delay says a stamp is about a time, s, as far as that is corrected."""
+        if self.since_s is None:
+            return 0.0
+        return float(self._corrected[0] + self._corrected[1] * (t_s - self._t_s))
+
+    @property
+    def rate(self) -> tuple[float, float]:
+        """The rate of the camera's clock against the joints', less 1, and its standard deviation."""
+        return float(self._corrected[1] + self._b[1]), float(np.sqrt(self._M[1, 1]))
+
+    @property
+    def sigma_s(self) -> float:
+        """Standard deviation of the offset, s."""
+        return float(np.hypot(np.sqrt(self._M[0, 0]), SYSTEMATIC_S))
+
+    def take(self, innovation: Innovation) -> ClockEffect | None:
+        """Take what the filter did with a measurement that it used, in order of time; return what the clock did to it."""
+        passed = innovation.t_s - self._t_s
+        first = not np.isfinite(passed)
+        if not (first or passed > 0.0):
+            return None
+        self._t_s = innovation.t_s
+        if first:
+            passed = 0.0
+        self._predict(passed, innovation.kept)
+        G = innovation.by_state @ self._V
+        if not first and innovation.outcome is Outcome.USED:
+            self._update(innovation, G, passed)
+        self._V -= innovation.gain @ G
+        self._V[self._delay] = 1.0, 0.0
+        offset_s, in_z, chi_square = float(self._b[0]), G @ self._b, self._chi_square
+        if not self._corrects():
+            return ClockEffect(offset_s, in_z, None) if chi_square > _SAID else None
+        change = self._V @ self._b
+        change[self._delay] = 0.0
+        self._corrected += self._b
+        self._b = np.zeros(2)
+        return ClockEffect(offset_s, in_z, change)
+
+    @property
+    def _chi_square(self) -> float:
+        return float(self._b @ np.linalg.solve(self._M, self._b))
+
+    def _corrects(self) -> bool:
+        """Return whether stamps are corrected."""
+        if self.since_s is None:
+            certain = self._chi_square > _CERTAIN
+            certain |= self._unrest > 0.0 and self._b[0] ** 2 > _CERTAIN_SIGMAS**2 * self._M[0, 0]
+            certain &= abs(self._b[0]) > _LEAST_S
+            self._certain_s = min(self._certain_s, self._t_s) if certain else np.inf
+            self.since_s = self._t_s if self._t_s - self._certain_s >= _STAYS_S else None
+        return self.since_s is not None
+
+    def _predict(self, passed: float, kept: Array) -> None:
+        """Predict over a time, s, in which the filter kept a share (K,) of its state."""
+        self._V[:, 1] -= passed * self._V[:, 0]
+        self._V *= kept[:, None]
+        self._V[self._delay] = 1.0, 0.0
+        step = np.array([[1.0, passed], [0.0, 1.0]])
+        self._b, self._corrected = step @ self._b, step @ self._corrected
+        self._unrest *= float(np.exp(-passed / _CALM_S))
+        self._unrest = self._unrest if self._unrest > _WALK else 0.0
+        walks = np.array([_WALK**2 + self._unrest**2, _RATE_WALK**2 + (self._unrest / _WINDOW_S) ** 2])
+        self._M = step @ self._M @ step.T + passed * np.diag(walks)
+
+    def _update(self, innovation: Innovation, G: Array, passed: float) -> None:
+        """Update offset and rate by an innovation with its derivative G (6, 2) by them."""
+        white = np.linalg.inv(innovation.cov)
+        r = innovation.z - G @ self._b
+        share = min(passed / _EXCESS_S, 1.0)
+        self._excess += share * (float(r @ white @ r) / 6.0 - self._excess)
+        along = white @ G / max(self._excess, 1.0)
+        fade = float(np.exp(-passed / _WINDOW_S))
+        self._score = fade * self._score + float(along[:, 0] @ r)
+        self._information = fade * self._information + float(along[:, 0] @ G[:, 0])
+        M = np.linalg.inv(np.linalg.inv(self._M) + along.T @ G)
+        left = r - G @ (M @ (along.T @ r))
+        if self.since_s is None and float(left @ white @ left) > _GATE * max(self._excess, 1.0):
+            return
+        self._b, self._M = self._b + M @ (along.T @ r), (M + M.T) / 2
+        if self._information <= 0.0:
+            return
+        surprise = self._score / self._information
+        if surprise**2 > _SURPRISING**2 * (1.0 / self._information + self._M[0, 0]):
+            self._unrest = max(self._unrest, abs(surprise) / float(np.sqrt(_WINDOW_S)))
+            self._score = self._information = 0.0

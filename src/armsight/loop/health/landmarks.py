@@ -1,0 +1,193 @@
+"""Fixed marker bodies in view: whether the cameras still stand where they stood, or a body is not fixed.
+
+In: measured poses of bodies that do not move, any number. Out: findings. The mean of the first poses of each body is its
+reference. A later mean differs from it by a tangent xi; if the cameras moved, their motion m in the left one's frame is the
+same for all bodies,
+
+    m = -Ad(T_left_body) xi
+
+A body that still stands where it stood proves that the cameras do; then those that moved are not fixed. Bodies that all
+moved agree on m (chi-square of their differences), or they do not. With a single body the two look alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import chdtri
+
+from armsight.data import Array, PoseEstimate
+from armsight.geometry.pose import adjoint, inverse, log_se3
+from armsight.loop.health.record import FALSE_ALARMS_PER_MINUTE, HealthFinding
+
+#: Poses of a mean.
+_SHOTS = 5
+#: Of the noise of one pose this share of the variance stays in each mean (where a disc lies in its pixels), and of the
+#: calibration's covariance this share differs between two positions of a body that hardly moved.
+_STAYS, _DIFFERS = 0.1, 2.5e-3
+#: A body that moved by less, m, is not reported.
+_LEAST_M = 1e-4
+
+
+@dataclass
+class _Landmark:
+    """A fixed body.
+
+    Attributes:
+        name: of the body.
+        T_left_body: its first pose; None before it was seen.
+        reference: (6,) mean tangent of the first poses from that; None before there are enough.
+        tangents: those of the mean that is being made, and when the first of them was seen, s.
+        newest: (6,) tangent of the newest mean from the reference, its covariance (6, 6), and since when it is, s.
+    """
+
+    name: str
+    T_left_body: Array | None = None
+    reference: Array | None = None
+    tangents: list[Array] = field(default_factory=list)
+    begin_s: float | None = None
+    newest: tuple[Array, Array, float | None] | None = None
+
+    def motion(self) -> tuple[Array, Array]:
+        """Return the motion (6,) of the cameras that explains the newest mean, and the inverse of its covariance."""
+        assert self.newest is not None
+        assert self.T_left_body is not None
+        to_left = adjoint(self.T_left_body)
+        return -to_left @ self.newest[0], np.asarray(np.linalg.inv(to_left @ self.newest[1] @ to_left.T), dtype=float)
+
+    @property
+    def shift_m(self) -> float:
+        """How far the body is from its reference, m."""
+        return 0.0 if self.newest is None else float(np.linalg.norm(self.newest[0][:3]))
+
+    @property
+    def moved(self) -> bool:
+        """Whether it moved in view."""
+        if self.newest is None:
+            return False
+        xi, cov, _ = self.newest
+        return self.shift_m > _LEAST_M and float(xi @ np.linalg.solve(cov, xi)) > _limit(6)
+
+
+def _limit(freedom: int) -> float:
+    """Return the chi-square of an alarm of some degrees of freedom: a mean is tested some times a second."""
+    return float(chdtri(freedom, FALSE_ALARMS_PER_MINUTE / 360.0))
+
+
+class LandmarkWatch:
+    """Watches the poses of fixed bodies.
+
+    Args:
+        names: of the bodies.
+
+    Attributes:
+        cameras_moved: whether the cameras were found to have moved.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._landmarks = [_Landmark(name) for name in names]
+        self._found: tuple[HealthFinding, ...] = ()
+        self.cameras_moved = False
+
+    @property
+    def never_seen(self) -> tuple[str, ...]:
+        """Names of the bodies that were not seen often enough to be watched."""
+        return tuple(each.name for each in self._landmarks if each.newest is None)
+
+    def take(self, row: int, estimate: PoseEstimate, t_s: float | None) -> None:
+        """Take a measured pose of the body of a row, in order of time, s (None: the shots have no times)."""
+        mark = self._landmarks[row]
+        if mark.T_left_body is None:
+            mark.T_left_body = estimate.T_left_body
+        if not mark.tangents:
+            mark.begin_s = t_s
+        mark.tangents.append(log_se3(inverse(mark.T_left_body) @ estimate.T_left_body))
+        if len(mark.tangents) < _SHOTS:
+            return
+        mean, mark.tangents = np.mean(mark.tangents, axis=0), []
+        if mark.reference is None:
+            mark.reference = mean
+        cov = (2.0 / _SHOTS + _STAYS) * estimate.cov_noise + _DIFFERS * (estimate.cov - estimate.cov_noise)
+        since_s = mark.newest[2] if mark.newest is not None and mark.moved else mark.begin_s
+        mark.newest = mean - mark.reference, cov, since_s
+        if row == max(k for k, each in enumerate(self._landmarks) if each.newest is not None):
+            self._found = self._decided() or self._found
+
+    def findings(self) -> tuple[HealthFinding, ...]:
+        """Return what was found so far; nothing while all is well."""
+        return self._found
+
+    def _decided(self) -> tuple[HealthFinding, ...]:
+        """Return what the newest means of all bodies say."""
+        known = [each for each in self._landmarks if each.newest is not None]
+        moved = [each for each in known if each.moved]
+        if not moved:
+            return ()
+        if len(moved) < len(known):  # one that stands proves that the cameras do
+            return tuple(_not_fixed(each) for each in moved)
+        if len(known) == 1:
+            return (
+                _finding(
+                    moved[0], f"the cameras moved, or the fixed body {moved[0].name}: with one alone the two look alike"
+                ),
+            )
+        together = _common(known)
+        if together is not None:
+            self.cameras_moved = True
+            return (_cameras(together, known),)
+        without = [(each, _common([other for other in known if other is not each])) for each in known]
+        agreed = [(each, common) for each, common in without if len(known) > 2 and common is not None]
+        if len(agreed) == 1:
+            self.cameras_moved = True
+            odd, common = agreed[0]
+            return _cameras(common, [each for each in known if each is not odd]), _not_fixed(odd)
+        names = ", ".join(each.name for each in known)
+        what = (
+            f"the fixed bodies {names} all moved, each by another motion: which are not fixed, or whether the cameras"
+        )
+        return (_finding(max(known, key=lambda each: each.shift_m), f"{what} moved as well, cannot be distinguished"),)
+
+
+def _common(marks: Sequence[_Landmark]) -> tuple[Array, Array] | None:
+    """Return the motion (6,) of the cameras that explains all bodies, and its covariance; None where none does."""
+    motions, whites = zip(*(each.motion() for each in marks), strict=True)
+    cov = np.linalg.inv(np.sum(whites, axis=0))
+    m = cov @ np.sum([white @ motion for motion, white in zip(motions, whites, strict=True)], axis=0)
+    chi_square = sum(float((each - m) @ white @ (each - m)) for each, white in zip(motions, whites, strict=True))
+    return (m, cov) if len(marks) == 1 or chi_square < _limit(6 * (len(marks) - 1)) else None
+
+
+def _cameras(common: tuple[Array, Array], marks: Sequence[_Landmark]) -> HealthFinding:
+    """Return the finding of cameras that moved."""
+    m, cov = common
+    size = float(np.linalg.norm(m[:3]))
+    along = m[:3] / max(size, 1e-12)
+    begins = [each.newest[2] for each in marks if each.newest is not None and each.newest[2] is not None]
+    return HealthFinding(
+        "fixed",
+        f"both cameras moved together: by {1e3 * size:.2f} mm and {np.degrees(np.linalg.norm(m[3:])):.3f} deg, as "
+        f"{len(marks)} fixed bodies show",
+        min(begins) if begins else None,
+        1e3 * size,
+        1e3 * float(np.sqrt(along @ cov[:3, :3] @ along)),
+        "mm",
+        "fasten the rig, and run again: that repeats the hand-eye calibration",
+    )
+
+
+def _not_fixed(mark: _Landmark) -> HealthFinding:
+    """Return the finding of a body that is not fixed."""
+    what = f"the fixed body {mark.name} is not fixed: it moved by {1e3 * mark.shift_m:.2f} mm, others did not"
+    return _finding(mark, what)
+
+
+def _finding(mark: _Landmark, what: str) -> HealthFinding:
+    """Return a finding that is sized by the motion of a body in view."""
+    assert mark.newest is not None
+    xi, cov, since_s = mark.newest
+    along = xi[:3] / max(mark.shift_m, 1e-12)
+    sigma_mm = 1e3 * float(np.sqrt(along @ cov[:3, :3] @ along))
+    advice = "fasten what moved, or leave the body out of --fixed; more fixed bodies say more"
+    return HealthFinding("fixed", what, since_s, 1e3 * mark.shift_m, sigma_mm, "mm", advice)

@@ -1,0 +1,191 @@
+"""A joint's motor from a recorded swing, and its potentiometer from a movement by hand.
+
+In: what the converters read while a joint swings to and fro (voltages, currents, angles; 100 readings a second and more).
+Out: a :class:`JointFit`. All is linear least squares: on integrals over time, so that no noisy reading has to be
+differentiated for the motor, and all is smoothed alike for the load (Ljung, "System Identification", 1999, section 4.2):
+
+    flux    integral of V  =  R integral of i + K (q + b/2 sign(w)) + drift
+    torque  K i  =  J dw/dt + B w + C sign(w) + gravity
+
+Gravity is a cosine and a sine of the angle, and b the backlash between the motor and the joint with its potentiometer:
+the motor leads the joint by half of it. Readings near a reversal, where the sign of the speed w is not certain, are
+left out of the sums, but not of the integrals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.robot.boards.tuning import MotorFigures
+
+_SMOOTH_S = 0.015  # standard deviation of the Gaussian that angles are smoothed by before they are differentiated
+_SURE = 0.2  # of the greatest speed: faster than so, the sign of the speed is certain
+_LEAST_READINGS = 100
+_LEAST_SWING_RAD = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit(Record):
+    """What a swing says of a joint.
+
+    Attributes:
+        motor: its motor.
+        backlash_rad: between motor and potentiometer, from stop to stop.
+        gravity_n_m: greatest torque of gravity over all angles, as far as the swing shows it.
+        resistance_sigma_ohm: standard deviation of the resistance, by the residuals.
+        constant_sigma_v_s: of the motor constant.
+        t_s: (n,) the readings' times from the first one on, s.
+        voltage_v: (n,) what the board put to the motor, smoothed.
+        predicted_v: (n,) what the fit says of it.
+    """
+
+    motor: MotorFigures
+    backlash_rad: float
+    gravity_n_m: float
+    resistance_sigma_ohm: float
+    constant_sigma_v_s: float
+    t_s: Array
+    voltage_v: Array
+    predicted_v: Array
+
+
+def fit_swing(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) -> JointFit:
+    """Identify a joint's motor from a swing.
+
+    Args:
+        t_s: (n,) times of the readings, rising, s.
+        voltage_v: (n,) duty times supply, V, positive where it drives the joint towards greater angles.
+        current_a: (n,) current of the motor, A, of the same sign; of one sign only from sensors that know no other.
+        angle_rad: (n,) angles of the joint.
+
+    Raises:
+        InputError: there are too few readings, or the joint did not move, or nothing of it looks like a motor.
+    """
+    if len(t_s) < _LEAST_READINGS or np.ptp(angle_rad) < _LEAST_SWING_RAD:
+        raise InputError(
+            f"{len(t_s)} readings over {np.ptp(angle_rad) if len(t_s) else 0:.4f} rad are too few to identify a motor by;"
+            f" {_LEAST_READINGS} over {_LEAST_SWING_RAD} rad are needed"
+        )
+    step_s = float(np.median(np.diff(t_s)))
+    t = np.arange(0.0, float(t_s[-1] - t_s[0]) + 0.5 * step_s, step_s)
+    volts, amperes, q = (np.interp(t, t_s - t_s[0], each) for each in (voltage_v, current_a, angle_rad))
+    speed = _smooth(q, step_s, derivative=True)
+    sure = _sure(speed, step_s)
+    if (amperes > -0.02 * np.abs(amperes).max()).all():
+        amperes = _signed(t, volts, amperes, q, speed, sure)
+    flux = _fit_flux(t, volts, amperes, q, speed, sure)
+    (resistance, constant, half), sigma = flux
+    if not (resistance > 0 and constant > 0):
+        raise InputError(
+            f"the swing fits no motor: resistance {resistance:.3g} ohm, constant {constant:.3g} V s/rad; both must be"
+            " positive: are current and voltage those of this motor?"
+        )
+    inertia, viscous, dry, gravity = _fit_torque(constant * amperes, q, speed, step_s, sure)
+    motor = MotorFigures(resistance, constant, inertia, max(viscous, 0.0), max(dry, 0.0))
+    smooth_v = _smooth(volts, step_s)
+    predicted = resistance * _smooth(amperes, step_s) + constant * speed
+    return JointFit(motor, max(2 * half, 0.0), gravity, sigma[0], sigma[1], t, smooth_v, predicted)
+
+
+def dead_spots(counts: Array, noise_counts: float, low: float, high: float) -> list[tuple[int, int]]:
+    """Return where a potentiometer that was moved by hand lost contact: first and last reading of each spot.
+
+    Args:
+        counts: (n,) readings of an even movement, a few milliseconds apart.
+        noise_counts: their noise at rest.
+        low: readings below are a short circuit.
+        high: readings above are an open wiper.
+    """
+    width = 15
+    padded = np.pad(counts, width // 2, mode="edge")
+    middle = np.median(np.lib.stride_tricks.sliding_window_view(padded, width), axis=1)
+    slope = np.abs(np.gradient(middle))
+    lost = (counts < low) | (counts > high) | (np.abs(counts - middle) > 400 + 12 * noise_counts + 10 * slope)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], lost.astype(int), [0]])))
+    spots: list[tuple[int, int]] = []
+    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        if spots and first - spots[-1][1] < 2 * width:
+            spots[-1] = (spots[-1][0], end - 1)
+        else:
+            spots.append((first, end - 1))
+    return spots
+
+
+def _smooth(values: Array, step_s: float, *, derivative: bool = False) -> Array:
+    """Return values (n,) convolved with a Gaussian, or their derivative by time."""
+    reach = max(2, round(4 * _SMOOTH_S / step_s))
+    at = np.arange(-reach, reach + 1) * step_s
+    kernel = np.exp(-0.5 * (at / _SMOOTH_S) ** 2)
+    kernel /= kernel.sum()
+    if derivative:
+        kernel = -at * kernel
+        kernel /= -(kernel * at).sum()
+        kernel = kernel.copy()
+    padded = np.pad(values, reach, mode="reflect", reflect_type="odd")
+    smoothed: Array = np.convolve(padded, kernel, mode="valid")
+    return smoothed
+
+
+def _sure(speed: Array, step_s: float) -> NDArray[np.bool_]:
+    """Return where (n,) the sign of the speed has been certain for long enough that no smoothing reaches a reversal."""
+    slow = np.abs(speed) < _SURE * np.abs(speed).max()
+    reach = round(3 * _SMOOTH_S / step_s)
+    near = np.convolve(slow, np.ones(2 * reach + 1), mode="same") > 0.5
+    near[: 2 * reach] = near[-2 * reach :] = True
+    return np.asarray(~near)
+
+
+def _integral(t: Array, values: Array) -> Array:
+    """Return the integral (n,) of values by time, by the trapezoidal rule."""
+    parts = 0.5 * (values[1:] + values[:-1]) * np.diff(t)
+    return np.concatenate([[0.0], np.cumsum(parts)])
+
+
+def _fit_flux(
+    t: Array, volts: Array, amperes: Array, q: Array, speed: Array, sure: NDArray[np.bool_]
+) -> tuple[tuple[float, float, float], tuple[float, float]]:
+    """Return resistance, constant and half the backlash, and the standard deviations of the first two."""
+    drift = np.vander(t / t[-1] - 0.5, 4)
+    columns = np.column_stack([_integral(t, amperes), q, np.sign(speed), drift])[sure]
+    right = _integral(t, volts)[sure]
+    solution, _, rank, _ = np.linalg.lstsq(columns, right, rcond=None)
+    if rank < columns.shape[1]:
+        raise InputError("the swing does not show the motor's resistance: its current never changed")
+    residual = right - columns @ solution
+    variance = float(residual @ residual) / (len(right) - columns.shape[1])
+    sigma = np.sqrt(np.diag(variance * np.linalg.inv(columns.T @ columns)))
+    resistance, constant, jump = (float(each) for each in solution[:3])
+    # Residuals of integrals are alike from one reading to the next: as many are independent as the smoothing leaves.
+    alike = np.sqrt(_SMOOTH_S / (t[1] - t[0]))
+    half = jump / constant if constant else 0.0
+    return (resistance, constant, half), (float(alike * sigma[0]), float(alike * sigma[1]))
+
+
+def _fit_torque(
+    torque: Array, q: Array, speed: Array, step_s: float, sure: NDArray[np.bool_]
+) -> tuple[float, float, float, float]:
+    """Return inertia, viscous and dry friction, and gravity's greatest torque."""
+    off = _smooth(q - q.mean(), step_s)
+    columns = [_smooth(speed, step_s, derivative=True), speed, np.sign(speed), np.cos(off), np.sin(off)]
+    # The acceleration is smoothed twice: so is everything else.
+    columns[1:] = [_smooth(each, step_s) for each in columns[1:]]
+    right = _smooth(_smooth(torque, step_s), step_s)
+    solution = np.linalg.lstsq(np.column_stack(columns)[sure], right[sure], rcond=None)[0]
+    inertia, viscous, dry, cosine, sine = (float(each) for each in solution)
+    if not inertia > 0:
+        raise InputError(f"the swing fits no motor: its inertia comes out as {inertia:.3g} kg m^2; it must be positive")
+    return inertia, viscous, dry, float(np.hypot(cosine, sine))
+
+
+def _signed(t: Array, volts: Array, amperes: Array, q: Array, speed: Array, sure: NDArray[np.bool_]) -> Array:
+    """Return currents with the signs that a motor's equation gives them, from a sensor that knows their size only."""
+    signed = np.abs(amperes) * np.sign(volts)
+    for _ in range(4):
+        (_, constant, _), _ = _fit_flux(t, volts, signed, q, speed, sure)
+        signed = np.abs(amperes) * np.sign(_smooth(volts, float(t[1] - t[0])) - constant * speed)
+    return signed

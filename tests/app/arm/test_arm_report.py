@@ -1,0 +1,108 @@
+"""``armsight arm plan`` and ``arm report``: injected zeros, droop and drift are found, parts sum up, mistakes are named."""
+
+import json
+
+import numpy as np
+import pytest
+
+from armsight.app.arm import evaluate
+from armsight.app.arm.evaluate import evaluate_arm, plan_report
+from armsight.app.run.folder import joint_columns
+from armsight.app.run.motion_file import read_motions
+from armsight.app.run.record import ToolTrack, write_columns, write_track
+from armsight.geometry.pose import exp_se3
+from armsight.loop.identify.model import gravity_levers
+from armsight.robot.arm_file import open_arm
+from cli_runs import assert_rejected
+
+ARM = open_arm("so101")
+ZERO_DEG, DROOP_DEG_PER_M, DRIFT_MM_PER_H = np.array([0.0, 0.8, -1.1, 0.6, 0.0]), 8.0, 8.0
+SIGMA = np.repeat([2e-5, 1e-4], 3)
+STEP_S, MOVES, RESTS = 0.04, 5, 15
+
+
+def everywhere(Ts):
+    return np.ones(len(Ts), bool)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The folder of a run with the motions that were planned, with zeros that are off, joints that droop, and noise."""
+    folder, rng = tmp_path_factory.mktemp("run"), np.random.default_rng(3)
+    around = ARM.home + np.vstack([np.zeros(5), rng.uniform(-1.0, 1.0, (12, 5))])
+    (folder / "motion.toml").write_text(plan_report(ARM, around, everywhere, poses=9, cycles=6))
+    plan = read_motions(ARM, folder / "motion.toml")
+    q_ref, phase, name = [], [], []
+    for motion in plan.motions:
+        rests = RESTS if motion.rest_s > 0 else 0
+        ends = motion.trajectory.at(np.array([0.0, motion.trajectory.duration_s])).q
+        q_ref += [ends[0] + share * (ends[1] - ends[0]) for share in np.linspace(0, 1, MOVES)] + rests * [ends[1]]
+        phase += MOVES * ["open_loop"] + rests * ["rest"]
+        name += (MOVES + rests) * [motion.name]
+    q_ref, phase, name = np.array(q_ref), np.array(phase), np.array(name)
+    t_s = 5.0 + STEP_S * np.arange(len(q_ref))
+    q = q_ref + np.radians(DROOP_DEG_PER_M) * gravity_levers(ARM, q_ref)
+    T = ARM.forward(q + np.radians(ZERO_DEG)) @ exp_se3(SIGMA * rng.normal(size=(len(q), 6)))
+    T[:, 0, 3] += 1e-3 * DRIFT_MM_PER_H * t_s / 3600.0
+    covs = np.tile(np.diag(SIGMA**2), (len(q), 1, 1))
+    write_track(folder, "vision", ToolTrack(t_s, T, phase, name, covs))
+    write_track(folder, "reference", ToolTrack(t_s, ARM.forward(q_ref), phase, name))
+    write_columns(folder, "joints", joint_columns(t_s, q, q_ref))
+    (folder / "summary.json").write_text(json.dumps({"nominal_arm": "so101", "board": "feetech", "health": []}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def report(run):
+    return evaluate_arm(run, ARM)
+
+
+def test_zeros_droop_and_drift_are_found_within_three_sigma(report):
+    for k in (1, 2, 3):
+        value, sigma = report.joints[k].zero_deg
+        assert abs(value - ZERO_DEG[k]) < 3 * sigma < 0.1
+        slope, sigma = report.joints[k].droop_deg_per_m
+        assert (
+            abs(slope - DROOP_DEG_PER_M) < 3 * sigma + 0.01 * DROOP_DEG_PER_M
+        )  # the lever at the reading is a little another
+    rate, sigma = report.drift_mm_per_h
+    assert abs(rate - DRIFT_MM_PER_H) < 3 * sigma < DRIFT_MM_PER_H
+    assert report.cycles >= 6
+    assert report.one_side_mm < 0.2
+    assert report.both_sides_mm[1] < 0.2
+    assert report.latency_s < 0.02
+
+
+def test_the_parts_of_the_error_sum_up_and_a_remedy_takes_its_part_away(report):
+    assert sum(part.share for part in report.parts.values()) == pytest.approx(1.0, abs=1e-9)
+    zeros, controller, rest = (report.parts[name] for name in ("zeros", "controller", "rest"))
+    assert min(zeros.share, controller.share) > 0.05
+    assert max(zeros.without_mm, controller.without_mm) < report.placed_mm
+    assert rest.rms_mm < 0.2 * report.placed_mm
+    assert report.accuracy_mm[0] >= report.placed_mm
+
+
+def test_page_pdf_and_json_are_written_and_another_arm_is_compared(armsight, run, report, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluate, "evaluate_arm", lambda folder, arm, *, progress: report)
+    out = tmp_path / "owner"
+    said = armsight("arm", "report", run, "-o", out)
+    assert said.code == 0, said.err
+    assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
+    assert "so101" in (out / "report.html").read_text()
+    written = json.loads((out / "report.json").read_text())
+    assert written["kind"] == "arm report"
+    assert {"share", "rms_mm", "without_mm", "remedy"} == set(written["parts"]["zeros"])
+    assert written["joints"][1]["sigma_zero_deg"] > 0
+    again = armsight("arm", "report", run, "--compare", out / "report.json", "--json")
+    assert json.loads(again.out) == written
+
+
+def test_mistakes_are_one_line(armsight, run, tmp_path):
+    assert_rejected(armsight("arm", "report", tmp_path), "does not name its arm")
+    assert_rejected(armsight("arm", "report", tmp_path, "--arm", "so101"), "is no run")
+    assert_rejected(armsight("arm", "report", run, "--arm", "six_r"), "is not of an arm of 6 joints")
+    (tmp_path / "other.json").write_text("{}")
+    assert_rejected(armsight("arm", "report", run, "--compare", tmp_path / "other.json"), "no report of an arm")
+    plan = ("arm", "plan", "so101", "--around", tmp_path, "-o", tmp_path / "plan.toml")
+    assert_rejected(armsight(*plan), "handeye_poses.csv")
+    assert not (tmp_path / "plan.toml").exists()

@@ -1,0 +1,176 @@
+"""A bring-up of one joint from a fresh board, its mistakes by name, and what becomes of a pulled cable and Ctrl-C."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from armsight.app.board.bringup import Bringup, Found, JointFound
+from armsight.app.board.command import command
+from armsight.errors import DeviceError, InputError
+from armsight.robot.boards.board import Board
+from armsight.robot.boards.board_file import read_configuration
+from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.identification import dead_spots, fit_swing
+from armsight.robot.boards.opening import open_emulator
+from armsight.sim.boards.workshop import Wiring, WorkshopPerson, drawn_workshop, swapped
+
+
+class Evening:
+    """A fresh emulated board with an arm nobody knows, and a person."""
+
+    def __init__(self, folder, wiring=None, *, seed=31, joints=(0,), mends=False):
+        self.plant, self.model = drawn_workshop(seed)
+        if wiring is not None:
+            self.plant.wiring = wiring
+        self.person = WorkshopPerson(self.plant, seed=seed, mends=mends)
+        self.link = EmulatedLink(open_emulator("host"), self.plant)
+        self.board = Board.connect(self.link)
+        self.bringup = Bringup(self.board, self.person, folder, joints)
+        self.joints = self.bringup.found.joints
+
+
+def known(evening):
+    """Let the potentiometers of all joints be known, so that a test need not move them."""
+    for each, sign in zip(evening.joints, evening.plant.wiring.potentiometer_signs, strict=True):
+        counts = np.array([5000.0, 60000.0])
+        each.noise_counts, each.range_counts = 15.0, counts.tolist()
+        each.marks = [[c, sign * (c - 32767.5) / 11342.5] for c in counts]
+
+
+def test_one_joint_is_identified_verified_and_stored(tmp_path):
+    evening = Evening(tmp_path)
+    evening.bringup.run()
+    found, model = evening.joints[0], evening.model
+    assert evening.person.problems == []
+    assert found.resistance_ohm == pytest.approx(model.resistance_ohm[0], rel=0.07)  # and its current sensor is 3 % off
+    assert found.constant_v_s == pytest.approx(model.constant_v_s[0], rel=0.03)
+    assert found.inertia_kg_m2 == pytest.approx(model.inertia_kg_m2[0], rel=0.15)
+    assert found.motor_direction == evening.plant.wiring.motor_signs[0]
+    assert found.following_rms_rad < 0.01
+    config, name = read_configuration(tmp_path / "board.toml")
+    assert (name, config.tobytes()) == ("pil", evening.board.configuration().tobytes())
+    assert config["silence_reaction"] == 1
+    assert not evening.board.status.drives_on
+    page = (tmp_path / "report.html").read_text()
+    assert "data:image/png" in page
+    assert f"{found.constant_v_s:.3f}" in page
+    # What is kept is taken up again: nothing is asked, nothing moves.
+    evening.plant.drives_s = 0.0
+    Bringup(evening.board, evening.person, tmp_path, [0]).run(["potentiometers", "motors", "swing"])
+    assert evening.plant.drives_s == 0.0
+
+
+@pytest.mark.parametrize(
+    ("wiring", "step", "said"),
+    [
+        (Wiring(open_potentiometers=frozenset({1})), "readings", "joint 2: its potentiometer is open"),
+        (Wiring(potentiometers=swapped(1, 4)), "potentiometers", "potentiometers of joints 2 and 5 are swapped"),
+        (Wiring(dead_spot=(1, 0.5, 0.55)), "potentiometers", "joint 2: its potentiometer has a dead spot at 2"),
+        (Wiring(motors=swapped(1, 4)), "motors", "motors of joints 2 and 5 are swapped"),
+        (Wiring(dead_motors=frozenset({1})), "motors", "joint 2: its motor is dead"),
+    ],
+)
+def test_a_mistake_is_named_and_nothing_moves_by_it(tmp_path, wiring, step, said):
+    evening = Evening(tmp_path, wiring, joints=[1])
+    if step == "motors":
+        known(evening)
+    if step == "potentiometers":
+        evening.joints[1].noise_counts = 10.0
+    evening.bringup.run([step])
+    assert len(evening.person.problems) == 1
+    assert said in evening.person.problems[0]
+    assert not evening.joints[1].done(step)
+    assert not evening.board.status.drives_on
+
+
+def test_a_pulse_moves_no_joint_further_than_3_degrees(tmp_path):
+    evening = Evening(tmp_path, joints=[0, 3])
+    known(evening)
+    evening.plant.mark()
+    evening.bringup.run(["motors"])
+    assert [evening.joints[j].motor_direction for j in (0, 3)] == [evening.plant.wiring.motor_signs[j] for j in (0, 3)]
+    assert np.degrees(evening.plant.far_rad.max()) < 3.0
+
+
+@pytest.mark.parametrize("raised", [KeyboardInterrupt, DeviceError("gone")])
+def test_the_motors_are_off_and_what_was_found_is_kept(tmp_path, raised):
+    evening = Evening(tmp_path)
+    known(evening)
+    evening.joints[0].motor_direction = 1
+    read = evening.link.read
+    ticks = []
+
+    def interrupted(wait_s=0.0):
+        if evening.board.status.drives_on:
+            ticks.append(wait_s)
+        if len(ticks) == 30:
+            if raised is not KeyboardInterrupt:
+                evening.link.read = evening.link.write = broken
+            raise raised
+        return read(wait_s)
+
+    def broken(*_):
+        raise DeviceError("gone")
+
+    evening.link.read = interrupted
+    with pytest.raises((KeyboardInterrupt, DeviceError)) as came:
+        evening.bringup.run(["motors", "swing"])
+    assert raised is KeyboardInterrupt or "what was found is kept" in str(came.value)
+    if raised is KeyboardInterrupt:  # switched off, not only left alone
+        assert evening.board.status.state == 0
+    evening.link.step(300)  # a board whose cable is pulled hears nothing
+    assert not evening.link.answer["outputs"]["drives_on"]
+    kept = Found.read(tmp_path / "bringup.json")
+    assert kept.joints[0].marks == evening.joints[0].marks
+
+
+def test_the_command_prints_what_was_found(tmp_path):
+    done = CliRunner().invoke(
+        command, ["bringup", "--board", "emulated:host", "--step", "readings", "-o", str(tmp_path), "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    assert all(1 < each["noise_counts"] < 30 for each in found["joints"])
+
+
+def test_a_foreign_file_of_what_was_found_is_rejected(tmp_path):
+    (tmp_path / "bringup.json").write_text("[]")
+    with pytest.raises(InputError, match=r"bringup\.json: not what a bring-up kept"):
+        Evening(tmp_path)
+    Found("nucleo-f446re", [JointFound() for _ in range(6)]).write(tmp_path / "bringup.json")
+    with pytest.raises(InputError, match="is of board nucleo-f446re; this one is pil"):
+        Evening(tmp_path)
+
+
+def test_a_motor_is_identified_exactly_without_noise_also_from_currents_without_a_sign():
+    t = np.arange(0, 5, 0.002)
+    q, w, a = (
+        sum(
+            s * np.real((2j * np.pi * f) ** n * np.exp(2j * np.pi * f * t) * -1j) for s, f in ((0.12, 0.5), (0.04, 2.0))
+        )
+        for n in range(3)
+    )
+    amperes = (0.05 * a + 0.03 * w + 0.2 * np.sign(w) + 1.5 * np.sin(q)) / 2.4
+    volts = 6.0 * amperes + 2.4 * w
+    for sensed, rel in ((amperes, 0.001), (np.abs(amperes), 0.05)):
+        fit = fit_swing(t, volts, sensed, q)
+        assert fit.motor.resistance_ohm == pytest.approx(6.0, rel=rel)
+        assert fit.motor.constant_v_s == pytest.approx(2.4, rel=rel)
+        assert fit.motor.inertia_kg_m2 == pytest.approx(0.05, rel=0.05)
+        assert fit.motor.dry_n_m == pytest.approx(0.2, rel=0.1)
+        assert fit.gravity_n_m == pytest.approx(1.5, rel=0.05)
+        assert fit.backlash_rad < 1e-3
+    with pytest.raises(InputError, match="too few to identify a motor"):
+        fit_swing(t, volts, amperes, 0 * q)
+    with pytest.raises(InputError, match="fits no motor"):
+        fit_swing(t, -volts, amperes, q)
+
+
+def test_dead_spots_are_where_contact_was_lost():
+    counts = np.linspace(5000, 60000, 2000) + np.random.default_rng(1).normal(0, 20, 2000)
+    assert dead_spots(counts, 20.0, 300, 65000) == []
+    counts[700:706] = 65535
+    counts[900] += 3000
+    assert dead_spots(counts, 20.0, 300, 65000) == [(700, 705), (900, 900)]

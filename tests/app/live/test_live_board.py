@@ -1,0 +1,166 @@
+"""The board for several threads: a stop goes before whoever drives it, and loses no reading."""
+
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from armsight.app.live.arm import ArmOptions, ArmStep
+from armsight.app.live.board import StoppableBoard
+from armsight.data import JointStates
+from armsight.errors import InputError
+from armsight.robot.boards.codes import BoardState, Command
+from armsight.robot.boards.contract import Abilities
+from armsight.robot.boards.feetech.board import FeetechBoard
+from armsight.robot.boards.feetech.bus import ServoBus
+from armsight.robot.models import MODELS
+from armsight.sim.boards.device import SteppedLink
+from armsight.sim.boards.so101 import So101Bus
+
+
+class FakeBoard:
+    """A board that reports its stop two receptions later, and notes who called it at once with whom."""
+
+    abilities = Abilities(6, 250.0)
+
+    def __init__(self):
+        self.status, self.calls, self.within, self.together, self.t = (
+            SimpleNamespace(state=BoardState.ENABLED),
+            [],
+            0,
+            0,
+            0,
+        )
+        self.inside, self.go_on = threading.Event(), threading.Event()
+
+    def receive(self, wait_s):
+        self.within += 1
+        self.together = max(self.together, self.within)
+        self.calls.append("receive")
+        self.t += 1
+        if "stop" in self.calls and len(self.calls) - self.calls.index("stop") > 2:
+            self.status.state = BoardState.STOPPED
+        self.within -= 1
+        return JointStates(np.array([float(self.t)]), np.full((1, 6), float(self.t)))
+
+    def stop(self):
+        self.calls.append("stop")
+
+    def command(self, command):
+        self.calls.append(command)
+        return 1
+
+    def confirm(self, sequence, wait_s=0.5):
+        self.inside.set()
+        self.go_on.wait(10.0)
+        self.status.state = BoardState.DISABLED
+
+
+def test_a_stop_loses_no_reading_and_is_cleared_by_a_command():
+    board = StoppableBoard(fake := FakeBoard())
+    board.receive(0.0)
+    board.stop()
+    assert board.stopped
+    assert board.rests
+    taken = board.receive(0.0)
+    assert taken.t_s.tolist() == [float(k) for k in range(2, fake.t + 1)]
+    fake.go_on.set()
+    board.clear_stop()
+    assert fake.calls[-1] is Command.CLEAR_STOP
+    assert not board.stopped
+
+
+def test_a_stop_goes_before_a_thread_that_never_lets_go():
+    board, ended = StoppableBoard(fake := FakeBoard()), threading.Event()
+
+    def drive():
+        while not ended.is_set():
+            board.receive(0.0)
+
+    thread = threading.Thread(target=drive)
+    thread.start()
+    board.stop()
+    ended.set()
+    thread.join(10.0)
+    assert board.rests
+    assert fake.together == 1
+
+
+def test_a_long_wait_is_made_of_short_ones():
+    waited = []
+    board = StoppableBoard(fake := FakeBoard())
+    fake.receive = lambda wait_s: waited.append(wait_s) or JointStates(np.array([float(len(waited))]), np.zeros((1, 6)))
+    assert board.receive(0.0).t_s.tolist() == [1.0]
+    assert board.receive(0.0101).t_s.tolist() == [2.0, 3.0, 4.0]
+    assert sum(waited) == pytest.approx(0.0101)
+    assert max(waited) < 0.005
+
+
+def test_a_stop_is_sent_while_another_call_waits_for_an_answer():
+    board = StoppableBoard(fake := FakeBoard())
+    thread = threading.Thread(target=lambda: board.confirm(1))
+    thread.start()
+    fake.inside.wait(10.0)
+    stopping = threading.Thread(target=board.stop)
+    stopping.start()
+    while "stop" not in fake.calls:
+        stopping.join(0.01)
+    assert thread.is_alive()
+    fake.status.state = BoardState.STOPPED
+    fake.go_on.set()
+    stopping.join(10.0)
+    thread.join(10.0)
+    assert not stopping.is_alive()
+
+
+def test_a_board_with_another_controller_is_stopped_when_it_follows_no_command():
+    link = SteppedLink(So101Bus.made())
+    board = StoppableBoard(FeetechBoard.connect(ServoBus(link, "feetech:PORT", now=link.now)))
+    board.enable()
+    assert not board.rests
+    board.stop()
+    assert board.rests
+    assert board.stopped
+    board.clear_stop()
+    assert not board.stopped
+
+
+def arm_step(tmp_path, board, measuring=None):
+    arm = MODELS["six_r"]
+    options = ArmOptions(arm, "six_r", board, tmp_path / "motion.toml", 30.0, 1e-3, "usb:0,1")
+    measuring = measuring or SimpleNamespace(rig=None, rig_path=None, target_spec=None, newest=None)
+    said = []
+    return ArmStep(tmp_path, options, SimpleNamespace(), measuring, None, said.append), said
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "says"),
+    [
+        ("nonsense", "usb:0,1", "no board 'nonsense'; there are"),
+        ("poses:", "usb:0,1", "no board 'poses:'"),
+        ("poses:nothing.csv", "usb:0,1", "nothing.csv"),
+        ("emulated:unicorn", "usb:0,1", "go together: --source sim:"),
+    ],
+)
+def test_a_board_that_cannot_be_right_is_rejected(name, source, says):
+    with pytest.raises(InputError, match=says):
+        ArmStep.check_board(name, source, MODELS["six_r"])
+
+
+def test_logged_joint_angles_stand_beside_the_shot_they_belong_to(tmp_path):
+    (tmp_path / "q.csv").write_text("shot,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\na,1,2,3,4,5,6\nb,2,2,3,4,5,6\n")
+    newest = SimpleNamespace(shot=SimpleNamespace(name="b", t_s=None)), None
+    measuring = SimpleNamespace(rig=None, rig_path=None, target_spec=None, newest=newest)
+    step, _ = arm_step(tmp_path, f"poses:{tmp_path}/q.csv", measuring)
+    step.open()
+    assert step.state.q_deg == pytest.approx((2, 2, 3, 4, 5, 6))
+    assert not step.state.moves
+    with pytest.raises(InputError, match="commands no motion"):
+        step.run(closed=False)
+    (tmp_path / "q.csv").write_text("q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n1,2,3,4,5,6\n2,2,3,4,5,6\n")
+    other, _ = arm_step(tmp_path, f"poses:{tmp_path}/q.csv")
+    with pytest.raises(InputError, match="neither a column shot nor t_s"):
+        other.open()
+    step.close()
+    other.close()

@@ -1,0 +1,71 @@
+"""The guided hand-eye calibration: each pose it chooses lowers the error, and it says when to stop."""
+
+import numpy as np
+import pytest
+
+from armsight.app.live import handeye
+from armsight.app.live.handeye import LEAST_POSES, MOST_POSES, HandEyeGuide, likely_joint_errors
+from armsight.app.run.calibrate import VisitedPose, handeye_poses
+from armsight.errors import InputError
+from armsight.geometry.pose import exp_se3, inverse, pose
+from armsight.loop.identify.read import read_poses
+from armsight.robot.models import MODELS
+from armsight.sim.example_rig import example_rig
+from armsight.sim.workcell.cameras import rig_pose
+
+ARM = MODELS["six_r"]
+NOISE = np.repeat((5e-4, 1e-3), 3)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """A guide that was led to its end with a noisy arm, what it took, and the truth."""
+    quick = pytest.MonkeyPatch()
+    quick.setattr(handeye, "LITTLE", 0.05)
+    rng = np.random.default_rng(7)
+    rig, T_tool_body = example_rig((1280, 720), 900.0), pose(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 0.03]))
+    T_base_rig = rig_pose(ARM, rig, T_tool_body, 7)
+    guide = HandEyeGuide(tmp_path_factory.mktemp("live"), ARM, "six_r", lambda note: pytest.fail(note.text))
+    guide.begin(handeye_poses(ARM, ARM.home[None], 3, 1), (ARM.q_min, ARM.q_max), rig)
+    while (q := guide.next_q) is not None:
+        seen = inverse(T_base_rig) @ ARM.forward(q) @ exp_se3(NOISE * rng.standard_normal(6)) @ T_tool_body
+        guide.add(VisitedPose(q, seen, np.diag(np.repeat((1e-9, 1e-9), 3)), np.zeros(6)))
+        guide.fit()
+    yield guide, T_base_rig
+    guide.close()
+    quick.undo()
+
+
+def test_it_ends_by_itself_with_the_error_it_predicts(calibrated):
+    guide, T_base_rig = calibrated
+    state = guide.state
+    assert state.good
+    assert LEAST_POSES <= state.poses <= MOST_POSES
+    assert state.progress[-1].predicted_mm < 0.75 * state.progress[0].predicted_mm
+    p = guide.run.Ts_left_body[:, :3, 3]
+    off = inverse(T_base_rig) @ guide.run.mounting.T_base_rig
+    error_mm = 1e3 * np.sqrt(((p @ off[:3, :3].T + off[:3, 3] - p) ** 2).sum(axis=1).mean())
+    assert error_mm < 3.0 * state.progress[-1].predicted_mm
+    assert 0.5 < state.progress[-1].heldout_mm < 2.5  # 0.87 mm of the flange, and its rotation over the distance
+
+
+def test_poses_are_written_as_the_commands_read_them(calibrated):
+    guide, _ = calibrated
+    assert len(read_poses(guide.poses_file).measured) == guide.state.poses
+    assert (guide.folder / "joints.csv").read_text().startswith("q1_rad,")
+
+
+def test_the_same_pose_again_is_rejected(calibrated):
+    guide, _ = calibrated
+    again = guide.run
+    with pytest.raises(InputError, match="like this one was taken"):
+        guide.add(VisitedPose(again.q[3], again.Ts_left_body[3], again.covs[3], np.zeros(6)))
+
+
+def test_a_singular_arm_does_not_explain_a_millimetre_by_degrees():
+    arm, q = ARM, ARM.home
+    T = arm.forward(q) @ exp_se3(np.array([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0]))
+    assert np.degrees(np.abs(likely_joint_errors(arm, q, T))).max() < 0.8
+    bent = q + np.radians([5, -20, 30, 10, 20, 5])
+    errors = np.radians([0.2, -0.1, 0.3, 0.1, -0.2, 0.1])
+    assert likely_joint_errors(arm, bent, arm.forward(bent + errors)) == pytest.approx(errors, abs=1e-3)

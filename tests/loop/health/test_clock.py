@@ -1,0 +1,38 @@
+"""A camera's clock that drifts against that of the joints: followed, named, and nothing else is blamed."""
+
+import numpy as np
+import pytest
+from faults import AT_S, watched_arm
+
+RATE = 6e-4
+
+
+@pytest.fixture(scope="module")
+def drifting():
+    return watched_arm(61, seconds=17.0, late=lambda t_s: RATE * t_s)
+
+
+def test_the_offset_is_followed_and_named_as_time(drifting):
+    (found,) = drifting.monitor.findings()
+    assert (found.cause, found.unit) == ("time", "ms")
+    true_ms = 1e3 * RATE * (17.0 - AT_S)
+    assert abs(found.size - true_ms) < 4 * found.sigma
+    assert found.sigma < 1.0
+    rate, sigma = drifting.estimator.clock.rate
+    assert abs(rate - RATE) < 4 * sigma
+    assert AT_S < found.since_s < AT_S + 6.0
+
+
+def test_poses_in_motion_stay_within_their_covariance_once_it_is_followed(drifting):
+    track = drifting.tracked
+    rows = np.flatnonzero(track.t_s > drifting.monitor.findings()[0].since_s + 0.5)[::20]
+    off = np.linalg.inv(track.Ts_base_tool[rows]) @ drifting.Ts_true[rows]
+    shift, cov = off[:, :3, 3], track.covs[rows, :3, :3]
+    assert np.mean(np.einsum("ni,nij,nj->n", shift, np.linalg.inv(cov), shift)) < 6.0
+
+
+def test_the_delay_that_was_measured_stays_where_the_clock_is_right():
+    right = watched_arm(62, seconds=10.0)
+    assert right.monitor.findings() == ()
+    assert right.estimator.clock.since_s is None
+    assert right.estimator.clock_offset_s(9.0) == 0.0

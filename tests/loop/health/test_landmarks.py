@@ -1,0 +1,74 @@
+"""Fixed bodies in view: cameras that moved together, bodies that are not fixed, and what looks alike."""
+
+import numpy as np
+import pytest
+
+from armsight.data import PoseEstimate
+from armsight.geometry.pose import exp_se3, inverse, pose
+from armsight.geometry.rotation import exp_so3
+from armsight.loop.health.landmarks import LandmarkWatch
+
+NOISE = np.diag(np.repeat([4e-5, 3e-4], 3) ** 2)
+COV = NOISE + np.diag(np.repeat([2e-4, 5e-4], 3) ** 2)
+AT_S = 4.0
+CAMERAS = np.array([5e-4, 0.0, 2e-4, 0.0, np.radians(0.05), 0.0])
+
+
+def watched(seed, count, *, cameras=None, bodies=None, seconds=8.0):
+    """A watch of so many fixed bodies; cameras (6,) or some bodies {row: (6,)} move at AT_S."""
+    rng = np.random.default_rng(seed)
+    watch = LandmarkWatch([f"post {k}" for k in range(count)])
+    Ts = [pose(exp_so3(0.4 * rng.normal(size=3)), np.array([0.3 * k - 0.3, 0.1, 1.0])) for k in range(count)]
+    root = np.linalg.cholesky(NOISE)
+    for t_s in np.arange(0.0, seconds, 0.1):
+        for row, T in enumerate(Ts):
+            if t_s >= AT_S:
+                T = T if cameras is None else inverse(exp_se3(cameras)) @ T
+                T = T if bodies is None or row not in bodies else T @ exp_se3(bodies[row])
+            T = T @ exp_se3(root @ rng.normal(size=6))
+            watch.take(row, PoseEstimate(T, COV, NOISE, 0.0, 0.0, 1.0, None), t_s)
+    return watch
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_nothing_is_found_where_nothing_moves(count):
+    for seed in range(5):
+        assert watched(seed, count, seconds=10.0).findings() == ()
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_cameras_that_moved_together_are_named_and_sized(count):
+    watch = watched(10, count, cameras=CAMERAS)
+    (found,) = watch.findings()
+    assert found.cause == "fixed"
+    assert "both cameras moved together" in found.what
+    assert watch.cameras_moved
+    assert abs(found.size - 1e3 * np.linalg.norm(CAMERAS[:3])) < 4 * found.sigma
+    assert found.since_s == pytest.approx(AT_S, abs=1.0)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_body_that_is_not_fixed_is_named_as_another_stands(count):
+    watch = watched(11, count, bodies={1: np.array([1e-3, 0, 0, 0, 0, 0])})
+    (found,) = watch.findings()
+    assert "post 1 is not fixed" in found.what
+    assert not watch.cameras_moved
+    assert abs(found.size - 1.0) < 4 * found.sigma
+
+
+def test_a_body_that_moves_beside_cameras_that_move_is_named_by_two_that_agree():
+    cameras, other = watched(12, 3, cameras=CAMERAS, bodies={2: np.array([0, 2e-3, 0, 0, 0, 0])}).findings()
+    assert "as 2 fixed bodies show" in cameras.what
+    assert "post 2 is not fixed" in other.what
+
+
+def test_what_looks_alike_is_not_decided():
+    (alone,) = watched(13, 1, cameras=CAMERAS).findings()
+    assert "with one alone the two look alike" in alone.what
+    shifts = {0: np.array([1e-3, 0, 0, 0, 0, 0]), 1: np.array([0, 1e-3, 0, 0, 0, 0.01])}
+    (both,) = watched(14, 2, bodies=shifts).findings()
+    assert "cannot be distinguished" in both.what
+
+
+def test_a_body_that_was_not_seen_is_named():
+    assert watched(15, 2, seconds=0.3).never_seen == ("post 0", "post 1")

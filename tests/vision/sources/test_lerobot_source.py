@@ -1,0 +1,136 @@
+"""LeRobot datasets of format 2 and 3: two cameras as shots, the joints, and what is missing in one line."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("pyarrow")
+
+from armsight.errors import InputError
+from armsight.vision.sources import notes_of, open_source
+from armsight.vision.sources.lerobot import LeRobotDataset
+
+FPS, KEYS = 10, ("observation.images.left", "observation.images.right")
+
+
+def video(path, levels):
+    """An MP4 whose frames have one grey level each."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (64, 48))
+    for level in levels:
+        writer.write(np.full((48, 64, 3), level, np.uint8))
+    writer.release()
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """Write a dataset of two episodes of five frames; the grey level says camera, episode and frame."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    def write(version):
+        v3 = version.startswith("v3")
+        template = (
+            "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+            if v3
+            else "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+        )
+        features = {key: {"dtype": "video", "shape": [48, 64, 3]} for key in KEYS}
+        features["observation.state"] = {"dtype": "float32", "shape": [2], "names": ["shoulder", "elbow"]}
+        info = {
+            "codebase_version": version,
+            "fps": FPS,
+            "chunks_size": 1000,
+            "video_path": template,
+            "features": features,
+        }
+        (tmp_path / "meta").mkdir()
+        (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
+        rows = [(k / FPS, e, k, [0.1 * k, float(e)]) for e in range(2) for k in range(5)]
+        names = ("timestamp", "episode_index", "frame_index", "observation.state")
+        (tmp_path / "data" / "chunk-000").mkdir(parents=True)
+        table = pa.table({name: [row[i] for row in rows] for i, name in enumerate(names)})
+        parquet.write_table(table, tmp_path / "data" / "chunk-000" / "file-000.parquet")
+        for c, key in enumerate(KEYS):
+            levels = [[100 * c + 50 * e + 10 * k for k in range(5)] for e in range(2)]
+            if v3:
+                video(tmp_path / template.format(video_key=key, chunk_index=0, file_index=0), levels[0] + levels[1])
+                continue
+            for e in range(2):
+                video(tmp_path / template.format(video_key=key, episode_chunk=0, episode_index=e), levels[e])
+        if v3:
+            columns = {"episode_index": [0, 1]}
+            for key in KEYS:
+                columns |= {f"videos/{key}/{part}_index": [0, 0] for part in ("chunk", "file")}
+                columns[f"videos/{key}/from_timestamp"] = [0.0, 5 / FPS]
+            (tmp_path / "meta" / "episodes").mkdir()
+            parquet.write_table(pa.table(columns), tmp_path / "meta" / "episodes" / "file-000.parquet")
+        return tmp_path
+
+    return write
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_frames_of_every_episode_are_shots(dataset, version):
+    folder = dataset(version)
+    source = open_source(f"lerobot:{folder}")
+    found = list(iter(source.read, None))
+    assert source.count == len(found) == 10
+    assert not notes_of(source)
+    assert [shot.problem for shot in found] == [None] * 10
+    for n, shot in enumerate(found):
+        for c, image in enumerate((shot.left, shot.right)):
+            assert abs(float(np.mean(image)) - (100 * c + 50 * (n // 5) + 10 * (n % 5))) < 4, (n, c)
+    assert np.all(np.diff([shot.t_s for shot in found]) > 0)
+    assert len(list(iter(open_source(f"lerobot:{folder},episode=1").read, None))) == 5
+    joints = LeRobotDataset(folder).joints()
+    assert joints.names == ("shoulder", "elbow")
+    np.testing.assert_allclose(joints.values[7], [0.2, 1.0], atol=1e-7)
+
+
+def test_an_episode_without_its_video_is_left_out_and_said(dataset):
+    folder = dataset("v2.1")
+    lost = folder / "videos" / "chunk-000" / KEYS[1] / "episode_000001.mp4"
+    lost.unlink()
+    source = open_source(f"lerobot:{folder}")
+    (note,) = notes_of(source)
+    assert note.startswith(f"episode 1: {lost}: the video of {KEYS[1]} is missing")
+    found = list(iter(source.read, None))
+    assert [shot.problem is None for shot in found] == [True] * 5 + [False] * 5
+    assert "is missing: download the dataset" in found[7].problem
+    for file in (folder / "videos").glob("**/*.mp4"):
+        file.unlink()
+    with pytest.raises(InputError, match="is missing: download the dataset with its videos"):
+        open_source(f"lerobot:{folder}")
+
+
+def test_a_video_that_is_cut_short_gives_shots_with_a_problem(dataset):
+    folder = dataset("v2.1")
+    video(folder / "videos" / "chunk-000" / KEYS[0] / "episode_000000.mp4", [0, 10, 20])
+    found = list(iter(open_source(f"lerobot:{folder}").read, None))
+    assert [shot.problem is None for shot in found] == [True] * 3 + [False] * 2 + [True] * 5
+    assert found[3].problem == "the left video has no frame at 0.300 s of episode 0"
+    (folder / "videos" / "chunk-000" / KEYS[0] / "episode_000001.mp4").write_bytes(b"no video")
+    with pytest.raises(InputError, match="not a video that this OpenCV can decode"):
+        list(iter(open_source(f"lerobot:{folder},episode=1").read, None))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda info: info.update(codebase_version="v1.6"), "codebase_version v1.6 is not read; v2 and v3 are"),
+        (lambda info: info.pop("features"), "damaged"),
+        (lambda info: info["features"].pop(KEYS[1]), "two cameras are needed"),
+    ],
+)
+def test_a_dataset_that_cannot_be_read_is_one_line(dataset, change, said):
+    folder = dataset("v2.1")
+    path = folder / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    change(info)
+    path.write_text(json.dumps(info))
+    with pytest.raises(InputError, match=said) as error:
+        open_source(f"lerobot:{folder}")
+    assert "\n" not in str(error.value)
