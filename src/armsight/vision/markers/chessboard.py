@@ -10,7 +10,7 @@ dark. The colours determine this unless columns + rows is even. The ambiguities 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.vision.markers.corner import OUTCOMES, CornerFits, crossing_signs, refine_corners
-from armsight.vision.markers.grid import grid_points, local_squares, rotations, scatter
+from armsight.vision.markers.grid import grid_points, local_squares, rotations
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.spec import Fields
 
@@ -167,15 +167,13 @@ def fit_grid(image: NDArray[np.uint8], rough: Array, arm: float = 1.0) -> Corner
         arm: as in :func:`~armsight.vision.markers.corner.refine_corners`.
 
     Returns:
-        The fits row by row; one without a rough position is not kept. Their covariances have the size that the corners
-        show, see :func:`~armsight.vision.markers.grid.scatter`.
+        The fits row by row; one without a rough position is not kept.
     """
     rough_uv = rough.reshape(-1, 2)
     first = refine_corners(image, rough_uv, local_squares(rough)[0].reshape(-1, 2, 2), arm=arm, rough=True)
     uv = np.where(first.kept[:, None], first.uv, rough_uv)
     squares, bows = (array.reshape(-1, 2, 2) for array in local_squares(uv.reshape(rough.shape)))
-    fits = refine_corners(image, uv, squares, bows, arm=arm, like=first)
-    return replace(fits, cov_uv=fits.cov_uv * scatter(fits.uv, fits.cov_uv, fits.kept & ~misfits(fits), rough.shape[1]))
+    return refine_corners(image, uv, squares, bows, arm=arm, like=first)
 
 
 def extends_beyond(
