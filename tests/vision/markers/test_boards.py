@@ -158,8 +158,9 @@ def test_boards_are_found_where_they_are(kind, tilt, rotation):
         assert (np.linalg.eigvalsh(found.cov_uv)[:, 0] > 0).all()
         normalised.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.cov_uv), error).mean())
     if "circles" not in kind or tilt == 0:
-        # 200 degrees of freedom and more scatter by 0.05; seven samples a pixel leave 0.002 px.
-        assert 0.85 < np.sqrt(np.mean(normalised) / 2) < 1.2
+        # 200 degrees of freedom and more scatter by 0.05; seven samples a pixel leave 0.002 px. Of tags the middles are as
+        # uncertain as predicted, see test_tag; single corners are less.
+        assert (0.7 if kind == "aprilgrid" else 0.85) < np.sqrt(np.mean(normalised) / 2) < 1.2
 
 
 @pytest.mark.parametrize("kind", BOARDS)
