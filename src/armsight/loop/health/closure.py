@@ -329,7 +329,7 @@ class ClosureWatch:
 
     @staticmethod
     def _is_within_backlash(finest: _Tested, found: Sequence[_Tested], least: float) -> bool:
-        """Return whether an angle of a joint, or another of the same joint that explains as much, is too small to report."""
+        """Return whether an angle of a joint, or another of its own that explains as much, is too small to report."""
         same = [each for each in found if each.suspect.joint == finest.suspect.joint and each.above > least]
         return any(abs(float(each.size[0])) < _LEAST_RAD for each in (finest, *same) if len(each.size) == 1)
 
