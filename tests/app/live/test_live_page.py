@@ -249,3 +249,4 @@ def test_the_arm_is_held_when_the_page_that_commands_is_closed(session, server, 
     until(lambda: session.arm.state.state.startswith("held at rest"))
     assert "the page" in session.sections()["overview"].held
     until(lambda: (session.folder / "run" / "summary.json").exists())
+    assert (session.folder / "run" / "run.mcap").stat().st_size > 10000

@@ -8,6 +8,7 @@ itself reports. With ``poses:FILE`` nothing is driven: another program moves the
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections import deque
@@ -43,6 +44,8 @@ from armsight.app.run.loop import Loop
 from armsight.app.run.motion_file import MotionPlan, read_motions
 from armsight.app.run.record import RunSegment, require_pyarrow
 from armsight.app.run.setup import HostClock, Setup, require_joints, setup_of
+from armsight.app.stream.datum import Published
+from armsight.app.stream.mcap_file import LazyMcap, properties
 from armsight.data import Array, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import read_text, write_text
@@ -516,20 +519,26 @@ class ArmStep:
             folder = self._fresh()
             make_room(folder)
             write_text(folder / "motion.toml", read_text(self.options.motion))
-            write_text(folder / "body.toml", read_text(str(self._measuring.target_spec)))
+            body_text = read_text(str(self._measuring.target_spec))
+            write_text(folder / "body.toml", body_text)
             rig.save(folder / "rig.json")
-            outcome = run_experiment(
-                setup,
-                rig,
-                plan,
-                targets,
-                progress=self._progress,
-                close_loop=closed,
-                begun=self._begun,
-                handeye=handeye,
-            )
-            properties = {"arm": setup.arm.name, "board": setup.board.welcome.board}
-            finished = Finished(setup.arm, rig, outcome, plan, None, properties, began, [], None)
+            texts = properties(rig, body_text, setup.arm, command="live")
+            published = Published(rig, setup.target.body, setup.arm, texts)
+            warn = lambda line: self._say(Note("warn", line.removeprefix("note: ")))  # noqa: E731
+            with contextlib.closing(LazyMcap(folder, published, warn)) as file:
+                outcome = run_experiment(
+                    setup,
+                    rig,
+                    plan,
+                    targets,
+                    progress=self._progress,
+                    close_loop=closed,
+                    begun=self._begun,
+                    handeye=handeye,
+                    publisher=file,
+                )
+            of_run = {"arm": setup.arm.name, "board": setup.board.welcome.board}
+            finished = Finished(setup.arm, rig, outcome, plan, None, of_run, began, [], None)
             return outcome
 
         outcome = self._moving(work)
