@@ -29,8 +29,10 @@ MOST_POINTS = 4000
 MOST_NAMES = 60
 #: More steps of removal after one another than this are one row of the selection's figure.
 MOST_REMOVED = 8
-#: Intervals of a joint's angle over which errors are averaged.
-_BINS = 12
+#: Sources that were selected together are named by the first where their names are longer.
+_MOST_LETTERS = 45
+#: Intervals of a joint's angle over which errors are averaged, at most; poses of one on average, at least.
+_BINS, _PER_BIN = 12, 6
 
 
 def _shown(run: Identification) -> tuple[Array, Array, Array, Array]:
@@ -87,9 +89,10 @@ def joints_figure(run: Identification) -> Figure:
 
 
 def _binned(ax: Axes, x: Array, y: Array, colour: str, name: str) -> None:
-    edges = np.linspace(x.min(), x.max() + 1e-9, _BINS + 1)
+    count = int(np.clip(len(x) // _PER_BIN, 2, _BINS))
+    edges = np.linspace(x.min(), x.max() + 1e-9, count + 1)
     at = np.digitize(x, edges) - 1
-    filled = [k for k in range(_BINS) if (at == k).any()]
+    filled = [k for k in range(count) if (at == k).any()]
     middle = (edges[:-1] + edges[1:]) / 2
     ax.plot(middle[filled], [y[at == k].mean() for k in filled], color=colour, linewidth=2, label=name)
 
@@ -107,6 +110,12 @@ def selection_rows(run: Identification) -> list[tuple[str, float, bool]]:
     return rows
 
 
+def _short(sources: str) -> str:
+    """Return the names of sources that were selected together, as one line of a figure."""
+    first, *others = sources.split(", ")
+    return f"{first} and {len(others)} more" if len(sources) > _MOST_LETTERS else sources
+
+
 def selection_figure(run: Identification) -> Figure:
     """Plot the forward selection by the error on poses left out, and the convergence of the final fit."""
     figure = new_figure(0.24 * len(selection_rows(run)) + 2.2)
@@ -114,7 +123,7 @@ def selection_figure(run: Identification) -> Figure:
     shown = selection_rows(run)
     rows = np.arange(len(shown))
     left.barh(rows, [rms for _, rms, _ in shown], color=[MUTED if gone else BLUE for _, _, gone in shown], height=0.7)
-    left.set_yticks(rows, [text for text, _, _ in shown])
+    left.set_yticks(rows, [_short(text) for text, _, _ in shown])
     left.invert_yaxis()
     left.set_xlabel("held-out RMS, in sigmas of the noise")
     left.set_title("added, and removed again (grey)")
@@ -153,10 +162,11 @@ def sources_figure(run: Identification) -> Figure:
     parts = sorted(contributions(run.found, run.measured).items(), key=lambda part: part[1])
     figure = new_figure(0.32 * len(parts) + 1.2)
     ax = figure.subplots()
-    ax.barh([kind for kind, _ in parts], [1e3 * size for _, size in parts], color=BLUE, height=0.65)
+    ax.barh([_short(kind) for kind, _ in parts], [1e3 * size for _, size in parts], color=BLUE, height=0.65)
     for row, (_, size) in enumerate(parts):
-        ax.text(1e3 * size, row, f" {1e3 * size:.3f}", va="center", color=INK)
-    ax.set_xlabel("RMS displacement of the tool, mm, beyond what base, tool and the sources selected before explain")
+        ax.text(1e3 * size, row, f" {1e3 * size:.3f}", va="center", color=INK).set_in_layout(False)
+    ax.set_xlim(0.0, 1.12e3 * max((size for _, size in parts), default=1e-3))  # room for the figures
+    ax.set_xlabel("RMS displacement of the tool, mm,\nbeyond what base, tool and the sources selected before explain")
     return figure
 
 
