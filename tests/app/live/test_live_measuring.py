@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from armsight.app.live.measuring import MeasureStep, by_rig, relative_pose
+from armsight.app.live.measuring import MeasureStep, relative_pose
 from armsight.data import Detections, Missed, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, pose, transform

@@ -180,6 +180,8 @@ def test_the_gradient_of_the_restricted_likelihood(structure):
         maps,
         {"robot drifting over its poses": pose_kernel(poses.A)},
         walk_gathered(poses),
+        np.array([0.0, 0.0, 0.0, 2.0]),
+        np.array([0.0, 0.0, 0.0, 0.7]),
     )
     b = blocks(linear, structure)
     logs = rng.normal(size=len(b.sources))
