@@ -49,8 +49,6 @@ UNCORRECTED_BELOW, CORRECTED_ABOVE = 0.02, 0.04
 #: bring it, m: an arm that needs more is not the arm of the table.
 MAX_CORRECTION_RAD = np.deg2rad(5.0)
 MAX_CORRECTION_M = 0.02
-#: A joint at rest whose sensor moves by more than this many of its steps was moved by its own controller.
-STIRRED_STEPS = 1.5
 #: Joints are at rest when measured slower than this (four sigma of a smoothed speed) and commanded slower than that, rad/s.
 REST_RAD_S, STANDING_RAD_S = 0.055, 1e-6
 
@@ -179,7 +177,6 @@ class PoseServo:
         self._correction = np.zeros(arm.joints)
         self._goal: Joints | None = None
         self._rest_s, self._lasting = 0.0, np.zeros(6)
-        self._stood, self._stood_s = np.zeros(arm.joints), 0.0
 
     def aim(self, motion: Trajectory, t_s: float, gravity: Callable[[Array], ArrayLike] = np.zeros_like) -> Aim:
         """Return the reference of the next command.
@@ -216,12 +213,9 @@ class PoseServo:
                 push += self.timing.gain * error if resting else self._follow * last
             change = self._joints(aim, push)
         if mode is Mode.VISION and resting:
-            if self._joint_loops is None:
-                change += self._crossing(estimator, aim, error)
-            elif self._stirred(estimate, self._joint_loops.step_rad):
-                change = np.zeros(self._arm.joints)
-            else:
-                change = self._held(aim, change + self._crossing(estimator, aim, error))
+            change += self._crossing(estimator, aim, error)
+            if self._joint_loops is not None:
+                change = self._held(aim, change)
                 self._droops(estimate, aim)
         return self._command(aim, change, mode, error)
 
@@ -268,18 +262,6 @@ class PoseServo:
         assert self._joint_loops is not None
         requested = np.abs(self._joints(aim, self._lasting)).max()
         return np.zeros_like(change) if requested < 0.5 * self._joint_loops.step_rad else change
-
-    def _stirred(self, estimate: ArmEstimate, step_rad: float) -> bool:
-        """Return whether a joint moved, by its own controller, since the newest measurement.
-
-        A controller with a dead zone goes to a goal at rest in jumps, and beyond it first: what vision saw meanwhile is
-        not to be integrated.
-        """
-        moved = bool(np.abs(estimate.q - self._stood).max() > STIRRED_STEPS * step_rad)
-        self._stood_s = 0.0 if moved else self._stood_s + self.timing.period_s
-        if moved:
-            self._stood = estimate.q
-        return self._stood_s <= estimate.vision_age_s + self.timing.vision_period_s
 
     def _droops(self, estimate: ArmEstimate, aim: Aim) -> None:
         """Learn how far the joints rest from what they are commanded, as far as their own sensors show it."""
