@@ -71,6 +71,7 @@ def test_an_arm_whose_geometry_is_off_is_recognised_and_the_covariance_allows_fo
         poses, Z, X, links = made(seed, n=30, camera=(2e-4, 5e-4, 5e-4), links=(3e-4, 1e-3))
         found = calibrate_structured(poses, links=links, structures=("robot and camera", "robot's geometry off"))
         assert found.structure == "robot's geometry off"
+        assert found.held_out_geometry.rms()[0] < 0.8 * found.held_out.rms()[0]
         of_links.append(nees(found, Z, X))
         white.append(nees(calibrate_structured(poses, structures=("robot and camera",)), Z, X))
     # Eight links say little about their variances: the median, of which a draw of three sigmas takes nothing.

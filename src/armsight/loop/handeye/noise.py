@@ -356,14 +356,15 @@ def reml(b: Blocks, start: Array, steps: int = 60) -> Array:
 
 def held_out(
     linear: Linear, structure: str, variances: Array, parts: list[NDArray[np.int64]], steps: int = 8
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Predict poses left out, part after part; the variances are estimated anew without them.
 
     Returns:
-        (N,) logarithms of the probability density of each pose's residual, and (N, 6) the residuals themselves under
-        transforms fitted without them.
+        (N,) logarithms of the probability density of each pose's residual; (N, 6) the residuals themselves under
+        transforms fitted without them; and (N, 6) what is left of them where the others' shared errors are predicted too.
     """
     density, residual = np.full(len(linear.e), np.nan), np.full((len(linear.e), 6), np.nan)
+    left = residual.copy()
     everything = np.arange(len(linear.e))
     whole = blocks(linear, structure) if structure in SHARED else None
     for part in parts:
@@ -383,8 +384,8 @@ def held_out(
             full = C[np.ix_(of, of)] - gain @ C[np.ix_(frm, of)] + JJ @ fitted.cov @ JJ.T
             S = np.array([full[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(part))])
             mean = mean - (C[np.ix_(of, frm)] @ fitted.weighted[0]).reshape(-1, 6)
-        density[part] = _log_normal(mean, S)
-    return density, residual
+        density[part], left[part] = _log_normal(mean, S), mean
+    return density, residual, left
 
 
 def _lines(rows: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -80,8 +80,9 @@ SURELY = 5.0
 HANGING = 1.0
 #: The structure that weights positions alone, and by how many sigmas its squared errors must be lower.
 POSITIONS, SURELY_LOWER = "positions alone", 3.0
-#: The structures that are tried only then.
-HANGS = tuple(name for name in SHARED if name != "robot's geometry off")
+#: The structure whose links are off, and the shared ones that are tried only where neighbours hang together.
+GEOMETRY = "robot's geometry off"
+HANGS = tuple(name for name in SHARED if name != GEOMETRY)
 #: Rounds of least squares and of leaving out.
 ROUNDS = 6
 
@@ -104,6 +105,8 @@ class StructuredHandEye(Record):
         arm_m: what the arm's error moves the body's middle by, RMS of the distance, m.
         camera_m: what vision's error does, m.
         held_out: the error on poses left out of the fit.
+        held_out_geometry: the same where the arm's geometry, as the other poses show it, is taken into account; None
+            without ``links``, or from too few poses.
         used: (N,) whether a pose was used, and not taken for a blunder.
         distance: (N,) Mahalanobis distance of each pose's residual, in units of its expectation.
         common: (K,) the errors that all poses share (``Poses.common``), as found, in sigmas.
@@ -124,6 +127,7 @@ class StructuredHandEye(Record):
     arm_m: float
     camera_m: float
     held_out: HeldOut
+    held_out_geometry: HeldOut | None
     used: NDArray[np.bool_]
     distance: Array
     common: Array
@@ -264,9 +268,20 @@ def calibrate_structured(
     found, used = _chosen(whole, guess, used, structures, progress)
     used_rows, distance = np.zeros(n, bool), np.full(n, np.nan)
     used_rows[order], distance[order] = used, found.distance
-    position, angle = np.full(n, np.nan), np.full(n, np.nan)
-    position[order], angle[order] = found.held_out.position_m, found.held_out.angle_rad
-    return replace(found, used=used_rows, distance=distance, held_out=HeldOut(position, angle))
+    geometry = None if found.held_out_geometry is None else _unsorted(found.held_out_geometry, order)
+    return replace(
+        found,
+        used=used_rows,
+        distance=distance,
+        held_out=_unsorted(found.held_out, order),
+        held_out_geometry=geometry,
+    )
+
+
+def _unsorted(of: HeldOut, order: NDArray[np.int64]) -> HeldOut:
+    """Return the errors of poses in their own order in that in which they were given."""
+    back = np.argsort(order)
+    return HeldOut(of.position_m[back], of.angle_rad[back])
 
 
 def _own_order(poses: Poses, t_s: Array | None) -> NDArray[np.int64]:
@@ -488,7 +503,7 @@ def _chosen(
             continue
         progress(f"hand-eye: poses left out ({name})")
         trials[name] = _trial(whole, guess, used, name, gathered)
-    best = _best(whole, trials)
+    best, geometry = _best(whole, trials), trials.get(GEOMETRY)
     progress(f"hand-eye: fitting ({best})")
     guess, used, variances = _settled(whole, guess, used, best, gathered)
     rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
@@ -520,7 +535,8 @@ def _chosen(
         likelihoods={name: trial[0] for name, trial in trials.items()},
         arm_m=arm,
         camera_m=camera,
-        held_out=_held_out_errors(whole, guess, trials[best][1], trials[best][2]),
+        held_out=_held_out_errors(whole, guess, trials[best][1], trials[best][3]),
+        held_out_geometry=None if geometry is None else _held_out_errors(whole, guess, geometry[2], geometry[3]),
         used=used,
         distance=distance,
         common=guess.common,
@@ -535,8 +551,8 @@ def _common_m(poses: Poses, guess: _Guess) -> float:
     return float(np.sqrt((off**2).sum(axis=-1).mean())) / guess.per_m if guess.common.size else 0.0
 
 
-#: Mean log density of poses left out, their residuals, and their rows.
-_Trial = tuple[float, Array, NDArray[np.int64]]
+#: Mean log density of poses left out, their residuals, what is left of them with shared errors predicted, and their rows.
+_Trial = tuple[float, Array, Array, NDArray[np.int64]]
 
 
 def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
@@ -658,8 +674,8 @@ def _trial(
     n = len(rows)
     order = np.arange(n) if whole.t_s is not None else np.random.default_rng(0).permutation(n)
     parts = [np.sort(part) for part in np.array_split(order, n if n <= FEW and structure not in SHARED else FOLDS)]
-    density, residual = held_out(linear, structure, variances, parts)
-    return float(density.mean()), residual, rows
+    density, residual, left = held_out(linear, structure, variances, parts)
+    return float(density.mean()), residual, left, rows
 
 
 def _held_out_errors(whole: _Problem, guess: _Guess, residual: Array, rows: NDArray[np.int64]) -> HeldOut:
