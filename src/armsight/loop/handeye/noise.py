@@ -207,7 +207,9 @@ def blocks(linear: Linear, structure: str) -> Blocks:
     if "image" in sources:
         own["image"] = linear.given
     if structure not in SHARED:
-        return Blocks(linear.e, linear.J, given, np.array([own[name] for name in sources]), sources, linear.known, linear.at)
+        return Blocks(
+            linear.e, linear.J, given, np.array([own[name] for name in sources]), sources, linear.known, linear.at
+        )
     parts = []
     for name in sources:
         if name.startswith("link"):
