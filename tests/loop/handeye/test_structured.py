@@ -1,5 +1,7 @@
 """The structure of the noise, its covariance by Monte Carlo, and what the motion leaves open."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from handeye_motions import error
@@ -89,6 +91,24 @@ def test_poses_left_out_distinguish_the_arms_error_from_the_cameras():
     assert camera.arm_m == 0
     assert camera.sigmas["depth_m"] == pytest.approx(2e-3, rel=0.3)
     assert camera.sigmas["lateral_m"] == pytest.approx(2e-4, rel=0.3)
+
+
+def test_errors_that_vision_shares_between_poses_are_found_by_the_arm():
+    poses, Z, X, _ = made(4, n=30, flange=(1e-4, 2e-4), camera=(1e-4, 2e-4, 3e-4))
+    depth = poses.B[:, :3, 3] * (
+        poses.B[:, 2, 3:] - poses.B[:, 2, 3].mean()
+    )  # along the view, a third of a mm at 1 sigma
+    scale = 3e-4 / np.linalg.norm(depth, axis=1).max()
+    common = np.zeros((30, 6, 1))
+    common[:, :3, 0] = scale * np.einsum("nji,nj->ni", poses.B[:, :3, :3], depth)
+    off = exp_se3(-4.0 * common[..., 0])
+    wrong = Poses(poses.A, poses.B @ off, poses.cov, poses.in_hand, poses.centre, common)
+    one = ("robot and camera",)
+    found, without = (calibrate_structured(p, structures=one) for p in (wrong, replace(wrong, common=None)))
+    assert found.common[0] == pytest.approx(4.0, abs=1.5)
+    assert nees(found, Z, X) < chi2.isf(1e-3, 12)
+    assert found.held_out.rms()[0] < 0.9 * without.held_out.rms()[0]
+    assert without.common_m == 0 < found.common_m
 
 
 def test_a_walk_of_the_eye_is_recognised():

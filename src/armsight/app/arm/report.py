@@ -117,9 +117,8 @@ def _map_figure(report: ArmReport, figure: FigureBase) -> None:
     """Plot the error over the workspace, from above and from the side."""
     size = 1e3 * np.linalg.norm(report.off, axis=1)
     enlarged = 0.08 * float(np.ptp(report.at[:, :2], axis=0).max()) / max(float(np.quantile(size, 0.9)) / 1e3, 1e-9)
-    for axes, (i, k), title in zip(
-        figure.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side"), strict=True
-    ):
+    both = figure.subplots(1, 2)
+    for axes, (i, k), title in zip(both, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
         shown = axes.scatter(report.at[:, i], report.at[:, k], c=size, s=18, cmap="viridis", vmin=0)
         axes.margins(0.15)
         axes.set_aspect("equal", adjustable="datalim")
@@ -127,7 +126,7 @@ def _map_figure(report: ArmReport, figure: FigureBase) -> None:
         axes.set_xlabel("x, m")
         axes.set_ylabel(f"{'xyz'[k]}, m")
         axes.set_title(f"error, {title}")
-    figure.colorbar(shown, ax=figure.axes, label="mm", shrink=0.8)
+    figure.colorbar(shown, ax=both, label="mm", shrink=0.8)
 
 
 def _parts_figure(report: ArmReport, figure: FigureBase) -> None:
@@ -245,7 +244,7 @@ def _figures_page(report: ArmReport) -> Figure:
     """Return a page with all figures for the PDF."""
     figure = new_figure(_PAGE)
     heights = [height for _, height, _ in _FIGURES.values()]
-    parts = figure.subfigures(len(heights), 1, height_ratios=heights, hspace=0.05)
+    parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights, hspace=0.05)[:, 0]
     for part, (caption, _, draw) in zip(parts, _FIGURES.values(), strict=True):
         draw(report, part)
         part.suptitle(caption, fontsize=9, color=MUTED)
