@@ -135,8 +135,8 @@ def statements(run: HandEyeAnswer) -> list[str]:
         )
     if found.common.size:
         lines.append(
-            f"the rig's calibration is off by {1e3 * found.common_m:.2f} mm RMS at the target, as the arm shows; the poses "
-            "used and left out are corrected by it"
+            f"the rig's calibration was fitted too: {1e3 * found.common_m:.2f} mm RMS at the target, at most "
+            f"{np.abs(found.common).max():.1f} of its own sigmas; poses used and left out are corrected by it"
         )
     if found.sigma_scale:
         lines.append(

@@ -205,9 +205,9 @@ def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
             "the joints are in radians, not degrees: name their columns q1_rad ..",
         )
     for joint in range(n):
-        turned = q * np.where(np.arange(n) == joint, -1.0, 1.0)
+        reversal = q * np.where(np.arange(n) == joint, -1.0, 1.0)
         yield (
-            replace(p, A=np.asarray(arm.forward(turned))),
+            replace(p, A=np.asarray(arm.forward(reversal))),
             f"joint {joint + 1} ({arm.joint_names[joint]}) counts the other way than {arm.name}'s: change the sign of "
             f"q{joint + 1}",
         )
