@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from armsight.data import SIDES, Array, Body, Dropped, Missed, Points, PoseEstimate
-from armsight.geometry.pose import transform
+from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
+from armsight.geometry.rotation import skew
 from armsight.vision.pnp import consensus_poses
 from armsight.vision.posefit import PixelObservations, PoseFit, fit_pose, whitened
 from armsight.vision.rig import StereoRig
@@ -157,6 +158,17 @@ def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
         return Missed(f"only {good.sum()} of {len(good)} detections agree with one pose of the body")
     reason = implausible(rig, body, points, fit, _chosen(observations, good), rigid)
     return _estimate(rig, body, points, fit, observations, good) if reason is None else Missed(reason)
+
+
+def by_rig(pose: PoseEstimate) -> Array:
+    """Return the derivative (6, P) of a pose (right tangent) by the rig's parameters, of the points both cameras saw."""
+    points, R = pose.points, pose.T_left_body[:3, :3]
+    p_body = transform(inverse(pose.T_left_body), points.p_left)
+    J = np.concatenate([np.tile(R, (len(p_body), 1, 1)), np.array([-R @ skew(p) for p in p_body])], axis=2)
+    WJ = np.linalg.solve(points.cov, J)
+    return np.asarray(
+        np.linalg.solve(np.einsum("nki,nkj->ij", WJ, J), np.einsum("nki,nkp->ip", WJ, points.calibration))
+    )
 
 
 def _unlocatable(body: Body, points: Points) -> str | None:

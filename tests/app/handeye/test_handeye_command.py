@@ -210,6 +210,14 @@ def test_what_does_not_fit_is_named(armsight, tmp_path, seen):
     joints = named(tmp_path / "q.csv", ",".join(f"q{i}_rad" for i in range(1, 7)), q[:, [0, 2, 1, 3, 4, 5]])
     rejected(joints, "the joints are in another order", "q1, q3, q2", more=("--model", "six_r"))
     rejected(joints, "give --model")
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    rejected(matrices(path, mirror @ A @ mirror), "left-handed frame: one axis is mirrored")
+    head, arm = ",".join(f"q{i}_deg" for i in range(1, 7)), ("--model", "six_r")
+    other_way = np.degrees(q) * np.array([1, 1, -1, 1, 1, 1])
+    rejected(named(tmp_path / "s.csv", head, other_way), "joint 3", "counts the other way", more=arm)
+    rejected(named(tmp_path / "u.csv", head, q), "the joints are in radians", more=arm)
+    gripper = np.column_stack([np.degrees(q), q[:, 0]])
+    rejected(named(tmp_path / "g.csv", head + ",q7_deg", gripper), "six_r has 6", "gripper", more=arm)
 
 
 def test_a_tcp_taken_for_the_flange_is_noted_where_the_joints_are_known(armsight, tmp_path, seen):

@@ -5,12 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from armsight.app.live.measuring import MeasureStep, by_rig, relative_pose
+from armsight.app.live.measuring import MeasureStep, relative_pose
 from armsight.data import Detections, Missed, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import example_rig
+from armsight.vision.locate import by_rig
 from armsight.vision.markers.board import open_board
 from armsight.vision.measure import measure_detections
 from armsight.vision.rig import StereoRig

@@ -1,5 +1,7 @@
 """The structure of the noise, its covariance by Monte Carlo, and what the motion leaves open."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from handeye_motions import error
@@ -71,6 +73,7 @@ def test_an_arm_whose_geometry_is_off_is_recognised_and_the_covariance_allows_fo
         poses, Z, X, links = made(seed, n=30, camera=(2e-4, 5e-4, 5e-4), links=(3e-4, 1e-3))
         found = calibrate_structured(poses, links=links, structures=("robot and camera", "robot's geometry off"))
         assert found.structure == "robot's geometry off"
+        assert found.held_out_geometry.rms()[0] < 0.8 * found.held_out.rms()[0]
         of_links.append(nees(found, Z, X))
         white.append(nees(calibrate_structured(poses, structures=("robot and camera",)), Z, X))
     # Eight links say little about their variances: the median, of which a draw of three sigmas takes nothing.
@@ -88,6 +91,24 @@ def test_poses_left_out_distinguish_the_arms_error_from_the_cameras():
     assert camera.arm_m == 0
     assert camera.sigmas["depth_m"] == pytest.approx(2e-3, rel=0.3)
     assert camera.sigmas["lateral_m"] == pytest.approx(2e-4, rel=0.3)
+
+
+def test_errors_that_vision_shares_between_poses_are_found_by_the_arm():
+    poses, Z, X, _ = made(4, n=30, flange=(1e-4, 2e-4), camera=(1e-4, 2e-4, 3e-4))
+    depth = poses.B[:, :3, 3] * (
+        poses.B[:, 2, 3:] - poses.B[:, 2, 3].mean()
+    )  # along the view, a third of a mm at 1 sigma
+    scale = 3e-4 / np.linalg.norm(depth, axis=1).max()
+    common = np.zeros((30, 6, 1))
+    common[:, :3, 0] = scale * np.einsum("nji,nj->ni", poses.B[:, :3, :3], depth)
+    off = exp_se3(-4.0 * common[..., 0])
+    wrong = Poses(poses.A, poses.B @ off, poses.cov, poses.in_hand, poses.centre, common)
+    one = ("robot and camera",)
+    found, without = (calibrate_structured(p, structures=one) for p in (wrong, replace(wrong, common=None)))
+    assert found.common[0] == pytest.approx(4.0, abs=1.5)
+    assert nees(found, Z, X) < chi2.isf(1e-3, 12)
+    assert found.held_out.rms()[0] < 0.9 * without.held_out.rms()[0]
+    assert without.common_m == 0 < found.common_m
 
 
 def test_a_walk_of_the_eye_is_recognised():
@@ -180,6 +201,8 @@ def test_the_gradient_of_the_restricted_likelihood(structure):
         maps,
         {"robot drifting over its poses": pose_kernel(poses.A)},
         walk_gathered(poses),
+        np.array([0.0, 0.0, 0.0, 2.0]),
+        np.array([0.0, 0.0, 0.0, 0.7]),
     )
     b = blocks(linear, structure)
     logs = rng.normal(size=len(b.sources))

@@ -21,7 +21,7 @@ from armsight.errors import InputError
 from armsight.files import read_text
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, FigureBase
 
 FILES = (PAGE, "report.pdf", "report.json")
 
@@ -113,14 +113,12 @@ def remarks(report: ArmReport) -> list[str]:
     ]
 
 
-def _map_figure(report: ArmReport) -> Figure:
+def _map_figure(report: ArmReport, figure: FigureBase) -> None:
     """Plot the error over the workspace, from above and from the side."""
-    figure = new_figure(4.6)
     size = 1e3 * np.linalg.norm(report.off, axis=1)
     enlarged = 0.08 * float(np.ptp(report.at[:, :2], axis=0).max()) / max(float(np.quantile(size, 0.9)) / 1e3, 1e-9)
-    for axes, (i, k), title in zip(
-        figure.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side"), strict=True
-    ):
+    both = figure.subplots(1, 2)
+    for axes, (i, k), title in zip(both, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
         shown = axes.scatter(report.at[:, i], report.at[:, k], c=size, s=18, cmap="viridis", vmin=0)
         axes.margins(0.15)
         axes.set_aspect("equal", adjustable="datalim")
@@ -128,13 +126,11 @@ def _map_figure(report: ArmReport) -> Figure:
         axes.set_xlabel("x, m")
         axes.set_ylabel(f"{'xyz'[k]}, m")
         axes.set_title(f"error, {title}")
-    figure.colorbar(shown, ax=figure.axes, label="mm", shrink=0.8)
-    return figure
+    figure.colorbar(shown, ax=both, label="mm", shrink=0.8)
 
 
-def _parts_figure(report: ArmReport) -> Figure:
+def _parts_figure(report: ArmReport, figure: FigureBase) -> None:
     """Plot the parts of the error: shares, and what each remedy would leave."""
-    figure = new_figure(3.2)
     left, right = figure.subplots(1, 2)
     names = list(report.parts)[::-1]
     rows = np.arange(len(names))
@@ -145,13 +141,11 @@ def _parts_figure(report: ArmReport) -> Figure:
     right.axvline(report.placed_mm, color=MUTED, linewidth=1)
     right.set_yticks(rows, [""] * len(rows))
     right.set_xlabel("RMS error with its remedy alone, mm (line: as it is)")
-    return figure
 
 
-def _joints_figure(report: ArmReport) -> Figure:
+def _joints_figure(report: ArmReport, figure: FigureBase) -> None:
     """Plot readings less commands against the gravity load's lever of each joint."""
     count = len(report.joints)
-    figure = new_figure(4.6)
     for i, axes in enumerate(figure.subplots(2, -(-count // 2)).ravel()):
         if i >= count:
             axes.set_axis_off()
@@ -165,27 +159,34 @@ def _joints_figure(report: ArmReport) -> Figure:
             axes.plot(1e3 * ends, mean + slope[0] * (ends - middle), color=RED, linewidth=1)
         axes.set_title(report.joints[i].name)
         axes.set_xlabel("lever of the load, mm")
-        axes.set_ylabel("reading less command, deg")
-    return figure
+        axes.set_ylabel("difference, deg")
+        low, high = axes.get_xlim()
+        if high - low < 1.0:  # a joint that gravity does not load: no digits of rounding
+            axes.set_xlim((low + high) / 2 - 0.5, (low + high) / 2 + 0.5)
 
 
-def _drift_figure(report: ArmReport) -> Figure:
+def _drift_figure(report: ArmReport, figure: FigureBase) -> None:
     """Plot how far the pose that came most often went from where it was first."""
-    figure = new_figure(2.8)
     axes = figure.subplots()
     axes.plot(60 * report.drift[:, 0], report.drift[:, 1], color=BLUE, marker="o", markersize=3)
     axes.set_xlabel("min")
     axes.set_ylabel("mm from the first visit")
     axes.set_title(f"one pose, {report.cycles} times")
-    return figure
 
 
-_FIGURES: dict[str, tuple[str, Callable[[ArmReport], Figure]]] = {
-    "parts": ("What explains the error, and what each remedy alone would leave.", _parts_figure),
-    "map": ("The error over the workspace after base and tool were fitted, enlarged.", _map_figure),
-    "joints": ("What each joint lacks of its command by its own sensor, against the gravity load.", _joints_figure),
-    "drift": ("The pose that came most often.", _drift_figure),
+#: Name -> caption, height in inches, and what draws it.
+_FIGURES: dict[str, tuple[str, float, Callable[[ArmReport, FigureBase], None]]] = {
+    "parts": ("What explains the error, and what each remedy alone would leave.", 3.2, _parts_figure),
+    "map": ("The error over the workspace after base and tool were fitted, enlarged.", 4.6, _map_figure),
+    "joints": (
+        "What each joint lacks of its command by its own sensor, against the gravity load.",
+        4.6,
+        _joints_figure,
+    ),
+    "drift": ("The pose that came most often.", 2.8, _drift_figure),
 }
+#: Height of a page of the PDF, inches.
+_PAGE = 13.0
 
 
 def write_report(report: ArmReport, others: Mapping[str, dict[str, Any]], folder: Path) -> None:
@@ -195,15 +196,14 @@ def write_report(report: ArmReport, others: Mapping[str, dict[str, Any]], folder
         InputError: matplotlib is missing, or the folder cannot be written to.
     """
     shown, said = tables(report, others), [line for line in remarks(report) if line]
-    heading = f"{report.arm}: {report.placed_mm:.2f} mm RMS"
+    heading = f"{report.arm}: {report.accuracy_mm[0]:.2f} mm RMS, {report.placed_mm:.2f} with base and tool fitted"
     sub = f"{report.poses} poses, {report.rests} rests in {60 * report.hours:.0f} min; controller: {report.board}"
     with drawing():
-        figures = {name: draw(report) for name, (_, draw) in _FIGURES.items()}
-        pdf = _pdf([_text_page(heading, sub, shown, said), *figures.values()])
-        images = {name: png(figure) for name, figure in figures.items()}
+        pdf = _pdf([_text_page(heading, sub, shown, said), _figures_page(report)])
+        images = {name: png(_figure(report, name)) for name in _FIGURES}
     plots = "".join(
         f"<figure>{picture(images[name], caption)}<figcaption>{caption}</figcaption></figure>\n"
-        for name, (caption, _) in _FIGURES.items()
+        for name, (caption, *_) in _FIGURES.items()
     )
     sections = {
         "figures": ("In numbers", "".join(map(html_table, shown))),
@@ -223,12 +223,31 @@ def text(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> str:
 
 def _text_page(heading: str, sub: str, shown: Sequence[TextTable], said: Sequence[str]) -> Figure:
     """Return a page of text for the PDF."""
-    figure = new_figure(13.0)
+    figure = new_figure(_PAGE)
     figure.set_layout_engine(None)
     lines = "\n\n".join([*(plain_text(table) for table in shown), "\n".join(_folded(line) for line in said)])
     figure.text(0.04, 0.97, heading, fontsize=16, va="top", weight="bold")
     figure.text(0.04, 0.945, sub, fontsize=9, va="top", color=MUTED)
-    figure.text(0.04, 0.915, lines, fontsize=6.2, va="top", family="monospace", linespacing=1.35)
+    figure.text(0.04, 0.915, lines, fontsize=7, va="top", family="monospace", linespacing=1.35)
+    return figure
+
+
+def _figure(report: ArmReport, name: str) -> Figure:
+    """Return a figure by itself."""
+    _, height, draw = _FIGURES[name]
+    figure = new_figure(height)
+    draw(report, figure)
+    return figure
+
+
+def _figures_page(report: ArmReport) -> Figure:
+    """Return a page with all figures for the PDF."""
+    figure = new_figure(_PAGE)
+    heights = [height for _, height, _ in _FIGURES.values()]
+    parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights, hspace=0.05)[:, 0]
+    for part, (caption, _, draw) in zip(parts, _FIGURES.values(), strict=True):
+        draw(report, part)
+        part.suptitle(caption, fontsize=9, color=MUTED)
     return figure
 
 

@@ -22,9 +22,11 @@ from armsight.errors import InputError
 from armsight.files import read_text
 from armsight.geometry.pose import exp_se3, transform
 from armsight.geometry.rotation import skew
+from armsight.loop.handeye.handeye import LEVER_M
 from armsight.vision.camera import Camera
 from armsight.vision.camera_file import camera_of
 from armsight.vision.image import grey, read_image
+from armsight.vision.locate import by_rig
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_target
 from armsight.vision.measure import measure
@@ -37,6 +39,8 @@ from armsight.vision.sources.pairs import PairsSource
 STEPS, SETTLED = 20, 1e-10
 #: Fewest images to calibrate a camera from.
 MIN_IMAGES = 5
+#: Errors of the rig that do less than this part of what its largest one does, or of this, m, are nothing.
+COMMON, LEAST_COMMON_M = 1e-2, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +57,7 @@ class Seen(Record):
         symmetries: motions (4, 4) of the body that change nothing to see.
         scatter_px: RMS of the reprojection; 0 where there are no images.
         notes: what was found out.
+        common: (N, 6, K) what K independent errors of the rig of one sigma do to the poses; None where unknown.
     """
 
     Ts: Array
@@ -64,6 +69,7 @@ class Seen(Record):
     symmetries: tuple[Array, ...] = ()
     scatter_px: float = 0.0
     notes: tuple[str, ...] = ()
+    common: Array | None = None
 
 
 def see_with_camera(
@@ -252,6 +258,7 @@ def see_with_rig(
     rig, found = StereoRig.load(rig_file), open_target(target)
     source = PairsSource.open(left, right)
     Ts, covs, names, missed, squares = [], [], [], [], []
+    by: dict[int, Array] = {}
     while (shot := source.read()) is not None:
         progress(f"reading {shot.name}")
         result = measure(rig, found, shot)
@@ -263,6 +270,7 @@ def see_with_rig(
             continue
         Ts.append(result.T_left_body)
         covs.append(result.cov_noise)
+        by[len(Ts) - 1] = by_rig(result)
         missed.append("")
         squares.append(result.reprojection_rms_px**2)
     if not squares:
@@ -276,7 +284,26 @@ def see_with_rig(
         found.body.points.mean(axis=0),
         _motions(found),
         float(np.sqrt(np.mean(squares))),
+        common=_common(rig.cov, by, len(Ts)),
     )
+
+
+def _common(cov: Array, by: dict[int, Array], count: int) -> Array | None:
+    """Return what the independent errors of a rig of one sigma do to the poses (N, 6, K); None where they do nothing.
+
+    Args:
+        cov: (P, P) covariance of the rig's parameters.
+        by: pose -> (6, P) its derivative by them.
+        count: N; poses that are missing are zero.
+    """
+    values, vectors = np.linalg.eigh(cov)
+    J = np.zeros((count, 6, len(cov)))
+    for k, D in by.items():
+        J[k] = D @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    sizes = np.repeat([1.0, LEVER_M], 3)[:, None]  # m, and rotations by how they move a point at LEVER_M
+    _, s, Vt = np.linalg.svd((sizes * J).reshape(-1, J.shape[2]), full_matrices=False)
+    kept = s > COMMON * max(float(s[0]), LEAST_COMMON_M)
+    return np.asarray(J @ Vt[kept].T) if kept.any() else None
 
 
 def upright(A: Array, B: Array, symmetries: tuple[Array, ...], in_hand: bool) -> tuple[Array, NDArray[np.int64]]:

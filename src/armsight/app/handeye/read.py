@@ -211,8 +211,10 @@ class _Columns:
     def joints(self, names: list[str], arm: Arm | None) -> Array:
         """Return joint angles (N, J), rad."""
         if arm is not None and len(names) != len(arm.joint_names):
+            advice = "; is the last one a gripper? remove its column" if len(names) == len(arm.joint_names) + 1 else ""
             raise InputError(
-                f"{self.path}: line 1: {len(names)} joints ({names[0]}..{names[-1]}); {arm.name} has {len(arm.joint_names)}"
+                f"{self.path}: line 1: {len(names)} joints ({names[0]}..{names[-1]}); {arm.name} has "
+                f"{len(arm.joint_names)}{advice}"
             )
         q = self.numbers(names)
         return np.radians(q) if names[0].endswith("_deg") else q

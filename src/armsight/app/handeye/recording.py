@@ -15,7 +15,7 @@ from armsight.app.handeye.images import Seen, upright
 from armsight.app.handeye.read import PoseTable
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.geometry.pose import inverse, log_se3, mean_pose
+from armsight.geometry.pose import adjoint, inverse, log_se3, mean_pose
 from armsight.loop.handeye.handeye import MIN_POSES, Poses
 from armsight.loop.handeye.streams import StructuredStreams
 from armsight.robot.arm import Arm
@@ -72,9 +72,15 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
     rows, matched = rows[shown], matched[shown]
     if len(rows) < MIN_POSES:
         raise InputError(f"{len(rows)} poses have both sides; {MIN_POSES} and more are needed, 15 are advised")
-    A, B = robot.Ts[rows], seen.Ts[matched]
+    A, B, covs = robot.Ts[rows], seen.Ts[matched], seen.covs[matched]
+    common = None if seen.common is None else seen.common[matched]
     if seen.symmetries:
         B, rotated = upright(A, B, seen.symmetries, in_hand)
+        for k in np.flatnonzero(rotated >= 0):
+            Ad = adjoint(inverse(seen.symmetries[rotated[k]]))
+            covs[k] = Ad @ covs[k] @ Ad.T
+            if common is not None:
+                common[k] = Ad @ common[k]
         if (rotated >= 0).any():
             notes.append(
                 f"the board looks the same rotated: {int((rotated >= 0).sum())} of {len(B)} were rotated to agree"
@@ -83,7 +89,7 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
     t_s = robot.t_s[rows] if robot.t_s is not None and (both_clocks or seen.t_s is None) else None
     names = tuple(f"line {robot.lines[r]} ({seen.names[k]})" for r, k in zip(rows, matched, strict=True))
     notes += _tcp(robot, arm)
-    poses = Poses(A, B, seen.covs[matched], in_hand, seen.centre)
+    poses = Poses(A, B, covs, in_hand, seen.centre, common)
     return PairedPoses(poses, rows, names, t_s, robot, seen, matched, tuple(notes))
 
 

@@ -127,6 +127,17 @@ def statements(run: HandEyeAnswer) -> list[str]:
         lines.append(
             f"clock offset {1e3 * run.offset_s:.2f} ± {1e3 * run.sigma_offset_s:.2f} ms, to be added to the camera's times"
         )
+    if found.held_out_geometry is not None:
+        plain, geometry = (1e3 * of.rms()[0] for of in (found.held_out, found.held_out_geometry))
+        lines.append(
+            f"with the geometry of the arm that the other poses show, poses left out come to {geometry:.2f} mm in place of "
+            f"{plain:.2f}; armsight identify finds it"
+        )
+    if found.common.size:
+        lines.append(
+            f"the rig's calibration was fitted too: {1e3 * found.common_m:.2f} mm RMS at the target, at most "
+            f"{np.abs(found.common).max():.1f} of its own sigmas; poses used and left out are corrected by it"
+        )
     if found.sigma_scale:
         lines.append(
             f"the target's lengths are {found.scale:.5f} ± {found.sigma_scale:.5f} of those given: correct --target's size"
@@ -188,6 +199,8 @@ def as_json(run: HandEyeAnswer) -> dict[str, Any]:
         "held_out_rms_m": position,
         "held_out_rms_rad": angle,
         "held_out_mean_m": found.held_out.mean()[0],
+        "held_out_geometry_rms_m": None if found.held_out_geometry is None else found.held_out_geometry.rms()[0],
+        "rig_calibration_rms_m": found.common_m,
         "arm_rms_m": found.arm_m,
         "camera_rms_m": found.camera_m,
         "noise": {

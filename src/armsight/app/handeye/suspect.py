@@ -34,6 +34,8 @@ BETTER, PLAUSIBLE_M = 4.0, 0.02
 SMALLER = 0.99
 #: Poses that a reading is evaluated by at most, and the rows by which poses are looked for against the images.
 EVALUATED, SHIFTS = 60, (1, -1, 2, -2)
+#: Mirrors one axis; the other two are this one rotated.
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 #: Scales that mistaken units make: mm for m, cm, inches.
 UNITS = {
     1000.0: "millimetres taken for metres",
@@ -130,9 +132,16 @@ def _readings(recording: PairedPoses, arm: Arm | None) -> Iterator[tuple[Poses, 
         "one, or one of the tables holds inverse transforms (base in flange, or rig in target)",
     )
     yield from _scaled(p)
+    whose = "" if arm is None else f", and --model {arm.name} the arm"
     yield (
         _resized(p),
-        f"the target seems to be {scale_between(p):.3g} times as large as given: is --target's size right? --scale fits it",
+        f"the target seems to be {scale_between(p):.3g} times as large as given: is --target's size right{whose}? --scale "
+        "fits it",
+    )
+    yield (
+        replace(p, A=MIRROR @ p.A @ MIRROR),
+        "one of the tables is of a left-handed frame: one axis is mirrored, in positions and rotations; robot and camera "
+        "poses are right-handed: change the sign of one axis, and of the rotations about the two others",
     )
     table = recording.robot
     if table.convention:
@@ -173,7 +182,10 @@ def _scaled(p: Poses) -> Iterator[tuple[Poses, str]]:
 
 
 def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
-    """Yield readings with the joints in another order; those of all permutations that the angles between poses support."""
+    """Yield readings of the joints: in another unit, one with another sense, in another order.
+
+    Of all permutations those that the angles between poses support.
+    """
     n = q.shape[1]
     rows = np.linspace(0, len(q) - 1, min(EVALUATED, len(q))).round().astype(np.int64)
     seen = _angles(inverse(p.B[rows]) if p.in_hand else p.B[rows])
@@ -187,6 +199,18 @@ def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
     for order in orders:
         rotated = _angles(np.asarray(arm.forward(q[rows][:, order])))
         scored.append((float(np.median(np.abs(rotated - seen))), np.array(order)))
+    if np.abs(radians := np.degrees(q)).max() < 2 * np.pi:
+        yield (
+            replace(p, A=np.asarray(arm.forward(radians))),
+            "the joints are in radians, not degrees: name their columns q1_rad ..",
+        )
+    for joint in range(n):
+        reversal = q * np.where(np.arange(n) == joint, -1.0, 1.0)
+        yield (
+            replace(p, A=np.asarray(arm.forward(reversal))),
+            f"joint {joint + 1} ({arm.joint_names[joint]}) counts the other way than {arm.name}'s: change the sign of "
+            f"q{joint + 1}",
+        )
     for _, at in sorted(scored, key=lambda one: one[0])[:3]:
         named = ", ".join(f"q{k + 1}" for k in at)
         yield (

@@ -32,6 +32,7 @@ from armsight.geometry.rotation import euler_zyx, skew
 from armsight.loop.handeye.pivot import MIN_POSES, Pivot, calibrate_pivot
 from armsight.loop.health import HealthMonitor
 from armsight.vision.follow.follower import Follower, follows
+from armsight.vision.locate import by_rig
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_target
 from armsight.vision.measure import measure
@@ -637,17 +638,6 @@ def relative_pose(rig: StereoRig, first: PoseEstimate, second: PoseEstimate) -> 
     Ad = adjoint(inverse(T))
     D = by_rig(second) - Ad @ by_rig(first)
     return T, second.cov_noise + Ad @ first.cov_noise @ Ad.T + D @ rig.cov @ D.T
-
-
-def by_rig(pose: PoseEstimate) -> Array:
-    """Return the derivative (6, P) of a pose (right tangent) by the rig's parameters, of the points both cameras saw."""
-    points, R = pose.points, pose.T_left_body[:3, :3]
-    p_body = transform(inverse(pose.T_left_body), points.p_left)
-    J = np.concatenate([np.tile(R, (len(p_body), 1, 1)), np.array([-R @ skew(p) for p in p_body])], axis=2)
-    WJ = np.linalg.solve(points.cov, J)
-    return np.asarray(
-        np.linalg.solve(np.einsum("nki,nkj->ij", WJ, J), np.einsum("nki,nkp->ip", WJ, points.calibration))
-    )
 
 
 def _most_rotated_deg(Ts: Array) -> float:

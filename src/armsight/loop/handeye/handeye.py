@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import cv2
@@ -65,6 +65,8 @@ class Poses(Record):
         cov: (N, 6, 6) covariance of B, right tangent, zero where unknown.
         in_hand: whether the rig is on the flange and the body stands still; else the body is on the flange.
         centre: (3,) the middle of what is seen of the body, body frame, m.
+        common: (N, 6, K) what K independent errors that all poses share (the rig's calibration), of one sigma each, do to
+            B, right tangent; None where unknown.
     """
 
     A: Array
@@ -72,10 +74,16 @@ class Poses(Record):
     cov: Array
     in_hand: bool
     centre: Array
+    common: Array | None = None
 
     def rows(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Poses:
         """Return a part of the poses."""
-        return Poses(self.A[rows], self.B[rows], self.cov[rows], self.in_hand, self.centre)
+        common = None if self.common is None else self.common[rows]
+        return Poses(self.A[rows], self.B[rows], self.cov[rows], self.in_hand, self.centre, common)
+
+    def corrected(self, errors: Array) -> Poses:
+        """Return the poses without shared errors (K,), in sigmas."""
+        return self if self.common is None else replace(self, B=self.B @ exp_se3(self.common @ errors))
 
     @property
     def right_side(self) -> Array:

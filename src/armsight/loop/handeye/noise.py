@@ -83,6 +83,8 @@ class Linear(Record):
         maps: source -> (N, 6, K) what K unit errors of a pose do to its residual.
         kernel: source -> (N, N) correlation of a shared source between poses.
         walk: source -> (N, 6, 6) covariance that a walk has gathered up to a pose, unit variance a frame.
+        known: (P,) information that there is about each unknown beside the residuals, zero for most.
+        at: (P,) where each unknown is, from where that information has it.
     """
 
     e: Array
@@ -91,6 +93,8 @@ class Linear(Record):
     maps: dict[str, Array]
     kernel: dict[str, Array]
     walk: dict[str, Array]
+    known: Array
+    at: Array
 
     def rows(self, rows: NDArray[np.int64]) -> Linear:
         """Return a part of the poses."""
@@ -101,6 +105,8 @@ class Linear(Record):
             {name: M[rows] for name, M in self.maps.items()},
             {name: K[np.ix_(rows, rows)] for name, K in self.kernel.items()},
             {name: W[rows] for name, W in self.walk.items()},
+            self.known,
+            self.at,
         )
 
 
@@ -172,6 +178,8 @@ class Blocks(Record):
         given: (n, m, m) what is given.
         parts: (K, n, m, m) what unit variances of the sources cause.
         sources: their K names.
+        known: (P,) information about each unknown beside the residuals.
+        at: (P,) where each is, from where that has it.
     """
 
     e: Array
@@ -179,6 +187,8 @@ class Blocks(Record):
     given: Array
     parts: Array
     sources: tuple[str, ...]
+    known: Array
+    at: Array
 
     def covariance(self, variances: Array) -> Array:
         """Return the covariance (n, m, m)."""
@@ -197,7 +207,9 @@ def blocks(linear: Linear, structure: str) -> Blocks:
     if "image" in sources:
         own["image"] = linear.given
     if structure not in SHARED:
-        return Blocks(linear.e, linear.J, given, np.array([own[name] for name in sources]), sources)
+        return Blocks(
+            linear.e, linear.J, given, np.array([own[name] for name in sources]), sources, linear.known, linear.at
+        )
     parts = []
     for name in sources:
         if name.startswith("link"):
@@ -218,6 +230,8 @@ def blocks(linear: Linear, structure: str) -> Blocks:
         _spread(given)[None],
         np.array(parts)[:, None],
         sources,
+        linear.known,
+        linear.at,
     )
 
 
@@ -265,17 +279,18 @@ def solve(b: Blocks, variances: Array) -> Solved:
     L = np.linalg.cholesky(C)
     Ci = np.asarray(np.linalg.inv(C) if len(C) > 1 else _inverse(L[0])[None])
     CiJ = Ci @ b.J
-    H = np.einsum("nki,nkj->ij", b.J, CiJ)
+    H = np.einsum("nki,nkj->ij", b.J, CiJ) + np.diag(b.known)
     unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))  # m, rad and s side by side
     values, vectors = np.linalg.eigh(unit[:, None] * H * unit)
     values = np.maximum(values, 1e-14 * values[-1])
     root = unit[:, None] * vectors / np.sqrt(values)
-    x = -root @ (root.T @ np.einsum("nki,nk->i", CiJ, b.e))
+    x = -root @ (root.T @ (np.einsum("nki,nk->i", CiJ, b.e) + b.known * b.at))
     left = b.e + b.J @ x
     weighted = (Ci @ left[..., None])[..., 0]
     logdet = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
     logdet_H = float(np.log(values).sum() - 2 * np.log(unit).sum())
-    return Solved(x, root, Ci, weighted, 0.5 * (logdet + logdet_H + float((left * weighted).sum())))
+    squares = float((left * weighted).sum() + (b.known * (b.at + x) ** 2).sum())
+    return Solved(x, root, Ci, weighted, 0.5 * (logdet + logdet_H + squares))
 
 
 def _inverse(L: Array) -> Array:
@@ -343,14 +358,15 @@ def reml(b: Blocks, start: Array, steps: int = 60) -> Array:
 
 def held_out(
     linear: Linear, structure: str, variances: Array, parts: list[NDArray[np.int64]], steps: int = 8
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Predict poses left out, part after part; the variances are estimated anew without them.
 
     Returns:
-        (N,) logarithms of the probability density of each pose's residual, and (N, 6) the residuals themselves under
-        transforms fitted without them.
+        (N,) logarithms of the probability density of each pose's residual; (N, 6) the residuals themselves under
+        transforms fitted without them; and (N, 6) what is left of them where the others' shared errors are predicted too.
     """
     density, residual = np.full(len(linear.e), np.nan), np.full((len(linear.e), 6), np.nan)
+    left = residual.copy()
     everything = np.arange(len(linear.e))
     whole = blocks(linear, structure) if structure in SHARED else None
     for part in parts:
@@ -370,8 +386,8 @@ def held_out(
             full = C[np.ix_(of, of)] - gain @ C[np.ix_(frm, of)] + JJ @ fitted.cov @ JJ.T
             S = np.array([full[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(part))])
             mean = mean - (C[np.ix_(of, frm)] @ fitted.weighted[0]).reshape(-1, 6)
-        density[part] = _log_normal(mean, S)
-    return density, residual
+        density[part], left[part] = _log_normal(mean, S), mean
+    return density, residual, left
 
 
 def _lines(rows: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ The rows are put into an order of their own first (by time, else by content), so
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from scipy.stats import f as f_distribution
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
-from armsight.geometry.pose import exp_se3, inverse, log_se3, mean_pose
+from armsight.geometry.pose import exp_se3, inverse, log_se3, mean_pose, transform
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.handeye import (
     CHANCE,
@@ -68,6 +68,8 @@ PER_VARIANCE = 8
 FOLDS, FEW = 5, 24
 #: Rotation about a second axis must exceed the noise of rotations by this factor, and this angle, rad.
 CLEARLY_ROTATED, LEAST_ROTATION = 3.0, np.radians(0.5)
+#: Rotations of half of the poses that differ by more than this, rad, are not of one motion.
+CONTRADICTS = np.radians(10.0)
 #: A sigma of the mounting beyond this (m, rad) is no calibration.
 OPEN_M, OPEN_RAD = 0.1, 0.1
 #: Degrees of freedom of Student's t in the robust start.
@@ -78,8 +80,9 @@ SURELY = 5.0
 HANGING = 1.0
 #: The structure that weights positions alone, and by how many sigmas its squared errors must be lower.
 POSITIONS, SURELY_LOWER = "positions alone", 3.0
-#: The structures that are tried only then.
-HANGS = tuple(name for name in SHARED if name != "robot's geometry off")
+#: The structure whose links are off, and the shared ones that are tried only where neighbours hang together.
+GEOMETRY = "robot's geometry off"
+HANGS = tuple(name for name in SHARED if name != GEOMETRY)
 #: Rounds of least squares and of leaving out.
 ROUNDS = 6
 
@@ -102,8 +105,12 @@ class StructuredHandEye(Record):
         arm_m: what the arm's error moves the body's middle by, RMS of the distance, m.
         camera_m: what vision's error does, m.
         held_out: the error on poses left out of the fit.
+        held_out_geometry: the same where the arm's geometry, as the other poses show it, is taken into account; None
+            without ``links``, or from too few poses.
         used: (N,) whether a pose was used, and not taken for a blunder.
         distance: (N,) Mahalanobis distance of each pose's residual, in units of its expectation.
+        common: (K,) the errors that all poses share (``Poses.common``), as found, in sigmas.
+        common_m: what they move the body's middle by, RMS of the distance, m.
     """
 
     eye: Eye
@@ -120,8 +127,11 @@ class StructuredHandEye(Record):
     arm_m: float
     camera_m: float
     held_out: HeldOut
+    held_out_geometry: HeldOut | None
     used: NDArray[np.bool_]
     distance: Array
+    common: Array
+    common_m: float
 
     def predict(self, Ts_base_flange: Array) -> Array:
         """Return T_rig_body (..., 4, 4) at poses of the flange (..., 4, 4)."""
@@ -132,7 +142,7 @@ class StructuredHandEye(Record):
 
 @dataclass(frozen=True, eq=False)
 class _Guess(Record):
-    """Transforms, scale and what is left of the time offset.
+    """Transforms, scale, what is left of the time offset, and errors that vision shares between poses, in sigmas.
 
     Lengths are in the unit of the measured body, in which a scale that is fitted is not drawn to small values by the
     body's noise: ``per_m`` of them make one metre.
@@ -142,13 +152,15 @@ class _Guess(Record):
     X: Array
     per_m: float = 1.0
     step_s: float = 0.0
+    common: Array = field(default_factory=lambda: np.zeros(0))
 
     def moved(self, x: Array, free: tuple[bool, bool]) -> _Guess:
         """Return the guess after a step (P,) of Z, X and what is free of scale and time."""
         rest = list(x[12:])
         per_m = self.per_m * float(np.exp(np.clip(rest.pop(0), -1, 1))) if free[0] else self.per_m
         step_s = self.step_s + float(np.clip(rest.pop(0), -0.05, 0.05)) if free[1] else self.step_s
-        return _Guess(self.Z @ exp_se3(x[:6]), self.X @ exp_se3(x[6:12]), per_m, step_s)
+        common = self.common + rest if rest else self.common  # none are free in the robust start
+        return _Guess(self.Z @ exp_se3(x[:6]), self.X @ exp_se3(x[6:12]), per_m, step_s, common)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,14 +179,17 @@ class _Problem(Record):
         return _Problem(self.poses.rows(rows), t_s, speed, self.free, links)
 
     def scaled(self, guess: _Guess) -> Poses:
-        """Return the poses with the guess's time, the flange's lengths in the body's unit."""
-        p = self.poses
+        """Return the poses with the guess's time and vision's shared errors, the flange's lengths in the body's unit."""
+        p = self.poses.corrected(guess.common) if guess.common.size else self.poses
         A = p.A.copy() if self.speed is None or guess.step_s == 0 else p.A @ exp_se3(guess.step_s * self.speed)
         A[:, :3, 3] *= guess.per_m
-        return Poses(A, p.B, p.cov, p.in_hand, p.centre)
+        return replace(p, A=A)
 
     def linear(self, guess: _Guess) -> Linear:
-        """Return the residuals at a guess, with what noise does to them; no shared sources."""
+        """Return the residuals at a guess, with what noise does to them; no shared sources.
+
+        Vision's shared errors are unknowns where the guess has them.
+        """
         poses = self.scaled(guess)
         e, J, carry = residuals(poses, guess.Z, guess.X)
         unit = np.repeat([guess.per_m, 1.0], 3)  # an error of the flange of 1 m, and of 1 rad
@@ -185,7 +200,11 @@ class _Problem(Record):
         carry = carry * unit
         if self.free[1] and self.speed is not None:
             J = np.concatenate([J, carry @ self.speed[..., None]], axis=2)
-        return Linear(e, J, poses.cov, error_maps(poses, carry, self.speed, self.links), {}, {})
+        before, shared = J.shape[2], guess.common.size
+        if shared and poses.common is not None:
+            J = np.concatenate([J, poses.common if poses.in_hand else -poses.common], axis=2)
+        known, at = np.repeat([0.0, 1.0], [before, shared]), np.append(np.zeros(before), guess.common)
+        return Linear(e, J, poses.cov, error_maps(poses, carry, self.speed, self.links), {}, {}, known, at)
 
     def metric(self, guess: _Guess, cov: Array) -> tuple[_Guess, Array]:
         """Return Z and X in m, and the covariance (P, P) of what was fitted with them."""
@@ -244,12 +263,25 @@ def calibrate_structured(
     else:
         guess, used = _robust(whole, _first(whole))
     require_rotations(whole.poses.rows(used), whole.linear(guess).e[used])
+    if poses.common is not None:
+        guess = replace(guess, common=np.zeros(poses.common.shape[2]))
     found, used = _chosen(whole, guess, used, structures, progress)
     used_rows, distance = np.zeros(n, bool), np.full(n, np.nan)
     used_rows[order], distance[order] = used, found.distance
-    position, angle = np.full(n, np.nan), np.full(n, np.nan)
-    position[order], angle[order] = found.held_out.position_m, found.held_out.angle_rad
-    return replace(found, used=used_rows, distance=distance, held_out=HeldOut(position, angle))
+    geometry = None if found.held_out_geometry is None else _unsorted(found.held_out_geometry, order)
+    return replace(
+        found,
+        used=used_rows,
+        distance=distance,
+        held_out=_unsorted(found.held_out, order),
+        held_out_geometry=geometry,
+    )
+
+
+def _unsorted(of: HeldOut, order: NDArray[np.int64]) -> HeldOut:
+    """Return the errors of poses in their own order in that in which they were given."""
+    back = np.argsort(order)
+    return HeldOut(of.position_m[back], of.angle_rad[back])
 
 
 def _own_order(poses: Poses, t_s: Array | None) -> NDArray[np.int64]:
@@ -370,6 +402,11 @@ def require_rotations(poses: Poses, e: Array) -> None:
     least = max(CLEARLY_ROTATED * noise, LEAST_ROTATION)
     spread = np.sqrt(np.maximum(values[::-1], 0.0))
     held = _held(poses)
+    if noise > CONTRADICTS and spread[0] > LEAST_ROTATION:
+        raise CalibrationError(
+            f"the rotations of both sides contradict each other by {np.degrees(noise):.0f} deg: they are not of the same "
+            "motion, or one side is read wrongly (order and sense of joints, rotations, which row belongs to which)"
+        )
     if spread[0] < least:
         raise CalibrationError(
             f"the flange hardly rotates (RMS {np.degrees(spread[0]):.2f} deg, noise {np.degrees(noise):.2f} deg): the "
@@ -466,7 +503,7 @@ def _chosen(
             continue
         progress(f"hand-eye: poses left out ({name})")
         trials[name] = _trial(whole, guess, used, name, gathered)
-    best = _best(whole, trials)
+    best, geometry = _best(whole, trials), trials.get(GEOMETRY)
     progress(f"hand-eye: fitting ({best})")
     guess, used, variances = _settled(whole, guess, used, best, gathered)
     rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
@@ -498,15 +535,24 @@ def _chosen(
         likelihoods={name: trial[0] for name, trial in trials.items()},
         arm_m=arm,
         camera_m=camera,
-        held_out=_held_out_errors(whole, guess, trials[best][1], trials[best][2]),
+        held_out=_held_out_errors(whole, guess, trials[best][1], trials[best][3]),
+        held_out_geometry=None if geometry is None else _held_out_errors(whole, guess, geometry[2], geometry[3]),
         used=used,
         distance=distance,
+        common=guess.common,
+        common_m=_common_m(whole.poses, guess),
     )
     return found, used
 
 
-#: Mean log density of poses left out, their residuals, and their rows.
-_Trial = tuple[float, Array, NDArray[np.int64]]
+def _common_m(poses: Poses, guess: _Guess) -> float:
+    """Return the RMS distance by which vision's shared errors move the body's middle, m."""
+    off = transform(poses.corrected(guess.common).B, poses.centre) - transform(poses.B, poses.centre)
+    return float(np.sqrt((off**2).sum(axis=-1).mean())) / guess.per_m if guess.common.size else 0.0
+
+
+#: Mean log density of poses left out, their residuals, what is left of them with shared errors predicted, and their rows.
+_Trial = tuple[float, Array, Array, NDArray[np.int64]]
 
 
 def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
@@ -593,7 +639,7 @@ def _settled(
             keep = 6 * _distances(whole, guess, structure, variances, gathered) < chdtri(6, CHANCE)
         if keep.sum() < max(MIN_POSES, len(keep) // 3):
             keep = used
-        settled = bool((keep == used).all()) and float(np.abs(x).max()) < 1e-5
+        settled = bool((keep == used).all()) and float(np.abs(x[:12]).max()) < 1e-5
         used = keep
         if settled:
             break
@@ -628,8 +674,8 @@ def _trial(
     n = len(rows)
     order = np.arange(n) if whole.t_s is not None else np.random.default_rng(0).permutation(n)
     parts = [np.sort(part) for part in np.array_split(order, n if n <= FEW and structure not in SHARED else FOLDS)]
-    density, residual = held_out(linear, structure, variances, parts)
-    return float(density.mean()), residual, rows
+    density, residual, left = held_out(linear, structure, variances, parts)
+    return float(density.mean()), residual, left, rows
 
 
 def _held_out_errors(whole: _Problem, guess: _Guess, residual: Array, rows: NDArray[np.int64]) -> HeldOut:
