@@ -19,10 +19,11 @@ def test_the_loop_has_the_bandwidth_and_damping_asked_for(bandwidth, damping):
 
 
 def test_feed_forward_is_what_the_motion_takes():
-    _, _, kd, kv, ka, kf, *_ = tuned_gains(MOTOR, 12.0, 40.0)
+    _, _, kd, kv, ka, kf, filter_s, _ = tuned_gains(MOTOR, 12.0, 40.0)
     speed, acceleration = 1.2, -3.0
     torque = 0.03 * acceleration + OWN * speed
-    assert STALL * (kv * speed + ka * acceleration - kd * speed) == pytest.approx(torque)
+    late_rad_s = (filter_s + 0.5e-3) * acceleration
+    assert STALL * (kv * speed + ka * acceleration - kd * (speed - late_rad_s)) == pytest.approx(torque)
     assert 0 < STALL * kf < 0.2
 
 

@@ -61,7 +61,7 @@ _SWING_RAD, _SWING_HZ, _SWING_MOST_RAD = (0.12, 0.04), (0.5, 2.0), 0.26
 _DITHER_DUTY, _DITHER_HZ = 0.07, 8.0
 _FIRST_SWING_S, _SWING_S, _GROW_S = 3.0, 5.0, 0.5
 _VERIFY_RAD, _VERIFY_HZ, _VERIFY_S, _VERIFY_MOST_RAD = 0.035, 0.5, 4.0, 0.01
-_GENTLE_RAD_S = 15.0  # bandwidth of the second swing
+_GENTLE_RAD_S, _GENTLE_NOISE = 15.0, 0.02  # bandwidth of the second swing, and the noise of its duty
 _TRACE = 400  # points of a figure's line
 
 
@@ -633,7 +633,7 @@ class Bringup:
         gains = gains_array(self._board.configuration())
         first = self._identify(joint, self._swung(joint, _FIRST_SWING_S))
         better = gains.copy()
-        gentle = min(_GENTLE_RAD_S, self._bandwidth(found, first))
+        gentle = min(_GENTLE_RAD_S, quiet_bandwidth(first, self.found.supply_v, found.noise_rad, _GENTLE_NOISE))
         better[joint] = tuned_gains(first, self.found.supply_v, gentle)
         self._board.confirm(self._board.set_gains(better))
         readings = self._swung(joint, _SWING_S)

@@ -7,7 +7,8 @@ order, ``J q''' + (D + S kd) q'' + S kp q' + S ki q = ...``; its poles are place
     kd = ((2 z + a) w J - D) / S,  kp = (1 + 2 z a) w^2 J / S,  ki = a w^3 J / S
 
 The feed-forward gives what the motion itself takes, so that nothing is left to the error: ``kv = D / S + kd``,
-``ka = J / S``, ``kf = C / S``. (Åström and Murray, "Feedback Systems", 2008, sections 10.2 and 10.5; Ellis, "Control System
+``ka = J / S - kd t``, ``kf = C / S``; t is by how much the filtered speed is late, which damps the less while the motion
+accelerates. (Åström and Murray, "Feedback Systems", 2008, sections 10.2 and 10.5; Ellis, "Control System
 Design Guide", 2012, chapter 6.)
 """
 
@@ -25,6 +26,7 @@ _INTEGRAL_SHARE, _FILTER_SHARE = 0.6, 0.25
 #: Dry friction is compensated by a little less than it is, so that it never drives.
 _FRICTION_SHARE = 0.9
 ANTI_WINDUP_PER_S = 20.0
+_TICK_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -71,41 +73,42 @@ def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, da
     per_rad_s2 = motor.inertia_kg_m2 / stall
     w, share = bandwidth_rad_s, _INTEGRAL_SHARE
     kd = max((2 * damping + share) * w * per_rad_s2 - own / stall, 0.0)
+    filter_s = _FILTER_SHARE / w
     return np.array(
         [
             (1 + 2 * damping * share) * w**2 * per_rad_s2,
             share * w**3 * per_rad_s2,
             kd,
             own / stall + kd,
-            per_rad_s2,
+            max(per_rad_s2 - kd * (filter_s + 0.5 * _TICK_S), 0.0),
             _FRICTION_SHARE * motor.dry_n_m / stall,
-            _FILTER_SHARE / bandwidth_rad_s,
+            filter_s,
             ANTI_WINDUP_PER_S,
         ]
     )
 
 
-#: Standard deviation of the duty that a potentiometer's noise may cause, and between which bandwidths one is looked for.
-_DUTY_NOISE, _LEAST_RAD_S, _MOST_RAD_S = 0.08, 5, 40
-_TICK_S = 1e-3
+#: Between which bandwidths one is looked for.
+_LEAST_RAD_S, _MOST_RAD_S = 5, 40
 #: Shares of the duty: all that motion and load may take, and of what the load leaves, what steady motion may take.
-_USED, _MOVING = 0.9, 0.7
+_USED, _MOVING = 0.95, 0.8
 _MOST_SPEED_RAD_S, _MOST_RAD_S2 = 2.0, 10.0
 
 
-def quiet_bandwidth(motor: MotorFigures, supply_v: float, noise_rad: float) -> float:
+def quiet_bandwidth(motor: MotorFigures, supply_v: float, noise_rad: float, duty_noise: float = 0.08) -> float:
     """Return the greatest bandwidth, rad/s, at which a potentiometer's noise hardly moves the duty.
 
     Args:
         motor: its motor.
         supply_v: nominal supply, V.
         noise_rad: standard deviation of a reading.
+        duty_noise: standard deviation of the duty that this noise may cause.
     """
     for bandwidth in range(_MOST_RAD_S, _LEAST_RAD_S, -1):
         kp, _, kd, *_, filter_s, _ = tuned_gains(motor, supply_v, bandwidth)
         share = _TICK_S / (filter_s + _TICK_S)
         speed_noise = noise_rad * share / _TICK_S * np.sqrt(2 / (2 - share))
-        if np.hypot(kp * noise_rad, kd * speed_noise) <= _DUTY_NOISE:
+        if np.hypot(kp * noise_rad, kd * speed_noise) <= duty_noise:
             return float(bandwidth)
     return float(_LEAST_RAD_S)
 
@@ -123,4 +126,4 @@ def motion_limits(motor: MotorFigures, supply_v: float, gravity_n_m: float) -> t
     load = min((gravity_n_m + motor.dry_n_m) / stall, _MOVING)
     speed = min(max(_MOVING * (_USED - load) * free_rad_s, 0.05), _MOST_SPEED_RAD_S)
     spare = max(_USED - load - speed / free_rad_s, 0.05)
-    return speed, min(max(0.8 * spare * stall / motor.inertia_kg_m2, 0.5), _MOST_RAD_S2)
+    return speed, min(max(spare * stall / motor.inertia_kg_m2, 0.5), _MOST_RAD_S2)
