@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from armsight.app.board.bringup import Bringup, Found, JointFound
+from armsight.app.board.bringup import Bringup
 from armsight.app.board.command import command
+from armsight.app.board.found import Found, JointFound
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.board_file import read_configuration

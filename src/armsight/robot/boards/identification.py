@@ -86,7 +86,9 @@ def fit_swing(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) 
             f"the swing fits no motor: resistance {resistance:.3g} ohm, constant {constant:.3g} V s/rad; both must be"
             " positive: are current and voltage those of this motor?"
         )
-    inertia, viscous, dry, gravity = _fit_torque(constant, amperes, (volts - resistance * amperes) / constant, q, step_s)
+    inertia, viscous, dry, gravity = _fit_torque(
+        constant, amperes, (volts - resistance * amperes) / constant, q, step_s
+    )
     motor = MotorFigures(resistance, constant, inertia, max(viscous, 0.0), max(dry, 0.0))
     smooth_v = _smooth(volts, step_s)
     predicted = resistance * _smooth(amperes, step_s) + constant * speed

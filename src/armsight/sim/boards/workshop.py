@@ -93,7 +93,7 @@ class WorkshopPlant:
     def sense(self) -> Sensed:
         """Return what the converters read now."""
         sensed, wiring = self.plant.sense(), self.wiring
-        true = self.bent(sensed.counts)
+        true = self.bent(sensed.counts.astype(float))
         counts = np.clip(np.where(np.array(wiring.potentiometer_signs) > 0, true, 65535.0 - true), 0, 65535)
         if wiring.dead_spot is not None:
             joint, low, high = wiring.dead_spot
