@@ -249,10 +249,10 @@ class Bringup:
     # ---- the board ----
 
     def _off(self) -> None:
-        """Switch the drives off, and clear what a step left; a board that is gone does so by itself."""
+        """Switch the drives off, whatever was last heard of them, and clear faults; a board that is gone does so itself."""
         with contextlib.suppress(ArmsightError):
-            if self._board.status.drives_on or self._board.status.faults:
-                self._board.confirm(self._board.command(Command.DISABLE))
+            self._board.confirm(self._board.command(Command.DISABLE))
+            if self._board.status.faults:
                 self._board.confirm(self._board.command(Command.CLEAR_FAULTS))
 
     def _use(self, config: Configuration) -> None:
