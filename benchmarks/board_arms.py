@@ -46,7 +46,7 @@ from armsight.sim.joints import (  # noqa: E402
     drawn_model,
 )
 
-STIFFNESS_N_M, PERIOD_TICKS = 40.0, 4
+STIFFNESS_N_M, PERIOD_TICKS = 32.0, 4
 NAMED_TICKS = 200  # from a fault to its final name
 #: Arrays of a plant: their names in board_arms.c and here.
 PLANT_ARRAYS = {
@@ -78,7 +78,7 @@ POT_NAMES = {
 
 def bandwidth(inertia):
     """As stiff as the converter's noise allows, whatever the joint moves."""
-    return float(np.clip(math.sqrt(STIFFNESS_N_M / inertia), 15.0, 60.0))
+    return float(np.clip(math.sqrt(STIFFNESS_N_M / inertia), 13.0, 40.0))
 
 
 def arm_configuration(model, rng):

@@ -76,7 +76,7 @@ def sine(arm):
     ahead = arm.start + grow * 0.5 * np.sin(w * t) * np.ones(6)
     speed = np.gradient(ahead, 4e-3, axis=0)
     passed, trace = arm.follow(ahead, speed, traced=True, stop_at_fault=True)
-    off = (trace[:, 0] - trace[:, 1])[2500:]
+    off = (trace[:-1, 0] - trace[1:, 1])[2500:]  # a row has where the tick moved the joint to: what the next one reads
     return 1e3 * np.sqrt((off**2).mean(axis=0)) if passed == 7500 else np.full(6, np.inf)
 
 

@@ -1,13 +1,15 @@
 """A bring-up of one joint from a fresh board, its mistakes by name, and what becomes of a pulled cable and Ctrl-C."""
 
+import io
 import json
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from armsight.app.board.bringup import Bringup, Found, JointFound
+from armsight.app.board.bringup import Bringup, TerminalOperator
 from armsight.app.board.command import command
+from armsight.app.board.found import Found, JointFound
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.board_file import read_configuration
@@ -124,6 +126,28 @@ def test_the_motors_are_off_and_what_was_found_is_kept(tmp_path, raised):
     assert not evening.link.answer["outputs"]["drives_on"]
     kept = Found.read(tmp_path / "bringup.json")
     assert kept.joints[0].marks == evening.joints[0].marks
+
+
+def test_an_answer_must_be_one_and_q_or_the_end_of_stdin_ends_it(tmp_path, monkeypatch):
+    evening = Evening(tmp_path)
+    known(evening)
+    said = []
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    typed = TerminalOperator(said.append)
+    answers = ["perhaps"]
+    monkeypatch.setattr(typed, "answer", lambda ask=typed.answer: answers.pop() if answers else ask())
+    Bringup(evening.board, typed, tmp_path, [0]).run(["motors"])
+    assert said[-3:] == ["'perhaps' is not understood; y, n or q is", said[-2], "ended; what was found is kept"]
+    assert evening.plant.drives_s == 0.0
+
+
+def test_nobody_who_answers_ends_it(tmp_path, monkeypatch):
+    monkeypatch.setattr("armsight.app.board.bringup._PATIENCE_S", 0.2)
+    evening = Evening(tmp_path)
+    known(evening)
+    evening.person.answer = lambda: None
+    with pytest.raises(InputError, match="no answer for 0 minutes; what was found is kept in"):
+        Bringup(evening.board, evening.person, tmp_path, [0]).run(["motors"])
 
 
 def test_the_command_prints_what_was_found(tmp_path):

@@ -1,5 +1,6 @@
 """Boards for tests: the host build behind a lock-step link, and a link that replays what a board might send."""
 
+import contextlib
 import os
 import pty
 import select
@@ -95,13 +96,14 @@ class PtyBoard:
     Every poll of the far side lets one tick pass for a millisecond of real time, at most; nothing is asserted on times.
     """
 
-    def __init__(self, *, fresh=False):
-        self.plant = JointPlant()
+    def __init__(self, *, fresh=False, plant=None):
+        self.plant = JointPlant() if plant is None else plant
         self.link = EmulatedLink(open_emulator("host"), self.plant)
         if not fresh:
             configured(self.link)
         self.master, slave = pty.openpty()
         tty.setraw(slave)
+        os.set_blocking(self.master, False)
         self.port = os.ttyname(slave)
         self._slave = slave
         self._stop = threading.Event()
@@ -109,12 +111,15 @@ class PtyBoard:
         self._thread.start()
 
     def _run(self):
+        unread = bytearray()
         while not self._stop.wait(0.0005):
             ready, _, _ = select.select([self.master], [], [], 0)
             try:
                 if ready:
                     self.link.write(os.read(self.master, 4096))
-                os.write(self.master, self.link.read(0.001))
+                unread += self.link.read(0.001)
+                with contextlib.suppress(BlockingIOError):  # nobody reads: the board goes on
+                    del unread[: os.write(self.master, unread)]
             except (OSError, DeviceError):
                 return
 

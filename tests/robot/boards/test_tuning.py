@@ -10,24 +10,27 @@ MOTOR = MotorFigures(resistance_ohm=6.0, constant_v_s=2.4, inertia_kg_m2=0.03, v
 STALL, OWN = 2.4 * 12.0 / 6.0, 2.4**2 / 6.0 + 0.02
 
 
-@pytest.mark.parametrize(("bandwidth", "damping"), [(30.0, 1.0), (60.0, 0.7), (45.0, 1.3)])
-def test_the_loop_has_the_bandwidth_and_damping_asked_for(bandwidth, damping):
-    kp, ki, kd, *_ = tuned_gains(MOTOR, 12.0, bandwidth, damping)
-    pair = np.roots([1.0, 2 * damping * bandwidth, bandwidth**2])
-    poles = np.roots([0.03, OWN + STALL * kd, STALL * kp, STALL * ki])
-    assert np.sort_complex(poles) == pytest.approx(np.sort_complex([*pair, -0.6 * bandwidth]), rel=1e-6)
+@pytest.mark.parametrize(("bandwidth", "damping"), [(30.0, 1.0), (60.0, 0.7), (45.0, 0.5)])
+def test_the_loop_with_its_filter_has_the_bandwidth_and_damping_asked_for(bandwidth, damping):
+    free = MotorFigures(resistance_ohm=1.0, constant_v_s=0.01, inertia_kg_m2=0.03, viscous_n_m_s=0.0, dry_n_m=0.0)
+    kp, ki, kd, *_, t, _ = tuned_gains(free, 1e4, bandwidth, damping)
+    stall, own = 100.0, 1e-4
+    poles = np.roots([0.03 * t, 0.03 + own * t, own + stall * (kd + kp * t), stall * (kp + ki * t), stall * ki])
+    expected = [np.roots([1.0, 2 * damping * w, w * w]) for w in (bandwidth, bandwidth / 0.35)]
+    assert np.poly(poles) == pytest.approx(np.poly(np.concatenate(expected)), rel=1e-3)
 
 
 def test_feed_forward_is_what_the_motion_takes():
-    _, _, kd, kv, ka, kf, *_ = tuned_gains(MOTOR, 12.0, 40.0)
+    _, _, kd, kv, ka, kf, filter_s, _ = tuned_gains(MOTOR, 12.0, 40.0)
     speed, acceleration = 1.2, -3.0
     torque = 0.03 * acceleration + OWN * speed
-    assert STALL * (kv * speed + ka * acceleration - kd * speed) == pytest.approx(torque)
+    late_rad_s = (filter_s + 0.5e-3) * acceleration
+    assert STALL * (kv * speed + ka * acceleration - kd * (speed - late_rad_s)) == pytest.approx(torque)
     assert 0 < STALL * kf < 0.2
 
 
 def test_a_motor_that_damps_itself_enough_gets_no_derivative():
-    _, _, kd, kv, *_ = tuned_gains(MOTOR, 12.0, 10.0)
+    _, _, kd, kv, *_ = tuned_gains(MOTOR, 12.0, 5.0)
     assert (kd, kv) == (0.0, pytest.approx(OWN / STALL))
 
 

@@ -16,43 +16,38 @@ What a step found is kept in ``bringup.json`` at once. While a step runs, a sile
 from __future__ import annotations
 
 import contextlib
-import json
+import queue
+import sys
+import threading
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import fields
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from armsight.app.board.command import STEPS
-from armsight.app.report.page import PAGE, html_page, picture, put_files, table, text
-from armsight.app.report.plotting import BLUE, MUTED, ORANGE, drawing, new_figure, png
+from armsight.app.board.found import Found, JointFound, put_gentle, report
+from armsight.app.report.page import PAGE, put_files
 from armsight.data import Array, JointCommand
 from armsight.errors import ArmsightError, DeviceError, InputError
-from armsight.files import read_text, write_text
+from armsight.files import write_text
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.board_file import configuration_text
 from armsight.robot.boards.codes import Command, Reaction
-from armsight.robot.boards.configuration import (
-    CONFIG_VERSION,
-    GAIN_RANGES,
-    GAINS,
-    JOINTS,
-    POT_NODES,
-    Configuration,
-    gains_array,
-    lab_configuration,
-)
+from armsight.robot.boards.configuration import JOINTS, POT_NODES, Configuration, gains_array
 from armsight.robot.boards.identification import dead_spots, fit_swing
 from armsight.robot.boards.reports import SensorReadings
-from armsight.robot.boards.tuning import MotorFigures, motion_limits, quiet_bandwidth, tuned_gains
+from armsight.robot.boards.tuning import MotorFigures, quiet_bandwidth, tuned_gains
 
 FOUND_FILE, CONFIG_FILE = "bringup.json", "board.toml"
 _EVERY_S, _PERIOD_S = 0.002, 0.01
+_ASK_S, _PATIENCE_S = 0.02, 900.0
+#: First letters of the answers to each kind of question.
+_ANSWERS = {"yes": ("y", "n"), "problem": ("r", "s")}
 _SHORT_COUNTS, _OPEN_COUNTS = 300, 65000
 _MOST_NOISE_COUNTS = 200.0
 _HAND_COUNTS = 1500.0  # a hand that moves a joint changes its reading by more
-_MARGIN_RAD = 0.05
 _JOG_RAD, _JOG_DUTY, _JOG_DUTY_PER_S, _JOG_MOST_RAD = 0.010, 0.6, 0.15, 0.05
 _DEAD_DUTY, _DEAD_A = 0.25, 0.02
 #: A swing: amplitudes, rad, and frequencies, Hz, that add up, and how far a joint may get away from where it began.
@@ -61,7 +56,7 @@ _SWING_RAD, _SWING_HZ, _SWING_MOST_RAD = (0.12, 0.04), (0.5, 2.0), 0.26
 _DITHER_DUTY, _DITHER_HZ = 0.07, 8.0
 _FIRST_SWING_S, _SWING_S, _GROW_S = 3.0, 5.0, 0.5
 _VERIFY_RAD, _VERIFY_HZ, _VERIFY_S, _VERIFY_MOST_RAD = 0.035, 0.5, 4.0, 0.01
-_GENTLE_RAD_S = 15.0  # bandwidth of the second swing
+_GENTLE_RAD_S, _GENTLE_NOISE = 12.0, 0.02  # bandwidth of the second swing, and the noise of its duty
 _TRACE = 400  # points of a figure's line
 
 
@@ -73,11 +68,11 @@ class Operator(Protocol):
         ...
 
     def ask(self, kind: str, joint: int | None, text: str) -> None:
-        """Hear a question: ``yes``, ``mark`` (an angle in degrees, or nothing at the end), ``problem`` (r, s or q)."""
+        """Hear a question: ``yes``, ``mark`` (an angle in degrees, or nothing at the end), ``problem`` (r or s)."""
         ...
 
     def answer(self) -> str | None:
-        """Return the answer, None while there is none."""
+        """Return the answer, None while there is none; q, to any question, ends the bring-up."""
         ...
 
 
@@ -89,139 +84,39 @@ class _Quit(Exception):
     """The person has had enough."""
 
 
-@dataclass
-class JointFound:
-    """What was found of a joint; None where it was not yet.
+class TerminalOperator:
+    """A person at this terminal: lines come from stdin while the board's time goes on; its end is a q.
 
-    Attributes:
-        noise_counts: standard deviation of its potentiometer at rest.
-        marks: pairs of counts and angle, rad.
-        range_counts: least and greatest reading of the movement by hand.
-        motor_direction: 1 or -1.
-        breakaway_duty: from which duty on the motor moved the joint.
-        resistance_ohm: of the motor, with the current sensor as it reads.
-        constant_v_s: motor constant at the joint, V s/rad.
-        inertia_kg_m2: at the joint.
-        viscous_n_m_s: viscous friction, N m s/rad.
-        dry_n_m: dry friction, N m.
-        backlash_rad: from stop to stop.
-        gravity_n_m: greatest torque of gravity.
-        fit_rms_v: by how much the fit misses the motor's voltage.
-        following_rms_rad: error of the small swing that verified the gains.
-        problems: what was named, in order.
-        traces: lines of figures by name.
+    Args:
+        echo: prints a line.
     """
 
-    noise_counts: float | None = None
-    marks: list[list[float]] = field(default_factory=list)
-    range_counts: list[float] | None = None
-    motor_direction: int | None = None
-    breakaway_duty: float | None = None
-    resistance_ohm: float | None = None
-    constant_v_s: float | None = None
-    inertia_kg_m2: float | None = None
-    viscous_n_m_s: float | None = None
-    dry_n_m: float | None = None
-    backlash_rad: float | None = None
-    gravity_n_m: float | None = None
-    fit_rms_v: float | None = None
-    following_rms_rad: float | None = None
-    problems: list[str] = field(default_factory=list)
-    traces: dict[str, list[float]] = field(default_factory=dict)
+    def __init__(self, echo: Callable[[str], None]) -> None:
+        self._echo, self._ended = echo, False
+        self._lines: queue.Queue[str] = queue.Queue()
+        threading.Thread(target=self._read, daemon=True).start()
 
-    @property
-    def motor(self) -> MotorFigures | None:
-        """Its motor, where it was identified."""
-        values = (self.resistance_ohm, self.constant_v_s, self.inertia_kg_m2, self.viscous_n_m_s, self.dry_n_m)
-        return None if None in values else MotorFigures(*values)  # type: ignore[arg-type]
+    def _read(self) -> None:
+        for line in sys.stdin:
+            self._lines.put(line.rstrip("\n"))
+        self._ended = True
 
-    def done(self, step: str) -> bool:
-        """Return whether a step has found what it looks for."""
-        looked_for = {
-            "readings": self.noise_counts,
-            "potentiometers": self.range_counts,
-            "motors": self.motor_direction,
-            "swing": self.resistance_ohm,
-            "verify": self.following_rms_rad,
-        }
-        return looked_for.get(step) is not None
+    def say(self, line: str) -> None:
+        """Print a line."""
+        self._echo(line)
 
-    def pot_table(self) -> tuple[list[int], list[float], int]:
-        """Return counts and angles, rad, of the potentiometer's table, and its direction; ends are extrapolated."""
-        if self.range_counts is None or len(self.marks) < 2:
-            return [2000, 63500], [-2.6, 2.6], 1
-        marks = np.array(sorted(self.marks))
-        counts, angles = marks[:, 0], marks[:, 1]
-        direction = 1 if angles[-1] > angles[0] else -1
-        low, high = self.range_counts
-        if low < counts[0] - 50:
-            slope = (angles[1] - angles[0]) / (counts[1] - counts[0])
-            counts, angles = np.r_[low, counts], np.r_[angles[0] + slope * (low - counts[0]), angles]
-        if high > counts[-1] + 50:
-            slope = (angles[-1] - angles[-2]) / (counts[-1] - counts[-2])
-            counts, angles = np.r_[counts, high], np.r_[angles, angles[-1] + slope * (high - counts[-1])]
-        return [round(float(c)) for c in counts], [float(direction * a) for a in angles], direction
+    def ask(self, kind: str, joint: int | None, text: str) -> None:
+        """Print a question; what was typed before it answers nothing: a yes lets joints move."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._lines.get_nowait()
+        self._echo(f"{text}: ")
 
-    def angles(self, counts: Array) -> Array:
-        """Return joint angles (n,), rad, of counts (n,), straight on beyond the table's ends as on the board."""
-        at, angle, direction = self.pot_table()
-        node = np.clip(np.searchsorted(at, counts), 1, len(at) - 1)
-        c, a = np.array(at, dtype=float), np.array(angle)
-        along = (counts - c[node - 1]) / (c[node] - c[node - 1])
-        return np.asarray(direction * (a[node - 1] + along * (a[node] - a[node - 1])), dtype=float)
-
-    @property
-    def rad_per_count(self) -> float:
-        """Mean slope of the table."""
-        counts, angles, _ = self.pot_table()
-        return (angles[-1] - angles[0]) / (counts[-1] - counts[0])
-
-    @property
-    def noise_rad(self) -> float:
-        """Noise of a reading."""
-        return (self.noise_counts or 10.0) * self.rad_per_count
-
-
-@dataclass
-class Found:
-    """What a bring-up found.
-
-    Attributes:
-        board: the board's name.
-        joints: of each joint.
-        supply_v: of the motors.
-        arm_time_s: time on the board's clock, over all runs.
-        verified: whether the small swing went well with what is stored.
-    """
-
-    board: str
-    joints: list[JointFound]
-    supply_v: float = 12.0
-    arm_time_s: float = 0.0
-    verified: bool = False
-
-    @classmethod
-    def read(cls, path: Path) -> Found:
-        """Read what an earlier run kept.
-
-        Raises:
-            InputError: it is no such file.
-        """
-        try:
-            data = json.loads(read_text(path))
-            names = {each.name for each in fields(JointFound)}
-            if data.pop("version") != CONFIG_VERSION or len(data["joints"]) != JOINTS:
-                raise ValueError("it is of another version")
-            joints = [JointFound(**{k: v for k, v in each.items() if k in names}) for each in data.pop("joints")]
-            return cls(joints=joints, **data)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(
-                f"{path}: not what a bring-up kept ({error}): remove it, or name another folder with -o"
-            ) from None
-
-    def write(self, path: Path) -> None:
-        """Keep it."""
-        write_text(path, json.dumps({"version": CONFIG_VERSION, **asdict(self)}, indent=1) + "\n")
+    def answer(self) -> str | None:
+        """Return the next line, if there is one."""
+        with contextlib.suppress(queue.Empty):
+            return self._lines.get_nowait()
+        return "q" if self._ended else None
 
 
 class Bringup:
@@ -297,9 +192,24 @@ class Bringup:
     def _wait(self, kind: str, joint: int | None, said: str) -> str:
         """Ask, and let the board's time pass until there is an answer; readings meanwhile are kept in ``_motion``."""
         self._person.ask(kind, joint, said)
-        while (answer := self._person.answer()) is None:
-            self._take(self._board.sensed(0.02))
-        return answer.strip().lower()
+        waited_s = 0.0
+        while True:
+            answer = self._person.answer()
+            if answer is not None:
+                short = answer.strip().lower()
+                if short.startswith("q"):
+                    raise _Quit
+                if kind not in _ANSWERS or short[:1] in _ANSWERS[kind]:
+                    return short
+                self._person.say(f"{answer!r} is not understood; {', '.join(_ANSWERS[kind])} or q is")
+                self._person.ask(kind, joint, said)
+            self._take(self._board.sensed(_ASK_S))
+            waited_s += _ASK_S
+            if waited_s > _PATIENCE_S:
+                raise InputError(
+                    f"no answer for {_PATIENCE_S / 60:.0f} minutes; what was found is kept in {self._folder}: the same"
+                    " command goes on there"
+                )
 
     def _yes(self, question: str) -> bool:
         return self._wait("yes", None, question).startswith("y")
@@ -332,8 +242,6 @@ class Bringup:
                 self._off()
                 self.found.joints[joint].problems.append(str(problem))
                 answer = self._wait("problem", joint, f"{problem} [r]epeat, [s]kip, [q]uit")
-            if answer.startswith("q"):
-                raise _Quit
             if not answer.startswith("r"):
                 self._skipped.add((step, joint))
                 return
@@ -341,10 +249,10 @@ class Bringup:
     # ---- the board ----
 
     def _off(self) -> None:
-        """Switch the drives off, and clear what a step left; a board that is gone does so by itself."""
+        """Switch the drives off, whatever was last heard of them, and clear faults; a board that is gone does so itself."""
         with contextlib.suppress(ArmsightError):
-            if self._board.status.drives_on or self._board.status.faults:
-                self._board.confirm(self._board.command(Command.DISABLE))
+            self._board.confirm(self._board.command(Command.DISABLE))
+            if self._board.status.faults:
                 self._board.confirm(self._board.command(Command.CLEAR_FAULTS))
 
     def _use(self, config: Configuration) -> None:
@@ -383,65 +291,8 @@ class Bringup:
         """Return the joints' angles (n, 6) of readings."""
         return np.stack([self.found.joints[j].angles(readings.counts[:, j]) for j in range(JOINTS)], axis=1)
 
-    # ---- configurations ----
-
-    def configuration(self, *, gains: bool, reaction: Reaction) -> Configuration:
-        """Return the configuration of what is known; without ``gains`` joints are not controlled and nothing is watched."""
-        config = lab_configuration()
-        supply = self.found.supply_v
-        config["supply_nominal_mv"] = round(1e3 * supply)
-        config["supply_min_mv"], config["supply_max_mv"] = round(800 * supply), round(1200 * supply)
-        config["silence_reaction"] = reaction
-        for joint, found in zip(config["joint"], self.found.joints, strict=True):
-            self._put_pot(joint, found)
-            joint["motor_direction"] = found.motor_direction or 1
-            joint["current_limit_ma"] = round(1e3 * self._current_a)
-            if gains and found.motor is not None:
-                self._put_motor(joint, found, found.motor)
-            else:
-                _put_free(joint, found)
-        return config
-
-    def _put_pot(self, joint: Configuration, found: JointFound) -> None:
-        pot = joint["pot"]
-        counts, angles, direction = found.pot_table()
-        pot["node_count"], pot["direction"] = len(counts), direction
-        pot["counts"] = counts + [0] * (POT_NODES - len(counts))
-        pot["angle_rad"] = angles + [0.0] * (POT_NODES - len(angles))
-        # A joint without a table may have an open input: it shall not keep the others from being driven.
-        pot["short_counts"], pot["open_counts"] = (
-            (0, 65535)
-            if found.range_counts is None
-            else (
-                max(1, min(1000, counts[0] // 2)),
-                min(65000, (counts[-1] + 65535) // 2 + 1),
-            )
-        )
-        ends = sorted((direction * angles[0], direction * angles[-1]))
-        joint["soft_min_rad"], joint["soft_max_rad"] = ends[0] + _MARGIN_RAD, ends[1] - _MARGIN_RAD
-        pot["jump_rad"] = max(0.02, 12 * found.noise_rad)
-
-    def _put_motor(self, joint: Configuration, found: JointFound, motor: MotorFigures) -> None:
-        """Put gains, limits and the motor's numbers."""
-        supply, gravity = self.found.supply_v, found.gravity_n_m or 0.0
-        joint["gains"] = np.array(tuple(tuned_gains(motor, supply, self._bandwidth(found, motor))), GAINS)
-        joint["motor"]["resistance_ohm"], joint["motor"]["constant_v_s"] = motor.resistance_ohm, motor.constant_v_s
-        joint["motor"]["apart_rad"] = max(0.03, 10 * found.noise_rad + 1.5 * (found.backlash_rad or 0.0))
-        speed, acceleration = motion_limits(motor, supply, gravity)
-        speed = min(speed, 0.9e3 * float(joint["pot"]["jump_rad"]))
-        for name, value in {
-            "speed_limit_rad_s": speed,
-            "acceleration_rad_s2": acceleration,
-            "deceleration_rad_s2": acceleration,
-            "jerk_rad_s3": 100 * acceleration,
-            "duty_limit": 1.0,
-            "stall_duty": 0.9,
-        }.items():
-            joint[name] = value
-        joint["current_limit_ma"] = round(1e3 * min(self._current_a, 0.95 * supply / motor.resistance_ohm))
-
-    def _bandwidth(self, found: JointFound, motor: MotorFigures) -> float:
-        return quiet_bandwidth(motor, self.found.supply_v, found.noise_rad)
+    def _configuration(self, reaction: Reaction, *, gains: bool) -> Configuration:
+        return self.found.configuration(self._current_a, reaction, gains=gains)
 
     # ---- the steps ----
 
@@ -535,7 +386,7 @@ class Bringup:
         ):
             return
         if todo:
-            self._use(self.configuration(gains=False, reaction=Reaction.RELEASE))
+            self._use(self._configuration(Reaction.RELEASE, gains=False))
         self._each("motors", self._jog)
         self._off()
 
@@ -617,9 +468,9 @@ class Bringup:
         ready = [j for j in self._joints if self.found.joints[j].done("motors")]
         todo = [j for j in ready if self._again or not self.found.joints[j].done("swing")]
         if todo:
-            config = self.configuration(gains=False, reaction=Reaction.RELEASE)
+            config = self._configuration(Reaction.RELEASE, gains=False)
             for j in ready:
-                _put_gentle(config["joint"][j], self.found.joints[j])
+                put_gentle(config["joint"][j], self.found.joints[j])
             self._use(config)
         self._each("swing", self._swing)
         self._off()
@@ -633,7 +484,7 @@ class Bringup:
         gains = gains_array(self._board.configuration())
         first = self._identify(joint, self._swung(joint, _FIRST_SWING_S))
         better = gains.copy()
-        gentle = min(_GENTLE_RAD_S, self._bandwidth(found, first))
+        gentle = min(_GENTLE_RAD_S, quiet_bandwidth(first, self.found.supply_v, found.noise_rad, _GENTLE_NOISE))
         better[joint] = tuned_gains(first, self.found.supply_v, gentle)
         self._board.confirm(self._board.set_gains(better))
         readings = self._swung(joint, _SWING_S)
@@ -686,7 +537,7 @@ class Bringup:
         if not ready:
             self._person.say("left out: no joint was identified")
             return
-        self._use(self.configuration(gains=True, reaction=Reaction.RELEASE))
+        self._use(self._configuration(Reaction.RELEASE, gains=True))
         self._mended("verify", ready[0], lambda _: self._follow(ready))
         self._off()
 
@@ -728,7 +579,7 @@ class Bringup:
         if not any(each.done("swing") for each in self.found.joints):
             self._person.say("nothing is stored: no joint was identified")
             return
-        config = self.configuration(gains=True, reaction=Reaction.HOLD)
+        config = self._configuration(Reaction.HOLD, gains=True)
         self._use(config)
         write_text(self._folder / CONFIG_FILE, configuration_text(config, self.found.board))
         page = report(self.found, gains_array(config))
@@ -737,26 +588,6 @@ class Bringup:
         if missing:
             self._person.say(f"joints {', '.join(missing)} were not identified: they are stored without gains")
         self._person.say(f"stored, and written to {self._folder / CONFIG_FILE}; figures: {self._folder / PAGE}")
-
-
-def _put_free(joint: Configuration, found: JointFound) -> None:
-    """Put gains of zero, and let nothing be watched that needs to know the motor."""
-    joint["gains"] = np.array((0, 0, 0, 0, 0, 0, 0.005, 20), GAINS)
-    joint["motor"]["resistance_ohm"] = 0.0
-    for name, value in {
-        "duty_limit": 1.0,
-        "stall_duty": 1.0,
-        "following_rad": 13.0,
-        "gravity_slew_per_s": 1000.0,
-    }.items():
-        joint[name] = value
-    joint["pot"]["frozen_rad"] = joint["pot"]["inverted_rad"] = 1.0
-
-
-def _put_gentle(joint: Configuration, found: JointFound) -> None:
-    """Put gains that move any joint a little: full duty at 30 degrees."""
-    joint["gains"] = np.array((2.0, 2.0, 0.0, 0.0, 0.0, 0.5 * (found.breakaway_duty or 0.0), 0.005, 20.0), GAINS)
-    joint["acceleration_rad_s2"], joint["jerk_rad_s3"] = 30.0, 3000.0
 
 
 def _swing_at(t_s: float, seconds: float) -> tuple[float, float]:
@@ -777,76 +608,3 @@ def _traces(**lines: Array) -> dict[str, list[float]]:
 
 def _pairs(marks: Array) -> str:
     return ", ".join(f"{np.degrees(angle):.1f} deg at {counts:.0f}" for counts, angle in marks)
-
-
-# ---- the page ----
-
-_NUMBERS: tuple[tuple[str, str, float, str], ...] = (
-    ("noise_counts", "noise, counts", 1, ".1f"),
-    ("motor_direction", "motor direction", 1, ".0f"),
-    ("breakaway_duty", "moves from duty, %", 100, ".1f"),
-    ("resistance_ohm", "R, ohm", 1, ".2f"),
-    ("constant_v_s", "K, V s/rad", 1, ".3f"),
-    ("inertia_kg_m2", "inertia, g m&sup2;", 1e3, ".1f"),
-    ("dry_n_m", "dry friction, N m", 1, ".3f"),
-    ("backlash_rad", "backlash, mrad", 1e3, ".1f"),
-    ("gravity_n_m", "gravity at most, N m", 1, ".2f"),
-    ("following_rms_rad", "follows to, mrad RMS", 1e3, ".2f"),
-)
-
-
-def report(found: Found, gains: Array) -> str:
-    """Return the page of figures.
-
-    Raises:
-        InputError: matplotlib is not installed.
-    """
-    rows = []
-    for j, each in enumerate(found.joints):
-        values = [(getattr(each, name), scale, form) for name, _, scale, form in _NUMBERS]
-        rows.append([f"joint {j + 1}", *("" if v is None else format(v * s, f) for v, s, f in values)])
-    gain_rows = [[f"joint {j + 1}", *(f"{value:.4g}" for value in row)] for j, row in enumerate(gains)]
-    problems = [[f"joint {j + 1}", text(line)] for j, each in enumerate(found.joints) for line in each.problems]
-    sections = {
-        "joints": ("Joints", table(["", *(title for _, title, _, _ in _NUMBERS)], rows, "numbers")),
-        "gains": ("Gains", table(["", *GAIN_RANGES], gain_rows, "numbers")),
-        "figures": ("Figures", _figures(found)),
-    }
-    if problems:
-        sections["problems"] = ("Problems on the way", table(["", "named"], problems, "prose"))
-    sub = f"board {found.board}, {found.supply_v:g} V, {found.arm_time_s:.0f} s of the board's time"
-    return html_page("Bring-up", "Bring-up of the arm's board", sub, sections)
-
-
-def _figures(found: Found) -> str:
-    """Return a row of plots for every joint: table, motor voltage of the swing, error of the small swing."""
-    shown = [(j, each) for j, each in enumerate(found.joints) if each.range_counts is not None]
-    if not shown:
-        return "<p>Nothing to show.</p>"
-    with drawing():
-        figure = new_figure(2.1 * len(shown))
-        axes = figure.subplots(len(shown), 3, squeeze=False)
-        for (j, each), (left, middle, right) in zip(shown, axes, strict=True):
-            counts, angles, direction = each.pot_table()
-            left.plot(counts, np.degrees(direction * np.array(angles)), color=BLUE)
-            marks = np.array(each.marks)
-            left.plot(marks[:, 0], np.degrees(marks[:, 1]), "o", color=ORANGE, ms=3)
-            left.set(title=f"joint {j + 1}: potentiometer", xlabel="counts", ylabel="deg")
-            lines = each.traces
-            if "swing_t_s" in lines:
-                middle.plot(lines["swing_t_s"], lines["swing_voltage_v"], color=MUTED, lw=1.5, label="put out")
-                middle.plot(lines["swing_t_s"], lines["swing_predicted_v"], color=BLUE, lw=0.8, label="R i + K w")
-                middle.legend(loc="upper right", fontsize=7)
-            middle.set(title="motor voltage of the swing", xlabel="s", ylabel="V")
-            if "verify_t_s" in lines:
-                right.plot(lines["verify_t_s"], 1e3 * np.array(lines["verify_error_rad"]), color=BLUE, lw=0.8)
-            right.set(title="error of the small swing, with noise", xlabel="s", ylabel="mrad")
-        return picture(png(figure), "For every joint: potentiometer table, motor voltage, following error")
-
-
-def found_json(found: Found) -> dict[str, Any]:
-    """Return what was found as JSON has it, without the figures' lines."""
-    record = asdict(found)
-    for each in record["joints"]:
-        del each["traces"]
-    return record

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import queue
-import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -246,7 +243,8 @@ def bringup(
     Each joint is moved by hand, each motor driven by a pulse of at most 3 degrees, and then, after a yes, by a swing of 10.
     What was found is kept: the same command goes on where it ended. On an emulated board an arm and a person are drawn.
     """
-    from armsight.app.board.bringup import Bringup, found_json
+    from armsight.app.board.bringup import Bringup, TerminalOperator
+    from armsight.app.board.found import found_json
     from armsight.app.report.page import writable_folder
     from armsight.app.report.plotting import require_matplotlib
     from armsight.files import check_folder
@@ -263,7 +261,7 @@ def bringup(
     check_folder(folder, problem="nothing of a bring-up can be written here")
     if name.startswith(SERIAL):
         board = open_board(name, baud=BAUD if baud is None else baud)
-        person: Operator = _TerminalPerson(echo)
+        person: Operator = TerminalOperator(echo)
     else:
         plant, _ = drawn_workshop(seed)
         person = WorkshopPerson(plant, seed=seed, say=echo)
@@ -479,8 +477,6 @@ def emulate(arm: str, seconds: float | None, as_json: bool) -> None:
 
     so101 is a servo bus with backlash and droop, for feetech:PORT; ar4 a Teensy with backlash and a homing that is off.
     """
-    import threading
-
     from armsight.robot.boards.ar4 import board as ar4
     from armsight.robot.boards.feetech import bus as feetech
     from armsight.sim.boards.ar4 import Ar4Teensy
@@ -493,38 +489,6 @@ def emulate(arm: str, seconds: float | None, as_json: bool) -> None:
     with serve(device, baud) as port:
         click.echo(json.dumps({"board": f"{kind}:{port.name}"}) if as_json else f"{kind}:{port.name}")
         threading.Event().wait(seconds)
-
-
-class _TerminalPerson:
-    """A person at this terminal: lines come from stdin while the board's time goes on.
-
-    Args:
-        echo: prints a line.
-    """
-
-    def __init__(self, echo: Callable[[str], None]) -> None:
-        self._echo = echo
-        self._lines: queue.Queue[str] = queue.Queue()
-        threading.Thread(target=self._read, daemon=True).start()
-
-    def _read(self) -> None:
-        for line in sys.stdin:
-            self._lines.put(line.rstrip("\n"))
-        self._lines.put("q")
-
-    def say(self, line: str) -> None:
-        """Print a line."""
-        self._echo(line)
-
-    def ask(self, kind: str, joint: int | None, text: str) -> None:
-        """Print a question."""
-        self._echo(f"{text}: ")
-
-    def answer(self) -> str | None:
-        """Return the next line, if there is one."""
-        with contextlib.suppress(queue.Empty):
-            return self._lines.get_nowait()
-        return None
 
 
 def _open(name: str, baud: int | None) -> Board:

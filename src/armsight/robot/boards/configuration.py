@@ -154,7 +154,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
 }
 
 #: The simulated arm's motors (:mod:`armsight.sim.joints`), and how stiffly they are driven.
-_LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S = MotorFigures(6.0, 2.4, 0.03, 0.02, 0.2), 12.0, 36.0
+_LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S = MotorFigures(6.0, 2.4, 0.03, 0.02, 0.2), 12.0, 24.0
 
 
 def lab_configuration() -> Configuration:

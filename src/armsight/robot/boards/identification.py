@@ -24,7 +24,8 @@ from armsight.errors import InputError
 from armsight.robot.boards.tuning import MotorFigures
 
 _SMOOTH_S = 0.015  # standard deviation of the Gaussian that angles are smoothed by before they are differentiated
-_SURE = 0.2  # of the greatest speed: faster than so, the sign of the speed is certain
+#: Shares of the greatest speed: faster than so, the sign of the joint's speed, and of the motor's, is certain.
+_SURE, _MOTOR_SURE = 0.2, 0.1
 _LEAST_READINGS = 100
 _LEAST_SWING_RAD = 0.02
 
@@ -75,7 +76,7 @@ def fit_swing(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) 
     t = np.arange(0.0, float(t_s[-1] - t_s[0]) + 0.5 * step_s, step_s)
     volts, amperes, q = (np.interp(t, t_s - t_s[0], each) for each in (voltage_v, current_a, angle_rad))
     speed = _smooth(q, step_s, derivative=True)
-    sure = _sure(speed, step_s)
+    sure = _sure(speed, step_s, _SURE)
     if (amperes > -0.02 * np.abs(amperes).max()).all():
         amperes = _signed(t, volts, amperes, q, speed, sure)
     flux = _fit_flux(t, volts, amperes, q, speed, sure)
@@ -85,7 +86,9 @@ def fit_swing(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) 
             f"the swing fits no motor: resistance {resistance:.3g} ohm, constant {constant:.3g} V s/rad; both must be"
             " positive: are current and voltage those of this motor?"
         )
-    inertia, viscous, dry, gravity = _fit_torque(constant * amperes, q, speed, step_s, sure)
+    inertia, viscous, dry, gravity = _fit_torque(
+        constant, amperes, (volts - resistance * amperes) / constant, q, step_s
+    )
     motor = MotorFigures(resistance, constant, inertia, max(viscous, 0.0), max(dry, 0.0))
     smooth_v = _smooth(volts, step_s)
     predicted = resistance * _smooth(amperes, step_s) + constant * speed
@@ -131,9 +134,9 @@ def _smooth(values: Array, step_s: float, *, derivative: bool = False) -> Array:
     return smoothed
 
 
-def _sure(speed: Array, step_s: float) -> NDArray[np.bool_]:
+def _sure(speed: Array, step_s: float, share: float) -> NDArray[np.bool_]:
     """Return where (n,) the sign of the speed has been certain for long enough that no smoothing reaches a reversal."""
-    slow = np.abs(speed) < _SURE * np.abs(speed).max()
+    slow = np.abs(speed) < share * np.abs(speed).max()
     reach = round(3 * _SMOOTH_S / step_s)
     near = np.convolve(slow, np.ones(2 * reach + 1), mode="same") > 0.5
     near[: 2 * reach] = near[-2 * reach :] = True
@@ -167,15 +170,18 @@ def _fit_flux(
 
 
 def _fit_torque(
-    torque: Array, q: Array, speed: Array, step_s: float, sure: NDArray[np.bool_]
+    constant: float, amperes: Array, motor_rad_s: Array, q: Array, step_s: float
 ) -> tuple[float, float, float, float]:
-    """Return inertia, viscous and dry friction, and gravity's greatest torque."""
-    off = _smooth(q - q.mean(), step_s)
-    columns = [_smooth(speed, step_s, derivative=True), speed, np.sign(speed), np.cos(off), np.sin(off)]
-    # The acceleration is smoothed twice: so is everything else.
-    columns[1:] = [_smooth(each, step_s) for each in columns[1:]]
-    right = _smooth(_smooth(torque, step_s), step_s)
-    solution = np.linalg.lstsq(np.column_stack(columns)[sure], right[sure], rcond=None)[0]
+    """Return inertia, viscous and dry friction, and gravity's greatest torque.
+
+    The speed (n,) is the motor's by its back-EMF: at a reversal the joint stands while the motor crosses the backlash.
+    """
+    speed = _smooth(motor_rad_s, step_s)
+    sure = _sure(speed, step_s, _MOTOR_SURE)
+    off = q - q.mean()
+    alike = (_smooth(each, step_s) for each in (np.sign(speed), np.cos(off), np.sin(off)))
+    columns = np.column_stack([_smooth(motor_rad_s, step_s, derivative=True), speed, *alike])
+    solution = np.linalg.lstsq(columns[sure], constant * _smooth(amperes, step_s)[sure], rcond=None)[0]
     inertia, viscous, dry, cosine, sine = (float(each) for each in solution)
     if not inertia > 0:
         raise InputError(f"the swing fits no motor: its inertia comes out as {inertia:.3g} kg m^2; it must be positive")

@@ -1,13 +1,19 @@
 """Gains of a joint from what its motor is, by a rule with two inputs: bandwidth and damping.
 
 With the torque ``K (u V - K w) / R`` and ``J``, ``B`` and ``C`` the inertia, viscous and dry friction at the joint, the
-stall torque is ``S = K V / R`` and the motor damps itself by ``D = K^2 / R + B``. With the integral the loop is of third
-order, ``J q''' + (D + S kd) q'' + S kp q' + S ki q = ...``; its poles are placed at ``(s^2 + 2 z w s + w^2) (s + a w)``:
+stall torque is ``S = K V / R`` and the motor damps itself by ``D = K^2 / R + B``. The speed that kd damps is filtered by a
+time constant t, which is part of the loop: its four poles are placed as two pairs of one damping z, the slower one at the
+bandwidth w, the faster one at v = w / 0.35, ``(s^2 + 2 z w s + w^2) (s^2 + 2 z v s + v^2) = s^4 + c3 s^3 + c2 s^2 + c1 s +
+c0``:
 
-    kd = ((2 z + a) w J - D) / S,  kp = (1 + 2 z a) w^2 J / S,  ki = a w^3 J / S
+    t = 1 / c3,  ki = t J c0 / S,  kp = t J c1 / S - ki t,  kd = t J c2 / S - kp t - D / (2 S)
 
+(t as if D were 0. Only half of what the motor damps by itself is counted: it is known to 15 % at first, and kd also says
+how hard a joint is held against a push.) For the noise that a potentiometer puts into the duty, a filter within the loop
+lets the bandwidth be half again as great as one beside it.
 The feed-forward gives what the motion itself takes, so that nothing is left to the error: ``kv = D / S + kd``,
-``ka = J / S``, ``kf = C / S``. (Åström and Murray, "Feedback Systems", 2008, sections 10.2 and 10.5; Ellis, "Control System
+``ka = J / S - kd t``, ``kf = C / S``; t is by how much the filtered speed is late, which damps the less while the motion
+accelerates. (Åström and Murray, "Feedback Systems", 2008, sections 10.2 and 10.5; Ellis, "Control System
 Design Guide", 2012, chapter 6.)
 """
 
@@ -20,11 +26,12 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError
 
-#: The integral's pole, and the corner of the speed's filter over the bandwidth: 1 / 0.25.
-_INTEGRAL_SHARE, _FILTER_SHARE = 0.6, 0.25
+#: The slower pair of poles over the faster one.
+_PAIRS = 0.35
 #: Dry friction is compensated by a little less than it is, so that it never drives.
 _FRICTION_SHARE = 0.9
-ANTI_WINDUP_PER_S = 20.0
+_LEAST_ANTI_WINDUP_PER_S = 20.0
+_TICK_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -46,14 +53,14 @@ class MotorFigures:
     dry_n_m: float
 
 
-def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 0.8) -> Array:
+def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 0.7) -> Array:
     """Return the gains of a joint by the rule above.
 
     Args:
         motor: its motor.
         supply_v: nominal supply, V.
-        bandwidth_rad_s: natural frequency of the loop's pair of poles, rad/s.
-        damping: of the pair, of critical.
+        bandwidth_rad_s: natural frequency of the slower pair of poles, rad/s.
+        damping: of both pairs, of critical.
 
     Returns:
         (8,) kp, ki, kd, kv, ka, kf, derivative filter, anti-windup.
@@ -69,43 +76,39 @@ def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, da
     stall = motor.constant_v_s * supply_v / motor.resistance_ohm
     own = motor.constant_v_s**2 / motor.resistance_ohm + motor.viscous_n_m_s
     per_rad_s2 = motor.inertia_kg_m2 / stall
-    w, share = bandwidth_rad_s, _INTEGRAL_SHARE
-    kd = max((2 * damping + share) * w * per_rad_s2 - own / stall, 0.0)
-    return np.array(
-        [
-            (1 + 2 * damping * share) * w**2 * per_rad_s2,
-            share * w**3 * per_rad_s2,
-            kd,
-            own / stall + kd,
-            per_rad_s2,
-            _FRICTION_SHARE * motor.dry_n_m / stall,
-            _FILTER_SHARE / bandwidth_rad_s,
-            ANTI_WINDUP_PER_S,
-        ]
-    )
+    slow, fast = ((1.0, 2 * damping * w, w * w) for w in (bandwidth_rad_s, bandwidth_rad_s / _PAIRS))
+    _, c3, c2, c1, c0 = np.polymul(slow, fast)
+    filter_s = 1 / c3
+    ki = filter_s * c0 * per_rad_s2
+    kp = filter_s * c1 * per_rad_s2 - ki * filter_s
+    kd = max(filter_s * c2 * per_rad_s2 - kp * filter_s - 0.5 * own / stall, 0.0)
+    ka = max(per_rad_s2 - kd * (filter_s + 0.5 * _TICK_S), 0.0)
+    kf = _FRICTION_SHARE * motor.dry_n_m / stall
+    return np.array([kp, ki, kd, own / stall + kd, ka, kf, filter_s, max(3 * ki / kp, _LEAST_ANTI_WINDUP_PER_S)])
 
 
-#: Standard deviation of the duty that a potentiometer's noise may cause, and between which bandwidths one is looked for.
-_DUTY_NOISE, _LEAST_RAD_S, _MOST_RAD_S = 0.08, 5, 40
-_TICK_S = 1e-3
+#: Between which bandwidths one is looked for; stiffer than ``w^2 J`` a gear with backlash chatters.
+_LEAST_RAD_S, _MOST_RAD_S, _MOST_N_M = 5, 40, 64.0
 #: Shares of the duty: all that motion and load may take, and of what the load leaves, what steady motion may take.
-_USED, _MOVING = 0.9, 0.7
+_USED, _MOVING = 0.95, 0.8
 _MOST_SPEED_RAD_S, _MOST_RAD_S2 = 2.0, 10.0
 
 
-def quiet_bandwidth(motor: MotorFigures, supply_v: float, noise_rad: float) -> float:
-    """Return the greatest bandwidth, rad/s, at which a potentiometer's noise hardly moves the duty.
+def quiet_bandwidth(motor: MotorFigures, supply_v: float, noise_rad: float, duty_noise: float = 0.08) -> float:
+    """Return the greatest bandwidth, rad/s, that is not too stiff and at which noise hardly moves the duty.
 
     Args:
         motor: its motor.
         supply_v: nominal supply, V.
         noise_rad: standard deviation of a reading.
+        duty_noise: standard deviation of the duty that this noise may cause.
     """
-    for bandwidth in range(_MOST_RAD_S, _LEAST_RAD_S, -1):
+    most = min(_MOST_RAD_S, round(np.sqrt(_MOST_N_M / motor.inertia_kg_m2)))
+    for bandwidth in range(most, _LEAST_RAD_S, -1):
         kp, _, kd, *_, filter_s, _ = tuned_gains(motor, supply_v, bandwidth)
         share = _TICK_S / (filter_s + _TICK_S)
         speed_noise = noise_rad * share / _TICK_S * np.sqrt(2 / (2 - share))
-        if np.hypot(kp * noise_rad, kd * speed_noise) <= _DUTY_NOISE:
+        if np.hypot(kp * noise_rad, kd * speed_noise) <= duty_noise:
             return float(bandwidth)
     return float(_LEAST_RAD_S)
 
@@ -123,4 +126,4 @@ def motion_limits(motor: MotorFigures, supply_v: float, gravity_n_m: float) -> t
     load = min((gravity_n_m + motor.dry_n_m) / stall, _MOVING)
     speed = min(max(_MOVING * (_USED - load) * free_rad_s, 0.05), _MOST_SPEED_RAD_S)
     spare = max(_USED - load - speed / free_rad_s, 0.05)
-    return speed, min(max(0.8 * spare * stall / motor.inertia_kg_m2, 0.5), _MOST_RAD_S2)
+    return speed, min(max(spare * stall / motor.inertia_kg_m2, 0.5), _MOST_RAD_S2)

@@ -86,10 +86,14 @@ class WorkshopPlant:
         self._from_rad = plant.link.copy()
         self.hold: tuple[int, float] | None = None
 
+    def bent(self, counts: Array) -> Array:
+        """Return counts (6,) of straight potentiometers as the bent ones read them."""
+        return np.asarray(counts + self._bend * np.sin(2 * np.pi * counts / 65536.0))
+
     def sense(self) -> Sensed:
         """Return what the converters read now."""
         sensed, wiring = self.plant.sense(), self.wiring
-        true = sensed.counts.astype(float) + self._bend * np.sin(2 * np.pi * sensed.counts / 65536.0)
+        true = self.bent(sensed.counts.astype(float))
         counts = np.clip(np.where(np.array(wiring.potentiometer_signs) > 0, true, 65535.0 - true), 0, 65535)
         if wiring.dead_spot is not None:
             joint, low, high = wiring.dead_spot

@@ -1,0 +1,319 @@
+"""What a bring-up found: the records of joints and board, their file, the configuration that follows, the page of figures.
+
+In: what :mod:`armsight.app.board.bringup` measured. Out: ``bringup.json``, a board's configuration, ``report.html``.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.app.report.page import html_page, picture, table, text
+from armsight.app.report.plotting import BLUE, MUTED, ORANGE, drawing, new_figure, png
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.files import read_text, write_text
+from armsight.robot.boards.codes import Reaction
+from armsight.robot.boards.configuration import (
+    CONFIG_VERSION,
+    GAIN_RANGES,
+    GAINS,
+    JOINTS,
+    POT_NODES,
+    Configuration,
+    lab_configuration,
+)
+from armsight.robot.boards.tuning import MotorFigures, motion_limits, quiet_bandwidth, tuned_gains
+
+_MARGIN_RAD = 0.05
+
+
+@dataclass
+class JointFound:
+    """What was found of a joint; None where it was not yet.
+
+    Attributes:
+        noise_counts: standard deviation of its potentiometer at rest.
+        marks: pairs of counts and angle, rad.
+        range_counts: least and greatest reading of the movement by hand.
+        motor_direction: 1 or -1.
+        breakaway_duty: from which duty on the motor moved the joint.
+        resistance_ohm: of the motor, with the current sensor as it reads.
+        constant_v_s: motor constant at the joint, V s/rad.
+        inertia_kg_m2: at the joint.
+        viscous_n_m_s: viscous friction, N m s/rad.
+        dry_n_m: dry friction, N m.
+        backlash_rad: from stop to stop.
+        gravity_n_m: greatest torque of gravity.
+        fit_rms_v: by how much the fit misses the motor's voltage.
+        following_rms_rad: error of the small swing that verified the gains.
+        problems: what was named, in order.
+        traces: lines of figures by name.
+    """
+
+    noise_counts: float | None = None
+    marks: list[list[float]] = field(default_factory=list)
+    range_counts: list[float] | None = None
+    motor_direction: int | None = None
+    breakaway_duty: float | None = None
+    resistance_ohm: float | None = None
+    constant_v_s: float | None = None
+    inertia_kg_m2: float | None = None
+    viscous_n_m_s: float | None = None
+    dry_n_m: float | None = None
+    backlash_rad: float | None = None
+    gravity_n_m: float | None = None
+    fit_rms_v: float | None = None
+    following_rms_rad: float | None = None
+    problems: list[str] = field(default_factory=list)
+    traces: dict[str, list[float]] = field(default_factory=dict)
+
+    @property
+    def motor(self) -> MotorFigures | None:
+        """Its motor, where it was identified."""
+        values = (self.resistance_ohm, self.constant_v_s, self.inertia_kg_m2, self.viscous_n_m_s, self.dry_n_m)
+        return None if None in values else MotorFigures(*values)  # type: ignore[arg-type]
+
+    def done(self, step: str) -> bool:
+        """Return whether a step has found what it looks for."""
+        looked_for = {
+            "readings": self.noise_counts,
+            "potentiometers": self.range_counts,
+            "motors": self.motor_direction,
+            "swing": self.resistance_ohm,
+            "verify": self.following_rms_rad,
+        }
+        return looked_for.get(step) is not None
+
+    def pot_table(self) -> tuple[list[int], list[float], int]:
+        """Return counts and angles, rad, of the potentiometer's table, and its direction; ends are extrapolated."""
+        if self.range_counts is None or len(self.marks) < 2:
+            return [2000, 63500], [-2.6, 2.6], 1
+        marks = np.array(sorted(self.marks))
+        counts, angles = marks[:, 0], marks[:, 1]
+        direction = 1 if angles[-1] > angles[0] else -1
+        low, high = self.range_counts
+        if low < counts[0] - 50:
+            slope = (angles[1] - angles[0]) / (counts[1] - counts[0])
+            counts, angles = np.r_[low, counts], np.r_[angles[0] + slope * (low - counts[0]), angles]
+        if high > counts[-1] + 50:
+            slope = (angles[-1] - angles[-2]) / (counts[-1] - counts[-2])
+            counts, angles = np.r_[counts, high], np.r_[angles, angles[-1] + slope * (high - counts[-1])]
+        return [round(float(c)) for c in counts], [float(direction * a) for a in angles], direction
+
+    def angles(self, counts: Array) -> Array:
+        """Return joint angles (n,), rad, of counts (n,), straight on beyond the table's ends as on the board."""
+        at, angle, direction = self.pot_table()
+        node = np.clip(np.searchsorted(at, counts), 1, len(at) - 1)
+        c, a = np.array(at, dtype=float), np.array(angle)
+        along = (counts - c[node - 1]) / (c[node] - c[node - 1])
+        return np.asarray(direction * (a[node - 1] + along * (a[node] - a[node - 1])), dtype=float)
+
+    @property
+    def rad_per_count(self) -> float:
+        """Mean slope of the table."""
+        counts, angles, _ = self.pot_table()
+        return (angles[-1] - angles[0]) / (counts[-1] - counts[0])
+
+    @property
+    def noise_rad(self) -> float:
+        """Noise of a reading."""
+        return (self.noise_counts or 10.0) * self.rad_per_count
+
+
+@dataclass
+class Found:
+    """What a bring-up found.
+
+    Attributes:
+        board: the board's name.
+        joints: of each joint.
+        supply_v: of the motors.
+        arm_time_s: time on the board's clock, over all runs.
+        verified: whether the small swing went well with what is stored.
+    """
+
+    board: str
+    joints: list[JointFound]
+    supply_v: float = 12.0
+    arm_time_s: float = 0.0
+    verified: bool = False
+
+    @classmethod
+    def read(cls, path: Path) -> Found:
+        """Read what an earlier run kept.
+
+        Raises:
+            InputError: it is no such file.
+        """
+        try:
+            data = json.loads(read_text(path))
+            names = {each.name for each in fields(JointFound)}
+            if data.pop("version") != CONFIG_VERSION or len(data["joints"]) != JOINTS:
+                raise ValueError("it is of another version")
+            joints = [JointFound(**{k: v for k, v in each.items() if k in names}) for each in data.pop("joints")]
+            return cls(joints=joints, **data)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(
+                f"{path}: not what a bring-up kept ({error}): remove it, or name another folder with -o"
+            ) from None
+
+    def write(self, path: Path) -> None:
+        """Keep it."""
+        write_text(path, json.dumps({"version": CONFIG_VERSION, **asdict(self)}, indent=1) + "\n")
+
+    def configuration(self, most_current_a: float, reaction: Reaction, *, gains: bool) -> Configuration:
+        """Return the configuration of what is known; without ``gains`` joints are not controlled and nothing is watched."""
+        config = lab_configuration()
+        supply = self.supply_v
+        config["supply_nominal_mv"] = round(1e3 * supply)
+        config["supply_min_mv"], config["supply_max_mv"] = round(800 * supply), round(1200 * supply)
+        config["silence_reaction"] = reaction
+        for joint, found in zip(config["joint"], self.joints, strict=True):
+            _put_pot(joint, found)
+            joint["motor_direction"] = found.motor_direction or 1
+            joint["current_limit_ma"] = round(1e3 * most_current_a)
+            if gains and found.motor is not None:
+                _put_motor(joint, found, found.motor, supply, most_current_a)
+            else:
+                _put_free(joint, found)
+        return config
+
+
+def _put_pot(joint: Configuration, found: JointFound) -> None:
+    pot = joint["pot"]
+    counts, angles, direction = found.pot_table()
+    pot["node_count"], pot["direction"] = len(counts), direction
+    pot["counts"] = counts + [0] * (POT_NODES - len(counts))
+    pot["angle_rad"] = angles + [0.0] * (POT_NODES - len(angles))
+    # A joint without a table may have an open input: it shall not keep the others from being driven.
+    pot["short_counts"], pot["open_counts"] = (
+        (0, 65535)
+        if found.range_counts is None
+        else (
+            max(1, min(1000, counts[0] // 2)),
+            min(65000, (counts[-1] + 65535) // 2 + 1),
+        )
+    )
+    ends = sorted((direction * angles[0], direction * angles[-1]))
+    joint["soft_min_rad"], joint["soft_max_rad"] = ends[0] + _MARGIN_RAD, ends[1] - _MARGIN_RAD
+    pot["jump_rad"] = max(0.02, 12 * found.noise_rad)
+
+
+def _put_motor(
+    joint: Configuration, found: JointFound, motor: MotorFigures, supply_v: float, most_current_a: float
+) -> None:
+    """Put gains, limits and the motor's numbers."""
+    bandwidth = quiet_bandwidth(motor, supply_v, found.noise_rad)
+    joint["gains"] = np.array(tuple(tuned_gains(motor, supply_v, bandwidth)), GAINS)
+    joint["motor"]["resistance_ohm"], joint["motor"]["constant_v_s"] = motor.resistance_ohm, motor.constant_v_s
+    joint["motor"]["apart_rad"] = max(0.03, 10 * found.noise_rad + 1.5 * (found.backlash_rad or 0.0))
+    speed, acceleration = motion_limits(motor, supply_v, found.gravity_n_m or 0.0)
+    speed = min(speed, 0.9e3 * float(joint["pot"]["jump_rad"]))
+    for name, value in {
+        "speed_limit_rad_s": speed,
+        "acceleration_rad_s2": acceleration,
+        "deceleration_rad_s2": acceleration,
+        "jerk_rad_s3": 100 * acceleration,
+        "duty_limit": 1.0,
+        "stall_duty": 0.9,
+    }.items():
+        joint[name] = value
+    joint["current_limit_ma"] = round(1e3 * min(most_current_a, 0.95 * supply_v / motor.resistance_ohm))
+
+
+def _put_free(joint: Configuration, found: JointFound) -> None:
+    """Put gains of zero, and let nothing be watched that needs to know the motor."""
+    joint["gains"] = np.array((0, 0, 0, 0, 0, 0, 0.005, 20), GAINS)
+    joint["motor"]["resistance_ohm"] = 0.0
+    for name, value in {
+        "duty_limit": 1.0,
+        "stall_duty": 1.0,
+        "following_rad": 13.0,
+        "gravity_slew_per_s": 1000.0,
+    }.items():
+        joint[name] = value
+    joint["pot"]["frozen_rad"] = joint["pot"]["inverted_rad"] = 1.0
+
+
+def put_gentle(joint: Configuration, found: JointFound) -> None:
+    """Put gains that move any joint a little: full duty at 30 degrees."""
+    joint["gains"] = np.array((2.0, 2.0, 0.0, 0.0, 0.0, 0.5 * (found.breakaway_duty or 0.0), 0.005, 20.0), GAINS)
+    joint["acceleration_rad_s2"], joint["jerk_rad_s3"] = 30.0, 3000.0
+
+
+# ---- the page ----
+
+_NUMBERS: tuple[tuple[str, str, float, str], ...] = (
+    ("noise_counts", "noise, counts", 1, ".1f"),
+    ("motor_direction", "motor direction", 1, ".0f"),
+    ("breakaway_duty", "moves from duty, %", 100, ".1f"),
+    ("resistance_ohm", "R, ohm", 1, ".2f"),
+    ("constant_v_s", "K, V s/rad", 1, ".3f"),
+    ("inertia_kg_m2", "inertia, g m&sup2;", 1e3, ".1f"),
+    ("dry_n_m", "dry friction, N m", 1, ".3f"),
+    ("backlash_rad", "backlash, mrad", 1e3, ".1f"),
+    ("gravity_n_m", "gravity at most, N m", 1, ".2f"),
+    ("following_rms_rad", "follows to, mrad RMS", 1e3, ".2f"),
+)
+
+
+def report(found: Found, gains: Array) -> str:
+    """Return the page of figures.
+
+    Raises:
+        InputError: matplotlib is not installed.
+    """
+    rows = []
+    for j, each in enumerate(found.joints):
+        values = [(getattr(each, name), scale, form) for name, _, scale, form in _NUMBERS]
+        rows.append([f"joint {j + 1}", *("" if v is None else format(v * s, f) for v, s, f in values)])
+    gain_rows = [[f"joint {j + 1}", *(f"{value:.4g}" for value in row)] for j, row in enumerate(gains)]
+    problems = [[f"joint {j + 1}", text(line)] for j, each in enumerate(found.joints) for line in each.problems]
+    sections = {
+        "joints": ("Joints", table(["", *(title for _, title, _, _ in _NUMBERS)], rows, "numbers")),
+        "gains": ("Gains", table(["", *GAIN_RANGES], gain_rows, "numbers")),
+        "figures": ("Figures", _figures(found)),
+    }
+    if problems:
+        sections["problems"] = ("Problems on the way", table(["", "named"], problems, "prose"))
+    sub = f"board {found.board}, {found.supply_v:g} V, {found.arm_time_s:.0f} s of the board's time"
+    return html_page("Bring-up", "Bring-up of the arm's board", sub, sections)
+
+
+def _figures(found: Found) -> str:
+    """Return a row of plots for every joint: table, motor voltage of the swing, error of the small swing."""
+    shown = [(j, each) for j, each in enumerate(found.joints) if each.range_counts is not None]
+    if not shown:
+        return "<p>Nothing to show.</p>"
+    with drawing():
+        figure = new_figure(2.1 * len(shown))
+        axes = figure.subplots(len(shown), 3, squeeze=False)
+        for (j, each), (left, middle, right) in zip(shown, axes, strict=True):
+            counts, angles, direction = each.pot_table()
+            left.plot(counts, np.degrees(direction * np.array(angles)), color=BLUE)
+            marks = np.array(each.marks)
+            left.plot(marks[:, 0], np.degrees(marks[:, 1]), "o", color=ORANGE, ms=3)
+            left.set(title=f"joint {j + 1}: potentiometer", xlabel="counts", ylabel="deg")
+            lines = each.traces
+            if "swing_t_s" in lines:
+                middle.plot(lines["swing_t_s"], lines["swing_voltage_v"], color=MUTED, lw=1.5, label="put out")
+                middle.plot(lines["swing_t_s"], lines["swing_predicted_v"], color=BLUE, lw=0.8, label="R i + K w")
+                middle.legend(loc="upper right", fontsize=7)
+            middle.set(title="motor voltage of the swing", xlabel="s", ylabel="V")
+            if "verify_t_s" in lines:
+                right.plot(lines["verify_t_s"], 1e3 * np.array(lines["verify_error_rad"]), color=BLUE, lw=0.8)
+            right.set(title="error of the small swing, with noise", xlabel="s", ylabel="mrad")
+        return picture(png(figure), "For every joint: potentiometer table, motor voltage, following error")
+
+
+def found_json(found: Found) -> dict[str, Any]:
+    """Return what was found as JSON has it, without the figures' lines."""
+    record = asdict(found)
+    for each in record["joints"]:
+        del each["traces"]
+    return record
