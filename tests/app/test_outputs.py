@@ -34,6 +34,7 @@ FOLDER_WRITERS = {
     "dense evaluate": (".",),
     "check": ("poses.csv",),
     "arm report": (".",),
+    "board bringup": ("--board", "serial:/dev/none"),
     "record": ("usb:97,98",),
     "demo": ("--arm", "no such arm"),
     "handeye": ("--robot", "poses.csv", "--eye", "in-hand", "--seen", "poses.csv"),

@@ -18,6 +18,7 @@ from armsight.errors import CalibrationError, InputError
 from armsight.geometry.check import checked
 from armsight.geometry.rotation import log_so3
 from armsight.loop.estimators import Delay, KalmanEstimator, Outcome, PoseMeasurement, Prior
+from armsight.loop.estimators.clock import SYSTEMATIC_S
 from armsight.robot.arm import Arm
 
 #: Lags that are tried, s: stamps may be early by a clock's offset, and late by a slow camera's buffers.
@@ -28,8 +29,6 @@ MIN_MEASUREMENTS = 20
 FIRST_SIGMA_S, PASSES = 5e-3, 2
 #: A delay worse known than this, s, is none: at 0.5 m/s it is 1 mm.
 MAX_SIGMA_S = 2e-3
-#: What the sides of the backlash, which the filter sees change a little late, leave of error; found on simulated sweeps, s.
-SYSTEMATIC_S = 1.5e-4
 #: The median deviation of normal samples, in sigma.
 _MEDIAN_OF_NORMAL = 0.6745
 #: A stamp that is further off than this, in sigma, is no jitter but a hiccup.

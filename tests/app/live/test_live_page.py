@@ -236,6 +236,9 @@ def test_the_arm_is_held_when_the_page_that_commands_is_closed(session, server, 
     until(lambda: any("stopped by a person: emergency stop" in event.text for event in session.events()))
     click(other, "a-clear")
     until(lambda: not state(other, "arm.stopped"))
+    if until(lambda: not session.arm.busy) and session.arm.state.away:  # it was moving when its motors were released
+        click(other, "a-start")
+        until(lambda: not session.arm.state.away and not session.arm.busy)
     click(other, "a-run-open")
     until(lambda: "hand-eye: pose" in (state(other, "arm.running") or ""))
     with pytest.raises(InputError, match="the arm moves"):

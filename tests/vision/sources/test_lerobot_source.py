@@ -1,6 +1,7 @@
 """LeRobot datasets of format 2 and 3: two cameras as shots, the joints, and what is missing in one line."""
 
 import json
+import os
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ FPS, KEYS = 10, ("observation.images.left", "observation.images.right")
 def video(path, levels):
     """An MP4 whose frames have one grey level each."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg reads it once, at its first use in the process
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (64, 48))
     for level in levels:
         writer.write(np.full((48, 64, 3), level, np.uint8))

@@ -249,6 +249,7 @@ def bringup(
     from armsight.app.board.bringup import Bringup, found_json
     from armsight.app.report.page import writable_folder
     from armsight.app.report.plotting import require_matplotlib
+    from armsight.files import check_folder
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.emulated import EmulatedLink
     from armsight.robot.boards.opening import SERIAL, emulator_name, open_board, open_emulator
@@ -259,9 +260,10 @@ def bringup(
         click.echo(line, err=True)
 
     require_matplotlib()
+    check_folder(folder, problem="nothing of a bring-up can be written here")
     if name.startswith(SERIAL):
-        person: Operator = _TerminalPerson(echo)
         board = open_board(name, baud=BAUD if baud is None else baud)
+        person: Operator = _TerminalPerson(echo)
     else:
         plant, _ = drawn_workshop(seed)
         person = WorkshopPerson(plant, seed=seed, say=echo)

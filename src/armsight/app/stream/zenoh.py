@@ -4,7 +4,7 @@
 port 7447); ``ROS_DOMAIN_ID`` is the domain. Messages are those of ``ros.py``, and the data themselves as JSON in
 std_msgs/String.
 
-Keys, tokens and attachments as docs/design.md of rmw_zenoh defines them: a message is put to
+Keys, tokens and attachments as rmw_zenoh's design page defines them: a message is put to
 ``DOMAIN/TOPIC/TYPE/HASH`` as CDR, with its sequence number, time stamp and the publisher's identity; tokens
 ``@ros2_lv/...`` make node and topics visible to ``ros2 topic list``.
 """

@@ -24,8 +24,8 @@ from armsight.loop.estimators.estimator import ClockEffect, Innovation, Outcome
 RATE = 2e-4
 #: Random walks of the offset, s per root of a second, and of the rate, 1 per root of a second.
 _WALK, _RATE_WALK = 3e-5, 3e-6
-#: What the model of the backlash lacks looks like an offset of up to this, s: found on simulated sweeps.
-SYSTEMATIC_S = 1.5e-4
+#: What the model of the backlash lacks looks like an offset of so much, s (standard deviation): found on simulated motions.
+SYSTEMATIC_S = 3e-4
 #: An offset of more than so many seconds is corrected from then on, where chi-square of offset and rate is larger than the
 #: limit for so long, s; where the offset changes by other than its rate, where it is beyond so many sigmas.
 _LEAST_S, _CERTAIN, _STAYS_S, _CERTAIN_SIGMAS = 5e-4, 30.0, 0.5, 3.0
@@ -34,8 +34,9 @@ _SAID = 14.0
 #: A measurement that an offset leaves less likely than this says nothing of it: something else is wrong.
 _GATE = float(chdtri(6, 1e-3))
 #: Residuals are compared over about this time, s. Beyond so many sigmas the offset changes by other than its rate: it is
-#: taken to walk by that much from then on, less and less with this time constant, s.
-_WINDOW_S, _SURPRISING, _CALM_S = 2.0, 3.0, 10.0
+#: taken to walk by that much from then on, less and less with this time constant, s. Residuals that determine an offset no
+#: better than so, s, do not say that it changed: the arm hardly moves, and what the model lacks would be taken for it.
+_WINDOW_S, _SURPRISING, _CALM_S, _SEEN_S = 2.0, 3.0, 10.0, 1e-3
 #: Innovations whose mean square exceeds their covariance widen it: mean over about this time, s.
 _EXCESS_S = 4.0
 
@@ -104,13 +105,13 @@ class ClockFollower:
 
     @property
     def _chi_square(self) -> float:
-        return float(self._b @ np.linalg.solve(self._M, self._b))
+        return float(self._b @ np.linalg.solve(self._M + np.diag([SYSTEMATIC_S**2, 0.0]), self._b))
 
     def _corrects(self) -> bool:
         """Return whether stamps are corrected."""
         if self.since_s is None:
             certain = self._chi_square > _CERTAIN
-            certain |= self._unrest > 0.0 and self._b[0] ** 2 > _CERTAIN_SIGMAS**2 * self._M[0, 0]
+            certain |= self._unrest > 0.0 and self._b[0] ** 2 > _CERTAIN_SIGMAS**2 * (self._M[0, 0] + SYSTEMATIC_S**2)
             certain &= abs(self._b[0]) > _LEAST_S
             self._certain_s = min(self._certain_s, self._t_s) if certain else np.inf
             self.since_s = self._t_s if self._t_s - self._certain_s >= _STAYS_S else None
@@ -143,7 +144,7 @@ class ClockFollower:
         if self.since_s is None and float(left @ white @ left) > _GATE * max(self._excess, 1.0):
             return
         self._b, self._M = self._b + M @ (along.T @ r), (M + M.T) / 2
-        if self._information <= 0.0:
+        if self._information * _SEEN_S**2 < 1.0:
             return
         surprise = self._score / self._information
         if surprise**2 > _SURPRISING**2 * (1.0 / self._information + self._M[0, 0]):

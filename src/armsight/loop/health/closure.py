@@ -319,12 +319,19 @@ class ClosureWatch:
         effect = _changes(self._parts, self._H[-1])[:, finest.suspect.columns]
         begin_s = (self._t[finest.begin - 1] + self._t[finest.begin]) / 2
         change = Change(finest.suspect, begin_s, finest.size, finest.cov, finest.chi_square, effect, alike)
-        shift = change.size if change.motion is None else change.motion.motion[:3]
+        shift = np.zeros(3) if change.motion is None else change.motion.motion[:3]
+        if change.motion is None and self._is_within_backlash(finest, found, least):
+            self.change = None if self.change is None or self.change.motion is None else self.change
+            return
         # Once something was reported, what explains it best replaces it, also where it is smaller than is reported first.
-        if self.change is not None or float(np.linalg.norm(shift)) > (
-            _LEAST_RAD if change.motion is None else _LEAST_M
-        ):
+        if self.change is not None or change.motion is None or float(np.linalg.norm(shift)) > _LEAST_M:
             self.change = change
+
+    @staticmethod
+    def _is_within_backlash(finest: _Tested, found: Sequence[_Tested], least: float) -> bool:
+        """Return whether an angle of a joint, or another of its own that explains as much, is too small to report."""
+        same = [each for each in found if each.suspect.joint == finest.suspect.joint and each.above > least]
+        return any(abs(float(each.size[0])) < _LEAST_RAD for each in (finest, *same) if len(each.size) == 1)
 
     def _refined(self, found: _Tested, begins: Array) -> _Tested:
         """Test a suspect at the beginnings between the neighbours of the one that was found for it."""
