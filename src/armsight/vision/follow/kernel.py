@@ -27,7 +27,8 @@ from armsight.geometry.matrix import (
 from armsight.kernels import kernel, kernel_types
 from armsight.vision.camera import distort
 from armsight.vision.discs.bias import disc_image
-from armsight.vision.markers.disc.fit import FitBuffers, common_noise, factor, fit, shape_of, solve, widen
+from armsight.vision.markers.disc.common import common, correct
+from armsight.vision.markers.disc.fit import PARAMETERS, FitBuffers, factor, fit, shape_of, solve
 from armsight.vision.markers.disc.search import Room, outline
 from armsight.vision.posefit import moved
 
@@ -466,15 +467,16 @@ def look(
                 code = OTHER_SIZE
         found.codes[m, side] = code
         if code == 0:
-            found.uv[m, side, 0], found.uv[m, side, 1] = theta[0], theta[1]
             found.contrast[m, side] = abs(theta[6])
-            work.rims[count, :] = work.rim
+            work.discs[count, :] = work.shown
             count += 1
-    times, common = common_noise(count, work.rims)
+    shared = np.empty(4)
+    common(image, count, work, shared)
     count = 0
     for m in range(len(scene.radii)):
         if found.codes[m, side] == SEEN:
-            widen(found.cov_uv[m, side], work.rims[count], times, common)
+            correct(image, noise, work.discs[count], shared, found.cov_uv[m, side], work)
+            found.uv[m, side] = work.discs[count, PARAMETERS : PARAMETERS + 2]
             count += 1
 
 

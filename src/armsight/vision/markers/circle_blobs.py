@@ -19,12 +19,13 @@ from scipy.spatial import KDTree
 
 from armsight.data import Array, Record
 from armsight.kernels import kernel
+from armsight.vision.markers.disc.common import common, correct
 from armsight.vision.markers.disc.fit import (
+    PARAMETERS,
     REASONS,
     SURROUND,
     UNKNOWNS,
     FitBuffers,
-    common_noise,
     factor,
     fit,
     gather,
@@ -32,7 +33,6 @@ from armsight.vision.markers.disc.fit import (
     normal_equations,
     of_centre,
     shape_of,
-    widen,
 )
 from armsight.vision.markers.disc.fit import workspace as workspace_of_fits
 from armsight.vision.markers.disc.search import Grey, Room, Words64, noise_of, search, workspace
@@ -271,13 +271,16 @@ def _fit_each(image: Grey, theta: Array, cov: Array, shape: Array, codes: NDArra
         if codes[i] == 0 or codes[i] in HARMLESS:
             shape_of(theta[i], shape[i])
         if codes[i] == 0:
-            work.rims[count, :] = work.rim
+            work.discs[count, :] = work.shown
             count += 1
-    times, common = common_noise(count, work.rims)
+    shared = np.empty(4)
+    common(image, count, work, shared)
     count = 0
     for i in range(len(theta)):
         if codes[i] == 0:
-            widen(cov[i], work.rims[count], times, common)
+            correct(image, noise, work.discs[count], shared, cov[i], work)
+            for a in range(UNKNOWNS):
+                theta[i, a] = work.discs[count, PARAMETERS + a]
             count += 1
 
 

@@ -10,9 +10,9 @@ gradient. There are ten unknowns: c, M, s, C, B, g. A surround that is uneven it
 uneven light slopes disc and surround in proportion to their levels, veiling glare slopes both alike (k = 1).
 
 The method is Gauss-Newton: a first step on a third of the rows, then all rows until the centre converges. Where the
-surround is textured, its own variance reduces the weight of its pixels; where the disc has a gradient (a score test),
-the kinds of gradient are averaged by their likelihood. The residuals of the fit reject look-alikes: those of the rim,
-those of the inside, and gradients that the model lacks.
+surround is textured, its own variance reduces the weight of its pixels. The fit takes the disc as flat and reports what a
+gradient of its own would change (a score test); :mod:`~armsight.vision.markers.disc.common` compares the discs of an
+image. The residuals reject look-alikes: those of the rim, those of the inside, and gradients that the model lacks.
 
 The file follows the fit: the work space, the model and its derivatives, the normal equations, the choice of pixels
 (those near the rim determine the position; of the rows that cross flat areas, which determine only levels and gradient,
@@ -38,6 +38,8 @@ MOST_PIXELS = 3072
 MOST_DISCS = 16384
 #: Unknowns: c (2), M (3), s, C, B, g (2).
 UNKNOWNS = 10
+#: What a fit shows of noise and light, and where its parameters are in it.
+SHOWN, PARAMETERS = 23, 13
 #: Floats in a cache line.
 _LINE = 16
 
@@ -81,8 +83,9 @@ class FitBuffers(NamedTuple):
         start: (10,) parameters at the start.
         products: (2, 13) of a gradient inside.
         sums: (12, 12) products of the rows of J.
-        rim: (3,) what the rim of the last fit shows of the noise, see :func:`rim_noise`.
-        rims: (MOST_DISCS, 3) the same for each disc of an image.
+        shown: (SHOWN,) what the last fit shows of noise and light: its rim (3, see :func:`rim_noise`), a gradient inside
+            (9, see :func:`slope_inside`), one outside (chi-square; -1 where the surround is textured), its parameters (10).
+        discs: (MOST_DISCS, SHOWN) the same for each disc of an image.
     """
 
     px: Floats
@@ -104,8 +107,8 @@ class FitBuffers(NamedTuple):
     start: Array
     products: Array
     sums: Array
-    rim: Array
-    rims: Array
+    shown: Array
+    discs: Array
 
 
 def _aligned(rows: int, columns: int) -> Floats:
@@ -124,7 +127,7 @@ def workspace() -> FitBuffers:
         px, py, level, J, J[n], left, inside,
         np.empty((n, n)), np.empty(n), np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n, np.float32),
         np.empty((4, 5)), np.empty((2, 16)), np.empty(n), np.empty(n), np.empty((2, 13)), np.empty((n + 2, n + 2)),
-        np.empty(3), np.empty((MOST_DISCS, 3)),
+        np.empty(SHOWN), np.empty((MOST_DISCS, SHOWN)),
     )  # fmt: skip
 
 
@@ -424,15 +427,11 @@ def _odd_harmonics() -> Array:
 
 
 _ODD = _odd_harmonics()
-#: Median of chi-square of six degrees, over six.
-_CHI6_MEDIAN = 0.8914
-#: From so many discs on, what their rims have in common is the image's noise.
-_LEAST_RIMS = 3
 
 
 @kernel
 def rim_noise(variance: float, work: FitBuffers) -> tuple[float, float, int]:
-    """Compare the deviations of the rim's sectors with white noise, and fill ``work.rim``.
+    """Compare the deviations of the rim's sectors with white noise, and fill the first of ``work.shown``.
 
     The centre moves with the first harmonic of what noise does along the rim. The odd harmonics after it (3, 5, 7) show
     how much of that there is, where noise is correlated between neighbours: by a demosaic, a filter, a compression. The
@@ -440,7 +439,7 @@ def rim_noise(variance: float, work: FitBuffers) -> tuple[float, float, int]:
 
     Args:
         variance: of the noise, as the residuals have it.
-        work: buffers; ``sectors`` is filled by :func:`rim`. ``rim`` is filled: power of the odd harmonics over that of
+        work: buffers; ``sectors`` is filled by :func:`rim`. ``shown`` is filled: power of the odd harmonics over that of
             white noise; mean square of the sectors' deviations beyond white noise, px^2; what chance makes of that.
 
     Returns:
@@ -460,38 +459,8 @@ def rim_noise(variance: float, work: FitBuffers) -> tuple[float, float, int]:
             if sectors[1, k] > 0.0:
                 total += _ODD[h, k] * sectors[0, k]
         power += total * total
-    work.rim[0], work.rim[1], work.rim[2] = power / white, off / max(count, 1), np.sqrt(chance) / max(count, 1)
+    work.shown[0], work.shown[1], work.shown[2] = power / white, off / max(count, 1), np.sqrt(chance) / max(count, 1)
     return off, chance, count
-
-
-@kernel
-def common_noise(n: int, rims: Array) -> tuple[float, float]:
-    """Return what the rims (N, 3) of an image's first n discs have in common, see :func:`rim_noise`.
-
-    Returns:
-        The factor of the variance of centres by correlated noise, one at least; the mean square of the sectors' deviations
-        beyond white noise, px^2. Both are medians, so that a few discs that are none do not count.
-    """
-    if n < _LEAST_RIMS:
-        return 1.0, 0.0
-    power, off = np.sort(rims[:n, 0].copy()), np.sort(rims[:n, 1].copy())
-    factor = 0.5 * (power[(n - 1) // 2] + power[n // 2]) / _CHI6_MEDIAN
-    return max(factor, 1.0), max(0.5 * (off[(n - 1) // 2] + off[n // 2]), 0.0)
-
-
-@kernel
-def widen(cov: Array, rim_of_disc: Array, factor: float, common_px2: float) -> None:
-    """Enlarge a centre's covariance (2, 2) by the image's noise, and by how far its own rim (3,) deviates beyond that.
-
-    A rim that deviates significantly, because a little of it is covered perhaps, may have shifted the centre as much.
-    """
-    for a in range(2):
-        for b in range(2):
-            cov[a, b] *= factor
-    own = rim_of_disc[1] - common_px2
-    if own > _RIM_CHANCE * rim_of_disc[2] * factor:
-        cov[0, 0] += own
-        cov[1, 1] += own
 
 
 @kernel
@@ -561,10 +530,27 @@ def _inside_products(n: int, cx: np.float32, cy: np.float32, work: FitBuffers, o
     out[0, 11], out[0, 12], out[1, 11], out[1, 12] = uu, uv, uv, vv
 
 
+#: Least grey level of a disc for relative gradients.
+_LEAST_LEVEL = 8.0
+
+
 @kernel
-def slope_inside(n: int, theta: Array, x0: float, y0: float, work: FitBuffers) -> float:
-    """Return by how much a gradient inside the disc would lower chi-square, in units of the noise's variance."""
-    g, L, scale, x, out = work.g, work.L, work.scale, work.x, work.products
+def slope_inside(n: int, theta: Array, x0: float, y0: float, variance: float, work: FitBuffers) -> None:
+    """Estimate a gradient inside the disc beside the ten unknowns, and what it would do to the centre.
+
+    One step of the twelve unknowns, in which the model is nearly linear (Schur complement of the two that are new).
+    ``work.shown`` is filled from 3 on: the gradient over the disc's level, 1/px (2); its information, px^2, as
+    elements 00, 01, 11 (3); by how much the fitted centre is off for each of it, px^2 (2, 2). Without information: zeros.
+
+    Args:
+        n: pixels.
+        theta: (10,) the converged parameters.
+        x0: the pixels' origin.
+        y0: see x0.
+        variance: of the noise, as the residuals have it.
+        work: the pixels, linearised, with the last step in ``work.x``.
+    """
+    g, L, scale, x, out, shown = work.g, work.L, work.scale, work.x, work.products, work.shown
     _inside_products(n, F(theta[0] - x0), F(theta[1] - y0), work, out)
     s0, s1 = out[0, 10], out[1, 10]
     k00, k01, k11 = out[0, 11], out[0, 12], out[1, 12]
@@ -572,19 +558,25 @@ def slope_inside(n: int, theta: Array, x0: float, y0: float, work: FitBuffers) -
     for a in range(UNKNOWNS):
         s0 -= out[0, a] * x[a]
         s1 -= out[1, a] * x[a]
+    level = max(theta[6] + theta[7], _LEAST_LEVEL)
     g[:] = out[0, :UNKNOWNS]
     solve(L, scale, g, x)
+    shown[8], shown[9] = level * x[0], level * x[1]
     for a in range(UNKNOWNS):
         k00 -= out[0, a] * x[a]
         k01 -= out[1, a] * x[a]
     g[:] = out[1, :UNKNOWNS]
     solve(L, scale, g, x)
+    shown[10], shown[11] = level * x[0], level * x[1]
     for a in range(UNKNOWNS):
         k11 -= out[1, a] * x[a]
     det = k00 * k11 - k01 * k01
     if not det > 0.0:
-        return 0.0
-    return float((k11 * s0 * s0 - 2 * k01 * s0 * s1 + k00 * s1 * s1) / det)
+        shown[3:12] = 0.0
+        return
+    shown[3], shown[4] = (k11 * s0 - k01 * s1) / (det * level), (k00 * s1 - k01 * s0) / (det * level)
+    information = level * level / variance
+    shown[5], shown[6], shown[7] = k00 * information, k01 * information, k11 * information
 
 
 @kernel
@@ -604,10 +596,6 @@ _SMALL_STEP_PX, _SMALL_STEP_SIGMAS = 0.02, 1.0
 _BLUR_LEAST_PX = 0.2
 #: A step of the centre after which the residuals away from the rim give the surround's variance, px.
 _WEIGH_PX = 0.3
-#: Chi-square of two degrees from which a disc or its surround may have a gradient: chance exceeds it in 1% and 10%.
-_SLOPE_INSIDE, _SLOPE_OUTSIDE = 9.2, 4.6
-#: How likely each kind of gradient is where there is one (LIGHT, SURROUND, GLARE).
-_KINDS = (0.6, 0.3, 0.1)
 
 #: Why a candidate is not a disc: code -> text. 0 is a disc.
 REASONS = {
@@ -632,7 +620,7 @@ _LEAST_RATIO = 0.22
 #: the blur for each share of the contrast that residuals have beyond noise (a textured surround moves the rim).
 _RIM_PX, _RIM_SHARE, _RIM_TEXTURE = 0.05, 0.005, 1.5
 #: Standard deviations of that beyond which it is significant.
-_RIM_CHANCE = 4.0
+RIM_CHANCE = 4.0
 #: Largest residuals beyond the image's noise, as a share of the contrast.
 _MOST_RESIDUAL = 0.1
 #: A centre that a textured surround makes less certain than this is rejected, px.
@@ -677,7 +665,7 @@ def _step(
 
 
 @kernel
-def _minimise(
+def minimise(
     n: int, theta: Array, x0: float, y0: float, slope: int, noise_sigma: float, weigh: bool, texture: float,
     work: FitBuffers,
 ) -> tuple[float, float]:  # fmt: skip
@@ -712,50 +700,6 @@ def _minimise(
 
 
 @kernel
-def _average(
-    n: int, theta: Array, x0: float, y0: float, noise_sigma: float, square: float, texture: float, cov: Array,
-    work: FitBuffers,
-) -> None:  # fmt: skip
-    """Replace centre and covariance by the mean over the kinds of gradient, weighted by likelihood (model averaging).
-
-    The result of SURROUND, its sum of squares included, is the input. A kind that is not distinguishable from another
-    moves the centre by up to its own standard deviation: the spread between the kinds is part of the covariance.
-    """
-    trial, start = work.trial, work.start
-    start[:] = theta
-    results, block, least = np.zeros((3, 7)), np.empty((2, 2)), square
-    results[SURROUND, 0], results[SURROUND, 1], results[SURROUND, 2] = square, theta[0], theta[1]
-    results[SURROUND, 3], results[SURROUND, 4], results[SURROUND, 5] = cov[0, 0], cov[0, 1], cov[1, 1]
-    for kind in (LIGHT, GLARE):
-        trial[:] = start
-        square, _ = _minimise(n, trial, x0, y0, kind, noise_sigma, False, texture, work)
-        results[kind, 0] = np.inf
-        if square >= 0.0:
-            of_centre(work, block)
-            variance = square / (n - UNKNOWNS)
-            results[kind, 0], results[kind, 1], results[kind, 2] = square, trial[0], trial[1]
-            results[kind, 3], results[kind, 4], results[kind, 5] = block[0, 0], block[0, 1], block[1, 1]
-            results[kind, 3:6] *= variance
-            least = min(least, square)
-    total = 0.0
-    for kind in range(3):
-        results[kind, 6] = _KINDS[kind] * np.exp(-0.5 * (results[kind, 0] - least) * (n - UNKNOWNS) / least)
-        total += results[kind, 6]
-    theta[0], theta[1] = 0.0, 0.0
-    for kind in range(3):
-        theta[0] += results[kind, 6] / total * results[kind, 1]
-        theta[1] += results[kind, 6] / total * results[kind, 2]
-    cov[:, :] = 0.0
-    for kind in range(3):
-        w, u, v = results[kind, 6] / total, results[kind, 1] - theta[0], results[kind, 2] - theta[1]
-        if w > 0.0:
-            cov[0, 0] += w * (results[kind, 3] + u * u)
-            cov[0, 1] += w * (results[kind, 4] + u * v)
-            cov[1, 1] += w * (results[kind, 5] + v * v)
-    cov[1, 0] = cov[0, 1]
-
-
-@kernel
 def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, work: FitBuffers) -> int:
     """Fit one disc.
 
@@ -765,7 +709,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
         theta: (10,) start: centre (raw px), M (1/px^2), blur (px), contrast, base, gradient (1/px); replaced by the
             result.
         cov: (2, 2) covariance of the centre, px^2; filled.
-        work: what :func:`workspace` returns.
+        work: what :func:`workspace` returns; ``work.shown`` is filled.
 
     Returns:
         0, or the reason why it is not a disc (REASONS).
@@ -779,7 +723,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     x0, y0 = np.rint(theta[0]), np.rint(theta[1])
     if _step(sample, theta, x0, y0, SURROUND, 0.0, work)[0] < 0.0:
         return 2
-    square, texture = _minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, 0.0, work)
+    square, texture = minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, 0.0, work)
     if square < 0.0:
         return 2
     # Clipped pixels have no noise and do not count for it.
@@ -800,16 +744,15 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     rim(n, theta, x0, y0, work, sectors)
     off, chance, count = rim_noise(variance, work)
     allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor) + _RIM_TEXTURE * theta[5] * excess
-    if off > count * allowed * allowed + _RIM_CHANCE * np.sqrt(chance):
+    if off > count * allowed * allowed + RIM_CHANCE * np.sqrt(chance):
         return 5
     spread(n, work, sectors[0])
     v_in = sectors[0, 0] * (1.0 + max(-texture, 0.0))
     if sectors[0, 2] > 10.0 and np.sqrt(max(v_in - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
         return 8
-    uneven = texture <= 0.0 and (
-        slope_inside(n, theta, x0, y0, work) > _SLOPE_INSIDE * variance
-        or slope_outside(theta, work) > _SLOPE_OUTSIDE * variance
-    )
+    slope_inside(n, theta, x0, y0, variance, work)
+    work.shown[12] = slope_outside(theta, work) / variance if texture <= 0.0 else -1.0
+    work.shown[PARAMETERS:] = theta
     of_centre(work, cov)
     if texture > 0.0:
         variance *= texture_factor(n, theta[5], texture, work)
@@ -818,8 +761,6 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     for a in range(2):
         for b in range(2):
             cov[a, b] *= variance
-    if uneven:
-        _average(n, theta, x0, y0, noise_sigma, square, texture, cov, work)
     return 0
 
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.kernels import kernel
-from armsight.vision.markers.disc.fit import FOUND_TWICE, FitBuffers, common_noise, factor, fit, shape_of, solve, widen
+from armsight.vision.markers.disc.common import common, correct
+from armsight.vision.markers.disc.fit import FOUND_TWICE, PARAMETERS, UNKNOWNS, FitBuffers, factor, fit, shape_of, solve
 
 #: Longest half chord, px: half of the largest disc, blur and all.
 _REACH = 44
@@ -426,9 +427,12 @@ def find(
             codes[good] = FOUND_TWICE
         else:
             shape_of(starts[good], shape[good])
-            work.rims[good, :] = work.rim
+            work.discs[good, :] = work.shown
             good += 1
-    times, common = common_noise(good, work.rims)
+    shared = np.empty(4)
+    common(image, good, work, shared)
     for i in range(good):
-        widen(cov[i], work.rims[i], times, common)
+        correct(image, noise, work.discs[i], shared, cov[i], work)
+        for a in range(UNKNOWNS):
+            starts[i, a] = work.discs[i, PARAMETERS + a]
     return good, n

@@ -1,0 +1,190 @@
+"""What the discs of one image have in common, and what only they show together: correlated noise and vignetting.
+
+In: what each disc's fit shows (``fit.FitBuffers.shown``). Out: corrected centres and their covariances.
+
+Noise that is correlated between neighbouring pixels moves the first harmonic of a rim, the centre, as it moves the higher
+odd ones, which no ellipse has: their power, over all discs, is the factor of the variances.
+
+A lens darkens its image with the square of the distance from the middle (cos^4, and vignetting): at x the light has the
+relative gradient a (x - m), in 1/px, with m the image's middle. A disc that is fitted as flat is off by up to 0.01 px then,
+and all discs of a body alike, so that it does not average out. No single disc shows the gradient; all together determine
+the one unknown, a. Behind a tone curve a is another one, and the same for discs of one level.
+
+A disc whose gradient, or whose surround's, is significant beyond that, measured by the noise of the image, is fitted with
+other kinds of gradient, too; they are averaged by their likelihood (model averaging).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array
+from armsight.kernels import kernel
+from armsight.vision.markers.disc.fit import (
+    GLARE,
+    LIGHT,
+    PARAMETERS,
+    RIM_CHANCE,
+    SURROUND,
+    UNKNOWNS,
+    FitBuffers,
+    clipped,
+    gather,
+    minimise,
+    of_centre,
+)
+
+#: Median of chi-square of six degrees, over six.
+_CHI6_MEDIAN = 0.8914
+#: From so many discs on, what they have in common is the image's.
+_LEAST_DISCS = 3
+#: Vignetting as it is to be expected: standard deviation of the light that is missing in the corners.
+_VIGNETTING = 0.3
+#: Chi-square of two degrees from which a disc or its surround may have a gradient: chance exceeds it in 1% and 10%.
+_SLOPE_INSIDE, _SLOPE_OUTSIDE = 9.2, 4.6
+#: How likely each kind of gradient is where there is one (LIGHT, SURROUND, GLARE).
+_KINDS = (0.6, 0.3, 0.1)
+
+
+@kernel
+def common(image: NDArray[np.uint8], n: int, work: FitBuffers, shared: Array) -> None:
+    """Fill what the first n discs of ``work.discs`` have in common.
+
+    Args:
+        image: (H, W) grey.
+        n: number of discs.
+        work: what they show.
+        shared: (4,) filled: factor of the variance of centres by correlated noise, one at least; mean square of the
+            deviations of the rims' sectors beyond white noise, px^2; the vignetting a, 1/px^2; n / 2 times its variance.
+            Medians, so that a few discs that are none do not count. An error of a moves all centres alike: in three of the
+            six degrees of freedom of a pose it counts n times as much as if it were independent, in the others hardly.
+    """
+    discs = work.discs
+    shared[0], shared[1], shared[2], shared[3] = 1.0, 0.0, 0.0, 0.0
+    if n < _LEAST_DISCS:
+        return
+    power, off = np.sort(discs[:n, 0].copy()), np.sort(discs[:n, 1].copy())
+    shared[0] = max(0.5 * (power[(n - 1) // 2] + power[n // 2]) / _CHI6_MEDIAN, 1.0)
+    shared[1] = max(0.5 * (off[(n - 1) // 2] + off[n // 2]), 0.0)
+    slope, weight, total = np.empty(n), np.empty(n), 0.0
+    for i in range(n):
+        u, v, k = _from_middle(image, discs[i], 0), _from_middle(image, discs[i], 1), discs[i, 5:8]
+        weight[i] = (u * u * k[0] + 2 * u * v * k[1] + v * v * k[2]) / shared[0]
+        along = u * (k[0] * discs[i, 3] + k[1] * discs[i, 4]) + v * (k[1] * discs[i, 3] + k[2] * discs[i, 4])
+        slope[i] = along / shared[0] / max(weight[i], 1e-300)
+        total += weight[i]
+    middle, below = 0.0, 0.0
+    for i in np.argsort(slope):
+        below += weight[i]
+        if below >= 0.5 * total:
+            middle = slope[i]
+            break
+    expected = 8.0 * _VIGNETTING / (image.shape[0] ** 2 + image.shape[1] ** 2)
+    information, sum_ = 1.0 / (expected * expected), 0.0
+    for i in range(n):
+        if (slope[i] - middle) ** 2 * weight[i] < _SLOPE_INSIDE:
+            information += weight[i]
+            sum_ += weight[i] * slope[i]
+    shared[2], shared[3] = sum_ / information, 0.5 * n / information
+
+
+@kernel
+def _from_middle(image: NDArray[np.uint8], disc: Array, axis: int) -> float:
+    """Return how far right of the image's middle (axis 0) or below it (axis 1) a disc is, px."""
+    return float(disc[PARAMETERS + axis] - 0.5 * (image.shape[1 - axis] - 1))
+
+
+@kernel
+def correct(
+    image: NDArray[np.uint8], noise_sigma: float, disc: Array, shared: Array, cov: Array, work: FitBuffers
+) -> None:
+    """Correct a disc's centre by what the image's discs have in common, and enlarge its covariance.
+
+    A rim that deviates significantly, because a little of it is covered perhaps, may have shifted the centre as much.
+
+    Args:
+        image: (H, W) grey.
+        noise_sigma: of the image, grey levels.
+        disc: (SHOWN,) what the disc's fit shows; the parameters in it are replaced.
+        shared: (4,) of :func:`common`.
+        cov: (2, 2) covariance of the centre, px^2, of the fit, replaced.
+        work: buffers.
+    """
+    factor, theta = shared[0], disc[PARAMETERS:]
+    u, v = _from_middle(image, disc, 0), _from_middle(image, disc, 1)
+    du, dv = disc[8] * u + disc[10] * v, disc[9] * u + disc[11] * v
+    a, b = disc[3] - shared[2] * u, disc[4] - shared[2] * v
+    own = disc[5] * a * a + 2 * disc[6] * a * b + disc[7] * b * b
+    slopes = disc[12] >= 0.0 and (own > _SLOPE_INSIDE * factor or disc[12] > _SLOPE_OUTSIDE * factor)
+    if not (slopes and _average(image, noise_sigma, theta, shared[2] * du, shared[2] * dv, factor, cov, work)):
+        theta[0] -= shared[2] * du
+        theta[1] -= shared[2] * dv
+        for i in range(2):
+            for j in range(2):
+                cov[i, j] *= factor
+    cov[0, 0] += shared[3] * du * du
+    cov[0, 1] += shared[3] * du * dv
+    cov[1, 0] += shared[3] * du * dv
+    cov[1, 1] += shared[3] * dv * dv
+    off = disc[1] - shared[1]
+    if off > RIM_CHANCE * disc[2] * factor:
+        cov[0, 0] += off
+        cov[1, 1] += off
+
+
+@kernel
+def _average(
+    image: NDArray[np.uint8], noise_sigma: float, theta: Array, shift_u: float, shift_v: float, factor: float, cov: Array,
+    work: FitBuffers,
+) -> bool:  # fmt: skip
+    """Replace centre and covariance by the mean over the kinds of gradient, weighted by likelihood; False: not possible.
+
+    A kind that is not distinguishable from another moves the centre by up to its own standard deviation: the spread between
+    the kinds is part of the covariance. The likelihood is that of noise whose variance is ``factor`` times as large.
+    """
+    trial, start = work.trial, work.start
+    start[:] = theta
+    x0, y0 = np.rint(theta[0]), np.rint(theta[1])
+    n, _ = gather(image, theta, work)
+    if n < 4 * UNKNOWNS:
+        return False
+    results, block, least, texture = np.zeros((3, 7)), np.empty((2, 2)), np.inf, 0.0
+    freedom = float(UNKNOWNS)
+    for kind in (SURROUND, LIGHT, GLARE):
+        trial[:] = start
+        square, weighed = minimise(n, trial, x0, y0, kind, noise_sigma, kind == SURROUND, texture, work)
+        results[kind, 0] = np.inf
+        if square < 0.0:
+            if kind == SURROUND:
+                return False
+            continue
+        if kind == SURROUND:
+            texture, freedom = weighed, float(max(n - clipped(n, work) - UNKNOWNS, UNKNOWNS))
+            start[:] = trial
+        of_centre(work, block)
+        results[kind, 0], results[kind, 1], results[kind, 2] = square, trial[0], trial[1]
+        results[kind, 3], results[kind, 4], results[kind, 5] = block[0, 0], block[0, 1], block[1, 1]
+        results[kind, 3:6] *= factor * square / freedom
+        least = min(least, square)
+    theta[:] = start
+    results[SURROUND, 1] -= shift_u
+    results[SURROUND, 2] -= shift_v
+    total = 0.0
+    for kind in range(3):
+        results[kind, 6] = _KINDS[kind] * np.exp(-0.5 * (results[kind, 0] - least) * freedom / (factor * least))
+        total += results[kind, 6]
+    theta[0], theta[1] = 0.0, 0.0
+    for kind in range(3):
+        if results[kind, 6] > 0.0:
+            theta[0] += results[kind, 6] / total * results[kind, 1]
+            theta[1] += results[kind, 6] / total * results[kind, 2]
+    cov[:, :] = 0.0
+    for kind in range(3):
+        w, u, v = results[kind, 6] / total, results[kind, 1] - theta[0], results[kind, 2] - theta[1]
+        if w > 0.0:
+            cov[0, 0] += w * (results[kind, 3] + u * u)
+            cov[0, 1] += w * (results[kind, 4] + u * v)
+            cov[1, 1] += w * (results[kind, 5] + v * v)
+    cov[1, 0] = cov[0, 1]
+    return True
