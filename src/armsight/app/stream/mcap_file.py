@@ -42,6 +42,7 @@ TOPICS: dict[type, str] = {
 }
 #: A shot that is younger by its own stamp was stamped by a live camera, s.
 _LIVE_S = 10.0
+_WAKES = 64  # data that are written together, where they come fast
 _SCHEMA = json.dumps({"type": "object"}).encode()
 
 
@@ -58,7 +59,7 @@ class McapSink(Sink):
 
     def __init__(self, path: Path, published: Published) -> None:
         require_foxglove("run.mcap", "record")
-        super().__init__()
+        super().__init__(wakes=_WAKES)
         self.path = path
         self._published, self._messages = published, Messages(published)
         try:

@@ -37,6 +37,8 @@ class Sink:
 
     Args:
         limit: how many data may wait.
+        wakes: so many that wait wake the thread; fewer wait for at most ``TICK_S``. A thread that is woken for every datum
+            takes the interpreter from the loop as often.
 
     Attributes:
         taken: how many data were taken.
@@ -45,11 +47,11 @@ class Sink:
         problem: what ended the publishing early; None where nothing did.
     """
 
-    def __init__(self, limit: int = 512) -> None:
+    def __init__(self, limit: int = 512, wakes: int = 1) -> None:
         self.taken = self.dropped = 0
         self.cpu_s = 0.0
         self.problem: str | None = None
-        self._limit = limit
+        self._limit, self._wakes = limit, wakes
         self._queue: deque[Datum] = deque()
         self._changed = threading.Condition()
         self._closing = False
@@ -69,7 +71,8 @@ class Sink:
                 self._queue.popleft()
                 self.dropped += 1
             self._queue.append(datum)
-            self._changed.notify()
+            if len(self._queue) >= self._wakes:
+                self._changed.notify()
 
     def close(self) -> None:
         """Publish what waits, and end the thread; a second call has no effect."""
@@ -84,7 +87,7 @@ class Sink:
         try:
             while True:
                 with self._changed:
-                    if not self._queue and not self._closing:
+                    if len(self._queue) < self._wakes and not self._closing:
                         self._changed.wait(TICK_S)
                     waiting, self._queue = self._queue, deque()
                     closing = self._closing

@@ -185,4 +185,4 @@ REJECTION_TEXTS: Mapping[Rejection, str] = {
 
 def faults_in(bits: int) -> tuple[Fault, ...]:
     """Return the faults of a set of bits, by code; bits that belong to no fault are ignored."""
-    return tuple(fault for fault in Fault if bits >> fault & 1)
+    return tuple(fault for fault in Fault if bits >> fault & 1) if bits else ()

@@ -32,15 +32,41 @@ class Message(Protocol):
     def __getattr__(self, name: str) -> Any: ...  # noqa: ANN401
 
 
-class _Angles(NamedTuple):
-    """A complete message of angles, with the attributes of the dialect's own."""
+class _Frame:
+    """A complete message, with the attributes of the dialect's own."""
 
-    tick: int
-    angle_rad: list[float]
+    def __init__(self, name: str, fields: dict[str, Any]) -> None:
+        self.__dict__ = fields
+        self._name = name
 
     def get_type(self) -> str:
         """Return the message's name."""
-        return "ANGLES"
+        return self._name
+
+
+class _Layout(NamedTuple):
+    """How a kind of message lies in its payload.
+
+    Attributes:
+        name: of the message.
+        extra: what its checksum counts beside its bytes.
+        unpacker: of its payload.
+        fields: each field's name, and its number, or for an array its slice, of what is unpacked.
+    """
+
+    name: str
+    extra: bytes
+    unpacker: struct.Struct
+    fields: tuple[tuple[str, int | slice], ...]
+
+    @classmethod
+    def of(cls, kind: Any) -> _Layout:  # noqa: ANN401 - a class of the generated dialect
+        """Return the layout of a kind of message."""
+        at, fields = 0, list[tuple[str, int | slice]]()
+        for name, length in zip(kind.ordered_fieldnames, kind.lengths, strict=True):
+            fields.append((name, at if length == 1 else slice(at, at + length)))
+            at += length
+        return cls(kind.msgname, bytes([kind.crc_extra]), kind.unpacker, tuple(fields))
 
 
 class Wire:
@@ -56,8 +82,13 @@ class Wire:
     def __init__(self, link: Link) -> None:
         self._link = link
         spoken = dialect()
-        self._mav, self._crc, angles = spoken.MAVLink(link), spoken.x25crc, spoken.MAVLink_angles_message
-        self._kind: tuple[int, bytes, struct.Struct] = (angles.id, bytes([angles.crc_extra]), angles.unpacker)
+        self._mav, self._crc = spoken.MAVLink(link), spoken.x25crc
+        #: Of the kinds that are numbers alone; the parser takes the others, a few in a session.
+        self._layouts = {
+            number: _Layout.of(kind)
+            for number, kind in spoken.mavlink_map.items()
+            if "s" not in kind.unpacker.format and "c" not in kind.unpacker.format
+        }
         self._mav.robust_parsing = True
         self._close = link.close
         self.heard = False
@@ -112,7 +143,7 @@ class Wire:
         while True:
             data = bytes(mav.buf[mav.buf_index :])
             mav.buf, mav.buf_index = bytearray(), 0
-            message = mav.parse_char(data[self._angles(data, found) :])
+            message = mav.parse_char(data[self._frames(data, found) :])
             if message is None:
                 return found
             if message.get_type() == _BAD:
@@ -123,22 +154,28 @@ class Wire:
                 self._count_frame(message.get_seq())
                 found.append(message)
 
-    def _angles(self, data: bytes, found: list[Message]) -> int:
-        """Append the frames of angles at the beginning of the data to ``found``; return where another byte begins."""
-        kind, extra, fields = self._kind
+    def _frames(self, data: bytes, found: list[Message]) -> int:
+        """Append the frames of numbers at the beginning of the data to ``found``; return where another byte begins.
+
+        The parser does the same in ten times as long, and there are more than a thousand a second.
+        """
         at, whole = 0, len(data)
         while whole - at >= _FRAME:
             marker, length, flags, _, number, _, _, low, high = _HEAD.unpack_from(data, at)
             end = at + _HEAD.size + length
-            if marker != _MARKERS[0] or flags or low | high << 16 != kind or end + _CHECK.size > whole:
+            layout = self._layouts.get(low | high << 16)
+            if marker != _MARKERS[0] or flags or layout is None or end + _CHECK.size > whole:
                 break
-            if self._crc(data[at + 1 : end] + extra).crc != _CHECK.unpack_from(data, end)[0]:
+            if self._crc(data[at + 1 : end] + layout.extra).crc != _CHECK.unpack_from(data, end)[0]:
                 break
             # Zeros at a payload's end are not sent; what is longer than known is of a newer dialect.
-            payload = data[at + _HEAD.size : end].ljust(fields.size, b"\0")
-            tick, *angle_rad = fields.unpack_from(payload)
+            payload = data[at + _HEAD.size : end].ljust(layout.unpacker.size, b"\0")
+            values = layout.unpacker.unpack_from(payload)
+            fields = {
+                name: values[where] if isinstance(where, int) else list(values[where]) for name, where in layout.fields
+            }
             self._count_frame(number)
-            found.append(cast(Message, _Angles(tick, angle_rad)))
+            found.append(cast(Message, _Frame(layout.name, fields)))
             at = end + _CHECK.size
         return at
 

@@ -95,43 +95,53 @@ def _row(
     depth: Light,
     ids: Image,
 ) -> None:
-    """Draw a capsule into a part of a row: its rays (n,) x, y, z; its light, depth and ids. Without branches.
+    """Draw a capsule into a part of a row: its rays (n,) x, y, z; its light, depth and ids.
+
+    Every number is computed before it is chosen: a branch left in the loop, and the compiler takes one pixel at a time.
 
     Light falls off with the cosine to the lamp, and what faces away from the viewer is a little darker, which distinguishes
     one link from the next. ``shown`` is the capsule's albedo and its id.
     """
     bx, by, bz, long, ba, radius = axis[0], axis[1], axis[2], axis[3], axis[4], axis[5]
+    cx, cy, cz, foot, head = axis[6], axis[7], axis[8], axis[9], axis[10]
     ax, ay, az = axis[11], axis[12], axis[13]
+    lx, ly, lz = lamp[0], lamp[1], lamp[2]
+    albedo, number = shown[0], np.int16(shown[1])
     for u in range(x.size):
+        was_light, was_depth, was_id = light[u], depth[u], ids[u]
         ad = ax * x[u] + ay * y[u] + az * z[u]
         bd = bx * x[u] + by * y[u] + bz * z[u]
-        past = axis[6] * x[u] + axis[7] * y[u] + axis[8] * z[u]  # by which it passes the axis, times the next's root
+        past = cx * x[u] + cy * y[u] + cz * z[u]  # by which it passes the axis, times the next's root
         A = max(long - bd * bd, _LEAST * long)
         h = long * (radius * radius * A - past * past)
-        t = (long * ad + ba * bd - np.sqrt(max(h, _ZERO))) / A
-        along = (ba + t * bd) / long
+        t_side = (long * ad + ba * bd - np.sqrt(max(h, _ZERO))) / A
+        along = (ba + t_side * bd) / long
         end = _ZERO if along < _HALF else _ONE
         # The ball at the nearer end, where the cylinder is met beyond it.
         ed = ad + end * bd
-        ball = ed * ed - (axis[9] + end * (axis[10] - axis[9]))
-        between = _ZERO < along < _ONE
-        t = t if between else ed - np.sqrt(max(ball, _ZERO))
-        seen = (h if between else ball) >= _ZERO and _ZERO < t < depth[u]
+        ball = ed * ed - (foot + end * (head - foot))
+        t_ball = ed - np.sqrt(max(ball, _ZERO))
+        between = (along > _ZERO) & (along < _ONE)
+        t = t_side if between else t_ball
+        root = h if between else ball
+        seen = (root >= _ZERO) & (t > _ZERO) & (t < was_depth)
         along = min(max((ba + t * bd) / long, _ZERO), _ONE)
         nx = (t * x[u] - ax - along * bx) / radius
         ny = (t * y[u] - ay - along * by) / radius
         nz = (t * z[u] - az - along * bz) / radius
-        cosine = nx * lamp[0] + ny * lamp[1] + nz * lamp[2]
+        cosine = nx * lx + ny * ly + nz * lz
         away = nx * x[u] + ny * y[u] + nz * z[u]
-        lamp_d = lamp[0] * x[u] + lamp[1] * y[u] + lamp[2] * z[u]
-        mirror = max(_TWO * cosine * away - lamp_d, _ZERO) if cosine > _ZERO else _ZERO
+        lamp_d = lx * x[u] + ly * y[u] + lz * z[u]
+        mirror = max(_TWO * cosine * away - lamp_d, _ZERO)
+        mirror = mirror if cosine > _ZERO else _ZERO
         square = mirror * mirror
         square = square * square
         square = square * square
         shade = (_AMBIENT + _LAMP * max(cosine, _ZERO)) * (_THREE_QUARTERS - _QUARTER * away) + _GLOSS * square * square
-        light[u] = shown[0] * shade if seen else light[u]
-        depth[u] = t if seen else depth[u]
-        ids[u] = shown[1] if seen else ids[u]
+        shade *= albedo
+        light[u] = shade if seen else was_light
+        depth[u] = t if seen else was_depth
+        ids[u] = number if seen else was_id
 
 
 @kernel(
