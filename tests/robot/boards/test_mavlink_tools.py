@@ -77,7 +77,7 @@ def test_a_tool_reads_and_sets_every_parameter(tool):
         message = heard(tool, "PARAM_VALUE")
         params[message.param_id], count = message.param_value, message.param_count
     assert count == 111
-    assert params["J3_KP"] == pytest.approx(15.876)
+    assert params["J3_KP"] == pytest.approx(9.277904)
     assert params["J6_CURRENT_MA"] == 1600
     for name, value in params.items():
         new = value - 1 if name.endswith(("_MA", "_MV", "_TICKS")) else np.float32(0.99 * value + 0.001)
