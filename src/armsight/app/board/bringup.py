@@ -50,6 +50,7 @@ _MOST_NOISE_COUNTS = 200.0
 _HAND_COUNTS = 1500.0  # a hand that moves a joint changes its reading by more
 _JOG_RAD, _JOG_DUTY, _JOG_DUTY_PER_S, _JOG_MOST_RAD = 0.010, 0.6, 0.15, 0.05
 _DEAD_DUTY, _DEAD_A = 0.25, 0.02
+_RESTS = 0.25  # of what counts as a motion
 #: A swing: amplitudes, rad, and frequencies, Hz, that add up, and how far a joint may get away from where it began.
 _SWING_RAD, _SWING_HZ, _SWING_MOST_RAD = (0.12, 0.04), (0.5, 2.0), 0.26
 #: A duty on top of it that no motion follows: it separates resistance from back-EMF where friction is all the load.
@@ -396,8 +397,8 @@ class Bringup:
         ways: list[float] = []
         breakaway = 0.0
         for sign in (1.0, -1.0):
-            start = self._q(self._hold_still(0.3)).mean(axis=0)
             enough = np.array([max(_JOG_RAD, 4 * each.noise_rad) for each in self.found.joints])
+            start = self._at_rest(joint, enough)
             moved, duty, readings = self._ramp(joint, sign, start, enough)
             current = float(np.abs(np.median(readings.current_a[-25:, joint])))
             ways.append(self._check_jog(joint, moved / enough, duty, current, last=sign < 0 and not any(ways)) * sign)
@@ -412,6 +413,19 @@ class Bringup:
             )
         self.found.joints[joint].motor_direction = int(directions[0])
         self._person.say(f"joint {joint + 1}: moves from {breakaway:.0%} duty on, motor direction {int(directions[0])}")
+
+    def _at_rest(self, joint: int, enough: Array) -> Array:
+        """Return where all joints (6,) have come to rest; ``enough`` is what counts as a motion later."""
+        for _ in range(10):
+            q = self._q(self._hold_still(0.3))
+            last = q[-(len(q) // 3) :]
+            sunk = np.abs(np.median(last, axis=0) - np.median(q[: len(q) // 3], axis=0)) / enough
+            if sunk.max() < _RESTS:
+                return np.asarray(last.mean(axis=0))
+        raise _Mistake(
+            f"joint {joint + 1}: meanwhile joint {int(np.argmax(sunk)) + 1} moves by itself: leave it where it stays, or"
+            " support it."
+        )
 
     def _hold_still(self, seconds: float) -> SensorReadings:
         """Leave the motors at duty 0."""
