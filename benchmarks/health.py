@@ -110,6 +110,18 @@ def arm_cases() -> Iterator[Case]:
         yield Case(f"delay wanders by 10 ms{at}", {"late": wanders}, "time", 0.0, lambda t, f=wanders: SPEED_M_S * f(t))
 
 
+def bump_cases() -> Iterator[Case]:
+    """Bumps of the rig of other sizes and directions, and rotations."""
+    for mm in (0.5, 1.0, 2.0, 4.0, 10.0):
+        for k, axis in enumerate("xyz"):
+            shift = np.append(1e-3 * mm * np.eye(3)[k], np.zeros(3))
+            yield Case(f"bump of {mm:g} mm along {axis}", {"motion": lambda t, m=shift: m}, "fixed", mm, lambda t: 1.0)
+    for deg in (0.1, 0.3, 1.0):
+        for k, axis in enumerate("xyz"):
+            turn = np.append(np.zeros(3), deg * DEG * np.eye(3)[k])
+            yield Case(f"turn by {deg:g} deg about {axis}", {"motion": lambda t, m=turn: m}, "fixed", 0.0, lambda t: 1.0)
+
+
 def body_run(case: Case, seed: int) -> dict:
     """Run a case of cameras and body."""
     named_s, squares, mm = np.nan, [], []
@@ -148,11 +160,16 @@ def arm_run(case: Case, seed: int) -> dict:
 def row_of(case: Case, seed: int, found: tuple, late_s: float, squares: list, mm: list) -> dict:
     """Return the row of a run."""
     right = [each for each in found if each.cause == case.cause]
+    named = [each for each in found if case.cause in (each.cause, *each.alternatives)]
     sized = right and case.size and right[0].sigma
     return {
         "case": case.name,
         "seed": seed,
-        "found": [f"{each.cause} {each.size:.3f} +- {each.sigma:.3f} {each.unit}" for each in found],
+        "found": [
+            f"{each.cause} {' or '.join(each.alternatives)} {each.size:.3f} +- {each.sigma:.3f} {each.unit}: {each.what}"
+            for each in found
+        ],
+        "named": bool(named) and len(found) == 1 if case.cause else not found,
         "right": bool(right) and len(found) == 1 if case.cause else not found,
         "late_s": None if np.isnan(late_s) else late_s,
         "size_sigmas": (abs(right[0].size) - abs(case.size)) / right[0].sigma if sized else None,
@@ -161,14 +178,14 @@ def row_of(case: Case, seed: int, found: tuple, late_s: float, squares: list, mm
     }
 
 
-_ROW = "{:48s} {:>7s} {:>7s} {:>9s} {:>8s} {:>7s} {:>7s} {:>7s} {:>7s}"
+_ROW = "{:48s} {:>7s} {:>7s} {:>7s} {:>9s} {:>8s} {:>7s} {:>7s} {:>7s} {:>7s}"
 
 
 def main(words: list[str], seeds: range, results: Path | None) -> None:
     """Make the runs that are not in the results yet, and print a line of each case."""
     done = [json.loads(line) for line in results.read_text().splitlines()] if results and results.exists() else []
-    print(_ROW.format("", "found", "right", "median, s", "worst, s", "sigmas", "worst", "NEES", "worst"))
-    for make, cases in ((body_run, body_cases()), (arm_run, arm_cases())):
+    print(_ROW.format("", "found", "right", "named", "median, s", "worst, s", "sigmas", "worst", "NEES", "worst"))
+    for make, cases in ((body_run, body_cases()), (arm_run, arm_cases()), (arm_run, bump_cases())):
         for case in cases:
             if words and not any(word in case.name for word in words):
                 continue
@@ -189,9 +206,9 @@ def show(case: Case, rows: list[dict]) -> None:
         values = [row[key] for row in rows if row[key] is not None]
         return (f"{mean(values):.1f}", f"{max(values, key=abs):.1f}") if values else ("-", "-")
 
-    found, right = (sum(bool(row[key]) for row in rows) for key in ("found", "right"))
+    found, right, named = (sum(bool(row[key]) for row in rows) for key in ("found", "right", "named"))
     sigmas = both("size_sigmas", lambda values: np.sqrt(np.mean(np.square(values))))
-    counts = f"{found}/{len(rows)}", f"{right}/{len(rows)}"
+    counts = f"{found}/{len(rows)}", f"{right}/{len(rows)}", f"{named}/{len(rows)}"
     print(_ROW.format(case.name, *counts, *both("late_s", np.median), *sigmas, *both("nees", np.mean)), flush=True)
     for row in rows:
         if not row["right"] and (row["found"] or not case.cause):

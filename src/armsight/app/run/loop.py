@@ -367,8 +367,8 @@ class Loop:
             if self.mounting is not None:
                 plain = self.mounting.pose_measurement(result, shot.t_s)
                 measurement = self.health.widened(plain)
-                if measurement is not plain and self.health.moved is not None:
-                    suspected = self.health.moved.suspected
+                if measurement is not plain:
+                    suspected = measurement.cov_common - plain.cov_common
                 outcome = self.estimator.vision(measurement)
                 T_base_rig, T_base_tool = self.mounting.T_base_rig, measurement.T_base_tool
                 self.log.outcomes.append(outcome)
