@@ -119,7 +119,9 @@ def bump_cases() -> Iterator[Case]:
     for deg in (0.1, 0.3, 1.0):
         for k, axis in enumerate("xyz"):
             turn = np.append(np.zeros(3), deg * DEG * np.eye(3)[k])
-            yield Case(f"turn by {deg:g} deg about {axis}", {"motion": lambda t, m=turn: m}, "fixed", 0.0, lambda t: 1.0)
+            yield Case(
+                f"turn by {deg:g} deg about {axis}", {"motion": lambda t, m=turn: m}, "fixed", 0.0, lambda t: 1.0
+            )
 
 
 def body_run(case: Case, seed: int) -> dict:

@@ -11,6 +11,7 @@ sigma_rz_rad`` about them; ``phase`` and ``motion``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any

@@ -73,8 +73,8 @@ class Innovation(Record):
         gain: (K, 6) what of z was added to the state; zero where the measurement was rejected.
         outcome: what became of it.
         clock: what is known of an error of the camera's clock; None where nothing is.
-        reference: (6,) as z, from the pose predicted by a state that stays (:meth:`KalmanEstimator.keep_reference`), and its
-            derivative (6, K); None where none is kept.
+        reference: (6,) as z, from the pose predicted by a state that stays, and its derivative (6, K); None where none is
+            kept (:meth:`KalmanEstimator.keep_reference`).
     """
 
     t_s: float

@@ -107,7 +107,7 @@ class Change(Record):
         suspect: what changed.
         begin_s: when, s.
         end_s: time of the newest measurement that was used, s.
-        size: (D,) by how much: tangent of base or tool [m; rad], an angle, rad, or a time, s; of what changes slowly so far.
+        size: (D,) by how much: tangent of base or tool [m; rad], an angle, rad, or a time, s; of a ramp so far.
         cov: (D, D) its covariance.
         chi_square: of the change against none.
         score: chi-square less what its parameters explain by chance: twice the logarithm of a likelihood, beyond a limit.
@@ -126,7 +126,7 @@ class Change(Record):
     T_base_tool: Array
 
     def displacement(self, T_base_tool: Array, t_s: float) -> tuple[Array, Array]:
-        """Return what it does to a measured pose of the tool (4, 4) at a time, s, right tangent (6,), and its covariance."""
+        """Return what it does to a measured pose of the tool (4, 4) at a time, s: right tangent (6,), covariance."""
         by = self.effect
         if self.suspect.kind != "body":  # the base moves the tool by the lever to it
             by = adjoint(inverse(T_base_tool) @ self.T_base_tool) @ by

@@ -28,7 +28,7 @@ from scipy.linalg import solve_triangular
 
 from armsight.data import Array
 from armsight.loop.estimators import Innovation, Outcome
-from armsight.loop.estimators.armerror import ErrorLayout, layout
+from armsight.loop.estimators.armerror import layout
 from armsight.loop.health.change import MARGIN, RAMPS, Change, Suspect, changing, ranked, suspects
 from armsight.loop.health.record import alarm_limit
 
@@ -362,5 +362,3 @@ def _begins(count: int) -> Array:
     """Return the blocks (S,) at which a change may begin: close to each other where they are new."""
     ages = np.unique(np.geomspace(1, count - 1, _BEGINS).round().astype(int))
     return np.asarray(count - ages[::-1])
-
-

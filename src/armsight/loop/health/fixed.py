@@ -21,7 +21,7 @@ import numpy as np
 from armsight.data import Array, Ids
 from armsight.loop.estimators import Innovation, Outcome
 from armsight.loop.estimators.armerror import layout
-from armsight.loop.health.change import RAMPS, Change, Suspect, changing, finding, ranked, suspects
+from armsight.loop.health.change import RAMPS, Change, Suspect, changing, ranked, suspects
 from armsight.loop.health.record import HealthFinding, alarm_limit
 
 #: A beginning is tried every so often, s; older than this many seconds their distances grow with their age.
