@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from faults import AT_S, watched_arm
 
+from armsight.loop.health.change import widened
+
 
 @pytest.mark.parametrize("seed", [30, 31, 32])
 def test_a_rig_that_stands_still_is_not_suspected(seed):
@@ -29,8 +31,8 @@ def test_a_knocked_rig_is_found_at_once(shift_mm, rotation_deg):
 def test_a_knock_widens_what_is_given_out_from_then_on():
     moved = watched_arm(34, lambda t_s: np.array([4e-3, 0.0, 0.0, 0.0, 0.0, 0.0]))
     (state,) = moved.estimator._states[-1:]
-    given = moved.monitor.widened(state.pose_measurement)
+    given = widened(state.pose_measurement, moved.monitor.changes)
     shift_m = np.sqrt(np.trace((given.cov_common - state.pose_measurement.cov_common)[:3, :3]))
     assert 3e-3 < shift_m < 8e-3
     early = replace(state.pose_measurement, t_s=AT_S - 1.0)
-    assert moved.monitor.widened(early) is early
+    assert widened(early, moved.monitor.changes) is early

@@ -158,17 +158,23 @@ def doubtful(changes: Sequence[Change]) -> bool:
     return any(each.suspect.moves or (each.suspect.kind, each.suspect.joint) == ("joint", 0) for each in changes)
 
 
-def widened(measurement: PoseMeasurement, changes: Sequence[Change]) -> PoseMeasurement:
-    """Return a pose measurement of the tool with what may have moved it in its common covariance.
+def suspected(measurement: PoseMeasurement, changes: Sequence[Change]) -> Array | None:
+    """Return the covariance (6, 6) of what hypotheses do to a pose measurement of the tool; None where they do nothing.
 
-    The covariance is that of the mixture of the hypotheses: of each the square of what it does, and its covariance.
+    It is that of their mixture: of each the square of what it does, and its covariance.
     """
     extra, t_s, T = np.zeros((6, 6)), measurement.t_s, measurement.T_base_tool
     for each, share in zip(changes, probabilities(changes) if changes else (), strict=True):
         if each.suspect.moves and t_s >= each.begin_s:
             shift, cov = each.displacement(T, t_s)
             extra += share * (np.outer(shift, shift) + cov)
-    return replace(measurement, cov_common=measurement.cov_common + extra) if extra.any() else measurement
+    return extra if extra.any() else None
+
+
+def widened(measurement: PoseMeasurement, changes: Sequence[Change]) -> PoseMeasurement:
+    """Return a pose measurement of the tool with what may have moved it in its common covariance."""
+    extra = suspected(measurement, changes)
+    return measurement if extra is None else replace(measurement, cov_common=measurement.cov_common + extra)
 
 
 #: What else it may be.

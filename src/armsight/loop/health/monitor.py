@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from armsight.data import Body, PoseEstimate
+from armsight.data import Array, Body, PoseEstimate
 from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement
 from armsight.loop.estimators.clock import ClockFollower
-from armsight.loop.health.change import Change, doubtful, finding, widened
+from armsight.loop.health.change import Change, doubtful, finding, suspected
 from armsight.loop.health.clock import clock_findings
 from armsight.loop.health.closure import ClosureWatch
 from armsight.loop.health.fixed import FixedWatch
@@ -148,9 +148,9 @@ class HealthMonitor:
             return () if self._clocks(changes) else (finding(changes, self._names),)
         return () if self._fixed is None else self._fixed.findings()
 
-    def widened(self, measurement: PoseMeasurement) -> PoseMeasurement:
-        """Return a pose measurement of the tool with what may have moved it in its common covariance."""
-        return widened(measurement, self.changes)
+    def suspected(self, measurement: PoseMeasurement) -> Array | None:
+        """Return the covariance (6, 6) of what may have moved a pose measurement of the tool; None where nothing is."""
+        return suspected(measurement, self.changes)
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
