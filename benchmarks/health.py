@@ -5,7 +5,8 @@ python health.py                         light simulation (projected points, an 
 python health.py --seeds 2100:2105       of these seeds alone
 python health.py bump slip               of the cases alone whose names contain one of these words
 python health.py --results rows.jsonl    each run is a line there; those that stand in it are not made again
-python health.py rendered knock          one rendered run of a fault in the workcell (worn arm), about two minutes each
+python health.py rendered knock          one rendered run of a fault in the workcell (worn arm), about two minutes; with
+                                         "fixed" two fixed bodies are in view (run --fixed) while the rig is bumped by 2 mm
 
 A run of a camera or a body takes about 1 s of computing, one of an arm 5 s. Delays count from when the fault displaces the
 measured pose by twice its claimed sigma. NEES is that of what is given out once the fault was named.
@@ -28,12 +29,18 @@ path[:0] = [str(TESTS), str(TESTS / "loop"), str(TESTS / "loop" / "health")]
 import faults  # noqa: E402
 
 import armsight.app.demo.demo as demo  # noqa: E402
-from armsight.geometry.pose import exp_se3, inverse, log_se3  # noqa: E402
+from armsight.geometry.pose import exp_se3, inverse, log_se3, pose  # noqa: E402
+from armsight.geometry.rotation import exp_so3  # noqa: E402
 from armsight.loop.estimators import Mounting  # noqa: E402
+from armsight.sim.example_rig import PLATE_M, TAG_FAMILY, TAG_M, TAG_MIDDLES_M  # noqa: E402
+from armsight.sim.render.scene import PosedBody, marker_bits, plate, tag  # noqa: E402
+from armsight.sim.workcell.cameras import WorkcellSource  # noqa: E402
+from armsight.vision.markers.marker import Target  # noqa: E402
+from armsight.vision.markers.targets import open_fixed  # noqa: E402
 
 DEG = float(np.radians(1.0))
 #: When the rig is knocked in a rendered run, s: in the motions with potentiometers alone.
-KNOCK_S = 26.0
+KNOCK_S, BUMP = 26.0, np.array([0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
 #: Duration of a light simulation of cameras and of an arm, s; when an arm is known and when its fault begins, s.
 BODY_S, ARM_S = 20.0, 50.0
 faults.LEARNED_S, faults.AT_S = 10.0, 20.0
@@ -118,9 +125,13 @@ def bump_cases() -> Iterator[Case]:
             yield Case(f"bump of {mm:g} mm along {axis}", {"motion": lambda t, m=shift: m}, "fixed", mm, lambda t: 1.0)
     for deg in (0.1, 0.3, 1.0):
         for k, axis in enumerate("xyz"):
-            turn = np.append(np.zeros(3), deg * DEG * np.eye(3)[k])
+            rotation = np.append(np.zeros(3), deg * DEG * np.eye(3)[k])
             yield Case(
-                f"turn by {deg:g} deg about {axis}", {"motion": lambda t, m=turn: m}, "fixed", 0.0, lambda t: 1.0
+                f"rotation by {deg:g} deg about {axis}",
+                {"motion": lambda t, m=rotation: m},
+                "fixed",
+                0.0,
+                lambda t: 1.0,
             )
 
 
@@ -217,6 +228,43 @@ def show(case: Case, rows: list[dict]) -> None:
             print(f"    seed {row['seed']}: {'; '.join(row['found'])}", flush=True)
 
 
+def fixed_plate(name: str, first: int, at_m: list[float]) -> tuple[Target, PosedBody]:
+    """Return a plate of four tags that does not move: as it is looked for, and as it is seen by the left camera."""
+    patterns, tags = [plate(*PLATE_M, value=0.12)], []
+    for k, middle in enumerate(TAG_MIDDLES_M):
+        T = pose(np.eye(3), np.append(middle, 0.0))
+        patterns.append(tag(marker_bits(TAG_FAMILY, first + k), TAG_M).on_body(T))
+        tags += [
+            f'[[markers]]\nname = "T{k}"\nposition_mm = [{1e3 * middle[0]}, {1e3 * middle[1]}, 0.0]',
+            "euler_zyx_deg = [0.0, 0.0, 0.0]",
+            f'tag = {{ family = "{TAG_FAMILY}", id = {first + k}, size_mm = {1e3 * TAG_M} }}',
+        ]
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"{name}.toml"
+        file.write_text("\n".join(["version = 2", f'name = "{name}"', *tags]) + "\n")
+        (target,) = open_fixed([str(file)], "")
+    return target, PosedBody(tuple(patterns), pose(exp_so3(np.array([0.0, 0.3, 0.0])), np.array(at_m)))
+
+
+PLATES = (("post1", 10, [-0.28, -0.26, 0.95]), ("post2", 20, [0.46, -0.26, 0.95]))
+
+
+def with_plates(case: str) -> tuple[Target, ...]:
+    """Put fixed plates before the workcell's cameras, which move where a case says so; return them as targets."""
+    plates = [fixed_plate(*each) for each in PLATES]
+    image = WorkcellSource._image
+
+    def seen(self, side, t_s, frames, body, shutter, number, held):
+        if number < 0:
+            return image(self, side, t_s, frames, body, shutter, number, held)
+        moved = inverse(exp_se3(BUMP)) if t_s >= KNOCK_S else np.eye(4)
+        every = tuple(p.on_body(moved @ each.T_camera_body) for _, each in plates for p in each.patterns)
+        return image(self, side, t_s, frames, body, shutter, number, PosedBody(every, np.eye(4)))
+
+    WorkcellSource._image = seen
+    return tuple(target for target, _ in plates)
+
+
 def rendered(case: str) -> None:
     """Run the quick demo with a fault and print what it says."""
     run, carry = demo.run_experiment, Mounting.pose_measurement
@@ -229,13 +277,15 @@ def rendered(case: str) -> None:
             target, discs = setup.target, setup.target.discs
             body = replace(discs.body, points=1.01 * discs.body.points)
             setup = replace(setup, target=type(target)(target.name, (), replace(discs, body=body)))
+        if case == "fixed":
+            setup = replace(setup, fixed=with_plates(case))
         return run(setup, rig, plan, targets, **options)
 
-    def moved(mounting, pose, t_s):
-        if case in ("knock", "bump") and t_s >= KNOCK_S:
-            motion = np.array([0.002, 0, 0, 0, 0, 0] if case == "bump" else [0.01, 0, 0, 0, 0.8 * DEG, 0])
-            pose = replace(pose, T_left_body=inverse(exp_se3(motion)) @ pose.T_left_body)
-        return carry(mounting, pose, t_s)
+    def moved(mounting, measured, t_s):
+        if case in ("knock", "bump", "fixed") and t_s >= KNOCK_S:
+            motion = np.array([0.01, 0, 0, 0, 0.8 * DEG, 0]) if case == "knock" else BUMP
+            measured = replace(measured, T_left_body=inverse(exp_se3(motion)) @ measured.T_left_body)
+        return carry(mounting, measured, t_s)
 
     demo.run_experiment, Mounting.pose_measurement = faulty, moved
     try:

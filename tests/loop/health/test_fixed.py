@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from arm_rig import off
 from faults import AT_S, watched_arm
 
 from armsight.loop.health.change import widened
@@ -36,3 +37,7 @@ def test_a_knock_widens_what_is_given_out_from_then_on():
     assert 3e-3 < shift_m < 8e-3
     early = replace(state.pose_measurement, t_s=AT_S - 1.0)
     assert widened(early, moved.monitor.changes) is early
+    rows = np.flatnonzero(moved.tracked.t_s > moved.found_s + 0.5)[::50]
+    error = off(moved.tracked.Ts_base_tool[rows], moved.Ts_true[rows])
+    squares = np.einsum("ni,ni->n", error, np.linalg.solve(moved.tracked.covs[rows], error[..., None])[..., 0])
+    assert np.mean(squares) < 12.0

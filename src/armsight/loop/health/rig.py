@@ -64,7 +64,7 @@ _ALARM, _ALARMS = (
     alarm_limit(len(_WIDE), 1.0 / TEST_S, 4),
     {part: alarm_limit(rows.stop - rows.start, 1.0 / TEST_S, 4) for part, rows in _PARTS.items()},
 )
-#: Whether a change matters is judged at so many of the newest poses: a skew does so in motion alone.
+#: A change matters or not at so many of the newest poses: a skew does so in motion alone.
 _POSES = 60
 #: Chi-square from which on a change that matters widens the poses: chance exceeds it in one of fifty tests.
 _SUSPECTED = float(chdtri(len(_WIDE), 0.02))
