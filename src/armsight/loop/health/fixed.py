@@ -103,10 +103,11 @@ class FixedWatch:
             self._F[:, :, self._steps.shape[1] :] += passed * self._steps[:, None, :RAMPS]
         self._last_s = t_s
         weight = min(passed / CORRELATED_S, 1.0)
-        F = innovation.kept[:, None] * self._F.reshape(self._size, -1)
-        G = innovation.by_state @ F
+        F, forgets = self._F.reshape(self._size, -1), innovation.kept < 1.0
+        G = (innovation.by_state * innovation.kept) @ F
         if innovation.gain.any():
-            self._F = (F - innovation.gain @ G).reshape(self._F.shape)
+            F[forgets] *= innovation.kept[forgets, None]
+            F -= innovation.gain @ G
         white = np.linalg.inv(innovation.cov)
         signature = np.moveaxis(G.reshape(6, -1, self._columns), 0, 1)
         whitened = white @ signature
@@ -137,17 +138,20 @@ class FixedWatch:
 
     def _decide(self, innovation: Innovation) -> None:
         """Test all beginnings; the hypotheses are what they are at the newest measurement."""
-        tested = [(each, *self._fitted(each)) for each in self._suspects]
-        moving = [(each[3] - (_RARER if each[0].slow else 0.0), each[3]) for each in tested if each[0].cause == "fixed"]
-        alarms = np.array([alarm for alarm, _ in moving])
+        moving = [each for each in self._suspects if each.cause == "fixed"]
+        explained = [self._fitted(each)[2] for each in moving]
+        alarms = np.array(
+            [gained - (_RARER if each.slow else 0.0) for each, gained in zip(moving, explained, strict=True)]
+        )
         kind, n = np.unravel_index(int(np.argmax(alarms)), alarms.shape)
-        found = float(moving[int(kind)][1][n])
+        found = float(explained[int(kind)][n])
         strongest = max((each.chi_square for each in self.changes if each.suspect.cause == "fixed"), default=0.0)
         if found <= max(_LIMITS[6], strongest):
             return
         near = slice(max(int(n) - 1, 0), int(n) + 2)
         columns, changes = changing(self._parts, innovation.by_state), list[Change]()
-        for each, d, cov, chi_squares in tested:
+        for each in self._suspects:
+            d, cov, chi_squares = self._fitted(each)
             k = near.start + int(np.argmax(chi_squares[near]))
             begin_s, chi_square = float(self._begins[k]), float(chi_squares[k])
             length = (innovation.t_s - begin_s) if each.slow else 1.0
