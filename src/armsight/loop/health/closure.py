@@ -65,7 +65,10 @@ def _limits(joints: int) -> dict[int, float]:
 
 
 class _Tested(NamedTuple):
-    """A hypothesis at its best beginning, a block; size, covariance, chi-square, and how far that is above its limit."""
+    """A hypothesis at its best beginning, a block; size, covariance, chi-square, how far that is above its limit.
+
+    And what it leaves unexplained, over what the blocks leave where nothing changed.
+    """
 
     suspect: Suspect
     begin: int
@@ -73,6 +76,7 @@ class _Tested(NamedTuple):
     cov: Array
     chi_square: float
     above: float
+    left: float
 
 
 class _Block:
@@ -282,7 +286,9 @@ class ClosureWatch:
         between = np.unique(np.concatenate([self._between(begins, row) for row in rows]))
         tested = [self._tested(np.array([k]), everything, without=k - 1) for k in between]
         finest = [max(each, key=lambda one: one.above) for each in zip(*tested, strict=True)]
-        changes = ranked([self._change(each) for each in finest])
+        # The errors are what the best one leaves, not what is left while nothing is taken to have changed.
+        left = max(finest, key=lambda each: each.above).left
+        changes = ranked([self._change(each, left) for each in finest])
         # Once something was reported, what explains it best replaces it, also where it is smaller than is reported first.
         if self.changes or _matters(changes[0]):
             self.changes = changes
@@ -295,13 +301,15 @@ class ClosureWatch:
         some = np.concatenate([some, near + np.arange(-1, 3)])
         return np.asarray(some[(some >= 1) & (some < len(self._t))])
 
-    def _change(self, found: _Tested) -> Change:
-        """Return a hypothesis as a record."""
+    def _change(self, found: _Tested, left: float) -> Change:
+        """Return a hypothesis as a record; the errors' variance is so many times what it was tested with."""
         assert self._newest is not None
         effect = changing(self._parts, self._newest.by_state)[:, found.suspect.columns]
         begin_s = (self._t[found.begin - 1] + self._t[found.begin]) / 2
         end_s, T = self._t[-1], self._newest.T_base_tool
-        return Change(found.suspect, begin_s, end_s, found.size, found.cov, found.chi_square, found.above, effect, T)
+        limit = _limits(self._parts.joints)[len(found.size)]
+        score, chi_square = (found.above + limit) / left - limit, found.chi_square / left
+        return Change(found.suspect, begin_s, end_s, found.size, left * found.cov, chi_square, score, effect, T)
 
     def _tested(self, begins: Array, hypotheses: Sequence[Suspect], without: int | None = None) -> list[_Tested]:
         """Test hypotheses at beginnings (S,); return each at the one of largest chi-square.
@@ -345,7 +353,9 @@ class ClosureWatch:
             n = int(np.argmax(chi_squares))
             cov, chi_square = np.linalg.inv(C[n]) * np.outer(wide, wide), float(chi_squares[n])
             above = chi_square + gained - limits[len(wide)] - (_RARER if each.slow else 0.0)
-            found.append(_Tested(each, int(begins[n]), wide * d[n], cov, chi_square, above))
+            rest = (left / excess - chi_square) / max(6.0 * len(t), 1.0)
+            share = max(rest, 1.0 / excess)  # the errors are no smaller than the blocks'
+            found.append(_Tested(each, int(begins[n]), wide * d[n], cov, chi_square, above, share))
         return found
 
 

@@ -103,11 +103,10 @@ class FixedWatch:
             self._F[:, :, self._steps.shape[1] :] += passed * self._steps[:, None, :RAMPS]
         self._last_s = t_s
         weight = min(passed / CORRELATED_S, 1.0)
-        F, forgets = self._F.reshape(self._size, -1), innovation.kept < 1.0
-        G = (innovation.by_state * innovation.kept) @ F
+        F = innovation.kept[:, None] * self._F.reshape(self._size, -1)
+        G = innovation.by_state @ F
         if innovation.gain.any():
-            F[forgets] *= innovation.kept[forgets, None]
-            F -= innovation.gain @ G
+            self._F = (F - innovation.gain @ G).reshape(self._F.shape)
         white = np.linalg.inv(innovation.cov)
         signature = np.moveaxis(G.reshape(6, -1, self._columns), 0, 1)
         whitened = white @ signature
