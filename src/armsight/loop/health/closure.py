@@ -259,8 +259,7 @@ class ClosureWatch:
     def _finest(self, begins: Array, found: _Tested) -> _Tested:
         """Return a hypothesis at the best beginning between the neighbours of the one that was found for it."""
         between = self._between(begins, int(np.searchsorted(begins, found.begin)))
-        tested = [self._tested(np.array([k]), (found.suspect,), without=k - 1)[0] for k in between]
-        return max(tested, key=lambda each: each.above)
+        return self._finest_of(between, (found.suspect,))[0]
 
     def _by_change(self, found: _Tested) -> Array:
         """Return the derivative (N, 6, D) of the blocks by a change, over the width of its prior."""
@@ -284,14 +283,23 @@ class ClosureWatch:
         # A jump between two beginnings looks like a drift: both are tried at those between.
         rows = {int(np.searchsorted(begins, each.begin)) for each in found if each is best or each.above > 0.0}
         between = np.unique(np.concatenate([self._between(begins, row) for row in rows]))
-        tested = [self._tested(np.array([k]), everything, without=k - 1) for k in between]
-        finest = [max(each, key=lambda one: one.above) for each in zip(*tested, strict=True)]
+        finest = self._finest_of(between, everything)
+        first = max(finest, key=lambda each: each.above).begin
+        beside = [k for k in (first - 1, first + 1) if 1 <= k < len(self._t) and k not in between]
+        if beside:
+            pairs = zip(finest, self._finest_of(np.array(beside), everything), strict=True)
+            finest = [max(pair, key=lambda each: each.above) for pair in pairs]
         # The errors are what the best one leaves, not what is left while nothing is taken to have changed.
         left = max(finest, key=lambda each: each.above).left
         changes = ranked([self._change(each, left) for each in finest])
         # Once something was reported, what explains it best replaces it, also where it is smaller than is reported first.
         if self.changes or _matters(changes[0]):
             self.changes = changes
+
+    def _finest_of(self, between: Array, hypotheses: Sequence[Suspect]) -> list[_Tested]:
+        """Return hypotheses, each at the best of some beginnings, the block into which the change fell left out."""
+        tested = [self._tested(np.array([k]), hypotheses, without=k - 1) for k in between]
+        return [max(each, key=lambda one: one.above) for each in zip(*tested, strict=True)]
 
     def _between(self, begins: Array, row: int) -> Array:
         """Return blocks between the neighbours of a beginning, those at the newest finding's among them."""
