@@ -129,6 +129,7 @@ class ClosureWatch:
 
     Attributes:
         changes: the hypotheses that explain best what was found, the best first; empty while all is well.
+        explained: the same, also where it is smaller than is reported: it explains what another test reports.
         strongest: of all tests the largest chi-square over its limit.
     """
 
@@ -148,6 +149,7 @@ class ClosureWatch:
         self._cov = np.diag(_BLOCK_SIGMA**2)
         self._clear()
         self.changes: tuple[Change, ...] = ()
+        self.explained: tuple[Change, ...] = ()
         self.strongest = 0.0
 
     def _clear(self) -> None:
@@ -291,7 +293,7 @@ class ClosureWatch:
             finest = [max(pair, key=lambda each: each.above) for pair in pairs]
         # The errors are what the best one leaves, not what is left while nothing is taken to have changed.
         left = max(finest, key=lambda each: each.above).left
-        changes = ranked([self._change(each, left) for each in finest])
+        changes = self.explained = ranked([self._change(each, left) for each in finest])
         # Once something was reported, what explains it best replaces it, also where it is smaller than is reported first.
         if self.changes or _matters(changes[0]):
             self.changes = changes

@@ -133,8 +133,10 @@ class HealthMonitor:
     @property
     def _every_change(self) -> tuple[Change, ...]:
         # The closure knows more causes than the innovations within a second, and sizes them better.
-        closed = () if self._closure is None else self._closure.changes
-        return closed or (() if self._fixed is None else self._fixed.changes)
+        if self._closure is None or self._fixed is None:
+            return ()
+        noticed = self._fixed.changes or self._fixed.reopened[0]
+        return self._closure.changes or (noticed and self._closure.explained) or self._fixed.changes
 
     def _clocks(self, changes: Sequence[Change]) -> bool:
         """Return whether a clock that is followed explains hypotheses as well."""
