@@ -5,7 +5,8 @@ python health.py                         light simulation (projected points, an 
 python health.py --seeds 2100:2105       of these seeds alone
 python health.py bump slip               of the cases alone whose names contain one of these words
 python health.py --results rows.jsonl    each run is a line there; those that stand in it are not made again
-python health.py rendered knock          one rendered run of a fault in the workcell (worn arm), about two minutes each
+python health.py rendered knock          one rendered run of a fault in the workcell (worn arm), about two minutes; with
+                                         "fixed" two fixed bodies are in view (run --fixed) while the rig is bumped by 2 mm
 
 A run of a camera or a body takes about 1 s of computing, one of an arm 5 s. Delays count from when the fault displaces the
 measured pose by twice its claimed sigma. NEES is that of what is given out once the fault was named.
@@ -28,12 +29,18 @@ path[:0] = [str(TESTS), str(TESTS / "loop"), str(TESTS / "loop" / "health")]
 import faults  # noqa: E402
 
 import armsight.app.demo.demo as demo  # noqa: E402
-from armsight.geometry.pose import exp_se3, inverse, log_se3  # noqa: E402
+from armsight.geometry.pose import exp_se3, inverse, log_se3, pose  # noqa: E402
+from armsight.geometry.rotation import exp_so3  # noqa: E402
 from armsight.loop.estimators import Mounting  # noqa: E402
+from armsight.sim.example_rig import PLATE_M, TAG_FAMILY, TAG_M, TAG_MIDDLES_M  # noqa: E402
+from armsight.sim.render.scene import PosedBody, marker_bits, plate, tag  # noqa: E402
+from armsight.sim.workcell.cameras import WorkcellSource  # noqa: E402
+from armsight.vision.markers.marker import Target  # noqa: E402
+from armsight.vision.markers.targets import open_fixed  # noqa: E402
 
 DEG = float(np.radians(1.0))
 #: When the rig is knocked in a rendered run, s: in the motions with potentiometers alone.
-KNOCK_S = 26.0
+KNOCK_S, BUMP = 26.0, np.array([0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
 #: Duration of a light simulation of cameras and of an arm, s; when an arm is known and when its fault begins, s.
 BODY_S, ARM_S = 20.0, 50.0
 faults.LEARNED_S, faults.AT_S = 10.0, 20.0
@@ -110,6 +117,24 @@ def arm_cases() -> Iterator[Case]:
         yield Case(f"delay wanders by 10 ms{at}", {"late": wanders}, "time", 0.0, lambda t, f=wanders: SPEED_M_S * f(t))
 
 
+def bump_cases() -> Iterator[Case]:
+    """Bumps of the rig of other sizes and directions, and rotations."""
+    for mm in (0.5, 1.0, 2.0, 4.0, 10.0):
+        for k, axis in enumerate("xyz"):
+            shift = np.append(1e-3 * mm * np.eye(3)[k], np.zeros(3))
+            yield Case(f"bump of {mm:g} mm along {axis}", {"motion": lambda t, m=shift: m}, "fixed", mm, lambda t: 1.0)
+    for deg in (0.1, 0.3, 1.0):
+        for k, axis in enumerate("xyz"):
+            rotation = np.append(np.zeros(3), deg * DEG * np.eye(3)[k])
+            yield Case(
+                f"rotation by {deg:g} deg about {axis}",
+                {"motion": lambda t, m=rotation: m},
+                "fixed",
+                0.0,
+                lambda t: 1.0,
+            )
+
+
 def body_run(case: Case, seed: int) -> dict:
     """Run a case of cameras and body."""
     named_s, squares, mm = np.nan, [], []
@@ -148,11 +173,16 @@ def arm_run(case: Case, seed: int) -> dict:
 def row_of(case: Case, seed: int, found: tuple, late_s: float, squares: list, mm: list) -> dict:
     """Return the row of a run."""
     right = [each for each in found if each.cause == case.cause]
+    named = [each for each in found if case.cause in (each.cause, *each.alternatives)]
     sized = right and case.size and right[0].sigma
     return {
         "case": case.name,
         "seed": seed,
-        "found": [f"{each.cause} {each.size:.3f} +- {each.sigma:.3f} {each.unit}" for each in found],
+        "found": [
+            f"{each.cause} {' or '.join(each.alternatives)} {each.size:.3f} +- {each.sigma:.3f} {each.unit}: {each.what}"
+            for each in found
+        ],
+        "named": bool(named) and len(found) == 1 if case.cause else not found,
         "right": bool(right) and len(found) == 1 if case.cause else not found,
         "late_s": None if np.isnan(late_s) else late_s,
         "size_sigmas": (abs(right[0].size) - abs(case.size)) / right[0].sigma if sized else None,
@@ -161,14 +191,14 @@ def row_of(case: Case, seed: int, found: tuple, late_s: float, squares: list, mm
     }
 
 
-_ROW = "{:48s} {:>7s} {:>7s} {:>9s} {:>8s} {:>7s} {:>7s} {:>7s} {:>7s}"
+_ROW = "{:48s} {:>7s} {:>7s} {:>7s} {:>9s} {:>8s} {:>7s} {:>7s} {:>7s} {:>7s}"
 
 
 def main(words: list[str], seeds: range, results: Path | None) -> None:
     """Make the runs that are not in the results yet, and print a line of each case."""
     done = [json.loads(line) for line in results.read_text().splitlines()] if results and results.exists() else []
-    print(_ROW.format("", "found", "right", "median, s", "worst, s", "sigmas", "worst", "NEES", "worst"))
-    for make, cases in ((body_run, body_cases()), (arm_run, arm_cases())):
+    print(_ROW.format("", "found", "right", "named", "median, s", "worst, s", "sigmas", "worst", "NEES", "worst"))
+    for make, cases in ((body_run, body_cases()), (arm_run, arm_cases()), (arm_run, bump_cases())):
         for case in cases:
             if words and not any(word in case.name for word in words):
                 continue
@@ -189,13 +219,50 @@ def show(case: Case, rows: list[dict]) -> None:
         values = [row[key] for row in rows if row[key] is not None]
         return (f"{mean(values):.1f}", f"{max(values, key=abs):.1f}") if values else ("-", "-")
 
-    found, right = (sum(bool(row[key]) for row in rows) for key in ("found", "right"))
+    found, right, named = (sum(bool(row[key]) for row in rows) for key in ("found", "right", "named"))
     sigmas = both("size_sigmas", lambda values: np.sqrt(np.mean(np.square(values))))
-    counts = f"{found}/{len(rows)}", f"{right}/{len(rows)}"
+    counts = f"{found}/{len(rows)}", f"{right}/{len(rows)}", f"{named}/{len(rows)}"
     print(_ROW.format(case.name, *counts, *both("late_s", np.median), *sigmas, *both("nees", np.mean)), flush=True)
     for row in rows:
         if not row["right"] and (row["found"] or not case.cause):
             print(f"    seed {row['seed']}: {'; '.join(row['found'])}", flush=True)
+
+
+def fixed_plate(name: str, first: int, at_m: list[float]) -> tuple[Target, PosedBody]:
+    """Return a plate of four tags that does not move: as it is looked for, and as it is seen by the left camera."""
+    patterns, tags = [plate(*PLATE_M, value=0.12)], []
+    for k, middle in enumerate(TAG_MIDDLES_M):
+        T = pose(np.eye(3), np.append(middle, 0.0))
+        patterns.append(tag(marker_bits(TAG_FAMILY, first + k), TAG_M).on_body(T))
+        tags += [
+            f'[[markers]]\nname = "T{k}"\nposition_mm = [{1e3 * middle[0]}, {1e3 * middle[1]}, 0.0]',
+            "euler_zyx_deg = [0.0, 0.0, 0.0]",
+            f'tag = {{ family = "{TAG_FAMILY}", id = {first + k}, size_mm = {1e3 * TAG_M} }}',
+        ]
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"{name}.toml"
+        file.write_text("\n".join(["version = 2", f'name = "{name}"', *tags]) + "\n")
+        (target,) = open_fixed([str(file)], "")
+    return target, PosedBody(tuple(patterns), pose(exp_so3(np.array([0.0, 0.3, 0.0])), np.array(at_m)))
+
+
+PLATES = (("post1", 10, [-0.28, -0.26, 0.95]), ("post2", 20, [0.46, -0.26, 0.95]))
+
+
+def with_plates(case: str) -> tuple[Target, ...]:
+    """Put fixed plates before the workcell's cameras, which move where a case says so; return them as targets."""
+    plates = [fixed_plate(*each) for each in PLATES]
+    image = WorkcellSource._image
+
+    def seen(self, side, t_s, frames, body, shutter, number, held):
+        if number < 0:
+            return image(self, side, t_s, frames, body, shutter, number, held)
+        moved = inverse(exp_se3(BUMP)) if t_s >= KNOCK_S else np.eye(4)
+        every = tuple(p.on_body(moved @ each.T_camera_body) for _, each in plates for p in each.patterns)
+        return image(self, side, t_s, frames, body, shutter, number, PosedBody(every, np.eye(4)))
+
+    WorkcellSource._image = seen
+    return tuple(target for target, _ in plates)
 
 
 def rendered(case: str) -> None:
@@ -210,13 +277,15 @@ def rendered(case: str) -> None:
             target, discs = setup.target, setup.target.discs
             body = replace(discs.body, points=1.01 * discs.body.points)
             setup = replace(setup, target=type(target)(target.name, (), replace(discs, body=body)))
+        if case == "fixed":
+            setup = replace(setup, fixed=with_plates(case))
         return run(setup, rig, plan, targets, **options)
 
-    def moved(mounting, pose, t_s):
-        if case in ("knock", "bump") and t_s >= KNOCK_S:
-            motion = np.array([0.002, 0, 0, 0, 0, 0] if case == "bump" else [0.01, 0, 0, 0, 0.8 * DEG, 0])
-            pose = replace(pose, T_left_body=inverse(exp_se3(motion)) @ pose.T_left_body)
-        return carry(mounting, pose, t_s)
+    def moved(mounting, measured, t_s):
+        if case in ("knock", "bump", "fixed") and t_s >= KNOCK_S:
+            motion = np.array([0.01, 0, 0, 0, 0.8 * DEG, 0]) if case == "knock" else BUMP
+            measured = replace(measured, T_left_body=inverse(exp_se3(motion)) @ measured.T_left_body)
+        return carry(mounting, measured, t_s)
 
     demo.run_experiment, Mounting.pose_measurement = faulty, moved
     try:

@@ -13,6 +13,7 @@ from armsight.geometry.pose import exp_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.estimators import Delay, KalmanEstimator, Mounting
 from armsight.loop.health import HealthMonitor
+from armsight.loop.health.change import widened
 from armsight.loop.servo import LoopTiming, PoseServo
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.example_rig import example_rig
@@ -112,7 +113,7 @@ class Moved:
                 measurement = replace(measurement, t_s=t_s + self.late(t_s - AT_S))
             if self.slip is not None:
                 measurement = replace(measurement, T_base_tool=measurement.T_base_tool @ small(self.slip))
-        outcome = self.estimator.vision(self.monitor.widened(measurement))
+        outcome = self.estimator.vision(widened(measurement, self.monitor.changes))
         self.monitor.work()
         if self.found_s is None and self.monitor.findings():
             self.found_s = t_s

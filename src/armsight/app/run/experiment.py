@@ -27,7 +27,7 @@ from armsight.data import Array, Body, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, Prior
 from armsight.loop.health import HealthFinding
-from armsight.loop.health.fixed import BaseMotion
+from armsight.loop.health.change import Change
 from armsight.loop.servo import JointLoops, LoopTiming, PoseServo
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
 from armsight.robot.boards.contract import MotionBoard
@@ -139,7 +139,7 @@ class RunResult:
         kept: the first shots of the motions.
         picture: the first shot in motion in which the body was found, and its pose.
         health: why the result must not be trusted; empty where nothing says so.
-        moved: a motion of the rig against the base of the arm; None where none was found.
+        changes: what explains a motion of the rig or the body; empty where none was found.
         ended_by: the error that ended the run early; None where there was none.
         interrupted: whether the keyboard ended the run.
     """
@@ -155,7 +155,7 @@ class RunResult:
     kept: list[Shot] = field(default_factory=list)
     picture: tuple[Shot, PoseEstimate] | None = None
     health: tuple[HealthFinding, ...] = ()
-    moved: BaseMotion | None = None
+    changes: tuple[Change, ...] = ()
     ended_by: ArmsightError | None = None
     interrupted: bool = False
 
@@ -278,7 +278,7 @@ def _run(
             with uninterrupted() as again:  # a second Ctrl-C must not keep the arm from stopping
                 _stopped(loop)
                 loop.close_record()
-                outcome.health, outcome.moved = loop.health.findings(), loop.health.moved
+                outcome.health, outcome.changes = loop.health.findings(), loop.health.changes
             outcome.interrupted = outcome.interrupted or bool(again)
 
 

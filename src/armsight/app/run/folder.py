@@ -233,7 +233,7 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
         if outcome.shutters is not None:
             keep(replace(finished.rig, shutters=outcome.shutters).save, folder / "rig.json")
         mounting = outcome.handeye.mounting
-        run = assembled(outcome.log, finished.arm, mounting, outcome.delay, finished.truth, outcome.moved)
+        run = assembled(outcome.log, finished.arm, mounting, outcome.delay, finished.truth, outcome.changes)
         keep(write_columns, folder, "joints", joint_columns(run.t_s, run.q, run.q_ref))
         for name, track in _tracks(run).items():
             keep(write_track, folder, name, track)

@@ -366,9 +366,8 @@ class Loop:
             result = self.health.received(result, shot.t_s)
             if self.mounting is not None:
                 plain = self.mounting.pose_measurement(result, shot.t_s)
-                measurement = self.health.widened(plain)
-                if measurement is not plain and self.health.moved is not None:
-                    suspected = self.health.moved.suspected
+                suspected = self.health.suspected(plain)
+                measurement = plain if suspected is None else replace(plain, cov_common=plain.cov_common + suspected)
                 outcome = self.estimator.vision(measurement)
                 T_base_rig, T_base_tool = self.mounting.T_base_rig, measurement.T_base_tool
                 self.log.outcomes.append(outcome)

@@ -11,6 +11,7 @@ sigma_rz_rad`` about them; ``phase`` and ``motion``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from armsight.errors import InputError
 from armsight.files import read_table, replacing
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import ArmEstimate, Delay, Mounting, Outcome, PoseMeasurement
-from armsight.loop.health.fixed import BaseMotion
+from armsight.loop.health.change import Change, widened
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Trajectory
 from armsight.vision.rig import StereoRig
@@ -321,7 +322,7 @@ def assembled(
     mounting: Mounting,
     delay: Delay,
     truth: tuple[Array, Array] | None = None,
-    moved: BaseMotion | None = None,
+    changes: Sequence[Change] = (),
 ) -> RunData:
     """Make the tracks of a run from its log.
 
@@ -331,15 +332,13 @@ def assembled(
         mounting: poses of cameras and body on the arm.
         delay: of the cameras' time stamps. Its uncertainty adds to the covariance of the pose of a moving tool.
         truth: times (N,), s, and poses (N, 4, 4) of the tool in the base frame, where they are known.
-        moved: a motion of the rig against the base; it adds to the covariance of vision from its beginning on.
+        changes: what may have moved rig or body; it adds to the covariance of vision from its beginning on.
     """
     t_s, q, q_ref = joints_of(log)
     planned = np.isfinite(q_ref).all(axis=1)
     named = _SegmentNames(log.segments)
     seen = [mounting.pose_measurement(p, t - delay.delay_s) for _, t, p in log.poses if isinstance(p, PoseEstimate)]
-    if moved is not None:
-        at = moved.begin_s
-        seen = [replace(s, cov_common=s.cov_common + moved.suspected) if s.t_s >= at else s for s in seen]
+    seen = [widened(each, changes) for each in seen]
     fused = [part for part in log.fused if part.covs is not None]
     return RunData(
         t_s,

@@ -96,12 +96,12 @@ class ClockFollower:
         self._V[self._delay] = 1.0, 0.0
         offset_s, in_z, chi_square = float(self._b[0]), G @ self._b, self._chi_square
         if not self._corrects():
-            return ClockEffect(offset_s, in_z, None) if chi_square > _SAID else None
+            return ClockEffect(offset_s, in_z, None, self.sigma_s) if chi_square > _SAID else None
         change = self._V @ self._b
         change[self._delay] = 0.0
         self._corrected += self._b
         self._b = np.zeros(2)
-        return ClockEffect(offset_s, in_z, change)
+        return ClockEffect(offset_s, in_z, change, self.sigma_s)
 
     @property
     def _chi_square(self) -> float:

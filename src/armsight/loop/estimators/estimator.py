@@ -40,11 +40,13 @@ class ClockEffect(NamedTuple):
         offset_s: by how much the stamp was later than the filter took it to be, s.
         in_z: (6,) what that made of the innovation, [m; rad]; the filter has adapted to it in part.
         change: (K,) what was added to the filter's state as stamps were corrected; None where they are not.
+        sigma_s: standard deviation of the offset, s.
     """
 
     offset_s: float
     in_z: Array
     change: Array | None
+    sigma_s: float
 
 
 class Outcome(Enum):
@@ -71,6 +73,8 @@ class Innovation(Record):
         gain: (K, 6) what of z was added to the state; zero where the measurement was rejected.
         outcome: what became of it.
         clock: what is known of an error of the camera's clock; None where nothing is.
+        reference: (6,) as z, from the pose predicted by a state that stays, and its derivative (6, K); None where none is
+            kept (:meth:`KalmanEstimator.keep_reference`).
     """
 
     t_s: float
@@ -82,6 +86,7 @@ class Innovation(Record):
     gain: Array
     outcome: Outcome
     clock: ClockEffect | None = None
+    reference: tuple[Array, Array] | None = None
 
 
 @dataclass(frozen=True)

@@ -85,6 +85,7 @@ class KalmanEstimator:
         self._states = [ErrorState(-np.inf, np.zeros(at.size), np.diag(self._model.sigmas**2), nowhere, None)]
         self.on_innovation: Callable[[Innovation], None] | None = None
         self.clock = None if learns_delay else ClockFollower(at.size, at.delay, delay.sigma_s)
+        self._reference: Array | None = None
         self._waiting: list[PoseMeasurement] = []
         self._outliers: list[Array] = []
         self._backlash_set = True  # whether the readings have the newest estimate of the backlash
@@ -106,6 +107,11 @@ class KalmanEstimator:
     def span_s(self) -> tuple[float, float]:
         """The oldest and the newest time that can be estimated, s."""
         return self._readings.span_s
+
+    def keep_reference(self) -> None:
+        """Say from now on what measurements are against the state as it is now, forgotten parts left out."""
+        self._reference = self._states[-1].x.copy()
+        self._reference[self._forgets] = 0.0
 
     def joints(self, states: JointStates) -> None:
         """Take readings of the potentiometers, in order of time."""
@@ -279,23 +285,35 @@ class KalmanEstimator:
         outcome = self._gate(z, S)
         if outcome is Outcome.OUTLIER:
             if report is not None:
-                report(
-                    Innovation(
-                        t_s, pose_measurement.T_base_tool, z, S, H, step.kept[0], np.zeros((self._at.size, 6)), outcome
-                    )
-                )
+                none = np.zeros((self._at.size, 6))
+                report(self._said(t_s, joints, pose_measurement, (z, S, H), (step.kept[0], none), outcome))
             return None, outcome
         if outcome is Outcome.REOPENED:
             P[self._diagonal] += self._opened
             PHt = P @ H.T
         x, P, K = self._update(x, P, joints, pose_measurement, first, PHt)
         if report is not None:
-            change = report(Innovation(t_s, pose_measurement.T_base_tool, z, S, H, step.kept[0], K, outcome))
+            change = report(self._said(t_s, joints, pose_measurement, (z, S, H), (step.kept[0], K), outcome))
             if change is not None and self.clock is not None:
                 x = x + change
                 by_delay = P[:, self._at.delay] / P[self._at.delay, self._at.delay]
                 P += (self.clock.sigma_s**2 - P[self._at.delay, self._at.delay]) * np.outer(by_delay, by_delay)
         return ErrorState(t_s, x, P, joints, pose_measurement), outcome
+
+    def _said(
+        self,
+        t_s: float,
+        joints: Smoothed,
+        pose_measurement: PoseMeasurement,
+        first: tuple[Array, Array, Array],
+        how: tuple[Array, Array],
+        outcome: Outcome,
+    ) -> Innovation:
+        """Return what became of a measurement: innovation, its covariance and derivative; what was kept, and the gain."""
+        reference = None
+        if self._reference is not None and self.on_innovation is not None:
+            reference = self._innovation(self._reference, joints, pose_measurement)[:2]
+        return Innovation(t_s, pose_measurement.T_base_tool, *first, *how, outcome, None, reference)
 
     def _innovation(self, x: Array, joints: Smoothed, pose_measurement: PoseMeasurement) -> tuple[Array, Array, Array]:
         """Return the innovation (6,) of a measurement, the model's derivative (6, size) by x, and the noise (6, 6)."""

@@ -1,26 +1,27 @@
-"""A rig that moved against the arm's base: found in the innovations of the estimator.
+"""What jumped or drifts: found at once in the innovations of the estimator.
 
-In: what the estimator did with each pose measurement. Out: the motion of the rig against the base, a jump or a drift, with
-the time of its beginning. The generalised likelihood ratio test of Willsky and Jones ("A generalized likelihood ratio
-approach to the detection and estimation of jumps in linear systems", 1976): a motion d of the arm's base in the rig
-changes six numbers of the filter's state at a time s; what a filter that does not know of it leaves of that, F, and its
-signature G in the innovations follow from the filter's own gains,
+In: what the estimator did with each pose measurement. Out: the hypotheses that explain it best. The generalised likelihood
+ratio test of Willsky and Jones ("A generalized likelihood ratio approach to the detection and estimation of jumps in
+linear systems", 1976): a change d of some numbers of the filter's state at a time s (base: the rig moved; tool: the body
+slipped; a zero: a potentiometer slipped; delay: the clock jumped); what a filter that does not know of it leaves of that,
+F, and its signature G in the innovations follow from the filter's own gains,
 
-    G_k = H_k kept_k F_k-1,    F_k = kept_k F_k-1 - K_k G_k,    F_s = I in the rows of the base
+    G_k = H_k kept_k F_k-1,    F_k = kept_k F_k-1 - K_k G_k,    F_s = I in the rows of what changed
 
 so that z_k = G_k d + noise; a drift adds its speed to F in every step. For each s the sums C = sum G^T S^-1 G and
 b = sum G^T S^-1 z give d = C^-1 b, and the chi-square b^T C^-1 b. Many beginnings are tried at once, the older the coarser.
+A motion of the base gives the alarm: with six numbers it explains most of what the others do. The likelihoods of all decide
+which of them is named.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from armsight.data import Array, Record
-from armsight.geometry.pose import adjoint, inverse
+from armsight.data import Array, Ids
 from armsight.loop.estimators import Innovation, Outcome
+from armsight.loop.estimators.armerror import layout
+from armsight.loop.health.change import RAMPS, Change, Suspect, changing, ranked, suspects
 from armsight.loop.health.record import HealthFinding, alarm_limit
 
 #: A beginning is tried every so often, s; older than this many seconds their distances grow with their age.
@@ -29,59 +30,49 @@ EVERY_S, _FINE_S, _RATIO = 0.2, 1.0, 1.4
 MOST, _TESTS_HZ = 20, 5.0
 #: Errors of the arm's model last about so long, s: innovations closer than that count as one.
 CORRELATED_S = 0.1
-#: A prior so wide that it decides nothing: m, rad; for a drift, of that much in a second.
-_WIDE = np.repeat([0.05, 0.1], 3)
+#: Priors so wide that they decide nothing: m, rad, s; for a drift, of that much in a second.
+_WIDE_M, _WIDE_RAD, _WIDE_S = 0.05, 0.1, 0.05
 #: A drift must explain so much more than a jump to be preferred.
-_RARER = np.array([0.0, 10.0])
-_LIMIT = alarm_limit(6, _TESTS_HZ, 2 * MOST)
-
-
-@dataclass(frozen=True, eq=False)
-class BaseMotion(Record):
-    """A motion of the rig against the arm's base.
-
-    Attributes:
-        begin_s: when it began, s.
-        drifts: whether it is a drift, else a jump.
-        motion: (6,) what the motion does to the measured pose of the tool, right tangent [m; rad]; of a drift, so far.
-        cov: (6, 6) its covariance.
-        chi_square: of the motion against none.
-    """
-
-    begin_s: float
-    drifts: bool
-    motion: Array
-    cov: Array
-    chi_square: float
-
-    @property
-    def suspected(self) -> Array:
-        """(6, 6) what the motion adds to the covariance of a measured pose of the tool."""
-        return np.asarray(np.outer(self.motion, self.motion) + self.cov)
+_RARER = 10.0
+_LIMITS = {freedom: alarm_limit(freedom, _TESTS_HZ, 2 * MOST) for freedom in (1, 6)}
 
 
 class FixedWatch:
-    """Watches whether the rig stands still in the arm's base.
+    """Watches whether rig, body, potentiometers and clock stay as they are.
 
     Args:
-        T_base_0: (4, 4) frame 0 of the arm's table in the base.
-        state_size: length of the filter's state, whose first six numbers are the tangent of the arm's base.
+        joints: how many the arm has.
 
     Attributes:
-        moved: the motion of the test that found the clearest one; None where none was found.
+        changes: the hypotheses of the test that found the clearest change, the best first; empty where none was found.
         reopened: how many times the estimator dropped what it had learned, and when it first did, s.
     """
 
-    def __init__(self, T_base_0: Array, state_size: int) -> None:
-        self._T_base_0, self._size = T_base_0, state_size
+    def __init__(self, joints: int) -> None:
+        at = self._parts = layout(joints)
+        self._size = at.size
+        # A column for each step: base, delay, tool, zeros after the first; then one for each ramp.
+        rows = [*range(6), at.delay, *range(6 * at.joints, 6 * at.joints + 6), *at.zeros[1:]]
+        self._steps = np.zeros((at.size, len(rows)))
+        self._steps[rows, np.arange(len(rows))] = 1.0
+        wide = np.full(len(rows), _WIDE_RAD)
+        wide[:3] = wide[RAMPS : RAMPS + 3] = _WIDE_M
+        wide[6] = _WIDE_S
+        self._wide, self._columns = np.append(wide, wide[:RAMPS]), len(rows) + RAMPS
+        self._suspects = tuple(each for each in suspects(at.joints) if each.kind != "backlash")
         self._begins = np.zeros(0)
-        self._F = np.zeros((state_size, 0, 2, 6))
-        self._C, self._b = np.zeros((0, 2, 6, 6)), np.zeros((0, 2, 6))
+        self._F = np.zeros((at.size, 0, self._columns))
+        self._C, self._b = np.zeros((0, self._columns, self._columns)), np.zeros((0, self._columns))
         self._squares, self._weights = np.zeros(0), np.zeros(0)
         self._last_s = self._tested_s = -np.inf
         self._rejected: list[Innovation] = []
-        self.moved: BaseMotion | None = None
+        self.changes: tuple[Change, ...] = ()
         self.reopened: tuple[int, float] = (0, np.inf)
+
+    def _of(self, suspect: Suspect) -> Ids:
+        """Return the columns (D,) of a suspect."""
+        first = self._steps.shape[1] if suspect.slow else 0
+        return first + np.arange(suspect.columns.start, suspect.columns.stop)
 
     def take(self, innovation: Innovation) -> None:
         """Take what the estimator did with a measurement, in order of time.
@@ -109,7 +100,7 @@ class FixedWatch:
         if not len(self._begins) or t_s - self._begins[-1] >= EVERY_S:
             self._begin(t_s)
         if np.isfinite(passed):
-            self._F[:6, :, 1] += passed * np.eye(6)[:, None]
+            self._F[:, :, self._steps.shape[1] :] += passed * self._steps[:, None, :RAMPS]
         self._last_s = t_s
         weight = min(passed / CORRELATED_S, 1.0)
         F = innovation.kept[:, None] * self._F.reshape(self._size, -1)
@@ -117,15 +108,15 @@ class FixedWatch:
         if innovation.gain.any():
             self._F = (F - innovation.gain @ G).reshape(self._F.shape)
         white = np.linalg.inv(innovation.cov)
-        signature = G.reshape(6, -1, 2, 6)
-        whitened = (white @ G).reshape(6, -1, 2, 6)
-        self._C += weight * np.einsum("inak,inal->nakl", signature, whitened)
-        self._b += weight * np.einsum("inak,i->nak", whitened, z)
+        signature = np.moveaxis(G.reshape(6, -1, self._columns), 0, 1)
+        whitened = white @ signature
+        self._C += weight * np.swapaxes(signature, 1, 2) @ whitened
+        self._b += weight * z @ whitened
         self._squares += weight * float(z @ white @ z)
         self._weights += weight
         if t_s - self._tested_s >= 1.0 / _TESTS_HZ:
             self._tested_s = t_s
-            self._decide(t_s, innovation.T_base_tool)
+            self._decide(innovation)
 
     def _begin(self, t_s: float) -> None:
         """Try a new beginning, and drop the ones that the age makes needless."""
@@ -136,52 +127,54 @@ class FixedWatch:
             last = age if keep[k] else last
         rows = np.flatnonzero(keep)
         rows = rows if len(rows) < MOST else np.delete(rows, 1)
-        new = np.zeros((self._size, 1, 2, 6))
-        new[:6, 0, 0] = np.eye(6)
+        new = np.zeros((self._size, 1, self._columns))
+        new[:, 0, : self._steps.shape[1]] = self._steps
         self._begins = np.append(self._begins[rows], t_s)
         self._F = np.concatenate([self._F[:, rows], new], axis=1)
-        self._C = np.concatenate([self._C[rows], np.zeros((1, 2, 6, 6))])
-        self._b = np.concatenate([self._b[rows], np.zeros((1, 2, 6))])
+        self._C = np.concatenate([self._C[rows], np.zeros((1, self._columns, self._columns))])
+        self._b = np.concatenate([self._b[rows], np.zeros((1, self._columns))])
         self._squares, self._weights = np.append(self._squares[rows], 0.0), np.append(self._weights[rows], 0.0)
 
-    def _decide(self, t_s: float, T_base_tool: Array) -> None:
-        """Test all beginnings; a motion is that of the tool at a pose (4, 4)."""
-        C = self._C * np.outer(_WIDE, _WIDE) + np.eye(6)
-        b = self._b * _WIDE
-        d = np.linalg.solve(C, b[..., None])[..., 0]
-        gained = np.einsum("nak,nak->na", b, d)
-        excess = np.maximum((self._squares[:, None] - gained) / np.maximum(6.0 * self._weights, 1.0)[:, None], 1.0)
-        chi_square = gained / excess
-        n, kind = np.unravel_index(int(np.argmax(chi_square - _RARER)), chi_square.shape)
-        found = float(chi_square[n, kind])
-        if found <= max(_LIMIT, 0.0 if self.moved is None else self.moved.chi_square):
+    def _decide(self, innovation: Innovation) -> None:
+        """Test all beginnings; the hypotheses are what they are at the newest measurement."""
+        moving = [each for each in self._suspects if each.cause == "fixed"]
+        explained = [self._fitted(each)[2] for each in moving]
+        alarms = np.array(
+            [gained - (_RARER if each.slow else 0.0) for each, gained in zip(moving, explained, strict=True)]
+        )
+        kind, n = np.unravel_index(int(np.argmax(alarms)), alarms.shape)
+        found = float(explained[int(kind)][n])
+        strongest = max((each.chi_square for each in self.changes if each.suspect.cause == "fixed"), default=0.0)
+        if found <= max(_LIMITS[6], strongest):
             return
-        length = (t_s - self._begins[n]) if kind else 1.0
-        to_tool = length * adjoint(inverse(T_base_tool) @ self._T_base_0) * _WIDE
-        cov = excess[n, kind] * to_tool @ np.linalg.inv(C[n, kind]) @ to_tool.T
-        self.moved = BaseMotion(float(self._begins[n]), bool(kind), to_tool @ d[n, kind], cov, found)
+        near = slice(max(int(n) - 1, 0), int(n) + 2)
+        columns, changes = changing(self._parts, innovation.by_state), list[Change]()
+        for each in self._suspects:
+            d, cov, chi_squares = self._fitted(each)
+            k = near.start + int(np.argmax(chi_squares[near]))
+            begin_s, chi_square = float(self._begins[k]), float(chi_squares[k])
+            length = (innovation.t_s - begin_s) if each.slow else 1.0
+            score = chi_square - _LIMITS[d.shape[1]] - (_RARER if each.slow else 0.0)
+            effect, T = columns[:, each.columns], innovation.T_base_tool
+            size, spread = length * d[k], length**2 * cov[k]
+            changes.append(Change(each, begin_s, innovation.t_s, size, spread, chi_square, score, effect, T))
+        self.changes = ranked(changes)
+
+    def _fitted(self, suspect: Suspect) -> tuple[Array, Array, Array]:
+        """Return a change (S, D) at all beginnings with covariance (S, D, D) and chi-square (S,)."""
+        rows = self._of(suspect)
+        wide = self._wide[rows]
+        C = self._C[:, rows[:, None], rows] * np.outer(wide, wide) + np.eye(len(rows))
+        b = self._b[:, rows] * wide
+        d = np.linalg.solve(C, b[..., None])[..., 0]
+        gained = np.einsum("nk,nk->n", b, d)
+        excess = np.maximum((self._squares - gained) / np.maximum(6.0 * self._weights, 1.0), 1.0)
+        return wide * d, excess[:, None, None] * np.linalg.inv(C) * np.outer(wide, wide), gained / excess
 
     def findings(self) -> tuple[HealthFinding, ...]:
-        """Return what was found so far; nothing while all is well."""
+        """Return that the estimator dropped what it had learned; nothing where it did not."""
         count, first_s = self.reopened
-        if (moved := self.moved) is None:
-            return () if not count else (_reopened_finding(count, first_s),)
-        shift = moved.motion[:3]
-        size = float(np.linalg.norm(shift))
-        along = shift / size
-        how = "drifts" if moved.drifts else "moved"
-        return (
-            HealthFinding(
-                "fixed",
-                f"the rig {how} against the base of the arm: the tool appears displaced by {1e3 * size:.2f} mm and "
-                f"{np.degrees(np.linalg.norm(moved.motion[3:])):.3f} deg{' so far' if moved.drifts else ''}",
-                moved.begin_s,
-                1e3 * size,
-                1e3 * float(np.sqrt(along @ moved.cov[:3, :3] @ along)),
-                "mm",
-                "fasten the rig and the base of the arm, and run again: that repeats the hand-eye calibration",
-            ),
-        )
+        return () if not count else (_reopened_finding(count, first_s),)
 
 
 def _reopened_finding(count: int, first_s: float) -> HealthFinding:

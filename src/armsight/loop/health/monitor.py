@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from armsight.data import Body, PoseEstimate
+from armsight.data import Array, Body, PoseEstimate
 from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement
-from armsight.loop.estimators.armerror import layout
 from armsight.loop.estimators.clock import ClockFollower
+from armsight.loop.health.change import Change, doubtful, finding, suspected
 from armsight.loop.health.clock import clock_findings
 from armsight.loop.health.closure import ClosureWatch
-from armsight.loop.health.fixed import BaseMotion, FixedWatch
+from armsight.loop.health.fixed import FixedWatch
 from armsight.loop.health.host import HostWatch
 from armsight.loop.health.landmarks import LandmarkWatch
 from armsight.loop.health.record import HealthFinding, Trust
@@ -45,6 +45,7 @@ class HealthMonitor:
         self._poses: list[tuple[PoseEstimate, float | None]] = []
         self._innovations: list[Innovation] = []
         self._clock: ClockFollower | None = None
+        self._names: tuple[str, ...] = ()
 
     def received(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
         """Do as :meth:`measured` without the tests, which :meth:`work` makes: a command is waiting for the pose.
@@ -102,10 +103,11 @@ class HealthMonitor:
 
     def follow(self, estimator: KalmanEstimator, arm: Arm) -> None:
         """Watch from now on, by what an estimator makes of the poses, whether rig, body and joints stay as they are."""
-        self._fixed = FixedWatch(arm.T_base_0, layout(arm.joints).size)
-        self._closure = ClosureWatch(estimator.sigmas, arm.joint_names)
-        self._innovations, self._clock = [], estimator.clock
+        self._fixed = FixedWatch(arm.joints)
+        self._closure = ClosureWatch(estimator.sigmas, arm.joints)
+        self._innovations, self._clock, self._names = [], estimator.clock, arm.joint_names
         estimator.on_innovation = self._note
+        estimator.keep_reference()
 
     def _note(self, innovation: Innovation) -> None:
         """Keep what became of a measurement for the tests; a contradiction counts at once."""
@@ -118,36 +120,48 @@ class HealthMonitor:
     def trust(self) -> Trust:
         """How far a loop may rely on the measured poses now."""
         cameras_moved = self._landmarks is not None and self._landmarks.cameras_moved
-        if self.moved is not None or cameras_moved or (self._rig is not None and self._rig.wrong_at_rest):
+        if doubtful(self.changes) or cameras_moved or (self._rig is not None and self._rig.wrong_at_rest):
             return Trust.NONE
         return Trust.DOUBTED if self._newest_s - self._doubted_s < DOUBT_S else Trust.FULL
 
     @property
-    def moved(self) -> BaseMotion | None:
-        """The motion of the rig against the base, or of the body on the tool, that was found; None where none was."""
-        if self._closure is not None and self._closure.change is not None:
-            return self._closure.change.motion
-        return None if self._fixed is None else self._fixed.moved
+    def changes(self) -> tuple[Change, ...]:
+        """The hypotheses that explain what the estimator saw of a change, the best first; empty where there is none."""
+        changes = self._every_change
+        return () if self._clocks(changes) else changes
 
-    def widened(self, measurement: PoseMeasurement) -> PoseMeasurement:
-        """Return a pose measurement of the tool with a motion of the rig against the base in its common covariance."""
-        moved = self.moved
-        if moved is None or measurement.t_s < moved.begin_s:
-            return measurement
-        return replace(measurement, cov_common=measurement.cov_common + moved.suspected)
+    @property
+    def _every_change(self) -> tuple[Change, ...]:
+        # The closure knows more causes than the innovations within a second, and sizes them better.
+        if self._closure is None or self._fixed is None:
+            return ()
+        noticed = self._fixed.changes or self._fixed.reopened[0]
+        return self._closure.changes or (noticed and self._closure.explained) or self._fixed.changes
+
+    def _clocks(self, changes: Sequence[Change]) -> bool:
+        """Return whether a clock that is followed explains hypotheses as well."""
+        followed = self._clock is not None and self._clock.since_s is not None
+        return followed and any(each.suspect.cause == "time" for each in changes)
+
+    def _changed(self) -> tuple[HealthFinding, ...]:
+        """Return what the estimator saw of a change: its hypotheses, or that it dropped what it had learned."""
+        changes = self._every_change
+        if changes:
+            return () if self._clocks(changes) else (finding(changes, self._names),)
+        return () if self._fixed is None else self._fixed.findings()
+
+    def suspected(self, measurement: PoseMeasurement) -> Array | None:
+        """Return the covariance (6, 6) of what may have moved a pose measurement of the tool; None where nothing is."""
+        return suspected(measurement, self.changes)
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
         self.work()
-        slow = () if self._closure is None else self._closure.findings()
-        # The closure knows more causes than the innovations within a second, and sizes them better.
-        fast = () if self._fixed is None or slow else self._fixed.findings()
         late = () if self._clock is None else clock_findings(self._clock, self._newest_s)
         seen = () if self._landmarks is None else self._landmarks.findings()
         return (
             *(() if self._rig is None else self._rig.findings()),
-            *slow,
-            *fast,
+            *self._changed(),
             *seen,
             *late,
             *self._host.findings(),

@@ -37,6 +37,7 @@ class HealthFinding:
         sigma: standard deviation of the size.
         unit: deg, mm, %, ms, or measurements.
         advice: what to do.
+        alternatives: other causes that explain it nearly as well.
     """
 
     cause: Cause
@@ -46,6 +47,7 @@ class HealthFinding:
     sigma: float
     unit: str
     advice: str
+    alternatives: tuple[Cause, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the object that summary.json and ``--json`` hold."""

@@ -59,7 +59,13 @@ _NECESSARY = 1e-4
 _ROTATIONS, _SCALED, _SKEWED = slice(2, 5), 5, 6
 #: What may be wrong, and its part of the seven numbers.
 _PARTS: dict[Part, slice] = {"rig": slice(0, 5), "body": slice(5, 6), "time": slice(6, 7)}
-_ALARM = alarm_limit(len(_WIDE), 1.0 / TEST_S)
+#: Chi-square of an alarm: of all seven numbers, and of each part alone, which share the probability of a false one.
+_ALARM, _ALARMS = (
+    alarm_limit(len(_WIDE), 1.0 / TEST_S, 4),
+    {part: alarm_limit(rows.stop - rows.start, 1.0 / TEST_S, 4) for part, rows in _PARTS.items()},
+)
+#: A change matters or not at so many of the newest poses: a skew does so in motion alone.
+_POSES = 60
 #: Chi-square from which on a change that matters widens the poses: chance exceeds it in one of fifty tests.
 _SUSPECTED = float(chdtri(len(_WIDE), 0.02))
 
@@ -137,7 +143,8 @@ class RigWatch:
         self._row_of[self._points] = np.arange(len(self._points))
         self._last = (-np.inf, np.eye(4))
         self._began: Array | None = None
-        self._effect = (np.zeros((6, len(_WIDE))), np.eye(6))
+        # What the seven numbers do to the newest poses, and the covariances of these.
+        self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
         self._test, self._window = ResidualSums(self._size, 0.0), ResidualSums(self._size, 0.0)
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
         self._timed = False
@@ -164,7 +171,7 @@ class RigWatch:
         if found is None:
             return np.zeros((6, 6))
         sums, by_fault = found
-        self._effect = (by_fault, estimate.cov)
+        self._effects.append((by_fault, estimate.cov))
         self._sum(sums, estimate.T_left_body, now_s)
         if self.suspected is None:
             return np.zeros((6, 6))
@@ -270,7 +277,8 @@ class RigWatch:
         self._window.add(self._test, 1.0)
         self._test = ResidualSums(self._size, 0.0)
         change = self._estimated(self._window)
-        alarm = change.chi_square > _ALARM and self._matters(change, slice(None))
+        certain = change.chi_square > _ALARM or any(change.alone[part] > limit for part, limit in _ALARMS.items())
+        alarm = certain and self._matters(change, slice(None))
         self._alarms = self._alarms + 1 if alarm else 0
         if 0 < self._alarms <= _FRESH:
             change = self._begun(change)
@@ -293,10 +301,11 @@ class RigWatch:
         return self.alarm and self.suspected is not None and self._to_blame(self.suspected) != ["time"]
 
     def _matters(self, change: RigChange, part: slice) -> bool:
-        """Return whether a part of the seven numbers moves the newest pose by so many of its sigmas."""
-        by_fault, cov = self._effect
-        shift = by_fault[:, part] @ change.f[part]
-        return float(shift @ np.linalg.solve(cov, shift)) > _MATTERS**2
+        """Return whether a part of the seven numbers moves one of the newest poses by so many of its sigmas."""
+        by_fault, cov = map(np.array, zip(*self._effects, strict=True))
+        shift = by_fault[:, :, part] @ change.f[part]
+        squares = np.einsum("ni,ni->n", shift, np.linalg.solve(cov, shift[..., None])[..., 0])
+        return float(np.max(squares)) > _MATTERS**2
 
     def _estimated(self, sums: ResidualSums) -> RigChange:
         """Return the seven numbers from sums, everything else eliminated."""

@@ -1,0 +1,254 @@
+"""Changes of rig, body, joints and clock as hypotheses: their likelihoods, what they do to poses, and how they are said.
+
+In: hypotheses that the tests of :mod:`armsight.loop.health.fixed` and :mod:`armsight.loop.health.closure` fitted to what
+the estimator did. Out: pose measurements widened by what they may be off, and the record that names the best hypothesis
+and those that explain nearly as much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from armsight.data import Array, Record
+from armsight.geometry.pose import adjoint, inverse
+from armsight.loop.estimators import PoseMeasurement
+from armsight.loop.estimators.armerror import ErrorLayout
+from armsight.loop.health.record import Cause, HealthFinding
+
+#: Hypotheses whose scores differ by less than this from the best cannot be distinguished from it.
+ALIKE = 12.0
+#: The errors of an arm have longer tails than Gaussian ones: chi-squares count by this factor less.
+MARGIN = 1.4
+
+Kind = Literal["rig", "drift", "body", "joint", "backlash", "time", "rate"]
+_CAUSES: dict[Kind, Cause] = {
+    "rig": "fixed",
+    "drift": "fixed",
+    "body": "body",
+    "joint": "joint",
+    "backlash": "joint",
+    "time": "time",
+    "rate": "time",
+}
+
+
+def changing(parts: ErrorLayout, H: Array) -> Array:
+    """Return the columns (6, 13 + 2 n - 1) of what may change, of the derivative (6, K) of the tool's pose by the state.
+
+    Base (6) and delay (1), which may change slowly, too; tool (6), zeros of the joints after the first (its own is a
+    rotation of the base), widths of the backlash.
+    """
+    # Of a gear that grew looser half is taken for each of the two that decide on the side: mostly they agree.
+    n, tool = parts.joints, 6 * parts.joints
+    widths = 0.5 * (H[:, parts.backlash : parts.backlash + n] + H[:, parts.floats : parts.floats + n])
+    delay = H[:, parts.delay : parts.delay + 1]
+    return np.concatenate([H[:, :6], delay, H[:, tool : tool + 6], H[:, parts.zeros[1:]], widths], axis=1)
+
+
+#: Of these columns those that may change slowly; and how many there are without the backlash, of n joints.
+RAMPS = 7
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """Something that may change.
+
+    Attributes:
+        kind: rig: it jumped; drift: it drifts; body: it slipped on the tool; joint: its zero jumped; backlash: it grew;
+            time: the camera's clock jumped; rate: it runs at another rate.
+        joint: row of the joint; -1 for what is not of one.
+        columns: its parameters among those that may change.
+    """
+
+    kind: Kind
+    joint: int
+    columns: slice
+
+    @property
+    def cause(self) -> Cause:
+        """The cause that a record gives."""
+        return _CAUSES[self.kind]
+
+    @property
+    def slow(self) -> bool:
+        """Whether it changes as a ramp, else as a step."""
+        return self.kind in ("drift", "rate")
+
+    @property
+    def moves(self) -> bool:
+        """Whether it makes measured poses wrong, beyond what a clock that is followed does."""
+        return self.kind in ("rig", "drift", "body")
+
+
+def suspects(joints: int) -> tuple[Suspect, ...]:
+    """Return all of an arm of n joints."""
+    tool = slice(RAMPS, RAMPS + 6)
+    return (
+        Suspect("rig", -1, slice(0, 6)),
+        Suspect("drift", -1, slice(0, 6)),
+        Suspect("body", -1, tool),
+        Suspect("time", -1, slice(6, 7)),
+        Suspect("rate", -1, slice(6, 7)),
+        Suspect("joint", 0, slice(5, 6)),
+        *(Suspect("joint", i, slice(tool.stop + i - 1, tool.stop + i)) for i in range(1, joints)),
+        *(Suspect("backlash", i, slice(tool.stop - 1 + joints + i, tool.stop + joints + i)) for i in range(joints)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Change(Record):
+    """A hypothesis: something changed, by so much.
+
+    Attributes:
+        suspect: what changed.
+        begin_s: when, s.
+        end_s: time of the newest measurement that was used, s.
+        size: (D,) by how much: tangent of base or tool [m; rad], an angle, rad, or a time, s; of a ramp so far.
+        cov: (D, D) its covariance.
+        chi_square: of the change against none.
+        score: chi-square less what its parameters explain by chance: twice the logarithm of a likelihood, beyond a limit.
+        effect: (6, D) what a unit of it does to the newest measured pose of the tool, right tangent.
+        T_base_tool: (4, 4) that pose.
+    """
+
+    suspect: Suspect
+    begin_s: float
+    end_s: float
+    size: Array
+    cov: Array
+    chi_square: float
+    score: float
+    effect: Array
+    T_base_tool: Array
+
+    def displacement(self, T_base_tool: Array, t_s: float) -> tuple[Array, Array]:
+        """Return what it does to a measured pose of the tool (4, 4) at a time, s: right tangent (6,), covariance."""
+        by = self.effect
+        if self.suspect.kind != "body":  # the base moves the tool by the lever to it
+            by = adjoint(inverse(T_base_tool) @ self.T_base_tool) @ by
+        if self.suspect.slow:
+            by = by * (t_s - self.begin_s) / (self.end_s - self.begin_s)
+        return by @ self.size, by @ self.cov @ by.T
+
+    @property
+    def newest(self) -> tuple[Array, Array]:
+        """What it does to the newest measured pose of the tool (6,), and its covariance (6, 6)."""
+        return self.displacement(self.T_base_tool, self.end_s)
+
+
+def ranked(changes: Sequence[Change]) -> tuple[Change, ...]:
+    """Return the hypotheses that cannot be distinguished from the one of highest score, that one first."""
+    best = max(each.score for each in changes)
+    return tuple(each for each in sorted(changes, key=lambda each: -each.score) if each.score > best - ALIKE)
+
+
+def probabilities(changes: Sequence[Change]) -> Array:
+    """Return the probabilities (N,) of hypotheses, equally probable before: their likelihoods, normalised."""
+    scores = np.array([each.score for each in changes])
+    likelihoods = np.exp((scores - scores.max()) / (2.0 * MARGIN))
+    return np.asarray(likelihoods / likelihoods.sum())
+
+
+def doubtful(changes: Sequence[Change]) -> bool:
+    """Return whether measured poses may be wrong by one of the hypotheses."""
+    return any(each.suspect.moves or (each.suspect.kind, each.suspect.joint) == ("joint", 0) for each in changes)
+
+
+def suspected(measurement: PoseMeasurement, changes: Sequence[Change]) -> Array | None:
+    """Return the covariance (6, 6) of what hypotheses do to a pose measurement of the tool; None where they do nothing.
+
+    It is that of their mixture: of each the square of what it does, and its covariance.
+    """
+    extra, t_s, T = np.zeros((6, 6)), measurement.t_s, measurement.T_base_tool
+    for each, share in zip(changes, probabilities(changes) if changes else (), strict=True):
+        if each.suspect.moves and t_s >= each.begin_s:
+            shift, cov = each.displacement(T, t_s)
+            extra += share * (np.outer(shift, shift) + cov)
+    return extra if extra.any() else None
+
+
+def widened(measurement: PoseMeasurement, changes: Sequence[Change]) -> PoseMeasurement:
+    """Return a pose measurement of the tool with what may have moved it in its common covariance."""
+    extra = suspected(measurement, changes)
+    return measurement if extra is None else replace(measurement, cov_common=measurement.cov_common + extra)
+
+
+#: What else it may be.
+_OTHER: dict[Kind, str] = {
+    "rig": "a rig that moved",
+    "drift": "a rig that drifts",
+    "body": "a body that slipped on the tool",
+    "joint": "a potentiometer of {name} that slipped",
+    "backlash": "more backlash of {name}",
+    "time": "a clock that jumped",
+    "rate": "a clock of another rate",
+}
+
+
+def finding(changes: Sequence[Change], names: Sequence[str]) -> HealthFinding:
+    """Return the finding of hypotheses that cannot be distinguished, the best first; names are those of the joints."""
+    best, kind, joint = changes[0], changes[0].suspect.kind, changes[0].suspect.joint
+    others = [
+        each.suspect for each in changes[1:] if {each.suspect.kind, kind} not in ({"rig", "drift"}, {"time", "rate"})
+    ]
+    named = dict.fromkeys(_OTHER[each.kind].format(name=names[each.joint]) for each in others)
+    unsure = f"; {' or '.join(named)} cannot be excluded" if named else ""
+    causes = [each.cause for each in others]
+    if (kind, joint) == ("joint", 0):
+        causes.append("fixed")
+    alternatives = tuple(cause for cause in dict.fromkeys(causes) if cause != best.suspect.cause)
+    if best.suspect.moves:
+        found = _moved_finding(best, unsure)
+    else:
+        found = _clock_finding(best, unsure) if best.suspect.cause == "time" else _joint_finding(best, names, unsure)
+    return replace(found, alternatives=alternatives)
+
+
+def _joint_finding(change: Change, names: Sequence[str], unsure: str) -> HealthFinding:
+    """Return the finding of a joint."""
+    kind, joint = change.suspect.kind, change.suspect.joint
+    size, sigma = float(np.degrees(change.size[0])), float(np.degrees(np.sqrt(change.cov[0, 0])))
+    if kind == "backlash":
+        grew = "grew" if size > 0 else "shrank"
+        what, advice = f"the backlash of {names[joint]} {grew} by {abs(size):.2f} deg", "look at the gear of this joint"
+    else:
+        same = ", or the rig rotated about the axis of this joint: the two look alike" if joint == 0 else ""
+        what = f"the potentiometer of {names[joint]} slipped by {size:.2f} deg{same}"
+        advice = "fasten the potentiometer on its shaft, and set its zero"
+    return HealthFinding("joint", what + unsure, change.begin_s, size, sigma, "deg", advice)
+
+
+def _clock_finding(change: Change, unsure: str) -> HealthFinding:
+    """Return the finding of a clock that is not followed yet."""
+    size, sigma = 1e3 * float(change.size[0]), 1e3 * float(np.sqrt(change.cov[0, 0]))
+    return HealthFinding(
+        "time",
+        f"the images come {abs(size):.2f} ms {'later' if size > 0 else 'earlier'} than at the beginning, against the "
+        f"readings of the joints{unsure}",
+        change.begin_s,
+        size,
+        sigma,
+        "ms",
+        "stamp images and readings by one clock, with the cameras' own stamps instead of times of arrival",
+    )
+
+
+def _moved_finding(change: Change, unsure: str) -> HealthFinding:
+    """Return the finding of a rig or a body that moved."""
+    shift, cov = change.newest
+    size = float(np.linalg.norm(shift[:3]))
+    along = shift[:3] / size
+    sigma = float(np.sqrt(along @ cov[:3, :3] @ along))
+    so_far = " so far" if change.suspect.slow else ""
+    by = f"displaced by {1e3 * size:.2f} mm and {np.degrees(np.linalg.norm(shift[3:])):.3f} deg{so_far}{unsure}"
+    if change.suspect.kind == "body":
+        what, advice = "the body slipped on the tool: it is ", "fasten the body on the tool, and run again"
+    else:
+        how = "drifts" if change.suspect.slow else "moved"
+        what = f"the rig {how} against the base of the arm: the tool appears "
+        advice = "fasten the rig and the base of the arm, and run again: that repeats the hand-eye calibration"
+    return HealthFinding(change.suspect.cause, what + by, change.begin_s, 1e3 * size, 1e3 * sigma, "mm", advice)

@@ -1,0 +1,63 @@
+"""Hypotheses of a change: what they do to a pose, how probable they are, and how they are named together."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm_rig import ARM, adjoint_of, off, small
+
+from armsight.loop.estimators import PoseMeasurement
+from armsight.loop.health.change import Change, doubtful, finding, probabilities, ranked, suspected, suspects
+
+SUSPECTS = {(each.kind, each.joint): each for each in suspects(6)}
+T, T_LATER = small(np.array([0.4, 0.1, 0.3, 0.2, -0.5, 1.0])), small(np.array([0.2, -0.3, 0.5, -1.0, 0.4, 0.3]))
+MOTION = np.array([2e-3, -1e-3, 5e-4, 1e-3, 2e-3, -1e-3])
+
+
+def change(kind, joint=-1, score=50.0, **other):
+    suspect = SUSPECTS[kind, joint]
+    size = np.full(1, 0.01) if joint >= 0 or suspect.cause == "time" else MOTION
+    effect = np.ones((6, 1)) if len(size) == 1 else np.eye(6) if kind == "body" else adjoint_of(np.linalg.inv(T))
+    cov = 1e-8 * np.eye(len(size))
+    return replace(Change(suspect, 10.0, 14.0, size, cov, 100.0, score, effect, T), **other)
+
+
+def test_a_motion_of_the_base_is_carried_to_the_pose_at_hand():
+    moved = small(MOTION)  # of the base
+    shift, cov = change("rig").displacement(T_LATER, 20.0)
+    np.testing.assert_allclose(shift, off(T_LATER, moved @ T_LATER), atol=1e-5)
+    carried = adjoint_of(np.linalg.inv(T_LATER))
+    np.testing.assert_allclose(cov, 1e-8 * carried @ carried.T, atol=1e-12)
+
+
+def test_a_slip_of_the_body_is_the_same_at_every_pose_and_a_drift_goes_on():
+    np.testing.assert_array_equal(change("body").displacement(T_LATER, 20.0)[0], MOTION)
+    now, later = (change("drift").displacement(T, t_s)[0] for t_s in (14.0, 18.0))
+    np.testing.assert_allclose(later, 2.0 * now, atol=1e-12)
+
+
+def test_a_pose_is_widened_by_the_mixture_of_what_cannot_be_distinguished():
+    measurement = PoseMeasurement(12.0, T, np.eye(6), np.zeros((6, 6)))
+    rig, body = change("rig"), change("body")
+    np.testing.assert_allclose(probabilities([rig, body]), 0.5)
+    both = [shift[:, None] * shift + cov for shift, cov in (each.displacement(T, 12.0) for each in (rig, body))]
+    np.testing.assert_allclose(suspected(measurement, [rig, body]), np.mean(both, axis=0))
+    assert suspected(replace(measurement, t_s=9.0), [rig, body]) is None
+    assert suspected(measurement, [change("joint", 2)]) is None
+
+
+@pytest.mark.parametrize(
+    ("given", "cause", "alternatives"),
+    [
+        ([("rig", -1, 60.0), ("body", -1, 55.0), ("joint", 2, 20.0)], "fixed", ("body",)),
+        ([("joint", 2, 60.0), ("rig", -1, 55.0), ("drift", -1, 54.0)], "joint", ("fixed",)),
+        ([("joint", 0, 60.0), ("rig", -1, 20.0)], "joint", ("fixed",)),
+        ([("time", -1, 60.0), ("rate", -1, 59.0)], "time", ()),
+    ],
+)
+def test_one_record_names_all_that_cannot_be_distinguished(given, cause, alternatives):
+    changes = ranked([change(*each) for each in given])
+    found = finding(changes, ARM.joint_names)
+    assert (found.cause, found.alternatives) == (cause, alternatives)
+    assert found.what.count("cannot be excluded") == (len(changes) > 1 and bool(alternatives))
+    assert doubtful(changes) == ("fixed" in (cause, *alternatives))
