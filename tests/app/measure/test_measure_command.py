@@ -204,6 +204,18 @@ def test_nothing_in_view_is_an_error_after_its_lines(start, rendered, armsight):
     assert "none of 12 shots could be measured" in said.err
 
 
+@pytest.mark.parametrize(
+    ("code", "what"), [(-1, "turned by 180 degrees"), (1, "mirrored"), (0, "upside down and mirrored")]
+)
+def test_images_that_a_driver_turned_are_named(start, arm, armsight, tmp_path, code, what):
+    for side in ("left", "right"):
+        image = cv2.imread(str(next(arm.glob(f"{side}*.png"))), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(tmp_path / f"{side}0.png"), cv2.flip(image, code))
+    said = armsight(*start, "--left", tmp_path / "left*.png", "--right", tmp_path / "right*.png")
+    assert said.code == 2
+    assert f"none of 1 shots could be measured: the images are {what} against those of the calibration" in said.err
+
+
 def test_left_and_right_exchanged_is_the_reason(start, arm, armsight):
     said = armsight(*start, "--left", arm / "right*.png", "--right", arm / "left*.png", "--json")
     assert said.code == 2

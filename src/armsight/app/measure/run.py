@@ -6,7 +6,7 @@ import contextlib
 import json
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from armsight.app.messages import colour, weak
 from armsight.app.progress import bar
 from armsight.app.stream.datum import Published, ShotDatum
 from armsight.app.stream.sink import Fanout, Publisher
-from armsight.data import SIDES, Body, Missed, PoseEstimate, Shot
+from armsight.data import SIDES, Body, Image, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines
@@ -123,6 +123,7 @@ def measure_shots(
     total: int | None
     discs: DiscTarget | None = None
     skewed: list[HealthFinding] = []
+    first: list[Shot] = []
     with contextlib.ExitStack() as stack:
         if detections is not None:
             body, shots = _detected(detections, target)
@@ -151,6 +152,7 @@ def measure_shots(
                 if again is not None:
                     stack.enter_context(contextlib.closing(again))
                 results = _moved(stereo, found, _shots(opened, stereo, rig), requested, again)
+            results = _keeping(results, first)
         view = None if folder is None else PictureFolder(folder, stereo, body, discs, total)
         # What was measured is written whatever ends the run; where one of the two cannot be written the other is.
         if view is not None:
@@ -174,6 +176,8 @@ def measure_shots(
             kept = f", kept in {output}" if output is not None and records else ""
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
             raise
+    if records and detections is None and not any(record.ok for record in records):
+        raise ArmsightError(_nothing_measured(records, _turned(stereo, found, first)))
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
     moved = next((r.shutters for r in records if r.shutters is not None), None)
     if save_rig is not None and moved is not None:
@@ -192,6 +196,15 @@ def measure_shots(
     if as_json and health:
         click.echo(json.dumps({"health": [found.to_json() for found in health]}))
     return health
+
+
+def _keeping(results: Iterator[Result], first: list[Shot]) -> Iterator[Result]:
+    """Yield the results; keep the first shot that was missed although both images are there."""
+    for result in results:
+        shot = result[0]
+        if not first and isinstance(result[1], Missed) and shot.left is not None and shot.right is not None:
+            first.append(shot)
+        yield result
 
 
 def _watched(
@@ -364,6 +377,30 @@ def _board_file(path: Path, rig: StereoRig, target: str) -> Path | None:
     return beside if beside.exists() else None
 
 
+def _nothing_measured(records: list[ShotPose], why: str = "") -> str:
+    return f"none of {len(records)} shots could be measured{why}; {records[0].shot}: {records[0].reason}"
+
+
+#: What a camera's driver may have done to its images -> how it is undone.
+_TURNS: dict[str, Callable[[Image], Image]] = {
+    "turned by 180 degrees": lambda image: image[::-1, ::-1],
+    "mirrored": lambda image: image[:, ::-1],
+    "upside down and mirrored": lambda image: image[::-1],
+}
+
+
+def _turned(rig: StereoRig, target: Target, shots: list[Shot]) -> str:
+    """Return what to say where a shot that was missed can be measured once its images are turned; empty otherwise."""
+    for shot in shots:
+        assert shot.left is not None
+        assert shot.right is not None
+        for what, undo in _TURNS.items():
+            left, right = (np.ascontiguousarray(undo(image)) for image in (shot.left, shot.right))
+            if isinstance(measure(rig, target, replace(shot, left=left, right=right)), PoseEstimate):
+                return f": the images are {what} against those of the calibration; the cameras must deliver both alike"
+    return ""
+
+
 def _close(
     records: list[ShotPose], seconds: float, output: Path | None, view: PictureFolder | None, board_file: Path | None
 ) -> None:
@@ -373,7 +410,7 @@ def _close(
     if not records:
         raise ArmsightError("the source ended without a single shot")
     if not good:
-        raise ArmsightError(f"none of {len(records)} shots could be measured; {missed[0].shot}: {missed[0].reason}")
+        raise ArmsightError(_nothing_measured(records))
     summary = f"measured {len(good)} of {len(records)} shots in {seconds:.1f} s"
     summary += f", {len(missed)} missed (their lines have the reasons)" if missed else ""
     ways = Counter(r.way for r in records if r.way is not None)
