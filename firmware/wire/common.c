@@ -425,6 +425,7 @@ void common_begin_session(wire_state *wire)
 {
     wire->common.waits = WAITS_NOT;
     wire->common.sensed_period = 0u;
+    wire->periods = wire_periods_at(wire->setup.baud);
     wire->common.tools = 0u;
     wire->common.owner_tick = wire_tick(wire);
 }
@@ -517,6 +518,9 @@ static uint32_t begin(wire_state *wire, const mavlink_command_long_t *asked)
 {
     switch (asked->command) {
     case MAV_CMD_COMPONENT_ARM_DISARM:
+        if (asked->param1 != 0.0f && asked->param1 != 1.0f) {
+            return MAV_RESULT_DENIED;
+        }
         return arm(wire, asked->param1);
     case MAV_CMD_DO_FLIGHTTERMINATION:
         return terminate(wire, asked->param1);
@@ -548,13 +552,13 @@ static void take_command_long(wire_state *wire, const mavlink_message_t *message
     wire->common.command = asked.command;
     wire->common.system = message->sysid;
     wire->common.component = message->compid;
-    if (asked.command == MAV_CMD_SET_MESSAGE_INTERVAL) {
-        acknowledge(wire, set_interval(wire, asked.param1, asked.param2), REJECTION_NONE);
-        return;
-    }
     if (!stops && !may_change(wire, message)) {
         acknowledge(wire, MAV_RESULT_DENIED, REJECTION_NOT_OWNER);
         say_rejection(wire, REJECTION_NOT_OWNER);
+        return;
+    }
+    if (asked.command == MAV_CMD_SET_MESSAGE_INTERVAL) {
+        acknowledge(wire, set_interval(wire, asked.param1, asked.param2), REJECTION_NONE);
         return;
     }
     const uint32_t result = begin(wire, &asked);

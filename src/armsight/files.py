@@ -31,6 +31,8 @@ def read_text(path: str | Path) -> str:
         raise InputError(f"{path}: no such file") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
+    except ValueError:  # it holds a NUL
+        raise InputError(f"{str(path)!r}: not the name of a file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
 

@@ -182,13 +182,16 @@ def test_the_ar4_drivers_offsets_are_corrected_in_their_file_and_the_old_file_is
     assert_rejected(armsight(*options[:4]), "no joint_offsets of ar4_ros_driver")
 
 
-def test_the_potentiometers_of_our_board_are_shifted_by_what_was_found():
+@pytest.mark.parametrize("direction", [1, -1])
+def test_the_potentiometers_of_our_board_are_shifted_by_what_was_found(direction):
     config = lab_configuration()
-    before = config["joint"]["pot"]["angle_rad"].copy()
+    config["joint"]["pot"]["direction"] = direction
+    before = config["joint"].copy()
     count = int(config["joint"][1]["pot"]["node_count"])
     further = np.radians([0.0, 1.5, 0.0, -0.5, 0.0, 0.0])
     changes = pot_changes(config, further)
-    np.testing.assert_allclose(
-        config["joint"]["pot"]["angle_rad"][1, :count] - before[1, :count], further[1], atol=1e-6
-    )
+    shifted = config["joint"]["pot"]["angle_rad"][1, :count] - before["pot"]["angle_rad"][1, :count]
+    np.testing.assert_allclose(direction * shifted, further[1], atol=1e-6)  # the board multiplies the table by it
     assert changes[3].new_deg - changes[3].old_deg == pytest.approx(-0.5, abs=1e-5)
+    for limit in ("soft_min_rad", "soft_max_rad"):  # the arm's stops stay where they are
+        np.testing.assert_allclose(config["joint"][limit] - before[limit], further, atol=1e-6)

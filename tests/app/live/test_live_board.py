@@ -9,7 +9,7 @@ import pytest
 from armsight.app.live.arm import ArmOptions, ArmStep
 from armsight.app.live.board import StoppableBoard
 from armsight.data import JointStates
-from armsight.errors import InputError
+from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.codes import BoardState, Command
 from armsight.robot.boards.contract import Abilities
 from armsight.robot.boards.feetech.board import FeetechBoard
@@ -69,6 +69,19 @@ def test_a_stop_loses_no_reading_and_is_cleared_by_a_command():
     board.clear_stop()
     assert fake.calls[-1] is Command.CLEAR_STOP
     assert not board.stopped
+
+
+def test_no_drive_is_switched_on_between_a_stop_and_its_end():
+    board = StoppableBoard(fake := FakeBoard())
+    board.stop()
+    for switch_on in (
+        board.enable,
+        lambda: board.command(Command.ENABLE),
+        lambda: board.command(Command.ENABLE_INWARD),
+    ):
+        with pytest.raises(DeviceError, match="stopped by a person: allow the drives again first"):
+            switch_on()
+    assert not {Command.ENABLE, Command.ENABLE_INWARD} & set(fake.calls)
 
 
 def test_a_stop_goes_before_a_thread_that_never_lets_go():

@@ -105,7 +105,8 @@ def test_a_run_on_devices_finds_everything_moves_and_ends_with_the_arm_held(arms
     assert summary["ended_by"] is None
     assert summary["handeye"]["poses"] == 12
     # Half an exposure of 2 ms and 12 ms, less the shortest transmission of a reading, which the clock offset includes.
-    assert 3e-3 < summary["camera_delay_s"]["value"] < 14e-3
+    delay = summary["camera_delay_s"]
+    assert 3e-3 < delay["value"] < 13e-3 + 4 * delay["sigma"]
     assert summary["shots"]["measured"] > 100
     # The host was never silent between its first command and its last, whatever was computed meanwhile.
     (loop,) = loops

@@ -14,19 +14,26 @@ AT_S = 4.0
 CAMERAS = np.array([5e-4, 0.0, 2e-4, 0.0, np.radians(0.05), 0.0])
 
 
-def watched(seed, count, *, cameras=None, bodies=None, seconds=8.0):
-    """A watch of so many fixed bodies; cameras (6,) or some bodies {row: (6,)} move at AT_S."""
+def watched(seed, count, *, cameras=None, bodies=None, seconds=8.0, hidden=None, coarse=None):
+    """A watch of so many fixed bodies; cameras (6,) or some bodies {row: (6,)} move at AT_S.
+
+    One may be hidden from a second before on, another be measured ten times worse.
+    """
     rng = np.random.default_rng(seed)
     watch = LandmarkWatch([f"post {k}" for k in range(count)])
     Ts = [pose(exp_so3(0.4 * rng.normal(size=3)), np.array([0.3 * k - 0.3, 0.1, 1.0])) for k in range(count)]
     root = np.linalg.cholesky(NOISE)
     for t_s in np.arange(0.0, seconds, 0.1):
         for row, T in enumerate(Ts):
+            if row == hidden and t_s > AT_S - 1.0:
+                continue
+            scale = 10.0 if row == coarse else 1.0
             if t_s >= AT_S:
                 T = T if cameras is None else inverse(exp_se3(cameras)) @ T
                 T = T if bodies is None or row not in bodies else T @ exp_se3(bodies[row])
-            T = T @ exp_se3(root @ rng.normal(size=6))
-            watch.take(row, PoseEstimate(T, COV, NOISE, 0.0, 0.0, 1.0, None), t_s)
+            T = T @ exp_se3(scale * root @ rng.normal(size=6))
+            noise = scale**2 * NOISE
+            watch.take(row, PoseEstimate(T, COV - NOISE + noise, noise, 0.0, 0.0, 1.0, None), t_s)
     return watch
 
 
@@ -60,6 +67,23 @@ def test_a_body_that_moves_beside_cameras_that_move_is_named_by_two_that_agree()
     cameras, other = watched(12, 3, cameras=CAMERAS, bodies={2: np.array([0, 2e-3, 0, 0, 0, 0])}).findings()
     assert "as 2 fixed bodies show" in cameras.what
     assert "post 2 is not fixed" in other.what
+
+
+@pytest.mark.parametrize("hidden", [0, 1])
+def test_a_body_that_left_the_view_does_not_end_the_watch(hidden):
+    (found,) = watched(15, 2, cameras=10.0 * CAMERAS, hidden=hidden, seconds=10.0).findings()
+    assert f"the cameras moved, or the fixed body post {1 - hidden}" in found.what
+    watch = watched(16, 3, cameras=10.0 * CAMERAS, hidden=hidden, seconds=10.0)
+    assert watch.cameras_moved
+    assert "as 2 fixed bodies show" in watch.findings()[0].what
+
+
+def test_a_body_that_is_measured_coarsely_does_not_prove_that_the_cameras_stand():
+    watch = watched(17, 2, cameras=CAMERAS, coarse=1)
+    (found,) = watch.findings()
+    assert "too coarsely" in found.what
+    (found,) = watched(18, 2, bodies={0: np.array([5e-3, 0, 0, 0, 0, 0])}, coarse=1).findings()
+    assert "post 0 is not fixed" in found.what
 
 
 def test_what_looks_alike_is_not_decided():

@@ -97,6 +97,7 @@ def test_a_tool_reads_and_sets_every_parameter(tool):
 
 
 def test_a_tool_arms_and_hears_of_faults_as_text(cable, tool):
+    assert ordered(tool, ARM, np.nan) == ordered(tool, ARM, 2) == DENIED
     assert ordered(tool, ARM, 1) == ACCEPTED
     assert "host silent" in heard(tool, "STATUSTEXT").text  # it commands no motion: the arm is held
     beat = heard(tool, "HEARTBEAT", lambda message: message.base_mode & 128)
@@ -118,7 +119,10 @@ def test_a_tool_neither_moves_an_arm_that_has_a_host_nor_answers_for_another_sys
     board.enable()
     raw.command_long_send(1, 1, ARM, 0, 0, 0, 0, 0, 0, 0, 0)
     raw.command_long_send(7, 1, TERMINATE, 0, 1, 0, 0, 0, 0, 0, 0)
+    for name in ("ANGLES", "JOINTS"):
+        raw.command_long_send(1, 1, INTERVAL, 0, getattr(dialect(), f"MAVLINK_MSG_ID_{name}"), -1, 0, 0, 0, 0, 0)
     link.step(20)
+    assert len(board.receive(0.02).t_s) >= 20  # nor does it silence what its host needs
     assert link.answer["outputs"]["state"] == BoardState.ENABLED
     raw.command_long_send(1, 1, TERMINATE, 0, 1, 0, 0, 0, 0, 0, 0)
     link.step(20)

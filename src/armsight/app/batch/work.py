@@ -10,6 +10,7 @@ import contextlib
 import io
 import json
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ from typing import Any
 
 from armsight.errors import ArmsightError
 
+#: What is printed is redirected for the whole process: one command at a time, where a worker has several threads.
+_PRINTS = threading.Lock()
 #: Rows of a table: column -> value.
 Row = dict[str, Any]
 
@@ -122,7 +125,7 @@ def _by_command(path: str, options: BatchOptions) -> tuple[Row, list[Row]]:
     command = importlib.import_module(f"armsight.app.{options.operation}.command").command
     printed = io.StringIO()
     quiet = contextlib.redirect_stderr(io.StringIO())
-    with contextlib.redirect_stdout(printed), quiet:
+    with _PRINTS, contextlib.redirect_stdout(printed), quiet:
         command.main([*arguments, "--json"], standalone_mode=False)
     return {"result": json.dumps(json.loads(printed.getvalue()), sort_keys=True)}, []
 

@@ -183,6 +183,8 @@ class Bringup:
             ) from None
         finally:
             self._off()
+            with contextlib.suppress(ArmsightError):
+                self._board.watch_sensors(0.0)  # its messages come as often as before
             self._keep()
 
     # ---- talking ----
@@ -422,6 +424,11 @@ class Bringup:
             sunk = np.abs(np.median(last, axis=0) - np.median(q[: len(q) // 3], axis=0)) / enough
             if sunk.max() < _RESTS:
                 return np.asarray(last.mean(axis=0))
+        known = np.array([each.done("potentiometers") for each in self.found.joints])
+        restless = ~(sunk < _RESTS)
+        if not restless[known].any():  # open inputs of joints without a table
+            enough[restless] = np.inf
+            return np.asarray(last.mean(axis=0))
         raise _Mistake(
             f"joint {joint + 1}: meanwhile joint {int(np.argmax(sunk)) + 1} moves by itself: leave it where it stays, or"
             " support it."
@@ -550,6 +557,12 @@ class Bringup:
         ready = [j for j in self._joints if self.found.joints[j].done("swing")]
         if not ready:
             self._person.say("left out: no joint was identified")
+            return
+        degrees = np.degrees(_VERIFY_RAD)
+        if not self._yes(
+            f"all joints found move by {degrees:.0f} degrees with the gains computed. Is the arm free to? [y/n]"
+        ):
+            self._person.say("left out: it was not allowed to move")
             return
         self._use(self._configuration(Reaction.RELEASE, gains=True))
         self._mended("verify", ready[0], lambda _: self._follow(ready))

@@ -238,6 +238,8 @@ def _put_free(joint: Configuration, found: JointFound) -> None:
     }.items():
         joint[name] = value
     joint["pot"]["frozen_rad"] = joint["pot"]["inverted_rad"] = 1.0
+    if found.range_counts is None:  # its input may be open
+        joint["pot"]["jump_rad"] = 1.0
 
 
 def put_gentle(joint: Configuration, found: JointFound) -> None:

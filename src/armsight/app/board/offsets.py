@@ -127,15 +127,20 @@ def ar4_changes(path: Path, further_rad: Array) -> tuple[str, list[ZeroChange]]:
 def pot_changes(config: Configuration, further_rad: Array) -> list[ZeroChange]:
     """Shift the potentiometers' tables of a configuration by the angles (6,), rad, by which joints really are further.
 
+    The soft limits go along: they stay where they are on the arm.
+
     Returns:
         The changes, by the first node of each.
     """
     further, changes = _checked(further_rad, len(config["joint"])), []
     for k, joint in enumerate(config["joint"]):
         pot, count = joint["pot"], int(joint["pot"]["node_count"])
-        old = float(np.degrees(pot["angle_rad"][0]))
-        pot["angle_rad"][:count] += further[k]
-        changes.append(ZeroChange(f"joint {k + 1}", old, float(np.degrees(pot["angle_rad"][0]))))
+        sign = int(pot["direction"])  # the board multiplies the table's angle by it
+        old = float(np.degrees(sign * pot["angle_rad"][0]))
+        pot["angle_rad"][:count] += sign * further[k]
+        joint["soft_min_rad"] += further[k]  # the stops stay where they are
+        joint["soft_max_rad"] += further[k]
+        changes.append(ZeroChange(f"joint {k + 1}", old, float(np.degrees(sign * pot["angle_rad"][0]))))
     check_configuration(config)
     return changes
 

@@ -448,7 +448,11 @@ class ArmStep:
             return "no calibrated rig yet: finish the calibration first, or give --rig"
         if measuring.target_spec is None:
             return "no body yet: choose one in the step Body"
-        if not follows(open_target(measuring.target_spec)):
+        try:
+            followed = follows(open_target(measuring.target_spec))
+        except InputError as error:
+            return str(error)
+        if not followed:
             return f"{measuring.target_spec} cannot be followed: the loop needs a body of three discs or more"
         return ""
 
@@ -484,7 +488,7 @@ class ArmStep:
     def _gone(self, board: StoppableBoard, why: str) -> None:
         """Give the board up."""
         self._say(Note("error", f"the board is disconnected: {why}"))
-        self._board, self._running = None, None
+        self._board, self._running, self._requested = None, None, None
         if self._simulated is None:
             board.close()
         else:
@@ -545,7 +549,9 @@ class ArmStep:
         if outcome is None or finished is None or folder is None:
             return
         if outcome.ended_text is not None:
-            self._say(Note("warn", f"the run has ended early: {outcome.ended_text}; what was measured is written"))
+            self._say(
+                Note("warn", f"the run has ended early: {outcome.ended_text}; what was measured is being written")
+            )
         self._take(outcome)
         self._run_folder = folder
         self._writing.submit(self._write, finished, folder)
@@ -621,9 +627,9 @@ class ArmStep:
     def _write(self, finished: Finished, folder: Path) -> None:
         try:
             summary = finish(finished, folder)
-        except ArmsightError as error:
-            if finished.outcome.ended_text is None:
-                self._say(Note("error", f"{folder}: {error}"))
+        except Exception as error:  # noqa: BLE001 - nobody else watches this thread
+            why = str(error) if isinstance(error, ArmsightError) else f"not written: {type(error).__name__}: {error}"
+            self._say(Note("error", f"{folder}: {why}"))
             return
         self._say(Note("good", f"the run is written to {folder}: report.html, summary.json"))
         if summary.health:

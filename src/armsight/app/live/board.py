@@ -17,6 +17,7 @@ from typing import Self
 import numpy as np
 
 from armsight.data import Array, JointCommand, JointStates
+from armsight.errors import DeviceError
 from armsight.robot.boards.codes import BoardState, Command
 from armsight.robot.boards.contract import Abilities, MotionBoard
 from armsight.robot.boards.reports import BoardStatus, JointReport, Welcome
@@ -93,6 +94,8 @@ class StoppableBoard:
     def command(self, command: Command) -> int:
         """Send another command and return its number."""
         with self._held() as board:
+            if command in (Command.ENABLE, Command.ENABLE_INWARD):
+                self._require_not_stopped()
             return board.command(command)
 
     def confirm(self, sequence: int, wait_s: float = 0.5) -> None:
@@ -103,7 +106,13 @@ class StoppableBoard:
     def enable(self, *, inward: bool = False) -> None:
         """Switch the drives on."""
         with self._held() as board:
+            self._require_not_stopped()
             board.enable(inward=inward)
+
+    def _require_not_stopped(self) -> None:
+        """Reject after a stop: also of a board that knows no such state the drives stay off."""
+        if self.stopped:
+            raise DeviceError("stopped by a person: allow the drives again first")
 
     def clear_stop(self) -> None:
         """Allow the drives again after a stop; they stay off until they are enabled."""

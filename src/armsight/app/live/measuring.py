@@ -38,8 +38,8 @@ from armsight.vision.markers.targets import open_target
 from armsight.vision.measure import measure
 from armsight.vision.rig import StereoRig
 
-#: Standard deviation of the time between the two exposures of a shot, s: of cameras that nothing synchronises.
-_SYNC_S = 1e-3
+#: Health is asked for once a second; so many times as long as it took it is not.
+_HEALTH_REST = 20.0
 #: Poses of the path and of the chart that are kept, and latencies for the percentiles.
 _TRAIL, _LATENCIES = 240, 600
 _AXIS_M = 0.05
@@ -185,8 +185,15 @@ class MeasureStep:
         newest: the newest shot with its pose; None before.
     """
 
-    def __init__(self, folder: Path, source: str, say: Callable[[Note], None], streams: tuple[str, ...] = ()) -> None:
-        self.folder, self.source, self._say = folder, source, say
+    def __init__(
+        self,
+        folder: Path,
+        source: str,
+        say: Callable[[Note], None],
+        streams: tuple[str, ...] = (),
+        sync_s: float = 1e-3,
+    ) -> None:
+        self.folder, self.source, self._say, self._sync_s = folder, source, say, sync_s
         self.rig: StereoRig | None = None
         self.rig_path: Path | None = None
         self.target_spec: str | None = None
@@ -255,12 +262,12 @@ class MeasureStep:
         self._streams.close()
         self._measure = None
         if self._second is not None:
-            self._second.prepare(self.rig)
+            self._second.prepare(self.rig, self._sync_s)
         if self.rig is None or self.target_spec is None:
             return
         rig, target = self.rig, open_target(self.target_spec)
-        self._target, self._measure = target, _measuring(rig, target)
-        self._monitor = HealthMonitor(rig, target.body, _SYNC_S)
+        self._target, self._measure = target, _measuring(rig, target, self._sync_s)
+        self._monitor = HealthMonitor(rig, target.body, self._sync_s)
         try:
             self._streams = open_streams(self._specs, Published(rig, target.body), self._said)
         except InputError as error:
@@ -296,8 +303,8 @@ class MeasureStep:
             self._write(live, result)
             self._streams.put(ShotDatum(live.shot, result, now))
             if now - self._health_s > 1.0:
-                self._health_s = now
                 self._health = tuple(found.line() for found in self._monitor.findings())
+                self._health_s = now + _HEALTH_REST * (time.monotonic() - now)
 
     def lately(self, within_s: float) -> list[PoseEstimate]:
         """Return the newest poses of the last so many seconds, oldest first."""
@@ -363,9 +370,10 @@ class MeasureStep:
                 return
             if self._measure is None:
                 raise InputError(self._lacking())
-            number = 1
-            while (path := self.folder / f"poses-{number}.csv").exists():
+            number, path = 1, self.folder / "poses-1.csv"
+            while path.exists() or path.with_suffix(".mcap").exists():
                 number += 1
+                path = self.folder / f"poses-{number}.csv"
             try:
                 self.folder.mkdir(parents=True, exist_ok=True)
                 self._file = path.open("x", encoding="utf-8")  # open while the recording lasts
@@ -566,10 +574,10 @@ def _mm(values: Array) -> tuple[float, ...]:
     return tuple(float(1e3 * x) for x in values)
 
 
-def _measuring(rig: StereoRig, target: Target) -> Callable[[LiveShot], PoseEstimate | Missed]:
-    """Return what measures a target in live shots."""
+def _measuring(rig: StereoRig, target: Target, sync_s: float) -> Callable[[LiveShot], PoseEstimate | Missed]:
+    """Return what measures a target in live shots whose two exposures are so far apart, s (standard deviation)."""
     if follows(target):
-        follower = Follower(rig, target)
+        follower = Follower(rig, target, sync_s)
         return lambda live: follower.measure(live.shot)
     return lambda live: measure(rig, target, live.shot)
 
@@ -583,9 +591,9 @@ class _Second:
     measure: Callable[[LiveShot], PoseEstimate | Missed] | None = None
     newest: tuple[int, PoseEstimate | Missed] | None = None
 
-    def prepare(self, rig: StereoRig | None) -> None:
-        """Get ready for a rig."""
-        self.measure, self.newest = None if rig is None else _measuring(rig, self.target), None
+    def prepare(self, rig: StereoRig | None, sync_s: float) -> None:
+        """Get ready for a rig, and for exposures that are so far apart, s."""
+        self.measure, self.newest = None if rig is None else _measuring(rig, self.target, sync_s), None
 
     def drawings(self, rig: StereoRig, number: int) -> tuple[Drawn, ...]:
         """Return its points as both cameras see them, if they are of the shot of a number or of its neighbour."""

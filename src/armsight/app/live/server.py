@@ -324,6 +324,8 @@ class LiveServer:
                 client.socket.transport.abort()
                 return False
             self._send(client, {"rejected": str(error)})
+        except Exception as error:  # noqa: BLE001 - a mistake of ours is said, and does not look like a page that left
+            self._send(client, {"rejected": f"{type(error).__name__}: {error}"})
         return True
 
     def _said(self, client: _Client, message: str) -> None:
@@ -384,15 +386,20 @@ class LiveServer:
 
     async def _states(self) -> None:
         """Send every page what has changed; watch whether the one that commands is still there."""
+        said = ""
         while True:
             await asyncio.sleep(_STATE_S)
             if not self._clients:
                 continue
+            texts: dict[str, str] = {}
             try:
                 texts = await asyncio.get_running_loop().run_in_executor(self._work, self._texts)
-            except ArmsightError as error:
-                self.session.say(Note("error", str(error)))
-                continue
+                said = ""
+            except Exception as error:  # noqa: BLE001 - this task also watches the page that commands
+                why = str(error) if isinstance(error, ArmsightError) else f"{type(error).__name__}: {error}"
+                if why != said:
+                    self.session.say(Note("error", why))
+                said = why
             for client in list(self._clients.values()):
                 self._update(client, texts)
             commander = self._clients.get(self._commander or 0)

@@ -269,7 +269,7 @@ class LiveSession:
         self._simulated = self._workcell(options) if simulated else None
         spec = options.calibration_board or (CHESSBOARD if simulated else _DEFAULT_BOARD)
         self.measuring = MeasureStep(
-            self.folder, "usb:LEFT,RIGHT" if simulated else self.source, self.say, options.streams
+            self.folder, "usb:LEFT,RIGHT" if simulated else self.source, self.say, options.streams, options.sync_s
         )
         self.capture = CameraCapture(self._open, self._camera_failed)
         self.calibration = self._calibration(spec, CalibrationAim())

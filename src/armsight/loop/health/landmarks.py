@@ -76,6 +76,10 @@ def _limit(freedom: int) -> float:
     return float(chdtri(freedom, FALSE_ALARMS_PER_MINUTE / 360.0))
 
 
+#: So many means of all bodies together for each of them are waited for those of a body that is not seen any more.
+_PATIENCE = 4
+
+
 class LandmarkWatch:
     """Watches the poses of fixed bodies.
 
@@ -89,6 +93,8 @@ class LandmarkWatch:
     def __init__(self, names: Sequence[str]) -> None:
         self._landmarks = [_Landmark(name) for name in names]
         self._found: tuple[HealthFinding, ...] = ()
+        self._fresh: set[int] = set()  # bodies with a new mean since the last test
+        self._waited = 0
         self.cameras_moved = False
 
     @property
@@ -112,21 +118,31 @@ class LandmarkWatch:
         cov = (2.0 / _SHOTS + _STAYS) * estimate.cov_noise + _DIFFERS * (estimate.cov - estimate.cov_noise)
         since_s = mark.newest[2] if mark.newest is not None and mark.moved else mark.begin_s
         mark.newest = mean - mark.reference, cov, since_s
-        if row == max(k for k, each in enumerate(self._landmarks) if each.newest is not None):
+        self._fresh.add(row)
+        self._waited += 1
+        known = {k for k, each in enumerate(self._landmarks) if each.newest is not None}
+        if self._fresh == known or self._waited >= _PATIENCE * len(known):  # else a body is not seen any more
             self._found = self._decided() or self._found
+            self._fresh.clear()
+            self._waited = 0
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
         return self._found
 
     def _decided(self) -> tuple[HealthFinding, ...]:
-        """Return what the newest means of all bodies say."""
-        known = [each for each in self._landmarks if each.newest is not None]
+        """Return what the newest means of the bodies in view say."""
+        known = [self._landmarks[k] for k in sorted(self._fresh)]
         moved = [each for each in known if each.moved]
         if not moved:
             return ()
-        if len(moved) < len(known):  # one that stands proves that the cameras do
-            return tuple(_not_fixed(each) for each in moved)
+        if len(moved) < len(known):  # one that stands proves that the cameras do, if their motion would show in it
+            if _common(known) is None:
+                return tuple(_not_fixed(each) for each in moved)
+            coarse = "the others are measured too coarsely to distinguish the two"
+            return tuple(
+                _finding(each, f"the cameras moved, or the fixed body {each.name}: {coarse}") for each in moved
+            )
         if len(known) == 1:
             return (
                 _finding(
