@@ -205,9 +205,9 @@ def test_nothing_in_view_is_an_error_after_its_lines(start, rendered, armsight):
 
 
 @pytest.mark.parametrize(
-    ("code", "what"), [(-1, "turned by 180 degrees"), (1, "mirrored"), (0, "upside down and mirrored")]
+    ("code", "what"), [(-1, "rotated by 180 degrees"), (1, "mirrored"), (0, "upside down and mirrored")]
 )
-def test_images_that_a_driver_turned_are_named(start, arm, armsight, tmp_path, code, what):
+def test_images_that_a_driver_flipped_are_named(start, arm, armsight, tmp_path, code, what):
     for side in ("left", "right"):
         image = cv2.imread(str(next(arm.glob(f"{side}*.png"))), cv2.IMREAD_GRAYSCALE)
         cv2.imwrite(str(tmp_path / f"{side}0.png"), cv2.flip(image, code))

@@ -254,7 +254,7 @@ class MeasureStep:
         with self._lock:
             self._second = second
             if second is not None:
-                second.prepare(self.rig)
+                second.prepare(self.rig, self._sync_s)
 
     def _prepare(self) -> None:
         """Get ready for rig and target."""

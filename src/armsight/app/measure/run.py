@@ -177,7 +177,7 @@ def measure_shots(
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
             raise
     if records and detections is None and not any(record.ok for record in records):
-        raise ArmsightError(_nothing_measured(records, _turned(stereo, found, first)))
+        raise ArmsightError(_nothing_measured(records, _flipped(stereo, found, first)))
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
     moved = next((r.shutters for r in records if r.shutters is not None), None)
     if save_rig is not None and moved is not None:
@@ -382,19 +382,19 @@ def _nothing_measured(records: list[ShotPose], why: str = "") -> str:
 
 
 #: What a camera's driver may have done to its images -> how it is undone.
-_TURNS: dict[str, Callable[[Image], Image]] = {
-    "turned by 180 degrees": lambda image: image[::-1, ::-1],
+_FLIPS: dict[str, Callable[[Image], Image]] = {
+    "rotated by 180 degrees": lambda image: image[::-1, ::-1],
     "mirrored": lambda image: image[:, ::-1],
     "upside down and mirrored": lambda image: image[::-1],
 }
 
 
-def _turned(rig: StereoRig, target: Target, shots: list[Shot]) -> str:
-    """Return what to say where a shot that was missed can be measured once its images are turned; empty otherwise."""
+def _flipped(rig: StereoRig, target: Target, shots: list[Shot]) -> str:
+    """Return what to say where a shot that was missed can be measured once its images are flipped; empty otherwise."""
     for shot in shots:
         assert shot.left is not None
         assert shot.right is not None
-        for what, undo in _TURNS.items():
+        for what, undo in _FLIPS.items():
             left, right = (np.ascontiguousarray(undo(image)) for image in (shot.left, shot.right))
             if isinstance(measure(rig, target, replace(shot, left=left, right=right)), PoseEstimate):
                 return f": the images are {what} against those of the calibration; the cameras must deliver both alike"
