@@ -127,15 +127,16 @@ with connect(f"ws://{at}/live", origin=f"http://{at}", max_size=2**24) as page:
 
 
 def loop(blocks: int) -> None:
-    """Compare the control loop's times without and with a page, alternately in blocks of 60 shots: the load is alike."""
+    """Compare the control loop's times without and with a page, alternately by 60 shots: the load is alike."""
     session, server, driver = at_the_page("1280x720@30")
     driver.quit()
     session.execute(records.GuideHandEye())
     until(lambda: session.arm.state.handeye.good and not session.sections()["overview"].moving, 900.0)
     times = {False: [], True: []}
-    for block in range(2 * blocks):
+    while min(len(each) for each in times.values()) < 60 * blocks:
+        with_page = len(times[True]) < len(times[False])
         page = None
-        if block % 2:
+        if with_page:
             page = subprocess.Popen([sys.executable, "-c", _PAGE, f"127.0.0.1:{server.port}"])
             until(lambda: server._clients)
         while (running := session.arm._loop) is None or not running.log.latency_s:
@@ -144,7 +145,7 @@ def loop(blocks: int) -> None:
             time.sleep(0.2)
         log, seen = running.log, len(running.log.latency_s)
         until(lambda log=log, seen=seen: len(log.latency_s) >= seen + 60 or session.arm._loop is None, 300.0)
-        times[bool(block % 2)] += list(log.latency_s[seen:])
+        times[with_page] += list(log.latency_s[seen:])
         if page is not None:
             page.terminate()
             page.wait()
