@@ -233,7 +233,7 @@ def test_the_arm_is_held_when_the_page_that_commands_is_closed(session, server, 
     until(lambda: other.find_element("id", "stopped").text == "or the space key")
     other.find_element("tag name", "body").send_keys(" ")  # while it moves
     until(lambda: other.execute_script("return armsight.stopAnswer && armsight.stopAnswer.stopped"))
-    until(lambda: any("stopped by a person: emergency stop" in event.text for event in session.events()))
+    until(lambda: any("has ended early: " in event.text for event in session.events()))
     click(other, "a-clear")
     until(lambda: not state(other, "arm.stopped"))
     if until(lambda: not session.arm.busy) and session.arm.state.away:  # it was moving when its motors were released
