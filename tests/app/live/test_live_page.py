@@ -143,11 +143,14 @@ def test_body_and_measure(page, session):
     click(page, "step-body")
     until(lambda: state(page, "body.grade") == "usable")
     click(page, "step-measure")
-    pose = until(lambda: state(page, "measure.pose"))
+    measured = until(lambda: (now := state(page, "measure")) and now["pose"] and now)
+    pose = measured["pose"]
     truth = session._simulated.workcell.truth
     distance_m = float(sum(x**2 for x in pose["position_mm"]) ** 0.5) / 1e3
     assert 0.6 < distance_m < 1.1
-    assert pose["points"] == 9
+    assert pose["points"] + len(measured["dropped"]) == 9, measured["dropped"]  # by chance, with a rig of six shots
+    assert pose["points"] >= 7
+    assert all(": " in each for each in measured["dropped"])
     assert max(pose["sigma_mm"]) < 3.0
     assert truth.rig.baseline_m > 0
     click(page, "m-zero")

@@ -56,7 +56,6 @@ from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Fault
 from armsight.robot.boards.opening import emulator_name, is_real, open_motion_board, slowed
 from armsight.robot.trajectories import point_to_point
-from armsight.vision.follow.follower import follows
 from armsight.vision.markers.targets import Composite, open_target
 from armsight.vision.rig import StereoRig
 
@@ -448,11 +447,7 @@ class ArmStep:
             return "no calibrated rig yet: finish the calibration first, or give --rig"
         if measuring.target_spec is None:
             return "no body yet: choose one in the step Body"
-        try:
-            followed = follows(open_target(measuring.target_spec))
-        except InputError as error:
-            return str(error)
-        if not followed:
+        if not measuring.followed:
             return f"{measuring.target_spec} cannot be followed: the loop needs a body of three discs or more"
         return ""
 

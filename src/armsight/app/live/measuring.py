@@ -231,6 +231,11 @@ class MeasureStep:
             self.rig, self.rig_path = rig, path
             self._prepare()
 
+    @property
+    def followed(self) -> bool:
+        """Whether the body that is measured can be followed from shot to shot."""
+        return self._measure is not None and follows(self._target)
+
     def use_target(self, spec: str) -> None:
         """Measure another target from now on.
 

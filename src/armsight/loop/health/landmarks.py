@@ -6,8 +6,9 @@ same for all bodies,
 
     m = -Ad(T_left_body) xi
 
-A body that still stands where it stood proves that the cameras do; then those that moved are not fixed. Bodies that all
-moved agree on m (chi-square of their differences), or they do not. With a single body the two look alike.
+A body that stands where it stood proves that the cameras do, if it is measured well enough to contradict m; then those that
+moved are not fixed. Bodies that all moved agree on m (chi-square of their differences), or they do not. With a single body
+the two look alike. Only the bodies seen since the last test count: a large motion may take one out of view.
 """
 
 from __future__ import annotations
