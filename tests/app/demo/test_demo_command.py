@@ -9,6 +9,7 @@ import pytest
 
 from armsight.app.demo import demo
 from armsight.app.demo.demo import Demo, run_demo
+from armsight.app.run import calibrate
 from armsight.errors import ArmsightError
 from armsight.geometry.rotation import from_quaternion_wxyz, log_so3
 from armsight.loop.identify.read import read_poses
@@ -21,14 +22,14 @@ SHORT = """
 kind = "joints"
 name = "there"
 q_deg = [34.0, -46.6, 74.2, -14.7, -134.4, 20.2]
-rest_s = 1.5
+rest_s = 1.2
 
 [[motion]]
 kind = "line"
 name = "line"
 by_mm = [20.0, -150.0, -10.0]
 duration_s = 0.9
-rest_s = 1.5
+rest_s = 1.2
 """
 
 
@@ -39,7 +40,8 @@ def short(tmp_path_factory):
     motion = folder / "short.toml"
     motion.write_text(SHORT)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo, "_AMOUNTS", {True: (10, 14, 0)})
+        patch.setattr(demo, "_AMOUNTS", {True: (10, 12, 0)})
+        patch.setattr(calibrate, "SWEEP_S", 2.5)
         patch.setattr(demo, "_MOTIONS", {True: motion})
         summary = run_demo(Demo(folder, emulator="host", quick=True, seed=4))
     return folder, summary.to_json(), summary

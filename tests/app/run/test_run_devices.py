@@ -55,7 +55,7 @@ def far(tmp_path, monkeypatch):
     monkeypatch.setattr(run_setup, "open_source", lambda spec: HostStamped(there))
     monkeypatch.setattr(run_setup, "HostClock", lambda: HostClock(there.now))
     monkeypatch.setattr(command, "_HANDEYE_POSES", 12)
-    monkeypatch.setattr(run_calibrate, "SWEEP_S", 3.0)
+    monkeypatch.setattr(run_calibrate, "SWEEP_S", 2.5)
     monkeypatch.setattr(run_calibrate, "DELAY_REST_S", 0.5)
     yield there
     there.close()
