@@ -14,7 +14,7 @@ from armsight.loop.servo import MAX_CORRECTION_RAD, RATE_SHARE, LoopTiming, Mode
 from armsight.robot.trajectories import point_to_point
 
 PERIOD_S = 0.016
-RATES_HZ = (4, 15, 30, 60, 120)
+RATES_HZ = (4, 30, 120)
 GOAL = MIDDLE + np.radians([15, -10, 12, -14, 10, 20])
 
 

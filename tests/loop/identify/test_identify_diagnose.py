@@ -16,7 +16,7 @@ from armsight.robot.arm_file import open_arm
 
 #: One whose axes lie in a plane but for its shoulder, one with a round wrist, and two with none.
 ARMS = ("six_r", "ur5", "ur10", "puma560")
-SEEDS = (1, 2)
+SEEDS = (1,)
 FRAME = "two of the instrument's axes are exchanged"
 
 
