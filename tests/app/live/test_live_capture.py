@@ -8,8 +8,11 @@ import pytest
 
 from armsight.app.live import capture as module
 from armsight.app.live.capture import CameraCapture, LiveShot
-from armsight.data import Shot
+from armsight.app.live.simulated import SimulatedCameras
+from armsight.data import PoseEstimate, Shot
 from armsight.errors import DeviceError
+from armsight.vision.markers.targets import open_target
+from armsight.vision.measure import measure
 
 LEFT, RIGHT = np.full((4, 6), 1, np.uint8), np.full((4, 6), 2, np.uint8)
 
@@ -107,3 +110,17 @@ def test_the_age_is_by_the_stamp_where_that_is_on_this_clock():
     assert LiveShot(Shot("a", LEFT, RIGHT, 99.9), 1, 100.0).age_s(100.1) == pytest.approx(0.2)
     for stamp in (None, 5.0, 200.0):  # none, or of another clock
         assert LiveShot(Shot("a", LEFT, RIGHT, stamp), 1, 100.0).age_s(100.1) == pytest.approx(0.1)
+
+
+def test_the_simulated_person_holds_the_board_beside_the_body(host_firmware, tmp_path):
+    """This seed once held it before the body, for good: no pose was measured any more."""
+    cameras = SimulatedCameras("640x360@15", "worn", 43, "host")
+    try:
+        (tmp_path / "body.toml").write_text(cameras.workcell.body_text)
+        cameras.person.act("board")
+        cameras.person.reach(None)
+        shot = cameras.person.shot(1)
+        result = measure(cameras.workcell.truth.rig, open_target(str(tmp_path / "body.toml")), shot)
+        assert isinstance(result, PoseEstimate), result
+    finally:
+        cameras.end()
