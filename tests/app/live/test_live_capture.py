@@ -8,9 +8,11 @@ import pytest
 
 from armsight.app.live import capture as module
 from armsight.app.live.capture import CameraCapture, LiveShot
+from armsight.app.live.records import UseCameras
+from armsight.app.live.session import LiveSession, SessionOptions
 from armsight.app.live.simulated import SimulatedCameras
 from armsight.data import PoseEstimate, Shot
-from armsight.errors import DeviceError
+from armsight.errors import DeviceError, InputError
 from armsight.vision.markers.targets import open_target
 from armsight.vision.measure import measure
 
@@ -124,3 +126,20 @@ def test_the_simulated_person_holds_the_board_beside_the_body(host_firmware, tmp
         assert isinstance(result, PoseEstimate), result
     finally:
         cameras.end()
+
+
+def test_one_camera_alone_is_one_line_and_the_session_stays(tmp_path):
+    session = LiveSession(SessionOptions(tmp_path / "live", "usb:7"))
+    session.start()
+    try:
+        until(lambda: session.events())
+        for missing in ("usb:7", "usb:7@640x480,exposure=5ms"):
+            with pytest.raises(InputError, match="names one camera, two are needed"):
+                session.execute(UseCameras(missing))
+        session.execute(UseCameras("usb:/dev/none-left,/dev/none-right"))
+        until(lambda: "none-left: no such camera" in (session.sections()["cameras"].problem or ""))
+        errors = [event.text for event in session.events() if event.level == "error"]
+        assert len(errors) == 2, errors
+        assert errors[0].startswith("usb:7 names one camera, two are needed")
+    finally:
+        session.close()

@@ -429,6 +429,8 @@ class LiveSession:
         self._require_rest()
         if self._simulated is not None or source.startswith(SIM):
             raise InputError("the workcell and real cameras are chosen when the session starts: --source")
+        if source.startswith("usb:"):
+            parsed_usb(source.removeprefix("usb:"))  # else those that are open would be closed for nothing
         self.capture.close()
         self.source, self.capture = source, CameraCapture(self._open, self._camera_failed)
         self.arm.capture, self.arm.options = self.capture, replace(self.arm.options, source=source)
