@@ -8,8 +8,13 @@ import pytest
 
 from armsight.app.live import capture as module
 from armsight.app.live.capture import CameraCapture, LiveShot
-from armsight.data import Shot
-from armsight.errors import DeviceError
+from armsight.app.live.records import UseCameras
+from armsight.app.live.session import LiveSession, SessionOptions
+from armsight.app.live.simulated import SimulatedCameras
+from armsight.data import PoseEstimate, Shot
+from armsight.errors import DeviceError, InputError
+from armsight.vision.markers.targets import open_target
+from armsight.vision.measure import measure
 
 LEFT, RIGHT = np.full((4, 6), 1, np.uint8), np.full((4, 6), 2, np.uint8)
 
@@ -107,3 +112,34 @@ def test_the_age_is_by_the_stamp_where_that_is_on_this_clock():
     assert LiveShot(Shot("a", LEFT, RIGHT, 99.9), 1, 100.0).age_s(100.1) == pytest.approx(0.2)
     for stamp in (None, 5.0, 200.0):  # none, or of another clock
         assert LiveShot(Shot("a", LEFT, RIGHT, stamp), 1, 100.0).age_s(100.1) == pytest.approx(0.1)
+
+
+def test_the_simulated_person_holds_the_board_beside_the_body(host_firmware, tmp_path):
+    """This seed once held it before the body, for good: no pose was measured any more."""
+    cameras = SimulatedCameras("640x360@15", "worn", 43, "host")
+    try:
+        (tmp_path / "body.toml").write_text(cameras.workcell.body_text)
+        cameras.person.act("board")
+        cameras.person.reach(None)
+        shot = cameras.person.shot(1)
+        result = measure(cameras.workcell.truth.rig, open_target(str(tmp_path / "body.toml")), shot)
+        assert isinstance(result, PoseEstimate), result
+    finally:
+        cameras.end()
+
+
+def test_one_camera_alone_is_one_line_and_the_session_stays(tmp_path):
+    session = LiveSession(SessionOptions(tmp_path / "live", "usb:7"))
+    session.start()
+    try:
+        until(lambda: session.events())
+        for missing in ("usb:7", "usb:7@640x480,exposure=5ms"):
+            with pytest.raises(InputError, match="names one camera, two are needed"):
+                session.execute(UseCameras(missing))
+        session.execute(UseCameras("usb:/dev/none-left,/dev/none-right"))
+        until(lambda: "none-left: no such camera" in (session.sections()["cameras"].problem or ""))
+        errors = [event.text for event in session.events() if event.level == "error"]
+        assert len(errors) == 2, errors
+        assert errors[0].startswith("usb:7 names one camera, two are needed")
+    finally:
+        session.close()

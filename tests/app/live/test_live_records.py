@@ -4,12 +4,13 @@ import dataclasses
 import json
 import random
 import string
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from armsight.app.live import records
-from armsight.app.live.records import COMMANDS, command_of, json_of, polyline
+from armsight.app.live.records import COMMANDS, command_of, json_of, json_text, polyline
 from armsight.errors import InputError
 
 EXAMPLES = {"str": "x", "float": 1.5, "bool": True}
@@ -67,5 +68,13 @@ def test_records_become_json():
     shown = json_of({"a": records.Drawn(0, "seen", (((1.0, 2.0),),)), "b": np.array([1.0, np.nan]), "c": np.int64(3)})
     assert shown == {"a": {"side": 0, "kind": "seen", "lines": [[[1.0, 2.0]]], "label": ""}, "b": [1.0, None], "c": 3}
     assert json.loads(json.dumps(shown)) == shown
+    state = {
+        "a": records.Drawn(1, "body", (((0.1, 2.0),),)),
+        "b": np.array([[1.0]]),
+        "c": np.float64(3),
+        "d": Path("x"),
+    }
+    for more in ({}, {"e": (np.nan, np.int64(2))}):  # the second is not all finite
+        assert json.loads(json_text(state | more)) == json_of(state | more)
     uv = np.array([[0.04, 1.0], [np.nan, 1.0], [2.0, 3.0]])
     assert polyline(uv, closed=True) == ((0.0, 1.0), (2.0, 3.0), (0.0, 1.0))

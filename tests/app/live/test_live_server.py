@@ -33,7 +33,7 @@ class FakeSession:
     def __init__(self):
         self.executed, self.held, self.said = [], [], []
         self.arm = SimpleNamespace(busy=False)
-        self.step, self.number, self.drawn = "cameras", 1, ()
+        self.step, self.number = "cameras", 1
 
     @property
     def newest(self):
@@ -42,6 +42,9 @@ class FakeSession:
 
     def sections(self):
         return {"overview": SimpleNamespace, "cameras": {"step": self.step}} | {"overview": {"step": self.step}}
+
+    def between_shots(self):
+        pass
 
     def events(self, after=0):
         return (Event(1, "12:00:00", "good", "begun"),) if after < 1 else ()

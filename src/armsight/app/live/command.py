@@ -92,8 +92,8 @@ def command(
     from armsight.app.stream.streams import open_streams
     from armsight.vision.sources.usb import parsed_usb
 
-    if source is not None and source.startswith("usb:"):
-        parsed_usb(source.removeprefix("usb:"))  # cameras may come later, their names may not
+    if source is not None and source.startswith("usb:") and "," in source:
+        parsed_usb(source.removeprefix("usb:"))  # cameras may come later, their names may not; one alone the page says
     open_streams(stream, Published(), lambda line: click.echo(line, err=True)).close()  # a mistake is said now
     options = SessionOptions(
         output,

@@ -531,7 +531,7 @@ class MeasureStep:
         assert self.rig is not None
         camera = self.rig.left
         width, height = camera.image_size_px
-        trail = tuple(tuple(round(float(x), 5) for x in p) for p in self._trail)
+        trail = tuple(map(tuple, np.round(np.array(self._trail).reshape(-1, 3), 5).tolist()))
         return Scene(
             tuple(tuple(float(x) for x in row) for row in self.rig.T_left_right),
             (0.5 * width / float(camera.intrinsics[0]), 0.5 * height / float(camera.intrinsics[1])),

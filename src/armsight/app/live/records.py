@@ -1,7 +1,7 @@
 """The typed records of a session: commands that it takes, events and drawings that it gives out; and both as JSON.
 
 A command is a frozen record of plain values; :func:`command_of` reads one from JSON and rejects everything else with one
-line that lists what is known. States are the records of the steps (``CalibrationState`` and so on); :func:`json_of` makes
+line that lists what is known. States are the records of the steps (``CalibrationState`` and so on); :func:`json_text` makes
 JSON of any of these records: arrays become lists, and numbers that are not finite become null.
 """
 
@@ -332,6 +332,23 @@ def _value(name: str, key: str, kind: str, value: object) -> Any:  # noqa: ANN40
     if type(value) is not _KINDS[kind] or (isinstance(value, float) and not math.isfinite(value)):
         raise InputError(f"{name}: {key} must be a finite {kind}, not {str(value)[:40]!r}")
     return value
+
+
+def json_text(value: object) -> str:
+    """Return records, arrays and paths as JSON; as :func:`json_of` says, and several times faster where all is finite."""
+    try:
+        return json.dumps(value, default=_plain, allow_nan=False)
+    except ValueError:
+        return json.dumps(json_of(value))
+
+
+def _plain(value: object) -> object:
+    """Return what the JSON encoder does not know as what it knows."""
+    if dataclasses.is_dataclass(value):
+        return vars(value)
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return value.item() if isinstance(value, np.generic) else json_of(value)
 
 
 def json_of(value: object) -> Any:  # noqa: ANN401 - whatever JSON holds

@@ -8,6 +8,8 @@ In: a :class:`~armsight.app.live.session.LiveSession`. Out: one HTML file over H
 - An image is binary: one byte side, four bytes number, JPEG. The next image of a side is sent when the page has said that
   it showed the last one (``{"shown": [SIDE, NUMBER]}``), and it is the newest then: a slow page misses images, and stores
   none.
+- While a loop moves the arm, states and images are made in the time between the command that followed from a shot and the
+  next shot: the loop shares the interpreter with this server, and an image must not wait for a page.
 - One page commands; the others look on and can stop. A page that commands and is silent while the arm moves is gone: the
   arm is held.
 
@@ -39,7 +41,7 @@ import cv2
 
 from armsight.app.live.capture import LiveShot
 from armsight.app.live.quality import Note
-from armsight.app.live.records import command_of, json_of
+from armsight.app.live.records import command_of, json_text
 from armsight.app.live.session import LiveSession
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.vision.image import grey
@@ -50,6 +52,8 @@ if TYPE_CHECKING:
 
 #: How often states are looked at, s; how often a page is sent the age of what it sees.
 _STATE_S = 0.1
+#: How often a newer shot is looked for while a page waits for one, s.
+_POLL_S = 0.01
 #: JPEG quality of the views, and the longest side that is sent, px.
 _JPEG, _SIDE_PX = 72, 1280
 #: A page that commands and says nothing for so long is gone, s; pages say something twice a second.
@@ -104,7 +108,7 @@ class LiveServer:
         self._commander: int | None = None
         self._number = 0
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._work, self._stops = ThreadPoolExecutor(3, "serve"), ThreadPoolExecutor(2, "stop")
+        self._work, self._stops = ThreadPoolExecutor(8, "serve"), ThreadPoolExecutor(2, "stop")
         self._page = importlib.resources.files(__package__).joinpath(PAGE).read_text(encoding="utf-8")
         self._jpeg: list[tuple[int, bytes]] = [(0, b""), (0, b"")]
         self._encoding: list[asyncio.Lock] = []
@@ -252,7 +256,7 @@ class LiveServer:
         async for message in socket:
             if message == "stop":
                 answer = await asyncio.get_running_loop().run_in_executor(self._stops, self.session.stop)
-                await socket.send(json.dumps(json_of(answer)))
+                await socket.send(json_text(answer))
             elif message == "alive":
                 await socket.send("alive")
 
@@ -283,7 +287,7 @@ class LiveServer:
         self._introduce()
 
     def _hold(self, why: str) -> None:
-        self._work.submit(self.session.hold, why)
+        self._stops.submit(self.session.hold, why)
 
     def _introduce(self) -> None:
         """Say to every page whether it commands."""
@@ -361,28 +365,35 @@ class LiveServer:
 
         with contextlib.suppress(ConnectionClosed):
             while True:
-                newest = self.session.newest if client.visible else None
-                sent = False
-                for side in (0, 1):
-                    number, shown = client.images[side]
-                    if newest is not None and shown and newest.number != number:
-                        client.images[side] = (newest.number, False)
-                        data = await self._encoded(side, newest)
-                        await client.socket.send(_HEADER.pack(side, newest.number) + data)
-                        sent = True
-                if not sent:
-                    client.wake.clear()
-                    with contextlib.suppress(asyncio.TimeoutError):
-                        await asyncio.wait_for(client.wake.wait(), 0.01 if client.visible else 0.5)
+                if client.visible and self._due(client):
+                    if self.session.arm.busy:
+                        await asyncio.get_running_loop().run_in_executor(self._work, self.session.between_shots)
+                    for side in self._due(client):
+                        number, data = await self._encoded(side)
+                        client.images[side] = (number, False)
+                        await client.socket.send(_HEADER.pack(side, number) + data)
+                    continue
+                awaited = client.visible and any(shown for _, shown in client.images)  # the cameras, not the page
+                client.wake.clear()
+                with contextlib.suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(client.wake.wait(), _POLL_S if awaited else 0.5)
 
-    async def _encoded(self, side: int, live: LiveShot) -> bytes:
-        """Return a view as JPEG, encoded once for all pages."""
+    def _due(self, client: _Client) -> list[int]:
+        """Return the sides of which a page has shown the last image, and there is a newer one."""
+        newest = self.session.newest
+        if newest is None:
+            return []
+        return [side for side, (number, shown) in enumerate(client.images) if shown and newest.number != number]
+
+    async def _encoded(self, side: int) -> tuple[int, bytes]:
+        """Return the number of the newest shot and its view as JPEG, encoded once for all pages."""
         async with self._encoding[side]:
-            number, data = self._jpeg[side]
-            if number != live.number:
+            live = self.session.newest
+            assert live is not None
+            if self._jpeg[side][0] != live.number:
                 data = await asyncio.get_running_loop().run_in_executor(self._work, _jpeg, live, side)
-                self._jpeg[side] = (live.number, data)
-        return data
+                self._jpeg[side] = live.number, data
+            return self._jpeg[side]
 
     async def _states(self) -> None:
         """Send every page what has changed; watch whether the one that commands is still there."""
@@ -408,12 +419,8 @@ class LiveServer:
 
     def _texts(self) -> dict[str, str]:
         """Return every section as text."""
-        texts = {
-            name: json.dumps({"section": name, "state": json_of(state)})
-            for name, state in self.session.sections().items()
-        }
-        texts["drawn"] = json.dumps({"drawn": json_of(self.session.drawn)})
-        return texts
+        self.session.between_shots()
+        return {name: json_text({"section": name, "state": state}) for name, state in self.session.sections().items()}
 
     def _update(self, client: _Client, texts: dict[str, str]) -> None:
         """Send a page what has changed, unless it has not taken what it was sent before."""
@@ -426,7 +433,7 @@ class LiveServer:
                 task.add_done_callback(lambda done: done.exception() if not done.cancelled() else None)
         for event in self.session.events(client.event):
             client.event = event.number
-            self._send(client, {"event": json_of(event)})
+            self._send(client, {"event": vars(event)})
 
 
 def _jpeg(live: LiveShot, side: int) -> bytes:

@@ -24,7 +24,7 @@ from armsight.app.live.capture import CameraCapture, LiveShot
 from armsight.app.live.guide import CalibrationAim
 from armsight.app.live.measuring import MeasureState, MeasureStep
 from armsight.app.live.quality import FlickerWatch, ImageQuality, Note, image_quality, quality_notes, same_camera
-from armsight.app.live.records import Command, Drawn, Event
+from armsight.app.live.records import Command, Event
 from armsight.app.live.simulated import ACTIONS, SimulatedCameras
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK
 from armsight.data import Record, Shot
@@ -429,6 +429,8 @@ class LiveSession:
         self._require_rest()
         if self._simulated is not None or source.startswith(SIM):
             raise InputError("the workcell and real cameras are chosen when the session starts: --source")
+        if source.startswith("usb:"):
+            parsed_usb(source.removeprefix("usb:"))  # else those that are open would be closed for nothing
         self.capture.close()
         self.source, self.capture = source, CameraCapture(self._open, self._camera_failed)
         self.arm.capture, self.arm.options = self.capture, replace(self.arm.options, source=source)
@@ -555,6 +557,7 @@ class LiveSession:
                 self._flicker(live.shot)
                 if live.arrived_s - quality_s > _QUALITY_S:
                     quality_s = live.arrived_s
+                    self.between_shots()
                     self._qualities(live.shot)
                 if self._step == "calibrate":
                     self.calibration.look(live)
@@ -643,12 +646,9 @@ class LiveSession:
         """The newest shot, to be shown."""
         return self.capture.newest
 
-    @property
-    def drawn(self) -> tuple[Drawn, ...]:
-        """What to draw over the views."""
-        if self._step == "calibrate":
-            return self.calibration.state.drawn
-        return self.measuring.state.drawn if self._step in ("measure", "arm", "health") else ()
+    def between_shots(self) -> None:
+        """Wait, while a loop moves the arm, until no image waits for its command (:meth:`ArmStep.between_shots`)."""
+        self.arm.between_shots()
 
     def sections(self) -> dict[str, object]:
         """Return the state, section by section: records of this package."""

@@ -25,7 +25,8 @@ from armsight.vision.pnp import body_poses
 ACTIONS = ("cover_left", "cover_right", "uncover", "unplug", "plug", "board", "no_board")
 #: A hand comes so near to an outline, m and rad; moves so fast, s per pose; and trembles, m and rad.
 _HAND, _MOVE_S, _TREMOR = (0.012, np.radians(3.0)), 1.2, (1e-4, np.radians(0.02))
-_FILL, _TRIES = (0.4, 0.8), 30  # of the image's height; poses among which one beside the arm is looked for
+#: Of the image's height; poses among which one beside the arm is looked for, and how often.
+_FILL, _TRIES, _ROUNDS = (0.4, 0.8), 30, 5
 _PACE_HZ = 15.0
 
 
@@ -42,9 +43,8 @@ class Person:
         self._rng = np.random.default_rng([seed, 21])
         self._pattern = chessboard(9, 6, 0.030)
         self._points = open_board(CHESSBOARD).body.points
-        self._from: Array | None = None
-        self._to: Array | None = None
-        self._began_s = 0.0
+        #: From where, to where, T_left_board (4, 4), and since when the board moves; None before it is held.
+        self._way: tuple[Array, Array, float] | None = None
         self._shown: Array | None = None  # the outline that is being reached
         self.covered: set[str] = set()
         self.unplugged = False
@@ -65,16 +65,14 @@ class Person:
         elif action in ("unplug", "plug"):
             self.unplugged = action == "unplug"
         else:
-            self.holds, self._to, self._shown = action == "board", None, None
+            self.holds, self._way, self._shown = action == "board", None, None
 
     def reach(self, outline_uv: tuple[Array, Array] | None) -> None:
-        """Move the board to where its points (M, 2) are drawn in both views; somewhere in view where nothing is drawn."""
+        """Move the board to where its points (M, 2) are drawn in both views; beside the arm where nothing is drawn."""
         rig = self._workcell.truth.rig
         if outline_uv is None:
-            if self._to is None:
-                poses = board_poses(self._rng, rig, self._pattern, _TRIES, fill=_FILL, tilt_deg=15.0)
-                beside = [T for T in poses if self._workcell.source.clear(self._pattern, T)]
-                self._move(beside[0] if beside else poses[0])
+            if self._way is None:
+                self._move(self._beside())
             return
         if self._shown is not None and np.abs(self._shown - outline_uv[0]).max() < 1.0:
             return
@@ -98,6 +96,16 @@ class Person:
                 break
         self._move(near)
 
+    def _beside(self) -> Array:
+        """Return a pose of the board in view, T_left_board (4, 4), where neither it nor the arm's body hides the other."""
+        source, rig = self._workcell.source, self._workcell.truth.rig
+        for _ in range(_ROUNDS):
+            poses = board_poses(self._rng, rig, self._pattern, _TRIES, fill=_FILL, tilt_deg=15.0)
+            for T in poses:
+                if source.clear(self._pattern, T, body_seen=True):
+                    return np.asarray(T)
+        return np.asarray(poses[0])
+
     def _visible(self, T_left_board: Array) -> bool:
         """Return whether both cameras see all of the board's points, and a little around them."""
         rig, p = self._workcell.truth.rig, transform(T_left_board, 1.1 * self._points - 0.1 * self._points.mean(axis=0))
@@ -108,23 +116,24 @@ class Person:
         )
 
     def _move(self, T: Array) -> None:
-        self._from = T if self._to is None else self._now()
-        self._to, self._began_s = T, time.monotonic()
-
-    def _now(self) -> Array:
-        """Return where the board is, T_left_board (4, 4)."""
-        assert self._from is not None
-        assert self._to is not None
-        x = min((time.monotonic() - self._began_s) / _MOVE_S, 1.0)
-        smooth = x * x * (3.0 - 2.0 * x)
-        return np.asarray(self._from @ exp_se3(smooth * log_se3(inverse(self._from) @ self._to)))
+        way = self._way
+        self._way = T if way is None else _where(way), T, time.monotonic()
 
     def shot(self, number: int) -> Shot | None:
         """Return what the cameras see while the board is held; None while it is not."""
-        if not self.holds or self._to is None:
+        way = self._way
+        if not self.holds or way is None:
             return None
-        T = self._now() @ exp_se3(self._rng.normal(0, 1, 6) * np.repeat(_TREMOR, 3))
+        T = _where(way) @ exp_se3(self._rng.normal(0, 1, 6) * np.repeat(_TREMOR, 3))
         return replace(self._workcell.source.still((self._pattern,), T, number), name=f"board{number:06d}")
+
+
+def _where(way: tuple[Array, Array, float]) -> Array:
+    """Return where a board is on its way now, T_left_board (4, 4)."""
+    start, end, began_s = way
+    x = min((time.monotonic() - began_s) / _MOVE_S, 1.0)
+    smooth = x * x * (3.0 - 2.0 * x)
+    return np.asarray(start @ exp_se3(smooth * log_se3(inverse(start) @ end)))
 
 
 class SimulatedCameras:

@@ -321,12 +321,13 @@ class WorkcellSource:
         for thread in self._threads:
             thread.shutdown()
 
-    def clear(self, pattern: Pattern, T_left_body: Array) -> bool:
+    def clear(self, pattern: Pattern, T_left_body: Array, *, body_seen: bool = False) -> bool:
         """Return whether nothing of the arm is before a pattern that is held somewhere, or in it, for both cameras.
 
         Args:
             pattern: what is held.
             T_left_body: (4, 4) where, m, left camera's frame.
+            body_seen: whether the pattern must not be before the arm's body either.
         """
         q = self._plant.path[-1, self._plant.arm.joints :]
         p_body = (self._plant.arm.forward(q) @ self._T_tool_body)[:3, 3]
@@ -339,7 +340,7 @@ class WorkcellSource:
             p = transform(T_camera_base @ self._cameras[0].T_base_camera @ T_left_body @ pattern.T_body_pattern, edge)
             uv, boxes = camera.camera.project(p), capsule_boxes(camera.camera, ends, radius)
             over = (boxes[:, :2] < uv.max(axis=0)).all(axis=1) & (boxes[:, 2:] > uv.min(axis=0)).all(axis=1)
-            if (over & (ends[..., 2].min(axis=1) - radius < p[:, 2].max())).any():
+            if (over & (ends[..., 2].min(axis=1) - radius < p[:, 2].max())).any() or (body_seen and over[-1]):
                 return False
         return True
 

@@ -215,6 +215,8 @@ def open_usb(rest: str, capture: Callable[[str], Capture] | None = None) -> UsbS
 
 def parsed_usb(rest: str) -> tuple[list[str], Settings]:
     """Read the text after ``usb:``."""
+    if re.fullmatch(r"[^,@]+(@[^,]*)?(,[a-z]+=[^,]*)*", rest):
+        raise InputError(f"usb:{rest} names one camera, two are needed: expected {_FORM}")
     form = re.fullmatch(r"([^,]+),([^,@]+)(?:@(\d+)x(\d+))?(?:@(\d+(?:\.\d+)?))?((?:,[a-z]+=[^,=]+)*)", rest)
     named = dict(part.split("=") for part in form[6].split(",")[1:]) if form else {}
     asked = named.pop("exposure", None)
