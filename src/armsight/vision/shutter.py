@@ -18,13 +18,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from armsight.data import Array, Body, Correspondences, Missed, PoseEstimate, Record
+from armsight.data import Array, Body, Correspondences, Ids, Missed, PoseEstimate, Record
 from armsight.errors import InputError
-from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
+from armsight.geometry.matrix import product, solved
+from armsight.geometry.pose import exp_se3, inverse, log_se3
+from armsight.kernels import kernel
 from armsight.vision.bundle import CAUCHY_SCALE
+from armsight.vision.camera import distort, pair_arguments
 from armsight.vision.locate import locate, misfit_limit
 from armsight.vision.match import gate
 from armsight.vision.posefit import PixelObservations, fit_pose, whitened
@@ -36,7 +41,9 @@ _BESIDE, _GAP = 2, 2.5
 #: Fewest moving shots, and the largest sigma that counts as found, as a share of the time between shots: without any
 #: estimate, frames paired by time have one of 0.29.
 _SHOTS_MIN, _SIGMA_MOST = 5, 0.05
-_STEPS, _DONE_S = 12, 1e-7
+_STEPS = 12
+#: The last step of the estimate is smaller than this, s, or than this share of the estimate's sigma.
+_DONE_S, _DONE_SIGMAS = 1e-7, 0.01
 #: Sigma of every detection while the shutters are unknown, px: a few px of gap pass, and names of discs stay unambiguous.
 LOOSE_PX = 1.0
 #: Largest share of H that may be noise of the velocity.
@@ -90,24 +97,26 @@ def motions(t_s: Array, Ts: Array, covs: Array) -> list[Motion | None]:
         Ts: (N, 4, 4) T_left_body.
         covs: (N, 6, 6) covariance of each, perturbation on the right.
     """
-    found: list[Motion | None] = []
+    found: list[Motion | None] = [None] * len(t_s)
     widest = _GAP * float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+    alike: dict[tuple[int, int, bool], list[int]] = {}  # where in a window of how many shots, and on both sides
     for k in range(len(t_s)):
         first = last = k
         while first > max(k - _BESIDE, 0) and t_s[first] - t_s[first - 1] <= widest:
             first -= 1
         while last < min(k + _BESIDE, len(t_s) - 1) and t_s[last + 1] - t_s[last] <= widest:
             last += 1
-        if last - first < 2:
-            found.append(None)
-            continue
-        rows, centred = np.arange(first, last + 1), first < k < last
-        xi, tau = log_se3(inverse(Ts[k]) @ Ts[rows]), t_s[rows] - t_s[k]
-        degree = min(len(rows) - 1, 3 if centred else 2)
-        X = tau[:, None] ** np.arange(degree + 1)
+        if last - first >= 2:
+            alike.setdefault((k - first, last - first + 1, first < k < last), []).append(k)
+    for (before, count, centred), some in alike.items():
+        rows = np.array(some)[:, None] - before + np.arange(count)
+        xi, tau = log_se3(inverse(Ts[some])[:, None] @ Ts[rows]), t_s[rows] - t_s[some][:, None]
+        X = tau[..., None] ** np.arange(min(count - 1, 3 if centred else 2) + 1)
         fit = np.linalg.pinv(X)
-        cov = np.einsum("n,nij->ij", fit[1] ** 2, covs[rows])
-        found.append(Motion(fit[1] @ xi, 2 * fit[2] @ xi, cov, centred))
+        twists, accelerations = (fit @ xi)[:, 1], 2 * (fit @ xi)[:, 2]
+        all_cov = np.einsum("gn,gnij->gij", fit[:, 1] ** 2, covs[rows])
+        for k, *of_motion in zip(some, twists, accelerations, all_cov, strict=True):
+            found[k] = Motion(*of_motion, centred)
     return found
 
 
@@ -176,7 +185,8 @@ def estimate_shutters(
             for o, T, motion, a in zip(observed, Ts, moving, apart, strict=True)
         ]
         Ts, covs = _poses(rig, body, moved_uv, Ts, moving)
-        if np.abs(step).max() < _DONE_S:
+        sigmas = np.sqrt(np.diag(np.linalg.inv(H - noise)))
+        if (np.abs(step) < np.maximum(_DONE_S, _DONE_SIGMAS * sigmas)).all():
             break
     cov = np.zeros((2, 2))
     inverted = np.linalg.inv(H - noise)
@@ -232,17 +242,91 @@ def _at_one_time(
     """Move N observations that were exposed dt_s (N,) after the shot's time to that time."""
     if motion is None:
         return o
-    p_body, uv = body.points[o.point], np.array(o.uv)
-    p_then = np.einsum("nij,nj->ni", motion.moved(T, dt_s)[:, :3], np.column_stack([p_body, np.ones(len(p_body))]))
-    p_now = transform(T, p_body)
-    T_right_left = inverse(rig.T_left_right)
-    for side, camera in enumerate(rig.cameras):
-        rows = o.camera == side
-        now, then = p_now[rows], p_then[rows]
-        if side == 1:
-            now, then = transform(T_right_left, now), transform(T_right_left, then)
-        uv[rows] -= camera.project(then) - camera.project(now)
+    uv = np.array(o.uv)
+    _shift(*_known(rig, body, o), *_moves(T, motion), dt_s, uv)
     return replace(o, uv=uv)
+
+
+def _known(rig: StereoRig, body: Body, o: PixelObservations) -> tuple[Any, ...]:
+    """Return what the kernels take of a rig and of N observations: two cameras, T_right_left, points, their cameras."""
+    p = np.ascontiguousarray(body.points[o.point])
+    return (*pair_arguments(rig.cameras), inverse(rig.T_left_right), p, o.camera)
+
+
+def _moves(T: Array, motion: Motion) -> tuple[Array, Array, Array]:
+    """Return a pose, a twist and an acceleration, as the kernels take them."""
+    return np.ascontiguousarray(T), motion.twist, motion.acceleration
+
+
+@kernel
+def _pixel(fisheye: bool, k: Array, d: Array, M: Array, p: Array, uv: Array, J: Array) -> bool:
+    """Fill the pixel uv (2,) of a body's point p (3,) in the camera with T_camera_body M (4, 4); return whether it is seen.
+
+    J (2, 6) becomes its derivative by the tangent of the pose, on the right.
+    """
+    q, xy, J_p, J_d = np.empty(3), np.empty(2), np.empty((2, 3)), np.empty((2, 8))
+    for i in range(3):
+        q[i] = M[i, 0] * p[0] + M[i, 1] * p[1] + M[i, 2] * p[2] + M[i, 3]
+    if q[2] <= 0.0 and not fisheye:
+        return False
+    distort(fisheye, d, q, xy, J_p, J_d)
+    for i in range(2):
+        uv[i] = k[i] * xy[i] + k[2 + i]
+        for j in range(3):
+            J[i, j] = k[i] * (J_p[i, 0] * M[0, j] + J_p[i, 1] * M[1, j] + J_p[i, 2] * M[2, j])
+        J[i, 3] = J[i, 2] * p[1] - J[i, 1] * p[2]
+        J[i, 4] = J[i, 0] * p[2] - J[i, 2] * p[0]
+        J[i, 5] = J[i, 1] * p[0] - J[i, 0] * p[1]
+    return True
+
+
+@kernel
+def _both(T_right_left: Array, T: Array) -> Array:
+    """Return (2, 4, 4) T_camera_body of both cameras."""
+    Ts = np.empty((2, 4, 4))
+    Ts[0], Ts[1] = T, product(T_right_left, T)
+    return Ts
+
+
+@kernel
+def _carried(xi: Array, p: Array, out: Array) -> None:
+    """Fill a point p (3,) moved by exp of a tangent (6,), [translation; rotation]."""
+    a, b, c = xi[3], xi[4], xi[5]
+    u = a * a + b * b + c * c
+    angle = math.sqrt(u)
+    s, g, h = 1.0 - u / 6, 0.5 - u / 24, 1 / 6 - u / 120
+    if u > 1e-8:
+        s, g, h = math.sin(angle) / angle, (1.0 - math.cos(angle)) / u, (angle - math.sin(angle)) / (u * angle)
+    kx, ky, kz = b * p[2] - c * p[1], c * p[0] - a * p[2], a * p[1] - b * p[0]
+    mx, my, mz = b * xi[2] - c * xi[1], c * xi[0] - a * xi[2], a * xi[1] - b * xi[0]
+    out[0] = p[0] + s * kx + g * (b * kz - c * ky) + xi[0] + g * mx + h * (b * mz - c * my)
+    out[1] = p[1] + s * ky + g * (c * kx - a * kz) + xi[1] + g * my + h * (c * mx - a * mz)
+    out[2] = p[2] + s * kz + g * (a * ky - b * kx) + xi[2] + g * mz + h * (a * my - b * mx)
+
+
+_PAIR = "const b1[::1], const f8[:, ::1], const f8[:, ::1], f8[:, ::1], const f8[:, ::1], const i8[::1]"
+_MOVES = "const f8[:, ::1], const f8[::1], const f8[::1]"
+
+
+@kernel(f"{_PAIR}, {_MOVES}, const f8[::1], f8[:, ::1]")
+def _shift(
+    fisheye: NDArray[np.bool_], k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, T: Array, twist: Array,
+    acceleration: Array, dt: Array, uv: Array,
+) -> None:  # fmt: skip
+    """Move pixels uv (N, 2) of points p (N, 3), exposed dt (N,) after the time of pose T, to that time; NaN out of view."""
+    Ts, xi, then = _both(T_right_left, T), np.empty(6), np.empty(3)
+    uv_now, uv_then, J = np.empty(2), np.empty(2), np.empty((2, 6))
+    for n in range(len(p)):
+        c = camera[n]
+        for i in range(6):
+            xi[i] = twist[i] * dt[n] + 0.5 * acceleration[i] * dt[n] * dt[n]
+        _carried(xi, p[n], then)
+        seen = _pixel(fisheye[c], k[c], d[c], Ts[c], p[n], uv_now, J)
+        if not (_pixel(fisheye[c], k[c], d[c], Ts[c], then, uv_then, J) and seen):
+            uv[n, 0] = uv[n, 1] = np.nan
+            continue
+        uv[n, 0] -= uv_then[0] - uv_now[0]
+        uv[n, 1] -= uv_then[1] - uv_now[1]
 
 
 def _poses(
@@ -272,23 +356,84 @@ def _linear(
 ) -> tuple[Array, Array, Array, Array]:
     """Return one shot's score (P,), curvature (P, P), what noise adds to it (P, P), and squared distances (N,)."""
     dt, by = exposed
-    W, A, _ = whitened(rig.cameras, rig.T_left_right, body.points, o, T)
-    now = _at_one_time(rig, body, o, T, motion, dt)
-    fit = fit_pose(rig.cameras, rig.T_left_right, body.points, now, T, robust=False, steps=0)
-    if fit is None:
-        zero = np.zeros((count, count))
-        return np.zeros(count), zero, zero, np.zeros(0)
-    weight = 1.0 / (1.0 + fit.distance2 / (CAUCHY_SCALE**2 * scale2))
-    root = np.repeat(np.sqrt(weight / scale2), 2)
-    r, A = (W @ fit.residuals_px[..., None]).ravel() * root, A * root[:, None]
-    rates = (A.reshape(len(dt), 2, 6) @ (motion.twist + dt[:, None] * motion.acceleration)[..., None])[..., 0]
-    M = (rates[:, :, None] * by[:, None, :count]).reshape(-1, count)
-    Q = np.linalg.qr(A)[0]
-    across = M - Q @ (Q.T @ M)
-    D = [A * np.repeat(by[:, i], 2)[:, None] for i in range(count)]
-    D = [d - Q @ (Q.T @ d) for d in D]
-    noise = np.array([[np.trace(a.T @ b @ motion.cov) for b in D] for a in D])
-    return across.T @ r, across.T @ across, noise, fit.distance2
+    uv = np.array(_at_one_time(rig, body, o, T, motion, dt).uv)
+    score, curvature, noise, d2 = np.zeros(count), np.zeros((count, count)), np.zeros((count, count)), np.empty(len(dt))
+    if not _score(
+        *_known(rig, body, o), *_moves(T, motion), dt, by[:, :count].copy(), uv, o.cov_uv, motion.cov,
+        CAUCHY_SCALE**2 * scale2, scale2, score, curvature, noise, d2,
+    ):  # fmt: skip
+        return np.zeros(count), np.zeros((count, count)), np.zeros((count, count)), np.zeros(0)
+    return score, curvature, noise, d2
+
+
+@kernel(
+    f"{_PAIR}, {_MOVES}, const f8[::1], f8[:, ::1], f8[:, ::1], const f8[:, :, ::1], const f8[:, ::1], f8, f8, f8[::1], "
+    "f8[:, ::1], f8[:, ::1], f8[::1]"
+)
+def _score(
+    fisheye: NDArray[np.bool_], k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, T: Array, twist: Array,
+    acceleration: Array, dt: Array, by: Array, uv: Array, cov: Array, cov_twist: Array, cauchy2: float, scale2: float,
+    score: Array, curvature: Array, noise: Array, d2: Array,
+) -> bool:  # fmt: skip
+    """Fill what :func:`_linear` returns from pixels uv (N, 2) that were moved to the time of pose T; False if it is none.
+
+    With A the derivatives by the pose and M those by the P parameters, whitened and weighted, what A explains is taken off
+    by the normal equations: M'M - M'A (A'A)^-1 A'M.
+    """
+    P = by.shape[1]
+    Ts, uv_now, J, rate = _both(T_right_left, T), np.empty(2), np.empty((2, 6)), np.empty(6)
+    S = np.zeros((1 + P + P * P, 6, 6))  # sums of A'A: plain, times each column of by, times each two
+    right = np.zeros((6, 1 + P))  # A'r, A'M
+    for n in range(len(p)):
+        c = camera[n]
+        if not _pixel(fisheye[c], k[c], d[c], Ts[c], p[n], uv_now, J):
+            return False
+        first = math.sqrt(cov[n, 0, 0])  # the Cholesky factor of the covariance, inverted
+        across = cov[n, 1, 0] / first
+        second = math.sqrt(cov[n, 1, 1] - across * across)
+        for i in range(6):
+            rate[i] = twist[i] + dt[n] * acceleration[i]
+            J[1, i] = (J[1, i] - across * (J[0, i] / first)) / second
+            J[0, i] /= first
+        r0 = (uv[n, 0] - uv_now[0]) / first
+        r1 = (uv[n, 1] - uv_now[1] - across * r0) / second
+        d2[n] = r0 * r0 + r1 * r1
+        weight = 1.0 / (1.0 + d2[n] / cauchy2) / scale2
+        m0 = m1 = 0.0
+        for i in range(6):
+            m0 += J[0, i] * rate[i]
+            m1 += J[1, i] * rate[i]
+        for i in range(6):
+            right[i, 0] += weight * (J[0, i] * r0 + J[1, i] * r1)
+            for a in range(P):
+                right[i, 1 + a] += weight * by[n, a] * (J[0, i] * m0 + J[1, i] * m1)
+            for j in range(6):
+                entry = weight * (J[0, i] * J[0, j] + J[1, i] * J[1, j])
+                S[0, i, j] += entry
+                for a in range(P):
+                    S[1 + a, i, j] += entry * by[n, a]
+                    for b in range(P):
+                        S[1 + P + P * a + b, i, j] += entry * by[n, a] * by[n, b]
+        for a in range(P):
+            score[a] += weight * by[n, a] * (m0 * r0 + m1 * r1)
+            for b in range(P):
+                curvature[a, b] += weight * by[n, a] * by[n, b] * (m0 * m0 + m1 * m1)
+    explained = solved(S[0], right)
+    for a in range(P):
+        for i in range(6):
+            score[a] -= right[i, 1 + a] * explained[i, 0]
+            for b in range(P):
+                curvature[a, b] -= right[i, 1 + a] * explained[i, 1 + b]
+    for b in range(P):
+        back = solved(S[0], S[1 + b])
+        for a in range(P):
+            for i in range(6):
+                for j in range(6):
+                    entry = S[1 + P + P * a + b, i, j]
+                    for m in range(6):
+                        entry -= S[1 + a, i, m] * back[m, j]
+                    noise[a, b] += entry * cov_twist[j, i]
+    return not math.isnan(score[0])
 
 
 @dataclass(frozen=True, eq=False)

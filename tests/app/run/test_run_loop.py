@@ -96,6 +96,25 @@ def stand(loop, seconds):
     loop.run(Planned(still, loop.t_s, lambda q: np.zeros(6)), seconds, RunSegment("open_loop", "", "", False))
 
 
+def test_what_is_published_waits_until_a_command_was_sent_also_if_that_fails():
+    board, happened = Standing(), []
+    loop = looped(board)
+    loop.publisher = SimpleNamespace(
+        put=lambda datum: None,
+        pause=lambda: happened.append("pause"),
+        resume=lambda: happened.append("resume"),
+        close=lambda: None,
+    )
+    board.send = lambda command: happened.append("command")
+    stand(loop, 0.02)
+    assert happened == ["pause", "command", "resume"] * 5 + ["resume"]
+    board.status.state = BoardState.FAULTED
+    happened.clear()
+    with pytest.raises(DeviceError):
+        stand(loop, 0.02)
+    assert happened == ["pause", "resume"]
+
+
 def test_cameras_that_stall_end_a_run_and_a_body_that_is_hidden_does_not():
     board = Standing()
     loop = looped(board, last_shot_s=2.0)

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -253,6 +254,40 @@ def test_a_reader_that_is_slow_loses_the_oldest_and_it_is_counted():
     sink.start()
     sink.close()
     assert sink.got == ["7", "8", "9", "10", "11"]
+
+
+def test_while_a_command_is_due_no_datum_is_begun_unless_many_wait():
+    from armsight.app.stream.sink import Sink
+
+    class Asked(threading.Event):
+        def __init__(self):
+            super().__init__()
+            self.asked = threading.Event()
+
+        def wait(self, timeout=None):
+            self.asked.set()
+            return super().wait()
+
+    class Listed(Sink):
+        def __init__(self):
+            super().__init__(limit=40)
+            self.got, self._may_write, self.begun = [], Asked(), []
+
+        def write(self, datum):
+            self.begun.append(self._may_write.asked.is_set())
+            self.got.append(datum.text)
+
+    sink = Listed()
+    sink.pause()
+    for k in range(20):
+        sink.put(NoteDatum(0.0, str(k)))
+    sink.start()
+    assert sink._may_write.asked.wait(10.0)
+    assert sink.got == [str(k) for k in range(11)]  # nine wait: less than a quarter of what may
+    sink.resume()
+    sink.close()
+    assert sink.got == [str(k) for k in range(20)]
+    assert sink.begun == [False] * 11 + [True] * 9
 
 
 def test_a_full_disk_ends_the_file_and_not_the_run(small_disk):

@@ -491,6 +491,7 @@ class Loop:
         try:
             while not over():
                 self.pass_time(self._rest_of_period())
+                self.publisher.pause()
                 self.on_period()
                 self._check_board()
                 controller.prepare(self.t_s)  # before the image is measured, so that its command need not wait for it
@@ -499,20 +500,23 @@ class Loop:
                     self._check_cameras(begin_s)
                 command, mode = controller.command(self.estimator)
                 self.board.send(command)
+                sent_s = time.perf_counter()
                 self.log.commands.append((self.t_s, command))
                 self.log.modes.append(mode)
                 self._publish()
+                self.publisher.resume()
                 if measured is not None:
                     shot, began, result = measured
                     if self.mounting is not None:  # before, no command depended on images
                         times_s = self.log.latency_s if self.follower.way == "followed" else self.log.search_s
-                        times_s.append(time.perf_counter() - began)
+                        times_s.append(sent_s - began)
                     self.on_shot(shot, result)
                     self._look_at_fixed(shot)
                     self.health.work()
                 if self._noted_s - self._written_s >= _WRITE_EVERY_S:
                     self._write()
         finally:
+            self.publisher.resume()
             self.log.segments.append(replace(segment, begin_s=begin_s, end_s=self.t_s))
 
     def _look_at_fixed(self, shot: Shot) -> None:

@@ -157,6 +157,16 @@ class LazyMcap:
         if self.sink is not None:
             self.sink.put(datum)
 
+    def pause(self) -> None:
+        """Begin to write no other datum until :meth:`resume`."""
+        if self.sink is not None:
+            self.sink.pause()
+
+    def resume(self) -> None:
+        """Write again."""
+        if self.sink is not None:
+            self.sink.resume()
+
     def put_shot(self, shot: Shot) -> None:
         """Take a shot that was recorded and not measured."""
         now = time.monotonic()  # the clock of live cameras' stamps

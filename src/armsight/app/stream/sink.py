@@ -16,6 +16,8 @@ from armsight.app.stream.datum import Datum
 
 #: How often ``tick`` is called at least, s.
 TICK_S = 0.25
+#: A sink that has this share of what may wait does not pause: before data are dropped a command may come late.
+_BEHIND = 0.25
 #: How long :meth:`Sink.close` waits for the thread, s.
 _CLOSE_S = 10.0
 
@@ -25,6 +27,14 @@ class Publisher(Protocol):
 
     def put(self, datum: Datum) -> None:
         """Take a datum."""
+        ...
+
+    def pause(self) -> None:
+        """Leave the interpreter to the caller until :meth:`resume`: begin to publish no other datum. Returns at once."""
+        ...
+
+    def resume(self) -> None:
+        """Publish again."""
         ...
 
     def close(self) -> None:
@@ -55,6 +65,8 @@ class Sink:
         self._queue: deque[Datum] = deque()
         self._changed = threading.Condition()
         self._closing = False
+        self._may_write = threading.Event()
+        self._may_write.set()
         self._thread = threading.Thread(target=self._run, name=type(self).__name__, daemon=True)
 
     def start(self) -> None:
@@ -74,8 +86,20 @@ class Sink:
             if len(self._queue) >= self._wakes:
                 self._changed.notify()
 
+    def pause(self) -> None:
+        """Begin to write no other datum until :meth:`resume`, for ``TICK_S`` at the most, unless much waits.
+
+        A thread that runs Python when a command is due delays it by up to the interpreter's switch interval.
+        """
+        self._may_write.clear()
+
+    def resume(self) -> None:
+        """Write again."""
+        self._may_write.set()
+
     def close(self) -> None:
         """Publish what waits, and end the thread; a second call has no effect."""
+        self._may_write.set()
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -91,7 +115,9 @@ class Sink:
                         self._changed.wait(TICK_S)
                     waiting, self._queue = self._queue, deque()
                     closing = self._closing
-                for datum in waiting:
+                for n, datum in enumerate(waiting):
+                    if len(waiting) - n + len(self._queue) < _BEHIND * self._limit:
+                        self._may_write.wait(TICK_S)
                     self.write(datum)
                 if time.monotonic() - ticked >= TICK_S:
                     self.tick()
@@ -130,6 +156,16 @@ class Fanout:
         """Hand a datum to every sink."""
         for sink in self.sinks:
             sink.put(datum)
+
+    def pause(self) -> None:
+        """Pause every sink."""
+        for sink in self.sinks:
+            sink.pause()
+
+    def resume(self) -> None:
+        """Resume every sink."""
+        for sink in self.sinks:
+            sink.resume()
 
     def close(self) -> None:
         """Close every sink."""

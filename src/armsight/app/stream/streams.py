@@ -38,6 +38,16 @@ class Streams:
         for sink in self._sinks.values():
             sink.put(datum)
 
+    def pause(self) -> None:
+        """Pause every stream."""
+        for sink in self._sinks.values():
+            sink.pause()
+
+    def resume(self) -> None:
+        """Resume every stream."""
+        for sink in self._sinks.values():
+            sink.resume()
+
     def close(self) -> None:
         """Close every stream; a second call has no effect."""
         sinks, self._sinks = self._sinks, {}

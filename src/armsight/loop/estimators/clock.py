@@ -14,6 +14,8 @@ clock may jump, or wander.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.special import chdtri
 
@@ -94,9 +96,10 @@ class ClockFollower:
             self._update(innovation, G, passed)
         self._V -= innovation.gain @ G
         self._V[self._delay] = 1.0, 0.0
-        offset_s, in_z, chi_square = float(self._b[0]), G @ self._b, self._chi_square
-        if not self._corrects():
-            return ClockEffect(offset_s, in_z, None, self.sigma_s) if chi_square > _SAID else None
+        offset_s, chi_square = float(self._b[0]), self._chi_square
+        if not self._corrects(chi_square):
+            return ClockEffect(offset_s, G @ self._b, None, self.sigma_s) if chi_square > _SAID else None
+        in_z = G @ self._b
         change = self._V @ self._b
         change[self._delay] = 0.0
         self._corrected += self._b
@@ -105,12 +108,14 @@ class ClockFollower:
 
     @property
     def _chi_square(self) -> float:
-        return float(self._b @ np.linalg.solve(self._M + np.diag([SYSTEMATIC_S**2, 0.0]), self._b))
+        (offset, rate), ((a, b), (_, c)) = self._b.tolist(), self._M.tolist()
+        a += SYSTEMATIC_S**2
+        return float((c * offset**2 - 2.0 * b * offset * rate + a * rate**2) / (a * c - b * b))
 
-    def _corrects(self) -> bool:
-        """Return whether stamps are corrected."""
+    def _corrects(self, chi_square: float) -> bool:
+        """Return whether stamps are corrected, with the chi-square of offset and rate."""
         if self.since_s is None:
-            certain = self._chi_square > _CERTAIN
+            certain = chi_square > _CERTAIN
             certain |= self._unrest > 0.0 and self._b[0] ** 2 > _CERTAIN_SIGMAS**2 * (self._M[0, 0] + SYSTEMATIC_S**2)
             certain &= abs(self._b[0]) > _LEAST_S
             self._certain_s = min(self._certain_s, self._t_s) if certain else np.inf
@@ -122,31 +127,43 @@ class ClockFollower:
         self._V[:, 1] -= passed * self._V[:, 0]
         self._V *= kept[:, None]
         self._V[self._delay] = 1.0, 0.0
-        step = np.array([[1.0, passed], [0.0, 1.0]])
-        self._b, self._corrected = step @ self._b, step @ self._corrected
-        self._unrest *= float(np.exp(-passed / _CALM_S))
+        self._b[0] += passed * self._b[1]
+        self._corrected[0] += passed * self._corrected[1]
+        self._unrest *= math.exp(-passed / _CALM_S)
         self._unrest = self._unrest if self._unrest > _WALK else 0.0
-        walks = np.array([_WALK**2 + self._unrest**2, _RATE_WALK**2 + (self._unrest / _WINDOW_S) ** 2])
-        self._M = step @ self._M @ step.T + passed * np.diag(walks)
+        (a, b), (_, c) = self._M.tolist()
+        a += passed * (2.0 * b + passed * c + _WALK**2 + self._unrest**2)
+        b += passed * c
+        c += passed * (_RATE_WALK**2 + (self._unrest / _WINDOW_S) ** 2)
+        self._M = np.array([[a, b], [b, c]])
 
     def _update(self, innovation: Innovation, G: Array, passed: float) -> None:
         """Update offset and rate by an innovation with its derivative G (6, 2) by them."""
-        white = np.linalg.inv(innovation.cov)
         r = innovation.z - G @ self._b
+        whitened = np.linalg.solve(innovation.cov, np.column_stack([r, G]))
+        r_white, G_white = whitened[:, 0], whitened[:, 1:]
         share = min(passed / _EXCESS_S, 1.0)
-        self._excess += share * (float(r @ white @ r) / 6.0 - self._excess)
-        along = white @ G / max(self._excess, 1.0)
-        fade = float(np.exp(-passed / _WINDOW_S))
-        self._score = fade * self._score + float(along[:, 0] @ r)
-        self._information = fade * self._information + float(along[:, 0] @ G[:, 0])
-        M = np.linalg.inv(np.linalg.inv(self._M) + along.T @ G)
-        left = r - G @ (M @ (along.T @ r))
-        if self.since_s is None and float(left @ white @ left) > _GATE * max(self._excess, 1.0):
+        self._excess += share * (float(r @ r_white) / 6.0 - self._excess)
+        excess = max(self._excess, 1.0)
+        score, information = G_white.T @ r / excess, G_white.T @ G / excess
+        fade = math.exp(-passed / _WINDOW_S)
+        self._score = fade * self._score + float(score[0])
+        self._information = fade * self._information + float(information[0, 0])
+        M = _inverted(_inverted(self._M) + information)
+        step = M @ score
+        if self.since_s is None and float((r - G @ step) @ (r_white - G_white @ step)) > _GATE * excess:
             return
-        self._b, self._M = self._b + M @ (along.T @ r), (M + M.T) / 2
+        self._b, self._M = self._b + step, M
         if self._information * _SEEN_S**2 < 1.0:
             return
         surprise = self._score / self._information
         if surprise**2 > _SURPRISING**2 * (1.0 / self._information + self._M[0, 0]):
-            self._unrest = max(self._unrest, abs(surprise) / float(np.sqrt(_WINDOW_S)))
+            self._unrest = max(self._unrest, abs(surprise) / math.sqrt(_WINDOW_S))
             self._score = self._information = 0.0
+
+
+def _inverted(A: Array) -> Array:
+    """Return the inverse of a symmetric matrix (2, 2)."""
+    (a, b), (_, c) = A.tolist()
+    determinant = a * c - b * b
+    return np.array([[c / determinant, -b / determinant], [-b / determinant, a / determinant]])

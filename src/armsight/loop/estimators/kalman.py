@@ -261,7 +261,7 @@ class KalmanEstimator:
         used = innovation.outcome is not Outcome.OUTLIER
         effect = self.clock.take(innovation) if used and self.clock is not None else None
         if self.on_innovation is not None:
-            self.on_innovation(replace(innovation, clock=effect))
+            self.on_innovation(innovation if effect is None else replace(innovation, clock=effect))
         return None if effect is None else effect.change
 
     def _take(
