@@ -56,6 +56,15 @@ def test_the_covariance_grows_until_it_covers_the_error():
     assert np.mean(errors[True], axis=0)[1] < 12.0
 
 
+def test_to_ask_often_changes_nothing():
+    *_, (silent, *_) = watched_body(8, rotated=np.radians([0.02, 0.0, 0.0]), seconds=2.9)
+    for k, (asked, *_) in enumerate(watched_body(8, rotated=np.radians([0.02, 0.0, 0.0]), seconds=2.9)):
+        if k % 20 == 0:
+            asked.findings()
+    assert asked._rig._window.H == pytest.approx(silent._rig._window.H, rel=1e-12)
+    assert asked.findings() == silent.findings() == asked.findings()
+
+
 def test_a_rig_without_covariance_is_not_tested():
     *_, estimate, _ = next(watched_body(6))
     monitor = HealthMonitor(replace(TRUE, cov=np.zeros_like(TRUE.cov)), BODY, SYNC_S)

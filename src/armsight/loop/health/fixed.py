@@ -17,6 +17,7 @@ which of them is named.
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from armsight.data import Array, Ids
 from armsight.loop.estimators import Innovation, Outcome
@@ -61,10 +62,14 @@ class FixedWatch:
         self._wide, self._columns = np.append(wide, wide[:RAMPS]), len(rows) + RAMPS
         self._suspects = tuple(each for each in suspects(at.joints) if each.kind != "backlash")
         self._begins = np.zeros(0)
-        self._F = np.zeros((at.size, 0, self._columns))
+        # In single precision, which is enough and takes half the time: it is by far the largest array.
+        self._F = np.zeros((at.size, 0, self._columns), np.float32)
         self._C, self._b = np.zeros((0, self._columns, self._columns)), np.zeros((0, self._columns))
         self._squares, self._weights = np.zeros(0), np.zeros(0)
-        self._last_s = self._tested_s = -np.inf
+        self._ramp_rows = np.array(rows[:RAMPS])
+        self._shots: list[tuple[Innovation, float]] = []  # since the newest beginning, each so long after the one before, s
+        self._newest: Innovation | None = None
+        self._last_s = -np.inf
         self._rejected: list[Innovation] = []
         self.changes: tuple[Change, ...] = ()
         self.reopened: tuple[int, float] = (0, np.inf)
@@ -92,34 +97,63 @@ class FixedWatch:
         self._add(innovation)
 
     def _add(self, innovation: Innovation) -> None:
-        """Add an innovation to the sums of all beginnings."""
-        t_s, z = innovation.t_s, innovation.z if innovation.clock is None else innovation.z - innovation.clock.in_z
+        """Add an innovation; where a new beginning is due, test with those before it."""
+        t_s = innovation.t_s
         passed = t_s - self._last_s
         if not passed > 0.0:
             return
         if not len(self._begins) or t_s - self._begins[-1] >= EVERY_S:
             self._begin(t_s)
-        if np.isfinite(passed):
-            self._F[:, :, self._steps.shape[1] :] += passed * self._steps[:, None, :RAMPS]
-        self._last_s = t_s
-        weight = min(passed / CORRELATED_S, 1.0)
-        F = innovation.kept[:, None] * self._F.reshape(self._size, -1)
-        G = innovation.by_state @ F
-        if innovation.gain.any():
-            self._F = (F - innovation.gain @ G).reshape(self._F.shape)
-        white = np.linalg.inv(innovation.cov)
-        signature = np.moveaxis(G.reshape(6, -1, self._columns), 0, 1)
-        whitened = white @ signature
-        self._C += weight * np.swapaxes(signature, 1, 2) @ whitened
-        self._b += weight * z @ whitened
-        self._squares += weight * float(z @ white @ z)
-        self._weights += weight
-        if t_s - self._tested_s >= 1.0 / _TESTS_HZ:
-            self._tested_s = t_s
-            self._decide(innovation)
+            if self._newest is not None:
+                self._decide(self._newest)
+        self._shots.append((innovation, passed))
+        self._last_s, self._newest = t_s, innovation
+
+    def _sum(self) -> None:
+        """Add the measurements since the newest beginning to the sums of all beginnings.
+
+        All are linear in F as it was before them, which is large and is passed over once: with G of all of them stacked,
+
+            (I + L) G = A F + Q,    F = kept F - U G + R
+
+        where L holds what the gains of earlier ones do to later ones (block triangular), and Q and R what the ramps add,
+        for all beginnings the same. A, Q, L and G are whitened.
+        """
+        shots, self._shots = self._shots, []
+        if not shots:
+            return
+        seen, n, steps = [innovation for innovation, _ in shots], 6 * len(shots), self._steps.shape[1]
+        weights = np.array([min(passed / CORRELATED_S, 1.0) for _, passed in shots])
+        spread = np.linalg.cholesky(np.array([each.cov for each in seen]) / weights[:, None, None])
+        white = np.linalg.inv(spread)
+        z = np.array([each.z if each.clock is None else each.z - each.clock.in_z for each in seen])
+        z = (white @ z[..., None]).ravel()
+        H = white @ np.array([each.by_state for each in seen])
+        gains = np.array([each.gain for each in seen]) @ spread
+        kept, ramps = np.ones(self._size), np.zeros(RAMPS)
+        U, L, A, Q = np.zeros((self._size, n)), np.eye(n), np.zeros((n, self._size)), np.zeros((n, RAMPS))
+        for k, (innovation, passed) in enumerate(shots):
+            at, keeps = slice(6 * k, 6 * k + 6), innovation.kept
+            kept = keeps * kept
+            ramps = keeps[self._ramp_rows] * (ramps + (passed if np.isfinite(passed) else 0.0))
+            U[:, : at.start] *= keeps[:, None]
+            L[at, : at.start], A[at], Q[at] = H[k] @ U[:, : at.start], H[k] * kept, H[k][:, self._ramp_rows] * ramps
+            U[:, at] = gains[k]
+        AQ = solve_triangular(L, np.column_stack([A, Q]), lower=True, unit_diagonal=True, check_finite=False)
+        G = (AQ[:, : self._size].astype(np.float32) @ self._F.reshape(self._size, -1)).reshape(n, -1, self._columns)
+        G[:, :, steps:] += AQ[:, None, self._size :]
+        left = (U.astype(np.float32) @ G.reshape(n, -1)).reshape(self._F.shape)
+        self._F = kept.astype(np.float32)[:, None, None] * self._F - left
+        self._F[self._ramp_rows, :, steps + np.arange(RAMPS)] += ramps[:, None]
+        signature = np.moveaxis(G, 0, 1).astype(float)
+        self._C += np.swapaxes(signature, 1, 2) @ signature
+        self._b += z @ signature
+        self._squares += float(z @ z)
+        self._weights += weights.sum()
 
     def _begin(self, t_s: float) -> None:
         """Try a new beginning, and drop the ones that the age makes needless."""
+        self._sum()
         ages = t_s - self._begins
         keep, last = np.zeros(len(ages), bool), np.inf
         for k, age in enumerate(ages):  # from the oldest on
@@ -127,7 +161,7 @@ class FixedWatch:
             last = age if keep[k] else last
         rows = np.flatnonzero(keep)
         rows = rows if len(rows) < MOST else np.delete(rows, 1)
-        new = np.zeros((self._size, 1, self._columns))
+        new = np.zeros((self._size, 1, self._columns), np.float32)
         new[:, 0, : self._steps.shape[1]] = self._steps
         self._begins = np.append(self._begins[rows], t_s)
         self._F = np.concatenate([self._F[:, rows], new], axis=1)

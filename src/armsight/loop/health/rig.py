@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Literal
 
@@ -357,17 +358,27 @@ class RigWatch:
         return found
 
     def findings(self) -> tuple[HealthFinding, ...]:
-        """Return what was found so far: nothing where no test gave an alarm."""
-        self._close_stay()
-        self._decide()
-        if not self.alarmed:
+        """Return what was found so far, the shots of the running test included: nothing where no test gave an alarm."""
+        ended = self._ended()
+        if not ended.alarmed:
             return ()
-        began_s, change = self._since()
+        began_s, change = ended._since()
         since_s = began_s if self._timed else None
         parts = self._to_blame(change)
         return tuple(
             _FINDINGS[part](change, since_s, len(parts) == 1 and not self._needed(change, part)) for part in parts
         )
+
+    def _ended(self) -> RigWatch:
+        """Return a copy whose running test was made; this one goes on with it."""
+        ended = copy(self)
+        ended._test, ended._window = (ResidualSums(self._size, each.begin_s) for each in (self._test, self._window))
+        ended._test.add(self._test, 1.0)
+        ended._window.add(self._window, 1.0)
+        ended._history = self._history.copy()
+        ended._close_stay()
+        ended._decide()
+        return ended
 
     def _needed(self, change: RigChange, part: Part) -> bool:
         """Return whether the other parts do not explain what was found."""
