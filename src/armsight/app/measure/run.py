@@ -133,7 +133,8 @@ def measure_shots(
             found = open_target(target)
             body, discs = found.body, found.discs
             opened = stack.enter_context(contextlib.closing(_opened(left, right, source)))
-            _say(notes_of(opened))
+            said = notes_of(opened)
+            _say(said)
             if output is not None and isinstance(opened, StoredSource):
                 check_writable(output, apart_from=opened.files)
             total, timed = opened.count, _timed(opened)
@@ -176,6 +177,8 @@ def measure_shots(
             kept = f", kept in {output}" if output is not None and records else ""
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
             raise
+        if detections is None:  # what only the images showed
+            _say(note for note in notes_of(opened) if note not in said)
     if records and detections is None and not any(record.ok for record in records):
         raise ArmsightError(_nothing_measured(records, _flipped(stereo, found, first)))
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
