@@ -180,8 +180,8 @@ class _File:
         share = float(same.sum() / changing.sum())
         given, rate = (1 - share) / self.period_s, 1 / self.period_s
         return (
-            f"{self.path}: {100 * share:.0f} % of the frames repeat the one before: the camera gave about {given:.0f} images "
-            f"a second and the file has {rate:.0f}; a repeated image is no new measurement, and its time is late"
+            f"{self.path}: {100 * share:.0f} % of the frames repeat the one before: the camera gave about {given:.0f} "
+            f"images a second and the file has {rate:.0f}; a repeated image is no new measurement, and its time is late"
         )
 
 
