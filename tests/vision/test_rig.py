@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from armsight.errors import InputError
 from armsight.geometry.pose import log_se3
-from armsight.vision.rig import VERSION, Shutters, StereoRig
+from armsight.vision.rig import VERSION, CameraNoise, Shutters, StereoRig
 from asserts import assert_jacobian
 from strategies import CAMERAS, ordinary_rig
 
@@ -247,6 +247,19 @@ def test_other_files_are_reported(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"rig\.json"):
         StereoRig.load(path)
+
+
+def test_the_noise_of_discs_is_stored_and_files_without_it_are_read(tmp_path):
+    path, noise = tmp_path / "rig.json", (CameraNoise(1.4, 700.0), CameraNoise(0.8, 650.0))
+    replace(ordinary_rig(), disc_noise=noise).save(path)
+    found = StereoRig.load(path)
+    assert found.disc_variance_factors == (1.4, 0.8)
+    assert found.disc_noise[1].freedom == 650.0
+    assert found.perturbed(np.zeros(found.parameter_count)).disc_variance_factors == (1.4, 0.8)
+    assert StereoRig.load(saved(tmp_path)).disc_variance_factors == (1.0, 1.0)
+    for wrong in (3, {"left": {}}, {side: {"variance_factor": -1, "freedom": 9} for side in ("left", "right")}):
+        with pytest.raises(InputError, match=r"rig\.json: "):
+            StereoRig.load(saved(tmp_path, disc_noise=wrong))
 
 
 def test_shutters_are_stored_and_files_without_them_are_read(tmp_path):

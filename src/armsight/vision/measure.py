@@ -7,6 +7,8 @@ estimate = measure(rig, target, open_source("recording").read())
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from armsight.data import SIDES, Body, Correspondences, Detections, Image, Missed, PoseEstimate, Shot
@@ -47,8 +49,10 @@ def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed
     left, right = (grey(image) for image in images)
     found = target.detect(left), target.detect(right)
     if target.discs is not None:
-        discs = target.discs.find(left), target.discs.find(right)
-        return locate_composite(rig, target.body, target.discs, found, discs, symmetries=target.symmetries)
+        factors = rig.disc_variance_factors
+        seen = [target.discs.find(image) for image in (left, right)]
+        first, second = (replace(d, cov_uv=f * d.cov_uv) for f, d in zip(factors, seen, strict=True))
+        return locate_composite(rig, target.body, target.discs, found, (first, second), symmetries=target.symmetries)
     problems = [f"{side}: {d.problem}" for side, d in zip(SIDES, found, strict=True) if d.problem is not None]
     if problems:
         return Missed("; ".join(problems))
@@ -77,7 +81,7 @@ def _without_bias(
     )
     nothing = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
     seen = match(rig, target.body, left, right, symmetries=target.symmetries)
-    return locate_discs(rig, target.body, discs, nothing, seen, rough.T_left_body, rough.cov)
+    return locate_discs(rig, target.body, discs, nothing, seen, rough.T_left_body)
 
 
 def size_problem(size_px: tuple[int, int], image: Image, side: str) -> str | None:

@@ -87,6 +87,30 @@ class Shutters(Record):
 
 
 @dataclass(frozen=True, eq=False)
+class CameraNoise(Record):
+    """What one image of a camera says too little of: how far the centres of discs are off, over what the image says.
+
+    Attributes:
+        variance_factor: squared errors of discs' centres over their variances by the image's own noise.
+        freedom: degrees of freedom it was measured with; its relative sigma is sqrt(2 / freedom).
+    """
+
+    variance_factor: float
+    freedom: float
+
+    def __post_init__(self) -> None:
+        """Check that both are positive and finite."""
+        super().__post_init__()
+        for name, value in (("variance_factor", self.variance_factor), ("freedom", self.freedom)):
+            if not 0 < value < np.inf:
+                raise InputError(f"{name} of a camera's disc noise must be a positive number, got {value}")
+
+    def __str__(self) -> str:
+        """Return the factor with its sigma, for people."""
+        return f"{self.variance_factor:.2f} ± {self.variance_factor * np.sqrt(2 / self.freedom):.2f}"
+
+
+@dataclass(frozen=True, eq=False)
 class StereoRig(Record):
     """Two cameras that see the same volume.
 
@@ -100,6 +124,7 @@ class StereoRig(Record):
         sigma_px: standard deviation of a detection beyond the image's own covariance, px: from the calibration.
         provenance: where the rig comes from: command, data, versions.
         shutters: when the rows of both cameras are exposed; None where it is unknown.
+        disc_noise: of the left and of the right camera; None where it was not measured.
     """
 
     left: Camera
@@ -109,6 +134,7 @@ class StereoRig(Record):
     sigma_px: float
     provenance: Mapping[str, Any] = field(default_factory=dict)
     shutters: Shutters | None = None
+    disc_noise: tuple[CameraNoise, CameraNoise] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and the rotation."""
@@ -135,6 +161,13 @@ class StereoRig(Record):
     def cameras(self) -> tuple[Camera, Camera]:
         """Left and right."""
         return self.left, self.right
+
+    @property
+    def disc_variance_factors(self) -> tuple[float, float]:
+        """By which the variances of discs' centres in left and right images are multiplied; 1 where it is unknown."""
+        if self.disc_noise is None:
+            return 1.0, 1.0
+        return self.disc_noise[0].variance_factor, self.disc_noise[1].variance_factor
 
     @property
     def parameter_count(self) -> int:
@@ -173,6 +206,7 @@ class StereoRig(Record):
             self.sigma_px,
             self.provenance,
             self.shutters,
+            self.disc_noise,
         )
 
     def rectify(self) -> Rectification:
@@ -212,6 +246,11 @@ class StereoRig(Record):
         }
         if self.shutters is not None:
             document["shutters"] = self.shutters.to_json()
+        if self.disc_noise is not None:
+            document["disc_noise"] = {
+                side: {"variance_factor": noise.variance_factor, "freedom": noise.freedom}
+                for side, noise in zip(("left", "right"), self.disc_noise, strict=True)
+            }
         return json.dumps(document, indent=1) + "\n"
 
     @staticmethod
@@ -242,6 +281,7 @@ class StereoRig(Record):
                 float(document["sigma_px"]),
                 _provenance(document),
                 _shutters(document.get("shutters")),
+                _disc_noise(document.get("disc_noise")),
             )
         except KeyError as error:
             raise InputError(f"{path}: the rig file has no {error.args[0]!r}") from None
@@ -304,6 +344,16 @@ def _shutters(entry: dict[str, Any] | None) -> Shutters | None:
         return None
     cov = checked(entry["covariance_s2"], (2, 2), "covariance_s2 of shutters")
     return Shutters(float(entry["skew_s"]), float(entry["readout_s"]), cov, float(entry.get("jitter_s", 0.0)))
+
+
+def _disc_noise(entry: dict[str, Any] | None) -> tuple[CameraNoise, CameraNoise] | None:
+    """Build what a rig file says of the noise of its cameras' discs, if it does."""
+    if entry is None:
+        return None
+    left, right = (
+        CameraNoise(float(entry[side]["variance_factor"]), float(entry[side]["freedom"])) for side in ("left", "right")
+    )
+    return left, right
 
 
 def _camera(entry: dict[str, Any]) -> Camera:

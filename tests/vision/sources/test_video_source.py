@@ -116,3 +116,43 @@ def test_what_is_no_video_is_named(film, picture, tmp_path, capfd):
             open_source(spec)
         assert said in str(caught.value)
     assert capfd.readouterr().err == ""
+
+
+def moving(k, rng, at_rest=False):
+    """A square that moves by 3 px a frame before noise, or rests."""
+    image = np.full((96, 160, 3), 60, np.uint8)
+    left = 10 + 3 * (0 if at_rest else k)
+    covered = np.clip(np.arange(160) + 1 - left, 0, 1) * np.clip(left + 30 - np.arange(160), 0, 1)
+    image[30:60] = 60 + 130 * covered[:, None]
+    return np.clip(image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("times", "share", "rate"), [(2, 50, 15), (3, 67, 10)])
+def test_frames_that_repeat_are_said_although_encoded_again(film, times, share, rate):
+    rng = np.random.default_rng(1)
+    repeated = [
+        np.clip(image + rng.normal(0, 0.5, image.shape), 0, 255).astype(np.uint8)
+        for k in range(36 // times)
+        for image in [moving(k, rng)] * times
+    ]
+    left, right = film("left.avi", repeated), film("right.avi", [moving(k, rng) for k in range(36)])
+    source = open_source(f"video:{left},{right}")
+    assert notes_of(source) == ()
+    while source.read() is not None:
+        pass
+    (note,) = notes_of(source)
+    assert note.startswith(f"{left}: ")
+    assert int(note.split(" % of the frames repeat")[0].split()[-1]) == pytest.approx(share, abs=4)
+    assert int(note.split(" images a second and the file has 30;")[0].split()[-1]) == pytest.approx(rate, abs=1)
+
+
+def test_what_moves_stops_and_rests_repeats_no_frames(film):
+    rng = np.random.default_rng(2)
+    stopping = [moving(k - 6 if k > 6 else 0, rng) if k < 18 else moving(12, rng) for k in range(36)]
+    swinging = [moving(12 + 12 * np.sin(k / 5), rng) for k in range(36)]
+    resting = [moving(0, rng, at_rest=True) for _ in range(36)]
+    for name, images in (("stops", stopping), ("swings", swinging), ("rests", resting)):
+        source = open_source(f"video:{film(f'{name}-left.avi', images)},{film(f'{name}-right.avi', images)}")
+        while source.read() is not None:
+            pass
+        assert notes_of(source) == (), name

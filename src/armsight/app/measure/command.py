@@ -43,7 +43,7 @@ from armsight.errors import InputError
     "--save-rig",
     metavar="RIG2.json",
     type=click.Path(path_type=Path),
-    help="Write the rig with the skew and readout found.",
+    help="Write the rig with the skew and readout found, and the noise of a moved body's discs.",
 )
 @click.option("-o", "--output", metavar="POSES.csv", type=click.Path(path_type=Path), help="Write the poses as CSV.")
 @click.option(

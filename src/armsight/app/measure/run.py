@@ -31,6 +31,7 @@ from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_fixed, open_target
 from armsight.vision.measure import measure, measure_seen, size_problem
+from armsight.vision.noise import DiscNoise
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.shutter import LOOSE_PX
 from armsight.vision.sources import PairsSource, Source, notes_of, open_source
@@ -108,8 +109,8 @@ def measure_shots(
         raise InputError("--fixed needs images: --detections has the markers of the target alone")
     fixed_targets = open_fixed(fixed, target)
     if save_rig is not None:
-        if requested is None:
-            raise InputError("--save-rig writes what --skew or --readout find: give --skew find")
+        if detections is not None:
+            raise InputError("--save-rig writes what images show of the cameras: --detections has none")
         check_writable(save_rig, apart_from=(rig, target, output))
     stereo = open_rig(rig)
     folder = None if view_dir is None else view_folder(view_dir)
@@ -124,6 +125,7 @@ def measure_shots(
     discs: DiscTarget | None = None
     skewed: list[HealthFinding] = []
     first: list[Shot] = []
+    noise: DiscNoise | None = None
     with contextlib.ExitStack() as stack:
         if detections is not None:
             body, shots = _detected(detections, target)
@@ -132,8 +134,15 @@ def measure_shots(
         else:
             found = open_target(target)
             body, discs = found.body, found.discs
+            if discs is not None:
+                noise = DiscNoise(stereo, found)
+            elif save_rig is not None and requested is None:
+                raise InputError(
+                    "--save-rig writes skew, readout and the noise of discs: give --skew find, or a body of discs"
+                )
             opened = stack.enter_context(contextlib.closing(_opened(left, right, source)))
-            _say(notes_of(opened))
+            said = notes_of(opened)
+            _say(said)
             if output is not None and isinstance(opened, StoredSource):
                 check_writable(output, apart_from=opened.files)
             total, timed = opened.count, _timed(opened)
@@ -152,7 +161,7 @@ def measure_shots(
                 if again is not None:
                     stack.enter_context(contextlib.closing(again))
                 results = _moved(stereo, found, _shots(opened, stereo, rig), requested, again)
-            results = _keeping(results, first)
+            results = _keeping(results, first, noise)
         view = None if folder is None else PictureFolder(folder, stereo, body, discs, total)
         # What was measured is written whatever ends the run; where one of the two cannot be written the other is.
         if view is not None:
@@ -176,12 +185,13 @@ def measure_shots(
             kept = f", kept in {output}" if output is not None and records else ""
             click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
             raise
+        if detections is None:  # what only the images showed
+            _say(note for note in notes_of(opened) if note not in said)
     if records and detections is None and not any(record.ok for record in records):
         raise ArmsightError(_nothing_measured(records, _flipped(stereo, found, first)))
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
     moved = next((r.shutters for r in records if r.shutters is not None), None)
-    if save_rig is not None and moved is not None:
-        replace(stereo, shutters=moved).save(save_rig)
+    _keep_noise(stereo, None if skewed else noise, moved, save_rig)
     health = monitor.findings()
     for name in monitor.fixed_never_seen:
         click.echo(f"note: the fixed body {name} was seen too rarely to say anything", err=True)
@@ -198,10 +208,33 @@ def measure_shots(
     return health
 
 
-def _keeping(results: Iterator[Result], first: list[Shot]) -> Iterator[Result]:
-    """Yield the results; keep the first shot that was missed although both images are there."""
+def _keep_noise(rig: StereoRig, noise: DiscNoise | None, moved: Shutters | None, save_rig: Path | None) -> None:
+    """Say how noisy the cameras' discs were, and write the rig with that and with the shutters that were found."""
+    found = None if noise is None else noise.found()
+    if found is not None:
+        left, right = found
+        kept = "" if save_rig is not None or rig.disc_noise is not None else "; --save-rig keeps it for single shots"
+        click.echo(
+            f"note: discs' centres vary {left} (left) and {right} (right) times as much as single images say{kept}",
+            err=True,
+        )
+    if save_rig is None:
+        return
+    if found is None and moved is None:
+        click.echo(
+            f"note: {save_rig} was not written: too few shots, or the body moved too little, to know the discs' noise",
+            err=True,
+        )
+        return
+    replace(rig, shutters=moved or rig.shutters, disc_noise=found or rig.disc_noise).save(save_rig)
+
+
+def _keeping(results: Iterator[Result], first: list[Shot], noise: DiscNoise | None) -> Iterator[Result]:
+    """Yield the results; keep the first shot that was missed although both images are there, and what shows the noise."""
     for result in results:
         shot = result[0]
+        if noise is not None and isinstance(result[1], PoseEstimate):
+            noise.add(result[1])
         if not first and isinstance(result[1], Missed) and shot.left is not None and shot.right is not None:
             first.append(shot)
         yield result

@@ -166,6 +166,12 @@ def _json(path: str, rig: StereoRig) -> dict[str, Any]:
         "sigma_px": rig.sigma_px,
         "sigmas": {name: sigma or None for name, sigma in _sigmas(rig).items()},
         "shutters": None if rig.shutters is None else rig.shutters.to_json(),
+        "disc_noise": None
+        if rig.disc_noise is None
+        else {
+            side: {"variance_factor": noise.variance_factor, "freedom": noise.freedom}
+            for side, noise in zip(("left", "right"), rig.disc_noise, strict=True)
+        },
         "provenance": dict(rig.provenance),
     }
 
@@ -189,6 +195,9 @@ def _lines(rig: StereoRig) -> list[str]:
     ]
     if rig.shutters is not None:
         lines.append(f"shutters: {rig.shutters}")
+    if rig.disc_noise is not None:
+        left, right = rig.disc_noise
+        lines.append(f"variance of discs' centres over what an image says: left {left}, right {right}")
     if not rig.cov.any():
         lines.append("uncertainty: unknown (no covariance in this rig file)")
     return [*lines, *(f"{key}: {value}" for key, value in rig.provenance.items())]

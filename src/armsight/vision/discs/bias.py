@@ -395,25 +395,22 @@ def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
     return Expected(uv, bias, shape, radius, facing, J, J_bias, J_rig, cov)
 
 
-def centred(
-    rig: StereoRig, target: DiscTarget, T_left_body: Array, cov_pose: Array, seen: Correspondences
-) -> Correspondences:
+def centred(rig: StereoRig, target: DiscTarget, T_left_body: Array, seen: Correspondences) -> Correspondences:
     """Convert centres of ellipses to images of the discs' centres: subtract the perspective bias.
 
     Args:
         rig: the calibrated pair.
         target: the discs; ``seen.ids`` are rows of its body.
-        T_left_body: (4, 4) approximate pose of the body.
-        cov_pose: (6, 6) covariance of its tangent; it adds to the covariance of the bias.
+        T_left_body: (4, 4) pose of the body, the one that is estimated from the result: an error of it is none of the
+            detections', for the bias follows the estimate.
         seen: centres of ellipses.
 
     Returns:
-        The same correspondences less the bias, with the covariance of both. Detections whose disc would have no image
-        at the pose become NaN.
+        The same correspondences less the bias, with the covariance of both, as far as the normals are not known.
+        Detections whose disc would have no image at the pose become NaN.
     """
     expected = expect(rig, target, T_left_body)
-    J = expected.J_bias[seen.ids]
-    cov = seen.cov_uv + J @ cov_pose @ np.swapaxes(J, 2, 3) + expected.cov_bias[seen.ids]
+    cov = seen.cov_uv + expected.cov_bias[seen.ids]
     uv = seen.uv - expected.bias[seen.ids]
     return Correspondences(seen.ids, uv, np.where(np.isfinite(uv)[..., None], cov, 0.0), seen.dropped)
 

@@ -51,7 +51,7 @@ def locate_composite(
         seen = assign(rig, target, by_code.T_left_body, by_code.cov, *discs)
         if isinstance(seen, Missed):
             return by_code
-        return locate_discs(rig, body, target, names, seen, by_code.T_left_body, by_code.cov)
+        return locate_discs(rig, body, target, names, seen, by_code.T_left_body)
     found = identify(rig, target, *discs)
     if isinstance(found, Missed):
         if isinstance(identify(rig, target, discs[1], discs[0]), IdentifiedDiscs):
@@ -61,7 +61,7 @@ def locate_composite(
         return Missed(
             "; ".join([*reasons, found.reason]) if len(body.points) > len(target.body.points) else found.reason
         )
-    return locate_discs(rig, body, target, names, found.seen, found.T_left_body, found.cov)
+    return locate_discs(rig, body, target, names, found.seen, found.T_left_body)
 
 
 def locate_discs(
@@ -71,7 +71,6 @@ def locate_discs(
     coded: Correspondences,
     seen: Correspondences,
     T_left_body: Array,
-    cov: Array,
 ) -> PoseEstimate | Missed:
     """Locate a body from named discs and coded points, the perspective bias of the discs subtracted.
 
@@ -82,12 +81,11 @@ def locate_discs(
         coded: detections of coded points, by rows of ``body``; may be empty.
         seen: ellipse centres by rows of ``target.body``.
         T_left_body: (4, 4) approximate pose of the body.
-        cov: (6, 6) covariance of its tangent.
     """
     first = len(body.points) - len(target.body.points)
     before: Array | None = None
     for _ in range(_ROUNDS):
-        centres = centred(rig, target, T_left_body, cov, seen)
+        centres = centred(rig, target, T_left_body, seen)
         if before is not None and np.nanmax(np.abs(centres.uv - before), initial=0.0) <= SETTLED_PX:
             break
         before = centres.uv
@@ -100,5 +98,5 @@ def locate_discs(
         result = locate(rig, body, triangulate(rig, body, together))
         if isinstance(result, Missed):
             return result
-        T_left_body, cov = result.T_left_body, result.cov
+        T_left_body = result.T_left_body
     return result

@@ -166,6 +166,7 @@ class Follower:
             np.array(discs.radii_m),
             np.where(discs.bright, 1, -1),
             0.0,
+            np.array(rig.disc_variance_factors),
         )
         self.expose_apart(apart_s)
         self._found = _buffers(len(discs.radii_m), rig.parameter_count)

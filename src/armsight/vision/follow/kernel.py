@@ -43,7 +43,7 @@ _OFF_SIGMAS = 6.0
 
 @kernel_types(
     "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], f8[:, ::1], "
-    "b1[::1], f8[::1], i8[::1], f8"
+    "b1[::1], f8[::1], i8[::1], f8, f8[::1]"
 )
 class DiscScene(NamedTuple):
     """The quantities that are constant from pair to pair.
@@ -63,6 +63,7 @@ class DiscScene(NamedTuple):
         radii: (M,) m.
         signs: (M,) 1 bright, -1 dark.
         apart_s: standard deviation of the time between the two exposures, s.
+        factors: (2,) by which a camera's variances are multiplied, of its discs' centres.
     """
 
     fisheye: NDArray[np.bool_]
@@ -79,6 +80,7 @@ class DiscScene(NamedTuple):
     radii: Array
     signs: NDArray[np.int64]
     apart_s: float
+    factors: Array
 
 
 @kernel_types(
@@ -477,6 +479,9 @@ def look(
         if found.codes[m, side] == SEEN:
             correct(image, noise, work.discs[count], shared, found.cov_uv[m, side], work)
             found.uv[m, side] = work.discs[count, PARAMETERS : PARAMETERS + 2]
+            for i in range(2):
+                for j in range(2):
+                    found.cov_uv[m, side, i, j] *= scene.factors[side]
             count += 1
 
 

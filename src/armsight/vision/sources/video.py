@@ -13,20 +13,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from armsight.data import Image, Shot
+from armsight.data import Array, Image, Shot
 from armsight.errors import InputError
 from armsight.vision.sources.capture import QuietCapture, open_capture
 
 #: Two rates that differ by more than this share are said.
 _RATES = 0.01
+#: Of how many rows and columns one is compared between frames.
+_EVERY = 4
+#: A frame repeats the one before if its mean squared difference from it is below this share of those nearby, in as many
+#: frames before it and after it; re-encoding leaves some difference. Where frames nearby differ by less, nothing changes,
+#: grey levels squared.
+_REPEAT_SHARE, _NEARBY, _LEAST_CHANGE = 1 / 16, 3, 0.25
+#: Repeated frames are said from this share on: what moves and stops has a few that look like it.
+_REPEATS_SAID = 0.15
 
 
 class VideoSource:
-    """Two video files, or one side-by-side file.
-
-    Attributes:
-        notes: what is odd about the files: different rates.
-    """
+    """Two video files, or one side-by-side file."""
 
     count: int | None = None  # what a container promises is an estimate
 
@@ -34,14 +38,19 @@ class VideoSource:
         self._files = list(files)
         first, last = self._files[0], self._files[-1]
         rates = [1 / file.period_s for file in (first, last)]
-        self.notes: tuple[str, ...] = ()
+        self._rates: tuple[str, ...] = ()
         if min(rates) > 0 and abs(rates[0] - rates[1]) > _RATES * max(rates):
-            self.notes = (
+            self._rates = (
                 f"{first.path} has {rates[0]:.4g} frames a second and {last.path} {rates[1]:.4g}: only those of nearly the "
                 "same time are paired, up to half a frame apart; set both cameras to one rate, or use what stands still",
             )
         self._shots = 0
         self._ended = False
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is odd about the files: different rates, and frames that repeat among those that were read."""
+        return (*self._rates, *(said for file in self._files if (said := file.repeats()) is not None))
 
     @staticmethod
     def open(left: str | Path, right: str | Path | None = None) -> VideoSource:
@@ -133,6 +142,8 @@ class _File:
         self.frames = 0
         self.t_s = 0.0
         self.held = False  # the current frame waits for a partner: the next grab keeps it
+        self._before: Array | None = None
+        self._changes: list[float] = []  # mean squared differences from the frame before, grey levels squared
 
     def grab(self) -> bool:
         """Go to the next frame; False at the end."""
@@ -147,7 +158,31 @@ class _File:
     def image(self) -> Image | None:
         """Decode the current frame; None if that fails."""
         ok, image = self.capture.retrieve()
-        return image if ok else None
+        if not ok:
+            return None
+        some = np.asarray(image[::_EVERY, ::_EVERY], np.float64)
+        if self._before is not None:
+            self._changes.append(float(np.mean((some - self._before) ** 2)))
+        self._before = some
+        return np.asarray(image)
+
+    def repeats(self) -> str | None:
+        """Return what to say where frames repeat the ones before them, as a slower camera's do in a faster file."""
+        changes = np.array(self._changes)
+        if len(changes) <= 2 * _NEARBY:
+            return None
+        runs = np.lib.stride_tricks.sliding_window_view(changes, _NEARBY).max(axis=1)
+        nearby = np.minimum(runs[: -_NEARBY - 1], runs[_NEARBY + 1 :])
+        changing = nearby > _LEAST_CHANGE
+        same = changing & (changes[_NEARBY:-_NEARBY] < _REPEAT_SHARE * nearby)
+        if same.sum() <= _REPEATS_SAID * max(changing.sum(), 1):
+            return None
+        share = float(same.sum() / changing.sum())
+        given, rate = (1 - share) / self.period_s, 1 / self.period_s
+        return (
+            f"{self.path}: {100 * share:.0f} % of the frames repeat the one before: the camera gave about {given:.0f} "
+            f"images a second and the file has {rate:.0f}; a repeated image is no new measurement, and its time is late"
+        )
 
 
 def open_video(rest: str) -> VideoSource:
