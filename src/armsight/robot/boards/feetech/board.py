@@ -53,7 +53,7 @@ ABILITIES = Abilities(
     RATE_HZ,
     LATENCY_S,
     LATENCY_S,
-    RAD_PER_COUNT,
+    (RAD_PER_COUNT,) * len(NAMES),
     _REST_RAD_S,
     _MOST_SPEED,
     _MOST_ACCELERATION,
@@ -77,7 +77,7 @@ class FeetechBoard:
     ) -> None:
         self._bus, self.calibration = bus, calibration
         count = len(calibration.ids)
-        self.abilities = replace(ABILITIES, joints=count)
+        self.abilities = replace(ABILITIES, joints=count, steps_rad=(RAD_PER_COUNT,) * count)
         self.welcome = Welcome("feetech: " + ", ".join(calibration.names), "STS3215", 0, bus.baud, None)
         self._begin_s = bus.now() if begin_s is None else begin_s
         self._sent = 0
