@@ -98,7 +98,7 @@ class Ar4Board:
         self._goal_speed: Array = np.zeros(JOINTS)
         self._written_s = self._back_s = -np.inf
         self._back = np.zeros(JOINTS)  # motor steps from which a goal is approached
-        self._arrived: Array | None = None  # the goal at which the joints came to rest, motor steps
+        self._approached: Array | None = None  # the goal that was approached so, motor steps
 
     @classmethod
     def connect(
@@ -312,29 +312,31 @@ class Ar4Board:
         self._enabled = True
 
     def _write_goal(self) -> None:
-        """Write the goal, in whole motor steps; a change at rest by no more than the dead steps is approached from behind.
+        """Write the goal, in whole motor steps; at rest, one within the dead steps is approached from behind, once.
 
         The last movement is then in the sense of the change: a joint that was moved in that sense before stays on the same
-        side of its backlash. One that has just arrived is left where it is, up to the dead steps short.
+        side of its backlash.
         """
         now = self._now()
         goal = np.rint(self.model.reported_deg(np.degrees(self._goal)) * self.model.steps_per_deg)
         still = max(np.abs(self._goal_speed).max(), np.abs(self._speed_rad_s).max()) < _STILL_RAD_S
         if now < self._back_s + 2 * _BACK_S:  # on the way back, or forth
             goal = self._back if now < self._back_s + _BACK_S else goal
-        elif not still or self._arrived is None:
-            self._arrived = goal if still else None
+        elif not still:
+            self._approached = None
         else:
             here = np.rint(self._reported * self.model.steps_per_deg)
             off = goal - here
-            near = (goal != self._arrived) & (off != 0) & (np.abs(off) <= DEAD_STEPS)
+            near = (off != 0) & (np.abs(off) <= DEAD_STEPS)
+            if self._approached is not None:
+                near &= goal != self._approached
             if near.any():
                 ends = [self.model.reported_deg(np.degrees(end)) for end in self.soft_limits()]
                 low, high = (each * self.model.steps_per_deg for each in (np.minimum(*ends), np.maximum(*ends)))
                 back = here - np.sign(off) * (DEAD_STEPS + 1)
                 # At a limit there is no way back, and the goal is approached from beyond.
                 back = np.where((back < low) | (back > high), goal + np.sign(off) * (DEAD_STEPS + 1), back)
-                self._arrived, self._back, self._back_s = goal, np.where(near, back, goal), now
+                self._approached, self._back, self._back_s = goal, np.where(near, back, goal), now
                 goal = self._back
         # Half a step more, as the firmware cuts off what is not a whole one.
         self._link.write(lines.move_to(((goal + 0.5 * np.sign(goal)) / self.model.steps_per_deg).tolist()))
