@@ -238,7 +238,7 @@ def ur3a(data: Path, work: Path) -> list[str]:
     return [*robot, *pairs]
 
 
-#: Recording -> where it is, its arguments, what is said of it, m, under which name, and what is wanted, mm.
+#: Recording -> its folder, its arguments, what is said of it, m, under which name, and its target, mm.
 REAL = {
     "kuka2": ("handeye/kuka2", kuka2, (("mean", "held_out_mean_m", 0.42),)),
     "open3dv": ("real/open3dv-discs", open3dv, (("mean", "held_out_mean_m", 0.60),)),
@@ -258,14 +258,14 @@ def real(names: list[str]) -> None:
     for name in names or list(REAL):
         if name not in REAL:
             raise SystemExit(f"no recording {name!r}; there are {', '.join(REAL)}")
-        place, arguments, figures = REAL[name]
-        if not (Path(data) / place).is_dir():
-            print(f"{name}: not measured: {Path(data) / place} is missing")
+        folder, arguments, figures = REAL[name]
+        if not (Path(data) / folder).is_dir():
+            print(f"{name}: not measured: {Path(data) / folder} is missing")
             continue
         with tempfile.TemporaryDirectory() as work:
             answer = command("handeye", *arguments(Path(data), Path(work)))
-        for what, key, wanted_mm in figures:
-            print(f"{name}: {what} {1e3 * answer[key]:.2f} mm on poses left out (wanted {wanted_mm:.2f})", flush=True)
+        for what, key, target_mm in figures:
+            print(f"{name}: {what} {1e3 * answer[key]:.2f} mm on poses left out (target {target_mm:.2f})", flush=True)
         unused = ", ".join(pose["name"] for pose in answer["poses"] if not pose["used"]) or "none"
         print(f"{name}: structure of the noise: {answer['noise']['structure']}; blunders: {unused}")
 

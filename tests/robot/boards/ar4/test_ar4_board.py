@@ -244,4 +244,4 @@ def test_a_goal_that_changes_at_rest_within_the_dead_steps_is_reached_in_the_sen
             board.receive(0.02)
         angles.append(device.true_deg)
     moved = (angles[1] - angles[0]) * board.model.steps_per_deg
-    np.testing.assert_allclose(moved, [steps, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-6)  # no play was taken up anew
+    np.testing.assert_allclose(moved, [steps, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-6)  # no backlash was taken up anew
