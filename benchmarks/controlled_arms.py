@@ -2,6 +2,7 @@
 
     python benchmarks/controlled_arms.py so101 0 1 2      light: projected discs with noise instead of rendered images
     python benchmarks/controlled_arms.py ar4 0 1 2
+    python benchmarks/controlled_arms.py rests ar4 0 1   the servo alone: seen with noise, frames and zeros known
     python benchmarks/controlled_arms.py lost 0 1 2       an AR4 whose joint slips by 1 degree while the loop is closed
     python benchmarks/controlled_arms.py report ar4 0     a recording of `arm plan`, and what `arm report` finds of
                                                the injected zeros and backlash
@@ -31,9 +32,11 @@ from armsight.app.run.folder import Finished, finish, make_room  # noqa: E402
 from armsight.app.run.motion_file import read_motions  # noqa: E402
 from armsight.app.run.setup import Setup  # noqa: E402
 from armsight.data import Shot  # noqa: E402
-from armsight.geometry.pose import inverse, pose  # noqa: E402
+from armsight.geometry.pose import exp_se3, inverse, pose  # noqa: E402
+from armsight.loop.servo import JointLoops, LoopTiming, PoseServo  # noqa: E402
 from armsight.robot.arm_file import open_arm  # noqa: E402
 from armsight.robot.boards.opening import slowed  # noqa: E402
+from armsight.robot.trajectories import point_to_point  # noqa: E402
 from armsight.sim.boards.device import STEP_S  # noqa: E402
 from armsight.sim.workcell.arm import imperfections, sample_arm  # noqa: E402
 from armsight.sim.workcell.body import body_target  # noqa: E402
@@ -151,6 +154,48 @@ def closed_loop(name, seed):
     return open_mm, closed_mm, float(sides[1].max())
 
 
+class KnownFrames:
+    """What an estimator says that sees the tool 50 ms late, with noise, knows the zeros, and no backlash."""
+
+    def __init__(self, arm, model, rng, q):
+        self.arm, self.model, self.rng, self.q, self.qd, self.next_s = arm, model, rng, q, np.zeros(len(q)), 0.0
+        self.zero, self.noise = arm.path[-1, model.joints :] - q, np.zeros(6)
+
+    def estimate(self):
+        true = self.model.forward(self.arm.path[max(len(self.arm.path) - 50, 0), self.model.joints :])
+        if self.arm.t_s >= self.next_s:
+            fresh = self.rng.normal(0.0, [3e-5] * 3 + [3e-4] * 3)
+            self.next_s, self.noise = self.arm.t_s + 1 / 30, 0.6 * self.noise + 0.4 * fresh
+        T = true @ exp_se3(self.noise)
+        return SimpleNamespace(T_base_tool=T, q=self.q, qd=self.qd, vision_age_s=0.05, cov_own=1e-10 * np.eye(6))
+
+    def tool(self, q, qd, *, pressed=False):
+        return self.model.forward(q + self.zero)
+
+
+def rests(name, seed, poses=3, rest_s=6.0, period_s=0.01):
+    """Print the rest errors, mm, of the servo over an emulated arm whose frames and zeros are known."""
+    own, rng = CONTROLLED[name], np.random.default_rng(seed)
+    model = slowed(standing(open_arm(name)), own.board)
+    arm, board = own.open(model, imperfections(PRESET), seed)
+    abilities, q = board.abilities, model.home
+    joints = JointLoops(abilities.steps_rad, abilities.rest_rad_s)
+    servo = PoseServo(model, LoopTiming(period_s, 1 / 30, 0.035, abilities.response_s), joints)
+    seen, found = KnownFrames(arm, model, rng, board.receive(0.0).q[-1]), []
+    for _ in range(poses):
+        goal = np.clip(q + np.radians(12) * rng.uniform(-1, 1, model.joints), model.q_min + 0.1, model.q_max - 0.1)
+        motion, begin_s, off = point_to_point(model, q, goal), arm.t_s, []
+        while arm.t_s < begin_s + motion.duration_s + rest_s:
+            board.send(servo.step(servo.aim(motion, arm.t_s - begin_s), seen).command)
+            for read in board.receive(period_s).q[-1:]:
+                seen.q, seen.qd = read, 0.6 * seen.qd + 0.4 * (read - seen.q) / period_s
+            off.append(model.forward(arm.path[-1, model.joints :])[:3, 3] - model.forward(goal)[:3, 3])
+        found.append(1e3 * float(np.sqrt((np.array(off[-round(0.2 / period_s) :]) ** 2).sum(axis=1).mean())))
+        q = goal
+    each = ", ".join(f"{mm:.3f}" for mm in found)
+    print(f"{name} seed {seed}: at rest {np.sqrt(np.mean(np.square(found))):.3f} mm ({each})", flush=True)
+
+
 def lost_steps(seed):
     """Let one joint of an AR4 slip by a degree while the loop is closed; print when and how it is named."""
     rng = np.random.default_rng([seed, 60])
@@ -218,6 +263,9 @@ def main(what, *rest):
     if what == "lost":
         for seed in map(int, rest or ("0",)):
             lost_steps(seed)
+    elif what == "rests":
+        for seed in map(int, rest[1:] or ("0",)):
+            rests(rest[0], seed)
     elif what == "report":
         for seed in map(int, rest[1:] or ("0",)):
             report(rest[0], seed)

@@ -1,7 +1,8 @@
-"""Hand-eye calibration beside the baselines of KinHEC, track by track, on sequences whose truth is known.
+"""Hand-eye calibration: beside the baselines of KinHEC on sequences whose truth is known, and on real recordings.
 
-    pip install kinhec==1.1 pandas pyarrow pyyaml
+    pip install -e ".[bench]"
     python benchmarks/handeye.py --tier small --seed 16180 -o kinhec.json
+    ARMSIGHT_DATA=.. python benchmarks/handeye.py --real      kuka2, open3dv, ur3a by the command alone, poses left out
 
 KinHEC (MIT) makes pose streams of arms and cameras: noise, degenerate motions, clock offsets, blunders, unknown scale,
 wrong kinematics, PnP. Its baselines get what its own protocol gives them (keyframes; the clock offset by correlation);
@@ -16,13 +17,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import subprocess
+import sys
 import tempfile
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
-import yaml
 from scipy.stats import chi2
 
 from armsight.errors import ArmsightError
@@ -176,6 +179,7 @@ def summary(rows: list[Row]) -> list[str]:
 def generated(tier: str, seed: int, folder: Path) -> None:
     """Make a tier's sequences with a seed of our own; what is there already is kept."""
     import kinhec
+    import yaml
     from kinhec.cli import main
 
     spec = yaml.safe_load((Path(kinhec.__file__).parent / "configs" / f"{tier}.yaml").read_text())
@@ -185,6 +189,85 @@ def generated(tier: str, seed: int, folder: Path) -> None:
     main(
         ["generate", "--tier", str(folder / "tier.yaml"), "--out", str(folder), "--no-card", "--work-dir", str(folder)]
     )
+
+
+def command(*words) -> dict:
+    """Run an armsight command with --json and return its answer; its words where it ends with an error."""
+    done = subprocess.run(
+        [sys.executable, "-c", "from armsight.app.main import main; main()", *map(str, words), "--json"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        raise SystemExit(f"armsight {words[0]} ended with {done.returncode}: {done.stderr.strip()}")
+    return json.loads(done.stdout)
+
+
+def kuka2(data: Path, _: Path) -> list[str]:
+    """Return the arguments for a camera in a KUKA's hand, calibrated from the same images."""
+    folder = data / "handeye" / "kuka2"
+    eye = ["--robot", folder / "RobotPosesVec.txt", "--eye", "in-hand"]
+    return [*eye, "--images", folder / "im_*.png", "--camera", "fit", "--target", "chessboard:24x17:15mm"]
+
+
+def open3dv(data: Path, work: Path) -> list[str]:
+    """Return the arguments for a camera with its own calibration in a hand, before a board of bright discs."""
+    folder = data / "real" / "open3dv-discs"
+    given = np.loadtxt(folder / "param.txt")
+    camera = {"image_size_px": [1920, 1200], "K": given[:9].reshape(3, 3).tolist(), "distortion": given[9:14].tolist()}
+    (work / "camera.json").write_text(json.dumps(camera))
+    rows = [(f"pos{k}.png", *np.loadtxt(folder / f"pos{k}.txt")) for k in range(8)]
+    names = "image,rx_deg,ry_deg,rz_deg,x_mm,y_mm,z_mm"
+    (work / "robot.csv").write_text("\n".join([names, *(",".join(map(str, row)) for row in rows)]))
+    robot = ["--robot", work / "robot.csv", "--rotation", "xyz", "--eye", "in-hand", "--camera", work / "camera.json"]
+    return [*robot, "--images", folder / "pos*.png", "--target", "acircles:7x11:10mm"]
+
+
+def ur3a(data: Path, work: Path) -> list[str]:
+    """Calibrate two webcams by the recording's own images; return the arguments for a board on a UR3e's flange."""
+    folder = data / "real" / "ur3a"
+    pairs = ["--left", folder / "cam1_*.png", "--right", folder / "cam2_*.png", "--target", "chessboard:9x7:20mm"]
+    alone = ["--left-intrinsics", folder / "intrinsics_cam1" / "*.jpg"]
+    alone += ["--right-intrinsics", folder / "intrinsics_cam2" / "*.jpg"]
+    command("calibrate", *pairs, *alone, "-o", work / "rig.json")
+    names, *rows = (folder / "joints.csv").read_text().split()
+    rows = [f"cam1_{int(row.split(',')[0]):02d}.png{row[row.index(',') :]}" for row in rows]
+    (work / "joints.csv").write_text("\n".join([names.replace("pose", "image"), *rows]))
+    robot = ["--robot", work / "joints.csv", "--model", "ur3e", "--eye", "to-hand", "--rig", work / "rig.json"]
+    return [*robot, *pairs]
+
+
+#: Recording -> its folder, its arguments, what is said of it, m, under which name, and its target, mm.
+REAL = {
+    "kuka2": ("handeye/kuka2", kuka2, (("mean", "held_out_mean_m", 0.42),)),
+    "open3dv": ("real/open3dv-discs", open3dv, (("mean", "held_out_mean_m", 0.60),)),
+    "ur3a": (
+        "real/ur3a",
+        ur3a,
+        (("RMS, nominal", "held_out_rms_m", 1.3), ("RMS, geometry identified", "held_out_geometry_rms_m", 1.0)),
+    ),
+}
+
+
+def real(names: list[str]) -> None:
+    """Print the errors on poses left out of real recordings, by the command alone."""
+    data = os.environ.get("ARMSIGHT_DATA")
+    if data is None:
+        raise SystemExit("ARMSIGHT_DATA is not set: it names the folder of the real recordings")
+    for name in names or list(REAL):
+        if name not in REAL:
+            raise SystemExit(f"no recording {name!r}; there are {', '.join(REAL)}")
+        folder, arguments, figures = REAL[name]
+        if not (Path(data) / folder).is_dir():
+            print(f"{name}: not measured: {Path(data) / folder} is missing")
+            continue
+        with tempfile.TemporaryDirectory() as work:
+            answer = command("handeye", *arguments(Path(data), Path(work)))
+        for what, key, target_mm in figures:
+            print(f"{name}: {what} {1e3 * answer[key]:.2f} mm on poses left out (target {target_mm:.2f})", flush=True)
+        unused = ", ".join(pose["name"] for pose in answer["poses"] if not pose["used"]) or "none"
+        print(f"{name}: structure of the noise: {answer['noise']['structure']}; blunders: {unused}")
 
 
 def main() -> None:
@@ -198,7 +281,11 @@ def main() -> None:
     )
     parser.add_argument("--limit", type=int, help="the first so many of each track")
     parser.add_argument("-o", "--output", type=Path, help="write every sequence's figures, JSON")
+    parser.add_argument("--real", nargs="*", metavar="NAME", help=f"real recordings instead: {', '.join(REAL)}")
     given = parser.parse_args()
+    if given.real is not None:
+        real(given.real)
+        return
     with tempfile.TemporaryDirectory() as temporary:
         folder = given.data or Path(temporary)
         if given.data is None:

@@ -10,7 +10,8 @@ from armsight.data import JointCommand
 from armsight.errors import InputError
 from armsight.loop.estimators import ESTIMATORS, Delay, Mounting
 from armsight.loop.health import Trust
-from armsight.loop.servo import MAX_CORRECTION_RAD, RATE_SHARE, LoopTiming, Mode, PoseServo
+from armsight.loop.servo import MAX_CORRECTION_RAD, RATE_SHARE, STEP_LEVER_M, LoopTiming, Mode, PoseServo, whole_steps
+from armsight.robot.arm_file import open_arm
 from armsight.robot.trajectories import point_to_point
 
 PERIOD_S = 0.016
@@ -236,3 +237,21 @@ def test_the_correction_displaces_the_tool_by_no_more_than_its_bound(monkeypatch
         assert np.linalg.norm(ARM.jacobian(MIDDLE)[:3] @ step.correction) < 0.01001
         workcell.advance(step.command, 16)
     assert "tool: largest correction" in limited
+
+
+def test_whole_steps_are_whole_and_no_worse_than_each_joint_rounded():
+    rng = np.random.default_rng(4)
+    arm = open_arm("ar4")
+    steps = np.radians(1 / np.array([44.4, 55.6, 55.6, 49.8, 21.9, 22.2]))
+    left, rounded = np.empty(20), np.empty(20)
+    for k in range(20):
+        J = arm.jacobian(arm.home + rng.uniform(-0.5, 0.5, 6))
+        requested = steps * rng.uniform(-4, 4, 6)
+        change = whole_steps(J, requested, steps)
+        np.testing.assert_allclose(change / steps, np.rint(change / steps), atol=1e-9)
+        lever = np.repeat([1.0, STEP_LEVER_M], 3)
+        left[k] = np.linalg.norm(lever * (J @ (requested - change)))
+        rounded[k] = np.linalg.norm(lever * (J @ (requested - steps * np.rint(requested / steps))))
+        np.testing.assert_array_equal(whole_steps(J, 0.05 * requested / 4, steps), 0.0)  # it would hunt
+    assert (left <= rounded + 1e-9).all()
+    assert left.mean() < 0.95 * rounded.mean()

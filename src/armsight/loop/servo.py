@@ -3,8 +3,9 @@
 In: a motion, an estimator, the time. Out: a :class:`JointCommand` for the joints' own controllers and how it came about.
 The command is the motion's joints plus a correction c (n,), with the motion's speeds fed forward. While the arm moves, c
 is the joint error, by the estimator's model, that must be made up for at the next pose to be reached; at rest, c integrates
-the tool's error itself. Tool errors become joint errors through the Jacobian, except in directions in which the arm is near
-a singularity. Gain, its margin, and what happens when vision is lost: docs/concepts/loop.md.
+the tool's error itself, or, over controllers that move joints by steps, is changed by whole steps now and then. Tool errors
+become joint errors through the Jacobian, except in directions in which the arm is near a singularity. Gain, its margin, and
+what happens when vision is lost: docs/concepts/loop.md.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from armsight.data import Array, JointCommand, Record
 from armsight.errors import InputError
@@ -36,6 +37,11 @@ RATE_SHARE = 0.1
 #: At rest a joint is taken through its backlash, with this time constant, s, for an error of the tool that lasts and of
 #: which the joint would have to make up so much, m: less is vision's noise.
 CROSS_S, CROSS_M = 0.3, 3e-5
+#: Over joints that move by steps the tool's error at rest is averaged for so long, s, before each change; a change is made
+#: where it lowers the error by this share of the largest displacement that one step of one joint makes: less would hunt.
+LOOK_S, WORTH_STEPS = 0.25, 0.25
+#: In a choice between whole steps an error of 1 rad counts as much as one of this, m.
+STEP_LEVER_M = 0.05
 #: How fast the servo learns by how much joints rest off their commands, s; that changes with the load from pose to pose.
 DROOP_S = 0.2
 #: In motion the correction comes to what the estimator asks for with this time constant, s, or vision's period if longer:
@@ -107,11 +113,11 @@ class JointLoops:
     """Controllers of the joints that armsight cannot tune, and which do not reach what they are commanded.
 
     Attributes:
-        step_rad: a joint does not come nearer to where it should be than about half of this.
+        steps_rad: (n,) the smallest step that each joint makes.
         rest_rad_s: a joint at rest is measured slower than this.
     """
 
-    step_rad: float
+    steps_rad: tuple[float, ...]
     rest_rad_s: float
 
 
@@ -177,6 +183,7 @@ class PoseServo:
         self._correction = np.zeros(arm.joints)
         self._goal: Joints | None = None
         self._rest_s, self._lasting = 0.0, np.zeros(6)
+        self._look_s, self._looks, self._stepped_to = 0.0, 0, np.zeros(arm.joints)
 
     def aim(self, motion: Trajectory, t_s: float, gravity: Callable[[Array], ArrayLike] = np.zeros_like) -> Aim:
         """Return the reference of the next command.
@@ -213,9 +220,10 @@ class PoseServo:
                 push += self.timing.gain * error if resting else self._follow * last
             change = self._joints(aim, push)
         if mode is Mode.VISION and resting:
-            change += self._crossing(estimator, aim, error)
-            if self._joint_loops is not None:
-                change = self._held(aim, change)
+            if self._joint_loops is None:
+                change += self._crossing(estimator, aim, error)
+            else:
+                change = self._stepped(estimator, aim, error)
                 self._droops(estimate, aim)
         return self._command(aim, change, mode, error)
 
@@ -253,15 +261,34 @@ class PoseServo:
         self._lasting += self.timing.gain * (error - self._lasting)
         requested = self._joints(aim, self._lasting)
         worth = np.abs(requested) * np.linalg.norm(aim.jacobian[:3], axis=0) > CROSS_M
+        return self._crossed(estimator, aim, requested, worth) * min(self.timing.period_s / CROSS_S, 1.0)
+
+    def _crossed(self, estimator: Estimator, aim: Aim, requested: Array, worth: NDArray[np.bool_]) -> Array:
+        """Return what (n,) takes joints through the backlash before requested changes (n,), of those that are worth it."""
         sides = np.stack([np.zeros_like(requested), np.where(worth, np.sign(requested), 0.0)])
         here, there = estimator.tool(np.stack([aim.goal.q, aim.goal.q]) + self._correction, sides, pressed=True)
-        return self._joints(aim, behind(here, there)) * min(self.timing.period_s / CROSS_S, 1.0)
+        return self._joints(aim, behind(here, there))
 
-    def _held(self, aim: Aim, change: Array) -> Array:
-        """Return the change (n,), none where the joints' controllers cannot make it: they would hunt."""
+    def _stepped(self, estimator: Estimator, aim: Aim, error: Array) -> Array:
+        """Return the change (n,) over joints that move by steps: look, move by whole steps, let the joints arrive.
+
+        An integral would ask for parts of steps, which their controllers do not make, or make at once when they add up.
+        """
         assert self._joint_loops is not None
-        requested = np.abs(self._joints(aim, self._lasting)).max()
-        return np.zeros_like(change) if requested < 0.5 * self._joint_loops.step_rad else change
+        arrived_s = self.timing.latency_s + self.timing.vision_period_s + self.timing.response_s
+        if self._look_s == 0.0:
+            self._stepped_to = self._correction
+        self._look_s += self.timing.period_s
+        if self._look_s > arrived_s:
+            self._looks += 1
+            self._lasting += (error - self._lasting) / self._looks
+        if self._look_s > arrived_s + LOOK_S:
+            steps = np.array(self._joint_loops.steps_rad)
+            requested = self._joints(aim, self._lasting)
+            requested += self._crossed(estimator, aim, requested, np.abs(requested) > 0.5 * steps)
+            self._stepped_to = self._correction + whole_steps(aim.jacobian, requested, steps)
+            self._look_s, self._looks, self._lasting = self.timing.period_s, 0, np.zeros(6)
+        return self._stepped_to - self._correction
 
     def _droops(self, estimate: ArmEstimate, aim: Aim) -> None:
         """Learn how far the joints rest from what they are commanded, as far as their own sensors show it."""
@@ -271,10 +298,11 @@ class PoseServo:
     def _resting(self, estimate: ArmEstimate, aim: Aim) -> bool:
         """Return whether the arm has been at rest for as long as the newest measurement is old."""
         requested = max(np.abs(aim.goal.qd).max(), np.abs(aim.ahead.qd).max())
-        still = bool(requested < STANDING_RAD_S and np.abs(estimate.qd).max() < self._rest_rad_s)
+        stepping = self._joint_loops is not None and self._rest_s > 0.0  # its own steps are not a motion
+        still = bool(requested < STANDING_RAD_S and (stepping or np.abs(estimate.qd).max() < self._rest_rad_s))
         self._rest_s = self._rest_s + self.timing.period_s if still else 0.0
         if not still:
-            self._lasting = np.zeros(6)
+            self._lasting, self._look_s, self._looks = np.zeros(6), 0.0, 0
         return still and self._rest_s > estimate.vision_age_s
 
     def _command(self, aim: Aim, change: Array, mode: Mode, error: Array) -> ServoStep:
@@ -301,6 +329,40 @@ class PoseServo:
             )
         command = JointCommand(q_ref, np.where(held, 0.0, qd_ref), aim.duty, period_s)
         return ServoStep(command, mode, correction, error, said)
+
+
+def whole_steps(J: Array, requested: Array, steps: Array) -> Array:
+    """Return the whole steps that displace the tool most nearly as requested angles would; none where that gains little.
+
+    The nearest combination, not each joint rounded: steps of several joints make up for each other. It is a local minimum
+    of the search over one joint or two by one step, from the rounded angles (the nearest point of a lattice: Babai, 1986).
+
+    Args:
+        J: (6, n) Jacobian, m/rad and rad/rad.
+        requested: (n,) joint angles, rad.
+        steps: (n,) the joints' steps, rad; 0 has no step.
+
+    Returns:
+        (n,) changes of the joints, rad.
+    """
+    n = len(steps)
+    lever = np.repeat([1.0, STEP_LEVER_M], 3)[:, None]
+    by_step, whole = lever * J * steps, steps > 0
+    count = np.where(whole, np.rint(requested / np.where(whole, steps, 1.0)), 0.0)
+    left = lever[:, 0] * (J @ np.where(whole, requested, 0.0))
+    before, left = float(np.linalg.norm(left)), left - by_step @ count
+    ones = np.eye(n)
+    pairs = [a * ones[i] + b * ones[j] for i in range(n) for j in range(i) for a in (-1, 1) for b in (-1, 1)]
+    moves = np.concatenate([ones, -ones, np.reshape(pairs, (-1, n))])
+    while True:
+        after = np.linalg.norm(left[:, None] - by_step @ moves.T, axis=0)
+        best = int(np.argmin(after))
+        if after[best] > np.linalg.norm(left) - 1e-9:
+            break
+        count, left = count + moves[best], left - by_step @ moves[best]
+    worth = WORTH_STEPS * float(np.linalg.norm(by_step[:3], axis=0).max())
+    count = count if before - np.linalg.norm(left) > worth else np.zeros(n)
+    return np.where(whole, count * steps, requested)
 
 
 def _corrected(s: Array) -> Array:

@@ -119,6 +119,19 @@ def test_a_walk_of_the_eye_is_recognised():
     assert nees(found, Z, X) < chi2.isf(1e-4, 12)
 
 
+def test_an_arm_that_wanders_is_recognised_by_poses_left_out():
+    poses, Z, X, _ = made(5, n=30, flange=(5e-5, 5e-5), camera=(5e-5, 5e-5, 5e-5))
+    steps = np.random.default_rng(6).normal(0.0, 4e-4, (30, 6))
+    wandered = replace(poses, A=poses.A @ exp_se3(np.cumsum(steps, axis=0)))
+    others = ("robot and camera", "robot drifting over time")
+    found = calibrate_structured(wandered, t_s=np.arange(30.0), structures=(*others, "robot walking over time"))
+    assert found.structure == "robot walking over time"
+    assert found.sigmas["drift_m"] == pytest.approx(4e-4 * np.sqrt(30), rel=0.4)  # over the whole
+    assert nees(found, Z, X) < chi2.isf(1e-3, 12)
+    plain = calibrate_structured(wandered, t_s=np.arange(30.0), structures=("robot and camera",))
+    assert nees(plain, Z, X) > 10 * nees(found, Z, X)
+
+
 def test_the_order_of_the_rows_changes_nothing():
     poses, _, _, _ = made(5, flange=(1e-3, 1e-3), camera=(1e-3, 1e-3, 1e-3))
     B = poses.B.copy()

@@ -69,7 +69,7 @@ def test_an_arm_that_the_workcell_does_not_take_is_one_line():
 def test_the_loop_closes_over_joints_that_rest_off_their_commands():
     """Five joints whose controllers leave an error that depends on the pose, and readings that show it."""
     arm = open_arm("so101")
-    servo = PoseServo(arm, LoopTiming(0.01, 0.03, 0.03, 0.1), JointLoops(np.radians(0.001), 0.35))
+    servo = PoseServo(arm, LoopTiming(0.01, 0.03, 0.03, 0.1), JointLoops((np.radians(0.001),) * 5, 0.35))
     goal = np.radians([10.0, -20.0, 25.0, 5.0, 15.0])
     motion, off = point_to_point(arm, goal, goal + 1e-9), np.radians([0.1, -1.5, 1.0, 0.5, 0.0])
     q, zero = goal.copy(), np.radians([0.0, 0.5, -0.4, 0.3, 0.0])  # what the sensors do not show

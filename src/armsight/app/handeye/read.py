@@ -6,8 +6,8 @@ In: a CSV, TSV or text file. Out: :class:`PoseTable`. Known forms:
   numbers of a rotation; the option ``rotation`` names its convention.
 - Universal Robots' ``p[x, y, z, rx, ry, rz]``, metres and a rotation vector, one a line.
 - named columns: ``x_m y_m z_m`` (or ``x_mm``, or ``x`` with ``unit``); ``qw qx qy qz``; or ``rx_deg ry_deg rz_deg`` (or
-  ``rx_rad``, ``rx``); or ``r11 .. r33``; or joints ``q1_deg ..`` (``q1_rad``) for a model. ``t_s`` is a time, ``image`` the
-  image that belongs to a row, ``name`` a name that both tables share.
+  ``rx_rad``, ``rx``); or ``r11 .. r33``; or joints ``q1_deg ..`` (``q1_rad``) for a model, also by LeRobot's names. ``t_s``
+  is a time, ``image`` the image that belongs to a row, ``name`` a name that both tables share.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from armsight.files import read_columns, read_table, read_text
 from armsight.geometry.rotation import nearest_rotation
 from armsight.loop.identify import ROTATIONS
 from armsight.robot.arm import Arm
+from armsight.robot.boards.feetech.calibration import degree_columns
 
 #: What three or four numbers of a rotation may mean: quaternions in both orders, and the conventions of three angles.
 CONVENTIONS = ("wxyz", "xyzw", *ROTATIONS)
@@ -133,7 +134,7 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
         return ["x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"], _even(path, rows, 6)
     first = text.partition("\n")[0]
     if any(mark in first for mark in ",;\t"):
-        cells = read_table(path, read_columns(columns, COLUMNS))
+        cells = degree_columns(path, read_table(path, read_columns(columns, COLUMNS)))
     else:
         cells = [line.split() for line in text.splitlines()]
     rows = [(line, [cell.strip() for cell in row]) for line, row in enumerate(cells, 1)]

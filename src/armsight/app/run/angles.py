@@ -18,6 +18,7 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import read_table
 from armsight.robot.arm import Arm
+from armsight.robot.boards.feetech.calibration import degree_columns
 
 #: Angles at the time of a shot are interpolated between rows at most so far apart, s.
 MOST_GAP_S = 0.25
@@ -101,7 +102,7 @@ def read_angles(path: str | Path, arm: Arm) -> LoggedAngles:
         InputError: unreadable, a joint is missing or too many, a field is no number, or degrees came as radians.
     """
     path = Path(path)
-    rows = read_table(path)
+    rows = degree_columns(path, read_table(path))
     if len(rows) < 2:
         raise InputError(f"{path}: no rows; a first line of column names and a line a pose are needed")
     header = [name.strip() for name in rows[0]]

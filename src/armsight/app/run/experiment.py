@@ -390,4 +390,4 @@ def timing(setup: Setup, delay: Delay) -> LoopTiming:
 def joint_loops(setup: Setup) -> JointLoops | None:
     """Return what the servo must know of the joints' own controllers; None where they are ours, with an integral."""
     abilities = setup.board.abilities
-    return JointLoops(abilities.step_rad, abilities.rest_rad_s) if abilities.own_controller else None
+    return JointLoops(abilities.steps_rad, abilities.rest_rad_s) if abilities.own_controller else None

@@ -17,7 +17,8 @@ those that neighbours share (a drift) one block (1, 6N, 6N): the same functions 
   model are known: what an arm whose lengths and zeros are not its model's does in each of its poses.
 - ``drift_m``, ``drift_rad``: an error of the flange that neighbouring poses share: a smooth function of the pose (an arm
   whose kinematics are not its model's) or of time (an arm that warms up), a Gaussian process (Rasmussen and Williams,
-  "Gaussian Processes for Machine Learning", 2006, eq. 2.31).
+  "Gaussian Processes for Machine Learning", 2006, eq. 2.31); or a random walk over time (an arm that slips, settles or
+  loses steps: what it has gained stays), a Wiener process.
 - ``walk_m``, ``walk_rad``: steps of a random walk of the eye's own pose, from frame to frame (visual odometry).
 
 Restricted likelihood: Patterson and Thompson, Biometrika 58, 1971; its gradient: Harville, JASA 72, 1977.
@@ -56,11 +57,18 @@ STRUCTURES: dict[str, tuple[str, ...]] = {
         "drift_rad",
     ),
     "robot drifting over time": ("flange_m", "flange_rad", "seen_m", "seen_rad", "drift_m", "drift_rad"),
+    "robot walking over time": ("flange_m", "flange_rad", "seen_m", "seen_rad", "drift_m", "drift_rad"),
     "camera walking": ("flange_m", "flange_rad", "walk_m", "walk_rad"),
     "positions alone": ("seen_m", "hardly_rad"),
 }
 #: Structures whose errors are shared between poses.
-SHARED = ("robot's geometry off", "robot drifting over its poses", "robot drifting over time", "camera walking")
+SHARED = (
+    "robot's geometry off",
+    "robot drifting over its poses",
+    "robot drifting over time",
+    "robot walking over time",
+    "camera walking",
+)
 #: Sources that are the arm's.
 OF_THE_ARM = ("flange_m", "flange_rad", "link_m", "link_rad", "drift_m", "drift_rad")
 #: Where a drift over poses has forgotten itself: this rotation, rad, or this way, m; and over time, a share of the whole.
@@ -166,6 +174,12 @@ def time_kernel(t_s: Array) -> Array:
     """Return the correlation (N, N) of a slow error between times (N,), s."""
     span = max(float(t_s.max() - t_s.min()), 1e-9) * FORGETS_SHARE
     return np.asarray(np.exp(-0.5 * ((t_s[:, None] - t_s[None]) / span) ** 2))
+
+
+def wiener_kernel(t_s: Array) -> Array:
+    """Return the covariance (N, N) of a random walk between times (N,), s, of variance 1 over the whole."""
+    begun = t_s - t_s.min()
+    return np.asarray(np.minimum(begun[:, None], begun[None]) / max(float(begun.max()), 1e-9))
 
 
 @dataclass(frozen=True, eq=False)

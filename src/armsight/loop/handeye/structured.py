@@ -54,6 +54,7 @@ from armsight.loop.handeye.noise import (
     solve,
     time_kernel,
     walk_gathered,
+    wiener_kernel,
 )
 
 #: Poses that variances and held-out likelihoods come from at most, evenly spread, and those of a shared error.
@@ -223,6 +224,7 @@ class _Problem(Record):
         kernel = {"robot drifting over its poses": pose_kernel(self.poses.A)}
         if self.t_s is not None:
             kernel["robot drifting over time"] = time_kernel(self.t_s)
+            kernel["robot walking over time"] = wiener_kernel(self.t_s)
         return replace(linear, kernel=kernel, walk=gathered)
 
 
@@ -475,7 +477,7 @@ def _allowed(structure: str, problem: _Problem, count: int, covered: bool) -> bo
         return problem.links is not None and count >= MIN_SHARED
     if "time_s" in sources:
         return problem.speed is not None
-    if structure == "robot drifting over time" or "walk_m" in sources:
+    if structure in ("robot drifting over time", "robot walking over time") or "walk_m" in sources:
         walks = "walk_m" not in sources or problem.poses.in_hand
         return problem.t_s is not None and count >= MIN_SHARED and walks
     return structure not in SHARED or count >= MIN_SHARED
@@ -589,10 +591,12 @@ def _hanging(
     linear = part.shared(part.linear(guess), guess, {})
     C = blocks(linear, structure).covariance(variances)
     white = np.linalg.solve(np.linalg.cholesky(C), linear.e[..., None])[..., 0]
-    kernels = dict(linear.kernel)
+    kernels, index = dict(linear.kernel), np.arange(len(rows))
+    beside = np.asarray(np.abs(index[:, None] - index[None]) == 1, dtype=float)
     if gathered:
-        n = len(rows)
-        kernels["camera walking"] = np.asarray(np.abs(np.subtract.outer(np.arange(n), np.arange(n))) == 1, dtype=float)
+        kernels["camera walking"] = beside
+    if "robot walking over time" in kernels:  # the fit takes the mean away, and with it what all have in common
+        kernels["robot walking over time"] = beside
     found = set()
     for name, K in kernels.items():
         others = K - np.diag(np.diag(K))

@@ -20,6 +20,7 @@ from armsight.errors import InputError
 from armsight.files import read_columns, read_table
 from armsight.loop.identify import ROTATIONS
 from armsight.loop.identify.measured import Measured
+from armsight.robot.boards.feetech.calibration import degree_columns
 from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS
 
 _UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
@@ -75,7 +76,7 @@ def read_poses(path: str | Path, *, rotation: str | None = None, columns: str | 
     """
     if rotation is not None and rotation not in ROTATIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(ROTATIONS)}")
-    rows = read_table(path, read_columns(columns, COLUMNS))
+    rows = degree_columns(path, read_table(path, read_columns(columns, COLUMNS)))
     if len(rows) < 2:
         raise InputError(f"{path}: no rows; a first line of column names and one line a pose are needed")
     header = [name.strip() for name in rows[0]]

@@ -29,7 +29,7 @@ class Abilities:
         rate_hz: readings a second, at most.
         latency_s: by how much the arm lags behind a motion within the two limits below, s; 0 where it is the tick's.
         response_s: from a small change of the command at rest to the joints having made it, s.
-        step_rad: what a joint is moved by at least, by a controller of its own; 0 where it has no such step.
+        steps_rad: (n,) what each joint is moved by at least, by a controller of its own; empty where it has no such step.
         rest_rad_s: a joint at rest is measured slower than this, rad/s.
         most_speed_rad_s: fastest motion that the controller follows with this lag, rad/s.
         most_acceleration_rad_s2: the same of its acceleration, rad/s^2.
@@ -42,7 +42,7 @@ class Abilities:
     rate_hz: float
     latency_s: float = 0.0
     response_s: float = 0.05
-    step_rad: float = 0.0
+    steps_rad: tuple[float, ...] = ()
     rest_rad_s: float = 0.055
     most_speed_rad_s: float = math.inf
     most_acceleration_rad_s2: float = math.inf

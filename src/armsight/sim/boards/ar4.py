@@ -84,6 +84,7 @@ class Ar4Teensy:
         self._joint = self._motor.copy()
         self._speed = np.zeros(_JOINTS)
         self._target = self._motor.copy()
+        self._whole = self._motor.copy()  # where a motor makes whole steps from
         self._most = np.full(_JOINTS, MOST_SPEED_DEG_S)
         self._encoder_zero = self._motor.copy()  # where an encoder reads 0
         self._stopped = self.stop_pressed
@@ -102,6 +103,7 @@ class Ar4Teensy:
         """Let a joint slip against its motor, as a belt does: the encoder does not see it."""
         degrees *= float(SENSE[joint])
         self._encoder_zero[joint] += degrees
+        self._whole[joint] += degrees
         self._motor[joint] += degrees
         self._target[joint] += degrees
         self._joint[joint] += degrees
@@ -169,10 +171,13 @@ class Ar4Teensy:
 
     def _steps(self) -> Array:
         """Return the encoders in whole motor steps, as the firmware computes with."""
-        counts = np.trunc(
-            (self._motor - self._encoder_zero) * ENCODER_DIRECTION * self.model.steps_per_deg * COUNTS_PER_STEP
-        )
-        return np.asarray(np.trunc(counts / COUNTS_PER_STEP))
+        counts = (self._pulsed() - self._encoder_zero) * ENCODER_DIRECTION * self.model.steps_per_deg * COUNTS_PER_STEP
+        return np.asarray(np.trunc(np.trunc(counts + np.copysign(1e-6, counts)) / COUNTS_PER_STEP))
+
+    def _pulsed(self) -> Array:
+        """Return where the motors are by the pulses they got: a stepper moves by whole steps."""
+        steps = self.model.steps_per_deg
+        return np.asarray(self._whole + np.rint((self._motor - self._whole) * steps) / steps)
 
     def _do(self, word: str, rest: str) -> None:
         if word == "ST":
@@ -226,7 +231,7 @@ class Ar4Teensy:
         goal = np.trunc(degrees * self.model.steps_per_deg * ENCODER_DIRECTION)
         steps = goal - self._steps()
         far = np.abs(steps) > DEAD_STEPS
-        there = self._motor + steps * ENCODER_DIRECTION / self.model.steps_per_deg
+        there = self._pulsed() + steps * ENCODER_DIRECTION / self.model.steps_per_deg
         self._target = np.where(far, there, self._target)
 
     def _move_with(self, degrees_s: Array) -> None:
@@ -248,7 +253,7 @@ class Ar4Teensy:
             # At the switch the encoder is set to the limit; the joint really is beside it.
             beside = SENSE[k] * self.mechanics.homing_deg[k] + self.mechanics.scatter_deg * self._rng.standard_normal()
             self._encoder_zero[k] = beside + model.offset_deg[k]
-            self._motor[k] = self._target[k] = beside
+            self._motor[k] = self._target[k] = self._whole[k] = beside
             self._joint[k] = beside + SENSE[k] * SWITCH_AT[k] * self.mechanics.backlash_deg[k] / 2
         self._follow()
         self._say("JC" + "".join(f"{'ABCDEF'[k]}{counts[k]}" for k in range(_JOINTS)))

@@ -10,7 +10,7 @@ from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.codes import Alarm, BoardState, Command
 from armsight.robot.boards.feetech.board import FeetechBoard
 from armsight.robot.boards.feetech.bus import ServoBus
-from armsight.robot.boards.feetech.calibration import NAMES, read_calibration, write_offsets
+from armsight.robot.boards.feetech.calibration import NAMES, degree_columns, read_calibration, write_offsets
 from armsight.robot.boards.feetech.registers import RAD_PER_COUNT
 from armsight.sim.boards.device import SteppedLink
 from armsight.sim.boards.so101 import So101Bus, So101Mechanics
@@ -286,3 +286,17 @@ def test_new_offsets_change_nothing_else_in_the_file(tmp_path):
 def test_the_mechanics_hold_their_zero_apart():
     device = So101Bus.made(So101Mechanics(zero_rad=(0.01, 0, 0, 0, 0, 0)))
     assert device.servos.true_q[0] - device.servos.shaft[0] == pytest.approx(0.01)
+
+
+def test_columns_of_lerobot_are_degrees_where_no_percent_can_be():
+    joints = ("elbow_flex", "shoulder_pan", "shoulder_lift", "wrist_flex", "wrist_roll", "gripper")
+    head = ["t_s", *(f"{name}.pos" for name in joints)]
+    rows = [head, ["0.0", "90.5", "1", "2", "3", "-101.5", "30"]]
+    read = degree_columns("log.csv", rows)
+    assert read[0] == ["t_s", "q3_deg", "q1_deg", "q2_deg", "q4_deg", "q5_deg", "gripper.pos"]
+    assert read[1] == rows[1]
+    with pytest.raises(InputError, match="degrees, or percent of each joint's range"):
+        degree_columns("log.csv", [head, ["0.0", "90.5", "1", "2", "3", "-99.5", "300"]])
+    with pytest.raises(InputError, match="read are those of one SO-100 or SO-101"):
+        degree_columns("log.csv", [["left_elbow_flex.pos", *head], ["1", *rows[1]]])
+    assert degree_columns("log.csv", [["q1_deg"], ["1"]]) == [["q1_deg"], ["1"]]

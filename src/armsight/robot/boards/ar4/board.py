@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NoReturn, Self
 
 import numpy as np
@@ -42,13 +43,11 @@ RATE_HZ = 50.0
 #: Steppers slow down towards every goal as if it were the last: they follow goals that move with v at a distance of
 #: v^2 / (2 a). At 20 degrees/s and 30 degrees/s^2 that is 6.7 degrees, or 0.33 s, and as much again from and to rest.
 MOST_SPEED_RAD_S, LATENCY_S = float(np.radians(20.0)), 0.7
-#: The firmware leaves goals within DEAD_STEPS alone. A joint at rest goes beyond such a goal by one step more, and from
-#: there to it: for so long, s, not again before so long, s; at rest goal and joint are slower than this, rad/s.
-_BEYOND_S, _BEYOND_AGAIN_S, _STILL_RAD_S = 0.25, 1.0, 0.02
-#: A motor step of the joints with the finest ones, rad.
-STEP_RAD = float(np.radians(1 / 50.0))
-#: A step of 0.1 degree at 30 degrees/s^2 takes 2 sqrt(0.1 / 30) s, and a goal waits until it is sent.
-_RESPONSE_S = 0.15
+#: The firmware leaves goals within DEAD_STEPS alone. A joint at rest steps back from such a goal first, by one step more,
+#: and comes to it from there: each way takes so long, s; at rest goal and joint are slower than this, rad/s.
+_BACK_S, _STILL_RAD_S = 0.25, 0.02
+#: The longer way, of up to 2 DEAD_STEPS + 1 steps or 0.23 degree, takes 2 sqrt(0.23 / 30) s.
+_RESPONSE_S = 2 * _BACK_S
 #: A goal further from the present position than this is a mistake, not a step of a motion.
 MOST_STEP_RAD = float(np.radians(20.0))
 _ANSWER_S, _START_S, _TRIES = 0.2, 0.6, 4
@@ -63,7 +62,7 @@ ABILITIES = Abilities(
     RATE_HZ,
     LATENCY_S,
     _RESPONSE_S,
-    STEP_RAD,
+    tuple(np.radians(1 / MODELS["mk3"].steps_per_deg).tolist()),
     0.055,
     MOST_SPEED_RAD_S,
     float(np.radians(MOST_ACCELERATION_DEG_S2)),
@@ -85,7 +84,7 @@ class Ar4Board:
 
     def __init__(self, link: Link, name: str, model: Ar4Model, now: Callable[[], float] = time.monotonic) -> None:
         self.name, self.model = name, model
-        self.abilities = ABILITIES
+        self.abilities = replace(ABILITIES, steps_rad=tuple(np.radians(1 / model.steps_per_deg).tolist()))
         self.welcome = Welcome(f"ar4 {model.name}", VERSION, 0, BAUD, None)
         self._link, self._now = link, now
         self._reader = LineReader()
@@ -97,9 +96,9 @@ class Ar4Board:
         self._speed_rad_s: Array = np.zeros(JOINTS)
         self._goal: Array = np.zeros(JOINTS)
         self._goal_speed: Array = np.zeros(JOINTS)
-        self._written_s = self._beyond_s = -np.inf
-        self._beyond = np.zeros(JOINTS)  # degrees beyond a goal from which it is approached
-        self._arrived: Array | None = None  # the goal at which the joints came to rest, degrees of the encoders
+        self._written_s = self._back_s = -np.inf
+        self._back = np.zeros(JOINTS)  # motor steps from which a goal is approached
+        self._approached: Array | None = None  # the goal that was approached so, motor steps
 
     @classmethod
     def connect(
@@ -313,26 +312,34 @@ class Ar4Board:
         self._enabled = True
 
     def _write_goal(self) -> None:
-        """Write the goal; what the host changes at rest by no more than the dead steps is reached from beyond it.
+        """Write the goal, in whole motor steps; at rest, one within the dead steps is approached from behind, once.
 
-        A joint that has just arrived is left where it is, up to those steps short: going beyond would take it through its
-        backlash.
+        The last movement is then in the sense of the change: a joint that was moved in that sense before stays on the same
+        side of its backlash.
         """
-        now, goal = self._now(), self.model.reported_deg(np.degrees(self._goal))
+        now = self._now()
+        goal = np.rint(self.model.reported_deg(np.degrees(self._goal)) * self.model.steps_per_deg)
         still = max(np.abs(self._goal_speed).max(), np.abs(self._speed_rad_s).max()) < _STILL_RAD_S
-        if not still or self._arrived is None:
-            self._arrived = goal if still else None
-        elif now >= self._beyond_s + _BEYOND_AGAIN_S:
-            off = np.rint((goal - self._reported) * self.model.steps_per_deg)
-            changed = np.abs(goal - self._arrived) * self.model.steps_per_deg >= 0.5
-            near = changed & (np.abs(off) >= 1) & (np.abs(off) <= DEAD_STEPS + 1)
+        if now < self._back_s + 2 * _BACK_S:  # on the way back, or forth
+            goal = self._back if now < self._back_s + _BACK_S else goal
+        elif not still:
+            self._approached = None
+        else:
+            here = np.rint(self._reported * self.model.steps_per_deg)
+            off = goal - here
+            near = (off != 0) & (np.abs(off) <= DEAD_STEPS)
+            if self._approached is not None:
+                near &= goal != self._approached
             if near.any():
-                self._beyond = np.where(near, np.sign(off) * (DEAD_STEPS + 1), 0.0) / self.model.steps_per_deg
-                self._beyond_s = now
-        if now < self._beyond_s + _BEYOND_S:
-            ends = [self.model.reported_deg(np.degrees(end)) for end in self.soft_limits()]
-            goal = np.clip(goal + self._beyond, np.minimum(*ends), np.maximum(*ends))
-        self._link.write(lines.move_to(goal.tolist()))
+                ends = [self.model.reported_deg(np.degrees(end)) for end in self.soft_limits()]
+                low, high = (each * self.model.steps_per_deg for each in (np.minimum(*ends), np.maximum(*ends)))
+                back = here - np.sign(off) * (DEAD_STEPS + 1)
+                # At a limit there is no way back, and the goal is approached from beyond.
+                back = np.where((back < low) | (back > high), goal + np.sign(off) * (DEAD_STEPS + 1), back)
+                self._approached, self._back, self._back_s = goal, np.where(near, back, goal), now
+                goal = self._back
+        # Half a step more, as the firmware cuts off what is not a whole one.
+        self._link.write(lines.move_to(((goal + 0.5 * np.sign(goal)) / self.model.steps_per_deg).tolist()))
         self._written_s = now
 
     def _read(self) -> None:

@@ -38,6 +38,8 @@ from armsight.robot.boards.reports import BoardStatus, JointFault, JointReport, 
 RATE_HZ = 200.0
 #: From a command to the state that shows it (SO-ARM100 issue 134).
 LATENCY_S = 0.115
+#: Until a joint has made a step of a count or two at rest: near its goal a servo creeps against its friction.
+_RESPONSE_S = 0.25
 #: A goal further from the present position than this is a mistake, not a step of a motion.
 MOST_STEP_RAD = float(np.radians(20.0))
 #: Speed and acceleration of the servos towards a goal: 2.6 rad/s, 25 rad/s^2 (100 counts/s^2 a unit).
@@ -52,8 +54,8 @@ ABILITIES = Abilities(
     len(NAMES),
     RATE_HZ,
     LATENCY_S,
-    LATENCY_S,
-    RAD_PER_COUNT,
+    _RESPONSE_S,
+    (RAD_PER_COUNT,) * len(NAMES),
     _REST_RAD_S,
     _MOST_SPEED,
     _MOST_ACCELERATION,
@@ -77,7 +79,7 @@ class FeetechBoard:
     ) -> None:
         self._bus, self.calibration = bus, calibration
         count = len(calibration.ids)
-        self.abilities = replace(ABILITIES, joints=count)
+        self.abilities = replace(ABILITIES, joints=count, steps_rad=(RAD_PER_COUNT,) * count)
         self.welcome = Welcome("feetech: " + ", ".join(calibration.names), "STS3215", 0, bus.baud, None)
         self._begin_s = bus.now() if begin_s is None else begin_s
         self._sent = 0
