@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The environment's Python with OpenCV 4, which lies in a folder of its own, before the newer one.
 OPENCV4 := PYTHONPATH=$(abspath $(VENV)/opencv4) $(BIN)/python
 # A file is one worker's; files in their order, which begins with the longest.
-PARALLEL := -n auto --maxprocesses=4 --dist=loadfile --no-loadscope-reorder
+PARALLEL := -n 3 --dist=loadfile --no-loadscope-reorder
 
 .PHONY: demo test lint docs bench clean
 
@@ -39,11 +39,11 @@ $(VENV)/.armsight: pyproject.toml setup.py $(shell find firmware -type f)
 
 $(VENV)/.armsight-test: pyproject.toml setup.py $(shell find firmware -type f)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test]"
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -e ".[test]"
 	touch $(VENV)/.armsight $@
 
 $(VENV)/.opencv4: $(VENV)/.armsight-test
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --upgrade --target $(VENV)/opencv4 "opencv-python-headless<5"
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --no-deps --upgrade --target $(VENV)/opencv4 "opencv-python-headless<5"
 	touch $@
 
 clean:

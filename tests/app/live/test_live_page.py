@@ -140,14 +140,16 @@ def test_calibrate(page, session):
 
 
 def test_body_and_measure(page, session):
-    assert session.measuring.rig_path == session.folder / "rig.json"
+    until(lambda: session.measuring.rig_path == session.folder / "rig.json")
     truth = session._simulated.workcell.truth
     truth.rig.save(session.folder / "true.json")  # a rig of six shots is good or poor by chance
     session.measuring.use_rig(truth.rig, session.folder / "true.json")
     click(page, "step-body")
     until(lambda: state(page, "body.grade") == "usable")
     click(page, "step-measure")
-    measured = until(lambda: (now := state(page, "measure")) and now["pose"] and now)
+    measured = until(
+        lambda: (now := state(page, "measure")) and now["rig"].endswith("true.json") and now["pose"] and now
+    )
     pose = measured["pose"]
     distance_m = float(sum(x**2 for x in pose["position_mm"]) ** 0.5) / 1e3
     assert 0.6 < distance_m < 1.1
