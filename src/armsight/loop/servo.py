@@ -226,6 +226,8 @@ class PoseServo:
             else:
                 change = self._stepped(estimator, aim, error)
                 self._droops(estimate, aim)
+        else:
+            self._look_s, self._looks = 0.0, 0
         return self._command(aim, change, mode, error)
 
     def _mode(self, estimate: ArmEstimate, trust: Trust) -> Mode:
@@ -305,7 +307,7 @@ class PoseServo:
         still = bool(requested < STANDING_RAD_S and (stepping or np.abs(estimate.qd).max() < self._rest_rad_s))
         self._rest_s = self._rest_s + self.timing.period_s if still else 0.0
         if not still:
-            self._lasting, self._look_s, self._looks = np.zeros(6), 0.0, 0
+            self._lasting = np.zeros(6)
         return still and self._rest_s > estimate.vision_age_s
 
     def _command(self, aim: Aim, change: Array, mode: Mode, error: Array) -> ServoStep:
