@@ -37,9 +37,10 @@ RATE_SHARE = 0.1
 #: At rest a joint is taken through its backlash, with this time constant, s, for an error of the tool that lasts and of
 #: which the joint would have to make up so much, m: less is vision's noise.
 CROSS_S, CROSS_M = 0.3, 3e-5
-#: Over joints that move by steps the tool's error at rest is averaged for so long, s, before each change; a change is made
-#: where it lowers the error by this share of the largest displacement that one step of one joint makes: less would hunt.
-LOOK_S, WORTH_STEPS = 0.25, 0.25
+#: Over joints that move by steps the tool's error at rest is averaged for so long, s, before a change, and for so long at
+#: most while there is none; a change is made where it lowers the error by this share of the largest displacement that one
+#: step of one joint makes: less would hunt.
+LOOK_S, LOOK_MOST_S, WORTH_STEPS = 0.25, 1.0, 0.25
 #: In a choice between whole steps an error of 1 rad counts as much as one of this, m.
 STEP_LEVER_M = 0.05
 #: How fast the servo learns by how much joints rest off their commands, s; that changes with the load from pose to pose.
@@ -225,6 +226,8 @@ class PoseServo:
             else:
                 change = self._stepped(estimator, aim, error)
                 self._droops(estimate, aim)
+        else:
+            self._look_s, self._looks = 0.0, 0
         return self._command(aim, change, mode, error)
 
     def _mode(self, estimate: ArmEstimate, trust: Trust) -> Mode:
@@ -280,14 +283,16 @@ class PoseServo:
             self._stepped_to = self._correction
         self._look_s += self.timing.period_s
         if self._look_s > arrived_s:
-            self._looks += 1
+            self._looks = min(self._looks + 1, math.ceil(LOOK_MOST_S / self.timing.period_s))
             self._lasting += (error - self._lasting) / self._looks
         if self._look_s > arrived_s + LOOK_S:
             steps = np.array(self._joint_loops.steps_rad)
             requested = self._joints(aim, self._lasting)
             requested += self._crossed(estimator, aim, requested, np.abs(requested) > 0.5 * steps)
-            self._stepped_to = self._correction + whole_steps(aim.jacobian, requested, steps)
-            self._look_s, self._looks, self._lasting = self.timing.period_s, 0, np.zeros(6)
+            change = whole_steps(aim.jacobian, requested, steps)
+            self._stepped_to, self._look_s = self._correction + change, arrived_s
+            if change.any():
+                self._look_s, self._looks, self._lasting = self.timing.period_s, 0, np.zeros(6)
         return self._stepped_to - self._correction
 
     def _droops(self, estimate: ArmEstimate, aim: Aim) -> None:
@@ -302,7 +307,7 @@ class PoseServo:
         still = bool(requested < STANDING_RAD_S and (stepping or np.abs(estimate.qd).max() < self._rest_rad_s))
         self._rest_s = self._rest_s + self.timing.period_s if still else 0.0
         if not still:
-            self._lasting, self._look_s, self._looks = np.zeros(6), 0.0, 0
+            self._lasting = np.zeros(6)
         return still and self._rest_s > estimate.vision_age_s
 
     def _command(self, aim: Aim, change: Array, mode: Mode, error: Array) -> ServoStep:
