@@ -76,7 +76,8 @@ static void window(motor_state *motor, const motor_config *config, float voltage
     if (motor->window_ticks < WINDOW_TICKS) {
         return;
     }
-    if (number_size(motor->gap_rad) < 0.5f * (config->apart_rad + motor->band_rad)) {
+    /* A gap that R and K may explain must be learnt from: else they would stay wrong for good. */
+    if (number_size(motor->gap_rad) < 0.5f * config->apart_rad + motor->band_rad) {
         learn(motor, config, angle_rad);
     }
     window_begin(motor, angle_rad);
