@@ -4,6 +4,7 @@ import io
 import json
 import os
 import pty
+import time
 
 import numpy as np
 import pytest
@@ -155,9 +156,14 @@ def test_typed_at_a_terminal_from_the_swing_to_the_stored_configuration(tmp_path
         if line.endswith("[y/n]: "):
             os.write(master, answers.pop(0).encode())
 
-    monkeypatch.setattr("sys.stdin", os.fdopen(slave, encoding="utf-8"))
-    Bringup(evening.board, TerminalOperator(heard), tmp_path, [0]).run(["swing", "verify", "store"])
-    os.write(master, b"\x04")  # end of the input: its reader ends
+    with open(slave, encoding="utf-8") as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        operator = TerminalOperator(heard)
+        Bringup(evening.board, operator, tmp_path, [0]).run(["swing", "verify", "store"])
+        os.write(master, b"\x04")
+        while operator.answer() != "q":  # the end of the input: its reader has ended
+            time.sleep(0.001)
+    os.close(master)
     assert answers == []
     config, _ = read_configuration(tmp_path / "board.toml")
     assert config.tobytes() == evening.board.configuration().tobytes()
