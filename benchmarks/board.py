@@ -96,18 +96,29 @@ def metric_1():
             print(f"{name:9}{what:24}{clock:16.0f}{clock / 1000:8.1f}x{processor:20.0f}{processor / 1000:8.1f}x")
 
 
+def instructions(code):
+    """How many Thumb instructions a block of bytes holds: one of four bytes begins with 0b11101, 0b11110 or 0b11111."""
+    count = at = 0
+    while at < len(code):
+        at += 4 if code[at + 1] >> 3 >= 0b11101 else 2
+        count += 1
+    return count
+
+
 class CountingEmulator(UnicornEmulator):
-    """Runs a tick's three parts one after the other and counts the instructions of each."""
+    """Runs a tick's three parts one after the other and counts the instructions of each, block by block."""
 
     def __init__(self, elf):
         import unicorn
 
-        self.counted, self.counts = 0, []
+        self.counted, self.counts, self.blocks = 0, [], {}
         super().__init__(elf)
-        self.uc.hook_add(unicorn.UC_HOOK_CODE, self._count)
+        self.uc.hook_add(unicorn.UC_HOOK_BLOCK, self._count)
 
-    def _count(self, *_):
-        self.counted += 1
+    def _count(self, uc, address, size, _):
+        if (address, size) not in self.blocks:
+            self.blocks[address, size] = instructions(bytes(uc.mem_read(address, size)))
+        self.counted += self.blocks[address, size]
 
     def tick(self, request):
         self._ram[self._request] = request

@@ -35,10 +35,8 @@ void core_init(core_state *core, const core_config *config, uint32_t source, uin
 }
 
 /* Read a potentiometer into the joint. */
-static void measure(core_state *core, uint32_t i, uint32_t counts)
+static void measure(core_state *core, joint_state *joint, const joint_config *config, uint32_t i, uint32_t counts)
 {
-    joint_state *joint = &core->joint[i];
-    const joint_config *config = &core->config.joint[i];
     const bool known = joint->pot.valid != 0u;
     const uint32_t fault = pot_read(&joint->pot, &config->pot, counts, core->config.pot_ticks);
     if (fault != FAULT_NONE) {
@@ -66,7 +64,7 @@ static bool advance(joint_state *joint, const joint_config *config, bool slowing
     if (slowing) {
         const float before_rad_s = joint->setpoint.speed_rad_s;
         resting = setpoint_slow(&joint->setpoint, joint->stop_rad_s2);
-        path_rad_s2 = (joint->setpoint.speed_rad_s - before_rad_s) / TICK_S;
+        path_rad_s2 = (joint->setpoint.speed_rad_s - before_rad_s) * (float)TICKS_PER_S;
         joint->held_back = 0u;
     } else {
         path_rad_s2 = setpoint_advance(&joint->setpoint);
@@ -76,21 +74,20 @@ static bool advance(joint_state *joint, const joint_config *config, bool slowing
         joint->limited |= LIMITED_SOFT;
         path_rad_s2 = 0.0f;
     }
-    const governor_limits limits = {.speed_rad_s = config->speed_limit_rad_s,
-                                    .acceleration_rad_s2 = config->acceleration_rad_s2,
-                                    .deceleration_rad_s2 = config->deceleration_rad_s2,
-                                    .jerk_rad_s3 = config->jerk_rad_s3,
-                                    .low_rad = joint->low_rad,
-                                    .high_rad = joint->high_rad};
-    joint->limited |= governor_step(&joint->reference, &joint->setpoint, path_rad_s2, &limits);
+    joint->limited |=
+        governor_step(&joint->reference, &joint->setpoint, path_rad_s2, config, joint->low_rad, joint->high_rad);
     if (resting && number_size(joint->reference.speed_rad_s) < 0.01f * config->speed_limit_rad_s) {
         settle(joint);
     } else {
         resting = false;
     }
     /* Limits that were widened for a joint outside close in behind it. */
-    joint->low_rad = number_clamp(joint->reference.position_rad, joint->low_rad, config->soft_min_rad);
-    joint->high_rad = number_clamp(joint->reference.position_rad, config->soft_max_rad, joint->high_rad);
+    if (joint->low_rad != config->soft_min_rad) {
+        joint->low_rad = number_clamp(joint->reference.position_rad, joint->low_rad, config->soft_min_rad);
+    }
+    if (joint->high_rad != config->soft_max_rad) {
+        joint->high_rad = number_clamp(joint->reference.position_rad, config->soft_max_rad, joint->high_rad);
+    }
     return resting;
 }
 
@@ -111,67 +108,68 @@ static void advance_arm(core_state *core)
     }
 }
 
-/* Return the duty of kp and kv that moves a free joint at its speed limit and a little more: what back-EMF and damping
- * take there. Without a known motor nothing bounds it. */
-static float spring_limit(const joint_config *config, float nominal_v)
+/* Return the duty of kp and kv that moves a free joint at its speed limit and a little more: what back-EMF (own_s_per_rad)
+ * and damping take there. Without a known motor nothing bounds it. */
+static float spring_limit(const joint_config *config, float own_s_per_rad)
 {
     if (config->motor.resistance_ohm <= 0.0f) {
         return FLT_MAX;
     }
-    const float per_rad_s = config->gains.kd_s_per_rad + config->motor.constant_v_s / nominal_v;
-    return SPARE_SPEED * config->speed_limit_rad_s * per_rad_s;
+    return SPARE_SPEED * config->speed_limit_rad_s * (config->gains.kd_s_per_rad + own_s_per_rad);
 }
 
-static void control(joint_state *joint, const joint_config *config, float nominal_v, float current_a)
+static void control(joint_state *joint, const joint_config *config, float per_nominal_v)
 {
-    const float over_a = number_size(current_a) - (float)config->current_limit_ma * 0.001f;
-    const float gravity_step = config->gravity_slew_per_s * TICK_S;
-    joint->gravity_duty +=
-        number_clamp(joint->gravity_asked - joint->gravity_duty, -gravity_step, gravity_step);
-    joint->duty_cap =
-        number_clamp(joint->duty_cap - config->current_cut_per_a_s * over_a * TICK_S, 0.0f, config->duty_limit);
-    float duty_cap = joint->duty_cap;
-    const float free_duty = config->speed_limit_rad_s * config->motor.constant_v_s / nominal_v;
-    if (motor_races(&joint->motor, &config->motor, config->speed_limit_rad_s) && duty_cap > free_duty) {
-        duty_cap = free_duty; /* it drives a free motor at its limit, and brakes a faster one */
+    if (joint->gravity_duty != joint->gravity_asked) {
+        const float gravity_step = config->gravity_slew_per_s * TICK_S;
+        joint->gravity_duty +=
+            number_clamp(joint->gravity_asked - joint->gravity_duty, -gravity_step, gravity_step);
+    }
+    if (joint->over_a > 0.0f || joint->duty_cap != config->duty_limit) {
+        const float cut_duty = config->current_cut_per_a_s * joint->over_a * TICK_S;
+        joint->duty_cap = number_clamp(joint->duty_cap - cut_duty, 0.0f, config->duty_limit);
+    }
+    float duty_low = -joint->duty_cap;
+    float duty_high = joint->duty_cap;
+    const float own_s_per_rad = config->motor.constant_v_s * per_nominal_v;
+    const float free_duty = config->speed_limit_rad_s * own_s_per_rad;
+    if (joint->motor.sure_rad_s > config->speed_limit_rad_s && joint->duty_cap > free_duty) {
+        if (joint->motor.speed_rad_s > 0.0f) { /* it is driven on as a free motor at its limit, and braked by all there is */
+            duty_high = free_duty;
+        } else {
+            duty_low = -free_duty;
+        }
         joint->limited |= LIMITED_SPEED;
     }
-    const float seen_rad_s =
-        motor_witness(&joint->motor, &config->motor, joint->pid.speed_rad_s, config->speed_limit_rad_s);
+    const float seen_rad_s = motor_witness(&joint->motor, joint->pid.speed_rad_s, config->speed_limit_rad_s);
     const float beyond_rad_s = number_size(seen_rad_s) - config->speed_limit_rad_s;
     const float more_rad_s = beyond_rad_s > 0.0f ? BEYOND * beyond_rad_s : 0.0f;
     const pid_demand demand = {.reference_rad = joint->reference.position_rad,
                                .reference_rad_s = joint->reference.speed_rad_s,
                                .reference_rad_s2 = joint->reference.acceleration_rad_s2,
                                .damped_rad_s = seen_rad_s + (seen_rad_s > 0.0f ? more_rad_s : -more_rad_s),
-                               .spring_limit = spring_limit(config, nominal_v),
+                               .spring_limit = spring_limit(config, own_s_per_rad),
                                .gravity_duty = joint->gravity_duty,
                                .duty_limit = config->duty_limit,
-                               .duty_cap = duty_cap,
+                               .duty_low = duty_low,
+                               .duty_high = duty_high,
                                .duty_slew_per_s = config->duty_slew_per_s};
     (void)pid_step(&joint->pid, &config->gains, &demand, &joint->limited);
 }
 
-/* Return a motor's current in its joint's direction, A. */
-static float joint_current(const core_state *core, const core_inputs *inputs, uint32_t i)
-{
-    return (float)(core->config.joint[i].motor_direction * inputs->current_ma[i]) * 0.001f;
-}
-
 /* Drive every joint, watch what comes of it. */
-static void drive(core_state *core, const core_inputs *inputs)
+static void drive(core_state *core)
 {
-    const float supply_v = (float)inputs->supply_mv * 0.001f;
-    const float nominal_v = (float)core->config.supply_nominal_mv * 0.001f;
+    const float per_nominal_v = 1000.0f / (float)core->config.supply_nominal_mv;
     advance_arm(core);
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         joint_state *joint = &core->joint[i];
-        const float current_a = joint_current(core, inputs, i);
+        const joint_config *config = &core->config.joint[i];
         if (joint->released == 0u) {
-            control(joint, &core->config.joint[i], nominal_v, current_a);
+            control(joint, config, per_nominal_v);
         }
-        safety_watch_joint(core, i, inputs->counts[i], supply_v, current_a);
-        if (!number_finite(joint->pid.duty) || !number_finite(joint->pid.integral_duty)) {
+        safety_watch_joint(core, joint, config, i);
+        if (!number_finite(joint->pid.duty + joint->pid.integral_duty)) {
             safety_raise(core, FAULT_ARITHMETIC, i);
         }
     }
@@ -257,16 +255,18 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
     }
     core->standing = 0u;
     const bool driven = safety_drives_on(core);
+    core->supply_v = (float)inputs->supply_mv * 0.001f;
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {
-        core->joint[i].limited = 0u;
-        measure(core, i, inputs->counts[i]);
-        const float current_a = joint_current(core, inputs, i);
-        const bool chopped = number_size(current_a) * 1000.0f > (float)core->config.joint[i].current_limit_ma;
-        if (chopped) { /* a driver that limits the current does not put the duty out */
-            motor_pause(&core->joint[i].motor, core->joint[i].pot.angle_rad);
+        joint_state *joint = &core->joint[i];
+        const joint_config *config = &core->config.joint[i];
+        joint->limited = 0u;
+        measure(core, joint, config, i, inputs->counts[i]);
+        joint->current_a = (float)(config->motor_direction * inputs->current_ma[i]) * 0.001f;
+        joint->over_a = number_size(joint->current_a) - (float)config->current_limit_ma * 0.001f;
+        if (joint->over_a > 0.0f) { /* a driver that limits the current does not put the duty out */
+            motor_pause(&joint->motor, joint->pot.angle_rad);
         } else if (driven) {
-            motor_measure(&core->joint[i].motor, &core->config.joint[i].motor, (float)inputs->supply_mv * 0.001f,
-                          current_a, core->joint[i].pot.angle_rad);
+            motor_measure(&joint->motor, &config->motor, core->supply_v, joint->current_a, joint->pot.angle_rad);
         }
     }
     safety_watch_arm(core, inputs);
@@ -277,7 +277,7 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
     }
     command_take(core, inputs);
     if (safety_drives_on(core)) {
-        drive(core, inputs);
+        drive(core);
     }
     close_brakes(core);
     if (safety_drives_on(core)) {

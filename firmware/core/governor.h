@@ -7,21 +7,12 @@
 
 #include "types.h"
 
-/* What a joint's reference keeps to. */
-typedef struct governor_limits {
-    float speed_rad_s;
-    float acceleration_rad_s2;
-    float deceleration_rad_s2; /* with which it can brake before a soft limit */
-    float jerk_rad_s3;
-    float low_rad;
-    float high_rad;
-} governor_limits;
-
 /* Stand still at position_rad. */
 void governor_hold(governor_state *reference, float position_rad);
 
-/* Follow the path for one tick; path_rad_s2 is its acceleration. Returns the LIMITED_... bits that hold it back. */
+/* Follow the path for one tick within [low_rad, high_rad]; path_rad_s2 is its acceleration. Returns the LIMITED_... bits
+ * that hold it back. */
 uint32_t governor_step(governor_state *reference, const setpoint_state *path, float path_rad_s2,
-                       const governor_limits *limits);
+                       const joint_config *config, float low_rad, float high_rad);
 
 #endif

@@ -1,7 +1,5 @@
 #include "motor.h"
 
-#include "number.h"
-
 #define FADE_S 0.4f           /* a gap fades with this time constant: what opens more slowly is not seen */
 #define PRIOR_VARIANCE 0.005625f /* of R and K over the configuration's: 0.075^2, so that three sigma of both cover 15 % */
 #define WANDER_VARIANCE 4e-7f /* by which each becomes less certain per window: windings get warm */
@@ -16,7 +14,6 @@
 #define AGREED 3.0f           /* of apart_rad: so much way together proves that the wiring was right */
 #define UNKNOWN_RAD_S 1000.0f
 #define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
-#define WITNESS 0.1f          /* of the speed limit: so much faster than the reading it must be to count */
 #define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
 
 void motor_start(motor_state *motor, float angle_rad, uint32_t phase)
@@ -37,27 +34,29 @@ void motor_start(motor_state *motor, float angle_rad, uint32_t phase)
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
 static void learn(motor_state *motor, const motor_config *config, float angle_rad)
 {
-    const float ticks = (float)motor->window_ticks;
-    const float ir_v = motor->window_ir_v / ticks;
-    const float kw_v = config->constant_v_s * (angle_rad - motor->window_rad) / (ticks * TICK_S);
-    const float noise_v = config->constant_v_s * WINDOW_NOISE_RAD / (ticks * TICK_S);
+    const float per_tick = 1.0f / (float)WINDOW_TICKS;
+    const float per_s = (float)TICKS_PER_S * per_tick;
+    const float ir_v = motor->window_ir_v * per_tick;
+    const float kw_v = config->constant_v_s * (angle_rad - motor->window_rad) * per_s;
+    const float noise_v = config->constant_v_s * WINDOW_NOISE_RAD * per_s;
     const float gain_r = motor->variance_rr * ir_v + motor->variance_rk * kw_v;
     const float gain_k = motor->variance_rk * ir_v + motor->variance_kk * kw_v;
     const float variance = ir_v * gain_r + kw_v * gain_k + noise_v * noise_v;
-    const float off_v = motor->window_v / ticks - motor->resistance_scale * ir_v - motor->constant_scale * kw_v;
+    const float off_v = motor->window_v * per_tick - motor->resistance_scale * ir_v - motor->constant_scale * kw_v;
     if (off_v * off_v <= SURPRISE * variance) {
+        const float per_variance = 1.0f / variance;
         const float way_rad = number_size(angle_rad - motor->window_rad);
         const bool moved = way_rad > WINDOW_WAY_RAD;
         motor->agreed_rad += moved ? way_rad : 0.0f;
         motor->resistance_scale =
-            number_clamp(motor->resistance_scale + gain_r * off_v / variance, SCALE_LOW, SCALE_HIGH);
+            number_clamp(motor->resistance_scale + gain_r * off_v * per_variance, SCALE_LOW, SCALE_HIGH);
         if (moved) { /* else the constant is only taken into account (Schmidt's form) */
             motor->constant_scale =
-                number_clamp(motor->constant_scale + gain_k * off_v / variance, SCALE_LOW, SCALE_HIGH);
-            motor->variance_kk += WANDER_VARIANCE - gain_k * gain_k / variance;
+                number_clamp(motor->constant_scale + gain_k * off_v * per_variance, SCALE_LOW, SCALE_HIGH);
+            motor->variance_kk += WANDER_VARIANCE - gain_k * gain_k * per_variance;
         }
-        motor->variance_rr += WANDER_VARIANCE - gain_r * gain_r / variance;
-        motor->variance_rk -= gain_r * gain_k / variance;
+        motor->variance_rr += WANDER_VARIANCE - gain_r * gain_r * per_variance;
+        motor->variance_rk -= gain_r * gain_k * per_variance;
     }
 }
 
@@ -77,7 +76,8 @@ static void window(motor_state *motor, const motor_config *config, float voltage
     if (motor->window_ticks < WINDOW_TICKS) {
         return;
     }
-    if (number_size(motor->gap_rad) < 0.5f * (config->apart_rad + motor->band_rad)) {
+    /* A gap that R and K may explain must be learnt from: else they would stay wrong for good. */
+    if (number_size(motor->gap_rad) < 0.5f * config->apart_rad + motor->band_rad) {
         learn(motor, config, angle_rad);
     }
     window_begin(motor, angle_rad);
@@ -88,6 +88,7 @@ void motor_pause(motor_state *motor, float angle_rad)
 {
     motor->last_rad = angle_rad;
     motor->unsure_rad_s = UNKNOWN_RAD_S;
+    motor->sure_rad_s = 0.0f;
     window_begin(motor, angle_rad);
 }
 
@@ -127,33 +128,14 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
         sample(motor, config, ir_v, emf_v, angle_rad);
     }
     window(motor, config, voltage_v, ir_v, angle_rad);
-}
-
-/* Return whether the motor's speed is known: not where no current is seen, as then its sensor may be broken. */
-static bool speed_is_known(const motor_state *motor, const motor_config *config)
-{
-    return config->resistance_ohm > 0.0f && motor->driven_ticks > SETTLE_TICKS &&
-           motor->current_a * config->resistance_ohm >
-               DEAD_SHARE * config->constant_v_s * number_size(motor->speed_rad_s);
-}
-
-bool motor_races(const motor_state *motor, const motor_config *config, float speed_limit_rad_s)
-{
-    return speed_is_known(motor, config) && number_size(motor->speed_rad_s) - motor->unsure_rad_s > speed_limit_rad_s;
-}
-
-float motor_witness(const motor_state *motor, const motor_config *config, float reading_rad_s, float speed_limit_rad_s)
-{
-    const float sure_rad_s = number_size(motor->speed_rad_s) - motor->unsure_rad_s - WITNESS * speed_limit_rad_s;
-    const bool faster = sure_rad_s > number_size(reading_rad_s);
-    return faster && speed_is_known(motor, config) ? motor->speed_rad_s : reading_rad_s;
+    const float size_rad_s = number_size(motor->speed_rad_s);
+    const bool known = motor->current_a * config->resistance_ohm > DEAD_SHARE * config->constant_v_s * size_rad_s;
+    motor->known = known ? 1u : 0u;
+    motor->sure_rad_s = known ? size_rad_s - motor->unsure_rad_s : 0.0f;
 }
 
 uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v)
 {
-    if (config->resistance_ohm <= 0.0f || number_size(motor->gap_rad) <= config->apart_rad + motor->band_rad) {
-        return FAULT_NONE;
-    }
     const float across_v = number_size(motor->duty) * supply_v;
     if (motor->current_a * config->resistance_ohm < DEAD_SHARE * across_v) {
         return FAULT_CURRENT_SENSOR;
@@ -284,9 +266,9 @@ uint32_t motor_names(const motor_state *motor, const motor_config *config, uint3
 #define SWING_RAD_S 0.3f  /* as far from the reference's speed at least */
 #define SWING_SHARE 0.2f  /* of the speed limit */
 
-bool motor_swings(motor_state *motor, const motor_config *config, float reference_rad_s, float speed_limit_rad_s)
+bool motor_swings(motor_state *motor, float reference_rad_s, float speed_limit_rad_s)
 {
-    if (!speed_is_known(motor, config)) {
+    if (motor->known == 0u) {
         motor->swings = 0u;
         return false;
     }

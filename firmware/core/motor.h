@@ -5,7 +5,10 @@
 
 #include <stdbool.h>
 
+#include "number.h"
 #include "types.h"
+
+#define MOTOR_WITNESS 0.1f /* of the speed limit: so much faster than the reading it must be to count */
 
 /* Begin to watch a joint that reads angle_rad; phase differs from joint to joint, so that not all are sampled at once. */
 void motor_start(motor_state *motor, float angle_rad, uint32_t phase);
@@ -18,13 +21,19 @@ void motor_pause(motor_state *motor, float angle_rad);
 void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad);
 
 /* Return the joint's speed: the reading's, or the motor's where that is faster beyond all its uncertainty. */
-float motor_witness(const motor_state *motor, const motor_config *config, float reading_rad_s, float speed_limit_rad_s);
+static inline float motor_witness(const motor_state *motor, float reading_rad_s, float speed_limit_rad_s)
+{
+    const float faster_rad_s = motor->sure_rad_s - MOTOR_WITNESS * speed_limit_rad_s;
+    return faster_rad_s > number_size(reading_rad_s) ? motor->speed_rad_s : reading_rad_s;
+}
 
-/* Return whether the motor is surely faster than the joint's limit. */
-bool motor_races(const motor_state *motor, const motor_config *config, float speed_limit_rad_s);
+/* Return whether motor and reading are apart further than noise, backlash and the motor's uncertain numbers explain. */
+static inline bool motor_is_apart(const motor_state *motor, const motor_config *config)
+{
+    return number_size(motor->gap_rad) > config->apart_rad + motor->band_rad;
+}
 
-/* Return the fault by which motor and reading are apart further than noise, backlash and the motor's uncertain numbers
- * explain, as it looks at first; FAULT_NONE where they are not. */
+/* Return the fault by which they are apart, as it looks at first. */
 uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v);
 
 /* Return the fault by what motor and reading did in the last 192 ms; suspect where that does not show it. A motor that was
@@ -32,7 +41,7 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
 uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect);
 
 /* Return whether the motor swings about a reference that moves at reference_rad_s. */
-bool motor_swings(motor_state *motor, const motor_config *config, float reference_rad_s, float speed_limit_rad_s);
+bool motor_swings(motor_state *motor, float reference_rad_s, float speed_limit_rad_s);
 
 /* Return whether the joint has been faster than its limit (rad/s) long enough to be sure; fast_rad_s is what the reading
  * says of it. */

@@ -10,7 +10,7 @@
 _Static_assert(FLT_EVAL_METHOD == 0, "float expressions must be computed in float");
 
 /* Return whether x is neither NaN nor infinite. */
-static inline bool number_finite(float x) { return x >= -FLT_MAX && x <= FLT_MAX; }
+static inline bool number_finite(float x) { return __builtin_fabsf(x) <= FLT_MAX; }
 
 /* Return whether x lies in [low, high]; NaN does not. */
 static inline bool number_within(float x, float low, float high) { return x >= low && x <= high; }

@@ -11,7 +11,7 @@ void pid_reset(pid_state *pid, float measured_rad)
 
 void pid_measure(pid_state *pid, const joint_gains *gains, float measured_rad)
 {
-    const float raw_rad_s = (measured_rad - pid->measured_rad) / TICK_S;
+    const float raw_rad_s = (measured_rad - pid->measured_rad) * (float)TICKS_PER_S;
     const float weight = TICK_S / (gains->derivative_filter_s + TICK_S);
     pid->speed_rad_s += weight * (raw_rad_s - pid->speed_rad_s);
     pid->measured_rad = measured_rad;
@@ -20,9 +20,9 @@ void pid_measure(pid_state *pid, const joint_gains *gains, float measured_rad)
 /* Return the duty asked for held to the limits, and say which of them held it. */
 static float limited_duty(const pid_state *pid, const pid_demand *demand, float asked, uint32_t *limited)
 {
-    const float within = number_clamp(asked, -demand->duty_cap, demand->duty_cap);
+    const float within = number_clamp(asked, demand->duty_low, demand->duty_high);
     if (within != asked) {
-        *limited |= demand->duty_cap < demand->duty_limit ? LIMITED_CURRENT : LIMITED_DUTY;
+        *limited |= number_size(within) < demand->duty_limit ? LIMITED_CURRENT : LIMITED_DUTY;
     }
     const float step = demand->duty_slew_per_s * TICK_S;
     const float reached = number_clamp(within, pid->duty - step, pid->duty + step);

@@ -16,6 +16,7 @@ float pot_angle(const pot_config *config, uint32_t counts)
 
 uint32_t pot_read(pot_state *pot, const pot_config *config, uint32_t counts, uint32_t confirm_ticks)
 {
+    pot->counts = counts;
     const float angle_rad = pot_angle(config, counts);
     /* The longer the last good reading is ago, the further the joint may have moved. */
     const float reach_rad = config->jump_rad * (float)(pot->bad_ticks + 1u);
@@ -53,10 +54,10 @@ void pot_watch(pot_state *pot, float reference_rad)
     pot->farthest_rad = 0.0f;
 }
 
-bool pot_is_frozen(pot_state *pot, const pot_config *config, uint32_t counts, float reference_rad)
+bool pot_is_frozen(pot_state *pot, const pot_config *config, float reference_rad)
 {
-    if (counts != pot->last_counts) {
-        pot->last_counts = counts;
+    if (pot->counts != pot->last_counts) {
+        pot->last_counts = pot->counts;
         pot->mark_rad = reference_rad;
     }
     return number_size(reference_rad - pot->mark_rad) > config->frozen_rad;

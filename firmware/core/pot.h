@@ -21,7 +21,7 @@ bool pot_is_read(const pot_state *pot);
 void pot_watch(pot_state *pot, float reference_rad);
 
 /* Return whether the counts have stood still while the reference (rad) travelled frozen_rad. Driven joints only. */
-bool pot_is_frozen(pot_state *pot, const pot_config *config, uint32_t counts, float reference_rad);
+bool pot_is_frozen(pot_state *pot, const pot_config *config, float reference_rad);
 
 /* Return whether the joint has moved away from its command by inverted_rad although it is driven towards it.
  * error_rad is reference minus angle, duty this tick's. Driven joints only. */

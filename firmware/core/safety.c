@@ -175,7 +175,7 @@ void safety_watch_arm(core_state *core, const core_inputs *inputs)
         safety_raise(core, FAULT_TICK_OVERRUN, NO_JOINT);
     }
     watch_supply(core, inputs->supply_mv);
-    for (uint32_t fault = 1u; fault < FAULT_COUNT; fault++) {
+    for (uint32_t fault = 1u; core->permanent != 0u && fault < FAULT_COUNT; fault++) {
         if ((core->permanent & (1u << fault)) != 0u) {
             safety_raise(core, fault, NO_JOINT);
         }
@@ -204,98 +204,97 @@ static uint32_t joint_stands(joint_state *joint, const joint_config *config)
     return joint->stall_ticks;
 }
 
-/* Watch a joint that is held to its limits and away from its reference. */
-static void watch_load(core_state *core, uint32_t joint)
+/* Watch a joint that is held to its limits and away from its reference by off_rad. */
+static void watch_load(core_state *core, joint_state *joint, const joint_config *config, uint32_t i, float off_rad)
 {
-    const joint_config *config = &core->config.joint[joint];
-    joint_state *state = &core->joint[joint];
-    const bool full = (state->limited & (LIMITED_DUTY | LIMITED_CURRENT)) != 0u;
-    const bool behind = number_size(state->pid.error_rad) > 0.5f * config->following_rad;
-    state->overload_ticks = in_a_row(state->overload_ticks, full && behind);
-    if (state->overload_ticks >= core->config.overload_ticks) {
-        safety_raise(core, FAULT_OVERLOAD, joint);
-        state->overload_ticks = 0u;
+    const bool full = (joint->limited & (LIMITED_DUTY | LIMITED_CURRENT)) != 0u;
+    joint->overload_ticks = in_a_row(joint->overload_ticks, full && off_rad > 0.5f * config->following_rad);
+    if (joint->overload_ticks >= core->config.overload_ticks) {
+        safety_raise(core, FAULT_OVERLOAD, i);
+        joint->overload_ticks = 0u;
     }
 }
 
-/* Watch the motor: as a witness of the motion, and for itself. */
-static void watch_motor(core_state *core, uint32_t joint, float supply_v, float current_a)
+/* Take back gains with which a joint swings. */
+static void take_back_gains(core_state *core, joint_state *joint, uint32_t i)
 {
-    const joint_config *config = &core->config.joint[joint];
-    joint_state *state = &core->joint[joint];
-    const uint32_t fault = motor_disagrees(&state->motor, &config->motor, supply_v);
-    if (fault != FAULT_NONE) {
-        safety_raise(core, fault, joint);
-        state->suspect = fault == FAULT_CURRENT_SENSOR ? FAULT_NONE : fault;
-        state->suspect_ticks = 0u;
+    joint_gains *gains = &core->config.joint[i].gains;
+    pid_change_gains(&joint->pid, gains, &core->start_gains.joint[i]);
+    *gains = core->start_gains.joint[i];
+    safety_changed_config(core, false);
+    joint->motor.swings = 0u;
+}
+
+/* Watch the motor: as a witness of the motion, and for itself. */
+static void watch_motor(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
+{
+    motor_state *motor = &joint->motor;
+    if (motor_is_apart(motor, &config->motor)) {
+        const uint32_t fault = motor_disagrees(motor, &config->motor, core->supply_v);
+        safety_raise(core, fault, i);
+        joint->suspect = fault == FAULT_CURRENT_SENSOR ? FAULT_NONE : fault;
+        joint->suspect_ticks = 0u;
         return;
     }
-    if (motor_swings(&state->motor, &config->motor, state->reference.speed_rad_s, config->speed_limit_rad_s)) {
-        safety_raise(core, FAULT_OSCILLATION, joint);
-        pid_change_gains(&state->pid, &config->gains, &core->start_gains.joint[joint]);
-        core->config.joint[joint].gains = core->start_gains.joint[joint];
-        safety_changed_config(core, false);
-        state->motor.swings = 0u;
+    if (motor_swings(motor, joint->reference.speed_rad_s, config->speed_limit_rad_s)) {
+        safety_raise(core, FAULT_OSCILLATION, i);
+        take_back_gains(core, joint, i);
     }
-    if (motor_is_fast(&state->motor, state->pid.speed_rad_s, config->speed_limit_rad_s)) {
-        safety_raise(core, FAULT_OVERSPEED, joint);
+    if (motor_is_fast(motor, joint->pid.speed_rad_s, config->speed_limit_rad_s)) {
+        safety_raise(core, FAULT_OVERSPEED, i);
     }
-    const bool hot = number_size(current_a) > 0.002f * (float)config->current_limit_ma;
-    state->motor.current_ticks = in_a_row(state->motor.current_ticks, hot);
-    if (state->motor.current_ticks >= OVERCURRENT_TICKS) {
-        safety_raise(core, FAULT_OVERCURRENT, joint);
+    const bool hot = 2.0f * joint->over_a > number_size(joint->current_a); /* more than twice the limit */
+    motor->current_ticks = in_a_row(motor->current_ticks, hot);
+    if (motor->current_ticks >= OVERCURRENT_TICKS) {
+        safety_raise(core, FAULT_OVERCURRENT, i);
     }
 }
 
 /* Give a fault of a joint that was let go of its right name, once the motion since then shows it. */
-static void name_suspect(core_state *core, uint32_t joint)
+static void name_suspect(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
-    joint_state *state = &core->joint[joint];
-    if (state->suspect == FAULT_NONE || ++state->suspect_ticks < NAME_TICKS) {
+    if (joint->suspect == FAULT_NONE || ++joint->suspect_ticks < NAME_TICKS) {
         return;
     }
-    const uint32_t suspect = state->suspect;
-    const uint32_t fault = motor_names(&state->motor, &core->config.joint[joint].motor, suspect);
-    state->suspect = FAULT_NONE;
-    core->joint_faults[joint] &= ~(1u << suspect);
-    core->joint_faults[joint] |= 1u << fault;
+    const uint32_t suspect = joint->suspect;
+    const uint32_t fault = motor_names(&joint->motor, &config->motor, suspect);
+    joint->suspect = FAULT_NONE;
+    core->joint_faults[i] &= ~(1u << suspect);
+    core->joint_faults[i] |= 1u << fault;
     uint32_t joints = 0u;
-    for (uint32_t i = 0u; i < JOINTS; i++) {
-        joints |= core->joint_faults[i];
+    for (uint32_t other = 0u; other < JOINTS; other++) {
+        joints |= core->joint_faults[other];
     }
     core->faults &= joints | ~(1u << suspect);
     core->faults |= 1u << fault;
-    if (core->first_fault == suspect && core->first_joint == joint) {
+    if (core->first_fault == suspect && core->first_joint == i) {
         core->first_fault = fault;
     }
 }
 
-void safety_watch_joint(core_state *core, uint32_t joint, uint32_t counts, float supply_v, float current_a)
+void safety_watch_joint(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
-    const joint_config *config = &core->config.joint[joint];
-    joint_state *state = &core->joint[joint];
-    const pid_state *pid = &state->pid;
-    if (state->released != 0u) {
-        name_suspect(core, joint);
+    if (joint->released != 0u) {
+        name_suspect(core, joint, config, i);
         return;
     }
-    watch_motor(core, joint, supply_v, current_a);
-    watch_load(core, joint);
-    if (pot_is_inverted(&state->pot, &config->pot, pid->error_rad, pid->duty)) {
+    const float off_rad = number_size(joint->pid.error_rad);
+    watch_motor(core, joint, config, i);
+    watch_load(core, joint, config, i, off_rad);
+    if (pot_is_inverted(&joint->pot, &config->pot, joint->pid.error_rad, joint->pid.duty)) {
         /* Where the motor is no witness, an inversion cannot be distinguished from a push: take the worse. */
         const bool witnessed = config->motor.resistance_ohm > 0.0f;
-        safety_raise(core, witnessed ? FAULT_PUSHED : FAULT_POT_INVERTED, joint);
-        pot_watch(&state->pot, state->reference.position_rad);
+        safety_raise(core, witnessed ? FAULT_PUSHED : FAULT_POT_INVERTED, i);
+        pot_watch(&joint->pot, joint->reference.position_rad);
     }
-    if (pot_is_frozen(&state->pot, &config->pot, counts, state->reference.position_rad)) {
-        safety_raise(core, FAULT_POT_FROZEN, joint);
+    if (pot_is_frozen(&joint->pot, &config->pot, joint->reference.position_rad)) {
+        safety_raise(core, FAULT_POT_FROZEN, i);
     }
-    if (joint_stands(state, config) >= core->config.stall_ticks) {
-        safety_raise(core, FAULT_STALL, joint);
+    if (joint_stands(joint, config) >= core->config.stall_ticks) {
+        safety_raise(core, FAULT_STALL, i);
     }
-    const bool behind = number_size(pid->error_rad) > config->following_rad;
-    state->following_ticks = in_a_row(state->following_ticks, behind);
-    if (state->following_ticks >= core->config.following_ticks) {
-        safety_raise(core, FAULT_FOLLOWING, joint);
+    joint->following_ticks = in_a_row(joint->following_ticks, off_rad > config->following_rad);
+    if (joint->following_ticks >= core->config.following_ticks) {
+        safety_raise(core, FAULT_FOLLOWING, i);
     }
 }

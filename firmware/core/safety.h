@@ -32,8 +32,8 @@ void safety_forget(core_state *core);
 /* Watch the tick timer, the memory, the supply and, while the arm follows the host, the host's silence. */
 void safety_watch_arm(core_state *core, const core_inputs *inputs);
 
-/* Watch a driven joint (0 to 5) that read counts in this tick, after its duty is known; current in its direction. */
-void safety_watch_joint(core_state *core, uint32_t joint, uint32_t counts, float supply_v, float current_a);
+/* Watch a driven joint, number i (0 to 5), after its duty is known. */
+void safety_watch_joint(core_state *core, joint_state *joint, const joint_config *config, uint32_t i);
 
 /* Begin the watch over the configuration in use from its first byte; known: its CRC is still the one it had. */
 void safety_changed_config(core_state *core, bool known);

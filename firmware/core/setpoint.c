@@ -38,6 +38,10 @@ bool setpoint_aim(setpoint_state *setpoint, float to_rad, float to_rad_s, uint32
     setpoint->to_rad_s = to_rad_s;
     setpoint->ticks = lengthened ? (uint32_t)least_ticks + 1u : ticks;
     setpoint->elapsed = 0u;
+    const float per_s = (float)TICKS_PER_S / (float)setpoint->ticks;
+    const float mean_rad_s = distance_rad * per_s;
+    setpoint->square_rad_s2 = (3.0f * mean_rad_s - 2.0f * setpoint->from_rad_s - to_rad_s) * per_s;
+    setpoint->cube_rad_s3 = (setpoint->from_rad_s + to_rad_s - 2.0f * mean_rad_s) * per_s * per_s;
     return lengthened;
 }
 
@@ -50,17 +54,12 @@ float setpoint_advance(setpoint_state *setpoint)
         setpoint->speed_rad_s = setpoint->to_rad_s;
         return 0.0f;
     }
-    const float duration_s = (float)setpoint->ticks * TICK_S;
-    const float per_s = 1.0f / duration_s;
-    const float s = (float)setpoint->elapsed / (float)setpoint->ticks;
-    const float distance = setpoint->to_rad - setpoint->from_rad;
-    const float first = setpoint->from_rad_s * duration_s;
-    const float last = setpoint->to_rad_s * duration_s;
-    const float square = 3.0f * distance - 2.0f * first - last;
-    const float cube = first + last - 2.0f * distance;
-    setpoint->position_rad = setpoint->from_rad + s * (first + s * (square + s * cube));
-    setpoint->speed_rad_s = (first + s * (2.0f * square + s * 3.0f * cube)) * per_s;
-    return (2.0f * square + s * 6.0f * cube) * per_s * per_s;
+    const float t_s = (float)setpoint->elapsed * TICK_S;
+    const float square = setpoint->square_rad_s2;
+    const float cube = setpoint->cube_rad_s3 * t_s;
+    setpoint->position_rad = setpoint->from_rad + t_s * (setpoint->from_rad_s + t_s * (square + cube));
+    setpoint->speed_rad_s = setpoint->from_rad_s + t_s * (2.0f * square + 3.0f * cube);
+    return 2.0f * square + 6.0f * cube;
 }
 
 bool setpoint_slow(setpoint_state *setpoint, float deceleration_rad_s2)

@@ -281,7 +281,8 @@ typedef struct pid_demand {
     float spring_limit;    /* largest duty of kp and kv together: what moves a free joint at its speed limit */
     float gravity_duty;
     float duty_limit;      /* 0 to 1 */
-    float duty_cap;        /* 0 to duty_limit: what the current limit leaves */
+    float duty_low;        /* -duty_limit to 0: what the current limit and a racing motor leave */
+    float duty_high;       /* 0 to duty_limit: likewise */
     float duty_slew_per_s;
     float damped_rad_s;    /* the speed that is damped: the measured one, or the motor's where the reading is wrong */
 } pid_demand;
@@ -292,6 +293,8 @@ typedef struct setpoint_state {
     float speed_rad_s;
     float from_rad;
     float from_rad_s;
+    float square_rad_s2; /* the cubic's coefficients of t^2 and t^3 */
+    float cube_rad_s3;
     float to_rad;
     float to_rad_s;
     uint32_t ticks;    /* length of the cubic */
@@ -312,6 +315,8 @@ typedef struct motor_state {
     float duty;              /* put out in the last tick, direction of the joint */
     float speed_rad_s;       /* by the back-EMF */
     float unsure_rad_s;      /* how far that may be off */
+    float sure_rad_s;        /* the size it has at least; 0 where it is not known */
+    uint32_t known;          /* not 0: a current is seen, without which its sensor may be broken */
     float travel_rad;        /* since the joint was enabled */
     float current_a;         /* the largest of late */
     float gap_rad;           /* travel of the reading less that of the motor; fades */
@@ -343,7 +348,8 @@ typedef struct motor_state {
 typedef struct pot_state {
     uint32_t valid;        /* not 0 once a reading was within its band */
     uint32_t bad_ticks;    /* implausible readings in a row */
-    uint32_t last_counts;
+    uint32_t counts;       /* this tick's, and */
+    uint32_t last_counts;  /* those since which the reference has moved */
     float angle_rad;       /* the last plausible one */
     float mark_rad;        /* where the reference was when the counts last changed */
     int32_t towards;       /* which way the joint is driven to its command, 0 while it is braked */
@@ -363,6 +369,8 @@ typedef struct joint_state {
     float gravity_duty;      /* in use; it follows gravity_asked */
     float gravity_asked;
     float stop_rad_s2;       /* deceleration on the way to a stop along the path */
+    float current_a;         /* the motor's, in the joint's direction, */
+    float over_a;            /* and how far it is beyond its limit */
     float duty_cap;          /* what the current limit leaves of the duty limit */
     float low_rad;           /* soft limits, widened to the joint's position while it is brought back in */
     float high_rad;
@@ -383,6 +391,7 @@ typedef struct core_state {
     uint32_t started;        /* not 0 after the first tick */
     uint32_t tick;
     uint32_t silent_ticks;
+    float supply_v;          /* this tick's */
     uint32_t supply_bad_ticks;
     uint32_t missed;         /* ticks lost of late; fades */
     uint32_t shorted;        /* not 0: windings stay shorted while the drives are off */

@@ -159,7 +159,12 @@ void wire_before_tick(wire_state *wire, core_inputs *inputs)
     inputs->taken_over = sessions - shared->sessions_taken;
     shared->sessions_taken = sessions;
     if (atomic_load(&shared->mail_full) != 0u) {
-        inputs->command = shared->mail;
+        inputs->command.kind = shared->mail.kind;
+        inputs->command.sequence = shared->mail.sequence;
+        inputs->command.move = shared->mail.move;
+        if (shared->mail.kind == COMMAND_GAINS) {
+            inputs->command.gains = shared->mail.gains;
+        }
         atomic_store(&shared->mail_full, 0u);
     } else {
         inputs->command.kind = COMMAND_NONE;

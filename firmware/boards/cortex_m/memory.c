@@ -60,6 +60,17 @@ void *memset(void *to, int value, size_t length)
 {
     uint8_t *target = to;
     const word fill = {(uint8_t)value * 0x01010101u};
+    if (((uintptr_t)to & 3u) == 0u) {
+        register uint32_t r3 __asm__("r3") = (uint8_t)value * 0x01010101u;
+        register uint32_t r4 __asm__("r4") = r3, r5 __asm__("r5") = r3, r6 __asm__("r6") = r3;
+        for (; length >= 32u; length -= 32u) {
+            __asm__ volatile("stmia %0!, {r3-r6}\n"
+                             "stmia %0!, {r3-r6}"
+                             : "+r"(target)
+                             : "r"(r3), "r"(r4), "r"(r5), "r"(r6)
+                             : "memory");
+        }
+    }
     for (; length >= 4u; length -= 4u, target += 4) {
         *(word *)(void *)target = fill;
         KEEP;

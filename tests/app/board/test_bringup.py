@@ -2,6 +2,9 @@
 
 import io
 import json
+import os
+import pty
+import time
 
 import numpy as np
 import pytest
@@ -139,6 +142,33 @@ def test_an_answer_must_be_one_and_q_or_the_end_of_stdin_ends_it(tmp_path, monke
     Bringup(evening.board, typed, tmp_path, [0]).run(["motors"])
     assert said[-3:] == ["'perhaps' is not understood; y, n or q is", said[-2], "ended; what was found is kept"]
     assert evening.plant.drives_s == 0.0
+
+
+def test_typed_at_a_terminal_from_the_swing_to_the_stored_configuration(tmp_path, monkeypatch):
+    evening = Evening(tmp_path)
+    known(evening)
+    evening.joints[0].motor_direction = evening.plant.wiring.motor_signs[0]
+    evening.bringup.found.write(tmp_path / "bringup.json")
+    master, slave = pty.openpty()
+    answers = ["perhaps\n", "y\n", "y\n"]
+
+    def heard(line):
+        if line.endswith("[y/n]: "):
+            os.write(master, answers.pop(0).encode())
+
+    with open(slave, encoding="utf-8") as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        operator = TerminalOperator(heard)
+        Bringup(evening.board, operator, tmp_path, [0]).run(["swing", "verify", "store"])
+        os.write(master, b"\x04")
+        while operator.answer() != "q":  # the end of the input: its reader has ended
+            time.sleep(0.001)
+    os.close(master)
+    assert answers == []
+    config, _ = read_configuration(tmp_path / "board.toml")
+    assert config.tobytes() == evening.board.configuration().tobytes()
+    assert config["joint"]["gains"]["kp_per_rad"][0] > 0
+    assert not evening.board.status.drives_on
 
 
 def test_nobody_who_answers_ends_it(tmp_path, monkeypatch):

@@ -40,6 +40,15 @@ def test_a_healthy_arm_under_load_has_no_fault(arms, library, seed):
     assert arm.first == (None, None)
 
 
+def test_a_resistance_learnt_wrongly_under_a_hand_is_learnt_rightly_afterwards(arms, library):
+    arm, joint = arms.Arm(library, 502012333), 5  # of 10,080 arms the one that this took for a frozen potentiometer
+    arm.enable()
+    arm.rest(1200)
+    assert arm.first == (None, None)
+    seen = arm.model.resistance_ohm[joint] / arms.RESISTANCE_OHM / arm.model.current_gain[joint]
+    assert arm.core.joint[joint].motor.resistance_scale == pytest.approx(seen, rel=0.02)
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_stuck_potentiometer_is_named_and_the_other_joints_are_held(arms, library, seed):
     arm = swinging(arms, library, seed)

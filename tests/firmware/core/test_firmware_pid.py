@@ -50,7 +50,8 @@ class Pid:
 
     def __init__(self, library, *gains, limit=1.0, slew=1000.0, cap=None, spring=1e9):
         self.library, self.state, self.gains = library, c.pid_state(), c.joint_gains(*gains[:4], 0.0, 0.0, *gains[4:])
-        self.demand = c.pid_demand(0, 0, 0, spring, 0, limit, limit if cap is None else cap, slew)
+        high = limit if cap is None else cap
+        self.demand = c.pid_demand(0, 0, 0, spring, 0, limit, -high, high, slew)
         self.limited = 0
         library.pid_reset(ctypes.byref(self.state), 0.0)
 

@@ -7,4 +7,8 @@
 void *memcpy(void *to, const void *from, size_t length);
 void *memset(void *to, int value, size_t length);
 
+/* Short ones of known length become a few instructions; without a C library compilers do that only by this name. */
+#define memcpy __builtin_memcpy
+#define memset __builtin_memset
+
 #endif

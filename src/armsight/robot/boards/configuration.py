@@ -155,6 +155,8 @@ RANGES: Mapping[str, tuple[float, float]] = {
 
 #: The simulated arm's motors (:mod:`armsight.sim.joints`), and how stiffly they are driven.
 _LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S = MotorFigures(6.0, 2.4, 0.03, 0.02, 0.2), 12.0, 24.0
+#: 10 mrad of backlash and five sigma of 20 counts of noise.
+_LAB_APART_RAD = 0.02
 
 
 def lab_configuration() -> Configuration:
@@ -162,7 +164,7 @@ def lab_configuration() -> Configuration:
     config = np.zeros((), CONFIG)
     joint = config["joint"]
     joint["gains"] = np.array(tuple(tuned_gains(_LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S)), GAINS)
-    joint["motor"] = np.array((_LAB_MOTOR.resistance_ohm, _LAB_MOTOR.constant_v_s, 0.03), MOTOR)
+    joint["motor"] = np.array((_LAB_MOTOR.resistance_ohm, _LAB_MOTOR.constant_v_s, _LAB_APART_RAD), MOTOR)
     pot = joint["pot"]
     pot["node_count"], pot["short_counts"], pot["open_counts"], pot["direction"] = 2, 1000, 64500, 1
     pot["counts"][:, :2], pot["angle_rad"][:, :2] = (3277, 62258), (-2.6, 2.6)
