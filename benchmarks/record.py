@@ -1,6 +1,6 @@
 """Figures of recordings: containers, cost of run.mcap, the real bags of tags, kill -9, batches by 1, 2 and 4 processes.
 
-    python benchmarks/record.py containers|cost|beside|bags|killed|batch ... [--data DIR]
+    python benchmarks/record.py containers|cost|beside|paused|bags|killed|batch ... [--data DIR]
 
 Each figure prints what it measured against its target; the exit code is 1 where one is missed. The map of tags of figure
 ``bags`` is fitted on even shots and evaluated on odd ones.
@@ -204,6 +204,43 @@ def beside(blocks: int = 40, shots: int = 60) -> None:
            f"{100 * abs(halves[0] / halves[1] - 1):.1f} %)", abs(change) <= 0.05)  # fmt: skip
 
 
+def paused(blocks: int = 6, shots: int = 150) -> None:
+    """4. Computing time that run.mcap's thread takes from a loop between image and command: as it comes, and paused."""
+    from marker_plate import LENS, parallel_rig
+    from marker_report import disc_target, opened
+
+    rng, rig, arm = np.random.default_rng(4), parallel_rig(LENS, 3.0), open_arm("six_r")
+    states = JointStates(0.001 * np.arange(4), 0.1 + 1e-4 * rng.normal(size=(4, 6)))
+    joints = JointsDatum(states, arm.forward(arm.home), np.eye(6), 0.0)
+    published = Published(rig, opened(disc_target()).body, arm, properties(rig, None, arm))
+
+    def work() -> None:  # about a millisecond of short calls, as a shot is
+        for _ in range(150):
+            np.linalg.solve(np.eye(6), np.eye(6))
+
+    taken: dict[bool, list[float]] = {False: [], True: []}
+    for block in range(blocks):
+        with tempfile.TemporaryDirectory() as folder:
+            sink = McapSink(Path(folder) / "run.mcap", published)
+            sink.start()
+            for _ in range(shots):
+                for _ in range(4):
+                    sink.put(joints)
+                if block % 2:
+                    sink.pause()
+                both, own = time.process_time(), time.thread_time()
+                work()
+                taken[bool(block % 2)].append(time.process_time() - both - (time.thread_time() - own))
+                sink.resume()
+                work()
+                time.sleep(5e-4)  # the board
+            sink.close()
+    off, on = (1e3 * np.array(taken[each]) for each in (False, True))
+    text = [f"{each.mean():.2f}; {np.percentile(each, 99):.2f} ms" for each in (on, off)]
+    report("taken between image and command, mean; 99th percentile",
+           f"{text[0]} (not paused {text[1]}; target a third of that)", bool(on.mean() <= off.mean() / 3))  # fmt: skip
+
+
 #: Recordings: calibration by their author, side of the tags, m, pairs of topics.
 BAGS = {
     "tagslam_2": (0.16, ""),
@@ -302,7 +339,8 @@ def batch(count: int = 100) -> None:
         report("two processes against one", f"{faster:.2f} times (target 1.8; wants two idle cores)", faster >= 1.8)
 
 
-FIGURES = {"containers": containers, "cost": cost, "beside": beside, "bags": bags, "killed": killed, "batch": batch}
+FIGURES = {"containers": containers, "cost": cost, "beside": beside, "paused": paused}
+FIGURES |= {"bags": bags, "killed": killed, "batch": batch}
 
 if __name__ == "__main__":
     for figure in sys.argv[1:] or FIGURES:

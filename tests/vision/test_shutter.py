@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from armsight.data import Body, Correspondences, Missed, PoseEstimate
-from armsight.geometry.pose import inverse, log_se3, pose, transform
+from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import example_rig
+from armsight.vision import shutter
+from armsight.vision.bundle import CAUCHY_SCALE
+from armsight.vision.posefit import PixelObservations, whitened
 from armsight.vision.shutter import (
     Motion,
     Shutters,
@@ -82,6 +85,37 @@ def test_known_readout_is_held_and_stamps_that_differ_are_taken_into_account():
     assert abs(found.skew_s - SKEW_S) < 4 * found.sigmas[0]
     blind = estimate_shutters(RIG, BODY, [replace(shot, apart_s=0.0) for shot in shots], known=known)
     assert isinstance(blind, Missed) or blind.sigmas[0] > 3 * found.sigmas[0]
+
+
+def test_kernels_move_pixels_and_sum_scores_as_whole_poses_and_matrices_do():
+    shot, rng = recorded(7, 0.3, count=1)[0][0], np.random.default_rng(7)
+    o, T = PixelObservations.of(shot.seen, 0.2), shot.T_left_body
+    motion = Motion(rng.normal(size=6), rng.normal(size=6), np.diag(rng.uniform(1e-6, 1e-5, 6)), True)
+    dt, scale2 = np.append(rng.uniform(-0.02, 0.02, len(o.point) - 1), 1e-9), 1.3
+    by = np.column_stack([o.camera, rng.uniform(-0.5, 0.5, len(dt))])
+    p = POINTS[o.point]
+    Ts = T @ exp_se3(motion.twist * dt[:, None] + motion.acceleration * dt[:, None] ** 2 / 2)
+    uv, now = np.empty((2, len(dt), 2))
+    for rows in (o.camera == 0, o.camera == 1):
+        to_camera = inverse(RIG.T_left_right) if o.camera[rows][0] else np.eye(4)
+        camera = RIG.cameras[o.camera[rows][0]]
+        now[rows] = camera.project(transform(to_camera @ T, p[rows]))
+        uv[rows] = o.uv[rows] - camera.project(transform(to_camera @ Ts[rows], p[rows])) + now[rows]
+    np.testing.assert_allclose(shutter._at_one_time(RIG, BODY, o, T, motion, dt).uv, uv, atol=1e-9)
+
+    W, A, _ = whitened(RIG.cameras, RIG.T_left_right, POINTS, o, T)
+    r = (W @ (uv - now)[..., None])[..., 0]
+    d2 = (r**2).sum(axis=1)
+    root = np.repeat(np.sqrt(1.0 / (1.0 + d2 / (CAUCHY_SCALE**2 * scale2)) / scale2), 2)
+    r, A = r.ravel() * root, A * root[:, None]
+    rates = (A.reshape(-1, 2, 6) @ (motion.twist + dt[:, None] * motion.acceleration)[..., None])[..., 0]
+    Q = np.linalg.qr(A)[0]
+    M, *D = ((rates[:, :, None] * by[:, None]).reshape(-1, 2), *(A * np.repeat(b, 2)[:, None] for b in by.T))
+    M, *D = (each - Q @ (Q.T @ each) for each in (M, *D))
+    noise = [[np.trace(a.T @ b @ motion.cov) for b in D] for a in D]
+    found = shutter._linear(RIG, BODY, o, T, motion, (dt, by), 2, scale2)
+    for got, expected in zip(found, (M.T @ r, M.T @ M, noise, d2), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-7)
 
 
 def test_wrong_detections_do_not_move_the_skew():

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Body, Correspondences, Ids, Missed, PoseEstimate, Record
 from armsight.errors import InputError
 from armsight.geometry.matrix import product, solved
-from armsight.geometry.pose import exp_se3, inverse, log_se3
+from armsight.geometry.pose import inverse, log_se3
 from armsight.kernels import kernel
 from armsight.vision.bundle import CAUCHY_SCALE
 from armsight.vision.camera import distort, pair_arguments
@@ -83,11 +83,6 @@ class Motion(Record):
     cov: Array
     centred: bool
 
-    def moved(self, T: Array, dt_s: Array) -> Array:
-        """Return the poses (N, 4, 4) at N times after that of pose T (4, 4), s."""
-        dt = dt_s[:, None]
-        return np.asarray(T @ exp_se3(self.twist * dt + self.acceleration * dt**2 / 2))
-
 
 def motions(t_s: Array, Ts: Array, covs: Array) -> list[Motion | None]:
     """Fit the motion about each of N poses to those around it; None where there are fewer than three.
@@ -114,9 +109,9 @@ def motions(t_s: Array, Ts: Array, covs: Array) -> list[Motion | None]:
         X = tau[..., None] ** np.arange(min(count - 1, 3 if centred else 2) + 1)
         fit = np.linalg.pinv(X)
         twists, accelerations = (fit @ xi)[:, 1], 2 * (fit @ xi)[:, 2]
-        all_cov = np.einsum("gn,gnij->gij", fit[:, 1] ** 2, covs[rows])
-        for k, *of_motion in zip(some, twists, accelerations, all_cov, strict=True):
-            found[k] = Motion(*of_motion, centred)
+        twist_covs = np.einsum("gn,gnij->gij", fit[:, 1] ** 2, covs[rows])
+        for k, twist, acceleration, cov in zip(some, twists, accelerations, twist_covs, strict=True):
+            found[k] = Motion(twist, acceleration, cov, centred)
     return found
 
 
@@ -243,19 +238,16 @@ def _at_one_time(
     if motion is None:
         return o
     uv = np.array(o.uv)
-    _shift(*_known(rig, body, o), *_moves(T, motion), dt_s, uv)
+    arguments = (*_known(rig, body, o, T, motion), dt_s, uv)
+    _shift(*arguments)
     return replace(o, uv=uv)
 
 
-def _known(rig: StereoRig, body: Body, o: PixelObservations) -> tuple[Any, ...]:
-    """Return what the kernels take of a rig and of N observations: two cameras, T_right_left, points, their cameras."""
+def _known(rig: StereoRig, body: Body, o: PixelObservations, T: Array, motion: Motion) -> tuple[Any, ...]:
+    """Return what the kernels take: two cameras, T_right_left, points, their cameras; pose, twist, acceleration."""
     p = np.ascontiguousarray(body.points[o.point])
-    return (*pair_arguments(rig.cameras), inverse(rig.T_left_right), p, o.camera)
-
-
-def _moves(T: Array, motion: Motion) -> tuple[Array, Array, Array]:
-    """Return a pose, a twist and an acceleration, as the kernels take them."""
-    return np.ascontiguousarray(T), motion.twist, motion.acceleration
+    pair = (*pair_arguments(rig.cameras), inverse(rig.T_left_right))
+    return (*pair, p, o.camera, np.ascontiguousarray(T), motion.twist, motion.acceleration)
 
 
 @kernel
@@ -304,11 +296,13 @@ def _carried(xi: Array, p: Array, out: Array) -> None:
     out[2] = p[2] + s * kz + g * (a * ky - b * kx) + xi[2] + g * mz + h * (a * my - b * mx)
 
 
-_PAIR = "const b1[::1], const f8[:, ::1], const f8[:, ::1], f8[:, ::1], const f8[:, ::1], const i8[::1]"
-_MOVES = "const f8[:, ::1], const f8[::1], const f8[::1]"
+_KNOWN = (
+    "const b1[::1], const f8[:, ::1], const f8[:, ::1], f8[:, ::1], const f8[:, ::1], const i8[::1], "
+    "const f8[:, ::1], const f8[::1], const f8[::1]"
+)
 
 
-@kernel(f"{_PAIR}, {_MOVES}, const f8[::1], f8[:, ::1]")
+@kernel(f"{_KNOWN}, const f8[::1], f8[:, ::1]")
 def _shift(
     fisheye: NDArray[np.bool_], k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, T: Array, twist: Array,
     acceleration: Array, dt: Array, uv: Array,
@@ -358,16 +352,25 @@ def _linear(
     dt, by = exposed
     uv = np.array(_at_one_time(rig, body, o, T, motion, dt).uv)
     score, curvature, noise, d2 = np.zeros(count), np.zeros((count, count)), np.zeros((count, count)), np.empty(len(dt))
-    if not _score(
-        *_known(rig, body, o), *_moves(T, motion), dt, by[:, :count].copy(), uv, o.cov_uv, motion.cov,
-        CAUCHY_SCALE**2 * scale2, scale2, score, curvature, noise, d2,
-    ):  # fmt: skip
+    weighting = o.cov_uv, motion.cov, CAUCHY_SCALE**2 * scale2, scale2
+    arguments = (
+        *_known(rig, body, o, T, motion),
+        dt,
+        by[:, :count].copy(),
+        uv,
+        *weighting,
+        score,
+        curvature,
+        noise,
+        d2,
+    )
+    if not _score(*arguments):
         return np.zeros(count), np.zeros((count, count)), np.zeros((count, count)), np.zeros(0)
     return score, curvature, noise, d2
 
 
 @kernel(
-    f"{_PAIR}, {_MOVES}, const f8[::1], f8[:, ::1], f8[:, ::1], const f8[:, :, ::1], const f8[:, ::1], f8, f8, f8[::1], "
+    f"{_KNOWN}, const f8[::1], f8[:, ::1], f8[:, ::1], const f8[:, :, ::1], const f8[:, ::1], f8, f8, f8[::1], "
     "f8[:, ::1], f8[:, ::1], f8[::1]"
 )
 def _score(
