@@ -42,7 +42,7 @@ from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder, write_text
 from armsight.geometry.pose import inverse, log_se3
 from armsight.geometry.rotation import quaternion_wxyz
-from armsight.loop.health import health_lines
+from armsight.loop.health import health_lines, unseen_lines
 from armsight.robot.arm import Arm
 from armsight.vision.detections import detections_text
 from armsight.vision.image import grey
@@ -339,6 +339,7 @@ def _notes(finished: Finished, run: RunData) -> list[str]:
     modes = Counter(run.modes.tolist())
     return [
         *health_lines(outcome.health),
+        *unseen_lines(outcome.fixed_unseen),
         f"hand-eye: {len(outcome.handeye.q)} poses used, {len(outcome.handeye.missed)} missed; left out, a pose is "
         f"predicted to {1e3 * position:.2f} mm, {np.degrees(angle):.3f} deg RMS: the error of the arm's nominal table",
         *outcome.handeye.missed,

@@ -150,6 +150,24 @@ class HealthMonitor:
             return () if self._clocks(changes) else (finding(changes, self._names),)
         return () if self._fixed is None else self._fixed.findings()
 
+    def _moved(self) -> tuple[HealthFinding, ...]:
+        """Return what the estimator and the fixed bodies say: one finding of cameras that moved, where both saw it."""
+        changed, seen = self._changed(), () if self._landmarks is None else self._landmarks.findings()
+        cameras = None if self._landmarks is None else self._landmarks.of_cameras
+        if cameras is None or not any(
+            cause in ("fixed", "estimator") for each in changed for cause in (each.cause, *each.alternatives)
+        ):
+            return (*changed, *seen)
+        (arm,) = changed
+        begins = [each.since_s for each in (arm, cameras) if each.since_s is not None]
+        what = f"{cameras.what}; the poses of the arm show that the cameras did"
+        if self._landmarks is not None and self._landmarks.cameras_moved:
+            what = cameras.what
+        if (arm.cause, arm.unit) == ("fixed", "mm"):
+            what += f": the tool appears displaced by {arm.size:.2f} mm"
+        one = replace(cameras, what=what, since_s=min(begins, default=None))
+        return (one, *(each for each in seen if each is not cameras))
+
     def suspected(self, measurement: PoseMeasurement) -> Array | None:
         """Return the covariance (6, 6) of what may have moved a pose measurement of the tool; None where nothing is."""
         return suspected(measurement, self.changes)
@@ -158,11 +176,9 @@ class HealthMonitor:
         """Return what was found so far; nothing while all is well."""
         self.work()
         late = () if self._clock is None else clock_findings(self._clock, self._newest_s)
-        seen = () if self._landmarks is None else self._landmarks.findings()
         return (
             *(() if self._rig is None else self._rig.findings()),
-            *self._changed(),
-            *seen,
+            *self._moved(),
             *late,
             *self._host.findings(),
         )
