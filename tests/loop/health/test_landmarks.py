@@ -110,8 +110,10 @@ def found_with(monkeypatch, watch, cause, alternatives=()):
     return monitor.findings()
 
 
-@pytest.mark.parametrize("count", [1, 2])
-@pytest.mark.parametrize(("cause", "alternatives"), [("fixed", ()), ("body", ("fixed",)), ("estimator", ())])
+@pytest.mark.parametrize(
+    ("count", "cause", "alternatives"),
+    [(1, "fixed", ()), (2, "fixed", ()), (1, "body", ("fixed",)), (2, "body", ("fixed",)), (2, "estimator", ())],
+)
 def test_cameras_that_arm_and_fixed_bodies_saw_move_are_one_finding(monkeypatch, count, cause, alternatives):
     (found,) = found_with(monkeypatch, watched(10, count, cameras=CAMERAS), cause, alternatives)
     assert (found.cause, found.alternatives, found.since_s) == ("fixed", (), AT_S - 0.2)
@@ -122,3 +124,4 @@ def test_a_joint_that_slips_and_a_body_that_is_not_fixed_are_two_findings(monkey
     cameras, posts = watched(10, 2, cameras=CAMERAS), watched(11, 2, bodies={1: np.array([1e-3, 0, 0, 0, 0, 0])})
     assert [each.cause for each in found_with(monkeypatch, cameras, "joint")] == ["joint", "fixed"]
     assert len(found_with(monkeypatch, posts, "fixed")) == 2
+    assert len(found_with(monkeypatch, watched(10, 1, cameras=CAMERAS), "estimator")) == 2

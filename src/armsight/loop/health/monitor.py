@@ -152,21 +152,23 @@ class HealthMonitor:
 
     def _moved(self) -> tuple[HealthFinding, ...]:
         """Return what the estimator and the fixed bodies say: one finding of cameras that moved, where both saw it."""
-        changed, seen = self._changed(), () if self._landmarks is None else self._landmarks.findings()
-        cameras = None if self._landmarks is None else self._landmarks.of_cameras
-        if cameras is None or not any(
-            cause in ("fixed", "estimator") for each in changed for cause in (each.cause, *each.alternatives)
-        ):
+        changed, marks = self._changed(), self._landmarks
+        seen = () if marks is None else marks.findings()
+        if marks is None or marks.of_cameras is None or not changed:
             return (*changed, *seen)
-        (arm,) = changed
+        (arm,), cameras = changed, marks.of_cameras
+        if "fixed" not in (arm.cause, *arm.alternatives) and not (arm.cause == "estimator" and marks.cameras_moved):
+            return (*changed, *seen)
         begins = [each.since_s for each in (arm, cameras) if each.since_s is not None]
-        what = f"{cameras.what}; the poses of the arm show that the cameras did"
-        if self._landmarks is not None and self._landmarks.cameras_moved:
-            what = cameras.what
+        what = (
+            cameras.what if marks.cameras_moved else f"{cameras.what}; the poses of the arm show that the cameras did"
+        )
         if (arm.cause, arm.unit) == ("fixed", "mm"):
             what += f": the tool appears displaced by {arm.size:.2f} mm"
-        one = replace(cameras, what=what, since_s=min(begins, default=None))
-        return (one, *(each for each in seen if each is not cameras))
+        return (
+            replace(cameras, what=what, since_s=min(begins, default=None)),
+            *(each for each in seen if each is not cameras),
+        )
 
     def suspected(self, measurement: PoseMeasurement) -> Array | None:
         """Return the covariance (6, 6) of what may have moved a pose measurement of the tool; None where nothing is."""

@@ -128,8 +128,6 @@ def open_fixed(specs: Sequence[str], target: str) -> tuple[Target, ...]:
                 raise InputError(
                     f"--fixed {spec} and {other} {alike}: a fixed body is another one, with markers of its own"
                 )
-        if f"--fixed {spec}" in opened:
-            raise InputError(f"--fixed {spec}: given twice")
         opened[f"--fixed {spec}"] = body
     return tuple(opened.values())[1:]
 
