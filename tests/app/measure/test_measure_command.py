@@ -422,6 +422,7 @@ def test_fixed_bodies_that_cannot_be_watched(rendered, armsight, tmp_path):
     shutil.copy(rendered.plate, copied)
     assert_rejected(armsight(*given, rendered.plate), "both have the marker")
     assert_rejected(armsight(*given, copied), "copied.toml and --target")
+    assert_rejected(armsight(*given, "points.csv"), "--fixed points.csv")
     assert_rejected(armsight(*given, "chessboard:9x6:25mm", "--fixed", "chessboard:9x6:25mm"), "at the same distances")
     assert_rejected(armsight(*given, tmp_path / "none.toml"), "none.toml")
     seen = [*given[:4], "--detections", "d.csv", "--fixed", rendered.plate]

@@ -122,6 +122,8 @@ def open_fixed(specs: Sequence[str], target: str) -> tuple[Target, ...]:
     """
     opened = {f"--target {target}": open_target(target)} if specs else {}
     for spec in specs:
+        if _kind(spec) == ".csv":
+            raise InputError(f"--fixed {spec}: a CSV has points, not markers; describe them in a TOML body file")
         body = open_target(spec)
         for other, seen in opened.items():
             if alike := _alike(body, seen):
