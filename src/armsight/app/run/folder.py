@@ -226,7 +226,14 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
         if outcome.handeye is None:
             if outcome.log.joints:
                 keep(write_columns, folder, "joints", joint_columns(*joints_of(outcome.log)))
-            summary = RunSummary(finished.properties, wall_s, outcome.ended_text, {}, health=outcome.health)
+            summary = RunSummary(
+                finished.properties,
+                wall_s,
+                outcome.ended_text,
+                {},
+                health=outcome.health,
+                fixed_unseen=outcome.fixed_unseen,
+            )
             keep(_write_summary, folder, summary)
             return summary, None
         keep(write_handeye, folder, outcome.handeye)
