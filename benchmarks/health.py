@@ -36,7 +36,7 @@ from armsight.sim.example_rig import PLATE_M, TAG_FAMILY, TAG_M, TAG_MIDDLES_M  
 from armsight.sim.render.scene import PosedBody, marker_bits, plate, tag  # noqa: E402
 from armsight.sim.workcell.cameras import WorkcellSource  # noqa: E402
 from armsight.vision.markers.marker import Target  # noqa: E402
-from armsight.vision.markers.targets import open_fixed  # noqa: E402
+from armsight.vision.markers.targets import open_target  # noqa: E402
 
 DEG = float(np.radians(1.0))
 #: When the rig is knocked in a rendered run, s: in the motions with potentiometers alone.
@@ -242,7 +242,7 @@ def fixed_plate(name: str, first: int, at_m: list[float]) -> tuple[Target, Posed
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.toml"
         file.write_text("\n".join(["version = 2", f'name = "{name}"', *tags]) + "\n")
-        (target,) = open_fixed([str(file)], "")
+        target = open_target(str(file))
     return target, PosedBody(tuple(patterns), pose(exp_so3(np.array([0.0, 0.3, 0.0])), np.array(at_m)))
 
 

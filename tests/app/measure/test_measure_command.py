@@ -404,8 +404,11 @@ def test_a_rig_whose_camera_moved_is_named_and_the_exit_code_says_so(rendered, t
 
 def test_a_fixed_body_that_moves_is_named(rendered, armsight, tmp_path):
     post = tmp_path / "post.toml"
-    shutil.copy(rendered.plate, post)
-    given = [rendered.rig, "--target", rendered.plate, "--source", rendered.folder / "arm", "--fixed"]
+    plate = tmp_path / "half.toml"
+    head, *tags = rendered.plate.read_text().split("[[markers]]")
+    plate.write_text("[[markers]]".join([head, *tags[::2]]))
+    post.write_text("[[markers]]".join([head, *tags[1::2]]))
+    given = [rendered.rig, "--target", plate, "--source", rendered.folder / "arm", "--fixed"]
     said = armsight("measure", *given, post, "--json")
     (found,) = said.lines[-1]["health"]
     assert said.code == 3, said.err
@@ -415,7 +418,12 @@ def test_a_fixed_body_that_moves_is_named(rendered, armsight, tmp_path):
 
 def test_fixed_bodies_that_cannot_be_watched(rendered, armsight, tmp_path):
     given = ["measure", rendered.rig, "--target", rendered.plate, "--source", rendered.folder / "arm", "--fixed"]
-    assert_rejected(armsight(*given, rendered.plate), "given twice")
+    copied = tmp_path / "copied.toml"
+    shutil.copy(rendered.plate, copied)
+    assert_rejected(armsight(*given, rendered.plate), "both have the marker")
+    assert_rejected(armsight(*given, copied), "copied.toml and --target")
+    assert_rejected(armsight(*given, "points.csv"), "--fixed points.csv")
+    assert_rejected(armsight(*given, "chessboard:9x6:25mm", "--fixed", "chessboard:9x6:25mm"), "at the same distances")
     assert_rejected(armsight(*given, tmp_path / "none.toml"), "none.toml")
     seen = [*given[:4], "--detections", "d.csv", "--fixed", rendered.plate]
     assert_rejected(armsight(*seen), "--fixed needs images")

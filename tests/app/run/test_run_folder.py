@@ -47,7 +47,18 @@ def test_what_is_not_known_is_null(tmp_path):
     assert summary["count"] == 3
     assert summary["said"] is True
     assert summary["ended_by"] is None
-    assert list(summary) == ["version", "health", "arm", "sigma_m", "values", "count", "said", "wall_s", "ended_by"]
+    assert list(summary) == [
+        "version",
+        "health",
+        "fixed_unseen",
+        "arm",
+        "sigma_m",
+        "values",
+        "count",
+        "said",
+        "wall_s",
+        "ended_by",
+    ]
 
 
 def test_nothing_measured_at_all_is_a_folder_all_the_same(tmp_path):

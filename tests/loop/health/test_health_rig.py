@@ -61,7 +61,7 @@ def test_to_ask_often_changes_nothing():
     for k, (asked, *_) in enumerate(watched_body(8, rotated=np.radians([0.02, 0.0, 0.0]), seconds=2.9)):
         if k % 20 == 0:
             asked.findings()
-    assert asked._rig._window.H == pytest.approx(silent._rig._window.H, rel=1e-12)
+    assert pytest.approx(silent._rig._window.H, rel=1e-12) == asked._rig._window.H
     assert asked.findings() == silent.findings() == asked.findings()
 
 

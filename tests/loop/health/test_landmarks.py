@@ -6,7 +6,10 @@ import pytest
 from armsight.data import PoseEstimate
 from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.geometry.rotation import exp_so3
+from armsight.loop.health import HealthFinding, HealthMonitor
 from armsight.loop.health.landmarks import LandmarkWatch
+from armsight.sim.example_rig import example_rig
+from armsight.sim.workcell.body import body_target
 
 NOISE = np.diag(np.repeat([4e-5, 3e-4], 3) ** 2)
 COV = NOISE + np.diag(np.repeat([2e-4, 5e-4], 3) ** 2)
@@ -96,3 +99,29 @@ def test_what_looks_alike_is_not_decided():
 
 def test_a_body_that_was_not_seen_is_named():
     assert watched(15, 2, seconds=0.3).never_seen == ("post 0", "post 1")
+
+
+def found_with(monkeypatch, watch, cause, alternatives=()):
+    """What a monitor finds, where an arm's estimator saw a change of a cause as well."""
+    arm = HealthFinding(cause, "what the arm says", AT_S - 0.2, 2.0, 0.1, "mm", "", alternatives)
+    monitor = HealthMonitor(example_rig(), body_target().body, 0.0)
+    monitor._landmarks = watch
+    monkeypatch.setattr(monitor, "_changed", lambda: (arm,))
+    return monitor.findings()
+
+
+@pytest.mark.parametrize(
+    ("count", "cause", "alternatives"),
+    [(1, "fixed", ()), (2, "fixed", ()), (1, "body", ("fixed",)), (2, "body", ("fixed",)), (2, "estimator", ())],
+)
+def test_cameras_that_arm_and_fixed_bodies_saw_move_are_one_finding(monkeypatch, count, cause, alternatives):
+    (found,) = found_with(monkeypatch, watched(10, count, cameras=CAMERAS), cause, alternatives)
+    assert (found.cause, found.alternatives, found.since_s) == ("fixed", (), AT_S - 0.2)
+    assert ("the poses of the arm show" in found.what) == (count == 1)
+
+
+def test_a_joint_that_slips_and_a_body_that_is_not_fixed_are_two_findings(monkeypatch):
+    cameras, posts = watched(10, 2, cameras=CAMERAS), watched(11, 2, bodies={1: np.array([1e-3, 0, 0, 0, 0, 0])})
+    assert [each.cause for each in found_with(monkeypatch, cameras, "joint")] == ["joint", "fixed"]
+    assert len(found_with(monkeypatch, posts, "fixed")) == 2
+    assert len(found_with(monkeypatch, watched(10, 1, cameras=CAMERAS), "estimator")) == 2

@@ -24,7 +24,7 @@ from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import SIDES, Body, Image, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
-from armsight.loop.health import HealthFinding, HealthMonitor, health_lines
+from armsight.loop.health import HealthFinding, HealthMonitor, health_lines, unseen_lines
 from armsight.vision.detections import SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows, measurer
 from armsight.vision.markers.disc.target import DiscTarget
@@ -193,8 +193,8 @@ def measure_shots(
     moved = next((r.shutters for r in records if r.shutters is not None), None)
     _keep_noise(stereo, None if skewed else noise, moved, save_rig)
     health = monitor.findings()
-    for name in monitor.fixed_never_seen:
-        click.echo(f"note: the fixed body {name} was seen too rarely to say anything", err=True)
+    for line in unseen_lines(monitor.fixed_never_seen):
+        click.echo(f"note: {line}", err=True)
     if skewed and any(each.cause in ("rig", "time") for each in health):
         # Of a moving body a skew looks like cameras that moved against each other; all shots together size it best.
         health = (*skewed, *(each for each in health if each.cause not in ("rig", "time")))

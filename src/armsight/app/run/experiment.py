@@ -140,6 +140,7 @@ class RunResult:
         picture: the first shot in motion in which the body was found, and its pose.
         health: why the result must not be trusted; empty where nothing says so.
         changes: what explains a motion of the rig or the body; empty where none was found.
+        fixed_unseen: names of the fixed bodies that were seen too rarely to be watched.
         ended_by: the error that ended the run early; None where there was none.
         interrupted: whether the keyboard ended the run.
     """
@@ -156,6 +157,7 @@ class RunResult:
     picture: tuple[Shot, PoseEstimate] | None = None
     health: tuple[HealthFinding, ...] = ()
     changes: tuple[Change, ...] = ()
+    fixed_unseen: tuple[str, ...] = ()
     ended_by: ArmsightError | None = None
     interrupted: bool = False
 
@@ -268,8 +270,6 @@ def _run(
         if look:
             _require_seen(loop, setup, plan)
         work(loop)
-        for name in loop.health.fixed_never_seen:
-            progress(f"the fixed body {name} was seen too rarely to say anything")
     except (ArmsightError, KeyboardInterrupt) as error:
         outcome.interrupted = isinstance(error, KeyboardInterrupt)
         outcome.ended_by = error if isinstance(error, ArmsightError) else None
@@ -279,6 +279,7 @@ def _run(
                 _stopped(loop)
                 loop.close_record()
                 outcome.health, outcome.changes = loop.health.findings(), loop.health.changes
+                outcome.fixed_unseen = loop.health.fixed_never_seen
             outcome.interrupted = outcome.interrupted or bool(again)
 
 

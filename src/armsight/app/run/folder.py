@@ -42,7 +42,7 @@ from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder, write_text
 from armsight.geometry.pose import inverse, log_se3
 from armsight.geometry.rotation import quaternion_wxyz
-from armsight.loop.health import health_lines
+from armsight.loop.health import health_lines, unseen_lines
 from armsight.robot.arm import Arm
 from armsight.vision.detections import detections_text
 from armsight.vision.image import grey
@@ -226,7 +226,14 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
         if outcome.handeye is None:
             if outcome.log.joints:
                 keep(write_columns, folder, "joints", joint_columns(*joints_of(outcome.log)))
-            summary = RunSummary(finished.properties, wall_s, outcome.ended_text, {}, health=outcome.health)
+            summary = RunSummary(
+                finished.properties,
+                wall_s,
+                outcome.ended_text,
+                {},
+                health=outcome.health,
+                fixed_unseen=outcome.fixed_unseen,
+            )
             keep(_write_summary, folder, summary)
             return summary, None
         keep(write_handeye, folder, outcome.handeye)
@@ -339,6 +346,7 @@ def _notes(finished: Finished, run: RunData) -> list[str]:
     modes = Counter(run.modes.tolist())
     return [
         *health_lines(outcome.health),
+        *unseen_lines(outcome.fixed_unseen),
         f"hand-eye: {len(outcome.handeye.q)} poses used, {len(outcome.handeye.missed)} missed; left out, a pose is "
         f"predicted to {1e3 * position:.2f} mm, {np.degrees(angle):.3f} deg RMS: the error of the arm's nominal table",
         *outcome.handeye.missed,

@@ -33,7 +33,7 @@ from armsight.app.run.metrics import (
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import RunData, ToolTrack
 from armsight.files import finite_json
-from armsight.loop.health import HealthFinding, health_lines
+from armsight.loop.health import HealthFinding, health_lines, unseen_lines
 from armsight.robot.arm import Arm
 from armsight.vision.rig import Shutters
 
@@ -120,6 +120,7 @@ class RunSummary:
         shots: numbers of shots.
         studies: error of vision against one quantity after the other.
         health: why the result must not be trusted; empty where nothing says so.
+        fixed_unseen: names of the fixed bodies that were seen too rarely to be watched.
     """
 
     properties: Mapping[str, Any]
@@ -137,6 +138,7 @@ class RunSummary:
     shots: ShotCounts | None = None
     studies: Sequence[Study] = ()
     health: Sequence[HealthFinding] = ()
+    fixed_unseen: Sequence[str] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the object of summary.json, SI units in the keys; numbers that are not known are None."""
@@ -164,6 +166,7 @@ class RunSummary:
         if self.handeye is not None:
             found["studies"] = [_study_json(study) for study in self.studies]
         found["health"] = [each.to_json() for each in self.health]
+        found["fixed_unseen"] = list(self.fixed_unseen)
         found |= {**self.properties, "wall_s": self.wall_s, "ended_by": self.ended_by}
         known: dict[str, Any] = finite_json(found)
         return known
@@ -256,6 +259,7 @@ def summary_of(
         ShotCounts(len(run.vision), run.missed, run.rejected, run.reopened, run.misfit_max),
         studies,
         result.health,
+        result.fixed_unseen,
     )
 
 
@@ -365,6 +369,8 @@ def print_summary(summary: RunSummary, folder: Path) -> None:
             print_table(table)
     for line in health_lines(summary.health):
         click.echo(weak(line), err=True, color=colour())
+    for line in unseen_lines(summary.fixed_unseen):
+        click.echo(f"note: {line}", err=True)
     lines = []
     if (hidden := summary.occlusion) is not None:
         lines.append(

@@ -6,6 +6,6 @@ docs/concepts/health.md.
 """
 
 from armsight.loop.health.monitor import HealthMonitor
-from armsight.loop.health.record import HealthFinding, Trust, health_lines
+from armsight.loop.health.record import HealthFinding, Trust, health_lines, unseen_lines
 
-__all__ = ["HealthFinding", "HealthMonitor", "Trust", "health_lines"]
+__all__ = ["HealthFinding", "HealthMonitor", "Trust", "health_lines", "unseen_lines"]

@@ -67,7 +67,9 @@ class FixedWatch:
         self._C, self._b = np.zeros((0, self._columns, self._columns)), np.zeros((0, self._columns))
         self._squares, self._weights = np.zeros(0), np.zeros(0)
         self._ramp_rows = np.array(rows[:RAMPS])
-        self._shots: list[tuple[Innovation, float]] = []  # since the newest beginning, each so long after the one before, s
+        self._shots: list[
+            tuple[Innovation, float]
+        ] = []  # since the newest beginning, each so long after the one before, s
         self._newest: Innovation | None = None
         self._last_s = -np.inf
         self._rejected: list[Innovation] = []

@@ -89,14 +89,16 @@ class LandmarkWatch:
 
     Attributes:
         cameras_moved: whether the cameras were found to have moved.
+        of_cameras: what says so, or that they may have; None where nothing does.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
         self._landmarks = [_Landmark(name) for name in names]
-        self._found: tuple[HealthFinding, ...] = ()
+        self._not_fixed: tuple[HealthFinding, ...] = ()
         self._fresh: set[int] = set()  # bodies with a new mean since the last test
         self._waited = 0
         self.cameras_moved = False
+        self.of_cameras: HealthFinding | None = None
 
     @property
     def never_seen(self) -> tuple[str, ...]:
@@ -123,48 +125,45 @@ class LandmarkWatch:
         self._waited += 1
         known = {k for k, each in enumerate(self._landmarks) if each.newest is not None}
         if self._fresh == known or self._waited >= _PATIENCE * len(known):  # else a body is not seen any more
-            self._found = self._decided() or self._found
+            of_cameras, not_fixed = self._decided()
+            if of_cameras is not None or not_fixed:
+                self.of_cameras, self._not_fixed = of_cameras, not_fixed
             self._fresh.clear()
             self._waited = 0
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
-        return self._found
+        return self._not_fixed if self.of_cameras is None else (self.of_cameras, *self._not_fixed)
 
-    def _decided(self) -> tuple[HealthFinding, ...]:
-        """Return what the newest means of the bodies in view say."""
+    def _decided(self) -> tuple[HealthFinding | None, tuple[HealthFinding, ...]]:
+        """Return what the newest means of the bodies in view say of the cameras, and of bodies that are not fixed."""
         known = [self._landmarks[k] for k in sorted(self._fresh)]
         moved = [each for each in known if each.moved]
         if not moved:
-            return ()
+            return None, ()
+        most, names = max(moved, key=lambda each: each.shift_m), ", ".join(each.name for each in moved)
+        some = f"fixed bod{'y' if len(moved) == 1 else 'ies'} {names}"
         if len(moved) < len(known):  # one that stands proves that the cameras do, if their motion would show in it
             if _common(known) is None:
-                return tuple(_not_fixed(each) for each in moved)
+                return None, tuple(_not_fixed(each) for each in moved)
             coarse = "the others are measured too coarsely to distinguish the two"
-            return tuple(
-                _finding(each, f"the cameras moved, or the fixed body {each.name}: {coarse}") for each in moved
-            )
+            return _finding(most, f"the cameras moved, or the {some}: {coarse}"), ()
         if len(known) == 1:
-            return (
-                _finding(
-                    moved[0], f"the cameras moved, or the fixed body {moved[0].name}: with one alone the two look alike"
-                ),
-            )
+            return _finding(most, f"the cameras moved, or the {some}: with one alone the two look alike"), ()
         together = _common(known)
         if together is not None:
             self.cameras_moved = True
-            return (_cameras(together, known),)
+            return _cameras(together, known), ()
         without = [(each, _common([other for other in known if other is not each])) for each in known]
         agreed = [(each, common) for each, common in without if len(known) > 2 and common is not None]
         if len(agreed) == 1:
             self.cameras_moved = True
             odd, common = agreed[0]
-            return _cameras(common, [each for each in known if each is not odd]), _not_fixed(odd)
-        names = ", ".join(each.name for each in known)
+            return _cameras(common, [each for each in known if each is not odd]), (_not_fixed(odd),)
         what = (
-            f"the fixed bodies {names} all moved, each by another motion: which are not fixed, or whether the cameras"
+            f"the {some} all moved, each by another motion: which are not fixed, or whether the cameras moved as well"
         )
-        return (_finding(max(known, key=lambda each: each.shift_m), f"{what} moved as well, cannot be distinguished"),)
+        return _finding(most, f"{what}, cannot be distinguished"), ()
 
 
 def _common(marks: Sequence[_Landmark]) -> tuple[Array, Array] | None:

@@ -150,6 +150,26 @@ class HealthMonitor:
             return () if self._clocks(changes) else (finding(changes, self._names),)
         return () if self._fixed is None else self._fixed.findings()
 
+    def _moved(self) -> tuple[HealthFinding, ...]:
+        """Return what the estimator and the fixed bodies say: one finding of cameras that moved, where both saw it."""
+        changed, marks = self._changed(), self._landmarks
+        seen = () if marks is None else marks.findings()
+        if marks is None or marks.of_cameras is None or not changed:
+            return (*changed, *seen)
+        (arm,), cameras = changed, marks.of_cameras
+        if "fixed" not in (arm.cause, *arm.alternatives) and not (arm.cause == "estimator" and marks.cameras_moved):
+            return (*changed, *seen)
+        begins = [each.since_s for each in (arm, cameras) if each.since_s is not None]
+        what = (
+            cameras.what if marks.cameras_moved else f"{cameras.what}; the poses of the arm show that the cameras did"
+        )
+        if (arm.cause, arm.unit) == ("fixed", "mm"):
+            what += f": the tool appears displaced by {arm.size:.2f} mm"
+        return (
+            replace(cameras, what=what, since_s=min(begins, default=None)),
+            *(each for each in seen if each is not cameras),
+        )
+
     def suspected(self, measurement: PoseMeasurement) -> Array | None:
         """Return the covariance (6, 6) of what may have moved a pose measurement of the tool; None where nothing is."""
         return suspected(measurement, self.changes)
@@ -158,11 +178,9 @@ class HealthMonitor:
         """Return what was found so far; nothing while all is well."""
         self.work()
         late = () if self._clock is None else clock_findings(self._clock, self._newest_s)
-        seen = () if self._landmarks is None else self._landmarks.findings()
         return (
             *(() if self._rig is None else self._rig.findings()),
-            *self._changed(),
-            *seen,
+            *self._moved(),
             *late,
             *self._host.findings(),
         )

@@ -64,6 +64,14 @@ def health_lines(health: Sequence[HealthFinding]) -> list[str]:
     return [f"do not trust this result: {found.line()}" for found in health]
 
 
+def unseen_lines(names: Sequence[str]) -> list[str]:
+    """Return the lines for a log or a terminal on fixed bodies that could not be watched."""
+    return [
+        f"the fixed body {name} was seen too rarely to be watched: both cameras must see it, as its file describes it"
+        for name in names
+    ]
+
+
 def alarm_limit(freedom: int, tests_per_s: float, hypotheses: int = 1) -> float:
     """Return the chi-square of an alarm, so that FALSE_ALARMS_PER_MINUTE bounds the false ones (Bonferroni).
 

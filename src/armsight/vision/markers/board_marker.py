@@ -121,27 +121,27 @@ def check_codes(tags: Sequence[Marker], boards: Sequence[Marker]) -> None:
         InputError: such a tag; the message names it and the board.
     """
     for entry in boards:
-        family, count = _codes(open_board(entry.fields["spec"]))
+        family, count = board_codes(open_board(entry.fields["spec"]))
         for tag in tags:
-            if _dictionary(family_name(tag.fields["family"])) == family and tag.fields["id"] < count:
+            if dictionary(family_name(tag.fields["family"])) == family and tag.fields["id"] < count:
                 raise tag.error(
                     f"{tag.fields['family']} id {tag.fields['id']} is on the board {entry.name!r} too, which has ids 0 to "
                     f"{count - 1}: use another id or family"
                 )
 
 
-def _codes(board: CalibrationBoard) -> tuple[str, int]:
+def board_codes(board: CalibrationBoard) -> tuple[str, int]:
     """Return the dictionary of a board's tags and their number; an empty name and 0 where it has no tags."""
     family, count = board.codes
-    return _dictionary(family), count
+    return dictionary(family), count
 
 
-def _dictionary(family: str) -> str:
+def dictionary(family: str) -> str:
     """Return the one name of all families that hold the same tags."""
     return APRILTAGS.get(family, family)
 
 
 def _alike(one: CalibrationBoard, other: CalibrationBoard) -> bool:
     """Whether the finder of one board may find the other: tags of one dictionary, or two of a kind without tags."""
-    families = _codes(one)[0], _codes(other)[0]
+    families = board_codes(one)[0], board_codes(other)[0]
     return families[0] == families[1] if any(families) else type(one) is type(other)

@@ -10,14 +10,17 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
 
 from armsight.data import Body, Detections, Record
 from armsight.errors import InputError
 from armsight.files import read_text
+from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.board import BOARDS, open_board
-from armsight.vision.markers.board_marker import BoardTarget, check_codes
+from armsight.vision.markers.board_marker import BoardTarget, board_codes, check_codes, dictionary
 from armsight.vision.markers.body_file import Marker, check_points, load_body_csv, read_body_file
-from armsight.vision.markers.calibrated_board import load_board_file
+from armsight.vision.markers.calibrated_board import EstimatedBoard, load_board_file
+from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.tag import TagTarget
@@ -32,6 +35,8 @@ MARKERS: dict[str, Callable[[str, Sequence[Marker]], Target]] = {
 
 #: The kind of a plain disc in a body file.
 DISC = "disc"
+#: Bodies without codes whose distances differ by less than this, m, cannot be distinguished safely.
+_SAME_M = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +118,46 @@ def open_fixed(specs: Sequence[str], target: str) -> tuple[Target, ...]:
     """Make the targets that do not move, beside the one that is measured.
 
     Raises:
-        InputError: as :func:`open_target`, or one is given twice.
+        InputError: as :func:`open_target`, or two are given of which one would be taken for the other.
     """
-    twice = [spec for k, spec in enumerate(specs) if spec == target or spec in specs[:k]]
-    if twice:
-        raise InputError(f"--fixed {twice[0]}: given twice; a fixed body is another one than --target")
-    return tuple(open_target(spec) for spec in specs)
+    opened = {f"--target {target}": open_target(target)} if specs else {}
+    for spec in specs:
+        if _kind(spec) == ".csv":
+            raise InputError(f"--fixed {spec}: a CSV has points, not markers; describe them in a TOML body file")
+        body = open_target(spec)
+        for other, seen in opened.items():
+            if alike := _alike(body, seen):
+                raise InputError(
+                    f"--fixed {spec} and {other} {alike}: a fixed body is another one, with markers of its own"
+                )
+        opened[f"--fixed {spec}"] = body
+    return tuple(opened.values())[1:]
+
+
+def _alike(target: Target, other: Target) -> str:
+    """Return why one of two targets may be taken for the other; empty where neither can."""
+    if both := _codes(target) & _codes(other):
+        return "both have the marker {} {}".format(*min(both))
+    apart, beside = (np.sort(pdist(each.body.points)) for each in (target, other))
+    coded = _codes(target) or _codes(other)
+    same = not coded and len(apart) == len(beside) and np.allclose(apart, beside, rtol=0.0, atol=_SAME_M)
+    return "have markers at the same distances" if same else ""
+
+
+def _codes(target: Target) -> set[tuple[str, int]]:
+    """Return family and number of every code on a target."""
+    if isinstance(target, Composite):
+        return set[tuple[str, int]]().union(*(_codes(part) for part in target.parts))
+    if isinstance(target, TagTarget):
+        return {(dictionary(tag.family), tag.identity) for tag in target.tags}
+    if isinstance(target, BoardTarget):
+        return set[tuple[str, int]]().union(*(_codes(mounted.board) for mounted in target.boards))
+    if isinstance(target, EstimatedBoard):
+        return _codes(target.drawing)
+    if isinstance(target, AprilGrid | Charuco):
+        family, count = board_codes(target)
+        return {(family, k) for k in range(count)}
+    return set()
 
 
 def _is_board_file(path: str) -> bool:
