@@ -6,9 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from armsight.app.live import arm
 from armsight.app.live.arm import ArmOptions, ArmStep
 from armsight.app.live.board import StoppableBoard
-from armsight.data import JointStates
+from armsight.data import JointStates, Missed
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.codes import BoardState, Command
 from armsight.robot.boards.contract import Abilities
@@ -177,3 +178,25 @@ def test_logged_joint_angles_stand_beside_the_shot_they_belong_to(tmp_path):
         other.open()
     step.close()
     other.close()
+
+
+def test_what_is_shown_waits_for_the_command_of_a_shot(tmp_path, monkeypatch):
+    monkeypatch.setattr(arm, "_PATIENCE_S", 60.0)
+    monkeypatch.setattr(arm, "_WATCHES_S", 60.0)
+    step, _ = arm_step(tmp_path, None)
+    step.between_shots()  # nothing moves: at once
+    step.capture = SimpleNamespace(newest=None)
+    loop = SimpleNamespace(log=SimpleNamespace(joints=[], poses=[]), mounting=None)
+    step._begun(loop)
+    step.between_shots()  # it watches no shot yet: at once
+    loop.log.poses.append(("0", 0.0, Missed("not seen")))
+    loop.on_period()
+    shown = threading.Event()
+    thread = threading.Thread(target=lambda: (step.between_shots(), shown.set()))
+    thread.start()
+    loop.on_period()  # no shot was answered
+    assert not shown.wait(0.05)
+    while not shown.wait(0.01):
+        loop.log.poses.append(("1", 0.0, Missed("not seen")))
+        loop.on_period()
+    thread.join()

@@ -66,7 +66,8 @@ _IDLE_S, _ASK_S = 0.004, 0.002
 _REST_S, _REST_RAD, _REST_M = 0.6, float(np.radians(0.3)), 1.5e-3
 _FEWEST_SEEN = 2
 _HANDEYE_POSES, _CHART = {False: 30, True: 14}, 400
-_PATIENCE_S = 0.1  # for a command of the loop, by whoever shows something
+#: For a command of the loop, by whoever shows something, s; a loop that answered no shot for so long watches none, s.
+_PATIENCE_S, _WATCHES_S = 0.1, 1.0
 _SLOWLY = 0.25  # share of the arm's limits on the way to the start
 
 
@@ -209,7 +210,7 @@ class ArmStep:
         self._mounting: Mounting | None = None
         self._running: str | None = None
         self._loop: Loop | None = None
-        self._answered = threading.Event()  # a command has followed from a shot
+        self._answered, self._answered_s = threading.Event(), -np.inf  # a command has followed from a shot
         self._seen = 0
         self._chart: deque[tuple[float, float, bool]] = deque(maxlen=_CHART)
         self._results, self._run_folder, self._start = (), None, None
@@ -697,15 +698,16 @@ class ArmStep:
         if isinstance(result, PoseEstimate) and loop.mounting is not None:
             self._mounting = loop.mounting
             self._note_error(loop)
+        self._answered_s = time.monotonic()
         self._answered.set()
 
     def between_shots(self) -> None:
-        """Wait, while a loop runs, until a command has followed from a shot, 0.1 s at most.
+        """Wait, while a loop watches shots, until a command has followed from one, 0.1 s at most.
 
         The loop shares the interpreter with all other threads; what is computed in the time from there to the next shot
         delays no image's command.
         """
-        if self._loop is not None:
+        if self._loop is not None and time.monotonic() - self._answered_s < _WATCHES_S:
             self._answered.clear()
             self._answered.wait(_PATIENCE_S)
 

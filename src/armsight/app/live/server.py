@@ -43,6 +43,7 @@ from armsight.app.live.capture import LiveShot
 from armsight.app.live.quality import Note
 from armsight.app.live.records import command_of, json_text
 from armsight.app.live.session import LiveSession
+from armsight.app.run.loop import SWITCH_S
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.vision.image import grey
 
@@ -130,7 +131,7 @@ class LiveServer:
         Raises:
             InputError: the port is in use, or the host is none of this computer's.
         """
-        sys.setswitchinterval(min(sys.getswitchinterval(), 1e-3))  # a stop waits no longer for whoever computes
+        sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_S))  # a stop waits no longer for whoever computes
         self._thread.start()
         self._ready.wait()
         if self._failed is not None:
