@@ -253,9 +253,9 @@ def test_the_noise_of_discs_is_stored_and_files_without_it_are_read(tmp_path):
     path, noise = tmp_path / "rig.json", (CameraNoise(1.4, 700.0), CameraNoise(0.8, 650.0))
     replace(ordinary_rig(), disc_noise=noise).save(path)
     found = StereoRig.load(path)
-    assert found.disc_variance_factors == (1.4, 0.8)
-    assert found.disc_noise[1].freedom == 650.0
-    assert found.perturbed(np.zeros(found.parameter_count)).disc_variance_factors == (1.4, 0.8)
+    assert found.disc_variance_factors == (1.4, 1.0)
+    assert (found.disc_noise[1].variance_factor, found.disc_noise[1].freedom) == (0.8, 650.0)
+    assert found.perturbed(np.zeros(found.parameter_count)).disc_variance_factors == (1.4, 1.0)
     assert StereoRig.load(saved(tmp_path)).disc_variance_factors == (1.0, 1.0)
     for wrong in (3, {"left": {}}, {side: {"variance_factor": -1, "freedom": 9} for side in ("left", "right")}):
         with pytest.raises(InputError, match=r"rig\.json: "):

@@ -164,10 +164,14 @@ class StereoRig(Record):
 
     @property
     def disc_variance_factors(self) -> tuple[float, float]:
-        """By which the variances of discs' centres in left and right images are multiplied; 1 where it is unknown."""
+        """By which the variances of discs' centres in left and right images are multiplied; 1 where it is unknown.
+
+        At least one: residuals do not have what all discs of an image share, and cannot show that a variance is too large.
+        """
         if self.disc_noise is None:
             return 1.0, 1.0
-        return self.disc_noise[0].variance_factor, self.disc_noise[1].variance_factor
+        left, right = self.disc_noise
+        return max(left.variance_factor, 1.0), max(right.variance_factor, 1.0)
 
     @property
     def parameter_count(self) -> int:

@@ -66,9 +66,8 @@ def test_a_far_start_ends_at_the_same_pose():
     rig, T = hd_rig(known=True), someplace(np.random.default_rng(2))
     target = discs_of(PLATE.body.points, radius=0.015)
     seen = Correspondences(np.arange(3), np.array(expect(rig, target, T).uv), np.tile(1e-4 * np.eye(2), (3, 2, 1, 1)))
-    cov = 1e-8 * np.eye(6)
-    near = locate_discs(rig, target.body, target, NOTHING, seen, T, cov)
-    far = locate_discs(rig, target.body, target, NOTHING, seen, T @ exp_se3(np.full(6, 0.02)), cov)
+    near = locate_discs(rig, target.body, target, NOTHING, seen, T)
+    far = locate_discs(rig, target.body, target, NOTHING, seen, T @ exp_se3(np.full(6, 0.02)))
     step = log_se3(inverse(near.T_left_body) @ far.T_left_body)
     # Settled to 1e-4 px: a thousandth of a sigma at 0.01 px of noise, times the geometry's weakness.
     assert step @ np.linalg.solve(near.cov, step) < 0.03**2

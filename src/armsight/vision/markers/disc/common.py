@@ -3,8 +3,7 @@
 In: what each disc's fit shows (``fit.FitBuffers.shown``). Out: corrected centres and their covariances.
 
 Noise that is correlated between neighbouring pixels moves the first harmonic of a rim, the centre, as it moves the higher
-odd ones, which no ellipse has: their power, over all discs, is the factor of the variances, above one or below. Six
-harmonics of a disc are an estimate of six degrees of freedom; what the factor is expected to be before counts as two.
+odd ones, which no ellipse has: their power, over all discs, is the factor of the variances.
 
 A lens darkens its image with the square of the distance from the middle (cos^4, and vignetting): at x the light has the
 relative gradient a (x - m), in 1/px, with m the image's middle. A disc that is fitted as flat is off by up to 0.01 px then,
@@ -36,11 +35,8 @@ from armsight.vision.markers.disc.fit import (
     of_centre,
 )
 
-#: Degrees of freedom of one rim's odd harmonics, the median of chi-square of as many, over that, and how many medians count
-#: at most: beyond is no noise (chance: 1 %).
-_RIM_FREEDOM, _CHI6_MEDIAN, _MOST_MEDIANS = 6.0, 0.8914, 3.0
-#: Degrees of freedom that the expectation of white noise counts as.
-_WHITE_FREEDOM = 2.0
+#: Median of chi-square of six degrees, over six.
+_CHI6_MEDIAN = 0.8914
 #: From so many discs on, what they have in common is the image's.
 _LEAST_DISCS = 3
 #: Vignetting as it is to be expected: standard deviation of the light that is missing in the corners.
@@ -59,26 +55,19 @@ def common(image: NDArray[np.uint8], n: int, work: FitBuffers, shared: Array) ->
         image: (H, W) grey.
         n: number of discs.
         work: what they show.
-        shared: (4,) filled: factor of the variance of centres by correlated noise; mean square of the
+        shared: (4,) filled: factor of the variance of centres by correlated noise, one at least; mean square of the
             deviations of the rims' sectors beyond white noise, px^2; the vignetting a, 1/px^2; n / 2 times its variance.
             Medians, so that a few discs that are none do not count. An error of a moves all centres alike: in three of the
             six degrees of freedom of a pose it counts n times as much as if it were independent, in the others hardly.
     """
     discs = work.discs
     shared[0], shared[1], shared[2], shared[3] = 1.0, 0.0, 0.0, 0.0
-    if n == 0:
-        return
-    power, off = np.sort(discs[:n, 0].copy()), np.sort(discs[:n, 1].copy())
-    most, total = _MOST_MEDIANS * 0.5 * (power[(n - 1) // 2] + power[n // 2]) / _CHI6_MEDIAN, 0.0
-    for i in range(n):
-        total += _RIM_FREEDOM * min(power[i], most)
-    # The mean of the variance, given chi-square: then squared errors over it are one on average however few the discs.
-    shared[0] = (total + _WHITE_FREEDOM) / (_RIM_FREEDOM * n + _WHITE_FREEDOM - 2.0)
     if n < _LEAST_DISCS:
         return
+    power, off = np.sort(discs[:n, 0].copy()), np.sort(discs[:n, 1].copy())
+    shared[0] = max(0.5 * (power[(n - 1) // 2] + power[n // 2]) / _CHI6_MEDIAN, 1.0)
     shared[1] = max(0.5 * (off[(n - 1) // 2] + off[n // 2]), 0.0)
-    slope, weight = np.empty(n), np.empty(n)
-    total = 0.0
+    slope, weight, total = np.empty(n), np.empty(n), 0.0
     for i in range(n):
         u, v, k = _from_middle(image, discs[i], 0), _from_middle(image, discs[i], 1), discs[i, 5:8]
         weight[i] = (u * u * k[0] + 2 * u * v * k[1] + v * v * k[2]) / shared[0]
