@@ -40,7 +40,7 @@ void *memcpy(void *to, const void *from, size_t length)
         for (; length >= 32u; length -= 32u) {
             __asm__ volatile("ldmia %1!, {r3-r6, r8-r10, r12}\n"
                              "stmia %0!, {r3-r6, r8-r10, r12}"
-                             : "+r"(target), "+r"(source)
+                             : "+&r"(target), "+r"(source)
                              :
                              : "r3", "r4", "r5", "r6", "r8", "r9", "r10", "r12", "memory");
         }

@@ -159,10 +159,14 @@ def test_typed_at_a_terminal_from_the_swing_to_the_stored_configuration(tmp_path
     with open(slave, encoding="utf-8") as stdin:
         monkeypatch.setattr("sys.stdin", stdin)
         operator = TerminalOperator(heard)
-        Bringup(evening.board, operator, tmp_path, [0]).run(["swing", "verify", "store"])
-        os.write(master, b"\x04")
-        while operator.answer() != "q":  # the end of the input: its reader has ended
-            time.sleep(0.001)
+        try:
+            Bringup(evening.board, operator, tmp_path, [0]).run(["swing", "verify", "store"])
+        finally:
+            os.write(master, b"\x04")
+            for _ in range(5000):  # until its reader has come to the end of the input, else stdin cannot be closed
+                if operator.answer() == "q":
+                    break
+                time.sleep(0.001)
     os.close(master)
     assert answers == []
     config, _ = read_configuration(tmp_path / "board.toml")

@@ -424,6 +424,14 @@ def test_fixed_bodies_that_cannot_be_watched(rendered, armsight, tmp_path):
     assert_rejected(armsight(*given, copied), "copied.toml and --target")
     assert_rejected(armsight(*given, "points.csv"), "--fixed points.csv")
     assert_rejected(armsight(*given, "chessboard:9x6:25mm", "--fixed", "chessboard:9x6:25mm"), "at the same distances")
+    for count in (50, 100):  # the first markers of one are those of the other
+        marker = f'tag = {{ family = "DICT_4X4_{count}", id = 3, size_mm = 40 }}'
+        pose = "position_mm = [0, 0, 0]\nquaternion_wxyz = [1, 0, 0, 0]"
+        (tmp_path / f"d{count}.toml").write_text(
+            f'version = 2\nname = "d"\n[[markers]]\nname = "t"\n{pose}\n{marker}\n'
+        )
+    both = "both have the marker DICT_4X4 3"
+    assert_rejected(armsight(*given, tmp_path / "d50.toml", "--fixed", tmp_path / "d100.toml"), both)
     assert_rejected(armsight(*given, tmp_path / "none.toml"), "none.toml")
     seen = [*given[:4], "--detections", "d.csv", "--fixed", rendered.plate]
     assert_rejected(armsight(*seen), "--fixed needs images")

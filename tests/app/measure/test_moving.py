@@ -72,8 +72,8 @@ def test_the_skew_is_noted_found_and_used(late, armsight, tmp_path):
         assert all(abs(float(row["skew_s"]) - SKEW_S) < 2e-4 for row in csv.DictReader(file))
     again = armsight("measure", tmp_path / "rig2.json", *start[2:])
     assert again.lines == found.lines
-    armsight(*start, "--save-rig", tmp_path / "rig3.json")
-    assert not (tmp_path / "rig3.json").exists()  # a skew is no noise
+    assert_rejected(armsight(*start, "--save-rig", tmp_path / "rig3.json"), "or a body of discs")
+    assert not (tmp_path / "rig3.json").exists()
 
 
 def test_the_shutters_of_the_rig_are_used_for_recordings_only(late, armsight, tmp_path):

@@ -370,9 +370,10 @@ class LiveServer:
                     if self.session.arm.busy:
                         await asyncio.get_running_loop().run_in_executor(self._work, self.session.between_shots)
                     for side in self._due(client):
-                        number, data = await self._encoded(side)
-                        client.images[side] = (number, False)
-                        await client.socket.send(_HEADER.pack(side, number) + data)
+                        if (encoded := await self._encoded(side)) is not None:
+                            number, data = encoded
+                            client.images[side] = (number, False)
+                            await client.socket.send(_HEADER.pack(side, number) + data)
                     continue
                 awaited = client.visible and any(shown for _, shown in client.images)  # the cameras, not the page
                 client.wake.clear()
@@ -386,11 +387,12 @@ class LiveServer:
             return []
         return [side for side, (number, shown) in enumerate(client.images) if shown and newest.number != number]
 
-    async def _encoded(self, side: int) -> tuple[int, bytes]:
-        """Return the number of the newest shot and its view as JPEG, encoded once for all pages."""
+    async def _encoded(self, side: int) -> tuple[int, bytes] | None:
+        """Return the number of the newest shot and its view as JPEG, encoded once for all pages; None without a shot."""
         async with self._encoding[side]:
             live = self.session.newest
-            assert live is not None
+            if live is None:  # other cameras are being opened
+                return None
             if self._jpeg[side][0] != live.number:
                 data = await asyncio.get_running_loop().run_in_executor(self._work, _jpeg, live, side)
                 self._jpeg[side] = live.number, data

@@ -191,7 +191,7 @@ def measure_shots(
         raise ArmsightError(_nothing_measured(records, _flipped(stereo, found, first)))
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
     moved = next((r.shutters for r in records if r.shutters is not None), None)
-    _keep_noise(stereo, None if skewed else noise, moved, save_rig)
+    _keep_noise(stereo, noise, bool(skewed), moved, save_rig)
     health = monitor.findings()
     for line in unseen_lines(monitor.fixed_never_seen):
         click.echo(f"note: {line}", err=True)
@@ -208,9 +208,14 @@ def measure_shots(
     return health
 
 
-def _keep_noise(rig: StereoRig, noise: DiscNoise | None, moved: Shutters | None, save_rig: Path | None) -> None:
-    """Say how noisy the cameras' discs were, and write the rig with that and with the shutters that were found."""
-    found = None if noise is None else noise.found()
+def _keep_noise(
+    rig: StereoRig, noise: DiscNoise | None, skewed: bool, moved: Shutters | None, save_rig: Path | None
+) -> None:
+    """Say how noisy the cameras' discs were, and write the rig with that and with the shutters that were found.
+
+    Of shots that show a skew the residuals are those of the motion, not of the discs.
+    """
+    found = None if noise is None or skewed else noise.found()
     if found is not None:
         left, right = found
         kept = "" if save_rig is not None or rig.disc_noise is not None else "; --save-rig keeps it for single shots"
@@ -221,10 +226,9 @@ def _keep_noise(rig: StereoRig, noise: DiscNoise | None, moved: Shutters | None,
     if save_rig is None:
         return
     if found is None and moved is None:
-        click.echo(
-            f"note: {save_rig} was not written: too few shots, or the body moved too little, to know the discs' noise",
-            err=True,
-        )
+        few = "too few shots, or the body moved too little, to know the discs' noise"
+        why = "the shots show a skew, which hides the discs' noise: give --skew find" if skewed else few
+        click.echo(weak(f"{save_rig} was not written: {why}"), err=True, color=colour())
         return
     replace(rig, shutters=moved or rig.shutters, disc_noise=found or rig.disc_noise).save(save_rig)
 

@@ -391,4 +391,5 @@ def timing(setup: Setup, delay: Delay) -> LoopTiming:
 def joint_loops(setup: Setup) -> JointLoops | None:
     """Return what the servo must know of the joints' own controllers; None where they are ours, with an integral."""
     abilities = setup.board.abilities
-    return JointLoops(abilities.steps_rad, abilities.rest_rad_s) if abilities.own_controller else None
+    steps_rad = abilities.steps_rad or (0.0,) * setup.arm.joints
+    return JointLoops(steps_rad, abilities.rest_rad_s) if abilities.own_controller else None

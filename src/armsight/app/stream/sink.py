@@ -87,7 +87,7 @@ class Sink:
                 self._changed.notify()
 
     def pause(self) -> None:
-        """Begin to write no other datum until :meth:`resume`, for ``TICK_S`` at the most, unless much waits.
+        """Begin to write no other datum until :meth:`resume`, for ``TICK_S`` each at the most, unless much waits.
 
         A thread that runs Python when a command is due delays it by up to the interpreter's switch interval.
         """

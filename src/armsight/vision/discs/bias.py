@@ -322,7 +322,6 @@ class Expected(Record):
         radius_px: (M, 2) longer half axes of the ellipses, px.
         facing: (M, 2) cosine between a disc's normal and its direction to the camera; NaN where the normal is unknown.
         J: (M, 2, 2, 6) derivative of ``uv`` by the tangent of the pose.
-        J_bias: (M, 2, 2, 6) derivative of ``bias`` by the tangent of the pose.
         J_rig: (M, 2, 2, P) derivative of ``uv`` by the rig's parameters.
         cov_bias: (M, 2, 2, 2) covariance of the bias where the normal is not known, px^2; zero where it is.
     """
@@ -333,7 +332,6 @@ class Expected(Record):
     radius_px: Array
     facing: Array
     J: Array
-    J_bias: Array
     J_rig: Array
     cov_bias: Array
 
@@ -366,7 +364,7 @@ def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
     known = np.isfinite(normals[:, 0])
     T_right_left, count = inverse(rig.T_left_right), len(points)
     uv, bias, shape = np.empty((count, 2, 2)), np.empty((count, 2, 2)), np.empty((count, 2, 3))
-    facing, J, J_bias = np.empty((count, 2)), np.empty((count, 2, 2, 6)), np.empty((count, 2, 2, 6))
+    facing, J = np.empty((count, 2)), np.empty((count, 2, 2, 6))
     J_rig, cov = np.zeros((count, 2, 2, rig.parameter_count)), np.zeros((count, 2, 2, 2))
     first = 0
     for side, camera in enumerate(rig.cameras):
@@ -382,7 +380,7 @@ def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
         by_position = np.concatenate([np.broadcast_to(R, (count, 3, 3)), -R @ skew(points)], axis=2)
         J[:, side] = J_P @ by_position
         J[:, side, :, 3:] -= J_n @ (R @ skew(np.where(known[:, None], normals, 0.0)))
-        bias[:, side], J_bias[:, side] = uv[:, side] - centre, J[:, side] - J_p @ by_position
+        bias[:, side] = uv[:, side] - centre
         reach2 = (target.radii_m**2 / p[:, 2]) ** 2
         moved = reach2[:, None, None] * np.diag([1.0, 1.0, 8.0]) / 15
         cov[~known, side] = (J_p @ moved @ np.swapaxes(J_p, 1, 2))[~known]
@@ -392,7 +390,7 @@ def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
             J_rig[:, side, :, first:] = np.concatenate([-J_p, J_p @ skew(p)], axis=2)
     mean, half = (shape[..., 0] + shape[..., 2]) / 2, (shape[..., 0] - shape[..., 2]) / 2
     radius = np.sqrt(mean + np.hypot(half, shape[..., 1]))
-    return Expected(uv, bias, shape, radius, facing, J, J_bias, J_rig, cov)
+    return Expected(uv, bias, shape, radius, facing, J, J_rig, cov)
 
 
 def centred(rig: StereoRig, target: DiscTarget, T_left_body: Array, seen: Correspondences) -> Correspondences:

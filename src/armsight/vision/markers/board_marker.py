@@ -7,6 +7,7 @@ about x.) Points are named after the marker and their name on the board: ``B.0``
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -137,8 +138,8 @@ def board_codes(board: CalibrationBoard) -> tuple[str, int]:
 
 
 def dictionary(family: str) -> str:
-    """Return the one name of all families that hold the same tags."""
-    return APRILTAGS.get(family, family)
+    """Return the one name of all families that hold the same tags: the first of DICT_4X4_100 are those of DICT_4X4_50."""
+    return APRILTAGS.get(family, re.sub(r"(\dX\d)_\d+$", r"\1", family))
 
 
 def _alike(one: CalibrationBoard, other: CalibrationBoard) -> bool:

@@ -139,8 +139,14 @@ def _alike(target: Target, other: Target) -> str:
     if both := _codes(target) & _codes(other):
         return "both have the marker {} {}".format(*min(both))
     apart, beside = (np.sort(pdist(each.body.points)) for each in (target, other))
+    kinds = {type(each.drawing if isinstance(each, EstimatedBoard) else each) for each in (target, other)}
     coded = _codes(target) or _codes(other)
-    same = not coded and len(apart) == len(beside) and np.allclose(apart, beside, rtol=0.0, atol=_SAME_M)
+    same = (
+        not coded
+        and len(kinds) == 1
+        and len(apart) == len(beside)
+        and np.allclose(apart, beside, rtol=0.0, atol=_SAME_M)
+    )
     return "have markers at the same distances" if same else ""
 
 

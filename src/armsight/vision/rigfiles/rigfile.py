@@ -224,4 +224,6 @@ def not_held(rig: StereoRig) -> tuple[str, ...]:
         lost.append("the covariance of the rig's parameters")
     if rig.shutters is not None:
         lost.append(f"the shutters: {rig.shutters}")
+    if rig.disc_noise is not None:
+        lost.append("the noise of discs' centres: {} (left), {} (right)".format(*rig.disc_noise))
     return (*lost, f"the detection noise sigma_px ({rig.sigma_px:g} px)", "the provenance")

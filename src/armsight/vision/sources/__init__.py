@@ -58,5 +58,5 @@ def open_source(spec: str) -> Source:
 
 
 def notes_of(source: Source) -> tuple[str, ...]:
-    """Return what a source left out or found odd when it was opened, a line each."""
+    """Return what a source left out or found odd, so far, a line each."""
     return tuple(getattr(source, "notes", ()))

@@ -213,9 +213,14 @@ def open_usb(rest: str, capture: Callable[[str], Capture] | None = None) -> UsbS
     return UsbSource(left, right)
 
 
+def is_one(rest: str) -> bool:
+    """Say whether the text after ``usb:`` names one camera alone."""
+    return re.fullmatch(r"[^,@]+(@[^,]*)?(,[a-z]+=[^,]*)*", rest) is not None
+
+
 def parsed_usb(rest: str) -> tuple[list[str], Settings]:
     """Read the text after ``usb:``."""
-    if re.fullmatch(r"[^,@]+(@[^,]*)?(,[a-z]+=[^,]*)*", rest):
+    if is_one(rest):
         raise InputError(f"usb:{rest} names one camera, two are needed: expected {_FORM}")
     form = re.fullmatch(r"([^,]+),([^,@]+)(?:@(\d+)x(\d+))?(?:@(\d+(?:\.\d+)?))?((?:,[a-z]+=[^,=]+)*)", rest)
     named = dict(part.split("=") for part in form[6].split(",")[1:]) if form else {}

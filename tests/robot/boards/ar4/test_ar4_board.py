@@ -245,3 +245,24 @@ def test_a_goal_that_changes_at_rest_within_the_dead_steps_is_reached_in_the_sen
         angles.append(device.true_deg)
     moved = (angles[1] - angles[0]) * board.model.steps_per_deg
     np.testing.assert_allclose(moved, [steps, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-6)  # no backlash was taken up anew
+
+
+def test_a_motion_that_begins_right_after_such_a_goal_is_followed_by_all_joints(homed):
+    board, _ = homed
+    q = np.radians([3.0, 10.0, -15.0, 5.0, 20.0, 5.0])
+    follow(board, q, 1.5)
+    reached = {}
+    for steps in (0, 1):
+        step = np.radians(steps / board.model.steps_per_deg) * np.eye(6)[0]
+        for _ in range(60):
+            board.send(JointCommand(q, REST, REST, 0.02))
+            board.receive(0.02)
+        board.send(JointCommand(q + step, REST, REST, 0.02))
+        board.receive(0.02)
+        for k in range(1, 13):
+            ramp = np.radians(15.0) * (0.02 * k) ** 2 * np.eye(6)[3]
+            board.send(JointCommand(q + step + ramp, ramp / (0.01 * k), REST, 0.02))
+            reached[steps] = np.degrees(board.receive(0.02).q[-1][3] - q[3])
+        follow(board, q, 1.5)
+    assert reached[0] > 0.2
+    assert reached[1] == pytest.approx(reached[0], abs=0.1)

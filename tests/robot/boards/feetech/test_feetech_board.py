@@ -299,4 +299,10 @@ def test_columns_of_lerobot_are_degrees_where_no_percent_can_be():
         degree_columns("log.csv", [head, ["0.0", "90.5", "1", "2", "3", "-99.5", "300"]])
     with pytest.raises(InputError, match="read are those of one SO-100 or SO-101"):
         degree_columns("log.csv", [["left_elbow_flex.pos", *head], ["1", *rows[1]]])
-    assert degree_columns("log.csv", [["q1_deg"], ["1"]]) == [["q1_deg"], ["1"]]
+    for names in (
+        ["q1_deg"],
+        ["q1_deg", "left_shoulder_pan.pos", *head],
+        ["q1", "tcp.pos"],
+    ):  # named already, or others'
+        table = [names, ["1"] * len(names)]
+        assert degree_columns("log.csv", table) == table

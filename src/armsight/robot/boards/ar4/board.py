@@ -98,6 +98,7 @@ class Ar4Board:
         self._goal_speed: Array = np.zeros(JOINTS)
         self._written_s = self._back_s = -np.inf
         self._back = np.zeros(JOINTS)  # motor steps from which a goal is approached
+        self._near = np.zeros(JOINTS, bool)  # the joints that are on the way there
         self._approached: Array | None = None  # the goal that was approached so, motor steps
 
     @classmethod
@@ -319,11 +320,11 @@ class Ar4Board:
         """
         now = self._now()
         goal = np.rint(self.model.reported_deg(np.degrees(self._goal)) * self.model.steps_per_deg)
-        still = max(np.abs(self._goal_speed).max(), np.abs(self._speed_rad_s).max()) < _STILL_RAD_S
-        if now < self._back_s + 2 * _BACK_S:  # on the way back, or forth
-            goal = self._back if now < self._back_s + _BACK_S else goal
-        elif not still:
-            self._approached = None
+        moves = np.abs(self._goal_speed).max() >= _STILL_RAD_S
+        if not moves and now < self._back_s + 2 * _BACK_S:  # on the way back, or forth
+            goal = np.where(self._near, self._back, goal) if now < self._back_s + _BACK_S else goal
+        elif moves or np.abs(self._speed_rad_s).max() >= _STILL_RAD_S:
+            self._approached, self._back_s = None, -np.inf
         else:
             here = np.rint(self._reported * self.model.steps_per_deg)
             off = goal - here
@@ -336,8 +337,8 @@ class Ar4Board:
                 back = here - np.sign(off) * (DEAD_STEPS + 1)
                 # At a limit there is no way back, and the goal is approached from beyond.
                 back = np.where((back < low) | (back > high), goal + np.sign(off) * (DEAD_STEPS + 1), back)
-                self._approached, self._back, self._back_s = goal, np.where(near, back, goal), now
-                goal = self._back
+                self._approached, self._near, self._back, self._back_s = goal, near, back, now
+                goal = np.where(near, back, goal)
         # Half a step more, as the firmware cuts off what is not a whole one.
         self._link.write(lines.move_to(((goal + 0.5 * np.sign(goal)) / self.model.steps_per_deg).tolist()))
         self._written_s = now

@@ -75,7 +75,7 @@ def degree_columns(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
     """
     head = [cell.strip() for cell in rows[0]] if rows else []
     theirs = [name for name in head if name.endswith(_POSITION) and name != GRIPPER + _POSITION]
-    if not theirs:
+    if not {f"{name}{_POSITION}" for name in NAMES} & set(theirs) or {"q1_deg", "q1_rad"} & set(head):
         return rows
     known = [name + _POSITION for name in NAMES]
     if sorted(theirs) != sorted(known):
