@@ -314,13 +314,18 @@ def test_an_interrupt_does_not_wait_for_what_is_being_computed():
 
 
 def test_the_interpreter_settings_of_a_loop_are_restored_afterwards():
-    before = sys.getswitchinterval()
-    for in_time in (True, False):
-        with steady(in_time=in_time):
-            assert (sys.getswitchinterval() < before) == in_time
-            assert not gc.isenabled()
-        assert sys.getswitchinterval() == before
-        assert gc.isenabled()
+    others = sys.getswitchinterval()
+    sys.setswitchinterval(0.005)
+    try:
+        before = sys.getswitchinterval()
+        for in_time in (True, False):
+            with steady(in_time=in_time):
+                assert (sys.getswitchinterval() < before) == in_time
+                assert not gc.isenabled()
+            assert sys.getswitchinterval() == before
+            assert gc.isenabled()
+    finally:
+        sys.setswitchinterval(others)
 
 
 def test_interrupts_are_held_back_and_reported():
