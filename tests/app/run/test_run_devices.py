@@ -141,7 +141,7 @@ def _agrees_with_the_truth(far, loop, tmp_path):
 
     lags = np.arange(-0.02, 0.02, 2e-4)
     best = lags[np.argmin([off(lag) for lag in lags])]
-    # The delay's sigma, 0.4 ms, jitter and drift; and a transmission that was longer, on a busy computer, when the delay was
+    # The delay's sigma, 0.4 ms, jitter and drift; and on a busy computer a transmission that was longer when the delay was
     # found than it is now.
     assert abs(best) < 3e-3
     assert off(best) < 1e-3  # discs of 3 px seen from 0.8 m; twice what is measured
