@@ -260,6 +260,9 @@ def test_the_noise_of_discs_is_stored_and_files_without_it_are_read(tmp_path):
     for wrong in (3, {"left": {}}, {side: {"variance_factor": -1, "freedom": 9} for side in ("left", "right")}):
         with pytest.raises(InputError, match=r"rig\.json: "):
             StereoRig.load(saved(tmp_path, disc_noise=wrong))
+    for wrong in (True, [1], {side: {"variance_factor": True, "freedom": 9} for side in ("left", "right")}):
+        with pytest.raises(InputError, match="disc_noise: expected left and right"):
+            StereoRig.load(saved(tmp_path, disc_noise=wrong))
 
 
 def test_shutters_are_stored_and_files_without_them_are_read(tmp_path):

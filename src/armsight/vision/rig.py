@@ -350,13 +350,20 @@ def _shutters(entry: dict[str, Any] | None) -> Shutters | None:
     return Shutters(float(entry["skew_s"]), float(entry["readout_s"]), cov, float(entry.get("jitter_s", 0.0)))
 
 
-def _disc_noise(entry: dict[str, Any] | None) -> tuple[CameraNoise, CameraNoise] | None:
+def _of(entry: object, key: str) -> object:
+    """Return what a JSON object has under a key; None where it is no object, or has none."""
+    return entry.get(key) if isinstance(entry, dict) else None
+
+
+def _disc_noise(entry: object) -> tuple[CameraNoise, CameraNoise] | None:
     """Build what a rig file says of the noise of its cameras' discs, if it does."""
     if entry is None:
         return None
-    left, right = (
-        CameraNoise(float(entry[side]["variance_factor"]), float(entry[side]["freedom"])) for side in ("left", "right")
-    )
+    given = [_of(_of(entry, side), key) for side in ("left", "right") for key in ("variance_factor", "freedom")]
+    numbers = [float(x) for x in given if isinstance(x, int | float) and not isinstance(x, bool)]
+    if len(numbers) != len(given):
+        raise InputError("disc_noise: expected left and right, each with the numbers variance_factor and freedom")
+    left, right = CameraNoise(*numbers[:2]), CameraNoise(*numbers[2:])
     return left, right
 
 
