@@ -105,6 +105,10 @@ class CameraNoise(Record):
             if not 0 < value < np.inf:
                 raise InputError(f"{name} of a camera's disc noise must be a positive number, got {value}")
 
+    def to_json(self) -> dict[str, float]:
+        """Return the object that rig files and ``rig show --json`` have."""
+        return {"variance_factor": self.variance_factor, "freedom": self.freedom}
+
     def __str__(self) -> str:
         """Return the factor with its sigma, for people."""
         return f"{self.variance_factor:.2f} ± {self.variance_factor * np.sqrt(2 / self.freedom):.2f}"
@@ -251,10 +255,8 @@ class StereoRig(Record):
         if self.shutters is not None:
             document["shutters"] = self.shutters.to_json()
         if self.disc_noise is not None:
-            document["disc_noise"] = {
-                side: {"variance_factor": noise.variance_factor, "freedom": noise.freedom}
-                for side, noise in zip(("left", "right"), self.disc_noise, strict=True)
-            }
+            left, right = self.disc_noise
+            document["disc_noise"] = {"left": left.to_json(), "right": right.to_json()}
         return json.dumps(document, indent=1) + "\n"
 
     @staticmethod

@@ -168,10 +168,7 @@ def _json(path: str, rig: StereoRig) -> dict[str, Any]:
         "shutters": None if rig.shutters is None else rig.shutters.to_json(),
         "disc_noise": None
         if rig.disc_noise is None
-        else {
-            side: {"variance_factor": noise.variance_factor, "freedom": noise.freedom}
-            for side, noise in zip(("left", "right"), rig.disc_noise, strict=True)
-        },
+        else dict(zip(("left", "right"), (noise.to_json() for noise in rig.disc_noise), strict=True)),
         "provenance": dict(rig.provenance),
     }
 
