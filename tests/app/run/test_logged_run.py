@@ -112,6 +112,16 @@ def test_rows_that_are_shifted_by_one_are_found_and_said(armsight, setting, tmp_
     assert "the angles of the row before fit every shot far better than its own" in said.err
 
 
+def test_angles_that_cannot_be_the_arms_are_said(armsight, setting, tmp_path):
+    names, _, q, _ = setting
+    exchanged = q[:, [0, 2, 1, 3, 4, 5]]
+    table(tmp_path / "angles.csv", ["shot", *DEG], [[n, *np.degrees(a)] for n, a in zip(names, exchanged, strict=True)])
+    said = run(armsight, tmp_path, "--json")
+    assert said.code == 3
+    assert "the joints' order is q1, q3, q2, q4, q5, q6" in said.err
+    assert said.lines[0]["weak"][0].startswith("the data fit this arm if")
+
+
 @pytest.mark.parametrize(
     ("header", "rows", "said"),
     [

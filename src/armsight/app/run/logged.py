@@ -23,11 +23,13 @@ from armsight.app.run.angles import LoggedAngles
 from armsight.app.run.calibrate import HandEyeRun
 from armsight.app.run.folder import write_handeye
 from armsight.data import Array, Missed, PoseEstimate, Record
-from armsight.errors import CalibrationError
+from armsight.errors import CalibrationError, InputError
 from armsight.files import write_text
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators import Mounting
 from armsight.loop.handeye.handeye import SHARES, HandEye, Share, calibrate_handeye
+from armsight.loop.identify.diagnose import check_plausible, without_tool
+from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
 from armsight.vision.markers.marker import Target
 from armsight.vision.measure import measure
@@ -50,6 +52,7 @@ class LoggedRun(Record):
         shots: how many shots there were.
         unpaired: shots that no row of angles belongs to.
         shift: 1 where the angles of the row before fit the shots better than their own, -1 those of the row behind, else 0.
+        implausible: why these angles cannot be this arm's; None where they can.
     """
 
     run: HandEyeRun
@@ -57,6 +60,7 @@ class LoggedRun(Record):
     shots: int
     unpaired: tuple[str, ...]
     shift: int
+    implausible: str | None
 
     @property
     def error_mm(self) -> Array:
@@ -72,7 +76,7 @@ class LoggedRun(Record):
     def weak(self) -> tuple[str, ...]:
         """Why the result must not be trusted; empty where nothing says so."""
         if not self.shift:
-            return ()
+            return () if self.implausible is None else (self.implausible,)
         side = "before" if self.shift > 0 else "behind"
         return (
             f"the angles of the row {side} fit every shot far better than its own: are rows and images shifted by one?",
@@ -138,8 +142,19 @@ def run_logged(
     approach = np.sign(np.where(np.abs(steps) > _MOVED_RAD, steps, 0.0))
     mounting = replace(Mounting.of(found, arm), cov=np.zeros((12, 12)))
     run = HandEyeRun(mounting, found, q, Ts, covs, approach, missed)
-    progress("hand-eye: are rows and shots shifted?")
-    return LoggedRun(run, tuple(names[k] for k in good), len(names), unpaired, _shift(arm, run, centre))
+    progress("hand-eye: are rows and shots shifted, are the angles this arm's?")
+    shift = _shift(arm, run, centre)
+    implausible = None if shift else _implausible(arm, q[found.used], Ts[found.used])
+    return LoggedRun(run, tuple(names[k] for k in good), len(names), unpaired, shift, implausible)
+
+
+def _implausible(arm: Arm, q: Array, Ts_left_body: Array) -> str | None:
+    """Return why the angles of poses cannot be this arm's, with what would make them fit; None where they can."""
+    try:
+        check_plausible(without_tool(arm), Measured(q, Ts_left_body[:, None, :3, 3], Ts_left_body[:, :3, :3]))
+    except InputError as error:
+        return str(error)
+    return None
 
 
 def _calibrated(
