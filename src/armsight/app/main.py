@@ -12,6 +12,7 @@ import sys
 
 import click
 
+from armsight.app.interrupts import terminate_as_interrupt
 from armsight.app.messages import colour, print_error
 from armsight.errors import ArmsightError
 
@@ -91,7 +92,8 @@ def group() -> None:
 
 
 def main() -> None:
-    """Run the command line and exit: 0 done, 2 a mistake in the input (one line on stderr), 130 interrupted."""
+    """Run the command line and exit: 0 done, 2 a mistake in the input (one line on stderr), 130 Ctrl-C or SIGTERM."""
+    terminate_as_interrupt()
     try:
         code = group.main(prog_name="armsight", standalone_mode=False, color=colour())
         if sys.stdout is not None:

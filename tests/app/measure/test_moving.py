@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from armsight.app.measure import run as measure_run
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import example_rig
@@ -107,3 +108,9 @@ def test_images_without_times_are_rejected(late, armsight):
     folder = late[0]
     pairs = "--left", folder / "left" / "left*.png", "--right", folder / "left" / "right*.png"
     assert_rejected(armsight("measure", folder / "rig.json", *TARGET, *pairs, "--skew", "find"), "recording with times")
+
+
+def test_a_rig_file_that_the_shots_have_nothing_for_is_said(tmp_path, capsys):
+    assert not measure_run._keep_noise(example_rig((640, 360)), None, False, None, tmp_path / "rig.json")
+    assert "rig.json was not written: too few shots" in capsys.readouterr().err
+    assert not (tmp_path / "rig.json").exists()

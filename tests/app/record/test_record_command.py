@@ -293,7 +293,8 @@ main()
 """
 
 
-def test_ctrl_c_in_a_real_process(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_of_a_real_process(tmp_path, number):
     """A recording without an end, interrupted as soon as some of it is stored."""
     folder = tmp_path / "a"
     process = subprocess.Popen(
@@ -306,7 +307,7 @@ def test_ctrl_c_in_a_real_process(tmp_path):
     )
     while process.poll() is None and not Path(folder, "right000004.png").exists():
         time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     out, err = process.communicate(timeout=60)
     found = read_back(folder)
     assert process.returncode == 130

@@ -87,11 +87,14 @@ def command(
         raise InputError('the page needs websockets, which is not installed: pip install "armsight[live]"') from None
 
     from armsight.app.live.server import LiveServer
-    from armsight.app.live.session import LiveSession, SessionOptions
+    from armsight.app.live.session import SIM, LiveSession, SessionOptions
     from armsight.app.stream.datum import Published
     from armsight.app.stream.streams import open_streams
+    from armsight.vision.sources import check_source
     from armsight.vision.sources.usb import is_one, parsed_usb
 
+    if source is not None and not source.startswith(SIM):
+        check_source(source)
     if source is not None and source.startswith("usb:") and not is_one(source.removeprefix("usb:")):
         parsed_usb(source.removeprefix("usb:"))  # cameras may come later, their names may not; one alone the page says
     open_streams(stream, Published(), lambda line: click.echo(line, err=True)).close()  # a mistake is said now

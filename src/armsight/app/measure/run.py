@@ -191,7 +191,7 @@ def measure_shots(
         raise ArmsightError(_nothing_measured(records, _flipped(stereo, found, first)))
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
     moved = next((r.shutters for r in records if r.shutters is not None), None)
-    _keep_noise(stereo, noise, bool(skewed), moved, save_rig)
+    saved = _keep_noise(stereo, noise, bool(skewed), moved, save_rig)
     health = monitor.findings()
     for line in unseen_lines(monitor.fixed_never_seen):
         click.echo(f"note: {line}", err=True)
@@ -205,15 +205,18 @@ def measure_shots(
         click.echo(weak(line), err=True, color=colour())
     if as_json and health:
         click.echo(json.dumps({"health": [found.to_json() for found in health]}))
+    if not saved and not health:
+        click.get_current_context().exit(1)
     return health
 
 
 def _keep_noise(
     rig: StereoRig, noise: DiscNoise | None, skewed: bool, moved: Shutters | None, save_rig: Path | None
-) -> None:
+) -> bool:
     """Say how noisy the cameras' discs were, and write the rig with that and with the shutters that were found.
 
-    Of shots that show a skew the residuals are those of the motion, not of the discs.
+    Returns False where a rig was to be written and the shots showed nothing to write. Of shots that show a skew the
+    residuals are those of the motion, not of the discs.
     """
     found = None if noise is None or skewed else noise.found()
     if found is not None:
@@ -224,13 +227,14 @@ def _keep_noise(
             err=True,
         )
     if save_rig is None:
-        return
+        return True
     if found is None and moved is None:
         few = "too few shots, or the body moved too little, to know the discs' noise"
         why = "the shots show a skew, which hides the discs' noise: give --skew find" if skewed else few
         click.echo(weak(f"{save_rig} was not written: {why}"), err=True, color=colour())
-        return
+        return False
     replace(rig, shutters=moved or rig.shutters, disc_noise=found or rig.disc_noise).save(save_rig)
+    return True
 
 
 def _keeping(results: Iterator[Result], first: list[Shot], noise: DiscNoise | None) -> Iterator[Result]:

@@ -65,7 +65,7 @@ def command(
         "recording": recording,
         "shots": len(replayed.poses),
         "measured": measured,
-        "missed": dict(reasons),
+        "missed": [{"reason": reason, "shots": count} for reason, count in reasons.most_common()],
         "estimates": len(replayed.live),
         "differences": replayed.differences,
         "same": None if replayed.differences is None else not any(replayed.differences.values()),

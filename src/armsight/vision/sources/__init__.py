@@ -24,7 +24,7 @@ from armsight.vision.sources.url import open_url
 from armsight.vision.sources.usb import open_usb
 from armsight.vision.sources.video import open_video
 
-__all__ = ["SOURCES", "FolderSource", "PairsSource", "Source", "notes_of", "open_source"]
+__all__ = ["SOURCES", "FolderSource", "PairsSource", "Source", "check_source", "notes_of", "open_source"]
 
 #: Kind -> what opens the rest of the text; another kind of source is one line here.
 SOURCES: dict[str, Callable[[str], Source]] = {
@@ -35,6 +35,18 @@ SOURCES: dict[str, Callable[[str], Source]] = {
     "bag": open_bag_source,
     "lerobot": open_lerobot,
 }
+
+
+def check_source(spec: str) -> None:
+    """Reject a text that can never be a source; what it names may come later.
+
+    Raises:
+        InputError: neither a known kind nor a folder.
+    """
+    kind, colon, _ = spec.partition(":")
+    if not (colon and kind in SOURCES) and not os.path.isdir(os.path.expanduser(spec)):
+        known = ", ".join(f"{name}:..." for name in SOURCES)
+        raise InputError(f"{spec}: not a source: known are {known}, or the path of a folder")
 
 
 def open_source(spec: str) -> Source:
@@ -48,13 +60,9 @@ def open_source(spec: str) -> Source:
         InputError: an unknown kind, or what is named is not there or not usable.
         DeviceError: a camera does not answer.
     """
+    check_source(spec)
     kind, colon, rest = spec.partition(":")
-    if colon and kind in SOURCES:
-        return SOURCES[kind](rest)
-    if os.path.isdir(os.path.expanduser(spec)):
-        return FolderSource.open(spec)
-    known = ", ".join(f"{name}:..." for name in SOURCES)
-    raise InputError(f"{spec}: not a source: known are {known}, or the path of a folder")
+    return SOURCES[kind](rest) if colon and kind in SOURCES else FolderSource.open(spec)
 
 
 def notes_of(source: Source) -> tuple[str, ...]:
