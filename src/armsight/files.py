@@ -9,7 +9,7 @@ import math
 import os
 import re
 import tempfile
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -119,6 +119,12 @@ def read_columns(text: str | None, known: Collection[str]) -> dict[str, str]:
             raise InputError(f"--columns {text}: {part.strip()} repeats a name")
         columns[name] = theirs
     return columns
+
+
+def columns_unused(names: Sequence[str], most: int = 8) -> str:
+    """Return which columns of a table were not read, as text, the first of many."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"columns not used: {', '.join(names[:most])}{more}"
 
 
 class _NamedFile(io.FileIO):

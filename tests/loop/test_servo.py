@@ -255,3 +255,19 @@ def test_whole_steps_are_whole_and_no_worse_than_each_joint_rounded():
         np.testing.assert_array_equal(whole_steps(J, 0.05 * requested / 4, steps), 0.0)  # it would hunt
     assert (left <= rounded + 1e-9).all()
     assert left.mean() < 0.95 * rounded.mean()
+
+
+def test_backlash_is_crossed_by_whole_steps_where_that_is_worth_it_and_not_known_to_be_wrong():
+    J, steps = np.zeros((6, 2)), np.full(2, 1e-3)
+    J[0] = [0.3, 0.29]
+    gaps = np.array([[0.0, 5.2e-3], [5.2e-3, 0.0]])
+    up = whole_steps(J, np.array([0.0, 3e-3]), steps, gaps)
+    np.testing.assert_allclose(
+        up, [3e-3, 0.0], atol=1e-12
+    )  # the joint that has no backlash to cross moves for the other
+    down = whole_steps(J, np.array([-3e-3, 0.0]), steps, gaps)
+    np.testing.assert_allclose(down, [0.0, -3e-3], atol=1e-12)
+    alone = whole_steps(J[:, :1], np.array([-12e-3]), steps[:1], gaps[:, :1])
+    np.testing.assert_allclose(alone, [-17e-3], atol=1e-12)  # 17 steps less 5.2 of backlash
+    none = whole_steps(J[:, :1], np.array([-2e-3]), steps[:1], gaps[:, :1])
+    np.testing.assert_array_equal(none, 0.0)  # half of 5.2 is more than 2

@@ -41,6 +41,8 @@ CROSS_S, CROSS_M = 0.3, 3e-5
 #: most while there is none; a change is made where it lowers the error by this share of the largest displacement that one
 #: step of one joint makes: less would hunt.
 LOOK_S, LOOK_MOST_S, WORTH_STEPS = 0.25, 1.0, 0.25
+#: Backlash that a joint must be taken through before it displaces the tool is known to this share of itself.
+GAP_SHARE = 0.5
 #: In a choice between whole steps an error of 1 rad counts as much as one of this, m.
 STEP_LEVER_M = 0.05
 #: How fast the servo learns by how much joints rest off their commands, s; that changes with the load from pose to pose.
@@ -135,6 +137,7 @@ class Aim(Record):
         U: (6, k) of its k = min(6, n) singular values, linear rows over the arm's size, and so are ``s`` and ``Vt``.
         s: (k,).
         Vt: (k, n).
+        passed_s: since the last command, s; the period where that is not known.
     """
 
     goal: Joints
@@ -145,6 +148,7 @@ class Aim(Record):
     U: Array
     s: Array
     Vt: Array
+    passed_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +189,7 @@ class PoseServo:
         self._goal: Joints | None = None
         self._rest_s, self._lasting = 0.0, np.zeros(6)
         self._look_s, self._looks, self._stepped_to = 0.0, 0, np.zeros(arm.joints)
+        self._last: tuple[Trajectory, float] | None = None  # the motion and its time at the last aim
 
     def aim(self, motion: Trajectory, t_s: float, gravity: Callable[[Array], ArrayLike] = np.zeros_like) -> Aim:
         """Return the reference of the next command.
@@ -194,12 +199,15 @@ class PoseServo:
             t_s: time since its start, on the clock of the estimator's newest reading, s.
             gravity: returns the duty (n,) that holds the arm against gravity at joint angles (n,), passed on.
         """
+        passed_s = t_s - self._last[1] if self._last is not None and self._last[0] is motion else 0.0
+        self._last = motion, t_s
         ahead = motion.at(t_s + self.timing.period_s)
         goal = self._goal or motion.at(t_s)
         duty = checked(gravity(ahead.q), (self._arm.joints,), "gravity")
         jacobian = self._arm.jacobian(goal.q)
         U, s, Vt = np.linalg.svd(jacobian / self._scale[:, None], full_matrices=False)
-        return Aim(goal, ahead, self._arm.forward(np.stack([goal.q, ahead.q])), duty, jacobian, U, s, Vt)
+        Ts = self._arm.forward(np.stack([goal.q, ahead.q]))
+        return Aim(goal, ahead, Ts, duty, jacobian, U, s, Vt, passed_s if passed_s > 0.0 else self.timing.period_s)
 
     def step(self, aim: Aim, estimator: Estimator, trust: Trust = Trust.FULL) -> ServoStep:
         """Make the next command.
@@ -272,6 +280,16 @@ class PoseServo:
         here, there = estimator.tool(np.stack([aim.goal.q, aim.goal.q]) + self._correction, sides, pressed=True)
         return self._joints(aim, behind(here, there))
 
+    def _gaps(self, estimator: Estimator, aim: Aim) -> Array:
+        """Return the backlash (2, n), rad, that each joint is to be taken through before it moves the tool up, and down."""
+        n = self._arm.joints
+        sides = np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
+        here, *there = estimator.tool(aim.goal.q + self._correction + 0.0 * sides, sides, pressed=True)
+        columns = (aim.jacobian / self._scale[:, None]).T
+        missing = np.array([behind(here, T) / self._scale for T in there]).reshape(2, n, 6)
+        by_joint = (missing * columns).sum(axis=2) / np.maximum((columns**2).sum(axis=1), UNCORRECTED_BELOW**2)
+        return np.asarray(np.maximum(np.array([[1.0], [-1.0]]) * by_joint, 0.0))
+
     def _stepped(self, estimator: Estimator, aim: Aim, error: Array) -> Array:
         """Return the change (n,) over joints that move by steps: look, move by whole steps, let the joints arrive.
 
@@ -281,18 +299,19 @@ class PoseServo:
         arrived_s = self.timing.latency_s + self.timing.vision_period_s + self.timing.response_s
         if self._look_s == 0.0:
             self._stepped_to = self._correction
-        self._look_s += self.timing.period_s
+        self._look_s += aim.passed_s
         if self._look_s > arrived_s:
-            self._looks = min(self._looks + 1, math.ceil(LOOK_MOST_S / self.timing.period_s))
+            self._looks = min(self._looks + 1, math.ceil(LOOK_MOST_S / aim.passed_s))
             self._lasting += (error - self._lasting) / self._looks
         if self._look_s > arrived_s + LOOK_S:
-            steps = np.array(self._joint_loops.steps_rad)
             requested = self._joints(aim, self._lasting)
-            requested += self._crossed(estimator, aim, requested, np.abs(requested) > 0.5 * steps)
-            change = whole_steps(aim.jacobian, requested, steps)
+            change = whole_steps(
+                aim.jacobian, requested, np.array(self._joint_loops.steps_rad), self._gaps(estimator, aim)
+            )
             self._stepped_to, self._look_s = self._correction + change, arrived_s
-            if change.any():
-                self._look_s, self._looks, self._lasting = self.timing.period_s, 0, np.zeros(6)
+            if change.any():  # what the rate lets it take comes on top
+                most = RATE_SHARE * self._arm.qd_max
+                self._look_s, self._looks, self._lasting = -float((np.abs(change) / most).max()), 0, np.zeros(6)
         return self._stepped_to - self._correction
 
     def _droops(self, estimate: ArmEstimate, aim: Aim) -> None:
@@ -305,7 +324,7 @@ class PoseServo:
         requested = max(np.abs(aim.goal.qd).max(), np.abs(aim.ahead.qd).max())
         stepping = self._joint_loops is not None and self._rest_s > 0.0  # its own steps are not a motion
         still = bool(requested < STANDING_RAD_S and (stepping or np.abs(estimate.qd).max() < self._rest_rad_s))
-        self._rest_s = self._rest_s + self.timing.period_s if still else 0.0
+        self._rest_s = self._rest_s + aim.passed_s if still else 0.0
         if not still:
             self._lasting = np.zeros(6)
         return still and self._rest_s > estimate.vision_age_s
@@ -336,38 +355,54 @@ class PoseServo:
         return ServoStep(command, mode, correction, error, said)
 
 
-def whole_steps(J: Array, requested: Array, steps: Array) -> Array:
+def whole_steps(J: Array, requested: Array, steps: Array, gaps: Array | None = None) -> Array:
     """Return the whole steps that displace the tool most nearly as requested angles would; none where that gains little.
 
     The nearest combination, not each joint rounded: steps of several joints make up for each other. It is a local minimum
-    of the search over one joint or two by one step, from the rounded angles (the nearest point of a lattice: Babai, 1986).
+    of the search over one joint or two by one step (the nearest point of a lattice: Babai, 1986), from the rounded angles
+    and from none. A joint that is first to be taken through backlash displaces the tool by what its steps leave of that,
+    and by less or more as far as the backlash is not known (GAP_SHARE): a joint that moves on needs no such thing.
 
     Args:
         J: (6, n) Jacobian, m/rad and rad/rad.
-        requested: (n,) joint angles, rad.
+        requested: (n,) angles by which the joints would have to move the tool, rad.
         steps: (n,) the joints' steps, rad; 0 has no step.
+        gaps: (2, n) backlash that each joint is taken through first, upwards and downwards, rad; None for none.
 
     Returns:
         (n,) changes of the joints, rad.
     """
     n = len(steps)
-    lever = np.repeat([1.0, STEP_LEVER_M], 3)[:, None]
-    by_step, whole = lever * J * steps, steps > 0
-    count = np.where(whole, np.rint(requested / np.where(whole, steps, 1.0)), 0.0)
-    left = lever[:, 0] * (J @ np.where(whole, requested, 0.0))
-    before, left = float(np.linalg.norm(left)), left - by_step @ count
+    gaps = np.zeros((2, n)) if gaps is None else gaps
+    lever, whole = np.repeat([1.0, STEP_LEVER_M], 3)[:, None] * J, steps > 0
+    by = np.where(whole, steps, 1.0)
+    requested_m = lever @ np.where(whole, requested, 0.0)
+    unsure = (GAP_SHARE * gaps) ** 2 * (lever**2).sum(axis=0)
+
+    def counts(index: Array) -> tuple[Array, Array]:
+        """Return steps (..., n) and the error (...,), m^2, that the index-th effective steps (..., n) leave."""
+        gap = np.where(index > 0, gaps[0], gaps[1])
+        count = np.sign(index) * (np.abs(index) + np.floor(gap / by))
+        left = requested_m - np.where(whole, count * by - np.sign(index) * gap, 0.0) @ lever.T
+        return count, (left**2).sum(axis=-1) + (np.where(index > 0, unsure[0], unsure[1]) * (index != 0)).sum(axis=-1)
+
     ones = np.eye(n)
     pairs = [a * ones[i] + b * ones[j] for i in range(n) for j in range(i) for a in (-1, 1) for b in (-1, 1)]
-    moves = np.concatenate([ones, -ones, np.reshape(pairs, (-1, n))])
-    while True:
-        after = np.linalg.norm(left[:, None] - by_step @ moves.T, axis=0)
-        best = int(np.argmin(after))
-        if after[best] > np.linalg.norm(left) - 1e-9:
-            break
-        count, left = count + moves[best], left - by_step @ moves[best]
-    worth = WORTH_STEPS * float(np.linalg.norm(by_step[:3], axis=0).max())
-    count = count if before - np.linalg.norm(left) > worth else np.zeros(n)
-    return np.where(whole, count * steps, requested)
+    moves = np.concatenate([ones, -ones, 2 * ones, -2 * ones, np.reshape(pairs, (-1, n))]) * whole
+    found = []
+    for index in (np.where(whole, np.rint(requested / by), 0.0), np.zeros(n)):
+        while True:
+            after = counts(index + moves)[1]
+            best = int(np.argmin(after))
+            if after[best] > counts(index)[1] - 1e-18:
+                break
+            index = index + moves[best]
+        found.append((float(counts(index)[1]), index))
+    left, index = min(found, key=lambda each: each[0])
+    worth = WORTH_STEPS * float(np.linalg.norm((lever * by)[:3] * whole, axis=0).max())
+    gains = float(np.linalg.norm(requested_m)) - math.sqrt(left) > worth
+    continuous = requested + np.where(requested > 0, gaps[0], -gaps[1] * (requested < 0))
+    return np.where(whole, counts(index)[0] * by if gains else 0.0, continuous)
 
 
 def _corrected(s: Array) -> Array:

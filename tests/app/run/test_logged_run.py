@@ -165,8 +165,10 @@ def test_motion_is_not_for_logged_poses(armsight, setting, tmp_path):
 
 
 def test_angles_far_apart_in_time_are_not_interpolated(tmp_path):
-    path = table(tmp_path / "a.csv", ["t_s", *DEG], [[0.0, *[0.0] * 6], [1.0, *[10.0] * 6], [1.1, *[20.0] * 6]])
+    rows = [[0.0, *[0.0] * 6, 1], [1.0, *[10.0] * 6, 2], [1.1, *[20.0] * 6, 3]]
+    path = table(tmp_path / "a.csv", ["t_s", *DEG, "elbow_flex.pos"], rows)
     angles = read_angles(path, open_arm("six_r"))
+    assert angles.unused == ("elbow_flex.pos",)
     before, within, exact = angles.at(["a", "b", "c"], [0.5, 1.05, 1.0])
     assert before is None
     assert np.degrees(within) == pytest.approx(15.0)

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import read_columns, read_table, read_text
+from armsight.files import columns_unused, read_columns, read_table, read_text
 from armsight.geometry.rotation import nearest_rotation
 from armsight.loop.identify import ROTATIONS
 from armsight.robot.arm import Arm
@@ -117,7 +117,10 @@ def read_pose_table(
         p, unit_m, notes = _positions(table, unit, detect_units)
         R, numbers, convention = table.rotations(rotation)
         Ts = stacked(R, p)
-    return PoseTable(path, lines, Ts, numbers, convention, q, table.times(), table.names(), unit_m, notes)
+    t_s, names = table.times(), table.names()
+    if unused := [name for name in head if name and name not in table.used and not re.fullmatch(r"_[0-3]", name)]:
+        notes = (*notes, f"{path}: {columns_unused(unused)}")
+    return PoseTable(path, lines, Ts, numbers, convention, q, t_s, names, unit_m, notes)
 
 
 def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, list[str]]]]:
@@ -188,6 +191,7 @@ class _Columns:
 
     def __init__(self, path: Path, head: list[str], rows: list[tuple[int, list[str]]]) -> None:
         self.path, self.at, self.rows = path, {name: k for k, name in enumerate(head)}, rows
+        self.used: set[str] = set()
 
     def has_position(self) -> bool:
         """Return whether there are positions."""
@@ -198,6 +202,7 @@ class _Columns:
         for name in names:
             if name not in self.at:
                 raise InputError(f"{self.path}: line 1: column {name} is missing; there are {', '.join(self.at)}")
+        self.used.update(names)
         out = np.empty((len(self.rows), len(names)))
         for i, (line, row) in enumerate(self.rows):
             for k, name in enumerate(names):
@@ -229,6 +234,7 @@ class _Columns:
         key = next((key for key in ("image", "name") if key in self.at), None)
         if key is None:
             return None
+        self.used.add(key)
         found = tuple(row[self.at[key]] for _, row in self.rows)
         twice = next((name for name in found if found.count(name) > 1), None)
         if twice is not None:

@@ -35,12 +35,14 @@ class LoggedAngles(Record):
         q: (N, n) joint angles, rad.
         shots: names of the shots the rows belong to; None where no column has them.
         t_s: (N,) times of the rows, s, rising; None where no column has them.
+        unused: the columns that were not read.
     """
 
     path: Path
     q: Array
     shots: tuple[str, ...] | None
     t_s: Array | None
+    unused: tuple[str, ...] = ()
 
     def at(self, names: Sequence[str], times_s: Sequence[float | None]) -> list[Array | None]:
         """Return the joint angles (n,), rad, at each shot; None at a shot that no row belongs to.
@@ -116,6 +118,8 @@ def read_angles(path: str | Path, arm: Arm) -> LoggedAngles:
             f"{path}:{lines[row][0]}: q{joint + 1}_rad is {q[row, joint]:g}: are these degrees? name the columns q1_deg ..."
         )
     shots = t_s = None
+    where = next((name for name in ("shot", "t_s") if name in header), None)
+    unused = tuple(name for k, name in enumerate(header) if name and k not in columns and name != where)
     if "shot" in header:
         at = header.index("shot")
         shots = tuple(_cell(path, line, header, row, at) for line, row in lines)
@@ -127,7 +131,7 @@ def read_angles(path: str | Path, arm: Arm) -> LoggedAngles:
         t_s = np.array([_number(path, line, header, row, at) for line, row in lines])
         if len(fallen := np.flatnonzero(np.diff(t_s) <= 0)):
             raise InputError(f"{path}:{lines[fallen[0] + 1][0]}: t_s does not rise: {t_s[fallen[0] + 1]:g} s")
-    return LoggedAngles(path, q, shots, t_s)
+    return LoggedAngles(path, q, shots, t_s, unused)
 
 
 def _joint_columns(path: Path, header: list[str], arm: Arm, count: int) -> tuple[list[int], float]:

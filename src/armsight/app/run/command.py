@@ -219,6 +219,7 @@ def _run_logged(
     from armsight.app.report.plotting import require_matplotlib
     from armsight.app.run.angles import read_angles
     from armsight.app.run.logged import run_logged, summary_lines, write_logged
+    from armsight.files import columns_unused
     from armsight.robot.arm_file import open_arm
     from armsight.vision.markers.targets import open_target
     from armsight.vision.rig import StereoRig
@@ -227,6 +228,8 @@ def _run_logged(
     require_matplotlib()
     arm, rig, target = open_arm(arm_spec), StereoRig.load(rig_path), open_target(target_spec)
     angles = read_angles(path, arm)
+    if angles.unused:
+        click.echo(f"note: {path}: {columns_unused(angles.unused)}", err=True)
     folder = writable_folder(output, "no run")
     with contextlib.closing(open_source(source_spec)) as source, steps() as progress:
         result = run_logged(source, rig, target, arm, angles, progress)
