@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from armsight.data import Array, JointCommand, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
+from armsight.kernels import kernel
 from armsight.loop.estimators.estimator import ArmEstimate, Estimator
 from armsight.loop.health.record import Trust
 from armsight.robot.arm import Arm
@@ -129,9 +130,11 @@ class Aim(Record):
     """The reference of the next command, as far as no measurement changes it: computed while an image is on its way.
 
     Attributes:
-        goal: the joints now, as the motion has them.
-        ahead: those a period from now.
+        ahead: the joints a period from now, as the motion has them.
+        q: (2, n) angles now and ahead, rad.
+        qd: (2, n) their speeds, rad/s.
         Ts_base_tool: (2, 4, 4) where they put the tool.
+        most: (n,) by how much the correction of each joint may change in the period, rad.
         duty: (n,) that holds the arm against gravity ahead.
         jacobian: (6, n) at the goal.
         U: (6, k) of its k = min(6, n) singular values, linear rows over the arm's size, and so are ``s`` and ``Vt``.
@@ -140,9 +143,11 @@ class Aim(Record):
         passed_s: since the last command, s; the period where that is not known.
     """
 
-    goal: Joints
     ahead: Joints
+    q: Array
+    qd: Array
     Ts_base_tool: Array
+    most: Array
     duty: Array
     jacobian: Array
     U: Array
@@ -205,9 +210,12 @@ class PoseServo:
         goal = self._goal or motion.at(t_s)
         duty = checked(gravity(ahead.q), (self._arm.joints,), "gravity")
         jacobian = self._arm.jacobian(goal.q)
-        U, s, Vt = np.linalg.svd(jacobian / self._scale[:, None], full_matrices=False)
-        Ts = self._arm.forward(np.stack([goal.q, ahead.q]))
-        return Aim(goal, ahead, Ts, duty, jacobian, U, s, Vt, passed_s if passed_s > 0.0 else self.timing.period_s)
+        U, s, Vt = map(np.ascontiguousarray, np.linalg.svd(jacobian / self._scale[:, None], full_matrices=False))
+        q, qd = np.stack([goal.q, ahead.q]), np.stack([goal.qd, ahead.qd])
+        fastest = self._arm.qd_max * self.timing.period_s
+        most = np.minimum(RATE_SHARE * fastest, np.maximum(fastest - np.abs(q[1] - q[0]), 0.0))
+        passed_s = passed_s if passed_s > 0.0 else self.timing.period_s
+        return Aim(ahead, q, qd, self._arm.forward(q), most, duty, jacobian, U, s, Vt, passed_s)
 
     def step(self, aim: Aim, estimator: Estimator, trust: Trust = Trust.FULL) -> ServoStep:
         """Make the next command.
@@ -254,8 +262,7 @@ class PoseServo:
 
     def _missing(self, estimator: Estimator, aim: Aim) -> Array:
         """Return how far the tool would be behind (2, 6) now and ahead with this correction."""
-        q, qd = np.stack([aim.goal.q, aim.ahead.q]), np.stack([aim.goal.qd, aim.ahead.qd])
-        return behind(aim.Ts_base_tool, estimator.tool(q + self._correction + self._droop, qd))
+        return behind(aim.Ts_base_tool, estimator.tool(aim.q + self._correction + self._droop, aim.qd))
 
     def _joints(self, aim: Aim, error: Array) -> Array:
         """Return the joint angles (n,) that make up for an error of the tool (6,).
@@ -265,7 +272,9 @@ class PoseServo:
         """
         if self._arm.joints < 6:
             return position_first(aim.jacobian / self._scale[:, None], error / self._scale, _corrected)[0]
-        return np.asarray((_corrected(aim.s) * ((error / self._scale) @ aim.U)) @ aim.Vt)
+        joints = np.empty(self._arm.joints)
+        _by_tool(aim.U, aim.s, aim.Vt, self._scale, error, joints)
+        return joints
 
     def _crossing(self, estimator: Estimator, aim: Aim, error: Array) -> Array:
         """Return a step (n,) through the backlash of joints that rest on its wrong side for what is to be corrected."""
@@ -276,15 +285,16 @@ class PoseServo:
 
     def _crossed(self, estimator: Estimator, aim: Aim, requested: Array, worth: NDArray[np.bool_]) -> Array:
         """Return what (n,) takes joints through the backlash before requested changes (n,), of those that are worth it."""
-        sides = np.stack([np.zeros_like(requested), np.where(worth, np.sign(requested), 0.0)])
-        here, there = estimator.tool(np.stack([aim.goal.q, aim.goal.q]) + self._correction, sides, pressed=True)
+        sides, q = np.zeros((2, len(requested))), np.empty((2, len(requested)))
+        sides[1], q[:] = worth * np.sign(requested), aim.q[0] + self._correction
+        here, there = estimator.tool(q, sides, pressed=True)
         return self._joints(aim, behind(here, there))
 
     def _gaps(self, estimator: Estimator, aim: Aim) -> Array:
         """Return the backlash (2, n), rad, that each joint is to be taken through before it moves the tool up, and down."""
         n = self._arm.joints
         sides = np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
-        here, *there = estimator.tool(aim.goal.q + self._correction + 0.0 * sides, sides, pressed=True)
+        here, *there = estimator.tool(aim.q[0] + self._correction + 0.0 * sides, sides, pressed=True)
         columns = (aim.jacobian / self._scale[:, None]).T
         missing = np.array([behind(here, T) / self._scale for T in there]).reshape(2, n, 6)
         by_joint = (missing * columns).sum(axis=2) / np.maximum((columns**2).sum(axis=1), UNCORRECTED_BELOW**2)
@@ -316,12 +326,12 @@ class PoseServo:
 
     def _droops(self, estimate: ArmEstimate, aim: Aim) -> None:
         """Learn how far the joints rest from what they are commanded, as far as their own sensors show it."""
-        off = estimate.q - aim.goal.q - self._correction
+        off = estimate.q - aim.q[0] - self._correction
         self._droop += min(self.timing.period_s / DROOP_S, 1.0) * (off - self._droop)
 
     def _resting(self, estimate: ArmEstimate, aim: Aim) -> bool:
         """Return whether the arm has been at rest for as long as the newest measurement is old."""
-        requested = max(np.abs(aim.goal.qd).max(), np.abs(aim.ahead.qd).max())
+        requested = np.abs(aim.qd).max()
         stepping = self._joint_loops is not None and self._rest_s > 0.0  # its own steps are not a motion
         still = bool(requested < STANDING_RAD_S and (stepping or np.abs(estimate.qd).max() < self._rest_rad_s))
         self._rest_s = self._rest_s + aim.passed_s if still else 0.0
@@ -331,28 +341,94 @@ class PoseServo:
 
     def _command(self, aim: Aim, change: Array, mode: Mode, error: Array) -> ServoStep:
         """Return the command with a change of the correction, as far as the limits allow."""
-        arm, period_s, ahead = self._arm, self.timing.period_s, aim.ahead
-        step = ahead.q - aim.goal.q
-        most = np.minimum(RATE_SHARE * arm.qd_max * period_s, np.maximum(arm.qd_max * period_s - np.abs(step), 0.0))
-        wished = _within(-MAX_CORRECTION_RAD, self._correction + _within(-most, change, most), MAX_CORRECTION_RAD)
-        displaced_m = float(np.linalg.norm(aim.jacobian[:3] @ wished))
-        if displaced_m > MAX_CORRECTION_M:
-            wished *= MAX_CORRECTION_M / displaced_m
-        q_ref = _within(arm.q_min, ahead.q + wished, arm.q_max)
-        held = q_ref != ahead.q + wished
-        correction = q_ref - ahead.q
-        qd_ref = _within(-arm.qd_max, ahead.qd + (correction - self._correction) / period_s, arm.qd_max)
-        self._correction, self._goal = correction, ahead
-        far = np.abs(wished) >= MAX_CORRECTION_RAD
+        arm, n = self._arm, self._arm.joints
+        q_ref, qd_ref, wished, correction = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+        limits = arm.q_min, arm.q_max, arm.qd_max, aim.most
+        numbers = float(MAX_CORRECTION_RAD), MAX_CORRECTION_M, self.timing.period_s
+        asked = self._correction, change
+        bounded = _bounded(aim.q, aim.qd, aim.jacobian, *limits, *numbers, *asked, wished, correction, q_ref, qd_ref)
+        self._correction, self._goal = correction, aim.ahead
         said: tuple[str, ...] = ()
-        if held.any() or far.any() or displaced_m > MAX_CORRECTION_M:
+        if bounded:
+            names = arm.joint_names
             said = (
-                *(("tool: largest correction",) if displaced_m > MAX_CORRECTION_M else ()),
-                *(f"{arm.joint_names[i]}: limit of its angle" for i in np.flatnonzero(held)),
-                *(f"{arm.joint_names[i]}: largest correction" for i in np.flatnonzero(far)),
+                *(("tool: largest correction",) if bounded > n else ()),
+                *(f"{names[i]}: limit of its angle" for i in np.flatnonzero(q_ref != aim.q[1] + wished)),
+                *(f"{names[i]}: largest correction" for i in np.flatnonzero(np.abs(wished) >= MAX_CORRECTION_RAD)),
             )
-        command = JointCommand(q_ref, np.where(held, 0.0, qd_ref), aim.duty, period_s)
-        return ServoStep(command, mode, correction, error, said)
+        return ServoStep(JointCommand(q_ref, qd_ref, aim.duty, self.timing.period_s), mode, correction, error, said)
+
+
+@kernel(
+    "const f8[:, ::1], const f8[:, ::1], const f8[:, ::1], const f8[::1], const f8[::1], const f8[::1], const f8[::1], f8, "
+    "f8, f8, const f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1]"
+)
+def _bounded(
+    q: Array,
+    qd: Array,
+    J: Array,
+    q_min: Array,
+    q_max: Array,
+    qd_max: Array,
+    most: Array,
+    most_rad: float,
+    most_m: float,
+    period_s: float,
+    correction: Array,
+    change: Array,
+    wished: Array,
+    now: Array,
+    q_ref: Array,
+    qd_ref: Array,
+) -> int:
+    """Write a command with a changed correction, as far as the limits allow.
+
+    Args:
+        q: (2, n) the motion's joints now and ahead, rad, and so are the speeds.
+        qd: see ``q``.
+        J: (6, n) Jacobian.
+        q_min: (n,) limits of the angles, rad.
+        q_max: (n,) the same.
+        qd_max: (n,) of the speeds, rad/s.
+        most: (n,) of the change, rad.
+        most_rad: of the correction, rad.
+        most_m: of the tool's displacement by it, m.
+        period_s: in which the joints are to be there, s.
+        correction: (n,) before, rad.
+        change: (n,) asked of it, rad.
+        wished: (n,) the correction without limits of the angles.
+        now: (n,) the correction.
+        q_ref: (n,) command.
+        qd_ref: (n,) its speeds.
+
+    Returns:
+        Number of joints that a limit keeps from being corrected further; beyond n where the tool's displacement is bounded.
+    """
+    joints = q.shape[1]
+    square, limited = 0.0, 0
+    for i in range(joints):
+        step = min(max(-most[i], change[i]), most[i])
+        wished[i] = min(max(-most_rad, correction[i] + step), most_rad)
+    for row in range(3):
+        moved = 0.0
+        for i in range(joints):
+            moved += J[row, i] * wished[i]
+        square += moved * moved
+    displaced_m = math.sqrt(square)
+    if displaced_m > most_m:
+        limited = joints + 1
+        for i in range(joints):
+            wished[i] *= most_m / displaced_m
+    for i in range(joints):
+        q_ref[i] = min(max(q_min[i], q[1, i] + wished[i]), q_max[i])
+        now[i] = q_ref[i] - q[1, i]
+        qd_ref[i] = min(max(-qd_max[i], qd[1, i] + (now[i] - correction[i]) / period_s), qd_max[i])
+        held = q_ref[i] != q[1, i] + wished[i]
+        if held:
+            qd_ref[i] = 0.0
+        if held or abs(wished[i]) >= most_rad:
+            limited += 1
+    return limited
 
 
 def whole_steps(J: Array, requested: Array, steps: Array, gaps: Array | None = None) -> Array:
@@ -405,12 +481,26 @@ def whole_steps(J: Array, requested: Array, steps: Array, gaps: Array | None = N
     return np.where(whole, counts(index)[0] * by if gains else 0.0, continuous)
 
 
+@kernel("const f8[:, ::1], const f8[::1], const f8[:, ::1], f8[::1], f8[::1], f8[::1]")
+def _by_tool(U: Array, s: Array, Vt: Array, scale: Array, error: Array, joints: Array) -> None:
+    """Write the joint angles (n,) that make up for an error of the tool (6,): U (6, k), s (k,) and Vt (k, n) of an aim."""
+    joints[:] = 0.0
+    for k in range(len(s)):
+        along = 0.0
+        for row in range(6):
+            along += error[row] / scale[row] * U[row, k]
+        along *= _share(s[k])
+        for i in range(len(joints)):
+            joints[i] += along * Vt[k, i]
+
+
+@kernel("f8")
+def _share(s: float) -> float:
+    """Return the inverse of a singular value, as far as its direction is corrected; 0 where it is not."""
+    able = (s - UNCORRECTED_BELOW) / (CORRECTED_ABOVE - UNCORRECTED_BELOW)
+    return min(max(able, 0.0), 1.0) / max(s, UNCORRECTED_BELOW)
+
+
 def _corrected(s: Array) -> Array:
-    """Return the inverses of singular values (k,) of what is corrected, 0 where a direction is not."""
-    able = _within(0.0, (s - UNCORRECTED_BELOW) / (CORRECTED_ABOVE - UNCORRECTED_BELOW), 1.0)
-    return np.asarray(able / np.maximum(s, UNCORRECTED_BELOW))
-
-
-def _within(low: Array | float, x: Array, high: Array | float) -> Array:
-    """Return numbers held within bounds; ``np.clip`` takes several times as long for six of them."""
-    return np.asarray(np.minimum(np.maximum(x, low), high))
+    """Return the same of singular values (k,)."""
+    return np.array([_share(float(each)) for each in s])

@@ -140,8 +140,10 @@ def test_covariances_are_those_of_the_matrices():
     )
     state = ErrorState(0.0, np.zeros(SIZE), root @ root.T, Smoothed(*(part[:1] for part in joints)), None)
     step = model.moved(state, joints, np.arange(n) * 1e-3)
-    _, Hs = model.poses(state.x, joints.q, joints.unseen)
-    for n, own in enumerate(model.covariances(state, step, Hs)):
+    Ts, Hs = model.poses(state.x, joints.q, joints.unseen)
+    poses, _, covs = model.tracked(state, step, joints)
+    np.testing.assert_array_equal(poses, Ts)
+    for n, own in enumerate(covs):
         moved = np.diag(step.kept[n]) @ state.P @ np.diag(step.kept[n]) + np.diag(step.added[n])
         expected = Hs[n] @ moved @ Hs[n].T
         assert np.abs(own - expected).max() < 1e-13 * np.abs(expected).max()

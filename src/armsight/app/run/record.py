@@ -198,7 +198,9 @@ class Skew:
     """
 
     def __init__(self, rig: StereoRig, sync_s: float) -> None:
-        self._rig, self._sync_s = rig, sync_s
+        baseline = rig.T_left_right[:3, 3]
+        length = float(np.linalg.norm(baseline))
+        self._along, self._by_speed_s = baseline / length, sync_s / length
         self._last: tuple[float, Array] | None = None
 
     def widened(self, pose: PoseEstimate, t_s: float) -> PoseEstimate:
@@ -212,12 +214,12 @@ class Skew:
         last, self._last = self._last, (t_s, p)
         if last is None or not 0.0 < t_s - last[0] < APART_S:
             return pose
-        baseline = self._rig.T_left_right[:3, 3]
-        along = float((p - last[1]) @ baseline) / (t_s - last[0]) / float(np.linalg.norm(baseline))
-        sigma = pose.T_left_body[:3, :3].T @ p * (self._sync_s * along / np.linalg.norm(baseline))
-        extra = np.zeros((6, 6))
-        extra[:3, :3] = np.outer(sigma, sigma)
-        return replace(pose, cov=pose.cov + extra, cov_noise=pose.cov_noise + extra)
+        speed = float((p - last[1]) @ self._along) / (t_s - last[0])
+        sigma = p @ pose.T_left_body[:3, :3] * (self._by_speed_s * speed)
+        cov, cov_noise, extra = pose.cov.copy(), pose.cov_noise.copy(), sigma[:, None] * sigma
+        cov[:3, :3] += extra
+        cov_noise[:3, :3] += extra
+        return replace(pose, cov=cov, cov_noise=cov_noise)
 
 
 @dataclass(frozen=True)

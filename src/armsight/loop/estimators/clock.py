@@ -20,6 +20,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from armsight.data import Array
+from armsight.geometry.matrix import product, solved
+from armsight.kernels import kernel
 from armsight.loop.estimators.estimator import ClockEffect, Innovation, Outcome
 
 #: Standard deviation of the rate before anything is measured; two crystals differ by less, computers' stamps by more.
@@ -90,12 +92,12 @@ class ClockFollower:
         self._t_s = innovation.t_s
         if first:
             passed = 0.0
-        self._predict(passed, innovation.kept)
-        G = innovation.by_state @ self._V
+        self._predict(passed)
+        G = np.empty((6, 2))
+        _signature(self._V, self._delay, passed, innovation.kept, innovation.by_state, G)
         if not first and innovation.outcome is Outcome.USED:
             self._update(innovation, G, passed)
-        self._V -= innovation.gain @ G
-        self._V[self._delay] = 1.0, 0.0
+        _absorb(self._V, self._delay, innovation.gain, G)
         offset_s, chi_square = float(self._b[0]), self._chi_square
         if not self._corrects(chi_square):
             return ClockEffect(offset_s, G @ self._b, None, self.sigma_s) if chi_square > _SAID else None
@@ -122,11 +124,8 @@ class ClockFollower:
             self.since_s = self._t_s if self._t_s - self._certain_s >= _STAYS_S else None
         return self.since_s is not None
 
-    def _predict(self, passed: float, kept: Array) -> None:
-        """Predict over a time, s, in which the filter kept a share (K,) of its state."""
-        self._V[:, 1] -= passed * self._V[:, 0]
-        self._V *= kept[:, None]
-        self._V[self._delay] = 1.0, 0.0
+    def _predict(self, passed: float) -> None:
+        """Predict offset and rate over a time, s."""
         self._b[0] += passed * self._b[1]
         self._corrected[0] += passed * self._corrected[1]
         self._unrest *= math.exp(-passed / _CALM_S)
@@ -139,19 +138,19 @@ class ClockFollower:
 
     def _update(self, innovation: Innovation, G: Array, passed: float) -> None:
         """Update offset and rate by an innovation with its derivative G (6, 2) by them."""
-        r = innovation.z - G @ self._b
-        whitened = np.linalg.solve(innovation.cov, np.column_stack([r, G]))
-        r_white, G_white = whitened[:, 0], whitened[:, 1:]
-        share = min(passed / _EXCESS_S, 1.0)
-        self._excess += share * (float(r @ r_white) / 6.0 - self._excess)
+        weights = np.empty((3, 3))
+        _weigh(innovation.cov, innovation.z, G, self._b, weights)
+        left = float(weights[0, 0])
+        self._excess += min(passed / _EXCESS_S, 1.0) * (left / 6.0 - self._excess)
         excess = max(self._excess, 1.0)
-        score, information = G_white.T @ r / excess, G_white.T @ G / excess
+        score, information = weights[1:, 0] / excess, weights[1:, 1:] / excess
         fade = math.exp(-passed / _WINDOW_S)
         self._score = fade * self._score + float(score[0])
         self._information = fade * self._information + float(information[0, 0])
         M = _inverted(_inverted(self._M) + information)
         step = M @ score
-        if self.since_s is None and float((r - G @ step) @ (r_white - G_white @ step)) > _GATE * excess:
+        left -= float(step @ (2.0 * score - information @ step)) * excess
+        if self.since_s is None and left > _GATE * excess:
             return
         self._b, self._M = self._b + step, M
         if self._information * _SEEN_S**2 < 1.0:
@@ -160,6 +159,37 @@ class ClockFollower:
         if surprise**2 > _SURPRISING**2 * (1.0 / self._information + self._M[0, 0]):
             self._unrest = max(self._unrest, abs(surprise) / math.sqrt(_WINDOW_S))
             self._score = self._information = 0.0
+
+
+@kernel("f8[:, ::1], i8, f8, const f8[::1], const f8[:, ::1], f8[:, ::1]")
+def _signature(V: Array, delay: int, passed: float, kept: Array, H: Array, G: Array) -> None:
+    """Propagate V (K, 2) over a time, s, in which the filter kept a share (K,) of its state; write H V (6, 2) to G."""
+    G[:] = 0.0
+    for k in range(V.shape[0]):
+        V[k, 1] = kept[k] * (V[k, 1] - passed * V[k, 0])
+        V[k, 0] *= kept[k]
+        if k == delay:
+            V[k, 0], V[k, 1] = 1.0, 0.0
+        for row in range(6):
+            G[row, 0] += H[row, k] * V[k, 0]
+            G[row, 1] += H[row, k] * V[k, 1]
+
+
+@kernel("f8[:, ::1], i8, const f8[:, ::1], f8[:, ::1]")
+def _absorb(V: Array, delay: int, gain: Array, G: Array) -> None:
+    """Subtract from V (K, 2) what the filter adapts to: gain (K, 6) times G (6, 2)."""
+    V -= product(gain, G)
+    V[delay, 0], V[delay, 1] = 1.0, 0.0
+
+
+@kernel("const f8[:, ::1], const f8[::1], f8[:, ::1], f8[::1], f8[:, ::1]")
+def _weigh(cov: Array, z: Array, G: Array, b: Array, weights: Array) -> None:
+    """Write A' cov^-1 A (3, 3) to weights, A = [z - G b, G]: the square, the score and the information of a residual."""
+    A = np.empty((6, 3))
+    for row in range(6):
+        A[row, 0] = z[row] - G[row, 0] * b[0] - G[row, 1] * b[1]
+        A[row, 1], A[row, 2] = G[row, 0], G[row, 1]
+    weights[:] = product(A.T, solved(cov, A))
 
 
 def _inverted(A: Array) -> Array:

@@ -1,7 +1,8 @@
-"""The filter's process and measurement model: the tool's poses by a state, and what motion makes the state forget.
+"""The filter's process and measurement model: what motion makes a state forget, and what a pose measurement adds to it.
 
-In: the vector of ``armerror`` with its covariance, and the joints as ``readings`` has them. Out: poses with derivatives,
-and what first-order Gauss-Markov processes in travel keep and add. Equations: docs/concepts/loop.md.
+In: the vector of ``armerror`` with its covariance, the joints as ``readings`` has them, pose measurements. Out: what
+first-order Gauss-Markov processes in travel keep and add, states before and after a measurement, poses of the tool with
+covariances. All of it is compiled: a command waits for it. Equations: docs/concepts/loop.md.
 """
 
 from __future__ import annotations
@@ -10,11 +11,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array
+from armsight.geometry.matrix import solved
 from armsight.kernels import kernel
 from armsight.loop.estimators import armerror
-from armsight.loop.estimators.armerror import Prior, layout
+from armsight.loop.estimators.armerror import Prior, layout, pose_and_derivative, tangent
 from armsight.loop.estimators.estimator import PoseMeasurement
 from armsight.loop.estimators.readings import Smoothed
 from armsight.robot.arm import Arm
@@ -25,9 +28,18 @@ LONGEST_CREEP_S = 4.0
 #: change some hundredths of a second early or late would be taken for a narrower backlash.
 LEARNING = 6.0
 
+#: Linearisations per measurement at most, and the change (m, rad) that ends them: it leaves about its square.
+ITERATIONS, SETTLED = 4, 1e-3
+#: A joint slower than this keeps its side of the backlash, rad/s.
+MOVES_RAD_S = 1e-3
+#: Covariances below this (of m, rad: 1e-20 of each) are set to zero: forgotten ones would decay to numbers so small that a
+#: processor takes a hundred times as long for each (denormals).
+NOTHING = 1e-40
+
 #: Sigmas added when vision contradicts the state again and again, as after a bump: to base and tool, and the joints' zeros.
 OPEN_M, OPEN_RAD = 10e-3, np.deg2rad(1.0)
 _MIN_SHARE = 1e-9  # of a share
+_NOWHERE, _NONE = np.eye(4), np.zeros((6, 6))  # where nothing was measured: a pose, and a covariance
 
 
 class ErrorState(NamedTuple):
@@ -51,6 +63,28 @@ class Propagation(NamedTuple):
     added: Array
 
 
+class Predicted(NamedTuple):
+    """A state at a pose measurement, before that is used.
+
+    Attributes:
+        x: (size,) the state, propagated.
+        P: (size, size) its covariance.
+        z: (6,) innovation.
+        H: (6, size) derivative of the predicted pose by the state.
+        R: (6, 6) noise of the measurement, without what all measurements share.
+        HP: (6, size) the product of H and P.
+        S: (6, 6) covariance of z, what all measurements share included.
+    """
+
+    x: Array
+    P: Array
+    z: Array
+    H: Array
+    R: Array
+    HP: Array
+    S: Array
+
+
 def opened(joints: int) -> Array:
     """Return the variances (size,) that are added when the filter of an arm of so many joints reopens."""
     at = layout(joints)
@@ -65,11 +99,8 @@ def smoothed_anew(state: ErrorState, then: Smoothed) -> ErrorState:
 
     Other smoothing leaves other noise; a link elsewhere in its backlash is off by another rest.
     """
-    x, at = state.x.copy(), layout(then.q.shape[1])
-    x[at.noise] += state.joints.q[0] - then.q[0]
-    friction, floats, lever = state.joints.unseen[0] - then.unseen[0]
-    x[at.rest : at.reading] -= 0.5 * (friction * x[at.backlash : at.floats] + floats * x[at.floats : at.compliance])
-    x[at.rest : at.reading] += lever * x[at.compliance : at.rest]
+    x = state.x.copy()
+    _smoothed_anew(x, state.joints.q, state.joints.unseen, then.q, then.unseen)
     return state._replace(x=x, joints=then)
 
 
@@ -125,7 +156,7 @@ class ErrorModel:
         Changes of side leave the joints ``learning`` times as uncertain as they are.
         """
         then = state.joints
-        come = joints.travel - then.travel, joints.flips - then.flips, np.repeat(then.variance, len(t_s), axis=0)
+        come = joints.travel - then.travel, joints.flips - then.flips, then.variance
         return self.carried(np.asarray(t_s, dtype=float) - state.t_s, *come, joints, learning=learning)
 
     def carried(
@@ -137,20 +168,113 @@ class ErrorModel:
             time_s: (N,) since a state, s.
             travel: (N, n) of the joints meanwhile, rad.
             flips: (N, 2, n) of the sides.
-            was: (N, n) what was left of a reading's variance at the state.
+            was: (N, n) what was left of a reading's variance at the state, or (1, n) at one state for all.
             joints: at the times.
             learning: as above.
         """
-        kept, added = np.ones((len(time_s), self.layout.size)), np.zeros((len(time_s), self.layout.size))
+        shape = len(time_s), self.layout.size
+        kept, added = np.empty(shape), np.empty(shape)
         noise = joints.variance, joints.lasts_s, was
         _forget(time_s, travel, flips, *noise, self.sigmas, self._forgets, learning, kept, added)
         return Propagation(kept, added)
 
-    def covariances(self, state: ErrorState, step: Propagation, Hs: Array) -> Array:
-        """Return the covariances (N, 6, 6) of poses by a propagated state, without what all measurements share."""
-        own = np.empty((len(Hs), 6, 6))
-        _covariances(Hs, step.kept, step.added, state.P, own)
-        return own
+    def tracked(self, state: ErrorState, step: Propagation, joints: Smoothed) -> tuple[Array, Array, Array]:
+        """Return the tool's poses (N, 4, 4) by a propagated state, and their covariances (N, 6, 6).
+
+        First with everything, then without what all measurements share.
+        """
+        count, measured = len(joints.q), state.pose_measurement
+        Ts, covs, own = np.empty((count, 4, 4)), np.empty((count, 6, 6)), np.empty((count, 6, 6))
+        common = (_NOWHERE, _NONE) if measured is None else (measured.T_base_tool, measured.cov_common)
+        _tracked(self._table, state.x, state.P, *step, joints.q, joints.unseen, *common, Ts, covs, own)
+        return Ts, covs, own
+
+    def imagined(
+        self, state: ErrorState, step: Propagation, now: Smoothed, q: Array, qd: Array, loose: NDArray[np.bool_]
+    ) -> Array:
+        """Return the tool's poses (N, 4, 4) if readings were q (N, n), rad, moving at qd (N, n), rad/s.
+
+        Args:
+            state: the newest.
+            step: its propagation to now.
+            now: the joints, N = 1.
+            q: the readings.
+            qd: their speeds.
+            loose: (n,) which links that gravity does not load change their side, too, as their joints move.
+        """
+        Ts = np.empty((len(q), 4, 4))
+        _imagined(self._table, state.x, step.kept[0], now.unseen[0], q, qd, loose, Ts)
+        return Ts
+
+    def innovation(
+        self, x: Array, joints: Smoothed, pose_measurement: PoseMeasurement, jitter_s: float
+    ) -> tuple[Array, Array, Array]:
+        """Return the innovation (6,) of a measurement, the model's derivative (6, size) by x, and the noise (6, 6).
+
+        Args:
+            x: the state.
+            joints: at the measurement.
+            pose_measurement: the measurement.
+            jitter_s: standard deviation of its time, s.
+        """
+        z, H, R = np.empty(6), np.empty((6, self.layout.size)), np.empty((6, 6))
+        seen = pose_measurement.T_base_tool, pose_measurement.cov_noise, jitter_s
+        _innovation(self._table, x, joints.q[0], joints.qd[0], joints.unseen[0], *seen, z, H, R)
+        return z, H, R
+
+    def predicted(
+        self,
+        state: ErrorState,
+        step: Propagation,
+        joints: Smoothed,
+        pose_measurement: PoseMeasurement,
+        jitter_s: float,
+    ) -> tuple[Predicted, float]:
+        """Return a state at a measurement, and the chi-square of that; arguments as for :meth:`innovation`."""
+        x, P, n = state.x.copy(), state.P.copy(), self.layout.size
+        at = Predicted(x, P, np.empty(6), np.empty((6, n)), np.empty((6, 6)), np.empty((6, n)), np.empty((6, 6)))
+        moved = step.kept[0], step.added[0], joints.q[0], joints.qd[0], joints.unseen[0]
+        seen = pose_measurement.T_base_tool, pose_measurement.cov_noise, pose_measurement.cov_common
+        return at, _predicted(self._table, *moved, *seen, jitter_s, *at)
+
+    def updated(
+        self,
+        at: Predicted,
+        joints: Smoothed,
+        pose_measurement: PoseMeasurement,
+        jitter_s: float,
+        *,
+        learns_delay: bool,
+    ) -> Array:
+        """Use a measurement: overwrite ``at.x`` and ``at.P`` by state and covariance after it; return the gain (size, 6).
+
+        The iterated update (Bell and Cathey, 1993). Other arguments as for :meth:`innovation`.
+
+        Args:
+            at: the state before.
+            joints: at the measurement.
+            pose_measurement: the measurement.
+            jitter_s: standard deviation of its time, s.
+            learns_delay: whether the delay is corrected; if not, it stays as it is, and so does its variance.
+        """
+        K = np.empty((self.layout.size, 6))
+        now = joints.q[0], joints.qd[0], joints.unseen[0]
+        seen = pose_measurement.T_base_tool, pose_measurement.cov_noise, jitter_s
+        _updated(self._table, *now, *seen, learns_delay, at.x, at.P, at.z, at.H, at.R, at.HP, K)
+        return K
+
+
+@kernel("f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1]")
+def _smoothed_anew(x: Array, q_was: Array, was: Array, q: Array, unseen: Array) -> None:
+    """Correct x (size,) for joints (1, n) and unseen (1, 3, n) that were others; see :func:`smoothed_anew`."""
+    joints = q.shape[1]
+    backlash = x.shape[0] - 7 - 5 * joints
+    for i in range(joints):
+        friction, floats = was[0, 0, i] - unseen[0, 0, i], was[0, 1, i] - unseen[0, 1, i]
+        lever, k = was[0, 2, i] - unseen[0, 2, i], backlash + i
+        x[k + 4 * joints] += q_was[0, i] - q[0, i]
+        x[k + 3 * joints] -= 0.5 * (friction * x[k] + floats * x[k + joints])
+        x[k + 3 * joints] += lever * x[k + 2 * joints]
 
 
 @kernel
@@ -176,13 +300,16 @@ def _forget(
     kept: Array,
     added: Array,
 ) -> None:
-    """Write into kept and added (N, size), ones and zeros before, what times (N,), travel (N, n) and flips (N, 2, n) do.
+    """Write into kept and added (N, size) what times (N,), travel (N, n) and flips (N, 2, n) do.
 
-    Of the readings' noise: ``variance`` and ``lasts`` (N, n) as in ``Smoothed``, ``was`` (N, n) the variance at the state.
+    Of the readings' noise: ``variance`` and ``lasts`` (N, n) as in ``Smoothed``, ``was`` (N or 1, n) the variance at the
+    state.
     """
     rest_travel, pose_travel, creep, flip, flip_float, reading = forgets
     joints, pose_at = travel.shape[1], sigmas.shape[0] - 7
+    kept[:], added[:] = 1.0, 0.0
     for n in range(len(time)):
+        before = was[min(n, len(was) - 1)]
         whole, crept = 0.0, creep**2 * min(abs(time[n]), LONGEST_CREEP_S)
         for i in range(joints):
             way, k = max(travel[n, i], 0.0), pose_at - 2 * joints + i
@@ -192,43 +319,254 @@ def _forget(
             flipped = flip**2 * max(flips[n, 0, i], 0.0) + flip_float**2 * max(flips[n, 1, i], 0.0)
             added[n, k] = sigmas[k] ** 2 * (1.0 - kept[n, k] ** 2) + crept + 0.5 * learning**2 * flipped
             # Of two means of the same readings the one of more has the share of the other's noise that it has of readings.
-            share, k = min(variance[n, i] / was[n, i], 1.0), pose_at - joints + i
+            share, k = min(variance[n, i] / before[i], 1.0), pose_at - joints + i
             kept[n, k] = share * _decayed(abs(time[n]) / lasts[n, i])
-            added[n, k] = reading**2 * max(variance[n, i] - kept[n, k] ** 2 * was[n, i], 0.0)
+            added[n, k] = reading**2 * max(variance[n, i] - kept[n, k] ** 2 * before[i], 0.0)
         for k in range(pose_at, pose_at + 6):
             kept[n, k] = _decayed(whole / pose_travel)
             added[n, k] = sigmas[k] ** 2 * (1.0 - kept[n, k] ** 2)
 
 
-@kernel("f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1]", fastmath={"contract"})
-def _covariances(Hs: Array, kept: Array, added: Array, P: Array, own: Array) -> None:
-    """Write H (K P K + A) H' into own (N, 6, 6): Hs (N, 6, size), kept, added (N, size).
+@kernel(fastmath={"contract"})
+def _times(H: Array, P: Array, HP: Array) -> None:
+    """Write the product of a derivative H (6, size) and a covariance P (size, size) to HP (6, size)."""
+    size = P.shape[0]
+    HP[:] = 0.0
+    for row in range(6):
+        for k in range(size):
+            factor = H[row, k]
+            if factor != 0.0:
+                for j in range(size):
+                    HP[row, j] += factor * P[k, j]
 
-    A has the rest, the readings' noise and the pose alone (:func:`_forget`).
+
+@kernel(fastmath={"contract", "reassoc", "nsz"})
+def _add_times(HP: Array, H: Array, out: Array) -> None:
+    """Add the product of HP (6, size) and the transpose of H (6, size) to out (6, 6)."""
+    for row in range(6):
+        for column in range(6):
+            total = 0.0
+            for k in range(H.shape[1]):
+                total += HP[row, k] * H[column, k]
+            out[row, column] += total
+
+
+@kernel(
+    "const f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], const f8[:, ::1], "
+    "const f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1]",
+    fastmath={"contract"},
+)
+def _tracked(
+    table: Array,
+    x: Array,
+    P: Array,
+    kept: Array,
+    added: Array,
+    q: Array,
+    unseen: Array,
+    T_measured: Array,
+    common: Array,
+    Ts: Array,
+    covs: Array,
+    own: Array,
+) -> None:
+    """Write poses (N, 4, 4) by a state propagated to readings q (N, n), and H (K P K + A) H' (N, 6, 6), to Ts and own.
+
+    K and A stand in kept and added (N, size): A has the rest, the readings' noise and the pose alone (:func:`_forget`).
+    The same with what all measurements share, to covs.
     """
-    size = kept.shape[1]
-    joints = (size - 13) // 18
-    by, moved = np.empty((size, 6)), np.empty((6, size))
-    for n in range(len(Hs)):
-        H = Hs[n]
-        moved[:], own[n] = 0.0, 0.0
+    size, joints = x.shape[0], q.shape[1]
+    moved, H, HP = np.empty(size), np.empty((6, size)), np.empty((6, size))
+    for n in range(len(q)):
         for k in range(size):
-            for row in range(6):
-                by[k, row] = H[row, k] * kept[n, k]
-        for row in range(6):
-            for k in range(size):
-                factor = by[k, row]
-                if factor != 0.0:
-                    for j in range(size):
-                        moved[row, j] += factor * P[k, j]
-        for k in range(size):
-            for row in range(6):
-                for column in range(6):
-                    own[n, row, column] += moved[row, k] * by[k, column]
+            moved[k] = x[k] * kept[n, k]
+        pose_and_derivative(table, moved, q[n], unseen[n], Ts[n], H)
+        own[n] = 0.0
         for k in range(size - 7 - 2 * joints, size - 1):
             for row in range(6):
                 for column in range(6):
                     own[n, row, column] += H[row, k] * added[n, k] * H[column, k]
+        for row in range(6):
+            for k in range(size):
+                H[row, k] *= kept[n, k]
+        _times(H, P, HP)
+        _add_times(HP, H, own[n])
+        covs[n] = own[n]
+        _add_shared(Ts[n], T_measured, common, covs[n])
+
+
+@kernel("const f8[::1], f8[::1], f8[::1], f8[:, ::1], const f8[:, ::1], const f8[:, ::1], b1[::1], f8[:, :, ::1]")
+def _imagined(
+    table: Array, x: Array, kept: Array, unseen: Array, q: Array, qd: Array, loose: NDArray[np.bool_], Ts: Array
+) -> None:
+    """Write the poses of :meth:`ErrorModel.imagined` to Ts (N, 4, 4); what is unseen (3, n) is that of now."""
+    size, joints = x.shape[0], q.shape[1]
+    moved, then, at, H = x * kept, unseen.copy(), np.empty(joints), np.empty((6, size))
+    moved[size - 7 - joints : size - 7] = 0.0  # noise of what was read, not of what might be
+    for n in range(len(q)):
+        for i in range(joints):
+            at[i] = q[n, i]
+            moves, side = abs(qd[n, i]) > MOVES_RAD_S, 1.0 if qd[n, i] > 0.0 else -1.0
+            then[0, i] = side if moves else unseen[0, i]
+            then[1, i] = side if moves and loose[i] else unseen[1, i]
+        pose_and_derivative(table, moved, at, then, Ts[n], H)
+
+
+@kernel
+def _add_shared(T: Array, T_measured: Array, common: Array, cov: Array) -> None:
+    """Add the covariance (6, 6) that all measurements share, of the tangent at one pose (4, 4), as that at another."""
+    R = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                R[i, j] += T[k, i] * T_measured[k, j]
+    for row in range(0, 6, 3):
+        for column in range(0, 6, 3):
+            for i in range(3):
+                for j in range(3):
+                    for k in range(3):
+                        for m in range(3):
+                            cov[row + i, column + j] += R[i, k] * common[row + k, column + m] * R[j, m]
+
+
+@kernel("f8[:, :, ::1], const f8[:, ::1], const f8[:, ::1], f8[:, :, ::1]")
+def _shared(Ts: Array, T_measured: Array, common: Array, covs: Array) -> None:
+    """Write the same at poses (N, 4, 4) to covs (N, 6, 6)."""
+    covs[:] = 0.0
+    for n in range(len(Ts)):
+        _add_shared(Ts[n], T_measured, common, covs[n])
+
+
+@kernel(
+    "const f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], const f8[:, ::1], const f8[:, ::1], f8, f8[::1], f8[:, ::1], "
+    "f8[:, ::1]"
+)
+def _innovation(
+    table: Array,
+    x: Array,
+    q: Array,
+    qd: Array,
+    unseen: Array,
+    T_measured: Array,
+    cov_noise: Array,
+    jitter_s: float,
+    z: Array,
+    H: Array,
+    R: Array,
+) -> None:
+    """Write the innovation (6,), the derivative (6, size) by x and the noise (6, 6) to z, H, R."""
+    T, delay = np.empty((4, 4)), x.shape[0] - 1
+    pose_and_derivative(table, x, q, unseen, T, H)
+    tangent(T, T_measured, z)
+    for row in range(6):
+        velocity = 0.0
+        for i in range(q.shape[0]):
+            velocity += table[6 * i + 5] * H[row, 6 * i + 5] * qd[i]
+        H[row, delay] = -velocity  # measured earlier by so much, the tool had not moved as far
+    for row in range(6):
+        for column in range(6):
+            R[row, column] = cov_noise[row, column] + jitter_s**2 * H[row, delay] * H[column, delay]
+
+
+@kernel(
+    "const f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], const f8[:, ::1], const f8[:, ::1], "
+    "const f8[:, ::1], f8, f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]"
+)
+def _predicted(
+    table: Array,
+    kept: Array,
+    added: Array,
+    q: Array,
+    qd: Array,
+    unseen: Array,
+    T_measured: Array,
+    cov_noise: Array,
+    cov_common: Array,
+    jitter_s: float,
+    x: Array,
+    P: Array,
+    z: Array,
+    H: Array,
+    R: Array,
+    HP: Array,
+    S: Array,
+) -> float:
+    """Propagate x and P in place, write the other parts of a :class:`Predicted`, and return the chi-square of z."""
+    for k in range(x.shape[0]):
+        if kept[k] != 1.0:
+            x[k] *= kept[k]
+            for j in range(x.shape[0]):
+                P[k, j] *= kept[k]
+                P[j, k] *= kept[k]
+        P[k, k] += added[k]
+    for k in range(x.shape[0]):
+        for j in range(x.shape[0]):
+            P[k, j] = P[k, j] if abs(P[k, j]) >= NOTHING else 0.0
+    _innovation(table, x, q, qd, unseen, T_measured, cov_noise, jitter_s, z, H, R)
+    _times(H, P, HP)
+    S[:] = R
+    S += cov_common
+    _add_times(HP, H, S)
+    return chi_square(S, z)
+
+
+@kernel(
+    "const f8[::1], f8[::1], f8[::1], f8[:, ::1], const f8[:, ::1], const f8[:, ::1], f8, b1, f8[::1], f8[:, ::1], "
+    "f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]",
+    fastmath={"contract"},
+)
+def _updated(
+    table: Array,
+    q: Array,
+    qd: Array,
+    unseen: Array,
+    T_measured: Array,
+    cov_noise: Array,
+    jitter_s: float,
+    learns_delay: bool,
+    x: Array,
+    P: Array,
+    z_at: Array,
+    H_at: Array,
+    R_at: Array,
+    HP: Array,
+    K: Array,
+) -> None:
+    """Overwrite x and P by those after a measurement, write the gain to K (size, 6); HP is used up."""
+    size = x.shape[0]
+    delay = size - 1
+    z, H, R, there = z_at.copy(), H_at.copy(), R_at.copy(), x.copy()
+    change, last = np.zeros(size), np.zeros(size)
+    for left in range(ITERATIONS, 0, -1):
+        _add_times(HP, H, R)
+        gain = solved(R, HP)
+        if not learns_delay:
+            gain[:, delay] = 0.0
+        most = 0.0
+        for k in range(size):
+            last[k], change[k] = change[k], 0.0
+            for row in range(6):
+                change[k] += gain[row, k] * z[row]
+            most = max(most, abs(change[k] - last[k]))
+            K[k] = gain[:, k]
+        if left == 1 or most < SETTLED:
+            break
+        for k in range(size):
+            there[k] = x[k] + change[k]
+        _innovation(table, there, q, qd, unseen, T_measured, cov_noise, jitter_s, z, H, R)
+        # The joints were taken at the delay of x, whatever the change: that part is not in z yet.
+        for row in range(6):
+            for k in range(delay):
+                z[row] += H[row, k] * change[k]
+        _times(H, P, HP)
+    for k in range(size):
+        x[k] += change[k]
+        for row in range(6):
+            for j in range(size):
+                P[k, j] -= K[k, row] * HP[row, j]
+    if not learns_delay:  # its row is as it was, its column is right
+        P[delay] = P[:, delay]
+    symmetric(P)
 
 
 @kernel("f8[:, ::1]")
@@ -259,8 +597,7 @@ def chi_square(S: Array, z: Array) -> float:
 
 def shared(pose_measurement: PoseMeasurement | None, Ts: Array) -> Array:
     """Return the covariance (N, 6, 6) that all measurements share, in the axes of poses (N, 4, 4)."""
-    if pose_measurement is None:
-        return np.zeros((len(Ts), 6, 6))
-    rotation = np.zeros((len(Ts), 6, 6))
-    rotation[:, :3, :3] = rotation[:, 3:, 3:] = np.swapaxes(Ts[:, :3, :3], 1, 2) @ pose_measurement.T_base_tool[:3, :3]
-    return np.asarray(rotation @ pose_measurement.cov_common @ np.swapaxes(rotation, 1, 2))
+    covs = np.zeros((len(Ts), 6, 6))
+    if pose_measurement is not None:
+        _shared(np.ascontiguousarray(Ts), pose_measurement.T_base_tool, pose_measurement.cov_common, covs)
+    return covs

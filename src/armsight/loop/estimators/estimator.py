@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
 from armsight.data import Array, JointStates, Record
 
 
@@ -31,6 +33,13 @@ class PoseMeasurement(Record):
     T_base_tool: Array
     cov_noise: Array
     cov_common: Array
+
+    def __post_init__(self) -> None:
+        """Lay the arrays out row by row, as kernels take them."""
+        fields = self.__dict__
+        for name in ("T_base_tool", "cov_noise", "cov_common"):
+            fields[name] = np.ascontiguousarray(fields[name], np.float64)
+        super().__post_init__()
 
 
 class ClockEffect(NamedTuple):

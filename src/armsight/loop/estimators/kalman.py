@@ -25,14 +25,15 @@ from armsight.loop.estimators.errormodel import (
     LEARNING,
     ErrorModel,
     ErrorState,
+    Predicted,
     Propagation,
     chi_square,
     opened,
-    symmetric,
+    smoothed_anew,
 )
 from armsight.loop.estimators.estimator import ArmEstimate, Delay, Innovation, Learned, Outcome, PoseMeasurement, Track
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
-from armsight.loop.estimators.smoothing import Interval, anew, blended, by_state, intervals
+from armsight.loop.estimators.smoothing import Interval, blended, by_state, intervals
 from armsight.robot.arm import Arm
 
 #: A measurement less likely than this is an outlier.
@@ -43,13 +44,6 @@ STUBBORN = 6
 HISTORY_S = 1.0
 #: Most measurements newer than the readings that are kept waiting.
 MAX_WAITING = 16
-#: Linearisations per measurement at most, and the change (m, rad) that ends them: it leaves about its square.
-ITERATIONS, SETTLED = 4, 1e-3
-#: A joint slower than this keeps its side of the backlash, rad/s.
-MOVES_RAD_S = 1e-3
-#: Covariances below this (of m, rad: 1e-20 of each) are set to zero: forgotten ones would decay to numbers so small that a
-#: processor takes a hundred times as long for each (denormals).
-_NOTHING = 1e-40
 _GATE = float(chdtri(6, CHANCE))
 
 
@@ -77,11 +71,11 @@ class KalmanEstimator:
         nowhere = Smoothed(none, none, ones, ones, np.zeros((1, 3, joints)), none, np.zeros((1, 2, joints)))
         at = self._at = self._model.layout
         # The whole widths (n,) of the backlash, whatever decides on the side; the rows of what is forgotten: the rest, the
-        # readings' noise and the pose, which stand side by side; and the diagonal of a covariance.
+        # readings' noise and the pose, which stand side by side.
         whole = np.eye(at.size)
         self._widths = whole[at.backlash : at.floats] + whole[at.floats : at.compliance]
-        self._forgets, self._diagonal = slice(at.rest, at.delay), np.diag_indices(at.size)
-        self._opened = opened(joints)
+        self._forgets = slice(at.rest, at.delay)
+        self._opened, self._tight = opened(joints), np.zeros(joints, np.bool_)
         self._states = [ErrorState(-np.inf, np.zeros(at.size), np.diag(self._model.sigmas**2), nowhere, None)]
         self.on_innovation: Callable[[Innovation], None] | None = None
         self.clock = None if learns_delay else ClockFollower(at.size, at.delay, delay.sigma_s)
@@ -165,7 +159,9 @@ class KalmanEstimator:
             return self.track(np.array([t_s]))[0]
         if self._newest is None:
             state, joints, step = self._now()
-            self._newest = by_state(self._model, state, np.array([self.span_s[1]]), joints, step)[0]
+            (T,), (cov,), (own,) = self._model.tracked(state, step, joints)
+            t_s = self.span_s[1]
+            self._newest = ArmEstimate(t_s, T, cov, own, joints.q[0], joints.qd[0], t_s - state.t_s)
         return self._newest
 
     def _now(self) -> tuple[ErrorState, Smoothed, Propagation]:
@@ -176,8 +172,15 @@ class KalmanEstimator:
 
     def _since(self, t_s: Array) -> tuple[ErrorState, Smoothed, Propagation]:
         """Return the same at (N,) times."""
-        joints, (state,) = self._readings.at(t_s), anew(self._readings, self._states[-1:])
+        state, joints = self._anew(self._states[-1], t_s)
         return state, joints, self._model.moved(state, joints, t_s)
+
+    def _anew(self, state: ErrorState, t_s: Array) -> tuple[ErrorState, Smoothed]:
+        """Return a state updated by the readings that have come since, and the joints at (N,) times."""
+        if state.t_s < self.span_s[0]:
+            return state, self._readings.at(t_s)
+        joints = self._readings.at(np.concatenate([[state.t_s], t_s]))
+        return smoothed_anew(state, joints.rows(0, 1)), joints.rows(1, len(t_s) + 1)
 
     def track(self, t_s: Array) -> Track:
         """Return the poses of the tool at (N,) times."""
@@ -202,14 +205,8 @@ class KalmanEstimator:
     def tool(self, q: Array, qd: Array, *, pressed: bool = False) -> Array:
         """Return T_base_tool if the potentiometers read q (N, n) moving at qd (N, n), by what is known now."""
         state, now, step = self._now()
-        unseen = np.repeat(now.unseen, len(q), axis=0)
-        moves = np.abs(qd) > MOVES_RAD_S
-        unseen[:, 0] = np.where(moves, np.sign(qd), now.unseen[:, 0])
-        if pressed:
-            unseen[:, 1] = np.where(moves & self._readings.loose(now.q[0]), np.sign(qd), now.unseen[:, 1])
-        x = state.x * step.kept
-        x[:, self._at.noise] = 0.0  # noise of what was read, not of what might be
-        return self._model.poses(x, q, unseen)[0]
+        loose = self._readings.loose(now.q[0]) if pressed else self._tight
+        return self._model.imagined(state, step, now, np.ascontiguousarray(q), np.ascontiguousarray(qd), loose)
 
     def learned(self) -> Learned:
         """Return what has been learned about the arm."""
@@ -272,28 +269,23 @@ class KalmanEstimator:
     ) -> tuple[ErrorState | None, Outcome]:
         """Return the state after a measurement, None where it is an outlier; report how it came about."""
         t_s = max(self._seen_s(pose_measurement, before), before.t_s)
-        joints, (before,) = self._readings.at(np.array([t_s])), anew(self._readings, [before])
-        step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
-        x, P = before.x * step.kept[0], before.P.copy()
-        P[self._forgets] *= step.kept[0, self._forgets, None]
-        P[:, self._forgets] *= step.kept[0, self._forgets]
-        P[self._diagonal] += step.added[0]
-        P[np.abs(P) < _NOTHING] = 0.0
-        z, H, R = first = self._innovation(x, joints, pose_measurement)
-        PHt = P @ H.T
-        S = H @ PHt + R + pose_measurement.cov_common
-        outcome = self._gate(z, S)
+        times, jitter_s = np.array([t_s]), self._delay.jitter_s
+        before, joints = self._anew(before, times)
+        step = self._model.moved(before, joints, times, learning=LEARNING)
+        at, chi = self._model.predicted(before, step, joints, pose_measurement, jitter_s)
+        outcome = self._gate(at, chi)
         if outcome is Outcome.OUTLIER:
             if report is not None:
                 none = np.zeros((self._at.size, 6))
-                report(self._said(t_s, joints, pose_measurement, (z, S, H), (step.kept[0], none), outcome))
+                report(self._said(t_s, joints, pose_measurement, at, (step.kept[0], none), outcome))
             return None, outcome
         if outcome is Outcome.REOPENED:
-            P[self._diagonal] += self._opened
-            PHt = P @ H.T
-        x, P, K = self._update(x, P, joints, pose_measurement, first, PHt)
+            at.P[np.diag_indices(self._at.size)] += self._opened
+            at.HP[:] += at.H * self._opened
+        K = self._model.updated(at, joints, pose_measurement, jitter_s, learns_delay=self._learns_delay)
+        x, P = at.x, at.P
         if report is not None:
-            change = report(self._said(t_s, joints, pose_measurement, (z, S, H), (step.kept[0], K), outcome))
+            change = report(self._said(t_s, joints, pose_measurement, at, (step.kept[0], K), outcome))
             if change is not None and self.clock is not None:
                 x = x + change
                 by_delay = P[:, self._at.delay] / P[self._at.delay, self._at.delay]
@@ -305,67 +297,20 @@ class KalmanEstimator:
         t_s: float,
         joints: Smoothed,
         pose_measurement: PoseMeasurement,
-        first: tuple[Array, Array, Array],
+        at: Predicted,
         how: tuple[Array, Array],
         outcome: Outcome,
     ) -> Innovation:
-        """Return what became of a measurement: innovation, its covariance and derivative; what was kept, and the gain."""
+        """Return what became of a measurement: the state at it; what was kept, and the gain; the outcome."""
         reference = None
         if self._reference is not None and self.on_innovation is not None:
-            reference = self._innovation(self._reference, joints, pose_measurement)[:2]
-        return Innovation(t_s, pose_measurement.T_base_tool, *first, *how, outcome, None, reference)
+            reference = self._model.innovation(self._reference, joints, pose_measurement, self._delay.jitter_s)[:2]
+        return Innovation(t_s, pose_measurement.T_base_tool, at.z, at.S, at.H, *how, outcome, None, reference)
 
-    def _innovation(self, x: Array, joints: Smoothed, pose_measurement: PoseMeasurement) -> tuple[Array, Array, Array]:
-        """Return the innovation (6,) of a measurement, the model's derivative (6, size) by x, and the noise (6, 6)."""
-        Ts, Hs = self._model.poses(x[None], joints.q, joints.unseen)
-        H = Hs[0]
-        velocity = (H[:, self._at.zeros] * self._arm.direction) @ joints.qd[0]
-        H[:, self._at.delay] = -velocity  # measured earlier by so much, the tool had not moved as far
-        R = pose_measurement.cov_noise + self._delay.jitter_s**2 * np.outer(velocity, velocity)
-        z = np.empty(6)
-        armerror.tangent(Ts[0], pose_measurement.T_base_tool, z)
-        return z, H, R
-
-    def _update(
-        self,
-        x: Array,
-        P: Array,
-        joints: Smoothed,
-        pose_measurement: PoseMeasurement,
-        first: tuple[Array, Array, Array],
-        PHt: Array,
-    ) -> tuple[Array, Array, Array]:
-        """Return state, covariance and gain after a measurement: the iterated update (Bell and Cathey, 1993).
-
-        Args:
-            x: the state.
-            P: its covariance, which is overwritten by the result.
-            joints: at the measurement.
-            pose_measurement: the measurement.
-            first: innovation, derivative and noise at x.
-            PHt: the product of P and the derivative's transpose.
-        """
-        (z, H, R), change = first, np.zeros(self._at.size)
-        for left in range(ITERATIONS, 0, -1):
-            K = np.linalg.solve(H @ PHt + R, PHt.T).T
-            if not self._learns_delay:
-                K[self._at.delay] = 0.0
-            last, change = change, K @ z
-            if left == 1 or np.abs(change - last).max() < SETTLED:
-                break
-            z, H, R = self._innovation(x + change, joints, pose_measurement)
-            # The joints were taken at the delay of x, whatever the change: that part is not in z yet.
-            z += H[:, : self._at.delay] @ change[: self._at.delay]
-            PHt = P @ H.T
-        P -= K @ PHt.T
-        if not self._learns_delay:  # its row is as it was, its column is right
-            P[self._at.delay] = P[:, self._at.delay]
-        symmetric(P)
-        return x + change, P, np.asarray(K)
-
-    def _gate(self, z: Array, S: Array) -> Outcome:
-        """Return whether an innovation (6,) with covariance (6, 6) is used, an outlier, or one too many to ignore."""
-        if chi_square(S, z) < _GATE:
+    def _gate(self, at: Predicted, chi: float) -> Outcome:
+        """Return whether an innovation, with its chi-square, is used, an outlier, or one too many to ignore."""
+        z, S = at.z, at.S
+        if chi < _GATE:
             self._outliers = []
             return Outcome.USED
         if self._outliers:

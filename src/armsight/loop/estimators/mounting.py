@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,7 +11,9 @@ import numpy as np
 from armsight.data import Array, PoseEstimate, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
+from armsight.geometry.matrix import product
 from armsight.geometry.pose import adjoint, inverse
+from armsight.kernels import kernel
 from armsight.loop.estimators.estimator import PoseMeasurement
 from armsight.loop.handeye.handeye import HandEye
 from armsight.robot.arm import Arm
@@ -36,12 +39,11 @@ class Mounting(Record):
         return Mounting(handeye.T_base_rig, inverse(arm.T_flange_tool) @ handeye.T_flange_body, handeye.cov)
 
     @cached_property
-    def _to_tool(self) -> Array:
-        return adjoint(self.T_tool_body)
-
-    @cached_property
-    def _T_body_tool(self) -> Array:
-        return inverse(self.T_tool_body)
+    def _parts(self) -> tuple[Array, Array, Array, Array]:
+        """T_base_rig, T_body_tool, the adjoint of T_tool_body and the covariance, as :func:`_carry` takes them."""
+        parts = self.T_base_rig, inverse(self.T_tool_body), adjoint(self.T_tool_body), self.cov
+        a, b, c, d = (np.ascontiguousarray(part, float) for part in parts)
+        return a, b, c, d
 
     def body(self, T_base_tool: Array) -> Array:
         """Return T_left_body (4, 4) with the tool at a pose (4, 4), m."""
@@ -60,27 +62,73 @@ class Mounting(Record):
         Raises:
             InputError: ``t_s`` is no number.
         """
-        if not np.isfinite(t_s):
+        if not math.isfinite(t_s):
             raise InputError(f"t_s is {t_s}; a measurement needs the time of its exposure, s")
-        T_rig_body, to_tool = checked(pose.T_left_body, (4, 4), "T_left_body"), self._to_tool
-        common = _positive(pose.cov - pose.cov_noise)
-        if self.cov.any():
-            by_mounting = np.concatenate([adjoint(inverse(T_rig_body)), -np.eye(6)], axis=1)
-            common = by_mounting @ self.cov @ by_mounting.T + common
-        return PoseMeasurement(
-            t_s,
-            self.T_base_rig @ T_rig_body @ self._T_body_tool,
-            to_tool @ pose.cov_noise @ to_tool.T,
-            to_tool @ common @ to_tool.T,
-        )
+        T_rig_body = np.ascontiguousarray(checked(pose.T_left_body, (4, 4), "T_left_body"))
+        common = np.subtract(pose.cov, pose.cov_noise, order="C")
+        if not _is_positive(common):
+            values, vectors = np.linalg.eigh((common + common.T) / 2)  # without what rounding made negative
+            common = np.ascontiguousarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+        T, noise, shared = np.empty((4, 4)), np.empty((6, 6)), np.empty((6, 6))
+        _carry(T_rig_body, np.ascontiguousarray(pose.cov_noise), common, *self._parts, T, noise, shared)
+        return PoseMeasurement(t_s, T, noise, shared)
 
 
-def _positive(cov: Array) -> Array:
-    """Return a covariance (6, 6) without what rounding made negative."""
-    try:
-        np.linalg.cholesky(cov)
-        return cov
-    except np.linalg.LinAlgError:
-        pass
-    values, vectors = np.linalg.eigh((cov + cov.T) / 2)
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+@kernel("f8[:, ::1]")
+def _is_positive(C: Array) -> bool:
+    """Return whether a covariance (6, 6) is positive definite: whether it has Cholesky's factor."""
+    L = np.zeros((6, 6))
+    for i in range(6):
+        for j in range(i + 1):
+            rest = C[i, j]
+            for k in range(j):
+                rest -= L[i, k] * L[j, k]
+            if i == j and not rest > 0.0:
+                return False
+            L[i, j] = math.sqrt(rest) if i == j else rest / L[j, j]
+    return True
+
+
+@kernel(
+    "const f8[:, ::1], const f8[:, ::1], f8[:, ::1], const f8[:, ::1], const f8[:, ::1], const f8[:, ::1], "
+    "const f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]"
+)
+def _carry(
+    T_rig_body: Array,
+    cov_noise: Array,
+    common: Array,
+    T_base_rig: Array,
+    T_body_tool: Array,
+    to_tool: Array,
+    cov: Array,
+    T: Array,
+    noise: Array,
+    shared: Array,
+) -> None:
+    """Write what :meth:`Mounting.pose_measurement` computes to T, noise and shared; the covariance common is used up.
+
+    Args:
+        T_rig_body: (4, 4) the measured pose.
+        cov_noise: (6, 6) its noise.
+        common: (6, 6) the rest of its covariance; that of the mounting is added.
+        T_base_rig: (4, 4) the mounting.
+        T_body_tool: (4, 4) the mounting.
+        to_tool: (6, 6) the adjoint of T_tool_body.
+        cov: (12, 12) covariance of the mounting.
+        T: (4, 4) of the tool.
+        noise: (6, 6) noise of the tool's pose.
+        shared: (6, 6) its covariance that all shots share.
+    """
+    by_mounting = np.zeros((6, 12))  # [Ad(T_rig_body^-1), -I]
+    for i in range(3):
+        for j in range(3):
+            by_mounting[i, j] = by_mounting[3 + i, 3 + j] = T_rig_body[j, i]
+            # t x row j of the identity, in the axes of the body
+            k, m = (j + 1) % 3, (j + 2) % 3
+            by_mounting[i, 3 + j] = T_rig_body[k, i] * -T_rig_body[m, 3] + T_rig_body[m, i] * T_rig_body[k, 3]
+    for i in range(6):
+        by_mounting[i, 6 + i] = -1.0
+    common += product(product(by_mounting, cov), by_mounting.T)
+    T[:] = product(product(T_base_rig, T_rig_body), T_body_tool)
+    noise[:] = product(product(to_tool, cov_noise), to_tool.T)
+    shared[:] = product(product(to_tool, common), to_tool.T)

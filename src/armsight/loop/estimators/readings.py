@@ -75,6 +75,10 @@ class Smoothed(NamedTuple):
     travel: Array
     flips: Array
 
+    def rows(self, begin: int, end: int) -> Smoothed:
+        """Return those at some of the times."""
+        return Smoothed(*(part[begin:end] for part in self))
+
 
 @kernel
 def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, dead: float, gap: Array) -> None:
@@ -288,10 +292,9 @@ class Readings:
             InputError: not within them.
         """
         oldest, newest = self.span_s
-        at, n = np.array(t_s, dtype=float), len(t_s)
-        j = self._joints
-        shapes = (j,), (j,), (j,), (j,), (3, j), (j,), (2, j)
-        joints = Smoothed(*(np.empty((n, *shape)) for shape in shapes))
+        at, n, j = np.array(t_s, dtype=float), len(t_s), self._joints
+        one, sides, unseen, empty = (n, j), (n, 2, j), (n, 3, j), np.empty
+        joints = Smoothed(empty(one), empty(one), empty(one), empty(one), empty(unseen), empty(one), empty(sides))
         kept = (self._t, self._q, self._memory, self._first, self._count)
         if not _smooth(*kept, at, self._sigma, *joints):
             raise InputError(

@@ -94,15 +94,13 @@ def anew(readings: Readings, states: list[ErrorState]) -> list[ErrorState]:
     if not any(kept):
         return states
     then = readings.at(np.array([state.t_s for state, there in zip(states, kept, strict=True) if there]))
-    rows = iter([Smoothed(*(part[k : k + 1] for part in then)) for k in range(len(then.q))])
+    rows = iter([then.rows(k, k + 1) for k in range(len(then.q))])
     return [smoothed_anew(state, next(rows)) if there else state for state, there in zip(states, kept, strict=True)]
 
 
 def by_state(model: ErrorModel, state: ErrorState, t_s: Array, joints: Smoothed, step: Propagation) -> Track:
     """Return the poses of the tool at times (N,), s, by one state, propagated."""
-    Ts, Hs = model.poses(state.x * step.kept, joints.q, joints.unseen)
-    own, age = model.covariances(state, step, Hs), t_s - state.t_s
-    return Track(t_s, Ts, own + shared(state.pose_measurement, Ts), own, joints.q, joints.qd, age)
+    return Track(t_s, *model.tracked(state, step, joints), joints.q, joints.qd, t_s - state.t_s)
 
 
 def _alone(model: ErrorModel, readings: Readings, part: Interval) -> Track:

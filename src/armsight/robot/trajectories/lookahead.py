@@ -13,6 +13,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.kernels import kernel
 from armsight.robot.trajectories.limits import outside
 from armsight.robot.trajectories.path import ROTATION_M, Path, PathPoints
 
@@ -98,13 +99,21 @@ def refined(arm: Arm, T_base_tool: Array, q_near: Array) -> Array:
 
 def behind(T_goal: Array, T: Array) -> Array:
     """Return how far poses (..., 4, 4) are behind others, (..., 6): [m; rad], base axes, for small rotations."""
-    M = T_goal[..., :3, :3] @ np.swapaxes(T[..., :3, :3], -1, -2)
-    off = np.empty((*T.shape[:-2], 6))
-    off[..., :3] = T_goal[..., :3, 3] - T[..., :3, 3]
-    off[..., 3] = (M[..., 2, 1] - M[..., 1, 2]) / 2
-    off[..., 4] = (M[..., 0, 2] - M[..., 2, 0]) / 2
-    off[..., 5] = (M[..., 1, 0] - M[..., 0, 1]) / 2
-    return off
+    off = np.empty((T.size // 16, 6))
+    goals, Ts = np.ascontiguousarray(T_goal, np.float64), np.ascontiguousarray(T, np.float64)
+    _behind(goals.reshape(-1, 4, 4), Ts.reshape(-1, 4, 4), off)
+    return off.reshape((*T.shape[:-2], 6))
+
+
+@kernel("const f8[:, :, ::1], const f8[:, :, ::1], f8[:, ::1]")
+def _behind(goals: Array, Ts: Array, off: Array) -> None:
+    """Write how far poses (N, 4, 4) are behind others to off (N, 6)."""
+    for n in range(len(Ts)):
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            off[n, i], off[n, 3 + i] = goals[n, i, 3] - Ts[n, i, 3], 0.0
+            for m in range(3):
+                off[n, 3 + i] += 0.5 * (goals[n, k, m] * Ts[n, j, m] - goals[n, j, m] * Ts[n, k, m])
 
 
 def derivatives(arm: Arm, q: Array, points: PathPoints) -> tuple[Array, Array]:
