@@ -1,8 +1,8 @@
-"""Forty mutants, small errors made by hand, and whether the tests see each: ``python tests/mutants.py [NAME ...]``.
+"""Some forty mutants, small errors made by hand, and whether the tests see each: ``python tests/mutants.py [NAME ...]``.
 
 A mutant is one change of one file: a sign flipped, a matrix transposed, an index off by one, a unit wrong. The
 checkout is copied to a temporary folder and never changed. The tests named for a mutant must pass without it and fail
-with it. Not part of ``make test``: all forty take some minutes on one core.
+with it. Not part of ``make test``: all take some minutes on one core.
 
     --list           show the table and run nothing
     --json FILE      write one record per mutant
@@ -154,9 +154,11 @@ MUTANTS = (
     Mutant("servo-gain", "off by one", f"{LOOP}/servo.py",
            "d**d / (d + 1) ** (d + 1)", "d**d / (d + 1) ** d", "test_servo.py", "gain_rule"),
     Mutant("servo-correction", "sign", f"{LOOP}/servo.py",
-           "= q_ref - ahead.q", "= ahead.q - q_ref", "test_servo.py", "a_tenth and 30", compiled=True),
+           "= q_ref[i] - q[1, i]", "= q[1, i] - q_ref[i]", "test_servo.py", "brought_back"),
     Mutant("servo-rate", "unit", f"{LOOP}/servo.py",
-           "qd_max * period_s, np.maximum(", "qd_max, np.maximum(", "test_servo.py", "within_every_limit", compiled=True),
+           "= self._arm.qd_max * self.timing.period_s", "= self._arm.qd_max", "test_servo.py", "brought_back"),
+    Mutant("estimators-update", "sign", f"{ESTIMATORS}/errormodel.py",
+           "P[k, j] -= K[k, row]", "P[k, j] += K[k, row]", "test_arm_error.py", "textbook"),
     Mutant("estimators-backlash", "sign", f"{ESTIMATORS}/armerror.py",
            "= -0.5 * unseen[0, i]", "= 0.5 * unseen[0, i]", "test_arm_error.py", "offsets_are or slow_arm"),
     Mutant("estimators-adjoint", "transposed", f"{ESTIMATORS}/armerror.py",

@@ -8,7 +8,7 @@ from arm_rig import ARM, MIDDLE, TICK_S, Workcell, distance_mm, mounts, rms, wor
 
 from armsight.data import JointCommand
 from armsight.errors import InputError
-from armsight.loop.estimators import ESTIMATORS, Delay, Mounting
+from armsight.loop.estimators import ESTIMATORS, ArmEstimate, Delay, Mounting
 from armsight.loop.health import Trust
 from armsight.loop.servo import MAX_CORRECTION_RAD, RATE_SHARE, STEP_LEVER_M, LoopTiming, Mode, PoseServo, whole_steps
 from armsight.robot.arm_file import open_arm
@@ -148,6 +148,33 @@ def test_without_any_vision_the_motion_is_commanded_as_it_is():
     assert np.array_equal(step.command.qd_ref, ahead.qd)
     assert (step.command.gravity_duty == 0.1).all()
     assert step.command.duration_s == PERIOD_S
+
+
+def test_a_tool_that_is_displaced_is_brought_back_no_faster_than_it_may():
+    """Without noise: the tool is 10 mm from where the joints put it, and the estimator says so."""
+    shift = np.array([8e-3, -4e-3, 4e-3])
+
+    class Displaced:
+        def __init__(self):
+            self.q = MIDDLE
+
+        def estimate(self):
+            T, none = self.tool(self.q[None], None)[0], np.zeros(6)
+            return ArmEstimate(0.0, T, np.eye(6) * 1e-12, np.eye(6) * 1e-12, self.q, none, 0.01)
+
+        def tool(self, q, qd, *, pressed=False):
+            Ts = ARM.forward(q)
+            Ts[:, :3, 3] += shift
+            return Ts
+
+    estimator, servo, motion = Displaced(), PoseServo(ARM, timing(60)), point_to_point(ARM, MIDDLE, MIDDLE + 0.1)
+    before = np.zeros(6)
+    for k in range(60):
+        step = servo.step(servo.aim(motion, k * PERIOD_S), estimator)
+        assert (np.abs(step.correction - before) <= RATE_SHARE * ARM.qd_max * PERIOD_S * (1 + 1e-9)).all()
+        before, estimator.q = step.correction, step.command.q_ref
+    reached = estimator.estimate().T_base_tool[:3, 3]
+    assert np.linalg.norm(reached - ARM.forward(motion.at(60 * PERIOD_S).q)[:3, 3]) < 0.1 * np.linalg.norm(shift)
 
 
 def test_commands_stay_within_every_limit_and_do_not_jump():

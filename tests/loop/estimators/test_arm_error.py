@@ -7,7 +7,7 @@ import pytest
 from arm_rig import ARM, MIDDLE, loads, product, sampled, small
 
 from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.estimators import armerror
+from armsight.loop.estimators import PoseMeasurement, armerror
 from armsight.loop.estimators.armerror import BASIS, Prior, layout
 from armsight.loop.estimators.errormodel import ErrorModel, ErrorState, chi_square
 from armsight.loop.estimators.readings import Smoothed
@@ -26,6 +26,8 @@ ODD = dataclasses.replace(
     T_flange_tool=small([0.0, 0.1, 0.1, -0.2, 0.4, 1.0]),
 )
 ARMS = [*MODELS.values(), ODD]
+#: Shapes of a Smoothed of one time.
+ONE = ((1, 6),) * 4 + ((1, 3, 6), (1, 6), (1, 2, 6))
 
 
 def evaluated(arm, x, q, unseen):
@@ -147,6 +149,36 @@ def test_covariances_are_those_of_the_matrices():
         moved = np.diag(step.kept[n]) @ state.P @ np.diag(step.kept[n]) + np.diag(step.added[n])
         expected = Hs[n] @ moved @ Hs[n].T
         assert np.abs(own - expected).max() < 1e-13 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("learns_delay", [True, False])
+def test_a_measurement_changes_state_and_covariance_as_the_textbook_has_it(learns_delay):
+    """Joseph's form of the update (Bucy and Joseph, 1968), which holds for every gain."""
+    rng = np.random.default_rng(7)
+    model, joints = ErrorModel(ARM, Prior(), 2e-4), Smoothed(*(rng.uniform(0.1, 0.2, shape) for shape in ONE))
+    root = 1e-4 * rng.normal(size=(SIZE, SIZE))
+    state = ErrorState(0.0, 1e-4 * rng.normal(size=SIZE), root @ root.T, joints, None)
+    T = model.poses(state.x, joints.q, joints.unseen)[0][0] @ small([1e-5, 2e-5, -1e-5, 1e-5, 3e-5, 2e-5])
+    seen = PoseMeasurement(0.05, T, np.diag([1e-10] * 3 + [1e-8] * 3), np.zeros((6, 6)))
+    step = model.moved(state, joints._replace(travel=joints.travel + 0.02), np.array([0.01]))
+    at, chi = model.predicted(state, step, joints, seen, 1e-4)
+    kept, velocity = np.diag(step.kept[0]), -at.H[:, -1]
+    P = kept @ state.P @ kept + np.diag(step.added[0])
+    np.testing.assert_allclose(at.P, P, rtol=1e-13, atol=0)
+    _, (H,) = model.poses(kept @ state.x, joints.q, joints.unseen)
+    H[:, -1] = -velocity
+    R = seen.cov_noise + 1e-4**2 * np.outer(velocity, velocity)
+    S = H @ P @ H.T + R
+    assert np.abs(at.S - S).max() < 1e-13 * np.abs(S).max()
+    assert chi == pytest.approx(at.z @ np.linalg.solve(S, at.z), rel=1e-9)
+    expected = np.linalg.solve(S, H @ P).T
+    expected[-1] *= learns_delay
+    gain = model.updated(at, joints, seen, 1e-4, learns_delay=learns_delay)
+    np.testing.assert_allclose(gain, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_allclose(at.x, kept @ state.x + expected @ at.z, rtol=0, atol=1e-14)
+    left = np.eye(SIZE) - expected @ H
+    after = left @ P @ left.T + expected @ R @ expected.T
+    np.testing.assert_allclose(at.P, after, rtol=0, atol=1e-9 * np.abs(P).max())
 
 
 def test_chi_square_is_that_of_the_inverse():
