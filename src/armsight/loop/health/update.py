@@ -8,8 +8,10 @@ baseline: the shots cannot distinguish it from the size of the body.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +33,8 @@ _MOVED = np.repeat([0.01, np.radians(2.0)], 3)
 #: Standard deviations of a detection by which detections are gated, step by step of the fit, px: loosely while the rig is
 #: wrong, at the end by that of the rig (0). And the one that the fit starts with, before the residuals give it.
 _GATES_PX, _NOISE_PX = (20.0, 2.0, 0.0, 0.0), 0.1
+#: In so many shots at most the uncertainty of the body is computed.
+_JUDGED = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,7 @@ class RigUpdate(Record):
         epipolar_px: RMS distance of the detections from their epipolar lines (Sampson), before and after.
         shots: number of shots that were used.
         stays: how many of them differ from one another.
+        uncertainty: standard deviation of the body's position with the new rig, over that with the calibration's.
     """
 
     rig: StereoRig
@@ -56,6 +61,38 @@ class RigUpdate(Record):
     epipolar_px: tuple[float, float]
     shots: int
     stays: int
+    uncertainty: float
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures as JSON has them."""
+        return {
+            "rotation_changed_deg": float(np.degrees(self.rotation_rad)),
+            "rotation_sigma_deg": float(np.degrees(self.sigma_rad)),
+            "shift_across_baseline_m": self.shift_m,
+            "depth_error_of_old_rig_m": {
+                f"{depth:g}": value if math.isfinite(value) else None
+                for depth, value in zip(DEPTHS_M, self.depth_errors_m, strict=True)
+            },
+            "epipolar_rms_before_px": self.epipolar_px[0],
+            "epipolar_rms_after_px": self.epipolar_px[1],
+            "shots": self.shots,
+            "differing_shots": self.stays,
+        }
+
+    def lines(self) -> list[str]:
+        """Return the figures as lines for people."""
+        depths = ", ".join(
+            f"{f'{1e3 * value:+.2f} mm' if math.isfinite(value) else 'unknown'} at {depth:g} m"
+            for depth, value in zip(DEPTHS_M, self.depth_errors_m, strict=True)
+        )
+        before, after = self.epipolar_px
+        return [
+            f"right camera: rotated by {np.degrees(self.rotation_rad):.3f} +- {np.degrees(self.sigma_rad):.3f} deg, "
+            f"shifted across the baseline by {1e3 * self.shift_m:.3f} mm",
+            f"depth error of the old rig: {depths}",
+            f"epipolar distance, RMS: {before:.3f} px before, {after:.3f} px after",
+            f"{self.shots} shots used, {self.stays} differ from one another",
+        ]
 
 
 def updated_rig(rig: StereoRig, body: Body, shots: Sequence[SeenShot]) -> RigUpdate | Missed:
@@ -94,13 +131,23 @@ def updated_rig(rig: StereoRig, body: Body, shots: Sequence[SeenShot]) -> RigUpd
         left = sums.square - 2.0 * float((step - so_far) @ sums.b) + float((step - so_far) @ sums.H @ (step - so_far))
         noise_px *= float(np.sqrt(max(left, 0.0) / max(sums.freedom, 1.0)))
         new, cov = rig.perturbed(step[:count]), whole[:count, :count]
-    return _checked(rig, replace(new, cov=(cov + cov.T) / 2), body, found, stays)
+    new = replace(new, cov=(cov + cov.T) / 2)
+    some = shots[:: -(-len(shots) // _JUDGED)]
+    now, then = (_position_sigma(each, body, some) for each in (new, replace(new, cov=rig.cov)))
+    return _checked(rig, new, body, found, (stays, now / then))
+
+
+def _position_sigma(rig: StereoRig, body: Body, shots: Sequence[SeenShot]) -> float:
+    """Return the RMS standard deviation of the body's position in some shots, m; NaN where none is measured."""
+    measured = [measure_seen(rig, body, shot) for shot in shots]
+    variances = [np.trace(each.cov[:3, :3]) for each in measured if isinstance(each, PoseEstimate)]
+    return float(np.sqrt(np.mean(variances))) if variances else float("nan")
 
 
 def _checked(
-    old: StereoRig, new: StereoRig, body: Body, found: Sequence[PoseEstimate], stays: int
+    old: StereoRig, new: StereoRig, body: Body, found: Sequence[PoseEstimate], said: tuple[int, float]
 ) -> RigUpdate | Missed:
-    """Return the update with its figures, or why it is rejected."""
+    """Return the update with its figures, or why it is rejected; the last two figures are given."""
     sigma = float(np.sqrt(np.linalg.eigvalsh(new.cov[-3:, -3:])[-1]))
     if sigma > MOST_SIGMA_RAD:
         return Missed(
@@ -127,7 +174,7 @@ def _checked(
         tuple(_depth_error(old, new, depth) for depth in DEPTHS_M),
         (before, after),
         len(found),
-        stays,
+        *said,
     )
 
 
