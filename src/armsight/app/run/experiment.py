@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -91,6 +92,15 @@ def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
             f"--arm {setup.arm.name} does not match the board's potentiometers (armsight board monitor)"
         )
     require_range(setup, np.vstack([targets, *(passed(m.trajectory) for m in plan.motions)]))
+
+
+def require_followed(rig: StereoRig, path: Path) -> None:
+    """Reject a rig that cannot be followed, as its file does not say how well it is known."""
+    if not rig.cov.any():
+        raise InputError(
+            f"--follow-rig: {path} has no covariance, so that a rig that moved cannot be told from one that was never well "
+            "known: calibrate it (armsight calibrate), or leave out --follow-rig"
+        )
 
 
 def passed(way: Trajectory) -> Array:

@@ -24,7 +24,14 @@ import numpy as np
 
 from armsight.app.run.record import Log, RunSegment, Skew, ToolTrack
 from armsight.app.run.setup import Setup
-from armsight.app.stream.datum import EventDatum, JointsDatum, ShotDatum, estimator_event, mounting_event
+from armsight.app.stream.datum import (
+    EventDatum,
+    JointsDatum,
+    ShotDatum,
+    estimator_event,
+    mounting_event,
+    restored_event,
+)
 from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import DeviceError
@@ -579,7 +586,8 @@ class Loop:
         self.mounting = correction.mounting(self.mounting)
         if correction.update is not None:
             self._recalibrate(correction.update.rig)
-        self.health.put_right(correction)
+        if (state := self.health.put_right(correction)) is not None:
+            self.publisher.put(EventDatum(self.t_s, restored_event(state)))
         self.log.corrections.append(correction)
         self.log.mountings.append((self.t_s, self.mounting))
 

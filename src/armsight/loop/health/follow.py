@@ -53,6 +53,7 @@ class RigCorrection(Record):
         update: of the cameras; None of the base.
         motion: (6,) right tangent from the old pose of the rig in the base to the new one, [m; rad]; zero of the cameras.
         cov: (6, 6) its covariance.
+        tool_m: by how much that displaced the measured tool, where this is what the arm's poses show, and its sigma, m.
     """
 
     what: Literal["cameras", "base"]
@@ -62,6 +63,7 @@ class RigCorrection(Record):
     update: RigUpdate | None
     motion: Array
     cov: Array
+    tool_m: tuple[float, float] | None = None
 
     def mounting(self, old: Mounting) -> Mounting:
         """Return where the rig is, from where it was thought to be."""
@@ -78,6 +80,8 @@ class RigCorrection(Record):
         found: dict[str, Any] = {"what": self.what, "since_s": self.since_s, "at_s": self.at_s, "by": self.by}
         if self.update is not None:
             return found | self.update.figures()
+        if self.tool_m is not None:
+            found |= {"tool_displaced_m": self.tool_m[0], "tool_displaced_sigma_m": self.tool_m[1]}
         sigmas = np.sqrt(np.diag(self.cov))
         return found | {
             "shift_m": self.motion[:3].tolist(),
@@ -89,15 +93,25 @@ class RigCorrection(Record):
     def line(self) -> str:
         """Return what was put right as one line for people."""
         if self.update is None:
-            shift, turn = (float(np.linalg.norm(part)) for part in (self.motion[:3], self.motion[3:]))
-            sigma = float(np.sqrt(np.linalg.eigvalsh(self.cov[:3, :3])[-1]))
+            shift, rotation = (float(np.linalg.norm(part)) for part in (self.motion[:3], self.motion[3:]))
             what = (
-                f"the rig in the base of the arm moved by {1e3 * shift:.2f} +- {1e3 * sigma:.2f} mm and "
-                f"{np.degrees(turn):.3f} deg, as {'the poses of the arm' if self.by == 'arm' else 'fixed bodies'} show"
+                f"it had moved against the base of the arm by {1e3 * shift:.2f} mm and {np.degrees(rotation):.3f} deg"
             )
+            if self.tool_m is None:
+                what += ", as fixed bodies show"
+            else:
+                what += (
+                    f", the tool had appeared displaced by {1e3 * self.tool_m[0]:.2f} +- {1e3 * self.tool_m[1]:.2f} mm"
+                )
         else:
             what = "; ".join(self.update.lines())
         return f"rig put right at {self.at_s:.1f} s, wrong since {self.since_s:.1f} s: {what}"
+
+
+def correction_lines(corrections: Sequence[RigCorrection], rejected: str | None) -> list[str]:
+    """Return the lines for a log or a terminal on what was put right, and why what else was found was not."""
+    left = () if rejected is None else (f"the rig was not put right: {rejected}",)
+    return [*(each.line() for each in corrections), *left]
 
 
 class RigFollower:
@@ -213,7 +227,9 @@ class RigFollower:
         # What was measured is exp(xi) times the true pose, with xi in the base's frame.
         xi, cov = best.displacement(np.eye(4), t_s)
         to_rig = adjoint(inverse(T_base_rig))
-        return RigCorrection("base", best.begin_s, at_s, "arm", None, -to_rig @ xi, to_rig @ cov @ to_rig.T)
+        motion, cov = -to_rig @ xi, to_rig @ cov @ to_rig.T
+        displaced_m = float(np.linalg.norm(shift[:3]))
+        return RigCorrection("base", best.begin_s, at_s, "arm", None, motion, cov, (displaced_m, sigma_m))
 
 
 def remeasured(rig: StereoRig, body: Body, pose: PoseEstimate) -> PoseEstimate | Missed:

@@ -155,8 +155,12 @@ class HealthMonitor:
             return None
         return marks.of_cameras.since_s, *marks.motion
 
-    def put_right(self, correction: RigCorrection) -> None:
-        """Begin anew after a correction, from what the estimator knew before the change; what was found stays found."""
+    def put_right(self, correction: RigCorrection) -> tuple[Array, Array] | None:
+        """Begin anew after a correction; what was found stays found.
+
+        Returns:
+            What the estimator knew before the change, with which it goes on: state and covariance; None without one.
+        """
         at_s, since_s = correction.at_s, correction.since_s
         cause = "rig" if correction.what == "cameras" else "fixed"
         self._corrected += tuple(
@@ -169,11 +173,13 @@ class HealthMonitor:
         if self._landmarks is not None:
             self._landmarks = LandmarkWatch(self._fixed_names)
         self._doubted_s = -np.inf
-        if self._estimator is not None and self._arm is not None:
-            before = [state for t_s, state in self._known if t_s < since_s - _DATED_S] or [self._known[0][1]]
-            self._known = deque([each for each in self._known if each[0] < since_s - _DATED_S], _KEPT)
-            self._estimator.restore(before[-1])
-            self._begin(self._estimator, self._arm)
+        if self._estimator is None or self._arm is None:
+            return None
+        before = [state for t_s, state in self._known if t_s < since_s - _DATED_S] or [self._known[0][1]]
+        self._known = deque([each for each in self._known if each[0] < since_s - _DATED_S], _KEPT)
+        self._estimator.restore(before[-1])
+        self._begin(self._estimator, self._arm)
+        return before[-1]
 
     @property
     def trust(self) -> Trust:
