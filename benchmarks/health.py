@@ -234,8 +234,9 @@ def show(case: Case, rows: list[dict]) -> None:
 def followed(seeds: range) -> None:
     """Print what is left once a rig was put right: cameras that rotate, and a closed loop whose rig moves."""
     print(
-        "cameras, rotated after 5 s: seed; put right after, s; rotation left, deg, and sigma; over a calibration's; NEES"
+        "cameras, rotated after 5 s: seed; put right after, s; rotation left, deg, and sigma; sigma of the body's position"
     )
+    print("with it and with the calibration, mm; NEES")
     for deg in (0.025, 0.05, 0.2):
         for k, axis in enumerate("xyz"):
             for seed in seeds:
@@ -276,10 +277,10 @@ def followed_cameras(seed: int, rotated: np.ndarray) -> str:
                 rig, at_s = found.update.rig, t_s
                 true = faults.TRUE.T_left_right @ exp_se3(np.append(np.zeros(3), rotated))
                 left = np.degrees(np.linalg.norm(log_se3(inverse(rig.T_left_right) @ true)[3:]))
-                sigma, ratio = np.degrees(found.update.sigma_rad), found.update.uncertainty
+                sigma, (now, then) = np.degrees(found.update.sigma_rad), found.update.sigma_m
     if rig is None:
         return f"{seed}; not put right: {follower.rejected}"
-    return f"{seed}; {at_s - 5.0:.1f}; {left:.4f} +- {sigma:.4f}; {ratio:.2f}; {np.mean(squares):.1f}"
+    return f"{seed}; {at_s - 5.0:.1f}; {left:.4f} +- {sigma:.4f}; {1e3 * now:.2f}, {1e3 * then:.2f}; {np.mean(squares):.1f}"
 
 
 def fixed_plate(name: str, first: int, at_m: list[float]) -> tuple[Target, PosedBody]:

@@ -148,7 +148,7 @@ def closed_loop(seed, motion=lambda t_s: np.zeros(6), *, closes=True, follows=Fa
         seconds: duration.
 
     Returns:
-        Of each 16 ms the time, s, the distance of the true tool from its reference, mm, whether the arm rests, and the mode;
+        Of each 16 ms the time, s, the distance of the true tool from its reference, mm, whether the arm rests, the mode;
         and what was put right.
     """
     rng = np.random.default_rng(seed)

@@ -31,7 +31,7 @@ def follower():
 def test_cameras_that_rotate_in_mid_run_are_put_right():
     rotated = np.array([0.0, np.radians(0.05), 0.0])
     poses, found, squares, rig = [], None, [], follower()
-    for monitor, t_s, T, estimate, _ in faults.watched_body(7001, rotated=rotated, at_s=2.0, seconds=6.5):
+    for monitor, t_s, T, estimate, _ in faults.watched_body(7001, rotated=rotated, at_s=2.0, seconds=6.0):
         poses.append((t_s, estimate))
         if found is None:
             rig = RigFollower(monitor._rig._rig, faults.BODY) if len(poses) == 1 else rig
@@ -40,7 +40,7 @@ def test_cameras_that_rotate_in_mid_run_are_put_right():
             found = None if since_s is None else rig.cameras(since_s, poses, t_s)
             if found is not None:
                 monitor.put_right(found)
-        else:
+        elif len(poses) % 5 == 0:
             again = faults.measured(found.update.rig, faults.BODY, T, estimate.points.seen.uv)
             off = log_se3(inverse(again.T_left_body) @ T)
             squares.append(off @ np.linalg.solve(again.cov, off))
@@ -103,6 +103,6 @@ def test_fixed_bodies_show_by_how_much_both_cameras_moved():
 
 
 def test_a_pose_is_measured_again_with_another_rig():
-    *_, (monitor, _, T, estimate, _) = faults.watched_body(7004, seconds=0.1)
+    *_, (monitor, _, _, estimate, _) = faults.watched_body(7004, seconds=0.1)
     again = remeasured(monitor._rig._rig, faults.BODY, estimate)
     assert np.linalg.norm(log_se3(inverse(again.T_left_body) @ estimate.T_left_body)[:3]) < 1e-4

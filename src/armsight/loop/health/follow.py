@@ -9,6 +9,7 @@ tool's position is known well enough with it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -30,12 +31,12 @@ from armsight.vision.triangulate import triangulate
 if TYPE_CHECKING:
     from armsight.loop.health.monitor import HealthMonitor
 
-#: An update may leave poses so many times as uncertain as the calibration did.
-ENOUGH = 1.5
+#: What is not known of a change of the cameras may be this share of what is not known of their calibration.
+SHARE = 0.5
 #: Most shots of an update; and by how much their number must have grown since an update that was rejected.
 _MOST_SHOTS, _MORE = 60, 1.25
-#: Largest standard deviation of the tool's position in its worst direction, by a motion of the rig that is put right, m;
-#: and by how much what else may have moved may place the tool elsewhere, m.
+#: Largest standard deviation of the tool's position by what is put right of the rig, m; and by how much what else may have
+#: moved may place the tool elsewhere, m.
 MOST_SIGMA_M, MOST_APART_M = 2e-4, 2e-4
 
 Poses = Callable[[], Sequence[tuple[float, PoseEstimate]]]
@@ -173,21 +174,25 @@ class RigFollower:
             settle_s: so long after ``since_s`` shots may still be from before, s.
         """
         used = _differing([pose for t_s, pose in poses if t_s >= since_s + settle_s])
+        before = _differing([pose for t_s, pose in poses if t_s < since_s - settle_s])
         if len(used) < max(LEAST_STAYS, _MORE * self._tried):
             self.rejected = (
                 self.rejected or f"cameras: {len(used)} shots since they moved differ, {LEAST_STAYS} are needed"
             )
             return None
         self._tried = len(used)
-        some = used[:: -(-len(used) // _MOST_SHOTS)]
-        found = updated_rig(self._rig, self._body, [seen_shot(str(k), pose) for k, pose in enumerate(some)])
+        before = before if len(before) >= LEAST_STAYS else []
+        found = updated_rig(self._rig, self._body, _some(used), _some(before))
         if isinstance(found, Missed):
             self.rejected = f"cameras: {found.reason}"
             return None
-        if found.uncertainty > ENOUGH:
+        now_m, then_m = found.sigma_m
+        by_m = math.sqrt(max(now_m**2 - then_m**2, 0.0))
+        most_m = max(MOST_SIGMA_M, SHARE * then_m) if before else then_m
+        if not by_m <= most_m:
             self.rejected = (
-                f"cameras: their pose would leave the body {found.uncertainty:.1f} times as uncertain as the calibration "
-                f"did, {ENOUGH:g} times are accepted: move the body through the whole view"
+                f"cameras: their pose would leave the body uncertain by {1e3 * by_m:.2f} mm, at most {1e3 * most_m:.2f} mm "
+                "are accepted: move the body through the whole view"
             )
             return None
         self._rig, self._tried, self.rejected = found.rig, 0, None
@@ -244,6 +249,11 @@ def _differing(poses: Sequence[PoseEstimate]) -> list[PoseEstimate]:
         if not kept or differ(kept[-1].T_left_body, pose.T_left_body):
             kept.append(pose)
     return kept
+
+
+def _some(poses: Sequence[PoseEstimate]) -> list[SeenShot]:
+    """Return the detections of some of the poses, if there are many."""
+    return [seen_shot(str(k), pose) for k, pose in enumerate(poses[:: -(-len(poses) // _MOST_SHOTS) or 1])]
 
 
 def seen_shot(name: str, pose: PoseEstimate) -> SeenShot:
