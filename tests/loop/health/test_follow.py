@@ -31,7 +31,7 @@ def follower():
 def test_cameras_that_rotate_in_mid_run_are_put_right():
     rotated = np.array([0.0, np.radians(0.05), 0.0])
     poses, found, squares, rig = [], None, [], follower()
-    for monitor, t_s, T, estimate, _ in faults.watched_body(7001, rotated=rotated, at_s=2.0, seconds=6.0):
+    for monitor, t_s, T, estimate, _ in faults.watched_body(7001, rotated=rotated, at_s=2.0, seconds=6.5):
         poses.append((t_s, estimate))
         if found is None:
             rig = RigFollower(monitor._rig._rig, faults.BODY) if len(poses) == 1 else rig
