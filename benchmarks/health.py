@@ -8,6 +8,8 @@ python health.py --results rows.jsonl    each run is a line there; those that st
 python health.py rendered knock          one rendered run of a fault in the workcell (worn arm), about two minutes; with
                                          "fixed" two fixed bodies are in view (run --fixed) while the rig is bumped by 2 mm
 
+python health.py follow                  a rig that is followed (run --follow-rig): when it is put right, what that leaves
+
 A run of a camera or a body takes about 1 s of computing, one of an arm 5 s. Delays count from when the fault displaces the
 measured pose by twice its claimed sigma. NEES is that of what is given out once the fault was named.
 """
@@ -32,6 +34,7 @@ import armsight.app.demo.demo as demo  # noqa: E402
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose  # noqa: E402
 from armsight.geometry.rotation import exp_so3  # noqa: E402
 from armsight.loop.estimators import Mounting  # noqa: E402
+from armsight.loop.health.follow import RigFollower  # noqa: E402
 from armsight.sim.example_rig import PLATE_M, TAG_FAMILY, TAG_M, TAG_MIDDLES_M  # noqa: E402
 from armsight.sim.render.scene import PosedBody, marker_bits, plate, tag  # noqa: E402
 from armsight.sim.workcell.cameras import WorkcellSource  # noqa: E402
@@ -228,6 +231,58 @@ def show(case: Case, rows: list[dict]) -> None:
             print(f"    seed {row['seed']}: {'; '.join(row['found'])}", flush=True)
 
 
+def followed(seeds: range) -> None:
+    """Print what is left once a rig was put right: cameras that rotate, and a closed loop whose rig moves."""
+    print(
+        "cameras, rotated after 5 s: seed; put right after, s; rotation left, deg, and sigma; sigma of the body's position"
+    )
+    print("with it and with the calibration, mm; NEES")
+    for deg in (0.025, 0.05, 0.2):
+        for k, axis in enumerate("xyz"):
+            for seed in seeds:
+                print(f"rotated by {deg:g} deg ({axis})", followed_cameras(seed, deg * DEG * np.eye(3)[k]), flush=True)
+    print("closed loop: seed; put right after, s; largest distance at rest from 10 s on, mm; in motion; moved by, mm")
+    faults.LEARNED_S, faults.AT_S = 5.0, 10.0
+    for name, motion in (
+        ("nothing wrong", lambda t: np.zeros(6)),
+        ("bumped by 0.5 mm", lambda t: 0.25 * BUMP),
+        ("bumped by 2 mm", lambda t: BUMP),
+        ("knocked by 10 mm, 0.8 deg", lambda t: np.array([0.01, 0.0, 0.0, 0.0, 0.8 * DEG, 0.0])),
+        ("drifts by 5 mm, 0.5 deg a minute", lambda t: np.array([0.005, 0.0, 0.0, 0.0, 0.5 * DEG, 0.0]) * t / 60.0),
+    ):
+        for seed in seeds:
+            rows, made = faults.closed_loop(seed, motion, follows=True, seconds=40.0)
+            late = [(mm, rests) for t_s, mm, rests, _ in rows if t_s > faults.AT_S + 10.0]
+            times = ", ".join(f"{each.at_s - faults.AT_S:.1f}" for each in made) or "-"
+            rest, moving = (max((mm for mm, rests in late if rests is kind), default=np.nan) for kind in (True, False))
+            sizes = ", ".join(f"{1e3 * each.tool_m[0]:.2f} +- {1e3 * each.tool_m[1]:.2f}" for each in made)
+            print(f"{name}: {seed}; {times}; {rest:.2f}; {moving:.2f}; {sizes}", flush=True)
+
+
+def followed_cameras(seed: int, rotated: np.ndarray) -> str:
+    """Rotate the right camera in mid-run; return what putting it right leaves."""
+    poses, follower, rig, squares, at_s = [], None, None, [], np.nan
+    for monitor, t_s, T, estimate, _ in faults.watched_body(seed, rotated=rotated, at_s=5.0, seconds=BODY_S):
+        given = monitor._rig._rig
+        follower = follower or RigFollower(given, faults.BODY)
+        poses.append((t_s, estimate))
+        if rig is not None:
+            uv = estimate.points.seen.uv
+            off = log_se3(inverse((again := faults.measured(rig, faults.BODY, T, uv)).T_left_body) @ T)
+            squares.append(off @ np.linalg.solve(again.cov, off))
+        elif (watch := monitor.cameras_moved()) is not None and round(t_s * faults.RATE_HZ) % 8 == 0:
+            since_s = watch.moved_since_s()
+            found = None if since_s is None else follower.cameras(since_s, poses, t_s)
+            if found is not None:
+                rig, at_s = found.update.rig, t_s
+                true = faults.TRUE.T_left_right @ exp_se3(np.append(np.zeros(3), rotated))
+                left = np.degrees(np.linalg.norm(log_se3(inverse(rig.T_left_right) @ true)[3:]))
+                sigma, (now, then) = np.degrees(found.update.sigma_rad), found.update.sigma_m
+    if rig is None:
+        return f"{seed}; not put right: {follower.rejected}"
+    return f"{seed}; {at_s - 5.0:.1f}; {left:.4f} +- {sigma:.4f}; {1e3 * now:.2f}, {1e3 * then:.2f}; {np.mean(squares):.1f}"
+
+
 def fixed_plate(name: str, first: int, at_m: list[float]) -> tuple[Target, PosedBody]:
     """Return a plate of four tags that does not move: as it is looked for, and as it is seen by the left camera."""
     patterns, tags = [plate(*PLATE_M, value=0.12)], []
@@ -309,7 +364,9 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", default="2100:2120")
     parser.add_argument("--results", type=Path)
     given = parser.parse_args()
-    if given.words[:1] == ["rendered"]:
+    if given.words[:1] == ["follow"]:
+        followed(range(*map(int, given.seeds.split(":"))))
+    elif given.words[:1] == ["rendered"]:
         for each in given.words[1:] or ("none", "rig", "body", "knock", "bump"):
             rendered(each)
     else:

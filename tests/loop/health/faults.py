@@ -9,11 +9,12 @@ import numpy as np
 from arm_rig import ARM, MIDDLE, Workcell, distance_mm, legs, mounts, run, small, worn
 
 from armsight.data import Body, Correspondences, JointCommand, Points, PoseEstimate
-from armsight.geometry.pose import exp_se3, pose
+from armsight.geometry.pose import adjoint, exp_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.estimators import Delay, KalmanEstimator, Mounting
 from armsight.loop.health import HealthMonitor
 from armsight.loop.health.change import widened
+from armsight.loop.health.follow import RigFollower
 from armsight.loop.servo import LoopTiming, PoseServo
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.example_rig import example_rig
@@ -83,12 +84,15 @@ LEARNED_S, AT_S = 5.0, 6.5
 class Moved:
     """An estimator whose cameras move at a time, which it does not know; it is watched once it has learned the arm."""
 
-    def __init__(self, estimator, T_base_rig, motion, slip=None, late=None):
+    def __init__(self, estimator, T_base_rig, motion, slip=None, late=None, follows=False):
         self.estimator, self.motion, self.T_base_rig = estimator, motion, T_base_rig
         self.slip = slip  # of the body on the tool (6,), [m; rad]
         self.late = late  # by how much the stamps are late, s, at seconds after AT_S
         self.monitor = HealthMonitor(example_rig(), body_target().body, 0.0)
         self.found_s = None
+        self.follower = RigFollower(example_rig(), body_target().body) if follows else None
+        self.mounting = Mounting(T_base_rig, np.eye(4), np.zeros((12, 12)))
+        self.corrections, self.looked_s = [], 0.0
 
     def joints(self, states):
         self.estimator.joints(states)
@@ -113,26 +117,44 @@ class Moved:
                 measurement = replace(measurement, t_s=t_s + self.late(t_s - AT_S))
             if self.slip is not None:
                 measurement = replace(measurement, T_base_tool=measurement.T_base_tool @ small(self.slip))
+        if self.corrections:
+            T = self.mounting.T_base_rig @ np.linalg.inv(T) @ measurement.T_base_tool
+            by = adjoint(np.linalg.inv(T) @ self.mounting.T_base_rig)
+            common = measurement.cov_common + by @ self.mounting.cov[:6, :6] @ by.T
+            measurement = replace(measurement, T_base_tool=T, cov_common=common)
         outcome = self.estimator.vision(widened(measurement, self.monitor.changes))
         self.monitor.work()
+        if self.follower is not None and t_s - self.looked_s > 0.25:
+            self.looked_s = t_s
+            found = self.follower.look(self.monitor, list, self.mounting.T_base_rig, t_s)
+            correction = None if found is None else found()
+            if correction is not None:
+                self.mounting = correction.mounting(self.mounting)
+                self.monitor.put_right(correction)
+                self.corrections.append(correction)
         if self.found_s is None and self.monitor.findings():
             self.found_s = t_s
         return outcome
 
 
-def closed_loop(seed, motion=lambda t_s: np.zeros(6), *, closes=True, seconds=24.0):
-    """A closed loop between poses, its rig moved at AT_S; return time, s, and distance of the true tool, mm, of each 16 ms.
+def closed_loop(seed, motion=lambda t_s: np.zeros(6), *, closes=True, follows=False, seconds=24.0):
+    """A closed loop between poses, its rig moved at AT_S.
 
     Args:
         seed: of the arm.
         motion: of the rig.
         closes: whether the loop is closed; else the potentiometers alone bring the tool there.
+        follows: whether the rig is put right.
         seconds: duration.
+
+    Returns:
+        Of each 16 ms the time, s, the distance of the true tool from its reference, mm, whether the arm rests, the mode;
+        and what was put right.
     """
     rng = np.random.default_rng(seed)
     true, said = mounts(rng)
     mount = true, Mounting(true[0], true[1], said.cov)
-    moved = Moved(KalmanEstimator(ARM, delay=Delay(0.0, 2e-4), learns_delay=False), true[0], motion)
+    moved = Moved(KalmanEstimator(ARM, delay=Delay(0.0, 2e-4), learns_delay=False), true[0], motion, follows=follows)
     workcell = Workcell(rng, worn(rng), moved, mount=mount)
     workcell.advance(None, 300)
     servo, goals = PoseServo(ARM, LoopTiming(0.016, 1 / 60, 0.061)), [MIDDLE]
@@ -149,7 +171,7 @@ def closed_loop(seed, motion=lambda t_s: np.zeros(6), *, closes=True, seconds=24
             T = workcell.advance(step.command if closes else alone, 16)[-1]
             off = distance_mm(T, ARM.forward(way.at(workcell.t_s - begin_s).q))
             rows.append((workcell.t_s, float(off), t_s > way.duration_s + 0.5, step.mode))
-    return rows
+    return rows, moved.corrections
 
 
 class SlippingArm:

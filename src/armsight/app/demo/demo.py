@@ -61,6 +61,7 @@ class Demo:
         quick: fewer calibration shots and motions, and no studies.
         nominal_arm: the arm model that the estimators and the controller have; by default the table the arm was built to.
         nominal_arm_name: its name in the summary; by default the arm's own.
+        follow_rig: whether a rig that moved is put right.
     """
 
     folder: Path
@@ -73,6 +74,7 @@ class Demo:
     quick: bool = False
     nominal_arm: Arm | None = None
     nominal_arm_name: str | None = None
+    follow_rig: bool = False
 
 
 def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummary:
@@ -106,7 +108,14 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
         published = Published(calibration.rig, setup.target.body, setup.arm, texts)
         with contextlib.closing(LazyMcap(demo.folder, published, progress)) as file:
             outcome = run_experiment(
-                setup, calibration.rig, plan, targets, progress=progress, cover=workcell.cover, publisher=file
+                setup,
+                calibration.rig,
+                plan,
+                targets,
+                progress=progress,
+                cover=workcell.cover,
+                publisher=file,
+                follow_rig=demo.follow_rig,
             )
         studies: list[Study] = []
         try:

@@ -21,7 +21,7 @@ from armsight.app.stream.datum import quaternion
 from armsight.app.stream.sink import Publisher
 from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
-from armsight.loop.estimators import ESTIMATORS, ArmEstimate, Delay, Estimator, Mounting, Prior
+from armsight.loop.estimators import ESTIMATORS, ArmEstimate, Delay, Estimator, KalmanEstimator, Mounting, Prior
 from armsight.robot.arm import Arm
 from armsight.vision.detections import SeenShot
 from armsight.vision.follow.follower import Follower, follows
@@ -155,6 +155,10 @@ class _RunAgain:
             self._mounting = Mounting(
                 *(np.array(content[key], float) for key in ("T_base_rig", "T_tool_body", "covariance"))
             )
+            return
+        if content["event"] == "restored":
+            if isinstance(self._estimator, KalmanEstimator):
+                self._estimator.restore((np.array(content["state"]), np.array(content["covariance"])))
             return
         options: dict[str, Any] = {"prior": Prior(**content["prior"]), "delay": Delay(**content["delay"])}
         if self._name == "kalman":

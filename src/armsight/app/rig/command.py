@@ -118,11 +118,11 @@ def update_(run: Path, output: str, since: float | None, report: Path | None, as
     RUN is the folder of armsight run or armsight demo. The body's file gives the scale; the calibration stays the prior of
     lenses and baseline. Rejected where the shots say too little.
     """
-    from armsight.app.rig.update import lines, update
+    from armsight.app.rig.update import update
 
     check_writable(output, apart_from=(run / "rig.json", run / "body.toml", run / "detections.csv"))
-    answer = update(run, Path(output), since, report)
-    click.echo(json.dumps(answer) if as_json else "\n".join(lines(answer)))
+    answer, lines = update(run, Path(output), since, report)
+    click.echo(json.dumps(answer) if as_json else "\n".join(lines))
 
 
 def _image_size(text: str) -> tuple[int, int]:

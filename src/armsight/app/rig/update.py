@@ -26,7 +26,7 @@ from armsight.vision.rig import StereoRig
 _FILES = {"rig": "rig.json", "body": "body.toml", "detections": "detections.csv"}
 
 
-def update(run: Path, output: Path, since_s: float | None, report: Path | None) -> dict[str, Any]:
+def update(run: Path, output: Path, since_s: float | None, report: Path | None) -> tuple[dict[str, Any], list[str]]:
     """Estimate the relative pose of a run's cameras again; write the rig, and a page where one is asked for.
 
     Args:
@@ -37,7 +37,7 @@ def update(run: Path, output: Path, since_s: float | None, report: Path | None) 
         report: folder of the page.
 
     Returns:
-        What was found, as JSON has it.
+        What was found, as JSON has it, and as lines for people.
 
     Raises:
         InputError: a file of the run is missing or wrong, or its shots do not determine the pose.
@@ -59,11 +59,11 @@ def update(run: Path, output: Path, since_s: float | None, report: Path | None) 
     made = {"command": "rig update", "run": str(run), "since_s": since_s, "shots": found.shots}
     new = replace(found.rig, provenance=made | {"before": dict(rig.provenance)})
     new.save(output)
-    answer = {"rig": str(output), "run": str(run), "since_s": since_s, **figures(found)}
+    answer = {"rig": str(output), "run": str(run), "since_s": since_s, **found.figures()}
     if folder is not None:
         put_files(folder, {PAGE: page(rig, new, found, run, since_s).encode()})
         answer["report"] = str(folder / PAGE)
-    return answer
+    return answer, [*found.lines(), f"written to {output}"]
 
 
 def _from(shots: list[SeenShot], times: Mapping[str, float], since_s: float) -> list[SeenShot]:
@@ -80,39 +80,6 @@ def _found_since(run: Path) -> float | None:
     except (OSError, ValueError, AttributeError, KeyError, TypeError):
         return None
     return float(since[0]) if since and isinstance(since[0], int | float) else None
-
-
-def figures(found: RigUpdate) -> dict[str, Any]:
-    """Return the figures of an update, as JSON has them."""
-    return {
-        "rotation_changed_deg": float(np.degrees(found.rotation_rad)),
-        "rotation_sigma_deg": float(np.degrees(found.sigma_rad)),
-        "shift_across_baseline_m": found.shift_m,
-        "depth_error_of_old_rig_m": {
-            f"{depth:g}": value if math.isfinite(value) else None
-            for depth, value in zip(DEPTHS_M, found.depth_errors_m, strict=True)
-        },
-        "epipolar_rms_before_px": found.epipolar_px[0],
-        "epipolar_rms_after_px": found.epipolar_px[1],
-        "shots": found.shots,
-        "differing_shots": found.stays,
-    }
-
-
-def lines(answer: Mapping[str, Any]) -> list[str]:
-    """Return what was found as lines for people."""
-    depths = ", ".join(
-        f"{'unknown' if value is None else f'{1e3 * value:+.2f} mm'} at {depth} m"
-        for depth, value in answer["depth_error_of_old_rig_m"].items()
-    )
-    return [
-        f"right camera: rotated by {answer['rotation_changed_deg']:.3f} +- {answer['rotation_sigma_deg']:.3f} deg, shifted "
-        f"across the baseline by {1e3 * answer['shift_across_baseline_m']:.3f} mm",
-        f"depth error of the old rig: {depths}",
-        f"epipolar distance, RMS: {answer['epipolar_rms_before_px']:.3f} px before, "
-        f"{answer['epipolar_rms_after_px']:.3f} px after",
-        f"{answer['shots']} shots used, {answer['differing_shots']} differ from one another; written to {answer['rig']}",
-    ]
 
 
 def page(old: StereoRig, new: StereoRig, found: RigUpdate, run: Path, since_s: float | None) -> str:

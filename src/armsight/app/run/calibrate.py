@@ -167,14 +167,17 @@ def find_mounting(
     """
     visited: list[VisitedPose] = []
     missed: list[str] = []
+    rows: list[slice] = []
     q_from = q_start
     for n, q_to in enumerate(targets):
         progress(f"hand-eye: pose {n + 1} of {len(targets)}")
+        before = len(loop.log.poses)
         found = visit(loop, arm, q_from, q_to, gravity, f"hand-eye {n + 1}")
         if isinstance(found, Missed):
             missed.append(found.reason)
         else:
             visited.append(found)
+            rows.append(slice(before, len(loop.log.poses)))
         q_from = q_to
     if len(visited) < 12:
         raise CalibrationError(
@@ -182,7 +185,15 @@ def find_mounting(
             + (missed[0] if missed else "move it into the view of both cameras")
         )
     progress("hand-eye: calibrating")
+    if loop.put_cameras_right():
+        visited = [_again(each, loop.log.poses[part]) for each, part in zip(visited, rows, strict=True)]
     return loop.compute(lambda: handeye_of(arm, visited, tuple(missed)))
+
+
+def _again(visited: VisitedPose, shots: Sequence[tuple[str, float, PoseEstimate | Missed]]) -> VisitedPose:
+    """Return a pose of an arm with the shots of it that were measured anew."""
+    seen = [pose for _, _, pose in shots if isinstance(pose, PoseEstimate)]
+    return VisitedPose.of(visited.q, seen, visited.approach) if seen else visited
 
 
 def visit(

@@ -37,6 +37,7 @@ class RunPlan:
         motions: the motions.
         targets: (N, n) joint angles of the hand-eye poses, rad.
         close_loop: whether the motions are made a second time with the loop closed.
+        follow_rig: whether a rig that moved is put right.
         streams: what to publish to.
         began: when the command began, by ``time.perf_counter``, s.
     """
@@ -45,6 +46,7 @@ class RunPlan:
     motions: MotionPlan
     targets: Array
     close_loop: bool
+    follow_rig: bool
     streams: tuple[str, ...]
     began: float
 
@@ -111,6 +113,11 @@ class RunPlan:
 )
 @click.option("--open-loop", is_flag=True, help="Control by the potentiometers alone; do not close the loop on vision.")
 @click.option(
+    "--follow-rig",
+    is_flag=True,
+    help="Put the rig right during the run where its cameras, or both, moved (docs/concepts/health.md).",
+)
+@click.option(
     "-o",
     "--output",
     default="run",
@@ -133,6 +140,7 @@ def command(
     sync_ms: float,
     stream: tuple[str, ...],
     open_loop: bool,
+    follow_rig: bool,
     output: Path,
     as_json: bool,
 ) -> None:
@@ -145,8 +153,10 @@ def command(
     name of the shot or by time, for shots of a recording. Exit code 3: the result must not be trusted.
     """
     if board_spec.startswith(_POSES):
-        if motion is not None or open_loop or fixed:
-            raise InputError(f"--board {board_spec} commands no motion: leave out --motion, --open-loop and --fixed")
+        if motion is not None or open_loop or fixed or follow_rig:
+            raise InputError(
+                f"--board {board_spec} commands no motion: leave out --motion, --open-loop, --fixed and --follow-rig"
+            )
         _run_logged(
             source_spec, Path(board_spec.removeprefix(_POSES)), rig_path, target_spec, arm_spec, output, as_json
         )
@@ -157,7 +167,7 @@ def command(
     from armsight.app.progress import steps
     from armsight.app.report.plotting import require_matplotlib
     from armsight.app.run.calibrate import handeye_poses
-    from armsight.app.run.experiment import require_start
+    from armsight.app.run.experiment import require_followed, require_start
     from armsight.app.run.folder import make_room, open_folder
     from armsight.app.run.motion_file import DEFAULT_MOTION
     from armsight.app.run.record import require_pyarrow
@@ -172,6 +182,8 @@ def command(
     require_pyarrow()
     arm = planned_for(open_arm(arm_spec), board_spec)
     rig, target = StereoRig.load(rig_path), open_target(target_spec)
+    if follow_rig:
+        require_followed(rig, rig_path)
     fixed_targets = open_fixed(fixed, target_spec)
     if not follows(target):
         raise InputError(
@@ -183,7 +195,7 @@ def command(
     targets = handeye_poses(arm, np.array(ends), _HANDEYE_POSES, 0)
     files = {"motion.toml": read_text(motion), "body.toml": read_text(target_spec)}
     open_folder(output)
-    plan = RunPlan(rig, motions, targets, not open_loop, stream, time.perf_counter())
+    plan = RunPlan(rig, motions, targets, not open_loop, follow_rig, stream, time.perf_counter())
     devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms, calibration)
     with steps() as progress:
         progress("opening the devices")
@@ -282,6 +294,7 @@ def _run(setup: Setup, plan: RunPlan, output: Path, body_text: str, progress: Pr
             plan.targets,
             progress=progress,
             close_loop=plan.close_loop,
+            follow_rig=plan.follow_rig,
             publisher=Fanout((file, streams)),
         )
     progress("writing and plotting")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, Prior
 from armsight.loop.health import HealthFinding
 from armsight.loop.health.change import Change
+from armsight.loop.health.follow import RigFollower
 from armsight.loop.servo import JointLoops, LoopTiming, PoseServo
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
 from armsight.robot.boards.contract import MotionBoard
@@ -92,6 +94,15 @@ def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
     require_range(setup, np.vstack([targets, *(passed(m.trajectory) for m in plan.motions)]))
 
 
+def require_followed(rig: StereoRig, path: Path) -> None:
+    """Reject a rig that cannot be followed, as its file does not say how well it is known."""
+    if not rig.cov.any():
+        raise InputError(
+            f"--follow-rig: {path} has no covariance, so that a rig that moved cannot be told from one that was never well "
+            "known: calibrate it (armsight calibrate), or leave out --follow-rig"
+        )
+
+
 def passed(way: Trajectory) -> Array:
     """Return joint angles (N, n) that a motion passes, rad."""
     return way.at(np.linspace(0.0, way.duration_s, _CHECKED)).q
@@ -141,6 +152,7 @@ class RunResult:
         health: why the result must not be trusted; empty where nothing says so.
         changes: what explains a motion of the rig or the body; empty where none was found.
         fixed_unseen: names of the fixed bodies that were seen too rarely to be watched.
+        not_corrected: why what was found of a rig that is followed was not put right; None where nothing was left.
         ended_by: the error that ended the run early; None where there was none.
         interrupted: whether the keyboard ended the run.
     """
@@ -158,6 +170,7 @@ class RunResult:
     health: tuple[HealthFinding, ...] = ()
     changes: tuple[Change, ...] = ()
     fixed_unseen: tuple[str, ...] = ()
+    not_corrected: str | None = None
     ended_by: ArmsightError | None = None
     interrupted: bool = False
 
@@ -184,6 +197,7 @@ def run_experiment(
     begun: Callable[[Loop], None] = lambda loop: None,
     publisher: Publisher | None = None,
     handeye: HandEyeRun | None = None,
+    follow_rig: bool = False,
 ) -> RunResult:
     """Run the experiment.
 
@@ -198,6 +212,7 @@ def run_experiment(
         begun: called with the loop before the drives are switched on.
         publisher: is given everything that is measured; it returns at once.
         handeye: a hand-eye calibration of this set-up; None to make one by visiting the targets.
+        follow_rig: whether a rig that moved is put right where the evidence suffices; it needs a covariance.
 
     Returns:
         All that was measured, also where something ended the run early.
@@ -205,6 +220,7 @@ def run_experiment(
     outcome, given = RunResult(setup.target.body, handeye=handeye), publisher or Fanout()
 
     def work(loop: Loop) -> None:
+        loop.rig_follower = RigFollower(rig, setup.target.body) if follow_rig else None
         _prepare(loop, setup, plan, targets, outcome, progress)
         _passes(loop, setup, plan, outcome, progress, cover, close_loop)
 
@@ -278,7 +294,8 @@ def _run(
             with uninterrupted() as again:  # a second Ctrl-C must not keep the arm from stopping
                 _stopped(loop)
                 loop.close_record()
-                outcome.health, outcome.changes = loop.health.findings(), loop.health.changes
+                outcome.health, outcome.changes = loop.health.findings(), loop.health.every_change
+                outcome.not_corrected = None if loop.rig_follower is None else loop.rig_follower.rejected
                 outcome.fixed_unseen = loop.health.fixed_never_seen
             outcome.interrupted = outcome.interrupted or bool(again)
 

@@ -43,6 +43,7 @@ from armsight.files import check_folder, write_text
 from armsight.geometry.pose import inverse, log_se3
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.health import health_lines, unseen_lines
+from armsight.loop.health.follow import correction_lines
 from armsight.robot.arm import Arm
 from armsight.vision.detections import detections_text
 from armsight.vision.image import grey
@@ -130,6 +131,7 @@ _TRACKS = ("truth", "potentiometers", "vision", "fused", "live", "reference")
 _OLD_TRACKS, _OLD_FIGURES = ("wanted",), ("cell",)
 _SHOTS = "shots"
 #: File of the detections of a run, for `armsight rig update`: at most so many shots, whose poses differ by so much, m, rad.
+_FOLLOWED = "rig_followed.json"
 DETECTIONS, _MOST_SHOTS, _DIFFERENT = "detections.csv", 400, 0.01
 #: Basis of a command -> its text in run.log.
 _BASED = {
@@ -223,6 +225,9 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
         keep(write_text, folder / "poses.csv", csv_text(_shot_poses(finished)))
         if drawn := _drawn_shots(outcome.log):
             keep(write_text, folder / DETECTIONS, detections_text(drawn, outcome.body))
+        if updates := [each.update for each in outcome.log.corrections if each.update is not None]:
+            made = {"command": "run --follow-rig", "before": dict(finished.rig.provenance)}
+            keep(replace(updates[-1].rig, provenance=made).save, folder / _FOLLOWED)
         if outcome.handeye is None:
             if outcome.log.joints:
                 keep(write_columns, folder, "joints", joint_columns(*joints_of(outcome.log)))
@@ -233,6 +238,8 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
                 {},
                 health=outcome.health,
                 fixed_unseen=outcome.fixed_unseen,
+                corrections=outcome.log.corrections,
+                not_corrected=outcome.not_corrected,
             )
             keep(_write_summary, folder, summary)
             return summary, None
@@ -293,7 +300,7 @@ def make_room(folder: Path) -> None:
     writable_folder(folder, "no run")
     names = [f"{name}.png" for name in (*NAMES, "pose", "workcell", *_OLD_FIGURES)]
     names += [f"{name}.{kind}" for name in (*_TRACKS, *_OLD_TRACKS, "joints") for kind in ("csv", "parquet")]
-    names += [PAGE, "run.log", "poses.csv", DETECTIONS, "handeye.json", "handeye_poses.csv", RUN_MCAP]
+    names += [PAGE, "run.log", "poses.csv", DETECTIONS, _FOLLOWED, "handeye.json", "handeye_poses.csv", RUN_MCAP]
     try:
         if (folder / _SHOTS).is_dir():
             shutil.rmtree(folder / _SHOTS)
@@ -347,6 +354,7 @@ def _notes(finished: Finished, run: RunData) -> list[str]:
     return [
         *health_lines(outcome.health),
         *unseen_lines(outcome.fixed_unseen),
+        *correction_lines(outcome.log.corrections, outcome.not_corrected),
         f"hand-eye: {len(outcome.handeye.q)} poses used, {len(outcome.handeye.missed)} missed; left out, a pose is "
         f"predicted to {1e3 * position:.2f} mm, {np.degrees(angle):.3f} deg RMS: the error of the arm's nominal table",
         *outcome.handeye.missed,

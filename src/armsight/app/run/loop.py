@@ -24,7 +24,14 @@ import numpy as np
 
 from armsight.app.run.record import Log, RunSegment, Skew, ToolTrack
 from armsight.app.run.setup import Setup
-from armsight.app.stream.datum import EventDatum, JointsDatum, ShotDatum, estimator_event, mounting_event
+from armsight.app.stream.datum import (
+    EventDatum,
+    JointsDatum,
+    ShotDatum,
+    estimator_event,
+    mounting_event,
+    restored_event,
+)
 from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import DeviceError
@@ -33,9 +40,10 @@ from armsight.loop.estimators import Estimator, KalmanEstimator, Mounting
 from armsight.loop.estimators.smoothing import Interval
 from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health import HealthMonitor
+from armsight.loop.health.follow import RigCorrection, RigFollower, remeasured
 from armsight.robot.boards.codes import BoardState
 from armsight.vision.follow.follower import Follower, measurer
-from armsight.vision.rig import Shutters
+from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.shutter import Motion, TimedShot, measure_with_motion
 
 #: How long one thread may hold the interpreter lock, s. An iteration of the loop takes the lock back about twelve times;
@@ -165,6 +173,8 @@ _WRITE_EVERY_S = 0.1  # interval that is computed at once, after a command was s
 _MOTION_S, _MOTION_NEWEST, _SCATTER_SHARE = 0.03, 100, 0.25
 _STOP_S = 0.3  # in which an interrupted motion comes to rest
 _FIXED_EVERY_S = 0.2  # in which fixed bodies are measured
+#: Where a rig is followed: how often it is looked whether it can be put right, s, and in so many of the newest shots.
+_RIG_EVERY_S, _RIG_SHOTS = 0.25, 2000
 _LEAST_WAIT_S = 0.001  # for the board, even when the loop is late: a lost board is detected by a timeout
 
 
@@ -197,6 +207,7 @@ class Loop:
         shutters: when the cameras expose, where they do not at one time: from the rig file, or found by the sweep. Once the
             delay is known, detections are moved to one time by the motion of the arm.
         health: watches whether the calibrations still hold.
+        rig_follower: decides when the rig can be put right; None where it is not followed.
         on_shot: called with each shot that was measured and its result, after the command that follows from it was sent.
         on_period: called in every period before its command; what it raises ends the motion.
         segment: the entry of the log of what is running, with its begin; None before the first.
@@ -220,6 +231,9 @@ class Loop:
         self._shot_s = -np.inf
         self._frames = FrameClock()
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s)
+        self.rig_follower: RigFollower | None = None
+        self._rig_work: Future[RigCorrection | None] | None = None
+        self._rig_s = -np.inf
         self._skew = Skew(follower.rig, setup.sync_s)
         self.health.watch_fixed([each.body.name for each in setup.fixed])
         self._measure_fixed = [measurer(follower.rig, each) for each in setup.fixed]
@@ -513,6 +527,7 @@ class Loop:
                     self.on_shot(shot, result)
                     self._look_at_fixed(shot)
                     self.health.work()
+                    self._follow_rig()
                 if self._noted_s - self._written_s >= _WRITE_EVERY_S:
                     self._write()
         finally:
@@ -538,6 +553,73 @@ class Loop:
             look()
         else:
             self._fixed_work = self._fixed_pool.submit(look)
+
+    def _follow_rig(self) -> None:
+        """Put the rig right once the evidence suffices; on hardware that is computed in a thread."""
+        if self._rig_work is not None and self._rig_work.done():
+            correction, self._rig_work = self._rig_work.result(), None
+            if correction is not None:
+                self._put_right(replace(correction, at_s=self.t_s))
+        if self.rig_follower is None or self.mounting is None or not self.health.follows or self._rig_work is not None:
+            return
+        if self.t_s - self._rig_s < _RIG_EVERY_S:
+            return
+        self._rig_s = self.t_s
+        work = self.rig_follower.look(self.health, self._newest_poses, self.mounting.T_base_rig, self.t_s)
+        if work is None:
+            return
+        if self.setup.clock is not None:
+            self._rig_work = self._fixed_pool.submit(work)
+        elif (found := work()) is not None:
+            self._put_right(found)
+
+    def _newest_poses(self) -> list[tuple[float, PoseEstimate]]:
+        """Return time and pose of the newest shots, measured with the rig as it is."""
+        since_s = max((each.at_s for each in self.log.corrections if each.update is not None), default=-np.inf)
+        newest = self.log.poses[-_RIG_SHOTS:]
+        return [(t_s, pose) for _, t_s, pose in newest if isinstance(pose, PoseEstimate) and t_s >= since_s]
+
+    def _put_right(self, correction: RigCorrection) -> None:
+        """Go on with a rig that was put right; the estimator goes on from what it knew before the change."""
+        assert self.mounting is not None
+        self.close_record()  # the estimator's memory does not reach further back afterwards
+        self.mounting = correction.mounting(self.mounting)
+        if correction.update is not None:
+            self._recalibrate(correction.update.rig)
+        if (state := self.health.put_right(correction)) is not None:
+            self.publisher.put(EventDatum(self.t_s, restored_event(state)))
+        self.log.corrections.append(correction)
+        self.log.mountings.append((self.t_s, self.mounting))
+
+    def _recalibrate(self, rig: StereoRig) -> None:
+        """Measure with another calibration of the cameras from now on."""
+        self.follower.recalibrate(rig)
+        self._skew = Skew(rig, self.setup.sync_s)
+        self._measure_fixed = [measurer(rig, each) for each in self.setup.fixed]
+
+    def put_cameras_right(self) -> bool:
+        """Put the cameras right before anything depends on their poses; return whether poses in the log were measured anew.
+
+        All poses since the cameras moved are measured again, and nothing needs to be doubted: the tests begin anew.
+        """
+        watch = None if self.rig_follower is None else self.health.cameras_moved()
+        since_s = None if watch is None else watch.moved_since_s()
+        if self.rig_follower is None or since_s is None:
+            return False
+        poses, follower, body = self._newest_poses(), self.rig_follower, self.setup.target.body
+        found = self.compute(lambda: follower.cameras(since_s, poses, self.t_s))
+        if found is None or found.update is None:
+            return False
+        rig = found.update.rig
+        self._recalibrate(rig)
+        self.log.poses[:] = [
+            (name, t_s, remeasured(rig, body, pose) if isinstance(pose, PoseEstimate) and t_s >= since_s else pose)
+            for name, t_s, pose in self.log.poses
+        ]
+        self.health = HealthMonitor(rig, body, self.setup.sync_s)
+        self.health.watch_fixed([each.body.name for each in self.setup.fixed])
+        self.log.corrections.append(replace(found, at_s=since_s))
+        return True
 
     def _rest_of_period(self) -> float:
         """Return how long to wait for the next iteration, s: what the last one has left of its period."""

@@ -26,6 +26,7 @@ from armsight.files import read_table, replacing
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import ArmEstimate, Delay, Mounting, Outcome, PoseMeasurement
 from armsight.loop.health.change import Change, widened
+from armsight.loop.health.follow import RigCorrection
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Trajectory
 from armsight.vision.rig import StereoRig
@@ -261,6 +262,8 @@ class Log:
         latency_s: computing time from an image in which the body was followed to the command that depends on it, s.
         search_s: the same of images in which the body was searched; commands continued meanwhile.
         segments: motions and rests with their times.
+        corrections: what was put right of the rig, in order of time.
+        mountings: from when on which mounting was used, s, where there was more than one: those after a correction.
     """
 
     joints: list[JointStates] = field(default_factory=list)
@@ -273,6 +276,12 @@ class Log:
     latency_s: list[float] = field(default_factory=list)
     search_s: list[float] = field(default_factory=list)
     segments: list[RunSegment] = field(default_factory=list)
+    corrections: list[RigCorrection] = field(default_factory=list)
+    mountings: list[tuple[float, Mounting]] = field(default_factory=list)
+
+    def mounting_at(self, t_s: float, first: Mounting) -> Mounting:
+        """Return the mounting that was used for a shot of a time, s; the first one before any correction."""
+        return next((mounting for since_s, mounting in reversed(self.mountings) if t_s >= since_s), first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,7 +348,11 @@ def assembled(
     t_s, q, q_ref = joints_of(log)
     planned = np.isfinite(q_ref).all(axis=1)
     named = _SegmentNames(log.segments)
-    seen = [mounting.pose_measurement(p, t - delay.delay_s) for _, t, p in log.poses if isinstance(p, PoseEstimate)]
+    seen = [
+        log.mounting_at(t, mounting).pose_measurement(p, t - delay.delay_s)
+        for _, t, p in log.poses
+        if isinstance(p, PoseEstimate)
+    ]
     seen = [widened(each, changes) for each in seen]
     fused = [part for part in log.fused if part.covs is not None]
     return RunData(

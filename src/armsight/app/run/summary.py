@@ -34,6 +34,7 @@ from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import RunData, ToolTrack
 from armsight.files import finite_json
 from armsight.loop.health import HealthFinding, health_lines, unseen_lines
+from armsight.loop.health.follow import RigCorrection, correction_lines
 from armsight.robot.arm import Arm
 from armsight.vision.rig import Shutters
 
@@ -121,6 +122,8 @@ class RunSummary:
         studies: error of vision against one quantity after the other.
         health: why the result must not be trusted; empty where nothing says so.
         fixed_unseen: names of the fixed bodies that were seen too rarely to be watched.
+        corrections: what was put right of a rig that was followed.
+        not_corrected: why what else was found of it was not; None where nothing was left.
     """
 
     properties: Mapping[str, Any]
@@ -139,6 +142,8 @@ class RunSummary:
     studies: Sequence[Study] = ()
     health: Sequence[HealthFinding] = ()
     fixed_unseen: Sequence[str] = ()
+    corrections: Sequence[RigCorrection] = ()
+    not_corrected: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the object of summary.json, SI units in the keys; numbers that are not known are None."""
@@ -167,6 +172,7 @@ class RunSummary:
             found["studies"] = [_study_json(study) for study in self.studies]
         found["health"] = [each.to_json() for each in self.health]
         found["fixed_unseen"] = list(self.fixed_unseen)
+        found["rig_corrections"] = [each.to_json() for each in self.corrections]
         found |= {**self.properties, "wall_s": self.wall_s, "ended_by": self.ended_by}
         known: dict[str, Any] = finite_json(found)
         return known
@@ -260,6 +266,8 @@ def summary_of(
         studies,
         result.health,
         result.fixed_unseen,
+        result.log.corrections,
+        result.not_corrected,
     )
 
 
@@ -369,7 +377,7 @@ def print_summary(summary: RunSummary, folder: Path) -> None:
             print_table(table)
     for line in health_lines(summary.health):
         click.echo(weak(line), err=True, color=colour())
-    for line in unseen_lines(summary.fixed_unseen):
+    for line in (*unseen_lines(summary.fixed_unseen), *correction_lines(summary.corrections, summary.not_corrected)):
         click.echo(f"note: {line}", err=True)
     lines = []
     if (hidden := summary.occlusion) is not None:

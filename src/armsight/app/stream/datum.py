@@ -212,4 +212,9 @@ def estimator_event(estimator: KalmanEstimator, *, anew: bool) -> dict[str, Any]
     }
 
 
+def restored_event(state: tuple[Array, Array]) -> dict[str, Any]:
+    """Return the content of the event that an estimator went on from an earlier state (K,), with covariance (K, K)."""
+    return {"event": "restored", "state": state[0].tolist(), "covariance": state[1].tolist()}
+
+
 Datum = ShotDatum | JointsDatum | NoteDatum | EventDatum

@@ -107,6 +107,17 @@ class KalmanEstimator:
         self._reference = self._states[-1].x.copy()
         self._reference[self._forgets] = 0.0
 
+    def remembered(self) -> tuple[Array, Array]:
+        """Return the state (K,) and its covariance (K, K) as they are, for :meth:`restore`."""
+        return self._states[-1].x.copy(), self._states[-1].P.copy()
+
+    def restore(self, state: tuple[Array, Array]) -> None:
+        """Go on from an earlier state: what was measured since is dropped, and what motion makes it forget is unknown."""
+        (x, P), rows, newest = (part.copy() for part in state), self._forgets, self._states[-1]
+        x[rows] = P[rows] = P[:, rows] = 0.0
+        P[self._diagonal] += np.where(np.diag(P) > 0.0, 0.0, self._model.sigmas**2)
+        self._states, self._outliers, self._newest, self._here = [newest._replace(x=x, P=P)], [], None, None
+
     def joints(self, states: JointStates) -> None:
         """Take readings of the potentiometers, in order of time."""
         self._newest = self._here = None

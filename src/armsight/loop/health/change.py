@@ -113,6 +113,7 @@ class Change(Record):
         score: chi-square less what its parameters explain by chance: twice the logarithm of a likelihood, beyond a limit.
         effect: (6, D) what a unit of it does to the newest measured pose of the tool, right tangent.
         T_base_tool: (4, 4) that pose.
+        until_s: when it was put right, s.
     """
 
     suspect: Suspect
@@ -124,6 +125,7 @@ class Change(Record):
     score: float
     effect: Array
     T_base_tool: Array
+    until_s: float = np.inf
 
     def displacement(self, T_base_tool: Array, t_s: float) -> tuple[Array, Array]:
         """Return what it does to a measured pose of the tool (4, 4) at a time, s: right tangent (6,), covariance."""
@@ -161,8 +163,11 @@ def doubtful(changes: Sequence[Change]) -> bool:
 def suspected(measurement: PoseMeasurement, changes: Sequence[Change]) -> Array | None:
     """Return the covariance (6, 6) of what hypotheses do to a pose measurement of the tool; None where they do nothing.
 
-    It is that of their mixture: of each the square of what it does, and its covariance.
+    It is that of their mixture: of each the square of what it does, and its covariance. Those that were put right before
+    say nothing.
     """
+    until_s = min((each.until_s for each in changes if each.until_s > measurement.t_s), default=np.inf)
+    changes = [each for each in changes if each.until_s == until_s]
     extra, t_s, T = np.zeros((6, 6)), measurement.t_s, measurement.T_base_tool
     for each, share in zip(changes, probabilities(changes) if changes else (), strict=True):
         if each.suspect.moves and t_s >= each.begin_s:

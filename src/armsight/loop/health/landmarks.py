@@ -90,6 +90,8 @@ class LandmarkWatch:
     Attributes:
         cameras_moved: whether the cameras were found to have moved.
         of_cameras: what says so, or that they may have; None where nothing does.
+        motion: (6,) motion of the cameras, right tangent in the left one's frame, with covariance (6, 6), once two tests in
+            a row agree on it: the mean of a test may hold poses from before.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -99,6 +101,8 @@ class LandmarkWatch:
         self._waited = 0
         self.cameras_moved = False
         self.of_cameras: HealthFinding | None = None
+        self.motion: tuple[Array, Array] | None = None
+        self._common: tuple[Array, Array] | None = None
 
     @property
     def never_seen(self) -> tuple[str, ...]:
@@ -125,7 +129,9 @@ class LandmarkWatch:
         self._waited += 1
         known = {k for k, each in enumerate(self._landmarks) if each.newest is not None}
         if self._fresh == known or self._waited >= _PATIENCE * len(known):  # else a body is not seen any more
+            last, self._common = self._common, None
             of_cameras, not_fixed = self._decided()
+            self.motion = _agreed(last, self._common)
             if of_cameras is not None or not_fixed:
                 self.of_cameras, self._not_fixed = of_cameras, not_fixed
             self._fresh.clear()
@@ -152,13 +158,14 @@ class LandmarkWatch:
             return _finding(most, f"the cameras moved, or the {some}: with one alone the two look alike"), ()
         together = _common(known)
         if together is not None:
-            self.cameras_moved = True
+            self.cameras_moved, self._common = True, together
             return _cameras(together, known), ()
         without = [(each, _common([other for other in known if other is not each])) for each in known]
         agreed = [(each, common) for each, common in without if len(known) > 2 and common is not None]
         if len(agreed) == 1:
             self.cameras_moved = True
             odd, common = agreed[0]
+            self._common = common
             return _cameras(common, [each for each in known if each is not odd]), (_not_fixed(odd),)
         what = (
             f"the {some} all moved, each by another motion: which are not fixed, or whether the cameras moved as well"
@@ -173,6 +180,14 @@ def _common(marks: Sequence[_Landmark]) -> tuple[Array, Array] | None:
     m = cov @ np.sum([white @ motion for motion, white in zip(motions, whites, strict=True)], axis=0)
     chi_square = sum(float((each - m) @ white @ (each - m)) for each, white in zip(motions, whites, strict=True))
     return (m, cov) if len(marks) == 1 or chi_square < _limit(6 * (len(marks) - 1)) else None
+
+
+def _agreed(last: tuple[Array, Array] | None, now: tuple[Array, Array] | None) -> tuple[Array, Array] | None:
+    """Return the newer of two motions (6,) with covariance (6, 6) if they agree."""
+    if last is None or now is None:
+        return None
+    apart = now[0] - last[0]
+    return now if float(apart @ np.linalg.solve(now[1] + last[1], apart)) < _limit(6) else None
 
 
 def _cameras(common: tuple[Array, Array], marks: Sequence[_Landmark]) -> HealthFinding:

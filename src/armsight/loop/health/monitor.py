@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from armsight.loop.health.change import Change, doubtful, finding, suspected
 from armsight.loop.health.clock import clock_findings
 from armsight.loop.health.closure import ClosureWatch
 from armsight.loop.health.fixed import FixedWatch
+from armsight.loop.health.follow import RigCorrection
 from armsight.loop.health.host import HostWatch
 from armsight.loop.health.landmarks import LandmarkWatch
 from armsight.loop.health.record import HealthFinding, Trust
@@ -23,6 +25,10 @@ from armsight.vision.rig import StereoRig
 
 #: So long after measurements contradicted what was learned the cause is open, s: the tests need some shots to find it.
 DOUBT_S = 2.0
+#: What the estimator knows is kept every so often, s, and so many times: to go on from there once something was put right.
+_KEEP_S, _KEPT = 1.0, 120
+#: A change is dated to about so much, s.
+_DATED_S = 0.7
 
 
 class HealthMonitor:
@@ -35,6 +41,7 @@ class HealthMonitor:
     """
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float) -> None:
+        self._body, self._sync_s = body, sync_s
         self._rig = RigWatch(rig, body, sync_s) if rig.cov.any() else None
         self._host = HostWatch()
         self._landmarks: LandmarkWatch | None = None
@@ -46,6 +53,12 @@ class HealthMonitor:
         self._innovations: list[Innovation] = []
         self._clock: ClockFollower | None = None
         self._names: tuple[str, ...] = ()
+        self._estimator: KalmanEstimator | None = None
+        self._arm: Arm | None = None
+        self._known: deque[tuple[float, tuple[Array, Array]]] = deque(maxlen=_KEPT)
+        # What was found and put right.
+        self._corrected: tuple[HealthFinding, ...] = ()
+        self._past: tuple[Change, ...] = ()
 
     def received(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
         """Do as :meth:`measured` without the tests, which :meth:`work` makes: a command is waiting for the pose.
@@ -60,6 +73,8 @@ class HealthMonitor:
         for pose, t_s in self._poses:
             self._take(pose, t_s)
         self._poses.clear()
+        if self._estimator is not None and (not self._known or self._newest_s - self._known[-1][0] >= _KEEP_S):
+            self._known.append((self._newest_s, self._estimator.remembered()))
         if self._fixed is not None and self._closure is not None:
             for innovation in self._innovations:
                 self._fixed.take(innovation)
@@ -89,7 +104,7 @@ class HealthMonitor:
 
     def watch_fixed(self, names: Sequence[str]) -> None:
         """Watch bodies in view that do not move, from now on."""
-        self._landmarks = LandmarkWatch(names)
+        self._landmarks, self._fixed_names = LandmarkWatch(names), tuple(names)
 
     def fixed_measured(self, row: int, pose: PoseEstimate, t_s: float | None) -> None:
         """Take the measured pose of the fixed body of a row, in order of time, s (None: the shots have no times)."""
@@ -103,6 +118,12 @@ class HealthMonitor:
 
     def follow(self, estimator: KalmanEstimator, arm: Arm) -> None:
         """Watch from now on, by what an estimator makes of the poses, whether rig, body and joints stay as they are."""
+        self._estimator, self._arm = estimator, arm
+        self._known.clear()
+        self._begin(estimator, arm)
+
+    def _begin(self, estimator: KalmanEstimator, arm: Arm) -> None:
+        """Begin the tests of what an estimator makes of the poses."""
         self._fixed = FixedWatch(arm.joints)
         self._closure = ClosureWatch(estimator.sigmas, arm.joints)
         self._innovations, self._clock, self._names = [], estimator.clock, arm.joint_names
@@ -115,6 +136,50 @@ class HealthMonitor:
         self._newest_s = innovation.t_s
         if innovation.outcome is Outcome.REOPENED:
             self._doubted_s = innovation.t_s
+
+    @property
+    def follows(self) -> bool:
+        """Whether what an estimator makes of the poses is watched."""
+        return self._fixed is not None
+
+    def cameras_moved(self) -> RigWatch | None:
+        """Return a copy of the watch of the cameras that found a change, for another thread; None where it found none."""
+        if self._rig is None or not self._rig.wrong_at_rest:
+            return None
+        return self._rig.copied()
+
+    def rig_moved(self) -> tuple[float, Array, Array] | None:
+        """Return since when, s, and by which motion (6,), with covariance, fixed bodies show that both cameras moved."""
+        marks = self._landmarks
+        if marks is None or marks.motion is None or marks.of_cameras is None or marks.of_cameras.since_s is None:
+            return None
+        return marks.of_cameras.since_s, *marks.motion
+
+    def put_right(self, correction: RigCorrection) -> tuple[Array, Array] | None:
+        """Begin anew after a correction; what was found stays found.
+
+        Returns:
+            What the estimator knew before the change, with which it goes on: state and covariance; None without one.
+        """
+        at_s, since_s = correction.at_s, correction.since_s
+        cause = "rig" if correction.what == "cameras" else "fixed"
+        self._corrected += tuple(
+            replace(each, corrected_s=at_s) for each in self.findings() if cause in (each.cause, *each.alternatives)
+        )
+        self._past += tuple(replace(each, until_s=at_s) for each in self.changes)
+        if correction.update is not None:
+            self._rig = RigWatch(correction.update.rig, self._body, self._sync_s)
+            self._suspected = np.zeros((6, 6))
+        if self._landmarks is not None:
+            self._landmarks = LandmarkWatch(self._fixed_names)
+        self._doubted_s = -np.inf
+        if self._estimator is None or self._arm is None:
+            return None
+        before = [state for t_s, state in self._known if t_s < since_s - _DATED_S] or [self._known[0][1]]
+        self._known = deque([each for each in self._known if each[0] < since_s - _DATED_S], _KEPT)
+        self._estimator.restore(before[-1])
+        self._begin(self._estimator, self._arm)
+        return before[-1]
 
     @property
     def trust(self) -> Trust:
@@ -174,11 +239,17 @@ class HealthMonitor:
         """Return the covariance (6, 6) of what may have moved a pose measurement of the tool; None where nothing is."""
         return suspected(measurement, self.changes)
 
+    @property
+    def every_change(self) -> tuple[Change, ...]:
+        """What explains the changes of a whole run: those that were put right, and those that were not."""
+        return (*self._past, *self.changes)
+
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
         self.work()
         late = () if self._clock is None else clock_findings(self._clock, self._newest_s)
         return (
+            *self._corrected,
             *(() if self._rig is None else self._rig.findings()),
             *self._moved(),
             *late,

@@ -38,6 +38,7 @@ class HealthFinding:
         unit: deg, mm, %, ms, or measurements.
         advice: what to do.
         alternatives: other causes that explain it nearly as well.
+        corrected_s: when it was put right, s; None where it was not.
     """
 
     cause: Cause
@@ -48,6 +49,7 @@ class HealthFinding:
     unit: str
     advice: str
     alternatives: tuple[Cause, ...] = ()
+    corrected_s: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the object that summary.json and ``--json`` hold."""
@@ -56,12 +58,16 @@ class HealthFinding:
     def line(self) -> str:
         """Return the finding as one line for people."""
         since = "" if self.since_s is None else f" since {self.since_s:.1f} s"
-        return f"{self.cause}: {self.what}{since}; {self.advice}"
+        right = "" if self.corrected_s is None else f", put right at {self.corrected_s:.1f} s"
+        return f"{self.cause}: {self.what}{since}{right}; {self.advice}"
 
 
 def health_lines(health: Sequence[HealthFinding]) -> list[str]:
     """Return the lines for a log, a terminal or a report: none where nothing was found."""
-    return [f"do not trust this result: {found.line()}" for found in health]
+    return [
+        f"do not trust {'this result' if found.corrected_s is None else 'what was measured meanwhile'}: {found.line()}"
+        for found in health
+    ]
 
 
 def unseen_lines(names: Sequence[str]) -> list[str]:

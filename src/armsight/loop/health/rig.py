@@ -187,7 +187,7 @@ class RigWatch:
             found = self._residuals(estimate, float(k))
             if found is None:
                 continue
-            if began is None or _differ(began, estimate.T_left_body):
+            if began is None or differ(began, estimate.T_left_body):
                 self._close_stay()
                 self._stay, self._stay_shots, began = ResidualSums(self._size, float(k)), 0, estimate.T_left_body
                 stays += 1
@@ -248,7 +248,7 @@ class RigWatch:
 
     def _sum(self, sums: ResidualSums, T: Array, now_s: float) -> None:
         """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
-        if self._stay is None or self._began is None or _differ(self._began, T):
+        if self._stay is None or self._began is None or differ(self._began, T):
             self._close_stay()
             self._stay, self._stay_shots, self._began = ResidualSums(self._size, now_s), 0, T
         self._stay.add(sums, 1.0)
@@ -369,16 +369,28 @@ class RigWatch:
             _FINDINGS[part](change, since_s, len(parts) == 1 and not self._needed(change, part)) for part in parts
         )
 
+    def copied(self) -> RigWatch:
+        """Return a copy that says what was found so far; this one goes on."""
+        copied = copy(self)
+        copied._history = self._history.copy()
+        return copied
+
     def _ended(self) -> RigWatch:
         """Return a copy whose running test was made; this one goes on with it."""
-        ended = copy(self)
+        ended = self.copied()
         ended._test, ended._window = (ResidualSums(self._size, each.begin_s) for each in (self._test, self._window))
         ended._test.add(self._test, 1.0)
         ended._window.add(self._window, 1.0)
-        ended._history = self._history.copy()
         ended._close_stay()
         ended._decide()
         return ended
+
+    def moved_since_s(self) -> float | None:
+        """Return since when the cameras alone are found to have moved, s; None where nothing or more was found."""
+        if not (self.alarm and self._timed and self.suspected is not None):
+            return None
+        since_s, change = self._since()
+        return since_s if self._to_blame(change) == ["rig"] else None
 
     def _needed(self, change: RigChange, part: Part) -> bool:
         """Return whether the other parts do not explain what was found."""
@@ -408,7 +420,7 @@ def _fault_directions(rig: StereoRig, size: int) -> Array:
     return by_fault
 
 
-def _differ(T: Array, other: Array) -> bool:
+def differ(T: Array, other: Array) -> bool:
     """Return whether two poses (4, 4) are so far apart that their errors count as independent."""
     apart = float(np.linalg.norm(T[:3, 3] - other[:3, 3]))
     cosine = (float(np.vdot(T[:3, :3], other[:3, :3])) - 1.0) / 2.0

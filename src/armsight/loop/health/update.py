@@ -4,18 +4,27 @@ In: a calibrated rig, a body, and detections of it. Out: the rig with what these
 they say too little. Model and sums are those of :mod:`armsight.loop.health.rig`. All parameters of the rig are estimated,
 with the calibration as their prior; the prior of the right camera's pose is dropped, except for the length of the
 baseline: the shots cannot distinguish it from the size of the body.
+
+Where there are shots from before the change as well, the change f alone is estimated: of both,
+
+    r = B x + S e + n before,    r = B (x + F f) + S e + n after
+
+with the calibration's error x and the body's e the same. What both have in common cancels, and poses stay in the frame in
+which they were before.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from armsight.data import Array, Body, Correspondences, Missed, PoseEstimate, Record
 from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.health.rig import RigWatch, free_directions
+from armsight.loop.health.rig import ResidualSums, RigWatch, free_directions
 from armsight.vision.detections import SeenShot
 from armsight.vision.match import epipolar_distances
 from armsight.vision.measure import measure_seen
@@ -26,11 +35,15 @@ from armsight.vision.triangulate import triangulate
 DEPTHS_M = (0.5, 1.0, 2.0)
 #: Fewer shots that differ than this are rejected, and a rotation of the right camera less well known than this, rad.
 LEAST_STAYS, MOST_SIGMA_RAD = 8, float(np.radians(0.02))
-#: The cameras may have moved so far (m, rad): the prior of their pose.
-_MOVED = np.repeat([0.01, np.radians(2.0)], 3)
+#: The cameras may have moved so far across the baseline (2), m, and about their axes (3), rad: the prior.
+_FREED = np.array([0.01, 0.01, *np.radians([2.0, 2.0, 2.0])])
 #: Standard deviations of a detection by which detections are gated, step by step of the fit, px: loosely while the rig is
 #: wrong, at the end by that of the rig (0). And the one that the fit starts with, before the residuals give it.
 _GATES_PX, _NOISE_PX = (20.0, 2.0, 0.0, 0.0), 0.1
+#: A rotation about the baseline's normal hardly changes epipolar distances: chance makes them so many times larger at most.
+_WORSE = 1.2
+#: In so many shots at most the uncertainty of the body is computed.
+_JUDGED = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +59,7 @@ class RigUpdate(Record):
         epipolar_px: RMS distance of the detections from their epipolar lines (Sampson), before and after.
         shots: number of shots that were used.
         stays: how many of them differ from one another.
+        sigma_m: standard deviation of the body's position with the new rig, and what it would be with the calibration's, m.
     """
 
     rig: StereoRig
@@ -56,15 +70,50 @@ class RigUpdate(Record):
     epipolar_px: tuple[float, float]
     shots: int
     stays: int
+    sigma_m: tuple[float, float]
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures as JSON has them."""
+        return {
+            "rotation_changed_deg": float(np.degrees(self.rotation_rad)),
+            "rotation_sigma_deg": float(np.degrees(self.sigma_rad)),
+            "shift_across_baseline_m": self.shift_m,
+            "depth_error_of_old_rig_m": {
+                f"{depth:g}": value if math.isfinite(value) else None
+                for depth, value in zip(DEPTHS_M, self.depth_errors_m, strict=True)
+            },
+            "epipolar_rms_before_px": self.epipolar_px[0],
+            "epipolar_rms_after_px": self.epipolar_px[1],
+            "shots": self.shots,
+            "differing_shots": self.stays,
+        }
+
+    def lines(self) -> list[str]:
+        """Return the figures as lines for people."""
+        depths = ", ".join(
+            f"{f'{1e3 * value:+.2f} mm' if math.isfinite(value) else 'unknown'} at {depth:g} m"
+            for depth, value in zip(DEPTHS_M, self.depth_errors_m, strict=True)
+        )
+        before, after = self.epipolar_px
+        return [
+            f"right camera: rotated by {np.degrees(self.rotation_rad):.3f} +- {np.degrees(self.sigma_rad):.3f} deg, "
+            f"shifted across the baseline by {1e3 * self.shift_m:.3f} mm",
+            f"depth error of the old rig: {depths}",
+            f"epipolar distance, RMS: {before:.3f} px before, {after:.3f} px after",
+            f"{self.shots} shots used, {self.stays} differ from one another",
+        ]
 
 
-def updated_rig(rig: StereoRig, body: Body, shots: Sequence[SeenShot]) -> RigUpdate | Missed:
+def updated_rig(
+    rig: StereoRig, body: Body, shots: Sequence[SeenShot], before: Sequence[SeenShot] = ()
+) -> RigUpdate | Missed:
     """Estimate the relative pose of a rig's cameras again.
 
     Args:
         rig: as it was calibrated, with its covariance.
         body: what is in view; its size gives the scale.
         shots: detections of it, anywhere in view.
+        before: detections of it from before the change, anywhere in view.
 
     Returns:
         The new rig, or why the shots do not determine it.
@@ -87,20 +136,84 @@ def updated_rig(rig: StereoRig, body: Body, shots: Sequence[SeenShot]) -> RigUpd
                 f"{stays} of {len(found)} shots differ from one another, {LEAST_STAYS} are needed: move the body through "
                 "the view"
             )
+        if before:
+            change = _Change.of(rig, new, body, before, (watch, sums), noise_px)
+            noise_px *= change.noise
+            free = free_directions(rig)
+            new, cov = rig.perturbed(free @ change.f), rig.cov + free @ change.cov @ free.T
+            continue
         L, so_far = watch.prior, np.zeros(len(sums.b))
         so_far[:count] = _difference(rig, new)
         whole = L @ np.linalg.solve(L.T @ sums.H @ L + np.eye(len(L)), L.T)
         step = whole @ (sums.b + sums.H @ so_far)
-        left = sums.square - 2.0 * float((step - so_far) @ sums.b) + float((step - so_far) @ sums.H @ (step - so_far))
-        noise_px *= float(np.sqrt(max(left, 0.0) / max(sums.freedom, 1.0)))
+        noise_px *= float(np.sqrt(_left(sums, step - so_far) / max(sums.freedom, 1.0)))
         new, cov = rig.perturbed(step[:count]), whole[:count, :count]
-    return _checked(rig, replace(new, cov=(cov + cov.T) / 2), body, found, stays)
+    new = replace(new, cov=(cov + cov.T) / 2)
+    some = shots[:: -(-len(shots) // _JUDGED)]
+    now, then = (_position_sigma(each, body, some) for each in (new, replace(new, cov=rig.cov)))
+    return _checked(rig, new, body, found, (stays, (now, then)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Change(Record):
+    """A change of the right camera's pose.
+
+    Attributes:
+        f: (5,) translation across the baseline (2), m, and rotation (3), rad, of the right camera.
+        cov: (5, 5) its covariance.
+        noise: standard deviation of the residuals over the one that they were whitened with.
+    """
+
+    f: Array
+    cov: Array
+    noise: float
+
+    @classmethod
+    def of(
+        cls,
+        rig: StereoRig,
+        new: StereoRig,
+        body: Body,
+        before: Sequence[SeenShot],
+        after: tuple[RigWatch, ResidualSums],
+        noise_px: float,
+    ) -> _Change:
+        """Estimate the change from shots before it, and the sums of those after it, which are about a rig ``new``."""
+        watch, later = RigWatch(replace(rig, sigma_px=noise_px), body, 0.0), after[1]
+        measured = [measure_seen(rig, body, shot) for shot in before]
+        sooner, _ = watch.information([each for each in measured if isinstance(each, PoseEstimate)])
+        count, size = rig.parameter_count, len(later.b)
+        F = np.zeros((size, 5))
+        F[:count] = free_directions(rig)
+        so_far = F.T[:, :count] @ _difference(rig, new)
+        HF, b = later.H @ F, later.b + later.H @ (F @ so_far)
+        H = np.block([[sooner.H + later.H, HF], [HF.T, F.T @ HF]])
+        M = np.zeros((size + 5, size + 5))
+        M[:size, :size], M[size:, size:] = watch.prior, np.diag(_FREED)
+        cov = M @ np.linalg.solve(M.T @ H @ M + np.eye(size + 5), M.T)
+        found = cov @ np.concatenate([sooner.b + b, F.T @ b])
+        x, f = found[:size], found[size:]
+        left = _left(sooner, x) + _left(later, x + F @ (f - so_far))
+        noise = float(np.sqrt(left / max(sooner.freedom + later.freedom, 1.0)))
+        return cls(f, (cov[size:, size:] + cov[size:, size:].T) / 2, noise)
+
+
+def _left(sums: ResidualSums, x: Array) -> float:
+    """Return the sum of squares that parameters (K,) leave."""
+    return max(sums.square - 2.0 * float(x @ sums.b) + float(x @ sums.H @ x), 0.0)
+
+
+def _position_sigma(rig: StereoRig, body: Body, shots: Sequence[SeenShot]) -> float:
+    """Return the RMS standard deviation of the body's position in some shots, m; NaN where none is measured."""
+    measured = [measure_seen(rig, body, shot) for shot in shots]
+    variances = [np.trace(each.cov[:3, :3]) for each in measured if isinstance(each, PoseEstimate)]
+    return float(np.sqrt(np.mean(variances))) if variances else float("nan")
 
 
 def _checked(
-    old: StereoRig, new: StereoRig, body: Body, found: Sequence[PoseEstimate], stays: int
+    old: StereoRig, new: StereoRig, body: Body, found: Sequence[PoseEstimate], said: tuple[int, tuple[float, float]]
 ) -> RigUpdate | Missed:
-    """Return the update with its figures, or why it is rejected."""
+    """Return the update with its figures, or why it is rejected; the last two figures are given."""
     sigma = float(np.sqrt(np.linalg.eigvalsh(new.cov[-3:, -3:])[-1]))
     if sigma > MOST_SIGMA_RAD:
         return Missed(
@@ -111,7 +224,7 @@ def _checked(
     before, after = (
         float(np.sqrt(np.mean(np.square(epipolar_distances(each, uv[:, 0], uv[:, 1]))))) for each in (old, new)
     )
-    if after > before:
+    if after > _WORSE * before:
         return Missed(
             f"the new pose explains the shots worse than the old one: epipolar distance {after:.3f} px, {before:.3f} "
             "before; was the body moving, or are cameras or body others than the files say?"
@@ -127,15 +240,14 @@ def _checked(
         tuple(_depth_error(old, new, depth) for depth in DEPTHS_M),
         (before, after),
         len(found),
-        stays,
+        *said,
     )
 
 
 def _prior(rig: StereoRig) -> Array:
     """Return the covariance (P, P) of the parameters once the cameras may have moved."""
     free = free_directions(rig)
-    moved = np.array([_MOVED[0], _MOVED[0], *_MOVED[3:]])
-    return np.asarray(rig.cov + (free * moved**2) @ free.T)
+    return np.asarray(rig.cov + (free * _FREED**2) @ free.T)
 
 
 def _difference(old: StereoRig, new: StereoRig) -> Array:

@@ -148,7 +148,19 @@ class Follower:
             )
         discs = target.discs
         assert discs is not None
-        self.rig, self.target = rig, target
+        self.target = target
+        self._describe(rig)
+        self.expose_apart(apart_s)
+        self._found = _buffers(len(discs.radii_m), rig.parameter_count)
+        self._cov_noise, self._rows = np.empty((6, 6)), np.arange(len(discs.radii_m))
+        self._limits = np.array([misfit_limit(2 * n - 6) for n in range(2 * len(discs.radii_m) + 1)])
+        self._work, self._outline = workspace(), search.workspace()
+
+    def _describe(self, rig: StereoRig) -> None:
+        """Set the rig."""
+        discs = self.target.discs
+        assert discs is not None
+        self.rig = rig
         kernel = [camera.kernel_arguments() for camera in rig.cameras]
         sizes = [camera.parameters.size for camera in rig.cameras]
         self._scene = DiscScene(
@@ -168,11 +180,12 @@ class Follower:
             0.0,
             np.array(rig.disc_variance_factors),
         )
+
+    def recalibrate(self, rig: StereoRig) -> None:
+        """Go on with another calibration of the same cameras: the body is followed as before."""
+        apart_s = self._scene.apart_s
+        self._describe(rig)
         self.expose_apart(apart_s)
-        self._found = _buffers(len(discs.radii_m), rig.parameter_count)
-        self._cov_noise, self._rows = np.empty((6, 6)), np.arange(len(discs.radii_m))
-        self._limits = np.array([misfit_limit(2 * n - 6) for n in range(2 * len(discs.radii_m) + 1)])
-        self._work, self._outline = workspace(), search.workspace()
 
     def expose_apart(self, apart_s: float) -> None:
         """Replace the standard deviation of the time between the two exposures of a shot, s."""

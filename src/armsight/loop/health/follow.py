@@ -1,0 +1,264 @@
+"""A rig put right while it is used: the cameras against each other, and the rig against the base of the arm.
+
+In: a :class:`~armsight.loop.health.HealthMonitor`, and the poses measured so far. Out: a :class:`RigCorrection` once the
+evidence suffices, else the reason why it does not. Cameras: the estimate of :mod:`armsight.loop.health.update`, from shots
+taken after the change; it is accepted when it leaves poses nearly as certain as the calibration did. Base: the motion
+that fixed bodies in view show; without these the one that the arm's poses show, if nothing else explains them and the
+tool's position is known well enough with it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from armsight.data import Array, Body, Missed, PoseEstimate, Record
+from armsight.geometry.pose import adjoint, exp_se3, inverse
+from armsight.loop.estimators import Mounting
+from armsight.loop.health.change import Change
+from armsight.loop.health.rig import TEST_S, RigWatch, differ
+from armsight.loop.health.update import LEAST_STAYS, RigUpdate, updated_rig
+from armsight.vision.detections import SeenShot
+from armsight.vision.locate import locate
+from armsight.vision.match import gate
+from armsight.vision.rig import StereoRig
+from armsight.vision.triangulate import triangulate
+
+if TYPE_CHECKING:
+    from armsight.loop.health.monitor import HealthMonitor
+
+#: What is not known of a change of the cameras may be this share of what is not known of their calibration.
+SHARE = 0.5
+#: Most shots of an update; and by how much their number must have grown since an update that was rejected.
+_MOST_SHOTS, _MORE = 60, 1.25
+#: Largest standard deviation of the tool's position by what is put right of the rig, m; and by how much what else may have
+#: moved may place the tool elsewhere, m.
+MOST_SIGMA_M, MOST_APART_M = 2e-4, 2e-4
+
+Poses = Callable[[], Sequence[tuple[float, PoseEstimate]]]
+
+
+@dataclass(frozen=True, eq=False)
+class RigCorrection(Record):
+    """Something of a rig that was put right.
+
+    Attributes:
+        what: cameras: the right camera's pose in the left one; base: the rig's pose in the base of the arm.
+        since_s: since when it was wrong, s on the clock of the shots.
+        at_s: from when on poses are measured with it, s.
+        by: what showed it: body, arm, fixed bodies.
+        update: of the cameras; None of the base.
+        motion: (6,) right tangent from the old pose of the rig in the base to the new one, [m; rad]; zero of the cameras.
+        cov: (6, 6) its covariance.
+        tool_m: by how much that displaced the measured tool, where this is what the arm's poses show, and its sigma, m.
+    """
+
+    what: Literal["cameras", "base"]
+    since_s: float
+    at_s: float
+    by: Literal["body", "arm", "fixed bodies"]
+    update: RigUpdate | None
+    motion: Array
+    cov: Array
+    tool_m: tuple[float, float] | None = None
+
+    def mounting(self, old: Mounting) -> Mounting:
+        """Return where the rig is, from where it was thought to be."""
+        if self.what == "cameras":
+            return old
+        cov, back = old.cov.copy(), adjoint(exp_se3(-self.motion))
+        cov[:6] = back @ cov[:6]
+        cov[:, :6] = cov[:, :6] @ back.T
+        cov[:6, :6] += self.cov
+        return Mounting(old.T_base_rig @ exp_se3(self.motion), old.T_tool_body, cov)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the object that summary.json holds."""
+        found: dict[str, Any] = {"what": self.what, "since_s": self.since_s, "at_s": self.at_s, "by": self.by}
+        if self.update is not None:
+            return found | self.update.figures()
+        if self.tool_m is not None:
+            found |= {"tool_displaced_m": self.tool_m[0], "tool_displaced_sigma_m": self.tool_m[1]}
+        sigmas = np.sqrt(np.diag(self.cov))
+        return found | {
+            "shift_m": self.motion[:3].tolist(),
+            "shift_sigma_m": sigmas[:3].tolist(),
+            "rotation_deg": np.degrees(self.motion[3:]).tolist(),
+            "rotation_sigma_deg": np.degrees(sigmas[3:]).tolist(),
+        }
+
+    def line(self) -> str:
+        """Return what was put right as one line for people."""
+        if self.update is None:
+            shift, rotation = (float(np.linalg.norm(part)) for part in (self.motion[:3], self.motion[3:]))
+            what = (
+                f"it had moved against the base of the arm by {1e3 * shift:.2f} mm and {np.degrees(rotation):.3f} deg"
+            )
+            if self.tool_m is None:
+                what += ", as fixed bodies show"
+            else:
+                what += (
+                    f", the tool had appeared displaced by {1e3 * self.tool_m[0]:.2f} +- {1e3 * self.tool_m[1]:.2f} mm"
+                )
+        else:
+            what = "; ".join(self.update.lines())
+        return f"rig put right at {self.at_s:.1f} s, wrong since {self.since_s:.1f} s: {what}"
+
+
+def correction_lines(corrections: Sequence[RigCorrection], rejected: str | None) -> list[str]:
+    """Return the lines for a log or a terminal on what was put right, and why what else was found was not."""
+    left = () if rejected is None else (f"the rig was not put right: {rejected}",)
+    return [*(each.line() for each in corrections), *left]
+
+
+class RigFollower:
+    """Decides when a rig can be put right, and by how much.
+
+    Args:
+        rig: as it was calibrated; it must have a covariance.
+        body: what is measured.
+
+    Attributes:
+        rejected: why what was found is not put right yet; None where nothing was found, or all was put right.
+    """
+
+    def __init__(self, rig: StereoRig, body: Body) -> None:
+        self._rig, self._body = rig, body
+        self._tried = 0  # differing shots of the last update that was rejected
+        self.rejected: str | None = None
+
+    def look(
+        self, monitor: HealthMonitor, poses: Poses, T_base_rig: Array, at_s: float
+    ) -> Callable[[], RigCorrection | None] | None:
+        """Return what computes a correction, or why there is none; None where nothing is found to have moved.
+
+        Args:
+            monitor: what was found.
+            poses: returns time, s, and pose of the newest shots, measured with the rig as it is, in order of time.
+            T_base_rig: (4, 4) the rig in the base as it is taken to be, m.
+            at_s: the time, s.
+        """
+        if (watch := monitor.cameras_moved()) is not None:
+            newest = poses()
+            return lambda: self._of_watch(watch, newest, at_s)
+        if (moved := monitor.rig_moved()) is not None:
+            return lambda: self.base_by_bodies(moved[0], moved[1:], at_s)
+        changes = monitor.changes
+        if changes and any(each.suspect.cause == "fixed" for each in changes):
+            return lambda: self.base_by_arm(changes, T_base_rig, at_s)
+        return None
+
+    def _of_watch(
+        self, watch: RigWatch, poses: Sequence[tuple[float, PoseEstimate]], at_s: float
+    ) -> RigCorrection | None:
+        """Return the cameras put right, where nothing else is found to have changed."""
+        since_s = watch.moved_since_s()
+        if since_s is None:
+            self.rejected = "cameras: their pose alone does not explain what the body's detections show"
+            return None
+        return self.cameras(since_s, poses, at_s)
+
+    def cameras(
+        self, since_s: float, poses: Sequence[tuple[float, PoseEstimate]], at_s: float, settle_s: float = TEST_S
+    ) -> RigCorrection | None:
+        """Return the cameras put right; None where the poses do not suffice, as ``rejected`` says.
+
+        Args:
+            since_s: since when the cameras are found to have moved, s.
+            poses: time, s, and pose of shots measured with the rig as it is, in order of time.
+            at_s: the time, s.
+            settle_s: so long after ``since_s`` shots may still be from before, s.
+        """
+        used = _differing([pose for t_s, pose in poses if t_s >= since_s + settle_s])
+        before = _differing([pose for t_s, pose in poses if t_s < since_s - settle_s])
+        if len(used) < max(LEAST_STAYS, _MORE * self._tried):
+            self.rejected = (
+                self.rejected or f"cameras: {len(used)} shots since they moved differ, {LEAST_STAYS} are needed"
+            )
+            return None
+        self._tried = len(used)
+        before = before if len(before) >= LEAST_STAYS else []
+        found = updated_rig(self._rig, self._body, _some(used), _some(before))
+        if isinstance(found, Missed):
+            self.rejected = f"cameras: {found.reason}"
+            return None
+        now_m, then_m = found.sigma_m
+        by_m = math.sqrt(max(now_m**2 - then_m**2, 0.0))
+        most_m = max(MOST_SIGMA_M, SHARE * then_m) if before else then_m
+        if not by_m <= most_m:
+            self.rejected = (
+                f"cameras: their pose would leave the body uncertain by {1e3 * by_m:.2f} mm, at most {1e3 * most_m:.2f} mm "
+                "are accepted: move the body through the whole view"
+            )
+            return None
+        self._rig, self._tried, self.rejected = found.rig, 0, None
+        return RigCorrection("cameras", since_s, at_s, "body", found, np.zeros(6), np.zeros((6, 6)))
+
+    def base_by_bodies(self, since_s: float, motion: tuple[Array, Array], at_s: float) -> RigCorrection | None:
+        """Return the rig put right by the motion (6,) of the cameras that fixed bodies show, with its covariance."""
+        self.rejected = None
+        return RigCorrection("base", since_s, at_s, "fixed bodies", None, *motion)
+
+    def base_by_arm(self, changes: Sequence[Change], T_base_rig: Array, at_s: float) -> RigCorrection | None:
+        """Return the rig put right by what the arm's poses show; None where they do not suffice, as ``rejected`` says.
+
+        Args:
+            changes: the hypotheses that explain them, the best first.
+            T_base_rig: (4, 4) the rig as it was calibrated, m.
+            at_s: the time, s.
+        """
+        best, others = changes[0], [each for each in changes[1:] if each.suspect.cause != "fixed"]
+        if best.suspect.cause != "fixed":
+            self.rejected = f"base: a change of the {best.suspect.cause} explains the poses of the arm better"
+            return None
+        T, t_s = best.T_base_tool, best.end_s
+        shift, cov = best.displacement(T, t_s)
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1]))
+        if sigma_m > MOST_SIGMA_M:
+            self.rejected = (
+                f"base: the tool would be uncertain by {1e3 * sigma_m:.2f} mm, at most {1e3 * MOST_SIGMA_M:g} mm are "
+                "accepted: move the arm more, about all its joints"
+            )
+            return None
+        apart = [float(np.linalg.norm((each.displacement(T, t_s)[0] - shift)[:3])) for each in others]
+        if max(apart, default=0.0) > MOST_APART_M:
+            self.rejected = f"base: {others[int(np.argmax(apart))].suspect.cause} cannot be excluded: move the arm more"
+            return None
+        self.rejected = None
+        # What was measured is exp(xi) times the true pose, with xi in the base's frame.
+        xi, cov = best.displacement(np.eye(4), t_s)
+        to_rig = adjoint(inverse(T_base_rig))
+        motion, cov = -to_rig @ xi, to_rig @ cov @ to_rig.T
+        displaced_m = float(np.linalg.norm(shift[:3]))
+        return RigCorrection("base", best.begin_s, at_s, "arm", None, motion, cov, (displaced_m, sigma_m))
+
+
+def remeasured(rig: StereoRig, body: Body, pose: PoseEstimate) -> PoseEstimate | Missed:
+    """Measure a pose again from its detections, with another calibration of the cameras."""
+    return locate(rig, body, triangulate(rig, body, gate(rig, body, pose.points.seen)))
+
+
+def _differing(poses: Sequence[PoseEstimate]) -> list[PoseEstimate]:
+    """Return poses that differ from the one before."""
+    kept: list[PoseEstimate] = []
+    for pose in poses:
+        if not kept or differ(kept[-1].T_left_body, pose.T_left_body):
+            kept.append(pose)
+    return kept
+
+
+def _some(poses: Sequence[PoseEstimate]) -> list[SeenShot]:
+    """Return the detections of some of the poses, if there are many."""
+    return [seen_shot(str(k), pose) for k, pose in enumerate(poses[:: -(-len(poses) // _MOST_SHOTS) or 1])]
+
+
+def seen_shot(name: str, pose: PoseEstimate) -> SeenShot:
+    """Return the detections of a measured pose."""
+    seen = pose.points.seen
+    paired = seen.paired
+    ids = seen.ids[paired]
+    return SeenShot(name, (ids, ids), (seen.uv[paired, 0], seen.uv[paired, 1]))
