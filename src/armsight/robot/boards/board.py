@@ -29,6 +29,7 @@ from armsight.robot.boards.configuration import (
     Configuration,
     check_configuration,
     check_gains,
+    check_pin,
 )
 from armsight.robot.boards.contract import Abilities
 from armsight.robot.boards.link import Link
@@ -436,6 +437,7 @@ class Board:
             DeviceError: the board rejected it.
         """
         check_configuration(config)
+        check_pin(config, self.welcome.board)
         data, session = config.tobytes(), self._session
         for offset in range(0, len(data), _PART):
             part = data[offset : offset + _PART]
