@@ -10,8 +10,8 @@ edges are at ticks of the board. An exposure of length T about time t gathers th
 
 of the LED's light, and dx/dt = +-1/T wherever an edge of the code is within it. So the brightness of single images, with a
 noise of 1% of the LED's, tells t to 1% of T; the sequence of many tells which bits they were. Exposures of a camera follow
-each other by its period: t = t0 + n period, with a jitter. The response of the camera to light is a cubic (tone curves),
-and what lies around the LED is a regressor (lamps, auto exposure). Search over delay and exposure by correlation; then
+each other by its period: t = t0 + n period, with a jitter. The response of the camera to light is a cubic (tone curves);
+the light of the image before (temporal filters of webcams) and what is around the LED (lamps) are regressors. Search over delay and exposure by correlation; then
 Gauss-Newton with the response projected out (Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least
 squares problems whose variables separate", 1973), weights by a noise of the brightness and a jitter of the exposures that
 are estimated from the residuals, and Tukey's weights against what hides the LED.
@@ -47,6 +47,8 @@ _POWERS, _PASSES, _STEPS = 3, 4, 12
 _TUKEY, _HIDDEN = 6.0, 0.3
 #: Fewest images with an edge of the code: the others tell no time.
 _EDGES = 16
+#: How well the LED's edges are at the board's ticks: interrupts that come before, s.
+_EDGE_S = 1e-5
 #: Stamps that scatter by more than this share of the period do not count images.
 _COUNTABLE = 0.2
 #: A batch of stamps, as many in a window: their means are independent where single stamps are smoothed.
@@ -209,14 +211,14 @@ def find_exposures(seen: Brightness, bit_s: float, *, near: tuple[float, float] 
             f"edges of the LED's code fall into {edges} of {len(n)} exposures, {_EDGES} at least are needed: set"
             f" sync_led_ticks to about the exposure, {1e3 * fit.theta[2]:.1f} ms"
         )
-    freedom = max(len(n) * (1.0 - hidden) - len(fit.theta) - _POWERS - 2, 1.0)
+    freedom = max(len(n) * (1.0 - hidden) - len(fit.theta) - _POWERS - 3, 1.0)
     birge = max(float(weighted @ weighted) / freedom, 1.0)
     return Exposures(
         n,
         float(fit.theta[0]),
         float(fit.theta[1]),
         float(fit.theta[2]),
-        birge * np.linalg.inv(H),
+        np.asarray(birge * np.linalg.inv(H), dtype=np.float64),
         jitter,
         noise / abs(fit.amplitude),
         hidden,
@@ -272,6 +274,7 @@ def _evaluated(seen: Brightness, n: Array, theta: Array, bit_s: float, weights: 
     after, before = _on((t + exposure / 2) / bit_s), _on((t - exposure / 2) / bit_s)
     by_t, by_exposure = (after - before) / exposure, ((after + before) / 2 - x) / exposure
     columns = [np.ones(len(x)), *(x**k for k in range(1, _POWERS + 1))]
+    columns.append(light(t - theta[1], exposure, bit_s))
     if np.ptp(seen.around) > 0:
         columns.append(seen.around - seen.around.mean())
     X = np.column_stack(columns)
@@ -358,7 +361,7 @@ def estimate_sync(
     return SyncEstimate(
         float(left.stamp_s.mean() - late.mean()),
         float(late.mean()),
-        math.sqrt(float(ours.cov[0, 0]) + max(scatter / _BATCHES, float(np.var(late)) / len(late))),
+        math.sqrt(float(ours.cov[0, 0]) + max(scatter / _BATCHES, float(np.var(late)) / len(late)) + _EDGE_S**2),
         theirs.t_s - ours.t_s,
         math.sqrt(float(ours.cov[0, 0] + theirs.cov[0, 0])),
         math.hypot(ours.jitter_s, theirs.jitter_s),
@@ -419,6 +422,7 @@ class SyncLedWatch:
             return None
         images = shot.left, shot.right
         self._height = shot.left.shape[0]
+        seen: tuple[Any, ...]
         if self._spots:
             seen = tuple(spot.brightness(image) for spot, image in zip(self._spots, images, strict=True))
         elif self._corners:
@@ -498,6 +502,34 @@ class SyncLedWatch:
             return found.reason
         self.estimates.append(found)
         return None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the object of summary.json: the newest estimate, the rate, how many windows there were."""
+        rate, newest = self.rate(), self.estimates[-1] if self.estimates else None
+        found: dict[str, Any] = {"windows": len(self.estimates), "missed": self.reason}
+        if newest is not None:
+            found |= {
+                "delay_s": {"value": newest.delay_s, "sigma": newest.sigma_delay_s},
+                "skew_s": {"value": newest.skew_s, "sigma": newest.sigma_skew_s},
+                "jitter_s": newest.jitter_s,
+                "exposure_s": [newest.left.exposure_s, newest.right.exposure_s],
+            }
+        if rate is not None:
+            found["rate"] = {"value": rate[0], "sigma": rate[1]}
+        return found
+
+    def __str__(self) -> str:
+        """Return what the LED told as a line for people."""
+        rate, newest = self.rate(), self.estimates[-1] if self.estimates else None
+        if newest is None:
+            return f"sync LED: not seen: {self.reason}"
+        gains = "" if rate is None else f", the stamps gain {1e6 * rate[0]:.1f} ± {1e6 * rate[1]:.1f} ppm"
+        return (
+            f"sync LED, in its row: delay {1e3 * newest.delay_s:.3f} ± {1e3 * newest.sigma_delay_s:.3f} ms, skew"
+            f" {1e3 * newest.skew_s:.3f} ± {1e3 * newest.sigma_skew_s:.3f} ms, exposures"
+            f" {1e3 * newest.left.exposure_s:.2f} and {1e3 * newest.right.exposure_s:.2f} ms{gains};"
+            f" {len(self.estimates)} windows" + ("" if self.reason is None else f"; at the end: {self.reason}")
+        )
 
     def rate(self) -> tuple[float, float] | None:
         """Return how fast the stamps gain on the board's clock, s/s, and its sigma; None with fewer than three windows."""

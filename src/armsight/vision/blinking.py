@@ -20,10 +20,12 @@ from armsight.vision.image import grey
 
 #: Pixels on a side of a block, and of the window about a spot.
 BLOCK, WINDOW = 8, 32
+#: Blocks on a side of what a block is compared with.
+_NEAR = 7
 #: Spots that are looked at more closely.
 CANDIDATES = 6
 #: A block blinks if its brightness scatters by so many times what those of the image usually do, and so much, grey levels.
-_TIMES, _LEAST = 6.0, 0.5
+_TIMES, _LEAST = 2.0, 0.5
 #: Grey level from which a pixel may be saturated; share of the strongest pixel's blinking that belongs to the spot, and
 #: below which a pixel is around it.
 _SATURATED, _SHARE, _AROUND = 250, 0.15, 0.05
@@ -67,9 +69,9 @@ def candidates(means: Array) -> list[tuple[int, int]]:
     Args:
         means: (N, h, w) block means of N images.
     """
-    changes = np.diff(means.astype(np.float32), axis=0).std(
-        axis=0
-    )  # slow changes, of the light or of shadows, are no blinking
+    # Lamps that flicker change all blocks alike, shadows change slowly: neither is what blinks.
+    apart = [image - cv2.blur(image, (_NEAR, _NEAR)) for image in means.astype(np.float32)]
+    changes = np.diff(apart, axis=0).std(axis=0)
     usual = float(np.median(changes))
     found, left = [], changes.copy()
     high, wide = means.shape[1] * BLOCK, means.shape[2] * BLOCK

@@ -57,6 +57,7 @@ from armsight.app.messages import UNTRUSTED
     metavar="FILE",
     help="The arm model to compute with, such as corrected.toml of armsight identify; by default the nominal table.",
 )
+@click.option("--sync-led", is_flag=True, help="Put an LED on the board's clock in view: it gives delay and skew.")
 @click.option("--quick", is_flag=True, help="Fewer calibration shots and motions, no studies.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
 def command(
@@ -68,6 +69,7 @@ def command(
     board: str,
     layout: str,
     nominal_arm: str | None,
+    sync_led: bool,
     quick: bool,
     as_json: bool,
 ) -> None:
@@ -92,7 +94,7 @@ def command(
     require_matplotlib()
     require_pyarrow()
     nominal = None if nominal_arm is None else open_arm(nominal_arm)
-    demo = Demo(output, arm, cameras, seed, emulator, layout, model, quick, nominal, nominal_arm)
+    demo = Demo(output, arm, cameras, seed, emulator, layout, model, quick, nominal, nominal_arm, sync_led)
     try:
         with steps() as progress:
             summary = run_demo(demo, progress=progress)

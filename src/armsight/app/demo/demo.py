@@ -61,6 +61,7 @@ class Demo:
         quick: fewer calibration shots and motions, and no studies.
         nominal_arm: the arm model that the estimators and the controller have; by default the table the arm was built to.
         nominal_arm_name: its name in the summary; by default the arm's own.
+        sync_led: whether an LED on the board's clock is in view.
     """
 
     folder: Path
@@ -73,6 +74,7 @@ class Demo:
     quick: bool = False
     nominal_arm: Arm | None = None
     nominal_arm_name: str | None = None
+    sync_led: bool = False
 
 
 def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummary:
@@ -186,6 +188,7 @@ def _workcell(demo: Demo, cameras: str, like: Workcell | None = None) -> Workcel
         model=open_arm(demo.model),
         assumed=nominal,
         like=like,
+        sync_led=demo.sync_led and like is None,
     )
 
 

@@ -27,12 +27,13 @@ from armsight.app.run.setup import Setup
 from armsight.app.stream.datum import EventDatum, JointsDatum, ShotDatum, estimator_event, mounting_event
 from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
-from armsight.errors import DeviceError
+from armsight.errors import ArmsightError, DeviceError
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import Estimator, KalmanEstimator, Mounting
 from armsight.loop.estimators.smoothing import Interval
 from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health import HealthMonitor
+from armsight.loop.sync_led import SyncLedWatch
 from armsight.robot.boards.codes import BoardState
 from armsight.vision.follow.follower import Follower, measurer
 from armsight.vision.rig import Shutters
@@ -163,6 +164,8 @@ _WRITE_EVERY_S = 0.1  # interval that is computed at once, after a command was s
 #: The motion of the body about an exposure is a cubic through the live estimates so near to it, s, which are among the
 #: newest so many. Their errors are correlated for longer than that: the scatter about the cubic shows this share of them.
 _MOTION_S, _MOTION_NEWEST, _SCATTER_SHARE = 0.03, 100, 0.25
+#: Searches for the sync LED before it is given up, two steps each, and the longest time for them, s.
+_LED_TRIES, _LED_S = 4, 60.0
 _STOP_S = 0.3  # in which an interrupted motion comes to rest
 _FIXED_EVERY_S = 0.2  # in which fixed bodies are measured
 _LEAST_WAIT_S = 0.001  # for the board, even when the loop is late: a lost board is detected by a timeout
@@ -197,6 +200,7 @@ class Loop:
         shutters: when the cameras expose, where they do not at one time: from the rig file, or found by the sweep. Once the
             delay is known, detections are moved to one time by the motion of the arm.
         health: watches whether the calibrations still hold.
+        led: follows the cameras' clock by the sync LED; None without one.
         on_shot: called with each shot that was measured and its result, after the command that follows from it was sent.
         on_period: called in every period before its command; what it raises ends the motion.
         segment: the entry of the log of what is running, with its begin; None before the first.
@@ -223,6 +227,9 @@ class Loop:
         self._skew = Skew(follower.rig, setup.sync_s)
         self.health.watch_fixed([each.body.name for each in setup.fixed])
         self._measure_fixed = [measurer(follower.rig, each) for each in setup.fixed]
+        bit_s = setup.sync_led_bit_s
+        self.led = None if bit_s is None else SyncLedWatch(bit_s)
+        self._led_work: Future[None] | None = None
         self._fixed_pool = ThreadPoolExecutor(1)
         self._fixed_work: Future[None] | None = None
         self._fixed_s = -np.inf
@@ -512,6 +519,7 @@ class Loop:
                         times_s.append(sent_s - began)
                     self.on_shot(shot, result)
                     self._look_at_fixed(shot)
+                    self._look_at_led(shot)
                     self.health.work()
                 if self._noted_s - self._written_s >= _WRITE_EVERY_S:
                     self._write()
@@ -538,6 +546,39 @@ class Loop:
             look()
         else:
             self._fixed_work = self._fixed_pool.submit(look)
+
+    def _look_at_led(self, shot: Shot) -> None:
+        """Look at the sync LED in a shot; what takes long is computed in a thread on hardware."""
+        work = None if self.led is None else self.led.take(shot)
+        if work is None:
+            return
+        if self._led_work is not None:
+            self._led_work.result()
+        if self.setup.clock is None:
+            work()
+        else:
+            self._led_work = self._fixed_pool.submit(work)
+
+    def find_led(self) -> None:
+        """Hold the arm until the sync LED was found by both cameras, where there is to be one.
+
+        Raises:
+            ArmsightError: it was not found; the message says why.
+        """
+        led, begin_s = self.led, self.t_s
+        if led is None:
+            return
+
+        def over() -> bool:
+            return bool(led.estimates) or led.tried >= _LED_TRIES or self.t_s - begin_s > _LED_S
+
+        self._iterate(Still(self._at_rest(PERIOD_S)), over, RunSegment("calibration", "", "", False), watch=True)
+        if not led.estimates:
+            reason = led.reason or f"no image in {_LED_S:g} s shows it"
+            raise ArmsightError(
+                f"the sync LED is not seen ({reason}): bring it into the view of both cameras, near the base, or leave out"
+                " --sync-led"
+            )
 
     def _rest_of_period(self) -> float:
         """Return how long to wait for the next iteration, s: what the last one has left of its period."""

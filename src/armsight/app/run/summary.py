@@ -121,6 +121,7 @@ class RunSummary:
         studies: error of vision against one quantity after the other.
         health: why the result must not be trusted; empty where nothing says so.
         fixed_unseen: names of the fixed bodies that were seen too rarely to be watched.
+        sync_led: what the sync LED told, as JSON; None without one.
     """
 
     properties: Mapping[str, Any]
@@ -139,6 +140,7 @@ class RunSummary:
     studies: Sequence[Study] = ()
     health: Sequence[HealthFinding] = ()
     fixed_unseen: Sequence[str] = ()
+    sync_led: Mapping[str, Any] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the object of summary.json, SI units in the keys; numbers that are not known are None."""
@@ -161,6 +163,8 @@ class RunSummary:
             found["camera_delay_s"] = {"value": self.delay_s[0], "sigma": self.delay_s[1]}
         if self.shutters is not None:
             found["shutters"] = self.shutters.to_json()
+        if self.sync_led is not None:
+            found["sync_led"] = dict(self.sync_led)
         if self.shots is not None:
             found["shots"] = asdict(self.shots)
         if self.handeye is not None:
@@ -260,6 +264,7 @@ def summary_of(
         studies,
         result.health,
         result.fixed_unseen,
+        None if result.led is None else result.led.to_json(),
     )
 
 

@@ -233,8 +233,8 @@ class Session:
         raise DeviceError(f"{self.name}: board {self.welcome.board} answers the hello, but sends no telemetry")
 
     def _ask_reaction(self) -> str:
-        """Return in words what the arm does by itself without a host, from the end of the configuration."""
-        ticks, reaction = struct.unpack("<II", self.config_part(CONFIG.itemsize - 8))
+        """Return in words what the arm does by itself without a host, as its configuration has it."""
+        ticks, reaction = struct.unpack_from("<II", self.config_part(_SILENCE_AT))
         does = "holds the arm where it comes to rest" if reaction == Reaction.HOLD else "switches the drives off"
         slows = "slows down and " if reaction == Reaction.HOLD else ""
         return f"; without commands the board {slows}{does} after {ticks / self.ticks_per_s * 1e3:.0f} ms"
@@ -245,6 +245,7 @@ _LONGEST_TICKS = 10000
 _STOPS = 3
 _STORE_S = 3.0  # a flash memory takes its time
 _PART = 200  # bytes of a CONFIG_PART
+_SILENCE_AT = CONFIG.itemsize - 16  # bytes: silence_ticks, silence_reaction
 _SET_MESSAGE_INTERVAL, _REBOOT = 511, 246  # MAV_CMD_
 _SLOW_ANGLES_US = 20000
 

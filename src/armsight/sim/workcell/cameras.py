@@ -317,6 +317,11 @@ class WorkcellSource:
         return shot
 
     @property
+    def shows_led(self) -> bool:
+        """Whether the sync LED is in view."""
+        return self._led is not None
+
+    @property
     def rendering(self) -> bool:
         """Whether the next shot's images are being rendered: a poll may have to wait for them."""
         begun = self._begun.get(self._next)
