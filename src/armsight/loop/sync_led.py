@@ -11,17 +11,18 @@ edges are at ticks of the board. An exposure of length T about time t gathers th
 of the LED's light, and dx/dt = +-1/T wherever an edge of the code is within it. So the brightness of single images, with a
 noise of 1% of the LED's, tells t to 1% of T; the sequence of many tells which bits they were. Exposures of a camera follow
 each other by its period: t = t0 + n period, with a jitter. The response of the camera to light is a cubic (tone curves);
-the light of the image before (temporal filters of webcams) and what is around the LED (lamps) are regressors. Search over delay and exposure by correlation; then
-Gauss-Newton with the response projected out (Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least
-squares problems whose variables separate", 1973), weights by a noise of the brightness and a jitter of the exposures that
-are estimated from the residuals, and Tukey's weights against what hides the LED.
+the light of the image before (temporal filters of webcams) and what is around the LED (lamps) are regressors. Search over
+delay and exposure by correlation; then Gauss-Newton with the response projected out (Golub and Pereyra, "The
+differentiation of pseudo-inverses and nonlinear least squares problems whose variables separate", 1973), weights by a noise
+of the brightness and a jitter of the exposures that are estimated from the residuals, and Tukey's weights against what
+hides the LED.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -41,8 +42,9 @@ _EXPOSURE_STEPS = 12
 #: Fewest images for an estimate, and for finding the code; share of the brightness that the code must explain to be found:
 #: by chance 40 images reach half of it once in 1e9 of the lags and exposures tried.
 LEAST, LEAST_FOUND, _EXPLAINED = 24, 40, 0.6
-#: Powers of the share of light in the response, and passes of the estimate with new weights.
-_POWERS, _PASSES, _STEPS = 3, 4, 12
+#: Powers of the share of light in the response, and passes of the estimate with new weights; of each its steps,
+#: and how many of the beginnings that fit best are followed.
+_POWERS, _PASSES, _STEPS, _STARTS = 3, 4, 12, 3
 #: Tukey's weights are zero beyond so many sigma; with more than this share of images there, the LED was hidden.
 _TUKEY, _HIDDEN = 6.0, 0.3
 #: Fewest images with an edge of the code: the others tell no time.
@@ -191,10 +193,11 @@ def find_exposures(seen: Brightness, bit_s: float, *, near: tuple[float, float] 
         for off in (-0.2, 0.0, 0.2)
         for factor in (0.85, 1.0, 1.18)
     ]
-    sigma = np.ones(len(n))
-    fits = [_fitted(seen, n, start, bit_s, 1.0 / sigma) for start in starts]
+    flat = np.ones(len(n))
+    starts.sort(key=lambda start: _evaluated(seen, n, start, bit_s, flat).cost)
+    fits = [_fitted(seen, n, start, bit_s, flat) for start in starts[:_STARTS]]
     fit = min(fits, key=lambda each: each.cost)
-    noise = jitter = 0.0
+    noise, jitter, sigma, tukey = 0.0, 0.0, flat, flat
     for _ in range(_PASSES):
         noise, jitter = _noises(fit.residual, fit.slope)
         sigma = np.sqrt(noise**2 + (fit.slope * jitter) ** 2)
@@ -295,13 +298,12 @@ def _noises(residual: Array, slope: Array) -> tuple[float, float]:
     """Return the noise of the brightness and the jitter of the exposures, s, by likelihood over a grid of their ratio."""
     scale = np.median(np.abs(residual)) / 0.6745 + 1e-12
     r = np.clip(residual, -4 * scale - np.abs(slope) * 1e-3, 4 * scale + np.abs(slope) * 1e-3)
-    best = (np.inf, 0.0, 0.0)
-    for jitter in (0.0, *np.geomspace(2e-6, 2e-3, 31)):
-        for noise in scale * np.geomspace(0.05, 3.0, 25):
-            v = noise**2 + (slope * jitter) ** 2
-            cost = float((r * r / v + np.log(v)).sum())
-            best = min(best, (cost, float(noise), float(jitter)))
-    return best[1], best[2]
+    jitters = np.concatenate([[0.0], np.geomspace(2e-6, 2e-3, 31)])
+    noises = scale * np.geomspace(0.05, 3.0, 25)
+    v = noises[:, None] ** 2 + (slope * jitters[:, None])[:, None] ** 2
+    cost = (r * r / v + np.log(v)).sum(axis=2)
+    jitter, noise = np.unravel_index(np.argmin(cost), cost.shape)
+    return float(noises[noise]), float(jitters[jitter])
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,7 +363,7 @@ def estimate_sync(
     return SyncEstimate(
         float(left.stamp_s.mean() - late.mean()),
         float(late.mean()),
-        math.sqrt(float(ours.cov[0, 0]) + max(scatter / _BATCHES, float(np.var(late)) / len(late)) + _EDGE_S**2),
+        math.sqrt(float(ours.cov[0, 0]) + max(scatter / _BATCHES, float(np.var(late)) / len(late))),
         theirs.t_s - ours.t_s,
         math.sqrt(float(ours.cov[0, 0] + theirs.cov[0, 0])),
         math.hypot(ours.jitter_s, theirs.jitter_s),
@@ -374,6 +376,8 @@ def estimate_sync(
 _SEARCH_SHOTS, _LOOK_SHOTS, _WINDOW_S, _WINDOW_SHOTS = 48, 72, 2.0, 48
 #: Windows without the LED after which it is looked for anew: the cameras may have moved.
 _LOST = 4
+#: Estimates so recent, s, are pooled: clocks drift by a few ppm.
+_POOLED_S = 30.0
 #: Delay and skew have changed beyond so many sigma, and so many seconds.
 _CHANGED, _CHANGED_S = 5.0, 3e-4
 
@@ -503,9 +507,27 @@ class SyncLedWatch:
         self.estimates.append(found)
         return None
 
+    def pooled(self) -> SyncEstimate | None:
+        """Return the mean of the estimates of late, as of the newest's time; None before there is one."""
+        if not self.estimates:
+            return None
+        newest = self.estimates[-1]
+        late = [each for each in self.estimates if newest.t_s - each.t_s <= _POOLED_S]
+        delay, sigma_delay = _mean([(each.delay_s, each.sigma_delay_s) for each in late])
+        skew, sigma_skew = _mean([(each.skew_s, each.sigma_skew_s) for each in late])
+        jitter = math.sqrt(sum(each.jitter_s**2 for each in late) / len(late))
+        return replace(
+            newest,
+            delay_s=delay,
+            sigma_delay_s=math.hypot(sigma_delay, _EDGE_S),
+            skew_s=skew,
+            sigma_skew_s=sigma_skew,
+            jitter_s=jitter,
+        )
+
     def to_json(self) -> dict[str, Any]:
-        """Return the object of summary.json: the newest estimate, the rate, how many windows there were."""
-        rate, newest = self.rate(), self.estimates[-1] if self.estimates else None
+        """Return the object of summary.json: the estimate of late, the rate, how many windows there were."""
+        rate, newest = self.rate(), self.pooled()
         found: dict[str, Any] = {"windows": len(self.estimates), "missed": self.reason}
         if newest is not None:
             found |= {
@@ -520,7 +542,7 @@ class SyncLedWatch:
 
     def __str__(self) -> str:
         """Return what the LED told as a line for people."""
-        rate, newest = self.rate(), self.estimates[-1] if self.estimates else None
+        rate, newest = self.rate(), self.pooled()
         if newest is None:
             return f"sync LED: not seen: {self.reason}"
         gains = "" if rate is None else f", the stamps gain {1e6 * rate[0]:.1f} ± {1e6 * rate[1]:.1f} ppm"
@@ -543,6 +565,15 @@ class SyncLedWatch:
         left = y * w - X @ theta
         birge = max(float(left @ left) / (len(t) - 2), 1.0)
         return float(theta[1]), math.sqrt(birge * float(np.linalg.inv(X.T @ X)[1, 1]))
+
+
+def _mean(values: list[tuple[float, float]]) -> tuple[float, float]:
+    """Return the weighted mean of values with sigmas, and its sigma: larger where they scatter more (Birge)."""
+    x, sigma = np.array(values).T
+    w = 1.0 / sigma**2
+    mean = float(w @ x / w.sum())
+    birge = max(float(w @ (x - mean) ** 2) / max(len(x) - 1, 1), 1.0)
+    return mean, math.sqrt(birge / float(w.sum()))
 
 
 def _lamp(seen: Brightness) -> str:

@@ -280,8 +280,9 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
     seen = [loop.mounting.pose_measurement(pose, t) for t, pose in shots]
     sync_s = loop.setup.sync_s if shutters is None else 0.0  # what is not known of the shutters is in the covariances
     delay = loop.compute(lambda: estimate_delay(arm, swept, seen, prior=STEADY, sync_s=sync_s))
-    if loop.led is not None and loop.led.row_shares is not None:
-        delay, shutters = with_led(delay, shutters, loop.led.estimates[-1], loop.led.row_shares)
+    blinked = None if loop.led is None else loop.led.pooled()
+    if loop.led is not None and blinked is not None and loop.led.row_shares is not None:
+        delay, shutters = with_led(delay, shutters, blinked, loop.led.row_shares)
     loop.shutters, loop.delay_s = shutters, delay.delay_s
     if shutters is not None:
         loop.follower.expose_apart(float(np.hypot(shutters.skew_s, shutters.jitter_s)))

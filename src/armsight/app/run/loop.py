@@ -223,6 +223,7 @@ class Loop:
         self._known: Mounting | None = None  # the mounting that was published
         self._shot_s = -np.inf
         self._frames = FrameClock()
+        self._stamp_s: float | None = None  # of the shot that is measured, as it was stamped
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s)
         self._skew = Skew(follower.rig, setup.sync_s)
         self.health.watch_fixed([each.body.name for each in setup.fixed])
@@ -455,6 +456,7 @@ class Loop:
         self._expected = self._twist = None
         shot = shot if shot is None or clock is None else clock.on_board(shot)
         if shot is not None and shot.t_s is not None:
+            self._stamp_s = shot.t_s
             shot = replace(shot, t_s=self._frames.time(shot.t_s))
         if shot is not None and self.mounting is not None and self.follower.way == "lost":
             self._expected = self.mounting.body(self.estimator.estimate().T_base_tool)
@@ -549,7 +551,7 @@ class Loop:
 
     def _look_at_led(self, shot: Shot) -> None:
         """Look at the sync LED in a shot; what takes long is computed in a thread on hardware."""
-        work = None if self.led is None else self.led.take(shot)
+        work = None if self.led is None else self.led.take(replace(shot, t_s=self._stamp_s))
         if work is None:
             return
         if self._led_work is not None:
