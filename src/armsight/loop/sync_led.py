@@ -9,7 +9,7 @@ edges are at ticks of the board. An exposure of length T about time t gathers th
     x = (C(t + T/2) - C(t - T/2)) / T,   dC/dt = 1 while the LED is on, else 0,
 
 of the LED's light, and dx/dt = +-1/T wherever an edge of the code is within it. So the brightness of single images, with a
-noise of 1% of the LED's, tells t to 1% of T; the sequence of many tells which bits they were. Exposures of a camera follow
+noise of 1% of the LED's, gives t to 1% of T; the sequence of many gives which bits they were. Exposures of a camera follow
 each other by its period: t = t0 + n period, with a jitter. The response of the camera to light is a cubic (tone curves);
 the light of the image before (temporal filters of webcams) and what is around the LED (lamps) are regressors. Search over
 delay and exposure by correlation; then Gauss-Newton with the response projected out (Golub and Pereyra, "The
@@ -47,7 +47,7 @@ LEAST, LEAST_FOUND, _EXPLAINED = 24, 40, 0.6
 _POWERS, _PASSES, _STEPS, _STARTS = 3, 4, 12, 3
 #: Tukey's weights are zero beyond so many sigma; with more than this share of images there, the LED was hidden.
 _TUKEY, _HIDDEN = 6.0, 0.3
-#: Fewest images with an edge of the code: the others tell no time.
+#: Fewest images with an edge of the code: the others say nothing of the time.
 _EDGES = 16
 #: How well the LED's edges are at the board's ticks: interrupts that come before, s.
 _EDGE_S = 1e-5
@@ -139,7 +139,7 @@ class Exposures(Record):
     hidden: float
 
 
-class _Fit(NamedTuple):
+class _CodeFit(NamedTuple):
     """A fit: parameters (t, period, exposure), s; residuals (N,), the model's slope by time (N,), weights, cost."""
 
     theta: Array
@@ -249,7 +249,7 @@ def _search(seen: Brightness, n: Array, stamp_s: float, period_s: float, bit_s: 
     return best[1], best[2]
 
 
-def _fitted(seen: Brightness, n: Array, theta: Array, bit_s: float, weights: Array) -> _Fit:
+def _fitted(seen: Brightness, n: Array, theta: Array, bit_s: float, weights: Array) -> _CodeFit:
     """Return a weighted fit by Gauss-Newton with a damped step, from theta (3,)."""
     found, damping = _evaluated(seen, n, theta, bit_s, weights), 1e-3
     for _ in range(_STEPS):
@@ -270,7 +270,7 @@ def _fitted(seen: Brightness, n: Array, theta: Array, bit_s: float, weights: Arr
     return found
 
 
-def _evaluated(seen: Brightness, n: Array, theta: Array, bit_s: float, weights: Array) -> _Fit:
+def _evaluated(seen: Brightness, n: Array, theta: Array, bit_s: float, weights: Array) -> _CodeFit:
     """Return the model at theta, its response to light the best by least squares."""
     t, exposure = theta[0] + n * theta[1], theta[2]
     x = light(t, exposure, bit_s)
@@ -291,7 +291,7 @@ def _evaluated(seen: Brightness, n: Array, theta: Array, bit_s: float, weights: 
     J = np.column_stack([slope, slope * n, rise * by_exposure]) * weights[:, None]
     J = J - U @ (U.T @ J)
     cost = float(np.square(residual * weights).sum())
-    return _Fit(np.asarray(theta), residual, slope, J, float(c[1 : _POWERS + 1].sum()), cost)
+    return _CodeFit(np.asarray(theta), residual, slope, J, float(c[1 : _POWERS + 1].sum()), cost)
 
 
 def _noises(residual: Array, slope: Array) -> tuple[float, float]:
@@ -541,7 +541,7 @@ class SyncLedWatch:
         return found
 
     def __str__(self) -> str:
-        """Return what the LED told as a line for people."""
+        """Return what the LED says as a line for people."""
         rate, newest = self.rate(), self.pooled()
         if newest is None:
             return f"sync LED: not seen: {self.reason}"

@@ -2,7 +2,7 @@
 
 In: the images of one camera that stands still. Out: spots whose brightness changes most, each with its brightness in every
 image; for the one that is chosen a :class:`Spot`, whose weights are how much each pixel around it blinks, so that its
-brightness has the least noise. Pixels that saturate are left out: their neighbours, lit by the lens's blur, tell the same.
+brightness has the least noise. Pixels that saturate are left out: their neighbours, lit by the lens's blur, say the same.
 
 The search is in two steps, for a second of images is too much to keep: the means of blocks of pixels find the candidates,
 then the pixels about them are kept until the weights are known.

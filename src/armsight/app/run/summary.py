@@ -121,7 +121,7 @@ class RunSummary:
         studies: error of vision against one quantity after the other.
         health: why the result must not be trusted; empty where nothing says so.
         fixed_unseen: names of the fixed bodies that were seen too rarely to be watched.
-        sync_led: what the sync LED told, as JSON; None without one.
+        sync_led: what the sync LED says, as JSON; None without one.
     """
 
     properties: Mapping[str, Any]
