@@ -44,6 +44,10 @@ typedef struct board_description {
 
     /* Main loop, drives off. Start anew, as after switching on. */
     void (*restart)(void);
+
+    /* Tick, right after sense, so that its edges do not move with the tick's cost. Switch the LED of this pin (as
+     * core_config's sync_led_pin, never 0) on or off; do nothing where the pin has another use. NULL without an LED. */
+    void (*light)(uint32_t pin, bool on);
 } board_description;
 
 #endif

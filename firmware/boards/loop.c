@@ -6,6 +6,7 @@
 #include "config.h"
 #include "core.h"
 #include "number.h"
+#include "sync_led.h"
 
 #define CHUNK 128u
 #define HUNG_TICKS 1000u /* a main loop that does not come round for so long hangs: the watchdog shall have it */
@@ -33,6 +34,9 @@ void loop_start(board_loop *loop, const board_description *board)
 void loop_tick(board_loop *loop)
 {
     loop->board->sense(&loop->inputs);
+    if (loop->board->light != NULL && loop->core.config.sync_led_pin != 0u) {
+        loop->board->light(loop->core.config.sync_led_pin, sync_led_on(&loop->core.config, loop->inputs.tick));
+    }
     wire_before_tick(&loop->wire, &loop->inputs);
     core_tick(&loop->core, &loop->inputs, &loop->outputs);
     loop->board->drive(&loop->outputs);

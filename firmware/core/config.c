@@ -69,6 +69,7 @@ void config_factory(core_config *config)
     config->overload_ticks = 500u;
     config->silence_ticks = 100u;
     config->silence_reaction = REACTION_HOLD;
+    config->sync_led_ticks = 3u;
 }
 
 static bool pot_is_valid(const pot_config *pot)
@@ -145,6 +146,8 @@ bool config_is_valid(const core_config *config)
            ticks_within(config->brake_engage_ticks, 0u, 1000u) && ticks_within(config->supply_ticks, 1u, 1000u) &&
            ticks_within(config->pot_ticks, 1u, 100u) && ticks_within(config->following_ticks, 1u, 10000u) &&
            ticks_within(config->stall_ticks, 1u, 10000u) && ticks_within(config->silence_ticks, 2u, 60000u) &&
+           (config->sync_led_pin == 0u || ticks_within(config->sync_led_pin, 16u, 143u)) &&
+           ticks_within(config->sync_led_ticks, 1u, 100u) &&
            (config->silence_reaction == REACTION_HOLD || config->silence_reaction == REACTION_RELEASE);
 }
 

@@ -198,6 +198,8 @@ typedef struct core_config {
     uint32_t brake_engage_ticks;  /* 0 to 1000: how long they take to close; the drives hold meanwhile */
     uint32_t silence_ticks;    /* 2 to 60000: longest time without a motion command */
     uint32_t silence_reaction; /* REACTION_HOLD or REACTION_RELEASE */
+    uint32_t sync_led_pin;     /* 0: no sync LED; else 16 (port + 1) + pin, port 0 (A) to 7 (H): PA0 is 16, PC10 is 58 */
+    uint32_t sync_led_ticks;   /* 1 to 100: how long each bit of the LED's code lasts */
 } core_config;
 
 /* One stored copy of the configuration. */

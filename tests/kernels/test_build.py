@@ -217,7 +217,9 @@ def test_compiled_kernels_give_what_python_gives(tmp_path):
     for name, value in fast.items():
         assert value.dtype == slow[name].dtype
         # Some hundred roundings of numbers below 10, and a difference over some milliseconds; integers are equal.
-        np.testing.assert_allclose(value, slow[name], rtol=2e-14, atol=1e-12 if name == "qd_ref" else 2e-14, err_msg=name)
+        np.testing.assert_allclose(
+            value, slow[name], rtol=2e-14, atol=1e-12 if name == "qd_ref" else 2e-14, err_msg=name
+        )
 
 
 def resident():

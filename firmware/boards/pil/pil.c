@@ -22,6 +22,7 @@ static bool restart_asked;
 
 static void sense(core_inputs *inputs)
 {
+    pil_answer_frame.sync_led = 0u;
     inputs->tick = pil_request_frame.tick;
     inputs->overrun = pil_request_frame.overrun;
     inputs->stop_pressed = pil_request_frame.stop_pressed;
@@ -31,6 +32,12 @@ static void sense(core_inputs *inputs)
 }
 
 static void drive(const core_outputs *outputs) { pil_answer_frame.outputs = *outputs; }
+
+static void light(uint32_t pin, bool on)
+{
+    (void)pin;
+    pil_answer_frame.sync_led = on ? 1u : 0u;
+}
 
 static void feed_watchdog(void) { unfed_ticks = 0u; }
 
@@ -80,6 +87,7 @@ static const board_description board = {
     .read_copy = read_copy,
     .write_copy = write_copy,
     .restart = ask_restart,
+    .light = light,
 };
 
 _Static_assert((BAUD + BAUD_PER_BYTE) / BAUD_PER_BYTE < FRAME_BYTES, "an answer has room for what a tick carries");

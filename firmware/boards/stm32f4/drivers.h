@@ -24,6 +24,13 @@ void clock_start(void);
 /* Connect the pins to what drives them. Startup only, after the timers are set up. */
 void pins_start(void);
 
+/* Make the pin of the sync LED (core_config's sync_led_pin) an output, unless the table or the debugger has it, or it is
+ * beyond port C. Startup only, after pins_start. */
+void pins_light_start(uint32_t led_pin);
+
+/* Switch the LED on or off, where pins_light_start could. Tick only. */
+void pins_light(uint32_t led_pin, bool on);
+
 /* Set up the PWM timers with all outputs off. Startup only. */
 void drives_start(void);
 

@@ -1,4 +1,6 @@
 /* Which pin does what. docs/howto/add_a_board.md shows the same table, and a test holds them together. */
+#include <stddef.h>
+
 #include "drivers.h"
 #include "registers.h"
 
@@ -46,6 +48,8 @@ static const pin pins[] = {
     {GPIOA, 5, ANALOG, FLOATING, 0}, /* supply */
 };
 
+static gpio_registers *led_port; /* of the sync LED; NULL without */
+
 static void put(word *reg, uint32_t value, uint32_t bits, uint32_t number)
 {
     *reg = (*reg & ~(((1u << bits) - 1u) << (bits * number))) | value << (bits * number);
@@ -69,5 +73,31 @@ void pins_start(void)
     (void)RCC->ahb1enr;
     for (uint32_t i = 0u; i < sizeof pins / sizeof pins[0]; i++) {
         connect(&pins[i]);
+    }
+}
+
+void pins_light_start(uint32_t led_pin)
+{
+    static gpio_registers *const ports[] = {GPIOA, GPIOB, GPIOC};
+    const uint32_t port = led_pin / 16u - 1u; /* of 0 it is beyond them all */
+    led_port = NULL;
+    if (port >= sizeof ports / sizeof ports[0]) {
+        return;
+    }
+    const pin led = {ports[port], (uint8_t)(led_pin % 16u), OUTPUT, FLOATING, 0};
+    bool taken = led.port == GPIOA && (led.number == 13u || led.number == 14u); /* the debugger's */
+    for (uint32_t i = 0u; i < sizeof pins / sizeof pins[0]; i++) {
+        taken = taken || (pins[i].port == led.port && pins[i].number == led.number);
+    }
+    if (!taken) {
+        connect(&led);
+        led_port = led.port;
+    }
+}
+
+void pins_light(uint32_t led_pin, bool on)
+{
+    if (led_port != NULL) {
+        led_port->bsrr = BIT(led_pin % 16u) << (on ? 0u : 16u);
     }
 }

@@ -65,6 +65,7 @@ static const board_description nucleo = {
     .read_copy = flash_read,
     .write_copy = flash_write,
     .restart = restart,
+    .light = pins_light,
 };
 
 void systick_interrupt(void)
@@ -100,6 +101,7 @@ void board_main(void)
     adc_start();
     uart_start();
     loop_start(&loop, &nucleo);
+    pins_light_start(loop.core.config.sync_led_pin);
     drives_run();
     watchdog_set_short();
     ticks_start();

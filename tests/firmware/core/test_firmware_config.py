@@ -168,6 +168,8 @@ WRONG_ARM = {
     "stall_ticks": [0, 10001],
     "silence_ticks": [1, 60001],
     "silence_reaction": [0, 3],
+    "sync_led_pin": [1, 15, 144],
+    "sync_led_ticks": [0, 101],
 }
 
 

@@ -23,7 +23,7 @@ def talking(speaker, **welcome):
         if data[7] == 0x28 and data[8] == 0xA0:  # HELLO, message 41000
             return speaker.welcome(**welcome) + speaker.status() + speaker.joints()
         reaction = (250).to_bytes(4, "little") + (2).to_bytes(4, "little")
-        return speaker.config_part(CONFIG.itemsize - 8, reaction) if data[7] == 0x36 else b""
+        return speaker.config_part(CONFIG.fields["silence_ticks"][1], reaction) if data[7] == 0x36 else b""
 
     return answer
 

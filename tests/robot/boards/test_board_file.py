@@ -1,10 +1,13 @@
 """board.toml: what is written is read back to the bit, and what is wrong is named."""
 
+import re
+from pathlib import Path
+
 import pytest
 
 from armsight.errors import InputError
 from armsight.robot.boards.board_file import configuration_text, put, read_configuration
-from armsight.robot.boards.configuration import lab_configuration
+from armsight.robot.boards.configuration import USED_PINS, lab_configuration
 
 
 def written(tmp_path, *changes):
@@ -38,9 +41,11 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path):
         (("soft_max_rad = 2.4", "soft_max_rad = '2.4'"), "joint.1.soft_max_rad is '2.4'; a number is needed"),
         (("silence_ticks = 100", "silence_ticks = 100.5"), "arm.silence_ticks is 100.5; a whole number is needed"),
         (("silence_ticks = 100", ""), "arm.silence_ticks is missing"),
-        (("version = 3", "version = 1"), "version is 1"),
+        (("version = 4", "version = 1"), "version is 1"),
         (("counts = [3277, 62258]", "counts = [3277]"), r"counts is \[3277\]; a list of 2 to 9 numbers is needed"),
         (("motor_direction = 1", "motor_direction = 0"), "joint 1: motor_direction is 0"),
+        (('led_pin = "none"', "led_pin = 3"), "sync_led_pin is 3; none or a pin such as PB13 is allowed"),
+        (('led_pin = "none"', 'led_pin = "PB16"'), "sync_led_pin is 'PB16'; none or a pin"),
     ],
 )
 def test_what_is_wrong_is_named_with_the_file(tmp_path, change, said):
@@ -69,3 +74,17 @@ def test_a_file_of_an_arm_with_fewer_joints_has_only_these(tmp_path):
     path.write_text(text.replace("joint_count = 4", "joint_count = 5"), encoding="utf-8")
     with pytest.raises(InputError, match=r"joint\.5\.soft_min_rad is missing"):
         read_configuration(path)
+
+
+def test_the_sync_led_takes_no_pin_that_has_another_use(tmp_path):
+    """The pins in use are those of the documentation's table, which a test holds to the firmware's, and the debugger's."""
+    table = Path(__file__).resolve().parents[3] / "docs" / "howto" / "add_a_board.md"
+    documented = re.findall(r"^\| [^|]+ \| (P[ABC]\d+) \|", table.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert USED_PINS["nucleo-f446re"] == {*documented, "PA13", "PA14"}
+    nucleo = ('board = "pil"', 'board = "nucleo-f446re"')
+    with pytest.raises(
+        InputError, match="sync_led_pin is PA8, which has another use on nucleo-f446re: take a free one"
+    ):
+        read_configuration(written(tmp_path, nucleo, ('led_pin = "none"', 'led_pin = "PA8"')))
+    config, _ = read_configuration(written(tmp_path, nucleo, ('led_pin = "none"', 'led_pin = "PB13"')))
+    assert config["sync_led_pin"] == 2 * 16 + 13

@@ -115,7 +115,7 @@ def test_what_a_tick_packs_and_reads_is_laid_out_alike():
         answer["tick"],
         *(outputs[name] for name in ("drives_on", "windings_shorted", "brakes_open")),
     ]
-    reported.append(answer["length"])
+    reported += [answer["sync_led"], answer["length"]]
     assert list(frames.ANSWER_FIELDS.unpack_from(packed)) == reported
     assert packed[frames.DUTY_AT : frames.DUTY_AT + 24] == outputs["duty"].tobytes()
     assert packed[frames.BYTES_AT :] == answer["bytes"].tobytes()

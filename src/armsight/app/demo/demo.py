@@ -62,6 +62,7 @@ class Demo:
         nominal_arm: the arm model that the estimators and the controller have; by default the table the arm was built to.
         nominal_arm_name: its name in the summary; by default the arm's own.
         follow_rig: whether a rig that moved is put right.
+        sync_led: whether an LED on the board's clock is in view.
     """
 
     folder: Path
@@ -75,6 +76,7 @@ class Demo:
     nominal_arm: Arm | None = None
     nominal_arm_name: str | None = None
     follow_rig: bool = False
+    sync_led: bool = False
 
 
 def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummary:
@@ -195,6 +197,7 @@ def _workcell(demo: Demo, cameras: str, like: Workcell | None = None) -> Workcel
         model=open_arm(demo.model),
         assumed=nominal,
         like=like,
+        sync_led=demo.sync_led and like is None,
     )
 
 

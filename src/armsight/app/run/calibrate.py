@@ -21,6 +21,7 @@ from armsight.geometry.rotation import exp_so3
 from armsight.loop.delay import MIN_MEASUREMENTS, estimate_delay
 from armsight.loop.estimators import Delay, Mounting, Prior
 from armsight.loop.handeye.handeye import SHARES, HandEye, Share, calibrate_handeye
+from armsight.loop.sync_led import with_led
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import point_to_point
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
@@ -290,6 +291,9 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
     seen = [loop.mounting.pose_measurement(pose, t) for t, pose in shots]
     sync_s = loop.setup.sync_s if shutters is None else 0.0  # what is not known of the shutters is in the covariances
     delay = loop.compute(lambda: estimate_delay(arm, swept, seen, prior=STEADY, sync_s=sync_s))
+    blinked = None if loop.led is None else loop.led.pooled()
+    if loop.led is not None and blinked is not None and loop.led.row_shares is not None:
+        delay, shutters = with_led(delay, shutters, blinked, loop.led.row_shares)
     loop.shutters, loop.delay_s = shutters, delay.delay_s
     if shutters is not None:
         loop.follower.expose_apart(float(np.hypot(shutters.skew_s, shutters.jitter_s)))

@@ -111,6 +111,11 @@ class RunPlan:
     metavar="STREAM",
     help="Publish meanwhile: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT, igtl:PORT or ros2:PORT; may be repeated.",
 )
+@click.option(
+    "--sync-led",
+    is_flag=True,
+    help="The board's sync LED (docs/howto/board.md) is in view of both cameras: it gives delay and skew.",
+)
 @click.option("--open-loop", is_flag=True, help="Control by the potentiometers alone; do not close the loop on vision.")
 @click.option(
     "--follow-rig",
@@ -139,6 +144,7 @@ def command(
     rate: float,
     sync_ms: float,
     stream: tuple[str, ...],
+    sync_led: bool,
     open_loop: bool,
     follow_rig: bool,
     output: Path,
@@ -153,9 +159,10 @@ def command(
     name of the shot or by time, for shots of a recording. Exit code 3: the result must not be trusted.
     """
     if board_spec.startswith(_POSES):
-        if motion is not None or open_loop or fixed or follow_rig:
+        if motion is not None or open_loop or fixed or follow_rig or sync_led:
             raise InputError(
-                f"--board {board_spec} commands no motion: leave out --motion, --open-loop, --fixed and --follow-rig"
+                f"--board {board_spec} commands no motion: leave out --motion, --open-loop, --fixed, --follow-rig and "
+                "--sync-led"
             )
         _run_logged(
             source_spec, Path(board_spec.removeprefix(_POSES)), rig_path, target_spec, arm_spec, output, as_json
@@ -196,7 +203,7 @@ def command(
     files = {"motion.toml": read_text(motion), "body.toml": read_text(target_spec)}
     open_folder(output)
     plan = RunPlan(rig, motions, targets, not open_loop, follow_rig, stream, time.perf_counter())
-    devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms, calibration)
+    devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms, calibration, sync_led)
     with steps() as progress:
         progress("opening the devices")
         with open_devices(devices) as setup:

@@ -31,6 +31,7 @@ from armsight.loop.health import HealthFinding
 from armsight.loop.health.change import Change
 from armsight.loop.health.follow import RigFollower
 from armsight.loop.servo import JointLoops, LoopTiming, PoseServo
+from armsight.loop.sync_led import SyncLedWatch, led_findings
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.trajectories import Trajectory, point_to_point
@@ -153,6 +154,7 @@ class RunResult:
         changes: what explains a motion of the rig or the body; empty where none was found.
         fixed_unseen: names of the fixed bodies that were seen too rarely to be watched.
         not_corrected: why what was found of a rig that is followed was not put right; None where nothing was left.
+        led: what followed the cameras' clock by the sync LED; None without one.
         ended_by: the error that ended the run early; None where there was none.
         interrupted: whether the keyboard ended the run.
     """
@@ -171,6 +173,7 @@ class RunResult:
     changes: tuple[Change, ...] = ()
     fixed_unseen: tuple[str, ...] = ()
     not_corrected: str | None = None
+    led: SyncLedWatch | None = None
     ended_by: ArmsightError | None = None
     interrupted: bool = False
 
@@ -296,6 +299,8 @@ def _run(
                 loop.close_record()
                 outcome.health, outcome.changes = loop.health.findings(), loop.health.every_change
                 outcome.not_corrected = None if loop.rig_follower is None else loop.rig_follower.rejected
+                if loop.led is not None:
+                    outcome.led, outcome.health = loop.led, (*outcome.health, *led_findings(loop.led))
                 outcome.fixed_unseen = loop.health.fixed_never_seen
             outcome.interrupted = outcome.interrupted or bool(again)
 
@@ -332,6 +337,9 @@ def _prepare(
     """Calibrate hand and eye, and measure the delay of the images; the arm ends at the plan's start."""
     arm, gravity = setup.arm, setup.gravity
     stands = plan.start
+    if loop.led is not None:
+        progress("looking for the sync LED")
+        loop.find_led()
     if outcome.handeye is None:
         outcome.handeye = find_mounting(loop, arm, plan.start, targets, gravity, progress)
         stands = targets[-1]

@@ -358,7 +358,8 @@ def _notes(finished: Finished, run: RunData) -> list[str]:
         f"hand-eye: {len(outcome.handeye.q)} poses used, {len(outcome.handeye.missed)} missed; left out, a pose is "
         f"predicted to {1e3 * position:.2f} mm, {np.degrees(angle):.3f} deg RMS: the error of the arm's nominal table",
         *outcome.handeye.missed,
-        f"delay of the images, by a sweep: {1e3 * outcome.delay.delay_s:.2f} ms, sigma {1e3 * outcome.delay.sigma_s:.2f} ms"
+        f"delay of the images, by {'a sweep' if outcome.led is None else 'the sync LED'}:"
+        f" {1e3 * outcome.delay.delay_s:.2f} ms, sigma {1e3 * outcome.delay.sigma_s:.2f} ms"
         if outcome.delay_found
         else f"the delay of the images was not measured: {1e3 * outcome.delay.delay_s:g} ms assumed",
         *(
@@ -366,6 +367,7 @@ def _notes(finished: Finished, run: RunData) -> list[str]:
             if outcome.shutters is None
             else [f"exposures: {outcome.shutters}; detections were moved to one time by the motion of the arm"]
         ),
+        *([] if outcome.led is None else [str(outcome.led)]),
         f"{len(run.vision)} shots measured, {run.missed} missed, {run.rejected} rejected by the estimator",
         *(f"{count} missed: {reason}" for reason, count in reasons.most_common(5)),
         "commands: " + ", ".join(f"{count} {_BASED.get(mode, f'on {mode}')}" for mode, count in modes.most_common()),

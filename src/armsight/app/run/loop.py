@@ -34,13 +34,14 @@ from armsight.app.stream.datum import (
 )
 from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
-from armsight.errors import DeviceError
+from armsight.errors import ArmsightError, DeviceError
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import Estimator, KalmanEstimator, Mounting
 from armsight.loop.estimators.smoothing import Interval
 from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health import HealthMonitor
 from armsight.loop.health.follow import RigCorrection, RigFollower, remeasured
+from armsight.loop.sync_led import SyncLedWatch
 from armsight.robot.boards.codes import BoardState
 from armsight.vision.follow.follower import Follower, measurer
 from armsight.vision.rig import Shutters, StereoRig
@@ -171,6 +172,8 @@ _WRITE_EVERY_S = 0.1  # interval that is computed at once, after a command was s
 #: The motion of the body about an exposure is a cubic through the live estimates so near to it, s, which are among the
 #: newest so many. Their errors are correlated for longer than that: the scatter about the cubic shows this share of them.
 _MOTION_S, _MOTION_NEWEST, _SCATTER_SHARE = 0.03, 100, 0.25
+#: Searches for the sync LED before it is given up, two steps each, and the longest time for them, s.
+_LED_TRIES, _LED_S = 4, 60.0
 _STOP_S = 0.3  # in which an interrupted motion comes to rest
 _FIXED_EVERY_S = 0.2  # in which fixed bodies are measured
 #: Where a rig is followed: how often it is looked whether it can be put right, s, and in so many of the newest shots.
@@ -208,6 +211,7 @@ class Loop:
             delay is known, detections are moved to one time by the motion of the arm.
         health: watches whether the calibrations still hold.
         rig_follower: decides when the rig can be put right; None where it is not followed.
+        led: follows the cameras' clock by the sync LED; None without one.
         on_shot: called with each shot that was measured and its result, after the command that follows from it was sent.
         on_period: called in every period before its command; what it raises ends the motion.
         segment: the entry of the log of what is running, with its begin; None before the first.
@@ -230,6 +234,7 @@ class Loop:
         self._known: Mounting | None = None  # the mounting that was published
         self._shot_s = -np.inf
         self._frames = FrameClock()
+        self._stamp_s: float | None = None  # of the shot that is measured, as it was stamped
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s)
         self.rig_follower: RigFollower | None = None
         self._rig_work: Future[RigCorrection | None] | None = None
@@ -237,6 +242,9 @@ class Loop:
         self._skew = Skew(follower.rig, setup.sync_s)
         self.health.watch_fixed([each.body.name for each in setup.fixed])
         self._measure_fixed = [measurer(follower.rig, each) for each in setup.fixed]
+        bit_s = setup.sync_led_bit_s
+        self.led = None if bit_s is None else SyncLedWatch(bit_s)
+        self._led_work: Future[None] | None = None
         self._fixed_pool = ThreadPoolExecutor(1)
         self._fixed_work: Future[None] | None = None
         self._fixed_s = -np.inf
@@ -462,6 +470,7 @@ class Loop:
         self._expected = self._twist = None
         shot = shot if shot is None or clock is None else clock.on_board(shot)
         if shot is not None and shot.t_s is not None:
+            self._stamp_s = shot.t_s
             shot = replace(shot, t_s=self._frames.time(shot.t_s))
         if shot is not None and self.mounting is not None and self.follower.way == "lost":
             self._expected = self.mounting.body(self.estimator.estimate().T_base_tool)
@@ -526,6 +535,7 @@ class Loop:
                         times_s.append(sent_s - began)
                     self.on_shot(shot, result)
                     self._look_at_fixed(shot)
+                    self._look_at_led(shot)
                     self.health.work()
                     self._follow_rig()
                 if self._noted_s - self._written_s >= _WRITE_EVERY_S:
@@ -620,6 +630,39 @@ class Loop:
         self.health.watch_fixed([each.body.name for each in self.setup.fixed])
         self.log.corrections.append(replace(found, at_s=since_s))
         return True
+
+    def _look_at_led(self, shot: Shot) -> None:
+        """Look at the sync LED in a shot; what takes long is computed in a thread on hardware."""
+        work = None if self.led is None else self.led.take(replace(shot, t_s=self._stamp_s))
+        if work is None:
+            return
+        if self._led_work is not None:
+            self._led_work.result()
+        if self.setup.clock is None:
+            work()
+        else:
+            self._led_work = self._fixed_pool.submit(work)
+
+    def find_led(self) -> None:
+        """Hold the arm until the sync LED was found by both cameras, where there is to be one.
+
+        Raises:
+            ArmsightError: it was not found; the message says why.
+        """
+        led, begin_s = self.led, self.t_s
+        if led is None:
+            return
+
+        def over() -> bool:
+            return bool(led.estimates) or led.tried >= _LED_TRIES or self.t_s - begin_s > _LED_S
+
+        self._iterate(Still(self._at_rest(PERIOD_S)), over, RunSegment("calibration", "", "", False), watch=True)
+        if not led.estimates:
+            reason = led.reason or f"no image in {_LED_S:g} s shows it"
+            raise ArmsightError(
+                f"the sync LED is not seen ({reason}): bring it into the view of both cameras, near the base, or leave out"
+                " --sync-led"
+            )
 
     def _rest_of_period(self) -> float:
         """Return how long to wait for the next iteration, s: what the last one has left of its period."""

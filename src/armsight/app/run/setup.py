@@ -20,6 +20,7 @@ import numpy as np
 from armsight.data import Array, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.robot.arm import Arm
+from armsight.robot.boards.board import Board
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.boards.opening import EMULATED, emulator_name, open_motion_board, slowed
 from armsight.vision.markers.marker import Target
@@ -100,6 +101,7 @@ class Setup:
         clock: converts times of the computer, which stamps the shots, to the board's; None in lock-step simulation, where
             shots are on the board's clock and time passes only in ``board.receive``.
         fixed: bodies in view that do not move.
+        sync_led_bit_s: how long each bit of the sync LED's code lasts, s; None where no LED is to be looked for.
     """
 
     arm: Arm
@@ -111,6 +113,7 @@ class Setup:
     sync_s: float
     clock: HostClock | None = None
     fixed: tuple[Target, ...] = ()
+    sync_led_bit_s: float | None = None
 
 
 class LiveShots:
@@ -183,7 +186,29 @@ def setup_of(workcell: Workcell) -> Setup:
         workcell.gravity_duty,
         timing.rate_hz,
         sync_s,
+        sync_led_bit_s=sync_led_bit_s(workcell.board, "the workcell") if workcell.source.shows_led else None,
     )
+
+
+def sync_led_bit_s(board: MotionBoard, name: str) -> float:
+    """Return how long each bit of the code lasts that a board's sync LED blinks, s.
+
+    Args:
+        board: the board.
+        name: what the user calls it.
+
+    Raises:
+        InputError: it has no LED.
+    """
+    if not isinstance(board, Board):
+        raise InputError(f"--sync-led: {name} keeps its own controller, which drives no LED on its clock")
+    config = board.configuration()
+    if not config["sync_led_pin"]:
+        raise InputError(
+            f"--sync-led: {name} drives no LED: choose its pin with armsight board config set 'arm.sync_led_pin=\"PB13\"',"
+            " and start the board anew"
+        )
+    return int(config["sync_led_ticks"]) / board.welcome.ticks_per_s
 
 
 @dataclass(frozen=True)
@@ -198,6 +223,7 @@ class Devices:
         rate_hz: rate of the cameras, Hz.
         sync_s: standard deviation of the time between the two exposures of a shot, s.
         calibration: LeRobot's calibration file of a servo bus; None without.
+        sync_led: whether an LED on the board's clock is in view.
     """
 
     source: str
@@ -207,6 +233,7 @@ class Devices:
     rate_hz: float
     sync_s: float
     calibration: Path | None = None
+    sync_led: bool = False
 
 
 def require_joints(board: MotionBoard, name: str, arm: Arm) -> None:
@@ -243,13 +270,15 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
 
             emulator = "unicorn" if board == EMULATED else emulator_name(board)
             cameras = source.removeprefix(_SIM) or _SIM_CAMERAS
+            led = devices.sync_led
             workcell = stack.enter_context(
-                Workcell.open(arm=_SIM_ARM, cameras=cameras, emulator=emulator, model=devices.arm)
+                Workcell.open(arm=_SIM_ARM, cameras=cameras, emulator=emulator, model=devices.arm, sync_led=led)
             )
             yield replace(setup_of(workcell), target=devices.target)
             return
         opened = stack.enter_context(open_motion_board(board, calibration=devices.calibration))
         require_joints(opened, board, devices.arm)
+        bit_s = sync_led_bit_s(opened, f"--board {board}") if devices.sync_led else None
         shots = LiveShots(open_source(source))
         stack.callback(shots.close)
         shots.start()
@@ -262,4 +291,5 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
             devices.rate_hz,
             devices.sync_s,
             HostClock(),
+            sync_led_bit_s=bit_s,
         )

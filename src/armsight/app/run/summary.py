@@ -124,6 +124,7 @@ class RunSummary:
         fixed_unseen: names of the fixed bodies that were seen too rarely to be watched.
         corrections: what was put right of a rig that was followed.
         not_corrected: why what else was found of it was not; None where nothing was left.
+        sync_led: what the sync LED says, as JSON; None without one.
     """
 
     properties: Mapping[str, Any]
@@ -144,6 +145,7 @@ class RunSummary:
     fixed_unseen: Sequence[str] = ()
     corrections: Sequence[RigCorrection] = ()
     not_corrected: str | None = None
+    sync_led: Mapping[str, Any] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the object of summary.json, SI units in the keys; numbers that are not known are None."""
@@ -166,6 +168,8 @@ class RunSummary:
             found["camera_delay_s"] = {"value": self.delay_s[0], "sigma": self.delay_s[1]}
         if self.shutters is not None:
             found["shutters"] = self.shutters.to_json()
+        if self.sync_led is not None:
+            found["sync_led"] = dict(self.sync_led)
         if self.shots is not None:
             found["shots"] = asdict(self.shots)
         if self.handeye is not None:
@@ -268,6 +272,7 @@ def summary_of(
         result.fixed_unseen,
         result.log.corrections,
         result.not_corrected,
+        None if result.led is None else result.led.to_json(),
     )
 
 

@@ -115,7 +115,7 @@ class KalmanEstimator:
         """Go on from an earlier state: what was measured since is dropped, and what motion makes it forget is unknown."""
         (x, P), rows, newest = (part.copy() for part in state), self._forgets, self._states[-1]
         x[rows] = P[rows] = P[:, rows] = 0.0
-        P[self._diagonal] += np.where(np.diag(P) > 0.0, 0.0, self._model.sigmas**2)
+        P[np.diag_indices(self._at.size)] += np.where(np.diag(P) > 0.0, 0.0, self._model.sigmas**2)
         self._states, self._outliers, self._newest, self._here = [newest._replace(x=x, P=P)], [], None, None
 
     def joints(self, states: JointStates) -> None:

@@ -29,6 +29,7 @@ from armsight.robot.boards.configuration import (
     Configuration,
     check_configuration,
     check_gains,
+    check_pin,
 )
 from armsight.robot.boards.contract import Abilities
 from armsight.robot.boards.link import Link
@@ -232,8 +233,8 @@ class Session:
         raise DeviceError(f"{self.name}: board {self.welcome.board} answers the hello, but sends no telemetry")
 
     def _ask_reaction(self) -> str:
-        """Return in words what the arm does by itself without a host, from the end of the configuration."""
-        ticks, reaction = struct.unpack("<II", self.config_part(CONFIG.itemsize - 8))
+        """Return in words what the arm does by itself without a host, as its configuration has it."""
+        ticks, reaction = struct.unpack_from("<II", self.config_part(_SILENCE_AT))
         does = "holds the arm where it comes to rest" if reaction == Reaction.HOLD else "switches the drives off"
         slows = "slows down and " if reaction == Reaction.HOLD else ""
         return f"; without commands the board {slows}{does} after {ticks / self.ticks_per_s * 1e3:.0f} ms"
@@ -244,6 +245,8 @@ _LONGEST_TICKS = 10000
 _STOPS = 3
 _STORE_S = 3.0  # a flash memory takes its time
 _PART = 200  # bytes of a CONFIG_PART
+assert CONFIG.fields is not None
+_SILENCE_AT = CONFIG.fields["silence_ticks"][1]  # bytes; silence_reaction follows
 _SET_MESSAGE_INTERVAL, _REBOOT = 511, 246  # MAV_CMD_
 _SLOW_ANGLES_US = 20000
 
@@ -436,6 +439,7 @@ class Board:
             DeviceError: the board rejected it.
         """
         check_configuration(config)
+        check_pin(config, self.welcome.board)
         data, session = config.tobytes(), self._session
         for offset in range(0, len(data), _PART):
             part = data[offset : offset + _PART]

@@ -37,10 +37,14 @@ from armsight.robot.boards.configuration import (
     RANGES,
     Configuration,
     check_configuration,
+    check_pin,
+    pin_name,
+    pin_number,
 )
 
 #: Parts of a joint that are tables of their own.
 _PARTS = ("gains", "pot", "motor")
+_PIN = "sync_led_pin"  # a name in the file: "PB13", or "none"
 _TABLES = ("counts", "angle_rad")  # of a potentiometer: as long as its node_count, which they replace
 
 
@@ -48,7 +52,8 @@ def entries(config: Configuration) -> Iterator[tuple[str, Any]]:
     """Yield every value of a configuration with its path, such as ``joint.3.pot.jump_rad``; tables as lists."""
     for name in CONFIG.names or ():
         if name != "joint":
-            yield f"arm.{name}", config[name].item()
+            value = config[name].item()
+            yield f"arm.{name}", pin_name(value) if name == _PIN else value
     for j in range(int(config["joint_count"])):
         yield from _of(config["joint"][j], f"joint.{j + 1}", config["joint"][j]["pot"])
 
@@ -81,6 +86,7 @@ def configuration_text(config: Configuration, board: str) -> str:
             lines += [""] * bool(table) + [f"[{here}]"]
             table = here
         low, high = RANGES.get(name, (None, None))
+        value = f'"{value}"' if name == _PIN else value
         lines.append(f"{name} = {value}" + (f"  # {low:g} to {high:g}" if low is not None and high is not None else ""))
     return "\n".join(lines) + "\n"
 
@@ -121,6 +127,7 @@ def read_configuration(path: Path) -> tuple[Configuration, str]:
             raise InputError(f"{path}: {error}") from None
     try:
         check_configuration(config)
+        check_pin(config, data["board"])
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return config, data["board"]
@@ -154,6 +161,9 @@ def put(config: Configuration, path: str, value: object) -> None:
     name = names[-1]
     if name not in (record.dtype.names or ()) or name in ("node_count", "joint", *_PARTS):
         raise InputError(f"nothing is called {path}")
+    if name == _PIN:
+        record[name] = pin_number(value)
+        return
     whole = record.dtype[name].base.kind != "f"
     if name in _TABLES:
         if not isinstance(value, list) or not 2 <= len(value) <= POT_NODES:

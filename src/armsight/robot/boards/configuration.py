@@ -11,6 +11,7 @@ A :data:`Configuration` is a structured numpy array of shape () laid out as ``co
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -24,7 +25,7 @@ from armsight.robot.boards.tuning import MotorFigures, tuned_gains
 Configuration = NDArray[np.void]
 JOINTS, POT_NODES = 6, 9
 #: Layout of the configuration this armsight knows: ``firmware/core/config.h``.
-CONFIG_VERSION = 3
+CONFIG_VERSION = 4
 
 GAINS = np.dtype(
     [
@@ -90,6 +91,8 @@ CONFIG = np.dtype(
         ("brake_engage_ticks", "<u4"),
         ("silence_ticks", "<u4"),
         ("silence_reaction", "<u4"),
+        ("sync_led_pin", "<u4"),
+        ("sync_led_ticks", "<u4"),
     ]
 )
 
@@ -141,7 +144,56 @@ _ARM_RANGES = {
     "brake_release_ticks": (0, 1000),
     "brake_engage_ticks": (0, 1000),
     "silence_ticks": (2, 60000),
+    "sync_led_ticks": (1, 100),
 }
+
+
+#: Pins as ``sync_led_pin`` has them, 0 for none: 16 (port + 1) + pin.
+PIN_NUMBERS = (16, 143)
+NO_PIN, _PIN_FORM = "none", "none or a pin such as PB13 is allowed"
+#: How long each bit of the sync LED's code lasts by default, ticks: no divisor of the usual periods of cameras.
+SYNC_LED_TICKS = 3
+#: Pins of a board that have another use, docs/howto/add_a_board.md; its debugger's too.
+USED_PINS: Mapping[str, frozenset[str]] = {
+    "nucleo-f446re": frozenset(
+        [f"PA{pin}" for pin in (*range(11), 13, 14)]
+        + [f"PB{pin}" for pin in (0, 1, *range(5, 11), 12)]
+        + [f"PC{pin}" for pin in range(10)]
+    )
+}
+
+
+def pin_name(number: int) -> str:
+    """Return the name of a pin, such as PB13; "none" for 0."""
+    return f"P{chr(ord('A') + number // 16 - 1)}{number % 16}" if number else NO_PIN
+
+
+def pin_number(name: object) -> int:
+    """Return a pin as the configuration has it: 0 for "none".
+
+    Raises:
+        InputError: it is no pin's name.
+    """
+    match = re.fullmatch(r"P([A-H])(\d|1[0-5])", name) if isinstance(name, str) else None
+    if name != NO_PIN and match is None:
+        raise InputError(f"sync_led_pin is {name!r}; {_PIN_FORM}")
+    return 0 if match is None else 16 * (ord(match[1]) - ord("A") + 1) + int(match[2])
+
+
+def check_pin(config: Configuration, board: str) -> None:
+    """Check that the sync LED's pin has no other use on a board of this name.
+
+    Raises:
+        InputError: it has, or the board has no such pin.
+    """
+    name = pin_name(int(config["sync_led_pin"]))
+    used = USED_PINS.get(board)
+    if used is not None and name != NO_PIN and (name in used or name[1] > "C"):
+        use = "has another use" if name in used else "is not led out"
+        raise InputError(
+            f"sync_led_pin is {name}, which {use} on {board}: take a free one, such as PB13"
+            " (docs/howto/add_a_board.md has the table); nothing was changed"
+        )
 
 
 #: All of them by name; no name stands for two things.
@@ -193,6 +245,7 @@ def lab_configuration() -> Configuration:
     config["supply_nominal_mv"], config["overload_ticks"] = round(1e3 * _LAB_SUPPLY_V), 200
     config["pot_ticks"], config["following_ticks"], config["stall_ticks"] = 5, 20, 200
     config["silence_ticks"], config["silence_reaction"] = 100, Reaction.HOLD
+    config["sync_led_ticks"] = SYNC_LED_TICKS
     return config
 
 
@@ -245,6 +298,8 @@ def _problems(config: Configuration) -> Iterator[str]:
         yield from (f"joint {j + 1}: {text}" for text in _joint_problems(joints[j]))
     if config["supply_min_mv"] >= config["supply_max_mv"]:
         yield "supply_min_mv must be below supply_max_mv"
+    if config["sync_led_pin"] and not PIN_NUMBERS[0] <= config["sync_led_pin"] <= PIN_NUMBERS[1]:
+        yield f"sync_led_pin is {config['sync_led_pin']}; {_PIN_FORM}"
     if config["silence_reaction"] not in tuple(Reaction):
         yield f"silence_reaction is {config['silence_reaction']}; 1 (hold) or 2 (release) is allowed"
 

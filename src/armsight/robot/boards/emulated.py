@@ -84,6 +84,8 @@ class EmulatedLink:
         self._awake, self._braked = False, True
         self._closed = False
         self._reply = bytes(ANSWER.itemsize)
+        #: Whether the sync LED is on in the millisecond that each tick begins; tick 0 is before the first.
+        self.sync_led = bytearray(1)
 
     @property
     def answer(self) -> Any:  # noqa: ANN401 - a structured scalar
@@ -130,6 +132,7 @@ class EmulatedLink:
         """Let time pass in which the board does not run: the last duties stay on, and what is sent to it is lost."""
         for _ in range(ticks):
             self._ticks += 1
+            self.sync_led.append(self.sync_led[-1])
             self._arriving()
             self._plant.sense()
             self._plant.step(self._duty, self._awake, self._braked)
@@ -177,8 +180,8 @@ class EmulatedLink:
     def _tick(self) -> None:
         self._ticks += 1
         reply = self._emulator.tick(self._request())
-        fields = ANSWER_FIELDS.unpack_from(reply) if len(reply) == ANSWER.itemsize else (0,) * 7
-        magic, version, tick, drives_on, shorted, brakes_open, length = fields
+        fields = ANSWER_FIELDS.unpack_from(reply) if len(reply) == ANSWER.itemsize else (0,) * 8
+        magic, version, tick, drives_on, shorted, brakes_open, led, length = fields
         if magic != ANSWER_MAGIC or version != VERSION or tick != self._ticks % _WRAP:
             raise DeviceError(
                 f"the emulated board did not answer tick {self._ticks} with a frame of version {VERSION}: its image and"
@@ -187,6 +190,7 @@ class EmulatedLink:
         self._reply = reply
         if self._watch is not None:
             self._watch(reply)
+        self.sync_led.append(1 if led else 0)
         self._duty = np.frombuffer(reply, _FLOAT, JOINTS, DUTY_AT)
         self._awake, self._braked = bool(drives_on or shorted), not brakes_open
         self._plant.step(self._duty, self._awake, self._braked)

@@ -10,7 +10,7 @@ import struct
 import numpy as np
 
 JOINTS = 6
-REQUEST_MAGIC, ANSWER_MAGIC, VERSION = 0x51525341, 0x4E415341, 2
+REQUEST_MAGIC, ANSWER_MAGIC, VERSION = 0x51525341, 0x4E415341, 3
 #: What a request may do before its tick.
 RESTART_POWER, RESTART_WATCHDOG = 1, 2
 #: Most bytes of the wire either way in one tick.
@@ -62,6 +62,7 @@ ANSWER = np.dtype(
         ("version", "<u4"),
         ("tick", "<u4"),
         ("outputs", OUTPUTS),
+        ("sync_led", "<u4"),
         ("length", "<u4"),
         ("bytes", "u1", WIRE_BYTES),
     ]
@@ -77,9 +78,9 @@ def _at(frame: np.dtype[np.void], name: str) -> int:
 
 #: The same frames for the tick itself, where a structured array costs more than the rest: a request whole, its arrays one
 #: after the other, and of an answer what every tick needs: magic, version, tick, whether the
-#: drives are on, the windings shorted and the brakes open, how many bytes.
+#: drives are on, the windings shorted and the brakes open, the sync LED, how many bytes.
 REQUEST_FIELDS = struct.Struct(f"<7I{JOINTS}I{JOINTS}iI{WIRE_BYTES}s")
-_DRIVES_AT, _LENGTH_AT = _at(ANSWER, "outputs") + _at(OUTPUTS, "drives_on"), _at(ANSWER, "length")
-ANSWER_FIELDS = struct.Struct(f"<3I{_DRIVES_AT - 12}x3I{_LENGTH_AT - _DRIVES_AT - 12}xI")
+_DRIVES_AT, _LED_AT = _at(ANSWER, "outputs") + _at(OUTPUTS, "drives_on"), _at(ANSWER, "sync_led")
+ANSWER_FIELDS = struct.Struct(f"<3I{_DRIVES_AT - 12}x3I{_LED_AT - _DRIVES_AT - 12}x2I")
 #: Where an answer has the duties, six little-endian floats, and what is said.
 DUTY_AT, BYTES_AT = _at(ANSWER, "outputs") + _at(OUTPUTS, "duty"), _at(ANSWER, "bytes")

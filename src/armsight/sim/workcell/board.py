@@ -13,7 +13,13 @@ import numpy as np
 from armsight.data import Array
 from armsight.robot.arm import Arm
 from armsight.robot.boards.codes import Reaction
-from armsight.robot.boards.configuration import CONFIG, Configuration, check_configuration
+from armsight.robot.boards.configuration import (
+    CONFIG,
+    SYNC_LED_TICKS,
+    Configuration,
+    check_configuration,
+    pin_number,
+)
 from armsight.sim.workcell.arm import pot_travel
 from armsight.sim.workcell.motors import SUPPLY_V, Motors, Solids, gravity_torque, inertia
 from armsight.sim.workcell.plant import COUNTS, HIGH_SHARE, LOW_SHARE
@@ -25,16 +31,18 @@ NATURAL_RAD_S = np.array([50.0, 70.0, 80.0, 85.0, 90.0, 90.0])
 DAMPING, INTEGRAL_PER_S, FILTER_S = 1.0, 8.0, 0.004
 _ACCELERATION_SPARE, _JERK_S = 2.0, 0.01  # likewise; time from none to all of it
 _BRAKE_TICKS = 20
+SYNC_LED_PIN = "PB13"
 _SPEED_SPARE = 1.2  # of the reference's limit over the arm's own
 
 
-def configuration(model: Arm, parts: Solids, motors: Motors) -> Configuration:
+def configuration(model: Arm, parts: Solids, motors: Motors, *, sync_led: bool = False) -> Configuration:
     """Return the board's configuration for an arm.
 
     Args:
         model: the nominal table.
         parts: its solids.
         motors: what drives it.
+        sync_led: whether an LED blinks its clock.
     """
     config = np.zeros((), CONFIG)
     joint, travel = config["joint"], pot_travel(model)
@@ -75,6 +83,8 @@ def configuration(model: Arm, parts: Solids, motors: Motors) -> Configuration:
     config["brake_release_ticks"] = config["brake_engage_ticks"] = _BRAKE_TICKS
     config["pot_ticks"], config["following_ticks"], config["stall_ticks"] = 5, 50, 300
     config["silence_ticks"], config["silence_reaction"] = 100, Reaction.HOLD
+    config["sync_led_ticks"] = SYNC_LED_TICKS
+    config["sync_led_pin"] = pin_number(SYNC_LED_PIN) if sync_led else 0
     check_configuration(config)
     return config
 

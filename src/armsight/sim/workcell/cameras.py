@@ -26,7 +26,7 @@ from armsight.sim.render.optics import Radiance, noise_start, noise_strip
 from armsight.sim.render.render import Shutter, outline
 from armsight.sim.render.scene import Pattern, PosedBody, plate
 from armsight.sim.workcell.controlled import ControlledArm
-from armsight.sim.workcell.images import ArmSeen, WorkcellCamera
+from armsight.sim.workcell.images import ArmSeen, LedSeen, WorkcellCamera
 from armsight.sim.workcell.motors import row_frames
 from armsight.sim.workcell.plant import TICK_S, ArmPlant
 from armsight.sim.workcell.raycast import arm_capsules, capsule_boxes
@@ -221,6 +221,9 @@ def rig_pose(model: Arm, rig: StereoRig, T_tool_body: Array, seed: int, distance
     return np.asarray(T_base_middle @ T_middle_left @ exp_se3(off))
 
 
+#: The sync LED: its radius, m, and its light, as of a reflectance; where it is, seen from the left camera, over the
+#: distance from the cameras to the body of an arm at home.
+_LED, LED_AT = (0.004, 0.5), (-0.40, 0.33, 1.25)
 #: The body is within so far of its origin, m.
 _BODY_M = 0.12
 #: A card that is held before the body: its sides, m; how far before it, m; its grey.
@@ -246,6 +249,7 @@ class WorkcellSource:
         clock: tuple[Callable[[], float], Callable[[float], None]],
         seed: int,
         pipeline: CameraPipeline | None = None,
+        led: tuple[Array, bytearray] | None = None,
     ) -> None:
         """Point the cameras at the arm.
 
@@ -257,6 +261,7 @@ class WorkcellSource:
             clock: returns the workcell's time, s; lets so many seconds of it pass.
             seed: of noise and timing.
             pipeline: what lies between light and file; white noise by default.
+            led: where the sync LED is (3,), m, base frame, and whether it is on in each millisecond; None without one.
         """
         self._plant, self._cameras, self._timing, self._seed = plant, cameras, timing, seed
         self._now, self._advance = clock
@@ -270,6 +275,7 @@ class WorkcellSource:
         self._gone_s, self._gone = np.inf, ""
         #: A thread for each side: a camera that remembers its images exposes them one after the other.
         self._threads = (ThreadPoolExecutor(1), ThreadPoolExecutor(1))
+        self._led = None if led is None else ([camera.led(led[0], *_LED) for camera in cameras], led[1])
         self._devices: list[SimulatedCamera] | None = None
         if pipeline is not None:
             self._devices = [SimulatedCamera(pipeline, timing.image_size_px, 2 * seed + side) for side in range(2)]
@@ -309,6 +315,11 @@ class WorkcellSource:
             shot = self._shot(newest)
             self._over_s = self._over(self._next)
         return shot
+
+    @property
+    def shows_led(self) -> bool:
+        """Whether the sync LED is in view."""
+        return self._led is not None
 
     @property
     def rendering(self) -> bool:
@@ -389,12 +400,28 @@ class WorkcellSource:
         t_s = np.array([times.left_s, times.right_s])
         frames = [row_frames(self._plant.arm, q) for q in self._q(t_s)]
         bodies = self._bodies(t_s, shutter)
+        leds = [None if held is not None else self._lit(side, float(t_s[side]), shutter) for side in range(2)]
         return [
             self._threads[side].submit(
-                self._image, side, float(t_s[side]), frames[side], bodies[side], shutter, number, held
+                self._image, side, float(t_s[side]), frames[side], bodies[side], shutter, number, held, leds[side]
             )
             for side in range(2)
         ]
+
+    def _lit(self, side: int, t_s: float, shutter: Shutter) -> LedSeen | None:
+        """Return the sync LED as a camera sees it in an exposure about a time, s; row by row."""
+        if self._led is None:
+            return None
+        led, on = self._led[0][side], self._led[1]
+        rows = np.arange(led.window[1], led.window[3])
+        middle = t_s + shutter.row_s * (rows - (self._timing.image_size_px[1] - 1) / 2)
+        half = max(shutter.exposure_s, 1e-6) / 2
+        first, last = int((middle[0] - half) / TICK_S) - 1, int((middle[-1] + half) / TICK_S) + 2
+        lit = np.frombuffer(bytes(on[max(first, 0) : last]), np.uint8)  # from the tick of its number on, for one
+        edges = (max(first, 0) + np.arange(len(lit) + 1)) * TICK_S
+        total = np.concatenate([[0.0], np.cumsum(lit) * TICK_S])
+        gathered = np.interp(middle + half, edges, total) - np.interp(middle - half, edges, total)
+        return led.lit(gathered / (2 * half))
 
     def _image(
         self,
@@ -405,6 +432,7 @@ class WorkcellSource:
         shutter: Shutter,
         number: int,
         held: PosedBody | None,
+        led: LedSeen | None,
     ) -> Image:
         """Render one camera's image of the arm in the middle of an exposure."""
         camera = self._cameras[side]
@@ -416,10 +444,10 @@ class WorkcellSource:
             bodies.append(_card(body.T_camera_body))
         arm = ArmSeen(self._plant.parts, frames)
         if self._devices is not None:
-            return self._through(self._devices[side], camera.radiance(arm, bodies, shutter), t_s, number)
+            return self._through(self._devices[side], camera.radiance(arm, bodies, shutter, led), t_s, number)
         # A shot for the calibration takes its noise from numbers of its own.
         start = noise_start(self._seed, side + (0 if number >= 0 else 2), abs(number))
-        return camera.image(arm, bodies, shutter, self._strip, start)
+        return camera.image(arm, bodies, shutter, self._strip, start, led)
 
     @staticmethod
     def _through(device: SimulatedCamera, light: Radiance, t_s: float, number: int) -> Image:

@@ -20,6 +20,7 @@ from functools import lru_cache
 import numpy as np
 
 from armsight.data import Array, Ids, Image, Record
+from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, pose, transform
 from armsight.kernels import kernel
 from armsight.sim.render.faces import Exposure, paint_faces, palette
@@ -238,6 +239,28 @@ def _moved(body: PosedBody, t_s: Array) -> Array:
     return np.asarray(body.T_camera_body @ exp_se3(np.outer(t_s, body.twist)))
 
 
+@dataclass(frozen=True, eq=False)
+class LedSeen(Record):
+    """A round LED that shines at a camera, or one that does so for a part of an exposure.
+
+    Attributes:
+        window: the pixels that its light reaches.
+        share: (h, w) of each pixel that it covers, times its light.
+        spread: (h, w) the same through the lens.
+        depth_m: its distance.
+    """
+
+    window: Window
+    share: Radiance
+    spread: Radiance
+    depth_m: float
+
+    def lit(self, rows: Array) -> LedSeen:
+        """Return it as it looks if it is on for a share (h,) of the exposure of each row of its window."""
+        on = rows[:, None].astype(np.float32)
+        return LedSeen(self.window, self.share * on, self.spread * on, self.depth_m)
+
+
 class WorkcellCamera:
     """A camera that stands in the workcell.
 
@@ -282,8 +305,35 @@ class WorkcellCamera:
         to_lamp = inverse(T_base_camera)[:3, :3] @ LAMP_BASE
         self._lamp = (to_lamp / np.linalg.norm(to_lamp)).astype(np.float32)
 
+    def led(self, p_base: Array, radius_m: float, light: float) -> LedSeen:
+        """Return an LED as it looks while it is on.
+
+        Args:
+            p_base: (3,) where it is, m.
+            radius_m: its radius.
+            light: as of a reflectance.
+        """
+        p = transform(inverse(self.T_base_camera), p_base)
+        uv, radius_px = self.camera.project(p[None])[0], radius_m * self.camera.matrix[0, 0] / p[2]
+        margin = math.ceil(radius_px) + _reach(self._psf_sigma_px) + 1
+        (u0, v0), (u1, v1) = np.floor(uv).astype(int) - margin, np.floor(uv).astype(int) + margin + 1
+        width, height = self.camera.image_size_px
+        if u0 < 0 or v0 < 0 or u1 > width or v1 > height:
+            raise InputError(f"the sync LED is out of a camera's view, at {uv[0]:.0f}, {uv[1]:.0f} px")
+        fine = (np.arange(16) + 0.5) / 16 - 0.5
+        u, v = np.add.outer(np.arange(u0, u1), fine) - uv[0], np.add.outer(np.arange(v0, v1), fine) - uv[1]
+        inside = (v * v)[:, :, None, None] + (u * u)[None, None] <= radius_px**2
+        share = (light * inside.mean(axis=(1, 3))).astype(np.float32)
+        return LedSeen((int(u0), int(v0), int(u1), int(v1)), share, spread(share, self._psf_sigma_px), float(p[2]))
+
     def image(
-        self, arm: ArmSeen | None, bodies: Sequence[PosedBody], shutter: Shutter, strip: Radiance, start: int
+        self,
+        arm: ArmSeen | None,
+        bodies: Sequence[PosedBody],
+        shutter: Shutter,
+        strip: Radiance,
+        start: int,
+        led: LedSeen | None = None,
     ) -> Image:
         """Return what the camera hands out.
 
@@ -293,27 +343,37 @@ class WorkcellCamera:
             shutter: how long it looks.
             strip: standard normal noise, from :func:`~armsight.sim.render.optics.noise_strip`.
             start: where in it this image's noise begins.
+            led: the sync LED as it is lit; None without.
 
         Returns:
             (H, W) uint8.
         """
-        seen, window, core = self._seen(arm, bodies, shutter)
-        out: Image = np.empty(self._still_grey.shape, np.uint8)
+        seen, window, core = self._seen(arm, bodies, shutter, led)
+        still = self._still_grey
+        if led is not None:
+            still = still.copy()
+            at = _part(led.window, (0, 0, 0, 0))
+            still[at] += led.spread * self._gain[at]
+        out: Image = np.empty(still.shape, np.uint8)
         s = self._sensor
         noises = (s.offset, s.read_noise, s.shot_noise)
-        exposed_window(self._still_grey, seen, window, core, self._gain, strip, start, noises, out)
+        exposed_window(still, seen, window, core, self._gain, strip, start, noises, out)
         return out
 
-    def radiance(self, arm: ArmSeen | None, bodies: Sequence[PosedBody], shutter: Shutter) -> Radiance:
+    def radiance(
+        self, arm: ArmSeen | None, bodies: Sequence[PosedBody], shutter: Shutter, led: LedSeen | None = None
+    ) -> Radiance:
         """Return the light (H, W) of each pixel before the lens's shading and the sensor; arguments as :meth:`image`."""
-        seen, window, core = self._seen(arm, bodies, shutter)
+        seen, window, core = self._seen(arm, bodies, shutter, led)
         out = self._still_light.copy()
+        if led is not None:
+            out[_part(led.window, (0, 0, 0, 0))] += led.spread
         if seen.size:
             out[_part(core, (0, 0, 0, 0))] = seen[_part(core, window)]
         return out
 
     def _seen(
-        self, arm: ArmSeen | None, bodies: Sequence[PosedBody], shutter: Shutter
+        self, arm: ArmSeen | None, bodies: Sequence[PosedBody], shutter: Shutter, led: LedSeen | None = None
     ) -> tuple[Radiance, Window, Window]:
         """Return the light of a window that holds all that moves, the window, and its core, which is exact."""
         ends, radius, albedo = (np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
@@ -327,6 +387,8 @@ class WorkcellCamera:
         u0, v0, u1, v1 = window
         light = self.still.light[v0:v1, u0:u1].copy()
         depth, ids = self.still.depth[v0:v1, u0:u1].copy(), np.zeros(light.shape, np.int16)
+        if led is not None:
+            _shine(led, window, light, depth)
         moving(self._rays, window, boxes, (ends, radius, albedo), self._lamp, light, depth, ids)
         seen = spread(light, self._psf_sigma_px) if light.size else light
         if exposure is not None and crop[0] < crop[2] and crop[1] < crop[3]:
@@ -417,6 +479,16 @@ class WorkcellCamera:
 def _part(part: Window, window: Window) -> tuple[slice, slice]:
     """Return the rows and columns of a part of a window."""
     return slice(part[1] - window[1], part[3] - window[1]), slice(part[0] - window[0], part[2] - window[0])
+
+
+def _shine(led: LedSeen, window: Window, light: Radiance, depth: Radiance) -> None:
+    """Add an LED to the light and the depths of a window, where it is within it."""
+    (u0, v0, u1, v1), (a0, b0, a1, b1) = led.window, window
+    both = max(u0, a0), max(v0, b0), min(u1, a1), min(v1, b1)
+    if both[0] < both[2] and both[1] < both[3]:
+        here, there = _part(both, window), _part(both, led.window)
+        light[here] += led.share[there]
+        depth[here] = np.where(led.share[there] > 0, np.minimum(depth[here], led.depth_m), depth[here])
 
 
 def _reach(sigma_px: float) -> int:

@@ -19,7 +19,7 @@ import numpy as np
 
 from armsight.data import Array, Image, Record, Shot
 from armsight.errors import InputError
-from armsight.geometry.pose import exp_se3, pose
+from armsight.geometry.pose import exp_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
@@ -37,6 +37,7 @@ from armsight.sim.workcell.body import body_patterns, body_target, body_text
 from armsight.sim.workcell.cameras import (
     BASELINE_M,
     DISTANCE_M,
+    LED_AT,
     CameraTiming,
     WorkcellSource,
     open_cameras,
@@ -121,6 +122,7 @@ class _Parts(NamedTuple):
         board: configured.
         gravity: returns the duty (n,) that compensates the nominal arm's gravity load at joint angles (n,), rad.
         default: whether it is the arm that the workcell was drawn for.
+        p_led: (3,) where the sync LED is, m, base frame; None without.
     """
 
     model: Arm
@@ -137,6 +139,7 @@ class _Parts(NamedTuple):
     board: MotionBoard
     gravity: Callable[[Array], Array]
     default: bool
+    p_led: Array | None
 
 
 def _standing(
@@ -190,9 +193,11 @@ def _five(model: Arm, T_home: Array, axes: Array) -> Array:
 
 
 def _driven(
-    model: Arm, amounts: Imperfections, seed: int, emulator: str, own: Controlled | None
+    model: Arm, amounts: Imperfections, seed: int, emulator: str, own: Controlled | None, *, sync_led: bool
 ) -> tuple[ArmPlant | ControlledArm, EmulatedLink | None, MotionBoard, Callable[[Array], Array]]:
     """Return an arm that was built to a model, the wire to our board if it has one, the board, and the gravity's duty."""
+    if own is not None and sync_led:
+        raise InputError(f"{model.name} keeps its own controller, which drives no sync LED")
     if own is not None:  # its zeros are off in its controller
         true = sample_arm(model, replace(amounts, zero_rad=0.0), seed).arm
         arm, own_board = own.open(true, amounts, seed)
@@ -206,7 +211,7 @@ def _driven(
     motors = chosen(model, links)  # as the drawing has them: friction as usual
     plant = ArmPlant(model, sample_arm(model, amounts, seed), seed)
     link = EmulatedLink(open_emulator(emulator), plant)
-    board = configured(link, configuration(model, links, motors))
+    board = configured(link, configuration(model, links, motors, sync_led=sync_led))
     return plant, link, board, partial(gravity_duty, model, links, motors)
 
 
@@ -235,7 +240,9 @@ class Workcell:
         self.body_text, self.chessboard_spec = body_text(), CHESSBOARD
         clock = (lambda: self.t_s, self.advance)
         body = (body_patterns(), self._T_tool_body)
-        self.source = WorkcellSource(self.plant, self._cameras, self.timing, body, clock, self._seed, parts.pipeline)
+        led = None if parts.p_led is None or self.link is None else (parts.p_led, self.link.sync_led)
+        sees = (self.plant, self._cameras, self.timing, body, clock, self._seed, parts.pipeline)
+        self.source = WorkcellSource(*sees, led)
 
     @classmethod
     def open(
@@ -252,6 +259,7 @@ class Workcell:
         baseline_m: float = BASELINE_M,
         noise: float = 2.0,
         like: Workcell | None = None,
+        sync_led: bool = False,
     ) -> Self:
         """Build a workcell; a second or so.
 
@@ -267,6 +275,7 @@ class Workcell:
             baseline_m: between the cameras.
             noise: of the sensors, grey levels; a preset has its own.
             like: a workcell of the same arm, seed, rig and noise: what its cameras see of the room is not cast anew.
+            sync_led: whether an LED on the board's clock is in view.
 
         Raises:
             InputError: an unknown name or a bad file, or ``like`` differs in more than the cameras' rate.
@@ -306,13 +315,14 @@ class Workcell:
         mount = pose(np.diag([-1.0, 1.0, -1.0]), _MOUNT_M) @ pose(exp_so3(_MOUNT_RAD), np.zeros(3))
         off = np.random.default_rng([seed, 9]).normal(0, 1, 6) * np.repeat((0.002, np.radians(1.0)), 3)
         T_base_rig = rig_pose(built_to, true_rig, mount, seed, distance_m)
-        plant, link, board, gravity = _driven(built_to, amounts, seed, emulator, own)
+        plant, link, board, gravity = _driven(built_to, amounts, seed, emulator, own, sync_led=sync_led)
         sensor = Sensor(read_noise=noise)
         seen = like._cameras if like is not None else _standing(true_rig, T_base_rig, plant, seed, sensor, psf_sigma_px)
         known = assumed if assumed is not None else built_to
         T_tool_body = mount @ exp_se3(off)
         parts = (known, timing, seed, plant, true_rig, T_base_rig, T_tool_body, seen, room)
-        return cls(_Parts(*parts, pipeline, link, board, gravity, built_to.name == DEFAULT_ARM))
+        p_led = transform(T_base_rig, distance_m * np.array(LED_AT)) if sync_led else None
+        return cls(_Parts(*parts, pipeline, link, board, gravity, built_to.name == DEFAULT_ARM, p_led))
 
     @property
     def t_s(self) -> float:
