@@ -118,15 +118,15 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     const float emf_v = voltage_v - motor->resistance_scale * ir_v;
     motor->speed_rad_s = emf_v / (motor->constant_scale * config->constant_v_s);
     const float keep = 1.0f - TICK_S / FADE_S;
-    motor->gap_rad = keep * motor->gap_rad + moved_rad - motor->speed_rad_s * TICK_S;
-    motor->band_rad = keep * motor->band_rad +
-                      (motor->unsure_rad_s < UNKNOWN_RAD_S ? motor->unsure_rad_s * TICK_S : 0.0f);
-    motor->travel_rad += motor->speed_rad_s * TICK_S;
+    const float travelled_rad = motor->speed_rad_s * TICK_S;
+    motor->travel_rad += travelled_rad;
     const float seen_a = number_size(current_a);
     motor->current_a = seen_a > keep * motor->current_a ? seen_a : keep * motor->current_a;
     if ((motor->driven_ticks + motor->phase) % SAMPLE_TICKS == 0u || motor->unsure_rad_s == UNKNOWN_RAD_S) {
         sample(motor, config, ir_v, emf_v, angle_rad);
     }
+    motor->gap_rad = keep * motor->gap_rad + moved_rad - travelled_rad;
+    motor->band_rad = keep * motor->band_rad + motor->unsure_rad_s * TICK_S;
     window(motor, config, voltage_v, ir_v, angle_rad);
     const float size_rad_s = number_size(motor->speed_rad_s);
     const bool known = motor->current_a * config->resistance_ohm > DEAD_SHARE * config->constant_v_s * size_rad_s;
@@ -264,23 +264,18 @@ uint32_t motor_names(const motor_state *motor, const motor_config *config, uint3
 #define SWING_TICKS 60u   /* a swing of 8 Hz and faster changes its side as often */
 #define SWINGS 8u         /* so many changes are no answer to anything */
 #define SWING_RAD_S 0.3f  /* as far from the reference's speed at least */
-#define SWING_SHARE 0.2f  /* of the speed limit */
 
-bool motor_swings(motor_state *motor, float reference_rad_s, float speed_limit_rad_s)
+bool motor_swings_far(motor_state *motor, float off_rad_s)
 {
-    if (motor->known == 0u) {
-        motor->swings = 0u;
+    const int32_t side = off_rad_s > 0.0f ? 1 : -1;
+    if (motor->known == 0u || number_size(off_rad_s) <= SWING_RAD_S) {
+        motor->swings = motor->known == 0u ? 0u : motor->swings;
         return false;
     }
-    const float share_rad_s = SWING_SHARE * speed_limit_rad_s;
-    const float far_rad_s = share_rad_s > SWING_RAD_S ? share_rad_s : SWING_RAD_S;
-    const float off_rad_s = motor->speed_rad_s - reference_rad_s;
-    const int32_t side = off_rad_s > far_rad_s ? 1 : (off_rad_s < -far_rad_s ? -1 : 0);
-    motor->swing_ticks = number_count(motor->swing_ticks);
-    if (side != 0 && side != motor->swing_side) {
-        motor->swings = motor->swing_ticks <= SWING_TICKS ? motor->swings + 1u : 0u;
+    if (side != motor->swing_side) {
+        motor->swings = motor->driven_ticks - motor->swing_since <= SWING_TICKS ? motor->swings + 1u : 0u;
         motor->swing_side = side;
-        motor->swing_ticks = 0u;
+        motor->swing_since = motor->driven_ticks;
     }
     return motor->swings >= SWINGS;
 }
@@ -292,6 +287,6 @@ bool motor_is_fast(motor_state *motor, float reading_rad_s, float speed_limit_ra
 {
     const float fast_rad_s = FAST * speed_limit_rad_s;
     const bool fast = number_size(motor->speed_rad_s) > fast_rad_s && number_size(reading_rad_s) > speed_limit_rad_s;
-    motor->fast_ticks = fast ? number_count(motor->fast_ticks) : 0u;
+    motor->fast_ticks = fast ? number_add(motor->fast_ticks, WATCH_TICKS) : 0u;
     return motor->fast_ticks >= FAST_TICKS;
 }
