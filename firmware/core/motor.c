@@ -2,11 +2,13 @@
 
 #define FADE_S 0.4f           /* a gap fades with this time constant: what opens more slowly is not seen */
 #define PRIOR_VARIANCE 0.005625f /* of R and K over the configuration's: 0.075^2, so that three sigma of both cover 15 % */
-#define WANDER_VARIANCE 4e-7f /* by which each becomes less certain per window: windings get warm */
+#define WANDER_VARIANCE 6e-9f /* by which each becomes less certain per tick: windings get warm */
 #define SIGMAS 3.0f
 #define SCALE_LOW 0.8f        /* further off than so is no tolerance of a motor */
 #define SCALE_HIGH 1.25f
-#define WINDOW_TICKS 32u      /* over which R and K are learnt */
+#define WINDOW_TICKS 32u      /* over which R and K are learnt; while the reading rests, its noise is that of the ends, */
+#define REST_TICKS 256u       /* so that a longer window says more, */
+#define REST_NOISE_RAD 0.0035f /* but the motor may move within its backlash */
 #define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
 #define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
@@ -34,11 +36,15 @@ void motor_start(motor_state *motor, float angle_rad, uint32_t phase)
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
 static void learn(motor_state *motor, const motor_config *config, float angle_rad)
 {
-    const float per_tick = 1.0f / (float)WINDOW_TICKS;
+    const float ticks = (float)motor->window_ticks;
+    const float per_tick = 1.0f / ticks;
+    const float wander = WANDER_VARIANCE * ticks;
+    motor->variance_rr += motor->variance_rr < PRIOR_VARIANCE ? wander : 0.0f; /* also where the window is not believed */
     const float per_s = (float)TICKS_PER_S * per_tick;
     const float ir_v = motor->window_ir_v * per_tick;
     const float kw_v = config->constant_v_s * (angle_rad - motor->window_rad) * per_s;
-    const float noise_v = config->constant_v_s * WINDOW_NOISE_RAD * per_s;
+    const float noise_rad = motor->window_ticks > WINDOW_TICKS ? REST_NOISE_RAD : WINDOW_NOISE_RAD;
+    const float noise_v = config->constant_v_s * noise_rad * per_s;
     const float gain_r = motor->variance_rr * ir_v + motor->variance_rk * kw_v;
     const float gain_k = motor->variance_rk * ir_v + motor->variance_kk * kw_v;
     const float variance = ir_v * gain_r + kw_v * gain_k + noise_v * noise_v;
@@ -53,9 +59,9 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
         if (moved) { /* else the constant is only taken into account (Schmidt's form) */
             motor->constant_scale =
                 number_clamp(motor->constant_scale + gain_k * off_v * per_variance, SCALE_LOW, SCALE_HIGH);
-            motor->variance_kk += WANDER_VARIANCE - gain_k * gain_k * per_variance;
+            motor->variance_kk += wander - gain_k * gain_k * per_variance;
         }
-        motor->variance_rr += WANDER_VARIANCE - gain_r * gain_r * per_variance;
+        motor->variance_rr -= gain_r * gain_r * per_variance;
         motor->variance_rk -= gain_r * gain_k * per_variance;
     }
 }
@@ -73,7 +79,10 @@ static void window(motor_state *motor, const motor_config *config, float voltage
     motor->window_v += voltage_v;
     motor->window_ir_v += ir_v;
     motor->window_ticks++;
-    if (motor->window_ticks < WINDOW_TICKS) {
+    if (motor->window_ticks % WINDOW_TICKS != 0u) {
+        return;
+    }
+    if (motor->window_ticks < REST_TICKS && number_size(angle_rad - motor->window_rad) <= WINDOW_WAY_RAD) {
         return;
     }
     /* A gap that R and K may explain must be learnt from: else they would stay wrong for good. */
