@@ -124,7 +124,7 @@ static void move_joint(joint_state *joint, const joint_config *config, const mov
 {
     const float limit_rad_s = config->speed_limit_rad_s;
     const float to_rad = number_clamp(move->position_rad[i], joint->low_rad, joint->high_rad);
-    float to_rad_s = number_clamp(move->speed_rad_s[i], -limit_rad_s, limit_rad_s);
+    float to_rad_s = number_bound(move->speed_rad_s[i], limit_rad_s);
     uint32_t held_back = to_rad_s != move->speed_rad_s[i] ? LIMITED_SPEED : 0u;
     if (to_rad != move->position_rad[i]) {
         held_back |= LIMITED_SOFT;

@@ -11,8 +11,6 @@
 #include "setpoint.h"
 
 #define GUARD 0xA5C3965Au
-#define BEYOND 2.0f       /* so much more is a speed damped beyond its limit */
-#define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up */
 
 void core_init(core_state *core, const core_config *config, uint32_t source, uint32_t reset)
 {
@@ -108,55 +106,6 @@ static void advance_arm(core_state *core)
     }
 }
 
-/* Return the duty of kp and kv that moves a free joint at its speed limit and a little more: what back-EMF (own_s_per_rad)
- * and damping take there. Without a known motor nothing bounds it. */
-static float spring_limit(const joint_config *config, float own_s_per_rad)
-{
-    if (config->motor.resistance_ohm <= 0.0f) {
-        return FLT_MAX;
-    }
-    return SPARE_SPEED * config->speed_limit_rad_s * (config->gains.kd_s_per_rad + own_s_per_rad);
-}
-
-static void control(joint_state *joint, const joint_config *config, float per_nominal_v)
-{
-    if (joint->gravity_duty != joint->gravity_asked) {
-        const float gravity_step = config->gravity_slew_per_s * TICK_S;
-        joint->gravity_duty +=
-            number_clamp(joint->gravity_asked - joint->gravity_duty, -gravity_step, gravity_step);
-    }
-    if (joint->over_a > 0.0f || joint->duty_cap != config->duty_limit) {
-        const float cut_duty = config->current_cut_per_a_s * joint->over_a * TICK_S;
-        joint->duty_cap = number_clamp(joint->duty_cap - cut_duty, 0.0f, config->duty_limit);
-    }
-    float duty_low = -joint->duty_cap;
-    float duty_high = joint->duty_cap;
-    const float own_s_per_rad = config->motor.constant_v_s * per_nominal_v;
-    const float free_duty = config->speed_limit_rad_s * own_s_per_rad;
-    if (joint->motor.sure_rad_s > config->speed_limit_rad_s && joint->duty_cap > free_duty) {
-        if (joint->motor.speed_rad_s > 0.0f) { /* it is driven on as a free motor at its limit, and braked by all there is */
-            duty_high = free_duty;
-        } else {
-            duty_low = -free_duty;
-        }
-        joint->limited |= LIMITED_SPEED;
-    }
-    const float seen_rad_s = motor_witness(&joint->motor, joint->pid.speed_rad_s, config->speed_limit_rad_s);
-    const float beyond_rad_s = number_size(seen_rad_s) - config->speed_limit_rad_s;
-    const float more_rad_s = beyond_rad_s > 0.0f ? BEYOND * beyond_rad_s : 0.0f;
-    const pid_demand demand = {.reference_rad = joint->reference.position_rad,
-                               .reference_rad_s = joint->reference.speed_rad_s,
-                               .reference_rad_s2 = joint->reference.acceleration_rad_s2,
-                               .damped_rad_s = seen_rad_s + (seen_rad_s > 0.0f ? more_rad_s : -more_rad_s),
-                               .spring_limit = spring_limit(config, own_s_per_rad),
-                               .gravity_duty = joint->gravity_duty,
-                               .duty_limit = config->duty_limit,
-                               .duty_low = duty_low,
-                               .duty_high = duty_high,
-                               .duty_slew_per_s = config->duty_slew_per_s};
-    (void)pid_step(&joint->pid, &config->gains, &demand, &joint->limited);
-}
-
 /* Drive every joint, watch what comes of it. */
 static void drive(core_state *core)
 {
@@ -166,13 +115,13 @@ static void drive(core_state *core)
         joint_state *joint = &core->joint[i];
         const joint_config *config = &core->config.joint[i];
         if (joint->released == 0u) {
-            control(joint, config, per_nominal_v);
+            pid_control(joint, config, per_nominal_v);
         }
-        safety_watch_joint(core, joint, config, i);
         if (!number_finite(joint->pid.duty + joint->pid.integral_duty)) {
             safety_raise(core, FAULT_ARITHMETIC, i);
         }
     }
+    safety_watch_joints(core);
 }
 
 /* Put out the joints' duties, for the present supply: gains are those of the nominal one. */
@@ -183,7 +132,7 @@ static void put_out(core_state *core, uint32_t supply_mv)
     const bool on = safety_drives_on(core);
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         joint_state *joint = &core->joint[i];
-        joint->motor.duty = on && joint->released == 0u ? number_clamp(joint->pid.duty * scale, -1.0f, 1.0f) : 0.0f;
+        joint->motor.duty = on && joint->released == 0u ? number_bound(joint->pid.duty * scale, 1.0f) : 0.0f;
     }
 }
 

@@ -40,9 +40,9 @@ uint32_t governor_step(governor_state *reference, const setpoint_state *path, fl
     const float back_rad_s = stopping_speed(2.0f * faster_rad_s2, number_size(error_rad), faster_rad_s2 * TRACK_S);
     const float asked_rad_s = path->speed_rad_s + (error_rad < 0.0f ? -back_rad_s : back_rad_s);
     const float late_rad_s = slower_rad_s2 * TRACK_S;
-    const float up = limit_speed(2.0f * slower_rad_s2, high_rad - before_rad, late_rad_s, fastest);
-    const float down = limit_speed(2.0f * slower_rad_s2, before_rad - low_rad, late_rad_s, fastest);
-    const float requested_rad_s = number_clamp(asked_rad_s, -down, up);
+    const float room_rad = asked_rad_s < 0.0f ? before_rad - low_rad : high_rad - before_rad;
+    const float requested_rad_s =
+        number_bound(asked_rad_s, limit_speed(2.0f * slower_rad_s2, room_rad, late_rad_s, fastest));
     float requested_rad_s2 = (requested_rad_s - before_rad_s) * ANSWER_PER_S;
     if (requested_rad_s == asked_rad_s) {
         requested_rad_s2 += path_rad_s2;
@@ -51,14 +51,13 @@ uint32_t governor_step(governor_state *reference, const setpoint_state *path, fl
     }
     const bool braking = requested_rad_s2 * before_rad_s < 0.0f;
     const float most_rad_s2 = braking && slower_rad_s2 > faster_rad_s2 ? slower_rad_s2 : faster_rad_s2;
-    const float held_rad_s2 = number_clamp(requested_rad_s2, -most_rad_s2, most_rad_s2);
-    const float step = config->jerk_rad_s3 * TICK_S;
+    const float held_rad_s2 = number_bound(requested_rad_s2, most_rad_s2);
     const float next_rad_s2 =
-        number_clamp(held_rad_s2, reference->acceleration_rad_s2 - step, reference->acceleration_rad_s2 + step);
+        number_towards(reference->acceleration_rad_s2, held_rad_s2, config->jerk_rad_s3 * TICK_S);
     if (next_rad_s2 != requested_rad_s2) {
         limited |= LIMITED_ACCELERATION;
     }
-    reference->speed_rad_s = number_clamp(before_rad_s + next_rad_s2 * TICK_S, -fastest, fastest);
+    reference->speed_rad_s = number_bound(before_rad_s + next_rad_s2 * TICK_S, fastest);
     reference->acceleration_rad_s2 = (reference->speed_rad_s - before_rad_s) * (float)TICKS_PER_S;
     const float reached_rad = before_rad + 0.5f * TICK_S * (before_rad_s + reference->speed_rad_s);
     reference->position_rad = number_clamp(reached_rad, low_rad, high_rad);

@@ -2,11 +2,13 @@
 
 #define FADE_S 0.4f           /* a gap fades with this time constant: what opens more slowly is not seen */
 #define PRIOR_VARIANCE 0.005625f /* of R and K over the configuration's: 0.075^2, so that three sigma of both cover 15 % */
-#define WANDER_VARIANCE 4e-7f /* by which each becomes less certain per window: windings get warm */
+#define WANDER_VARIANCE 6e-9f /* by which each becomes less certain per tick: windings get warm */
 #define SIGMAS 3.0f
 #define SCALE_LOW 0.8f        /* further off than so is no tolerance of a motor */
 #define SCALE_HIGH 1.25f
-#define WINDOW_TICKS 32u      /* over which R and K are learnt */
+#define WINDOW_TICKS 32u      /* over which R and K are learnt; while the reading rests, its noise is that of the ends, */
+#define REST_TICKS 256u       /* so that a longer window says more, */
+#define REST_NOISE_RAD 0.0035f /* but the motor may move within its backlash */
 #define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
 #define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
@@ -34,11 +36,15 @@ void motor_start(motor_state *motor, float angle_rad, uint32_t phase)
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
 static void learn(motor_state *motor, const motor_config *config, float angle_rad)
 {
-    const float per_tick = 1.0f / (float)WINDOW_TICKS;
+    const float ticks = (float)motor->window_ticks;
+    const float per_tick = 1.0f / ticks;
+    const float wander = WANDER_VARIANCE * ticks;
+    motor->variance_rr += motor->variance_rr < PRIOR_VARIANCE ? wander : 0.0f; /* also where the window is not believed */
     const float per_s = (float)TICKS_PER_S * per_tick;
     const float ir_v = motor->window_ir_v * per_tick;
     const float kw_v = config->constant_v_s * (angle_rad - motor->window_rad) * per_s;
-    const float noise_v = config->constant_v_s * WINDOW_NOISE_RAD * per_s;
+    const float noise_rad = motor->window_ticks > WINDOW_TICKS ? REST_NOISE_RAD : WINDOW_NOISE_RAD;
+    const float noise_v = config->constant_v_s * noise_rad * per_s;
     const float gain_r = motor->variance_rr * ir_v + motor->variance_rk * kw_v;
     const float gain_k = motor->variance_rk * ir_v + motor->variance_kk * kw_v;
     const float variance = ir_v * gain_r + kw_v * gain_k + noise_v * noise_v;
@@ -53,9 +59,9 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
         if (moved) { /* else the constant is only taken into account (Schmidt's form) */
             motor->constant_scale =
                 number_clamp(motor->constant_scale + gain_k * off_v * per_variance, SCALE_LOW, SCALE_HIGH);
-            motor->variance_kk += WANDER_VARIANCE - gain_k * gain_k * per_variance;
+            motor->variance_kk += wander - gain_k * gain_k * per_variance;
         }
-        motor->variance_rr += WANDER_VARIANCE - gain_r * gain_r * per_variance;
+        motor->variance_rr -= gain_r * gain_r * per_variance;
         motor->variance_rk -= gain_r * gain_k * per_variance;
     }
 }
@@ -73,7 +79,10 @@ static void window(motor_state *motor, const motor_config *config, float voltage
     motor->window_v += voltage_v;
     motor->window_ir_v += ir_v;
     motor->window_ticks++;
-    if (motor->window_ticks < WINDOW_TICKS) {
+    if (motor->window_ticks % WINDOW_TICKS != 0u) {
+        return;
+    }
+    if (motor->window_ticks < REST_TICKS && number_size(angle_rad - motor->window_rad) <= WINDOW_WAY_RAD) {
         return;
     }
     /* A gap that R and K may explain must be learnt from: else they would stay wrong for good. */
@@ -118,15 +127,15 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     const float emf_v = voltage_v - motor->resistance_scale * ir_v;
     motor->speed_rad_s = emf_v / (motor->constant_scale * config->constant_v_s);
     const float keep = 1.0f - TICK_S / FADE_S;
-    motor->gap_rad = keep * motor->gap_rad + moved_rad - motor->speed_rad_s * TICK_S;
-    motor->band_rad = keep * motor->band_rad +
-                      (motor->unsure_rad_s < UNKNOWN_RAD_S ? motor->unsure_rad_s * TICK_S : 0.0f);
-    motor->travel_rad += motor->speed_rad_s * TICK_S;
+    const float travelled_rad = motor->speed_rad_s * TICK_S;
+    motor->travel_rad += travelled_rad;
     const float seen_a = number_size(current_a);
     motor->current_a = seen_a > keep * motor->current_a ? seen_a : keep * motor->current_a;
     if ((motor->driven_ticks + motor->phase) % SAMPLE_TICKS == 0u || motor->unsure_rad_s == UNKNOWN_RAD_S) {
         sample(motor, config, ir_v, emf_v, angle_rad);
     }
+    motor->gap_rad = keep * motor->gap_rad + moved_rad - travelled_rad;
+    motor->band_rad = keep * motor->band_rad + motor->unsure_rad_s * TICK_S;
     window(motor, config, voltage_v, ir_v, angle_rad);
     const float size_rad_s = number_size(motor->speed_rad_s);
     const bool known = motor->current_a * config->resistance_ohm > DEAD_SHARE * config->constant_v_s * size_rad_s;
@@ -264,23 +273,18 @@ uint32_t motor_names(const motor_state *motor, const motor_config *config, uint3
 #define SWING_TICKS 60u   /* a swing of 8 Hz and faster changes its side as often */
 #define SWINGS 8u         /* so many changes are no answer to anything */
 #define SWING_RAD_S 0.3f  /* as far from the reference's speed at least */
-#define SWING_SHARE 0.2f  /* of the speed limit */
 
-bool motor_swings(motor_state *motor, float reference_rad_s, float speed_limit_rad_s)
+bool motor_swings_far(motor_state *motor, float off_rad_s)
 {
-    if (motor->known == 0u) {
-        motor->swings = 0u;
+    const int32_t side = off_rad_s > 0.0f ? 1 : -1;
+    if (motor->known == 0u || number_size(off_rad_s) <= SWING_RAD_S) {
+        motor->swings = motor->known == 0u ? 0u : motor->swings;
         return false;
     }
-    const float share_rad_s = SWING_SHARE * speed_limit_rad_s;
-    const float far_rad_s = share_rad_s > SWING_RAD_S ? share_rad_s : SWING_RAD_S;
-    const float off_rad_s = motor->speed_rad_s - reference_rad_s;
-    const int32_t side = off_rad_s > far_rad_s ? 1 : (off_rad_s < -far_rad_s ? -1 : 0);
-    motor->swing_ticks = number_count(motor->swing_ticks);
-    if (side != 0 && side != motor->swing_side) {
-        motor->swings = motor->swing_ticks <= SWING_TICKS ? motor->swings + 1u : 0u;
+    if (side != motor->swing_side) {
+        motor->swings = motor->driven_ticks - motor->swing_since <= SWING_TICKS ? motor->swings + 1u : 0u;
         motor->swing_side = side;
-        motor->swing_ticks = 0u;
+        motor->swing_since = motor->driven_ticks;
     }
     return motor->swings >= SWINGS;
 }
@@ -292,6 +296,6 @@ bool motor_is_fast(motor_state *motor, float reading_rad_s, float speed_limit_ra
 {
     const float fast_rad_s = FAST * speed_limit_rad_s;
     const bool fast = number_size(motor->speed_rad_s) > fast_rad_s && number_size(reading_rad_s) > speed_limit_rad_s;
-    motor->fast_ticks = fast ? number_count(motor->fast_ticks) : 0u;
+    motor->fast_ticks = fast ? number_add(motor->fast_ticks, WATCH_TICKS) : 0u;
     return motor->fast_ticks >= FAST_TICKS;
 }

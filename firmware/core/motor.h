@@ -40,11 +40,20 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
  * let go of changes its speed by itself: only then a reading that drifts can be distinguished from one that slips. */
 uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect);
 
-/* Return whether the motor swings about a reference that moves at reference_rad_s. */
-bool motor_swings(motor_state *motor, float reference_rad_s, float speed_limit_rad_s);
+#define MOTOR_SWING 0.2f /* of the speed limit: so far from the reference's speed a swing goes at least */
+
+/* Return whether the motor swings about its reference, from whose speed it is far off by off_rad_s. */
+bool motor_swings_far(motor_state *motor, float off_rad_s);
+
+/* Return whether the motor swings about a reference that moves at reference_rad_s. To be asked each tick. */
+static inline bool motor_swings(motor_state *motor, float reference_rad_s, float speed_limit_rad_s)
+{
+    const float off_rad_s = motor->speed_rad_s - reference_rad_s;
+    return number_size(off_rad_s) > MOTOR_SWING * speed_limit_rad_s && motor_swings_far(motor, off_rad_s);
+}
 
 /* Return whether the joint has been faster than its limit (rad/s) long enough to be sure; fast_rad_s is what the reading
- * says of it. */
+ * says of it. To be asked each WATCH_TICKS. */
 bool motor_is_fast(motor_state *motor, float reading_rad_s, float speed_limit_rad_s);
 
 #endif

@@ -1,7 +1,11 @@
 #include "pid.h"
 
+#include "motor.h"
 #include "number.h"
 
+#define INLINE static inline __attribute__((always_inline))
+#define BEYOND 2.0f       /* so much more is a speed damped beyond its limit */
+#define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up */
 #define CREEP_RAD_S 0.005f /* from here on dry friction is compensated by half and more */
 
 void pid_reset(pid_state *pid, float measured_rad)
@@ -18,14 +22,13 @@ void pid_measure(pid_state *pid, const joint_gains *gains, float measured_rad)
 }
 
 /* Return the duty asked for held to the limits, and say which of them held it. */
-static float limited_duty(const pid_state *pid, const pid_demand *demand, float asked, uint32_t *limited)
+INLINE float limited_duty(const pid_state *pid, const pid_demand *demand, float asked, uint32_t *limited)
 {
     const float within = number_clamp(asked, demand->duty_low, demand->duty_high);
     if (within != asked) {
         *limited |= number_size(within) < demand->duty_limit ? LIMITED_CURRENT : LIMITED_DUTY;
     }
-    const float step = demand->duty_slew_per_s * TICK_S;
-    const float reached = number_clamp(within, pid->duty - step, pid->duty + step);
+    const float reached = number_towards(pid->duty, within, demand->duty_slew_per_s * TICK_S);
     if (reached != within) {
         *limited |= LIMITED_SLEW;
     }
@@ -35,12 +38,13 @@ static float limited_duty(const pid_state *pid, const pid_demand *demand, float 
 /* Return a direction, -1 to 1, without a jump where it changes. */
 static float direction_of(float speed_rad_s) { return speed_rad_s / (number_size(speed_rad_s) + CREEP_RAD_S); }
 
-float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *demand, uint32_t *limited)
+/* The law; inline, so that pid_control needs no demand in memory. */
+INLINE float step(pid_state *pid, const joint_gains *gains, const pid_demand *demand, uint32_t *limited)
 {
     const float error_rad = demand->reference_rad - pid->measured_rad;
     /* However far the reference is away: the joint is not driven to it faster than its speed limit. */
     const float requested = gains->kp_per_rad * error_rad + gains->kv_s_per_rad * demand->reference_rad_s;
-    const float spring = number_clamp(requested, -demand->spring_limit, demand->spring_limit);
+    const float spring = number_bound(requested, demand->spring_limit);
     const float gathered_rad = spring == requested ? error_rad : 0.0f; /* nor does the integral make it faster */
     const float forward = gains->ka_s2_per_rad * demand->reference_rad_s2 +
                           gains->kf_duty * direction_of(demand->reference_rad_s) + demand->gravity_duty;
@@ -55,7 +59,7 @@ float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *deman
         /* Nothing feeds the integral: what a change of gains left in it fades. */
         integral -= TICK_S * gains->anti_windup_per_s * integral;
     }
-    pid->integral_duty = number_clamp(integral, -demand->duty_limit, demand->duty_limit);
+    pid->integral_duty = number_bound(integral, demand->duty_limit);
     if (pid->integral_duty != integral) {
         *limited |= LIMITED_DUTY;
     }
@@ -64,6 +68,59 @@ float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *deman
     pid->reference_rad_s = demand->reference_rad_s;
     pid->reference_rad_s2 = demand->reference_rad_s2;
     return duty;
+}
+
+float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *demand, uint32_t *limited)
+{
+    return step(pid, gains, demand, limited);
+}
+
+/* Return the duty of kp and kv that moves a free joint at its speed limit and a little more: what back-EMF (own_s_per_rad)
+ * and damping take there. Without a known motor nothing bounds it. */
+static float spring_limit(const joint_config *config, float own_s_per_rad)
+{
+    if (config->motor.resistance_ohm <= 0.0f) {
+        return FLT_MAX;
+    }
+    return SPARE_SPEED * config->speed_limit_rad_s * (config->gains.kd_s_per_rad + own_s_per_rad);
+}
+
+void pid_control(joint_state *joint, const joint_config *config, float per_nominal_v)
+{
+    if (joint->gravity_duty != joint->gravity_asked) {
+        joint->gravity_duty =
+            number_towards(joint->gravity_duty, joint->gravity_asked, config->gravity_slew_per_s * TICK_S);
+    }
+    if (joint->over_a > 0.0f || joint->duty_cap != config->duty_limit) {
+        const float cut_duty = config->current_cut_per_a_s * joint->over_a * TICK_S;
+        joint->duty_cap = number_clamp(joint->duty_cap - cut_duty, 0.0f, config->duty_limit);
+    }
+    float duty_low = -joint->duty_cap;
+    float duty_high = joint->duty_cap;
+    const float own_s_per_rad = config->motor.constant_v_s * per_nominal_v;
+    const float free_duty = config->speed_limit_rad_s * own_s_per_rad;
+    if (joint->motor.sure_rad_s > config->speed_limit_rad_s && joint->duty_cap > free_duty) {
+        if (joint->motor.speed_rad_s > 0.0f) { /* it is driven on as a free motor at its limit, and braked by all there is */
+            duty_high = free_duty;
+        } else {
+            duty_low = -free_duty;
+        }
+        joint->limited |= LIMITED_SPEED;
+    }
+    const float seen_rad_s = motor_witness(&joint->motor, joint->pid.speed_rad_s, config->speed_limit_rad_s);
+    const float beyond_rad_s = number_size(seen_rad_s) - config->speed_limit_rad_s;
+    const float more_rad_s = beyond_rad_s > 0.0f ? BEYOND * beyond_rad_s : 0.0f;
+    const pid_demand demand = {.reference_rad = joint->reference.position_rad,
+                               .reference_rad_s = joint->reference.speed_rad_s,
+                               .reference_rad_s2 = joint->reference.acceleration_rad_s2,
+                               .damped_rad_s = seen_rad_s + (seen_rad_s > 0.0f ? more_rad_s : -more_rad_s),
+                               .spring_limit = spring_limit(config, own_s_per_rad),
+                               .gravity_duty = joint->gravity_duty,
+                               .duty_limit = config->duty_limit,
+                               .duty_low = duty_low,
+                               .duty_high = duty_high,
+                               .duty_slew_per_s = config->duty_slew_per_s};
+    (void)step(&joint->pid, &config->gains, &demand, &joint->limited);
 }
 
 void pid_change_gains(pid_state *pid, const joint_gains *before, const joint_gains *after)

@@ -16,6 +16,10 @@ void pid_measure(pid_state *pid, const joint_gains *gains, float measured_rad);
 /* Compute this tick's duty (-duty_limit to duty_limit) from the last measurement; sets LIMITED_... bits in *limited. */
 float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *demand, uint32_t *limited);
 
+/* Compute a joint's duty of this tick within what its limits, a speed beyond its limit and the host's gravity duty leave;
+ * per_nominal_v: 1 / nominal supply. */
+void pid_control(joint_state *joint, const joint_config *config, float per_nominal_v);
+
 /* Move what a change of gains would add to the output into the integral, so that the output does not jump. */
 void pid_change_gains(pid_state *pid, const joint_gains *before, const joint_gains *after);
 

@@ -16,6 +16,7 @@ float pot_angle(const pot_config *config, uint32_t counts)
 
 uint32_t pot_read(pot_state *pot, const pot_config *config, uint32_t counts, uint32_t confirm_ticks)
 {
+    pot->alive |= counts ^ pot->counts;
     pot->counts = counts;
     const float angle_rad = pot_angle(config, counts);
     /* The longer the last good reading is ago, the further the joint may have moved. */
@@ -56,8 +57,8 @@ void pot_watch(pot_state *pot, float reference_rad)
 
 bool pot_is_frozen(pot_state *pot, const pot_config *config, float reference_rad)
 {
-    if (pot->counts != pot->last_counts) {
-        pot->last_counts = pot->counts;
+    if (pot->alive != 0u) {
+        pot->alive = 0u;
         pot->mark_rad = reference_rad;
     }
     return number_size(reference_rad - pot->mark_rad) > config->frozen_rad;

@@ -188,8 +188,8 @@ void safety_watch_arm(core_state *core, const core_inputs *inputs)
     }
 }
 
-/* Return the count of ticks in a row in which something holds. */
-static uint32_t in_a_row(uint32_t ticks, bool holds) { return holds ? number_count(ticks) : 0u; }
+/* Return the count of ticks in a row in which something holds, looked at each WATCH_TICKS. */
+static uint32_t in_a_row(uint32_t ticks, bool holds) { return holds ? number_add(ticks, WATCH_TICKS) : 0u; }
 
 /* Return for how many ticks the joint has been driven hard without rotating. Travel is looked at, not speed: the noise
  * of a potentiometer is a speed, but it leads nowhere. */
@@ -236,10 +236,6 @@ static void watch_motor(core_state *core, joint_state *joint, const joint_config
         joint->suspect_ticks = 0u;
         return;
     }
-    if (motor_swings(motor, joint->reference.speed_rad_s, config->speed_limit_rad_s)) {
-        safety_raise(core, FAULT_OSCILLATION, i);
-        take_back_gains(core, joint, i);
-    }
     if (motor_is_fast(motor, joint->pid.speed_rad_s, config->speed_limit_rad_s)) {
         safety_raise(core, FAULT_OVERSPEED, i);
     }
@@ -253,7 +249,8 @@ static void watch_motor(core_state *core, joint_state *joint, const joint_config
 /* Give a fault of a joint that was let go of its right name, once the motion since then shows it. */
 static void name_suspect(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
-    if (joint->suspect == FAULT_NONE || ++joint->suspect_ticks < NAME_TICKS) {
+    joint->suspect_ticks = in_a_row(joint->suspect_ticks, joint->suspect != FAULT_NONE);
+    if (joint->suspect_ticks < NAME_TICKS) {
         return;
     }
     const uint32_t suspect = joint->suspect;
@@ -272,7 +269,7 @@ static void name_suspect(core_state *core, joint_state *joint, const joint_confi
     }
 }
 
-void safety_watch_joint(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
+static void watch_joint(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
     if (joint->released != 0u) {
         name_suspect(core, joint, config, i);
@@ -296,5 +293,20 @@ void safety_watch_joint(core_state *core, joint_state *joint, const joint_config
     joint->following_ticks = in_a_row(joint->following_ticks, off_rad > config->following_rad);
     if (joint->following_ticks >= core->config.following_ticks) {
         safety_raise(core, FAULT_FOLLOWING, i);
+    }
+}
+
+void safety_watch_joints(core_state *core)
+{
+    for (uint32_t i = core->tick % WATCH_TICKS; i < core->config.joint_count; i += WATCH_TICKS) {
+        watch_joint(core, &core->joint[i], &core->config.joint[i], i);
+    }
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) { /* what swings may do so at every tick */
+        joint_state *joint = &core->joint[i];
+        const float limit_rad_s = core->config.joint[i].speed_limit_rad_s;
+        if (joint->released == 0u && motor_swings(&joint->motor, joint->reference.speed_rad_s, limit_rad_s)) {
+            safety_raise(core, FAULT_OSCILLATION, i);
+            take_back_gains(core, joint, i);
+        }
     }
 }

@@ -32,8 +32,8 @@ void safety_forget(core_state *core);
 /* Watch the tick timer, the memory, the supply and, while the arm follows the host, the host's silence. */
 void safety_watch_arm(core_state *core, const core_inputs *inputs);
 
-/* Watch a driven joint, number i (0 to 5), after its duty is known. */
-void safety_watch_joint(core_state *core, joint_state *joint, const joint_config *config, uint32_t i);
+/* Watch the driven joints whose turn it is, every one each WATCH_TICKS, after their duties are known. */
+void safety_watch_joints(core_state *core);
 
 /* Begin the watch over the configuration in use from its first byte; known: its CRC is still the one it had. */
 void safety_changed_config(core_state *core, bool known);

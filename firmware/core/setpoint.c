@@ -64,8 +64,7 @@ float setpoint_advance(setpoint_state *setpoint)
 
 bool setpoint_slow(setpoint_state *setpoint, float deceleration_rad_s2)
 {
-    const float step = deceleration_rad_s2 * TICK_S;
-    setpoint->speed_rad_s -= number_clamp(setpoint->speed_rad_s, -step, step);
+    setpoint->speed_rad_s = number_towards(setpoint->speed_rad_s, 0.0f, deceleration_rad_s2 * TICK_S);
     setpoint->position_rad += setpoint->speed_rad_s * TICK_S;
     if (setpoint->speed_rad_s != 0.0f) {
         return false;

@@ -15,6 +15,7 @@
 #define TICKS_PER_S 1000u
 #define TICK_S 0.001f
 #define NO_JOINT 255u
+#define WATCH_TICKS 3u /* each joint is watched every third tick, a third of them in each: so no tick is long */
 
 /* X(name, code, reaction, text): the faults. A fault latches; docs/reference/firmware.md says when each comes. */
 #define FAULT_LIST(X)                                                                                 \
@@ -338,7 +339,7 @@ typedef struct motor_state {
     float sample_motor_rad[MOTOR_SAMPLES];
     float agreed_rad;        /* the motor's way on which the reading went along */
     int32_t swing_side;      /* which side of the reference's speed the motor's was on last */
-    uint32_t swing_ticks;    /* since it changed */
+    uint32_t swing_since;    /* driven_ticks when it changed */
     uint32_t swings;         /* changes in quick succession */
     uint32_t fast_ticks;     /* faster than the limit, in a row */
     uint32_t current_ticks;  /* beyond twice the current limit, in a row */
@@ -350,8 +351,8 @@ typedef struct motor_state {
 typedef struct pot_state {
     uint32_t valid;        /* not 0 once a reading was within its band */
     uint32_t bad_ticks;    /* implausible readings in a row */
-    uint32_t counts;       /* this tick's, and */
-    uint32_t last_counts;  /* those since which the reference has moved */
+    uint32_t counts;       /* this tick's */
+    uint32_t alive;        /* not 0: they have changed since mark_rad was set */
     float angle_rad;       /* the last plausible one */
     float mark_rad;        /* where the reference was when the counts last changed */
     int32_t towards;       /* which way the joint is driven to its command, 0 while it is braked */
