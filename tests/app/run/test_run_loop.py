@@ -23,6 +23,7 @@ from armsight.app.run.record import Log, RunSegment
 from armsight.app.run.setup import Setup
 from armsight.data import JointStates, Missed, Shot
 from armsight.errors import ArmsightError, CalibrationError, DeviceError, InputError
+from armsight.geometry.pose import pose
 from armsight.loop.estimators import Delay, KalmanEstimator
 from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.codes import BoardState
@@ -30,7 +31,7 @@ from armsight.robot.trajectories import point_to_point
 
 ARM = open_arm("six_r")
 #: A rig of which nothing is known, so that nothing can be tested.
-UNKNOWN = SimpleNamespace(cov=np.zeros((30, 30)), shutters=None)
+UNKNOWN = SimpleNamespace(cov=np.zeros((30, 30)), shutters=None, T_left_right=pose(np.eye(3), [0.2, 0.0, 0.0]))
 
 
 class Standing:
