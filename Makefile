@@ -4,6 +4,10 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 # The environment's Python with OpenCV 4, which lies in a folder of its own, before the newer one.
 OPENCV4 := PYTHONPATH=$(abspath $(VENV)/opencv4) $(BIN)/python
+# pip writes no bytecode where it builds the package (13 s of a processor): most of it is never imported.
+export PIP_COMPILE := 0
+# As the commands set it: OpenBLAS's threads wait for each other at every small matrix, which tests in parallel pay for.
+export OPENBLAS_NUM_THREADS ?= 1
 # A file is one worker's; files in their order, which begins with the longest.
 PARALLEL := -n 3 --dist=loadfile --no-loadscope-reorder
 
@@ -34,7 +38,7 @@ bench: $(VENV)/.armsight-test  ## every figure, peers beside; real recordings ar
 # The firmware is built with the package, with zig from PyPI; ARMSIGHT_FIRMWARE_COMPILER=gcc asks for arm-none-eabi-gcc.
 $(VENV)/.armsight: pyproject.toml setup.py $(shell find firmware -type f)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[sim,record]"
+	$(BIN)/python -m pip install --quiet --compile --disable-pip-version-check -e ".[sim,record]"
 	touch $@
 
 $(VENV)/.armsight-test: pyproject.toml setup.py $(shell find firmware -type f)

@@ -59,19 +59,18 @@ class Arrow(Record):
     def of(A: Array, B: Array, r: Array, shot: Ids, shot_count: int, cost: float) -> Arrow:
         """Assemble from whitened residuals r (N, 2), their derivatives A (N, 2, Q), B (N, 2, K) and shots (N,), sorted."""
         q, k = A.shape[2], B.shape[2]
-        H_cross, H_shots, g_shots = (
-            np.zeros((shot_count, k, q)),
-            np.zeros((shot_count, k, k)),
-            np.zeros((shot_count, k)),
-        )
-        bounds = np.searchsorted(shot, np.arange(shot_count + 1))
-        for j in range(shot_count):
-            rows = slice(bounds[j], bounds[j + 1])
-            m = 2 * (bounds[j + 1] - bounds[j])
-            a, b, e = A[rows].reshape(m, q), B[rows].reshape(m, k), r[rows].reshape(m)
-            H_cross[j], H_shots[j], g_shots[j] = b.T @ a, b.T @ b, b.T @ e
-        flat = A.reshape(2 * len(A), q)
-        return Arrow(flat.T @ flat, H_cross, H_shots, flat.T @ r.reshape(-1), g_shots, cost)
+        counts = np.bincount(shot, minlength=shot_count)
+        most = int(counts.max(initial=0))
+        if most * shot_count > len(shot):  # shots of unequal size are filled up with zeros: their products come at once
+            rows = np.arange(len(shot)) + np.repeat(np.arange(shot_count) * most - np.cumsum(counts) + counts, counts)
+            full = [np.zeros((shot_count * most, *each.shape[1:])) for each in (A, B, r)]
+            for each, given in zip(full, (A, B, r), strict=True):
+                each[rows] = given
+            A, B, r = full
+        a, b = A.reshape(shot_count, 2 * most, q), B.reshape(shot_count, 2 * most, k).transpose(0, 2, 1)
+        flat, e = A.reshape(2 * len(A), q), r.reshape(-1)
+        g_shots = (b @ e.reshape(shot_count, 2 * most, 1))[..., 0]
+        return Arrow(flat.T @ flat, b @ a, b @ b.transpose(0, 2, 1), flat.T @ e, g_shots, cost)
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Solve for the shared step (Q,) and the shots' steps (S, K) with Marquardt's damping."""

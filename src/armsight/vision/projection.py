@@ -164,46 +164,78 @@ class BundleModel(Record):
         return np.asarray(self.points + np.tensordot(shape, self.modes, axes=1))
 
 
+@kernel(nogil=True)
+def _cross(a: Array, b: Array, out: Array) -> None:
+    """Write the cross product of a and b (3,) into out."""
+    out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@kernel(nogil=True)
+def _by(row: Array, M: Array, out: Array) -> None:
+    """Write a row (3,) times a matrix (3, 3) into out."""
+    for c in range(3):
+        out[c] = row[0] * M[0, c] + row[1] * M[1, c] + row[2] * M[2, c]
+
+
 @kernel(
-    "i8[::1], i8, f8[:, :, ::1], i8, f8[:, :, ::1], f8[:, :, ::1], i8[::1], const f8[:, :, ::1], f8[:, :, ::1]",
-    "i8[::1], i8, f8[:, :, :], i8, f8[:, :, ::1], f8[:, :, ::1], i8[::1], const f8[:, :, ::1], f8[:, :, ::1]",
+    "i8[::1], (i8, i8), (f8[:, :, ::1], f8[:, :, :], f8[:, :, ::1]), (f8[:, ::1], f8[:, ::1], f8[:, ::1]), "
+    "(f8[:, :, :], f8[:, :, :], f8[:, :, :]), i8[::1], const f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1]",
+    nogil=True,
 )
 def _fill(
     rows: NDArray[np.intp],
-    start: int,
-    J_k: Array,
-    rig: int,
-    by_rig: Array,
-    by_point: Array,
+    columns: tuple[int, int],
+    Js: tuple[Array, Array, Array],
+    ps: tuple[Array, Array, Array],
+    Rs: tuple[Array, Array, Array],
     points: Ids,
     modes: Array,
-    J: Array,
+    J_shared: Array,
+    J_shot: Array,
 ) -> None:
-    """Write one camera's rows of the derivative J (N, 2, Q), zero before, by the shared parameters.
+    """Write one camera's rows of both derivatives of :func:`predict`, zero before: the chain rule, row by row.
 
     Args:
         rows: (n,) which rows.
-        start: column of the camera's first parameter.
-        J_k: (n, 2, c) derivative by the camera's parameters.
-        rig: column of the relative pose.
-        by_rig: (n, 2, 6) derivative by it; (0, 2, 6) for the left camera.
-        by_point: (n, 2, 3) derivative by the body's points.
+        columns: of the camera's first parameter, of the relative pose; below zero for the left camera, which has none.
+        Js: derivatives by the point (n, 2, 3), by the camera's parameters (n, 2, c), by the disc's normal (n or 0, 2, 3).
+        ps: the point in the camera's frame (n, 3), in the body's frame (n, 3) and from its middle (n, 3), m.
+        Rs: (n, 3, 3) rotations to the camera's frame of the body as it stood, and as it has moved; right Jacobians of
+            its motion; (0, 3, 3) where it stood still.
         points: (n,) which points.
         modes: (M, 3, K) the shape's modes by point.
-        J: to be written.
+        J_shared: to be written.
+        J_shot: to be written.
     """
+    start, rig = columns
+    J_p, J_k, J_normal = Js
+    side, by_body, by_point, normal, tilt = np.empty(3), np.empty(3), np.empty(3), np.zeros(3), np.zeros(3)
+    first = abs(rig)
     for n in range(rows.size):
         mode = modes[points[n]]
         for i in range(2):
-            row = J[rows[n], i]
+            shared, own = J_shared[rows[n], i], J_shot[rows[n], i]
             for k in range(J_k.shape[2]):
-                row[start + k] = J_k[n, i, k]
-            if by_rig.shape[0]:
-                for k in range(6):
-                    row[rig + k] = by_rig[n, i, k]
-            x, y, z = by_point[n, i, 0], by_point[n, i, 1], by_point[n, i, 2]
+                shared[start + k] = J_k[n, i, k]
+            _by(J_p[n, i], Rs[0][n], by_body)
+            _by(J_p[n, i], Rs[1][n], by_point)
+            if J_normal.shape[0]:
+                _cross(J_normal[n, i], Rs[1][n, :, 2], normal)
+                _by(normal, Rs[0][n], tilt)
+            _cross(ps[1][n], by_body, side)
+            for c in range(3):
+                own[c], own[3 + c] = by_body[c], side[c] - tilt[c]
+            if rig >= 0:
+                _cross(J_p[n, i], ps[0][n], side)
+                for c in range(3):
+                    shared[rig + c], shared[rig + 3 + c] = -J_p[n, i, c], side[c] + normal[c]
+                if Rs[2].shape[0]:
+                    _cross(ps[2][n], by_point, side)
+                    _by(side, Rs[2][n], own[9:])
+                    for c in range(3):
+                        own[6 + c] = by_body[c]
             for k in range(mode.shape[1]):
-                row[rig + 6 + k] = x * mode[0, k] + y * mode[1, k] + z * mode[2, k]
+                shared[first + 6 + k] = by_point[0] * mode[0, k] + by_point[1] * mode[1, k] + by_point[2] * mode[2, k]
 
 
 def predict(model: BundleModel, state: BundleState, observations: Observations) -> tuple[Array, Array, Array]:
@@ -225,36 +257,35 @@ def predict(model: BundleModel, state: BundleState, observations: Observations) 
     J_shared, J_shot = np.zeros((len(uv), 2, count)), np.zeros((len(uv), 2, 12 if len(state.motions) else 6))
     body, middle = model.body(state.shape), model.points.mean(axis=0)
     modes = np.ascontiguousarray(model.modes.transpose(1, 2, 0))
-    T_right_left = inverse(state.T_left_right)
+    moves, still = len(state.motions) > 0, np.zeros((0, 3, 3))
     for side, camera in enumerate(state.cameras):
-        rows = observations.camera == side
+        rows = np.flatnonzero(observations.camera == side)
         points, shots = observations.point[rows], observations.shot[rows]
-        T = state.Ts_left_body[shots]
-        T = T if side == 0 else T_right_left @ T
-        p_body, by_body = body[points], T[:, :3, :3]
-        by_point = by_body
-        if side == 1 and len(state.motions):
-            arm = p_body - middle
-            R = exp_so3(np.array(state.motions[:, 3:]))[shots]
-            p_body = (R @ arm[..., None])[..., 0] + middle + state.motions[shots, :3]
-            by_point = by_body @ R
+        Ts = state.Ts_left_body if side == 0 else inverse(state.T_left_right) @ state.Ts_left_body
+        T, p_body = Ts[shots], body[points]
+        by_body = by_point = T[:, :3, :3]
+        arm, turned = p_body - middle, still
+        if side == 1 and moves:
+            Rs = exp_so3(np.array(state.motions[:, 3:]))
+            p_body = (Rs[shots] @ arm[..., None])[..., 0] + middle + state.motions[shots, :3]
+            by_point, turned = (Ts[:, :3, :3] @ Rs)[shots], _right_jacobians(state.motions[:, 3:])[shots]
         p = transform(T, p_body)
         uv[rows], J_p, J_k = camera.project_jacobians(p)
-        by_normal, normals = np.zeros((0, 2, 3)), by_point[:, :, 2]
+        J_normal = np.zeros((0, 2, 3))
         if model.disc_radius_m > 0:
-            uv[rows], J_p, by_normal = _ellipses(camera, p, normals, model.disc_radius_m, uv[rows], J_p)
-            by_tilt = by_normal @ skew(normals) @ by_body
-        by_body, by_point = J_p @ by_body, J_p @ by_point
-        J_shot[rows, :, :6] = np.concatenate([by_body, -by_body @ skew(p_body)], axis=2)
-        if side == 1 and len(state.motions):
-            by_rotation = -by_point @ skew(arm) @ _right_jacobians(state.motions[:, 3:])[shots]
-            J_shot[rows, :, 6:] = np.concatenate([by_body, by_rotation], axis=2)
-        start = 0 if side == 0 else sizes[0]
-        by_rig = np.concatenate([-J_p, J_p @ skew(p)], axis=2) if side == 1 else np.zeros((0, 2, 6))
-        if len(by_normal):
-            J_shot[rows, :, 3:6] -= by_tilt
-            by_rig[:, :, 3:] += by_normal[: len(by_rig)] @ skew(normals[: len(by_rig)])
-        _fill(np.flatnonzero(rows), start, J_k, n_cameras, by_rig, by_point, points, modes, J_shared)
+            uv[rows], J_p, J_normal = _ellipses(camera, p, by_point[:, :, 2], model.disc_radius_m, uv[rows], J_p)
+        columns = (0, -n_cameras) if side == 0 else (sizes[0], n_cameras)
+        _fill(
+            rows,
+            columns,
+            (J_p, J_k, J_normal),
+            (p, p_body, arm),
+            (by_body, by_point, turned),
+            points,
+            modes,
+            J_shared,
+            J_shot,
+        )
     return uv, J_shared, J_shot
 
 
