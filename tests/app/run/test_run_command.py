@@ -84,6 +84,12 @@ def test_a_rig_that_was_never_calibrated(armsight, files, tmp_path):
     assert_rejected(said, "half.json")
 
 
+def test_a_rig_that_cannot_be_followed(armsight, files, tmp_path):
+    said = armsight(*arguments(files, tmp_path / "run", "--follow-rig"))  # the true rig, without covariance
+    assert_rejected(said, "--follow-rig", "rig.json has no covariance")
+    assert not (tmp_path / "run").exists()
+
+
 def test_another_arm_than_the_boards(armsight, files, tmp_path):
     (tmp_path / "far.toml").write_text("start_deg = [40, 0, 0, 0, -90, 0]\n" + MOTION)
     said = armsight(*arguments(files, tmp_path / "run", "--motion", tmp_path / "far.toml"))

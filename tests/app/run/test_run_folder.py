@@ -51,6 +51,7 @@ def test_what_is_not_known_is_null(tmp_path):
         "version",
         "health",
         "fixed_unseen",
+        "rig_corrections",
         "arm",
         "sigma_m",
         "values",

@@ -35,12 +35,12 @@ def test_cameras_that_rotate_in_mid_run_are_put_right():
         poses.append((t_s, estimate))
         if found is None:
             rig = RigFollower(monitor._rig._rig, faults.BODY) if len(poses) == 1 else rig
-            watch = monitor.cameras_moved() if len(poses) % 15 == 0 else None
+            watch = monitor.cameras_moved() if len(poses) % 30 == 0 else None
             since_s = None if watch is None else watch.moved_since_s()
             found = None if since_s is None else rig.cameras(since_s, poses, t_s)
             if found is not None:
                 monitor.put_right(found)
-        elif len(poses) % 5 == 0:
+        elif len(poses) % 8 == 0:
             again = faults.measured(found.update.rig, faults.BODY, T, estimate.points.seen.uv)
             off = log_se3(inverse(again.T_left_body) @ T)
             squares.append(off @ np.linalg.solve(again.cov, off))

@@ -99,8 +99,8 @@ def require_followed(rig: StereoRig, path: Path) -> None:
     """Reject a rig that cannot be followed, as its file does not say how well it is known."""
     if not rig.cov.any():
         raise InputError(
-            f"--follow-rig: {path} has no covariance, so that a rig that moved cannot be told from one that was never well "
-            "known: calibrate it (armsight calibrate), or leave out --follow-rig"
+            f"--follow-rig: {path} has no covariance, so that a rig that moved cannot be distinguished from one that was "
+            "never well known: calibrate it (armsight calibrate), or leave out --follow-rig"
         )
 
 

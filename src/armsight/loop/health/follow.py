@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 #: What is not known of a change of the cameras may be this share of what is not known of their calibration.
 SHARE = 0.5
-#: Most shots of an update; and by how much their number must have grown since an update that was rejected.
+#: Most shots of an update; and how many times as many there must be as in an update that was rejected.
 _MOST_SHOTS, _MORE = 60, 1.25
 #: Largest standard deviation of the tool's position by what is put right of the rig, m; and by how much what else may have
-#: moved may place the tool elsewhere, m.
+#: moved may displace the tool further, m.
 MOST_SIGMA_M, MOST_APART_M = 2e-4, 2e-4
 
 Poses = Callable[[], Sequence[tuple[float, PoseEstimate]]]

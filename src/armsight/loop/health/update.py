@@ -43,7 +43,7 @@ _GATES_PX, _NOISE_PX = (20.0, 2.0, 0.0, 0.0), 0.1
 #: A rotation about the baseline's normal hardly changes epipolar distances: chance makes them so many times larger at most.
 _WORSE = 1.2
 #: In so many shots at most the uncertainty of the body is computed.
-_JUDGED = 12
+_SIZED = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ def updated_rig(
         noise_px *= float(np.sqrt(_left(sums, step - so_far) / max(sums.freedom, 1.0)))
         new, cov = rig.perturbed(step[:count]), whole[:count, :count]
     new = replace(new, cov=(cov + cov.T) / 2)
-    some = shots[:: -(-len(shots) // _JUDGED)]
+    some = shots[:: -(-len(shots) // _SIZED)]
     now, then = (_position_sigma(each, body, some) for each in (new, replace(new, cov=rig.cov)))
     return _checked(rig, new, body, found, (stays, (now, then)))
 
