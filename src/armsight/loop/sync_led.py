@@ -49,6 +49,8 @@ _POWERS, _PASSES, _STEPS, _STARTS = 3, 4, 12, 3
 _TUKEY, _HIDDEN = 6.0, 0.3
 #: Fewest images with an edge of the code: the others say nothing of the time.
 _EDGES = 16
+#: So short an exposure, over a bit of the code, that the edges within exposures are few.
+_SHORT = 0.25
 #: How well the LED's edges are at the board's ticks: interrupts that come before, s.
 _EDGE_S = 1e-5
 #: Stamps that scatter by more than this share of the period do not count images.
@@ -209,7 +211,11 @@ def find_exposures(seen: Brightness, bit_s: float, *, near: tuple[float, float] 
     J = fit.jacobian
     H, weighted = J.T @ J, fit.residual * tukey / sigma
     edges = int(np.sum((fit.slope != 0) & (tukey > 0)))
-    if edges < _EDGES or np.linalg.cond(H / np.sqrt(np.outer(np.diag(H), np.diag(H)))) > 1e10:
+    if (
+        edges < _EDGES
+        or fit.theta[2] < _SHORT * bit_s
+        or np.linalg.cond(H / np.sqrt(np.outer(np.diag(H), np.diag(H)))) > 1e10
+    ):
         return Missed(
             f"edges of the LED's code fall into {edges} of {len(n)} exposures, {_EDGES} at least are needed: set"
             f" sync_led_ticks to about the exposure, {1e3 * fit.theta[2]:.1f} ms"

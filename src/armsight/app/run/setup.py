@@ -205,7 +205,7 @@ def sync_led_bit_s(board: MotionBoard, name: str) -> float:
     config = board.configuration()
     if not config["sync_led_pin"]:
         raise InputError(
-            f"--sync-led: {name} drives no LED: choose its pin with armsight board config set 'arm.sync_led_pin=\"PB13\"',"
+            f"--sync-led: {name} drives no LED: choose its pin with armsight board config set arm.sync_led_pin=PB13,"
             " and start the board anew"
         )
     return int(config["sync_led_ticks"]) / board.welcome.ticks_per_s

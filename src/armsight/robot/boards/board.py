@@ -245,8 +245,9 @@ _LONGEST_TICKS = 10000
 _STOPS = 3
 _STORE_S = 3.0  # a flash memory takes its time
 _PART = 200  # bytes of a CONFIG_PART
-assert CONFIG.fields is not None
-_SILENCE_AT = CONFIG.fields["silence_ticks"][1]  # bytes; silence_reaction follows
+_FIELDS = CONFIG.fields
+assert _FIELDS is not None
+_SILENCE_AT: int = _FIELDS["silence_ticks"][1]  # bytes; silence_reaction follows
 _SET_MESSAGE_INTERVAL, _REBOOT = 511, 246  # MAV_CMD_
 _SLOW_ANGLES_US = 20000
 
