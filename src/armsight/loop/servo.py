@@ -42,8 +42,9 @@ CROSS_S, CROSS_M = 0.3, 3e-5
 #: most while there is none; a change is made where it lowers the error by this share of the largest displacement that one
 #: step of one joint makes: less would hunt.
 LOOK_S, LOOK_MOST_S, WORTH_STEPS = 0.25, 1.0, 0.25
-#: Backlash that a joint must be taken through before it displaces the tool is known to this share of itself.
-GAP_SHARE = 0.5
+#: Backlash that a joint must be taken through before it displaces the tool is known to the first share of itself, and how
+#: much a joint then displaces the tool to the second: the Jacobian is that of the table, not of the arm.
+GAP_SHARE, MOVE_SHARE = 0.5, 0.02
 #: In a choice between whole steps an error of 1 rad counts as much as one of this, m.
 STEP_LEVER_M = 0.05
 #: How fast the servo learns by how much joints rest off their commands, s; that changes with the load from pose to pose.
@@ -435,9 +436,9 @@ def whole_steps(J: Array, requested: Array, steps: Array, gaps: Array | None = N
     """Return the whole steps that displace the tool most nearly as requested angles would; none where that gains little.
 
     The nearest combination, not each joint rounded: steps of several joints make up for each other. It is a local minimum
-    of the search over one joint or two by one step (the nearest point of a lattice: Babai, 1986), from the rounded angles
-    and from none. A joint that is first to be taken through backlash displaces the tool by what its steps leave of that,
-    and by less or more as far as the backlash is not known (GAP_SHARE): a joint that moves on needs no such thing.
+    of the search over one joint or two by one step (the nearest point of a lattice: Babai, 1986), from rounded angles and
+    from none. A joint that is first to be taken through backlash displaces the tool by what its steps leave of that. What
+    is not known of backlash and displacement counts as error: joints that move on, and short ways, are preferred.
 
     Args:
         J: (6, n) Jacobian, m/rad and rad/rad.
@@ -453,20 +454,24 @@ def whole_steps(J: Array, requested: Array, steps: Array, gaps: Array | None = N
     lever, whole = np.repeat([1.0, STEP_LEVER_M], 3)[:, None] * J, steps > 0
     by = np.where(whole, steps, 1.0)
     requested_m = lever @ np.where(whole, requested, 0.0)
-    unsure = (GAP_SHARE * gaps) ** 2 * (lever**2).sum(axis=0)
+    weight = (lever**2).sum(axis=0)
+    unsure = (GAP_SHARE * gaps) ** 2
+    stiff = lever.T @ lever + np.diag(MOVE_SHARE**2 * weight + 1e-12)
+    shortest = np.linalg.solve(stiff, lever.T @ requested_m)
 
     def counts(index: Array) -> tuple[Array, Array]:
         """Return steps (..., n) and the error (...,), m^2, that the index-th effective steps (..., n) leave."""
         gap = np.where(index > 0, gaps[0], gaps[1])
         count = np.sign(index) * (np.abs(index) + np.floor(gap / by))
-        left = requested_m - np.where(whole, count * by - np.sign(index) * gap, 0.0) @ lever.T
-        return count, (left**2).sum(axis=-1) + (np.where(index > 0, unsure[0], unsure[1]) * (index != 0)).sum(axis=-1)
+        moved = np.where(whole, count * by - np.sign(index) * gap, 0.0)
+        variance = np.where(index > 0, unsure[0], unsure[1]) * (index != 0) + (MOVE_SHARE * moved) ** 2
+        return count, ((requested_m - moved @ lever.T) ** 2).sum(axis=-1) + variance @ weight
 
     ones = np.eye(n)
     pairs = [a * ones[i] + b * ones[j] for i in range(n) for j in range(i) for a in (-1, 1) for b in (-1, 1)]
     moves = np.concatenate([ones, -ones, 2 * ones, -2 * ones, np.reshape(pairs, (-1, n))]) * whole
     found = []
-    for index in (np.where(whole, np.rint(requested / by), 0.0), np.zeros(n)):
+    for index in (np.where(whole, np.rint(shortest / by), 0.0), np.zeros(n)):
         while True:
             after = counts(index + moves)[1]
             best = int(np.argmin(after))

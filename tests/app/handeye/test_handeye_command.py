@@ -168,6 +168,8 @@ def test_streams_with_an_unknown_clock_offset(armsight, tmp_path):
     document, _ = found(armsight, robot, seen, "--streams")
     assert_right(document)
     assert abs(document["clock_offset_s"] - 0.123) < 4 * document["clock_offset_sigma_s"] < 4e-3
+    other = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "to-hand", "--streams")
+    assert_rejected(other, robot, "these poses fit --eye in-hand, not to-hand")
 
 
 def test_millimetres_are_rejected_or_detected(armsight, tmp_path, seen):
@@ -218,6 +220,12 @@ def test_what_does_not_fit_is_named(armsight, tmp_path, seen):
     rejected(named(tmp_path / "u.csv", head, q), "the joints are in radians", more=arm)
     gripper = np.column_stack([np.degrees(q), q[:, 0]])
     rejected(named(tmp_path / "g.csv", head + ",q7_deg", gripper), "six_r has 6", "gripper", more=arm)
+    units = named(tmp_path / "t.csv", head.replace("q6_deg", "q6_rad"), q)
+    rejected(units, "has q6_rad where q6_deg is expected", more=arm)
+    rejected(named(tmp_path / "d.csv", head.replace("deg", "rad"), 90 + q), "are these degrees?", more=arm)
+    displaced = A.copy()
+    displaced[7:] = A[7:] @ exp_se3(np.array([0.0, 0.0, 0.1, 0.4, 0.0, 0.3]))
+    rejected(matrices(path, displaced), "fit one mounting each, but not the same", "TCP were displaced")
 
 
 def test_a_tcp_taken_for_the_flange_is_noted_where_the_joints_are_known(armsight, tmp_path, seen):

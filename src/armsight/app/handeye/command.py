@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from armsight.app.handeye.images import Seen
     from armsight.app.handeye.read import PoseTable
     from armsight.app.handeye.result import HandEyeAnswer
+    from armsight.robot.arm import Arm
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
     )
     seen = _seen(options, progress)
     if options.streams:
-        return _streams(options, robot, seen, progress)
+        return _streams(options, robot, seen, arm, progress)
     recording = paired(robot, seen, options.eye == "in-hand", arm)
     progress("looking at whether both sides fit")
     recording = require_plausible(recording, arm, detect_units=options.detect_units, scale=options.scale)
@@ -199,12 +200,16 @@ def _seen(options: Options, progress: Callable[[str], None]) -> Seen:
     return see_with_rig(options.rig, str(options.left), str(options.right), target, progress)
 
 
-def _streams(options: Options, robot: PoseTable, seen: Seen, progress: Callable[[str], None]) -> HandEyeAnswer:
+def _streams(
+    options: Options, robot: PoseTable, seen: Seen, arm: Arm | None, progress: Callable[[str], None]
+) -> HandEyeAnswer:
     """Calibrate two streams with an unknown clock offset."""
     from armsight.app.handeye.plan import plan_poses
     from armsight.app.handeye.recording import of_streams
     from armsight.app.handeye.result import HandEyeAnswer
-    from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams
+    from armsight.app.handeye.suspect import require_plausible
+    from armsight.loop.handeye.handeye import MIN_POSES
+    from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams, coarse_offset
 
     for path, t_s in ((options.robot, robot.t_s), (options.seen, seen.t_s)):
         if t_s is None:
@@ -214,9 +219,17 @@ def _streams(options: Options, robot: PoseTable, seen: Seen, progress: Callable[
     hand = PoseStream.of(robot.t_s, robot.Ts, str(options.robot))
     eye_stream = PoseStream.of(seen.t_s, seen.Ts, str(options.seen))
     eye: Literal["in_hand", "to_hand"] = "in_hand" if options.eye == "in-hand" else "to_hand"
+    progress("looking at whether both sides fit")
+    roughly_s = coarse_offset(hand, eye_stream)
+    A, there = hand.at(eye_stream.t_s + roughly_s)
+    if there.sum() >= MIN_POSES:
+        pairs = of_streams(
+            robot, seen, (A[there], eye_stream.Ts[there]), eye_stream.t_s[there], roughly_s, eye == "in_hand"
+        )
+        require_plausible(pairs, arm, scale=options.scale, streams=True)
     found = calibrate_structured_streams(
         hand, eye_stream, eye=eye, centre=seen.centre, scale=options.scale, progress=progress
     )
-    recording = of_streams(robot, seen, found)
+    recording = of_streams(robot, seen, (found.A, found.B), found.t_s, found.offset_s, eye == "in_hand")
     plan = plan_poses(found.handeye, recording.poses, options.plan) if options.plan else None
     return HandEyeAnswer(recording, found.handeye, found.offset_s, found.sigma_offset_s, plan)

@@ -41,6 +41,8 @@ COLUMNS = (
 )
 #: Lengths beyond this, m, are no robot's: they are mm; below the other, all of them, they are m taken for mm.
 FAR_M, NEAR_M = 20.0, 0.02
+#: No joint rotates further, rad; larger numbers of radians are degrees.
+MOST_RAD = 4 * np.pi
 #: How far a matrix may be from a rotation: what six digits leave.
 LOOSE = 2e-3
 _UR = re.compile(r"p\[([^\]]*)\]")
@@ -222,8 +224,21 @@ class _Columns:
                 f"{self.path}: line 1: {len(names)} joints ({names[0]}..{names[-1]}); {arm.name} has "
                 f"{len(arm.joint_names)}{advice}"
             )
+        unit = names[0][-3:]
+        for k, name in enumerate(names, 1):
+            if name != f"q{k}_{unit}":
+                raise InputError(
+                    f"{self.path}: line 1: has {name} where q{k}_{unit} is expected: joints are numbered from 1 on, "
+                    "each once, all in degrees or all in radians"
+                )
         q = self.numbers(names)
-        return np.radians(q) if names[0].endswith("_deg") else q
+        if unit == "rad" and np.abs(q).max() > MOST_RAD:
+            row, joint = np.unravel_index(int(np.abs(q).argmax()), q.shape)
+            raise InputError(
+                f"{self.path}: line {self.rows[row][0]}: q{joint + 1}_rad is {q[row, joint]:g}: are these degrees? name "
+                "the columns q1_deg .."
+            )
+        return np.radians(q) if unit == "deg" else q
 
     def times(self) -> Array | None:
         """Return the times (N,), s."""

@@ -17,7 +17,6 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import adjoint, inverse, log_se3, mean_pose
 from armsight.loop.handeye.handeye import MIN_POSES, Poses
-from armsight.loop.handeye.streams import StructuredStreams
 from armsight.robot.arm import Arm
 
 #: Poses of one TCP agree within this, m and rad, with a constant transform from the model's flange.
@@ -150,12 +149,23 @@ def links_of(recording: PairedPoses, arm: Arm) -> Array | None:
     return np.asarray(inverse(frames) @ frames[:, -1:])
 
 
-def of_streams(robot: PoseTable, seen: Seen, found: StructuredStreams) -> PairedPoses:
-    """Return the rows of two streams that were calibrated; the flange's poses are interpolated."""
+def of_streams(
+    robot: PoseTable, seen: Seen, sides: tuple[Array, Array], t_s: Array, offset_s: float, in_hand: bool
+) -> PairedPoses:
+    """Return the rows of two streams that belong together.
+
+    Args:
+        robot: the flange's stream.
+        seen: the eye's.
+        sides: (M, 4, 4) the flange, interpolated, and (M, 4, 4) the target at the eye's times.
+        t_s: (M,) these times, eye's clock, s.
+        offset_s: added to them, they are the flange's.
+        in_hand: whether the arm carries the eye.
+    """
     assert robot.t_s is not None
     assert seen.t_s is not None
-    rows = np.clip(np.searchsorted(robot.t_s, found.t_s + found.offset_s), 0, len(robot.t_s) - 1)
-    matched = np.searchsorted(seen.t_s, found.t_s)
-    poses = Poses(found.A, found.B, np.zeros((len(found.A), 6, 6)), found.handeye.eye == "in_hand", seen.centre)
-    names = tuple(f"t {t:.3f} s" for t in found.t_s)
-    return PairedPoses(poses, rows, names, found.t_s, robot, seen, matched, (*robot.notes, *seen.notes))
+    rows = np.clip(np.searchsorted(robot.t_s, t_s + offset_s), 0, len(robot.t_s) - 1)
+    matched = np.searchsorted(seen.t_s, t_s)
+    poses = Poses(*sides, np.zeros((len(t_s), 6, 6)), in_hand, seen.centre)
+    names = tuple(f"t {t:.3f} s" for t in t_s)
+    return PairedPoses(poses, rows, names, t_s, robot, seen, matched, (*robot.notes, *seen.notes))

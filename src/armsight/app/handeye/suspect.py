@@ -34,6 +34,10 @@ BETTER, PLAUSIBLE_M = 4.0, 0.02
 SMALLER = 0.99
 #: Poses that a reading is evaluated by at most, and the rows by which poses are looked for against the images.
 EVALUATED, SHIFTS = 60, (1, -1, 2, -2)
+#: Rows at least on either side of where something may have been displaced, and places that are looked at first.
+PART, PLACES = 6, 12
+#: Orders of the joints that are looked at: the angles between poses do not tell joints with parallel axes apart.
+ORDERS = 12
 #: Mirrors one axis; the other two are this one rotated.
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 #: Scales that mistaken units make: mm for m, cm, inches.
@@ -69,7 +73,12 @@ def _angles(Ts: Array) -> Array:
 
 
 def require_plausible(
-    recording: PairedPoses, arm: Arm | None, *, detect_units: bool = False, scale: bool = False
+    recording: PairedPoses,
+    arm: Arm | None,
+    *,
+    detect_units: bool = False,
+    scale: bool = False,
+    streams: bool = False,
 ) -> PairedPoses:
     """Reject data that fit far better read in another way.
 
@@ -77,6 +86,7 @@ def require_plausible(
         recording: the rows.
         arm: the model, where the robot's poses come from joints.
         scale: whether the target's size is fitted, and may be anything.
+        streams: whether the rows are of streams whose clocks agree roughly only: they are not shifted then.
         detect_units: whether lengths in another unit are converted, with a note, in place of an error.
 
     Returns:
@@ -91,7 +101,7 @@ def require_plausible(
         return recording
     best, advice, converted = as_given, "", None
     units = {said for _, said in _scaled(p)}
-    for poses, said in _readings(recording, arm):
+    for poses, said in _readings(recording, arm, () if streams else SHIFTS):
         try:
             other = misfit(_resized(poses) if scale else poses)
         except np.linalg.LinAlgError:
@@ -106,14 +116,50 @@ def require_plausible(
         raise InputError(
             f"{recording.robot.path}: {advice} (median residual {1e3 * best:.1f} mm; as given {1e3 * as_given:.1f})"
         )
+    displaced = _displaced(p, as_given) if not scale else None
+    if displaced is not None:
+        raise InputError(
+            f"{recording.robot.path}: the rows up to {recording.names[displaced - 1]} and those from "
+            f"{recording.names[displaced]} on fit one mounting each, but not the same (as given, median residual "
+            f"{1e3 * as_given:.1f} mm): base, camera, target or the robot's TCP were displaced or changed about there: use "
+            "one of both parts"
+        )
+    if as_given > PLAUSIBLE_M:
+        note = (
+            f"{recording.robot.path}: half of the rows are off by more than {1e3 * as_given:.0f} mm in any mounting, and "
+            "no other reading fits: what is found is no calibration; check one row by hand, or take the poses again"
+        )
+        return replace(recording, notes=(*recording.notes, note))
     return recording
 
 
-def _readings(recording: PairedPoses, arm: Arm | None) -> Iterator[tuple[Poses, str]]:
+def _displaced(p: Poses, as_given: float) -> int | None:
+    """Return the first row after which another mounting fits, where either part alone fits far better than the whole."""
+    n = len(p.A)
+
+    def worse(k: int) -> float:
+        return max(misfit(p.rows(np.arange(k))), misfit(p.rows(np.arange(k, n))))
+
+    if n < 2 * PART:
+        return None
+    places = np.unique(np.linspace(PART, n - PART, min(PLACES, n - 2 * PART + 1)).round().astype(int))
+    found = {int(k): worse(int(k)) for k in places}
+    step = int(np.diff(places).max()) if len(places) > 1 else 1
+    while step > 1:
+        step = (step + 1) // 2
+        best = min(found, key=lambda k: found[k])
+        for k in (best - step, best + step):
+            if PART <= k <= n - PART and k not in found:
+                found[k] = worse(k)
+    best = min(found, key=lambda k: found[k])
+    return best if found[best] < min(as_given / BETTER, PLAUSIBLE_M) else None
+
+
+def _readings(recording: PairedPoses, arm: Arm | None, shifts: tuple[int, ...]) -> Iterator[tuple[Poses, str]]:
     """Yield other readings of the same data, with what it would mean."""
     p = recording.poses
     n = len(p.A)
-    for shift in SHIFTS:
+    for shift in shifts:
         if n - abs(shift) >= 6:
             first, second = (
                 (slice(shift, None), slice(None, -shift)) if shift > 0 else (slice(None, shift), slice(-shift, None))
@@ -211,7 +257,7 @@ def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
             f"joint {joint + 1} ({arm.joint_names[joint]}) counts the other way than {arm.name}'s: change the sign of "
             f"q{joint + 1}",
         )
-    for _, at in sorted(scored, key=lambda one: one[0])[:3]:
+    for _, at in sorted(scored, key=lambda one: one[0])[:ORDERS]:
         named = ", ".join(f"q{k + 1}" for k in at)
         yield (
             replace(p, A=np.asarray(arm.forward(q[:, at]))),
