@@ -12,6 +12,7 @@
 #define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
 #define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
+#define WARMER 0.03f          /* by so much of R windings may be warmer than was learnt: 8 K */
 #define SAMPLE_TICKS 8u
 #define AGREED 3.0f           /* of apart_rad: so much way together proves that the wiring was right */
 #define UNKNOWN_RAD_S 1000.0f
@@ -49,6 +50,12 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
     const float gain_k = motor->variance_rk * ir_v + motor->variance_kk * kw_v;
     const float variance = ir_v * gain_r + kw_v * gain_k + noise_v * noise_v;
     const float off_v = motor->window_v * per_tick - motor->resistance_scale * ir_v - motor->constant_scale * kw_v;
+    const float warmer_v = WARMER * ir_v;
+    const bool explained = off_v * off_v <= SURPRISE * variance + warmer_v * warmer_v;
+    const float off_rad = off_v / (config->constant_v_s * per_s);
+    const bool begins = motor->unexplained_rad * off_rad <= 0.0f; /* another side than before */
+    motor->unexplained_rad = explained ? 0.0f : (begins ? off_rad : motor->unexplained_rad + off_rad);
+    motor->unexplained = explained ? 0u : (begins ? 1u : motor->unexplained + 1u);
     if (off_v * off_v <= SURPRISE * variance) {
         const float per_variance = 1.0f / variance;
         const float way_rad = number_size(angle_rad - motor->window_rad);
@@ -82,8 +89,10 @@ static void window(motor_state *motor, const motor_config *config, float voltage
     if (motor->window_ticks % WINDOW_TICKS != 0u) {
         return;
     }
-    if (motor->window_ticks < REST_TICKS && number_size(angle_rad - motor->window_rad) <= WINDOW_WAY_RAD) {
-        return;
+    const float reach_rad = motor->sure_rad_s * (TICK_S * (float)WINDOW_TICKS);
+    if (motor->window_ticks < REST_TICKS && number_size(angle_rad - motor->window_rad) <= WINDOW_WAY_RAD &&
+        reach_rad <= WINDOW_WAY_RAD) {
+        return; /* neither the reading nor the motor moves: the longer the window, the better */
     }
     /* A gap that R and K may explain must be learnt from: else they would stay wrong for good. */
     if (number_size(motor->gap_rad) < 0.5f * config->apart_rad + motor->band_rad) {
