@@ -38,7 +38,7 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path):
         (("soft_max_rad = 2.4", "soft_max_rad = '2.4'"), "joint.1.soft_max_rad is '2.4'; a number is needed"),
         (("silence_ticks = 100", "silence_ticks = 100.5"), "arm.silence_ticks is 100.5; a whole number is needed"),
         (("silence_ticks = 100", ""), "arm.silence_ticks is missing"),
-        (("version = 3", "version = 1"), "version is 1"),
+        (("version = 4", "version = 1"), "version is 1"),
         (("counts = [3277, 62258]", "counts = [3277]"), r"counts is \[3277\]; a list of 2 to 9 numbers is needed"),
         (("motor_direction = 1", "motor_direction = 0"), "joint 1: motor_direction is 0"),
     ],
