@@ -25,7 +25,7 @@ uint32_t config_crc_on(uint32_t crc, const void *bytes, uint32_t length)
 
 uint32_t config_crc(const void *bytes, uint32_t length) { return ~config_crc_on(0xFFFFFFFFu, bytes, length); }
 
-#define TURN_RAD 6.28318531f
+#define REV_RAD 6.28318531f
 
 static const joint_config factory_joint = {
     .gains = {.kp_per_rad = 1.0f, .derivative_filter_s = 0.005f, .anti_windup_per_s = 10.0f},
@@ -54,7 +54,7 @@ static const joint_config factory_joint = {
     .stall_rad = 0.01f,
     .current_limit_ma = 1000u,
     .motor_direction = 1,
-    .encoder = {.counts_per_rev = (float)ENCODER_TURN, .direction = 1},
+    .encoder = {.counts_per_rev = (float)ENCODER_REV, .direction = 1},
 };
 
 void config_factory(core_config *config)
@@ -100,7 +100,7 @@ static bool table_is_valid(const pot_config *pot)
 static bool encoder_is_valid(const encoder_config *encoder)
 {
     const bool quadrature = encoder->sensor == SENSOR_QUADRATURE;
-    const bool placed = quadrature ? encoder->input >= 1u && encoder->input <= JOINTS : encoder->zero_counts < ENCODER_TURN;
+    const bool placed = quadrature ? encoder->input >= 1u && encoder->input <= JOINTS : encoder->zero_counts < ENCODER_REV;
     return encoder->sensor <= SENSOR_ABSOLUTE && placed && number_within(encoder->counts_per_rev, 16.0f, 1e7f) &&
            (encoder->direction == 1 || encoder->direction == -1) && number_within(encoder->home_rad, -13.0f, 13.0f);
 }
@@ -131,12 +131,12 @@ static bool table_is_consistent(const joint_config *joint)
            pot->counts[pot->node_count - 1u] < pot->open_counts;
 }
 
-/* Return whether a step of an encoder is small enough, and the soft limits lie within the turn it can tell. */
+/* Return whether a step of an encoder is small enough, and the soft limits lie within the revolution it measures. */
 static bool encoder_is_consistent(const joint_config *joint)
 {
     const encoder_config *encoder = &joint->encoder;
-    const float step_rad = TURN_RAD / encoder->counts_per_rev;
-    const float half_rad = (0.5f * (float)ENCODER_TURN - 1.0f) * step_rad;
+    const float step_rad = REV_RAD / encoder->counts_per_rev;
+    const float half_rad = (0.5f * (float)ENCODER_REV - 1.0f) * step_rad;
     const bool within = encoder->sensor == SENSOR_QUADRATURE || (joint->soft_min_rad >= encoder->home_rad - half_rad &&
                                                                  joint->soft_max_rad <= encoder->home_rad + half_rad);
     return within && step_rad <= 0.5f * joint->pot.jump_rad && step_rad <= 0.5f * joint->pot.frozen_rad;

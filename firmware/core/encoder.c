@@ -9,7 +9,7 @@
 #define LOOPS_DONE 0x0100u  /* LF of DIAAGC: the offsets are compensated */
 #define MAGNET 0x0E00u      /* MAGL, MAGH and COF of DIAAGC */
 
-_Static_assert(ENCODER_TURN == ANGLE + 1u, "14 bits are a whole turn");
+_Static_assert(ENCODER_REV == ANGLE + 1u, "14 bits are a revolution");
 
 bool encoder_frames_sound(uint32_t frames)
 {
@@ -22,13 +22,13 @@ bool encoder_frames_sound(uint32_t frames)
 
 bool encoder_magnet_wrong(uint32_t frames) { return (frames & MAGNET << 16) != 0u; }
 
-/* Return how many counts from its zero the encoder is. Counts of a timer wrap, those of a turn do at its far side. */
+/* Return how many counts from its zero the encoder is. Counts of a timer wrap, those of an angle do half a revolution away. */
 static int32_t from_zero(const encoder_state *encoder, const encoder_config *config, uint32_t counts)
 {
     if (config->sensor == SENSOR_QUADRATURE) {
         return (int32_t)(counts - encoder->zero_counts);
     }
-    return (int32_t)((counts - config->zero_counts + ENCODER_TURN / 2u) & ANGLE) - (int32_t)(ENCODER_TURN / 2u);
+    return (int32_t)((counts - config->zero_counts + ENCODER_REV / 2u) & ANGLE) - (int32_t)(ENCODER_REV / 2u);
 }
 
 uint32_t encoder_read(encoder_state *encoder, pot_state *pot, const joint_config *config, uint32_t reading,

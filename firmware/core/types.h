@@ -116,7 +116,7 @@ enum {
 /* What reads a joint's angle. */
 enum { SENSOR_POTENTIOMETER = 0, SENSOR_QUADRATURE = 1, SENSOR_ABSOLUTE = 2 };
 
-#define ENCODER_TURN 16384u /* counts of an absolute encoder's turn */
+#define ENCODER_REV 16384u /* counts of an absolute encoder's revolution */
 
 /* Beside the 14 bits of an absolute encoder's angle, in telemetry. */
 enum { ENCODER_UNSOUND = 16384, ENCODER_MAGNET = 32768 };
@@ -176,9 +176,9 @@ typedef struct motor_config {
 typedef struct encoder_config {
     uint32_t sensor;      /* SENSOR_...; the rest is not looked at for a potentiometer */
     uint32_t input;       /* 1 to JOINTS, no two joints' the same: which timer; quadrature only */
-    float counts_per_rev; /* 16 to 1e7: of one turn of the joint, four edges a line and the gear included */
+    float counts_per_rev; /* 16 to 1e7: of one revolution of the joint, four edges a line and the gear included */
     int32_t direction;    /* 1 or -1, multiplies the counts */
-    uint32_t zero_counts; /* 0 to ENCODER_TURN - 1; absolute only */
+    uint32_t zero_counts; /* 0 to ENCODER_REV - 1; absolute only */
     float home_rad;       /* -13 to 13 */
 } encoder_config;
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
-from armsight.robot.boards.codes import Sensor
+from armsight.robot.boards.codes import SensorKind
 from armsight.robot.boards.link import Sensed
 from armsight.sim.joints import JointPlant
 
@@ -41,8 +41,8 @@ class Encoders(Record):
     """What reads six joints.
 
     Attributes:
-        kind: (6,) of :class:`~armsight.robot.boards.codes.Sensor`.
-        counts_per_rev: (6,) of a turn of the joint, negative where counts fall with the angle.
+        kind: (6,) of :class:`~armsight.robot.boards.codes.SensorKind`.
+        counts_per_rev: (6,) of a revolution of the joint, negative where counts fall with the angle.
         zero_counts: (6,) reading of an absolute one at 0 rad.
     """
 
@@ -77,8 +77,10 @@ class EncodedPlant:
     def sense(self) -> Sensed:
         """Return what the converters, the timers and the encoders' wire read now."""
         sensed = self.plant.sense()
-        for j in np.flatnonzero(self._encoders.kind):
-            sensed.counts[j] = self._quadrature(j) if self._encoders.kind[j] == Sensor.QUADRATURE else self._absolute(j)
+        for j in map(int, np.flatnonzero(self._encoders.kind)):
+            sensed.counts[j] = (
+                self._quadrature(j) if self._encoders.kind[j] == SensorKind.QUADRATURE else self._absolute(j)
+            )
         return sensed
 
     def step(self, duty: Array, awake: bool, braked: bool = False) -> None:

@@ -62,7 +62,7 @@ def test_a_magnet_too_weak_or_too_strong_is_reported_in_the_diagnosis(library, b
 
 
 @given(counts=st.integers(-8192, 8191), zero=st.integers(0, 16383), direction=st.sampled_from((1, -1)))
-def test_an_absolute_angle_is_that_from_its_zero_across_the_turns_end(library, counts, zero, direction):
+def test_an_absolute_angle_is_that_from_its_zero_across_its_wrap(library, counts, zero, direction):
     reader = Reader(library, encoder_joint(c.SENSOR_ABSOLUTE, direction=direction, zero=zero, home=0.25))
     assert reader.read(reading((zero + counts) % 16384)) == c.FAULT_NONE
     assert reader.pot.angle_rad == pytest.approx(0.25 + direction * counts * 2 * math.pi / 16384, abs=2e-6)

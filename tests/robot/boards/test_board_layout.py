@@ -83,7 +83,7 @@ def test_codes_and_texts_are_the_headers(which, ours, texts):
         ("CONFIG_", codes.ConfigSource),
         ("REACTION_", codes.Reaction),
         ("COMMAND_", codes.Command),
-        ("SENSOR_", codes.Sensor),
+        ("SENSOR_", codes.SensorKind),
     ],
 )
 def test_enumerations_are_the_headers(prefix, ours):

@@ -8,14 +8,14 @@ import pytest
 from armsight.data import JointCommand
 from armsight.errors import ArmsightError, InputError
 from armsight.robot.boards.board_file import configuration_text, read_configuration
-from armsight.robot.boards.codes import Command, Fault, Sensor
+from armsight.robot.boards.codes import Command, Fault, SensorKind
 from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.opening import configured, open_emulator
 from armsight.sim.encoders import EncodedPlant, EncoderFault, Encoders
 from armsight.sim.joints import JointPlant, drawn_model
 
-KIND = np.array([Sensor.POTENTIOMETER, Sensor.QUADRATURE, Sensor.ABSOLUTE] * 2)
+KIND = np.array([SensorKind.POTENTIOMETER, SensorKind.QUADRATURE, SensorKind.ABSOLUTE] * 2)
 PER_REV = np.array([1.0, 40000.0, -16384.0, 1.0, -12345.6, 16384.0])
 HOME_RAD = 0.2
 ZERO = np.array([0, 0, 3000, 0, 0, 16000])
@@ -25,14 +25,14 @@ def encoder_configuration():
     config = lab_configuration()
     for j, joint in enumerate(config["joint"]):
         if KIND[j]:
-            zero = ZERO[j] if KIND[j] == Sensor.ABSOLUTE else 0
+            zero = ZERO[j] if KIND[j] == SensorKind.ABSOLUTE else 0
             joint["encoder"] = (
                 KIND[j],
                 j + 1,
                 abs(PER_REV[j]),
                 np.sign(PER_REV[j]),
                 zero,
-                HOME_RAD * (KIND[j] == Sensor.QUADRATURE),
+                HOME_RAD * (KIND[j] == SensorKind.QUADRATURE),
             )
     return config
 

@@ -289,12 +289,12 @@ def home(name: str, baud: int | None, at_once: str, yes: bool, as_json: bool) ->
     """
     from armsight.robot.boards.ar4.board import Ar4Board
     from armsight.robot.boards.board import Board
-    from armsight.robot.boards.codes import Command, Sensor
+    from armsight.robot.boards.codes import Command, SensorKind
 
     with _open_any(name, baud) as board:
         if (
             isinstance(board, Board)
-            and (board.configuration()["joint"]["encoder"]["sensor"] == Sensor.QUADRATURE).any()
+            and (board.configuration()["joint"]["encoder"]["sensor"] == SensorKind.QUADRATURE).any()
         ):
             if not yes:
                 click.confirm(

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from armsight.errors import InputError
-from armsight.robot.boards.codes import Sensor
+from armsight.robot.boards.codes import SensorKind
 from armsight.robot.boards.configuration import (
     CONFIG,
     CONFIG_VERSION,
@@ -50,7 +50,7 @@ _TABLES = ("counts", "angle_rad")  # of a potentiometer: as long as its node_cou
 
 #: What of a potentiometer's configuration an encoder has no use for.
 _POT_ONLY = (*_TABLES, "short_counts", "open_counts", "direction")
-_SENSORS = {each.name.lower(): each for each in Sensor}
+_SENSORS = {each.name.lower(): each for each in SensorKind}
 
 
 def entries(config: Configuration) -> Iterator[tuple[str, Any]]:
@@ -60,7 +60,7 @@ def entries(config: Configuration) -> Iterator[tuple[str, Any]]:
             yield f"arm.{name}", config[name].item()
     for j in range(int(config["joint_count"])):
         joint = config["joint"][j]
-        sensor = Sensor(int(joint["encoder"]["sensor"]))
+        sensor = SensorKind(int(joint["encoder"]["sensor"]))
         used = {"sensor", *ENCODER_FIELDS[sensor]}
         for path, value in _of(joint, f"joint.{j + 1}", joint["pot"]):
             part, name = path.split(".")[2], path.rpartition(".")[2]

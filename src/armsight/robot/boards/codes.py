@@ -107,7 +107,7 @@ class Command(IntEnum):
     HOME = 8
 
 
-class Sensor(IntEnum):
+class SensorKind(IntEnum):
     """What reads a joint's angle."""
 
     POTENTIOMETER = 0

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.robot.boards.codes import Reaction, Sensor
+from armsight.robot.boards.codes import Reaction, SensorKind
 from armsight.robot.boards.tuning import MotorFigures, tuned_gains
 
 Configuration = NDArray[np.void]
 JOINTS, POT_NODES = 6, 9
-#: Counts of an absolute encoder's turn.
-ENCODER_TURN = 16384
+#: Counts of an absolute encoder's revolution.
+ENCODER_REV = 16384
 #: Layout of the configuration this armsight knows: ``firmware/core/config.h``.
 CONFIG_VERSION = 4
 
@@ -131,14 +131,14 @@ _TABLE_RANGES = {"node_count": (2, POT_NODES)}
 _ENCODER_RANGES = {
     "input": (1, JOINTS),
     "counts_per_rev": (16.0, 1e7),
-    "zero_counts": (0, ENCODER_TURN - 1),
+    "zero_counts": (0, ENCODER_REV - 1),
     "home_rad": (-13.0, 13.0),
 }
 #: What of an encoder's configuration each kind of sensor needs beside the kind itself.
-ENCODER_FIELDS: Mapping[Sensor, tuple[str, ...]] = {
-    Sensor.POTENTIOMETER: (),
-    Sensor.QUADRATURE: ("input", "counts_per_rev", "direction", "home_rad"),
-    Sensor.ABSOLUTE: ("counts_per_rev", "direction", "zero_counts", "home_rad"),
+ENCODER_FIELDS: Mapping[SensorKind, tuple[str, ...]] = {
+    SensorKind.POTENTIOMETER: (),
+    SensorKind.QUADRATURE: ("input", "counts_per_rev", "direction", "home_rad"),
+    SensorKind.ABSOLUTE: ("counts_per_rev", "direction", "zero_counts", "home_rad"),
 }
 _JOINT_RANGES = {
     "soft_min_rad": (-13.0, 13.0),
@@ -273,7 +273,7 @@ def _problems(config: Configuration) -> Iterator[str]:
     inputs: dict[int, int] = {}
     for j in range(count):
         encoder = joints[j]["encoder"]
-        if encoder["sensor"] == Sensor.QUADRATURE and (taken := inputs.setdefault(int(encoder["input"]), j)) != j:
+        if encoder["sensor"] == SensorKind.QUADRATURE and (taken := inputs.setdefault(int(encoder["input"]), j)) != j:
             yield f"joints {taken + 1} and {j + 1} are both on encoder input {encoder['input']}; each timer counts for one"
     if config["supply_min_mv"] >= config["supply_max_mv"]:
         yield "supply_min_mv must be below supply_max_mv"
@@ -284,9 +284,9 @@ def _problems(config: Configuration) -> Iterator[str]:
 def _ranged(joint: Configuration) -> tuple[tuple[Configuration, Mapping[str, tuple[float, float]]], ...]:
     plain = (joint, _JOINT_RANGES), (joint["pot"], _POT_RANGES), (joint["motor"], _MOTOR_RANGES)
     sensor = int(joint["encoder"]["sensor"])
-    if sensor == Sensor.POTENTIOMETER:
+    if sensor == SensorKind.POTENTIOMETER:
         return *plain, (joint["pot"], _TABLE_RANGES)
-    needed = ENCODER_FIELDS[Sensor(sensor)] if sensor in tuple(Sensor) else ()
+    needed = ENCODER_FIELDS[SensorKind(sensor)] if sensor in tuple(SensorKind) else ()
     return *plain, (joint["encoder"], {name: each for name, each in _ENCODER_RANGES.items() if name in needed})
 
 
@@ -298,10 +298,10 @@ def _outside(values: Configuration, ranges: Mapping[str, tuple[float, float]]) -
 
 def _joint_problems(joint: Configuration) -> Iterator[str]:
     sensor = int(joint["encoder"]["sensor"])
-    if sensor not in tuple(Sensor):
-        kinds = ", ".join(f"{each.value} ({each.name.lower()})" for each in Sensor)
+    if sensor not in tuple(SensorKind):
+        kinds = ", ".join(f"{each.value} ({each.name.lower()})" for each in SensorKind)
         yield f"sensor is {sensor}; {kinds} are allowed"
-    yield from _table_problems(joint) if sensor == Sensor.POTENTIOMETER else _encoder_problems(joint)
+    yield from _table_problems(joint) if sensor == SensorKind.POTENTIOMETER else _encoder_problems(joint)
     if joint["soft_min_rad"] >= joint["soft_max_rad"]:
         yield "soft_min_rad must be below soft_max_rad"
     if joint["motor_direction"] not in (1, -1):
@@ -318,11 +318,11 @@ def _encoder_problems(joint: Configuration) -> Iterator[str]:
         yield f"direction of the encoder is {encoder['direction']}; 1 or -1 is allowed"
     # float32 in the board's own order, so that both say the same
     step = np.float32(2 * np.pi) / encoder["counts_per_rev"]
-    half = np.float32(ENCODER_TURN // 2 - 1) * step
+    half = np.float32(ENCODER_REV // 2 - 1) * step
     low, high = encoder["home_rad"] - half, encoder["home_rad"] + half
-    absolute = encoder["sensor"] == Sensor.ABSOLUTE
+    absolute = encoder["sensor"] == SensorKind.ABSOLUTE
     if absolute and (joint["soft_min_rad"] < low or joint["soft_max_rad"] > high):
-        yield f"the soft limits must lie within the encoder's turn, {low:.4g} to {high:.4g} rad"
+        yield f"the soft limits must lie within the encoder's revolution, {low:.4g} to {high:.4g} rad"
     for name in ("jump_rad", "frozen_rad"):
         if step > np.float32(0.5) * pot[name]:
             yield f"{name} must be two counts of the encoder or more, {2 * step:.2g} rad"
