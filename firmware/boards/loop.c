@@ -11,6 +11,17 @@
 #define CHUNK 128u
 #define HUNG_TICKS 1000u /* a main loop that does not come round for so long hangs: the watchdog shall have it */
 
+/* Return whether the board has the sensors that a configuration asks for. */
+static bool has_sensors(const board_loop *loop, const core_config *config)
+{
+    for (uint32_t joint = 0u; joint < config->joint_count; joint++) {
+        if ((loop->board->sensors >> config->joint[joint].encoder.sensor & 1u) == 0u) {
+            return false;
+        }
+    }
+    return true;
+}
+
 /* Return what config_load says of the two stored copies, which it leaves in loop->copies. */
 static uint32_t load(board_loop *loop, core_config *config)
 {
@@ -24,7 +35,10 @@ void loop_start(board_loop *loop, const board_description *board)
     core_config config;
     memset(loop, 0, sizeof *loop); /* a compound literal may take its size of stack */
     loop->board = board;
-    const uint32_t source = load(loop, &config);
+    uint32_t source = load(loop, &config);
+    if (!has_sensors(loop, &config)) { /* written by the firmware of another board */
+        source = CONFIG_FACTORY;
+    }
     core_init(&loop->core, &config, source, board->reset_cause());
     wire_setup setup = {board->name, board->baud, source, &loop->core.config, {0}};
     board->crash(&setup.crash);
@@ -60,6 +74,9 @@ static bool write(board_loop *loop, const core_config *config)
 static bool store(board_loop *loop, const core_config *config)
 {
     core_config stored;
+    if (!has_sensors(loop, config)) {
+        return false;
+    }
     load(loop, &stored);
     const bool done = write(loop, config);
     if (done && load(loop, &stored) != CONFIG_NEWEST) {

@@ -1,5 +1,6 @@
 #include "command.h"
 
+#include "encoder.h"
 #include "governor.h"
 #include "motor.h"
 #include "number.h"
@@ -43,6 +44,9 @@ static uint32_t enable(core_state *core, bool inward)
         const joint_config *config = &core->config.joint[i];
         if (!pot_is_read(&core->joint[i].pot)) {
             return REJECTION_POT_UNREAD;
+        }
+        if (!encoder_is_homed(&core->joint[i].encoder, config)) {
+            return REJECTION_NOT_HOMED;
         }
         if (!inward && !number_within(core->joint[i].pot.angle_rad, config->soft_min_rad, config->soft_max_rad)) {
             return REJECTION_OUTSIDE_LIMITS;
@@ -169,6 +173,20 @@ static uint32_t take_gains(core_state *core, const gain_set *gains)
     return REJECTION_NONE;
 }
 
+/* Take the arm, which somebody has brought to its home, as being there. */
+static uint32_t home(core_state *core)
+{
+    if (safety_drives_on(core)) {
+        return REJECTION_WRONG_STATE;
+    }
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
+        joint_state *joint = &core->joint[i];
+        encoder_home(&joint->encoder, &core->config.joint[i]);
+        joint->pot.valid = joint->encoder.homed != 0u ? 0u : joint->pot.valid; /* its next angle is no jump */
+    }
+    return REJECTION_NONE;
+}
+
 static uint32_t execute(core_state *core, const core_inputs *inputs)
 {
     const core_command *command = &inputs->command;
@@ -187,6 +205,8 @@ static uint32_t execute(core_state *core, const core_inputs *inputs)
         return clear_stop(core, inputs->stop_pressed != 0u);
     case COMMAND_GAINS:
         return take_gains(core, &command->gains);
+    case COMMAND_HOME:
+        return home(core);
     default:
         return REJECTION_UNKNOWN_COMMAND;
     }

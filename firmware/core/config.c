@@ -6,6 +6,7 @@
 #include "pid.h"
 
 _Static_assert(sizeof(pot_config) == 2u * (POT_NODES + 3u) + 4u * (POT_NODES + 4u), "pot_config has a hole");
+_Static_assert(sizeof(encoder_config) == 24u, "encoder_config has a hole");
 _Static_assert(offsetof(config_copy, crc) == sizeof(config_copy) - sizeof(uint32_t), "config_copy has a hole");
 
 uint32_t config_crc_on(uint32_t crc, const void *bytes, uint32_t length)
@@ -23,6 +24,8 @@ uint32_t config_crc_on(uint32_t crc, const void *bytes, uint32_t length)
 }
 
 uint32_t config_crc(const void *bytes, uint32_t length) { return ~config_crc_on(0xFFFFFFFFu, bytes, length); }
+
+#define REV_RAD 6.28318531f
 
 static const joint_config factory_joint = {
     .gains = {.kp_per_rad = 1.0f, .derivative_filter_s = 0.005f, .anti_windup_per_s = 10.0f},
@@ -51,6 +54,7 @@ static const joint_config factory_joint = {
     .stall_rad = 0.01f,
     .current_limit_ma = 1000u,
     .motor_direction = 1,
+    .encoder = {.counts_per_rev = (float)ENCODER_REV, .direction = 1},
 };
 
 void config_factory(core_config *config)
@@ -72,7 +76,7 @@ void config_factory(core_config *config)
     config->sync_led_ticks = 3u;
 }
 
-static bool pot_is_valid(const pot_config *pot)
+static bool table_is_valid(const pot_config *pot)
 {
     if (pot->node_count < 2u || pot->node_count > POT_NODES || pot->short_counts >= pot->open_counts) {
         return false;
@@ -91,8 +95,23 @@ static bool pot_is_valid(const pot_config *pot)
             return false;
         }
     }
-    return (pot->direction == 1 || pot->direction == -1) && number_within(pot->jump_rad, 1e-4f, 1.0f) &&
-           number_within(pot->frozen_rad, 1e-3f, 1.0f) && number_within(pot->inverted_rad, 1e-3f, 1.0f);
+    return pot->direction == 1 || pot->direction == -1;
+}
+
+static bool encoder_is_valid(const encoder_config *encoder)
+{
+    const bool quadrature = encoder->sensor == SENSOR_QUADRATURE;
+    const bool placed = quadrature ? encoder->input >= 1u && encoder->input <= JOINTS : encoder->zero_counts < ENCODER_REV;
+    return encoder->sensor <= SENSOR_ABSOLUTE && placed && number_within(encoder->counts_per_rev, 16.0f, 1e7f) &&
+           (encoder->direction == 1 || encoder->direction == -1) && number_within(encoder->home_rad, -13.0f, 13.0f);
+}
+
+static bool sensor_is_valid(const joint_config *joint)
+{
+    const pot_config *pot = &joint->pot;
+    const bool own = joint->encoder.sensor == SENSOR_POTENTIOMETER ? table_is_valid(pot) : encoder_is_valid(&joint->encoder);
+    return own && number_within(pot->jump_rad, 1e-4f, 1.0f) && number_within(pot->frozen_rad, 1e-3f, 1.0f) &&
+           number_within(pot->inverted_rad, 1e-3f, 1.0f);
 }
 
 static bool motor_is_valid(const motor_config *motor)
@@ -101,22 +120,54 @@ static bool motor_is_valid(const motor_config *motor)
            number_within(motor->apart_rad, 1e-3f, 1.0f);
 }
 
-/* Return whether the numbers fit each other: a stall shows below the duty's limit, the table reaches the soft limits. */
-static bool joint_is_consistent(const joint_config *joint)
+/* Return whether a potentiometer's table reaches the soft limits, within its band. */
+static bool table_is_consistent(const joint_config *joint)
 {
     const pot_config *pot = &joint->pot;
     const float first = (float)pot->direction * pot->angle_rad[0];
     const float last = (float)pot->direction * pot->angle_rad[pot->node_count - 1u];
     const float low = first < last ? first : last;
     const float high = first < last ? last : first;
-    return joint->stall_duty <= joint->duty_limit && joint->soft_min_rad >= low && joint->soft_max_rad <= high &&
-           pot->short_counts < pot->counts[0] && pot->counts[pot->node_count - 1u] < pot->open_counts &&
-           joint->speed_limit_rad_s * TICK_S < pot->jump_rad;
+    return joint->soft_min_rad >= low && joint->soft_max_rad <= high && pot->short_counts < pot->counts[0] &&
+           pot->counts[pot->node_count - 1u] < pot->open_counts;
+}
+
+/* Return whether a step of an encoder is small enough, and the soft limits lie within the revolution it measures. */
+static bool encoder_is_consistent(const joint_config *joint)
+{
+    const encoder_config *encoder = &joint->encoder;
+    const float step_rad = REV_RAD / encoder->counts_per_rev;
+    const float half_rad = (0.5f * (float)ENCODER_REV - 1.0f) * step_rad;
+    const bool within = encoder->sensor == SENSOR_QUADRATURE || (joint->soft_min_rad >= encoder->home_rad - half_rad &&
+                                                                 joint->soft_max_rad <= encoder->home_rad + half_rad);
+    return within && step_rad <= 0.5f * joint->pot.jump_rad && step_rad <= 0.5f * joint->pot.frozen_rad;
+}
+
+/* Return whether the numbers fit each other: a stall shows below the duty's limit, the sensor reaches the soft limits. */
+static bool joint_is_consistent(const joint_config *joint)
+{
+    const bool own = joint->encoder.sensor == SENSOR_POTENTIOMETER ? table_is_consistent(joint) : encoder_is_consistent(joint);
+    return own && joint->stall_duty <= joint->duty_limit && joint->speed_limit_rad_s * TICK_S < joint->pot.jump_rad;
+}
+
+/* Return whether no two quadrature encoders are on one timer. */
+static bool inputs_differ(const core_config *config)
+{
+    uint32_t taken = 0u;
+    for (uint32_t joint = 0u; joint < config->joint_count; joint++) {
+        const encoder_config *encoder = &config->joint[joint].encoder;
+        const uint32_t bit = encoder->sensor == SENSOR_QUADRATURE ? 1u << encoder->input : 0u;
+        if ((taken & bit) != 0u) {
+            return false;
+        }
+        taken |= bit;
+    }
+    return true;
 }
 
 static bool joint_is_valid(const joint_config *joint)
 {
-    return pid_gains_in_range(&joint->gains) && pot_is_valid(&joint->pot) && motor_is_valid(&joint->motor) &&
+    return pid_gains_in_range(&joint->gains) && sensor_is_valid(joint) && motor_is_valid(&joint->motor) &&
            number_within(joint->soft_min_rad, -13.0f, 13.0f) && number_within(joint->soft_max_rad, -13.0f, 13.0f) &&
            joint->soft_min_rad < joint->soft_max_rad && number_within(joint->speed_limit_rad_s, 0.01f, 20.0f) &&
            number_within(joint->deceleration_rad_s2, 0.1f, 1000.0f) &&
@@ -141,7 +192,7 @@ bool config_is_valid(const core_config *config)
             return false;
         }
     }
-    return config->supply_min_mv < config->supply_max_mv && ticks_within(config->supply_nominal_mv, 1000u, 100000u) &&
+    return inputs_differ(config) && config->supply_min_mv < config->supply_max_mv && ticks_within(config->supply_nominal_mv, 1000u, 100000u) &&
            ticks_within(config->overload_ticks, 1u, 10000u) && ticks_within(config->brake_release_ticks, 0u, 1000u) &&
            ticks_within(config->brake_engage_ticks, 0u, 1000u) && ticks_within(config->supply_ticks, 1u, 1000u) &&
            ticks_within(config->pot_ticks, 1u, 100u) && ticks_within(config->following_ticks, 1u, 10000u) &&

@@ -2,6 +2,7 @@
 
 #include "command.h"
 #include "config.h"
+#include "encoder.h"
 #include "governor.h"
 #include "motor.h"
 #include "number.h"
@@ -32,11 +33,14 @@ void core_init(core_state *core, const core_config *config, uint32_t source, uin
     safety_changed_config(core, false);
 }
 
-/* Read a potentiometer into the joint. */
+/* Read a joint's sensor. */
 static void measure(core_state *core, joint_state *joint, const joint_config *config, uint32_t i, uint32_t counts)
 {
     const bool known = joint->pot.valid != 0u;
-    const uint32_t fault = pot_read(&joint->pot, &config->pot, counts, core->config.pot_ticks);
+    const uint32_t fault =
+        config->encoder.sensor == SENSOR_POTENTIOMETER
+            ? pot_read(&joint->pot, &config->pot, counts, core->config.pot_ticks)
+            : encoder_read(&joint->encoder, &joint->pot, config, counts, core->config.pot_ticks);
     if (fault != FAULT_NONE) {
         safety_raise(core, fault, i);
     }

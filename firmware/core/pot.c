@@ -16,17 +16,20 @@ float pot_angle(const pot_config *config, uint32_t counts)
 
 uint32_t pot_read(pot_state *pot, const pot_config *config, uint32_t counts, uint32_t confirm_ticks)
 {
+    const uint32_t suspect = counts < config->short_counts  ? FAULT_POT_SHORT
+                             : counts > config->open_counts ? FAULT_POT_OPEN
+                                                            : FAULT_NONE;
+    return pot_take(pot, config, counts, pot_angle(config, counts), suspect, confirm_ticks);
+}
+
+uint32_t pot_take(pot_state *pot, const pot_config *config, uint32_t counts, float angle_rad, uint32_t suspect,
+                  uint32_t confirm_ticks)
+{
     pot->alive |= counts ^ pot->counts;
     pot->counts = counts;
-    const float angle_rad = pot_angle(config, counts);
     /* The longer the last good reading is ago, the further the joint may have moved. */
     const float reach_rad = config->jump_rad * (float)(pot->bad_ticks + 1u);
-    uint32_t suspect = FAULT_NONE;
-    if (counts < config->short_counts) {
-        suspect = FAULT_POT_SHORT;
-    } else if (counts > config->open_counts) {
-        suspect = FAULT_POT_OPEN;
-    } else if (pot->valid != 0u && number_size(angle_rad - pot->angle_rad) > reach_rad) {
+    if (suspect == FAULT_NONE && pot->valid != 0u && number_size(angle_rad - pot->angle_rad) > reach_rad) {
         suspect = FAULT_POT_JUMP;
     }
     if (suspect != FAULT_NONE) {

@@ -14,6 +14,11 @@ float pot_angle(const pot_config *config, uint32_t counts);
  * plausible: the angle stays. Returns the fault once that lasts confirm_ticks (1 or more), FAULT_NONE until then. */
 uint32_t pot_read(pot_state *pot, const pot_config *config, uint32_t counts, uint32_t confirm_ticks);
 
+/* Take an angle (rad) that a sensor of any kind has at these counts. suspect: FAULT_NONE, or why it is no reading. As
+ * pot_read otherwise. */
+uint32_t pot_take(pot_state *pot, const pot_config *config, uint32_t counts, float angle_rad, uint32_t suspect,
+                  uint32_t confirm_ticks);
+
 /* Return whether the present angle is a reading of this tick. */
 bool pot_is_read(const pot_state *pot);
 

@@ -78,6 +78,9 @@ void safety_raise(core_state *core, uint32_t fault, uint32_t joint)
     if (joint < JOINTS) {
         core->joint_faults[joint] |= bit;
     }
+    if (joint < JOINTS && fault_reactions[fault] == REACTION_JOINT) {
+        core->joint[joint].encoder.homed = 0u; /* an encoder that missed counts has lost its zero */
+    }
     if (core->first_fault == FAULT_NONE) {
         core->first_fault = fault;
         core->first_joint = joint;

@@ -47,7 +47,8 @@
     X(MEMORY, 26, RELEASE, "memory: the configuration in use has changed by itself")                  \
     X(TICKS_LOST, 27, RELEASE, "ticks lost: the control loop loses time again and again")             \
     X(TAKEN_OVER, 28, HOLD, "taken over: another host said hello while the arm was driven")           \
-    X(CRASH, 29, RELEASE, "restarted after a crash of the firmware")
+    X(CRASH, 29, RELEASE, "restarted after a crash of the firmware")                                      \
+    X(ENCODER, 30, JOINT, "encoder: no sound reading: its wires, or a magnet too weak or too strong")
 
 /* X(name, code, text): the states. */
 #define STATE_LIST(X)                                                     \
@@ -71,7 +72,8 @@
     X(NO_HELLO, 9, "no hello of the board's own version came: only STOP is acknowledged")    \
     X(TOO_MANY, 10, "too many commands at once")                                       \
     X(CONFIG_BROKEN, 11, "the configuration came incomplete, or could not be stored")    \
-    X(NOT_OWNER, 12, "another host has the session: say hello again")
+    X(NOT_OWNER, 12, "another host has the session: say hello again")                                                \
+    X(NOT_HOMED, 13, "an encoder does not know its zero: bring the arm to its home and give HOME")
 
 #define FAULT_CODE(name, code, reaction, text) FAULT_##name = (code),
 #define STATE_CODE(name, code, text) STATE_##name = (code),
@@ -109,7 +111,16 @@ enum {
     COMMAND_CLEAR_FAULTS = 5,
     COMMAND_CLEAR_STOP = 6,
     COMMAND_GAINS = 7,
+    COMMAND_HOME = 8,
 };
+
+/* What reads a joint's angle. */
+enum { SENSOR_POTENTIOMETER = 0, SENSOR_QUADRATURE = 1, SENSOR_ABSOLUTE = 2 };
+
+#define ENCODER_REV 16384u /* counts of an absolute encoder's revolution */
+
+/* Beside the 14 bits of an absolute encoder's angle, in telemetry. */
+enum { ENCODER_UNSOUND = 16384, ENCODER_MAGNET = 32768 };
 
 /* What holds a joint back without being a fault, one bit each. */
 enum {
@@ -161,6 +172,17 @@ typedef struct motor_config {
     float apart_rad;      /* 1e-3 to 1: how far motor and potentiometer may be apart: noise and backlash */
 } motor_config;
 
+/* The encoder of one joint. The joint is at home_rad where its counts are those of the zero: an absolute one's
+ * zero_counts, a quadrature one's when COMMAND_HOME came. Of pot then only jump_rad, frozen_rad and inverted_rad count. */
+typedef struct encoder_config {
+    uint32_t sensor;      /* SENSOR_...; the rest is not looked at for a potentiometer */
+    uint32_t input;       /* 1 to JOINTS, no two joints' the same: which timer; quadrature only */
+    float counts_per_rev; /* 16 to 1e7: of one revolution of the joint, four edges a line and the gear included */
+    int32_t direction;    /* 1 or -1, multiplies the counts */
+    uint32_t zero_counts; /* 0 to ENCODER_REV - 1; absolute only */
+    float home_rad;       /* -13 to 13 */
+} encoder_config;
+
 /* The configuration of one joint. */
 typedef struct joint_config {
     joint_gains gains;
@@ -181,6 +203,7 @@ typedef struct joint_config {
     float stall_rad;           /* 1e-4 to 1: rotating less than this within stall_ticks is standing still */
     uint32_t current_limit_ma; /* motor current from which the duty is cut */
     int32_t motor_direction;   /* 1 or -1, multiplies the duty on its way out */
+    encoder_config encoder;    /* what reads the joint, where it is no potentiometer */
 } joint_config;
 
 /* The configuration of the arm. Times are in ticks of 1 ms. */
@@ -235,7 +258,8 @@ typedef struct core_inputs {
     uint32_t stop_pressed;       /* not 0: an emergency stop is asked for, by button or by message */
     uint32_t taken_over;         /* not 0: another host began a session */
     uint32_t supply_mv;          /* motor supply */
-    uint32_t counts[JOINTS];     /* potentiometers, 0 to 65535 */
+    uint32_t counts[JOINTS];     /* what the joint's sensor reads: a potentiometer 0 to 65535; a quadrature timer, which
+                                    wraps at 2^32; an AS5047's frames, its angle below and DIAAGC in the upper half */
     int32_t current_ma[JOINTS];  /* motor currents, positive where a positive duty drives them; 0 where not measured */
     core_command command;        /* COMMAND_NONE where none came since the last tick */
 } core_inputs;
@@ -361,6 +385,13 @@ typedef struct pot_state {
     float farthest_rad;    /* how far that way it has been meanwhile */
 } pot_state;
 
+/* What is remembered of one encoder beside pot_state, which has its angle. */
+typedef struct encoder_state {
+    uint32_t counts;      /* this tick's; quadrature */
+    uint32_t zero_counts; /* those at home_rad */
+    uint32_t homed;       /* not 0: it is known that they are */
+} encoder_state;
+
 /* What is remembered of one joint. */
 typedef struct joint_state {
     pid_state pid;
@@ -385,6 +416,7 @@ typedef struct joint_state {
     float stall_mark_rad;    /* where the joint was when stall_ticks began */
     uint32_t held_back;      /* LIMITED_SOFT and LIMITED_SPEED of the last motion command */
     uint32_t limited;        /* LIMITED_... of this tick */
+    encoder_state encoder;
 } joint_state;
 
 /* The whole controller. */

@@ -8,6 +8,7 @@
 
 #include "common.h"
 #include "config.h"
+#include "encoder.h"
 #include "inside.h"
 #include "number.h"
 #include "safety.h"
@@ -332,7 +333,7 @@ static void write_sensed(wire_state *wire)
     mavlink_sensed_t sensed = {.tick = report->outputs.tick};
     memcpy(sensed.duty, report->last_duty, sizeof sensed.duty);
     for (uint32_t joint = 0u; joint < JOINTS; joint++) {
-        sensed.counts[joint] = (uint16_t)(report->counts[joint] < 65535u ? report->counts[joint] : 65535u);
+        sensed.counts[joint] = (uint16_t)encoder_telemetry(&wire->setup.config->joint[joint], report->counts[joint]);
         sensed.current_ma[joint] = short_of(report->current_ma[joint]);
     }
     mavlink_message_t message;

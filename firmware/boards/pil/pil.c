@@ -77,6 +77,7 @@ static void ask_restart(void) { restart_asked = true; }
 static const board_description board = {
     .name = "pil",
     .baud = BAUD,
+    .sensors = 1u << SENSOR_POTENTIOMETER | 1u << SENSOR_QUADRATURE | 1u << SENSOR_ABSOLUTE,
     .sense = sense,
     .drive = drive,
     .feed_watchdog = feed_watchdog,

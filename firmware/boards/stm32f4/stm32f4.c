@@ -55,6 +55,7 @@ static void restart(void)
 static const board_description nucleo = {
     .name = "nucleo-f446re",
     .baud = UART_BAUD,
+    .sensors = 1u << SENSOR_POTENTIOMETER,
     .sense = sense,
     .drive = drive,
     .feed_watchdog = watchdog_feed,

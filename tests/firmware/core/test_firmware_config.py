@@ -154,6 +154,7 @@ WRONG = {
     "stall_duty": [0, 0.81, 1.01, NAN],
     "stall_rad": [0, 1.01, NAN],
     "motor_direction": [0, 3],
+    "encoder.sensor": [3],
 }
 WRONG_ARM = {
     "joint_count": [0, 7],
@@ -197,7 +198,11 @@ def test_a_value_outside_its_range_makes_the_configuration_invalid(library, path
 
 def test_every_value_has_its_range_tried(library):
     """A field added to the configuration must be added here."""
-    leaves = {name for name, _ in c.joint_config._fields_ if name not in ("gains", "pot", "motor", "current_limit_ma")}
+    leaves = {
+        name
+        for name, _ in c.joint_config._fields_
+        if name not in ("gains", "pot", "motor", "encoder", "current_limit_ma")
+    }
     leaves |= {f"gains.{name}" for name, _ in c.joint_gains._fields_}
     assert leaves <= set(WRONG)
     assert {name for name, _ in c.core_config._fields_} - {"joint", "supply_max_mv"} == set(WRONG_ARM)

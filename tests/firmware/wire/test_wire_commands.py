@@ -143,7 +143,7 @@ def test_a_stop_is_taken_whatever_its_number_and_reported_only_when_taken(workin
     assert board.answer.outputs.state == c.STATE_STOPPED, "an older number than 100 is stale still"
 
 
-@pytest.mark.parametrize("kind", [0, c.COMMAND_MOVE, c.COMMAND_GAINS, 8, 0x100, 2**32 - 1])
+@pytest.mark.parametrize("kind", [0, c.COMMAND_MOVE, c.COMMAND_GAINS, 9, 0x100, 2**32 - 1])
 def test_a_command_of_an_unknown_kind_is_rejected(working, kind):
     board, host = working
     board.run(30, host.command(kind))

@@ -9,7 +9,7 @@ import pytest
 
 from armsight import firmware
 from armsight.robot.boards import codes, configuration, frames
-from armsight.robot.boards.configuration import CONFIG, GAINS, JOINT, MOTOR, POT
+from armsight.robot.boards.configuration import CONFIG, ENCODER, GAINS, JOINT, MOTOR, POT
 
 FIRMWARE = Path(__file__).resolve().parents[3] / "firmware"
 NUMBERS = {"JOINTS": 6, "POT_NODES": 9, "FRAME_BYTES": 512}
@@ -25,6 +25,7 @@ RECORDS = {
     "joint_gains": GAINS,
     "pot_config": POT,
     "motor_config": MOTOR,
+    "encoder_config": ENCODER,
     "joint_config": JOINT,
     "core_config": CONFIG,
     "core_outputs": frames.OUTPUTS,
@@ -82,6 +83,7 @@ def test_codes_and_texts_are_the_headers(which, ours, texts):
         ("CONFIG_", codes.ConfigSource),
         ("REACTION_", codes.Reaction),
         ("COMMAND_", codes.Command),
+        ("SENSOR_", codes.SensorKind),
     ],
 )
 def test_enumerations_are_the_headers(prefix, ours):

@@ -9,7 +9,14 @@ from hypothesis import strategies as st
 
 from armsight import firmware
 from armsight.errors import InputError
-from armsight.robot.boards.configuration import CONFIG, check_configuration, check_gains, gains_array, lab_configuration
+from armsight.robot.boards.configuration import (
+    CONFIG,
+    ENCODER,
+    check_configuration,
+    check_gains,
+    gains_array,
+    lab_configuration,
+)
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +107,21 @@ def test_every_range_is_held_on_both_sides(is_valid, path):
     for value in EDGES:
         config = changed(path, 1, 1, value)
         assert is_good(config) == is_valid(config), value
+
+
+@pytest.mark.parametrize("sensor", [1, 2])
+def test_an_encoders_ranges_are_held_on_both_sides(is_valid, sensor):
+    edges = [*EDGES, 6, 7, 15.9, 16, 628, 629, 1e7, 2e7, 16383, 16384]
+    fields = [("joint", "encoder", name) for name in ENCODER.names]
+    for path in [*fields, ("joint", "soft_max_rad"), ("joint", "pot", "jump_rad"), ("joint", "pot", "counts")]:
+        for value in edges:
+            config = changed(path, 1, 0, value)
+            encoders, given = config["joint"]["encoder"], config["joint"]["encoder"][1].copy()
+            encoders[1] = (sensor, 2, 16384.0, 1, 0, 0.0)
+            if path[1] == "encoder":
+                encoders[path[2]][1] = given[path[2]]
+            encoders[0] = (1, 3, 16384.0, 1, 0, 0.0)
+            assert is_good(config) == is_valid(config), (path, value)
 
 
 @pytest.mark.parametrize(

@@ -283,12 +283,26 @@ def bringup(
 @click.option("--yes", is_flag=True, help="Do not ask.")
 @_JSON
 def home(name: str, baud: int | None, at_once: str, yes: bool, as_json: bool) -> None:
-    """Home an AR4: its joints go to their limit switches, where the encoders are set, and then to rest at 0."""
-    import numpy as np
+    """Home an AR4: its joints go to their limit switches, where the encoders are set, and then to rest at 0.
 
+    A board with our firmware moves nothing: quadrature encoders take where the arm stands, drives off, for their home_rad.
+    """
     from armsight.robot.boards.ar4.board import Ar4Board
+    from armsight.robot.boards.board import Board
+    from armsight.robot.boards.codes import Command, SensorKind
 
     with _open_any(name, baud) as board:
+        if (
+            isinstance(board, Board)
+            and (board.configuration()["joint"]["encoder"]["sensor"] == SensorKind.QUADRATURE).any()
+        ):
+            if not yes:
+                click.confirm(
+                    "is the arm where its encoders have home_rad, and does it stay there?", abort=True, err=True
+                )
+            board.confirm(board.command(Command.HOME))
+            _print_home(board.receive(0.05).q[-1], as_json)
+            return
         if not isinstance(board, Ar4Board):
             raise InputError(f"{name} has no limit switches to be homed at; its sensors are absolute")
         if not yes:
@@ -297,6 +311,12 @@ def home(name: str, baud: int | None, at_once: str, yes: bool, as_json: bool) ->
             )
         board.home(at_once=int(at_once))
         q = board.receive().q[-1]
+    _print_home(q, as_json)
+
+
+def _print_home(q: Array, as_json: bool) -> None:
+    import numpy as np
+
     degrees = [round(float(each), 3) for each in np.degrees(q)]
     click.echo(json.dumps({"q_rad": [round(float(each), 6) for each in q]}) if as_json else f"homed, at {degrees} deg")
 

@@ -55,7 +55,7 @@ def config_group(
         with open_board(name, baud) as board:
             _same_board(file, board_name, board)
             theirs = dict(entries(board.configuration()))
-        found = {path: [theirs[path], value] for path, value in entries(ours) if theirs[path] != value}
+        found = {path: [theirs.get(path), value] for path, value in entries(ours) if theirs.get(path) != value}
         if as_json:
             click.echo(json.dumps(found))
         for path, (on_board, in_file) in found.items():

@@ -2,7 +2,7 @@
 
 In: a :data:`~armsight.robot.boards.configuration.Configuration`. Out: TOML text, and back, to the last bit::
 
-    version = 2                  # layout of the configuration
+    version = 4                  # layout of the configuration
     board = "nucleo-f446re"      # the board it belongs to
 
     [arm]
@@ -14,6 +14,8 @@ In: a :data:`~armsight.robot.boards.configuration.Configuration`. Out: TOML text
     [joint.1.gains]
     [joint.1.pot]
     [joint.1.motor]
+    [joint.1.encoder]
+    sensor = "potentiometer"     # or quadrature, or absolute: then with counts_per_rev, direction, zero
 
 Every value must be there, once; a name that is not known is named with the one it was perhaps meant to be.
 """
@@ -29,9 +31,11 @@ from typing import Any
 import numpy as np
 
 from armsight.errors import InputError
+from armsight.robot.boards.codes import SensorKind
 from armsight.robot.boards.configuration import (
     CONFIG,
     CONFIG_VERSION,
+    ENCODER_FIELDS,
     JOINTS,
     POT_NODES,
     RANGES,
@@ -43,9 +47,14 @@ from armsight.robot.boards.configuration import (
 )
 
 #: Parts of a joint that are tables of their own.
-_PARTS = ("gains", "pot", "motor")
+_PARTS = ("gains", "pot", "motor", "encoder")
 _PIN = "sync_led_pin"  # a name in the file: "PB13", or "none"
 _TABLES = ("counts", "angle_rad")  # of a potentiometer: as long as its node_count, which they replace
+
+
+#: What of a potentiometer's configuration an encoder has no use for.
+_POT_ONLY = (*_TABLES, "short_counts", "open_counts", "direction")
+_SENSORS = {each.name.lower(): each for each in SensorKind}
 
 
 def entries(config: Configuration) -> Iterator[tuple[str, Any]]:
@@ -55,7 +64,15 @@ def entries(config: Configuration) -> Iterator[tuple[str, Any]]:
             value = config[name].item()
             yield f"arm.{name}", pin_name(value) if name == _PIN else value
     for j in range(int(config["joint_count"])):
-        yield from _of(config["joint"][j], f"joint.{j + 1}", config["joint"][j]["pot"])
+        joint = config["joint"][j]
+        sensor = SensorKind(int(joint["encoder"]["sensor"]))
+        used = {"sensor", *ENCODER_FIELDS[sensor]}
+        for path, value in _of(joint, f"joint.{j + 1}", joint["pot"]):
+            part, name = path.split(".")[2], path.rpartition(".")[2]
+            if part == "encoder" and name == "sensor":
+                yield path, sensor.name.lower()
+            elif name in used if part == "encoder" else not (part == "pot" and name in _POT_ONLY and used > {"sensor"}):
+                yield path, value
 
 
 def _of(record: Configuration, path: str, pot: Configuration) -> Iterator[tuple[str, Any]]:
@@ -86,7 +103,11 @@ def configuration_text(config: Configuration, board: str) -> str:
             lines += [""] * bool(table) + [f"[{here}]"]
             table = here
         low, high = RANGES.get(name, (None, None))
-        value = f'"{value}"' if name == _PIN else value
+        if name == _PIN:
+            value = f'"{value}"'
+        elif isinstance(value, str):
+            lines.append(f'{name} = "{value}"  # {", ".join(_SENSORS)}')
+            continue
         lines.append(f"{name} = {value}" + (f"  # {low:g} to {high:g}" if low is not None and high is not None else ""))
     return "\n".join(lines) + "\n"
 
@@ -112,6 +133,13 @@ def read_configuration(path: Path) -> tuple[Configuration, str]:
     if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= JOINTS:
         raise InputError(f"{path}: arm.joint_count is {count!r}; 1 to {JOINTS} is needed: the joints the arm has")
     config["joint_count"], config["joint"]["pot"]["node_count"][:count] = count, 2
+    for j in range(count):  # first of all: what else there is to say depends on it
+        path_of = f"joint.{j + 1}.encoder.sensor"
+        if path_of in given:
+            try:
+                put(config, path_of, given[path_of])
+            except InputError as error:
+                raise InputError(f"{path}: {error}") from None
     known = dict(entries(config))
     for name in given:
         if name not in known:
@@ -163,6 +191,11 @@ def put(config: Configuration, path: str, value: object) -> None:
         raise InputError(f"nothing is called {path}")
     if name == _PIN:
         record[name] = pin_number(value)
+        return
+    if name == "sensor":
+        if not isinstance(value, str) or value not in _SENSORS:
+            raise InputError(f"{path} is {value!r}; there are {', '.join(_SENSORS)}")
+        record[name] = _SENSORS[value]
         return
     whole = record.dtype[name].base.kind != "f"
     if name in _TABLES:

@@ -52,6 +52,7 @@ class Fault(IntEnum):
     TICKS_LOST = 27
     TAKEN_OVER = 28
     CRASH = 29
+    ENCODER = 30
 
 
 class Alarm(IntEnum):
@@ -81,6 +82,7 @@ class Rejection(IntEnum):
     TOO_MANY = 10
     CONFIG_BROKEN = 11
     NOT_OWNER = 12
+    NOT_HOMED = 13
 
 
 class Limited(IntFlag):
@@ -102,6 +104,15 @@ class Command(IntEnum):
     DISABLE = 4
     CLEAR_FAULTS = 5
     CLEAR_STOP = 6
+    HOME = 8
+
+
+class SensorKind(IntEnum):
+    """What reads a joint's angle."""
+
+    POTENTIOMETER = 0
+    QUADRATURE = 1
+    ABSOLUTE = 2
 
 
 class Reaction(IntEnum):
@@ -157,6 +168,7 @@ FAULT_TEXTS: Mapping[Fault, str] = {
     Fault.TICKS_LOST: "ticks lost: the control loop loses time again and again",
     Fault.TAKEN_OVER: "taken over: another host said hello while the arm was driven",
     Fault.CRASH: "restarted after a crash of the firmware",
+    Fault.ENCODER: "encoder: no sound reading: its wires, or a magnet too weak or too strong",
 }
 ALARM_TEXTS: Mapping[Alarm, str] = {
     Alarm.VOLTAGE: "supply outside the servo's limits",
@@ -180,6 +192,7 @@ REJECTION_TEXTS: Mapping[Rejection, str] = {
     Rejection.TOO_MANY: "too many commands at once",
     Rejection.CONFIG_BROKEN: "the configuration came incomplete, or could not be stored",
     Rejection.NOT_OWNER: "another host has the session: say hello again",
+    Rejection.NOT_HOMED: "an encoder does not know its zero: bring the arm to its home and give HOME",
 }
 
 

@@ -19,11 +19,13 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.robot.boards.codes import Reaction
+from armsight.robot.boards.codes import Reaction, SensorKind
 from armsight.robot.boards.tuning import MotorFigures, tuned_gains
 
 Configuration = NDArray[np.void]
 JOINTS, POT_NODES = 6, 9
+#: Counts of an absolute encoder's revolution.
+ENCODER_REV = 16384
 #: Layout of the configuration this armsight knows: ``firmware/core/config.h``.
 CONFIG_VERSION = 4
 
@@ -53,6 +55,16 @@ POT = np.dtype(
     ]
 )
 MOTOR = np.dtype([("resistance_ohm", "<f4"), ("constant_v_s", "<f4"), ("apart_rad", "<f4")])
+ENCODER = np.dtype(
+    [
+        ("sensor", "<u4"),
+        ("input", "<u4"),
+        ("counts_per_rev", "<f4"),
+        ("direction", "<i4"),
+        ("zero_counts", "<u4"),
+        ("home_rad", "<f4"),
+    ]
+)
 JOINT = np.dtype(
     [
         ("gains", GAINS),
@@ -73,6 +85,7 @@ JOINT = np.dtype(
         ("stall_rad", "<f4"),
         ("current_limit_ma", "<u4"),
         ("motor_direction", "<i4"),
+        ("encoder", ENCODER),
     ]
 )
 CONFIG = np.dtype(
@@ -108,7 +121,6 @@ GAIN_RANGES = {
     "anti_windup_per_s": (0.0, 1000.0),
 }
 _POT_RANGES = {
-    "node_count": (2, POT_NODES),
     "jump_rad": (1e-4, 1.0),
     "frozen_rad": (1e-3, 1.0),
     "inverted_rad": (1e-3, 1.0),
@@ -117,6 +129,19 @@ _MOTOR_RANGES = {
     "resistance_ohm": (0.0, 1000.0),
     "constant_v_s": (1e-3, 1e3),
     "apart_rad": (1e-3, 1.0),
+}
+_TABLE_RANGES = {"node_count": (2, POT_NODES)}
+_ENCODER_RANGES = {
+    "input": (1, JOINTS),
+    "counts_per_rev": (16.0, 1e7),
+    "zero_counts": (0, ENCODER_REV - 1),
+    "home_rad": (-13.0, 13.0),
+}
+#: What of an encoder's configuration each kind of sensor needs beside the kind itself.
+ENCODER_FIELDS: Mapping[SensorKind, tuple[str, ...]] = {
+    SensorKind.POTENTIOMETER: (),
+    SensorKind.QUADRATURE: ("input", "counts_per_rev", "direction", "home_rad"),
+    SensorKind.ABSOLUTE: ("counts_per_rev", "direction", "zero_counts", "home_rad"),
 }
 _JOINT_RANGES = {
     "soft_min_rad": (-13.0, 13.0),
@@ -200,6 +225,8 @@ def check_pin(config: Configuration, board: str) -> None:
 RANGES: Mapping[str, tuple[float, float]] = {
     **GAIN_RANGES,
     **_POT_RANGES,
+    **_TABLE_RANGES,
+    **_ENCODER_RANGES,
     **_MOTOR_RANGES,
     **_JOINT_RANGES,
     **_ARM_RANGES,
@@ -296,6 +323,11 @@ def _problems(config: Configuration) -> Iterator[str]:
         for values, ranges in _ranged(joints[j]):
             yield from (f"joint {j + 1}: {text}" for text in _outside(values, ranges))
         yield from (f"joint {j + 1}: {text}" for text in _joint_problems(joints[j]))
+    inputs: dict[int, int] = {}
+    for j in range(count):
+        encoder = joints[j]["encoder"]
+        if encoder["sensor"] == SensorKind.QUADRATURE and (taken := inputs.setdefault(int(encoder["input"]), j)) != j:
+            yield f"joints {taken + 1} and {j + 1} are both on encoder input {encoder['input']}; each timer counts for one"
     if config["supply_min_mv"] >= config["supply_max_mv"]:
         yield "supply_min_mv must be below supply_max_mv"
     if config["sync_led_pin"] and not PIN_NUMBERS[0] <= config["sync_led_pin"] <= PIN_NUMBERS[1]:
@@ -305,7 +337,12 @@ def _problems(config: Configuration) -> Iterator[str]:
 
 
 def _ranged(joint: Configuration) -> tuple[tuple[Configuration, Mapping[str, tuple[float, float]]], ...]:
-    return (joint, _JOINT_RANGES), (joint["pot"], _POT_RANGES), (joint["motor"], _MOTOR_RANGES)
+    plain = (joint, _JOINT_RANGES), (joint["pot"], _POT_RANGES), (joint["motor"], _MOTOR_RANGES)
+    sensor = int(joint["encoder"]["sensor"])
+    if sensor == SensorKind.POTENTIOMETER:
+        return *plain, (joint["pot"], _TABLE_RANGES)
+    needed = ENCODER_FIELDS[SensorKind(sensor)] if sensor in tuple(SensorKind) else ()
+    return *plain, (joint["encoder"], {name: each for name, each in _ENCODER_RANGES.items() if name in needed})
 
 
 def _outside(values: Configuration, ranges: Mapping[str, tuple[float, float]]) -> Iterator[str]:
@@ -315,6 +352,38 @@ def _outside(values: Configuration, ranges: Mapping[str, tuple[float, float]]) -
 
 
 def _joint_problems(joint: Configuration) -> Iterator[str]:
+    sensor = int(joint["encoder"]["sensor"])
+    if sensor not in tuple(SensorKind):
+        kinds = ", ".join(f"{each.value} ({each.name.lower()})" for each in SensorKind)
+        yield f"sensor is {sensor}; {kinds} are allowed"
+    yield from _table_problems(joint) if sensor == SensorKind.POTENTIOMETER else _encoder_problems(joint)
+    if joint["soft_min_rad"] >= joint["soft_max_rad"]:
+        yield "soft_min_rad must be below soft_max_rad"
+    if joint["motor_direction"] not in (1, -1):
+        yield f"motor_direction is {joint['motor_direction']}; 1 or -1 is allowed"
+    if joint["stall_duty"] > joint["duty_limit"]:
+        yield "stall_duty must not be beyond duty_limit"
+    if np.float32(joint["speed_limit_rad_s"]) * np.float32(1e-3) >= joint["pot"]["jump_rad"]:
+        yield "jump_rad must be further than the joint moves in a tick at its speed limit"
+
+
+def _encoder_problems(joint: Configuration) -> Iterator[str]:
+    encoder, pot = joint["encoder"], joint["pot"]
+    if encoder["direction"] not in (1, -1):
+        yield f"direction of the encoder is {encoder['direction']}; 1 or -1 is allowed"
+    # float32 in the board's own order, so that both say the same
+    step = np.float32(2 * np.pi) / encoder["counts_per_rev"]
+    half = np.float32(ENCODER_REV // 2 - 1) * step
+    low, high = encoder["home_rad"] - half, encoder["home_rad"] + half
+    absolute = encoder["sensor"] == SensorKind.ABSOLUTE
+    if absolute and (joint["soft_min_rad"] < low or joint["soft_max_rad"] > high):
+        yield f"the soft limits must lie within the encoder's revolution, {low:.4g} to {high:.4g} rad"
+    for name in ("jump_rad", "frozen_rad"):
+        if step > np.float32(0.5) * pot[name]:
+            yield f"{name} must be two counts of the encoder or more, {2 * step:.2g} rad"
+
+
+def _table_problems(joint: Configuration) -> Iterator[str]:
     pot = joint["pot"]
     n = int(pot["node_count"])
     counts, angles = np.diff(pot["counts"][:n].astype(int)), np.diff(pot["angle_rad"][:n].astype(float))
@@ -324,17 +393,10 @@ def _joint_problems(joint: Configuration) -> Iterator[str]:
         yield "the angles of the potentiometer's table must rise or fall throughout, within -13 to 13 rad"
     if pot["short_counts"] >= pot["open_counts"]:
         yield "short_counts must be below open_counts"
-    if joint["soft_min_rad"] >= joint["soft_max_rad"]:
-        yield "soft_min_rad must be below soft_max_rad"
-    for name, value in (("direction", pot["direction"]), ("motor_direction", joint["motor_direction"])):
-        if value not in (1, -1):
-            yield f"{name} is {value}; 1 or -1 is allowed"
+    if pot["direction"] not in (1, -1):
+        yield f"direction is {pot['direction']}; 1 or -1 is allowed"
     table = int(pot["direction"]) * pot["angle_rad"][:n]
     if joint["soft_min_rad"] < table.min() or joint["soft_max_rad"] > table.max():
         yield "the soft limits must lie within the potentiometer's table"
     if not pot["short_counts"] < pot["counts"][0] or not pot["counts"][n - 1] < pot["open_counts"]:
         yield "the potentiometer's table must lie between short_counts and open_counts"
-    if joint["stall_duty"] > joint["duty_limit"]:
-        yield "stall_duty must not be beyond duty_limit"
-    if np.float32(joint["speed_limit_rad_s"]) * np.float32(1e-3) >= pot["jump_rad"]:
-        yield "jump_rad must be further than the joint moves in a tick at its speed limit"
