@@ -397,7 +397,17 @@ def test_a_rig_whose_camera_moved_is_named_and_the_exit_code_says_so(rendered, t
     (found,) = said.lines[-1]["health"]
     assert said.code == 3, said.err
     assert found["cause"] == "rig"
-    assert found.keys() == {"cause", "what", "since_s", "size", "sigma", "unit", "advice", "alternatives"}
+    assert found.keys() == {
+        "cause",
+        "what",
+        "since_s",
+        "size",
+        "sigma",
+        "unit",
+        "advice",
+        "alternatives",
+        "corrected_s",
+    }
     assert abs(found["size"] - 0.3) < 4 * found["sigma"]
     assert "do not trust this result: rig: " in said.err
 
