@@ -34,9 +34,9 @@ BETTER, PLAUSIBLE_M = 4.0, 0.02
 SMALLER = 0.99
 #: Poses that a reading is evaluated by at most, and the rows by which poses are looked for against the images.
 EVALUATED, SHIFTS = 60, (1, -1, 2, -2)
-#: Rows at least on either side of where something may have been displaced, and places that are looked at first.
-PART, PLACES = 6, 12
-#: Orders of the joints that are looked at: the angles between poses do not tell joints with parallel axes apart.
+#: Rows at least on either side of where something may have been displaced, and rows that are tried first.
+PART, TRIED = 6, 12
+#: Orders of the joints that are looked at: the angles between poses do not distinguish parallel axes.
 ORDERS = 12
 #: Mirrors one axis; the other two are this one rotated.
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -142,9 +142,9 @@ def _displaced(p: Poses, as_given: float) -> int | None:
 
     if n < 2 * PART:
         return None
-    places = np.unique(np.linspace(PART, n - PART, min(PLACES, n - 2 * PART + 1)).round().astype(int))
-    found = {int(k): worse(int(k)) for k in places}
-    step = int(np.diff(places).max()) if len(places) > 1 else 1
+    tried = np.unique(np.linspace(PART, n - PART, min(TRIED, n - 2 * PART + 1)).round().astype(int))
+    found = {int(k): worse(int(k)) for k in tried}
+    step = int(np.diff(tried).max()) if len(tried) > 1 else 1
     while step > 1:
         step = (step + 1) // 2
         best = min(found, key=lambda k: found[k])
