@@ -264,11 +264,11 @@ def predict(model: BundleModel, state: BundleState, observations: Observations) 
         Ts = state.Ts_left_body if side == 0 else inverse(state.T_left_right) @ state.Ts_left_body
         T, p_body = Ts[shots], body[points]
         by_body = by_point = T[:, :3, :3]
-        arm, turned = p_body - middle, still
+        arm, jacobians = p_body - middle, still
         if side == 1 and moves:
             Rs = exp_so3(np.array(state.motions[:, 3:]))
             p_body = (Rs[shots] @ arm[..., None])[..., 0] + middle + state.motions[shots, :3]
-            by_point, turned = (Ts[:, :3, :3] @ Rs)[shots], _right_jacobians(state.motions[:, 3:])[shots]
+            by_point, jacobians = (Ts[:, :3, :3] @ Rs)[shots], _right_jacobians(state.motions[:, 3:])[shots]
         p = transform(T, p_body)
         uv[rows], J_p, J_k = camera.project_jacobians(p)
         J_normal = np.zeros((0, 2, 3))
@@ -280,7 +280,7 @@ def predict(model: BundleModel, state: BundleState, observations: Observations) 
             columns,
             (J_p, J_k, J_normal),
             (p, p_body, arm),
-            (by_body, by_point, turned),
+            (by_body, by_point, jacobians),
             points,
             modes,
             J_shared,
