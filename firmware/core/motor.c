@@ -8,6 +8,7 @@
 #define SCALE_HIGH 1.25f
 #define WINDOW_TICKS 32u      /* over which R and K are learnt; while the reading rests, its noise is that of the ends, */
 #define REST_TICKS 256u       /* so that a longer window says more, */
+#define ROUGH_VARIANCE 4e-4f  /* only once R is known to 2 %: else a hand that lets go teaches a wrong one for good */
 #define REST_NOISE_RAD 0.0035f /* but the motor may move within its backlash */
 #define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
@@ -91,7 +92,7 @@ static void window(motor_state *motor, const motor_config *config, float voltage
         return;
     }
     const float reach_rad = motor->sure_rad_s * (TICK_S * (float)WINDOW_TICKS);
-    if (motor->window_ticks < REST_TICKS && number_size(angle_rad - motor->window_rad) <= WINDOW_WAY_RAD &&
+    if (motor->window_ticks < REST_TICKS && motor->variance_rr < ROUGH_VARIANCE && number_size(angle_rad - motor->window_rad) <= WINDOW_WAY_RAD &&
         reach_rad <= WINDOW_WAY_RAD) {
         return; /* neither the reading nor the motor moves: the longer the window, the better */
     }
