@@ -8,6 +8,7 @@
 #define SCALE_HIGH 1.25f
 #define WINDOW_TICKS 32u      /* over which R and K are learnt; while the reading rests, its noise is that of the ends, */
 #define REST_TICKS 256u       /* so that a longer window says more, */
+#define ROUGH_VARIANCE 4e-4f  /* only once R is known to 2 %: else a hand that lets go teaches a wrong one for good */
 #define REST_NOISE_RAD 0.0035f /* but the motor may move within its backlash */
 #define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
@@ -44,14 +45,15 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
     const float per_s = (float)TICKS_PER_S * per_tick;
     const float ir_v = motor->window_ir_v * per_tick;
     const float kw_v = config->constant_v_s * (angle_rad - motor->window_rad) * per_s;
-    const float noise_rad = motor->window_ticks > WINDOW_TICKS ? REST_NOISE_RAD : WINDOW_NOISE_RAD;
+    const bool rested = motor->window_ticks > WINDOW_TICKS; /* such windows may still be the first to tell R */
+    const float noise_rad = rested ? REST_NOISE_RAD : WINDOW_NOISE_RAD;
     const float noise_v = config->constant_v_s * noise_rad * per_s;
     const float gain_r = motor->variance_rr * ir_v + motor->variance_rk * kw_v;
     const float gain_k = motor->variance_rk * ir_v + motor->variance_kk * kw_v;
     const float variance = ir_v * gain_r + kw_v * gain_k + noise_v * noise_v;
     const float off_v = motor->window_v * per_tick - motor->resistance_scale * ir_v - motor->constant_scale * kw_v;
     const float warmer_v = WARMER * ir_v;
-    const bool explained = off_v * off_v <= SURPRISE * variance + warmer_v * warmer_v;
+    const bool explained = rested || off_v * off_v <= SURPRISE * variance + warmer_v * warmer_v;
     const float off_rad = off_v / (config->constant_v_s * per_s);
     const bool begins = motor->unexplained_rad * off_rad <= 0.0f; /* another side than before */
     motor->unexplained_rad = explained ? 0.0f : (begins ? off_rad : motor->unexplained_rad + off_rad);
@@ -90,7 +92,7 @@ static void window(motor_state *motor, const motor_config *config, float voltage
         return;
     }
     const float reach_rad = motor->sure_rad_s * (TICK_S * (float)WINDOW_TICKS);
-    if (motor->window_ticks < REST_TICKS && number_size(angle_rad - motor->window_rad) <= WINDOW_WAY_RAD &&
+    if (motor->window_ticks < REST_TICKS && motor->variance_rr < ROUGH_VARIANCE && number_size(angle_rad - motor->window_rad) <= WINDOW_WAY_RAD &&
         reach_rad <= WINDOW_WAY_RAD) {
         return; /* neither the reading nor the motor moves: the longer the window, the better */
     }
