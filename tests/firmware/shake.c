@@ -51,7 +51,7 @@ static void prepare(core_inputs *inputs, uint32_t tick)
     if (draw() % 2u == 0u) {
         aim(&inputs->command.move);
     }
-    inputs->command.kind = draw() % 9u;
+    inputs->command.kind = draw() % 10u;
 }
 
 static int sound(const core_outputs *outputs)
@@ -75,6 +75,10 @@ static int run(uint32_t round)
     config_copy copies[2];
     config_factory(&config);
     memset(&inputs, 0, sizeof inputs);
+    for (uint32_t i = 0; round % 2u == 1u && i < JOINTS; i++) {
+        config.joint[i].encoder.sensor = draw() % 3u;
+        config.joint[i].encoder.input = i + 1u;
+    }
     config_seal(&copies[0], &config, draw());
     config_seal(&copies[1], &config, draw());
     ((unsigned char *)&copies[round % 2u])[draw() % sizeof copies[0]] ^= (unsigned char)draw();
