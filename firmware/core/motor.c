@@ -41,11 +41,11 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
     const float ticks = (float)motor->window_ticks;
     const float per_tick = 1.0f / ticks;
     const float wander = WANDER_VARIANCE * ticks;
-    motor->variance_rr += motor->variance_rr < PRIOR_VARIANCE ? wander : 0.0f; /* also where the window is not believed */
+    motor->variance_rr += motor->variance_rr < PRIOR_VARIANCE ? wander : 0.0f; /* also where nothing is learnt */
     const float per_s = (float)TICKS_PER_S * per_tick;
     const float ir_v = motor->window_ir_v * per_tick;
     const float kw_v = config->constant_v_s * (angle_rad - motor->window_rad) * per_s;
-    const bool rested = motor->window_ticks > WINDOW_TICKS; /* such windows may still be the first to tell R */
+    const bool rested = motor->window_ticks > WINDOW_TICKS; /* such windows may still be the first to show R */
     const float noise_rad = rested ? REST_NOISE_RAD : WINDOW_NOISE_RAD;
     const float noise_v = config->constant_v_s * noise_rad * per_s;
     const float gain_r = motor->variance_rr * ir_v + motor->variance_rk * kw_v;

@@ -32,7 +32,7 @@ void safety_forget(core_state *core);
 /* Watch the tick timer, the memory, the supply and, while the arm follows the host, the host's silence. */
 void safety_watch_arm(core_state *core, const core_inputs *inputs);
 
-/* Watch the driven joints whose turn it is, every one each WATCH_TICKS, after their duties are known. */
+/* Watch some of the driven joints, every one once in WATCH_TICKS, after their duties are known. */
 void safety_watch_joints(core_state *core);
 
 /* Begin the watch over the configuration in use from its first byte; known: its CRC is still the one it had. */

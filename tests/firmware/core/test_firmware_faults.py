@@ -116,7 +116,7 @@ def fall_silent(arm):
     arm.tick(101)
 
 
-#: Fault -> (how to provoke it on a moving arm, the joint it must name; ANY: that whose turn it is, all being blocked).
+#: Fault -> (how to provoke it on a moving arm, the joint it must name; ANY: all are blocked, and one is watched first).
 ANY = -1
 PROVOKE = {
     "POT_OPEN": (spoiling(read_as(2, 65535), 20), 2),
