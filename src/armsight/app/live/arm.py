@@ -34,6 +34,7 @@ from armsight.app.run.experiment import (
     START_RAD,
     RunResult,
     passed,
+    require_followed,
     require_range,
     require_start,
     run_experiment,
@@ -84,6 +85,7 @@ class ArmOptions:
         sync_s: standard deviation of the time between the two exposures of a shot, s.
         source: spec of the cameras.
         calibration: LeRobot's calibration file of a servo bus; None without.
+        follow_rig: whether a rig that moves during a run is put right.
     """
 
     arm: Arm
@@ -94,6 +96,7 @@ class ArmOptions:
     sync_s: float
     source: str
     calibration: Path | None = None
+    follow_rig: bool = False
 
 
 @dataclass(frozen=True)
@@ -518,6 +521,8 @@ class ArmStep:
 
         def work(setup: Setup, rig: StereoRig, plan: MotionPlan, targets: Array) -> RunResult:
             nonlocal folder, finished
+            if self.options.follow_rig:
+                require_followed(rig, Path(self._measuring.rig_path or "rig.json"))
             folder = self._fresh()
             make_room(folder)
             write_text(folder / "motion.toml", read_text(self.options.motion))
@@ -538,6 +543,7 @@ class ArmStep:
                     begun=self._begun,
                     handeye=handeye,
                     publisher=file,
+                    follow_rig=self.options.follow_rig,
                 )
             of_run = {"arm": setup.arm.name, "board": setup.board.welcome.board}
             finished = Finished(setup.arm, rig, outcome, plan, None, of_run, began, [], None)
@@ -759,7 +765,11 @@ class ArmStep:
             f"armsight run --source {options.source} --board {options.board or 'serial:PORT'} --rig "
             f"{self._measuring.rig_path or 'rig.json'} --target {self._measuring.target_spec or 'body.toml'} "
             f"--arm {options.arm_spec}"
-            + (" -o run" if self._logged is not None else f" --motion {options.motion} -o run")
+            + (
+                " -o run"
+                if self._logged is not None
+                else f" --motion {options.motion}{' --follow-rig' * options.follow_rig} -o run"
+            )
         )
         plain = ArmState(
             options.arm.name,

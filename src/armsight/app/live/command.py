@@ -53,6 +53,11 @@ _HERE = ("127.0.0.1", "localhost", "::1")
 @click.option(
     "--port", type=click.IntRange(0, 65535), default=8722, show_default=True, help="Port; 0 takes a free one."
 )
+@click.option(
+    "--follow-rig",
+    is_flag=True,
+    help="Put the rig right during a run where its cameras, or both, moved (docs/concepts/health.md).",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the simulated workcell.")
 @click.option("--stream", multiple=True, metavar="STREAM", help="Publish every shot measured: see armsight measure -h.")
 @click.option("--json", "as_json", is_flag=True, help="Print the address as one JSON object.")
@@ -70,6 +75,7 @@ def command(
     output: Path,
     host: str,
     port: int,
+    follow_rig: bool,
     seed: int,
     stream: tuple[str, ...],
     as_json: bool,
@@ -112,6 +118,7 @@ def command(
         seed,
         calibration,
         stream,
+        follow_rig,
     )
     session = LiveSession(options)
     server = LiveServer(session, host, port, None if host in _HERE else secrets.token_urlsafe(18))

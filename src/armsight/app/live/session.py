@@ -73,6 +73,7 @@ class SessionOptions:
         seed: of a simulated workcell.
         servo_calibration: LeRobot's calibration file of a servo bus.
         streams: what every measured shot is published to.
+        follow_rig: whether a rig that moves during a run is put right.
     """
 
     folder: Path
@@ -88,6 +89,7 @@ class SessionOptions:
     seed: int = 0
     servo_calibration: Path | None = None
     streams: tuple[str, ...] = ()
+    follow_rig: bool = False
 
 
 @dataclass(frozen=True)
@@ -287,6 +289,7 @@ class LiveSession:
                 options.sync_s,
                 self.source,
                 options.servo_calibration,
+                options.follow_rig,
             ),
             self.capture,
             self.measuring,
