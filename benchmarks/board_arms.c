@@ -205,6 +205,9 @@ static void cascade_tick(core_state *core, const core_inputs *inputs, core_outpu
         integral_duty[i] += TICK * (inertia * bandwidth_rad_s * bandwidth_rad_s * off_rad_s +
                                     (double)gains->anti_windup_per_s * (duty - asked));
         last_duty[i] = duty;
+        pid_state *pid = &core->joint[i].pid; /* the core watches its own law: let that follow what drives the joint */
+        pid->integral_duty += (float)duty - pid->duty;
+        pid->duty = (float)duty;
         outputs->duty[i] = (float)duty;
     }
 }

@@ -13,7 +13,6 @@
 #define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
 #define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
-#define WARMER 0.03f          /* by so much of R windings may be warmer than was learnt: 8 K */
 #define SAMPLE_TICKS 8u
 #define AGREED 3.0f           /* of apart_rad: so much way together proves that the wiring was right */
 #define UNKNOWN_RAD_S 1000.0f
@@ -45,19 +44,12 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
     const float per_s = (float)TICKS_PER_S * per_tick;
     const float ir_v = motor->window_ir_v * per_tick;
     const float kw_v = config->constant_v_s * (angle_rad - motor->window_rad) * per_s;
-    const bool rested = motor->window_ticks > WINDOW_TICKS; /* such windows may still be the first to show R */
-    const float noise_rad = rested ? REST_NOISE_RAD : WINDOW_NOISE_RAD;
+    const float noise_rad = motor->window_ticks > WINDOW_TICKS ? REST_NOISE_RAD : WINDOW_NOISE_RAD;
     const float noise_v = config->constant_v_s * noise_rad * per_s;
     const float gain_r = motor->variance_rr * ir_v + motor->variance_rk * kw_v;
     const float gain_k = motor->variance_rk * ir_v + motor->variance_kk * kw_v;
     const float variance = ir_v * gain_r + kw_v * gain_k + noise_v * noise_v;
     const float off_v = motor->window_v * per_tick - motor->resistance_scale * ir_v - motor->constant_scale * kw_v;
-    const float warmer_v = WARMER * ir_v;
-    const bool explained = rested || off_v * off_v <= SURPRISE * variance + warmer_v * warmer_v;
-    const float off_rad = off_v / (config->constant_v_s * per_s);
-    const bool begins = motor->unexplained_rad * off_rad <= 0.0f; /* another side than before */
-    motor->unexplained_rad = explained ? 0.0f : (begins ? off_rad : motor->unexplained_rad + off_rad);
-    motor->unexplained = explained ? 0u : (begins ? 1u : motor->unexplained + 1u);
     if (off_v * off_v <= SURPRISE * variance) {
         const float per_variance = 1.0f / variance;
         const float way_rad = number_size(angle_rad - motor->window_rad);

@@ -9,7 +9,6 @@
 #include "types.h"
 
 #define MOTOR_WITNESS 0.1f /* of the speed limit: so much faster than the reading it must be to count */
-#define MOTOR_UNEXPLAINED 3u /* windows in a row: fewer may be a gear that crosses its backlash */
 
 /* Begin to watch a joint that reads angle_rad; phase differs from joint to joint, so that not all are sampled at once. */
 void motor_start(motor_state *motor, float angle_rad, uint32_t phase);
@@ -31,8 +30,7 @@ static inline float motor_witness(const motor_state *motor, float reading_rad_s,
 /* Return whether motor and reading are apart further than noise, backlash and the motor's uncertain numbers explain. */
 static inline bool motor_is_apart(const motor_state *motor, const motor_config *config)
 {
-    return number_size(motor->gap_rad) > config->apart_rad + motor->band_rad ||
-           (motor->unexplained >= MOTOR_UNEXPLAINED && number_size(motor->unexplained_rad) > config->apart_rad);
+    return number_size(motor->gap_rad) > config->apart_rad + motor->band_rad;
 }
 
 /* Return the fault by which they are apart, as it looks at first. */

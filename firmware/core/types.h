@@ -362,8 +362,6 @@ typedef struct motor_state {
     float sample_read_rad[MOTOR_SAMPLES];
     float sample_motor_rad[MOTOR_SAMPLES];
     float agreed_rad;        /* the motor's way on which the reading went along */
-    uint32_t unexplained;    /* windows in a row, off to one side, that no R and K explain, */
-    float unexplained_rad;   /* and the motor's way beyond the reading's in them */
     int32_t swing_side;      /* which side of the reference's speed the motor's was on last */
     uint32_t swing_since;    /* driven_ticks when it changed */
     uint32_t swings;         /* changes in quick succession */

@@ -33,6 +33,7 @@ def declare(library: Library) -> Library:
         "encoder_magnet_wrong": (flag, [word]),
         "encoder_read": (word, [pointer, pointer, pointer, word, word]),
         "encoder_telemetry": (word, [pointer, word]),
+        "sync_led_on": (flag, [pointer, word]),
         "config_crc": (word, [pointer, word]),
         "config_factory": (None, [pointer]),
         "config_is_valid": (flag, [pointer]),

@@ -6,6 +6,8 @@ import pytest
 from firmware_arm import JOINTS, LabArm, lab_config, read_as, supply
 from firmware_layout import STATES, c
 
+from armsight.loop.sync_led import code
+
 NAN = float("nan")
 
 
@@ -282,3 +284,12 @@ def test_joints_that_are_not_there_are_not_looked_at(library):
     assert (out.state, out.faults) == (c.STATE_ENABLED, 0)
     assert all(out.duty[joint] != 0 for joint in range(3))
     assert not any(out.duty[joint] or out.angle_rad[joint] or out.reference_rad[joint] for joint in (3, 4, 5))
+
+
+def test_the_sync_led_shows_its_code_where_it_has_a_pin(library):
+    config = lab_config(library)
+    config.sync_led_pin, config.sync_led_ticks = 29, 3
+    shown = [library.sync_led_on(ctypes.byref(config), tick) for tick in range(4 * 511 * 3)]
+    assert shown == [bool(bit) for bit in code() for _ in range(3)] * 4
+    config.sync_led_pin = 0
+    assert not any(library.sync_led_on(ctypes.byref(config), tick) for tick in range(30))
