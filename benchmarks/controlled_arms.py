@@ -228,8 +228,10 @@ def lost_steps(seed):
 
 
 def report(name, seed, poses=20, cycles=4):
-    """Record what `armsight arm plan` plans, report it, and set the found zeros and backlash against the injected ones.
+    """Record what `armsight arm plan` plans, report it, and set the found zeros and backlash against the true ones.
 
+    The true zero of a joint is the mean over the rests of its true angle less its reading: a loaded AR4's joint leans to
+    one side of its backlash, and its switches scatter.
     The run's folder stays in the system's temporary folder, for `armsight arm report`.
     """
     cell, folder = LightCell(name, seed), Path(tempfile.gettempdir()) / f"arm_report_{name}_{seed}"
@@ -245,7 +247,9 @@ def report(name, seed, poses=20, cycles=4):
     result = evaluate_arm(folder, open_arm(name))
     device = cell.arm.device
     ar4 = name == "ar4"
-    zeros = np.array(device.mechanics.homing_deg) if ar4 else np.degrees(device.servos.mechanics.zero_rad)
+    times, read = (np.concatenate([getattr(each, field) for each in found.log.joints]) for field in ("t_s", "q"))
+    ends = [segment.end_s for segment in found.log.segments if segment.phase == "rest"]
+    zeros = np.degrees(np.mean([cell.true_q(times[k]) - read[k] for k in np.searchsorted(times, ends) - 1], axis=0))
     backlash = np.array(device.mechanics.backlash_deg) if ar4 else np.full(5, np.nan)
     print(
         f"{name} seed {seed}: {result.placed_mm:.2f} mm; parts:",

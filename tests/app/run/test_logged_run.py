@@ -140,6 +140,7 @@ def test_angles_that_cannot_be_the_arms_are_said(armsight, setting, tmp_path):
         (["t_s", *DEG], [[1, *range(6)], [2, *range(6)]], "no shot was taken while angles were logged"),
         (DEG, [range(6)] * 3, "3 rows, but 24 shots"),
         (["shot", *DEG], [], "no rows"),
+        ([name.replace("deg", "rad") for name in DEG], [[" "]], "no rows"),
         (
             ["shot", *DEG],
             [["0000", *range(6)]],
@@ -160,7 +161,7 @@ def test_a_wrong_file_is_one_line(armsight, setting, tmp_path, header, rows, sai
 def test_motion_is_not_for_logged_poses(armsight, setting, tmp_path):
     assert_rejected(
         run(armsight, tmp_path, "--open-loop"),
-        "commands no motion: leave out --motion, --open-loop, --fixed and --follow-rig",
+        "commands no motion: leave out --motion, --open-loop, --fixed, --follow-rig and --sync-led",
     )
     assert_rejected(run(armsight, tmp_path), "angles.csv: no such file")
 

@@ -105,12 +105,12 @@ def read_angles(path: str | Path, arm: Arm) -> LoggedAngles:
     """
     path = Path(path)
     rows = degree_columns(path, read_table(path))
-    if len(rows) < 2:
+    lines = [(line, row) for line, row in enumerate(rows[1:], 2) if any(cell.strip() for cell in row)]
+    if not lines:
         raise InputError(f"{path}: no rows; a first line of column names and a line a pose are needed")
     header = [name.strip() for name in rows[0]]
     count = len(arm.a)
     columns, factor = _joint_columns(path, header, arm, count)
-    lines = [(line, row) for line, row in enumerate(rows[1:], 2) if any(cell.strip() for cell in row)]
     q = factor * np.array([[_number(path, line, header, row, k) for k in columns] for line, row in lines])
     if factor == 1.0 and np.abs(q).max() > _MOST_RAD:
         row, joint = np.unravel_index(int(np.abs(q).argmax()), q.shape)

@@ -76,7 +76,10 @@ def path_figure(run: RunData) -> Figure:
     axes.set_xlabel("x, mm")
     axes.set_ylabel("y, mm")
     axes.set_zlabel("z, mm")
-    axes.set_aspect("equal")
+    spans = np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1)
+    axes.set_box_aspect(spans, zoom=0.9)  # equal scales; labels of the axes stay on the page
+    for axis, share in zip("xyz", spans / spans.max(), strict=True):
+        axes.locator_params(axis=axis, nbins=max(2, round(8 * share)))
     axes.legend(loc="upper left", fontsize=8)
     return figure
 
