@@ -12,7 +12,7 @@ import click
 
 from armsight.app.board.config import config_group
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
-from armsight.errors import InputError
+from armsight.errors import DeviceError, InputError
 
 if TYPE_CHECKING:
     from armsight.app.board.bringup import Operator
@@ -301,7 +301,10 @@ def home(name: str, baud: int | None, at_once: str, yes: bool, as_json: bool) ->
                     "is the arm where its encoders have home_rad, and does it stay there?", abort=True, err=True
                 )
             board.confirm(board.command(Command.HOME))
-            _print_home(board.receive(0.05).q[-1], as_json)
+            q = board.receive(0.05).q
+            if not len(q):
+                raise DeviceError(f"{name} reports no angles after it was homed")
+            _print_home(q[-1], as_json)
             return
         if not isinstance(board, Ar4Board):
             raise InputError(f"{name} has no limit switches to be homed at; its sensors are absolute")

@@ -565,7 +565,12 @@ class Loop:
             self._fixed_work = self._fixed_pool.submit(look)
 
     def _follow_rig(self) -> None:
-        """Put the rig right once the evidence suffices; on hardware that is computed in a thread."""
+        """Put the rig right once the evidence suffices; on hardware that is computed in a thread.
+
+        Not while that thread measures fixed bodies: their poses are of one rig, and go to the watch of that rig.
+        """
+        if self._fixed_work is not None and not self._fixed_work.done():
+            return
         if self._rig_work is not None and self._rig_work.done():
             correction, self._rig_work = self._rig_work.result(), None
             if correction is not None:

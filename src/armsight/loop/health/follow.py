@@ -160,10 +160,15 @@ class RigFollower:
         if since_s is None:
             self.rejected = "cameras: their pose alone does not explain what the body's detections show"
             return None
-        return self.cameras(since_s, poses, at_s)
+        return self.cameras(since_s, poses, at_s, mounted=True)
 
     def cameras(
-        self, since_s: float, poses: Sequence[tuple[float, PoseEstimate]], at_s: float, settle_s: float = TEST_S
+        self,
+        since_s: float,
+        poses: Sequence[tuple[float, PoseEstimate]],
+        at_s: float,
+        settle_s: float = TEST_S,
+        mounted: bool = False,
     ) -> RigCorrection | None:
         """Return the cameras put right; None where the poses do not suffice, as ``rejected`` says.
 
@@ -172,6 +177,7 @@ class RigFollower:
             poses: time, s, and pose of shots measured with the rig as it is, in order of time.
             at_s: the time, s.
             settle_s: so long after ``since_s`` shots may still be from before, s.
+            mounted: whether hand-eye stands on the poses before: then only the change may be estimated, which needs them.
         """
         used = _differing([pose for t_s, pose in poses if t_s >= since_s + settle_s])
         before = _differing([pose for t_s, pose in poses if t_s < since_s - settle_s])
@@ -179,6 +185,9 @@ class RigFollower:
             self.rejected = (
                 self.rejected or f"cameras: {len(used)} shots since they moved differ, {LEAST_STAYS} are needed"
             )
+            return None
+        if mounted and len(before) < LEAST_STAYS:
+            self.rejected = f"cameras: {len(before)} shots from before they moved differ, {LEAST_STAYS} are needed"
             return None
         self._tried = len(used)
         before = before if len(before) >= LEAST_STAYS else []

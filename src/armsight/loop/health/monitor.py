@@ -151,9 +151,12 @@ class HealthMonitor:
     def rig_moved(self) -> tuple[float, Array, Array] | None:
         """Return since when, s, and by which motion (6,), with covariance, fixed bodies show that both cameras moved."""
         marks = self._landmarks
-        if marks is None or marks.motion is None or marks.of_cameras is None or marks.of_cameras.since_s is None:
+        motion, cameras = (
+            (None, None) if marks is None else (marks.motion, marks.of_cameras)
+        )  # a thread may change them
+        if motion is None or cameras is None or cameras.since_s is None:
             return None
-        return marks.of_cameras.since_s, *marks.motion
+        return cameras.since_s, *motion
 
     def put_right(self, correction: RigCorrection) -> tuple[Array, Array] | None:
         """Begin anew after a correction; what was found stays found.
