@@ -114,8 +114,11 @@ def replay_run(
         pace: of the replay.
         publisher: is given what comes out.
         changed: whether arm or estimator are others: the estimates are then not compared with the recorded ones.
+
+    Raises:
+        InputError: arm or estimator are others, and the rig was put right during the run.
     """
-    state = _RunAgain(arm, estimator)
+    state = _RunAgain(arm, estimator, changed)
     poses: list[ShotPose] = []
     rows: list[LiveRow] = []
     before: list[RecordedDatum] = []
@@ -143,8 +146,8 @@ def replay_run(
 class _RunAgain:
     """The estimator of a run, and what was given to it."""
 
-    def __init__(self, arm: Arm, name: str) -> None:
-        self._arm, self._name = arm, name
+    def __init__(self, arm: Arm, name: str, changed: bool) -> None:
+        self._arm, self._name, self._changed = arm, name, changed
         self._estimator: Estimator | None = None
         self._mounting: Mounting | None = None
         self._batches: list[JointStates] = []
@@ -157,6 +160,11 @@ class _RunAgain:
             )
             return
         if content["event"] == "restored":
+            if self._changed:  # it went on from a state of the run's estimator
+                raise InputError(
+                    "the rig was put right during this run (--follow-rig): it can be estimated again with the run's own arm "
+                    "and estimator only; leave out --arm and --estimator"
+                )
             if isinstance(self._estimator, KalmanEstimator):
                 self._estimator.restore((np.array(content["state"]), np.array(content["covariance"])))
             return

@@ -111,12 +111,17 @@ class KalmanEstimator:
         """Return the state (K,) and its covariance (K, K) as they are, for :meth:`restore`."""
         return self._states[-1].x.copy(), self._states[-1].P.copy()
 
+    def nothing_known(self) -> tuple[Array, Array]:
+        """Return the state (K,) and the covariance (K, K) that :meth:`restore` makes the prior of."""
+        return np.zeros(self._at.size), np.zeros((self._at.size, self._at.size))
+
     def restore(self, state: tuple[Array, Array]) -> None:
         """Go on from an earlier state: what was measured since is dropped, and what motion makes it forget is unknown."""
         (x, P), rows, newest = (part.copy() for part in state), self._forgets, self._states[-1]
         x[rows] = P[rows] = P[:, rows] = 0.0
         P[np.diag_indices(self._at.size)] += np.where(np.diag(P) > 0.0, 0.0, self._model.sigmas**2)
         self._states, self._outliers, self._newest, self._here = [newest._replace(x=x, P=P)], [], None, None
+        self._waiting, self._backlash_set = [], False
 
     def joints(self, states: JointStates) -> None:
         """Take readings of the potentiometers, in order of time."""

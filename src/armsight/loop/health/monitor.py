@@ -26,7 +26,7 @@ from armsight.vision.rig import StereoRig
 #: So long after measurements contradicted what was learned the cause is open, s: the tests need some shots to find it.
 DOUBT_S = 2.0
 #: What the estimator knows is kept every so often, s, and so many times: to go on from there once something was put right.
-_KEEP_S, _KEPT = 1.0, 120
+_KEEP_S, _KEPT = 1.0, 600
 #: A change is dated to about so much, s.
 _DATED_S = 0.7
 
@@ -178,11 +178,11 @@ class HealthMonitor:
         self._doubted_s = -np.inf
         if self._estimator is None or self._arm is None:
             return None
-        before = [state for t_s, state in self._known if t_s < since_s - _DATED_S] or [self._known[0][1]]
         self._known = deque([each for each in self._known if each[0] < since_s - _DATED_S], _KEPT)
-        self._estimator.restore(before[-1])
+        before = self._known[-1][1] if self._known else self._estimator.nothing_known()
+        self._estimator.restore(before)
         self._begin(self._estimator, self._arm)
-        return before[-1]
+        return before
 
     @property
     def trust(self) -> Trust:
