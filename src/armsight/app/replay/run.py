@@ -162,8 +162,8 @@ class _RunAgain:
         if content["event"] == "restored":
             if self._changed:  # it went on from a state of the run's estimator
                 raise InputError(
-                    "the rig was put right during this run (--follow-rig): it can be estimated again with the run's own arm "
-                    "and estimator only; leave out --arm and --estimator"
+                    "the rig was put right during this run (--follow-rig): it can be estimated again with the run's own "
+                    "arm and estimator only; leave out --arm and --estimator"
                 )
             if isinstance(self._estimator, KalmanEstimator):
                 self._estimator.restore((np.array(content["state"]), np.array(content["covariance"])))
