@@ -453,9 +453,11 @@ class SyncLedWatch:
         return lambda: self._done(work, batch)
 
     def _done(self, work: Callable[[_Batch], str | None], batch: _Batch) -> None:
-        self.reason = work(batch)
-        self.tried += 1
-        self._busy = False
+        try:
+            self.reason = work(batch)
+        finally:
+            self.tried += 1
+            self._busy = False
 
     def _search(self, batch: _Batch) -> str | None:
         """Find the windows of what blinks."""

@@ -95,7 +95,9 @@ def config_group(
                 try:
                     value = tomllib.loads(f"value = {text}")["value"]
                 except tomllib.TOMLDecodeError:
-                    if path.strip() == "arm.sync_led_pin":  # a name, which a shell takes the quotes from
+                    if path.strip().endswith(
+                        (".sync_led_pin", ".encoder.sensor")
+                    ):  # a name, which a shell takes the quotes from
                         put(config, path.strip(), text.strip())
                         continue
                     raise InputError(f"{change}: a path, = and a number are needed: joint.3.soft_max_rad=1.2") from None
