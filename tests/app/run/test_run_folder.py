@@ -52,6 +52,7 @@ def test_what_is_not_known_is_null(tmp_path):
         "health",
         "fixed_unseen",
         "rig_corrections",
+        "rig_not_corrected",
         "arm",
         "sigma_m",
         "values",

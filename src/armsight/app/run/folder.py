@@ -240,6 +240,7 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
                 fixed_unseen=outcome.fixed_unseen,
                 corrections=outcome.log.corrections,
                 not_corrected=outcome.not_corrected,
+                sync_led=None if outcome.led is None else outcome.led.to_json(),
             )
             keep(_write_summary, folder, summary)
             return summary, None

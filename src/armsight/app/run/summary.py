@@ -177,6 +177,7 @@ class RunSummary:
         found["health"] = [each.to_json() for each in self.health]
         found["fixed_unseen"] = list(self.fixed_unseen)
         found["rig_corrections"] = [each.to_json() for each in self.corrections]
+        found["rig_not_corrected"] = self.not_corrected
         found |= {**self.properties, "wall_s": self.wall_s, "ended_by": self.ended_by}
         known: dict[str, Any] = finite_json(found)
         return known
