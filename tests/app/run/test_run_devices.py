@@ -98,8 +98,8 @@ def test_a_run_on_devices_finds_everything_moves_and_ends_with_the_arm_held(arms
     said = armsight(*arguments(far, tmp_path, "--json"))
     assert said.err == ""
     summary = said.lines[0]
-    # This computer may be busy with other work: its stalls are named, and nothing else is.
-    assert {each["cause"] for each in summary["health"]} <= {"host"}
+    # This computer may be busy with other work: its stalls are named, and that readings come later than at the beginning.
+    assert {each["cause"] for each in summary["health"]} <= {"host", "time"}
     assert said.code == (3 if summary["health"] else 0)
     assert summary == json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["ended_by"] is None

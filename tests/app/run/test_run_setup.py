@@ -60,6 +60,15 @@ def test_a_host_that_is_busy_for_some_time_does_not_disturb_the_clock():
     assert np.abs(after).max() < 2e-4  # and is back with the first readings
 
 
+def test_once_the_rate_is_known_a_busy_host_moves_the_clock_by_less_than_clocks_may_drift():
+    rows = heard(np.random.default_rng(2), 5e-5, 70.0, pause=(50.0, 65.0))
+    off = rows[rows[:, 0] > 40.0]
+    off = off[:, 1] - off[:, 0] + 1e-3
+    assert np.abs(off).max() < 0.25 * DRIFT * 15.0
+    rows = heard(np.random.default_rng(3), 5e-5, 70.0)
+    assert np.abs(np.diff(rows[rows[:, 0] > 60.0], axis=1) + 1e-3).max() < 1.5e-4
+
+
 @pytest.mark.parametrize(
     ("t_s", "said"), [(None, "has no time"), (3.0, "was taken 12343 s ago"), (1.7e9, "was taken -")]
 )

@@ -8,8 +8,10 @@ in a thread. :func:`setup_of` makes the setup of a workcell; :func:`open_devices
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,6 +38,8 @@ _SIM = "sim:"
 _SIM_ARM, _SIM_CAMERAS = "worn", "1280x720@60"
 #: Bound on the relative drift of the two clocks: 50 ppm for each crystal, and the slewing of the host's clock.
 DRIFT = 2e-4
+#: The clocks' rate is that of so many seconds; the least transmission times of two seconds differ by about this, s.
+_WINDOW_S, _SCATTER_S = 60, 1e-3
 #: A live image's time stamp differs from the present time by at most this, s.
 _LIVE_S = 10.0
 
@@ -46,8 +50,10 @@ class HostClock:
     A reading received at time h of the host's clock with the board's stamp b gives h - b: the offset of the clocks plus
     the transmission time. The estimate is the minimum of these differences: the offset plus the shortest transmission
     time. The latter is constant over a run; it becomes part of the cameras' delay, which is measured afterwards. Between
-    two readings the minimum is allowed to rise at the rate at which the clocks can drift (``DRIFT``): so it follows the
-    drift, and one reading that arrives quickly restores it.
+    two readings the minimum is allowed to rise as the clocks drift apart: so it follows the drift, and one reading that
+    arrives quickly restores it. How fast they drift is the slope of the line under all minima of the last ``_WINDOW_S``
+    that is highest in their middle (Moon, Skelly and Towsley, "Estimation and removal of clock skew from network delay
+    measurements", 1999), so that a host that is busy for seconds does not move the offset by as much as any clock drifts.
 
     Args:
         now: the host's clock, s; the one that stamps the images.
@@ -56,15 +62,32 @@ class HostClock:
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         self._now = now
         self._least_s: float | None = None
-        self._heard_s = 0.0
+        self._heard_s, self._rise = 0.0, DRIFT
+        self._minima = deque[tuple[float, float]](maxlen=_WINDOW_S)  # of each second: board's time, difference
 
     def heard(self, board_s: float) -> None:
         """Update the offset with the board's time stamp of a reading received just now, s."""
         now = self._now()
-        offset = now - board_s
+        difference = offset = now - board_s
         if self._least_s is not None:
-            offset = min(offset, self._least_s + DRIFT * (now - self._heard_s))
+            offset = min(offset, self._least_s + self._rise * (now - self._heard_s))
         self._least_s, self._heard_s = offset, now
+        if not self._minima or board_s >= math.floor(self._minima[-1][0]) + 1.0:
+            self._rise = self._highest_rate()
+            self._minima.append((board_s, difference))
+        elif difference < self._minima[-1][1]:
+            self._minima[-1] = board_s, difference
+
+    def _highest_rate(self) -> float:
+        """Return how fast the offset rises, at most: the line under the minima, and what their scatter leaves open."""
+        if len(self._minima) < 2:
+            return DRIFT
+        t_s, least_s = np.array(self._minima).T
+        middle = 0.5 * (t_s[0] + t_s[-1])
+        n = np.searchsorted(t_s, middle, side="right")
+        rates = (least_s[n:] - least_s[:n, None]) / (t_s[n:] - t_s[:n, None])
+        rate = rates.flat[np.argmin(least_s[:n, None] + rates * (middle - t_s[:n, None]))]
+        return float(np.clip(rate + _SCATTER_S / (t_s[-1] - t_s[0]), -DRIFT, DRIFT))
 
     def on_board(self, shot: Shot) -> Shot:
         """Return a shot with its time on the board's clock; a reading must have been heard before.
