@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import pytest
+from _pytest.runner import runtestprotocol
 from hypothesis import settings
 
 from armsight.errors import DeviceError, InputError
@@ -26,6 +27,21 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def pytest_report_header() -> str:
     """Name what differs between the environments in which the tests run."""
     return f"OpenCV {cv2.__version__}"
+
+
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
+    """Run a test against the clock a second time where it failed: the computer may have stood still meanwhile."""
+    if item.get_closest_marker("real_time") is None:
+        return None
+    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    reports = runtestprotocol(item, log=False, nextitem=nextitem)
+    if any(each.failed for each in reports):
+        item._initrequest()  # type: ignore[attr-defined]
+        reports = runtestprotocol(item, log=False, nextitem=nextitem)
+    for each in reports:
+        item.ihook.pytest_runtest_logreport(report=each)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
 
 
 @pytest.fixture(scope="session")

@@ -16,6 +16,8 @@ from board_rigs import PtyBoard
 from armsight.app.board.found import Found, JointFound
 from armsight.sim.boards.workshop import drawn_workshop
 
+pytestmark = pytest.mark.real_time
+
 
 class Terminal:
     """The command at a terminal of its own, beside a fresh board with a drawn arm."""

@@ -19,6 +19,8 @@ from armsight.robot.models import MODELS
 from armsight.sim.boards.device import SteppedLink
 from armsight.sim.boards.so101 import So101Bus
 
+pytestmark = pytest.mark.real_time
+
 
 class FakeBoard:
     """A board that reports its stop two receptions later, and notes who called it at once with whom."""

@@ -16,6 +16,8 @@ from armsight.errors import DeviceError, InputError
 from armsight.vision.markers.targets import open_target
 from armsight.vision.measure import measure
 
+pytestmark = pytest.mark.real_time
+
 LEFT, RIGHT = np.full((4, 6), 1, np.uint8), np.full((4, 6), 2, np.uint8)
 
 

@@ -14,6 +14,8 @@ from armsight.errors import InputError
 from armsight.files import read_table
 from armsight.vision.rig import StereoRig
 
+pytestmark = pytest.mark.real_time
+
 pytest.importorskip("websockets")
 webdriver = pytest.importorskip("selenium.webdriver")
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")

@@ -26,6 +26,8 @@ pytest.importorskip("websockets")
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+pytestmark = pytest.mark.real_time
+
 
 class FakeSession:
     """A session of two grey images, an arm that moves, and commands that are noted."""

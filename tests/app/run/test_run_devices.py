@@ -25,6 +25,7 @@ from armsight.robot.boards.opening import open_board
 from cli_runs import assert_rejected
 
 pytestmark = [
+    pytest.mark.real_time,
     pytest.mark.usefixtures("host_firmware"),
     pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals"),
 ]

@@ -20,7 +20,10 @@ from armsight.robot.boards.opening import open_board
 from armsight.robot.boards.serial import SerialLink, list_ports
 from armsight.sim.joints import PotFault
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals"),
+]
 
 
 @pytest.fixture

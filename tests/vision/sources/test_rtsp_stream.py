@@ -14,7 +14,7 @@ from armsight.errors import DeviceError
 from armsight.vision.sources import open_source
 from armsight.vision.sources.url import STREAMS, RtspStream
 
-pytestmark = pytest.mark.opencv
+pytestmark = [pytest.mark.opencv, pytest.mark.real_time]
 
 PERIOD = 0.04
 SDP = "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=-\r\nc=IN IP4 0.0.0.0\r\nt=0 0\r\nm=video 0 RTP/AVP 26\r\na=control:t\r\n"

@@ -17,7 +17,7 @@ from armsight.errors import DeviceError, InputError
 from armsight.vision.sources import open_source, url
 from armsight.vision.sources.url import MjpegStream, RtspStream, UrlSource
 
-pytestmark = pytest.mark.opencv
+pytestmark = [pytest.mark.opencv, pytest.mark.real_time]
 
 PERIOD = 0.03
 BOUNDARY = "frameboundary"
