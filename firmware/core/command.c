@@ -113,11 +113,14 @@ static uint32_t check_move(const core_state *core, const move_command *move)
     const bool lasts = move->duration_ticks >= 1u && move->duration_ticks <= 10000u;
     uint32_t rejection = lasts ? REJECTION_NONE : REJECTION_OUT_OF_RANGE;
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {
-        if (!number_finite(move->position_rad[i]) || !number_finite(move->speed_rad_s[i]) ||
-            !number_finite(move->gravity_duty[i])) {
+        const float gravity_duty = move->gravity_duty[i];
+        if (!number_finite(move->position_rad[i]) || !number_finite(move->speed_rad_s[i])) {
             return REJECTION_NOT_FINITE;
         }
-        if (!number_within(move->gravity_duty[i], -1.0f, 1.0f)) {
+        if (!(number_size(gravity_duty) <= 1.0f)) {
+            if (!number_finite(gravity_duty)) {
+                return REJECTION_NOT_FINITE;
+            }
             rejection = REJECTION_OUT_OF_RANGE;
         }
     }
@@ -158,11 +161,8 @@ static uint32_t take_move(core_state *core, const move_command *move)
 static uint32_t take_gains(core_state *core, const gain_set *gains)
 {
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {
-        if (!pid_gains_finite(&gains->joint[i])) {
-            return REJECTION_NOT_FINITE;
-        }
         if (!pid_gains_in_range(&gains->joint[i])) {
-            return REJECTION_OUT_OF_RANGE;
+            return pid_gains_finite(&gains->joint[i]) ? REJECTION_OUT_OF_RANGE : REJECTION_NOT_FINITE;
         }
     }
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {

@@ -10,16 +10,16 @@
 _Static_assert(FLT_EVAL_METHOD == 0, "float expressions must be computed in float");
 
 /* Return whether x is neither NaN nor infinite. */
-static inline bool number_finite(float x) { return __builtin_fabsf(x) <= FLT_MAX; }
+inline bool number_finite(float x) { return __builtin_fabsf(x) <= FLT_MAX; }
 
 /* Return whether x lies in [low, high]; NaN does not. */
-static inline bool number_within(float x, float low, float high) { return x >= low && x <= high; }
+inline bool number_within(float x, float low, float high) { return x >= low && x <= high; }
 
 /* Return x held within [low, high]; low <= high. */
-static inline float number_clamp(float x, float low, float high) { return x < low ? low : (x > high ? high : x); }
+inline float number_clamp(float x, float low, float high) { return x < low ? low : (x > high ? high : x); }
 
 /* Return x held within [-size, size]; size 0 or more. Quicker than number_clamp where x is mostly within. */
-static inline float number_bound(float x, float size)
+inline float number_bound(float x, float size)
 {
     if (__builtin_fabsf(x) <= size) {
         return x;
@@ -28,7 +28,7 @@ static inline float number_bound(float x, float size)
 }
 
 /* Return the target, or what lies most on the way to it from start; most 0 or more. */
-static inline float number_towards(float start, float target, float most)
+inline float number_towards(float start, float target, float most)
 {
     const float way = target - start;
     if (__builtin_fabsf(way) <= most) {
@@ -38,16 +38,16 @@ static inline float number_towards(float start, float target, float most)
 }
 
 /* Return the size of x: one instruction. */
-static inline float number_size(float x) { return __builtin_fabsf(x); }
+inline float number_size(float x) { return __builtin_fabsf(x); }
 
 /* Return the square root of x, 0 or more: one instruction, rounded as IEEE 754 says. */
-static inline float number_root(float x) { return __builtin_sqrtf(x); }
+inline float number_root(float x) { return __builtin_sqrtf(x); }
 
 /* Return count + 1, or count where it would wrap. */
-static inline uint32_t number_count(uint32_t count) { return count == UINT32_MAX ? count : count + 1u; }
+inline uint32_t number_count(uint32_t count) { return count == UINT32_MAX ? count : count + 1u; }
 
 /* Return count + more, or count where it would wrap. */
-static inline uint32_t number_add(uint32_t count, uint32_t more)
+inline uint32_t number_add(uint32_t count, uint32_t more)
 {
     return count > UINT32_MAX - more ? count : count + more;
 }

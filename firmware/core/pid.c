@@ -13,13 +13,7 @@ void pid_reset(pid_state *pid, float measured_rad)
     *pid = (pid_state){.measured_rad = measured_rad};
 }
 
-void pid_measure(pid_state *pid, const joint_gains *gains, float measured_rad)
-{
-    const float raw_rad_s = (measured_rad - pid->measured_rad) * (float)TICKS_PER_S;
-    const float weight = TICK_S / (gains->derivative_filter_s + TICK_S);
-    pid->speed_rad_s += weight * (raw_rad_s - pid->speed_rad_s);
-    pid->measured_rad = measured_rad;
-}
+extern inline void pid_measure(pid_state *, const joint_gains *, float);
 
 /* Return the duty asked for held to the limits, and say which of them held it. */
 INLINE float limited_duty(const pid_state *pid, const pid_demand *demand, float asked, uint32_t *limited)

@@ -11,7 +11,13 @@
 void pid_reset(pid_state *pid, float measured_rad);
 
 /* Take this tick's measurement (rad) into the speed filter; every tick, driven or not. */
-void pid_measure(pid_state *pid, const joint_gains *gains, float measured_rad);
+inline void pid_measure(pid_state *pid, const joint_gains *gains, float measured_rad)
+{
+    const float raw_rad_s = (measured_rad - pid->measured_rad) * (float)TICKS_PER_S;
+    const float weight = TICK_S / (gains->derivative_filter_s + TICK_S);
+    pid->speed_rad_s += weight * (raw_rad_s - pid->speed_rad_s);
+    pid->measured_rad = measured_rad;
+}
 
 /* Compute this tick's duty (-duty_limit to duty_limit) from the last measurement; sets LIMITED_... bits in *limited. */
 float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *demand, uint32_t *limited);

@@ -10,7 +10,7 @@ float pot_angle(const pot_config *config, uint32_t counts)
     }
     const float run = (float)(config->counts[node] - config->counts[node - 1u]);
     const float rise = config->angle_rad[node] - config->angle_rad[node - 1u];
-    const float along = (float)counts - (float)config->counts[node - 1u];
+    const float along = (float)(int32_t)(counts - config->counts[node - 1u]);
     return (float)config->direction * (config->angle_rad[node - 1u] + rise * (along / run));
 }
 

@@ -34,10 +34,7 @@ const char *state_text(uint32_t code) { return code < STATE_COUNT ? state_texts[
 const char *rejection_name(uint32_t code) { return code < REJECTION_COUNT ? rejection_names[code] : "?"; }
 const char *rejection_text(uint32_t code) { return code < REJECTION_COUNT ? rejection_texts[code] : "?"; }
 
-bool safety_drives_on(const core_state *core)
-{
-    return core->state == STATE_ENABLED || core->state == STATE_STOPPING || core->state == STATE_HOLDING;
-}
+extern inline bool safety_drives_on(const core_state *);
 
 /* Begin to slow all references down in the same time, so that the arm stays on its path: the joint that needs longest
  * brakes as hard as it may, the others less. */

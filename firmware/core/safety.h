@@ -18,7 +18,10 @@ const char *state_text(uint32_t code);
 const char *rejection_text(uint32_t code);
 
 /* Return whether the drives are on in the present state. */
-bool safety_drives_on(const core_state *core);
+inline bool safety_drives_on(const core_state *core)
+{
+    return core->state == STATE_ENABLED || core->state == STATE_STOPPING || core->state == STATE_HOLDING;
+}
 
 /* Latch a fault of a joint (0 to 5, or NO_JOINT), whose cause stands in this tick, and react to it. */
 void safety_raise(core_state *core, uint32_t fault, uint32_t joint);

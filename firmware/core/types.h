@@ -359,8 +359,6 @@ typedef struct motor_state {
     float window_rad;        /* the reading at its beginning */
     uint32_t window_ticks;
     uint32_t sampled;        /* samples taken */
-    float sample_read_rad[MOTOR_SAMPLES];
-    float sample_motor_rad[MOTOR_SAMPLES];
     float agreed_rad;        /* the motor's way on which the reading went along */
     int32_t swing_side;      /* which side of the reference's speed the motor's was on last */
     uint32_t swing_since;    /* driven_ticks when it changed */
@@ -369,6 +367,8 @@ typedef struct motor_state {
     uint32_t current_ticks;  /* beyond twice the current limit, in a row */
     uint32_t driven_ticks;   /* since the windings were closed */
     uint32_t phase;          /* when it is sampled */
+    float sample_read_rad[MOTOR_SAMPLES];
+    float sample_motor_rad[MOTOR_SAMPLES];
 } motor_state;
 
 /* What is remembered of one potentiometer. */
@@ -396,7 +396,6 @@ typedef struct joint_state {
     setpoint_state setpoint;
     governor_state reference;
     pot_state pot;
-    motor_state motor;
     uint32_t released;       /* not 0: a fault took it out of the drive, its windings are shorted */
     uint32_t suspect;        /* the fault by which motor and reading disagreed, until it has its name */
     uint32_t suspect_ticks;  /* since then */
@@ -415,13 +414,14 @@ typedef struct joint_state {
     uint32_t held_back;      /* LIMITED_SOFT and LIMITED_SPEED of the last motion command */
     uint32_t limited;        /* LIMITED_... of this tick */
     encoder_state encoder;
+    motor_state motor;
 } joint_state;
 
 /* The whole controller. */
 typedef struct core_state {
     uint32_t guard_head; /* a known word on either side: an erroneous write that passes through shows */
-    core_config config;
     joint_state joint[JOINTS];
+    core_config config;
     uint32_t state;
     uint32_t started;        /* not 0 after the first tick */
     uint32_t tick;

@@ -32,7 +32,7 @@ from armsight.firmware.elf import read_elf
 #: Names a compiler for the build at install, where no option can be given.
 COMPILER_VARIABLE = "ARMSIGHT_FIRMWARE_COMPILER"
 _ARM_GCC = "arm-none-eabi-gcc"
-_OPTIMISE = ("-O2", "-ffunction-sections", "-fdata-sections", "-g0")
+_OPTIMISE = ("-O2", "-fomit-frame-pointer", "-ffunction-sections", "-fdata-sections", "-g0")
 _HOST = ("-O2", "-shared", "-fPIC", "-g0")
 _ZIG_M4F = ("-target", "thumb-freestanding-eabihf", "-mcpu=cortex_m4+vfp4d16sp", "-fno-unwind-tables")
 _GCC_M4F = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
