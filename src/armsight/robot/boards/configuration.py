@@ -181,9 +181,9 @@ SYNC_LED_TICKS = 3
 #: Pins of a board that have another use, docs/howto/add_a_board.md; its debugger's too.
 USED_PINS: Mapping[str, frozenset[str]] = {
     "nucleo-f446re": frozenset(
-        [f"PA{pin}" for pin in (*range(11), 13, 14)]
-        + [f"PB{pin}" for pin in (0, 1, *range(5, 11), 12)]
-        + [f"PC{pin}" for pin in range(10)]
+        [f"PA{pin}" for pin in (*range(11), 13, 14, 15)]
+        + [f"PB{pin}" for pin in (*range(11), 12, 14, 15)]
+        + [f"PC{pin}" for pin in range(13)]
     )
 }
 

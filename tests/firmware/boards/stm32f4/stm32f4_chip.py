@@ -11,6 +11,43 @@ MOE, LOCK_BITS = 1 << 15, 3 << 8
 FLAG_SHIFT = (0, 6, 16, 22)
 
 
+def even(value: int) -> int:
+    """Return 15 bits with the bit before them that makes the number of ones even."""
+    return value | (value.bit_count() & 1) << 15
+
+
+class AbsoluteSensor:
+    """An AS5047: a frame answers the one before it; one that it does not understand sets the error bit until it is read."""
+
+    ANGLE, DIAGNOSIS, ERRORS = 0x3FFF, 0x3FFC, 0x0001
+
+    def __init__(self, angle: int) -> None:
+        self.values = {self.ANGLE: angle, self.DIAGNOSIS: 0x0180, self.ERRORS: 0}
+        self.answer = self.ANGLE
+        self.asleep = 0  # frames until it answers
+        self.spoiled = 0  # bits that are flipped on their way to it in the next frame
+        self._ended = True
+
+    def deselect(self) -> None:
+        """Chip select is high: the frame is over."""
+        self._ended = True
+
+    def frame(self, frame: int) -> int:
+        """Take a frame, give the answer to the one before it."""
+        if self.asleep or not self._ended:
+            self.asleep = max(0, self.asleep - 1)
+            return 0
+        frame, self.spoiled, self._ended = frame ^ self.spoiled, 0, False
+        said = even(self.values[self.answer] & 0x3FFF | (0x4000 if self.values[self.ERRORS] else 0))
+        if self.answer == self.ERRORS:
+            self.values[self.ERRORS] = 0
+        if even(frame & 0x7FFF) != frame or not frame & 0x4000 or frame & 0x3FFF not in self.values:
+            self.values[self.ERRORS] = 4
+        else:
+            self.answer = frame & 0x3FFF
+        return said
+
+
 class Chip(ClockAndFlash):
     """Everything behind the processor's bus."""
 
@@ -20,6 +57,7 @@ class Chip(ClockAndFlash):
         self.levels: dict[int, int] = {}  # the converter's reading of each channel
         self.position = 0  # of the converter in its scan
         self.pended = False
+        self.sensors: dict[str, AbsoluteSensor] = {}  # by the pin that selects them
 
     # pins
 
@@ -72,6 +110,9 @@ class Chip(ClockAndFlash):
         """The lower half sets, the upper one resets."""
         odr = f"{name[:5]}.ODR"
         self[odr] = self[odr] & ~(value >> 16) | value & 0xFFFF
+        for pin, sensor in self.sensors.items():
+            if self.output(pin):
+                sensor.deselect()
 
     def get_gpio_idr(self, name: str) -> int:
         """Return the levels of a port's pins."""
@@ -189,6 +230,37 @@ class Chip(ClockAndFlash):
         for _ in range(count):
             self.transfer(stream, 2, self.levels.get(sequence[self.position], 0))
             self.position = (self.position + 1) % len(sequence)
+
+    # encoders
+
+    def count(self, timer: str, edges: int) -> None:
+        """Rotate the quadrature encoder at a timer."""
+        first, second = (pin for (pin, _), what in ALTERNATE.items() if what.startswith(timer))
+        ready = self.function(first) == f"{timer}_CH1" and self.function(second) == f"{timer}_CH2"
+        inputs = self[f"{timer}.CCMR1"] & 0x303 == 0x101 and not self[f"{timer}.CCER"]
+        if not (ready and inputs and self[f"{timer}.SMCR"] == 3 and self[f"{timer}.CR1"] == 1):
+            self.wrong(f"{timer} does not count both lines of its encoder")
+        self[f"{timer}.CNT"] = (self[f"{timer}.CNT"] + edges) % (self[f"{timer}.ARR"] + 1)
+
+    def set_spi_dr(self, name: str, value: int) -> None:
+        """A frame goes out to the one sensor that is selected, and its answer comes in."""
+        spi = name[:4]
+        # On; 16 bits, select by software, high; a quarter or less of the fastest clock; master; mode 1.
+        if self[f"{spi}.CR1"] & 0xFC7 != 0xB45 or self.apb1()[0] / (2 << (self[f"{spi}.CR1"] >> 3 & 7)) > 10e6:
+            self.wrong(f"{spi} is not set up for an AS5047")
+        connected = {self.function(pin) for (pin, _), what in ALTERNATE.items() if what.startswith(spi)}
+        if connected != {f"{spi}_SCK", f"{spi}_MISO", f"{spi}_MOSI"}:
+            self.wrong(f"{spi} has not its pins")
+        selected = [sensor for pin, sensor in self.sensors.items() if self.output(pin) == 0.0]
+        if len(selected) > 1 or self[f"{spi}.SR"] & 1:
+            self.wrong(f"{spi}: {len(selected)} sensors selected, or a frame not read")
+        self[name] = selected[0].frame(value) if selected else 0  # the line is pulled low
+        self[f"{spi}.SR"] |= 1
+
+    def get_spi_dr(self, name: str) -> int:
+        """Reading it clears RXNE."""
+        self[f"{name[:4]}.SR"] &= ~1
+        return self[name]
 
     # wire
 

@@ -17,6 +17,10 @@ DMA = _row("LISR", "HISR", "LIFCR", "HIFCR") | {
 
 #: Peripheral: base address, registers by offset, and the bit that gives it its clock (none: always on).
 PERIPHERALS = {
+    "TIM2": (0x40000000, TIM, ("APB1ENR", 0)),
+    "TIM3": (0x40000400, TIM, ("APB1ENR", 1)),
+    "TIM4": (0x40000800, TIM, ("APB1ENR", 2)),
+    "SPI3": (0x40003C00, {"CR1": 0x0, "CR2": 0x4, "SR": 0x8, "DR": 0xC}, ("APB1ENR", 15)),
     "PWR": (0x40007000, {"CR": 0x0, "CSR": 0x4}, ("APB1ENR", 28)),
     "IWDG": (0x40003000, {"KR": 0x0, "PR": 0x4, "RLR": 0x8, "SR": 0xC}, None),
     "USART2": (
@@ -81,6 +85,15 @@ ALTERNATE = {
     ("PB12", 1): "TIM1_BKIN",
     ("PA2", 7): "USART2_TX",
     ("PA3", 7): "USART2_RX",
+    ("PA15", 1): "TIM2_CH1",
+    ("PB3", 1): "TIM2_CH2",
+    ("PB4", 2): "TIM3_CH1",
+    ("PB5", 2): "TIM3_CH2",
+    ("PB6", 2): "TIM4_CH1",
+    ("PB7", 2): "TIM4_CH2",
+    ("PC10", 6): "SPI3_SCK",
+    ("PC11", 6): "SPI3_MISO",
+    ("PC12", 6): "SPI3_MOSI",
 }
 
 #: The converter's channel of each pin, of the datasheet's table.

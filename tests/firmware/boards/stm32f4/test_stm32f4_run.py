@@ -17,7 +17,7 @@ from stm32f4_registers import ADC_CHANNEL
 from armsight.firmware import dialect
 
 PWM_PINS = ("PA8", "PA9", "PA10", "PC6", "PC7", "PC8")
-DIRECTION_PINS = ("PB5", "PB6", "PB7", "PB8", "PB9", "PB10")
+DIRECTION_PINS = ("PB2", "PB14", "PB15", "PB8", "PB9", "PB10")
 POT_PINS = ("PC0", "PC1", "PC2", "PC3", "PC4", "PC5")
 COPIES = (FLASH + 0x4000, FLASH + 0x8000)
 SUPPLY_LEVEL = 709  # of 4096: 12 V behind the divider by 21
