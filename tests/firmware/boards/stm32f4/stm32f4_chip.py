@@ -4,7 +4,7 @@ It does not know the firmware. Whatever the manual forbids is written into ``wro
 """
 
 from stm32f4_clock import ClockAndFlash
-from stm32f4_registers import ALTERNATE
+from stm32f4_registers import ALTERNATE, NAMED, NUCLEO, Part
 
 HTIF, TCIF, ALL_FLAGS = 1 << 4, 1 << 5, 0x3D
 MOE, LOCK_BITS = 1 << 15, 3 << 8
@@ -51,8 +51,8 @@ class AbsoluteSensor:
 class Chip(ClockAndFlash):
     """Everything behind the processor's bus."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, part: Part = NUCLEO) -> None:
+        super().__init__(part)
         self.inputs: dict[str, int] = {}
         self.levels: dict[int, int] = {}  # the converter's reading of each channel
         self.position = 0  # of the converter in its scan
@@ -122,7 +122,7 @@ class Chip(ClockAndFlash):
 
     def breaks(self) -> None:
         """Let the break inputs do their work."""
-        for timer, pin in (("TIM1", "PB12"), ("TIM8", "PA6")):
+        for timer, pin in self.part.breaks:
             bdtr = self[f"{timer}.BDTR"]
             if not bdtr >> 12 & 1 or self.function(pin) != f"{timer}_BKIN":
                 continue
@@ -215,12 +215,22 @@ class Chip(ClockAndFlash):
         """Let the PWM go through so many periods; each triggers a scan."""
         self.conversions(count * len(self.sequence()))
 
+    def _triggered_by_tim8(self) -> bool:
+        ready = self["TIM8.CR1"] & 1 and self["TIM8.CR2"] >> 4 & 7 == 7 and self["TIM8.CCMR2"] >> 12 & 7 == 6
+        return bool(ready and 0 < self["TIM8.CCR4"] < self["TIM8.ARR"])
+
+    def _triggered_by_tim4(self) -> bool:
+        """TIM4 starts with TIM1, has its period, and its fourth channel rises once in it."""
+        together = self["TIM1.CR1"] & 1 and self["TIM1.CR2"] >> 4 & 7 == 1 and self["TIM4.SMCR"] == 6
+        period = self["TIM4.ARR"] + 1 == 2 * self["TIM1.ARR"] and self["TIM4.PSC"] == self["TIM1.PSC"]
+        rises = self["TIM4.CCMR2"] >> 8 & 0x73 == 0x70 and self["TIM4.CCER"] == 1 << 12
+        return bool(together and period and rises and 0 < self["TIM4.CCR4"] <= self["TIM4.ARR"])
+
     def conversions(self, count: int) -> None:
         """Let the converter do so many conversions of its scans, if it is triggered and somebody takes them."""
         stream, cr2 = "DMA2.S0", self["ADC1.CR2"]
-        triggered = self["TIM8.CR1"] & 1 and self["TIM8.CR2"] >> 4 & 7 == 7
-        triggered = triggered and self["TIM8.CCMR2"] >> 12 & 7 == 6 and 0 < self["TIM8.CCR4"] < self["TIM8.ARR"]
-        listens = cr2 & 1 and cr2 >> 28 & 3 == 1 and cr2 >> 24 & 15 == 14 and self["ADC1.CR1"] >> 8 & 1
+        triggered = self._triggered_by_tim4() if self.part.trigger == 9 else self._triggered_by_tim8()
+        listens = cr2 & 1 and cr2 >> 28 & 3 == 1 and cr2 >> 24 & 15 == self.part.trigger and self["ADC1.CR1"] >> 8 & 1
         listens = listens and not self["ADC1.SR"] >> 5 & 1  # an overrun stops the requests
         if not (triggered and listens and cr2 >> 8 & 3 == 3 and self[f"{stream}CR"] & 1):
             return
@@ -266,9 +276,9 @@ class Chip(ClockAndFlash):
 
     def receive(self, data: bytes) -> None:
         """Let bytes come in on the wire."""
-        stream = "DMA1.S5"
-        ready = self["USART2.CR1"] & 0x2004 == 0x2004 and self["USART2.CR3"] & 0x40 and self[f"{stream}CR"] & 1
-        if not ready or self[f"{stream}CR"] >> 25 & 7 != 4 or self[f"{stream}PAR"] != 0x40004404:
+        uart, stream, _ = self.part.uart
+        ready = self[f"{uart}.CR1"] & 0x2004 == 0x2004 and self[f"{uart}.CR3"] & 0x40 and self[f"{stream}CR"] & 1
+        if not ready or self[f"{stream}CR"] >> 25 & 7 != 4 or self[f"{stream}PAR"] != NAMED[f"{uart}.DR"]:
             self.wrong("nobody takes the bytes of the wire")
             return
         for byte in data:
@@ -276,20 +286,20 @@ class Chip(ClockAndFlash):
 
     def send(self, most: int) -> bytes:
         """Let the wire carry at most so many bytes away; return them."""
-        stream, data = "DMA1.S6", bytearray()
+        (uart, _, stream), data = self.part.uart, bytearray()
         while self[f"{stream}CR"] & 1 and len(data) < most:
-            if self["USART2.CR1"] & 0x2008 != 0x2008 or not self["USART2.CR3"] & 0x80:
-                self.wrong("USART2 does not send")
+            if self[f"{uart}.CR1"] & 0x2008 != 0x2008 or not self[f"{uart}.CR3"] & 0x80:
+                self.wrong(f"{uart} does not send")
             if self[f"{stream}CR"] >> 25 & 7 != 4 or self[f"{stream}CR"] >> 6 & 3 != 1:
-                self.wrong("DMA1 stream 6 does not serve USART2's sender")
-            if self[f"{stream}PAR"] != 0x40004404:
-                self.wrong("DMA1 stream 6 does not write to USART2")
+                self.wrong(f"{stream} does not serve {uart}'s sender")
+            if self[f"{stream}PAR"] != NAMED[f"{uart}.DR"]:
+                self.wrong(f"{stream} does not write to {uart}")
             data.append(self.transfer(stream, 1, None))
         return bytes(data)
 
-    def get_usart2_dr(self, name: str) -> int:
+    def get_usart_dr(self, name: str) -> int:
         """Reading it after SR clears an overrun."""
-        self["USART2.SR"] &= ~(1 << 3)
+        self[f"{self.part.uart[0]}.SR"] &= ~(1 << 3)
         return self[name]
 
     def set_scb_icsr(self, name: str, value: int) -> None:
