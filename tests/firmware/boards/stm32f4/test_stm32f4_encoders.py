@@ -51,13 +51,13 @@ def sound(angle: int, diagnosis: int = 0x0180) -> int:
 def test_counts_of_any_timer_reach_any_joint_and_wrap_where_32_bits_do(compiler, library):
     emulator = started(compiler, configured(library, {4: (1, 1), 0: (1, 2), 2: (1, 3)}))
     chip = emulator.chip
-    turned = {"TIM2": 0, "TIM3": 0, "TIM4": 0}
+    moved = {"TIM2": 0, "TIM3": 0, "TIM4": 0}
     for step in (100, -300, 30000, 32767, -32768, 32767):
-        for k, timer in enumerate(turned):
+        for k, timer in enumerate(moved):
             chip.count(timer, step // (k + 1))
-            turned[timer] += step // (k + 1)
+            moved[timer] += step // (k + 1)
         counts = read(emulator)
-        assert [counts[4], counts[0], counts[2]] == [total % 2**32 for total in turned.values()]
+        assert [counts[4], counts[0], counts[2]] == [total % 2**32 for total in moved.values()]
     assert [counts[joint] for joint in (1, 3, 5)] == [0, 0, 0]  # potentiometers' pins at ground
     assert chip["TIM2.CCMR1"] == 0x8181  # both inputs filtered
     assert chip.wrongs == []
