@@ -113,7 +113,7 @@ def draw_board(sheet: Sheet) -> None:
     sheet.text(61.5, 35, "supply: PA5  CN10-11", size=9.5, color=SENSE)
     right = (
         (54.5, "PWM 1: PA8", LOGIC),
-        (50.5, "DIR 1: PB5", LOGIC),
+        (50.5, "DIR 1: PB2", LOGIC),
         (46.5, "enable: PC9  CN10-1", LOGIC),
         (42.5, "CS 1: PA0", SENSE),
         (37, "stop: PA6  CN10-13", STOP),

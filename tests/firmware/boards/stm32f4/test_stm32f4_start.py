@@ -186,6 +186,8 @@ def test_the_wiring_picture_shows_the_same_pins():
         assert [tuple(pin.split()) for pin in shown] == [socket[what.format(joint)] for what in expected]
     for what, said in (("motor supply", "supply"), ("emergency stop", "stop"), ("enable of all bridges", "enable")):
         assert f"{said}: {socket[what][0]}  {socket[what][1]}" in script
+    for what, said in (("direction of joint 1", "DIR 1"), ("PWM of joint 1", "PWM 1"), ("current of joint 1", "CS 1")):
+        assert f"{said}: {socket[what][0]}" in script
 
 
 def test_the_currents_are_read_around_the_middle_of_the_pulses(booted):
