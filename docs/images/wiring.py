@@ -20,9 +20,9 @@ matplotlib.rcParams["svg.hashsalt"] = "armsight"  # and the same file whenever i
 INK, MOTOR, LOGIC, SENSE, STOP = "#1b1f24", "#b4451f", "#1f5fb4", "#2a7d3f", "#8a1c5c"
 PAPER, BOARD = "#ffffff", "#eef3fa"
 JOINTS = (
-    ("1", "PC0  CN7-38", "PA8  CN10-23", "PB5  CN10-29", "PA0  CN7-28"),
-    ("2", "PC1  CN7-36", "PA9  CN10-21", "PB6  CN10-17", "PA1  CN7-30"),
-    ("3", "PC2  CN7-35", "PA10 CN10-33", "PB7  CN7-21", "PA4  CN7-32"),
+    ("1", "PC0  CN7-38", "PA8  CN10-23", "PB2  CN10-22", "PA0  CN7-28"),
+    ("2", "PC1  CN7-36", "PA9  CN10-21", "PB14 CN10-28", "PA1  CN7-30"),
+    ("3", "PC2  CN7-35", "PA10 CN10-33", "PB15 CN10-26", "PA4  CN7-32"),
     ("4", "PC3  CN7-37", "PC6  CN10-4", "PB8  CN10-3", "PA7  CN10-15"),
     ("5", "PC4  CN10-34", "PC7  CN10-19", "PB9  CN10-5", "PB0  CN7-34"),
     ("6", "PC5  CN10-6", "PC8  CN10-2", "PB10 CN10-25", "PB1  CN10-24"),
@@ -113,7 +113,7 @@ def draw_board(sheet: Sheet) -> None:
     sheet.text(61.5, 35, "supply: PA5  CN10-11", size=9.5, color=SENSE)
     right = (
         (54.5, "PWM 1: PA8", LOGIC),
-        (50.5, "DIR 1: PB5", LOGIC),
+        (50.5, "DIR 1: PB2", LOGIC),
         (46.5, "enable: PC9  CN10-1", LOGIC),
         (42.5, "CS 1: PA0", SENSE),
         (37, "stop: PA6  CN10-13", STOP),

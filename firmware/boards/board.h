@@ -11,8 +11,7 @@ typedef struct board_description {
     const char *name; /* at most 16 characters, sent in WELCOME */
     uint32_t baud;    /* bits a second on the wire, 8N1: the telemetry's rate follows from it */
 
-    /* The kinds of sensors it reads, one bit 1 << SENSOR_... each: a configuration with another kind is not valid here. */
-    uint32_t sensors;
+    board_abilities abilities; /* sent in WELCOME */
 
     /* Tick. Fill in everything but the command: tick, overrun, stop_pressed (the button), supply_mv, counts,
      * current_ma. taken_over is the wire's. */

@@ -11,15 +11,17 @@
 #define CHUNK 128u
 #define HUNG_TICKS 1000u /* a main loop that does not come round for so long hangs: the watchdog shall have it */
 
-/* Return whether the board has the sensors that a configuration asks for. */
-static bool has_sensors(const board_loop *loop, const core_config *config)
+/* Return whether the board has the joints and the sensors that a configuration asks for. */
+static bool suits(const board_abilities *board, const core_config *config)
 {
     for (uint32_t joint = 0u; joint < config->joint_count; joint++) {
-        if ((loop->board->sensors >> config->joint[joint].encoder.sensor & 1u) == 0u) {
+        const encoder_config *encoder = &config->joint[joint].encoder;
+        const bool there = encoder->sensor != SENSOR_QUADRATURE || encoder->input <= board->quadrature_inputs;
+        if ((board->sensors >> encoder->sensor & 1u) == 0u || !there) {
             return false;
         }
     }
-    return true;
+    return config->joint_count <= board->joints;
 }
 
 /* Return what config_load says of the two stored copies, which it leaves in loop->copies. */
@@ -36,11 +38,13 @@ void loop_start(board_loop *loop, const board_description *board)
     memset(loop, 0, sizeof *loop); /* a compound literal may take its size of stack */
     loop->board = board;
     uint32_t source = load(loop, &config);
-    if (!has_sensors(loop, &config)) { /* written by the firmware of another board */
+    if (!suits(&board->abilities, &config)) { /* written by the firmware of another board, or the factory's six joints */
+        config_factory(&config);
+        config.joint_count = board->abilities.joints;
         source = CONFIG_FACTORY;
     }
     core_init(&loop->core, &config, source, board->reset_cause());
-    wire_setup setup = {board->name, board->baud, source, &loop->core.config, {0}};
+    wire_setup setup = {board->name, board->baud, source, &loop->core.config, {0}, board->abilities};
     board->crash(&setup.crash);
     wire_init(&loop->wire, &setup);
 }
@@ -74,7 +78,7 @@ static bool write(board_loop *loop, const core_config *config)
 static bool store(board_loop *loop, const core_config *config)
 {
     core_config stored;
-    if (!has_sensors(loop, config)) {
+    if (!suits(&loop->board->abilities, config)) {
         return false;
     }
     load(loop, &stored);

@@ -117,6 +117,13 @@ enum {
 /* What reads a joint's angle. */
 enum { SENSOR_POTENTIOMETER = 0, SENSOR_QUADRATURE = 1, SENSOR_ABSOLUTE = 2 };
 
+/* What a board has for joints: a configuration that asks for more is not valid there. */
+typedef struct board_abilities {
+    uint32_t joints;            /* how many, 1 to JOINTS */
+    uint32_t sensors;           /* one bit 1 << SENSOR_... for each kind it reads */
+    uint32_t quadrature_inputs; /* timers that count: inputs 1 to so many */
+} board_abilities;
+
 #define ENCODER_REV 16384u /* counts of an absolute encoder's revolution */
 
 /* Beside the 14 bits of an absolute encoder's angle, in telemetry. */

@@ -138,7 +138,9 @@ static void take_hello(wire_state *wire, const mavlink_message_t *message)
         .ticks_per_s = TICKS_PER_S,
         .baud = wire->setup.baud,
         .config_source = wire->setup.config_source,
-        .joints = JOINTS,
+        .joints = wire->setup.abilities.joints,
+        .sensors = wire->setup.abilities.sensors,
+        .quadrature_inputs = wire->setup.abilities.quadrature_inputs,
         .session = wire->session,
         .firmware = FIRMWARE_VERSION,
     };

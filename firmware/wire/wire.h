@@ -27,6 +27,7 @@ typedef struct wire_setup {
     uint32_t config_source;    /* CONFIG_NEWEST, CONFIG_OLDER or CONFIG_FACTORY */
     const core_config *config; /* in use; the tick may change its gains */
     crash_record crash;        /* that the board started after */
+    board_abilities abilities;
 } wire_setup;
 
 /* How often each kind of telemetry goes out, in ticks. */

@@ -83,7 +83,9 @@ def stack_use(board: str) -> StackUse:
 
 def _hooks(board: str) -> set[str]:
     """Return the functions the board's struct literal names."""
-    sources = (build.source_folder() / "boards" / board).glob("*.c")
+    sources = [
+        build.source_folder() / source for source in build.board_sources(board) if f"/{build.drivers(board)}/" in source
+    ]
     return {name for source in sources for name in _HOOK.findall(source.read_text(encoding="utf-8"))}
 
 

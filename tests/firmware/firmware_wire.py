@@ -18,6 +18,7 @@ class Setup(ctypes.Structure):
         ("config_source", ctypes.c_uint32),
         ("config", ctypes.c_void_p),
         ("crash", ctypes.c_uint32 * 4),
+        ("abilities", ctypes.c_uint32 * 3),
     )
 
 

@@ -1,4 +1,4 @@
-/* The converter: TIM8 starts a scan of all channels once a PWM period, DMA puts it into a ring of the last sixteen
+/* The converter: a timer starts a scan of all channels once a PWM period, DMA puts it into a ring of the last sixteen
  * scans. A tick adds up the ring, whichever scan is just being replaced: always the last sixteen of each channel. */
 #include "drivers.h"
 #include "registers.h"
@@ -12,7 +12,7 @@ _Static_assert(CHANNELS * CONVERSION_CLOCKS < ADC_HZ / PWM_HZ, "a scan ends befo
 _Static_assert(SCANS < PWM_HZ / TICKS_PER_S, "all sixteen scans are younger than a tick");
 
 /* Of each reading in a scan, the converter's channel. */
-static const uint8_t channel[CHANNELS] = {0, 1, 4, 7, 8, 9, 5, 10, 11, 12, 13, 14, 15};
+static const uint8_t channel[CHANNELS] = ADC_CHANNELS;
 static volatile uint16_t ring[SCANS][CHANNELS];
 
 static void scan_start(void)
@@ -30,7 +30,7 @@ static void scan_start(void)
     ADC1->smpr1 = sampling[1];
     ADC1->cr1 = ADC_CR1_SCAN;
     ADC1->sr = 0u;
-    ADC1->cr2 = ADC_CR2_EXTEN_RISING | ADC_CR2_EXTSEL_TIM8_TRGO | ADC_CR2_DDS | ADC_CR2_DMA | ADC_CR2_ADON;
+    ADC1->cr2 = ADC_CR2_EXTEN_RISING | ADC_TRIGGER | ADC_CR2_DDS | ADC_CR2_DMA | ADC_CR2_ADON;
 }
 
 static void ring_start(void)
@@ -74,11 +74,11 @@ void adc_read(core_inputs *inputs)
             sum[i] += ring[scan][i];
         }
     }
-    for (uint32_t joint = 0u; joint < JOINTS; joint++) {
+    for (uint32_t joint = 0u; joint < BOARD_JOINTS; joint++) {
         inputs->current_ma[joint] = (int32_t)(sum[joint] * CURRENT_FULL_MA >> 16);
-        inputs->counts[joint] = running ? sum[JOINTS + 1u + joint] : OPEN_COUNTS;
+        inputs->counts[joint] = running ? sum[BOARD_JOINTS + 1u + joint] : OPEN_COUNTS;
     }
-    inputs->supply_mv = (uint32_t)((uint64_t)sum[JOINTS] * SUPPLY_FULL_MV >> 16);
+    inputs->supply_mv = running ? (uint32_t)((uint64_t)sum[BOARD_JOINTS] * SUPPLY_FULL_MV >> 16) : 0u;
     if (!running) {
         adc_start();
     }

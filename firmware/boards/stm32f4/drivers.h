@@ -1,28 +1,35 @@
-/* What the Nucleo-F446RE's drivers give. docs/howto/add_a_board.md has the pin table and the wiring. */
+/* What the drivers of an STM32F4 board give. chip.h says which board: its clocks, peripherals and pins. */
 #ifndef ARMSIGHT_STM32F4_DRIVERS_H
 #define ARMSIGHT_STM32F4_DRIVERS_H
 
 #include <stdbool.h>
 
+#include <chip.h> /* of the board's own folder */
+
 #include "types.h"
 
-#define PROCESSOR_HZ 180000000u
-#define TIMER_HZ PROCESSOR_HZ /* of TIM1 and TIM8: twice their bus, which is half the processor's */
-#define UART_HZ 45000000u     /* of USART2's bus, APB1 */
-#define ADC_HZ 22500000u      /* a quarter of the converter's bus, APB2 */
 #define PWM_HZ 20000u
 #define PWM_STEPS (TIMER_HZ / PWM_HZ / 2u) /* the counter goes up and down once a period */
 #define UART_BAUD 921600u
 #define SCANS 16u             /* readings of each converter channel added up: 16 of 12 bits make 16 bits */
-#define CHANNELS 13u          /* six currents, the supply, six potentiometers, in this order */
+#define CHANNELS (2u * BOARD_JOINTS + 1u) /* currents, the supply, potentiometers, in this order */
 #define CONVERSION_CLOCKS 68u /* 56 sampling, 12 converting */
 
-/* Bring the processor to 180 MHz: from the ST-Link's 8 MHz, or from the internal oscillator where there is none.
+/* Bring the processor to its speed: from the external clock, or from the internal oscillator where there is none.
  * Startup only, before any other peripheral has its clock. */
 void clock_start(void);
 
-/* Connect the pins to what drives them. Startup only, after the timers are set up. */
+/* Who needs a pin: every board (ALWAYS), quadrature encoders (the number of their input), or absolute ones (SPI). */
+enum { ALWAYS = 0, SPI = 255 };
+
+/* Connect the pins to what drives them, but for the encoders'. Startup only, after the timers are set up. */
 void pins_start(void);
+
+/* Connect the pins of a quadrature encoder's input, or of SPI. Startup only, once their peripheral is set up. */
+void pins_connect(uint32_t user);
+
+/* Let a joint's potentiometer pin be the chip select of its absolute encoder, high. Startup only. */
+void pins_select_start(uint32_t joint);
 
 /* Make the pin of the sync LED (core_config's sync_led_pin) an output, unless the table or the debugger has it, or it is
  * beyond port C. Startup only, after pins_start. */
@@ -34,7 +41,7 @@ void pins_light(uint32_t led_pin, bool on);
 /* Set up the PWM timers with all outputs off. Startup only. */
 void drives_start(void);
 
-/* Let both timers run, and with them the converter. Startup only, last. */
+/* Let the timers run, and with them the converter. Startup only, last. */
 void drives_run(void);
 
 /* Drive the motors with these duties (-1 to 1); a number that is none counts as 0. Tick only. */
@@ -49,11 +56,17 @@ bool drives_stopped(void);
 /* Start the converter; the timers trigger it. Startup, and the tick where it stands still. */
 void adc_start(void);
 
-/* Read what the converter saw since the last tick. Where it stood still every potentiometer reads open (65535), and it
- * is started again. Tick only. */
+/* Read what the converter saw since the last tick. Where it stood still every potentiometer reads open (65535), there is
+ * no supply, and it is started again. Tick only. */
 void adc_read(core_inputs *inputs);
 
-/* Start the wire on the ST-Link's serial port. Startup only. */
+/* Set up the encoders that a configuration has, and wait up to 20 ms for each absolute one. Startup only. */
+void encoders_start(const core_config *config);
+
+/* Put the readings of the encoders in place of their joints' potentiometers. Tick only, after adc_read. */
+void encoders_read(core_inputs *inputs);
+
+/* Start the wire. Startup only. */
 void uart_start(void);
 
 /* Take up to room bytes that came in and return how many; add those lost for lack of room to *overrun. Main loop. */

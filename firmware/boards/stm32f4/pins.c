@@ -1,4 +1,4 @@
-/* Which pin does what. docs/howto/add_a_board.md shows the same table, and a test holds them together. */
+/* Pins: chip.h says which does what. */
 #include <stddef.h>
 
 #include "drivers.h"
@@ -13,40 +13,11 @@ typedef struct pin {
     uint8_t mode;
     uint8_t pull;
     uint8_t function; /* alternate function, of the datasheet's table */
+    uint8_t user;
 } pin;
 
-static const pin pins[] = {
-    {GPIOC, 9, OUTPUT, PULL_DOWN, 0}, /* enables all bridges */
-    {GPIOA, 8, ALTERNATE, PULL_DOWN, 1},  /* PWM 1: TIM1_CH1 */
-    {GPIOA, 9, ALTERNATE, PULL_DOWN, 1},  /* PWM 2: TIM1_CH2 */
-    {GPIOA, 10, ALTERNATE, PULL_DOWN, 1}, /* PWM 3: TIM1_CH3 */
-    {GPIOC, 6, ALTERNATE, PULL_DOWN, 3},  /* PWM 4: TIM8_CH1 */
-    {GPIOC, 7, ALTERNATE, PULL_DOWN, 3},  /* PWM 5: TIM8_CH2 */
-    {GPIOC, 8, ALTERNATE, PULL_DOWN, 3},  /* PWM 6: TIM8_CH3 */
-    {GPIOB, 5, OUTPUT, PULL_DOWN, 0}, /* directions 1 to 6 */
-    {GPIOB, 6, OUTPUT, PULL_DOWN, 0},
-    {GPIOB, 7, OUTPUT, PULL_DOWN, 0},
-    {GPIOB, 8, OUTPUT, PULL_DOWN, 0},
-    {GPIOB, 9, OUTPUT, PULL_DOWN, 0},
-    {GPIOB, 10, OUTPUT, PULL_DOWN, 0},
-    {GPIOA, 6, ALTERNATE, PULL_UP, 3},  /* emergency stop: TIM8_BKIN */
-    {GPIOB, 12, ALTERNATE, PULL_UP, 1}, /* emergency stop: TIM1_BKIN */
-    {GPIOA, 2, ALTERNATE, FLOATING, 7}, /* USART2_TX */
-    {GPIOA, 3, ALTERNATE, PULL_UP, 7},  /* USART2_RX */
-    {GPIOC, 0, ANALOG, FLOATING, 0}, /* potentiometers 1 to 6 */
-    {GPIOC, 1, ANALOG, FLOATING, 0},
-    {GPIOC, 2, ANALOG, FLOATING, 0},
-    {GPIOC, 3, ANALOG, FLOATING, 0},
-    {GPIOC, 4, ANALOG, FLOATING, 0},
-    {GPIOC, 5, ANALOG, FLOATING, 0},
-    {GPIOA, 0, ANALOG, FLOATING, 0}, /* currents 1 to 6 */
-    {GPIOA, 1, ANALOG, FLOATING, 0},
-    {GPIOA, 4, ANALOG, FLOATING, 0},
-    {GPIOA, 7, ANALOG, FLOATING, 0},
-    {GPIOB, 0, ANALOG, FLOATING, 0},
-    {GPIOB, 1, ANALOG, FLOATING, 0},
-    {GPIOA, 5, ANALOG, FLOATING, 0}, /* supply */
-};
+#define PIN(port, number, mode, pull, function, user) {port, number, mode, pull, function, user},
+static const pin pins[] = {PIN_LIST(PIN)};
 
 static gpio_registers *led_port; /* of the sync LED; NULL without */
 
@@ -71,9 +42,22 @@ void pins_start(void)
 {
     RCC->ahb1enr |= RCC_AHB1ENR_GPIOA | RCC_AHB1ENR_GPIOB | RCC_AHB1ENR_GPIOC;
     (void)RCC->ahb1enr;
+    pins_connect(ALWAYS);
+}
+
+void pins_connect(uint32_t user)
+{
     for (uint32_t i = 0u; i < sizeof pins / sizeof pins[0]; i++) {
-        connect(&pins[i]);
+        if (pins[i].user == user) {
+            connect(&pins[i]);
+        }
     }
+}
+
+void pins_select_start(uint32_t joint)
+{
+    SELECT_PORT->bsrr = BIT(joint);
+    put(&SELECT_PORT->moder, OUTPUT, 2u, joint);
 }
 
 void pins_light_start(uint32_t led_pin)
@@ -84,7 +68,7 @@ void pins_light_start(uint32_t led_pin)
     if (port >= sizeof ports / sizeof ports[0]) {
         return;
     }
-    const pin led = {ports[port], (uint8_t)(led_pin % 16u), OUTPUT, FLOATING, 0};
+    const pin led = {ports[port], (uint8_t)(led_pin % 16u), OUTPUT, FLOATING, 0, ALWAYS};
     bool taken = led.port == GPIOA && (led.number == 13u || led.number == 14u); /* the debugger's */
     for (uint32_t i = 0u; i < sizeof pins / sizeof pins[0]; i++) {
         taken = taken || (pins[i].port == led.port && pins[i].number == led.number);

@@ -1,5 +1,5 @@
-/* The registers of the STM32F446 this board uses. Names are the reference manual's (RM0390) in lower case; the
- * processor's own are ARMv7-M's. A gap named reserved keeps the offsets. */
+/* The registers of the STM32F446 and STM32F411 that the boards use. Names are the reference manuals' (RM0390, whose
+ * chapters are named; RM0383 has the same) in lower case; the processor's own are ARMv7-M's. A gap named reserved keeps the offsets. */
 #ifndef ARMSIGHT_STM32F4_REGISTERS_H
 #define ARMSIGHT_STM32F4_REGISTERS_H
 
@@ -16,7 +16,6 @@ typedef struct flash_registers {
 } flash_registers;
 #define FLASH ((flash_registers *)0x40023C00u)
 #define FLASH_ACR_LATENCY 0xFu
-#define FLASH_WAIT_STATES 5u /* 150 to 180 MHz at 2.7 V or more */
 #define FLASH_ACR_PRFTEN BIT(8)
 #define FLASH_ACR_ICEN BIT(9)
 #define FLASH_ACR_DCEN BIT(10)
@@ -62,6 +61,7 @@ typedef struct rcc_registers {
 #define RCC_CFGR_SW_PLL 2u
 #define RCC_CFGR_SWS_PLL FIELD(2, 2)
 #define RCC_CFGR_SWS_MASK FIELD(3, 2)
+#define RCC_CFGR_PPRE1_DIV2 FIELD(4, 10)
 #define RCC_CFGR_PPRE1_DIV4 FIELD(5, 10)
 #define RCC_CFGR_PPRE2_DIV2 FIELD(4, 13)
 #define RCC_AHB1ENR_GPIOA BIT(0)
@@ -69,10 +69,15 @@ typedef struct rcc_registers {
 #define RCC_AHB1ENR_GPIOC BIT(2)
 #define RCC_AHB1ENR_DMA1 BIT(21)
 #define RCC_AHB1ENR_DMA2 BIT(22)
+#define RCC_APB1ENR_TIM2 BIT(0) /* 3 and 4 follow */
+#define RCC_APB1ENR_TIM4 BIT(2)
+#define RCC_APB1ENR_SPI2 BIT(14)
+#define RCC_APB1ENR_SPI3 BIT(15)
 #define RCC_APB1ENR_USART2 BIT(17)
 #define RCC_APB1ENR_PWR BIT(28)
 #define RCC_APB2ENR_TIM1 BIT(0)
 #define RCC_APB2ENR_TIM8 BIT(1)
+#define RCC_APB2ENR_USART1 BIT(4)
 #define RCC_APB2ENR_ADC1 BIT(8)
 #define RCC_CSR_RMVF BIT(24)
 #define RCC_CSR_IWDGRSTF BIT(29)
@@ -103,7 +108,7 @@ typedef struct dma_registers {
 #define DMA_CR_MSIZE_HALF FIELD(1, 13)
 #define DMA_CR_PL(priority) FIELD(priority, 16)
 #define DMA_CR_CHSEL(channel) FIELD(channel, 25)
-#define DMA_HTIF BIT(4) /* half of the transfer; streams 0 and 4; 1 and 5 six bits further, 2 and 6 sixteen */
+#define DMA_HTIF BIT(4) /* half of the transfer; streams 0 and 4; 1 and 5 six bits further, 2 and 6 sixteen, 3 and 7 22 */
 #define DMA_TCIF BIT(5) /* the whole of it */
 #define DMA_FLAGS 0x3Du /* all five */
 
@@ -125,23 +130,33 @@ typedef struct adc_registers {
 #define ADC_CR2_ADON BIT(0)
 #define ADC_CR2_DMA BIT(8)
 #define ADC_CR2_DDS BIT(9)
+#define ADC_CR2_EXTSEL_TIM4_CC4 FIELD(9, 24)
 #define ADC_CR2_EXTSEL_TIM8_TRGO FIELD(14, 24)
 #define ADC_CR2_EXTEN_RISING FIELD(1, 28)
 #define ADC_SMP_56 3u /* sampling for 56 of its clocks; a conversion takes 12 more */
 
-/* RM0390 chapter 16, advanced-control timers. */
+/* RM0390 chapters 16 and 17, timers. */
 typedef struct tim_registers {
     word cr1, cr2, smcr, dier, sr, egr, ccmr1, ccmr2, ccer, cnt, psc, arr, rcr, ccr1, ccr2, ccr3, ccr4, bdtr;
 } tim_registers;
+#define TIM2 ((tim_registers *)0x40000000u)
+#define TIM3 ((tim_registers *)0x40000400u)
+#define TIM4 ((tim_registers *)0x40000800u)
 #define TIM1 ((tim_registers *)0x40010000u)
 #define TIM8 ((tim_registers *)0x40010400u)
 #define TIM_CR1_CEN BIT(0)
 #define TIM_CR1_CENTRE FIELD(1, 5)
 #define TIM_CR1_ARPE BIT(7)
+#define TIM_CR2_TRGO_ENABLE FIELD(1, 4)
 #define TIM_CR2_TRGO_OC4REF FIELD(7, 4)
+#define TIM_SMCR_ENCODER 3u /* counts the edges of both inputs */
+#define TIM_SMCR_TRIGGER 6u /* starts with another timer: of TIM4's, its first is TIM1 */
 #define TIM_SR_BIF BIT(7)
 #define TIM_EGR_UG BIT(0)
 #define TIM_OC_PWM1_PRELOAD FIELD(0xD, 3) /* OCxM = 110, OCxPE = 1; the upper channel eight bits further */
+#define TIM_OC4_PWM2 FIELD(7, 12) /* high from its compare value on */
+#define TIM_CCER_CC4E BIT(12)
+#define TIM_IC_FILTERED 0x8181u /* channels 1 and 2 are inputs; what lasts 6 times 8 clocks is an edge */
 #define TIM_BDTR_LOCK3 FIELD(3, 8)
 #define TIM_BDTR_OSSI BIT(10)
 #define TIM_BDTR_OSSR BIT(11)
@@ -153,6 +168,7 @@ typedef struct tim_registers {
 typedef struct usart_registers {
     word sr, dr, brr, cr1, cr2, cr3, gtpr;
 } usart_registers;
+#define USART1 ((usart_registers *)0x40011000u)
 #define USART2 ((usart_registers *)0x40004400u)
 #define USART_SR_ORE BIT(3)
 #define USART_CR1_RE BIT(2)
@@ -160,6 +176,21 @@ typedef struct usart_registers {
 #define USART_CR1_UE BIT(13)
 #define USART_CR3_DMAR BIT(6)
 #define USART_CR3_DMAT BIT(7)
+
+/* RM0390 chapter 26, SPI. */
+typedef struct spi_registers {
+    word cr1, cr2, sr, dr;
+} spi_registers;
+#define SPI2 ((spi_registers *)0x40003800u)
+#define SPI3 ((spi_registers *)0x40003C00u)
+#define SPI_CR1_CPHA BIT(0)
+#define SPI_CR1_MSTR BIT(2)
+#define SPI_CR1_DIV8 FIELD(2, 3)
+#define SPI_CR1_SPE BIT(6)
+#define SPI_CR1_SSI BIT(8)
+#define SPI_CR1_SSM BIT(9)
+#define SPI_CR1_DFF BIT(11) /* 16 bits */
+#define SPI_SR_RXNE BIT(0)
 
 /* RM0390 chapter 20, independent watchdog. */
 typedef struct iwdg_registers {
@@ -173,6 +204,7 @@ typedef struct iwdg_registers {
 /* RM0390 chapter 33, what stands still while a debugger has stopped the processor. */
 #define DBGMCU_APB1_FZ (*(word *)0xE0042008u)
 #define DBGMCU_APB2_FZ (*(word *)0xE004200Cu)
+#define DBGMCU_TIM4 BIT(2)
 #define DBGMCU_IWDG BIT(12)
 #define DBGMCU_TIM1 BIT(0)
 #define DBGMCU_TIM8 BIT(1)

@@ -1,4 +1,4 @@
-/* The Nucleo-F446RE as a board: what the common loop asks for, and the tick's timer.
+/* An STM32F4 as a board: what the common loop asks for, and the tick's timer.
  *
  * SysTick counts milliseconds and asks for PendSV, which has the lowest priority and runs the tick: so a tick that
  * takes too long is seen while it runs, and no millisecond goes uncounted. The main loop serves the wire. Floats are
@@ -24,6 +24,7 @@ static void sense(core_inputs *inputs)
     overruns_reported = seen;
     inputs->stop_pressed = drives_stopped() ? 1u : 0u;
     adc_read(inputs);
+    encoders_read(inputs);
 }
 
 static void drive(const core_outputs *outputs)
@@ -52,10 +53,11 @@ static void restart(void)
     }
 }
 
-static const board_description nucleo = {
-    .name = "nucleo-f446re",
+static const board_description board = {
+    .name = BOARD_NAME,
     .baud = UART_BAUD,
-    .sensors = 1u << SENSOR_POTENTIOMETER,
+    .abilities = {BOARD_JOINTS, 1u << SENSOR_POTENTIOMETER | 1u << SENSOR_QUADRATURE | 1u << SENSOR_ABSOLUTE,
+                  QUADRATURE_INPUTS},
     .sense = sense,
     .drive = drive,
     .feed_watchdog = watchdog_feed,
@@ -101,7 +103,8 @@ void board_main(void)
     pins_start();
     adc_start();
     uart_start();
-    loop_start(&loop, &nucleo);
+    loop_start(&loop, &board);
+    encoders_start(&loop.core.config);
     pins_light_start(loop.core.config.sync_led_pin);
     drives_run();
     watchdog_set_short();

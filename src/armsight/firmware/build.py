@@ -32,6 +32,8 @@ from armsight.firmware.elf import read_elf
 #: Names a compiler for the build at install, where no option can be given.
 COMPILER_VARIABLE = "ARMSIGHT_FIRMWARE_COMPILER"
 _ARM_GCC = "arm-none-eabi-gcc"
+#: Boards that are a header and a linker script for the drivers in another one's folder.
+_DRIVERS = {"blackpill": "stm32f4"}
 _OPTIMISE = ("-O2", "-fomit-frame-pointer", "-ffunction-sections", "-fdata-sections", "-g0")
 _HOST = ("-O2", "-shared", "-fPIC", "-g0")
 _ZIG_M4F = ("-target", "thumb-freestanding-eabihf", "-mcpu=cortex_m4+vfp4d16sp", "-fno-unwind-tables")
@@ -133,7 +135,12 @@ def includes(mavlink: Path, *folders: str) -> list[str]:
 
 def board_sources(board: str) -> list[str]:
     """Return the C files of a board's image."""
-    return _found("core", "wire", "boards", "boards/cortex_m", f"boards/{board}")
+    return _found("core", "wire", "boards", "boards/cortex_m", f"boards/{drivers(board)}")
+
+
+def drivers(board: str) -> str:
+    """Return in whose folder the drivers of a board are."""
+    return _DRIVERS.get(board, board)
 
 
 def host_sources() -> list[str]:
@@ -148,7 +155,8 @@ def _found(*folders: str) -> list[str]:
 
 def board_flags(board: str, mavlink: Path) -> list[str]:
     """Return the flags every source of a board's image is compiled with."""
-    return [*_OPTIMISE, "-isystem", "boards/cortex_m/include", *includes(mavlink, f"boards/{board}", "boards/cortex_m")]
+    own = [f"boards/{folder}" for folder in dict.fromkeys((board, drivers(board)))]
+    return [*_OPTIMISE, "-isystem", "boards/cortex_m/include", *includes(mavlink, *own, "boards/cortex_m")]
 
 
 def build_board(board: str, target: Path, compiler: Compiler) -> Path:

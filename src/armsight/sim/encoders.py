@@ -78,10 +78,12 @@ class EncodedPlant:
         """Return what the converters, the timers and the encoders' wire read now."""
         sensed = self.plant.sense()
         for j in map(int, np.flatnonzero(self._encoders.kind)):
-            sensed.counts[j] = (
-                self._quadrature(j) if self._encoders.kind[j] == SensorKind.QUADRATURE else self._absolute(j)
-            )
+            sensed.counts[j] = self.reading(j)
         return sensed
+
+    def reading(self, j: int) -> int:
+        """Return what the encoder of joint j, which has one, reads now."""
+        return self._quadrature(j) if self._encoders.kind[j] == SensorKind.QUADRATURE else self._absolute(j)
 
     def step(self, duty: Array, awake: bool, braked: bool = False) -> None:
         """Let 1 ms pass with these duties (6,)."""

@@ -218,5 +218,5 @@ def test_what_was_built_reads_well(armsight, programmers, tmp_path):
 
 
 def test_only_a_real_board_is_flashed(armsight, programmers, tmp_path):
-    assert FLASHED == ("stm32f4",)
+    assert FLASHED == ("stm32f4", "blackpill")
     assert_rejected(armsight("board", "flash", "--board", "pil", "-o", tmp_path), "pil is no board to plug in")

@@ -4,6 +4,7 @@ import io
 import json
 import os
 import pty
+import re
 import time
 
 import numpy as np
@@ -16,23 +17,26 @@ from armsight.app.board.found import Found, JointFound
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.board_file import read_configuration
+from armsight.robot.boards.codes import Reaction, SensorKind
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.identification import dead_spots, fit_swing
 from armsight.robot.boards.opening import open_emulator
-from armsight.sim.boards.workshop import Wiring, WorkshopPerson, drawn_workshop, swapped
+from armsight.sim.boards.workshop import Wiring, WorkshopPerson, drawn_encoders, drawn_workshop, swapped
+from armsight.sim.encoders import EncodedPlant, EncoderFault
 
 
 class Evening:
     """A fresh emulated board with an arm nobody knows, and a person."""
 
-    def __init__(self, folder, wiring=None, *, seed=31, joints=(0,), mends=False):
-        self.plant, self.model = drawn_workshop(seed)
+    def __init__(self, folder, wiring=None, *, seed=31, joints=(0,), mends=False, encoders=None):
+        self.drawn = drawn_encoders(seed, {j: kind for j, (kind, _) in (encoders or {}).items()})
+        self.plant, self.model = drawn_workshop(seed, encoders=self.drawn)
         if wiring is not None:
             self.plant.wiring = wiring
         self.person = WorkshopPerson(self.plant, seed=seed, mends=mends)
         self.link = EmulatedLink(open_emulator("host"), self.plant)
         self.board = Board.connect(self.link)
-        self.bringup = Bringup(self.board, self.person, folder, joints)
+        self.bringup = Bringup(self.board, self.person, folder, joints, encoders=encoders)
         self.joints = self.bringup.found.joints
 
 
@@ -65,6 +69,83 @@ def test_one_joint_is_identified_verified_and_stored(tmp_path):
     evening.plant.drives_s = 0.0
     Bringup(evening.board, evening.person, tmp_path, [0]).run(["potentiometers", "motors", "swing"])
     assert evening.plant.drives_s == 0.0
+
+
+@pytest.fixture
+def short_ways(monkeypatch):
+    """Let the hand move joints less far, which takes less of the test's time."""
+    monkeypatch.setattr("armsight.sim.boards.workshop.MARKS_DEG", (-60.0, 0.0, 60.0))
+
+
+ENCODERS = {0: (SensorKind.QUADRATURE, 2), 1: (SensorKind.ABSOLUTE, 0)}
+
+
+def test_encoders_are_found_by_their_counts_direction_and_zero_and_homed_where_they_stand(tmp_path, short_ways):
+    evening = Evening(tmp_path, joints=[0, 1], encoders=ENCODERS, seed=53)
+    evening.bringup.run(["readings", "potentiometers"])
+    evening.bringup._joints = [0]
+    evening.bringup.run(["motors"])
+    assert evening.person.problems == []
+    for j, found in enumerate(evening.joints[:2]):
+        assert found.counts_per_rev == pytest.approx(evening.drawn.counts_per_rev[j], rel=0.01)
+        # A protractor is read to 3 mrad.
+        ends = found.encoder_angles(np.array(found.range_counts))
+        assert np.sort(np.abs(ends)) == pytest.approx(
+            [np.pi / 3, np.pi / 2], abs=0.05
+        )  # to a mark, and to where it hangs
+    assert evening.joints[0].motor_direction == evening.plant.wiring.motor_signs[0]
+    here = evening.plant.plant.link[:2]
+    assert evening.board.receive(0.05).q[-1, :2] == pytest.approx(here, abs=0.02)
+    # Another run, of a board that was switched off meanwhile: a quadrature encoder's position is asked for.
+    evening.link.restart()
+    evening.plant.encoded = EncodedPlant(evening.plant.plant, evening.drawn)
+    asked = []
+    evening.person.ask = lambda kind, joint, said, ask=evening.person.ask: (asked.append(kind), ask(kind, joint, said))
+    again = Bringup(Board.connect(evening.link), evening.person, tmp_path, [0, 1])
+    again.run(["potentiometers"])
+    again._use(again._configuration(Reaction.RELEASE, gains=False))
+    assert asked == ["angle"]
+    assert again._board.receive(0.05).q[-1, :2] == pytest.approx(evening.plant.plant.link[:2], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("joint", "fault", "step", "said"),
+    [
+        (1, EncoderFault.LOW, "readings", "joint 2: its encoder gives no sound reading"),
+        (1, EncoderFault.MAGNET, "readings", "joint 2: its encoder reports its magnet as too weak or too strong"),
+        (0, EncoderFault.LOW, "potentiometers", r"does not follow the hand. Are both its lines in, A and B\?"),
+    ],
+)
+def test_a_mistake_of_an_encoder_is_named(tmp_path, short_ways, joint, fault, step, said):
+    evening = Evening(tmp_path, joints=[joint], encoders=ENCODERS)
+    evening.plant.encoded.fault[joint] = fault
+    evening.bringup.run(["readings", step])
+    assert re.search(said, evening.person.problems[0])
+
+
+def test_an_absolute_encoder_must_be_on_the_joints_axis_and_counts_must_be_even():
+    found = JointFound(sensor="absolute", marks=[[100.0, -1.0], [100 + 16384 * 5 / np.pi, 1.0]])
+    with pytest.raises(InputError, match=r"counts 81920 a revolution of the joint; .* on the joint's own axis\?"):
+        found.fit_encoder()
+    found = JointFound(sensor="quadrature", marks=[[0.0, -1.0], [500.0, 0.0], [2000.0, 1.0]])
+    assert found.fit_encoder() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["2"], "--encoder 2: a joint and a kind are needed"),
+        (["7:absolute"], "--encoder 7:absolute: a joint and a kind"),
+        (["2:absolute", "2:quadrature:1"], "joint 2 has two encoders"),
+        (["1:quadrature:3", "2:quadrature:3"], "two quadrature encoders are at one input"),
+    ],
+)
+def test_encoders_that_cannot_be_are_rejected(tmp_path, given, said):
+    options = [word for each in given for word in ("--encoder", each)]
+    done = CliRunner().invoke(command, ["bringup", "--board", "emulated:host", "-o", str(tmp_path / "new"), *options])
+    assert isinstance(done.exception, InputError)
+    assert said in str(done.exception)
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(

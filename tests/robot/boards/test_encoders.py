@@ -1,6 +1,7 @@
 """An emulated board whose joints are read by encoders: zero, motion, faults, the same bits on host and processor."""
 
 import hashlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from armsight.robot.boards.codes import Command, Fault, SensorKind
 from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.opening import configured, open_emulator
+from armsight.robot.boards.reports import BoardAbilities
 from armsight.sim.encoders import EncodedPlant, EncoderFault, Encoders
 from armsight.sim.joints import JointPlant, drawn_model
 
@@ -102,6 +104,19 @@ def test_host_and_processor_compute_the_same_bits():
         here.move(0.3, 15)
         digests.append(digest.hexdigest())
     assert digests[0] == digests[1]
+
+
+def test_a_board_says_what_it_has_and_is_given_no_more():
+    here = Encoded()
+    assert (here.board.welcome.abilities.joints, here.board.welcome.abilities.quadrature_inputs) == (6, 6)
+    for said, has in (
+        ("joint_count is 6; pil has 4 joints", BoardAbilities(4, tuple(SensorKind), 6)),
+        ("joint 2: sensor is quadrature; pil reads potentiometer", BoardAbilities(6, (SensorKind.POTENTIOMETER,), 0)),
+        ("joint 5: encoder input is 5; pil has 1 to 3", BoardAbilities(6, tuple(SensorKind), 3)),
+    ):
+        here.board.welcome = replace(here.board.welcome, abilities=has)
+        with pytest.raises(InputError, match=said):
+            here.board.store(encoder_configuration())
 
 
 def written(tmp_path, *changes):

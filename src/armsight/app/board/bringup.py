@@ -1,10 +1,11 @@
-"""``armsight board bringup``: from a board, motors and potentiometers that nobody knows to an arm that follows.
+"""``armsight board bringup``: from a board, motors and potentiometers or encoders that nobody knows to an arm that follows.
 
 In: a board with factory values, and an :class:`Operator` who moves joints, reads angles and answers. Out: a configuration,
 stored on the board and written as ``board.toml``, what was found as ``bringup.json``, and a page of figures. The steps:
 
-    readings         every potentiometer at rest: its noise; an open or short one by name
-    potentiometers   each joint moved by hand: the table of its potentiometer, direction, range, dead spots
+    readings         every potentiometer at rest: its noise; an open or short one by name; encoders without sound readings
+    potentiometers   each joint moved by hand: the table of its potentiometer, direction, range, dead spots; of an encoder
+                     its counts of a revolution, direction and zero
     motors           each motor by a pulse of at most 3 degrees: which joint it moves, which way, from which duty on
     swing            each joint by 10 degrees, after a yes: R, K, inertia, friction, backlash
     verify           all joints by 2 degrees with the gains computed of it
@@ -19,8 +20,8 @@ import contextlib
 import queue
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -34,8 +35,8 @@ from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import write_text
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.board_file import configuration_text
-from armsight.robot.boards.codes import Command, Reaction
-from armsight.robot.boards.configuration import JOINTS, POT_NODES, Configuration, gains_array
+from armsight.robot.boards.codes import Command, Reaction, SensorKind
+from armsight.robot.boards.configuration import ENCODER_REV, JOINTS, POT_NODES, Configuration, gains_array
 from armsight.robot.boards.identification import dead_spots, fit_swing
 from armsight.robot.boards.reports import SensorReadings
 from armsight.robot.boards.tuning import MotorFigures, quiet_bandwidth, tuned_gains
@@ -47,7 +48,9 @@ _ASK_S, _PATIENCE_S = 0.02, 900.0
 _ANSWERS = {"yes": ("y", "n"), "problem": ("r", "s")}
 _SHORT_COUNTS, _OPEN_COUNTS = 300, 65000
 _MOST_NOISE_COUNTS = 200.0
-_HAND_COUNTS = 1500.0  # a hand that moves a joint changes its reading by more
+_HAND_COUNTS, _HAND_ENCODER_COUNTS = 1500.0, 40.0  # a hand that moves a joint changes its reading by more
+_UNEVEN_RAD = 0.1
+_UNSOUND, _MAGNET = 0x4000, 0x8000  # beside an absolute encoder's angle (ENCODER_... of types.h)
 _JOG_RAD, _JOG_DUTY, _JOG_DUTY_PER_S, _JOG_MOST_RAD = 0.010, 0.6, 0.15, 0.05
 _DEAD_DUTY, _DEAD_A = 0.25, 0.02
 _RESTS = 0.25  # of what counts as a motion
@@ -128,6 +131,7 @@ class Bringup:
         person: who answers.
         folder: where everything is written.
         joints: which, from 0.
+        encoders: joints that are read by an encoder, from 0: its kind, and which input a quadrature one is at.
         again: do also what an earlier run has found.
         most_current_a: what a motor may draw.
     """
@@ -139,9 +143,13 @@ class Bringup:
         folder: Path,
         joints: Sequence[int] = range(JOINTS),
         *,
+        encoders: Mapping[int, tuple[SensorKind, int]] | None = None,
         again: bool = False,
         most_current_a: float = 2.0,
     ) -> None:
+        abilities = board.welcome.abilities
+        count = JOINTS if abilities is None else abilities.joints
+        joints = [j for j in joints if j < count]
         self._board, self._person, self._folder = board, person, folder
         self._joints, self._again, self._current_a = list(joints), again, most_current_a
         path = folder / FOUND_FILE
@@ -149,6 +157,14 @@ class Bringup:
         self.found = Found.read(path) if path.exists() else Found(name, [JointFound() for _ in range(JOINTS)])
         if self.found.board != name:
             raise InputError(f"{path} is of board {self.found.board}; this one is {name}: name another folder with -o")
+        self.found.joint_count = count
+        for j, (kind, which) in (encoders or {}).items():
+            known = self.found.joints[j]
+            if (known.kind, known.encoder_input) != (kind, which):
+                self.found.joints[j] = JointFound(sensor=kind.name.lower(), encoder_input=which)
+        self._last: dict[int, float] = {}  # newest counts of encoders, going on where a reading wraps
+        self._bias: dict[int, float] = {}
+        self._flags = np.zeros(JOINTS, dtype=int)
         self._skipped: set[tuple[str, int]] = set()
         self._motion: list[SensorReadings] = []
 
@@ -170,6 +186,7 @@ class Bringup:
         try:
             self._board.watch_sensors(_EVERY_S)
             self.found.supply_v = round(self._board.status.supply_v, 1)
+            self._meet_encoders()
             for step in STEPS:
                 if step in steps:
                     self._person.say(f"== {step}")
@@ -206,7 +223,7 @@ class Bringup:
                     return short
                 self._person.say(f"{answer!r} is not understood; {', '.join(_ANSWERS[kind])} or q is")
                 self._person.ask(kind, joint, said)
-            self._take(self._board.sensed(_ASK_S))
+            self._take(self._sensed(_ASK_S))
             waited_s += _ASK_S
             if waited_s > _PATIENCE_S:
                 raise InputError(
@@ -245,6 +262,8 @@ class Bringup:
                 self._off()
                 self.found.joints[joint].problems.append(str(problem))
                 answer = self._wait("problem", joint, f"{problem} [r]epeat, [s]kip, [q]uit")
+            if step in ("motors", "swing", "verify") and self._counting():
+                self._use(self._board.configuration())  # a fault took a quadrature encoder's zero away
             if not answer.startswith("r"):
                 self._skipped.add((step, joint))
                 return
@@ -259,18 +278,80 @@ class Bringup:
                 self._board.confirm(self._board.command(Command.CLEAR_FAULTS))
 
     def _use(self, config: Configuration) -> None:
-        """Store a configuration and start the board with it."""
+        """Store a configuration and start the board with it; quadrature encoders are where they were."""
         self._off()
+        counting = self._counting()
+        for j in counting:
+            found = self.found.joints[j]
+            home = found.angles(np.array([self._last.get(j, 0.0)])) if found.range_counts else np.zeros(1)
+            config["joint"][j]["encoder"]["home_rad"] = home[0]
         self._board.store(config)
         self._board.restart()
         self._board.watch_sensors(_EVERY_S)
-        self._board.sensed(0.05)
+        counts = self._board.sensed(0.05).counts
+        for j in counting:
+            if j in self._last and len(counts):
+                self._bias[j] = self._last[j] - counts[-1, j]
+        if counting:
+            self._board.confirm(self._board.command(Command.HOME))
+
+    def _counting(self) -> list[int]:
+        """Return the joints that are read by a quadrature encoder."""
+        joints = self.found.joints[: self.found.joint_count]
+        return [j for j, each in enumerate(joints) if each.kind == SensorKind.QUADRATURE]
+
+    def _meet_encoders(self) -> None:
+        """Let the board read the encoders that were named, and learn where quadrature ones of an earlier run are."""
+        requested = self._configuration(Reaction.RELEASE, gains=False)["joint"]["encoder"][: self.found.joint_count]
+        has = self._board.configuration()["joint"]["encoder"][: self.found.joint_count]
+        if (requested["sensor"] != has["sensor"]).any() or (requested["input"] != has["input"])[
+            requested["sensor"] == SensorKind.QUADRATURE
+        ].any():
+            self._use(self._configuration(Reaction.RELEASE, gains=False))
+        unknown = [j for j in self._counting() if j not in self._last]
+        if unknown:
+            self._collect(0.1)
+        for j in unknown:
+            found = self.found.joints[j]
+            if found.range_counts is None or found.counts_per_rev is None:
+                continue
+            angle = None
+            while angle is None:
+                question = (
+                    f"joint {j + 1}: its encoder counts from where it was switched on. At which angle is it, degrees"
+                )
+                with contextlib.suppress(ValueError):
+                    angle = float(np.radians(float(self._wait("angle", j, question))))
+            zero = self._last[j] - angle * found.counts_per_rev / (2 * np.pi)
+            shift, found.zero_counts = zero - found.zero_counts, zero
+            found.range_counts = [each + shift for each in found.range_counts]
+            found.marks = [[counts + shift, at] for counts, at in found.marks]
+
+    def _sensed(self, seconds: float) -> SensorReadings:
+        """Return what was read in the next seconds; encoders' counts go on where their readings wrap."""
+        readings = self._board.sensed(seconds)
+        if not len(readings.t_s):
+            return readings
+        counts = readings.counts.copy()
+        for j, found in enumerate(self.found.joints):
+            if found.kind == SensorKind.POTENTIOMETER:
+                continue
+            raw = counts[:, j].astype(int)
+            period = 65536
+            if found.kind == SensorKind.ABSOLUTE:
+                self._flags[j] |= np.bitwise_or.reduce(raw) & ~(ENCODER_REV - 1)
+                raw, period = raw & (ENCODER_REV - 1), ENCODER_REV
+            shown = raw + self._bias.get(j, 0.0)
+            steps = np.diff(shown, prepend=self._last.get(j, shown[0]))
+            counts[:, j] = self._last.get(j, shown[0]) + np.cumsum((steps + period / 2) % period - period / 2)
+            self._last[j] = float(counts[-1, j])
+        return replace(readings, counts=counts)
 
     def _collect(self, seconds: float) -> SensorReadings:
         """Return what the converters read in the next seconds."""
         self._motion.clear()
         for _ in range(max(1, round(seconds / 0.02))):
-            self._take(self._board.sensed(0.02))
+            self._take(self._sensed(0.02))
         return self._collected()
 
     def _collected(self) -> SensorReadings:
@@ -282,7 +363,7 @@ class Bringup:
     def _move(self, q_ref: Array, qd_ref: Array, duty: Array) -> SensorReadings:
         """Command a step of ``_PERIOD_S`` and return what was read in it."""
         self._board.send(JointCommand(q_ref, qd_ref, duty, _PERIOD_S))
-        readings = self._board.sensed(_PERIOD_S)
+        readings = self._sensed(_PERIOD_S)
         self._take(readings)
         status = self._board.status
         if status.faults:
@@ -303,7 +384,22 @@ class Bringup:
         self._person.say("leave the arm alone for a second")
         self._each("readings", self._reading)
 
+    def _encoder_reading(self, joint: int) -> None:
+        """Look at an encoder at rest."""
+        self._flags[joint] = 0
+        counts, name = self._collect(0.5).counts[:, joint], f"joint {joint + 1}: its encoder"
+        if self._flags[joint] & _UNSOUND:
+            raise _Mistake(f"{name} gives no sound reading. Are its six leads in, and its chip select this joint's?")
+        if self._flags[joint] & _MAGNET:
+            raise _Mistake(f"{name} reports its magnet as too weak or too strong. Is it 0.5 to 3 mm away, and centred?")
+        noise = max(float(np.std(counts)), 0.5)
+        self.found.joints[joint].noise_counts = round(noise, 2)
+        self._person.say(f"joint {joint + 1}: {self.found.joints[joint].sensor} encoder, noise {noise:.1f} counts")
+
     def _reading(self, joint: int) -> None:
+        if self.found.joints[joint].kind != SensorKind.POTENTIOMETER:
+            self._encoder_reading(joint)
+            return
         counts = self._collect(0.5).counts[:, joint]
         middle = float(np.median(counts))
         name = f"joint {joint + 1}: its potentiometer"
@@ -355,32 +451,59 @@ class Bringup:
     def _check_hand(self, joint: int, counts: Array, marks: list[list[float]]) -> None:
         """Look at a movement by hand, and keep its table."""
         found, name = self.found.joints[joint], f"joint {joint + 1}"
-        good = np.where((counts > _SHORT_COUNTS) & (counts < _OPEN_COUNTS), counts, np.nan)
+        encoded = np.array([each.kind != SensorKind.POTENTIOMETER for each in self.found.joints])
+        good = np.where(encoded | (counts > _SHORT_COUNTS) & (counts < _OPEN_COUNTS), counts, np.nan)
         way = np.array([np.ptp(each[np.isfinite(each)]) if np.isfinite(each).sum() > 10 else 0.0 for each in good.T])
+        way /= np.where(encoded, _HAND_ENCODER_COUNTS, _HAND_COUNTS)
         other = int(np.argmax(way))
-        if way[joint] < _HAND_COUNTS < way[other]:
+        if way[joint] < 1 < way[other]:
             raise _Mistake(
-                f"{name}: moving it moves the reading of joint {other + 1}: the potentiometers of joints {joint + 1} and"
+                f"{name}: moving it moves the reading of joint {other + 1}: the {found.sensor}s of joints {joint + 1} and"
                 f" {other + 1} are swapped. Swap their plugs."
             )
-        if way[joint] < _HAND_COUNTS:
-            raise _Mistake(f"{name}: its reading does not follow the hand. Does its potentiometer's shaft go along?")
-        spots = dead_spots(counts[:, joint], found.noise_counts or 10.0, _SHORT_COUNTS, _OPEN_COUNTS)
+        if way[joint] < 1:
+            hint = (
+                "Are both its lines in, A and B?" if found.kind == SensorKind.QUADRATURE else "Does its shaft go along?"
+            )
+            raise _Mistake(f"{name}: its reading does not follow the hand. {hint}")
+        spots = []
+        if not encoded[joint]:
+            spots = dead_spots(counts[:, joint], found.noise_counts or 10.0, _SHORT_COUNTS, _OPEN_COUNTS)
         if len(marks) < 2 or len(marks) > POT_NODES - 2:
             raise _Mistake(f"{name}: {len(marks)} angles were measured; 2 to {POT_NODES - 2} are needed.")
         ordered = np.array(sorted(marks))
         rises = np.diff(ordered[:, 1])
-        if not ((rises > 0).all() or (rises < 0).all()) or (np.diff(ordered[:, 0]) < 100).any():
+        apart = 4 if encoded[joint] else 100
+        if not ((rises > 0).all() or (rises < 0).all()) or (np.diff(ordered[:, 0]) < apart).any():
             raise _Mistake(
                 f"{name}: the angles measured do not rise or fall with the reading: {_pairs(ordered)}. Measure again."
             )
         found.marks, found.range_counts = marks, [float(np.nanmin(good[:, joint])), float(np.nanmax(good[:, joint]))]
+        if encoded[joint]:
+            self._fit_encoder(joint)
         if spots:
             around = [(max(first - 3, 0), min(last + 3, len(counts) - 1)) for first, last in spots]
             where = [np.degrees(found.angles(counts[list(ends), joint])) for ends in around]
             spans = ", ".join(f"{min(each):.1f} to {max(each):.1f} deg" for each in where)
             found.range_counts = None
             raise _Mistake(f"{name}: its potentiometer has a dead spot at {spans}. Clean or replace it.")
+
+    def _fit_encoder(self, joint: int) -> None:
+        """Find an encoder's counts of a revolution, direction and zero."""
+        found, name = self.found.joints[joint], f"joint {joint + 1}"
+        try:
+            off = found.fit_encoder()
+        except InputError as error:
+            found.range_counts = found.counts_per_rev = None
+            raise _Mistake(f"{name}: {error}") from None
+        if off > _UNEVEN_RAD:
+            pairs = _pairs(np.array(sorted(found.marks)))
+            found.range_counts = found.counts_per_rev = None
+            raise _Mistake(
+                f"{name}: the angles measured are off an even count by up to {np.degrees(off):.1f} degrees: {pairs}. Are"
+                " counts lost, or was an angle misread? Measure again."
+            )
+        self._person.say(f"{name}: {abs(found.counts_per_rev or 0):.0f} counts a revolution")
 
     def _motors(self) -> None:
         todo = [j for j in self._joints if self._again or not self.found.joints[j].done("motors")]
@@ -611,7 +734,14 @@ class Bringup:
         write_text(self._folder / CONFIG_FILE, configuration_text(config, self.found.board))
         page = report(self.found, gains_array(config))
         put_files(self._folder, {PAGE: page.encode()})
-        missing = [str(j + 1) for j, each in enumerate(self.found.joints) if not each.done("swing")]
+        for j in self._counting():
+            home = np.degrees(float(config["joint"][j]["encoder"]["home_rad"]))
+            self._person.say(
+                f"joint {j + 1}: its home is where it stands now, {home:.1f} deg: mark it; after each start bring it"
+                " there and give armsight board home"
+            )
+        joints = self.found.joints[: self.found.joint_count]
+        missing = [str(j + 1) for j, each in enumerate(joints) if not each.done("swing")]
         if missing:
             self._person.say(f"joints {', '.join(missing)} were not identified: they are stored without gains")
         self._person.say(f"stored, and written to {self._folder / CONFIG_FILE}; figures: {self._folder / PAGE}")

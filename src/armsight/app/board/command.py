@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from armsight.app.board.bringup import Operator
     from armsight.data import Array
     from armsight.robot.boards.board import Board
+    from armsight.robot.boards.codes import SensorKind
     from armsight.robot.boards.contract import MotionBoard
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
@@ -216,6 +218,13 @@ def selftest_(name: str, baud: int | None, drives: bool, as_json: bool) -> int:
 )
 @click.option("--step", "steps", multiple=True, type=click.Choice(STEPS), help="Only this step; may be repeated.")
 @click.option("--joint", "joints", multiple=True, type=click.IntRange(1, 6), help="Only this joint; may be repeated.")
+@click.option(
+    "--encoder",
+    "encoders",
+    multiple=True,
+    metavar="JOINT:KIND",
+    help="A joint that an encoder reads: 2:absolute, or 3:quadrature:1 with its input; may be repeated.",
+)
 @click.option("--again", is_flag=True, help="Do also what was found before.")
 @click.option(
     "--current",
@@ -233,12 +242,13 @@ def bringup(
     folder: Path,
     steps: tuple[str, ...],
     joints: tuple[int, ...],
+    encoders: tuple[str, ...],
     again: bool,
     most_current_a: float,
     seed: int,
     as_json: bool,
 ) -> None:
-    """Bring up an arm of unknown motors and potentiometers, step by step, and store its configuration.
+    """Bring up an arm of unknown motors and potentiometers or encoders, step by step, and store its configuration.
 
     Each joint is moved by hand, each motor driven by a pulse of at most 3 degrees, and then, after a yes, by a swing of 10.
     What was found is kept: the same command goes on where it ended. On an emulated board an arm and a person are drawn.
@@ -252,27 +262,49 @@ def bringup(
     from armsight.robot.boards.emulated import EmulatedLink
     from armsight.robot.boards.opening import SERIAL, emulator_name, open_board, open_emulator
     from armsight.robot.boards.serial import BAUD
-    from armsight.sim.boards.workshop import WorkshopPerson, drawn_workshop
+    from armsight.sim.boards.workshop import WorkshopPerson, drawn_encoders, drawn_workshop
 
     def echo(line: str) -> None:
         click.echo(line, err=True)
 
     require_matplotlib()
+    kinds = _encoders(encoders)
     check_folder(folder, problem="nothing of a bring-up can be written here")
     if name.startswith(SERIAL):
         board = open_board(name, baud=BAUD if baud is None else baud)
         person: Operator = TerminalOperator(echo)
     else:
-        plant, _ = drawn_workshop(seed)
+        plant, _ = drawn_workshop(seed, encoders=drawn_encoders(seed, {j: kind for j, (kind, _) in kinds.items()}))
         person = WorkshopPerson(plant, seed=seed, say=echo)
         board = Board.connect(EmulatedLink(open_emulator(emulator_name(name)), plant), name="the emulated board")
     with board:
         writable_folder(folder, "nothing of a bring-up")
         chosen = [joint - 1 for joint in sorted(set(joints))] or range(6)
-        session = Bringup(board, person, folder, chosen, again=again, most_current_a=most_current_a)
+        session = Bringup(board, person, folder, chosen, encoders=kinds, again=again, most_current_a=most_current_a)
         session.run(steps or STEPS)
     if as_json:
         click.echo(json.dumps(found_json(session.found)))
+
+
+def _encoders(given: tuple[str, ...]) -> dict[int, tuple[SensorKind, int]]:
+    """Return kind and input of the encoders given, by joint from 0."""
+    from armsight.robot.boards.codes import SensorKind
+
+    found: dict[int, tuple[SensorKind, int]] = {}
+    for each in given:
+        match = re.fullmatch(r"([1-6]):(?:(absolute)|quadrature:([1-6]))", each)
+        if match is None:
+            raise InputError(
+                f"--encoder {each}: a joint and a kind are needed: 2:absolute, or 3:quadrature:1 with its input"
+            )
+        kind = SensorKind.ABSOLUTE if match[2] else SensorKind.QUADRATURE
+        if int(match[1]) - 1 in found:
+            raise InputError(f"--encoder {each}: joint {match[1]} has two encoders; one is needed")
+        found[int(match[1]) - 1] = (kind, int(match[3] or 0))
+    inputs = [which for kind, which in found.values() if kind == SensorKind.QUADRATURE]
+    if len(set(inputs)) < len(inputs):
+        raise InputError("--encoder: two quadrature encoders are at one input; each needs its own")
+    return found
 
 
 @command.command()

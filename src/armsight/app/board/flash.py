@@ -18,7 +18,7 @@ from armsight.firmware import build
 from armsight.firmware.elf import read_elf
 
 #: Boards a programmer can write; the emulated one needs none.
-FLASHED = ("stm32f4",)
+FLASHED = ("stm32f4", "blackpill")
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,10 @@ from armsight.app.report.plotting import BLUE, MUTED, ORANGE, drawing, new_figur
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
-from armsight.robot.boards.codes import Reaction
+from armsight.robot.boards.codes import Reaction, SensorKind
 from armsight.robot.boards.configuration import (
     CONFIG_VERSION,
+    ENCODER_REV,
     GAIN_RANGES,
     GAINS,
     JOINTS,
@@ -51,6 +52,10 @@ class JointFound:
         gravity_n_m: greatest torque of gravity.
         fit_rms_v: by how much the fit misses the motor's voltage.
         following_rms_rad: error of the small swing that verified the gains.
+        sensor: what reads it: potentiometer, quadrature or absolute.
+        encoder_input: of a quadrature encoder: which.
+        counts_per_rev: of its encoder, a revolution of the joint; negative where counts fall with the angle.
+        zero_counts: of its encoder at 0 rad; counts go on beyond where a reading wraps.
         problems: what was named, in order.
         traces: lines of figures by name.
     """
@@ -69,6 +74,10 @@ class JointFound:
     gravity_n_m: float | None = None
     fit_rms_v: float | None = None
     following_rms_rad: float | None = None
+    sensor: str = "potentiometer"
+    encoder_input: int = 0
+    counts_per_rev: float | None = None
+    zero_counts: float = 0.0
     problems: list[str] = field(default_factory=list)
     traces: dict[str, list[float]] = field(default_factory=dict)
 
@@ -89,8 +98,45 @@ class JointFound:
         }
         return looked_for.get(step) is not None
 
+    @property
+    def kind(self) -> SensorKind:
+        """What reads it."""
+        return SensorKind[self.sensor.upper()]
+
+    def fit_encoder(self) -> float:
+        """Fit a line to the angles marked: counts of a revolution and zero; returns the greatest deviation, rad.
+
+        Raises:
+            InputError: an absolute encoder that does not go with the joint one to one.
+        """
+        marks = np.array(self.marks)
+        slope, offset = np.polyfit(marks[:, 1], marks[:, 0], 1)
+        per_rev = float(2 * np.pi * slope)
+        if self.kind == SensorKind.ABSOLUTE:
+            if not 0.95 < abs(per_rev) / ENCODER_REV < 1.05:
+                raise InputError(
+                    f"its encoder counts {abs(per_rev):.0f} a revolution of the joint; an absolute one must count"
+                    f" {ENCODER_REV}. Is its magnet on the joint's own axis?"
+                )
+            per_rev = float(np.copysign(ENCODER_REV, per_rev))
+            offset = np.mean(marks[:, 0] - per_rev / (2 * np.pi) * marks[:, 1])
+        self.counts_per_rev, self.zero_counts = float(round(per_rev)), float(offset)
+        return float(np.abs(marks[:, 1] - self.encoder_angles(marks[:, 0])).max())
+
+    def encoder_angles(self, counts: Array) -> Array:
+        """Return joint angles (n,), rad, of an encoder's counts (n,)."""
+        per_rev = self.counts_per_rev or 1.0
+        return np.asarray(2 * np.pi / per_rev * (counts - self.zero_counts), dtype=float)
+
     def pot_table(self) -> tuple[list[int], list[float], int]:
-        """Return counts and angles, rad, of the potentiometer's table, and its direction; ends are extrapolated."""
+        """Return counts and angles, rad, of the potentiometer's table, and its direction; ends are extrapolated.
+
+        Of an encoder the ends of its range, which is a straight line.
+        """
+        if self.counts_per_rev is not None and self.range_counts is not None:
+            sign = 1 if self.counts_per_rev > 0 else -1
+            ends = self.encoder_angles(np.array(self.range_counts))
+            return [round(each) for each in self.range_counts], (sign * ends).tolist(), sign
         if self.range_counts is None or len(self.marks) < 2:
             return [2000, 63500], [-2.6, 2.6], 1
         marks = np.array(sorted(self.marks))
@@ -108,6 +154,11 @@ class JointFound:
     def angles(self, counts: Array) -> Array:
         """Return joint angles (n,), rad, of counts (n,), straight on beyond the table's ends as on the board."""
         at, angle, direction = self.pot_table()
+        if (
+            self.kind == SensorKind.ABSOLUTE and self.counts_per_rev is not None
+        ):  # within half a revolution of the middle
+            middle = 0.5 * (at[0] + at[-1])
+            counts = middle + (counts - middle + ENCODER_REV / 2) % ENCODER_REV - ENCODER_REV / 2
         node = np.clip(np.searchsorted(at, counts), 1, len(at) - 1)
         c, a = np.array(at, dtype=float), np.array(angle)
         along = (counts - c[node - 1]) / (c[node] - c[node - 1])
@@ -133,6 +184,7 @@ class Found:
         board: the board's name.
         joints: of each joint.
         supply_v: of the motors.
+        joint_count: how many joints the board has.
         arm_time_s: time on the board's clock, over all runs.
         verified: whether the small swing went well with what is stored.
     """
@@ -140,6 +192,7 @@ class Found:
     board: str
     joints: list[JointFound]
     supply_v: float = 12.0
+    joint_count: int = JOINTS
     arm_time_s: float = 0.0
     verified: bool = False
 
@@ -169,12 +222,13 @@ class Found:
     def configuration(self, most_current_a: float, reaction: Reaction, *, gains: bool) -> Configuration:
         """Return the configuration of what is known; without ``gains`` joints are not controlled and nothing is watched."""
         config = lab_configuration()
+        config["joint_count"] = self.joint_count
         supply = self.supply_v
         config["supply_nominal_mv"] = round(1e3 * supply)
         config["supply_min_mv"], config["supply_max_mv"] = round(800 * supply), round(1200 * supply)
         config["silence_reaction"] = reaction
         for joint, found in zip(config["joint"], self.joints, strict=True):
-            _put_pot(joint, found)
+            _put_sensor(joint, found)
             joint["motor_direction"] = found.motor_direction or 1
             joint["current_limit_ma"] = round(1e3 * most_current_a)
             if gains and found.motor is not None:
@@ -184,8 +238,24 @@ class Found:
         return config
 
 
-def _put_pot(joint: Configuration, found: JointFound) -> None:
-    pot = joint["pot"]
+def _put_sensor(joint: Configuration, found: JointFound) -> None:
+    """Put what reads a joint, and its soft limits."""
+    _, angles, direction = found.pot_table()
+    ends = sorted((direction * angles[0], direction * angles[-1]))
+    joint["soft_min_rad"], joint["soft_max_rad"] = ends[0] + _MARGIN_RAD, ends[1] - _MARGIN_RAD
+    joint["pot"]["jump_rad"] = max(0.02, 12 * found.noise_rad)
+    if found.kind == SensorKind.POTENTIOMETER:
+        _put_pot(joint["pot"], found)
+        return
+    per_rev = found.counts_per_rev or float(ENCODER_REV)
+    middle = 0.5 * (ends[0] + ends[1])
+    absolute = found.kind == SensorKind.ABSOLUTE
+    zero = round(found.zero_counts + middle * per_rev / (2 * np.pi)) % ENCODER_REV if absolute else 0
+    sign = 1 if per_rev > 0 else -1
+    joint["encoder"] = (found.kind, found.encoder_input, abs(per_rev), sign, zero, middle if absolute else 0.0)
+
+
+def _put_pot(pot: Configuration, found: JointFound) -> None:
     counts, angles, direction = found.pot_table()
     pot["node_count"], pot["direction"] = len(counts), direction
     pot["counts"] = counts + [0] * (POT_NODES - len(counts))
@@ -199,9 +269,6 @@ def _put_pot(joint: Configuration, found: JointFound) -> None:
             min(65000, (counts[-1] + 65535) // 2 + 1),
         )
     )
-    ends = sorted((direction * angles[0], direction * angles[-1]))
-    joint["soft_min_rad"], joint["soft_max_rad"] = ends[0] + _MARGIN_RAD, ends[1] - _MARGIN_RAD
-    pot["jump_rad"] = max(0.02, 12 * found.noise_rad)
 
 
 def _put_motor(
@@ -300,7 +367,7 @@ def _figures(found: Found) -> str:
             left.plot(counts, np.degrees(direction * np.array(angles)), color=BLUE)
             marks = np.array(each.marks)
             left.plot(marks[:, 0], np.degrees(marks[:, 1]), "o", color=ORANGE, ms=3)
-            left.set(title=f"joint {j + 1}: potentiometer", xlabel="counts", ylabel="deg")
+            left.set(title=f"joint {j + 1}: {each.sensor}", xlabel="counts", ylabel="deg")
             lines = each.traces
             if "swing_t_s" in lines:
                 middle.plot(lines["swing_t_s"], lines["swing_voltage_v"], color=MUTED, lw=1.5, label="put out")

@@ -61,7 +61,11 @@ def welcome_text(board: MotionBoard) -> str:
     if welcome.config_source is None:
         return "; ".join([f"{text}, {welcome.baud} baud", *board.abilities.missing])
     source = _SOURCES[welcome.config_source]
-    return f"{text}, {welcome.ticks_per_s} ticks/s, {welcome.baud} baud, runs on {source}"
+    text = f"{text}, {welcome.ticks_per_s} ticks/s, {welcome.baud} baud"
+    if has := welcome.abilities:
+        kinds = [f"{kind.name.lower()}" for kind in has.sensors]
+        text = f"{text}, {has.joints} joints by {', '.join(kinds)} (quadrature inputs: {has.quadrature_inputs})"
+    return f"{text}, runs on {source}"
 
 
 def status_json(board: MotionBoard, states: JointStates) -> dict[str, Any]:

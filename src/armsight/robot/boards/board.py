@@ -21,7 +21,7 @@ import numpy as np
 from armsight.data import Array, JointCommand, JointStates
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import dialect
-from armsight.robot.boards.codes import REJECTION_TEXTS, Command, Reaction, Rejection
+from armsight.robot.boards.codes import REJECTION_TEXTS, Command, Reaction, Rejection, SensorKind
 from armsight.robot.boards.configuration import (
     CONFIG,
     CONFIG_VERSION,
@@ -441,6 +441,7 @@ class Board:
         """
         check_configuration(config)
         check_pin(config, self.welcome.board)
+        _check_abilities(config, self.welcome)
         data, session = config.tobytes(), self._session
         for offset in range(0, len(data), _PART):
             part = data[offset : offset + _PART]
@@ -465,6 +466,28 @@ class Board:
         """Return the number of the next command."""
         self._sequence = (self._sequence + 1) % _WRAP
         return self._sequence
+
+
+def _check_abilities(config: Configuration, welcome: Welcome) -> None:
+    """Raise InputError where a configuration asks for more than the board has."""
+    has = welcome.abilities
+    if has is None:
+        return
+    count = int(config["joint_count"])
+    if count > has.joints:
+        raise InputError(f"joint_count is {count}; {welcome.board} has {has.joints} joints; nothing was changed")
+    for number, encoder in enumerate(config["joint"]["encoder"][:count], start=1):
+        kind = SensorKind(int(encoder["sensor"]))
+        if kind not in has.sensors:
+            read = ", ".join(each.name.lower() for each in has.sensors)
+            raise InputError(
+                f"joint {number}: sensor is {kind.name.lower()}; {welcome.board} reads {read}; nothing was changed"
+            )
+        if kind == SensorKind.QUADRATURE and encoder["input"] > has.quadrature_inputs:
+            raise InputError(
+                f"joint {number}: encoder input is {encoder['input']}; {welcome.board} has 1 to {has.quadrature_inputs};"
+                " nothing was changed"
+            )
 
 
 def _six(name: str, values: Array) -> list[float]:

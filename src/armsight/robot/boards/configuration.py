@@ -178,13 +178,16 @@ PIN_NUMBERS = (16, 143)
 NO_PIN, _PIN_FORM = "none", "none or a pin such as PB13 is allowed"
 #: How long each bit of the sync LED's code lasts by default, ticks: no divisor of the usual periods of cameras.
 SYNC_LED_TICKS = 3
-#: Pins of a board that have another use, docs/howto/add_a_board.md; its debugger's too.
+#: Pins of a board that have another use, docs/howto/add_a_board.md and blackpill.md; its debugger's too.
 USED_PINS: Mapping[str, frozenset[str]] = {
     "nucleo-f446re": frozenset(
-        [f"PA{pin}" for pin in (*range(11), 13, 14)]
-        + [f"PB{pin}" for pin in (0, 1, *range(5, 11), 12)]
-        + [f"PC{pin}" for pin in range(10)]
-    )
+        [f"PA{pin}" for pin in (*range(11), 13, 14, 15)]
+        + [f"PB{pin}" for pin in (*range(11), 12, 14, 15)]
+        + [f"PC{pin}" for pin in range(13)]
+    ),
+    "blackpill-f411ce": frozenset(
+        [f"PA{pin}" for pin in (*range(12), 13, 14, 15)] + [f"PB{pin}" for pin in (*range(11), *range(12, 16))]
+    ),
 }
 
 
@@ -215,8 +218,9 @@ def check_pin(config: Configuration, board: str) -> None:
     used = USED_PINS.get(board)
     if used is not None and name != NO_PIN and (name in used or name[1] > "C"):
         use = "has another use" if name in used else "is not led out"
+        free = next(pin for pin in ("PB13", "PA12") if pin not in used)
         raise InputError(
-            f"sync_led_pin is {name}, which {use} on {board}: take a free one, such as PB13"
+            f"sync_led_pin is {name}, which {use} on {board}: take a free one, such as {free}"
             " (docs/howto/add_a_board.md has the table); nothing was changed"
         )
 

@@ -16,11 +16,27 @@ from armsight.robot.boards.codes import (
     Fault,
     Limited,
     Rejection,
+    SensorKind,
     faults_in,
 )
 from armsight.robot.boards.wire import Message
 
 _NO_JOINT = 255
+
+
+@dataclass(frozen=True)
+class BoardAbilities:
+    """What a board has for joints.
+
+    Attributes:
+        joints: how many.
+        sensors: the kinds of sensors it reads.
+        quadrature_inputs: how many quadrature encoders it counts: inputs 1 to so many.
+    """
+
+    joints: int
+    sensors: tuple[SensorKind, ...]
+    quadrature_inputs: int
 
 
 @dataclass(frozen=True)
@@ -34,6 +50,7 @@ class Welcome:
         baud: bits a second on its wire.
         config_source: where its configuration came from; None where it has none of ours.
         crash: where the firmware crashed before it started: exception, pc, lr and CFSR; None where it did not.
+        abilities: what it has for joints; None where it does not say.
     """
 
     board: str
@@ -42,6 +59,7 @@ class Welcome:
     baud: int
     config_source: ConfigSource | None
     crash: tuple[int, ...] | None = None
+    abilities: BoardAbilities | None = None
 
 
 @dataclass(frozen=True)
@@ -188,7 +206,13 @@ def welcome_of(message: Message) -> Welcome:
         baud=message.baud,
         config_source=ConfigSource(message.config_source),
         crash=tuple(map(int, message.crash)) if any(message.crash) else None,
+        abilities=_abilities_of(message) if message.sensors else None,
     )
+
+
+def _abilities_of(message: Message) -> BoardAbilities:
+    sensors = tuple(kind for kind in SensorKind if message.sensors >> kind & 1)
+    return BoardAbilities(int(message.joints), sensors, int(message.quadrature_inputs))
 
 
 def status_of(message: Message, t_s: float) -> BoardStatus:

@@ -7,13 +7,15 @@ reads a protractor, and, asked to, pushes the plugs in rightly (:class:`Workshop
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from armsight.data import Array
+from armsight.robot.boards.codes import SensorKind
 from armsight.robot.boards.link import Sensed
+from armsight.sim.encoders import EncodedPlant, Encoders
 from armsight.sim.joints import JOINTS, JointModel, JointPlant, drawn_model
 
 _IN_ORDER = tuple(range(JOINTS))
@@ -66,6 +68,7 @@ class WorkshopPlant:
         plant: the joints.
         wiring: how they are wired.
         bend_counts: (6,) by how much each potentiometer is off a straight line, at most.
+        encoders: what reads the joints that have no potentiometer; those are wired rightly.
 
     Attributes:
         wiring: may be changed at any time.
@@ -76,8 +79,12 @@ class WorkshopPlant:
         far_rad: (6,) farthest way of the joints from where each was when the drives came on.
     """
 
-    def __init__(self, plant: JointPlant, wiring: Wiring, bend_counts: Array | None = None) -> None:
+    def __init__(
+        self, plant: JointPlant, wiring: Wiring, bend_counts: Array | None = None, encoders: Encoders | None = None
+    ) -> None:
         self.plant, self.wiring = plant, wiring
+        self.encoded = None if encoders is None else EncodedPlant(plant, encoders)
+        self._encoded = [] if encoders is None else np.flatnonzero(encoders.kind).tolist()
         self._bend = np.zeros(JOINTS) if bend_counts is None else bend_counts
         self.load_n_m = np.zeros(JOINTS)
         self._target = 0.0
@@ -101,6 +108,8 @@ class WorkshopPlant:
                 counts[joint] = _OPEN_COUNTS
         counts = counts[list(wiring.potentiometers)]
         counts[list(wiring.open_potentiometers)] = _OPEN_COUNTS
+        for joint in self._encoded:
+            counts[joint] = self.encoded.reading(joint) if self.encoded else 0
         current = (sensed.current_ma * np.array(wiring.motor_signs))[list(wiring.motors)]
         current[list(wiring.dead_motors)] = 0
         return replace_sensed(sensed, counts, current)
@@ -153,17 +162,31 @@ def drawn_wiring(seed: int) -> Wiring:
     return Wiring(motor_signs=tuple(map(int, motors)), potentiometer_signs=tuple(map(int, pots)))
 
 
-def drawn_workshop(seed: int, *, load: float = 0.6) -> tuple[WorkshopPlant, JointModel]:
+def drawn_workshop(
+    seed: int, *, load: float = 0.6, encoders: Encoders | None = None
+) -> tuple[WorkshopPlant, JointModel]:
     """Return an arm as it hangs on its evening, and what it is made of.
 
     Args:
         seed: of all that is drawn.
         load: greatest gravity load of the stall torque.
+        encoders: what reads joints in place of potentiometers.
     """
     rng = np.random.default_rng([seed, 22])
     model = drawn_model(seed, load=load)
     plant = JointPlant(-np.sign(model.gravity_n_m) * np.pi / 2, seed=seed, model=model)
-    return WorkshopPlant(plant, drawn_wiring(seed), rng.uniform(0, 100, JOINTS)), model
+    return WorkshopPlant(plant, drawn_wiring(seed), rng.uniform(0, 100, JOINTS), encoders), model
+
+
+def drawn_encoders(seed: int, kinds: Mapping[int, SensorKind]) -> Encoders | None:
+    """Return encoders for these joints as they happen to come: lines, direction and zero; None without any."""
+    if not kinds:
+        return None
+    rng = np.random.default_rng([seed, 24])
+    kind = np.array([kinds.get(j, SensorKind.POTENTIOMETER) for j in range(JOINTS)])
+    lines, sign = rng.integers(4000, 50000, JOINTS), rng.choice((-1, 1), JOINTS)
+    per_rev = sign * np.where(kind == SensorKind.ABSOLUTE, 16384, lines)
+    return Encoders(kind, per_rev.astype(float), rng.integers(0, 16384, JOINTS))
 
 
 class WorkshopPerson:
@@ -215,6 +238,8 @@ class WorkshopPerson:
         workshop = self._workshop
         if self._kind == "mark":
             return self._mark()
+        if self._kind == "angle":
+            return f"{np.degrees(workshop.plant.link[self._joint] + self._rng.normal(0, _PROTRACTOR_RAD)):.1f}"
         if self._kind == "problem":
             first = self._text not in self._tried
             self._tried.add(self._text)

@@ -4,22 +4,60 @@ It does not know the firmware. Whatever the manual forbids is written into ``wro
 """
 
 from stm32f4_clock import ClockAndFlash
-from stm32f4_registers import ALTERNATE
+from stm32f4_registers import ALTERNATE, NAMED, NUCLEO, Part
 
 HTIF, TCIF, ALL_FLAGS = 1 << 4, 1 << 5, 0x3D
 MOE, LOCK_BITS = 1 << 15, 3 << 8
 FLAG_SHIFT = (0, 6, 16, 22)
 
 
+def even(value: int) -> int:
+    """Return 15 bits with the bit before them that makes the number of ones even."""
+    return value | (value.bit_count() & 1) << 15
+
+
+class AbsoluteSensor:
+    """An AS5047: a frame answers the one before it; one that it does not understand sets the error bit until it is read."""
+
+    ANGLE, DIAGNOSIS, ERRORS = 0x3FFF, 0x3FFC, 0x0001
+
+    def __init__(self, angle: int) -> None:
+        self.values = {self.ANGLE: angle, self.DIAGNOSIS: 0x0180, self.ERRORS: 0}
+        self.answer = self.ANGLE
+        self.asleep = 0  # frames until it answers
+        self.spoiled = 0  # bits that are flipped on their way to it in the next frame
+        self._ended = True
+
+    def deselect(self) -> None:
+        """Chip select is high: the frame is over."""
+        self._ended = True
+
+    def frame(self, frame: int) -> int:
+        """Take a frame, give the answer to the one before it."""
+        if self.asleep or not self._ended:
+            self.asleep = max(0, self.asleep - 1)
+            return 0
+        frame, self.spoiled, self._ended = frame ^ self.spoiled, 0, False
+        said = even(self.values[self.answer] & 0x3FFF | (0x4000 if self.values[self.ERRORS] else 0))
+        if self.answer == self.ERRORS:
+            self.values[self.ERRORS] = 0
+        if even(frame & 0x7FFF) != frame or not frame & 0x4000 or frame & 0x3FFF not in self.values:
+            self.values[self.ERRORS] = 4
+        else:
+            self.answer = frame & 0x3FFF
+        return said
+
+
 class Chip(ClockAndFlash):
     """Everything behind the processor's bus."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, part: Part = NUCLEO) -> None:
+        super().__init__(part)
         self.inputs: dict[str, int] = {}
         self.levels: dict[int, int] = {}  # the converter's reading of each channel
         self.position = 0  # of the converter in its scan
         self.pended = False
+        self.sensors: dict[str, AbsoluteSensor] = {}  # by the pin that selects them
 
     # pins
 
@@ -72,6 +110,9 @@ class Chip(ClockAndFlash):
         """The lower half sets, the upper one resets."""
         odr = f"{name[:5]}.ODR"
         self[odr] = self[odr] & ~(value >> 16) | value & 0xFFFF
+        for pin, sensor in self.sensors.items():
+            if self.output(pin):
+                sensor.deselect()
 
     def get_gpio_idr(self, name: str) -> int:
         """Return the levels of a port's pins."""
@@ -81,7 +122,7 @@ class Chip(ClockAndFlash):
 
     def breaks(self) -> None:
         """Let the break inputs do their work."""
-        for timer, pin in (("TIM1", "PB12"), ("TIM8", "PA6")):
+        for timer, pin in self.part.breaks:
             bdtr = self[f"{timer}.BDTR"]
             if not bdtr >> 12 & 1 or self.function(pin) != f"{timer}_BKIN":
                 continue
@@ -174,12 +215,22 @@ class Chip(ClockAndFlash):
         """Let the PWM go through so many periods; each triggers a scan."""
         self.conversions(count * len(self.sequence()))
 
+    def _triggered_by_tim8(self) -> bool:
+        ready = self["TIM8.CR1"] & 1 and self["TIM8.CR2"] >> 4 & 7 == 7 and self["TIM8.CCMR2"] >> 12 & 7 == 6
+        return bool(ready and 0 < self["TIM8.CCR4"] < self["TIM8.ARR"])
+
+    def _triggered_by_tim4(self) -> bool:
+        """TIM4 starts with TIM1, has its period, and its fourth channel rises once in it."""
+        together = self["TIM1.CR1"] & 1 and self["TIM1.CR2"] >> 4 & 7 == 1 and self["TIM4.SMCR"] == 6
+        period = self["TIM4.ARR"] + 1 == 2 * self["TIM1.ARR"] and self["TIM4.PSC"] == self["TIM1.PSC"]
+        rises = self["TIM4.CCMR2"] >> 8 & 0x73 == 0x70 and self["TIM4.CCER"] == 1 << 12
+        return bool(together and period and rises and 0 < self["TIM4.CCR4"] <= self["TIM4.ARR"])
+
     def conversions(self, count: int) -> None:
         """Let the converter do so many conversions of its scans, if it is triggered and somebody takes them."""
         stream, cr2 = "DMA2.S0", self["ADC1.CR2"]
-        triggered = self["TIM8.CR1"] & 1 and self["TIM8.CR2"] >> 4 & 7 == 7
-        triggered = triggered and self["TIM8.CCMR2"] >> 12 & 7 == 6 and 0 < self["TIM8.CCR4"] < self["TIM8.ARR"]
-        listens = cr2 & 1 and cr2 >> 28 & 3 == 1 and cr2 >> 24 & 15 == 14 and self["ADC1.CR1"] >> 8 & 1
+        triggered = self._triggered_by_tim4() if self.part.trigger == 9 else self._triggered_by_tim8()
+        listens = cr2 & 1 and cr2 >> 28 & 3 == 1 and cr2 >> 24 & 15 == self.part.trigger and self["ADC1.CR1"] >> 8 & 1
         listens = listens and not self["ADC1.SR"] >> 5 & 1  # an overrun stops the requests
         if not (triggered and listens and cr2 >> 8 & 3 == 3 and self[f"{stream}CR"] & 1):
             return
@@ -190,13 +241,44 @@ class Chip(ClockAndFlash):
             self.transfer(stream, 2, self.levels.get(sequence[self.position], 0))
             self.position = (self.position + 1) % len(sequence)
 
+    # encoders
+
+    def count(self, timer: str, edges: int) -> None:
+        """Rotate the quadrature encoder at a timer."""
+        first, second = (pin for (pin, _), what in ALTERNATE.items() if what.startswith(timer))
+        ready = self.function(first) == f"{timer}_CH1" and self.function(second) == f"{timer}_CH2"
+        inputs = self[f"{timer}.CCMR1"] & 0x303 == 0x101 and not self[f"{timer}.CCER"]
+        if not (ready and inputs and self[f"{timer}.SMCR"] == 3 and self[f"{timer}.CR1"] == 1):
+            self.wrong(f"{timer} does not count both lines of its encoder")
+        self[f"{timer}.CNT"] = (self[f"{timer}.CNT"] + edges) % (self[f"{timer}.ARR"] + 1)
+
+    def set_spi_dr(self, name: str, value: int) -> None:
+        """A frame goes out to the one sensor that is selected, and its answer comes in."""
+        spi = name[:4]
+        # On; 16 bits, select by software, high; a quarter or less of the fastest clock; master; mode 1.
+        if self[f"{spi}.CR1"] & 0xFC7 != 0xB45 or self.apb1()[0] / (2 << (self[f"{spi}.CR1"] >> 3 & 7)) > 10e6:
+            self.wrong(f"{spi} is not set up for an AS5047")
+        connected = {self.function(pin) for (pin, _), what in ALTERNATE.items() if what.startswith(spi)}
+        if connected != {f"{spi}_SCK", f"{spi}_MISO", f"{spi}_MOSI"}:
+            self.wrong(f"{spi} has not its pins")
+        selected = [sensor for pin, sensor in self.sensors.items() if self.output(pin) == 0.0]
+        if len(selected) > 1 or self[f"{spi}.SR"] & 1:
+            self.wrong(f"{spi}: {len(selected)} sensors selected, or a frame not read")
+        self[name] = selected[0].frame(value) if selected else 0  # the line is pulled low
+        self[f"{spi}.SR"] |= 1
+
+    def get_spi_dr(self, name: str) -> int:
+        """Reading it clears RXNE."""
+        self[f"{name[:4]}.SR"] &= ~1
+        return self[name]
+
     # wire
 
     def receive(self, data: bytes) -> None:
         """Let bytes come in on the wire."""
-        stream = "DMA1.S5"
-        ready = self["USART2.CR1"] & 0x2004 == 0x2004 and self["USART2.CR3"] & 0x40 and self[f"{stream}CR"] & 1
-        if not ready or self[f"{stream}CR"] >> 25 & 7 != 4 or self[f"{stream}PAR"] != 0x40004404:
+        uart, stream, _ = self.part.uart
+        ready = self[f"{uart}.CR1"] & 0x2004 == 0x2004 and self[f"{uart}.CR3"] & 0x40 and self[f"{stream}CR"] & 1
+        if not ready or self[f"{stream}CR"] >> 25 & 7 != 4 or self[f"{stream}PAR"] != NAMED[f"{uart}.DR"]:
             self.wrong("nobody takes the bytes of the wire")
             return
         for byte in data:
@@ -204,20 +286,20 @@ class Chip(ClockAndFlash):
 
     def send(self, most: int) -> bytes:
         """Let the wire carry at most so many bytes away; return them."""
-        stream, data = "DMA1.S6", bytearray()
+        (uart, _, stream), data = self.part.uart, bytearray()
         while self[f"{stream}CR"] & 1 and len(data) < most:
-            if self["USART2.CR1"] & 0x2008 != 0x2008 or not self["USART2.CR3"] & 0x80:
-                self.wrong("USART2 does not send")
+            if self[f"{uart}.CR1"] & 0x2008 != 0x2008 or not self[f"{uart}.CR3"] & 0x80:
+                self.wrong(f"{uart} does not send")
             if self[f"{stream}CR"] >> 25 & 7 != 4 or self[f"{stream}CR"] >> 6 & 3 != 1:
-                self.wrong("DMA1 stream 6 does not serve USART2's sender")
-            if self[f"{stream}PAR"] != 0x40004404:
-                self.wrong("DMA1 stream 6 does not write to USART2")
+                self.wrong(f"{stream} does not serve {uart}'s sender")
+            if self[f"{stream}PAR"] != NAMED[f"{uart}.DR"]:
+                self.wrong(f"{stream} does not write to {uart}")
             data.append(self.transfer(stream, 1, None))
         return bytes(data)
 
-    def get_usart2_dr(self, name: str) -> int:
+    def get_usart_dr(self, name: str) -> int:
         """Reading it after SR clears an overrun."""
-        self["USART2.SR"] &= ~(1 << 3)
+        self[f"{self.part.uart[0]}.SR"] &= ~(1 << 3)
         return self[name]
 
     def set_scb_icsr(self, name: str, value: int) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from stm32f4_registers import ADDRESS, PERIPHERALS, RESET
+from stm32f4_registers import ADDRESS, NUCLEO, PERIPHERALS, RESET, Part
 
 READY_AFTER = 3  # reads until a ready flag follows
 KEYS = (0x45670123, 0xCDEF89AB)
@@ -14,7 +14,8 @@ class ClockAndFlash:
 
     RAM = (0x20000000, 0x20020000)
 
-    def __init__(self) -> None:
+    def __init__(self, part: Part = NUCLEO) -> None:
+        self.part = part
         self.values = {name: RESET.get(name, 0) for name in ADDRESS.values()}
         self.writes: list[tuple[str, int]] = []
         self.wrongs: list[str] = []
@@ -61,7 +62,10 @@ class ClockAndFlash:
 
     def clocked(self, name: str) -> bool:
         """Return whether a register's peripheral has its clock."""
-        gate = PERIPHERALS[name.split(".")[0]][2]
+        peripheral = name.split(".")[0]
+        if peripheral in self.part.absent:
+            return False
+        gate = PERIPHERALS[peripheral][2]
         return gate is None or bool(self[f"RCC.{gate[0]}"] >> gate[1] & 1)
 
     def read(self, address: int, size: int) -> int:
@@ -101,13 +105,16 @@ class ClockAndFlash:
         if self["RCC.CFGR"] >> 2 & 3 != 2:
             return 16e6
         factors = self["RCC.PLLCFGR"]
-        source = 8e6 if factors >> 22 & 1 else 16e6
+        source = self.part.hse_hz if factors >> 22 & 1 else 16e6
         return source / (factors & 63) * (factors >> 6 & 511) / (2 + 2 * (factors >> 16 & 3))
 
     def _bus(self, shift: int) -> tuple[float, float]:
         prescale = self["RCC.CFGR"] >> shift & 7
         divider = 1 << (prescale - 3) if prescale >= 4 else 1
         return self.sysclk() / divider, self.sysclk() / divider * (1 if divider == 1 else 2)
+
+    def _buses(self) -> tuple[float, float, float]:
+        return self.sysclk(), self.apb1()[0], self.apb2()[0]
 
     def apb1(self) -> tuple[float, float]:
         """Return the clocks of the slow bus and of its timers."""
@@ -130,9 +137,11 @@ class ClockAndFlash:
         old = self[name]
         if (old ^ value) >> 18 & 1 and old >> 16 & 1:
             self.wrong("HSEBYP changed while HSE is on")
+        if value >> 18 & 1 and self.part.crystal:
+            self.wrong("a crystal is bypassed")
         if value >> 24 & 1 and not old >> 24 & 1:
             factors = self["RCC.PLLCFGR"]
-            source = 8e6 if factors >> 22 & 1 else 16e6
+            source = self.part.hse_hz if factors >> 22 & 1 else 16e6
             vco_in = source / (factors & 63)
             if factors >> 22 & 1 and not old >> 17 & 1:
                 self.wrong("the PLL's source is not ready")
@@ -156,18 +165,20 @@ class ClockAndFlash:
         if value & 3 == 2 and self[name] >> 2 & 3 != 2:
             if not self["RCC.CR"] >> 25 & 1:
                 self.wrong("switched to a PLL that is not locked")
-            if not self["PWR.CSR"] >> 17 & 1:
+            if self.part.over_drive and not self["PWR.CSR"] >> 17 & 1:
                 self.wrong("switched beyond 168 MHz without over-drive")
             self[name] = value & ~(3 << 2) | 2 << 2
-            if self["FLASH.ACR"] & 15 < -(-self.sysclk() // 30e6) - 1:
+            if self["PWR.CR"] >> 14 & 3 != 3:
+                self.wrong("switched to a fast clock without the regulator's scale 1")
+            if self.sysclk() > self.part.flash_hz[min(self["FLASH.ACR"] & 15, len(self.part.flash_hz) - 1)]:
                 self.wrong("switched to a clock too fast for the flash memory's wait states")
-            if self.sysclk() > 180e6 or self.apb1()[0] > 45e6 or self.apb2()[0] > 90e6:
+            if any(hz > most for hz, most in zip(self._buses(), self.part.most_hz, strict=True)):
                 self.wrong("a bus runs too fast")
 
     def _enable(self, name: str, value: int) -> None:
         switching = self["PWR.CR"] >> 17 & 1 and not self["PWR.CSR"] >> 17 & 1
         before = not self["PWR.CSR"] >> 17 & 1 and value & ~(1 << 28)
-        if switching or before:
+        if self.part.over_drive and (switching or before):
             self.wrong(f"{name}: a peripheral gets its clock before over-drive is on")
         self[name] = value
 
@@ -186,6 +197,8 @@ class ClockAndFlash:
 
     def set_pwr_cr(self, name: str, value: int) -> None:
         """The switch to over-drive waits for over-drive."""
+        if value >> 16 & 3 and not self.part.over_drive:
+            self.wrong("over-drive, which it does not have")
         if value >> 17 & 1 and not self["PWR.CSR"] >> 16 & 1:
             self.wrong("ODSWEN before ODRDY")
         self[name] = value

@@ -7,7 +7,7 @@ import struct
 from pathlib import Path
 
 from stm32f4_chip import Chip
-from stm32f4_registers import ADDRESS
+from stm32f4_registers import ADDRESS, NUCLEO, Part
 from unicorn import UC_ARCH_ARM, UC_HOOK_CODE, UC_HOOK_MEM_WRITE, UC_MODE_MCLASS, UC_MODE_THUMB, Uc
 from unicorn.arm_const import (
     UC_ARM_REG_LR,
@@ -34,8 +34,8 @@ MOST_US = 60_000_000  # of one run: a loop that never ends is a failure, not a w
 class Emulator:
     """One chip with a program in its flash memory."""
 
-    def __init__(self, elf_path: Path) -> None:
-        self.chip = Chip()
+    def __init__(self, elf_path: Path, part: Part = NUCLEO) -> None:
+        self.chip = Chip(part)
         self.uc = Uc(UC_ARCH_ARM, UC_MODE_THUMB | UC_MODE_MCLASS)
         self.uc.ctl_set_cpu_model(UC_CPU_ARM_CORTEX_M4)
         self.uc.mem_map(FLASH, FLASH_BYTES)

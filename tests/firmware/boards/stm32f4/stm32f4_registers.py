@@ -1,4 +1,6 @@
-"""Where the STM32F446's registers lie: the tables of its reference manual once more, apart from the firmware's header."""
+"""Where the registers of the STM32F446 and STM32F411 lie: their manuals' tables again, apart from the firmware's header."""
+
+from dataclasses import dataclass
 
 
 def _row(*names: str) -> dict[str, int]:
@@ -17,12 +19,22 @@ DMA = _row("LISR", "HISR", "LIFCR", "HIFCR") | {
 
 #: Peripheral: base address, registers by offset, and the bit that gives it its clock (none: always on).
 PERIPHERALS = {
+    "TIM2": (0x40000000, TIM, ("APB1ENR", 0)),
+    "TIM3": (0x40000400, TIM, ("APB1ENR", 1)),
+    "TIM4": (0x40000800, TIM, ("APB1ENR", 2)),
+    "SPI2": (0x40003800, {"CR1": 0x0, "CR2": 0x4, "SR": 0x8, "DR": 0xC}, ("APB1ENR", 14)),
+    "SPI3": (0x40003C00, {"CR1": 0x0, "CR2": 0x4, "SR": 0x8, "DR": 0xC}, ("APB1ENR", 15)),
     "PWR": (0x40007000, {"CR": 0x0, "CSR": 0x4}, ("APB1ENR", 28)),
     "IWDG": (0x40003000, {"KR": 0x0, "PR": 0x4, "RLR": 0x8, "SR": 0xC}, None),
     "USART2": (
         0x40004400,
         {"SR": 0x0, "DR": 0x4, "BRR": 0x8, "CR1": 0xC, "CR2": 0x10, "CR3": 0x14},
         ("APB1ENR", 17),
+    ),
+    "USART1": (
+        0x40011000,
+        {"SR": 0x0, "DR": 0x4, "BRR": 0x8, "CR1": 0xC, "CR2": 0x10, "CR3": 0x14},
+        ("APB2ENR", 4),
     ),
     "TIM1": (0x40010000, TIM, ("APB2ENR", 0)),
     "TIM8": (0x40010400, TIM, ("APB2ENR", 1)),
@@ -74,6 +86,7 @@ ALTERNATE = {
     ("PA8", 1): "TIM1_CH1",
     ("PA9", 1): "TIM1_CH2",
     ("PA10", 1): "TIM1_CH3",
+    ("PA11", 1): "TIM1_CH4",
     ("PC6", 3): "TIM8_CH1",
     ("PC7", 3): "TIM8_CH2",
     ("PC8", 3): "TIM8_CH3",
@@ -81,6 +94,20 @@ ALTERNATE = {
     ("PB12", 1): "TIM1_BKIN",
     ("PA2", 7): "USART2_TX",
     ("PA3", 7): "USART2_RX",
+    ("PB6", 7): "USART1_TX",
+    ("PB7", 7): "USART1_RX",
+    ("PB13", 5): "SPI2_SCK",
+    ("PB14", 5): "SPI2_MISO",
+    ("PB15", 5): "SPI2_MOSI",
+    ("PA15", 1): "TIM2_CH1",
+    ("PB3", 1): "TIM2_CH2",
+    ("PB4", 2): "TIM3_CH1",
+    ("PB5", 2): "TIM3_CH2",
+    ("PB6", 2): "TIM4_CH1",
+    ("PB7", 2): "TIM4_CH2",
+    ("PC10", 6): "SPI3_SCK",
+    ("PC11", 6): "SPI3_MISO",
+    ("PC12", 6): "SPI3_MOSI",
 }
 
 #: The converter's channel of each pin, of the datasheet's table.
@@ -92,3 +119,55 @@ ADDRESS = {
     for name, offset in registers.items()
 }
 NAMED = {name: address for address, name in ADDRESS.items()}
+
+
+@dataclass(frozen=True)
+class Part:
+    """What distinguishes a chip, on its board.
+
+    Attributes:
+        hse_hz: its external clock.
+        crystal: whether that is a crystal, not a clock.
+        over_drive: whether it has one, for more than 168 MHz.
+        most_hz: processor, slow and fast bus.
+        flash_hz: up to which clock the flash memory needs 0, 1, ... wait states, at 2.7 V or more.
+        breaks: timers with a break input, and the pin of it in use.
+        trigger: the converter's choice of trigger.
+        uart: the wire, and its streams in and out.
+        absent: peripherals of the table above that it does not have.
+    """
+
+    hse_hz: float
+    crystal: bool
+    over_drive: bool
+    most_hz: tuple[float, float, float]
+    flash_hz: tuple[float, ...]
+    breaks: tuple[tuple[str, str], ...]
+    trigger: int
+    uart: tuple[str, str, str]
+    absent: tuple[str, ...]
+
+
+#: The Nucleo-F446RE and the Black Pill: RM0390 and RM0383, table of wait states and chapter 6.
+NUCLEO = Part(
+    hse_hz=8e6,
+    crystal=False,
+    over_drive=True,
+    most_hz=(180e6, 45e6, 90e6),
+    flash_hz=(30e6, 60e6, 90e6, 120e6, 150e6, 180e6),
+    breaks=(("TIM1", "PB12"), ("TIM8", "PA6")),
+    trigger=14,
+    uart=("USART2", "DMA1.S5", "DMA1.S6"),
+    absent=(),
+)
+BLACK_PILL = Part(
+    hse_hz=25e6,
+    crystal=True,
+    over_drive=False,
+    most_hz=(100e6, 50e6, 100e6),
+    flash_hz=(30e6, 64e6, 90e6, 100e6),
+    breaks=(("TIM1", "PB12"),),
+    trigger=9,
+    uart=("USART1", "DMA2.S5", "DMA2.S7"),
+    absent=("TIM8",),
+)

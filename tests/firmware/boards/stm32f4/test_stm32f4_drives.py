@@ -11,7 +11,7 @@ from stm32f4_build import COMPILERS, fresh
 from stm32f4_emulator import RAM
 
 PWM_PINS = ("PA8", "PA9", "PA10", "PC6", "PC7", "PC8")
-DIRECTION_PINS = ("PB5", "PB6", "PB7", "PB8", "PB9", "PB10")
+DIRECTION_PINS = ("PB2", "PB14", "PB15", "PB8", "PB9", "PB10")
 ENABLE_PIN = "PC9"
 COMPARE = (*(f"TIM1.CCR{i}" for i in (1, 2, 3)), *(f"TIM8.CCR{i}" for i in (1, 2, 3)))
 STEPS = 4500  # 180 MHz / (2 * 20 kHz)

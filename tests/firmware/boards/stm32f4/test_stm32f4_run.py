@@ -5,6 +5,7 @@ Every tick the same inputs go to the core's host build; what it asks for must st
 
 import ctypes
 import zlib
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -16,9 +17,30 @@ from stm32f4_registers import ADC_CHANNEL
 
 from armsight.firmware import dialect
 
-PWM_PINS = ("PA8", "PA9", "PA10", "PC6", "PC7", "PC8")
-DIRECTION_PINS = ("PB5", "PB6", "PB7", "PB8", "PB9", "PB10")
-POT_PINS = ("PC0", "PC1", "PC2", "PC3", "PC4", "PC5")
+
+@dataclass(frozen=True)
+class Wiring:
+    """A board's pins, one of each for a joint, and its PWM's steps."""
+
+    board: str
+    pwm: tuple[str, ...]
+    direction: tuple[str, ...]
+    pots: tuple[str, ...]
+    supply: str
+    enable: str
+    steps: int
+
+
+NUCLEO = Wiring(
+    "stm32f4",
+    ("PA8", "PA9", "PA10", "PC6", "PC7", "PC8"),
+    ("PB2", "PB14", "PB15", "PB8", "PB9", "PB10"),
+    ("PC0", "PC1", "PC2", "PC3", "PC4", "PC5"),
+    "PA5",
+    "PC9",
+    4500,
+)
+PWM_PINS = NUCLEO.pwm
 COPIES = (FLASH + 0x4000, FLASH + 0x8000)
 SUPPLY_LEVEL = 709  # of 4096: 12 V behind the divider by 21
 SUPPLY_MV = 16 * SUPPLY_LEVEL * 69300 >> 16
@@ -32,13 +54,16 @@ def sealed(config, serial: int) -> bytes:
 class Nucleo:
     """An emulated Nucleo with an arm and a host, and the same arm on the core's host build."""
 
-    def __init__(self, compiler: str, library, *, watchdog: bool = False) -> None:
-        self.emulator = fresh(compiler)
+    def __init__(
+        self, compiler: str, library, *, watchdog: bool = False, wiring: Wiring = NUCLEO, joints: int = 0
+    ) -> None:
+        self.wiring, self.emulator = wiring, fresh(compiler, wiring.board)
         self.chip = self.emulator.chip
         self.chip.inputs |= {"PA6": 0, "PB12": 0}
         if watchdog:
             self.chip["RCC.CSR"] |= 1 << 29
         self.config = lab_config(library)
+        self.config.joint_count = joints or len(wiring.pwm)
         for copy, at in enumerate(COPIES):
             self.emulator.uc.mem_write(at, sealed(self.config, copy + 1))
         self.arm = LabArm(library, self.config, watchdog=watchdog)
@@ -52,12 +77,12 @@ class Nucleo:
     def _converter(self, arm) -> None:
         """What the converter makes of the plant's angles: 12 bits, the same in every scan."""
         arm.inputs.supply_mv = SUPPLY_MV
-        for i, pin in enumerate(POT_PINS):
+        for i, pin in enumerate(self.wiring.pots):
             level = arm.inputs.counts[i] >> 4
             arm.inputs.counts[i] = 16 * level
             self.chip.levels[ADC_CHANNEL[pin]] = level
-        self.chip.levels[ADC_CHANNEL["PA5"]] = SUPPLY_LEVEL
-        arm.inputs.stop_pressed = self.chip.input("PA6")
+        self.chip.levels[ADC_CHANNEL[self.wiring.supply]] = SUPPLY_LEVEL
+        arm.inputs.stop_pressed = self.chip.input("PB12")
 
     def run(self, ticks: int = 1) -> None:
         """Let both run, and compare what the pins do with what the core asks for."""
@@ -70,14 +95,15 @@ class Nucleo:
 
     def compare(self) -> None:
         expected = self.arm.outputs
-        duties = np.array(expected.duty, np.float32)
-        steps = np.floor(np.abs(duties) * np.float32(4500) + np.float32(0.5)).astype(int)
-        assert self.chip.output("PC9") == float(bool(expected.drives_on or expected.windings_shorted))
-        assert [self.chip.output(pin) for pin in PWM_PINS] == [
-            step / 4500 * expected.drives_on for step in steps.tolist()
+        wiring = self.wiring
+        duties = np.array(expected.duty, np.float32)[: len(wiring.pwm)]
+        steps = np.floor(np.abs(duties) * np.float32(wiring.steps) + np.float32(0.5)).astype(int)
+        assert self.chip.output(wiring.enable) == float(bool(expected.drives_on or expected.windings_shorted))
+        assert [self.chip.output(pin) for pin in wiring.pwm] == [
+            step / wiring.steps * expected.drives_on for step in steps.tolist()
         ]
         if expected.drives_on or expected.windings_shorted:
-            assert [self.chip.output(pin) for pin in DIRECTION_PINS] == (duties < 0.0).astype(float).tolist()
+            assert [self.chip.output(pin) for pin in wiring.direction] == (duties < 0.0).astype(float).tolist()
         assert self.chip.wrongs == []
 
     def send(self, message) -> None:

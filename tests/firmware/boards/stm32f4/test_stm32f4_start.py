@@ -15,7 +15,7 @@ from armsight.firmware.elf import read_elf
 
 ROOT = Path(__file__).resolve().parents[4]
 PWM_PINS = ("PA8", "PA9", "PA10", "PC6", "PC7", "PC8")
-DIRECTION_PINS = ("PB5", "PB6", "PB7", "PB8", "PB9", "PB10")
+DIRECTION_PINS = ("PB2", "PB14", "PB15", "PB8", "PB9", "PB10")
 ENABLE_PIN = "PC9"
 INTERRUPTS = 97  # of the STM32F446, position 0 to 96
 
@@ -153,7 +153,9 @@ def documented() -> list[tuple[str, str, str, str]]:
 
 def test_every_pin_does_what_the_documentation_says(booted):
     chip, rows = booted.chip, documented()
-    assert len(rows) == 30
+    for user in (1, 2, 3, 255):
+        booted.call("pins_connect", user)  # as a configuration with encoders lets it
+    assert len(rows) == 39
     for what, pin, _, peripheral in rows:
         analog = re.fullmatch(r"ADC1_IN(\d+)", peripheral)
         assert chip.function(pin) == ("analog" if analog else peripheral), what
@@ -184,6 +186,8 @@ def test_the_wiring_picture_shows_the_same_pins():
         assert [tuple(pin.split()) for pin in shown] == [socket[what.format(joint)] for what in expected]
     for what, said in (("motor supply", "supply"), ("emergency stop", "stop"), ("enable of all bridges", "enable")):
         assert f"{said}: {socket[what][0]}  {socket[what][1]}" in script
+    for what, said in (("direction of joint 1", "DIR 1"), ("PWM of joint 1", "PWM 1"), ("current of joint 1", "CS 1")):
+        assert f"{said}: {socket[what][0]}" in script
 
 
 def test_the_currents_are_read_around_the_middle_of_the_pulses(booted):
