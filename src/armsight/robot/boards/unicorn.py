@@ -64,8 +64,8 @@ class UnicornEmulator:
         self._ram = mmap.mmap(-1, _RAM_BYTES)
         data = unicorn.UC_PROT_READ | unicorn.UC_PROT_WRITE
         self.uc.mem_map_ptr(_RAM, _RAM_BYTES, data, np.frombuffer(self._ram, np.uint8).ctypes.data)
-        # The processor's own map lets code run in RAM, and Unicorn takes every store to such a page through a slow path that
-        # looks for translated code: two thirds of a tick's time. So our pages' permissions are in place of that map.
+        # The processor's own map lets code run in RAM, and Unicorn takes every store to such a page through a slow path
+        # that looks for translated code: more than half of a tick's time. These permissions are in place of that map.
         self.uc.ctl_set_tlb_mode(unicorn.UC_TLB_VIRTUAL)
         code = unicorn.UC_PROT_READ | unicorn.UC_PROT_EXEC
         self.uc.hook_add(unicorn.UC_HOOK_TLB_FILL, partial(_fill, code, data))
