@@ -1,5 +1,6 @@
 """The emulators: the same bits from every compiler on every one of them, and what is said where one cannot run."""
 
+import contextlib
 import hashlib
 import shutil
 
@@ -117,6 +118,15 @@ def test_an_image_that_breaks_down_is_reported(images):
     emulator._tick = 0x2000F001  # into the RAM, where zeros are instructions that run off its end
     with pytest.raises(DeviceError, match="the emulated board broke down"):
         emulator.tick(bytes(REQUEST.itemsize))
+
+
+def test_code_cannot_write_to_the_flash_and_can_to_the_ram(images):
+    for store, breaks in (("40f20001c0f20001", True), ("40f20001c2f20001", False)):  # movw, movt: r1 = 0; 0x20000000
+        emulator = UnicornEmulator.open(images[next(iter(images))])
+        emulator.uc.mem_write(0x3F000, bytes.fromhex(store + "08607047"))  # str r0, [r1]; bx lr
+        emulator._tick = 0x3F001
+        with pytest.raises(DeviceError, match="broke down") if breaks else contextlib.nullcontext():
+            emulator.tick(bytes(REQUEST.itemsize))
 
 
 @pytest.mark.parametrize("emulator", [UnicornEmulator, HostEmulator])

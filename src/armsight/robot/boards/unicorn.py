@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import mmap
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -25,6 +26,12 @@ _THUMB = 1
 #: wait for an interrupt ends the emulation; where it ends by an address, Unicorn translates the code there anew every time.
 _CALL, _CALLER = _FLASH_BYTES - 16, b"\xa0\x47\x30\xbf\x02\xe0"
 _END = _CALL + 12
+
+
+def _fill(code: int, data: int, _uc: object, address: int, _access: int, entry: Any, _user: object) -> bool:  # noqa: ANN401
+    """Map a page that is not in the TLB to itself: code may be read and run, data read and written."""
+    entry.paddr, entry.perms = address, code if address < _FLASH + _FLASH_BYTES else data
+    return True
 
 
 class UnicornEmulator:
@@ -53,11 +60,15 @@ class UnicornEmulator:
         self.uc.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
         self.uc.mem_map(_FLASH, _FLASH_BYTES)
         self.uc.mem_map(_CONTROL, _CONTROL_BYTES)
-        # The board's RAM is memory of ours, so that frames need no call to be written or read. No code runs there: where it
-        # might, Unicorn looks at every store for code that it changes.
+        # The board's RAM is memory of ours, so that frames need no call to be written or read. No code runs there.
         self._ram = mmap.mmap(-1, _RAM_BYTES)
         data = unicorn.UC_PROT_READ | unicorn.UC_PROT_WRITE
         self.uc.mem_map_ptr(_RAM, _RAM_BYTES, data, np.frombuffer(self._ram, np.uint8).ctypes.data)
+        # The processor's own map lets code run in RAM, and Unicorn takes every store to such a page through a slow path
+        # that looks for translated code: more than half of a tick's time. These permissions are in place of that map.
+        self.uc.ctl_set_tlb_mode(unicorn.UC_TLB_VIRTUAL)
+        code = unicorn.UC_PROT_READ | unicorn.UC_PROT_EXEC
+        self.uc.hook_add(unicorn.UC_HOOK_TLB_FILL, partial(_fill, code, data))
         for segment in elf.segments:
             self.uc.mem_write(segment.load_address, segment.data)
         self.uc.mem_write(_CALL, _CALLER)
