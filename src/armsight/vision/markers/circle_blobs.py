@@ -273,7 +273,7 @@ def _fit_each(image: Grey, theta: Array, cov: Array, shape: Array, codes: NDArra
         if codes[i] == 0:
             work.discs[count, :] = work.shown
             count += 1
-    shared = np.empty(4)
+    shared = np.empty(3)
     common(image, count, work, shared)
     count = 0
     for i in range(len(theta)):

@@ -96,6 +96,34 @@ def test_vignetting_that_no_single_disc_shows_does_not_pull_all_of_them():
     assert 0.7 < np.mean(normed) < 1.3
 
 
+def test_noise_that_is_correlated_and_grows_with_contrast_is_that_of_each_discs_like():
+    rng = np.random.default_rng(21)
+    size, normed = 44, {30.0: [], 130.0: []}
+    for _ in range(12):
+        light, noise, true = np.full((3 * size, 6 * size), 60.0), rng.normal(size=(3 * size, 6 * size)), []
+        for _ in range(4):  # of 3 px, as processing leaves it
+            noise = (noise + np.roll(noise, 1, 0) + np.roll(noise, 1, 1) + np.roll(noise, (1, 1), (0, 1))) / 2
+        noise *= 2.0 / noise.std()
+        for k in range(18):
+            c, contrast, at = (
+                size / 2 + rng.uniform(-0.5, 0.5, 2),
+                (30.0, 130.0)[k % 2],
+                np.array([k % 6, k // 6]) * size,
+            )
+            here = (slice(at[1], at[1] + size), slice(at[0], at[0] + size))
+            light[here] += contrast * share([outline(c, 11, 10, 0.3)], 1.0, np.zeros(2), size)
+            noise[here] *= contrast / 60.0
+            true.append((c + at, contrast))
+        found = BRIGHT.find(grey(light + noise, 0.0, rng))
+        for c, contrast in true:
+            k = int(np.argmin(np.linalg.norm(found.uv - c, axis=1)))
+            e = found.uv[k] - c
+            normed[contrast].append(e @ np.linalg.solve(found.cov_uv[k], e) / 2)
+    # 108 chi-squares each: 0.1; taken as white, 4 and more. The covariance is never below that of white noise.
+    assert 0.6 < np.mean(normed[30.0]) < 1.35
+    assert 0.6 < np.mean(normed[130.0]) < 1.35
+
+
 def test_motion_smears_a_disc_about_its_middle_or_is_reported():
     rng = np.random.default_rng(3)
     size, c, r = 72, np.array([35.6, 35.2]), 8.0

@@ -2,8 +2,9 @@
 
 In: what each disc's fit shows (``fit.FitBuffers.shown``). Out: corrected centres and their covariances.
 
-Noise that is correlated between neighbouring pixels moves the first harmonic of a rim, the centre, as it moves the higher
-odd ones, which no ellipse has: their power, over all discs, is the factor of the variances.
+Noise that is correlated between neighbouring pixels, and what processing makes of a rim as it lies on the grid, move the
+first harmonic of a rim, the centre, as they move the higher odd ones, which no ellipse has: their power, over all discs of
+about the same contrast, is the noise that the centres have.
 
 A lens darkens its image with the square of the distance from the middle (cos^4, and vignetting): at x the light has the
 relative gradient a (x - m), in 1/px, with m the image's middle. A disc that is fitted as flat is off by up to 0.01 px then,
@@ -23,9 +24,9 @@ from armsight.data import Array
 from armsight.kernels import kernel
 from armsight.vision.markers.disc.fit import (
     GLARE,
+    HARMONICS,
     LIGHT,
     PARAMETERS,
-    RIM_CHANCE,
     SURROUND,
     UNKNOWNS,
     FitBuffers,
@@ -35,10 +36,17 @@ from armsight.vision.markers.disc.fit import (
     of_centre,
 )
 
-#: Median of chi-square of six degrees, over six.
-_CHI6_MEDIAN = 0.8914
-#: From so many discs on, what they have in common is the image's.
+#: From so many discs on, vignetting is estimated.
 _LEAST_DISCS = 3
+#: Contrasts of discs whose rims have the same noise, one over the other: what processing makes of a rim grows with it.
+_ALIKE = 1.6
+#: A power of six degrees of freedom that chance exceeds in 0.3 %, over its mean; and the most that one disc counts.
+_RIM_CHANCE = 3.3
+#: By how much the first harmonic of the noise exceeds the later ones, as a share of what is not white: what lies along rows
+#: and columns of pixels moves a long piece of the rim at once. Found with the simulated cameras.
+_FIRST = 0.4
+#: Degrees of freedom with which noise is taken to be white before any rim is seen.
+_WHITE = 4.0
 #: Vignetting as it is to be expected: standard deviation of the light that is missing in the corners.
 _VIGNETTING = 0.3
 #: Chi-square of two degrees from which a disc or its surround may have a gradient: chance exceeds it in 1% and 10%.
@@ -48,31 +56,60 @@ _KINDS = (0.6, 0.3, 0.1)
 
 
 @kernel
+def _rim_noise(n: int, discs: Array) -> None:
+    """Estimate the noise along the rims of the first n discs, from all that have about the same contrast.
+
+    Their first column, the power of a disc's rim, is replaced by its ratio to what the others show (white noise at least),
+    the third by the factor of the variance of its centre over that of white noise. The power has 2 HARMONICS degrees of
+    freedom for each disc; the factor contains by how much the mean inverse of so few exceeds the inverse of their mean.
+    What exceeds white noise moves the rim, and the centre as the rim moves: the other unknowns, which enlarge what white
+    noise does, have no part in that. It is never below that of white noise: errors of the model move centres, too.
+    """
+    order, first = np.argsort(-np.abs(discs[:n, PARAMETERS + 6])), 0
+    while first < n:
+        end = first
+        least = abs(discs[order[first], PARAMETERS + 6]) / _ALIKE
+        while end < n and abs(discs[order[end], PARAMETERS + 6]) >= least:
+            end += 1
+        alike = order[first:end]
+        most, total = _RIM_CHANCE * np.median(discs[alike, 0]), 0.0
+        for i in alike:
+            total += min(discs[i, 0], most)
+        power = max(total / (end - first), 1e-12)
+        measured = 2.0 * HARMONICS * (end - first)
+        freedom = measured + _WHITE
+        for i in alike:
+            discs[i, 0] /= max(power, 1.0 / discs[i, 2])
+            factor = (_WHITE + measured * power * discs[i, 2]) / (freedom - 2.0)
+            discs[i, 2] = 1.0 + (1.0 + _FIRST) * max(factor - 1.0, 0.0) / discs[i, 13]
+        first = end
+
+
+@kernel
 def common(image: NDArray[np.uint8], n: int, work: FitBuffers, shared: Array) -> None:
     """Fill what the first n discs of ``work.discs`` have in common.
 
     Args:
         image: (H, W) grey.
         n: number of discs.
-        work: what they show.
-        shared: (4,) filled: factor of the variance of centres by correlated noise, one at least; mean square of the
-            deviations of the rims' sectors beyond white noise, px^2; the vignetting a, 1/px^2; n / 2 times its variance.
-            Medians, so that a few discs that are none do not count. An error of a moves all centres alike: in three of the
-            six degrees of freedom of a pose it counts n times as much as if it were independent, in the others hardly.
+        work: what they show; power and its third column become ratios, see :func:`_rim_noise`.
+        shared: (3,) filled: mean square of the deviations of the rims' sectors beyond white noise, px^2; the vignetting a,
+            1/px^2; n / 2 times its variance. Medians, so that a few discs that are none do not count. An error of a moves
+            all centres alike: in three of the six degrees of freedom of a pose it counts n times as much as if it were
+            independent, in the others hardly.
     """
     discs = work.discs
-    shared[0], shared[1], shared[2], shared[3] = 1.0, 0.0, 0.0, 0.0
+    shared[0], shared[1], shared[2] = 0.0, 0.0, 0.0
+    _rim_noise(n, discs)
     if n < _LEAST_DISCS:
         return
-    power, off = np.sort(discs[:n, 0].copy()), np.sort(discs[:n, 1].copy())
-    shared[0] = max(0.5 * (power[(n - 1) // 2] + power[n // 2]) / _CHI6_MEDIAN, 1.0)
-    shared[1] = max(0.5 * (off[(n - 1) // 2] + off[n // 2]), 0.0)
+    shared[0] = max(np.median(discs[:n, 1]), 0.0)
     slope, weight, total = np.empty(n), np.empty(n), 0.0
     for i in range(n):
-        u, v, k = _from_middle(image, discs[i], 0), _from_middle(image, discs[i], 1), discs[i, 5:8]
-        weight[i] = (u * u * k[0] + 2 * u * v * k[1] + v * v * k[2]) / shared[0]
+        u, v, k = _from_middle(image, discs[i], 0), _from_middle(image, discs[i], 1), discs[i, 5:8] / discs[i, 2]
+        weight[i] = u * u * k[0] + 2 * u * v * k[1] + v * v * k[2]
         along = u * (k[0] * discs[i, 3] + k[1] * discs[i, 4]) + v * (k[1] * discs[i, 3] + k[2] * discs[i, 4])
-        slope[i] = along / shared[0] / max(weight[i], 1e-300)
+        slope[i] = along / max(weight[i], 1e-300)
         total += weight[i]
     middle, below = 0.0, 0.0
     for i in np.argsort(slope):
@@ -86,7 +123,7 @@ def common(image: NDArray[np.uint8], n: int, work: FitBuffers, shared: Array) ->
         if (slope[i] - middle) ** 2 * weight[i] < _SLOPE_INSIDE:
             information += weight[i]
             sum_ += weight[i] * slope[i]
-    shared[2], shared[3] = sum_ / information, 0.5 * n / information
+    shared[1], shared[2] = sum_ / information, 0.5 * n / information
 
 
 @kernel
@@ -101,34 +138,36 @@ def correct(
 ) -> None:
     """Correct a disc's centre by what the image's discs have in common, and enlarge its covariance.
 
-    A rim that deviates significantly, because a little of it is covered perhaps, may have shifted the centre as much.
+    A rim that deviates significantly more than others, because a little of it is covered perhaps, may have shifted the
+    centre as much.
 
     Args:
         image: (H, W) grey.
         noise_sigma: of the image, grey levels.
         disc: (SHOWN,) what the disc's fit shows; the parameters in it are replaced.
-        shared: (4,) of :func:`common`.
+        shared: (3,) of :func:`common`.
         cov: (2, 2) covariance of the centre, px^2, of the fit, replaced.
         work: buffers.
     """
-    factor, theta = shared[0], disc[PARAMETERS:]
+    factor, theta = disc[2], disc[PARAMETERS:]
     u, v = _from_middle(image, disc, 0), _from_middle(image, disc, 1)
     du, dv = disc[8] * u + disc[10] * v, disc[9] * u + disc[11] * v
-    a, b = disc[3] - shared[2] * u, disc[4] - shared[2] * v
+    a, b = disc[3] - shared[1] * u, disc[4] - shared[1] * v
     own = disc[5] * a * a + 2 * disc[6] * a * b + disc[7] * b * b
     slopes = disc[12] >= 0.0 and (own > _SLOPE_INSIDE * factor or disc[12] > _SLOPE_OUTSIDE * factor)
-    if not (slopes and _average(image, noise_sigma, theta, shared[2] * du, shared[2] * dv, factor, cov, work)):
-        theta[0] -= shared[2] * du
-        theta[1] -= shared[2] * dv
+    if not (slopes and _average(image, noise_sigma, theta, shared[1] * du, shared[1] * dv, factor, cov, work)):
+        theta[0] -= shared[1] * du
+        theta[1] -= shared[1] * dv
+        texture = max(-disc[12], 1.0)  # the power contains its correlation
         for i in range(2):
             for j in range(2):
-                cov[i, j] *= factor
-    cov[0, 0] += shared[3] * du * du
-    cov[0, 1] += shared[3] * du * dv
-    cov[1, 0] += shared[3] * du * dv
-    cov[1, 1] += shared[3] * dv * dv
-    off = disc[1] - shared[1]
-    if off > RIM_CHANCE * disc[2] * factor:
+                cov[i, j] *= factor if texture == 1.0 else max(factor / texture, 1.0)
+    cov[0, 0] += shared[2] * du * du
+    cov[0, 1] += shared[2] * du * dv
+    cov[1, 0] += shared[2] * du * dv
+    cov[1, 1] += shared[2] * dv * dv
+    off = disc[1] - shared[0]
+    if off > 0.0 and disc[0] > _RIM_CHANCE:
         cov[0, 0] += off
         cov[1, 1] += off
 

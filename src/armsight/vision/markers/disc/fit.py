@@ -39,7 +39,7 @@ MOST_DISCS = 16384
 #: Unknowns: c (2), M (3), s, C, B, g (2).
 UNKNOWNS = 10
 #: What a fit shows of noise and light, and where its parameters are in it.
-SHOWN, PARAMETERS = 23, 13
+SHOWN, PARAMETERS = 24, 14
 #: Floats in a cache line.
 _LINE = 16
 
@@ -83,8 +83,10 @@ class FitBuffers(NamedTuple):
         start: (10,) parameters at the start.
         products: (2, 13) of a gradient inside.
         sums: (12, 12) products of the rows of J.
-        shown: (SHOWN,) what the last fit shows of noise and light: its rim (3, see :func:`rim_noise`), a gradient inside
-            (9, see :func:`slope_inside`), one outside (chi-square; -1 where the surround is textured), its parameters (10).
+        shown: (SHOWN,) what the last fit shows of noise and light: its rim (power, see :func:`rim_power`; mean
+            square of the sectors' deviations beyond white noise, px^2; 1 / power of white noise), a gradient inside
+            (9, see :func:`slope_inside`), one outside (chi-square; of a textured surround minus :func:`texture_factor`),
+            by how much the other unknowns enlarge the variance of the centre, its parameters (10).
         discs: (MOST_DISCS, SHOWN) the same for each disc of an image.
     """
 
@@ -416,51 +418,77 @@ def rim(n: int, theta: Array, x0: float, y0: float, work: FitBuffers, sectors: A
         sectors[0, k] /= max(sectors[1, k], 1e-12)
 
 
-def _odd_harmonics() -> Array:
-    """Return cosines and sines (6, SECTORS) of 3, 5 and 7 times the angle of each sector of :func:`rim`."""
-    angles = np.empty(SECTORS)
-    for k in range(SECTORS):
-        within = np.radians((33.75 if k & 1 else 11.25) if k & 2 else (56.25 if k & 1 else 78.75))
-        right, below = bool(k & 8), bool(k & 4)
-        angles[k] = np.arctan2(np.sin(within) * (1 if below else -1), np.cos(within) * (1 if right else -1))
-    return np.array([f(h * angles) for h in (3, 5, 7) for f in (np.cos, np.sin)])
-
-
-_ODD = _odd_harmonics()
-
-
 @kernel
-def rim_noise(variance: float, work: FitBuffers) -> tuple[float, float, int]:
-    """Compare the deviations of the rim's sectors with white noise, and fill the first of ``work.shown``.
-
-    The centre moves with the first harmonic of what noise does along the rim. The odd harmonics after it (3, 5, 7) show
-    how much of that there is, where noise is correlated between neighbours: by a demosaic, a filter, a compression. The
-    even ones do not count: the pixel grid has them, too, and they do not move the centre.
+def off_ellipse(variance: float, work: FitBuffers) -> tuple[float, float, int]:
+    """Compare the deviations of the rim's sectors, as :func:`rim` fills them, with white noise.
 
     Args:
         variance: of the noise, as the residuals have it.
-        work: buffers; ``sectors`` is filled by :func:`rim`. ``shown`` is filled: power of the odd harmonics over that of
-            white noise; mean square of the sectors' deviations beyond white noise, px^2; what chance makes of that.
+        work: buffers.
 
     Returns:
         Sum of the squared deviations beyond white noise, px^2; its variance; number of sectors.
     """
-    sectors, off, chance, count, power, white = work.sectors, 0.0, 0.0, 0, 0.0, 1e-30
+    sectors, off, chance, count = work.sectors, 0.0, 0.0, 0
     for k in range(SECTORS):
         if sectors[1, k] > 0.0:
             expected = variance / sectors[1, k]
             off += sectors[0, k] ** 2 - expected
             chance += 2.0 * expected * expected
             count += 1
-            white += 3.0 * expected
-    for h in range(len(_ODD)):
-        total = 0.0
-        for k in range(SECTORS):
-            if sectors[1, k] > 0.0:
-                total += _ODD[h, k] * sectors[0, k]
-        power += total * total
-    work.shown[0], work.shown[1], work.shown[2] = power / white, off / max(count, 1), np.sqrt(chance) / max(count, 1)
     return off, chance, count
+
+
+#: Harmonics of the rim that :func:`rim_power` adds, two degrees of freedom each: 3, 5 and 7.
+HARMONICS = 3
+#: Blur of the noise along a rim over that of its edge, squared: the lens blurs the edge only, the processing both; and the
+#: most by which it is made up for.
+_NOISE_BLUR, _MOST_BLURRED = 0.25, 1.0
+
+
+@kernel(fastmath=True)
+def rim_power(n: int, theta: Array, x0: float, y0: float, variance: float, work: FitBuffers) -> tuple[float, float]:
+    """Measure by how much the rim deviates from the ellipse in its harmonics 3, 5 and 7.
+
+    The centre moves with the first harmonic of what noise does along the rim. The odd ones after the ellipse's own (0, 1
+    and 2) show how much of that there is where noise is correlated between neighbours, by a demosaic, a filter, a
+    compression, or depends on how the rim lies on their grid. The even ones do not count: the pixel grid has them, in all
+    discs alike, and moves no centre with them. What exceeds white noise, of ``variance`` as the residuals have it, is
+    raised where it is shorter than the noise's blur.
+
+    Returns:
+        Their power, px^3: the variance of the rim's displacement, px^2, times the length of rim that moves as one, but for
+        a factor; and how many times smaller it is than the variance of the residuals where they are white, 1/px^3.
+    """
+    px, py, J, left = work.px, work.py, work.J, work.left
+    cx, cy, r00 = F(theta[0] - x0), F(theta[1] - y0), F(np.sqrt(theta[2]))
+    r01 = F(theta[3]) / r00
+    r11 = F(np.sqrt(theta[4] - r01 * r01))
+    c3, s3, c5, s5, c7, s7, white = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+    for i in range(n):
+        x = r00 * (px[i] - cx) + r01 * (py[i] - cy)
+        y = r11 * (py[i] - cy)
+        scale = _ONE / np.sqrt(x * x + y * y + F(1e-12))
+        x *= scale
+        y *= scale
+        square = J[0, i] * J[0, i] + J[1, i] * J[1, i]
+        a = np.sqrt(square) * left[i]
+        white += square
+        x2, y2 = x * x - y * y, F(2.0) * x * y
+        x3, y3 = x2 * x - y2 * y, x2 * y + y2 * x
+        x5, y5 = x3 * x2 - y3 * y2, x3 * y2 + y3 * x2
+        c3 += a * x3
+        s3 += a * y3
+        c5 += a * x5
+        s5 += a * y5
+        c7 += a * (x5 * x2 - y5 * y2)
+        s7 += a * (x5 * y2 + y5 * x2)
+    radius = (theta[2] * theta[4] - theta[3] * theta[3]) ** -0.25
+    blurred, total = _NOISE_BLUR * (theta[5] / radius) ** 2, 0.0
+    for h, square in ((3, c3 * c3 + s3 * s3), (5, c5 * c5 + s5 * s5), (7, c7 * c7 + s7 * s7)):
+        total += square + (np.exp(min(blurred * h * h, _MOST_BLURRED)) - 1.0) * (square - variance * white)
+    white = max(white, F(1e-12))
+    return float(total / (white * white)) * radius / HARMONICS, float(white) / radius
 
 
 @kernel
@@ -742,7 +770,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if excess > _MOST_RESIDUAL:
         return 10
     rim(n, theta, x0, y0, work, sectors)
-    off, chance, count = rim_noise(variance, work)
+    off, chance, count = off_ellipse(variance, work)
     allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor) + _RIM_TEXTURE * theta[5] * excess
     if off > count * allowed * allowed + RIM_CHANCE * np.sqrt(chance):
         return 5
@@ -751,11 +779,16 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if sectors[0, 2] > 10.0 and np.sqrt(max(v_in - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
         return 8
     slope_inside(n, theta, x0, y0, variance, work)
-    work.shown[12] = slope_outside(theta, work) / variance if texture <= 0.0 else -1.0
+    power, information = rim_power(n, theta, x0, y0, variance, work)
+    work.shown[0], work.shown[1], work.shown[2] = power, off / max(count, 1), information / variance
+    work.shown[12] = slope_outside(theta, work) / variance
     work.shown[PARAMETERS:] = theta
     of_centre(work, cov)
+    radius = det**-0.25
+    work.shown[13] = max(0.25 * (cov[0, 0] + cov[1, 1]) * information * radius, 1.0)
     if texture > 0.0:
-        variance *= texture_factor(n, theta[5], texture, work)
+        work.shown[12] = -texture_factor(n, theta[5], texture, work)
+        variance *= -work.shown[12]
         if variance * (cov[0, 0] + cov[1, 1]) > 2.0 * _MOST_SIGMA_PX * _MOST_SIGMA_PX:
             return 10
     for a in range(2):

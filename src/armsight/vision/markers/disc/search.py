@@ -429,7 +429,7 @@ def find(
             shape_of(starts[good], shape[good])
             work.discs[good, :] = work.shown
             good += 1
-    shared = np.empty(4)
+    shared = np.empty(3)
     common(image, good, work, shared)
     for i in range(good):
         correct(image, noise, work.discs[i], shared, cov[i], work)
