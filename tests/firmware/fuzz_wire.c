@@ -29,8 +29,8 @@ static mavlink_status_t framing;
 static uint32_t session; /* of the last WELCOME */
 
 #define SAID_BYTES 1024u
-#define WELCOME_BYTES 78u /* header and payload, with the session at its end */
-#define SESSION_AT 74u
+#define SESSION_AT 74u /* in a WELCOME, with its header */
+#define SESSION_END 78u
 
 static uint8_t said[SAID_BYTES]; /* what went out since the last greeting */
 static uint32_t said_count;
@@ -42,12 +42,12 @@ static void hear(const uint8_t *bytes, uint32_t length)
     const uint32_t taken = length < room ? length : room;
     memcpy(&said[said_count], bytes, taken);
     said_count += taken;
-    for (uint32_t i = 0u; i + WELCOME_BYTES <= said_count; i++) {
+    for (uint32_t i = 0u; i + SESSION_END <= said_count; i++) {
         const uint32_t kind = said[i + 7u] | (uint32_t)said[i + 8u] << 8 | (uint32_t)said[i + 9u] << 16;
         const uint32_t whole = said[i + 1u] + 10u; /* zeros at its end are left out */
-        if (said[i] == MAVLINK_STX && kind == MAVLINK_MSG_ID_WELCOME && whole <= WELCOME_BYTES && whole > SESSION_AT) {
+        if (said[i] == MAVLINK_STX && kind == MAVLINK_MSG_ID_WELCOME && whole > SESSION_AT) {
             session = 0u;
-            memcpy(&session, &said[i + SESSION_AT], whole - SESSION_AT);
+            memcpy(&session, &said[i + SESSION_AT], (whole < SESSION_END ? whole : SESSION_END) - SESSION_AT);
         }
     }
 }

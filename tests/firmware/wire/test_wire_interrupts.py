@@ -63,10 +63,13 @@ class Interrupted:
         library = ctypes.CDLL(str(firmware.host_library()))
         config = lab_config(library)
         self.whole(self.host.hello())
+        for _ in range(3):  # the answer takes more than a tick
+            self.whole()
         for message in [*self.host.parts(config), self.host.store(config)]:
             self.whole(message)
         self.whole()
         self.whole(restart=c.RESTART_POWER)
+        self.sent.clear()  # a message that the restart cut
         self.whole(self.host.hello())
         for _ in range(30):
             self.whole()
