@@ -1,4 +1,4 @@
-"""The control loop with a rig that is followed, and with a sync LED: projected points, an arm that obeys."""
+"""The control loop with a rig that is followed, and with a sync LED: an arm that goes where it is sent."""
 
 import json
 import sys
