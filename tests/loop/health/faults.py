@@ -48,8 +48,8 @@ def ripple(amplitude_px, waves, phase):
     """A lens that displaces by so much, with so many waves over width and height."""
 
     def displaced(side, uv):
-        turn = 2 * np.pi * (uv / TRUE.cameras[side].image_size_px) @ waves + phase + side
-        return uv + amplitude_px * np.stack([np.sin(turn), np.cos(turn)], axis=-1)
+        angle = 2 * np.pi * (uv / TRUE.cameras[side].image_size_px) @ waves + phase + side
+        return uv + amplitude_px * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
 
     return displaced
 

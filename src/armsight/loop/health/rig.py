@@ -1,4 +1,4 @@
-"""Cameras that moved against each other or expose late, a body of another size: found in the residuals of measured poses.
+"""Cameras that moved, expose late or have another lens than their model, a body of another size: found in residuals.
 
 In: measured poses with the detections they came from. Out: an estimate of seven numbers that a calibration fixes: the five
 degrees of freedom of the right camera's pose in the left one that do not change the scale (rotation, and translation across
@@ -15,8 +15,8 @@ baseline have the same effect: which of them is wrong cannot be distinguished. T
 camera by the body's motion between the shots; each shot has a skew of its own besides, of a known standard deviation.
 
 What the camera model lacks (a lens whose distortion it cannot express, a sensor that is tilted) displaces whatever appears
-at the same place in an image by the same: r = ... + L beta, with L polynomials of the place, of which each camera has its
-own. It is reported where beta explains more than any change of the seven numbers at any time does.
+at the same position in an image by the same: r = ... + L beta, with L polynomials of the position, of which each camera has
+its own. It is reported where beta explains more than any change of the seven numbers at any time does.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ _ALARM, _ALARMS = (
 _POSES = 60
 #: Chi-square from which on a change that matters widens the poses: chance exceeds it in one of fifty tests.
 _SUSPECTED = float(chdtri(len(_WIDE), 0.02))
-#: Powers (x, y) of the polynomials of the place in an image: all products up to this degree.
+#: Powers (x, y) of the polynomials of the position in an image: all products up to this degree.
 _DEGREE = 4
 _POWERS = np.array([(i, k) for i in range(_DEGREE + 1) for k in range(_DEGREE + 1 - i)])
 #: Numbers of what the camera models lack: of two cameras, along u and v; and how wide their prior is, px.
@@ -453,18 +453,24 @@ class RigWatch:
         return sums.begin_s, change
 
     def _split(self, tests: Sequence[ResidualSums]) -> tuple[ResidualSums, RigChange, float]:
-        """Return the sums of the tests after the beginning of a change, the change that they show, and what is left."""
+        """Return the sums of the tests after the beginning of a change, the change that they show, and what is left.
+
+        The test before its beginning may be of both times: it is left out, and counts as noise.
+        """
         after, found, least = ResidualSums(self._size, 0.0), None, np.inf
         before = ResidualSums(self._size, 0.0)
         for sums in tests:
             before.add(sums, 1.0)
-        for sums in reversed(tests):
-            after.add(sums, 1.0)
-            before.add(sums, -1.0)
+        for k in reversed(range(len(tests))):
+            after.add(tests[k], 1.0)
+            before.add(tests[k], -1.0)
+            mixed = tests[k - 1] if k else ResidualSums(self._size, tests[0].begin_s)
+            before.add(mixed, -1.0)
             change, none = self._estimated(after), self._estimated(before)
-            if change.left + none.left + none.gained < least:
-                least = change.left + none.left + none.gained
-                found = ResidualSums(self._size, sums.begin_s), change
+            before.add(mixed, 1.0)
+            left = change.left + none.left + none.gained + mixed.freedom
+            if left < least:
+                least, found = left, (ResidualSums(self._size, mixed.begin_s), change)
                 found[0].add(after, 1.0)
         assert found is not None
         return *found, float(least)
@@ -504,7 +510,7 @@ class RigWatch:
 
     def moved_since_s(self) -> float | None:
         """Return since when the cameras alone are found to have moved, s; None where nothing or more was found."""
-        if not (self.alarm and self._timed and self.suspected is not None):
+        if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None:
             return None
         since_s, change = self._since()
         return since_s if self._to_blame(change) == ["rig"] else None
@@ -523,7 +529,7 @@ class RigWatch:
 
 
 def _polynomials(rig: StereoRig, sides: Ids, uv: Array) -> Array:
-    """Return (N, 2, M) what each coefficient displaces a detection of a camera by: Chebyshev polynomials of its place."""
+    """Return (N, 2, M) what each coefficient displaces a detection of a camera by: Chebyshev polynomials of its uv."""
     half = np.array([camera.image_size_px for camera in rig.cameras])[sides] / 2.0
     x = np.clip((uv + 0.5) / half - 1.0, -1.0, 1.0)
     T = [np.ones_like(x), x]
@@ -621,7 +627,7 @@ def _lens_finding(lens: LensError) -> HealthFinding:
     besides = "; a change of the cameras, the body or their times cannot be excluded" if lens.needed else ""
     return HealthFinding(
         "lens",
-        f"residuals of {size:.3f} px RMS depend on the place in the images alone, which the model of the cameras cannot "
+        f"residuals of {size:.3f} px RMS depend on the position in the images alone, which the model of the cameras cannot "
         f"express{besides}",
         None,
         size,
