@@ -78,6 +78,16 @@ def body_cases() -> Iterator[Case]:
         yield Case(f"right camera {share:g} ms late", {"skew_s": 1e-3 * share}, "time", share)
 
 
+def lens_cases() -> Iterator[Case]:
+    """Lenses and sensors that the model of the cameras cannot express, on two patches."""
+    for px in (0.15, 0.3, 0.6):
+        for waves, phase in (((1.2, 0.9), 0.4), ((2.1, -1.3), 2.0)):
+            lens = faults.ripple(px, np.array(waves), phase)
+            yield Case(f"lens rippled by {px:g} px, {waves[0]:g} waves across", {"lens": lens}, "lens")
+    for deg in (2.0, 4.0):
+        yield Case(f"sensors tilted by {deg:g} deg", {"lens": faults.tilt(deg)}, "lens")
+
+
 def arm_cases() -> Iterator[Case]:
     """Cases of an arm: as in the table, half and twice."""
     yield Case("nothing wrong (arm)")
@@ -143,7 +153,7 @@ def body_run(case: Case, seed: int) -> dict:
     named_s, squares, mm = np.nan, [], []
     begin_s = case.options.get("at_s", 0.0)
     for monitor, t_s, T, _, given in faults.watched_body(seed, seconds=BODY_S, **case.options):
-        if np.isnan(named_s) and monitor._rig.alarm:
+        if np.isnan(named_s) and (monitor._rig.alarm or monitor._rig.lens is not None):
             named_s = t_s
         if t_s > (begin_s if np.isnan(named_s) else named_s) + SETTLED_S:
             off = log_se3(inverse(given.T_left_body) @ T)
@@ -201,7 +211,12 @@ def main(words: list[str], seeds: range, results: Path | None) -> None:
     """Make the runs that are not in the results yet, and print a line of each case."""
     done = [json.loads(line) for line in results.read_text().splitlines()] if results and results.exists() else []
     print(_ROW.format("", "found", "right", "named", "median, s", "worst, s", "sigmas", "worst", "NEES", "worst"))
-    for make, cases in ((body_run, body_cases()), (arm_run, arm_cases()), (arm_run, bump_cases())):
+    for make, cases in (
+        (body_run, body_cases()),
+        (body_run, lens_cases()),
+        (arm_run, arm_cases()),
+        (arm_run, bump_cases()),
+    ):
         for case in cases:
             if words and not any(word in case.name for word in words):
                 continue

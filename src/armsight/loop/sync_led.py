@@ -384,8 +384,9 @@ _SEARCH_SHOTS, _LOOK_SHOTS, _WINDOW_S, _WINDOW_SHOTS = 48, 72, 2.0, 48
 _LOST = 4
 #: Estimates so recent, s, are pooled: clocks drift by a few ppm.
 _POOLED_S = 30.0
-#: Delay and skew have changed beyond so many sigma, and so many seconds.
-_CHANGED, _CHANGED_S = 5.0, 3e-4
+#: Delay and skew have changed beyond so many sigma, and so many seconds; the delay of a sweep differs from the LED's beyond
+#: so many seconds: what the sweep's model of the arm lacks of friction and backlash is up to 1 ms.
+_CHANGED, _CHANGED_S, _APART_S = 5.0, 3e-4, 1.5e-3
 
 
 _SIDES = ("left", "right")
@@ -406,10 +407,14 @@ class SyncLedWatch:
         reason: why there is no estimate of the newest window; None where there is one, or nothing was tried yet.
         tried: how many windows and searches there were.
         row_shares: (2,) the LED's row in both images, -1/2 at the top to 1/2 at the bottom; None before it was found.
+        reading: by how much a reading of a joint is older than its stamp, and its sigma, s.
+        apart: the delay that a sweep of the arm found less that of the LED, its sigma, and when it was found, s; None
+            before.
     """
 
-    def __init__(self, bit_s: float) -> None:
-        self._bit_s = bit_s
+    def __init__(self, bit_s: float, reading: tuple[float, float] = (0.0, 0.0)) -> None:
+        self._bit_s, self.reading = bit_s, reading
+        self.apart: tuple[float, float, float] | None = None
         self.estimates: list[SyncEstimate] = []
         self.reason: str | None = None
         self.tried = self._lost = 0
@@ -597,7 +602,11 @@ def _lamp(seen: Brightness) -> str:
 
 
 def with_led(
-    delay: Delay, shutters: Shutters | None, found: SyncEstimate, row_shares: Array
+    delay: Delay,
+    shutters: Shutters | None,
+    found: SyncEstimate,
+    row_shares: Array,
+    reading: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Delay, Shutters | None]:
     """Combine what a sweep of the arm found with what the LED says.
 
@@ -606,29 +615,47 @@ def with_led(
         shutters: by the sweep, or of the rig; None where the cameras seemed to expose at one time.
         found: by the LED, in its rows.
         row_shares: (2,) these rows, -1/2 at the top to 1/2 at the bottom.
+        reading: by how much a reading of a joint is older than its stamp, and its sigma, s.
 
     Returns:
-        The delay of the middle row of the left camera, and the shutters: None where the LED sees no skew either.
+        The delay of the middle row of the left camera against the readings of the joints, and the shutters: None where the
+        LED sees no skew either.
     """
     left, right = row_shares
+    late_s, sigma_late_s = found.delay_s - reading[0], math.hypot(found.sigma_delay_s, reading[1])
     if shutters is None:
         cov = np.diag([found.sigma_skew_s**2, 0.0])
         apart = max(_CHANGED * found.sigma_skew_s, _SIMULTANEOUS_S)
         both = None if abs(found.skew_s) < apart else Shutters(found.skew_s, 0.0, cov, found.jitter_s)
-        return Delay(found.delay_s, found.sigma_delay_s, delay.jitter_s), both
+        return Delay(late_s, sigma_late_s, delay.jitter_s), both
     x, P, H = np.array([shutters.skew_s, shutters.readout_s]), shutters.cov, np.array([1.0, right - left])
     gain = P @ H / float(H @ P @ H + found.sigma_skew_s**2)
     x, P = x + gain * (found.skew_s - float(H @ x)), P - np.outer(gain, H @ P)
     both = Shutters(float(x[0]), max(float(x[1]), 0.0), (P + P.T) / 2, found.jitter_s)
-    sigma_s = math.hypot(found.sigma_delay_s, float(left) * math.sqrt(float(P[1, 1])))
-    return Delay(found.delay_s + float(left) * both.readout_s, sigma_s, delay.jitter_s), both
+    sigma_s = math.hypot(sigma_late_s, float(left) * math.sqrt(float(P[1, 1])))
+    return Delay(late_s + float(left) * both.readout_s, sigma_s, delay.jitter_s), both
 
 
 def led_findings(watch: SyncLedWatch) -> tuple[HealthFinding, ...]:
-    """Return by how much delay or skew have changed since the LED was found; nothing while they stay."""
+    """Return by how much delay or skew have changed since the LED was found, or differ from the sweep's; else nothing."""
+    found = list[HealthFinding]()
+    if watch.apart is not None and abs(watch.apart[0]) > max(_CHANGED * watch.apart[1], _APART_S):
+        apart_s, sigma_s, t_s = watch.apart
+        found.append(
+            HealthFinding(
+                "time",
+                f"a sweep of the arm finds the images {abs(1e3 * apart_s):.2f} ms {'later' if apart_s > 0 else 'earlier'} "
+                "against the readings of the joints than the sync LED does against the board's clock, which was used",
+                t_s,
+                1e3 * apart_s,
+                1e3 * sigma_s,
+                "ms",
+                "look for joints that lag or slip (armsight identify), and for a filter of the readings before the board",
+            )
+        )
     if len(watch.estimates) < 2:
-        return ()
-    first, found = watch.estimates[0], list[HealthFinding]()
+        return tuple(found)
+    first = watch.estimates[0]
     for what, value, sigma in (
         ("the images come", "delay_s", "sigma_delay_s"),
         ("the right camera exposes", "skew_s", "sigma_skew_s"),

@@ -47,8 +47,10 @@ def test_the_rotation_since_the_finding_is_put_right(armsight, run_folder, tmp_p
     done = armsight("rig", "update", run_folder, "-o", tmp_path / "rig2.json", "--report", tmp_path / "page", "--json")
     found = json.loads(done.out)
     assert (found["since_s"], found["shots"]) == (5.0, 30)
-    assert found["rotation_changed_deg"] == pytest.approx(0.1, abs=0.01)
-    assert found["epipolar_rms_after_px"] <= found["epipolar_rms_before_px"]
+    assert found["rotation_changed_deg"] == pytest.approx(0.1, abs=0.006)
+    # The error of the calibration stays: what changed is estimated, with the shots from before.
+    assert found["epipolar_rms_after_px"] <= 1.2 * found["epipolar_rms_before_px"]
+    assert found["rotation_sigma_deg"] < 0.003
     assert list(found["depth_error_of_old_rig_m"]) == ["0.5", "1", "2"]
     assert StereoRig.load(tmp_path / "rig2.json").cov.any()
     assert "Old and new rig" in (tmp_path / "page" / "report.html").read_text()

@@ -9,12 +9,13 @@ import numpy as np
 from arm_rig import ARM, MIDDLE, Workcell, distance_mm, legs, mounts, run, small, worn
 
 from armsight.data import Body, Correspondences, JointCommand, Points, PoseEstimate
-from armsight.geometry.pose import adjoint, exp_se3, pose
+from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.estimators import Delay, KalmanEstimator, Mounting
 from armsight.loop.health import HealthMonitor
 from armsight.loop.health.change import widened
 from armsight.loop.health.follow import RigFollower
+from armsight.loop.health.rig import RigWatch
 from armsight.loop.servo import LoopTiming, PoseServo
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.example_rig import example_rig
@@ -43,11 +44,61 @@ def measured(rig, body, T_start, uv):
     return PoseEstimate(fit.T_left_body, noise + gain @ rig.cov @ gain.T, noise, 0.0, 0.0, 1.0, points)
 
 
-def watched_body(seed, *, rotated=None, scale=1.0, skew_s=0.0, at_s=0.0, seconds=12.0):
+def ripple(amplitude_px, waves, phase):
+    """A lens that displaces by so much, with so many waves over width and height."""
+
+    def displaced(side, uv):
+        angle = 2 * np.pi * (uv / TRUE.cameras[side].image_size_px) @ waves + phase + side
+        return uv + amplitude_px * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+
+    return displaced
+
+
+def tilt(deg):
+    """Sensors that are tilted, each about another axis."""
+
+    def displaced(side, uv):
+        f, centre = TRUE.cameras[side].intrinsics[0], TRUE.cameras[side].intrinsics[2:]
+        return centre + (uv - centre) / (1 - np.radians(deg) * (uv - centre)[..., side, None] / f)
+
+    return displaced
+
+
+def calibrated_with(lens, rng):
+    """The rig that a calibration finds with such lenses, and the true frame of the left camera in its own.
+
+    Its model cannot express them: what is left is its noise.
+    """
+    free = replace(TRUE, cov=np.diag((300 * SIGMAS) ** 2), sigma_px=0.1)
+    for _ in range(3):
+        watch, seen = RigWatch(free, BODY, 0.0), []
+        for _ in range(40):
+            T = pose(exp_so3(rng.uniform(-0.6, 0.6, 3)), np.array([0.1, 0, 0.9]) + rng.uniform(-0.25, 0.25, 3))
+            uv = both_pixels(TRUE, BODY.points @ T[:3, :3].T + T[:3, 3])
+            seen.append((T, measured(free, BODY, T, np.stack([lens(side, uv[:, side]) for side in range(2)], axis=1))))
+        sums, _ = watch.information([each for _, each in seen])
+        count, L = free.parameter_count, watch.prior[: free.parameter_count, : free.parameter_count]
+        H, b = L.T @ sums.H[:count, :count] @ L + np.eye(count), L.T @ sums.b[:count]
+        free = free.perturbed(L @ np.linalg.solve(H, b))
+    left = (sums.square - b @ np.linalg.solve(H, b)) / sums.freedom
+    sigma_px = float(np.hypot(0.1, SIGMA_PX) * np.sqrt(left))
+    wider = np.hypot(1.0, sigma_px / SIGMA_PX)
+    # Rotated cameras are shifted images: the frame of the left one is the calibration's own.
+    moved = [measured(free, BODY, T, each.points.seen.uv).T_left_body @ np.linalg.inv(T) for T, each in seen]
+    middle = pose(np.eye(3), [0.1, 0, 0.9])
+    mean = middle @ exp_se3(np.mean([log_se3(inverse(middle) @ D @ middle) for D in moved], axis=0)) @ inverse(middle)
+    given = free.perturbed(wider * SIGMAS * rng.normal(size=count))
+    return replace(given, cov=np.diag((wider * SIGMAS) ** 2), sigma_px=sigma_px), mean
+
+
+def watched_body(seed, *, rotated=None, scale=1.0, skew_s=0.0, at_s=0.0, seconds=12.0, lens=None):
     """Watch a body that moves and rests; yield the monitor, the time, the true pose, and what it returned for each shot."""
     rng = np.random.default_rng(seed)
-    cov = np.diag(SIGMAS**2)
-    given = replace(TRUE.perturbed(SIGMAS * rng.normal(size=len(SIGMAS))), cov=cov, sigma_px=0.0)
+    if lens is None:
+        given, frame = TRUE.perturbed(SIGMAS * rng.normal(size=len(SIGMAS))), np.eye(4)
+        given = replace(given, cov=np.diag(SIGMAS**2), sigma_px=0.0)
+    else:
+        given, frame = calibrated_with(lens, rng)
     moved = (
         TRUE
         if rotated is None
@@ -68,8 +119,10 @@ def watched_body(seed, *, rotated=None, scale=1.0, skew_s=0.0, at_s=0.0, seconds
         true = moved if t >= at_s else TRUE
         uv, uv_late = (both_pixels(true, points @ each[:3, :3].T + each[:3, 3]) for each in (T, late))
         uv[:, 1] = uv_late[:, 1]
-        estimate = measured(given, body, T, uv + SIGMA_PX * rng.normal(size=uv.shape))
-        yield monitor, t, T, estimate, monitor.measured(estimate, t)
+        if lens is not None:
+            uv = np.stack([lens(side, uv[:, side]) for side in range(2)], axis=1)
+        estimate = measured(given, body, frame @ T, uv + SIGMA_PX * rng.normal(size=uv.shape))
+        yield monitor, t, frame @ T, estimate, monitor.measured(estimate, t)
 
 
 def ended(seed, **fault):

@@ -36,3 +36,17 @@ def test_the_delay_that_was_measured_stays_where_the_clock_is_right():
     assert right.monitor.findings() == ()
     assert right.estimator.clock.since_s is None
     assert right.estimator.clock_offset_s(9.0) == 0.0
+
+
+def test_an_earlier_state_is_gone_back_to_with_the_clock_of_that_time(drifting):
+    """The last test of this run: it takes the clock back."""
+    estimator = drifting.estimator
+    known, offset_s = estimator.remembered(), estimator.clock_offset_s(17.0)
+    estimator.clock._b += 1.0
+    estimator.clock._corrected += 1.0
+    estimator.restore(known)
+    assert estimator.clock_offset_s(17.0) == offset_s
+    np.testing.assert_array_equal(estimator.clock.remembered()[:14], known.clock[:14])
+    estimator.restore(estimator.nothing_known())
+    assert estimator.clock_offset_s(17.0) == offset_s
+    assert np.count_nonzero(estimator.clock._V) == 1

@@ -1,13 +1,16 @@
 """A rig that is put right while it is used."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import faults
 import numpy as np
 import pytest
 
+from armsight.data import Missed
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.estimators import Mounting
+from armsight.loop.health import HealthFinding, HealthMonitor, follow
 from armsight.loop.health.change import Change, suspects
 from armsight.loop.health.follow import RigCorrection, RigFollower, remeasured
 from armsight.loop.health.landmarks import LandmarkWatch
@@ -28,37 +31,58 @@ def follower():
     return RigFollower(faults.TRUE, faults.BODY)
 
 
-def test_cameras_that_rotate_in_mid_run_are_put_right():
-    rotated = np.array([0.0, np.radians(0.05), 0.0])
-    poses, found, squares, rig = [], None, [], follower()
-    for monitor, t_s, T, estimate, _ in faults.watched_body(7001, rotated=rotated, at_s=2.0, seconds=6.5):
-        poses.append((t_s, estimate))
-        if found is None:
-            rig = RigFollower(monitor._rig._rig, faults.BODY) if len(poses) == 1 else rig
-            watch = monitor.cameras_moved() if len(poses) % 30 == 0 else None
-            since_s = None if watch is None else watch.moved_since_s()
-            found = None if since_s is None else rig.cameras(since_s, poses, t_s)
-            if found is not None:
-                monitor.put_right(found)
-        elif len(poses) % 8 == 0:
-            again = faults.measured(found.update.rig, faults.BODY, T, estimate.points.seen.uv)
-            off = log_se3(inverse(again.T_left_body) @ T)
-            squares.append(off @ np.linalg.solve(again.cov, off))
-    assert found.at_s < 6.0
-    assert found.since_s == pytest.approx(2.0, abs=1.1)
-    true = faults.TRUE.T_left_right @ exp_se3(np.append(np.zeros(3), rotated))
-    off = log_se3(inverse(found.update.rig.T_left_right) @ true)[3:]
-    assert np.degrees(np.linalg.norm(off)) < 0.02
-    assert np.mean(squares) < 22.5  # the calibration's error is drawn once: six degrees of freedom, one of a thousand
-    (finding,) = monitor.findings()
-    assert (finding.cause, finding.corrected_s) == ("rig", found.at_s)
-
-
 def test_few_shots_are_rejected_with_the_reason():
     *_, (_, t_s, _, estimate, _) = faults.watched_body(7002, seconds=0.2)
     one = follower()
     assert one.cameras(0.0, [(t_s + 2.0, estimate)] * 20, 5.0) is None
     assert "1 shots since they moved differ" in one.rejected
+
+
+def test_after_a_rejection_new_shots_are_waited_for_however_many_there_were(monkeypatch):
+    *_, (_, _, _, estimate, _) = faults.watched_body(7005, seconds=0.1)
+    tried = []
+    monkeypatch.setattr(follow, "updated_rig", lambda *given: tried.append(1) or Missed("as ever"))
+    one = follower()
+    shots = [
+        (0.1 * k, replace(estimate, T_left_body=estimate.T_left_body @ exp_se3(0.05 * (k % 2) * np.ones(6))))
+        for k in range(200)
+    ]
+    for newest in range(50, 200):  # the window has 40 shots always
+        one.cameras(0.0, shots[newest - 40 : newest], 20.0)
+    assert len(tried) == 15
+    assert one.rejected == "cameras: as ever"
+
+
+def test_fixed_bodies_that_say_too_little_put_nothing_right():
+    one, p_left = follower(), np.array([0.0, 0.0, 0.9])
+    motion = np.array([0.002, 0, 0, 0, 0, 0])
+    sigmas = np.repeat([5e-5, 1e-4], 3)
+    assert one.base_by_bodies(2.0, (motion, np.diag(sigmas**2)), 5.0, p_left).by == "fixed bodies"
+    assert one.base_by_bodies(2.0, (motion, np.diag((3 * sigmas) ** 2)), 5.0, p_left) is None
+    assert "uncertain by 0.31 mm" in one.rejected
+
+
+def test_findings_of_another_cause_stay_after_a_correction():
+    """What began before, a body that others prove to move, and joints; cameras that rotated explain the rest."""
+    at = {"size": 1.0, "sigma": 0.1, "unit": "mm", "advice": "look"}
+    joint, slip = (HealthFinding("joint", f"joint {k} slipped by 1 deg", t_s, **at) for k, t_s in ((2, 3.0), (3, 8.5)))
+    body, post, rig = (
+        HealthFinding(cause, what, 8.5, **at)
+        for cause, what in (("body", "it slipped by 1 mm"), ("fixed", "a post"), ("fixed", "the rig moved by 2 mm"))
+    )
+    monitor = HealthMonitor(faults.TRUE, faults.BODY, 0.0)
+    monitor.watch_fixed(["post"])
+    for what, found, stays in (
+        ("base", (joint, post, rig), [(joint.cause, None), ("fixed", None), ("fixed", 9.0)]),
+        ("cameras", (joint, slip, body), [("joint", None), ("joint", None)]),
+    ):
+        monitor._kept, monitor._landmarks.not_fixed = (), (post,)
+        monitor._moved = lambda found=found: found
+        update = None if what == "base" else SimpleNamespace(rig=faults.TRUE)
+        monitor.put_right(RigCorrection(what, 8.0, 9.0, "body", update, np.zeros(6), np.zeros((6, 6))))
+        del monitor._moved
+        assert {(each.cause, each.corrected_s) for each in monitor.findings()} == set(stays)
+        assert len(monitor.findings()) == len(stays)
 
 
 def test_a_motion_of_the_rig_is_undone_by_its_mounting():

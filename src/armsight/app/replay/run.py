@@ -21,7 +21,16 @@ from armsight.app.stream.datum import quaternion
 from armsight.app.stream.sink import Publisher
 from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
-from armsight.loop.estimators import ESTIMATORS, ArmEstimate, Delay, Estimator, KalmanEstimator, Mounting, Prior
+from armsight.loop.estimators import (
+    ESTIMATORS,
+    ArmEstimate,
+    Delay,
+    Estimator,
+    KalmanEstimator,
+    Mounting,
+    Prior,
+    Remembered,
+)
 from armsight.robot.arm import Arm
 from armsight.vision.detections import SeenShot
 from armsight.vision.follow.follower import Follower, follows
@@ -166,7 +175,17 @@ class _RunAgain:
                     "arm and estimator only; leave out --arm and --estimator"
                 )
             if isinstance(self._estimator, KalmanEstimator):
-                self._estimator.restore((np.array(content["state"]), np.array(content["covariance"])))
+                state, P, clock = (content.get(key) for key in ("state", "covariance", "clock"))
+                known = None if clock is None else np.array(clock, float)
+                self._estimator.restore(Remembered(np.array(state), np.array(P), known))
+            return
+        if content["event"] == "remeasured":  # with cameras that were put right
+            again = {row["t_s"]: row for row in content["shots"]}
+            self._seen = [
+                (t_s, _with_pose(pose, again[t_s]) if t_s in again else pose)
+                for t_s, pose in self._seen
+                if t_s not in again or again[t_s]["T_left_body"] is not None
+            ]
             return
         options: dict[str, Any] = {"prior": Prior(**content["prior"]), "delay": Delay(**content["delay"])}
         if self._name == "kalman":
@@ -199,6 +218,12 @@ class _RunAgain:
             suspected = np.array(content["covariance_suspected"], float)
             measurement = replace(measurement, cov_common=measurement.cov_common + suspected)
         return self._estimator.vision(measurement).value
+
+
+def _with_pose(pose: PoseEstimate, row: dict[str, Any]) -> PoseEstimate:
+    """Return a pose as it was measured again."""
+    T, cov, noise = (np.array(row[f"{key}_body"]) for key in ("T_left", "covariance", "covariance_precision"))
+    return replace(pose, T_left_body=T, cov=cov, cov_noise=noise)
 
 
 def _differences(before: list[RecordedDatum], rows: list[LiveRow]) -> dict[str, float]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,8 @@ import numpy as np
 from armsight.app.report.page import PAGE, html_page, put_files, table, text, writable_folder
 from armsight.data import Missed
 from armsight.errors import InputError
-from armsight.loop.health.update import DEPTHS_M, RigUpdate, updated_rig
+from armsight.loop.health.rig import TEST_S
+from armsight.loop.health.update import DEPTHS_M, LEAST_STAYS, RigUpdate, updated_rig
 from armsight.vision.detections import SeenShot, detection_times, read_detections
 from armsight.vision.markers.targets import open_body
 from armsight.vision.rig import StereoRig
@@ -50,10 +50,14 @@ def update(run: Path, output: Path, since_s: float | None, report: Path | None) 
     folder = None if report is None else writable_folder(report, "no page")
     shots = read_detections(files["detections"], body)
     since_s = _found_since(run) if since_s is None else since_s
-    used = shots if since_s is None else _from(shots, detection_times(files["detections"]), since_s)
+    used, before = shots, list[SeenShot]()
+    if since_s is not None:
+        times = detection_times(files["detections"])
+        used = [shot for shot in shots if times.get(shot.name, -math.inf) >= since_s]
+        before = [shot for shot in shots if times.get(shot.name, math.inf) < since_s - TEST_S]
     if not used:
         raise InputError(f"{files['detections']}: no shot from {since_s:g} s on; it has {len(shots)} shots")
-    found = updated_rig(rig, body, used)
+    found = updated_rig(rig, body, used, before if len(before) >= LEAST_STAYS else ())
     if isinstance(found, Missed):
         raise InputError(f"{run}: the rig is not updated: {found.reason}")
     made = {"command": "rig update", "run": str(run), "since_s": since_s, "shots": found.shots}
@@ -64,11 +68,6 @@ def update(run: Path, output: Path, since_s: float | None, report: Path | None) 
         put_files(folder, {PAGE: page(rig, new, found, run, since_s).encode()})
         answer["report"] = str(folder / PAGE)
     return answer, [*found.lines(), f"written to {output}"]
-
-
-def _from(shots: list[SeenShot], times: Mapping[str, float], since_s: float) -> list[SeenShot]:
-    """Return the shots from a time on."""
-    return [shot for shot in shots if times.get(shot.name, -math.inf) >= since_s]
 
 
 def _found_since(run: Path) -> float | None:

@@ -293,7 +293,10 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
     delay = loop.compute(lambda: estimate_delay(arm, swept, seen, prior=STEADY, sync_s=sync_s))
     blinked = None if loop.led is None else loop.led.pooled()
     if loop.led is not None and blinked is not None and loop.led.row_shares is not None:
-        delay, shutters = with_led(delay, shutters, blinked, loop.led.row_shares)
+        by_sweep = delay
+        delay, shutters = with_led(by_sweep, shutters, blinked, loop.led.row_shares, loop.led.reading)
+        sigma_s = float(np.hypot(by_sweep.sigma_s, delay.sigma_s))
+        loop.led.apart = (by_sweep.delay_s - delay.delay_s, sigma_s, loop.t_s)
     loop.shutters, loop.delay_s = shutters, delay.delay_s
     if shutters is not None:
         loop.follower.expose_apart(float(np.hypot(shutters.skew_s, shutters.jitter_s)))

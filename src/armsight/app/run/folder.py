@@ -42,6 +42,7 @@ from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder, write_text
 from armsight.geometry.pose import inverse, log_se3
 from armsight.geometry.rotation import quaternion_wxyz
+from armsight.loop.estimators import Mounting
 from armsight.loop.health import health_lines, unseen_lines
 from armsight.loop.health.follow import correction_lines
 from armsight.robot.arm import Arm
@@ -59,13 +60,20 @@ def joint_columns(t_s: Array, q: Array, q_ref: Array) -> dict[str, Any]:
     return named
 
 
-def write_handeye(folder: Path, run: HandEyeRun) -> None:
-    """Write the hand-eye calibration, and the poses it was made from as ``armsight identify`` reads them."""
+def write_handeye(folder: Path, run: HandEyeRun, corrected: Sequence[tuple[float, Mounting]] = ()) -> None:
+    """Write the hand-eye calibration, and the poses it was made from as ``armsight identify`` reads them.
+
+    Args:
+        folder: of the run.
+        run: the calibration.
+        corrected: mountings of a rig that was put right, and from when on, s: the last one is written as the current one.
+    """
     found, (position, angle) = run.found, run.found.held_out.rms()
-    calibration = {
-        "T_base_rig": run.mounting.T_base_rig.tolist(),
-        "T_tool_body": run.mounting.T_tool_body.tolist(),
-        "cov": found.cov.tolist(),
+    newest = corrected[-1][1] if corrected else run.mounting
+    calibration: dict[str, Any] = {
+        "T_base_rig": newest.T_base_rig.tolist(),
+        "T_tool_body": newest.T_tool_body.tolist(),
+        "cov": (found.cov + newest.cov - run.mounting.cov).tolist(),
         "held_out_position_rms_m": position,
         "held_out_angle_rms_rad": angle,
         "sigma_flange_m": found.sigma_flange_m,
@@ -73,6 +81,8 @@ def write_handeye(folder: Path, run: HandEyeRun) -> None:
         "poses": len(run.q),
         "missed": list(run.missed),
     }
+    if corrected:
+        calibration |= {"since_s": corrected[-1][0], "T_base_rig_before": run.mounting.T_base_rig.tolist()}
     write_text(folder / "handeye.json", json.dumps(calibration, indent=1) + "\n")
     T = run.Ts_left_body
     covs = [left_axes(one, cov) for one, cov in zip(T, run.covs, strict=True)]
@@ -244,7 +254,7 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
             )
             keep(_write_summary, folder, summary)
             return summary, None
-        keep(write_handeye, folder, outcome.handeye)
+        keep(write_handeye, folder, outcome.handeye, outcome.log.mountings)
         if outcome.shutters is not None:
             keep(replace(finished.rig, shutters=outcome.shutters).save, folder / "rig.json")
         mounting = outcome.handeye.mounting

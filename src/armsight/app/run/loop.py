@@ -30,6 +30,7 @@ from armsight.app.stream.datum import (
     ShotDatum,
     estimator_event,
     mounting_event,
+    remeasured_event,
     restored_event,
 )
 from armsight.app.stream.sink import Fanout, Publisher
@@ -243,7 +244,7 @@ class Loop:
         self.health.watch_fixed([each.body.name for each in setup.fixed])
         self._measure_fixed = [measurer(follower.rig, each) for each in setup.fixed]
         bit_s = setup.sync_led_bit_s
-        self.led = None if bit_s is None else SyncLedWatch(bit_s)
+        self.led = None if bit_s is None else SyncLedWatch(bit_s, setup.board.abilities.reading_age_s)
         self._led_work: Future[None] | None = None
         self._fixed_pool = ThreadPoolExecutor(1)
         self._fixed_work: Future[None] | None = None
@@ -627,12 +628,13 @@ class Loop:
             return False
         rig = found.update.rig
         self._recalibrate(rig)
-        self.log.poses[:] = [
-            (name, t_s, remeasured(rig, body, pose) if isinstance(pose, PoseEstimate) and t_s >= since_s else pose)
-            for name, t_s, pose in self.log.poses
-        ]
-        self.health = HealthMonitor(rig, body, self.setup.sync_s)
-        self.health.watch_fixed([each.body.name for each in self.setup.fixed])
+        again = list[tuple[float, PoseEstimate | Missed]]()
+        for k, (name, t_s, pose) in enumerate(self.log.poses):
+            if isinstance(pose, PoseEstimate) and t_s >= since_s:
+                again.append((t_s, remeasured(rig, body, pose)))
+                self.log.poses[k] = (name, *again[-1])
+        self.publisher.put(EventDatum(self.t_s, remeasured_event(again)))
+        self.health.recalibrated(found)
         self.log.corrections.append(replace(found, at_s=since_s))
         return True
 

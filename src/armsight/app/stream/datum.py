@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 from armsight.app.measure.poses import left_axes, shot_pose
 from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Record, Shot
 from armsight.files import finite_json
-from armsight.loop.estimators import KalmanEstimator, Mounting
+from armsight.loop.estimators import KalmanEstimator, Mounting, Remembered
 from armsight.robot.arm import Arm
 from armsight.vision.rig import StereoRig
 
@@ -212,9 +212,26 @@ def estimator_event(estimator: KalmanEstimator, *, anew: bool) -> dict[str, Any]
     }
 
 
-def restored_event(state: tuple[Array, Array]) -> dict[str, Any]:
-    """Return the content of the event that an estimator went on from an earlier state (K,), with covariance (K, K)."""
-    return {"event": "restored", "state": state[0].tolist(), "covariance": state[1].tolist()}
+def restored_event(state: Remembered) -> dict[str, Any]:
+    """Return the content of the event that an estimator went on from an earlier state."""
+    clock = None if state.clock is None else [None if np.isnan(value) else value for value in state.clock.tolist()]
+    return {"event": "restored", "state": state.x.tolist(), "covariance": state.P.tolist(), "clock": clock}
+
+
+def remeasured_event(poses: Sequence[tuple[float, PoseEstimate | Missed]]) -> dict[str, Any]:
+    """Return the content of the event that shots were measured again with another rig: time, s, and result of each."""
+    rows = [
+        {"t_s": t_s, "T_left_body": None}
+        if isinstance(pose, Missed)
+        else {
+            "t_s": t_s,
+            "T_left_body": pose.T_left_body.tolist(),
+            "covariance_body": pose.cov.tolist(),
+            "covariance_precision_body": pose.cov_noise.tolist(),
+        }
+        for t_s, pose in poses
+    ]
+    return {"event": "remeasured", "shots": rows}
 
 
 Datum = ShotDatum | JointsDatum | NoteDatum | EventDatum

@@ -24,7 +24,7 @@ from armsight.loop.estimators.estimator import (
     PoseMeasurement,
     Track,
 )
-from armsight.loop.estimators.kalman import KalmanEstimator
+from armsight.loop.estimators.kalman import KalmanEstimator, Remembered
 from armsight.loop.estimators.latest import LatestEstimator
 from armsight.loop.estimators.mounting import Mounting
 
@@ -41,6 +41,7 @@ __all__ = [
     "Outcome",
     "PoseMeasurement",
     "Prior",
+    "Remembered",
     "Track",
 ]
 

@@ -67,6 +67,28 @@ class ClockFollower:
         self._certain_s = np.inf  # since when the offset is
         self.since_s: float | None = None
 
+    def remembered(self) -> Array:
+        """Return all that is known now (2 K + 14,), for :meth:`restore`; NaN stands for what is not."""
+        since_s = math.nan if self.since_s is None else self.since_s
+        known = (self._score, self._information, self._excess, self._unrest, self._t_s, since_s)
+        return np.concatenate([known, self._b, self._corrected, self._M.ravel(), self._V.ravel()])
+
+    def restore(self, state: Array | None, forgotten: slice) -> None:
+        """Go on from an earlier state; rows of the filter's state that are unknown then have no bias.
+
+        Without a state the filter knows nothing, and the clock is what is followed now.
+        """
+        if state is None:
+            self._V[:] = 0.0
+            self._V[self._delay, 0] = 1.0
+            return
+        self._score, self._information, self._excess, self._unrest, self._t_s, since_s = state[:6].tolist()
+        self.since_s = None if math.isnan(since_s) else since_s
+        self._b, self._corrected = state[6:8].copy(), state[8:10].copy()
+        self._M, self._V = state[10:14].reshape(2, 2).copy(), state[14:].reshape(-1, 2).copy()
+        self._V[forgotten] = 0.0
+        self._certain_s = np.inf
+
     def offset_s(self, t_s: float) -> float:
         """Return by how much later than its delay says a stamp is about a time, s, as far as that is corrected."""
         if self.since_s is None:

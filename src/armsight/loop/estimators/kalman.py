@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -45,6 +46,18 @@ HISTORY_S = 1.0
 #: Most measurements newer than the readings that are kept waiting.
 MAX_WAITING = 16
 _GATE = float(chdtri(6, CHANCE))
+
+
+class Remembered(NamedTuple):
+    """What an estimator knew.
+
+    ``x`` (K,) and ``P`` (K, K): the arm's error and its covariance; ``clock``: what the clock's follower knew, None where
+    that is not known.
+    """
+
+    x: Array
+    P: Array
+    clock: Array | None
 
 
 class KalmanEstimator:
@@ -107,17 +120,23 @@ class KalmanEstimator:
         self._reference = self._states[-1].x.copy()
         self._reference[self._forgets] = 0.0
 
-    def remembered(self) -> tuple[Array, Array]:
-        """Return the state (K,) and its covariance (K, K) as they are, for :meth:`restore`."""
-        return self._states[-1].x.copy(), self._states[-1].P.copy()
+    def remembered(self) -> Remembered:
+        """Return what is known now, for :meth:`restore`."""
+        newest = self._states[-1]
+        return Remembered(newest.x.copy(), newest.P.copy(), None if self.clock is None else self.clock.remembered())
 
-    def nothing_known(self) -> tuple[Array, Array]:
-        """Return the state (K,) and the covariance (K, K) that :meth:`restore` makes the prior of."""
-        return np.zeros(self._at.size), np.zeros((self._at.size, self._at.size))
+    def nothing_known(self) -> Remembered:
+        """Return that of which :meth:`restore` makes the prior."""
+        return Remembered(np.zeros(self._at.size), np.zeros((self._at.size, self._at.size)), None)
 
-    def restore(self, state: tuple[Array, Array]) -> None:
-        """Go on from an earlier state: what was measured since is dropped, and what motion makes it forget is unknown."""
-        (x, P), rows, newest = (part.copy() for part in state), self._forgets, self._states[-1]
+    def restore(self, state: Remembered) -> None:
+        """Go on from an earlier state: what was measured since is dropped, and what motion makes it forget is unknown.
+
+        Of a clock whose state is not known at that time what is followed now stays.
+        """
+        x, P, rows, newest = state.x.copy(), state.P.copy(), self._forgets, self._states[-1]
+        if self.clock is not None:
+            self.clock.restore(state.clock, rows)
         x[rows] = P[rows] = P[:, rows] = 0.0
         P[np.diag_indices(self._at.size)] += np.where(np.diag(P) > 0.0, 0.0, self._model.sigmas**2)
         self._states, self._outliers, self._newest, self._here = [newest._replace(x=x, P=P)], [], None, None

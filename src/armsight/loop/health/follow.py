@@ -18,8 +18,10 @@ import numpy as np
 
 from armsight.data import Array, Body, Missed, PoseEstimate, Record
 from armsight.geometry.pose import adjoint, exp_se3, inverse
+from armsight.geometry.rotation import skew
 from armsight.loop.estimators import Mounting
 from armsight.loop.health.change import Change
+from armsight.loop.health.record import Cause
 from armsight.loop.health.rig import TEST_S, RigWatch, differ
 from armsight.loop.health.update import LEAST_STAYS, RigUpdate, updated_rig
 from armsight.vision.detections import SeenShot
@@ -33,8 +35,8 @@ if TYPE_CHECKING:
 
 #: What is not known of a change of the cameras may be this share of what is not known of their calibration.
 SHARE = 0.5
-#: Most shots of an update; and how many times as many there must be as in an update that was rejected.
-_MOST_SHOTS, _MORE = 60, 1.25
+#: Most shots of an update; and after one that was rejected so large a share of its shots must be new.
+_MOST_SHOTS, _NEW = 60, 0.25
 #: Largest standard deviation of the tool's position by what is put right of the rig, m; and by how much what else may have
 #: moved may displace the tool further, m.
 MOST_SIGMA_M, MOST_APART_M = 2e-4, 2e-4
@@ -65,6 +67,11 @@ class RigCorrection(Record):
     motion: Array
     cov: Array
     tool_m: tuple[float, float] | None = None
+
+    @property
+    def cause(self) -> Cause:
+        """What a finding calls it."""
+        return "rig" if self.what == "cameras" else "fixed"
 
     def mounting(self, old: Mounting) -> Mounting:
         """Return where the rig is, from where it was thought to be."""
@@ -128,7 +135,7 @@ class RigFollower:
 
     def __init__(self, rig: StereoRig, body: Body) -> None:
         self._rig, self._body = rig, body
-        self._tried = 0  # differing shots of the last update that was rejected
+        self._tried, self._tried_s = 0, -math.inf  # differing shots of the last update that was rejected; the newest, s
         self.rejected: str | None = None
 
     def look(
@@ -145,12 +152,14 @@ class RigFollower:
         if (watch := monitor.cameras_moved()) is not None:
             newest = poses()
             return lambda: self._of_watch(watch, newest, at_s)
-        if (moved := monitor.rig_moved()) is not None:
-            return lambda: self.base_by_bodies(moved[0], moved[1:], at_s)
-        changes = monitor.changes
-        if changes and any(each.suspect.cause == "fixed" for each in changes):
-            return lambda: self.base_by_arm(changes, T_base_rig, at_s)
-        return None
+        changes, moved = monitor.changes, monitor.rig_moved()
+        by_arm = any(each.suspect.cause == "fixed" for each in changes)
+        if moved is not None and (newest := poses()):
+            p_left = newest[-1][1].T_left_body[:3, 3]
+            found = self.base_by_bodies(moved[0], moved[1:], at_s, p_left)
+            if found is not None or not by_arm:
+                return lambda: found
+        return (lambda: self.base_by_arm(changes, T_base_rig, at_s)) if by_arm else None
 
     def _of_watch(
         self, watch: RigWatch, poses: Sequence[tuple[float, PoseEstimate]], at_s: float
@@ -181,7 +190,8 @@ class RigFollower:
         """
         used = _differing([pose for t_s, pose in poses if t_s >= since_s + settle_s])
         before = _differing([pose for t_s, pose in poses if t_s < since_s - settle_s])
-        if len(used) < max(LEAST_STAYS, _MORE * self._tried):
+        new = _differing([pose for t_s, pose in poses if t_s > max(self._tried_s, since_s + settle_s)])
+        if len(used) < LEAST_STAYS or len(new) < _NEW * self._tried:
             self.rejected = (
                 self.rejected or f"cameras: {len(used)} shots since they moved differ, {LEAST_STAYS} are needed"
             )
@@ -189,7 +199,7 @@ class RigFollower:
         if mounted and len(before) < LEAST_STAYS:
             self.rejected = f"cameras: {len(before)} shots from before they moved differ, {LEAST_STAYS} are needed"
             return None
-        self._tried = len(used)
+        self._tried, self._tried_s = len(used), poses[-1][0]
         before = before if len(before) >= LEAST_STAYS else []
         found = updated_rig(self._rig, self._body, _some(used), _some(before))
         if isinstance(found, Missed):
@@ -204,11 +214,28 @@ class RigFollower:
                 "are accepted: move the body through the whole view"
             )
             return None
-        self._rig, self._tried, self.rejected = found.rig, 0, None
+        self._rig, self._tried, self._tried_s, self.rejected = found.rig, 0, -math.inf, None
         return RigCorrection("cameras", since_s, at_s, "body", found, np.zeros(6), np.zeros((6, 6)))
 
-    def base_by_bodies(self, since_s: float, motion: tuple[Array, Array], at_s: float) -> RigCorrection | None:
-        """Return the rig put right by the motion (6,) of the cameras that fixed bodies show, with its covariance."""
+    def base_by_bodies(
+        self, since_s: float, motion: tuple[Array, Array], at_s: float, p_left: Array
+    ) -> RigCorrection | None:
+        """Return the rig put right by what fixed bodies show; None where that does not suffice, as ``rejected`` says.
+
+        Args:
+            since_s: since when the cameras are found to have moved, s.
+            motion: (6,) of the cameras, right tangent in the left one's frame, [m; rad], and its covariance.
+            at_s: the time, s.
+            p_left: (3,) where the body on the tool is, in the left camera's frame, m.
+        """
+        at_body = np.hstack([np.eye(3), -skew(p_left)])
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(at_body @ motion[1] @ at_body.T)[-1]))
+        if sigma_m > MOST_SIGMA_M:
+            self.rejected = (
+                f"base: the fixed bodies leave the body on the tool uncertain by {1e3 * sigma_m:.2f} mm, at most "
+                f"{1e3 * MOST_SIGMA_M:g} mm are accepted: use more or larger ones, on all sides of the tool"
+            )
+            return None
         self.rejected = None
         return RigCorrection("base", since_s, at_s, "fixed bodies", None, *motion)
 

@@ -90,13 +90,14 @@ class LandmarkWatch:
     Attributes:
         cameras_moved: whether the cameras were found to have moved.
         of_cameras: what says so, or that they may have; None where nothing does.
+        not_fixed: bodies that are not fixed, as others prove.
         motion: (6,) motion of the cameras, right tangent in the left one's frame, with covariance (6, 6), once two tests in
             a row agree on it: the mean of a test may hold poses from before.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
         self._landmarks = [_Landmark(name) for name in names]
-        self._not_fixed: tuple[HealthFinding, ...] = ()
+        self.not_fixed: tuple[HealthFinding, ...] = ()
         self._fresh: set[int] = set()  # bodies with a new mean since the last test
         self._waited = 0
         self.cameras_moved = False
@@ -133,13 +134,13 @@ class LandmarkWatch:
             of_cameras, not_fixed = self._decided()
             self.motion = _agreed(last, self._common)
             if of_cameras is not None or not_fixed:
-                self.of_cameras, self._not_fixed = of_cameras, not_fixed
+                self.of_cameras, self.not_fixed = of_cameras, not_fixed
             self._fresh.clear()
             self._waited = 0
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
-        return self._not_fixed if self.of_cameras is None else (self.of_cameras, *self._not_fixed)
+        return self.not_fixed if self.of_cameras is None else (self.of_cameras, *self.not_fixed)
 
     def _decided(self) -> tuple[HealthFinding | None, tuple[HealthFinding, ...]]:
         """Return what the newest means of the bodies in view say of the cameras, and of bodies that are not fixed."""

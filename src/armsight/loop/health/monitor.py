@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from armsight.data import Array, Body, PoseEstimate
-from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement
+from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement, Remembered
 from armsight.loop.estimators.clock import ClockFollower
 from armsight.loop.health.change import Change, doubtful, finding, suspected
 from armsight.loop.health.clock import clock_findings
@@ -55,9 +55,9 @@ class HealthMonitor:
         self._names: tuple[str, ...] = ()
         self._estimator: KalmanEstimator | None = None
         self._arm: Arm | None = None
-        self._known: deque[tuple[float, tuple[Array, Array]]] = deque(maxlen=_KEPT)
-        # What was found and put right.
-        self._corrected: tuple[HealthFinding, ...] = ()
+        self._known: deque[tuple[float, Remembered]] = deque(maxlen=_KEPT)
+        # What was found before a correction: what it put right, and what else.
+        self._kept: tuple[HealthFinding, ...] = ()
         self._past: tuple[Change, ...] = ()
 
     def received(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
@@ -158,23 +158,26 @@ class HealthMonitor:
             return None
         return cameras.since_s, *motion
 
-    def put_right(self, correction: RigCorrection) -> tuple[Array, Array] | None:
+    def recalibrated(self, correction: RigCorrection) -> None:
+        """Begin the tests of cameras and bodies anew, for cameras that were put right before anything relied on them.
+
+        Of what these tests found what began before the cameras moved, or is of another cause, stays found.
+        """
+        self._kept += self._left(correction)
+        self._renew(correction)
+
+    def put_right(self, correction: RigCorrection) -> Remembered | None:
         """Begin anew after a correction; what was found stays found.
 
         Returns:
-            What the estimator knew before the change, with which it goes on: state and covariance; None without one.
+            What the estimator knew before the change, with which it goes on; None without one.
         """
         at_s, since_s = correction.at_s, correction.since_s
-        cause = "rig" if correction.what == "cameras" else "fixed"
-        self._corrected += tuple(
-            replace(each, corrected_s=at_s) for each in self.findings() if cause in (each.cause, *each.alternatives)
-        )
+        self.work()
+        right = [each for each in self._tested(correction) if self._explained(each, correction)]
+        self._kept += (*(replace(each, corrected_s=at_s) for each in right), *self._left(correction))
         self._past += tuple(replace(each, until_s=at_s) for each in self.changes)
-        if correction.update is not None:
-            self._rig = RigWatch(correction.update.rig, self._body, self._sync_s)
-            self._suspected = np.zeros((6, 6))
-        if self._landmarks is not None:
-            self._landmarks = LandmarkWatch(self._fixed_names)
+        self._renew(correction)
         self._doubted_s = -np.inf
         if self._estimator is None or self._arm is None:
             return None
@@ -183,6 +186,41 @@ class HealthMonitor:
         self._estimator.restore(before)
         self._begin(self._estimator, self._arm)
         return before
+
+    def _tested(self, correction: RigCorrection) -> tuple[HealthFinding, ...]:
+        """Return what those tests found that begin anew after a correction."""
+        cameras = () if self._rig is None or correction.update is None else self._rig.findings()
+        return (*cameras, *self._moved())
+
+    def _left(self, correction: RigCorrection) -> tuple[HealthFinding, ...]:
+        """Return what else they found: that goes on though its test does not know of it any more.
+
+        Cameras that moved against each other displace all poses, which arm and bodies then seem to explain: of what began
+        with them, or later, only joints count, which may be meant as well. The tests find again what is still wrong.
+        """
+        left, cause = list[HealthFinding](), correction.cause
+        for each in self._tested(correction):
+            if self._explained(each, correction):
+                continue
+            if each.since_s is not None and each.since_s < correction.since_s - _DATED_S:
+                left.append(each)
+            elif correction.update is None or each.cause == "joint":
+                left.append(replace(each, alternatives=tuple(dict.fromkeys((*each.alternatives, cause)))))
+        return tuple(left)
+
+    def _explained(self, found: HealthFinding, correction: RigCorrection) -> bool:
+        """Return whether a correction puts right what was found: not a body that others prove not to be fixed."""
+        if self._landmarks is not None and found in self._landmarks.not_fixed:
+            return False
+        return correction.cause in (found.cause, *found.alternatives)
+
+    def _renew(self, correction: RigCorrection) -> None:
+        """Begin the tests of cameras and bodies anew."""
+        if correction.update is not None:
+            self._rig = RigWatch(correction.update.rig, self._body, self._sync_s)
+            self._suspected = np.zeros((6, 6))
+        if self._landmarks is not None:
+            self._landmarks = LandmarkWatch(self._fixed_names)
 
     @property
     def trust(self) -> Trust:
@@ -251,10 +289,17 @@ class HealthMonitor:
         """Return what was found so far; nothing while all is well."""
         self.work()
         late = () if self._clock is None else clock_findings(self._clock, self._newest_s)
-        return (
-            *self._corrected,
+        now = (
             *(() if self._rig is None else self._rig.findings()),
             *self._moved(),
             *late,
             *self._host.findings(),
         )
+        again = {_subject(each) for each in now}
+        kept = (each for each in self._kept if each.corrected_s is not None or _subject(each) not in again)
+        return (*kept, *now)
+
+
+def _subject(found: HealthFinding) -> tuple[str, str]:
+    """Return what a finding is about: its cause, and its words before it says by how much."""
+    return found.cause, found.what.partition(" by ")[0]

@@ -10,9 +10,10 @@ from typing import Any, Literal
 from scipy.special import chdtri
 
 #: rig: one camera against the other; body: the body, or what looks the same; fixed: the rig against the arm's base;
-#: time: shots that are not of one time; joint: a potentiometer that slipped, backlash that grew; estimator: measurements
-#: that contradict what it had learned, without another cause; host: images that are delivered twice.
-Cause = Literal["rig", "body", "fixed", "time", "joint", "estimator", "host"]
+#: time: shots that are not of one time; lens: what the model of the cameras cannot express; joint: a potentiometer that
+#: slipped, backlash that grew; estimator: measurements that contradict what it had learned, without another cause; host:
+#: images that are delivered twice.
+Cause = Literal["rig", "body", "fixed", "time", "lens", "joint", "estimator", "host"]
 #: Probability of a false alarm of each test within a minute, while its noise model holds.
 FALSE_ALARMS_PER_MINUTE = 1e-4
 
@@ -30,12 +31,12 @@ class HealthFinding:
     """Something that no longer holds, and because of which results must not be trusted.
 
     Attributes:
-        cause: what is wrong: rig, body, fixed, time, joint, estimator, host.
+        cause: what is wrong: rig, body, fixed, time, lens, joint, estimator, host.
         what: what was found, one sentence.
         since_s: since when, s on the clock of the shots; None where the shots have no times.
         size: by how much, in ``unit``.
         sigma: standard deviation of the size.
-        unit: deg, mm, %, ms, or measurements.
+        unit: deg, mm, px, %, ms, or measurements.
         advice: what to do.
         alternatives: other causes that explain it nearly as well.
         corrected_s: when it was put right, s; None where it was not.

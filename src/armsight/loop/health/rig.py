@@ -1,4 +1,4 @@
-"""Cameras that moved against each other or expose late, a body of another size: found in the residuals of measured poses.
+"""Cameras that moved, expose late or have another lens than their model, a body of another size: found in residuals.
 
 In: measured poses with the detections they came from. Out: an estimate of seven numbers that a calibration fixes: the five
 degrees of freedom of the right camera's pose in the left one that do not change the scale (rotation, and translation across
@@ -13,6 +13,10 @@ is estimated with x and e eliminated (generalised least squares); chi-square of 
 that needs no body is the epipolar distance; the rest says what the body's known shape does. Size of body and length of
 baseline have the same effect: which of them is wrong cannot be distinguished. The skew shows in the detections of the right
 camera by the body's motion between the shots; each shot has a skew of its own besides, of a known standard deviation.
+
+What the camera model lacks (a lens whose distortion it cannot express, a sensor that is tilted) displaces whatever appears
+at the same position in an image by the same: r = ... + L beta, with L polynomials of the position, of which each camera has
+its own. It is reported where beta explains more than any change of the seven numbers at any time does.
 """
 
 from __future__ import annotations
@@ -69,6 +73,16 @@ _ALARM, _ALARMS = (
 _POSES = 60
 #: Chi-square from which on a change that matters widens the poses: chance exceeds it in one of fifty tests.
 _SUSPECTED = float(chdtri(len(_WIDE), 0.02))
+#: Powers (x, y) of the polynomials of the position in an image: all products up to this degree.
+_DEGREE = 4
+_POWERS = np.array([(i, k) for i in range(_DEGREE + 1) for k in range(_DEGREE + 1 - i)])
+#: Numbers of what the camera models lack: of two cameras, along u and v; and how wide their prior is, px.
+_LENS, _LENS_PX = 4 * len(_POWERS), 1.0
+#: Standard deviations of its prior that are tried: the one of the largest evidence is taken (MacKay, 1992).
+_LENS_SCALES_PX = tuple(2.0**k for k in range(-6, 2))
+#: It is tested in every so many tests; its chi-square of an alarm.
+_LENS_TESTS = 4
+_LENS_ALARM = alarm_limit(_LENS, 1.0 / (TEST_S * _LENS_TESTS))
 
 
 class ResidualSums:
@@ -84,6 +98,13 @@ class ResidualSums:
         self.b += weight * other.b
         self.square += weight * other.square
         self.freedom += weight * other.freedom
+
+    def of(self, size: int) -> ResidualSums:
+        """Return those of the first parameters alone."""
+        found = ResidualSums(size, self.begin_s)
+        found.H, found.b = self.H[:size, :size].copy(), self.b[:size].copy()
+        found.square, found.freedom = self.square, self.freedom
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +132,25 @@ class RigChange(Record):
     left: float
 
 
+@dataclass(frozen=True, eq=False)
+class LensError(Record):
+    """What the camera models lack.
+
+    Attributes:
+        beta: (M,) coefficients of its polynomials, px.
+        cov: (M, M) their covariance.
+        size_px: RMS of the residuals that it explains, px, and its standard deviation.
+        chi_square: by how much it explains more than a change of the seven numbers does.
+        needed: which of these are needed besides.
+    """
+
+    beta: Array
+    cov: Array
+    size_px: tuple[float, float]
+    chi_square: float
+    needed: tuple[Part, ...]
+
+
 class RigWatch:
     """Watches the calibrated pose of the cameras and the size of the body.
 
@@ -125,6 +165,7 @@ class RigWatch:
         suspected: the change that the newest test found, where it matters and is more likely than not; it widens poses.
         alarm: whether the newest test found one that is certain.
         alarmed: whether any did.
+        lens: what the camera models lack, where that is certain and matters.
     """
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float) -> None:
@@ -146,7 +187,15 @@ class RigWatch:
         self._began: Array | None = None
         # What the seven numbers do to the newest poses, and the covariances of these.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
-        self._test, self._window = ResidualSums(self._size, 0.0), ResidualSums(self._size, 0.0)
+        self._full = self._size + _LENS
+        self._test, self._window = ResidualSums(self._full, 0.0), ResidualSums(self._size, 0.0)
+        # Since the beginning, for what the camera models lack, and what that does to the newest poses.
+        self._whole, self._by_lens = ResidualSums(self._full, 0.0), deque[Array](maxlen=_POSES)
+        self._seen, self._looked = (
+            np.zeros((_LENS, _LENS)),
+            0,
+        )  # mean of the squares of the polynomials, of so many shots
+        self.lens: LensError | None = None
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
         self._timed = False
         self.alarm = self.alarmed = False
@@ -165,23 +214,28 @@ class RigWatch:
         """
         now_s, self._timed = (float(self._shots), False) if t_s is None else (t_s, True)
         self._shots += 1
-        if self.suspected is None and self._timed and 0.0 <= now_s - self._last[0] < _LEAST_S:
+        if self.suspected is None and self.lens is None and self._timed and 0.0 <= now_s - self._last[0] < _LEAST_S:
             return np.zeros((6, 6))
         found = self._residuals(estimate, now_s)
         self._last = (now_s, estimate.T_left_body)
         if found is None:
             return np.zeros((6, 6))
-        sums, by_fault = found
+        sums, by_fault, by_lens = found
         self._effects.append((by_fault, estimate.cov))
+        self._by_lens.append(by_lens)
         self._sum(sums, estimate.T_left_body, now_s)
-        if self.suspected is None:
-            return np.zeros((6, 6))
-        shift = by_fault @ self.suspected.f
-        return np.asarray(np.outer(shift, shift) + by_fault @ self.suspected.cov @ by_fault.T)
+        added = np.zeros((6, 6))
+        if self.lens is not None:
+            shift = by_lens @ self.lens.beta
+            added += np.outer(shift, shift) + by_lens @ self.lens.cov @ by_lens.T
+        if self.suspected is not None and (self.lens is None or self.lens.needed):
+            shift = by_fault @ self.suspected.f
+            added += np.outer(shift, shift) + by_fault @ self.suspected.cov @ by_fault.T
+        return added
 
     def information(self, estimates: Sequence[PoseEstimate]) -> tuple[ResidualSums, int]:
         """Return the sums of measured poses, and how many of these differ: consecutive ones that are alike count as one."""
-        self._test = ResidualSums(self._size, 0.0)
+        self._test = ResidualSums(self._full, 0.0)
         stays, began = 0, None
         for k, estimate in enumerate(estimates):
             found = self._residuals(estimate, float(k))
@@ -189,16 +243,19 @@ class RigWatch:
                 continue
             if began is None or differ(began, estimate.T_left_body):
                 self._close_stay()
-                self._stay, self._stay_shots, began = ResidualSums(self._size, float(k)), 0, estimate.T_left_body
+                self._stay, self._stay_shots, began = ResidualSums(self._full, float(k)), 0, estimate.T_left_body
                 stays += 1
             assert self._stay is not None
             self._stay.add(found[0], 1.0)
             self._stay_shots += 1
         self._close_stay()
-        return self._test, stays
+        return self._test.of(self._size), stays
 
-    def _residuals(self, estimate: PoseEstimate, now_s: float) -> tuple[ResidualSums, Array] | None:
-        """Return the sums of one shot, its pose eliminated, and the derivative (6, 7) of the pose by the seven numbers."""
+    def _residuals(self, estimate: PoseEstimate, now_s: float) -> tuple[ResidualSums, Array, Array] | None:
+        """Return the sums of one shot, its pose eliminated, and what changes the pose.
+
+        That is its derivatives (6, 7) by the seven numbers, and (6, M) by what the camera models lack.
+        """
         seen, rig, points = estimate.points.seen, self._rig, self._body.points
         good = np.zeros(len(points), bool)
         good[estimate.points.ids] = True
@@ -215,7 +272,7 @@ class RigWatch:
             return None
         W, A, B = whitened(cameras, rig.T_left_right, points, observations, T)
         count, n = rig.parameter_count, len(A)
-        rest = np.zeros((n, self._size + 1))
+        rest = np.zeros((n, self._full + 1))
         rest[:, :count] = B
         by_point = A[:, :3].reshape(-1, 2, 3)
         rest[:, count] = (by_point @ points[ids][:, :, None]).ravel()
@@ -225,6 +282,9 @@ class RigWatch:
         late = A @ self._velocity(estimate.T_left_body, now_s)
         late.reshape(-1, 2, 2)[:, 0] = 0.0  # of the right camera alone
         rest[:, self._size - 1] = late
+        field = _polynomials(rig, sides, observations.uv)
+        self._noise_px = float(np.sqrt(np.trace(cov.mean(axis=0)) / 2.0))
+        rest[:, self._size : self._full] = (W @ field).reshape(n, -1)
         rest[:, -1] = (W @ fit.residuals_px[:, :, None]).ravel()
         gain = np.linalg.solve(A.T @ A, A.T @ rest)
         rest -= A @ gain
@@ -232,9 +292,9 @@ class RigWatch:
         along, k2 = late @ rest, float(late @ late) - float((A.T @ late) @ np.linalg.solve(A.T @ A, A.T @ late))
         # The shot's own skew, of variance 1, is eliminated (Sherman and Morrison).
         whole = rest.T @ rest - np.outer(along, along) / (1.0 + k2)
-        sums = ResidualSums(self._size, now_s)
+        sums = ResidualSums(self._full, now_s)
         sums.H, sums.b, sums.square, sums.freedom = whole[:-1, :-1], whole[:-1, -1], float(whole[-1, -1]), n - 6.0
-        return sums, -gain[:, :-1] @ self._by_fault
+        return sums, -gain[:, : self._size] @ self._by_fault, np.asarray(-gain[:, self._size : self._full])
 
     def _velocity(self, T: Array, now_s: float) -> Array:
         """Return the velocity (6,) of the body between the shot before and this one, 1/s; zero where it is unknown."""
@@ -250,7 +310,7 @@ class RigWatch:
         """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
         if self._stay is None or self._began is None or differ(self._began, T):
             self._close_stay()
-            self._stay, self._stay_shots, self._began = ResidualSums(self._size, now_s), 0, T
+            self._stay, self._stay_shots, self._began = ResidualSums(self._full, now_s), 0, T
         self._stay.add(sums, 1.0)
         self._stay_shots += 1
         begin_s = self._test.begin_s if self._test.freedom else self._stay.begin_s
@@ -271,12 +331,14 @@ class RigWatch:
         """Test for a change with the newest sums; weigh the older ones down."""
         if not self._test.freedom:
             return
-        self._history.append(self._test)
+        if len(self._history) < _KEPT:
+            self._whole.add(self._test, 1.0)
+        test, self._test = self._test.of(self._size), ResidualSums(self._full, 0.0)
+        self._history.append(test)
         weight = float(np.exp(-1.0 / FORGET_TESTS))
         for name in ("H", "b", "square", "freedom"):
             setattr(self._window, name, weight * getattr(self._window, name))
-        self._window.add(self._test, 1.0)
-        self._test = ResidualSums(self._size, 0.0)
+        self._window.add(test, 1.0)
         change = self._estimated(self._window)
         certain = change.chi_square > _ALARM or any(change.alone[part] > limit for part, limit in _ALARMS.items())
         alarm = certain and self._matters(change, slice(None))
@@ -287,19 +349,69 @@ class RigWatch:
             change if alarm or (change.chi_square > _SUSPECTED and self._matters(change, slice(None))) else None
         )
         self.alarm, self.alarmed = alarm, self.alarmed or alarm
+        if len(self._history) < _KEPT and (0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0):
+            self.lens = self._lens()
+
+    def _lens(self) -> LensError | None:
+        """Return what the camera models lack; None where a change of the seven explains as much, or it hardly matters."""
+        K, sums, faults = self._size, self._whole, len(_WIDE)
+        every = np.arange(K + faults + _LENS)
+        changed, lens = every[K : K + faults], every[K + faults :]
+        M = np.zeros((self._full, len(every)))
+        M[:K, :K], M[:K, changed] = self.prior, self._by_fault * _WIDE
+        M[K:, lens] = _LENS_PX * np.eye(_LENS)
+        H, b = M.T @ sums.H @ M + np.eye(len(every)), M.T @ sums.b
+
+        def gained(*without: Ids) -> float:
+            rows = np.setdiff1d(every, np.concatenate([*without, np.zeros(0, int)]))
+            return float(b[rows] @ cho_solve(cho_factor(H[np.ix_(rows, rows)]), b[rows]))
+
+        most, by_lens = gained(), gained(changed)
+        excess = max((sums.square - most) / max(sums.freedom, 1.0), 1.0)
+        if by_lens - gained(lens) < _LENS_ALARM * excess:
+            return None
+        more = (self._split(list(self._history))[2] - (sums.square - by_lens)) / excess  # than a change at any time
+        if more < _LENS_ALARM:
+            return None
+        needed = tuple(
+            part
+            for part, rows in _PARTS.items()
+            if (most - gained(changed[rows])) / excess > chdtri(rows.stop - rows.start, _NECESSARY)
+        )
+        explained = (by_lens - gained(changed, lens)) / excess
+        size = self._noise_px * float(np.sqrt(2.0 * excess * explained / max(sums.freedom, 1.0)))
+        sigma = size * float(np.sqrt(_LENS / 2.0 + explained)) / explained
+        beta, cov = max((self._of_lens(sums, scale, excess) for scale in _LENS_SCALES_PX), key=lambda each: each[2])[:2]
+        found = LensError(beta, cov, (size, sigma), more, needed)
+        shifts = np.array(self._by_lens) @ beta
+        covs = np.array([cov for _, cov in self._effects])
+        squares = np.einsum("ni,ni->n", shifts, np.linalg.solve(covs, shifts[..., None])[..., 0])
+        return found if self.alarm or float(np.max(squares)) > _MATTERS**2 else None
+
+    def _of_lens(self, sums: ResidualSums, scale_px: float, excess: float) -> tuple[Array, Array, float]:
+        """Return the coefficients (M,), px, with a prior of some size, their covariance (M, M), and its log-evidence."""
+        L = np.zeros((self._full, self._full))
+        L[: self._size, : self._size], L[self._size :, self._size :] = self.prior, scale_px * np.eye(_LENS)
+        inner = cho_factor(L.T @ sums.H @ L / excess + np.eye(len(L)))
+        b = L.T @ sums.b / excess
+        found = cho_solve(inner, b)
+        evidence = 0.5 * float(b @ found) - float(np.log(np.diag(inner[0])).sum())
+        rows = L[self._size :]
+        return rows @ found, rows @ cho_solve(inner, rows.T), evidence
 
     def _begun(self, change: RigChange) -> RigChange:
         """Return the change estimated from its beginning on; drop what was before."""
         count = self._alarms + _BEFORE
         if len(self._history) <= count:
             return change
-        self._window, change = self._split(list(self._history)[-count:])
+        self._window, change, _ = self._split(list(self._history)[-count:])
         return change
 
     @property
     def wrong_at_rest(self) -> bool:
         """Whether what is suspected makes poses wrong also where nothing moves."""
-        return self.alarm and self.suspected is not None and self._to_blame(self.suspected) != ["time"]
+        parts = [] if self.suspected is None else self._to_blame(self.suspected)
+        return self.alarm and not set(parts) <= {"time"}
 
     def _matters(self, change: RigChange, part: slice) -> bool:
         """Return whether a part of the seven numbers moves one of the newest poses by so many of its sigmas."""
@@ -337,29 +449,37 @@ class RigWatch:
 
         It is the beginning that leaves least unexplained: with the seven numbers zero before it, and estimated after it.
         """
-        sums, change = self._split(list(self._history))
+        sums, change, _ = self._split(list(self._history))
         return sums.begin_s, change
 
-    def _split(self, tests: Sequence[ResidualSums]) -> tuple[ResidualSums, RigChange]:
-        """Return the sums of the tests after the beginning of a change, and the change estimated from them."""
+    def _split(self, tests: Sequence[ResidualSums]) -> tuple[ResidualSums, RigChange, float]:
+        """Return the sums of the tests after the beginning of a change, the change that they show, and what is left.
+
+        The test before its beginning may be of both times: it is left out, and counts as noise.
+        """
         after, found, least = ResidualSums(self._size, 0.0), None, np.inf
         before = ResidualSums(self._size, 0.0)
         for sums in tests:
             before.add(sums, 1.0)
-        for sums in reversed(tests):
-            after.add(sums, 1.0)
-            before.add(sums, -1.0)
+        for k in reversed(range(len(tests))):
+            after.add(tests[k], 1.0)
+            before.add(tests[k], -1.0)
+            mixed = tests[k - 1] if k else ResidualSums(self._size, tests[0].begin_s)
+            before.add(mixed, -1.0)
             change, none = self._estimated(after), self._estimated(before)
-            if change.left + none.left + none.gained < least:
-                least = change.left + none.left + none.gained
-                found = ResidualSums(self._size, sums.begin_s), change
+            before.add(mixed, 1.0)
+            left = change.left + none.left + none.gained + mixed.freedom
+            if left < least:
+                least, found = left, (ResidualSums(self._size, mixed.begin_s), change)
                 found[0].add(after, 1.0)
         assert found is not None
-        return found
+        return *found, float(least)
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far, the shots of the running test included: nothing where no test gave an alarm."""
         ended = self._ended()
+        if ended.lens is not None:
+            return (_lens_finding(ended.lens),)
         if not ended.alarmed:
             return ()
         began_s, change = ended._since()
@@ -378,7 +498,10 @@ class RigWatch:
     def _ended(self) -> RigWatch:
         """Return a copy whose running test was made; this one goes on with it."""
         ended = self.copied()
-        ended._test, ended._window = (ResidualSums(self._size, each.begin_s) for each in (self._test, self._window))
+        ended._test, ended._window, ended._whole = (
+            ResidualSums(len(each.b), each.begin_s) for each in (self._test, self._window, self._whole)
+        )
+        ended._whole.add(self._whole, 1.0)
         ended._test.add(self._test, 1.0)
         ended._window.add(self._window, 1.0)
         ended._close_stay()
@@ -387,7 +510,7 @@ class RigWatch:
 
     def moved_since_s(self) -> float | None:
         """Return since when the cameras alone are found to have moved, s; None where nothing or more was found."""
-        if not (self.alarm and self._timed and self.suspected is not None):
+        if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None:
             return None
         since_s, change = self._since()
         return since_s if self._to_blame(change) == ["rig"] else None
@@ -400,7 +523,26 @@ class RigWatch:
 
     def _to_blame(self, change: RigChange) -> list[Part]:
         """Return the parts that are needed to explain a change; where none is, the one that explains most alone."""
+        if self.lens is not None:
+            return list(self.lens.needed)
         return [part for part in _PARTS if self._needed(change, part)] or [max(_PARTS, key=change.alone.__getitem__)]
+
+
+def _polynomials(rig: StereoRig, sides: Ids, uv: Array) -> Array:
+    """Return (N, 2, M) what each coefficient displaces a detection of a camera by: Chebyshev polynomials of its uv."""
+    half = np.array([camera.image_size_px for camera in rig.cameras])[sides] / 2.0
+    x = np.clip((uv + 0.5) / half - 1.0, -1.0, 1.0)
+    T = [np.ones_like(x), x]
+    while len(T) <= _DEGREE:
+        T.append(2.0 * x * T[-1] - T[-2])
+    each = np.array(T)
+    values = each[_POWERS[:, 0], :, 0] * each[_POWERS[:, 1], :, 1]
+    count = len(_POWERS)
+    found = np.zeros((len(uv), 2, 2, 2, count))  # detection, along u or v; camera, along u or v, polynomial
+    rows = np.arange(len(uv))
+    for axis in range(2):
+        found[rows, axis, sides, axis] = values.T
+    return found.reshape(len(uv), 2, _LENS)
 
 
 def free_directions(rig: StereoRig) -> Array:
@@ -476,6 +618,24 @@ def _skew_finding(change: RigChange, since_s: float | None, alone: bool) -> Heal
         sigma,
         "ms",
         "trigger both cameras together; in a recording --skew find moves the detections to one time",
+    )
+
+
+def _lens_finding(lens: LensError) -> HealthFinding:
+    """Return the finding of camera models that lack something."""
+    size, sigma = lens.size_px
+    besides = "; a change of the cameras, the body or their times cannot be excluded" if lens.needed else ""
+    return HealthFinding(
+        "lens",
+        f"residuals of {size:.3f} px RMS depend on the position in the images alone, which the model of the cameras cannot "
+        f"express{besides}",
+        None,
+        size,
+        sigma,
+        "px",
+        "calibrate again with a richer lens model and with targets over the whole of both images; look for a lens that is "
+        "loose or behind a window",
+        lens.needed,
     )
 
 

@@ -248,6 +248,9 @@ _PART = 200  # bytes of a CONFIG_PART
 _FIELDS = CONFIG.fields
 assert _FIELDS is not None
 _SILENCE_AT: int = _FIELDS["silence_ticks"][1]  # bytes; silence_reaction follows
+#: By how much readings are older than the tick that reports them, and its standard deviation, s: half of the sixteen scans
+#: that are added up; what the potentiometers' wires and filters add is not known.
+_READING_AGE_S = {"nucleo-f446re": (4e-4, 1e-4)}
 _SET_MESSAGE_INTERVAL, _REBOOT = 511, 246  # MAV_CMD_
 _SLOW_ANGLES_US = 20000
 
@@ -266,7 +269,8 @@ class Board:
 
     def __init__(self, link: Link, session: Session) -> None:
         self._link, self._session = link, session
-        self.abilities = Abilities(JOINTS, session.ticks_per_s)
+        age_s = _READING_AGE_S.get(session.welcome.board, (0.0, 0.0))
+        self.abilities = Abilities(JOINTS, session.ticks_per_s, reading_age_s=age_s)
         self.welcome: Welcome = session.welcome
         # The board may remember commands of an earlier host: ours are newer than all of them.
         self._sequence = max(session.status.acknowledged_sequence, session.status.rejected_sequence)

@@ -36,6 +36,7 @@ class Abilities:
         takes_duty: whether ``gravity_duty`` of a command reaches the motors.
         own_controller: whether the joints are controlled by a controller that armsight cannot tune, configure or test.
         releases: whether the drives can be switched off.
+        reading_age_s: by how much a reading is older than its stamp, and its standard deviation, s.
     """
 
     joints: int
@@ -49,6 +50,7 @@ class Abilities:
     takes_duty: bool = True
     own_controller: bool = False
     releases: bool = True
+    reading_age_s: tuple[float, float] = (0.0, 0.0)
 
     def slowed(self, arm: Arm) -> Arm:
         """Return an arm whose motions are planned no faster than the controller follows them."""
