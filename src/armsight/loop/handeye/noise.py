@@ -26,6 +26,7 @@ Restricted likelihood: Patterson and Thompson, Biometrika 58, 1971; its gradient
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,6 +77,11 @@ FORGETS_RAD, FORGETS_M, FORGETS_SHARE = 1.0, 0.4, 0.15
 #: Errors of position and angle of one source are alike at LEVER_M, as far as poses do not say otherwise: the sigma of the
 #: logarithm of their variances' ratio. Few poses, or links, say little about two variances: one may vanish by chance.
 LIKE_EACH_OTHER = 1.5
+#: Step of the logarithm of a variance for differences; the sigma of such a logarithm at most; and the least degrees of
+#: freedom of one direction: below 2 there is no mean.
+STEP_LOG, KNOWN_LOG, LEAST_FREEDOM = 0.1, 3.0, 3.0
+#: Information about a direction that a block leaves when it is left out is taken for this share at least.
+LEAST_LEFT = 0.02
 #: Sigmas are looked for between these (m, rad, s), and the factor of the covariance that is given up to the last.
 LOW, HIGH, HIGH_IMAGE = 1e-7, 0.3, 100.0
 
@@ -368,6 +374,53 @@ def reml(b: Blocks, start: Array, steps: int = 60) -> Array:
         options={"maxiter": steps, "ftol": 1e-7},
     )
     return np.asarray(np.exp(found.x))
+
+
+def freedom(b: Blocks, variances: Array, cov: Callable[[Array], Array], count: int) -> float:
+    """Return of how many degrees of freedom Student's ellipsoid of a covariance is, whose variances are estimates.
+
+    Satterthwaite's: a variance v of the unknowns that is known with the variance w has 2 v^2 / w, where w follows from the
+    curvature of the restricted likelihood; those of several directions are joined as Fai and Cornelius do (J. Statistical
+    Computation and Simulation 54, 1996).
+
+    Args:
+        b: the residuals that the variances were estimated from.
+        variances: (K,) the estimates.
+        cov: variances -> (P, P) covariance of the unknowns.
+        count: of the unknowns, the first so many.
+    """
+    logs = np.log(variances)
+    steps = STEP_LOG * np.eye(len(logs))
+    slopes = [(_value_and_gradient(logs + s, b)[1] - _value_and_gradient(logs - s, b)[1]) / (2 * STEP_LOG) for s in steps]
+    values, vectors = np.linalg.eigh(0.5 * (np.array(slopes) + np.transpose(slopes)))
+    known = (vectors / (np.maximum(values, 0.0) + KNOWN_LOG**-2)) @ vectors.T
+    unit = 1 / np.sqrt(np.diag(cov(variances))[:count])
+    sizes, axes = np.linalg.eigh(unit[:, None] * cov(variances)[:count, :count] * unit)
+    white = unit[:, None] * axes / np.sqrt(sizes)
+
+    def along(at: Array) -> Array:
+        return np.asarray(np.einsum("pk,pq,qk->k", white, cov(np.exp(at))[:count, :count], white))
+
+    by = np.array([(along(logs + s) - along(logs - s)) / (2 * STEP_LOG) for s in steps])
+    of_each = np.maximum(2 / np.maximum(np.einsum("ik,ij,jk->k", by, known, by), 1e-9), LEAST_FREEDOM)
+    total = float(np.sum(of_each / (of_each - 2)))
+    return 2 * total / max(total - count, 1e-9)
+
+
+def jackknife(b: Blocks, s: Solved) -> Array:
+    """Return the covariance (P, P) of the unknowns that leaving out one block after the other shows, at the same weights.
+
+    It holds for errors that are not as the structure says, too (Wu, Annals of Statistics 14, 1986).
+    """
+    CiJ = s.inverse @ b.J
+    H = np.einsum("nki,nkj->nij", b.J, CiJ)
+    root = s.root  # whitens: the unit matrix is all information
+    left = np.eye(root.shape[1]) - root.T @ H @ root
+    pulls = np.einsum("nki,nk->ni", b.J, s.weighted) @ root
+    values, vectors = np.linalg.eigh(left)
+    values = np.maximum(values, LEAST_LEFT)
+    moved = np.einsum("nij,nj,nkj,nk->ni", vectors, 1 / values, vectors, pulls) @ root.T
+    return np.asarray(moved.T @ moved * (len(b.e) - 1) / len(b.e))
 
 
 def held_out(

@@ -168,6 +168,7 @@ def calibrate_structured_streams(
     eye: Eye = "to_hand",
     centre: ArrayLike = (0.0, 0.0, 0.0),
     scale: bool = False,
+    links_at: Callable[[Array], Array] | None = None,
     progress: Callable[[str], None] = lambda line: None,
 ) -> StructuredStreams:
     """Find the mounting, the time offset and the structure of the noise of two streams.
@@ -178,6 +179,8 @@ def calibrate_structured_streams(
         eye: as in :func:`~armsight.loop.handeye.handeye.calibrate_handeye`.
         centre: (3,) the middle of the body's points, body frame, m.
         scale: whether the size of the target may be wrong.
+        links_at: times (N,), s, on the hand's clock -> T_link_flange (N, L, 4, 4) of every link, where the joints and a
+            model are known.
         progress: called with the name of each step as it begins.
 
     Raises:
@@ -199,7 +202,13 @@ def calibrate_structured_streams(
         )
         speed = log_se3(inverse(early[good]) @ late[good]) / SPEED_S
         found = calibrate_structured(
-            poses, t_s=t_eye[good], speed=speed, scale=scale, structures=structures, progress=progress
+            poses,
+            t_s=t_eye[good],
+            speed=speed,
+            links=None if links_at is None else links_at(t_eye[good] + offset),
+            scale=scale,
+            structures=structures,
+            progress=progress,
         )
         offset += found.step_s
     return StructuredStreams(found, offset, found.sigma_step_s, t_eye[good], poses.A, poses.B)

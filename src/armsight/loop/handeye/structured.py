@@ -47,7 +47,9 @@ from armsight.loop.handeye.noise import (
     Linear,
     blocks,
     error_maps,
+    freedom,
     held_out,
+    jackknife,
     left_out_squares,
     pose_kernel,
     reml,
@@ -84,6 +86,8 @@ POSITIONS, SURELY_LOWER = "positions alone", 3.0
 #: The structure whose links are off, and the shared ones that are tried only where neighbours hang together.
 GEOMETRY = "robot's geometry off"
 HANGS = tuple(name for name in SHARED if name != GEOMETRY)
+#: Draws by which structures are weighted, and the weight below which one is not true.
+DRAWS, HARDLY_TRUE = 400, 0.02
 #: Rounds of least squares and of leaving out.
 ROUNDS = 6
 
@@ -510,12 +514,14 @@ def _chosen(
     guess, used, variances = _settled(whole, guess, used, best, gathered)
     rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
     linear = _linear(whole, guess, rows, best, gathered)
-    solved = solve(blocks(linear, best), variances)
-    x, cov = solved.x, solved.cov
+    x, cov = _student(whole, guess, used, best, variances, gathered)
+    weights = _weights(trials, best)
+    mixed = weights[best] * cov
+    for name in weights.keys() - {best}:  # what the other structures that may be true as well would answer
+        other, spread = _student(whole, guess, used, name, trials[name].variances, gathered)
+        mixed = mixed + weights[name] * (spread + np.outer(other - x, other - x))
+    cov = mixed
     guess = guess.moved(x, whole.free)
-    freedom = max(linear.e.size // 2 - 9, 3)  # of positions, whose fit also rotates the frames
-    # Few residuals say little about the variances: Student's ellipsoid in place of the normal one (Hotelling).
-    cov = cov * float(6 * f_distribution.ppf(0.95, 6, freedom) / chdtri(6, 0.05))
     metric, cov = whole.metric(guess, cov)
     require_known(whole.poses, metric.Z, metric.X, cov)
     sigmas = {name: float(np.sqrt(v)) for name, v in zip(STRUCTURES[best], variances, strict=True)}
@@ -534,11 +540,11 @@ def _chosen(
         sigma_step_s=rest.pop(0) if whole.free[1] else 0.0,
         structure=best,
         sigmas=sigmas,
-        likelihoods={name: trial[0] for name, trial in trials.items()},
+        likelihoods={name: float(trial.density.mean()) for name, trial in trials.items()},
         arm_m=arm,
         camera_m=camera,
-        held_out=_held_out_errors(whole, guess, trials[best][1], trials[best][3]),
-        held_out_geometry=None if geometry is None else _held_out_errors(whole, guess, geometry[2], geometry[3]),
+        held_out=_held_out_errors(whole, guess, trials[best].residual, trials[best].rows),
+        held_out_geometry=None if geometry is None else _held_out_errors(whole, guess, geometry.left, geometry.rows),
         used=used,
         distance=distance,
         common=guess.common,
@@ -553,8 +559,71 @@ def _common_m(poses: Poses, guess: _Guess) -> float:
     return float(np.sqrt((off**2).sum(axis=-1).mean())) / guess.per_m if guess.common.size else 0.0
 
 
-#: Mean log density of poses left out, their residuals, what is left of them with shared errors predicted, and their rows.
-_Trial = tuple[float, Array, Array, NDArray[np.int64]]
+@dataclass(frozen=True, eq=False)
+class _Trial(Record):
+    """A structure on poses left out.
+
+    Attributes:
+        density: (N,) logarithm of the probability density of each pose left out.
+        residual: (N, 6) their residuals under transforms fitted without them.
+        left: (N, 6) what is left of them with shared errors predicted.
+        rows: (N,) which rows they are.
+        variances: (K,) of the sources, from all of them.
+    """
+
+    density: Array
+    residual: Array
+    left: Array
+    rows: NDArray[np.int64]
+    variances: Array
+
+
+def _weights(trials: dict[str, _Trial], best: str) -> dict[str, float]:
+    """Return how probable the structures are that poses left out do not exclude, the best among them.
+
+    By the densities of poses left out, smoothed by what their sum is uncertain (pseudo-BMA+; Yao et al., Bayesian Analysis
+    13, 2018). Positions alone are chosen by another rule, and have none.
+    """
+    if best == POSITIONS:
+        return {best: 1.0}
+    names = [best, *(name for name in trials if name not in (best, POSITIONS))]
+    of = trials[best]
+    sums, sigmas = np.zeros(len(names)), np.zeros(len(names))
+    for k, name in enumerate(names[1:], 1):
+        other = trials[name]
+        n = min(len(of.rows), len(other.rows))
+        sums[k] = n * (other.density.mean() - of.density.mean())
+        if np.array_equal(of.rows, other.rows):
+            sigmas[k] = np.sqrt(n) * float((other.density - of.density).std())
+    drawn = sums + sigmas * np.random.default_rng(0).standard_normal((DRAWS, len(names)))
+    odds = np.exp(drawn - drawn.max(axis=1, keepdims=True))
+    shares = (odds / odds.sum(axis=1, keepdims=True)).mean(axis=0)
+    kept = {name: float(share) for name, share in zip(names, shares, strict=True) if name == best or share > HARDLY_TRUE}
+    return {name: share / sum(kept.values()) for name, share in kept.items()}
+
+
+def _student(
+    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, variances: Array, gathered: dict[str, Array]
+) -> tuple[Array, Array]:
+    """Return the step (P,) from a guess to the least squares of a structure, and its covariance (P, P).
+
+    Where leaving out poses shows a larger one than the structure does, mean of a block of three, it is that. Residuals say
+    little about some variances: it is Student's ellipsoid in place of the normal one (Hotelling).
+    """
+    rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if structure in SHARED else MAX_FIT)
+    few = _spread(rows, MAX_SHARED if structure in SHARED else MAX_VARIANCE)
+    b = blocks(_linear(whole, guess, rows, structure, gathered), structure)
+    solved = solve(b, variances)
+    cov = solved.cov
+    if structure not in SHARED:
+        shown, grow = jackknife(b, solved), np.ones(len(cov))
+        for part in (slice(k, k + 3) for k in range(0, 12, 3)):
+            grow[part] = np.sqrt(max(float(np.trace(np.linalg.solve(cov[part, part], shown[part, part]))) / 3, 1.0))
+        cov = cov * np.outer(grow, grow)
+    estimated = blocks(_linear(whole, guess, few, structure, gathered), structure)
+    known = freedom(estimated, variances, lambda v: solve(b, v).cov, 12)
+    known = min(known, max(6 * len(rows) // 2 - 9, 3))  # of positions, whose fit also rotates the frames
+    return solved.x, cov * float(6 * f_distribution.ppf(0.95, 6, known) / chdtri(6, 0.05))
 
 
 def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
@@ -563,12 +632,12 @@ def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
     Positions alone never win so: they do where they predict positions left out better, clearly and surely.
     """
     others = {name: trial for name, trial in trials.items() if name != POSITIONS} or trials
-    best = max(others, key=lambda name: others[name][0])
+    best = max(others, key=lambda name: others[name].density.mean())
     if POSITIONS not in trials or best in SHARED or best == POSITIONS:
         return best
     of, alone = (
         np.sum((e[:, :3] - np.cross(whole.poses.centre, e[:, 3:])) ** 2, axis=1)
-        for e in (trials[best][1], trials[POSITIONS][1])
+        for e in (trials[best].residual, trials[POSITIONS].residual)
     )
     lower = of - alone
     sure = lower.mean() > SURELY_LOWER * lower.std() / np.sqrt(len(lower))
@@ -670,7 +739,7 @@ def _distances(whole: _Problem, guess: _Guess, structure: str, variances: Array,
 def _trial(
     whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, gathered: dict[str, Array]
 ) -> _Trial:
-    """Return the mean log density of poses left out under a structure, their residuals, and their rows."""
+    """Leave out poses under a structure."""
     rows = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_VARIANCE)
     linear = _linear(whole, guess, rows, structure, gathered)
     b = blocks(linear, structure)
@@ -679,7 +748,7 @@ def _trial(
     order = np.arange(n) if whole.t_s is not None else np.random.default_rng(0).permutation(n)
     parts = [np.sort(part) for part in np.array_split(order, n if n <= FEW and structure not in SHARED else FOLDS)]
     density, residual, left = held_out(linear, structure, variances, parts)
-    return float(density.mean()), residual, left, rows
+    return _Trial(density, residual, left, rows, variances)
 
 
 def _held_out_errors(whole: _Problem, guess: _Guess, residual: Array, rows: NDArray[np.int64]) -> HeldOut:
