@@ -170,6 +170,10 @@ def test_streams_with_an_unknown_clock_offset(armsight, tmp_path):
     assert abs(document["clock_offset_s"] - 0.123) < 4 * document["clock_offset_sigma_s"] < 4e-3
     other = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "to-hand", "--streams")
     assert_rejected(other, robot, "these poses fit --eye in-hand, not to-hand")
+    large = named(tmp_path / "c.csv", head, np.hstack([t_hand[:, None], 39.37 * A[:, :3, 3], quaternions(A)]))
+    document, notes = found(armsight, large, seen, "--streams", "--detect-units")
+    assert "inches taken for metres; converted" in notes
+    assert_right(document)
 
 
 def test_millimetres_are_rejected_or_detected(armsight, tmp_path, seen):

@@ -192,7 +192,10 @@ def test_too_few_poses_and_unknown_needs_are_rejected():
     assert calibrate_structured(poses, links=links, structures=("robot's geometry off",)).used.any()
 
 
-@pytest.mark.parametrize("structure", ["robot", "robot and camera", "robot drifting over its poses", "camera walking"])
+@pytest.mark.parametrize(
+    "structure",
+    ["robot", "robot and camera", "robot's geometry off", "robot drifting over its poses", "camera walking"],
+)
 def test_the_gradient_of_the_restricted_likelihood(structure):
     rng = np.random.default_rng(2)
     poses, _, _, _ = made(2, n=6, in_hand=True)
@@ -207,6 +210,7 @@ def test_the_gradient_of_the_restricted_likelihood(structure):
             ("seen_m", 3),
         )
     }
+    maps |= {name: np.random.default_rng(k).normal(size=(6, 6, 6)) for k, name in enumerate(("link_m", "link_rad"))}
     linear = Linear(
         rng.normal(size=(6, 6)),
         rng.normal(size=(6, 6, 4)),

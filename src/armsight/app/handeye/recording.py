@@ -5,6 +5,7 @@ In: a table of robot poses, and what was seen. Out: :class:`PairedPoses`, rows t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -147,6 +148,21 @@ def links_of(recording: PairedPoses, arm: Arm) -> Array | None:
         return None
     frames = np.array([arm.links(q) for q in recording.robot.q[recording.rows]])
     return np.asarray(inverse(frames) @ frames[:, -1:])
+
+
+def links_between(robot: PoseTable, arm: Arm) -> Callable[[Array], Array] | None:
+    """Return what gives T_link_flange (N, L, 4, 4) at times (N,), robot's clock, s; None where the table has no joints."""
+    if robot.q is None or robot.t_s is None:
+        return None
+    t_s, rows = np.unique(robot.t_s, return_index=True)
+    q = robot.q[rows]
+
+    def links(times: Array) -> Array:
+        between = np.stack([np.interp(times, t_s, column) for column in q.T], axis=1)
+        frames = np.array([arm.links(one) for one in between])
+        return np.asarray(inverse(frames) @ frames[:, -1:])
+
+    return links
 
 
 def of_streams(

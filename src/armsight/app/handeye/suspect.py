@@ -60,6 +60,13 @@ def misfit(poses: Poses) -> float:
     return float(np.median(np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1))))
 
 
+def resized(Ts: Array, before: Array, after: Array) -> Array:
+    """Return poses with their lengths converted as those of others were, (N, 4, 4) all."""
+    out = Ts.copy()
+    out[:, :3, 3] *= np.linalg.norm(after[:, :3, 3]) / max(float(np.linalg.norm(before[:, :3, 3])), 1e-12)
+    return out
+
+
 def _resized(p: Poses) -> Poses:
     """Return the poses with the target's lengths multiplied by what fits."""
     B = p.B.copy()

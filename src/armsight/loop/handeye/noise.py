@@ -62,9 +62,8 @@ STRUCTURES: dict[str, tuple[str, ...]] = {
     "camera walking": ("flange_m", "flange_rad", "walk_m", "walk_rad"),
     "positions alone": ("seen_m", "hardly_rad"),
 }
-#: Structures whose errors are shared between poses.
+#: Structures whose errors are shared between poses, and are no unknowns.
 SHARED = (
-    "robot's geometry off",
     "robot drifting over its poses",
     "robot drifting over time",
     "robot walking over time",
@@ -200,6 +199,7 @@ class Blocks(Record):
         sources: their K names.
         known: (P,) information about each unknown beside the residuals.
         at: (P,) where each is, from where that has it.
+        links: (P,) of which source's variance an unknown is, an error of a link; -1 for the others.
     """
 
     e: Array
@@ -209,6 +209,7 @@ class Blocks(Record):
     sources: tuple[str, ...]
     known: Array
     at: Array
+    links: NDArray[np.int64]
 
     def covariance(self, variances: Array) -> Array:
         """Return the covariance (n, m, m)."""
@@ -223,35 +224,39 @@ def blocks(linear: Linear, structure: str) -> Blocks:
     n = len(linear.e)
     sources = STRUCTURES[structure]
     given = np.zeros_like(linear.given) if "image" in sources else linear.given
-    own = {name: M @ np.swapaxes(M, 1, 2) for name, M in linear.maps.items() if name in sources}
+    links = [name for name in sources if name.startswith("link")]
+    own = {name: M @ np.swapaxes(M, 1, 2) for name, M in linear.maps.items() if name in sources and name not in links}
     if "image" in sources:
         own["image"] = linear.given
+    none = np.full(linear.J.shape[2], -1)
     if structure not in SHARED:
-        return Blocks(
-            linear.e, linear.J, given, np.array([own[name] for name in sources]), sources, linear.known, linear.at
-        )
-    parts = []
+        # An error that all poses share, of known variance, is an unknown with that information about it.
+        J = np.concatenate([linear.J, *(linear.maps[name] for name in links)], axis=2)
+        of = np.concatenate([none, *(np.full(linear.maps[name].shape[2], sources.index(name)) for name in links)])
+        nothing = np.zeros(J.shape[2] - len(none))
+        known, at = np.append(linear.known, nothing), np.append(linear.at, nothing)
+        parts = np.array([own.get(name, np.zeros_like(given)) for name in sources])
+        return Blocks(linear.e, J, given, parts, sources, known, at, of)
+    shared = []
     for name in sources:
-        if name.startswith("link"):
-            M = linear.maps[name].reshape(6 * n, -1)
-            parts.append(M @ M.T)
-        elif name in own:
-            parts.append(_spread(own[name]))
+        if name in own:
+            shared.append(_spread(own[name]))
         elif name in linear.walk:
             first = np.minimum(np.arange(n)[:, None], np.arange(n)[None])
-            parts.append(_joined(linear.walk[name][first]))
+            shared.append(_joined(linear.walk[name][first]))
         else:
             M = linear.maps["flange_m" if name == "drift_m" else "flange_rad"]
             K = 1 + linear.kernel[structure]  # what changes by so much from pose to pose has a constant part as large
-            parts.append(_joined(K[..., None, None] * np.einsum("iak,jbk->ijab", M, M)))
+            shared.append(_joined(K[..., None, None] * np.einsum("iak,jbk->ijab", M, M)))
     return Blocks(
         linear.e.reshape(1, -1),
         linear.J.reshape(1, 6 * n, -1),
         _spread(given)[None],
-        np.array(parts)[:, None],
+        np.array(shared)[:, None],
         sources,
         linear.known,
         linear.at,
+        none,
     )
 
 
@@ -274,7 +279,7 @@ class Solved(Record):
     """The weighted least squares at given variances.
 
     Attributes:
-        x: (P,) the step that minimises the squares of e + J x.
+        x: (P,) the step that minimises the squares of e + J x, the links' errors last.
         root: (P, P) root @ root.T is its covariance.
         inverse: (n, m, m) inverse covariance of the residuals.
         weighted: (n, m) inverse covariance times what is left.
@@ -299,24 +304,33 @@ def solve(b: Blocks, variances: Array) -> Solved:
     L = np.linalg.cholesky(C)
     Ci = np.asarray(np.linalg.inv(C) if len(C) > 1 else _inverse(L[0])[None])
     CiJ = Ci @ b.J
-    H = np.einsum("nki,nkj->ij", b.J, CiJ) + np.diag(b.known)
+    is_link = b.links >= 0
+    known = np.where(is_link, 1 / variances[b.links], b.known)
+    H = np.einsum("nki,nkj->ij", b.J, CiJ) + np.diag(known)
     unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))  # m, rad and s side by side
     values, vectors = np.linalg.eigh(unit[:, None] * H * unit)
     values = np.maximum(values, 1e-14 * values[-1])
     root = unit[:, None] * vectors / np.sqrt(values)
-    x = -root @ (root.T @ (np.einsum("nki,nk->i", CiJ, b.e) + b.known * b.at))
+    x = -root @ (root.T @ (np.einsum("nki,nk->i", CiJ, b.e) + known * b.at))
     left = b.e + b.J @ x
     weighted = (Ci @ left[..., None])[..., 0]
     logdet = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
     logdet_H = float(np.log(values).sum() - 2 * np.log(unit).sum())
-    squares = float((left * weighted).sum() + (b.known * (b.at + x) ** 2).sum())
-    return Solved(x, root, Ci, weighted, 0.5 * (logdet + logdet_H + squares))
+    squares = float((left * weighted).sum() + (known * (b.at + x) ** 2).sum())
+    logdet_links = -float(np.log(known[is_link]).sum())
+    return Solved(x, root, Ci, weighted, 0.5 * (logdet + logdet_H + logdet_links + squares))
 
 
 def _inverse(L: Array) -> Array:
     """Return the inverse of L L^T."""
     half, _ = dpotri(L, lower=1)
     return np.asarray(np.tril(half) + np.tril(half, -1).T)
+
+
+def own_squares(b: Blocks, variances: Array, x: Array) -> Array:
+    """Return the squared Mahalanobis length (N,) of each pose's residual after a step (P,); independent poses only."""
+    left = b.e + b.J @ x
+    return np.asarray(np.einsum("ni,ni->n", left, np.linalg.solve(b.covariance(variances), left[..., None])[..., 0]))
 
 
 def left_out_squares(b: Blocks, s: Solved) -> Array:
@@ -341,6 +355,9 @@ def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
     projected = s.inverse - root @ np.swapaxes(root, 1, 2)
     traces = flat @ (projected - s.weighted[:, :, None] * s.weighted[:, None, :]).reshape(-1)
     gradient = 0.5 * variances * traces
+    for k in np.unique(b.links[b.links >= 0]):
+        of = b.links == k
+        gradient[k] += 0.5 * float(of.sum() - ((s.root[of] ** 2).sum() + (s.x[of] ** 2).sum()) / variances[k])
     cost = s.cost
     if "link_m" in b.sources or b.sources in (("flange_m", "flange_rad"), ("seen_m", "seen_rad")):
         m = len(b.sources) - 2
@@ -391,7 +408,9 @@ def freedom(b: Blocks, variances: Array, cov: Callable[[Array], Array], count: i
     """
     logs = np.log(variances)
     steps = STEP_LOG * np.eye(len(logs))
-    slopes = [(_value_and_gradient(logs + s, b)[1] - _value_and_gradient(logs - s, b)[1]) / (2 * STEP_LOG) for s in steps]
+    slopes = [
+        (_value_and_gradient(logs + s, b)[1] - _value_and_gradient(logs - s, b)[1]) / (2 * STEP_LOG) for s in steps
+    ]
     values, vectors = np.linalg.eigh(0.5 * (np.array(slopes) + np.transpose(slopes)))
     known = (vectors / (np.maximum(values, 0.0) + KNOWN_LOG**-2)) @ vectors.T
     unit = 1 / np.sqrt(np.diag(cov(variances))[:count])
@@ -434,25 +453,26 @@ def held_out(
     """
     density, residual = np.full(len(linear.e), np.nan), np.full((len(linear.e), 6), np.nan)
     left = residual.copy()
-    everything = np.arange(len(linear.e))
+    everything, own = np.arange(len(linear.e)), linear.J.shape[2]
     whole = blocks(linear, structure) if structure in SHARED else None
     for part in parts:
         others = np.setdiff1d(everything, part)
         rest = blocks(linear.rows(others), structure)
         again = reml(rest, variances, steps)
         fitted = solve(rest, again)
-        mean, J = linear.e[part] + linear.J[part] @ fitted.x, linear.J[part]
-        residual[part] = mean
+        residual[part] = linear.e[part] + linear.J[part] @ fitted.x[:own]
         if whole is None:
-            S = blocks(linear.rows(part), structure).covariance(again) + J @ fitted.cov @ np.swapaxes(J, 1, 2)
+            b = blocks(linear.rows(part), structure)
+            mean = b.e + b.J @ fitted.x
+            S = b.covariance(again) + b.J @ fitted.cov @ np.swapaxes(b.J, 1, 2)
         else:
             C = whole.covariance(again)[0]
             of, frm = _lines(part), _lines(others)
             gain = C[np.ix_(of, frm)] @ fitted.inverse[0]
-            JJ = J.reshape(len(of), -1) - gain @ rest.J[0]
+            JJ = linear.J[part].reshape(len(of), -1) - gain @ rest.J[0]
             full = C[np.ix_(of, of)] - gain @ C[np.ix_(frm, of)] + JJ @ fitted.cov @ JJ.T
             S = np.array([full[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(part))])
-            mean = mean - (C[np.ix_(of, frm)] @ fitted.weighted[0]).reshape(-1, 6)
+            mean = residual[part] - (C[np.ix_(of, frm)] @ fitted.weighted[0]).reshape(-1, 6)
         density[part], left[part] = _log_normal(mean, S), mean
     return density, residual, left
 

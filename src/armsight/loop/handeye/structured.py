@@ -51,6 +51,7 @@ from armsight.loop.handeye.noise import (
     held_out,
     jackknife,
     left_out_squares,
+    own_squares,
     pose_kernel,
     reml,
     solve,
@@ -59,10 +60,11 @@ from armsight.loop.handeye.noise import (
     wiener_kernel,
 )
 
-#: Poses that variances and held-out likelihoods come from at most, evenly spread, and those of a shared error.
-MAX_VARIANCE, MAX_SHARED = 150, 40
-#: Poses that the transforms come from at most, and those with a shared error.
-MAX_FIT, MAX_SHARED_FIT = 1000, 120
+#: Poses that a fit comes from at most, evenly spread. The structure is chosen from as many: what is claimed of many poses
+#: must have been looked for in as many.
+MAX_FIT = 1000
+#: With a shared error, poses that variances and held-out likelihoods come from at most, and the transforms.
+MAX_SHARED, MAX_SHARED_FIT = 40, 120
 #: Fewest poses for a structure with shared errors.
 MIN_SHARED = 12
 #: Numbers left of the residuals for each variance at least: fewer do not determine it.
@@ -83,9 +85,8 @@ SURELY = 5.0
 HANGING = 1.0
 #: The structure that weights positions alone, and by how many sigmas its squared errors must be lower.
 POSITIONS, SURELY_LOWER = "positions alone", 3.0
-#: The structure whose links are off, and the shared ones that are tried only where neighbours hang together.
+#: The structure whose links are off.
 GEOMETRY = "robot's geometry off"
-HANGS = tuple(name for name in SHARED if name != GEOMETRY)
 #: Draws by which structures are weighted, and the weight below which one is not true.
 DRAWS, HARDLY_TRUE = 400, 0.02
 #: Rounds of least squares and of leaving out.
@@ -355,7 +356,7 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
     scaled = replace(problem, poses=problem.scaled(_Guess(np.eye(4), np.eye(4), per_m)))
     guesses = [replace(guess, per_m=per_m) for guess in _first(scaled)]
     found, used = _robust(free, guesses)
-    rows = _spread(np.flatnonzero(used), MAX_VARIANCE)
+    rows = _spread(np.flatnonzero(used), MAX_FIT)
     linear = free.rows(rows).linear(found)
     b = blocks(linear, "robot and camera")
     solved = solve(b, reml(b, _start_variances(linear, "robot and camera")))
@@ -505,7 +506,7 @@ def _chosen(
     hanging = _hanging(whole, guess, used, simple, variances, gathered)
     trials = {}
     for name in names:
-        if name in HANGS and name not in hanging:
+        if name in SHARED and name not in hanging:
             continue
         progress(f"hand-eye: poses left out ({name})")
         trials[name] = _trial(whole, guess, used, name, gathered)
@@ -598,12 +599,19 @@ def _weights(trials: dict[str, _Trial], best: str) -> dict[str, float]:
     drawn = sums + sigmas * np.random.default_rng(0).standard_normal((DRAWS, len(names)))
     odds = np.exp(drawn - drawn.max(axis=1, keepdims=True))
     shares = (odds / odds.sum(axis=1, keepdims=True)).mean(axis=0)
-    kept = {name: float(share) for name, share in zip(names, shares, strict=True) if name == best or share > HARDLY_TRUE}
+    kept = {
+        name: float(share) for name, share in zip(names, shares, strict=True) if name == best or share > HARDLY_TRUE
+    }
     return {name: share / sum(kept.values()) for name, share in kept.items()}
 
 
 def _student(
-    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, variances: Array, gathered: dict[str, Array]
+    whole: _Problem,
+    guess: _Guess,
+    used: NDArray[np.bool_],
+    structure: str,
+    variances: Array,
+    gathered: dict[str, Array],
 ) -> tuple[Array, Array]:
     """Return the step (P,) from a guess to the least squares of a structure, and its covariance (P, P).
 
@@ -611,19 +619,20 @@ def _student(
     little about some variances: it is Student's ellipsoid in place of the normal one (Hotelling).
     """
     rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if structure in SHARED else MAX_FIT)
-    few = _spread(rows, MAX_SHARED if structure in SHARED else MAX_VARIANCE)
-    b = blocks(_linear(whole, guess, rows, structure, gathered), structure)
+    few = _spread(rows, MAX_SHARED if structure in SHARED else MAX_FIT)
+    linear = _linear(whole, guess, rows, structure, gathered)
+    b, own = blocks(linear, structure), linear.J.shape[2]
     solved = solve(b, variances)
-    cov = solved.cov
+    cov = solved.cov[:own, :own]
     if structure not in SHARED:
-        shown, grow = jackknife(b, solved), np.ones(len(cov))
+        shown, grow = jackknife(b, solved)[:own, :own], np.ones(own)
         for part in (slice(k, k + 3) for k in range(0, 12, 3)):
             grow[part] = np.sqrt(max(float(np.trace(np.linalg.solve(cov[part, part], shown[part, part]))) / 3, 1.0))
         cov = cov * np.outer(grow, grow)
     estimated = blocks(_linear(whole, guess, few, structure, gathered), structure)
     known = freedom(estimated, variances, lambda v: solve(b, v).cov, 12)
     known = min(known, max(6 * len(rows) // 2 - 9, 3))  # of positions, whose fit also rotates the frames
-    return solved.x, cov * float(6 * f_distribution.ppf(0.95, 6, known) / chdtri(6, 0.05))
+    return solved.x[:own], cov * float(6 * f_distribution.ppf(0.95, 6, known) / chdtri(6, 0.05))
 
 
 def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
@@ -633,7 +642,7 @@ def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
     """
     others = {name: trial for name, trial in trials.items() if name != POSITIONS} or trials
     best = max(others, key=lambda name: others[name].density.mean())
-    if POSITIONS not in trials or best in SHARED or best == POSITIONS:
+    if POSITIONS not in trials or best in (*SHARED, GEOMETRY, POSITIONS):
         return best
     of, alone = (
         np.sum((e[:, :3] - np.cross(whole.poses.centre, e[:, 3:])) ** 2, axis=1)
@@ -692,7 +701,7 @@ def _settled(
     """Alternate variances, transforms and blunders until they stay."""
     variances: Array | None = None
     for _ in range(ROUNDS):
-        few = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_VARIANCE)
+        few = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_FIT)
         linear = _linear(whole, guess, few, structure, gathered)
         if variances is None:
             variances = reml(blocks(linear, structure), _start_variances(linear, structure))
@@ -702,12 +711,16 @@ def _settled(
         linear = _linear(whole, guess, rows, structure, gathered)
         b = blocks(linear, structure)
         solved = solve(b, variances)
-        x = solved.x
+        x = solved.x[: linear.J.shape[2]]
+        if structure == GEOMETRY:
+            far = own_squares(blocks(whole.linear(guess), structure), variances, solved.x)
         guess = guess.moved(x, whole.free)
         if structure in SHARED:
             far = left_out_squares(b, solved)
             keep = used.copy()
             keep[rows[(far > chdtri(6, CHANCE)) & (far > 0.3 * far.max())]] = False
+        elif structure == GEOMETRY:
+            keep = far < chdtri(6, CHANCE)
         else:
             keep = 6 * _distances(whole, guess, structure, variances, gathered) < chdtri(6, CHANCE)
         if keep.sum() < max(MIN_POSES, len(keep) // 3):
@@ -740,7 +753,7 @@ def _trial(
     whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, gathered: dict[str, Array]
 ) -> _Trial:
     """Leave out poses under a structure."""
-    rows = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_VARIANCE)
+    rows = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_FIT)
     linear = _linear(whole, guess, rows, structure, gathered)
     b = blocks(linear, structure)
     variances = reml(b, _start_variances(linear, structure))
