@@ -229,7 +229,14 @@ def test_what_does_not_fit_is_named(armsight, tmp_path, seen):
     rejected(named(tmp_path / "d.csv", head.replace("deg", "rad"), 90 + q), "are these degrees?", more=arm)
     displaced = A.copy()
     displaced[7:] = A[7:] @ exp_se3(np.array([0.0, 0.0, 0.1, 0.4, 0.0, 0.3]))
-    rejected(matrices(path, displaced), "fit one mounting each, but not the same", "TCP were displaced")
+    rejected(
+        matrices(path, displaced),
+        "those from line 8",
+        "fit one mounting each, but not the same",
+        "TCP changed, by 99 mm and 28.6 deg",
+    )
+    displaced[7:] = exp_se3(np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.1])) @ A[7:]
+    rejected(matrices(path, displaced), "those from line 8", "the robot's base, or the target, was displaced by")
 
 
 def test_a_tcp_taken_for_the_flange_is_noted_where_the_joints_are_known(armsight, tmp_path, seen):
