@@ -267,7 +267,7 @@ def report(name, seed, poses=20, cycles=4):
 def injected_droop(cell, times, read, ends):
     """Return the droop of an SO-101's joints, deg per metre of the report's lever: of the torques it really carried."""
     servos, rows = cell.arm.device.servos, np.searchsorted(times, ends) - 1
-    loads = np.array([servos._load(np.append(cell.true_q(times[k]), 0.0))[:-1] for k in rows])
+    loads = np.array([servos._load(np.append(cell.true_q(times[k]), 0.0))[:-1].copy() for k in rows])
     droops = -np.degrees(loads / servos.mechanics.stiffness_n_m_rad)
     levers = gravity_levers(cell.model, read[rows])
     slopes = [
