@@ -61,7 +61,7 @@ def misfit(poses: Poses) -> float:
 
 def _sizes(e: Array) -> Array:
     """Return by how much tangents (N, 6) move a point at 0.3 m, (N,), m."""
-    return np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1))
+    return np.asarray(np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1)))
 
 
 def resized(Ts: Array, before: Array, after: Array) -> Array:
