@@ -35,7 +35,7 @@ from scipy.linalg.lapack import dpotri
 from scipy.optimize import minimize
 
 from armsight.data import Array, Record
-from armsight.geometry.pose import adjoint, inverse
+from armsight.geometry.pose import adjoint, inverse, small_adjoint
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.handeye import HARDLY, LEVER_M, Poses
 
@@ -48,6 +48,16 @@ STRUCTURES: dict[str, tuple[str, ...]] = {
     "robot and image": ("flange_m", "flange_rad", "image"),
     "robot, camera and time stamps": ("flange_m", "flange_rad", "lateral_m", "depth_m", "seen_rad", "time_s"),
     "robot's geometry off": ("flange_m", "flange_rad", "lateral_m", "depth_m", "seen_rad", "link_m", "link_rad"),
+    "robot's geometry and time stamps off": (
+        "flange_m",
+        "flange_rad",
+        "lateral_m",
+        "depth_m",
+        "seen_rad",
+        "time_s",
+        "link_m",
+        "link_rad",
+    ),
     "robot drifting over its poses": (
         "flange_m",
         "flange_rad",
@@ -83,6 +93,8 @@ STEP_LOG, KNOWN_LOG, LEAST_FREEDOM = 0.1, 3.0, 3.0
 LEAST_LEFT = 0.02
 #: Sigmas are looked for between these (m, rad, s), and the factor of the covariance that is given up to the last.
 LOW, HIGH, HIGH_IMAGE = 1e-7, 0.3, 100.0
+#: Errors of links beyond this are no small ones any more: the arm is to be identified first.
+HIGH_LINK_M, HIGH_LINK_RAD = 0.01, 0.015
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +135,14 @@ class Linear(Record):
         )
 
 
-def error_maps(poses: Poses, carry: Array, speed: Array | None, links: Array | None = None) -> dict[str, Array]:
+def error_maps(
+    poses: Poses, e: Array, carry: Array, speed: Array | None, links: Array | None = None
+) -> dict[str, Array]:
     """Return what unit errors of each independent source do to the residuals.
 
     Args:
         poses: N poses.
+        e: (N, 6) the residuals.
         carry: (N, 6, 6) adjoints that map an error of the flange to the residuals.
         speed: (N, 6) twist of the flange, right tangent, m/s and rad/s; None: no streams.
         links: (N, L, 4, 4) T_link_flange, m; None: no model.
@@ -149,7 +164,9 @@ def error_maps(poses: Poses, carry: Array, speed: Array | None, links: Array | N
     if speed is not None:
         maps["time_s"] = carry @ speed[..., None]
     if links is not None:
-        moved = np.swapaxes(carry[:, None] @ adjoint(inverse(links)), 1, 2)  # (N, 6, L, 6)
+        # As the derivative by the mounting is: an error of the flange's frame and one of the mounting are the same.
+        bent = (np.eye(6) + 0.5 * small_adjoint(e)) @ carry
+        moved = np.swapaxes(bent[:, None] @ adjoint(inverse(links)), 1, 2)  # (N, 6, L, 6)
         maps["link_m"], maps["link_rad"] = (moved[..., part].reshape(n, 6, -1) for part in (slice(3), slice(3, 6)))
     return maps
 
@@ -378,7 +395,8 @@ def reml(b: Blocks, start: Array, steps: int = 60) -> Array:
         steps: iterations at most.
     """
     low = 2 * np.log(LOW)
-    bounds = [(low, 2 * np.log(HIGH_IMAGE if name == "image" else HIGH)) for name in b.sources]
+    high = {"image": HIGH_IMAGE, "link_m": HIGH_LINK_M, "link_rad": HIGH_LINK_RAD}
+    bounds = [(low, 2 * np.log(high.get(name, HIGH))) for name in b.sources]
     if "hardly_rad" in b.sources:
         bounds[b.sources.index("hardly_rad")] = (2 * np.log(HARDLY),) * 2
     found = minimize(

@@ -85,8 +85,8 @@ SURELY = 5.0
 HANGING = 1.0
 #: The structure that weights positions alone, and by how many sigmas its squared errors must be lower.
 POSITIONS, SURELY_LOWER = "positions alone", 3.0
-#: The structure whose links are off.
-GEOMETRY = "robot's geometry off"
+#: The structures whose links are off.
+GEOMETRY = ("robot's geometry off", "robot's geometry and time stamps off")
 #: Draws by which structures are weighted, and the weight below which one is not true.
 DRAWS, HARDLY_TRUE = 400, 0.02
 #: Rounds of least squares and of leaving out.
@@ -210,7 +210,7 @@ class _Problem(Record):
         if shared and poses.common is not None:
             J = np.concatenate([J, poses.common if poses.in_hand else -poses.common], axis=2)
         known, at = np.repeat([0.0, 1.0], [before, shared]), np.append(np.zeros(before), guess.common)
-        return Linear(e, J, poses.cov, error_maps(poses, carry, self.speed, self.links), {}, {}, known, at)
+        return Linear(e, J, poses.cov, error_maps(poses, e, carry, self.speed, self.links), {}, {}, known, at)
 
     def metric(self, guess: _Guess, cov: Array) -> tuple[_Guess, Array]:
         """Return Z and X in m, and the covariance (P, P) of what was fitted with them."""
@@ -479,7 +479,8 @@ def _allowed(structure: str, problem: _Problem, count: int, covered: bool) -> bo
     if "image" in sources:
         return covered
     if "link_m" in sources:
-        return problem.links is not None and count >= MIN_SHARED
+        timed = "time_s" not in sources or problem.speed is not None
+        return problem.links is not None and count >= MIN_SHARED and timed
     if "time_s" in sources:
         return problem.speed is not None
     if structure in ("robot drifting over time", "robot walking over time") or "walk_m" in sources:
@@ -510,7 +511,8 @@ def _chosen(
             continue
         progress(f"hand-eye: poses left out ({name})")
         trials[name] = _trial(whole, guess, used, name, gathered)
-    best, geometry = _best(whole, trials), trials.get(GEOMETRY)
+    best, geometries = _best(whole, trials), [trials[name] for name in GEOMETRY if name in trials]
+    geometry = max(geometries, key=lambda trial: float(trial.density.mean()), default=None)
     progress(f"hand-eye: fitting ({best})")
     guess, used, variances = _settled(whole, guess, used, best, gathered)
     rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
@@ -642,7 +644,7 @@ def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
     """
     others = {name: trial for name, trial in trials.items() if name != POSITIONS} or trials
     best = max(others, key=lambda name: others[name].density.mean())
-    if POSITIONS not in trials or best in (*SHARED, GEOMETRY, POSITIONS):
+    if POSITIONS not in trials or best in (*SHARED, *GEOMETRY, POSITIONS):
         return best
     of, alone = (
         np.sum((e[:, :3] - np.cross(whole.poses.centre, e[:, 3:])) ** 2, axis=1)
@@ -712,14 +714,14 @@ def _settled(
         b = blocks(linear, structure)
         solved = solve(b, variances)
         x = solved.x[: linear.J.shape[2]]
-        if structure == GEOMETRY:
+        if structure in GEOMETRY:
             far = own_squares(blocks(whole.linear(guess), structure), variances, solved.x)
         guess = guess.moved(x, whole.free)
         if structure in SHARED:
             far = left_out_squares(b, solved)
             keep = used.copy()
             keep[rows[(far > chdtri(6, CHANCE)) & (far > 0.3 * far.max())]] = False
-        elif structure == GEOMETRY:
+        elif structure in GEOMETRY:
             keep = far < chdtri(6, CHANCE)
         else:
             keep = 6 * _distances(whole, guess, structure, variances, gathered) < chdtri(6, CHANCE)
