@@ -33,6 +33,7 @@ from armsight.app.run.motion_file import read_motions  # noqa: E402
 from armsight.app.run.setup import Setup  # noqa: E402
 from armsight.data import Shot  # noqa: E402
 from armsight.geometry.pose import exp_se3, inverse, pose  # noqa: E402
+from armsight.loop.identify.model import gravity_levers  # noqa: E402
 from armsight.loop.servo import JointLoops, LoopTiming, PoseServo  # noqa: E402
 from armsight.robot.arm_file import open_arm  # noqa: E402
 from armsight.robot.boards.opening import slowed  # noqa: E402
@@ -251,15 +252,29 @@ def report(name, seed, poses=20, cycles=4):
     ends = [segment.end_s for segment in found.log.segments if segment.phase == "rest"]
     zeros = np.degrees(np.mean([cell.true_q(times[k]) - read[k] for k in np.searchsorted(times, ends) - 1], axis=0))
     backlash = np.array(device.mechanics.backlash_deg) if ar4 else np.full(5, np.nan)
+    droop = np.zeros(cell.model.joints) if ar4 else injected_droop(cell, times, read, ends)
     print(
         f"{name} seed {seed}: {result.placed_mm:.2f} mm; parts:",
         {k: f"{100 * p.share:.0f} %" for k, p in result.parts.items()},
     )
     for k, joint in enumerate(result.joints):
         print(f"  {joint.name:14} zero {joint.zero_deg} true {zeros[k]:.3f}; backlash {joint.backlash_deg}", end=" ")
-        print(f"true {backlash[k]:.3f}; droop {joint.droop_deg_per_m} deg/m, {joint.droop_deg}", end="; ")
+        print(f"true {backlash[k]:.3f}; droop {joint.droop_deg_per_m} true {droop[k]:.2f} deg/m", end="; ")
         print(f"sides {joint.hysteresis_deg}; {joint.latency_s} s")
     return result
+
+
+def injected_droop(cell, times, read, ends):
+    """Return the droop of an SO-101's joints, deg per metre of the report's lever: of the torques it really carried."""
+    servos, rows = cell.arm.device.servos, np.searchsorted(times, ends) - 1
+    loads = np.array([servos._load(np.append(cell.true_q(times[k]), 0.0))[:-1].copy() for k in rows])
+    droops = -np.degrees(loads / servos.mechanics.stiffness_n_m_rad)
+    levers = gravity_levers(cell.model, read[rows])
+    slopes = [
+        np.polyfit(lever, droop, 1)[0] if np.ptp(lever) > 1e-6 else 0.0
+        for lever, droop in zip(levers.T, droops.T, strict=True)
+    ]
+    return np.array(slopes)
 
 
 def main(what, *rest):

@@ -64,16 +64,32 @@ class Row:
     peers: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def _links(sequence, seen) -> np.ndarray | None:
-    """T_link_flange by the joints read and the arm's nominal model; None for a body that no arm moves."""
+def _links_at(sequence):
+    """Times -> T_link_flange by the joints read and the arm's nominal model; None for a body that no arm moves."""
     from kinhec.kinematics import forward_kinematics_all
     from kinhec.robots import get_robot
 
-    if sequence.robot.q_meas is None:
+    t, q = sequence.robot.t, sequence.robot.q_meas
+    if q is None:
         return None
     robot = get_robot(sequence.manifest["robot"])
-    frames = np.array([forward_kinematics_all(robot, q) for q in sequence.robot.q_meas[seen]])
-    return inverse(frames) @ frames[:, -1:]
+
+    def flange(joints):
+        return np.array([forward_kinematics_all(robot, one)[-1] for one in joints])
+
+    q = np.array(q)
+    for _ in range(2):  # KinHEC's poses have noise that its joints have not: joints that give these very poses
+        T = flange(q)
+        off = log_se3(inverse(T) @ sequence.robot.T_base_ee_meas)
+        by = [log_se3(inverse(T) @ flange(q + 1e-6 * one)) / 1e-6 for one in np.eye(q.shape[1])]
+        q += np.einsum("nji,ni->nj", np.linalg.pinv(np.stack(by, axis=2), rcond=1e-2), off)
+
+    def links(at):
+        joints = np.stack([np.interp(at, t, column) for column in q.T], axis=1)
+        frames = np.array([forward_kinematics_all(robot, one) for one in joints])
+        return inverse(frames) @ frames[:, -1:]
+
+    return links
 
 
 def ours(sequence, row: Row, joints: bool) -> None:
@@ -83,15 +99,17 @@ def ours(sequence, row: Row, joints: bool) -> None:
     eye = "in_hand" if sequence.eye_in_hand else "to_hand"
     ordered = sequence.manifest["sampling_mode"] == "continuous"
     started = time.perf_counter()
+    links_at = _links_at(sequence) if joints else None
     try:
         if sequence.synchronous:
             A = sequence.robot.T_base_ee_meas[seen]
             poses = Poses(A, B, np.zeros((len(A), 6, 6)), eye == "in_hand", np.zeros(3))
-            links = _links(sequence, seen) if joints else None
+            links = None if links_at is None else links_at(t)
             found = calibrate_structured(poses, t_s=t if ordered else None, links=links, scale=True)
         else:
             hand = PoseStream.of(sequence.robot.t, sequence.robot.T_base_ee_meas, "hand")
-            streams = calibrate_structured_streams(hand, PoseStream.of(t, B, "eye"), eye=eye, scale=True)
+            eyes = PoseStream.of(t, B, "eye")
+            streams = calibrate_structured_streams(hand, eyes, eye=eye, scale=True, links_at=links_at)
             found = streams.handeye
             row.offset_ms = 1e3 * abs(-streams.offset_s - sequence.time_offset)
     except ArmsightError as error:

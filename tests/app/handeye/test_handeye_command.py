@@ -170,6 +170,10 @@ def test_streams_with_an_unknown_clock_offset(armsight, tmp_path):
     assert abs(document["clock_offset_s"] - 0.123) < 4 * document["clock_offset_sigma_s"] < 4e-3
     other = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "to-hand", "--streams")
     assert_rejected(other, robot, "these poses fit --eye in-hand, not to-hand")
+    large = named(tmp_path / "c.csv", head, np.hstack([t_hand[:, None], 39.37 * A[:, :3, 3], quaternions(A)]))
+    document, notes = found(armsight, large, seen, "--streams", "--detect-units")
+    assert "inches taken for metres; converted" in notes
+    assert_right(document)
 
 
 def test_millimetres_are_rejected_or_detected(armsight, tmp_path, seen):
@@ -225,7 +229,14 @@ def test_what_does_not_fit_is_named(armsight, tmp_path, seen):
     rejected(named(tmp_path / "d.csv", head.replace("deg", "rad"), 90 + q), "are these degrees?", more=arm)
     displaced = A.copy()
     displaced[7:] = A[7:] @ exp_se3(np.array([0.0, 0.0, 0.1, 0.4, 0.0, 0.3]))
-    rejected(matrices(path, displaced), "fit one mounting each, but not the same", "TCP were displaced")
+    rejected(
+        matrices(path, displaced),
+        "those from line 8",
+        "fit one mounting each, but not the same",
+        "TCP changed, by 99 mm and 28.6 deg",
+    )
+    displaced[7:] = exp_se3(np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.1])) @ A[7:]
+    rejected(matrices(path, displaced), "those from line 8", "the robot's base, or the target, was displaced by")
 
 
 def test_a_tcp_taken_for_the_flange_is_noted_where_the_joints_are_known(armsight, tmp_path, seen):

@@ -55,6 +55,15 @@ def test_the_coarse_offset_is_within_a_sample():
     assert coarse_offset(hand, seen) == pytest.approx(OFFSET_S, abs=1.5 / 30)
 
 
+@pytest.mark.parametrize(("noise_rad", "blunders"), [(1e-3, 0.2), (0.1, 0.0)])
+def test_blunders_and_noise_leave_the_coarse_offset_near(noise_rad, blunders):
+    hand, seen, _, _ = streams(3, noise_rad=noise_rad)
+    rng, Ts = np.random.default_rng(8), seen.Ts.copy()
+    wrong = rng.random(len(Ts)) < blunders
+    Ts[wrong, :3, :3] = Rotation.random(int(wrong.sum()), random_state=8).as_matrix()
+    assert coarse_offset(hand, PoseStream(seen.t_s, Ts)) == pytest.approx(OFFSET_S, abs=1.5 / 30)
+
+
 def test_streams_that_stand_still_or_do_not_overlap_are_rejected():
     hand, seen, _, _ = streams(3)
     still = PoseStream(hand.t_s, np.repeat(hand.Ts[:1], len(hand.t_s), axis=0))

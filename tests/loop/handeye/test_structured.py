@@ -10,7 +10,18 @@ from scipy.stats import chi2
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import exp_se3, inverse
 from armsight.loop.handeye.handeye import Poses
-from armsight.loop.handeye.noise import Linear, _value_and_gradient, blocks, pose_kernel, walk_gathered
+from armsight.loop.handeye.noise import (
+    Blocks,
+    Linear,
+    _value_and_gradient,
+    blocks,
+    freedom,
+    jackknife,
+    pose_kernel,
+    reml,
+    solve,
+    walk_gathered,
+)
 from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams
 from armsight.loop.handeye.structured import calibrate_structured
 from armsight.robot.arm_file import open_arm
@@ -192,7 +203,10 @@ def test_too_few_poses_and_unknown_needs_are_rejected():
     assert calibrate_structured(poses, links=links, structures=("robot's geometry off",)).used.any()
 
 
-@pytest.mark.parametrize("structure", ["robot", "robot and camera", "robot drifting over its poses", "camera walking"])
+@pytest.mark.parametrize(
+    "structure",
+    ["robot", "robot and camera", "robot's geometry off", "robot drifting over its poses", "camera walking"],
+)
 def test_the_gradient_of_the_restricted_likelihood(structure):
     rng = np.random.default_rng(2)
     poses, _, _, _ = made(2, n=6, in_hand=True)
@@ -207,6 +221,7 @@ def test_the_gradient_of_the_restricted_likelihood(structure):
             ("seen_m", 3),
         )
     }
+    maps |= {name: np.random.default_rng(k).normal(size=(6, 6, 6)) for k, name in enumerate(("link_m", "link_rad"))}
     linear = Linear(
         rng.normal(size=(6, 6)),
         rng.normal(size=(6, 6, 4)),
@@ -221,6 +236,28 @@ def test_the_gradient_of_the_restricted_likelihood(structure):
     logs = rng.normal(size=len(b.sources))
     numeric = numeric_jacobian(lambda x: np.array([_value_and_gradient(x, b)[0]]), logs, 1e-3)[0]
     np.testing.assert_allclose(_value_and_gradient(logs, b)[1], numeric, rtol=1e-5, atol=1e-7)
+
+
+def one_variance(n, P):
+    rng = np.random.default_rng(7)
+    eye = np.broadcast_to(np.eye(6), (1, n, 6, 6))
+    none = np.zeros(P)
+    J = rng.normal(size=(n, 6, P))
+    return Blocks(0.02 * rng.normal(size=(n, 6)), J, np.zeros((n, 6, 6)), eye, ("seen_m",), none, none, np.full(P, -1))
+
+
+def test_the_freedom_of_one_variance_is_that_of_its_residuals():
+    b = one_variance(8, 12)
+    found = freedom(b, reml(b, np.array([1e-3])), lambda variances: solve(b, variances).cov, 12)
+    assert found == pytest.approx(48 - 12, rel=0.02)
+
+
+def test_the_jackknife_is_that_of_fits_without_one_pose_each():
+    b, one = one_variance(9, 4), np.array([1.0])
+    whole, others = solve(b, one), [np.delete(np.arange(9), k) for k in range(9)]
+    fits = [solve(replace(b, e=b.e[k], J=b.J[k], given=b.given[k], parts=b.parts[:, k]), one).x for k in others]
+    moved = np.array(fits) - whole.x
+    np.testing.assert_allclose(jackknife(b, whole), moved.T @ moved * 8 / 9, rtol=1e-6)
 
 
 def test_a_pose_kernel_is_a_covariance():

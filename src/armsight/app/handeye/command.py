@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -205,9 +205,9 @@ def _streams(
 ) -> HandEyeAnswer:
     """Calibrate two streams with an unknown clock offset."""
     from armsight.app.handeye.plan import plan_poses
-    from armsight.app.handeye.recording import of_streams
+    from armsight.app.handeye.recording import links_between, of_streams
     from armsight.app.handeye.result import HandEyeAnswer
-    from armsight.app.handeye.suspect import require_plausible
+    from armsight.app.handeye.suspect import require_plausible, resized
     from armsight.loop.handeye.handeye import MIN_POSES
     from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams, coarse_offset
 
@@ -219,6 +219,7 @@ def _streams(
     hand = PoseStream.of(robot.t_s, robot.Ts, str(options.robot))
     eye_stream = PoseStream.of(seen.t_s, seen.Ts, str(options.seen))
     eye: Literal["in_hand", "to_hand"] = "in_hand" if options.eye == "in-hand" else "to_hand"
+    notes = (*robot.notes, *seen.notes)
     progress("looking at whether both sides fit")
     roughly_s = coarse_offset(hand, eye_stream)
     A, there = hand.at(eye_stream.t_s + roughly_s)
@@ -226,10 +227,25 @@ def _streams(
         pairs = of_streams(
             robot, seen, (A[there], eye_stream.Ts[there]), eye_stream.t_s[there], roughly_s, eye == "in_hand"
         )
-        require_plausible(pairs, arm, scale=options.scale, streams=True)
+        checked = require_plausible(pairs, arm, detect_units=options.detect_units, scale=options.scale, streams=True)
+        notes = checked.notes
+        hand, eye_stream = (
+            replace(stream, Ts=resized(stream.Ts, before, after))
+            for stream, before, after in (
+                (hand, pairs.poses.A, checked.poses.A),
+                (eye_stream, pairs.poses.B, checked.poses.B),
+            )
+        )
     found = calibrate_structured_streams(
-        hand, eye_stream, eye=eye, centre=seen.centre, scale=options.scale, progress=progress
+        hand,
+        eye_stream,
+        eye=eye,
+        centre=seen.centre,
+        scale=options.scale,
+        links_at=None if arm is None else links_between(robot, arm),
+        progress=progress,
     )
     recording = of_streams(robot, seen, (found.A, found.B), found.t_s, found.offset_s, eye == "in_hand")
+    recording = replace(recording, notes=notes)
     plan = plan_poses(found.handeye, recording.poses, options.plan) if options.plan else None
     return HandEyeAnswer(recording, found.handeye, found.offset_s, found.sigma_offset_s, plan)

@@ -55,7 +55,7 @@ def plan_poses(found: StructuredHandEye, poses: Poses, count: int, seed: int = 0
     A, B = _candidates(found, poses.rows(found.used), rng)
     candidates = Poses(A, B, np.zeros((len(A), 6, 6)), poses.in_hand, poses.centre)
     _, J, carry = residuals(candidates, found.T_base_still, found.T_flange_held)
-    maps = error_maps(candidates, carry, None)
+    maps = error_maps(candidates, np.zeros((len(candidates.A), 6)), carry, None)
     C = np.mean(poses.cov, axis=0) + np.zeros((len(A), 6, 6))
     for name in STRUCTURES[found.structure]:
         if name in maps:

@@ -5,6 +5,7 @@ In: a table of robot poses, and what was seen. Out: :class:`PairedPoses`, rows t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,8 @@ from armsight.robot.arm import Arm
 
 #: Poses of one TCP agree within this, m and rad, with a constant transform from the model's flange.
 TCP_M, TCP_RAD = 5e-3, 0.02
+#: Step of a joint for differences, rad.
+STEP_RAD = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,8 +148,42 @@ def links_of(recording: PairedPoses, arm: Arm) -> Array | None:
     """Return T_link_flange (N, L, 4, 4) of all links by the joints of the table; None where it has none."""
     if recording.robot.q is None:
         return None
-    frames = np.array([arm.links(q) for q in recording.robot.q[recording.rows]])
-    return np.asarray(inverse(frames) @ frames[:, -1:])
+    q, T_flange_tcp = _joints_of(recording.robot, arm, recording.robot.q)
+    frames = np.array([arm.links(one) for one in q[recording.rows]])
+    return np.asarray(inverse(frames) @ frames[:, -1:] @ T_flange_tcp)
+
+
+def _joints_of(robot: PoseTable, arm: Arm, q: Array) -> tuple[Array, Array]:
+    """Return joints that give the table's very poses, and the TCP (4, 4) that these are of, in the flange.
+
+    Poses that scatter against their joints would otherwise be explained by errors of links, as what the joints show of it.
+    """
+    if robot.numbers.shape[1] == 0:
+        return q, np.eye(4)
+    T_flange_tcp = mean_pose(inverse(np.asarray(arm.forward(q))) @ robot.Ts)
+    goal, q = robot.Ts @ inverse(T_flange_tcp), q.copy()
+    for _ in range(2):
+        back = inverse(np.asarray(arm.forward(q)))
+        by = [log_se3(back @ np.asarray(arm.forward(q + STEP_RAD * one))) / STEP_RAD for one in np.eye(q.shape[1])]
+        off = log_se3(back @ goal)
+        q += np.einsum("nji,ni->nj", np.linalg.pinv(np.stack(by, axis=2), rcond=1e-2), off)
+    return q, T_flange_tcp
+
+
+def links_between(robot: PoseTable, arm: Arm) -> Callable[[Array], Array] | None:
+    """Return what gives T_link_flange (N, L, 4, 4) at times (N,), robot's clock, s; None where the table has no joints."""
+    if robot.q is None or robot.t_s is None:
+        return None
+    t_s, rows = np.unique(robot.t_s, return_index=True)
+    q, T_flange_tcp = _joints_of(robot, arm, robot.q)
+    q = q[rows]
+
+    def links(times: Array) -> Array:
+        between = np.stack([np.interp(times, t_s, column) for column in q.T], axis=1)
+        frames = np.array([arm.links(one) for one in between])
+        return np.asarray(inverse(frames) @ frames[:, -1:] @ T_flange_tcp)
+
+    return links
 
 
 def of_streams(

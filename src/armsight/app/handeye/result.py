@@ -133,6 +133,10 @@ def statements(run: HandEyeAnswer) -> list[str]:
             f"with the geometry of the arm that the other poses show, poses left out come to {geometry:.2f} mm in place of "
             f"{plain:.2f}; armsight identify finds it"
         )
+    elif run.recording.robot.q is None:
+        lines.append(
+            "without joints and --model the sigmas leave out what the arm's own geometry is off by in all poses alike"
+        )
     if found.common.size:
         lines.append(
             f"the rig's calibration was fitted too: {1e3 * found.common_m:.2f} mm RMS at the target, at most "

@@ -56,8 +56,19 @@ def misfit(poses: Poses) -> float:
     if not found:
         return float("inf")
     X, Z = found[0]
-    e, _, _ = residuals(part, Z, X)
-    return float(np.median(np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1))))
+    return float(np.median(_sizes(residuals(part, Z, X)[0])))
+
+
+def _sizes(e: Array) -> Array:
+    """Return by how much tangents (N, 6) move a point at 0.3 m, (N,), m."""
+    return np.asarray(np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1)))
+
+
+def resized(Ts: Array, before: Array, after: Array) -> Array:
+    """Return poses with their lengths converted as those of others were, (N, 4, 4) all."""
+    out = Ts.copy()
+    out[:, :3, 3] *= np.linalg.norm(after[:, :3, 3]) / max(float(np.linalg.norm(before[:, :3, 3])), 1e-12)
+    return out
 
 
 def _resized(p: Poses) -> Poses:
@@ -118,11 +129,11 @@ def require_plausible(
         )
     displaced = _displaced(p, as_given) if not scale else None
     if displaced is not None:
+        first, what = _moved(p, displaced)
         raise InputError(
-            f"{recording.robot.path}: the rows up to {recording.names[displaced - 1]} and those from "
-            f"{recording.names[displaced]} on fit one mounting each, but not the same (as given, median residual "
-            f"{1e3 * as_given:.1f} mm): base, camera, target or the robot's TCP were displaced or changed about there: use "
-            "one of both parts"
+            f"{recording.robot.path}: the rows up to {recording.names[first - 1]} and those from "
+            f"{recording.names[first]} on fit one mounting each, but not the same (as given, median residual "
+            f"{1e3 * as_given:.1f} mm): {what} about there: use one of both parts"
         )
     if as_given > PLAUSIBLE_M:
         note = (
@@ -153,6 +164,28 @@ def _displaced(p: Poses, as_given: float) -> int | None:
                 found[k] = worse(k)
     best = min(found, key=lambda k: found[k])
     return best if found[best] < min(as_given / BETTER, PLAUSIBLE_M) else None
+
+
+def _moved(p: Poses, row: int) -> tuple[int, str]:
+    """Return the first row of another mounting, about a row, and what was displaced before it.
+
+    That is what the flange carries, what stands still, or either.
+    """
+    rows = np.arange(len(p.A))
+    parts = (p.rows(rows[:row]), p.rows(rows[row:]))
+    (X, Z), (X_after, Z_after) = (starts(part.A, part.right_side)[0] for part in parts)
+    before, after = (_sizes(residuals(p, *both)[0]) for both in ((Z, X), (Z_after, X_after)))
+    costs = np.append(0.0, np.cumsum(before - after))[PART : len(rows) - PART + 1]
+    first = PART + int(np.argmin(costs))
+    held, still = (log_se3(inverse(T) @ T_after) for T, T_after in ((X, X_after), (Z, Z_after)))
+    sizes = _sizes(np.array([held, still]))
+    camera, target = ("the camera", "the target") if p.in_hand else ("the target", "the camera")
+    if sizes.max() < BETTER * sizes.min():
+        return first, "base, camera, target or the robot's TCP were displaced or changed"
+    e, what = (held, f"{camera} on the flange was displaced, or the TCP changed,")
+    if sizes[1] > sizes[0]:
+        e, what = still, f"the robot's base, or {target}, was displaced"
+    return first, f"{what} by {1e3 * np.linalg.norm(e[:3]):.0f} mm and {np.degrees(np.linalg.norm(e[3:])):.1f} deg"
 
 
 def _readings(recording: PairedPoses, arm: Arm | None, shifts: tuple[int, ...]) -> Iterator[tuple[Poses, str]]:

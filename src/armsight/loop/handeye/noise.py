@@ -26,6 +26,7 @@ Restricted likelihood: Patterson and Thompson, Biometrika 58, 1971; its gradient
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +35,7 @@ from scipy.linalg.lapack import dpotri
 from scipy.optimize import minimize
 
 from armsight.data import Array, Record
-from armsight.geometry.pose import adjoint, inverse
+from armsight.geometry.pose import adjoint, inverse, small_adjoint
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.handeye import HARDLY, LEVER_M, Poses
 
@@ -47,6 +48,16 @@ STRUCTURES: dict[str, tuple[str, ...]] = {
     "robot and image": ("flange_m", "flange_rad", "image"),
     "robot, camera and time stamps": ("flange_m", "flange_rad", "lateral_m", "depth_m", "seen_rad", "time_s"),
     "robot's geometry off": ("flange_m", "flange_rad", "lateral_m", "depth_m", "seen_rad", "link_m", "link_rad"),
+    "robot's geometry and time stamps off": (
+        "flange_m",
+        "flange_rad",
+        "lateral_m",
+        "depth_m",
+        "seen_rad",
+        "time_s",
+        "link_m",
+        "link_rad",
+    ),
     "robot drifting over its poses": (
         "flange_m",
         "flange_rad",
@@ -61,9 +72,8 @@ STRUCTURES: dict[str, tuple[str, ...]] = {
     "camera walking": ("flange_m", "flange_rad", "walk_m", "walk_rad"),
     "positions alone": ("seen_m", "hardly_rad"),
 }
-#: Structures whose errors are shared between poses.
+#: Structures whose errors are shared between poses, and are no unknowns.
 SHARED = (
-    "robot's geometry off",
     "robot drifting over its poses",
     "robot drifting over time",
     "robot walking over time",
@@ -76,8 +86,15 @@ FORGETS_RAD, FORGETS_M, FORGETS_SHARE = 1.0, 0.4, 0.15
 #: Errors of position and angle of one source are alike at LEVER_M, as far as poses do not say otherwise: the sigma of the
 #: logarithm of their variances' ratio. Few poses, or links, say little about two variances: one may vanish by chance.
 LIKE_EACH_OTHER = 1.5
+#: Step of the logarithm of a variance for differences; the sigma of such a logarithm at most; and the least degrees of
+#: freedom of one direction: below 2 there is no mean.
+STEP_LOG, KNOWN_LOG, LEAST_FREEDOM = 0.1, 3.0, 3.0
+#: Information about a direction that a block leaves when it is left out is taken for this share at least.
+LEAST_LEFT = 0.02
 #: Sigmas are looked for between these (m, rad, s), and the factor of the covariance that is given up to the last.
 LOW, HIGH, HIGH_IMAGE = 1e-7, 0.3, 100.0
+#: Errors of links beyond this are no small ones any more: the arm is to be identified first.
+HIGH_LINK_M, HIGH_LINK_RAD = 0.01, 0.015
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +135,14 @@ class Linear(Record):
         )
 
 
-def error_maps(poses: Poses, carry: Array, speed: Array | None, links: Array | None = None) -> dict[str, Array]:
+def error_maps(
+    poses: Poses, e: Array, carry: Array, speed: Array | None, links: Array | None = None
+) -> dict[str, Array]:
     """Return what unit errors of each independent source do to the residuals.
 
     Args:
         poses: N poses.
+        e: (N, 6) the residuals.
         carry: (N, 6, 6) adjoints that map an error of the flange to the residuals.
         speed: (N, 6) twist of the flange, right tangent, m/s and rad/s; None: no streams.
         links: (N, L, 4, 4) T_link_flange, m; None: no model.
@@ -144,7 +164,9 @@ def error_maps(poses: Poses, carry: Array, speed: Array | None, links: Array | N
     if speed is not None:
         maps["time_s"] = carry @ speed[..., None]
     if links is not None:
-        moved = np.swapaxes(carry[:, None] @ adjoint(inverse(links)), 1, 2)  # (N, 6, L, 6)
+        # As the derivative by the mounting is: an error of the flange's frame and one of the mounting are the same.
+        bent = (np.eye(6) + 0.5 * small_adjoint(e)) @ carry
+        moved = np.swapaxes(bent[:, None] @ adjoint(inverse(links)), 1, 2)  # (N, 6, L, 6)
         maps["link_m"], maps["link_rad"] = (moved[..., part].reshape(n, 6, -1) for part in (slice(3), slice(3, 6)))
     return maps
 
@@ -194,6 +216,7 @@ class Blocks(Record):
         sources: their K names.
         known: (P,) information about each unknown beside the residuals.
         at: (P,) where each is, from where that has it.
+        links: (P,) of which source's variance an unknown is, an error of a link; -1 for the others.
     """
 
     e: Array
@@ -203,6 +226,7 @@ class Blocks(Record):
     sources: tuple[str, ...]
     known: Array
     at: Array
+    links: NDArray[np.int64]
 
     def covariance(self, variances: Array) -> Array:
         """Return the covariance (n, m, m)."""
@@ -217,35 +241,39 @@ def blocks(linear: Linear, structure: str) -> Blocks:
     n = len(linear.e)
     sources = STRUCTURES[structure]
     given = np.zeros_like(linear.given) if "image" in sources else linear.given
-    own = {name: M @ np.swapaxes(M, 1, 2) for name, M in linear.maps.items() if name in sources}
+    links = [name for name in sources if name.startswith("link")]
+    own = {name: M @ np.swapaxes(M, 1, 2) for name, M in linear.maps.items() if name in sources and name not in links}
     if "image" in sources:
         own["image"] = linear.given
+    none = np.full(linear.J.shape[2], -1)
     if structure not in SHARED:
-        return Blocks(
-            linear.e, linear.J, given, np.array([own[name] for name in sources]), sources, linear.known, linear.at
-        )
-    parts = []
+        # An error that all poses share, of known variance, is an unknown with that information about it.
+        J = np.concatenate([linear.J, *(linear.maps[name] for name in links)], axis=2)
+        of = np.concatenate([none, *(np.full(linear.maps[name].shape[2], sources.index(name)) for name in links)])
+        nothing = np.zeros(J.shape[2] - len(none))
+        known, at = np.append(linear.known, nothing), np.append(linear.at, nothing)
+        parts = np.array([own.get(name, np.zeros_like(given)) for name in sources])
+        return Blocks(linear.e, J, given, parts, sources, known, at, of)
+    shared = []
     for name in sources:
-        if name.startswith("link"):
-            M = linear.maps[name].reshape(6 * n, -1)
-            parts.append(M @ M.T)
-        elif name in own:
-            parts.append(_spread(own[name]))
+        if name in own:
+            shared.append(_spread(own[name]))
         elif name in linear.walk:
             first = np.minimum(np.arange(n)[:, None], np.arange(n)[None])
-            parts.append(_joined(linear.walk[name][first]))
+            shared.append(_joined(linear.walk[name][first]))
         else:
             M = linear.maps["flange_m" if name == "drift_m" else "flange_rad"]
             K = 1 + linear.kernel[structure]  # what changes by so much from pose to pose has a constant part as large
-            parts.append(_joined(K[..., None, None] * np.einsum("iak,jbk->ijab", M, M)))
+            shared.append(_joined(K[..., None, None] * np.einsum("iak,jbk->ijab", M, M)))
     return Blocks(
         linear.e.reshape(1, -1),
         linear.J.reshape(1, 6 * n, -1),
         _spread(given)[None],
-        np.array(parts)[:, None],
+        np.array(shared)[:, None],
         sources,
         linear.known,
         linear.at,
+        none,
     )
 
 
@@ -268,7 +296,7 @@ class Solved(Record):
     """The weighted least squares at given variances.
 
     Attributes:
-        x: (P,) the step that minimises the squares of e + J x.
+        x: (P,) the step that minimises the squares of e + J x, the links' errors last.
         root: (P, P) root @ root.T is its covariance.
         inverse: (n, m, m) inverse covariance of the residuals.
         weighted: (n, m) inverse covariance times what is left.
@@ -293,24 +321,33 @@ def solve(b: Blocks, variances: Array) -> Solved:
     L = np.linalg.cholesky(C)
     Ci = np.asarray(np.linalg.inv(C) if len(C) > 1 else _inverse(L[0])[None])
     CiJ = Ci @ b.J
-    H = np.einsum("nki,nkj->ij", b.J, CiJ) + np.diag(b.known)
+    is_link = b.links >= 0
+    known = np.where(is_link, 1 / variances[b.links], b.known)
+    H = np.einsum("nki,nkj->ij", b.J, CiJ) + np.diag(known)
     unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))  # m, rad and s side by side
     values, vectors = np.linalg.eigh(unit[:, None] * H * unit)
     values = np.maximum(values, 1e-14 * values[-1])
     root = unit[:, None] * vectors / np.sqrt(values)
-    x = -root @ (root.T @ (np.einsum("nki,nk->i", CiJ, b.e) + b.known * b.at))
+    x = -root @ (root.T @ (np.einsum("nki,nk->i", CiJ, b.e) + known * b.at))
     left = b.e + b.J @ x
     weighted = (Ci @ left[..., None])[..., 0]
     logdet = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
     logdet_H = float(np.log(values).sum() - 2 * np.log(unit).sum())
-    squares = float((left * weighted).sum() + (b.known * (b.at + x) ** 2).sum())
-    return Solved(x, root, Ci, weighted, 0.5 * (logdet + logdet_H + squares))
+    squares = float((left * weighted).sum() + (known * (b.at + x) ** 2).sum())
+    logdet_links = -float(np.log(known[is_link]).sum())
+    return Solved(x, root, Ci, weighted, 0.5 * (logdet + logdet_H + logdet_links + squares))
 
 
 def _inverse(L: Array) -> Array:
     """Return the inverse of L L^T."""
     half, _ = dpotri(L, lower=1)
     return np.asarray(np.tril(half) + np.tril(half, -1).T)
+
+
+def own_squares(b: Blocks, variances: Array, x: Array) -> Array:
+    """Return the squared Mahalanobis length (N,) of each pose's residual after a step (P,); independent poses only."""
+    left = b.e + b.J @ x
+    return np.asarray(np.einsum("ni,ni->n", left, np.linalg.solve(b.covariance(variances), left[..., None])[..., 0]))
 
 
 def left_out_squares(b: Blocks, s: Solved) -> Array:
@@ -335,6 +372,9 @@ def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
     projected = s.inverse - root @ np.swapaxes(root, 1, 2)
     traces = flat @ (projected - s.weighted[:, :, None] * s.weighted[:, None, :]).reshape(-1)
     gradient = 0.5 * variances * traces
+    for k in np.unique(b.links[b.links >= 0]):
+        of = b.links == k
+        gradient[k] += 0.5 * float(of.sum() - ((s.root[of] ** 2).sum() + (s.x[of] ** 2).sum()) / variances[k])
     cost = s.cost
     if "link_m" in b.sources or b.sources in (("flange_m", "flange_rad"), ("seen_m", "seen_rad")):
         m = len(b.sources) - 2
@@ -355,7 +395,8 @@ def reml(b: Blocks, start: Array, steps: int = 60) -> Array:
         steps: iterations at most.
     """
     low = 2 * np.log(LOW)
-    bounds = [(low, 2 * np.log(HIGH_IMAGE if name == "image" else HIGH)) for name in b.sources]
+    high = {"image": HIGH_IMAGE, "link_m": HIGH_LINK_M, "link_rad": HIGH_LINK_RAD}
+    bounds = [(low, 2 * np.log(high.get(name, HIGH))) for name in b.sources]
     if "hardly_rad" in b.sources:
         bounds[b.sources.index("hardly_rad")] = (2 * np.log(HARDLY),) * 2
     found = minimize(
@@ -370,6 +411,55 @@ def reml(b: Blocks, start: Array, steps: int = 60) -> Array:
     return np.asarray(np.exp(found.x))
 
 
+def freedom(b: Blocks, variances: Array, cov: Callable[[Array], Array], count: int) -> float:
+    """Return of how many degrees of freedom Student's ellipsoid of a covariance is, whose variances are estimates.
+
+    Satterthwaite's: a variance v of the unknowns that is known with the variance w has 2 v^2 / w, where w follows from the
+    curvature of the restricted likelihood; those of several directions are joined as Fai and Cornelius do (J. Statistical
+    Computation and Simulation 54, 1996).
+
+    Args:
+        b: the residuals that the variances were estimated from.
+        variances: (K,) the estimates.
+        cov: variances -> (P, P) covariance of the unknowns.
+        count: of the unknowns, the first so many.
+    """
+    logs = np.log(variances)
+    steps = STEP_LOG * np.eye(len(logs))
+    slopes = [
+        (_value_and_gradient(logs + s, b)[1] - _value_and_gradient(logs - s, b)[1]) / (2 * STEP_LOG) for s in steps
+    ]
+    values, vectors = np.linalg.eigh(0.5 * (np.array(slopes) + np.transpose(slopes)))
+    known = (vectors / (np.maximum(values, 0.0) + KNOWN_LOG**-2)) @ vectors.T
+    unit = 1 / np.sqrt(np.diag(cov(variances))[:count])
+    sizes, axes = np.linalg.eigh(unit[:, None] * cov(variances)[:count, :count] * unit)
+    white = unit[:, None] * axes / np.sqrt(sizes)
+
+    def along(at: Array) -> Array:
+        return np.asarray(np.einsum("pk,pq,qk->k", white, cov(np.exp(at))[:count, :count], white))
+
+    by = np.array([(along(logs + s) - along(logs - s)) / (2 * STEP_LOG) for s in steps])
+    of_each = np.maximum(2 / np.maximum(np.einsum("ik,ij,jk->k", by, known, by), 1e-9), LEAST_FREEDOM)
+    total = float(np.sum(of_each / (of_each - 2)))
+    return 2 * total / max(total - count, 1e-9)
+
+
+def jackknife(b: Blocks, s: Solved) -> Array:
+    """Return the covariance (P, P) of the unknowns that leaving out one block after the other shows, at the same weights.
+
+    It holds for errors that are not as the structure says, too (Wu, Annals of Statistics 14, 1986).
+    """
+    CiJ = s.inverse @ b.J
+    H = np.einsum("nki,nkj->nij", b.J, CiJ)
+    root = s.root  # whitens: the unit matrix is all information
+    left = np.eye(root.shape[1]) - root.T @ H @ root
+    pulls = np.einsum("nki,nk->ni", b.J, s.weighted) @ root
+    values, vectors = np.linalg.eigh(left)
+    values = np.maximum(values, LEAST_LEFT)
+    moved = np.einsum("nij,nj,nkj,nk->ni", vectors, 1 / values, vectors, pulls) @ root.T
+    return np.asarray(moved.T @ moved * (len(b.e) - 1) / len(b.e))
+
+
 def held_out(
     linear: Linear, structure: str, variances: Array, parts: list[NDArray[np.int64]], steps: int = 8
 ) -> tuple[Array, Array, Array]:
@@ -381,25 +471,26 @@ def held_out(
     """
     density, residual = np.full(len(linear.e), np.nan), np.full((len(linear.e), 6), np.nan)
     left = residual.copy()
-    everything = np.arange(len(linear.e))
+    everything, own = np.arange(len(linear.e)), linear.J.shape[2]
     whole = blocks(linear, structure) if structure in SHARED else None
     for part in parts:
         others = np.setdiff1d(everything, part)
         rest = blocks(linear.rows(others), structure)
         again = reml(rest, variances, steps)
         fitted = solve(rest, again)
-        mean, J = linear.e[part] + linear.J[part] @ fitted.x, linear.J[part]
-        residual[part] = mean
+        residual[part] = linear.e[part] + linear.J[part] @ fitted.x[:own]
         if whole is None:
-            S = blocks(linear.rows(part), structure).covariance(again) + J @ fitted.cov @ np.swapaxes(J, 1, 2)
+            b = blocks(linear.rows(part), structure)
+            mean = b.e + b.J @ fitted.x
+            S = b.covariance(again) + b.J @ fitted.cov @ np.swapaxes(b.J, 1, 2)
         else:
             C = whole.covariance(again)[0]
             of, frm = _lines(part), _lines(others)
             gain = C[np.ix_(of, frm)] @ fitted.inverse[0]
-            JJ = J.reshape(len(of), -1) - gain @ rest.J[0]
+            JJ = linear.J[part].reshape(len(of), -1) - gain @ rest.J[0]
             full = C[np.ix_(of, of)] - gain @ C[np.ix_(frm, of)] + JJ @ fitted.cov @ JJ.T
             S = np.array([full[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(part))])
-            mean = mean - (C[np.ix_(of, frm)] @ fitted.weighted[0]).reshape(-1, 6)
+            mean = residual[part] - (C[np.ix_(of, frm)] @ fitted.weighted[0]).reshape(-1, 6)
         density[part], left[part] = _log_normal(mean, S), mean
     return density, residual, left
 

@@ -33,6 +33,8 @@ MIN_SPEED_RAD_S = 0.02
 ROUNDS, SETTLED_S = 12, 1e-6
 #: Over this time the speed of the flange is measured, s.
 SPEED_S = 0.02
+#: Steps between poses over which angular speeds are taken, and how much faster than the slower stream is a blunder.
+OVER, FASTER = (4, 12, 36), 1.3
 #: Blocks at least: fewer do not determine a variance.
 MIN_BLOCKS = 8
 #: Less than this part of a direction's information without one block counts as none: its sigma is a thousand times as
@@ -168,6 +170,7 @@ def calibrate_structured_streams(
     eye: Eye = "to_hand",
     centre: ArrayLike = (0.0, 0.0, 0.0),
     scale: bool = False,
+    links_at: Callable[[Array], Array] | None = None,
     progress: Callable[[str], None] = lambda line: None,
 ) -> StructuredStreams:
     """Find the mounting, the time offset and the structure of the noise of two streams.
@@ -178,6 +181,8 @@ def calibrate_structured_streams(
         eye: as in :func:`~armsight.loop.handeye.handeye.calibrate_handeye`.
         centre: (3,) the middle of the body's points, body frame, m.
         scale: whether the size of the target may be wrong.
+        links_at: times (N,), s, on the hand's clock -> T_link_flange (N, L, 4, 4) of every link, where the joints and a
+            model are known.
         progress: called with the name of each step as it begins.
 
     Raises:
@@ -199,7 +204,13 @@ def calibrate_structured_streams(
         )
         speed = log_se3(inverse(early[good]) @ late[good]) / SPEED_S
         found = calibrate_structured(
-            poses, t_s=t_eye[good], speed=speed, scale=scale, structures=structures, progress=progress
+            poses,
+            t_s=t_eye[good],
+            speed=speed,
+            links=None if links_at is None else links_at(t_eye[good] + offset),
+            scale=scale,
+            structures=structures,
+            progress=progress,
         )
         offset += found.step_s
     return StructuredStreams(found, offset, found.sigma_step_s, t_eye[good], poses.A, poses.B)
@@ -208,29 +219,42 @@ def calibrate_structured_streams(
 def coarse_offset(hand: PoseStream, eye: PoseStream) -> float:
     """Return the offset, s, at which the two angular speeds agree best: to be added to the eye's times.
 
+    Speeds are taken over intervals of several lengths, short ones for quick motions and long ones against noise; the length
+    counts under which agreement stands out most. Faster than the slower stream ever rotates is a blunder of the other.
+
     Raises:
         CalibrationError: nothing rotates.
     """
     step = float(np.clip(np.median(np.diff(eye.t_s)), 0.005, 0.05))
-    over = 4 * step
-    speeds = []
-    for stream in (hand, eye):
-        grid = np.arange(stream.t_s[0] + over, stream.t_s[-1] - over, step)
-        speed, good = stream.angular_speed(grid, over)
-        speeds.append((grid[0], np.where(good, speed, 0.0), good.astype(float)))
-    (t_hand, a, in_a), (t_eye, b, in_b) = speeds
-    if max(np.quantile(a, 0.9), np.quantile(b, 0.9)) < MIN_SPEED_RAD_S:
+    if max(float(np.quantile(_speeds(stream, step, OVER[0])[1], 0.9)) for stream in (hand, eye)) < MIN_SPEED_RAD_S:
         raise CalibrationError(
             "nothing rotates in these streams: rotate the flange, about two axes, at 10 deg/s and more"
         )
+    shorter = min(np.ptp(stream.t_s) for stream in (hand, eye))
+    lengths = [over for over in OVER if over == OVER[0] or 10 * over * step < shorter]
+    return min(_agreement(hand, eye, step, over) for over in lengths)[1]
+
+
+def _speeds(stream: PoseStream, step: float, over: int) -> tuple[float, Array, Array]:
+    """Return the first time, angular speeds over so many steps, rad/s, and 1.0 where the stream covers them."""
+    grid = np.arange(stream.t_s[0] + over * step, stream.t_s[-1] - over * step, step)
+    speed, good = stream.angular_speed(grid, over * step)
+    return float(grid[0]), np.where(good, speed, 0.0), good.astype(float)
+
+
+def _agreement(hand: PoseStream, eye: PoseStream, step: float, over: int) -> tuple[float, float]:
+    """Return how much the speeds differ at best, as a share of what they differ by at other offsets, and the offset, s."""
+    (t_hand, a, in_a), (t_eye, b, in_b) = (_speeds(stream, step, over) for stream in (hand, eye))
+    most = FASTER * min(float(np.quantile(speed, 0.99)) for speed in (a, b))
+    a, in_a, b, in_b = np.where(a > most, 0.0, a), in_a * (a <= most), np.where(b > most, 0.0, b), in_b * (b <= most)
     both = _correlation(in_a, in_b)
     enough = both > 0.3 * both.max()
-    squares = _correlation(a**2 * in_a, in_b) + _correlation(in_a, b**2 * in_b) - 2 * _correlation(a, b)
     # The mean square difference of the speeds, against what they are themselves where they overlap.
     size = _correlation(a**2 * in_a, in_b) + _correlation(in_a, b**2 * in_b)
+    squares = size - 2 * _correlation(a, b)
     cost = np.where(enough & (size > 1e-9), squares / np.maximum(size, 1e-12), np.inf)
     lag = int(np.argmin(cost)) - (len(b) - 1)
-    return float(t_hand + lag * step - t_eye)
+    return float(cost.min() / np.median(cost[np.isfinite(cost)])), float(t_hand + lag * step - t_eye)
 
 
 def _correlation(a: Array, b: Array) -> Array:

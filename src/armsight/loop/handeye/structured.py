@@ -47,8 +47,11 @@ from armsight.loop.handeye.noise import (
     Linear,
     blocks,
     error_maps,
+    freedom,
     held_out,
+    jackknife,
     left_out_squares,
+    own_squares,
     pose_kernel,
     reml,
     solve,
@@ -57,10 +60,11 @@ from armsight.loop.handeye.noise import (
     wiener_kernel,
 )
 
-#: Poses that variances and held-out likelihoods come from at most, evenly spread, and those of a shared error.
-MAX_VARIANCE, MAX_SHARED = 150, 40
-#: Poses that the transforms come from at most, and those with a shared error.
-MAX_FIT, MAX_SHARED_FIT = 1000, 120
+#: Poses that a fit comes from at most, evenly spread. The structure is chosen from as many: what is claimed of many poses
+#: must have been looked for in as many.
+MAX_FIT = 1000
+#: With a shared error, poses that variances and held-out likelihoods come from at most, and the transforms.
+MAX_SHARED, MAX_SHARED_FIT = 40, 120
 #: Fewest poses for a structure with shared errors.
 MIN_SHARED = 12
 #: Numbers left of the residuals for each variance at least: fewer do not determine it.
@@ -81,9 +85,10 @@ SURELY = 5.0
 HANGING = 1.0
 #: The structure that weights positions alone, and by how many sigmas its squared errors must be lower.
 POSITIONS, SURELY_LOWER = "positions alone", 3.0
-#: The structure whose links are off, and the shared ones that are tried only where neighbours hang together.
-GEOMETRY = "robot's geometry off"
-HANGS = tuple(name for name in SHARED if name != GEOMETRY)
+#: The structures whose links are off.
+GEOMETRY = ("robot's geometry off", "robot's geometry and time stamps off")
+#: Draws by which structures are weighted, and the weight below which one is not true.
+DRAWS, HARDLY_TRUE = 400, 0.02
 #: Rounds of least squares and of leaving out.
 ROUNDS = 6
 
@@ -205,7 +210,7 @@ class _Problem(Record):
         if shared and poses.common is not None:
             J = np.concatenate([J, poses.common if poses.in_hand else -poses.common], axis=2)
         known, at = np.repeat([0.0, 1.0], [before, shared]), np.append(np.zeros(before), guess.common)
-        return Linear(e, J, poses.cov, error_maps(poses, carry, self.speed, self.links), {}, {}, known, at)
+        return Linear(e, J, poses.cov, error_maps(poses, e, carry, self.speed, self.links), {}, {}, known, at)
 
     def metric(self, guess: _Guess, cov: Array) -> tuple[_Guess, Array]:
         """Return Z and X in m, and the covariance (P, P) of what was fitted with them."""
@@ -351,7 +356,7 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
     scaled = replace(problem, poses=problem.scaled(_Guess(np.eye(4), np.eye(4), per_m)))
     guesses = [replace(guess, per_m=per_m) for guess in _first(scaled)]
     found, used = _robust(free, guesses)
-    rows = _spread(np.flatnonzero(used), MAX_VARIANCE)
+    rows = _spread(np.flatnonzero(used), MAX_FIT)
     linear = free.rows(rows).linear(found)
     b = blocks(linear, "robot and camera")
     solved = solve(b, reml(b, _start_variances(linear, "robot and camera")))
@@ -474,7 +479,8 @@ def _allowed(structure: str, problem: _Problem, count: int, covered: bool) -> bo
     if "image" in sources:
         return covered
     if "link_m" in sources:
-        return problem.links is not None and count >= MIN_SHARED
+        timed = "time_s" not in sources or problem.speed is not None
+        return problem.links is not None and count >= MIN_SHARED and timed
     if "time_s" in sources:
         return problem.speed is not None
     if structure in ("robot drifting over time", "robot walking over time") or "walk_m" in sources:
@@ -501,21 +507,24 @@ def _chosen(
     hanging = _hanging(whole, guess, used, simple, variances, gathered)
     trials = {}
     for name in names:
-        if name in HANGS and name not in hanging:
+        if name in SHARED and name not in hanging:
             continue
         progress(f"hand-eye: poses left out ({name})")
         trials[name] = _trial(whole, guess, used, name, gathered)
-    best, geometry = _best(whole, trials), trials.get(GEOMETRY)
+    best, geometries = _best(whole, trials), [trials[name] for name in GEOMETRY if name in trials]
+    geometry = max(geometries, key=lambda trial: float(trial.density.mean()), default=None)
     progress(f"hand-eye: fitting ({best})")
     guess, used, variances = _settled(whole, guess, used, best, gathered)
     rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
     linear = _linear(whole, guess, rows, best, gathered)
-    solved = solve(blocks(linear, best), variances)
-    x, cov = solved.x, solved.cov
+    x, cov = _student(whole, guess, used, best, variances, gathered)
+    weights = _weights(trials, best)
+    mixed = weights[best] * cov
+    for name in weights.keys() - {best}:  # what the other structures that may be true as well would answer
+        other, spread = _student(whole, guess, used, name, trials[name].variances, gathered)
+        mixed = mixed + weights[name] * (spread + np.outer(other - x, other - x))
+    cov = mixed
     guess = guess.moved(x, whole.free)
-    freedom = max(linear.e.size // 2 - 9, 3)  # of positions, whose fit also rotates the frames
-    # Few residuals say little about the variances: Student's ellipsoid in place of the normal one (Hotelling).
-    cov = cov * float(6 * f_distribution.ppf(0.95, 6, freedom) / chdtri(6, 0.05))
     metric, cov = whole.metric(guess, cov)
     require_known(whole.poses, metric.Z, metric.X, cov)
     sigmas = {name: float(np.sqrt(v)) for name, v in zip(STRUCTURES[best], variances, strict=True)}
@@ -534,11 +543,11 @@ def _chosen(
         sigma_step_s=rest.pop(0) if whole.free[1] else 0.0,
         structure=best,
         sigmas=sigmas,
-        likelihoods={name: trial[0] for name, trial in trials.items()},
+        likelihoods={name: float(trial.density.mean()) for name, trial in trials.items()},
         arm_m=arm,
         camera_m=camera,
-        held_out=_held_out_errors(whole, guess, trials[best][1], trials[best][3]),
-        held_out_geometry=None if geometry is None else _held_out_errors(whole, guess, geometry[2], geometry[3]),
+        held_out=_held_out_errors(whole, guess, trials[best].residual, trials[best].rows),
+        held_out_geometry=None if geometry is None else _held_out_errors(whole, guess, geometry.left, geometry.rows),
         used=used,
         distance=distance,
         common=guess.common,
@@ -553,8 +562,79 @@ def _common_m(poses: Poses, guess: _Guess) -> float:
     return float(np.sqrt((off**2).sum(axis=-1).mean())) / guess.per_m if guess.common.size else 0.0
 
 
-#: Mean log density of poses left out, their residuals, what is left of them with shared errors predicted, and their rows.
-_Trial = tuple[float, Array, Array, NDArray[np.int64]]
+@dataclass(frozen=True, eq=False)
+class _Trial(Record):
+    """A structure on poses left out.
+
+    Attributes:
+        density: (N,) logarithm of the probability density of each pose left out.
+        residual: (N, 6) their residuals under transforms fitted without them.
+        left: (N, 6) what is left of them with shared errors predicted.
+        rows: (N,) which rows they are.
+        variances: (K,) of the sources, from all of them.
+    """
+
+    density: Array
+    residual: Array
+    left: Array
+    rows: NDArray[np.int64]
+    variances: Array
+
+
+def _weights(trials: dict[str, _Trial], best: str) -> dict[str, float]:
+    """Return how probable the structures are that poses left out do not exclude, the best among them.
+
+    By the densities of poses left out, smoothed by what their sum is uncertain (pseudo-BMA+; Yao et al., Bayesian Analysis
+    13, 2018). Positions alone are chosen by another rule, and have none.
+    """
+    if best == POSITIONS:
+        return {best: 1.0}
+    names = [best, *(name for name in trials if name not in (best, POSITIONS))]
+    of = trials[best]
+    sums, sigmas = np.zeros(len(names)), np.zeros(len(names))
+    for k, name in enumerate(names[1:], 1):
+        other = trials[name]
+        n = min(len(of.rows), len(other.rows))
+        sums[k] = n * (other.density.mean() - of.density.mean())
+        if np.array_equal(of.rows, other.rows):
+            sigmas[k] = np.sqrt(n) * float((other.density - of.density).std())
+    drawn = sums + sigmas * np.random.default_rng(0).standard_normal((DRAWS, len(names)))
+    odds = np.exp(drawn - drawn.max(axis=1, keepdims=True))
+    shares = (odds / odds.sum(axis=1, keepdims=True)).mean(axis=0)
+    kept = {
+        name: float(share) for name, share in zip(names, shares, strict=True) if name == best or share > HARDLY_TRUE
+    }
+    return {name: share / sum(kept.values()) for name, share in kept.items()}
+
+
+def _student(
+    whole: _Problem,
+    guess: _Guess,
+    used: NDArray[np.bool_],
+    structure: str,
+    variances: Array,
+    gathered: dict[str, Array],
+) -> tuple[Array, Array]:
+    """Return the step (P,) from a guess to the least squares of a structure, and its covariance (P, P).
+
+    Where leaving out poses shows a larger one than the structure does, mean of a block of three, it is that. Residuals say
+    little about some variances: it is Student's ellipsoid in place of the normal one (Hotelling).
+    """
+    rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if structure in SHARED else MAX_FIT)
+    few = _spread(rows, MAX_SHARED if structure in SHARED else MAX_FIT)
+    linear = _linear(whole, guess, rows, structure, gathered)
+    b, own = blocks(linear, structure), linear.J.shape[2]
+    solved = solve(b, variances)
+    cov = solved.cov[:own, :own]
+    if structure not in SHARED:
+        shown, grow = jackknife(b, solved)[:own, :own], np.ones(own)
+        for part in (slice(k, k + 3) for k in range(0, 12, 3)):
+            grow[part] = np.sqrt(max(float(np.trace(np.linalg.solve(cov[part, part], shown[part, part]))) / 3, 1.0))
+        cov = cov * np.outer(grow, grow)
+    estimated = blocks(_linear(whole, guess, few, structure, gathered), structure)
+    known = freedom(estimated, variances, lambda v: solve(b, v).cov, 12)
+    known = min(known, max(6 * len(rows) // 2 - 9, 3))  # of positions, whose fit also rotates the frames
+    return solved.x[:own], cov * float(6 * f_distribution.ppf(0.95, 6, known) / chdtri(6, 0.05))
 
 
 def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
@@ -563,12 +643,12 @@ def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
     Positions alone never win so: they do where they predict positions left out better, clearly and surely.
     """
     others = {name: trial for name, trial in trials.items() if name != POSITIONS} or trials
-    best = max(others, key=lambda name: others[name][0])
-    if POSITIONS not in trials or best in SHARED or best == POSITIONS:
+    best = max(others, key=lambda name: others[name].density.mean())
+    if POSITIONS not in trials or best in (*SHARED, *GEOMETRY, POSITIONS):
         return best
     of, alone = (
         np.sum((e[:, :3] - np.cross(whole.poses.centre, e[:, 3:])) ** 2, axis=1)
-        for e in (trials[best][1], trials[POSITIONS][1])
+        for e in (trials[best].residual, trials[POSITIONS].residual)
     )
     lower = of - alone
     sure = lower.mean() > SURELY_LOWER * lower.std() / np.sqrt(len(lower))
@@ -623,7 +703,7 @@ def _settled(
     """Alternate variances, transforms and blunders until they stay."""
     variances: Array | None = None
     for _ in range(ROUNDS):
-        few = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_VARIANCE)
+        few = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_FIT)
         linear = _linear(whole, guess, few, structure, gathered)
         if variances is None:
             variances = reml(blocks(linear, structure), _start_variances(linear, structure))
@@ -633,12 +713,16 @@ def _settled(
         linear = _linear(whole, guess, rows, structure, gathered)
         b = blocks(linear, structure)
         solved = solve(b, variances)
-        x = solved.x
+        x = solved.x[: linear.J.shape[2]]
+        if structure in GEOMETRY:
+            far = own_squares(blocks(whole.linear(guess), structure), variances, solved.x)
         guess = guess.moved(x, whole.free)
         if structure in SHARED:
             far = left_out_squares(b, solved)
             keep = used.copy()
             keep[rows[(far > chdtri(6, CHANCE)) & (far > 0.3 * far.max())]] = False
+        elif structure in GEOMETRY:
+            keep = far < chdtri(6, CHANCE)
         else:
             keep = 6 * _distances(whole, guess, structure, variances, gathered) < chdtri(6, CHANCE)
         if keep.sum() < max(MIN_POSES, len(keep) // 3):
@@ -670,8 +754,8 @@ def _distances(whole: _Problem, guess: _Guess, structure: str, variances: Array,
 def _trial(
     whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, gathered: dict[str, Array]
 ) -> _Trial:
-    """Return the mean log density of poses left out under a structure, their residuals, and their rows."""
-    rows = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_VARIANCE)
+    """Leave out poses under a structure."""
+    rows = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_FIT)
     linear = _linear(whole, guess, rows, structure, gathered)
     b = blocks(linear, structure)
     variances = reml(b, _start_variances(linear, structure))
@@ -679,7 +763,7 @@ def _trial(
     order = np.arange(n) if whole.t_s is not None else np.random.default_rng(0).permutation(n)
     parts = [np.sort(part) for part in np.array_split(order, n if n <= FEW and structure not in SHARED else FOLDS)]
     density, residual, left = held_out(linear, structure, variances, parts)
-    return float(density.mean()), residual, left, rows
+    return _Trial(density, residual, left, rows, variances)
 
 
 def _held_out_errors(whole: _Problem, guess: _Guess, residual: Array, rows: NDArray[np.int64]) -> HeldOut:
