@@ -28,6 +28,7 @@ from strategies import ordinary_rig
         (("check",), ["RUN|POSES.csv", "armsight check -h"]),
         (("dense", "a", "b", "c", "--method", "x", "-o", "d"), ["'x' is not one of", "armsight dense match -h"]),
         (("calibrate", "--left", "a1", "a2", "-o", "r"), ["unexpected extra argument", "quote a glob, --left 'DIR/"]),
+        (("calibrate", "--left", "a1", "a2", "a3", "-o", "r"), ["extra arguments (a2 ..); quote"]),
         (("demo", "--board", "real"), ["--board real", "emulated:unicorn", "armsight demo -h"]),
     ],
 )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import sys
 
 import click
@@ -128,6 +129,7 @@ def _usage_text(error: click.ClickException) -> str:
     text = " ".join(error.format_message().split()).replace("'. (", "' (").rstrip(".")
     text = text[:1].lower() + text[1:]
     if "extra argument" in text and {"--left", "--right"} & set(sys.argv):
+        text = re.sub(r"\((\S+) .+\)", r"(\1 ..)", text)
         return f"{text}; quote a glob, --left 'DIR/left*.png', or the shell puts every file name there"
     context = error.ctx if isinstance(error, click.UsageError) else None
     return text if context is None else f"{text}; the usage is in: {' '.join(context.command_path.split())} -h"

@@ -85,6 +85,13 @@ class ResidualSums:
         self.square += weight * other.square
         self.freedom += weight * other.freedom
 
+    def less(self, other: ResidualSums) -> ResidualSums:
+        """Return these sums without another's."""
+        rest = ResidualSums(len(self.b), self.begin_s)
+        rest.add(self, 1.0)
+        rest.add(other, -1.0)
+        return rest
+
 
 @dataclass(frozen=True, eq=False)
 class RigChange(Record):
@@ -149,6 +156,7 @@ class RigWatch:
         self._test, self._window = ResidualSums(self._size, 0.0), ResidualSums(self._size, 0.0)
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
         self._timed = False
+        self._stays: deque[ResidualSums] = deque(maxlen=TEST_SHOTS)  # of the running test
         self.alarm = self.alarmed = False
         self._alarms = 0  # in a row
         self.suspected: RigChange | None = None
@@ -265,6 +273,9 @@ class RigWatch:
             if not self._test.freedom:
                 self._test.begin_s = self._stay.begin_s
             self._test.add(self._stay, 1.0 / self._stay_shots)
+            mean = ResidualSums(self._size, self._stay.begin_s)
+            mean.add(self._stay, 1.0 / self._stay_shots)
+            self._stays.append(mean)
         self._stay, self._stay_shots = None, 0
 
     def _decide(self) -> None:
@@ -276,10 +287,12 @@ class RigWatch:
         for name in ("H", "b", "square", "freedom"):
             setattr(self._window, name, weight * getattr(self._window, name))
         self._window.add(self._test, 1.0)
-        self._test = ResidualSums(self._size, 0.0)
+        self._test, stays, self._stays = ResidualSums(self._size, 0.0), self._stays, deque(maxlen=TEST_SHOTS)
         change = self._estimated(self._window)
-        certain = change.chi_square > _ALARM or any(change.alone[part] > limit for part, limit in _ALARMS.items())
-        alarm = certain and self._matters(change, slice(None))
+        alarm = _certain(change) and self._matters(change, slice(None))
+        if alarm and not self._timed:
+            # Without times one pose in which the body moved between the exposures must not pass for moved cameras.
+            alarm = all(_certain(self._estimated(self._window.less(stay))) for stay in stays)
         self._alarms = self._alarms + 1 if alarm else 0
         if 0 < self._alarms <= _FRESH:
             change = self._begun(change)
@@ -372,7 +385,7 @@ class RigWatch:
     def copied(self) -> RigWatch:
         """Return a copy that says what was found so far; this one goes on."""
         copied = copy(self)
-        copied._history = self._history.copy()
+        copied._history, copied._stays = self._history.copy(), self._stays.copy()
         return copied
 
     def _ended(self) -> RigWatch:
@@ -401,6 +414,11 @@ class RigWatch:
     def _to_blame(self, change: RigChange) -> list[Part]:
         """Return the parts that are needed to explain a change; where none is, the one that explains most alone."""
         return [part for part in _PARTS if self._needed(change, part)] or [max(_PARTS, key=change.alone.__getitem__)]
+
+
+def _certain(change: RigChange) -> bool:
+    """Return whether chance explains neither all seven numbers nor one of their parts."""
+    return change.chi_square > _ALARM or any(change.alone[part] > limit for part, limit in _ALARMS.items())
 
 
 def free_directions(rig: StereoRig) -> Array:
