@@ -79,11 +79,14 @@ class _Sections(click.Group):
         return command
 
     def invoke(self, ctx: click.Context) -> object:
-        """Run a command; an interrupt leaves as Abort, before click prints an empty line for it."""
+        """Run a command; an interrupt leaves as Abort, before click prints an empty line; `| head` is no error."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
             raise click.exceptions.Abort from None
+        except BrokenPipeError:  # click would exit with 1
+            _silence_stdout()
+            raise click.exceptions.Exit(0) from None
 
 
 @click.group(cls=_Sections, context_settings={"help_option_names": ["-h", "--help"]})

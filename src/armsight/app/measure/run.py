@@ -434,7 +434,11 @@ def _undone(left: Image, right: Image) -> dict[str, tuple[Image, Image]]:
     """Return the images with each mistake undone that may have been made with them, by what to say of it."""
     undone = {"left and right are exchanged: the images fit the rig the other way round": (right, left)}
     for what, undo in _FLIPS.items():
-        sides = {"images": (undo(left), undo(right)), "left images": (undo(left), right), "right images": (left, undo(right))}
+        sides = {
+            "images": (undo(left), undo(right)),
+            "left images": (undo(left), right),
+            "right images": (left, undo(right)),
+        }
         for which, images in sides.items():
             said = f"the {which} are {what} against those of the calibration; the cameras must deliver both alike"
             undone[said] = images

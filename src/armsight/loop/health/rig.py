@@ -290,8 +290,8 @@ class RigWatch:
         self._test, stays, self._stays = ResidualSums(self._size, 0.0), self._stays, deque(maxlen=TEST_SHOTS)
         change = self._estimated(self._window)
         alarm = _certain(change) and self._matters(change, slice(None))
-        if alarm and not self._timed:
-            # Without times one pose in which the body moved between the exposures must not pass for moved cameras.
+        if alarm and not self._timed and len(stays) > 1:
+            # Without times, one pose among others in which the body moved between the exposures must not pass for moved cameras.
             alarm = all(_certain(self._estimated(self._window.less(stay))) for stay in stays)
         self._alarms = self._alarms + 1 if alarm else 0
         if 0 < self._alarms <= _FRESH:

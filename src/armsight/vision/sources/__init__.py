@@ -47,7 +47,15 @@ def check_source(spec: str) -> None:
     if not (colon and kind in SOURCES) and not os.path.isdir(os.path.expanduser(spec)):
         known = ", ".join(f"{name}:..." for name in SOURCES)
         path = os.path.expanduser(spec)
-        meant = "url" if "://" in spec else "usb" if spec.startswith("/dev/video") else "video" if os.path.isfile(path) else ""
+        meant = (
+            "url"
+            if "://" in spec
+            else "usb"
+            if spec.startswith("/dev/video")
+            else "video"
+            if os.path.isfile(path)
+            else ""
+        )
         hint = f" ({meant}:{spec}?)" if meant else ""
         raise InputError(f"{spec}: not a source{hint}: known are {known}, or the path of a folder")
 
