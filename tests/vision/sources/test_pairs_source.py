@@ -179,7 +179,7 @@ def test_an_index_is_followed(tmp_path, store, read_back):
 
 
 def test_a_file_or_an_address_without_its_kind_is_given_one():
-    with pytest.raises(InputError, match=r"not a source \(url:http://a/b\?\): known are"):
+    with pytest.raises(InputError, match=r"not a source \(url:LEFT,RIGHT\?\): known are"):
         open_source("http://a/b")
     with pytest.raises(InputError, match=r"not a source \(video:.*\.py\?\): known are"):
         open_source(__file__)

@@ -291,7 +291,7 @@ class RigWatch:
         change = self._estimated(self._window)
         alarm = _certain(change) and self._matters(change, slice(None))
         if alarm and not self._timed and len(stays) > 1:
-            # Without times, one pose among others in which the body moved between the exposures must not pass for moved cameras.
+            # Without times: one pose of several, in which the body moved between the exposures, is no moved camera.
             alarm = all(_certain(self._estimated(self._window.less(stay))) for stay in stays)
         self._alarms = self._alarms + 1 if alarm else 0
         if 0 < self._alarms <= _FRESH:
