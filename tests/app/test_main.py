@@ -46,6 +46,16 @@ def test_the_package_runs_and_has_a_version():
     assert ran.stderr.startswith("armsight: error: no such command")
 
 
+def test_a_reader_that_closed_is_no_error():
+    reader, writer = os.pipe()
+    os.close(reader)
+    ran = subprocess.run(
+        [sys.executable, "-m", "armsight", "arm", "list"], stdout=writer, stderr=subprocess.PIPE, check=False
+    )
+    os.close(writer)
+    assert (ran.returncode, ran.stderr) == (0, b"")
+
+
 def stderr_of(arguments, **environment):
     """Return what a run prints on stderr where that is a terminal."""
     ours, theirs = pty.openpty()
