@@ -28,6 +28,7 @@ from strategies import ordinary_rig
         (("check",), ["RUN|POSES.csv", "armsight check -h"]),
         (("dense", "a", "b", "c", "--method", "x", "-o", "d"), ["'x' is not one of", "armsight dense match -h"]),
         (("calibrate", "--left", "a1", "a2", "-o", "r"), ["unexpected extra argument", "quote a glob, --left 'DIR/"]),
+        (("calibrate", "--left", "a1", "a2", "a3", "-o", "r"), ["extra arguments (a2 ..); quote"]),
         (("demo", "--board", "real"), ["--board real", "emulated:unicorn", "armsight demo -h"]),
     ],
 )
@@ -43,6 +44,16 @@ def test_the_package_runs_and_has_a_version():
     ran = subprocess.run([sys.executable, "-m", "armsight", "nothing"], capture_output=True, text=True, check=False)
     assert ran.returncode == 2
     assert ran.stderr.startswith("armsight: error: no such command")
+
+
+def test_a_reader_that_closed_is_no_error():
+    reader, writer = os.pipe()
+    os.close(reader)
+    ran = subprocess.run(
+        [sys.executable, "-m", "armsight", "arm", "list"], stdout=writer, stderr=subprocess.PIPE, check=False
+    )
+    os.close(writer)
+    assert (ran.returncode, ran.stderr) == (0, b"")
 
 
 def stderr_of(arguments, **environment):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import sys
 
 import click
@@ -78,11 +79,14 @@ class _Sections(click.Group):
         return command
 
     def invoke(self, ctx: click.Context) -> object:
-        """Run a command; an interrupt leaves as Abort, before click prints an empty line for it."""
+        """Run a command; an interrupt leaves as Abort, before click prints an empty line; `| head` is no error."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
             raise click.exceptions.Abort from None
+        except BrokenPipeError:  # click would exit with 1
+            _silence_stdout()
+            raise click.exceptions.Exit(0) from None
 
 
 @click.group(cls=_Sections, context_settings={"help_option_names": ["-h", "--help"]})
@@ -128,6 +132,7 @@ def _usage_text(error: click.ClickException) -> str:
     text = " ".join(error.format_message().split()).replace("'. (", "' (").rstrip(".")
     text = text[:1].lower() + text[1:]
     if "extra argument" in text and {"--left", "--right"} & set(sys.argv):
+        text = re.sub(r"\((\S+) .+\)", r"(\1 ..)", text)
         return f"{text}; quote a glob, --left 'DIR/left*.png', or the shell puts every file name there"
     context = error.ctx if isinstance(error, click.UsageError) else None
     return text if context is None else f"{text}; the usage is in: {' '.join(context.command_path.split())} -h"

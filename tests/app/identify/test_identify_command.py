@@ -7,17 +7,20 @@ import sys
 import tomllib
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from identify_files import arm_toml, poses_csv
 from scipy.spatial.transform import Rotation
 
+from armsight.app.identify.run import headline
 from armsight.geometry.pose import pose
 from armsight.loop.identify.corrected import Corrected
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.read import read_poses
+from armsight.loop.identify.validate import Errors, Validation
 from armsight.robot.arm_file import open_arm, read_arm_toml
 from cli_runs import Said, assert_rejected, run
 
@@ -70,6 +73,15 @@ def test_a_person_reads_the_held_out_line_first(tmp_path, capsys):
     assert "-v" in answer.out
     few = poses_csv(tmp_path / "few.csv", n=24)
     assert "not fitted, or not alone" in said(capsys, "--arm", "six_r", "--data", few, "-v").out
+
+
+def test_an_identified_arm_that_is_no_better_is_said_so():
+    small, large = (Errors(np.full((3, 1), error), np.zeros(0)) for error in (1e-3, 2e-3))
+    lines = [
+        headline(SimpleNamespace(held_out=Validation(*arms, False, 1.0), how="3 poses"))
+        for arms in ((large, small), (small, large))
+    ]
+    assert ["no better than the nominal arm" in line for line in lines] == [False, True]
 
 
 def test_a_written_urdf_is_the_identified_arm():

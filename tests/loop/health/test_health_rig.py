@@ -90,6 +90,24 @@ def test_a_rig_without_covariance_is_not_tested():
     assert monitor.findings() == ()
 
 
+def test_one_pose_among_others_without_times_is_no_moved_camera():
+    """A body that moved between the two exposures of one pair of images looks like moved cameras in that pair alone."""
+    rig = replace(TRUE, cov=np.diag(SIGMAS**2), sigma_px=0.0)
+    good, moved = (
+        [estimate for *_, estimate, _ in watched_body(7, rotated=rotated, seconds=2.0)][::10]
+        for rotated in (None, np.radians([0.3, 0.0, 0.0]))
+    )
+
+    def causes(estimates):
+        watch = RigWatch(rig, BODY, SYNC_S)
+        for estimate in estimates:
+            watch.take(estimate, None)
+        return [found.cause for found in watch.findings()]
+
+    assert causes([moved[0], *good[1:]]) == []
+    assert causes(moved) == causes(moved[:1]) == ["rig"]
+
+
 def test_the_estimate_is_what_dense_least_squares_gives():
     """The sums with everything eliminated, against one dense fit of all parameters with their priors."""
     rows = [

@@ -95,7 +95,7 @@ def test_gross_corners_and_a_wrong_pair_are_named_and_cost_nothing():
     assert [r.pair for r in c.rejected] == ["p08"]
     assert "wrong corners" in c.rejected[0].reason
     assert [note.split(":")[0] for note in c.notes] == ["p02", "p05", "p11"]
-    assert all("1 of 108 corners of both images dropped" in note for note in c.notes)
+    assert all("1 of 108 points of both images dropped" in note for note in c.notes)
     # The pairs' positions in the folds shift by one, so held-out metrics differ a little whatever is done.
     assert c.heldout.epipolar_rms_px == pytest.approx(best.heldout.epipolar_rms_px, rel=0.03)
     assert c.heldout.rigid_rms_m == pytest.approx(best.heldout.rigid_rms_m, rel=0.03)

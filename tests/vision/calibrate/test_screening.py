@@ -93,7 +93,7 @@ def test_only_what_is_wrong_is_thrown_out():
     uv[single] += (5.0, 0.0)
     dirty = screen(flat(board.body.points), truth(true, Ts), replace(observations, uv=uv), names)
     assert [r.pair for r in dirty.rejected] == ["p06"]
-    assert dirty.notes == ("p02: 1 of 108 corners of both images dropped as gross errors",)
+    assert dirty.notes == ("p02: 1 of 108 points of both images dropped as gross errors",)
     assert 6 not in dirty.kept
     assert dirty.observations.shot_count == len(pairs) - 1
     assert len(dirty.observations.shot) == len(observations.shot) - 108 - 1

@@ -118,6 +118,9 @@ def test_a_glob_that_matches_nothing_or_a_folder_says_so(tmp_path):
         PairsSource.open(f"{tmp_path}/nothing*.png", f"{tmp_path}/*")
     with pytest.raises(InputError, match="is a folder; give its images"):
         PairsSource.open(str(tmp_path), str(tmp_path))
+    (tmp_path / "IMG_1.JPG").touch()
+    with pytest.raises(InputError, match=r"nothing\*.png: no such file; the images there are '.*/\*.JPG'"):
+        PairsSource.open(f"{tmp_path}/nothing*.png", f"{tmp_path}/*")
 
 
 def test_a_folder_with_left_and_right_subfolders(tmp_path, store, read_back):
@@ -173,6 +176,13 @@ def test_an_index_is_followed(tmp_path, store, read_back):
     assert (x.name, x.t_s, read_back(x.left), read_back(x.right)) == ("x", 1.25, ("left", 3), ("right", 3))
     assert (y.name, y.t_s, y.problem, y.left) == ("y", 1.5, "camera asleep", None)
     assert (z.t_s, z.problem) == (None, f"{tmp_path}/gone.png: no such file")
+
+
+def test_a_file_or_an_address_without_its_kind_is_given_one():
+    with pytest.raises(InputError, match=r"not a source \(url:LEFT,RIGHT\?\): known are"):
+        open_source("http://a/b")
+    with pytest.raises(InputError, match=r"not a source \(video:.*\.py\?\): known are"):
+        open_source(__file__)
 
 
 @pytest.mark.parametrize("spec", ["film:a.mp4", "/no/such/folder", "usbcam", ""])

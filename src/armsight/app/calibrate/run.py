@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.metadata
+import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,14 +21,14 @@ from armsight.data import SIDES, Detections
 from armsight.errors import InputError
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.bodies import calibrate_bodies
-from armsight.vision.calibrate.result import Calibration
+from armsight.vision.calibrate.result import Calibration, RejectedPair
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
 from armsight.vision.image import grey, read_image
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import load_body_csv
 from armsight.vision.sources import PairsSource
-from armsight.vision.sources.pairs import image_files, natural_key
+from armsight.vision.sources.pairs import image_files, natural_key, no_files
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 
@@ -42,7 +44,7 @@ def files_of(pattern: str | None) -> list[Path]:
         return []
     files = sorted(image_files(pattern), key=natural_key)
     if not files:
-        raise InputError(f"{pattern}: no such file; quote a glob such as 'DIR/left*.png' to keep the shell off it")
+        raise InputError(no_files(pattern))
     return files
 
 
@@ -166,6 +168,16 @@ def summary(
     }
 
 
+def _rejected_lines(rejected: Sequence[RejectedPair]) -> list[str]:
+    """Return a line for each pair that was rejected; neighbours rejected for one reason share a line."""
+    lines = []
+    for reason, group in itertools.groupby(rejected, key=lambda r: r.reason):
+        first, *more = (r.pair for r in group)
+        pairs = f"{1 + len(more)} pairs {first} to {more[-1]}" if more else f"pair {first}"
+        lines.append(f"rejected {pairs}: {reason}")
+    return lines
+
+
 def print_result(calibration: Calibration, output: Path, board_file: Path | None, report: Path | None) -> None:
     """Print the held-out metrics first, then those of the fit, then what is weak."""
     c, h = calibration, calibration.heldout
@@ -185,7 +197,7 @@ def print_result(calibration: Calibration, output: Path, board_file: Path | None
         f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg; the body differs from its "
         f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
         *([] if c.disc_radius_m is None else [f"radius of the board's discs: {1e3 * c.disc_radius_m:.3f} mm"]),
-        *(f"rejected pair {rejected.pair}: {rejected.reason}" for rejected in c.rejected),
+        *_rejected_lines(c.rejected),
         *(f"note: {note}" for note in c.notes),
         *(weak(weakness) for weakness in c.weaknesses),
         f"rig written to {output}" + (f", report to {report / PAGE}" if report is not None else ""),

@@ -170,7 +170,8 @@ def _notes(found: Identified, measured: Measured, lines: Array) -> tuple[str, ..
     notes = []
     if len(found.left_out):
         shown = ", ".join(f"{lines[k]:.0f}" for k in found.left_out[:8]) + (", .." if len(found.left_out) > 8 else "")
-        notes.append(f"{len(found.left_out)} poses taken for mistakes and left out: line {shown}")
+        poses = f"{len(found.left_out)} pose{'s' if len(found.left_out) > 1 else ''}"
+        notes.append(f"{poses} taken for mistakes and left out: line {shown}")
     numbers = len(measured) * measured.size
     free = int(found.solution.free.sum())
     if numbers < 3 * len(found.model.nominal()):
@@ -303,7 +304,8 @@ def headline(run: Identification) -> str:
     line += f", {1e3 * before['max_m']:.2f} -> {1e3 * after['max_m']:.2f} mm largest"
     if "mean_rad" in after:
         line += f", {np.degrees(before['mean_rad']):.3f} -> {np.degrees(after['mean_rad']):.3f} deg mean"
-    return f"{line} ({run.how})"
+    no_better = "; no better than the nominal arm: keep that one, or take more poses"
+    return f"{line} ({run.how}){no_better if after['mean_m'] >= before['mean_m'] else ''}"
 
 
 def value_text(p: Parameter, value: float) -> str:

@@ -188,7 +188,7 @@ def measure_shots(
         if detections is None:  # what only the images showed
             _say(note for note in notes_of(opened) if note not in said)
     if records and detections is None and not any(record.ok for record in records):
-        raise ArmsightError(_nothing_measured(records, _flipped(stereo, found, first)))
+        raise ArmsightError(_nothing_measured(records, _mistaken(stereo, found, first)))
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
     moved = next((r.shutters for r in records if r.shutters is not None), None)
     saved = _keep_noise(stereo, noise, bool(skewed), moved, save_rig)
@@ -419,7 +419,7 @@ def _board_file(path: Path, rig: StereoRig, target: str) -> Path | None:
 
 
 def _nothing_measured(records: list[ShotPose], why: str = "") -> str:
-    return f"none of {len(records)} shots could be measured{why}; {records[0].shot}: {records[0].reason}"
+    return f"none of {len(records)} shots could be measured: {why or f'{records[0].shot}: {records[0].reason}'}"
 
 
 #: What a camera's driver may have done to its images -> how it is undone.
@@ -430,15 +430,36 @@ _FLIPS: dict[str, Callable[[Image], Image]] = {
 }
 
 
-def _flipped(rig: StereoRig, target: Target, shots: list[Shot]) -> str:
-    """Return what to say where a shot that was missed can be measured once its images are flipped; empty otherwise."""
+def _undone(left: Image, right: Image) -> dict[str, tuple[Image, Image]]:
+    """Return the images with each mistake undone that may have been made with them, by what to say of it."""
+    undone = {"left and right are exchanged: the images fit the rig the other way round": (right, left)}
+    for what, undo in _FLIPS.items():
+        sides = {
+            "images": (undo(left), undo(right)),
+            "left images": (undo(left), right),
+            "right images": (left, undo(right)),
+        }
+        for which, images in sides.items():
+            said = f"the {which} are {what} against those of the calibration; the cameras must deliver both alike"
+            undone[said] = images
+    return undone
+
+
+def _mistaken(rig: StereoRig, target: Target, shots: list[Shot]) -> str:
+    """Return what was done to the images where a missed shot can be measured once it is undone; empty otherwise.
+
+    Rotated images of two parallel cameras nearly fit the rig exchanged, and the other way round: the better fit decides.
+    """
     for shot in shots:
         assert shot.left is not None
         assert shot.right is not None
-        for what, undo in _FLIPS.items():
-            left, right = (np.ascontiguousarray(undo(image)) for image in (shot.left, shot.right))
-            if isinstance(measure(rig, target, replace(shot, left=left, right=right)), PoseEstimate):
-                return f": the images are {what} against those of the calibration; the cameras must deliver both alike"
+        fits = {}
+        for what, images in _undone(shot.left, shot.right).items():
+            left, right = map(np.ascontiguousarray, images)
+            if isinstance(found := measure(rig, target, replace(shot, left=left, right=right)), PoseEstimate):
+                fits[-len(found.points.ids), found.reprojection_rms_px] = what
+        if fits:
+            return fits[min(fits)]
     return ""
 
 

@@ -197,4 +197,5 @@ def _lines(rig: StereoRig) -> list[str]:
         lines.append(f"variance of discs' centres over what an image says: left {left}, right {right}")
     if not rig.cov.any():
         lines.append("uncertainty: unknown (no covariance in this rig file)")
-    return [*lines, *(f"{key}: {value}" for key, value in rig.provenance.items())]
+    made = rig.provenance.items()
+    return [*lines, *(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {value}" for key, value in made)]

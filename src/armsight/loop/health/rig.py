@@ -106,6 +106,13 @@ class ResidualSums:
         found.square, found.freedom = self.square, self.freedom
         return found
 
+    def less(self, other: ResidualSums) -> ResidualSums:
+        """Return these sums without another's."""
+        rest = ResidualSums(len(self.b), self.begin_s)
+        rest.add(self, 1.0)
+        rest.add(other, -1.0)
+        return rest
+
 
 @dataclass(frozen=True, eq=False)
 class RigChange(Record):
@@ -191,13 +198,12 @@ class RigWatch:
         self._test, self._window = ResidualSums(self._full, 0.0), ResidualSums(self._size, 0.0)
         # Since the beginning, for what the camera models lack, and what that does to the newest poses.
         self._whole, self._by_lens = ResidualSums(self._full, 0.0), deque[Array](maxlen=_POSES)
-        self._seen, self._looked = (
-            np.zeros((_LENS, _LENS)),
-            0,
-        )  # mean of the squares of the polynomials, of so many shots
+        # Mean of the squares of the polynomials, of so many shots.
+        self._seen, self._looked = np.zeros((_LENS, _LENS)), 0
         self.lens: LensError | None = None
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
         self._timed = False
+        self._stays: deque[ResidualSums] = deque(maxlen=TEST_SHOTS)  # of the running test
         self.alarm = self.alarmed = False
         self._alarms = 0  # in a row
         self.suspected: RigChange | None = None
@@ -325,6 +331,9 @@ class RigWatch:
             if not self._test.freedom:
                 self._test.begin_s = self._stay.begin_s
             self._test.add(self._stay, 1.0 / self._stay_shots)
+            mean = ResidualSums(self._size, self._stay.begin_s)
+            mean.add(self._stay.of(self._size), 1.0 / self._stay_shots)
+            self._stays.append(mean)
         self._stay, self._stay_shots = None, 0
 
     def _decide(self) -> None:
@@ -339,9 +348,12 @@ class RigWatch:
         for name in ("H", "b", "square", "freedom"):
             setattr(self._window, name, weight * getattr(self._window, name))
         self._window.add(test, 1.0)
+        stays, self._stays = self._stays, deque(maxlen=TEST_SHOTS)
         change = self._estimated(self._window)
-        certain = change.chi_square > _ALARM or any(change.alone[part] > limit for part, limit in _ALARMS.items())
-        alarm = certain and self._matters(change, slice(None))
+        alarm = _certain(change) and self._matters(change, slice(None))
+        if alarm and not self._timed and len(stays) > 1:
+            # Without times: one pose of several, in which the body moved between the exposures, is no moved camera.
+            alarm = all(_certain(self._estimated(self._window.less(stay))) for stay in stays)
         self._alarms = self._alarms + 1 if alarm else 0
         if 0 < self._alarms <= _FRESH:
             change = self._begun(change)
@@ -492,7 +504,7 @@ class RigWatch:
     def copied(self) -> RigWatch:
         """Return a copy that says what was found so far; this one goes on."""
         copied = copy(self)
-        copied._history = self._history.copy()
+        copied._history, copied._stays = self._history.copy(), self._stays.copy()
         return copied
 
     def _ended(self) -> RigWatch:
@@ -543,6 +555,11 @@ def _polynomials(rig: StereoRig, sides: Ids, uv: Array) -> Array:
     for axis in range(2):
         found[rows, axis, sides, axis] = values.T
     return found.reshape(len(uv), 2, _LENS)
+
+
+def _certain(change: RigChange) -> bool:
+    """Return whether chance explains neither all seven numbers nor one of their parts."""
+    return change.chi_square > _ALARM or any(change.alone[part] > limit for part, limit in _ALARMS.items())
 
 
 def free_directions(rig: StereoRig) -> Array:

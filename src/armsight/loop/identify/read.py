@@ -102,7 +102,7 @@ def _requested(path: str | Path, columns: dict[str, int], rotation: str | None) 
     if beyond is not None:
         raise InputError(f"{path}: line 1: column {beyond}: an arm here has at most {MOST_JOINTS} joints")
     angles = {unit: [i for i in _JOINTS if f"q{i}_{unit}" in columns] for unit in ("rad", "deg")}
-    joints = max(FEWEST_JOINTS, *(max(there, default=0) for there in angles.values()))
+    joints = max(FEWEST_JOINTS, *(max(there, default=0) for there in angles.values())) if any(angles.values()) else 6
     ways = [[f"q{i + 1}_{unit}" for i in range(joints)] for unit in angles]
     requested = _alternative(path, columns, ways, "joint angles")
     poses = ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]

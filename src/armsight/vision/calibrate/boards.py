@@ -412,7 +412,7 @@ def _enough(usable: int, given: int, rejected: list[RejectedPair]) -> None:
     raise CalibrationError(
         f"{usable} of {given} pairs are usable, at least {LEAST_PAIRS} are needed, 15 or more are better"
         + (f": {why}{more}" if why else "")
-        + ". Is --target the board in the images (inner corners, columns x rows)?"
+        + ". Is --target the board in the images (columns x rows, of a chessboard the inner corners)?"
         + (
             " Does a driver mirror the images of one camera?"
             if any("gross errors" in r.reason for r in rejected)

@@ -122,7 +122,8 @@ def screen(
     for j in kept:
         mine = observations.shot == j
         if lost := int((mine & ~good).sum()):
-            notes.append(f"{names[j]}: {lost} of {mine.sum()} corners of both images dropped as gross errors")
+            which = " of both images" if len(set(observations.camera[mine])) > 1 else ""
+            notes.append(f"{names[j]}: {lost} of {mine.sum()} points{which} dropped as gross errors")
     unscreened = _renumbered(observations, np.isin(observations.shot, kept), kept)
     solution = minimise(_of_shots(model, kept), state, final, sigma)
     return Screened(final, unscreened, kept, solution, tuple(rejected), tuple(notes))

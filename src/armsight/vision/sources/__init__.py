@@ -46,7 +46,12 @@ def check_source(spec: str) -> None:
     kind, colon, _ = spec.partition(":")
     if not (colon and kind in SOURCES) and not os.path.isdir(os.path.expanduser(spec)):
         known = ", ".join(f"{name}:..." for name in SOURCES)
-        raise InputError(f"{spec}: not a source: known are {known}, or the path of a folder")
+        hint = ""
+        if "://" in spec or spec.startswith("/dev/video"):
+            hint = f" ({'url' if '://' in spec else 'usb'}:LEFT,RIGHT?)"
+        elif os.path.isfile(os.path.expanduser(spec)):
+            hint = f" (video:{spec}?)"
+        raise InputError(f"{spec}: not a source{hint}: known are {known}, or the path of a folder")
 
 
 def open_source(spec: str) -> Source:

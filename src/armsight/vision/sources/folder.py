@@ -15,13 +15,12 @@ from pathlib import Path
 
 from armsight.errors import InputError
 from armsight.files import read_text
-from armsight.vision.sources.pairs import StoredPair, StoredSource, match
+from armsight.vision.sources.pairs import IMAGES, StoredPair, StoredSource, match
 
 #: The index of a recording, and its columns; t_s is empty where the source has no clock, left and right where the shot
 #: has a problem.
 INDEX = "shots.csv"
 COLUMNS = ("shot", "t_s", "left", "right", "problem")
-_IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
 
 
 class FolderSource(StoredSource):
@@ -48,7 +47,7 @@ def _matched(folder: Path) -> tuple[StoredPair, ...]:
         files = below.iterdir() if below.is_dir() else folder.glob(f"{side}*")
         sides.append(
             (
-                [file for file in files if file.suffix.lower() in _IMAGES],
+                [file for file in files if file.suffix.lower() in IMAGES],
                 below if below.is_dir() else folder / f"{side}*",
             )
         )

@@ -10,6 +10,7 @@ from __future__ import annotations
 import glob
 import os
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,9 @@ from pathlib import Path
 from armsight.data import Shot
 from armsight.errors import InputError
 from armsight.vision.image import read_image
+
+#: Endings of image files, in lower case.
+IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
 
 
 @dataclass(frozen=True)
@@ -103,9 +107,7 @@ def match(lefts: Iterable[Path], rights: Iterable[Path], said_left: str, said_ri
     left, right = (sorted(files, key=natural_key) for files in (lefts, rights))
     for files, said in ((left, said_left), (right, said_right)):
         if not files:
-            if os.path.isdir(os.path.expanduser(said)):
-                raise InputError(f"{said}: is a folder; give its images as a quoted glob such as '{said}/left*.png'")
-            raise InputError(f"{said}: no such file; quote a glob such as 'DIR/left*.png' to keep the shell off it")
+            raise InputError(no_files(said))
     both = {file.resolve() for file in left} & {file.resolve() for file in right}
     if both:
         raise InputError(f"{min(both)}: is both a left and a right image ({said_left} and {said_right})")
@@ -116,6 +118,19 @@ def match(lefts: Iterable[Path], rights: Iterable[Path], said_left: str, said_ri
             f"first without a partner: {alone or max(left, right, key=len)[min(len(left), len(right))]}"
         )
     return tuple(StoredPair(name, file, partner) for name, file, partner in zip(_names(left), left, right, strict=True))
+
+
+def no_files(said: str) -> str:
+    """Return why no file is meant by the user's text, with the glob of the images that lie there."""
+    path = Path(os.path.expanduser(said))
+    folder = path if path.is_dir() else path.parent
+    suffixes = Counter(file.suffix for file in folder.glob("*") if file.suffix.lower() in IMAGES)
+    there = f"{folder}/*{suffixes.most_common(1)[0][0]}" if suffixes else None
+    if path.is_dir():
+        return f"{said}: is a folder; give its images as a quoted glob such as '{there or f'{said}/left*.png'}'"
+    if there is not None:
+        return f"{said}: no such file; the images there are '{there}'"
+    return f"{said}: no such file; quote a glob such as 'DIR/left*.png' to keep the shell off it"
 
 
 def image_files(pattern: str) -> list[Path]:
