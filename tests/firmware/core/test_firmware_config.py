@@ -174,6 +174,19 @@ WRONG_ARM = {
 }
 
 
+WRONG_ENCODER = {
+    "input": [0, 7],
+    "counts_per_rev": [15, 2e7, NAN],  # and steps that no jump may be
+    "direction": [0, 2, -2],
+    "home_rad": [-13.5, NAN, INF],
+}
+WRONG_ABSOLUTE = {
+    "zero_counts": [16384],
+    "counts_per_rev": [200.0],  # a step of 0.03 rad: more than half of what counts as a jump
+    "home_rad": [2.0, -2.0],  # a soft limit is half a revolution away from it
+}
+
+
 def put(record, path, value):
     *folders, last = path.split(".")
     for name in folders:
@@ -194,6 +207,39 @@ def test_a_value_outside_its_range_makes_the_configuration_invalid(library, path
         arm = LabArm(library, config)  # even where it is handed over as good
         assert arm.tick().first_fault == c.FAULT_CONFIG
         assert arm.core.config.silence_ticks == 100
+
+
+@pytest.mark.parametrize(
+    ("sensor", "wrong"), [(c.SENSOR_QUADRATURE, WRONG_ENCODER), (c.SENSOR_ABSOLUTE, WRONG_ABSOLUTE)]
+)
+def test_a_value_of_an_encoder_outside_its_range_makes_the_configuration_invalid(library, sensor, wrong):
+    for name, values in wrong.items():
+        for value in values:
+            config = lab_config(library)
+            config.sync_led_pin = 16
+            config.joint[4].pot.direction = -1  # of a table that no longer counts
+            config.joint[4].encoder = c.encoder_config(sensor, 2, 16384.0, -1, 100, 0.0)
+            assert library.config_is_valid(ctypes.byref(config))
+            setattr(config.joint[4].encoder, name, value)
+            assert not library.config_is_valid(ctypes.byref(config)), (name, value)
+
+
+def test_two_quadrature_encoders_on_one_input_make_the_configuration_invalid(library):
+    config = lab_config(library)
+    for joint, timer in (1, 2), (3, 4):
+        config.joint[joint].encoder = c.encoder_config(c.SENSOR_QUADRATURE, timer, 16384.0, 1, 0, 0.0)
+    assert library.config_is_valid(ctypes.byref(config))
+    config.joint[3].encoder.input = 2
+    assert not library.config_is_valid(ctypes.byref(config))
+
+
+def test_a_table_that_falls_serves_a_joint_that_turns_the_other_way(library):
+    config = lab_config(library)
+    pot = config.joint[4].pot
+    pot.direction = -1
+    assert library.config_is_valid(ctypes.byref(config))
+    pot.angle_rad[pot.node_count - 1] = 0.5 * config.joint[4].soft_max_rad  # now its reach is too short on one side
+    assert not library.config_is_valid(ctypes.byref(config))
 
 
 def test_every_value_has_its_range_tried(library):
