@@ -196,6 +196,49 @@ def test_a_value_outside_its_range_makes_the_configuration_invalid(library, path
         assert arm.core.config.silence_ticks == 100
 
 
+# Of an encoder: the kinds whose range it is, and what each may not be. Its limits are 3.14 rad to either side of its home.
+BOTH = (c.SENSOR_QUADRATURE, c.SENSOR_ABSOLUTE)
+WRONG_ENCODER = {
+    "encoder.input": ((c.SENSOR_QUADRATURE,), [0, 7, 4]),  # 4: the other one's
+    "encoder.zero_counts": ((c.SENSOR_ABSOLUTE,), [16384]),
+    "encoder.counts_per_rev": (BOTH, [15, 64, 2e7, NAN]),  # 64: a step is larger than a jump
+    "encoder.direction": (BOTH, [0, 2]),
+    "encoder.home_rad": (BOTH, [-13.5, 13.5, NAN]),
+    "pot.frozen_rad": ((c.SENSOR_QUADRATURE,), [0.001]),
+    "soft_min_rad": ((c.SENSOR_ABSOLUTE,), [-2.9]),
+    "soft_max_rad": ((c.SENSOR_ABSOLUTE,), [3.9]),
+}
+
+
+@pytest.mark.parametrize("path", WRONG_ENCODER)
+def test_a_value_of_an_encoder_outside_its_range_makes_the_configuration_invalid(library, path):
+    kinds, values = WRONG_ENCODER[path]
+    for kind in kinds:
+        turn = 16384 if kind == c.SENSOR_ABSOLUTE else 4096
+        for value in values:
+            config = lab_config(library)
+            config.joint[3].encoder = c.encoder_config(c.SENSOR_QUADRATURE, 4, 16384, 1, 0, 0.0)
+            config.joint[4].encoder = c.encoder_config(kind, 5, turn, -1, 16383, 0.5)
+            assert library.config_is_valid(ctypes.byref(config))
+            put(config.joint[4], path, value)
+            assert not library.config_is_valid(ctypes.byref(config)), (kind, value)
+
+
+@pytest.mark.parametrize(("path", "value"), [("sync_led_pin", 16), ("sync_led_pin", 143), ("sync_led_ticks", 100)])
+def test_the_ends_of_a_range_belong_to_it(library, path, value):
+    config = lab_config(library)
+    put(config, path, value)
+    assert library.config_is_valid(ctypes.byref(config))
+
+
+@pytest.mark.parametrize(("angles", "direction"), [((-2.6, 2.6), -1), ((2.6, -2.6), 1), ((2.6, -2.6), -1)])
+def test_a_table_may_fall_and_its_direction_be_turned_round(library, angles, direction):
+    config = lab_config(library)
+    pot = config.joint[4].pot
+    pot.angle_rad[: pot.node_count], pot.direction = angles, direction
+    assert library.config_is_valid(ctypes.byref(config))
+
+
 def test_every_value_has_its_range_tried(library):
     """A field added to the configuration must be added here."""
     leaves = {
@@ -205,4 +248,5 @@ def test_every_value_has_its_range_tried(library):
     }
     leaves |= {f"gains.{name}" for name, _ in c.joint_gains._fields_}
     assert leaves <= set(WRONG)
+    assert {f"encoder.{name}" for name, _ in c.encoder_config._fields_} <= {*WRONG, *WRONG_ENCODER}
     assert {name for name, _ in c.core_config._fields_} - {"joint", "supply_max_mv"} == set(WRONG_ARM)
