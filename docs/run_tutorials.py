@@ -112,6 +112,13 @@ class Runner:
                     execute(command, here)
         return here
 
+    def take(self, commands: tuple[str, ...], made: Path) -> None:
+        """Take what a shared block's commands have made in another folder, instead of running them."""
+        self._begin(self._shared)
+        for each in made.iterdir():
+            (self._shared / each.name).symlink_to(each)
+        self._done.add(commands)
+
     def _run_shared(self, block: Block) -> None:
         if block.commands not in self._done:
             self._begin(self._shared)

@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from hypothesis import settings
 
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.opening import open_emulator
+from made_once import begin, made_once
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -51,6 +53,24 @@ def data_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f"no real recordings at {path}; set ARMSIGHT_DATA to their folder")
     return path
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _made_once(tmp_path_factory: pytest.TempPathFactory) -> None:
+    begin(tmp_path_factory)
+
+
+def _demo(folder: Path) -> None:
+    command = [sys.executable, "-m", "armsight", "demo", "--quick", "-o", "demo"]
+    ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    (folder / "demo.txt").write_text(ran.stdout, encoding="utf-8")
+
+
+@pytest.fixture(scope="session")
+def quick_demo() -> Path:
+    """The folder in which ``armsight demo --quick -o demo`` ran, with what it printed in demo.txt."""
+    return made_once("quick_demo", _demo)
 
 
 @pytest.fixture(scope="session")

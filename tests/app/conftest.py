@@ -8,6 +8,7 @@ import pytest
 from armsight.sim.example_rig import demo_recording
 from armsight.sim.recording import Truth
 from cli_runs import Said, run
+from made_once import made_once
 
 
 @pytest.fixture
@@ -52,13 +53,16 @@ class Files:
 
 
 @pytest.fixture(scope="session")
-def rendered(tmp_path_factory):
+def rendered():
     """Record 12 pairs of a board and 16 shots of an end-effector, 640x360, and calibrate."""
-    folder = tmp_path_factory.mktemp("rendered")
-    of_board, of_arm = demo_recording(folder, seed=3, image_size_px=(640, 360), boards=12, shots=16, rate_hz=4.0)
-    here = Files(folder, of_board, of_arm)
-    assert run("calibrate", *here.board, "--lens-model", "brown5", "--folds", 4, "-o", here.rig) == 0
-    return here
+
+    def make(folder):
+        truth = demo_recording(folder, seed=3, image_size_px=(640, 360), boards=12, shots=16, rate_hz=4.0)
+        here = Files(folder, *truth)
+        assert run("calibrate", *here.board, "--lens-model", "brown5", "--folds", 4, "-o", here.rig) == 0
+
+    folder = made_once("rendered", make)
+    return Files(folder, Truth.load(folder / "board"), Truth.load(folder / "arm"))
 
 
 @pytest.fixture

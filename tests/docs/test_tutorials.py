@@ -12,8 +12,10 @@ from run_tutorials import PAGES, Runner, blocks, pictures  # noqa: E402
 
 
 @pytest.fixture(scope="module")
-def runner(tmp_path_factory):
-    return Runner(tmp_path_factory.mktemp("tutorials"))
+def runner(tmp_path_factory, quick_demo):
+    runner = Runner(tmp_path_factory.mktemp("tutorials"))
+    runner.take(("armsight demo --quick -o demo",), quick_demo)
+    return runner
 
 
 def test_every_tutorial_is_run():

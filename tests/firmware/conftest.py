@@ -4,29 +4,33 @@ import ctypes
 
 import pytest
 from firmware_arm import LabArm, declare
-from firmware_build import build_host, compilers
+from firmware_build import HOST_FILE, build_host, compilers
 from firmware_layout import c
 from firmware_pil import BAUD, Host, PilBoard, working_board
 from firmware_wire import BareWire
 
 from armsight.firmware import build
+from made_once import made_once
 
 
 @pytest.fixture(scope="session")
 def mavlink():
     """The folder of the dialect's generated C headers."""
     pytest.importorskip("pymavlink", reason="needs pymavlink to generate the dialect: pip install pymavlink")
-    with build.headers() as folder:
-        yield folder
+    return made_once("mavlink", lambda folder: build.generate("C", folder))
 
 
 @pytest.fixture(scope="session")
-def library_files(tmp_path_factory, mavlink):
+def library_files(mavlink):
     """The host build of every compiler found, by the compiler's name."""
     found = compilers()
     if not found:
         pytest.skip("no C compiler: install gcc, or ziglang from PyPI")
-    return {name: build_host(compiler, tmp_path_factory.mktemp(name), mavlink) for name, compiler in found.items()}
+
+    def built(name):
+        return made_once(f"host-{name}", lambda folder: build_host(found[name], folder, mavlink)) / HOST_FILE
+
+    return {name: built(name) for name in found}
 
 
 @pytest.fixture(scope="session")

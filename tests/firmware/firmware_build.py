@@ -5,7 +5,10 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import pytest
+
 from armsight.firmware import build
+from made_once import made_once
 
 FIRMWARE = build.source_folder()
 HERE = Path(__file__).parent
@@ -13,6 +16,7 @@ CORE = [source for source in build.host_sources() if source.startswith("core/")]
 WIRE = [source for source in build.host_sources() if source.startswith("wire/")]
 HOST = build.host_sources()
 SHARED = ("-O2", "-shared", "-fPIC")
+HOST_FILE = "firmware_host.so"
 
 
 def own_compiler() -> list[str] | None:
@@ -52,7 +56,18 @@ def compile_c(compiler, target, sources, *flags, mavlink=None) -> subprocess.Com
 
 def build_host(compiler, folder: Path, mavlink: Path) -> Path:
     """Build the shared library of the host board into ``folder``."""
-    library = folder / "firmware_host.so"
+    library = folder / HOST_FILE
     done = compile_c(compiler, library, HOST, *SHARED, mavlink=mavlink)
     assert done.returncode == 0, done.stderr
     return library
+
+
+def board_image(board: str, compiler: str) -> Path:
+    """Return the ELF that the package's own build makes of a board with a compiler, or skip where there is none."""
+    found = build.compilers()
+    if compiler not in found:
+        pytest.skip(f"no {compiler} for ARM: pip install ziglang, or apt-get install gcc-arm-none-eabi gcc")
+    file = f"{board}.elf"
+    return (
+        made_once(f"{board}-{compiler}", lambda folder: build.build_board(board, folder / file, found[compiler])) / file
+    )

@@ -6,6 +6,7 @@ pointer may reach any function of the board's struct literal. Recursion would ha
 
 from __future__ import annotations
 
+import functools
 import re
 import tempfile
 from collections.abc import Mapping
@@ -60,6 +61,7 @@ class StackUse:
         return self.main.stack_bytes + sum(INTERRUPT_BYTES + each.stack_bytes for each in (self.tick, *self.nested))
 
 
+@functools.cache
 def stack_use(board: str) -> StackUse:
     """Return the stack a board needs; :class:`~armsight.errors.InputError` without gcc for ARM, or without a bound."""
     compiler = build.open_compiler("gcc")

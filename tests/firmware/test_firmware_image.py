@@ -5,7 +5,7 @@ import sys
 import firmware_stack as stack
 import numpy as np
 import pytest
-from firmware_build import FIRMWARE
+from firmware_build import FIRMWARE, board_image
 from firmware_layout import c
 from firmware_pil import Host
 
@@ -48,7 +48,7 @@ def test_a_run_takes_no_more_stack_than_the_bound(tmp_path, name):
     found = build.compilers()
     if name not in found or "gcc" not in found:
         pytest.skip(f"needs {name}, and gcc for the bound")
-    image = build.build_board("pil", tmp_path / "pil.elf", found[name])
+    image = board_image("pil", name)
     try:
         emulator = open_emulator("unicorn", image)
     except InputError as missing:
@@ -182,7 +182,7 @@ def test_memory_is_copied_and_filled_at_any_address_and_length(tmp_path, name):
     found = build.compilers()
     if name not in found:
         pytest.skip(f"needs {name} for a Cortex-M4F")
-    image = build.build_board("pil", tmp_path / "pil.elf", found[name])
+    image = board_image("pil", name)
     try:
         emulator = open_emulator("unicorn", image)
     except InputError as missing:

@@ -4,7 +4,7 @@ import json
 import shutil
 
 import pytest
-from firmware_build import FIRMWARE, build_host, compilers
+from firmware_build import FIRMWARE, board_image, build_host, compilers
 from firmware_layout import c
 
 from armsight import firmware
@@ -47,11 +47,9 @@ def traces(library_files):
 
 
 @pytest.fixture(scope="module")
-def images(tmp_path_factory):
+def images():
     """The image as each compiler makes it, by name."""
-    folder = tmp_path_factory.mktemp("images")
-    found = build.compilers()
-    return {name: build.build_board("pil", folder / f"{name}.elf", found[name]) for name in IMAGES if name in found}
+    return {name: board_image("pil", name) for name in IMAGES if name in build.compilers()}
 
 
 def image_of(images, name):

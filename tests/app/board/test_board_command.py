@@ -5,6 +5,7 @@ import shutil
 import stat
 
 import pytest
+from firmware_build import board_image
 
 from armsight.app.board import selftest as board_selftest
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
@@ -150,9 +151,9 @@ def test_an_image_is_built_with_its_pieces(armsight, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def stm32f4(tmp_path_factory):
-    """The real board's image, built once."""
-    return build.build_board("stm32f4", tmp_path_factory.mktemp("image") / "stm32f4.elf", build.open_compiler())
+def stm32f4():
+    """The real board's image."""
+    return board_image("stm32f4", build.open_compiler().name)
 
 
 @pytest.fixture

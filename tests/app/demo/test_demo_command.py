@@ -1,7 +1,8 @@
-"""The whole experiment, made small: the firmware's host build, few calibration shots, a short motion."""
+"""The whole experiment: what `armsight demo --quick` leaves, and how a demo ends that goes wrong."""
 
 import csv
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,6 @@ import pytest
 
 from armsight.app.demo import demo
 from armsight.app.demo.demo import Demo, run_demo
-from armsight.app.run import calibrate
 from armsight.errors import ArmsightError
 from armsight.geometry.rotation import from_quaternion_wxyz, log_so3
 from armsight.loop.identify.read import read_poses
@@ -17,34 +17,12 @@ from armsight.sim.workcell.cameras import open_cameras
 from armsight.sim.workcell.workcell import Workcell
 from cli_runs import assert_rejected
 
-SHORT = """
-[[motion]]
-kind = "joints"
-name = "there"
-q_deg = [34.0, -46.6, 74.2, -14.7, -134.4, 20.2]
-rest_s = 1.2
-
-[[motion]]
-kind = "line"
-name = "line"
-by_mm = [20.0, -150.0, -10.0]
-duration_s = 0.9
-rest_s = 1.2
-"""
-
 
 @pytest.fixture(scope="module")
-def short(tmp_path_factory):
-    """Run the experiment on a short motion; returns the folder and the summary."""
-    folder = tmp_path_factory.mktemp("run")
-    motion = folder / "short.toml"
-    motion.write_text(SHORT)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo, "_AMOUNTS", {True: (10, 12, 0)})
-        patch.setattr(calibrate, "SWEEP_S", 2.5)
-        patch.setattr(demo, "_MOTIONS", {True: motion})
-        summary = run_demo(Demo(folder, emulator="host", quick=True, seed=4))
-    return folder, summary.to_json(), summary
+def quick(quick_demo):
+    """Return the folder of a run of ``armsight demo --quick``, its summary, and what it printed."""
+    folder = quick_demo / "demo"
+    return folder, json.loads((folder / "summary.json").read_text()), (quick_demo / "demo.txt").read_text()
 
 
 def rows(folder, name):
@@ -54,12 +32,24 @@ def rows(folder, name):
     return np.array([float(r["t_s"]) for r in found]), p, q, np.array([r["phase"] for r in found])
 
 
+def hidden(folder, t_s):
+    """While a card hides the body, half a second of the first circle, errors are counted for themselves."""
+    begin_s, end_s = map(float, re.search(r"([\d.]+) s to +([\d.]+) s +open_loop +circle", log_of(folder)).groups())
+    card_s = begin_s + 0.4 * (end_s - begin_s)
+    return (t_s > card_s - 0.01) & (t_s < card_s + 0.55)
+
+
+def log_of(folder):
+    return (folder / "run.log").read_text()
+
+
 @pytest.mark.parametrize("name", ["vision", "potentiometers", "fused", "live"])
-def test_anyone_can_recompute_the_metrics_from_the_files(short, name):
-    folder, summary, _ = short
+def test_anyone_can_recompute_the_metrics_from_the_files(quick, name):
+    folder, summary, _ = quick
     t, p, q, phase = rows(folder, name)
     t_true, p_true, q_true, _ = rows(folder, "truth")
-    moving = phase == "open_loop"
+    moving = (phase == "open_loop") & ~hidden(folder, t)
+    assert moving.sum() == summary[name]["rows"]
     at = np.stack([np.interp(t, t_true, p_true[:, i]) for i in range(3)], axis=1)
     off = np.linalg.norm(p - at, axis=1)[moving]
     assert np.sqrt((off**2).mean()) == pytest.approx(summary[name]["position_rms_m"], rel=1e-3)
@@ -73,8 +63,8 @@ def test_anyone_can_recompute_the_metrics_from_the_files(short, name):
     assert np.sqrt(np.square(angles).mean()) == pytest.approx(summary[name]["orientation_rms_rad"], abs=1e-3)
 
 
-def test_vision_is_accurate_and_potentiometers_are_not(short):
-    _, summary, _ = short
+def test_vision_is_accurate_and_potentiometers_are_not(quick):
+    _, summary, _ = quick
     assert summary["ended_by"] is None
     assert summary["vision"]["position_rms_m"] < 0.2e-3
     assert summary["vision"]["orientation_rms_rad"] < np.radians(0.15)
@@ -85,22 +75,21 @@ def test_vision_is_accurate_and_potentiometers_are_not(short):
     assert summary["camera_delay_s"]["value"] == pytest.approx(13e-3, abs=0.4e-3)
 
 
-def test_the_record_is_there_for_every_reading(short):
-    folder, *_ = short
+def test_the_record_is_there_for_every_reading(quick):
+    folder, *_ = quick
     np.testing.assert_allclose(rows(folder, "fused")[0], rows(folder, "potentiometers")[0], rtol=0, atol=1e-6)
 
 
-def test_closing_the_loop_reduces_the_errors(short):
-    _, summary, _ = short
+def test_closing_the_loop_reduces_the_errors(quick):
+    _, summary, _ = quick
     c = summary["closed_loop"]
     assert c["rest_error_after_m"] < c["rest_error_before_m"] / 5
     assert c["path_error_after_m"] < c["path_error_before_m"] / 2
 
 
-def test_the_folder_holds_what_its_page_says(short):
-    folder, summary, _ = short
+def test_the_folder_holds_what_its_page_says(quick):
+    folder, summary, _ = quick
     assert summary["version"] == 2
-    assert json.loads((folder / "summary.json").read_text()) == json.loads(json.dumps(summary))
     for name in ("truth", "vision", "potentiometers", "fused", "live", "reference", "joints"):
         assert (folder / f"{name}.csv").stat().st_size > 1000
         assert (folder / f"{name}.parquet").stat().st_size > 1000
@@ -115,9 +104,8 @@ def test_the_folder_holds_what_its_page_says(short):
     assert len(hands) == summary["handeye"]["poses"]
     assert set(np.unique(hands.approach)) == {-1, 0, 1} or set(np.unique(hands.approach)) == {-1, 1}
     assert np.linalg.eigvalsh(hands.cov).min() > 0
-    log = (folder / "run.log").read_text()
-    assert "shots measured" in log
-    assert "line" in log
+    assert "shots measured" in log_of(folder)
+    assert "line" in log_of(folder)
 
 
 def broken(tmp_path, monkeypatch, mend):
@@ -212,20 +200,14 @@ def test_the_study_of_rates_takes_the_same_cameras(cameras):
     assert replace(at, rate_hz=given.rate_hz) == given
 
 
-def test_people_read_millimetres(armsight, tmp_path, monkeypatch, short):
-    folder, values, summary = short
-    monkeypatch.setattr(demo, "run_demo", lambda demo, **options: summary)
-    said = armsight("demo", "-o", tmp_path)
-    assert said.code == 0
-    lines = said.out.splitlines()
-    vision = next(line for line in lines if line.startswith("vision"))
-    assert vision.split()[1] == f"{1e3 * values['vision']['position_rms_m']:.3f}"
-    assert "RMS, mm" in said.out
-    assert "times smaller" in said.out
+def test_people_read_millimetres(quick):
+    folder, summary, printed = quick
+    vision = next(line for line in printed.splitlines() if line.startswith("vision"))
+    assert vision.split()[1] == f"{1e3 * summary['vision']['position_rms_m']:.3f}"
+    assert "RMS, mm" in printed
+    assert "times smaller" in printed
     page = (folder / "report.html").read_text()  # the same numbers as in the terminal
     assert all(f"<td>{cell}</td>" in page for cell in vision.split()[1:])
-    again = armsight("demo", "-o", tmp_path, "--json")
-    assert again.lines[0]["seed"] == 4
 
 
 def test_an_arm_model_that_cannot_be_read_leaves_nothing_behind(armsight, tmp_path):

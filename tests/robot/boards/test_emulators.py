@@ -1,13 +1,12 @@
-"""The emulators: the same bits from every compiler on every one of them, and what is said where one cannot run."""
+"""The emulators: what a trace is made of, and what is said where one cannot run (their bits: test_pil_emulators)."""
 
 import contextlib
 import hashlib
 import shutil
 
 import pytest
+from firmware_build import board_image
 
-from armsight.app.board.scenarios import DRIVEN
-from armsight.app.board.selftest import run_scenario
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import build
 from armsight.robot.boards import qemu
@@ -23,39 +22,9 @@ COMPILERS = ("zig", "gcc")
 
 
 @pytest.fixture(scope="module")
-def images(tmp_path_factory):
+def images():
     """The emulated board's image by compiler, of this checkout's sources."""
-    folder = tmp_path_factory.mktemp("images")
-    found = build.compilers()
-    return {name: build.build_board("pil", folder / f"{name}.elf", found[name]) for name in COMPILERS if name in found}
-
-
-@pytest.fixture(scope="module")
-def library(tmp_path_factory):
-    """The host library of this checkout's sources."""
-    return build.build_host(tmp_path_factory.mktemp("library") / "host.so", build.open_compiler())
-
-
-@pytest.fixture(scope="module")
-def expected(library):
-    """What each scenario does on the host build."""
-    return {name: run_scenario(scenario, HostEmulator.open(library)) for name, scenario in DRIVEN.items()}
-
-
-@pytest.mark.parametrize("scenario", DRIVEN)
-def test_every_scenario_passes(expected, scenario):
-    assert expected[scenario].problems == ()
-
-
-@pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("emulator", [UnicornEmulator, QemuEmulator])
-def test_every_emulator_and_compiler_gives_the_same_bits(images, expected, emulator, compiler):
-    if compiler not in images:
-        pytest.skip(f"{compiler} is not installed")
-    if emulator is QemuEmulator and not shutil.which(qemu.PROGRAM):
-        pytest.skip(f"{qemu.PROGRAM} is not installed")
-    for name, scenario in DRIVEN.items():
-        assert run_scenario(scenario, emulator.open(images[compiler])) == expected[name], name
+    return {name: board_image("pil", name) for name in COMPILERS if name in build.compilers()}
 
 
 def test_one_bit_of_a_potentiometer_is_another_trace():
@@ -80,8 +49,8 @@ def test_one_bit_of_a_potentiometer_is_another_trace():
     assert traces[0] != traces[1]
 
 
-def test_two_host_boards_do_not_share_anything(library):
-    first, second = (EmulatedLink(HostEmulator.open(library), JointPlant(seed=seed)) for seed in (1, 2))
+def test_two_host_boards_do_not_share_anything():
+    first, second = (EmulatedLink(open_emulator("host"), JointPlant(seed=seed)) for seed in (1, 2))
     first.step(5)
     second.step(1)
     assert first.answer["tick"] == 5

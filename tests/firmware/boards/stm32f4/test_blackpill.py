@@ -4,8 +4,9 @@ import re
 from pathlib import Path
 
 import pytest
+from firmware_build import board_image
 from firmware_layout import c
-from stm32f4_build import COMPILERS, fresh, image
+from stm32f4_build import COMPILERS, fresh
 from stm32f4_chip import AbsoluteSensor
 from stm32f4_emulator import RAM
 from stm32f4_registers import ADC_CHANNEL
@@ -37,7 +38,7 @@ def booted():
 
 
 def test_the_image_fits_and_its_boot_does_nothing_the_manual_forbids(booted):
-    elf, chip = read_elf(image(COMPILER, BOARD)), booted.chip
+    elf, chip = read_elf(board_image(BOARD, COMPILER)), booted.chip
     assert elf.hard_float
     assert all(
         segment.load_address + len(segment.data) <= 0x08004000 or segment.load_address >= 0x0800C000

@@ -6,7 +6,8 @@ import struct
 from pathlib import Path
 
 import pytest
-from stm32f4_build import COMPILERS, fresh, image
+from firmware_build import board_image
+from stm32f4_build import COMPILERS, fresh
 from stm32f4_emulator import FLASH, RAM
 from stm32f4_registers import ADC_CHANNEL
 from unicorn.arm_const import UC_ARM_REG_SP
@@ -37,7 +38,7 @@ def booted(emulator):
 
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_the_image_computes_in_hardware_and_fits(compiler, capsys):
-    elf = read_elf(image(compiler))
+    elf = read_elf(board_image("stm32f4", compiler))
     assert elf.hard_float
     with capsys.disabled():
         print(f"\nstm32f4 by {compiler}: {elf.flash_bytes} bytes of flash memory, {elf.ram_bytes} of RAM")
@@ -48,7 +49,7 @@ def test_the_image_computes_in_hardware_and_fits(compiler, capsys):
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_the_image_leaves_the_stored_configurations_alone(compiler):
     """Sectors 1 and 2 (0x08004000 to 0x0800BFFF) hold them: nothing may be loaded there."""
-    for segment in read_elf(image(compiler)).segments:
+    for segment in read_elf(board_image("stm32f4", compiler)).segments:
         end = segment.load_address + len(segment.data)
         assert end <= 0x08004000 or segment.load_address >= 0x0800C000
 
