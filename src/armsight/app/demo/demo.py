@@ -198,6 +198,7 @@ def _workcell(demo: Demo, cameras: str, like: Workcell | None = None) -> Workcel
         assumed=nominal,
         like=like,
         sync_led=demo.sync_led and like is None,
+        processes=like is None,
     )
 
 
