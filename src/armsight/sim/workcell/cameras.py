@@ -243,9 +243,8 @@ class _Exposed(NamedTuple):
         number: of the shot; below zero where something is held before the cameras for the calibration.
         t_s: middle of the exposure, s.
         shutter: how long it looks.
-        Ts_base_link: (n + 1, 4, 4) row frames of the arm.
-        T_camera_body: (4, 4) where the body on the tool is, m.
-        twist: (6,) its velocity.
+        first: the millisecond of the first row of ``q``.
+        q: (M, n) the links' true angles at the milliseconds about the exposure, rad; to the newest one.
         covered: whether a card is held before it.
         held: what else is held, left camera's frame; None for nothing.
         led: the sync LED as it is lit; None without.
@@ -254,9 +253,8 @@ class _Exposed(NamedTuple):
     number: int
     t_s: float
     shutter: Shutter
-    Ts_base_link: Array
-    T_camera_body: Array
-    twist: Array
+    first: int
+    q: Array
     covered: bool
     held: PosedBody | None
     led: LedSeen | None
@@ -268,8 +266,9 @@ class _Side:
     Args:
         side: 0 left, 1 right.
         cameras: left and right.
+        arm: the true table.
         parts: the arm's solids.
-        patterns: on the tool.
+        body: the patterns on the tool, and T_tool_body (4, 4), m.
         seed: of the noise.
         pipeline: what lies between light and file; None for white noise.
     """
@@ -278,12 +277,14 @@ class _Side:
         self,
         side: int,
         cameras: tuple[WorkcellCamera, WorkcellCamera],
+        arm: Arm,
         parts: Solids,
-        patterns: tuple[Pattern, ...],
+        body: tuple[tuple[Pattern, ...], Array],
         seed: int,
         pipeline: CameraPipeline | None,
     ) -> None:
-        self._side, self._camera, self._parts, self._patterns, self._seed = side, cameras[side], parts, patterns, seed
+        self._side, self._camera, self._arm, self._parts, self._seed = side, cameras[side], arm, parts, seed
+        self._patterns, self._T_tool_body = body
         size = self._camera.camera.image_size_px
         self._T_this_left = inverse(self._camera.T_base_camera) @ cameras[0].T_base_camera
         self._strip = noise_strip(seed, size) if pipeline is None else None
@@ -291,17 +292,38 @@ class _Side:
 
     def __call__(self, seen: _Exposed) -> Image:
         """Return the image (H, W) of an exposure, uint8."""
-        bodies = [PosedBody(self._patterns, seen.T_camera_body, seen.twist)]
+        body = self._body(seen)
+        bodies = [body]
         if seen.held is not None:
             bodies.append(seen.held.seen_from(self._T_this_left))
         if seen.covered:
-            bodies.append(_card(seen.T_camera_body))
-        arm = ArmSeen(self._parts, seen.Ts_base_link)
+            bodies.append(_card(body.T_camera_body))
+        arm = ArmSeen(self._parts, row_frames(self._arm, _q(seen, np.array([seen.t_s]))[0]))
         if self._strip is None:
             return self._through(self._camera.radiance(arm, bodies, seen.shutter, seen.led), seen.t_s, seen.number)
         # A shot for the calibration takes its noise from numbers of its own.
         start = noise_start(self._seed, self._side + (0 if seen.number >= 0 else 2), abs(seen.number))
         return self._camera.image(arm, bodies, seen.shutter, self._strip, start, seen.led)
+
+    def _body(self, seen: _Exposed) -> PosedBody:
+        """Return the body as the camera sees it: its mean pose during the exposure of its own rows, and its velocity."""
+        T_camera_base = inverse(self._camera.T_base_camera)
+        shutter, camera = seen.shutter, self._camera.camera
+
+        def at(t_s: Array) -> Array:
+            """Return the poses (N, 4, 4) at times (N,)."""
+            return np.asarray(T_camera_base @ self._arm.forward(_q(seen, t_s)) @ self._T_tool_body)
+
+        reach, rows_s = max(shutter.exposure_s, TICK_S) / 2, 0.0
+        if shutter.row_s:  # its rows are exposed at another time than the image's middle row
+            row = camera.project(at(np.array([seen.t_s]))[:, :3, 3])[0, 1]
+            rows_s = shutter.row_s * float(row - (camera.image_size_px[1] - 1) / 2)
+        Ts = at(seen.t_s + rows_s + reach * np.array([*_NODES, -1.0, 1.0]))
+        moved = log_se3(inverse(Ts[[1, 1, 1, 3]]) @ Ts[[0, 1, 2, 4]])
+        twist = moved[3] / (2 * reach)
+        shift = 0.5 * (_WEIGHTS @ moved[:3]) if shutter.exposure_s else np.zeros(6)
+        to_mean, to_row = exp_se3(np.stack([shift, -rows_s * twist]))
+        return PosedBody(self._patterns, Ts[1] @ to_mean @ to_row, twist)
 
     def _through(self, light: Radiance, t_s: float, number: int) -> Image:
         """Return what a camera makes of the light; a board that is held still has been there for some images."""
@@ -312,6 +334,22 @@ class _Side:
         device.forget()
         first = 2**40 - _SETTLED * number  # noise of numbers of its own
         return [device.expose(light, t_s, first + k) for k in range(_SETTLED)][-1]
+
+
+def _q(seen: _Exposed, t_s: Array) -> Array:
+    """Return the links' true angles (N, n) at times (N,), by a cubic through the four nearest milliseconds."""
+    count = seen.first + len(seen.q)
+    at = np.clip(t_s / TICK_S, 0.0, count - 1.0)
+    first = np.clip(np.floor(at).astype(int) - 1, 0, max(count - 4, 0))
+    x = (at - first)[:, None]
+    p = [seen.q[np.minimum(first + k, count - 1) - seen.first] for k in range(4)]
+    weights = (
+        -(x - 1) * (x - 2) * (x - 3) / 6,
+        x * (x - 2) * (x - 3) / 2,
+        -x * (x - 1) * (x - 3) / 2,
+        x * (x - 1) * (x - 2) / 6,
+    )
+    return np.asarray(sum(w * q for w, q in zip(weights, p, strict=True)))
 
 
 class WorkcellSource:
@@ -348,7 +386,7 @@ class WorkcellSource:
         """
         self._plant, self._cameras, self._timing, self._seed = plant, cameras, timing, seed
         self._now, self._advance = clock
-        self._patterns, self._T_tool_body = body
+        _, self._T_tool_body = body
         self._next = 0
         self._begun: dict[int, list[Future[Image]]] = {}
         self._over_s = self._over(0)
@@ -358,7 +396,7 @@ class WorkcellSource:
         #: A thread for each side: a camera that remembers its images exposes them one after the other.
         self._threads = (ThreadPoolExecutor(1), ThreadPoolExecutor(1))
         self._led = None if led is None else ([camera.led(led[0], *_LED) for camera in cameras], led[1])
-        given = (cameras, plant.parts, self._patterns, seed, pipeline)
+        given = (cameras, plant.arm, plant.parts, body, seed, pipeline)
         self._sides = [Process(_Side, side, *given) if processes else _Side(side, *given) for side in range(2)]
         #: Name of each shot that was handed out -> when it was taken, for evaluation only.
         self.taken: dict[str, ShotTimes] = {}
@@ -480,27 +518,20 @@ class WorkcellSource:
         self, times: ShotTimes, shutter: Shutter, number: int, held: PosedBody | None
     ) -> list[Future[Image]]:
         """Begin to render both images, each in a thread of its own: they share nothing that changes."""
-        t_s = np.array([times.left_s, times.right_s])
-        frames = [row_frames(self._plant.arm, q) for q in self._q(t_s)]
-        bodies = self._bodies(t_s, shutter)
-        leds = [None if held is not None else self._lit(side, float(t_s[side]), shutter) for side in range(2)]
-        covered = [any(start <= t < end for start, end in self._covers) for t in t_s]
+        path, n = self._plant.path, self._plant.arm.joints
+
+        def seen(side: int, t_s: float) -> _Exposed:
+            first = max(int((t_s - self._seen_s()) / TICK_S) - _SPARE_TICKS, 0)
+            first = min(first, max(len(path) - 4, 0))
+            covered = any(start <= t_s < end for start, end in self._covers)
+            led = None if held is not None else self._lit(side, t_s, shutter)
+            return _Exposed(number, t_s, shutter, first, path[first:, n:].copy(), covered, held, led)
+
         return [
-            self._threads[side].submit(
-                self._sides[side],
-                _Exposed(
-                    number,
-                    float(t_s[side]),
-                    shutter,
-                    frames[side],
-                    bodies[side].T_camera_body,
-                    bodies[side].twist,
-                    covered[side],
-                    held,
-                    leds[side],
-                ),
+            thread.submit(draw, seen(side, t_s))
+            for side, (thread, draw, t_s) in enumerate(
+                zip(self._threads, self._sides, (times.left_s, times.right_s), strict=True)
             )
-            for side in range(2)
         ]
 
     def _lit(self, side: int, t_s: float, shutter: Shutter) -> LedSeen | None:
@@ -517,48 +548,6 @@ class WorkcellSource:
         total = np.concatenate([[0.0], np.cumsum(lit) * TICK_S])
         gathered = np.interp(middle + half, edges, total) - np.interp(middle - half, edges, total)
         return led.lit(gathered / (2 * half))
-
-    def _q(self, t_s: Array) -> Array:
-        """Return the links' true angles (N, n) at times (N,), by a cubic through the four nearest milliseconds."""
-        path = self._plant.path
-        at = np.clip(t_s / TICK_S, 0.0, len(path) - 1.0)
-        first = np.clip(np.floor(at).astype(int) - 1, 0, max(len(path) - 4, 0))
-        x = (at - first)[:, None]
-        links = slice(self._plant.arm.joints, None)
-        p = [path[np.minimum(first + k, len(path) - 1), links] for k in range(4)]
-        weights = (
-            -(x - 1) * (x - 2) * (x - 3) / 6,
-            x * (x - 2) * (x - 3) / 2,
-            -x * (x - 1) * (x - 3) / 2,
-            x * (x - 1) * (x - 2) / 6,
-        )
-        return np.asarray(sum(w * q for w, q in zip(weights, p, strict=True)))
-
-    def _bodies(self, t_s: Array, shutter: Shutter) -> list[PosedBody]:
-        """Return the body as each camera sees it in an exposure about its time (2,), s.
-
-        That is its mean pose during the exposure of its own rows, and its velocity.
-        """
-        Ts_camera_base = np.array([inverse(camera.T_base_camera) for camera in self._cameras])[:, None]
-
-        def at(times: Array) -> Array:
-            """Return the poses (2, N, 4, 4) at times (2, N)."""
-            Ts_base_tool = self._plant.arm.forward(self._q(times.ravel())).reshape(*times.shape, 4, 4)
-            return np.asarray(Ts_camera_base @ Ts_base_tool @ self._T_tool_body)
-
-        reach = max(shutter.exposure_s, TICK_S) / 2
-        rows_s = np.zeros(2)
-        if shutter.row_s:  # its rows are exposed at another time than the image's middle row
-            for side, (camera, T) in enumerate(zip(self._cameras, at(t_s[:, None])[:, 0], strict=True)):
-                row = camera.camera.project(T[None, :3, 3])[0, 1]
-                rows_s[side] = shutter.row_s * float(row - (camera.camera.image_size_px[1] - 1) / 2)
-        Ts = at((t_s + rows_s)[:, None] + reach * np.array([*_NODES, -1.0, 1.0]))
-        moved = log_se3(inverse(Ts[:, [1, 1, 1, 3]]) @ Ts[:, [0, 1, 2, 4]])
-        twists = moved[:, 3] / (2 * reach)
-        shifts = 0.5 * (_WEIGHTS @ moved[:, :3]) if shutter.exposure_s else np.zeros((2, 6))
-        to_mean, to_row = exp_se3(np.stack([shifts, -rows_s[:, None] * twists]))
-        Ts_camera_body = Ts[:, 1] @ to_mean @ to_row
-        return [PosedBody(self._patterns, T, twist) for T, twist in zip(Ts_camera_body, twists, strict=True)]
 
 
 def _card(T_camera_body: Array) -> PosedBody:
