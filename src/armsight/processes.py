@@ -7,6 +7,7 @@ program that started it: so a script needs no guard of its main module, as :mod:
 
 from __future__ import annotations
 
+import importlib
 import os
 import pickle
 import signal
@@ -27,7 +28,7 @@ _LENGTH = struct.Struct("<q")
 class Process:
     """A function in a child process, which ends with :meth:`close` or with this process.
 
-    The constructor returns at once, while the child still imports and makes. Calls from several threads wait for each other.
+    The constructor returns at once, while the child still imports and makes. Calls of several threads wait for each other.
 
     Args:
         make: returns the function that is called; it can be imported by its name.
@@ -69,6 +70,17 @@ class Process:
                 assert pipe is not None
                 pipe.close()
             self._child.wait()
+
+
+def caller(*modules: str) -> Callable[..., Any]:
+    """Return what calls any function with its arguments, once these modules are imported: for :class:`Process`."""
+    for module in modules:
+        importlib.import_module(module)
+
+    def call(function: Callable[..., Any], *arguments: object) -> Any:  # noqa: ANN401 - what the function returns
+        return function(*arguments)
+
+    return call
 
 
 def serve() -> None:
@@ -122,7 +134,7 @@ def _receive(pipe: IO[bytes]) -> Any:  # noqa: ANN401 - what was sent
     count = _LENGTH.unpack(_read(pipe, _LENGTH.size))[0]
     sizes = struct.unpack(f"<{count}q", _read(pipe, 8 * count))
     content, *arrays = [_read(pipe, size) for size in sizes]
-    return pickle.loads(content, buffers=arrays)  # noqa: S301 - from a process of our own
+    return pickle.loads(content, buffers=arrays)
 
 
 def _read(pipe: Any, size: int) -> bytearray:  # noqa: ANN401 - an unbuffered file
