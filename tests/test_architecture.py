@@ -20,7 +20,7 @@ MAY_IMPORT = {
     "app": {"geometry", "kernels", "firmware", "vision", "robot", "sim", "loop"},
 }
 #: The ground: what each of these modules may import of armsight.
-GROUND = {"data": {"errors"}, "errors": set(), "files": {"errors"}}
+GROUND = {"data": {"errors"}, "errors": set(), "files": {"errors"}, "processes": {"errors"}}
 #: What lies outside that geometry may use.
 GEOMETRY_USES = {"numpy", "scipy"}
 

@@ -28,6 +28,7 @@ from armsight.data import Array
 from armsight.errors import ArmsightError
 from armsight.files import write_text
 from armsight.geometry.pose import inverse
+from armsight.processes import Process, caller
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
 from armsight.sim.workcell.cameras import camera_name, open_cameras
@@ -38,6 +39,8 @@ from armsight.vision.calibrate.result import Calibration
 #: Pairs of the calibration target, hand-eye poses, shots for each value of a study: by default, and with --quick.
 _AMOUNTS = {False: (40, 30, 8), True: (30, 15, 0)}
 _MOTIONS = {False: DEFAULT_MOTION, True: QUICK}
+#: What the second process imports first: it evaluates lens models, and draws figures.
+_SECOND = ("armsight.vision.calibrate.boards", "armsight.app.run.report", "matplotlib.figure")
 #: Cameras of an arm with our firmware, and of one that keeps its own controller and is slower.
 _CAMERAS, _SLOW_CAMERAS = "1280x720@60", "1280x720@30"
 #: Rests of an arm with its own controller, s: from a command to its state it takes a tenth of a second and more.
@@ -94,13 +97,13 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
     open_folder(demo.folder)
     progress("building the workcell")
     cameras = demo.cameras or (_SLOW_CAMERAS if demo.model in CONTROLLED else _CAMERAS)
-    with _workcell(demo, cameras) as workcell:
+    with _workcell(demo, cameras) as workcell, contextlib.closing(Process(caller, *_SECOND)) as second:
         motion = _motion_text(demo, workcell)
         make_room(demo.folder)
         write_text(demo.folder / "motion.toml", motion)
         plan = read_motions(workcell.model, demo.folder / "motion.toml")
         progress("rendering the calibration target")
-        calibration = calibrated(workcell.chessboard_spec, workcell.chessboard_shots(pairs), progress)
+        calibration = calibrated(workcell.chessboard_spec, workcell.chessboard_shots(pairs), progress, second)
         calibration.rig.save(demo.folder / "rig.json")
         write_text(demo.folder / "body.toml", workcell.body_text)
         poses = np.vstack([workcell.model.home, workcell.poses])
@@ -139,7 +142,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
         with ThreadPoolExecutor(1) as beside:
             overview = beside.submit(workcell.picture)
             finished = Finished(
-                workcell.model, calibration.rig, outcome, plan, truth, of_run, began, studies, overview.result
+                workcell.model, calibration.rig, outcome, plan, truth, of_run, began, studies, overview.result, second
             )
             return finish(finished, demo.folder)
 
@@ -198,6 +201,7 @@ def _workcell(demo: Demo, cameras: str, like: Workcell | None = None) -> Workcel
         assumed=nominal,
         like=like,
         sync_led=demo.sync_led and like is None,
+        processes=like is None,
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -45,8 +46,10 @@ _SAMPLES = 50  # candidates for each pose
 _NEAR = np.radians(70.0)  # a joint that rotated further has changed to another configuration of the arm
 
 
-def calibrated(target_spec: str, shots: Iterable[Shot], progress: Progress) -> Calibration:
-    """Calibrate a rig from shots of a flat calibration target, such as chessboard:9x6:25mm."""
+def calibrated(
+    target_spec: str, shots: Iterable[Shot], progress: Progress, second: Callable[..., Any] | None = None
+) -> Calibration:
+    """Calibrate a rig from shots of a flat calibration target, such as chessboard:9x6:25mm; ``second`` calls beside."""
     board = open_board(target_spec)
     pairs, sizes = [], None
     for shot in shots:
@@ -58,7 +61,7 @@ def calibrated(target_spec: str, shots: Iterable[Shot], progress: Progress) -> C
         progress(f"detecting the calibration target: {len(pairs)} pairs")
     if sizes is None:
         raise CalibrationError("no shot of the calibration target")
-    return calibrate_boards(board, pairs, sizes, progress=progress)
+    return calibrate_boards(board, pairs, sizes, progress=progress, second=second)
 
 
 def handeye_poses(arm: Arm, around: Array, count: int, seed: int) -> Array:

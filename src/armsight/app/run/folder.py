@@ -169,6 +169,7 @@ class Finished:
         studies: made after it.
         overview: returns an image (H, W, 3) BGR of the workcell from aside, waiting until it is rendered; None for a real
             arm.
+        second: calls a function in another process, which draws about half of the figures; None without one.
     """
 
     arm: Arm
@@ -180,6 +181,7 @@ class Finished:
     began: float
     studies: Sequence[Study]
     overview: Callable[[], Image] | None
+    second: Callable[..., Any] | None = None
 
 
 def finish(finished: Finished, folder: Path) -> RunSummary:
@@ -222,7 +224,7 @@ def write_run(finished: Finished, folder: Path) -> RunSummary:
     if came:
         raise KeyboardInterrupt
     if report is not None:
-        write_run_report(report, folder)
+        write_run_report(report, folder, finished.second)
         summary = replace(summary, wall_s=_wall_s(finished))  # with the time that plotting took
         _write_summary(folder, summary)
     return summary

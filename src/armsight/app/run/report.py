@@ -6,10 +6,11 @@ loop, latency); the overview, one figure of all; the studies of vision; the page
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -359,8 +360,13 @@ class RunReport:
     notes: Sequence[str]
 
 
-def write_run_report(report: RunReport, folder: Path) -> Path:
+def write_run_report(report: RunReport, folder: Path, second: Callable[..., Any] | None = None) -> Path:
     """Write the page and its PNGs.
+
+    Args:
+        report: the contents.
+        folder: of the run.
+        second: calls a function in another process, which draws about half of the figures; None without one.
 
     Returns:
         The page, report.html.
@@ -374,29 +380,58 @@ def write_run_report(report: RunReport, folder: Path) -> Path:
         if image is not None:
             files[f"{name}.png"] = cv2.imencode(".png", image)[1].tobytes()
             embedded[name] = _box("png", files[f"{name}.png"], name)
-    with drawing():
-        for name, figure in _figures(report).items():
-            if figure is not None:
-                files[f"{name}.png"] = png(figure)
-                embedded[name] = _box("svg+xml", svg(figure), name) if name != "overview" else ""
+    for name, (pixels, lines) in _drawn(report, second).items():
+        files[f"{name}.png"] = pixels
+        embedded[name] = "" if lines is None else _box("svg+xml", lines, name)
     put_files(folder, {**files, PAGE: _page(report, embedded).encode()})
     return folder / PAGE
 
 
-def _figures(report: RunReport) -> dict[str, Figure | None]:
-    """Return the figures by name; None where the run has nothing to plot."""
-    both = report.before is not None and report.after is not None
-    return {
-        "joints": joints_figure(report.run),
-        "path": path_figure(report.run),
-        "errors": errors_figure(report.run),
-        "loop": loop_figure(report.before, report.after) if both else None,  # type: ignore[arg-type]
-        "latency": latency_figure(report.run),
-        "studies": studies_figure(report.summary.studies) if report.summary.studies else None,
-        "overview": overview_figure(report.picture, report.before, report.after)
-        if report.picture is not None and report.before is not None and report.after is not None
-        else None,
-    }
+def _drawn(report: RunReport, second: Callable[..., Any] | None) -> dict[str, tuple[bytes, bytes | None]]:
+    """Return the figures by name, in their order: as PNG, and as SVG where the page shows them."""
+    if second is None:
+        return _files(report, NAMES)
+    beside = replace(report, workcell=None, notes=())
+    with ThreadPoolExecutor(1) as pool:
+        others = pool.submit(second, _files, beside, _BESIDE)
+        found = _files(report, [name for name in NAMES if name not in _BESIDE]) | others.result()
+    return {name: found[name] for name in NAMES if name in found}
+
+
+def _files(report: RunReport, names: Sequence[str]) -> dict[str, tuple[bytes, bytes | None]]:
+    """Draw figures by their names; those that the run has nothing for are left out."""
+    found = dict[str, tuple[bytes, bytes | None]]()
+    with drawing():
+        for name in names:
+            figure = _figure(report, name)
+            if figure is not None:
+                found[name] = png(figure), None if name == "overview" else svg(figure)
+    return found
+
+
+def _figure(report: RunReport, name: str) -> Figure | None:
+    """Return a figure; None where the run has nothing to plot."""
+    before, after = report.before, report.after
+    if name in _OF_RUN:
+        return _OF_RUN[name](report.run)
+    if name == "studies":
+        return studies_figure(report.summary.studies) if report.summary.studies else None
+    if before is None or after is None:
+        return None
+    if name == "loop":
+        return loop_figure(before, after)
+    return None if report.picture is None else overview_figure(report.picture, before, after)
+
+
+#: Figures of all tracks of a run.
+_OF_RUN: dict[str, Callable[[RunData], Figure | None]] = {
+    "joints": joints_figure,
+    "path": path_figure,
+    "errors": errors_figure,
+    "latency": latency_figure,
+}
+#: What a second process draws: about half of the work.
+_BESIDE = ("path", "errors", "overview")
 
 
 def _box(kind: str, data: bytes, name: str) -> str:

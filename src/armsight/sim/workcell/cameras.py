@@ -12,12 +12,14 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from armsight.data import Array, Image, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
+from armsight.processes import Process
 from armsight.robot.arm import Arm
 from armsight.sim.camera.pipeline import SimulatedCamera
 from armsight.sim.camera.stages import CameraPipeline, preset_names
@@ -27,7 +29,7 @@ from armsight.sim.render.render import Shutter, outline
 from armsight.sim.render.scene import Pattern, PosedBody, plate
 from armsight.sim.workcell.controlled import ControlledArm
 from armsight.sim.workcell.images import ArmSeen, LedSeen, WorkcellCamera
-from armsight.sim.workcell.motors import row_frames
+from armsight.sim.workcell.motors import Solids, row_frames
 from armsight.sim.workcell.plant import TICK_S, ArmPlant
 from armsight.sim.workcell.raycast import arm_capsules, capsule_boxes
 from armsight.vision.rig import StereoRig
@@ -234,6 +236,122 @@ _SPARE_TICKS = 2
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
+class _Exposed(NamedTuple):
+    """What is before a camera in an exposure.
+
+    Attributes:
+        number: of the shot; below zero where something is held before the cameras for the calibration.
+        t_s: middle of the exposure, s.
+        shutter: how long it looks.
+        first: the millisecond of the first row of ``q``.
+        q: (M, n) the links' true angles at the milliseconds about the exposure, rad; to the newest one.
+        covered: whether a card is held before it.
+        held: what else is held, left camera's frame; None for nothing.
+        led: the sync LED as it is lit; None without.
+    """
+
+    number: int
+    t_s: float
+    shutter: Shutter
+    first: int
+    q: Array
+    covered: bool
+    held: PosedBody | None
+    led: LedSeen | None
+
+
+class _Side:
+    """One of the two cameras: what is before it becomes an image.
+
+    Args:
+        side: 0 left, 1 right.
+        cameras: left and right.
+        arm: the true table.
+        parts: the arm's solids.
+        body: the patterns on the tool, and T_tool_body (4, 4), m.
+        seed: of the noise.
+        pipeline: what lies between light and file; None for white noise.
+    """
+
+    def __init__(
+        self,
+        side: int,
+        cameras: tuple[WorkcellCamera, WorkcellCamera],
+        arm: Arm,
+        parts: Solids,
+        body: tuple[tuple[Pattern, ...], Array],
+        seed: int,
+        pipeline: CameraPipeline | None,
+    ) -> None:
+        self._side, self._camera, self._arm, self._parts, self._seed = side, cameras[side], arm, parts, seed
+        self._patterns, self._T_tool_body = body
+        size = self._camera.camera.image_size_px
+        self._T_this_left = inverse(self._camera.T_base_camera) @ cameras[0].T_base_camera
+        self._strip = noise_strip(seed, size) if pipeline is None else None
+        self._device = None if pipeline is None else SimulatedCamera(pipeline, size, 2 * seed + side)
+
+    def __call__(self, seen: _Exposed) -> Image:
+        """Return the image (H, W) of an exposure, uint8."""
+        body = self._body(seen)
+        bodies = [body]
+        if seen.held is not None:
+            bodies.append(seen.held.seen_from(self._T_this_left))
+        if seen.covered:
+            bodies.append(_card(body.T_camera_body))
+        arm = ArmSeen(self._parts, row_frames(self._arm, _q(seen, np.array([seen.t_s]))[0]))
+        if self._strip is None:
+            return self._through(self._camera.radiance(arm, bodies, seen.shutter, seen.led), seen.t_s, seen.number)
+        # A shot for the calibration takes its noise from numbers of its own.
+        start = noise_start(self._seed, self._side + (0 if seen.number >= 0 else 2), abs(seen.number))
+        return self._camera.image(arm, bodies, seen.shutter, self._strip, start, seen.led)
+
+    def _body(self, seen: _Exposed) -> PosedBody:
+        """Return the body as the camera sees it: its mean pose during the exposure of its own rows, and its velocity."""
+        T_camera_base = inverse(self._camera.T_base_camera)
+        shutter, camera = seen.shutter, self._camera.camera
+
+        def at(t_s: Array) -> Array:
+            """Return the poses (N, 4, 4) at times (N,)."""
+            return np.asarray(T_camera_base @ self._arm.forward(_q(seen, t_s)) @ self._T_tool_body)
+
+        reach, rows_s = max(shutter.exposure_s, TICK_S) / 2, 0.0
+        if shutter.row_s:  # its rows are exposed at another time than the image's middle row
+            row = camera.project(at(np.array([seen.t_s]))[:, :3, 3])[0, 1]
+            rows_s = shutter.row_s * float(row - (camera.image_size_px[1] - 1) / 2)
+        Ts = at(seen.t_s + rows_s + reach * np.array([*_NODES, -1.0, 1.0]))
+        moved = log_se3(inverse(Ts[[1, 1, 1, 3]]) @ Ts[[0, 1, 2, 4]])
+        twist = moved[3] / (2 * reach)
+        shift = 0.5 * (_WEIGHTS @ moved[:3]) if shutter.exposure_s else np.zeros(6)
+        to_mean, to_row = exp_se3(np.stack([shift, -rows_s * twist]))
+        return PosedBody(self._patterns, Ts[1] @ to_mean @ to_row, twist)
+
+    def _through(self, light: Radiance, t_s: float, number: int) -> Image:
+        """Return what a camera makes of the light; a board that is held still has been there for some images."""
+        device = self._device
+        assert device is not None
+        if number >= 0:
+            return device.expose(light, t_s, number)
+        device.forget()
+        first = 2**40 - _SETTLED * number  # noise of numbers of its own
+        return [device.expose(light, t_s, first + k) for k in range(_SETTLED)][-1]
+
+
+def _q(seen: _Exposed, t_s: Array) -> Array:
+    """Return the links' true angles (N, n) at times (N,), by a cubic through the four nearest milliseconds."""
+    count = seen.first + len(seen.q)
+    at = np.clip(t_s / TICK_S, 0.0, count - 1.0)
+    first = np.clip(np.floor(at).astype(int) - 1, 0, max(count - 4, 0))
+    x = (at - first)[:, None]
+    p = [seen.q[np.minimum(first + k, count - 1) - seen.first] for k in range(4)]
+    weights = (
+        -(x - 1) * (x - 2) * (x - 3) / 6,
+        x * (x - 2) * (x - 3) / 2,
+        -x * (x - 1) * (x - 3) / 2,
+        x * (x - 1) * (x - 2) / 6,
+    )
+    return np.asarray(sum(w * q for w, q in zip(weights, p, strict=True)))
+
+
 class WorkcellSource:
     """The workcell's cameras.
 
@@ -250,6 +368,8 @@ class WorkcellSource:
         seed: int,
         pipeline: CameraPipeline | None = None,
         led: tuple[Array, bytearray] | None = None,
+        *,
+        processes: bool = False,
     ) -> None:
         """Point the cameras at the arm.
 
@@ -262,11 +382,11 @@ class WorkcellSource:
             seed: of noise and timing.
             pipeline: what lies between light and file; white noise by default.
             led: where the sync LED is (3,), m, base frame, and whether it is on in each millisecond; None without one.
+            processes: whether each camera's images are rendered in a process of its own.
         """
         self._plant, self._cameras, self._timing, self._seed = plant, cameras, timing, seed
         self._now, self._advance = clock
-        self._patterns, self._T_tool_body = body
-        self._strip = noise_strip(seed, timing.image_size_px)
+        _, self._T_tool_body = body
         self._next = 0
         self._begun: dict[int, list[Future[Image]]] = {}
         self._over_s = self._over(0)
@@ -276,9 +396,8 @@ class WorkcellSource:
         #: A thread for each side: a camera that remembers its images exposes them one after the other.
         self._threads = (ThreadPoolExecutor(1), ThreadPoolExecutor(1))
         self._led = None if led is None else ([camera.led(led[0], *_LED) for camera in cameras], led[1])
-        self._devices: list[SimulatedCamera] | None = None
-        if pipeline is not None:
-            self._devices = [SimulatedCamera(pipeline, timing.image_size_px, 2 * seed + side) for side in range(2)]
+        given = (cameras, plant.arm, plant.parts, body, seed, pipeline)
+        self._sides = [Process(_Side, side, *given) if processes else _Side(side, *given) for side in range(2)]
         #: Name of each shot that was handed out -> when it was taken, for evaluation only.
         self.taken: dict[str, ShotTimes] = {}
 
@@ -328,9 +447,11 @@ class WorkcellSource:
         return begun is not None and not all(image.done() for image in begun)
 
     def close(self) -> None:
-        """End the threads."""
-        for thread in self._threads:
+        """End the threads, and the processes."""
+        for thread, side in zip(self._threads, self._sides, strict=True):
             thread.shutdown()
+            if isinstance(side, Process):
+                side.close()
 
     def clear(self, pattern: Pattern, T_left_body: Array, *, body_seen: bool = False) -> bool:
         """Return whether nothing of the arm is before a pattern that is held somewhere, or in it, for both cameras.
@@ -397,15 +518,20 @@ class WorkcellSource:
         self, times: ShotTimes, shutter: Shutter, number: int, held: PosedBody | None
     ) -> list[Future[Image]]:
         """Begin to render both images, each in a thread of its own: they share nothing that changes."""
-        t_s = np.array([times.left_s, times.right_s])
-        frames = [row_frames(self._plant.arm, q) for q in self._q(t_s)]
-        bodies = self._bodies(t_s, shutter)
-        leds = [None if held is not None else self._lit(side, float(t_s[side]), shutter) for side in range(2)]
+        path, n = self._plant.path, self._plant.arm.joints
+
+        def seen(side: int, t_s: float) -> _Exposed:
+            first = max(int((t_s - self._seen_s()) / TICK_S) - _SPARE_TICKS, 0)
+            first = min(first, max(len(path) - 4, 0))
+            covered = any(start <= t_s < end for start, end in self._covers)
+            led = None if held is not None else self._lit(side, t_s, shutter)
+            return _Exposed(number, t_s, shutter, first, path[first:, n:].copy(), covered, held, led)
+
         return [
-            self._threads[side].submit(
-                self._image, side, float(t_s[side]), frames[side], bodies[side], shutter, number, held, leds[side]
+            thread.submit(draw, seen(side, t_s))
+            for side, (thread, draw, t_s) in enumerate(
+                zip(self._threads, self._sides, (times.left_s, times.right_s), strict=True)
             )
-            for side in range(2)
         ]
 
     def _lit(self, side: int, t_s: float, shutter: Shutter) -> LedSeen | None:
@@ -422,83 +548,6 @@ class WorkcellSource:
         total = np.concatenate([[0.0], np.cumsum(lit) * TICK_S])
         gathered = np.interp(middle + half, edges, total) - np.interp(middle - half, edges, total)
         return led.lit(gathered / (2 * half))
-
-    def _image(
-        self,
-        side: int,
-        t_s: float,
-        frames: Array,
-        body: PosedBody,
-        shutter: Shutter,
-        number: int,
-        held: PosedBody | None,
-        led: LedSeen | None,
-    ) -> Image:
-        """Render one camera's image of the arm in the middle of an exposure."""
-        camera = self._cameras[side]
-        bodies = [body]
-        if held is not None:
-            T_this_left = inverse(camera.T_base_camera) @ self._cameras[0].T_base_camera
-            bodies.append(held.seen_from(T_this_left))
-        if any(start <= t_s < end for start, end in self._covers):
-            bodies.append(_card(body.T_camera_body))
-        arm = ArmSeen(self._plant.parts, frames)
-        if self._devices is not None:
-            return self._through(self._devices[side], camera.radiance(arm, bodies, shutter, led), t_s, number)
-        # A shot for the calibration takes its noise from numbers of its own.
-        start = noise_start(self._seed, side + (0 if number >= 0 else 2), abs(number))
-        return camera.image(arm, bodies, shutter, self._strip, start, led)
-
-    @staticmethod
-    def _through(device: SimulatedCamera, light: Radiance, t_s: float, number: int) -> Image:
-        """Return what a camera makes of the light; a board that is held still has been there for some images."""
-        if number >= 0:
-            return device.expose(light, t_s, number)
-        device.forget()
-        first = 2**40 - _SETTLED * number  # noise of numbers of its own
-        return [device.expose(light, t_s, first + k) for k in range(_SETTLED)][-1]
-
-    def _q(self, t_s: Array) -> Array:
-        """Return the links' true angles (N, n) at times (N,), by a cubic through the four nearest milliseconds."""
-        path = self._plant.path
-        at = np.clip(t_s / TICK_S, 0.0, len(path) - 1.0)
-        first = np.clip(np.floor(at).astype(int) - 1, 0, max(len(path) - 4, 0))
-        x = (at - first)[:, None]
-        links = slice(self._plant.arm.joints, None)
-        p = [path[np.minimum(first + k, len(path) - 1), links] for k in range(4)]
-        weights = (
-            -(x - 1) * (x - 2) * (x - 3) / 6,
-            x * (x - 2) * (x - 3) / 2,
-            -x * (x - 1) * (x - 3) / 2,
-            x * (x - 1) * (x - 2) / 6,
-        )
-        return np.asarray(sum(w * q for w, q in zip(weights, p, strict=True)))
-
-    def _bodies(self, t_s: Array, shutter: Shutter) -> list[PosedBody]:
-        """Return the body as each camera sees it in an exposure about its time (2,), s.
-
-        That is its mean pose during the exposure of its own rows, and its velocity.
-        """
-        Ts_camera_base = np.array([inverse(camera.T_base_camera) for camera in self._cameras])[:, None]
-
-        def at(times: Array) -> Array:
-            """Return the poses (2, N, 4, 4) at times (2, N)."""
-            Ts_base_tool = self._plant.arm.forward(self._q(times.ravel())).reshape(*times.shape, 4, 4)
-            return np.asarray(Ts_camera_base @ Ts_base_tool @ self._T_tool_body)
-
-        reach = max(shutter.exposure_s, TICK_S) / 2
-        rows_s = np.zeros(2)
-        if shutter.row_s:  # its rows are exposed at another time than the image's middle row
-            for side, (camera, T) in enumerate(zip(self._cameras, at(t_s[:, None])[:, 0], strict=True)):
-                row = camera.camera.project(T[None, :3, 3])[0, 1]
-                rows_s[side] = shutter.row_s * float(row - (camera.camera.image_size_px[1] - 1) / 2)
-        Ts = at((t_s + rows_s)[:, None] + reach * np.array([*_NODES, -1.0, 1.0]))
-        moved = log_se3(inverse(Ts[:, [1, 1, 1, 3]]) @ Ts[:, [0, 1, 2, 4]])
-        twists = moved[:, 3] / (2 * reach)
-        shifts = 0.5 * (_WEIGHTS @ moved[:, :3]) if shutter.exposure_s else np.zeros((2, 6))
-        to_mean, to_row = exp_se3(np.stack([shifts, -rows_s[:, None] * twists]))
-        Ts_camera_body = Ts[:, 1] @ to_mean @ to_row
-        return [PosedBody(self._patterns, T, twist) for T, twist in zip(Ts_camera_body, twists, strict=True)]
 
 
 def _card(T_camera_body: Array) -> PosedBody:

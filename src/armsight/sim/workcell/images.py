@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -261,13 +262,34 @@ class LedSeen(Record):
         return LedSeen(self.window, self.share * on, self.spread * on, self.depth_m)
 
 
+class _Room(NamedTuple):
+    """What a camera sees while nothing moves, and what its images are made of.
+
+    Attributes:
+        corners: rays of the pixels' corners.
+        rays: (3, H, W) unit rays of all pixels.
+        still: what stands still before it.
+        light: (H, W) its light through the lens.
+        grey: (H, W) the same, shaded, in grey levels.
+        gain: (H, W) grey levels of a reflectance of 1.
+        lamp: (3,) unit vector to the lamp, camera's frame.
+    """
+
+    corners: Array
+    rays: Radiance
+    still: StillView
+    light: Radiance
+    grey: Radiance
+    gain: Radiance
+    lamp: Radiance
+
+
 class WorkcellCamera:
     """A camera that stands in the workcell.
 
     Attributes:
         camera: its lens.
         T_base_camera: (4, 4) where it is, m.
-        still: what stands still before it.
     """
 
     def __init__(
@@ -281,7 +303,7 @@ class WorkcellCamera:
         psf_sigma_px: float = LENS.psf_sigma_px,
         more: Array | None = None,
     ) -> None:
-        """Look at the workcell once.
+        """Stand there; the first image takes a second longer.
 
         Args:
             camera: its lens.
@@ -293,17 +315,39 @@ class WorkcellCamera:
             more: boxes that stand there besides, see ``raycast``.
         """
         self.camera, self.T_base_camera = camera, T_base_camera
+        self._foot, self._seed, self._more = foot, seed, more
         self._sensor, self._psf_sigma_px = sensor or Sensor(), psf_sigma_px
-        self._corners = corner_rays(camera)
-        rays = pixel_rays(self._corners)
-        self.still: StillView = view(camera, rays, T_base_camera, seed, foot, more)
-        self._rays = np.ascontiguousarray(rays.transpose(2, 0, 1), np.float32)
-        width, height = camera.image_size_px
-        self._gain = shaded(np.full((height, width), self._sensor.gain, np.float32), LENS)
-        self._still_light = spread(self.still.light, self._psf_sigma_px)
-        self._still_grey = self._still_light * self._gain
-        to_lamp = inverse(T_base_camera)[:3, :3] @ LAMP_BASE
-        self._lamp = (to_lamp / np.linalg.norm(to_lamp)).astype(np.float32)
+        self._seen_room: _Room | None = None
+
+    @property
+    def _room(self) -> _Room:
+        """What it sees while nothing moves: found when it looks for the first time, in a second; some 40 MB."""
+        if self._seen_room is None:
+            self._seen_room = self._look()
+        return self._seen_room
+
+    def _look(self) -> _Room:
+        corners = corner_rays(self.camera)
+        rays = pixel_rays(corners)
+        still = view(self.camera, rays, self.T_base_camera, self._seed, self._foot, self._more)
+        width, height = self.camera.image_size_px
+        gain = shaded(np.full((height, width), self._sensor.gain, np.float32), LENS)
+        light = spread(still.light, self._psf_sigma_px)
+        to_lamp = inverse(self.T_base_camera)[:3, :3] @ LAMP_BASE
+        return _Room(
+            corners,
+            np.ascontiguousarray(rays.transpose(2, 0, 1), np.float32),
+            still,
+            light,
+            light * gain,
+            gain,
+            (to_lamp / np.linalg.norm(to_lamp)).astype(np.float32),
+        )
+
+    @property
+    def still(self) -> StillView:
+        """What stands still before it."""
+        return self._room.still
 
     def led(self, p_base: Array, radius_m: float, light: float) -> LedSeen:
         """Return an LED as it looks while it is on.
@@ -349,15 +393,15 @@ class WorkcellCamera:
             (H, W) uint8.
         """
         seen, window, core = self._seen(arm, bodies, shutter, led)
-        still = self._still_grey
+        still = self._room.grey
         if led is not None:
             still = still.copy()
             at = _part(led.window, (0, 0, 0, 0))
-            still[at] += led.spread * self._gain[at]
+            still[at] += led.spread * self._room.gain[at]
         out: Image = np.empty(still.shape, np.uint8)
         s = self._sensor
         noises = (s.offset, s.read_noise, s.shot_noise)
-        exposed_window(still, seen, window, core, self._gain, strip, start, noises, out)
+        exposed_window(still, seen, window, core, self._room.gain, strip, start, noises, out)
         return out
 
     def radiance(
@@ -365,7 +409,7 @@ class WorkcellCamera:
     ) -> Radiance:
         """Return the light (H, W) of each pixel before the lens's shading and the sensor; arguments as :meth:`image`."""
         seen, window, core = self._seen(arm, bodies, shutter, led)
-        out = self._still_light.copy()
+        out = self._room.light.copy()
         if led is not None:
             out[_part(led.window, (0, 0, 0, 0))] += led.spread
         if seen.size:
@@ -389,7 +433,7 @@ class WorkcellCamera:
         depth, ids = self.still.depth[v0:v1, u0:u1].copy(), np.zeros(light.shape, np.int16)
         if led is not None:
             _shine(led, window, light, depth)
-        moving(self._rays, window, boxes, (ends, radius, albedo), self._lamp, light, depth, ids)
+        moving(self._room.rays, window, boxes, (ends, radius, albedo), self._room.lamp, light, depth, ids)
         seen = spread(light, self._psf_sigma_px) if light.size else light
         if exposure is not None and crop[0] < crop[2] and crop[1] < crop[3]:
             core = self._core(crop, margin)
@@ -403,7 +447,7 @@ class WorkcellCamera:
         capsules = arm_capsules(arm.parts, arm.Ts_base_link, self.T_base_camera)
         boxes, window = capsule_boxes(self.camera, *capsules[:2]), (0, 0, width, height)
         light, depth, ids = self.still.light.copy(), self.still.depth.copy(), np.zeros((height, width), np.int16)
-        moving(self._rays, window, boxes, capsules, self._lamp, light, depth, ids)
+        moving(self._room.rays, window, boxes, capsules, self._room.lamp, light, depth, ids)
         return ids
 
     def _around(self, boxes: Ids, margin: int) -> Window:
@@ -467,7 +511,7 @@ class WorkcellCamera:
         total, edges = np.empty((v1 - v0, u1 - u0), np.float32), np.zeros((v1 - v0, u1 - u0), np.float32)
         layers = (behind[0][_part(crop, window)], behind[1][_part(crop, window)], behind[2][_part(crop, window)])
         shown, taps = exposure._replace(Ms=Ms, boxes=boxes), part_taps(self._psf_sigma_px)
-        paint_faces(self._corners, self._rays, shown, (u0, v0), layers, taps, total, edges)
+        paint_faces(self._room.corners, self._room.rays, shown, (u0, v0), layers, taps, total, edges)
         return np.asarray(spread(total, self._psf_sigma_px) + edges)
 
     def _core(self, window: Window, margin: int) -> Window:

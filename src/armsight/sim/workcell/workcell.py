@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import NamedTuple, Self
@@ -123,6 +122,7 @@ class _Parts(NamedTuple):
         gravity: returns the duty (n,) that compensates the nominal arm's gravity load at joint angles (n,), rad.
         default: whether it is the arm that the workcell was drawn for.
         p_led: (3,) where the sync LED is, m, base frame; None without.
+        processes: whether each camera's images are rendered in a process of its own.
     """
 
     model: Arm
@@ -140,16 +140,15 @@ class _Parts(NamedTuple):
     gravity: Callable[[Array], Array]
     default: bool
     p_led: Array | None
+    processes: bool
 
 
 def _standing(
     rig: StereoRig, T_base_rig: Array, plant: ArmPlant | ControlledArm, seed: int, sensor: Sensor, psf_sigma_px: float
 ) -> tuple[WorkcellCamera, WorkcellCamera]:
-    """Return a rig's cameras where they stand; each casts what stands still before it, in a thread of its own."""
+    """Return a rig's cameras where they stand."""
     stand = partial(WorkcellCamera, foot=plant.parts, seed=seed, sensor=sensor, psf_sigma_px=psf_sigma_px)
-    with ThreadPoolExecutor(2) as pool:
-        left, right = pool.map(stand, rig.cameras, (T_base_rig, T_base_rig @ rig.T_left_right))
-    return left, right
+    return stand(rig.left, T_base_rig), stand(rig.right, T_base_rig @ rig.T_left_right)
 
 
 def _ahead(T_base_tool: Array) -> Array:
@@ -242,7 +241,7 @@ class Workcell:
         body = (body_patterns(), self._T_tool_body)
         led = None if parts.p_led is None or self.link is None else (parts.p_led, self.link.sync_led)
         sees = (self.plant, self._cameras, self.timing, body, clock, self._seed, parts.pipeline)
-        self.source = WorkcellSource(*sees, led)
+        self.source = WorkcellSource(*sees, led, processes=parts.processes)
 
     @classmethod
     def open(
@@ -260,6 +259,7 @@ class Workcell:
         noise: float = 2.0,
         like: Workcell | None = None,
         sync_led: bool = False,
+        processes: bool = False,
     ) -> Self:
         """Build a workcell; a second or so.
 
@@ -276,6 +276,8 @@ class Workcell:
             noise: of the sensors, grey levels; a preset has its own.
             like: a workcell of the same arm, seed, rig and noise: what its cameras see of the room is not cast anew.
             sync_led: whether an LED on the board's clock is in view.
+            processes: whether each camera's images are rendered in a process of its own, which takes a second to begin:
+                for long runs.
 
         Raises:
             InputError: an unknown name or a bad file, or ``like`` differs in more than the cameras' rate.
@@ -322,7 +324,7 @@ class Workcell:
         T_tool_body = mount @ exp_se3(off)
         parts = (known, timing, seed, plant, true_rig, T_base_rig, T_tool_body, seen, room)
         p_led = transform(T_base_rig, distance_m * np.array(LED_AT)) if sync_led else None
-        return cls(_Parts(*parts, pipeline, link, board, gravity, built_to.name == DEFAULT_ARM, p_led))
+        return cls(_Parts(*parts, pipeline, link, board, gravity, built_to.name == DEFAULT_ARM, p_led, processes))
 
     @property
     def t_s(self) -> float:

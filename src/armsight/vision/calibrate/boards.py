@@ -15,8 +15,11 @@ what they blur (empirical Bayes), so a perfect board stays perfect.
 from __future__ import annotations
 
 import contextlib
+from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +113,15 @@ def _freed(model: BundleModel, solution: BundleSolution) -> float:
     return freed + float(modes - variance[len(variance) - modes :].sum() / model.shape_sigma_m**2)
 
 
+Progress = Callable[[str], None]
+#: Calls a function with arguments in another process, and returns what it returns.
+Second = Callable[..., Any]
+
+
+def _silent(message: str) -> None:
+    """Take a line of progress and show it nowhere."""
+
+
 @dataclass(frozen=True, eq=False)
 class Trial(Record):
     """One way to model cameras and board, adjusted to all pairs and evaluated on held-out ones.
@@ -149,9 +161,10 @@ class LensModelSearch(Record):
     sizes: tuple[tuple[int, int], tuple[int, int]]
     progress: Callable[[str], None]
 
-    def best(self, models: tuple[str, ...]) -> tuple[Trial, dict[str, HeldOutErrors]]:
+    def best(self, models: tuple[str, ...], second: Second | None = None) -> tuple[Trial, dict[str, HeldOutErrors]]:
         """Return the first model that no later one beats by more than WORTH, and the held-out errors of all."""
-        trials = {name: trial for name in models if (trial := self.trial(name)) is not None}
+        found = self._trials(models, second)
+        trials = {name: trial for name in models if (trial := found[name]) is not None}
         if not trials:
             raise CalibrationError("no distortion model could be adjusted to the detections")
         reference = next(iter(trials.values())).heldout
@@ -163,9 +176,34 @@ class LensModelSearch(Record):
                 chosen, least = trial, score
         return chosen, {name: trial.heldout for name, trial in trials.items()}
 
+    def _trials(self, models: tuple[str, ...], second: Second | None) -> dict[str, Trial | None]:
+        """Return the trial of each model; a second process takes the next one as soon as it is free, as this one does."""
+        waiting, found = deque(models), dict[str, Trial | None]()
+
+        def take(trial: Callable[[str], Trial | None]) -> None:
+            while True:
+                try:
+                    name = waiting.popleft()
+                except IndexError:  # none is left
+                    return
+                self.progress(f"evaluating distortion model {name} on held-out pairs")
+                found[name] = trial(name)
+
+        if second is None or len(models) < 2:
+            take(self.trial)
+            return found
+        quiet = replace(self, progress=_silent)
+        with ThreadPoolExecutor(1) as beside:
+            others = beside.submit(take, lambda name: second(LensModelSearch.trial, quiet, name))
+            try:
+                take(self.trial)
+            finally:
+                waiting.clear()
+            others.result()
+        return found
+
     def trial(self, distortion: str) -> Trial | None:
         """Adjust and cross-validate one distortion model; None where its adjustment fails."""
-        self.progress(f"evaluating distortion model {distortion} on held-out pairs")
         try:
             model, motion, solution = self._adjusted(self._converted(distortion))
             errors = cross_validate(
@@ -234,7 +272,6 @@ class LensModelSearch(Record):
 
 
 LEAST_PAIRS = 3
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +298,8 @@ def calibrate_boards(
     flat: bool = False,
     folds: int = FOLDS,
     singles: Sequence[Pair] = (),
-    progress: Progress = lambda message: None,
+    progress: Progress = _silent,
+    second: Second | None = None,
 ) -> Calibration:
     """Calibrate two cameras from pairs of images of one board.
 
@@ -275,6 +313,7 @@ def calibrate_boards(
         singles: detections of further images of the same board by one camera alone, the other side empty and with a
             reason: they help to determine what is inside the camera.
         progress: called with a line about what is being done.
+        second: calls a function in another process, which takes its share of the distortion models; None without one.
 
     Returns:
         The rig, its held-out errors, and what was rejected.
@@ -298,7 +337,7 @@ def calibrate_boards(
     selection = _Selection(
         model, observations, tuple(pair.name for pair in usable), sizes, folds, pair_count, len(pairs), progress
     )
-    screened, trial, tried = selection.chosen(first.state, models)
+    screened, trial, tried = selection.chosen(first.state, models, second)
     lens = trial.solution.state.cameras[0].model
     if lens != first.state.cameras[0].model and (screened.rejected or screened.notes):
         # Pairs rejected under a simple lens may fit the one that was chosen.
@@ -465,7 +504,9 @@ class _Selection(Record):
     given: int
     progress: Progress
 
-    def chosen(self, start: BundleState, models: tuple[str, ...]) -> tuple[Screened, Trial, dict[str, HeldOutErrors]]:
+    def chosen(
+        self, start: BundleState, models: tuple[str, ...], second: Second | None = None
+    ) -> tuple[Screened, Trial, dict[str, HeldOutErrors]]:
         """Reject gross errors, then return the best model's trial and the held-out errors of all."""
         start = replace(start, shape=np.zeros(len(self.model.modes)))
         screened, motion = self._screened(self.model, start), None
@@ -477,7 +518,7 @@ class _Selection(Record):
             motion = moving.shots(screened.kept)
         folds = min(self.folds, self._pairs(screened))
         search = LensModelSearch(self.model, motion, screened, folds, self.sizes, self.progress)
-        return screened, *search.best(models)
+        return screened, *search.best(models, second)
 
     def _screened(self, model: BundleModel, start: BundleState, sigma_px: float = 1.0) -> Screened:
         """Reject gross errors; too few pairs are an error."""
