@@ -116,7 +116,13 @@ def motions(t_s: Array, Ts: Array, covs: Array) -> list[Motion | None]:
 
 
 def estimate_shutters(
-    rig: StereoRig, body: Body, shots: Sequence[TimedShot], *, known: Shutters | None = None, readout: bool = False
+    rig: StereoRig,
+    body: Body,
+    shots: Sequence[TimedShot],
+    *,
+    known: Shutters | None = None,
+    readout: bool = False,
+    sigma_most: float = _SIGMA_MOST,
 ) -> Shutters | Missed:
     """Estimate the skew of two cameras, and the readout time of their rolling shutters, from a moving body.
 
@@ -126,6 +132,7 @@ def estimate_shutters(
         shots: in the order of their time.
         known: the readout that is given, and where to begin; nothing by default.
         readout: estimate the readout too.
+        sigma_most: largest sigma that counts as found, as a share of the median time between shots.
 
     Returns:
         Both with covariance, or why they cannot be found: too few shots that move, or too slow.
@@ -188,7 +195,7 @@ def estimate_shutters(
     cov[:count, :count] = _birge(marginal - step @ H / len(marginal), H) * inverted @ H @ inverted
     sigma = np.sqrt(np.diag(cov))
     for name, value, s in zip(("skew", "readout"), theta[:count], sigma, strict=False):
-        if s > _SIGMA_MOST * float(np.median(np.diff(t_s))):
+        if s > sigma_most * float(np.median(np.diff(t_s))):
             return Missed(
                 f"the motion is too slow or too short to find the {name}: {1e3 * value:.2f} ± {1e3 * s:.2f} ms; move "
                 "the body faster, or longer"

@@ -204,7 +204,7 @@ def test_a_video_is_named_with_what_to_do(armsight, tmp_path):
         (tmp_path / f"{side}.mp4").write_bytes(b"")
     videos = ("--left", tmp_path / "left.mp4", "--right", tmp_path / "right.mp4")
     said = armsight("calibrate", *videos, *CHESS, "-o", tmp_path / "rig.json")
-    assert_rejected(said, "left.mp4", "is a video", "armsight record")
+    assert_rejected(said, "left.mp4", "is a video", "--source video:LEFT,RIGHT")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.bundle import BundleModel, BundleState, Observations, minimise
 from armsight.vision.calibrate import boards
-from armsight.vision.calibrate.boards import calibrate_boards
+from armsight.vision.calibrate.boards import calibrate_boards, calibrate_recording
 from armsight.vision.calibrate.heldout import pair_errors, summary
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.match import join, renamed
@@ -169,3 +169,43 @@ def test_learning_ends_at_the_scale_of_what_is_plainly_seen():
     assert motion.scale_m == pytest.approx(WAY_M, rel=0.04)
     assert motion.scale_rad == pytest.approx(ROTATION_RAD, rel=0.04)
     assert motion.rms_m == pytest.approx(np.sqrt((seen[:, :3] ** 2).mean()), rel=1e-12)
+
+
+def swung(t_s):
+    """Poses (N, 4, 4) of a board that is swung and tilted in a hand."""
+    swing = np.sin(2 * np.pi * t_s[:, None] * [0.5, 0.7, 0.3] + [0.3, 0.9, 1.7])
+    tilts = swing * [0.35, 0.3, 0.2] + [0.25, -0.2, 0.1]
+    return np.array(
+        [pose(exp_so3(w), [-0.08, -0.06, 0.6] + s * [0.08, 0.06, 0.08]) for w, s in zip(tilts, swing, strict=True)]
+    )
+
+
+def recorded(skew_s, count=40, rate_hz=12.0, seed=3):
+    """The true rig, the board, times and pairs of a swung board whose right images are late."""
+    true, board, _ = rig_and_board()
+    t_s = np.arange(count) / rate_hz
+    early, late = (
+        board_pairs(true, board.body.points, swung(t_s + d), sigma=SIGMA_PX, seed=s)
+        for d, s in ((0.0, seed), (skew_s, seed + 1))
+    )
+    return true, board, t_s, [replace(a, right=b.right) for a, b in zip(early, late, strict=True)]
+
+
+@pytest.mark.parametrize("skew_s", [0.02, -0.055])  # the second is nearer to the right camera's next image
+def test_the_skew_is_found_from_a_recording(skew_s):
+    true, board, t_s, pairs = recorded(skew_s)
+    c = calibrate_recording(board, pairs, t_s, SIZES, models=("brown5",), flat=True, folds=2)
+    found = c.rig.shutters
+    assert found is not None, c.notes
+    assert abs(found.skew_s - skew_s) < max(4 * found.sigmas[0], 1e-3)
+    assert found.sigmas[0] < 1e-3
+    assert c.heldout.epipolar_rms_px < 2 * SIGMA_PX
+    assert abs(c.rig.baseline_m - true.baseline_m) < 1e-3
+    assert any("do not expose at one time" in note for note in c.notes)
+
+
+def test_a_recording_without_skew_has_none():
+    _, board, t_s, pairs = recorded(0.0)
+    c = calibrate_recording(board, pairs, t_s, SIZES, models=("brown5",), flat=True, folds=2)
+    assert c.rig.shutters is None
+    assert any("expose at one time within" in note for note in c.notes)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -13,12 +15,18 @@ from armsight.errors import InputError
 from armsight.files import check_folder, check_outputs
 from armsight.vision.calibrate import FOLDS, MODELS
 
+if TYPE_CHECKING:
+    from armsight.vision.sources import Source
+
 _VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 
 
 @click.command("calibrate")
 @click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
 @click.option("--right", metavar="GLOB", help="Right images, matched to the left ones by sorted name.")
+@click.option(
+    "--source", metavar="SPEC", help="A recording with times instead, such as video:L.mp4,R.mp4: the skew is found."
+)
 @click.option("--left-intrinsics", metavar="GLOB", help="More images of the target, by the left camera alone.")
 @click.option("--right-intrinsics", metavar="GLOB", help="The same by the right camera.")
 @click.option("--target", metavar="SPEC", help="The target, such as chessboard:9x6:25mm (inner corners, square).")
@@ -48,6 +56,7 @@ _VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 def command(
     left: str | None,
     right: str | None,
+    source: str | None,
     left_intrinsics: str | None,
     right_intrinsics: str | None,
     target: str | None,
@@ -64,22 +73,27 @@ def command(
 ) -> None:
     """Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.
 
-    From images: --left, --right and --target. From detections of a known body with known intrinsics: --detections,
-    --cameras and --body.
+    From images: --left, --right and --target. From a recording of a board that moves before cameras that may not expose
+    at one time: --source and --target. From detections of a known body with known intrinsics: --detections, --cameras
+    and --body.
     """
-    images, points = (left, right, target), (detections, cameras, body)
-    if (None in images) == (None in points) or any(images) == any(points):
-        raise InputError("give --left, --right and --target, or --detections, --cameras and --body")
+    globs, points = (left, right), (detections, cameras, body)
+    images = (source, target) if source is not None else (*globs, target)
+    if (None in images) == (None in points) or any((*globs, *images)) == any(points) or (source and any(globs)):
+        raise InputError(
+            "give --left, --right and --target, or --source and --target, or --detections, --cameras and --body"
+        )
     if refine_body is not None and detections is None:
         raise InputError("--refine-body goes with --detections; a target in images is estimated without it")
-    if (left_intrinsics or right_intrinsics) and left is None:
-        raise InputError("--left-intrinsics and --right-intrinsics go with --left, --right and --target")
+    if (left_intrinsics or right_intrinsics) and target is None:
+        raise InputError("--left-intrinsics and --right-intrinsics go with images of a --target")
 
     from armsight.app.calibrate.report import REPORT_FILES, write_report
     from armsight.app.calibrate.run import (
         calibrate_detections,
         calibrate_images,
         files_of,
+        open_recording,
         print_result,
         provenance,
         summary,
@@ -89,17 +103,20 @@ def command(
     from armsight.vision.markers.body_file import save_body_csv
     from armsight.vision.markers.calibrated_board import save_board_file
     from armsight.vision.sources import PairsSource
+    from armsight.vision.sources.pairs import StoredSource
 
-    source = None if left is None or right is None else PairsSource.open(left, right)
-    video = next((f for f in (source.files if source is not None else ()) if f.suffix.lower() in _VIDEOS), None)
-    if video is not None:
-        raise InputError(
-            f"{video}: is a video, and calibrate takes images: `armsight record video:LEFT,RIGHT -o DIR` stores them. Use "
-            "boards that stand still; `armsight measure --skew find --save-rig` then finds the skew of the cameras"
-        )
+    opened: Source | None = None
+    if left is not None and right is not None:
+        opened = PairsSource.open(left, right)
+        video = next((file for file in opened.files if file.suffix.lower() in _VIDEOS), None)
+        if video is not None:
+            raise InputError(f"{video}: is a video: give both as --source video:LEFT,RIGHT")
+    elif source is not None:
+        opened = open_recording(source)
     alone = (files_of(left_intrinsics), files_of(right_intrinsics))
-    inputs = points if source is None else (*source.files, *alone[0], *alone[1])
-    board_file = None if source is None else output.parent / f"{output.stem}.board.toml"
+    files = opened.files if isinstance(opened, StoredSource) else ()
+    inputs = points if opened is None else (*files, *alone[0], *alone[1])
+    board_file = None if opened is None else output.parent / f"{output.stem}.board.toml"
     check_outputs((output, refine_body, board_file), inputs)
     if report is not None:
         require_matplotlib()
@@ -110,10 +127,14 @@ def command(
             problem="no report can be written here",
         )
     started = time.perf_counter()
-    if source is not None and target is not None and board_file is not None:
+    if opened is not None and target is not None and board_file is not None:
         models = MODELS if lens_model is None else (lens_model,)
-        calibration = calibrate_images(source, alone, target, models, flat=flat_target, folds=folds)
-        given = {"left": str(left), "right": str(right), "target": target, "board": board_file.name}
+        with contextlib.closing(opened):
+            calibration = calibrate_images(
+                opened, alone, target, models, flat=flat_target, folds=folds, recorded=source is not None
+            )
+        given = {"source": source} if source is not None else {"left": str(left), "right": str(right)}
+        given |= {"target": target, "board": board_file.name}
         more = {"left_intrinsics": left_intrinsics, "right_intrinsics": right_intrinsics}
         given |= {name: pattern for name, pattern in more.items() if pattern is not None}
     elif detections is not None and cameras is not None and body is not None:

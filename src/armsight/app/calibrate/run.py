@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import importlib.metadata
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 import cv2
+import numpy as np
 
 from armsight.app.calibrate.report import MOTION_FITTED
 from armsight.app.messages import weak
 from armsight.app.progress import bar, steps
 from armsight.app.report.page import PAGE
 from armsight.app.report.table import TextTable, print_table
-from armsight.data import SIDES, Detections
+from armsight.data import SIDES, Detections, Shot
 from armsight.errors import InputError
-from armsight.vision.calibrate.boards import Pair, calibrate_boards
+from armsight.vision.calibrate.boards import Pair, calibrate_boards, calibrate_recording
 from armsight.vision.calibrate.bodies import calibrate_bodies
 from armsight.vision.calibrate.result import Calibration, RejectedPair
 from armsight.vision.camera_file import read_cameras
@@ -27,8 +28,11 @@ from armsight.vision.detections import read_detections
 from armsight.vision.image import grey, read_image
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import load_body_csv
-from armsight.vision.sources import PairsSource
-from armsight.vision.sources.pairs import image_files, natural_key, no_files
+from armsight.vision.sources import Source, notes_of, open_source
+from armsight.vision.sources.bag import BagSource
+from armsight.vision.sources.lerobot import LeRobotSource
+from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files
+from armsight.vision.sources.video import VideoSource
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 
@@ -70,43 +74,84 @@ def _single(path: Path, target: CalibrationBoard, side: int, size: tuple[int, in
     return Pair(str(path), *((found, nothing) if side == 0 else (nothing, found)))
 
 
+def open_recording(spec: str) -> Source:
+    """Open a recording whose shots have times.
+
+    Raises:
+        InputError: live cameras, or a recording without times.
+    """
+    opened = open_source(spec)
+    if isinstance(opened, StoredSource | VideoSource | BagSource | LeRobotSource):
+        if not isinstance(opened, StoredSource) or any(pair.t_s is not None for pair in opened.pairs):
+            return opened
+        opened.close()
+        raise InputError(f"{spec}: its shots have no times (shots.csv): give the images as --left and --right")
+    opened.close()
+    raise InputError(
+        f"{spec}: are live cameras: `armsight record {spec} -o DIR` stores a recording, and --source DIR takes it"
+    )
+
+
 def calibrate_images(
-    source: PairsSource,
+    source: Source,
     alone: tuple[list[Path], list[Path]],
     spec: str,
     models: tuple[str, ...],
     *,
     flat: bool,
     folds: int,
+    recorded: bool = False,
 ) -> Calibration:
-    """Detect a board, given by its spec, in every pair of images, and in those of one camera alone, and calibrate."""
+    """Detect a board, given by its spec, in every shot, and in images of one camera alone, and calibrate.
+
+    Of shots that were ``recorded`` the times are used: the board may move, and the skew of the cameras is found.
+    """
     target = open_board(spec)
     pairs: list[Pair] = []
+    times: list[float | None] = []
     singles: list[Pair] = []
     sizes: Sizes | None = None
-    with bar("detecting the target", len(source.pairs) + sum(map(len, alone))) as advance:
-        for stored in source.pairs:
-            shot = stored.load()
+    total = None if source.count is None else source.count + sum(map(len, alone))
+    with bar("detecting the target", total) as advance:
+        for shot, files in _shots(source):
             if shot.left is None or shot.right is None:
                 nothing = Detections.none(shot.problem or "no image")
                 unread = (nothing, replace(nothing, problem=None))  # the problem names the file of one side
-                left, right = unread[::-1] if (shot.problem or "").startswith(f"{stored.right}:") else unread
+                left, right = unread[::-1] if (shot.problem or "").startswith(f"{files[1]}:") else unread
                 pairs.append(Pair(shot.name, left, right))
             else:
                 now = tuple((image.shape[1], image.shape[0]) for image in (shot.left, shot.right))
-                sizes = _same(sizes, (now[0], now[1]), stored.left, stored.right)
+                sizes = _same(sizes, (now[0], now[1]), *files)
                 pairs.append(Pair(shot.name, target.detect(grey(shot.left)), target.detect(grey(shot.right))))
+            times.append(shot.t_s)
             advance()
         for side, paths in enumerate(alone if sizes is not None else ()):
             for path in paths:
                 singles.append(_single(path, target, side, sizes[side] if sizes is not None else (0, 0)))
                 advance()
     if sizes is None:
+        if not pairs:
+            raise InputError("the recording has no shots")
         raise InputError(f"none of {len(pairs)} pairs can be read; {pairs[0].name}: {pairs[0].left.problem}")
+    options = {"models": models, "flat": flat, "folds": folds, "singles": singles}
     with steps() as progress:
-        return calibrate_boards(
-            target, pairs, sizes, models=models, flat=flat, folds=folds, singles=singles, progress=progress
-        )
+        if not recorded:
+            return calibrate_boards(target, pairs, sizes, progress=progress, **options)
+        known = [(pair, t) for pair, t in zip(pairs, times, strict=True) if t is not None]
+        t_s = np.array([t for _, t in known])
+        calibration = calibrate_recording(target, [pair for pair, _ in known], t_s, sizes, progress=progress, **options)
+        return replace(calibration, notes=(*notes_of(source), *calibration.notes))
+
+
+def _shots(source: Source) -> Iterator[tuple[Shot, tuple[Path | str, Path | str]]]:
+    """Yield the shots of a source with the names of what they come from, for messages."""
+    if isinstance(source, StoredSource):
+        for stored in source.pairs:
+            shot = stored.load()
+            yield shot, (stored.left or shot.name, stored.right or shot.name)
+        return
+    while (next_one := source.read()) is not None:
+        yield next_one, (f"shot {next_one.name}", f"shot {next_one.name}")
 
 
 def calibrate_detections(detections: Path, cameras: Path, body: Path, *, refine_body: bool, folds: int) -> Calibration:
@@ -117,7 +162,7 @@ def calibrate_detections(detections: Path, cameras: Path, body: Path, *, refine_
         return calibrate_bodies(known, shots, pair, refine_body=refine_body, folds=folds, progress=progress)
 
 
-def _same(sizes: Sizes | None, now: Sizes, left: Path | None, right: Path | None) -> Sizes:
+def _same(sizes: Sizes | None, now: Sizes, left: Path | str, right: Path | str) -> Sizes:
     """Return the sizes of the images; raise an InputError if they differ from those before."""
     for side, path in enumerate((left, right)):
         if sizes is not None and sizes[side] != now[side]:
@@ -161,6 +206,7 @@ def summary(
         "sigma_px": c.rig.sigma_px,
         "body_deviation_rms_m": c.deviation_m,
         "disc_radius_m": c.disc_radius_m,
+        "shutters": None if c.rig.shutters is None else c.rig.shutters.to_json(),
         "rig": str(output),
         "board": None if board_file is None else str(board_file),
         "report": str(report / PAGE) if report is not None else None,

@@ -15,6 +15,7 @@ what they blur (empirical Bayes), so a perfect board stays perfect.
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Detections, Record
+from armsight.data import Array, Body, Detections, Missed, Record
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid
@@ -48,8 +49,10 @@ from armsight.vision.camera import DISTORTION_MODELS, Camera
 from armsight.vision.discs.bias import apparent_radii
 from armsight.vision.markers.board import CalibrationBoard
 from armsight.vision.match import join, renamed
+from armsight.vision.pnp import body_poses
 from armsight.vision.projection import of_middles, smooth
-from armsight.vision.rig import StereoRig
+from armsight.vision.rig import Shutters, StereoRig
+from armsight.vision.shutter import TimedShot, aligned, at_one_time, estimate_shutters
 
 #: A later model must lower the held-out error by this share to be preferred; a fisheye, which other programs do not
 #: use for an ordinary lens, by more.
@@ -71,6 +74,19 @@ _NOISE_ROUNDS, _MOTION_ROUNDS = 4, 8
 #: Rounds of the discs' radius and the poses; a radius given may differ by this factor from what the images show: print and
 #: lens widen or narrow what is dark.
 _RADIUS_ROUNDS, _RADIUS_RATIO = 2, 1.1
+#: Rounds of skew and cameras in turns; the skew has settled where it changes by less than this share of its sigma. In the
+#: first rounds only the relative pose of the cameras is adjusted.
+_SKEW_ROUNDS, _SETTLED, _POSE_ROUNDS = 40, 0.03, 2
+#: Least sigma of a detection meanwhile, px: with a smaller one the robust loss would give up on shots that move far. What
+#: the detections scatter by is measured.
+_SKEW_PX = 0.3
+#: Largest sigma of a skew that counts as found, as a share of the time between shots (without an estimate it is 0.29), and
+#: the sigmas beyond which there is one.
+_SKEW_UNSURE, _SKEW_SIGMAS = 0.1, 3.0
+#: Beyond this share of the time between shots the left frame is paired with the right camera's one before or behind.
+_REPAIR = 0.6
+#: Most pairs of a recording that are adjusted, spread over it, and most shots in a row that the skew is found from.
+_PAIRS_MOST, _SKEW_SHOTS = 100, 300
 
 
 def rigid_board(points: Array) -> BundleModel:
@@ -529,3 +545,191 @@ class _Selection(Record):
     def _pairs(self, screened: Screened) -> int:
         """Return how many pairs remain; images of one camera alone come after them and do not count."""
         return int((screened.kept < self.pair_count).sum())
+
+
+def calibrate_recording(
+    board: CalibrationBoard,
+    pairs: Sequence[Pair],
+    t_s: Array,
+    sizes: tuple[tuple[int, int], tuple[int, int]],
+    *,
+    models: tuple[str, ...] = MODELS,
+    flat: bool = False,
+    folds: int = FOLDS,
+    singles: Sequence[Pair] = (),
+    progress: Progress = lambda message: None,
+) -> Calibration:
+    """Calibrate two cameras that may expose at different times, from a recording of a board that moves.
+
+    Skew and cameras are estimated in turns (:mod:`armsight.vision.shutter`), then every detection is moved to the time of
+    its left image, and the pairs are calibrated as simultaneous ones. Alternating leaves the sigma of the skew at given
+    cameras; with rho its correlation with them an error shrinks by rho^2 each round, so the sigma of both together is
+    that over sqrt(1 - shrinkage).
+
+    Args:
+        board: the board's drawing and its symmetries.
+        pairs: detections of every shot, in the order of their time.
+        t_s: (N,) times of the shots, s, rising.
+        sizes: image size of the left and of the right camera, px.
+        models: distortion models to choose from by held-out error.
+        flat: hold the board to its drawing.
+        folds: how many parts the pairs are split into for the held-out errors.
+        singles: detections of further images by one camera alone.
+        progress: called with a line about what is being done.
+
+    Returns:
+        As :func:`calibrate_boards`, with the skew in the rig where there is one; a note says so, or why it was not found.
+
+    Raises:
+        CalibrationError: fewer than three usable pairs, or views that do not determine the cameras.
+        InputError: the times do not rise.
+    """
+    given, several = _spread(pairs), tuple(m for m in ("brown4", "fisheye") if m in models) or models[:1]
+    first = calibrate_boards(
+        board, given, sizes, models=several, flat=flat, folds=2, singles=singles, progress=progress
+    )
+    progress("looking for the skew of the cameras")
+    found = _Recording(board, tuple(pairs), t_s, first, not singles).one_time()
+    if isinstance(found, Missed):
+        said = f"no skew of the cameras is taken into account: {found.reason}"
+        moved, dropped, shutters = given, len(pairs) - len(given), None
+    else:
+        shutters, moved = found
+        said = f"the cameras do not expose at one time: {shutters}; the detections were moved to one time"
+        dropped = len(moved) - len(moved := _spread(moved))
+    calibration = calibrate_boards(
+        board, moved, sizes, models=models, flat=flat, folds=folds, singles=singles, progress=progress
+    )
+    notes = [said] + ([f"{len(moved)} pairs spread over the recording were used"] if dropped else [])
+    calibration = replace(
+        calibration,
+        rig=replace(calibration.rig, shutters=shutters),
+        pairs_found=len(pairs),
+        notes=(*calibration.notes, *notes),
+        recorded=True,
+    )
+    return replace(calibration, weaknesses=weaknesses(calibration))
+
+
+def _spread(pairs: Sequence[Pair]) -> list[Pair]:
+    """Return at most _PAIRS_MOST pairs in which both cameras see the board, evenly spread; all where there are few."""
+    if len(pairs) <= _PAIRS_MOST:
+        return list(pairs)
+    seen = [pair for pair in pairs if min(len(pair.left.ids), len(pair.right.ids)) >= LEAST_CORNERS]
+    if len(seen) <= _PAIRS_MOST:
+        return seen
+    return [seen[k] for k in np.linspace(0, len(seen) - 1, _PAIRS_MOST).round().astype(int)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Recording(Record):
+    """A recording of a moving board, and the cameras as they seem where all its shots are taken as simultaneous."""
+
+    board: CalibrationBoard
+    pairs: tuple[Pair, ...]
+    t_s: Array
+    first: Calibration
+    free_cameras: bool
+
+    @property
+    def body(self) -> Body:
+        """The board as found."""
+        return self.first.body
+
+    def one_time(self) -> tuple[Shutters, list[Pair]] | Missed:
+        """Return the skew and the pairs with every detection moved to the time of its left image, or why there is none."""
+        rig = replace(self.first.rig, sigma_px=max(self.first.solution.sigma_px, _SKEW_PX))
+        interval = float(np.median(np.diff(self.t_s))) if len(self.t_s) > 1 else 1.0
+        later, steps = 0, [0.0]
+        shots = self.shots(rig, later)
+        found: Shutters | Missed = Shutters(0.0, 0.0, np.zeros((2, 2)))
+        for turn in range(_SKEW_ROUNDS):
+            before = found
+            some = _busiest(shots)
+            found = estimate_shutters(rig, self.body, list(some.values()), known=before, sigma_most=np.inf)
+            if isinstance(found, Missed):
+                return found
+            steps.append(found.skew_s - before.skew_s)
+            settled = abs(steps[-1]) < _SETTLED * found.sigmas[0]
+            if abs(found.skew_s + later * interval) > _REPAIR * interval and not self.board.symmetries:
+                later = -round(found.skew_s / interval)
+                shots = self.shots(rig, later)
+                if abs(later) * 4 > len(self.pairs) or len(shots) < LEAST_PAIRS:
+                    return Missed("the shots do not agree with one skew: are these recordings of one time?")
+            elif settled and turn > _POSE_ROUNDS:
+                break
+            else:
+                rig = self.adjusted(
+                    rig, _busiest(shots), found, free_cameras=self.free_cameras and turn >= _POSE_ROUNDS
+                )
+        shutters = replace(found, cov=found.cov / (1.0 - _shrinkage(steps, float(found.sigmas[0]))))
+        sigma = float(shutters.sigmas[0])
+        if sigma > _SKEW_UNSURE * interval:
+            return Missed(
+                f"it comes out as {1e3 * shutters.skew_s:.0f} ± {1e3 * sigma:.0f} ms, with {1e3 * interval:.0f} ms between "
+                "two shots: record more shots a second, or move the board less abruptly and for longer"
+            )
+        if abs(shutters.skew_s) < _SKEW_SIGMAS * sigma and shutters.jitter_s == 0:
+            return Missed(f"they expose at one time within {1e3 * (abs(shutters.skew_s) + 2 * sigma):.2g} ms")
+        return shutters, self.moved(rig, shots, later, shutters)
+
+    def shots(self, rig: StereoRig, later: int) -> dict[int, TimedShot]:
+        """Return the shots of left frames with right ones ``later`` frames behind, with the left camera's pose to begin."""
+        found = {}
+        for k, (t, pair) in enumerate(zip(self.t_s, self.pairs, strict=True)):
+            if not 0 <= k + later < len(self.pairs):
+                continue
+            left, right = pair.left, self.pairs[k + later].right
+            if min(len(left.ids), len(right.ids)) < LEAST_CORNERS:
+                continue
+            poses = body_poses(self.body.points[left.ids], rig.left, left.uv)
+            if poses:
+                apart_s = float(self.t_s[k + later] - t)
+                found[k] = TimedShot(float(t), join(left, right), poses[0][0], apart_s)
+        return found
+
+    def adjusted(
+        self, rig: StereoRig, shots: dict[int, TimedShot], shutters: Shutters, *, free_cameras: bool
+    ) -> StereoRig:
+        """Return the cameras adjusted to the shots that can be moved to one time."""
+        known = aligned(rig, self.body, list(shots.values()), shutters)
+        chosen = [
+            (at_one_time(rig, self.body, shot.seen, a, shutters), a.T_left_body)
+            for shot, a in zip(shots.values(), known, strict=True)
+            if a.motion is not None and a.motion.centred
+        ]
+        observations = Observations.from_shots([seen for seen, _ in chosen])
+        radius_m = self.first.disc_radius_m or 0.0
+        model = replace(rigid_board(self.body.points), disc_radius_m=radius_m, free_cameras=free_cameras)
+        state = BundleState(rig.cameras, rig.T_left_right, np.array([T for _, T in chosen]), np.zeros(0))
+        state = minimise(model, state, observations, rig.sigma_px, max_steps=_STEPS, least_decrease=_ROUGHLY).state
+        return replace(rig, left=state.cameras[0], right=state.cameras[1], T_left_right=state.T_left_right)
+
+    def moved(self, rig: StereoRig, shots: dict[int, TimedShot], later: int, shutters: Shutters) -> list[Pair]:
+        """Return the pairs at one time; without those whose motion is not seen from both sides."""
+        pairs = []
+        for (k, shot), a in zip(shots.items(), aligned(rig, self.body, list(shots.values()), shutters), strict=True):
+            if a.motion is None or not a.motion.centred:
+                continue
+            right, now = self.pairs[k + later].right, at_one_time(rig, self.body, shot.seen, a, shutters)
+            uv = now.uv[np.searchsorted(now.ids, right.ids), 1]
+            if np.isfinite(uv).all():
+                pairs.append(replace(self.pairs[k], right=replace(right, uv=uv)))
+        return pairs
+
+
+def _busiest(shots: dict[int, TimedShot]) -> dict[int, TimedShot]:
+    """Return at most _SKEW_SHOTS shots in a row: those in which the board moves furthest."""
+    if len(shots) <= _SKEW_SHOTS:
+        return shots
+    at = np.array([shot.T_left_body[:3, 3] for shot in shots.values()])
+    ways = np.minimum(np.linalg.norm(np.diff(at, axis=0), axis=1), 0.1)  # an abrupt change is another pose, no motion
+    sums = np.convolve(ways, np.ones(_SKEW_SHOTS - 1), "valid")
+    first = int(np.argmax(sums))
+    return dict(list(shots.items())[first : first + _SKEW_SHOTS])
+
+
+def _shrinkage(steps: list[float], sigma_s: float) -> float:
+    """Return by what an error of the skew shrinks from round to round: the last ratio of steps that are no noise."""
+    ratios = [abs(b / a) for a, b in itertools.pairwise(steps) if abs(a) > 0.1 * sigma_s]
+    return float(np.clip(ratios[-1], 0.0, 0.95)) if ratios else 0.0

@@ -90,6 +90,7 @@ class Calibration(Record):
         weaknesses: what is weak, and what to do about it.
         motion: how far the board moved between the two exposures of a pair; None where it stood still.
         disc_radius_m: radius of the board's discs, m, given or as the images show it; None for other boards.
+        recorded: whether the pairs had times, so that the skew of the cameras was looked for.
     """
 
     rig: StereoRig
@@ -108,6 +109,7 @@ class Calibration(Record):
     weaknesses: tuple[str, ...]
     motion: ExposureMotion | None = None
     disc_radius_m: float | None = None
+    recorded: bool = False
 
     @property
     def reprojection_rms_px(self) -> float:

@@ -119,8 +119,17 @@ def _moved(calibration: Calibration, motion: ExposureMotion) -> str:
         f"{1e3 * motion.rms_rad:.1f} mrad RMS along and about each axis ({way_px:.2f} px{most}): the cameras are not "
         f"synchronised. The rig's noise of {calibration.rig.sigma_px:.2f} px allows for a body that moves like that, the "
         f"corners alone have {calibration.solution.sigma_px:.2f} px: hold still what is measured, or trigger both cameras "
-        "together. By what time they differ is not found here, for images have none: `armsight measure --skew find "
-        "--save-rig` finds it from a recording of what moves"
+        f"together.{_hint(calibration)}"
+    )
+
+
+def _hint(calibration: Calibration) -> str:
+    """Say how the skew of the cameras is found, where it was not."""
+    if calibration.recorded:
+        return ""
+    return (
+        " By what time they differ is not found here, for images have none: give a recording, `armsight calibrate --source "
+        "video:LEFT,RIGHT` or a folder of `armsight record`, of a board that moves"
     )
 
 
