@@ -452,3 +452,28 @@ def test_fixed_bodies_that_cannot_be_watched(rendered, armsight, tmp_path):
     assert_rejected(armsight(*given, tmp_path / "none.toml"), "none.toml")
     seen = [*given[:4], "--detections", "d.csv", "--fixed", rendered.plate]
     assert_rejected(armsight(*seen), "--fixed needs images")
+
+
+def test_cameras_that_moved_so_far_that_most_shots_are_missed_are_asked_about(rendered, seen, armsight):
+    rig, lines = StereoRig.load(rendered.rig), ["shot,camera,marker,u_px,v_px"]
+    body, moved = open_body(str(rendered.plate)), exp_se3(np.radians([0.0, 0.0, 0.0, 0.3, 0.0, 0.0]))
+    for shot, T in enumerate(rendered.of_arm.Ts_left_body):
+        p = transform(T, body.points)
+        for side, camera, T_left in (
+            ("left", rig.left, np.eye(4)),
+            ("right", rig.right, rig.T_left_right @ (moved if shot else np.eye(4))),
+        ):
+            uv = camera.project(transform(inverse(T_left), p))
+            lines += [f"{shot},{side},{name},{u},{v}" for name, (u, v) in zip(body.point_names, uv, strict=True)]
+    (seen / "d.csv").write_text("\n".join(lines) + "\n")
+    said = armsight(*by_detections(rendered, seen), "--json")
+    (found,) = said.lines[-1]["health"]
+    assert [record["status"] for record in said.lines[:-1]] == ["ok"] + 15 * ["missed"]
+    assert (said.code, found["cause"]) == (3, "rig")
+    assert abs(found["size"] - 0.3) < 0.02
+    assert "did the cameras move? 15 of 16 shots" in found["what"]
+    (seen / "d.csv").write_text("\n".join(line for line in lines if not line.startswith("0,")) + "\n")
+    said = armsight(*by_detections(rendered, seen))
+    assert said.code == 2
+    assert "none of 15 shots could be measured: " in said.err
+    assert "did the cameras move?" in said.err

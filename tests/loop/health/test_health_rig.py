@@ -90,22 +90,26 @@ def test_a_rig_without_covariance_is_not_tested():
     assert monitor.findings() == ()
 
 
-def test_one_pose_among_others_without_times_is_no_moved_camera():
+def test_images_that_do_not_belong_together_in_one_shot_are_no_moved_camera():
     """A body that moved between the two exposures of one pair of images looks like moved cameras in that pair alone."""
     rig = replace(TRUE, cov=np.diag(SIGMAS**2), sigma_px=0.0)
     good, moved = (
-        [estimate for *_, estimate, _ in watched_body(7, rotated=rotated, seconds=2.0)][::10]
+        [estimate for *_, estimate, _ in watched_body(7, rotated=rotated, seconds=4.0)][::10]
         for rotated in (None, np.radians([0.3, 0.0, 0.0]))
     )
 
-    def causes(estimates):
+    def findings(estimates, period_s):
         watch = RigWatch(rig, BODY, SYNC_S)
-        for estimate in estimates:
-            watch.take(estimate, None)
-        return [found.cause for found in watch.findings()]
+        for k, estimate in enumerate(estimates):
+            watch.take(estimate, None if period_s is None else k * period_s)
+        return [(found.cause, found.alternatives) for found in watch.findings()]
 
-    assert causes([moved[0], *good[1:]]) == []
-    assert causes(moved) == causes(moved[:1]) == ["rig"]
+    for period_s in (None, 1 / 3, 2.0):
+        one_of_several = [*good[:4], moved[4], *good[5:]]
+        assert findings(one_of_several, period_s) == findings(good[:4] + moved[4:5], period_s) == []
+        assert findings(moved, period_s) == findings(good[:4] + moved[4:], period_s) == [("rig", ())]
+        # One pose alone leaves both open.
+        assert findings(moved[:1], period_s) == [("rig", ("time",))]
 
 
 def test_the_estimate_is_what_dense_least_squares_gives():

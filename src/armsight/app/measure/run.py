@@ -25,6 +25,7 @@ from armsight.data import SIDES, Body, Image, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines, unseen_lines
+from armsight.loop.health.update import contradiction
 from armsight.vision.detections import SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows, measurer
 from armsight.vision.markers.disc.target import DiscTarget
@@ -44,6 +45,10 @@ from armsight.vision.sources.video import VideoSource
 
 #: Standard deviation of the time between the two exposures of a shot, s: of cameras that nothing synchronises to better.
 _SYNC_S = 1e-3
+#: Shots that were missed are measured again with detections of this standard deviation, px, so many of them.
+_WIDE_PX, _AGAIN = 2.0, 200
+#: So many shots that fit badly are named.
+_NAMED = 3
 #: A shot that is younger by its own stamp was stamped by a live camera, s.
 _LIVE_S = 10.0
 
@@ -131,6 +136,8 @@ def measure_shots(
             body, shots = _detected(detections, target)
             results = ((Shot(s.name, None, None, s.t_s), measure_seen(stereo, body, s), None, None) for s in shots)
             total = len(shots)
+            by_name = {s.name: s for s in shots}
+            missed = _Contradicting(stereo, body, lambda rig, shot: measure_seen(rig, body, by_name[shot.name]))
         else:
             found = open_target(target)
             body, discs = found.body, found.discs
@@ -162,6 +169,7 @@ def measure_shots(
                     stack.enter_context(contextlib.closing(again))
                 results = _moved(stereo, found, _shots(opened, stereo, rig), requested, again)
             results = _keeping(results, first, noise)
+            missed = _Contradicting(stereo, body, lambda rig, shot: measure(rig, found, shot))
         view = None if folder is None else PictureFolder(folder, stereo, body, discs, total)
         # What was measured is written whatever ends the run; where one of the two cannot be written the other is.
         if view is not None:
@@ -172,7 +180,7 @@ def measure_shots(
         publisher = stack.enter_context(contextlib.closing(_streams(streams, stereo, body)))
         try:
             _run(
-                _watched(stereo, fixed_targets, results, monitor),
+                _watched(stereo, fixed_targets, missed.keeping(results), monitor),
                 total,
                 body,
                 records,
@@ -187,14 +195,18 @@ def measure_shots(
             raise
         if detections is None:  # what only the images showed
             _say(note for note in notes_of(opened) if note not in said)
-    if records and detections is None and not any(record.ok for record in records):
-        raise ArmsightError(_nothing_measured(records, _mistaken(stereo, found, first)))
+    contradicted = missed.finding()
+    if records and not any(record.ok for record in records):
+        mistake = _mistaken(stereo, found, first) if detections is None else ""
+        raise ArmsightError(_nothing_measured(records, mistake, contradicted))
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
     moved = next((r.shutters for r in records if r.shutters is not None), None)
     saved = _keep_noise(stereo, noise, bool(skewed), moved, save_rig)
     health = monitor.findings()
     for line in unseen_lines(monitor.fixed_never_seen):
         click.echo(f"note: {line}", err=True)
+    if contradicted is not None:
+        health = (contradicted, *(each for each in health if each.cause not in ("rig", "body", "lens")))
     if skewed and any(each.cause in ("rig", "time") for each in health):
         # Of a moving body a skew looks like cameras that moved against each other; all shots together size it best.
         health = (*skewed, *(each for each in health if each.cause not in ("rig", "time")))
@@ -246,6 +258,36 @@ def _keeping(results: Iterator[Result], first: list[Shot], noise: DiscNoise | No
         if not first and isinstance(result[1], Missed) and shot.left is not None and shot.right is not None:
             first.append(shot)
         yield result
+
+
+class _Contradicting:
+    """Shots that show the target and contradict the rig: their poses, measured with a wide gate."""
+
+    def __init__(self, rig: StereoRig, body: Body, again: Callable[[StereoRig, Shot], PoseEstimate | Missed]) -> None:
+        self._rig, self._body, self._again = rig, body, again
+        self._wide = replace(rig, sigma_px=max(rig.sigma_px, _WIDE_PX))
+        self._found: list[PoseEstimate] = []
+        self._missed = self._tried = self._measured = 0
+
+    def keeping(self, results: Iterator[Result]) -> Iterator[Result]:
+        """Yield the results; keep what those that were missed show."""
+        for result in results:
+            shot, measured = result[:2]
+            self._measured += isinstance(measured, PoseEstimate)
+            if isinstance(measured, Missed) and shot.problem is None:
+                self._missed += 1
+                if self._tried < _AGAIN:
+                    self._tried += 1
+                    if isinstance(wide := self._again(self._wide, shot), PoseEstimate):
+                        self._found.append(wide)
+            yield result
+
+    def finding(self) -> HealthFinding | None:
+        """Return what explains them, where they are more than those that were measured; None elsewhere."""
+        count = round(len(self._found) / max(self._tried, 1) * self._missed)
+        if not self._found or count <= self._measured:
+            return None
+        return contradiction(self._rig, self._body, self._found, (count, count + self._measured))
 
 
 def _watched(
@@ -418,8 +460,12 @@ def _board_file(path: Path, rig: StereoRig, target: str) -> Path | None:
     return beside if beside.exists() else None
 
 
-def _nothing_measured(records: list[ShotPose], why: str = "") -> str:
-    return f"none of {len(records)} shots could be measured: {why or f'{records[0].shot}: {records[0].reason}'}"
+def _nothing_measured(records: list[ShotPose], mistake: str, contradicted: HealthFinding | None) -> str:
+    """Return why no shot could be measured: what was done to the images, or the first reason and what explains it."""
+    why = mistake or f"{records[0].shot}: {records[0].reason}"
+    if contradicted is not None and contradicted.cause == "rig" and not mistake:
+        why += f". {contradicted.what}; {contradicted.advice}"
+    return f"none of {len(records)} shots could be measured: {why}"
 
 
 #: What a camera's driver may have done to its images -> how it is undone.
@@ -456,7 +502,8 @@ def _mistaken(rig: StereoRig, target: Target, shots: list[Shot]) -> str:
         fits = {}
         for what, images in _undone(shot.left, shot.right).items():
             left, right = map(np.ascontiguousarray, images)
-            if isinstance(found := measure(rig, target, replace(shot, left=left, right=right)), PoseEstimate):
+            found = measure(rig, target, replace(shot, left=left, right=right))
+            if isinstance(found, PoseEstimate) and len(found.points.ids) > len(found.dropped):
                 fits[-len(found.points.ids), found.reprojection_rms_px] = what
         if fits:
             return fits[min(fits)]
@@ -471,8 +518,6 @@ def _close(
     missed = [r for r in records if not r.ok]
     if not records:
         raise ArmsightError("the source ended without a single shot")
-    if not good:
-        raise ArmsightError(_nothing_measured(records))
     summary = f"measured {len(good)} of {len(records)} shots in {seconds:.1f} s"
     summary += f", {len(missed)} missed (their lines have the reasons)" if missed else ""
     ways = Counter(r.way for r in records if r.way is not None)
@@ -481,8 +526,10 @@ def _close(
         summary += "; " + ", ".join(f"{count} {way} ({took[way]:.1f} ms each)" for way, count in ways.most_common())
     if jumps := [r.shot for r in records if r.jump]:
         summary += f"; jumped in {', '.join(jumps[:5])}" + (f" and {len(jumps) - 5} more" if len(jumps) > 5 else "")
-    if odd := sum(r.misfit > 1 for r in good):
-        summary += f"; {odd} fit the body worse than the noise allows (misfit in their lines; their sigma includes it)"
+    if odd := [r.shot for r in good if r.misfit > 1]:
+        which = f" ({', '.join(odd)})" if len(odd) <= _NAMED else ""
+        summary += f"; {len(odd)} fit the body worse than the noise allows{which}"
+        summary += " (misfit in their lines; their sigma includes it)"
         if board_file is not None:
             summary += f"; the rig's calibration found the shape of this board: measure with --target {board_file}"
     summary += f"; {view.summary()}" if view is not None else ""

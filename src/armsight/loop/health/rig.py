@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -80,8 +80,10 @@ _POWERS = np.array([(i, k) for i in range(_DEGREE + 1) for k in range(_DEGREE + 
 _LENS, _LENS_PX = 4 * len(_POWERS), 1.0
 #: Standard deviations of its prior that are tried: the one of the largest evidence is taken (MacKay, 1992).
 _LENS_SCALES_PX = tuple(2.0**k for k in range(-6, 2))
-#: It is tested in every so many tests; its chi-square of an alarm.
-_LENS_TESTS = 4
+#: It is tested in every so many tests, from so many poses that differ; its chi-square of an alarm.
+_LENS_TESTS, _LENS_POSES = 4, 8
+#: It is named where it explains so much more than a change of the seven numbers, as a share of what that explains.
+_LENS_SHARE = 0.5
 _LENS_ALARM = alarm_limit(_LENS, 1.0 / (TEST_S * _LENS_TESTS))
 
 
@@ -203,7 +205,10 @@ class RigWatch:
         self.lens: LensError | None = None
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
         self._timed = False
-        self._stays: deque[ResidualSums] = deque(maxlen=TEST_SHOTS)  # of the running test
+        # What each moment of the running test says, and what the alarm of the test before it would have rested on.
+        self._moments: list[ResidualSums] = []
+        self._doubted: ResidualSums | None = None
+        self._poses = 0  # that differ
         self.alarm = self.alarmed = False
         self._alarms = 0  # in a row
         self.suspected: RigChange | None = None
@@ -256,6 +261,18 @@ class RigWatch:
             self._stay_shots += 1
         self._close_stay()
         return self._test.of(self._size), stays
+
+    def explained(self, estimates: Sequence[PoseEstimate]) -> tuple[StereoRig, Body, HealthFinding]:
+        """Return the rig and the body with the change that poses show, which are known to be wrong, and what it is."""
+        sums, self._poses = self.information(estimates)
+        change = self._estimated(sums)
+        more = {part: change.chi_square - change.without[part] for part in ("rig", "body")}
+        part: Part = max(("rig", "body"), key=lambda each: (more[each], change.alone[each]))
+        sure = more[part] > chdtri(_PARTS[part].stop - _PARTS[part].start, _NECESSARY)
+        found = _FINDINGS[part](change, None, not sure)
+        rig = self._rig.perturbed(free_directions(self._rig) @ change.f[_PARTS["rig"]])
+        body = replace(self._body, points=(1.0 + change.f[_SCALED]) * self._body.points)
+        return rig, body, found if self._poses > 1 else _of_one_pose(found)
 
     def _residuals(self, estimate: PoseEstimate, now_s: float) -> tuple[ResidualSums, Array, Array] | None:
         """Return the sums of one shot, its pose eliminated, and what changes the pose.
@@ -331,29 +348,37 @@ class RigWatch:
             if not self._test.freedom:
                 self._test.begin_s = self._stay.begin_s
             self._test.add(self._stay, 1.0 / self._stay_shots)
-            mean = ResidualSums(self._size, self._stay.begin_s)
-            mean.add(self._stay.of(self._size), 1.0 / self._stay_shots)
-            self._stays.append(mean)
+            self._poses += 1
+            if self._stay_shots == 1:
+                self._moments.append(self._stay)
         self._stay, self._stay_shots = None, 0
 
     def _decide(self) -> None:
         """Test for a change with the newest sums; weigh the older ones down."""
         if not self._test.freedom:
             return
-        if len(self._history) < _KEPT:
-            self._whole.add(self._test, 1.0)
-        test, self._test = self._test.of(self._size), ResidualSums(self._full, 0.0)
-        self._history.append(test)
+        whole, self._test = self._test, ResidualSums(self._full, 0.0)
+        test, moments, self._moments = whole.of(self._size), self._moments, []
         weight = float(np.exp(-1.0 / FORGET_TESTS))
         for name in ("H", "b", "square", "freedom"):
             setattr(self._window, name, weight * getattr(self._window, name))
         self._window.add(test, 1.0)
-        stays, self._stays = self._stays, deque(maxlen=TEST_SHOTS)
         change = self._estimated(self._window)
         alarm = _certain(change) and self._matters(change, slice(None))
-        if alarm and not self._timed and len(stays) > 1:
-            # Without times: one pose of several, in which the body moved between the exposures, is no moved camera.
-            alarm = all(_certain(self._estimated(self._window.less(stay))) for stay in stays)
+        doubted, self._doubted = self._doubted, None
+        if alarm and moments and not self._alarms and self._poses > 1:
+            worst = self._worst(moments)
+            without = self._window.less(worst.of(self._size))
+            if not _certain(estimated := self._estimated(without)):
+                # Images that do not belong together are no moved camera; newer shots that agree with them are.
+                if doubted is not None:
+                    self._window.add(doubted, 1.0)
+                else:
+                    whole, test = whole.less(worst), test.less(worst.of(self._size))
+                    self._window, self._doubted, change, alarm = without, worst.of(self._size), estimated, False
+        if len(self._history) < _KEPT:
+            self._whole.add(whole, 1.0)
+        self._history.append(test)
         self._alarms = self._alarms + 1 if alarm else 0
         if 0 < self._alarms <= _FRESH:
             change = self._begun(change)
@@ -361,8 +386,17 @@ class RigWatch:
             change if alarm or (change.chi_square > _SUSPECTED and self._matters(change, slice(None))) else None
         )
         self.alarm, self.alarmed = alarm, self.alarmed or alarm
-        if len(self._history) < _KEPT and (0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0):
+        due = 0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0
+        if due and len(self._history) < _KEPT and self._poses >= _LENS_POSES:
             self.lens = self._lens()
+
+    def _worst(self, moments: list[ResidualSums]) -> ResidualSums:
+        """Return the sums of the moments that fit worst: of one, or where shots have no times of a tenth of them."""
+        count = 1 if self._timed else max(1, len(moments) // 10)
+        worst = ResidualSums(self._full, 0.0)
+        for moment in sorted(moments, key=lambda each: each.square - each.freedom)[-count:]:
+            worst.add(moment, 1.0)
+        return worst
 
     def _lens(self) -> LensError | None:
         """Return what the camera models lack; None where a change of the seven explains as much, or it hardly matters."""
@@ -383,7 +417,9 @@ class RigWatch:
         if by_lens - gained(lens) < _LENS_ALARM * excess:
             return None
         more = (self._split(list(self._history))[2] - (sums.square - by_lens)) / excess  # than a change at any time
-        if more < _LENS_ALARM:
+        # A lens that lacks a little is not to blame where the cameras moved: then they explain most.
+        moved = gained(lens) - gained(changed, lens)
+        if more < max(_LENS_ALARM, _LENS_SHARE * moved / excess):
             return None
         needed = tuple(
             part
@@ -497,14 +533,15 @@ class RigWatch:
         began_s, change = ended._since()
         since_s = began_s if self._timed else None
         parts = self._to_blame(change)
-        return tuple(
-            _FINDINGS[part](change, since_s, len(parts) == 1 and not self._needed(change, part)) for part in parts
+        found = (_FINDINGS[part](change, since_s, len(parts) == 1 and not self._needed(change, part)) for part in parts)
+        return (
+            tuple(found) if ended._poses > 1 or (self._timed and self._shots > 1) else tuple(map(_of_one_pose, found))
         )
 
     def copied(self) -> RigWatch:
         """Return a copy that says what was found so far; this one goes on."""
         copied = copy(self)
-        copied._history, copied._stays = self._history.copy(), self._stays.copy()
+        copied._history, copied._moments = self._history.copy(), self._moments.copy()
         return copied
 
     def _ended(self) -> RigWatch:
@@ -654,6 +691,13 @@ def _lens_finding(lens: LensError) -> HealthFinding:
         "loose or behind a window",
         lens.needed,
     )
+
+
+def _of_one_pose(found: HealthFinding) -> HealthFinding:
+    """Return a finding that rests on one pose, with what looks the same."""
+    same = "or the two images do not belong together (another pair's, or the body moved between them): one pose cannot tell"
+    advice = f"measure more poses; if all say so, {found.advice}"
+    return replace(found, what=f"{found.what}; {same}", advice=advice, alternatives=("time",))
 
 
 _FINDINGS = {"rig": _rig_finding, "body": _scale_finding, "time": _skew_finding}

@@ -24,9 +24,11 @@ import numpy as np
 
 from armsight.data import Array, Body, Correspondences, Missed, PoseEstimate, Record
 from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.health.record import HealthFinding
 from armsight.loop.health.rig import ResidualSums, RigWatch, free_directions
 from armsight.vision.detections import SeenShot
-from armsight.vision.match import epipolar_distances
+from armsight.vision.locate import locate
+from armsight.vision.match import epipolar_distances, gate
 from armsight.vision.measure import measure_seen
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import triangulate
@@ -42,6 +44,8 @@ _FREED = np.array([0.01, 0.01, *np.radians([2.0, 2.0, 2.0])])
 _GATES_PX, _NOISE_PX = (20.0, 2.0, 0.0, 0.0), 0.1
 #: A rotation about the baseline's normal hardly changes epipolar distances: chance makes them so many times larger at most.
 _WORSE = 1.2
+#: A change of the cameras is meant where this share of the shots that contradict the rig fits with it.
+_EXPLAINED = 0.8
 #: In so many shots at most the uncertainty of the body is computed.
 _SIZED = 12
 
@@ -152,6 +156,40 @@ def updated_rig(
     some = shots[:: -(-len(shots) // _SIZED)]
     now, then = (_position_sigma(each, body, some) for each in (new, replace(new, cov=rig.cov)))
     return _checked(rig, new, body, found, (stays, (now, then)))
+
+
+def contradiction(rig: StereoRig, body: Body, missed: Sequence[PoseEstimate], shots: tuple[int, int]) -> HealthFinding:
+    """Return what explains that most shots that show a body contradict the rig.
+
+    Args:
+        rig: as it was calibrated.
+        body: what is in view.
+        missed: poses of shots that contradict it, measured with a wide gate.
+        shots: how many do, and how many show the body.
+    """
+    moved, resized, found = RigWatch(rig, body, 0.0).explained(missed)
+    seen = [each.points.seen for each in missed]
+    again = [locate(moved, resized, triangulate(moved, resized, gate(moved, resized, each))) for each in seen]
+    right = sum(isinstance(each, PoseEstimate) for each in again)
+    uv = np.concatenate([each.uv[each.paired] for each in seen])
+    low, off_px, high = np.percentile(epipolar_distances(rig, uv[:, 0], uv[:, 1]).max(axis=1), (16.0, 50.0, 84.0))
+    shown = (
+        f"{shots[0]} of {shots[1]} shots that show the target contradict the rig, {off_px:.1f} px off epipolar lines"
+    )
+    if right >= _EXPLAINED * len(missed):
+        question = "did the cameras move? " if found.cause == "rig" else ""
+        return replace(found, what=f"{question}{shown}; {right} of {len(missed)} fit if {found.what}")
+    return HealthFinding(
+        "rig",
+        f"{shown}, and no one change of the cameras explains them: did they move again and again, or do left and right "
+        "images not belong together?",
+        None,
+        float(off_px),
+        float(high - low) / 2.0,
+        "px",
+        "look at the pairs of images; fasten the cameras and calibrate the rig again",
+        ("time",),
+    )
 
 
 @dataclass(frozen=True, eq=False)
