@@ -182,9 +182,9 @@ def _shifted(arm: Arm, measured: Measured, off: float) -> str | None:
         better, _, scale = misfit(arm, q[rows], p[rows])
         if abs(np.log(scale)) < np.log1p(SCALE_OFF) and better < min(off / BETTER, max(BAD_SHARE * _span(p), BAD_M)):
             return (
-                f"the rows are shifted by {abs(shift)}: the joint angles of row {1 + max(shift, 0)} belong to the pose of row "
-                f"{1 + max(-shift, 0)} (off by {1e3 * off:.0f} mm as they are, {1e3 * better:.1f} mm so); remove what is too "
-                "much at either end, or join the tables by names or times"
+                f"the rows are shifted by {abs(shift)}: the joint angles of row {1 + max(shift, 0)} belong to the pose of "
+                f"row {1 + max(-shift, 0)} (off by {1e3 * off:.0f} mm as they are, {1e3 * better:.1f} mm so); remove what "
+                "is too much at either end, or join the tables by names or times"
             )
     return None
 
