@@ -1,6 +1,8 @@
 """``armsight handeye``: forms of tables, what it says, and what it rejects."""
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -8,6 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from armsight.app.handeye.images import upright
+from armsight.app.handeye.read import read_pose_table
+from armsight.app.handeye.recording import matched_rows
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.robot.arm_file import open_arm
 from cli_runs import assert_rejected
@@ -331,3 +335,19 @@ def test_a_board_that_looks_the_same_rotated_is_rotated_back(in_hand):
     back, which = upright(A, rotated, (flip,), in_hand)
     np.testing.assert_allclose(back, B, atol=1e-12)
     assert list(np.flatnonzero(which >= 0)) == [2, 5, 6]
+
+
+def test_what_measure_wrote_is_joined_by_the_names_of_its_shots(tmp_path):
+    B = motion()[2]
+    rows = [[f"{k:04d}", "ok", "", k / 2, *row] for k, row in enumerate(np.hstack([B[:, :3, 3], quaternions(B)]))]
+    rows[4][1:] = ["missed", "no body", 2.0, *[""] * 7]
+    path = named(tmp_path / "measured.csv", "shot,status,reason,t_s,x_m,y_m,z_m,qw,qx,qy,qz", rows)
+    table = read_pose_table(path)
+    np.testing.assert_allclose(table.Ts, np.delete(B, 4, axis=0), atol=1e-9)
+    assert table.names == tuple(f"{k:04d}" for k in range(14) if k != 4)
+    assert len(table.notes) == 1
+    assert "1 of 14 shots were missed" in table.notes[0]
+    images = replace(table, names=tuple(f"img/{name}.png" for name in table.names[::-1]))
+    of_robot, of_seen = matched_rows(images, table.names)
+    assert [table.names[k] for k in of_seen] == [Path(images.names[k]).stem for k in of_robot]
+    assert of_seen[0] == 12

@@ -14,7 +14,8 @@ import pytest
 from identify_files import arm_toml, poses_csv
 from scipy.spatial.transform import Rotation
 
-from armsight.app.identify.run import headline
+from armsight.app.identify.run import headline, read_measured
+from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.loop.identify.corrected import Corrected
 from armsight.loop.identify.measured import Measured
@@ -328,3 +329,51 @@ def test_full_poses_with_covariance_are_read(tmp_path):
     np.testing.assert_allclose(measured.R_rig_body[0], R.as_matrix(), atol=1e-12)
     np.testing.assert_allclose(measured.cov[0, :3, :3], R.as_matrix().T @ C[:3, :3] @ R.as_matrix(), atol=1e-12)
     np.testing.assert_array_equal(measured.approach[0], [1, -1, 0, 1, 1, 1])
+
+
+def apart(tmp_path, n=40):
+    """The poses of ``poses_csv`` as what vision wrote, shot by shot, one missed, and their joint angles."""
+    head, *rows = [line.split(",") for line in poses_csv(tmp_path / "whole.csv", n=n).read_text().split()]
+    seen = [f"{k:04d},ok,,{','.join(row[6:])}" for k, row in enumerate(rows)]
+    seen[3] = "0003,missed,no body,,,"
+    (tmp_path / "seen.csv").write_text("\n".join(["shot,status,reason," + ",".join(head[6:]), *seen]) + "\n")
+    return tmp_path / "seen.csv", head[:6], [row[:6] for row in rows]
+
+
+def read_joined(data, joints):
+    return read_measured(data, open_arm("six_r"), joints)
+
+
+def test_joints_of_a_table_of_their_own(tmp_path, armsight):
+    seen, head, q = apart(tmp_path)
+    whole = read_poses(tmp_path / "whole.csv").measured.q
+    by_row, by_name = tmp_path / "rows.csv", tmp_path / "names.csv"
+    by_row.write_text("\n".join([",".join(head), *(",".join(row) for row in q)]))
+    read = read_joined(seen, by_row)
+    np.testing.assert_allclose(read.measured.q, np.delete(whole, 3, axis=0), atol=1e-12)
+    assert read.lines[:4].tolist() == [2, 3, 4, 6]
+    assert "1 of 40 shots were missed" in read.notes[-1]
+    backwards = [f"img/{k:04d}.png," + ",".join(q[k]) for k in range(39, 1, -1)]
+    by_name.write_text("\n".join(["image," + ",".join(head), *backwards]))
+    read = read_joined(seen, by_name)
+    np.testing.assert_allclose(read.measured.q, whole[[2, *range(4, 40)]], atol=1e-12)
+    assert "2 of 40 poses have no row" in " ".join(read.notes)
+    by_row.write_text("\n".join([",".join(head), *(",".join(row) for row in q[1:])]))
+    assert_rejected(armsight("identify", "--arm", "six_r", "--data", seen, "--joints", by_row), "39", "40", "image")
+    whole_too = armsight("identify", "--arm", "six_r", "--data", tmp_path / "whole.csv", "--joints", by_name)
+    assert_rejected(whole_too, "q1_rad", "--joints")
+
+
+def test_joints_by_time_are_those_of_rests(tmp_path):
+    q = np.repeat(np.arange(3.0)[:, None] * 0.1 + np.zeros(6), 20, axis=0)  # rests of 2 s, and jumps in 0.1 s
+    rows = [f"{0.1 * k:.1f}," + ",".join(map(str, one)) for k, one in enumerate(q)]
+    joints, seen = tmp_path / "joints.csv", tmp_path / "seen.csv"
+    joints.write_text("\n".join(["t_s," + ",".join(f"q{k}_rad" for k in range(1, 7)), *rows]))
+    shots = [f"{k},{0.25 * k + 0.05},1,2,{k}" for k in range(40)]
+    seen.write_text("\n".join(["shot,t_s,p1_x_m,p1_y_m,p1_z_m", *shots]))
+    read = read_joined(seen, joints)
+    np.testing.assert_allclose(read.measured.q[:, 0], [0.0, 0.1, 0.2], atol=1e-12)
+    assert np.all(np.abs((0.25 * (read.lines - 2) + 0.05) % 2.0 - 1.0) < 0.5)
+    seen.write_text("\n".join(["shot,t_s,p1_x_m,p1_y_m,p1_z_m", *(f"{k},{k + 1e6},1,2,{k}" for k in range(40))]))
+    with pytest.raises(InputError, match="other clocks"):
+        read_joined(seen, joints)

@@ -170,3 +170,14 @@ def test_rotations_of_something_else_are_rejected():
     w, measured = made("ur5", 1)
     other = Rotation.random(len(measured), rng=0).as_matrix()
     assert "rotations are not of this arm" in said(w, replace(measured, R_rig_body=other))
+
+
+@pytest.mark.parametrize("shift", [1, -2])
+def test_rows_that_are_shifted_are_reported(shift):
+    w, measured = made("ur5", 1)
+    text = said(w, points(measured, q=np.roll(measured.q, shift, axis=0)))
+    rows = (
+        "angles of row 2 belong to the pose of row 1" if shift == 1 else "angles of row 1 belong to the pose of row 3"
+    )
+    assert f"shifted by {abs(shift)}" in text
+    assert rows in text

@@ -7,7 +7,8 @@ In: a CSV, TSV or text file. Out: :class:`PoseTable`. Known forms:
 - Universal Robots' ``p[x, y, z, rx, ry, rz]``, metres and a rotation vector, one a line.
 - named columns: ``x_m y_m z_m`` (or ``x_mm``, or ``x`` with ``unit``); ``qw qx qy qz``; or ``rx_deg ry_deg rz_deg`` (or
   ``rx_rad``, ``rx``); or ``r11 .. r33``; or joints ``q1_deg ..`` (``q1_rad``) for a model, also by LeRobot's names. ``t_s``
-  is a time, ``image`` the image that belongs to a row, ``name`` a name that both tables share.
+  is a time, ``image`` the image that belongs to a row, ``name`` (``shot`` in what ``armsight measure`` writes) a name that
+  both tables share; rows whose ``status`` is missed are left out.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ from armsight.robot.boards.feetech.calibration import degree_columns
 
 #: What three or four numbers of a rotation may mean: quaternions in both orders, and the conventions of three angles.
 CONVENTIONS = ("wxyz", "xyzw", *ROTATIONS)
+#: Columns whose cells name the rows.
+NAMES = ("image", "name", "shot")
 #: Names that ``--columns`` may give the file's own for.
 COLUMNS = (
     *(f"{axis}{unit}" for axis in "xyz" for unit in ("", "_m", "_mm")),
@@ -37,7 +40,7 @@ COLUMNS = (
     *(f"r{axis}{unit}" for axis in "xyz" for unit in ("", "_deg", "_rad")),
     *(f"r{i}{j}" for i in "123" for j in "123"),
     *(f"q{i}_{unit}" for i in range(1, 8) for unit in ("rad", "deg")),
-    *("t_s", "image", "name"),
+    *("t_s", *NAMES),
 )
 #: Lengths beyond this, m, are no robot's: they are mm; below the other, all of them, they are m taken for mm.
 FAR_M, NEAR_M = 20.0, 0.02
@@ -86,6 +89,7 @@ def read_pose_table(
     detect_units: bool = False,
     columns: str | None = None,
     arm: Arm | None = None,
+    only_joints: bool = False,
 ) -> PoseTable:
     """Read a table of poses.
 
@@ -96,6 +100,7 @@ def read_pose_table(
         detect_units: whether lengths that cannot be metres are taken for millimetres, with a note.
         columns: NAME=THEIRS,... with names of COLUMNS.
         arm: the model whose joints the table has.
+        only_joints: whether positions are passed over: the poses are then those of the joints.
 
     Raises:
         InputError: the file, the line and what was expected.
@@ -103,6 +108,7 @@ def read_pose_table(
     if rotation is not None and rotation not in CONVENTIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
     head, rows = _cells(path, columns)
+    rows, left_out = _without_missed(path, head, rows)
     table = _Columns(path, head, rows)
     lines = np.array([line for line, _ in rows])
     unit_m, q = 1.0, None
@@ -111,7 +117,11 @@ def read_pose_table(
     joints = sorted((int(found[1]), name) for name in head if (found := _JOINT.fullmatch(name)))
     if joints:
         q = table.joints([name for _, name in joints], arm)
-    if q is not None and arm is not None and not table.has_position():
+    if only_joints and q is None:
+        raise InputError(
+            f"{path}: line 1: no joint angles: q1_deg .. or q1_rad .. are needed; there are {', '.join(head)}"
+        )
+    if q is not None and arm is not None and (only_joints or not table.has_position()):
         Ts = np.asarray(arm.forward(q))
     elif q is not None and not table.has_position():
         raise InputError(f"{path}: joint angles need the arm: give --model, a name (armsight arm list) or a .urdf file")
@@ -120,7 +130,12 @@ def read_pose_table(
         R, numbers, convention = table.rotations(rotation)
         Ts = stacked(R, p)
     t_s, names = table.times(), table.names()
-    if unused := [name for name in head if name and name not in table.used and not re.fullmatch(r"_[0-3]", name)]:
+    notes = (*left_out, *notes)
+    if (
+        not only_joints
+        and "reason" not in head
+        and (unused := [name for name in head if name and name not in table.used and not re.fullmatch(r"_[0-3]", name)])
+    ):
         notes = (*notes, f"{path}: {columns_unused(unused)}")
     return PoseTable(path, lines, Ts, numbers, convention, q, t_s, names, unit_m, notes)
 
@@ -143,8 +158,9 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
     else:
         cells = [line.split() for line in text.splitlines()]
     rows = [(line, [cell.strip() for cell in row]) for line, row in enumerate(cells, 1)]
-    rows = [(line, row[:-1] if row and row[-1] == "" else row) for line, row in rows if any(row)]
-    rows = [(line, row) for line, row in rows if not row[0].startswith("#")]
+    rows = [(line, row) for line, row in rows if any(row) and not row[0].startswith("#")]
+    count = len(rows[0][1]) - (rows[0][1][-1] == "") if rows else 0
+    rows = [(line, row[:-1] if len(row) == count + 1 and row[-1] == "" else row) for line, row in rows]
     if not rows:
         raise InputError(f"{path}: no rows; one line a pose is needed")
     head = rows[0][1]
@@ -166,6 +182,19 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
             "position, quaternion), 7 (position, quaternion), 6 (position, three numbers of a rotation); or name columns"
         )
     return forms[len(head)], _even(path, rows, len(head))
+
+
+def _without_missed(
+    path: Path, head: list[str], rows: list[tuple[int, list[str]]]
+) -> tuple[list[tuple[int, list[str]]], tuple[str, ...]]:
+    """Return the rows but those of shots that ``armsight measure`` missed, and a note that counts these."""
+    if "status" not in head or "reason" not in head:
+        return rows, ()
+    kept = [(line, row) for line, row in rows if row[head.index("status")] != "missed"]
+    if not kept:
+        raise InputError(f"{path}: all of its {len(rows)} shots were missed; the column reason says why")
+    missed = len(rows) - len(kept)
+    return kept, (f"{path}: {missed} of {len(rows)} shots were missed, and are left out",) if missed else ()
 
 
 def _even(path: Path, rows: list[tuple[int, list[str]]], count: int) -> list[tuple[int, list[str]]]:
@@ -246,7 +275,7 @@ class _Columns:
 
     def names(self) -> tuple[str, ...] | None:
         """Return the names of the rows, or of their images."""
-        key = next((key for key in ("image", "name") if key in self.at), None)
+        key = next((key for key in NAMES if key in self.at), None)
         if key is None:
             return None
         self.used.add(key)

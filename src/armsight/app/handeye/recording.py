@@ -5,7 +5,7 @@ In: a table of robot poses, and what was seen. Out: :class:`PairedPoses`, rows t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,7 +65,7 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
         InputError: rows and images do not pair up, or hardly one shows the target.
     """
     notes = [*robot.notes, *seen.notes]
-    rows, matched = _matched(robot, seen)
+    rows, matched = matched_rows(robot, seen.names)
     shown = np.array([not seen.missed[k] for k in matched])
     lost = [f"{seen.names[k]} ({seen.missed[k]})" for k in matched[~shown]]
     if lost:
@@ -95,12 +95,18 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
     return PairedPoses(poses, rows, names, t_s, robot, seen, matched, tuple(notes))
 
 
-def _matched(robot: PoseTable, seen: Seen) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of both sides that belong together."""
+def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows of both sides that belong together: by name where the robot's table has names, else by order.
+
+    Args:
+        robot: the robot's table.
+        seen: names of what was seen, one a row.
+
+    Raises:
+        InputError: no name is among those seen, or other numbers of rows.
+    """
     if robot.names is not None:
-        there = {name: k for k, name in enumerate(seen.names)} | {
-            Path(name).stem: k for k, name in enumerate(seen.names)
-        }
+        there = {name: k for k, name in enumerate(seen)} | {Path(name).stem: k for k, name in enumerate(seen)}
         keys = [
             next((key for key in (name, Path(name).name, Path(name).stem) if key in there), None)
             for name in robot.names
@@ -108,16 +114,16 @@ def _matched(robot: PoseTable, seen: Seen) -> tuple[NDArray[np.int64], NDArray[n
         found = [(r, there[key]) for r, key in enumerate(keys) if key is not None]
         if not found:
             raise InputError(
-                f"{robot.path}: none of its names ({robot.names[0]}, ...) is among those seen ({seen.names[0]}, ...)"
+                f"{robot.path}: none of its names ({robot.names[0]}, ...) is among those seen ({seen[0]}, ...)"
             )
         rows, matched = (np.array(part) for part in zip(*found, strict=True))
         return rows, matched
-    if len(robot.Ts) != len(seen.Ts):
+    if len(robot.Ts) != len(seen):
         raise InputError(
-            f"{robot.path}: {len(robot.Ts)} robot poses, but {len(seen.Ts)} images or target poses: give it a column "
+            f"{robot.path}: {len(robot.Ts)} robot poses, but {len(seen)} images or target poses: give it a column "
             "image (or name), or t_s on both sides and --streams, so that they can be determined apart"
         )
-    return np.arange(len(robot.Ts)), np.arange(len(seen.Ts))
+    return np.arange(len(robot.Ts)), np.arange(len(seen))
 
 
 def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:

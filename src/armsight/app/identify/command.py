@@ -28,6 +28,12 @@ from armsight.loop.identify import ROTATIONS
     help="Required: joint angles, and measured poses of the tool.",
 )
 @click.option(
+    "--joints",
+    metavar="JOINTS.csv",
+    type=click.Path(path_type=Path),
+    help="The joint angles, where the poses have none: by name, row or time.",
+)
+@click.option(
     "--validate", "other", metavar="OTHER.csv", type=click.Path(path_type=Path), help="Poses to validate with."
 )
 @click.option(
@@ -53,6 +59,7 @@ def command(
     ctx: click.Context,
     arm_name: str | None,
     data: Path | None,
+    joints: Path | None,
     other: Path | None,
     rotation: str | None,
     columns: str | None,
@@ -71,20 +78,30 @@ def command(
         raise InputError("give --arm and --data: armsight identify --arm ur10 --data poses.csv -o corrected/")
 
     from armsight.app.identify.report import write_identify_report
-    from armsight.app.identify.run import headline, identify_json, results_in, run_identify, text, write_results
+    from armsight.app.identify.run import (
+        headline,
+        identify_json,
+        read_measured,
+        results_in,
+        run_identify,
+        text,
+        write_results,
+    )
     from armsight.app.progress import steps
     from armsight.app.report.plotting import require_matplotlib
-    from armsight.loop.identify.read import read_poses
     from armsight.robot.arm_file import open_arm
 
     arm = open_arm(arm_name)
     if output is not None:
         require_matplotlib()
     started = time.perf_counter()
-    with nullcontext() if output is None else results_in(output, (data, other, Path(arm_name))), steps() as progress:
+    with (
+        nullcontext() if output is None else results_in(output, (data, joints, other, Path(arm_name))),
+        steps() as progress,
+    ):
         progress("reading")
-        read = read_poses(data, rotation=rotation, columns=columns)
-        held = None if other is None else read_poses(other, rotation=rotation, columns=columns)
+        read = read_measured(data, arm, joints, rotation=rotation, columns=columns)
+        held = None if other is None else read_measured(other, arm, joints, rotation=rotation, columns=columns)
         notes = read.notes if held is None else (*read.notes, *(f"{other}: {note}" for note in held.notes))
         run = run_identify(
             arm,

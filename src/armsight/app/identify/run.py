@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -17,9 +18,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from armsight.app.handeye.read import COLUMNS as POSE_COLUMNS
+from armsight.app.handeye.read import NAMES, PoseTable, read_pose_table
+from armsight.app.handeye.recording import matched_rows
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
-from armsight.files import check_writable, write_text
+from armsight.files import check_writable, read_columns, read_table, write_text
 from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
 from armsight.loop.identify.corrected import Corrected, zeros_text
 from armsight.loop.identify.diagnose import check_plausible, without_tool
@@ -27,6 +31,7 @@ from armsight.loop.identify.identify import Identified, contributions, identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model, Parameter
 from armsight.loop.identify.placement import with_placement
+from armsight.loop.identify.read import COLUMNS, Read, poses_in, read_poses
 from armsight.loop.identify.validate import MIN_POSES, Errors, Validation, errors, require_alike, validate
 from armsight.robot.arm import Arm
 
@@ -36,6 +41,9 @@ FOLDS = 5
 MANY = 500
 #: Few poses to validate with that are further from the nominal arm than this, m, are not of it: no arm is so inaccurate.
 FAR_M = 0.1
+#: Joined by time, a shot counts where no joint reads further from its angle than this, rad, so long before and after, s: an
+#: offset of the clocks would be taken for an error of a moving arm.
+REST_RAD, REST_S = 3e-3, 0.2
 #: What is written beside the report.
 FILES = ("corrected.toml", "corrected.urdf", "zeros.toml", "parameters.csv", "identify.json")
 
@@ -63,6 +71,114 @@ class Identification(Record):
     how: str
     lines: Array
     notes: tuple[str, ...]
+
+
+def read_measured(
+    data: Path, arm: Arm, joints: Path | None = None, *, rotation: str | None = None, columns: str | None = None
+) -> Read:
+    """Read measured poses with their joint angles, of one file or of two.
+
+    Args:
+        data: the poses; with their joint angles if ``joints`` is None.
+        arm: whose joints they are.
+        joints: a table of joint angles, joined to the poses by the names of their rows (``image``, ``name``, ``shot``), by
+            order where there are none, or by time (``t_s``) where the tables have other numbers of rows.
+        rotation: as in :func:`read_poses`.
+        columns: as in :func:`read_poses`; joints, times and names may be those of ``joints``.
+
+    Raises:
+        InputError: either file, or they do not fit together.
+    """
+    if joints is None:
+        return read_poses(data, rotation=rotation, columns=columns)
+    parts = [] if columns is None else columns.split(",")
+    theirs = [
+        part for part in parts if (name := part.partition("=")[0].strip()) in POSE_COLUMNS and name not in COLUMNS
+    ]
+    theirs += [part for part in parts if re.match(r"\s*q\d+_", part)]
+    table = read_pose_table(joints, columns=",".join(theirs) or None, arm=arm, only_joints=True)
+    ours = ",".join(part for part in parts if part not in theirs) or None
+    rows, notes = _with_joints(data, read_table(data, read_columns(ours, COLUMNS)), table)
+    read = poses_in(data, rows, rotation=rotation)
+    return read._replace(notes=(*table.notes, *notes, *read.notes))
+
+
+def _with_joints(data: Path, rows: list[list[str]], table: PoseTable) -> tuple[list[list[str]], list[str]]:
+    """Return a table's cells with the joint angles of each row, blank where it has none or no pose, and notes."""
+    assert table.q is not None
+    head = [name.strip() for name in rows[0]] if rows else []
+    if own := next((name for name in head if re.fullmatch(r"q\d+_(rad|deg)", name)), None):
+        raise InputError(f"{data}: line 1: has joint angles of its own ({own}): leave them out, or --joints")
+    there = [k for k, row in enumerate(rows) if k and any(cell.strip() for cell in row)]
+
+    def cells(name: str) -> list[str]:
+        at = head.index(name)
+        return [rows[k][at].strip() if at < len(rows[k]) else "" for k in there]
+
+    key = next((name for name in NAMES if name in head), None)
+    if table.names is None and len(table.q) != len(there) and table.t_s is not None and "t_s" in head:
+        angles, notes = _at_rest(data, cells("t_s"), there, table)
+    elif table.names is not None and key is None:
+        raise InputError(
+            f"{data}: line 1: no column {', '.join(NAMES)}, by which {table.path} names its rows; there are "
+            f"{', '.join(head)}"
+        )
+    else:
+        at, among = matched_rows(table, [f"line {k + 1}" for k in there] if key is None else cells(key))
+        angles = {there[i]: table.q[row] for row, i in zip(at, among, strict=True)}
+        alone = len(there) - len(angles)
+        notes = [f"{alone} of {len(there)} poses have no row in {table.path}, and are left out"] if alone else []
+    missed = (
+        {k for k, status in zip(there, cells("status"), strict=True) if status == "missed"}
+        if "status" in head
+        else set()
+    )
+    if missed:
+        notes.append(f"{len(missed)} of {len(there)} shots were missed, and are left out")
+    out = [[*rows[0], *(f"q{k}_rad" for k in range(1, table.q.shape[1] + 1))]] if rows else []
+    out += [
+        [*row, *map(repr, angles[k].tolist())] if k in angles and k not in missed else []
+        for k, row in enumerate(rows)
+        if k
+    ]
+    return out, notes
+
+
+def _at_rest(data: Path, times: list[str], lines: list[int], table: PoseTable) -> tuple[dict[int, Array], list[str]]:
+    """Return the joint angles (J,), rad, at the middle shot of each rest, by its line, and notes."""
+    assert table.t_s is not None
+    assert table.q is not None
+    order = np.argsort(table.t_s, kind="stable")
+    t_s, q = table.t_s[order], table.q[order]
+    rests: list[list[tuple[int, Array]]] = []
+    inside = 0
+    for line, cell in zip(lines, times, strict=True):
+        try:
+            at = float(cell)
+        except ValueError:
+            raise InputError(f"{data}: line {line + 1}: t_s is {cell!r}, must be a number, s") from None
+        if not t_s[0] <= at <= t_s[-1]:
+            continue
+        inside += 1
+        near = q[max(np.searchsorted(t_s, at - REST_S) - 1, 0) : np.searchsorted(t_s, at + REST_S, side="right") + 1]
+        here = np.array([np.interp(at, t_s, column) for column in q.T])
+        if np.abs(near - here).max() > REST_RAD:
+            continue
+        if rests and np.abs(rests[-1][0][1] - here).max() <= REST_RAD:
+            rests[-1].append((line, here))
+        else:
+            rests.append([(line, here)])
+    if not inside:
+        raise InputError(
+            f"{data}: no time t_s is within those of {table.path}, {t_s[0]:.1f} to {t_s[-1]:.1f} s: other clocks? name the "
+            f"rows of both tables instead ({', '.join(NAMES)})"
+        )
+    if not rests:
+        raise InputError(
+            f"{data}: the arm never rests at a shot, by {table.path}: let it rest {2 * REST_S:g} s and more at each pose"
+        )
+    notes = [f"{len(rests)} rests of the arm, by {table.path}; of each the middle shot counts, of {len(times)} shots"]
+    return dict(rest[len(rest) // 2] for rest in rests), notes
 
 
 def run_identify(

@@ -46,11 +46,15 @@ SCALE_OFF = 0.2
 BAD_RAD = 2 * np.sqrt(6) * np.hypot(SIGMA["offset"], SIGMA["alpha"])
 #: Poses looked at, and those that every order and sign is tried on.
 POSES, FEW = 80, 24
+#: With fewer poses rows that are shifted may fit by chance.
+FEWEST = 12
 #: What joint angles may have been multiplied by.
 _ANGLES = (
     (np.pi / 180, "degrees; name the columns q1_deg .. q6_deg"),
     (180 / np.pi, "radians; name the columns q1_rad .. q6_rad"),
 )
+#: Rows by which the two sides of a table may be shifted against each other.
+SHIFTS = (1, -1, 2, -2, 3, -3)
 #: Orders whose signs are tried, best first.
 MAX_JOINT_ORDERS = 40
 _SCALES = {1e-3: "m, not mm", 1e3: "mm, not m", 1e-1: "dm or cm", 10.0: "cm", 1 / 25.4: "inches", 25.4: "inches"}
@@ -132,7 +136,7 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
     if good and not scaled:
         _check_rotations(arm, measured, rows)
         return
-    explanation = _angles(arm, q, p, off)
+    explanation = _shifted(arm, measured, off) or _angles(arm, q, p, off)
     if explanation is None:
         explanation = _unit(scale) if good else _proposal(arm, q, p, off)
     raise InputError(explanation or _no_arm(off))
@@ -164,6 +168,25 @@ def _unit(scale: float) -> str:
             "name the columns by their unit: p1_x_m or p1_x_mm"
         )
     return f"the points are {scale:.3g} times as large as this arm's motions: is it the right model, in the right unit?"
+
+
+def _shifted(arm: Arm, measured: Measured, off: float) -> str | None:
+    """Return by how many rows the joint angles are shifted against the poses, if the data fit so, or None."""
+    n = len(measured)
+    for shift in SHIFTS:
+        if n - abs(shift) < FEWEST:
+            continue
+        q = measured.q[max(shift, 0) : n + min(shift, 0)]
+        p = measured.p_rig[max(-shift, 0) : n - max(shift, 0)]
+        rows = np.linspace(0, len(q) - 1, min(POSES, len(q))).astype(int)
+        better, _, scale = misfit(arm, q[rows], p[rows])
+        if abs(np.log(scale)) < np.log1p(SCALE_OFF) and better < min(off / BETTER, max(BAD_SHARE * _span(p), BAD_M)):
+            return (
+                f"the rows are shifted by {abs(shift)}: the joint angles of row {1 + max(shift, 0)} belong to the pose of "
+                f"row {1 + max(-shift, 0)} (off by {1e3 * off:.0f} mm as they are, {1e3 * better:.1f} mm so); remove what "
+                "is too much at either end, or join the tables by names or times"
+            )
+    return None
 
 
 def _angles(arm: Arm, q: Array, p: Array, off: float) -> str | None:

@@ -74,9 +74,23 @@ def read_poses(path: str | Path, *, rotation: str | None = None, columns: str | 
     Raises:
         InputError: unreadable, columns missing, fields that are no numbers, or hardly a row without gaps.
     """
+    return poses_in(path, read_table(path, read_columns(columns, COLUMNS)), rotation=rotation)
+
+
+def poses_in(path: str | Path, rows: list[list[str]], *, rotation: str | None = None) -> Read:
+    """Read the rows of a file as :func:`read_poses` does; blank rows are passed over.
+
+    Args:
+        path: the file, for errors.
+        rows: its cells, names first.
+        rotation: as in :func:`read_poses`.
+
+    Raises:
+        InputError: as :func:`read_poses`.
+    """
     if rotation is not None and rotation not in ROTATIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(ROTATIONS)}")
-    rows = degree_columns(path, read_table(path, read_columns(columns, COLUMNS)))
+    rows = degree_columns(path, rows)
     if len(rows) < 2:
         raise InputError(f"{path}: no rows; a first line of column names and one line a pose are needed")
     header = [name.strip() for name in rows[0]]
