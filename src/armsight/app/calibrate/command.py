@@ -6,6 +6,7 @@ import json
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -13,12 +14,16 @@ from armsight.errors import InputError
 from armsight.files import check_folder, check_outputs
 from armsight.vision.calibrate import FOLDS, MODELS
 
+if TYPE_CHECKING:
+    from armsight.vision.sources.pairs import StoredSource
+
 _VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 
 
 @click.command("calibrate")
 @click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
 @click.option("--right", metavar="GLOB", help="Right images, matched to the left ones by sorted name.")
+@click.option("--source", metavar="SOURCE", help="Instead: a folder, as armsight record writes it, or side by side.")
 @click.option("--left-intrinsics", metavar="GLOB", help="More images of the target, by the left camera alone.")
 @click.option("--right-intrinsics", metavar="GLOB", help="The same by the right camera.")
 @click.option("--target", metavar="SPEC", help="The target, such as chessboard:9x6:25mm (inner corners, square).")
@@ -48,6 +53,7 @@ _VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 def command(
     left: str | None,
     right: str | None,
+    source: str | None,
     left_intrinsics: str | None,
     right_intrinsics: str | None,
     target: str | None,
@@ -64,15 +70,15 @@ def command(
 ) -> None:
     """Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.
 
-    From images: --left, --right and --target. From detections of a known body with known intrinsics: --detections,
-    --cameras and --body.
+    From images: --left, --right and --target, or --source and --target. From detections of a known body with known
+    intrinsics: --detections, --cameras and --body.
     """
-    images, points = (left, right, target), (detections, cameras, body)
-    if (None in images) == (None in points) or any(images) == any(points):
-        raise InputError("give --left, --right and --target, or --detections, --cameras and --body")
+    images, points = (left, right, target) if source is None else (source, target), (detections, cameras, body)
+    if (None in images) == (None in points) or any(images) == any(points) or (source and (left or right)):
+        raise InputError("give --left, --right (or --source) and --target, or --detections, --cameras and --body")
     if refine_body is not None and detections is None:
         raise InputError("--refine-body goes with --detections; a target in images is estimated without it")
-    if (left_intrinsics or right_intrinsics) and left is None:
+    if (left_intrinsics or right_intrinsics) and target is None:
         raise InputError("--left-intrinsics and --right-intrinsics go with --left, --right and --target")
 
     from armsight.app.calibrate.report import REPORT_FILES, write_report
@@ -88,18 +94,11 @@ def command(
     from armsight.app.report.plotting import require_matplotlib
     from armsight.vision.markers.body_file import save_body_csv
     from armsight.vision.markers.calibrated_board import save_board_file
-    from armsight.vision.sources import PairsSource
 
-    source = None if left is None or right is None else PairsSource.open(left, right)
-    video = next((f for f in (source.files if source is not None else ()) if f.suffix.lower() in _VIDEOS), None)
-    if video is not None:
-        raise InputError(
-            f"{video}: is a video, and calibrate takes images: `armsight record video:LEFT,RIGHT -o DIR` stores them. Use "
-            "boards that stand still; `armsight measure --skew find --save-rig` then finds the skew of the cameras"
-        )
+    pairs = _pairs(left, right, source)
     alone = (files_of(left_intrinsics), files_of(right_intrinsics))
-    inputs = points if source is None else (*source.files, *alone[0], *alone[1])
-    board_file = None if source is None else output.parent / f"{output.stem}.board.toml"
+    inputs = points if pairs is None else (*pairs.files, *alone[0], *alone[1])
+    board_file = None if pairs is None else output.parent / f"{output.stem}.board.toml"
     check_outputs((output, refine_body, board_file), inputs)
     if report is not None:
         require_matplotlib()
@@ -110,12 +109,12 @@ def command(
             problem="no report can be written here",
         )
     started = time.perf_counter()
-    if source is not None and target is not None and board_file is not None:
+    if pairs is not None and target is not None and board_file is not None:
         models = MODELS if lens_model is None else (lens_model,)
-        calibration = calibrate_images(source, alone, target, models, flat=flat_target, folds=folds)
-        given = {"left": str(left), "right": str(right), "target": target, "board": board_file.name}
-        more = {"left_intrinsics": left_intrinsics, "right_intrinsics": right_intrinsics}
-        given |= {name: pattern for name, pattern in more.items() if pattern is not None}
+        calibration = calibrate_images(pairs, alone, target, models, flat=flat_target, folds=folds)
+        named = {"left": left, "right": right, "source": source, "target": target, "board": board_file.name}
+        named |= {"left_intrinsics": left_intrinsics, "right_intrinsics": right_intrinsics}
+        given = {name: text for name, text in named.items() if text is not None}
     elif detections is not None and cameras is not None and body is not None:
         calibration = calibrate_detections(detections, cameras, body, refine_body=refine_body is not None, folds=folds)
         given = {"detections": str(detections), "cameras": str(cameras), "body": str(body)}
@@ -131,3 +130,33 @@ def command(
         click.echo(json.dumps(summary(calibration, output, board_file, report, time.perf_counter() - started)))
     else:
         print_result(calibration, output, board_file, report)
+
+
+def _pairs(left: str | None, right: str | None, spec: str | None) -> StoredSource | None:
+    """Open the pairs of images; None where detections were given instead.
+
+    Raises:
+        InputError: not stored images, or none that pair up.
+    """
+    from armsight.vision.sources import SOURCES, FolderSource, PairsSource, check_source
+
+    if spec is None and (left is None or right is None):
+        return None
+    moving = None
+    if spec is None:
+        pairs: StoredSource = PairsSource.open(str(left), str(right))
+        video = next((file for file in pairs.files if file.suffix.lower() in _VIDEOS), None)
+        moving = None if video is None else (f"{video}: is a video, and calibrate takes images", "video:LEFT,RIGHT")
+    else:
+        check_source(spec)
+        kind, colon, rest = spec.partition(":")
+        if colon and kind in SOURCES and kind != "folder":
+            moving = f"{spec}: calibrate takes stored images", spec
+        else:
+            pairs = FolderSource.open(rest if colon and kind == "folder" else spec)
+    if moving is not None:
+        raise InputError(
+            f"{moving[0]}: `armsight record {moving[1]} -o DIR` stores them. Use "
+            "boards that stand still; `armsight measure --skew find --save-rig` then finds the skew of the cameras"
+        )
+    return pairs

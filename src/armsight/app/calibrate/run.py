@@ -22,13 +22,13 @@ from armsight.errors import InputError
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.bodies import calibrate_bodies
 from armsight.vision.calibrate.result import Calibration, RejectedPair
+from armsight.vision.calibrate.screen import merged_notes
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
 from armsight.vision.image import grey, read_image
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import load_body_csv
-from armsight.vision.sources import PairsSource
-from armsight.vision.sources.pairs import image_files, natural_key, no_files
+from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 
@@ -71,7 +71,7 @@ def _single(path: Path, target: CalibrationBoard, side: int, size: tuple[int, in
 
 
 def calibrate_images(
-    source: PairsSource,
+    source: StoredSource,
     alone: tuple[list[Path], list[Path]],
     spec: str,
     models: tuple[str, ...],
@@ -198,7 +198,7 @@ def print_result(calibration: Calibration, output: Path, board_file: Path | None
         f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
         *([] if c.disc_radius_m is None else [f"radius of the board's discs: {1e3 * c.disc_radius_m:.3f} mm"]),
         *_rejected_lines(c.rejected),
-        *(f"note: {note}" for note in c.notes),
+        *(f"note: {note}" for note in merged_notes(c.notes)),
         *(weak(weakness) for weakness in c.weaknesses),
         f"rig written to {output}" + (f", report to {report / PAGE}" if report is not None else ""),
         *(
