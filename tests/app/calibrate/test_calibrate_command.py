@@ -205,6 +205,9 @@ def test_a_video_is_named_with_what_to_do(armsight, tmp_path):
     videos = ("--left", tmp_path / "left.mp4", "--right", tmp_path / "right.mp4")
     said = armsight("calibrate", *videos, *CHESS, "-o", tmp_path / "rig.json")
     assert_rejected(said, "left.mp4", "is a video", "armsight record")
+    spec = f"video:{tmp_path / 'left.mp4'}"
+    said = armsight("calibrate", "--source", spec, *CHESS, "-o", tmp_path / "rig.json")
+    assert_rejected(said, f"armsight record {spec} -o DIR")
 
 
 @pytest.mark.parametrize(
@@ -238,6 +241,8 @@ def test_a_report_where_a_file_stands(few, armsight, tmp_path):
         ("--left", "a", "--right", "b", "--target", "chessboard:9x6:25mm", "--detections", "d.csv"),
         ("--left", "a", "--right", "b", "--target", "chessboard:9x6:25mm", "--refine-body", "d.csv"),
         ("--detections", "d.csv", "--cameras", "c.json"),
+        ("--source", "s", "--left", "a", "--right", "b", "--target", "chessboard:9x6:25mm"),
+        ("--source", "s"),
     ],
 )
 def test_options_that_do_not_go_together(armsight, tmp_path, options):

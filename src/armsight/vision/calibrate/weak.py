@@ -106,8 +106,9 @@ def _synchrony(calibration: Calibration) -> str | None:
     late = [calibration.pairs[int(j)] for j, e in zip(errors.pair, errors.epipolar_px, strict=True) if e > 2.5 * usual]
     if late and usual > 0:
         return (
-            f"{len(late)} pairs have an epipolar error over 2.5 times the usual {usual:.2f} px ({', '.join(late[:4])}): "
-            "unsynchronised cameras see a moving board at two positions; hold it still, or trigger both cameras together"
+            f"{f'{len(late)} pairs have' if len(late) > 1 else 'a pair has'} an epipolar error over 2.5 times the usual "
+            f"{usual:.2f} px ({', '.join(late[:4])}): unsynchronised cameras see a moving board at two positions; hold it "
+            "still, or trigger both cameras together; calibrate again without such pairs"
         )
     return None
 
