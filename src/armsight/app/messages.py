@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 
 import click
+
+from armsight.errors import InputError
 
 #: Exit code of a command that is done, but whose result must not be trusted (docs/concepts/health.md).
 UNTRUSTED = 3
@@ -23,3 +26,20 @@ def print_error(text: str) -> None:
 def weak(text: str) -> str:
     """Return a line that says what is weak about a result."""
     return click.style(f"weak: {text}", fg="yellow")
+
+
+def require(what: str, extra: str, *modules: str) -> None:
+    """Check that packages are installed, and name all that are missing at once.
+
+    Args:
+        what: what needs them, for the message.
+        extra: armsight's extra that has them all.
+        modules: their names.
+
+    Raises:
+        InputError: one of them is missing.
+    """
+    missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    if missing:
+        names, verb = " and ".join(missing), "is" if len(missing) == 1 else "are"
+        raise InputError(f'{what} needs {names}, which {verb} not installed: pip install "armsight[{extra}]"')

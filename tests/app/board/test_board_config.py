@@ -39,7 +39,8 @@ def test_mistakes_are_one_line_and_change_nothing(armsight, tmp_path):
     path.write_text(armsight("board", "config", "get", *HOST).out.replace('"pil"', '"other"', 1), encoding="utf-8")
     assert_rejected(armsight("board", "config", "store", str(path), *HOST), "is for board other; this one is pil")
     assert_rejected(
-        armsight("board", "config", "set", "joint.3.soft_max=1.2", *HOST), "nothing is called joint.3.soft_max"
+        armsight("board", "config", "set", "joint.3.soft_max=1.2", *HOST),
+        "nothing is called joint.3.soft_max; is it joint.3.soft_max_rad?",
     )
     assert_rejected(armsight("board", "config", "set", "joint.3.soft_max_rad=9", *HOST), "soft limits must lie within")
     assert_rejected(

@@ -148,6 +148,9 @@ def test_a_plan_is_a_motion_file(tmp_path, capsys, test, cycles, count):
     arm, plan = open_arm("six_r"), read_motions(open_arm("six_r"), out)
     assert len(plan.motions) == count
     (found,) = answer.lines
+    assert [("2 of the" in note, "fewer than 3 times" in note) for note in found["notes"]] == (
+        [(True, True)] if test in ("poses", "line") else []
+    )
     attained = {}
     for motion in plan.motions:
         q = motion.trajectory.at(np.linspace(0, motion.trajectory.duration_s, 100)).q

@@ -42,6 +42,16 @@ def unsynchronised(true, board, Ts, motions, seed=0):
     return pairs
 
 
+def test_the_one_board_that_moved_among_few_is_rejected():
+    true, board, Ts = rig_and_board(count=9)
+    motions = np.zeros((9, 6))
+    motions[3, :3] = 1.2e-3  # a significant motion of nine pairs, and no other pair moved
+    pairs = unsynchronised(true, board, Ts, motions)
+    c = calibrate_boards(board, pairs, SIZES, models=("brown4",), folds=2, flat=True)
+    assert [rejected.pair for rejected in c.rejected] == [pairs[3].name]
+    assert c.motion is None
+
+
 @pytest.fixture(scope="module")
 def moved():
     true, board, Ts = rig_and_board(count=24)

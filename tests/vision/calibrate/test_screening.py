@@ -10,7 +10,7 @@ from armsight.geometry.rotation import exp_so3
 from armsight.vision.bundle import BundleModel, BundleState, Observations, minimise
 from armsight.vision.calibrate.boards import calibrate_boards
 from armsight.vision.calibrate.heldout import cross_validate, folds_of, pair_errors, residual_epipolar_rms, summary
-from armsight.vision.calibrate.screen import correct_symmetries, noise_px, robust_sigma, screen
+from armsight.vision.calibrate.screen import correct_symmetries, merged_notes, noise_px, robust_sigma, screen
 from armsight.vision.calibrate.start import pinhole, relative_poses, start_board
 from armsight.vision.calibrate.weak import coverage, weaknesses
 from armsight.vision.match import join, renamed
@@ -95,6 +95,11 @@ def test_only_what_is_wrong_is_thrown_out():
     assert [r.pair for r in dirty.rejected] == ["p06"]
     assert dirty.notes == ("p02: 1 of 108 points of both images dropped as gross errors",)
     assert 6 not in dirty.kept
+    many = [f"p0{k}: {k + 1} of 108 points dropped as gross errors" for k in range(4)]
+    assert merged_notes(["p09: corrected", *many[:3]]) == ["p09: corrected", *many[:3]]
+    merged = merged_notes(["p09: corrected", *many])
+    assert merged[0] == "p09: corrected"
+    assert merged[1].startswith("10 points in 4 pairs dropped as gross errors; most in p03 (4), p02 (3), p01 (2)")
     assert dirty.observations.shot_count == len(pairs) - 1
     assert len(dirty.observations.shot) == len(observations.shot) - 108 - 1
 

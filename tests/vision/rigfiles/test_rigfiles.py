@@ -429,6 +429,7 @@ def data(*values):
         ({"projection_matrix": ...}, "has no 'projection_matrix'"),
         ({"camera_matrix": {"rows": 3}}, "has no 'data'"),
         ({"camera_matrix": 5}, "has no 'data'"),
+        ({"camera_matrix": data(1, 2) | {"rows": 3}}, "camera_matrix says 3 rows and 2 cols, and its data holds 2"),
         ({"camera_matrix": data(1, 2)}, "camera_matrix.data must hold 3 x 3 numbers, got 2"),
         ({"camera_matrix": data(*([0.0] * 9))}, "camera_matrix must be"),
         ({"camera_matrix": data("a")}, "camera_matrix.data must be numbers"),

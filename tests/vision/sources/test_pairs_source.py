@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -133,6 +135,19 @@ def test_a_folder_with_left_and_right_subfolders(tmp_path, store, read_back):
         ("2", 2, 2),
         ("10", 10, 10),
     ]
+
+
+def test_files_that_hold_both_images_side_by_side(tmp_path):
+    for k in (2, 10):
+        cv2.imwrite(str(tmp_path / f"S {k}.png"), np.repeat(np.uint8([[k, k + 1]]), 40, axis=1).repeat(30, axis=0))
+    found = shots(open_source(str(tmp_path)))
+    assert [(shot.name, shot.left.shape, int(shot.left.max()), int(shot.right.min())) for shot in found] == [
+        ("S 2", (30, 40), 2, 3),
+        ("S 10", (30, 40), 10, 11),
+    ]
+    cv2.imwrite(str(tmp_path / "S 1.png"), np.zeros((30, 40), np.uint8))
+    with pytest.raises(InputError, match=r"S 1.png: is 40x30, which is not two images side by side; name the images"):
+        FolderSource.open(tmp_path)
 
 
 def test_a_folder_without_shots_or_none_at_all(tmp_path):

@@ -90,8 +90,12 @@ def config_group(
 
         with open_board(name, baud) as board:
             config = board.configuration()
+            seen: set[str] = set()
             for change in changes:
                 path, _, text = change.partition("=")
+                if path.strip() in seen:
+                    raise InputError(f"{path.strip()} is given twice; nothing was changed")
+                seen.add(path.strip())
                 try:
                     value = tomllib.loads(f"value = {text}")["value"]
                 except tomllib.TOMLDecodeError:

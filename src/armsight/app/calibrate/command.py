@@ -25,7 +25,7 @@ _VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 @click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
 @click.option("--right", metavar="GLOB", help="Right images, matched to the left ones by sorted name.")
 @click.option(
-    "--source", metavar="SPEC", help="A recording with times instead, such as video:L.mp4,R.mp4: the skew is found."
+    "--source", metavar="SOURCE", help="Instead: a folder or a recording; with times, the skew of the cameras is found."
 )
 @click.option("--left-intrinsics", metavar="GLOB", help="More images of the target, by the left camera alone.")
 @click.option("--right-intrinsics", metavar="GLOB", help="The same by the right camera.")
@@ -93,7 +93,7 @@ def command(
         calibrate_detections,
         calibrate_images,
         files_of,
-        open_recording,
+        open_stored,
         print_result,
         provenance,
         summary,
@@ -112,7 +112,7 @@ def command(
         if video is not None:
             raise InputError(f"{video}: is a video: give both as --source video:LEFT,RIGHT")
     elif source is not None:
-        opened = open_recording(source)
+        opened = open_stored(source)
     alone = (files_of(left_intrinsics), files_of(right_intrinsics))
     files = opened.files if isinstance(opened, StoredSource) else ()
     inputs = points if opened is None else (*files, *alone[0], *alone[1])
@@ -130,9 +130,7 @@ def command(
     if opened is not None and target is not None and board_file is not None:
         models = MODELS if lens_model is None else (lens_model,)
         with contextlib.closing(opened):
-            calibration = calibrate_images(
-                opened, alone, target, models, flat=flat_target, folds=folds, recorded=source is not None
-            )
+            calibration = calibrate_images(opened, alone, target, models, flat=flat_target, folds=folds)
         given = {"source": source} if source is not None else {"left": str(left), "right": str(right)}
         given |= {"target": target, "board": board_file.name}
         more = {"left_intrinsics": left_intrinsics, "right_intrinsics": right_intrinsics}

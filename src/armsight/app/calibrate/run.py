@@ -23,6 +23,7 @@ from armsight.errors import InputError
 from armsight.vision.calibrate.boards import Pair, calibrate_boards, calibrate_recording
 from armsight.vision.calibrate.bodies import calibrate_bodies
 from armsight.vision.calibrate.result import Calibration, RejectedPair
+from armsight.vision.calibrate.screen import merged_notes
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
 from armsight.vision.image import grey, read_image
@@ -74,18 +75,15 @@ def _single(path: Path, target: CalibrationBoard, side: int, size: tuple[int, in
     return Pair(str(path), *((found, nothing) if side == 0 else (nothing, found)))
 
 
-def open_recording(spec: str) -> Source:
-    """Open a recording whose shots have times.
+def open_stored(spec: str) -> Source:
+    """Open a folder or a recording.
 
     Raises:
-        InputError: live cameras, or a recording without times.
+        InputError: live cameras.
     """
     opened = open_source(spec)
     if isinstance(opened, StoredSource | VideoSource | BagSource | LeRobotSource):
-        if not isinstance(opened, StoredSource) or any(pair.t_s is not None for pair in opened.pairs):
-            return opened
-        opened.close()
-        raise InputError(f"{spec}: its shots have no times (shots.csv): give the images as --left and --right")
+        return opened
     opened.close()
     raise InputError(
         f"{spec}: are live cameras: `armsight record {spec} -o DIR` stores a recording, and --source DIR takes it"
@@ -100,11 +98,10 @@ def calibrate_images(
     *,
     flat: bool,
     folds: int,
-    recorded: bool = False,
 ) -> Calibration:
     """Detect a board, given by its spec, in every shot, and in images of one camera alone, and calibrate.
 
-    Of shots that were ``recorded`` the times are used: the board may move, and the skew of the cameras is found.
+    Where shots have times, the board may move, and the skew of the cameras is found.
     """
     target = open_board(spec)
     pairs: list[Pair] = []
@@ -133,11 +130,11 @@ def calibrate_images(
         if not pairs:
             raise InputError("the recording has no shots")
         raise InputError(f"none of {len(pairs)} pairs can be read; {pairs[0].name}: {pairs[0].left.problem}")
-    options = {"models": models, "flat": flat, "folds": folds, "singles": singles}
+    options: dict[str, Any] = {"models": models, "flat": flat, "folds": folds, "singles": singles}
     with steps() as progress:
-        if not recorded:
-            return calibrate_boards(target, pairs, sizes, progress=progress, **options)
         known = [(pair, t) for pair, t in zip(pairs, times, strict=True) if t is not None]
+        if not known:
+            return calibrate_boards(target, pairs, sizes, progress=progress, **options)
         t_s = np.array([t for _, t in known])
         calibration = calibrate_recording(target, [pair for pair, _ in known], t_s, sizes, progress=progress, **options)
         return replace(calibration, notes=(*notes_of(source), *calibration.notes))
@@ -244,7 +241,7 @@ def print_result(calibration: Calibration, output: Path, board_file: Path | None
         f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
         *([] if c.disc_radius_m is None else [f"radius of the board's discs: {1e3 * c.disc_radius_m:.3f} mm"]),
         *_rejected_lines(c.rejected),
-        *(f"note: {note}" for note in c.notes),
+        *(f"note: {note}" for note in merged_notes(c.notes)),
         *(weak(weakness) for weakness in c.weaknesses),
         f"rig written to {output}" + (f", report to {report / PAGE}" if report is not None else ""),
         *(

@@ -13,3 +13,7 @@ a report.
 
 #: Test -> how many cycles it has unless asked otherwise.
 CYCLES = {"poses": 30, "wide": 1, "line": 10, "circle": 3}
+#: Test -> how many cycles ISO 9283 requires.
+REQUIRED_CYCLES = {"poses": 30, "line": 10}
+#: The first pose must have been attained this many times for its drift.
+DRIFT_CYCLES = 10

@@ -191,6 +191,8 @@ def plan(
     test = plan_test(open_arm(arm_name), name, cycles, middle, speed / 1e3, visible_in)
     if output is not None:
         write_text(output, test.motions if output.suffix == ".toml" else plan_csv(test.plan))
+    for note in test.notes:
+        click.echo(f"note: {note}", err=True)
     if as_json:
         click.echo(json.dumps(plan_json(test)))
         return

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from armsight.app.check import DRIFT_CYCLES
 from armsight.app.check.result import (
     CheckResult,
     CircleResult,
@@ -28,8 +29,6 @@ from armsight.loop.iso9283.statistic import Metric
 
 #: Where no pose was attained often enough for a repeatability: this many poses and more give errors over the workspace.
 _WIDE = 10
-#: The first pose must have been attained this many times for its drift.
-_DRIFTS = 10
 #: A pose attained fewer times than this is not searched for outliers.
 _OUTLIER_ROWS = 10
 #: A row is named an outlier where its distance from the median position is more than this many times the median distance.
@@ -150,7 +149,7 @@ def _drift_of_first(often: dict[str, list[Row]]) -> DriftResult | None:
         return None
     name, rows = next(iter(often.items()))
     timed = [row for row in rows if row.t_s is not None]
-    if len(timed) < _DRIFTS:
+    if len(timed) < DRIFT_CYCLES:
         return None
     times, wander, largest = iso9283.drift(np.array([row.t_s for row in timed]), _positions(timed))
     return DriftResult(name, times, wander, largest)

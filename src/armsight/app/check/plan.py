@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.check import CYCLES
+from armsight.app.check import CYCLES, DRIFT_CYCLES, REQUIRED_CYCLES
 from armsight.app.run.motion_file import read_motions
 from armsight.data import Array
 from armsight.errors import InputError
@@ -24,6 +24,7 @@ from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.iso9283.paths import plane_axes
 from armsight.loop.iso9283.plan import CLEAR_RAD, CheckPlan, everywhere, plan_check
+from armsight.loop.iso9283.poses import MIN_POSES
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Trajectory, circle, line
 from armsight.vision.markers.targets import open_target
@@ -55,6 +56,22 @@ class PlannedTest(NamedTuple):
     cycles: int
     plan: CheckPlan
     motions: str
+
+    @property
+    def notes(self) -> list[str]:
+        """What fewer cycles than the standard's leave out of the evaluation."""
+        required = REQUIRED_CYCLES.get(self.name, 1)
+        if self.cycles >= required:
+            return []
+        poses = self.name == "poses"
+        if self.cycles < MIN_POSES:
+            what = "pose attained" if poses else "path followed"
+            lost = f"`armsight check` leaves out every {what} fewer than {MIN_POSES} times: there will be no accuracy, "
+            lost += "repeatability, distance and drift" if poses else "and no repeatability"
+        else:
+            lost = "the intervals of repeatability will be wide (docs/howto/iso9283.md)"
+            lost += f", and drift needs {DRIFT_CYCLES} cycles" if poses and self.cycles < DRIFT_CYCLES else ""
+        return [f"{self.cycles} of the {required} cycles that ISO 9283 requires: {lost}"]
 
 
 def plan_test(
@@ -229,4 +246,5 @@ def plan_json(test: PlannedTest) -> dict[str, object]:
         "poses": list(test.plan.names),
         "q_rad": test.plan.q.tolist(),
         "T_base_tool": test.plan.Ts_base_tool.tolist(),
+        "notes": test.notes,
     }

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from armsight.app.messages import UNTRUSTED
+from armsight.app.messages import UNTRUSTED, require
 
 
 @click.command("demo")
@@ -86,15 +86,13 @@ def command(
             f"--board {board}: the workcell's board is emulated:unicorn, emulated:qemu or emulated:host"
         )
 
+    require("the demo", "sim", "matplotlib", "pyarrow", "mujoco", *(["unicorn"] if emulator == "unicorn" else []))
+
     from armsight.app.demo.demo import Demo, run_demo
     from armsight.app.progress import steps
-    from armsight.app.report.plotting import require_matplotlib
-    from armsight.app.run.record import require_pyarrow
     from armsight.app.run.summary import print_summary
     from armsight.robot.arm_file import open_arm
 
-    require_matplotlib()
-    require_pyarrow()
     nominal = None if nominal_arm is None else open_arm(nominal_arm)
     demo = Demo(output, arm, cameras, seed, emulator, layout, model, quick, nominal, nominal_arm, follow_rig, sync_led)
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from armsight.app.handeye.read import PoseTable
     from armsight.app.handeye.result import HandEyeAnswer
     from armsight.robot.arm import Arm
+
+_BY_RIG = "--rig with --left and --right, or with --source"
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,7 @@ class Options:
     rig: Path | None
     left: str | None
     right: str | None
+    source: str | None
     target: str | None
     streams: bool
     scale: bool
@@ -73,6 +77,7 @@ class Options:
 @click.option("--rig", metavar="RIG.json", type=click.Path(path_type=Path), help="A calibrated pair of cameras.")
 @click.option("--left", metavar="GLOB", help="Left images of the rig; quote the glob.")
 @click.option("--right", metavar="GLOB", help="Right images.")
+@click.option("--source", metavar="SOURCE", help="A folder or recording instead (see armsight record -h).")
 @click.option("--target", metavar="SPEC|BODY", help="A board such as chessboard:9x6:25mm, or a body file.")
 @click.option("--streams", is_flag=True, help="Both tables are streams (t_s) whose clocks differ: find the offset.")
 @click.option("--scale", is_flag=True, help="The target's size may be wrong: fit it.")
@@ -127,16 +132,15 @@ def _require_one_way(options: Options) -> None:
     ways = {
         "--seen": options.seen is not None,
         "--images with --camera": options.images is not None or options.camera is not None,
-        "--rig with --left and --right": options.rig is not None
-        or options.left is not None
-        or options.right is not None,
+        _BY_RIG: any(given is not None for given in (options.rig, options.left, options.right, options.source)),
     }
     if sum(ways.values()) != 1:
         raise InputError(f"give what the camera saw in one way: {', or '.join(ways)}")
     if (options.images is None) != (options.camera is None):
         raise InputError("--images and --camera belong together: --camera CAMERA.json, or --camera fit")
-    if ways["--rig with --left and --right"] and None in (options.rig, options.left, options.right):
-        raise InputError("--rig, --left and --right belong together")
+    pair = (options.left, options.right)
+    if ways[_BY_RIG] and (options.rig is None or (any(pair) if options.source is not None else not all(pair))):
+        raise InputError("--rig, --left and --right belong together, or --rig and --source")
     if options.seen is None and options.target is None:
         raise InputError("images need --target, such as chessboard:9x6:25mm (inner corners, side of a square)")
     if options.streams and options.seen is None:
@@ -187,6 +191,7 @@ def _seen(options: Options, progress: Callable[[str], None]) -> Seen:
     from armsight.app.handeye.images import see_with_camera, see_with_rig
     from armsight.app.handeye.read import read_pose_table
     from armsight.app.handeye.recording import seen_in_table
+    from armsight.vision.sources import PairsSource, Source, open_source
 
     if options.seen is not None:
         table = read_pose_table(
@@ -197,7 +202,12 @@ def _seen(options: Options, progress: Callable[[str], None]) -> Seen:
     if options.images is not None:
         return see_with_camera(options.images, str(options.camera), target, progress)
     assert options.rig is not None
-    return see_with_rig(options.rig, str(options.left), str(options.right), target, progress)
+    if options.source is not None:
+        source: Source = open_source(options.source)
+    else:
+        source = PairsSource.open(str(options.left), str(options.right))
+    with contextlib.closing(source):
+        return see_with_rig(options.rig, source, target, progress)
 
 
 def _streams(

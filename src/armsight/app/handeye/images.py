@@ -33,7 +33,7 @@ from armsight.vision.measure import measure
 from armsight.vision.pnp import body_poses
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import focal_and_centre, load_yaml, need
-from armsight.vision.sources.pairs import PairsSource
+from armsight.vision.sources.source import Source
 
 #: Steps of the refinement of a pose, and the change, m and rad, below which it has settled.
 STEPS, SETTLED = 20, 1e-10
@@ -241,14 +241,13 @@ def _motions(target: Target) -> tuple[Array, ...]:
 
 
 def see_with_rig(
-    rig_file: Path, left: str, right: str, target: str, progress: Callable[[str], None] = lambda line: None
+    rig_file: Path, source: Source, target: str, progress: Callable[[str], None] = lambda line: None
 ) -> Seen:
     """Measure the target in the pairs of a rig.
 
     Args:
         rig_file: the rig.
-        left: glob of the left images.
-        right: glob of the right images.
+        source: its pairs of images.
         target: a board's spec or a body's file.
         progress: called with the name of each shot.
 
@@ -256,7 +255,6 @@ def see_with_rig(
         InputError: no such files, or hardly a pair with the target.
     """
     rig, found = StereoRig.load(rig_file), open_target(target)
-    source = PairsSource.open(left, right)
     Ts, covs, names, missed, squares = [], [], [], [], []
     by: dict[int, Array] = {}
     while (shot := source.read()) is not None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.messages import UNTRUSTED
+from armsight.app.messages import UNTRUSTED, require
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
 
@@ -172,12 +172,10 @@ def command(
     import numpy as np
 
     from armsight.app.progress import steps
-    from armsight.app.report.plotting import require_matplotlib
     from armsight.app.run.calibrate import handeye_poses
     from armsight.app.run.experiment import require_followed, require_start
     from armsight.app.run.folder import make_room, open_folder
     from armsight.app.run.motion_file import DEFAULT_MOTION
-    from armsight.app.run.record import require_pyarrow
     from armsight.app.run.setup import Devices, open_devices, planned_for
     from armsight.app.run.summary import print_summary
     from armsight.robot.arm_file import open_arm
@@ -185,8 +183,7 @@ def command(
     from armsight.vision.markers.targets import open_fixed, open_target
     from armsight.vision.rig import StereoRig
 
-    require_matplotlib()
-    require_pyarrow()
+    require("a run", "run", "matplotlib", "pyarrow", *(["unicorn"] if board_spec == "emulated:unicorn" else []))
     arm = planned_for(open_arm(arm_spec), board_spec)
     rig, target = StereoRig.load(rig_path), open_target(target_spec)
     if follow_rig:

@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 
 from armsight.errors import InputError
+from armsight.files import read_text
 from armsight.robot.boards.codes import SensorKind
 from armsight.robot.boards.configuration import (
     CONFIG,
@@ -119,8 +120,8 @@ def read_configuration(path: Path) -> tuple[Configuration, str]:
         InputError: it cannot be read, or names the file and the value that is missing, unknown, or out of range.
     """
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        data = tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: no board.toml: {error}") from None
     if data.get("version") != CONFIG_VERSION or not isinstance(data.get("board"), str):
         raise InputError(
@@ -143,9 +144,7 @@ def read_configuration(path: Path) -> tuple[Configuration, str]:
     known = dict(entries(config))
     for name in given:
         if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; is it {near[0]}?" if near else ""
-            raise InputError(f"{path}: nothing is called {name}{hint}")
+            raise InputError(f"{path}: {_unknown(name, config)}")
     for name in known:
         if name not in given:
             raise InputError(f"{path}: {name} is missing")
@@ -169,6 +168,12 @@ def _flat(data: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
             yield f"{path}{name}", value
 
 
+def _unknown(path: str, config: Configuration) -> str:
+    """Return that a configuration has no such path, and which it may be."""
+    near = difflib.get_close_matches(path, dict(entries(config)), 1)
+    return f"nothing is called {path}" + (f"; is it {near[0]}?" if near else "")
+
+
 def put(config: Configuration, path: str, value: object) -> None:
     """Put a value, a number or a potentiometer's table, into a configuration, in-place.
 
@@ -181,14 +186,16 @@ def put(config: Configuration, path: str, value: object) -> None:
     elif names[0] == "joint" and len(names) > 2 and names[1] in map(str, range(1, JOINTS + 1)):
         record, names = config["joint"][int(names[1]) - 1], names[2:]
     else:
-        raise InputError(f"nothing is called {path}; such names are arm.silence_ticks and joint.3.pot.jump_rad")
+        raise InputError(
+            f"nothing is called {path}; such names are arm.silence_ticks and joint.3.pot.jump_rad, joints 1 to {JOINTS}"
+        )
     for name in names[:-1]:
         if name not in _PARTS or name not in (record.dtype.names or ()):
-            raise InputError(f"nothing is called {path}")
+            raise InputError(_unknown(path, config))
         record = record[name]
     name = names[-1]
     if name not in (record.dtype.names or ()) or name in ("node_count", "joint", *_PARTS):
-        raise InputError(f"nothing is called {path}")
+        raise InputError(_unknown(path, config))
     if name == _PIN:
         record[name] = pin_number(value)
         return

@@ -17,7 +17,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -100,7 +100,7 @@ def printed_board(points: Array) -> BundleModel:
     return BundleModel(points, smooth(points, BOARD_DEGREE), BOARD_SIGMA_SHARE * diagonal, True)
 
 
-def motion_of(model: BundleModel, screened: Screened, count: int) -> ExposureMotion | None:
+def motion_of(model: BundleModel, screened: Screened, count: int) -> tuple[ExposureMotion, dict[int, str]] | None:
     """Test whether the board moved between the exposures: each camera agrees with itself better than with the other.
 
     Args:
@@ -109,7 +109,8 @@ def motion_of(model: BundleModel, screened: Screened, count: int) -> ExposureMot
         count: number of pairs before screening.
 
     Returns:
-        A first motion for all ``count`` pairs, or None where it is not significant.
+        A first motion for all ``count`` pairs, and the pair that moved furthest, with the reason to reject it should it be
+        the only one; None where no motion is significant.
     """
     guess = ExposureMotion.guessed(model.points, len(screened.kept))
     still, observations = screened.solution, screened.observations
@@ -119,7 +120,13 @@ def motion_of(model: BundleModel, screened: Screened, count: int) -> ExposureMot
     motion, taken = guess.updated(solution)
     if noise_px(solution, observations, _freed(model, solution) + taken) > (1 - MOTION_WORTH) * before:
         return None
-    return replace(motion, weights=np.ones(count))
+    furthest = int(np.argmin(motion.weights))
+    way = solution.state.motions[furthest]
+    why = (
+        f"the images show the board {1e3 * np.linalg.norm(way[:3]):.2f} mm and {np.degrees(np.linalg.norm(way[3:])):.2f} "
+        "degrees apart, as in no other pair: wrong corners, or a board that moved between the two images"
+    )
+    return replace(motion, weights=np.ones(count)), {int(screened.kept[furthest]): why}
 
 
 def _freed(model: BundleModel, solution: BundleSolution) -> float:
@@ -526,8 +533,12 @@ class _Selection(Record):
         """Reject gross errors, then return the best model's trial and the held-out errors of all."""
         start = replace(start, shape=np.zeros(len(self.model.modes)))
         screened, motion = self._screened(self.model, start), None
-        if (moving := motion_of(self.model, screened, self.observations.shot_count)) is not None:
+        found = motion_of(self.model, screened, self.observations.shot_count)
+        if found is not None and (still := self._without(start, screened, found[1])) is not None:
+            screened, found = still, None
+        if found is not None:
             # A board that moved between the exposures looks like gross errors under the assumption that it stood still.
+            moving, _ = found
             self.progress("looking for gross errors again: the board moved between the exposures")
             eased = replace(self.model, motion_sigmas=MOTION_EASE * moving.sigmas)
             screened = self._screened(eased, start, robust_sigma(screened.solution))
@@ -536,9 +547,23 @@ class _Selection(Record):
         search = LensModelSearch(self.model, motion, screened, folds, self.sizes, self.progress)
         return screened, *search.best(models, second)
 
-    def _screened(self, model: BundleModel, start: BundleState, sigma_px: float = 1.0) -> Screened:
+    def _without(self, start: BundleState, screened: Screened, furthest: dict[int, str]) -> Screened | None:
+        """Return the detections without the pair that moved furthest where no motion is significant in the others.
+
+        In few pairs one alone makes a motion significant, and would hide behind it.
+        """
+        if self._pairs(screened) <= LEAST_PAIRS:
+            return None
+        with contextlib.suppress(CalibrationError):
+            others = self._screened(self.model, start, known=furthest)
+            return others if motion_of(self.model, others, self.observations.shot_count) is None else None
+        return None
+
+    def _screened(
+        self, model: BundleModel, start: BundleState, sigma_px: float = 1.0, known: Mapping[int, str] | None = None
+    ) -> Screened:
         """Reject gross errors; too few pairs are an error."""
-        screened = screen(model, start, self.observations, self.names, sigma_px=sigma_px)
+        screened = screen(model, start, self.observations, self.names, sigma_px=sigma_px, known=known)
         _enough(self._pairs(screened), self.given, list(screened.rejected))
         return screened
 

@@ -6,6 +6,7 @@ rejected is named with its reason.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +31,9 @@ LOST_SHARE = 0.25
 #: Fewest corners, seen by both cameras, that make a pair useful.
 LEAST_CORNERS = 6
 _ROUNDS = 6
+#: As many pairs of which corners were dropped have a line of their own.
+_NAMED = 3
+_DROPPED = "dropped as gross errors"
 _MEDIAN_CHI2_2 = 1.3863  # median of the chi-square distribution of two degrees of freedom
 
 
@@ -78,7 +82,13 @@ def robust_sigma(solution: BundleSolution) -> float:
 
 
 def screen(
-    model: BundleModel, start: BundleState, observations: Observations, names: tuple[str, ...], *, sigma_px: float = 1.0
+    model: BundleModel,
+    start: BundleState,
+    observations: Observations,
+    names: tuple[str, ...],
+    *,
+    sigma_px: float = 1.0,
+    known: Mapping[int, str] | None = None,
 ) -> Screened:
     """Adjust robustly and reject gross corners and bad pairs until no more are found.
 
@@ -88,14 +98,15 @@ def screen(
         observations: all detections.
         names: (S,) names of the pairs.
         sigma_px: standard deviation of a detection to begin with, px.
+        known: pairs that are known to be bad, and why.
 
     Returns:
         The detections that remain.
     """
-    rejected: list[RejectedPair] = []
-    kept = np.arange(observations.shot_count)
+    rejected = [RejectedPair(names[j], reason) for j, reason in (known or {}).items()]
+    kept = np.setdiff1d(np.arange(observations.shot_count), list(known or ()))
     good = np.ones(len(observations.shot), bool)
-    state, sigma = start, sigma_px
+    state, sigma = replace(start, Ts_left_body=start.Ts_left_body[kept]), sigma_px
     for _ in range(_ROUNDS):
         rows = good & np.isin(observations.shot, kept)
         now = _renumbered(observations, rows, kept)
@@ -123,10 +134,21 @@ def screen(
         mine = observations.shot == j
         if lost := int((mine & ~good).sum()):
             which = " of both images" if len(set(observations.camera[mine])) > 1 else ""
-            notes.append(f"{names[j]}: {lost} of {mine.sum()} points{which} dropped as gross errors")
+            notes.append(f"{names[j]}: {lost} of {mine.sum()} points{which} {_DROPPED}")
     unscreened = _renumbered(observations, np.isin(observations.shot, kept), kept)
     solution = minimise(_of_shots(model, kept), state, final, sigma)
     return Screened(final, unscreened, kept, solution, tuple(rejected), tuple(notes))
+
+
+def merged_notes(notes: Sequence[str]) -> list[str]:
+    """Return a calibration's notes with one for all pairs of which corners were dropped, where those are many."""
+    dropped = {note: int(note.rpartition(": ")[2].split()[0]) for note in notes if note.endswith(_DROPPED)}
+    if len(dropped) <= _NAMED:
+        return list(notes)
+    worst = sorted(dropped, key=lambda note: -dropped[note])[:_NAMED]
+    most = ", ".join(f"{note.rpartition(': ')[0]} ({dropped[note]})" for note in worst)
+    line = f"{sum(dropped.values())} points in {len(dropped)} pairs {_DROPPED}; most in {most}; all: --json, --report"
+    return [*(note for note in notes if note not in dropped), line]
 
 
 def _of_shots(model: BundleModel, kept: NDArray[np.int64]) -> BundleModel:

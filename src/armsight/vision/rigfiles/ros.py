@@ -134,7 +134,11 @@ def _read_one(document: Mapping[str, Foreign], options: ImportOptions) -> tuple[
 
 def _data(document: Mapping[str, Foreign], key: str, shape: tuple[int, int] | None) -> Array:
     """Return the numbers of a matrix entry, (n,) where no shape is required."""
-    data = checked(need(need(document, key), "data"), (None,), f"{key}.data")
+    matrix = need(document, key)
+    data = checked(need(matrix, "data"), (None,), f"{key}.data")
+    rows, cols = matrix.get("rows"), matrix.get("cols")
+    if isinstance(rows, int) and isinstance(cols, int) and rows * cols != data.size:
+        raise InputError(f"{key} says {rows} rows and {cols} cols, and its data holds {data.size} numbers")
     if shape is None:
         return data
     if data.size != shape[0] * shape[1]:

@@ -2,7 +2,8 @@
 
 In: a folder. Out: its shots, in the order of the index. A recording has an index, ``shots.csv``, one line a shot: its
 name, the time of the grab, the two files and, where there are none, why. Without an index the images are left* and
-right* in the folder, or all images in its subfolders left and right, paired by sorted name.
+right* in the folder, or all images in its subfolders left and right, paired by sorted name. Images of other names show
+left and right side by side.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 
 from armsight.errors import InputError
 from armsight.files import read_text
-from armsight.vision.sources.pairs import IMAGES, StoredPair, StoredSource, match
+from armsight.vision.sources.pairs import IMAGES, StoredPair, StoredSource, halves, match, names_of, natural_key
 
 #: The index of a recording, and its columns; t_s is empty where the source has no clock, left and right where the shot
 #: has a problem.
@@ -53,9 +54,14 @@ def _matched(folder: Path) -> tuple[StoredPair, ...]:
         )
     (left, said_left), (right, said_right) = sides
     if not left and not right:
-        raise InputError(
-            f"{folder}: holds no shots: expected {INDEX}, images left* and right*, or folders left and right"
-        )
+        both = sorted((file for file in folder.iterdir() if file.suffix.lower() in IMAGES), key=natural_key)
+        if not both:
+            raise InputError(
+                f"{folder}: holds no shots: expected {INDEX}, images left* and right*, folders left and right, or images "
+                "that show left and right side by side"
+            )
+        halves(both[0])  # images of single cameras, whose names do not say which, are no pairs
+        return tuple(StoredPair(name, file, file) for name, file in zip(names_of(both), both, strict=True))
     return match(left, right, str(said_left), str(said_right))
 
 

@@ -15,7 +15,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from armsight.data import Shot
+import numpy as np
+
+from armsight.data import Image, Shot
 from armsight.errors import InputError
 from armsight.vision.image import read_image
 
@@ -25,7 +27,10 @@ IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".we
 
 @dataclass(frozen=True)
 class StoredPair:
-    """The files of one shot; left and right are None where the recording has no images, and ``problem`` says why."""
+    """The files of one shot; left and right are None where the recording has no images, and ``problem`` says why.
+
+    One file for both holds the left image and the right one side by side.
+    """
 
     name: str
     left: Path | None
@@ -38,9 +43,27 @@ class StoredPair:
         if self.left is None or self.right is None:
             return Shot(self.name, None, None, self.t_s, self.problem)
         try:
+            if self.left == self.right:
+                return Shot(self.name, *halves(self.left), self.t_s)
             return Shot(self.name, read_image(self.left), read_image(self.right), self.t_s)
         except InputError as error:
             return Shot(self.name, None, None, self.t_s, str(error))
+
+
+def halves(file: Path) -> tuple[Image, Image]:
+    """Return the left and the right half of an image file.
+
+    Raises:
+        InputError: it cannot be read, or is too narrow for two images.
+    """
+    image = read_image(file)
+    height, width = image.shape[:2]
+    if width % 2 or width < 2 * height:
+        raise InputError(
+            f"{file}: is {width}x{height}, which is not two images side by side; name the images of two cameras left* "
+            "and right*"
+        )
+    return np.ascontiguousarray(image[:, : width // 2]), np.ascontiguousarray(image[:, width // 2 :])
 
 
 class StoredSource:
@@ -110,14 +133,19 @@ def match(lefts: Iterable[Path], rights: Iterable[Path], said_left: str, said_ri
             raise InputError(no_files(said))
     both = {file.resolve() for file in left} & {file.resolve() for file in right}
     if both:
-        raise InputError(f"{min(both)}: is both a left and a right image ({said_left} and {said_right})")
+        raise InputError(
+            f"{min(both)}: is both a left and a right image ({said_left} and {said_right}); files that hold both side by "
+            "side are given as --source DIR"
+        )
     alone = _without_partner(left, right)
     if alone is not None or len(left) != len(right):
         raise InputError(
             f"{said_left} and {said_right} do not pair up: {len(left)} left and {len(right)} right images; "
             f"first without a partner: {alone or max(left, right, key=len)[min(len(left), len(right))]}"
         )
-    return tuple(StoredPair(name, file, partner) for name, file, partner in zip(_names(left), left, right, strict=True))
+    return tuple(
+        StoredPair(name, file, partner) for name, file, partner in zip(names_of(left), left, right, strict=True)
+    )
 
 
 def no_files(said: str) -> str:
@@ -157,7 +185,7 @@ def _without_partner(left: Sequence[Path], right: Sequence[Path]) -> Path | None
     return files[min(alone)] if alone else None
 
 
-def _names(files: Sequence[Path]) -> list[str]:
+def names_of(files: Sequence[Path]) -> list[str]:
     """Return a short unique name a file: its stem, with the folders below the common one where stems repeat."""
     stems = [file.stem for file in files]
     if len(set(stems)) == len(stems):
