@@ -6,26 +6,36 @@ BIN := $(VENV)/bin
 OPENCV4 := PYTHONPATH=$(abspath $(VENV)/opencv4) $(BIN)/python
 # pip writes no bytecode where it builds the package (13 s of a processor): most of it is never imported.
 export PIP_COMPILE := 0
+# Python writes it for what is imported: without it each of a hundred processes compiles its imports again, for 3 s and more.
+unexport PYTHONDONTWRITEBYTECODE
 # As the commands set it: OpenBLAS's threads wait for each other at every small matrix, which tests in parallel pay for.
 export OPENBLAS_NUM_THREADS ?= 1
 # A file is one worker's; files in their order, which begins with the longest.
 PARALLEL := -n 3 --dist=loadfile --no-loadscope-reorder
 
-.PHONY: demo test lint docs bench clean
+.PHONY: demo test pytest lint style types docs bench clean
 
 demo: $(VENV)/.armsight  ## the whole experiment in the simulated workcell, held against its truth
 	$(BIN)/armsight demo -o demo
 
-test: $(VENV)/.armsight-test $(VENV)/.opencv4 lint  ## everything that must hold
+test: $(VENV)/.armsight-test $(VENV)/.opencv4 style  ## everything that must hold
 	$(BIN)/python -m armsight.kernels.build
+	+$(MAKE) --no-print-directory --jobs=2 types pytest
+
+pytest:
 	$(BIN)/python -m pytest $(PARALLEL)
 	$(OPENCV4) -c "import cv2; assert cv2.__version__.startswith('4.'), cv2.__version__"
 	$(OPENCV4) -m pytest $(PARALLEL) -m opencv $$(grep -rl --include="test_*.py" "pytest.mark.opencv" tests)
 
-lint: $(VENV)/.armsight-test
+lint: style types
+
+style: $(VENV)/.armsight-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+
+# A minute of one processor: beside the tests, where they leave one free.
+types: $(VENV)/.armsight-test
+	nice -n 10 $(BIN)/mypy
 
 docs: $(VENV)/.armsight-test  ## the site, into docs/_build/html; runs the tutorials and the examples where they changed
 	$(BIN)/python docs/run_tutorials.py docs/_made

@@ -17,7 +17,10 @@ from armsight.sim.boards.device import serve
 from armsight.sim.boards.so101 import So101Bus
 from cli_runs import assert_rejected
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals"),
+]
 
 
 @pytest.fixture

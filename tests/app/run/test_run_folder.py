@@ -106,7 +106,7 @@ def test_the_exit_code_says_whether_the_result_can_be_trusted(tmp_path, monkeypa
     assert said.code == (3 if found else 0)
     assert ("do not trust this result: rig: a camera is rotated" in said.err) is bool(found)
     again = armsight("demo", "--json", "-o", tmp_path / "demo")
-    assert [each["health"] for each in again.lines] == [[each.to_json() for each in found]]
+    assert [each["health"] for each in again.lines] == [json.loads(json.dumps([each.to_json() for each in found]))]
 
 
 def test_the_report_begins_with_what_must_not_be_trusted():

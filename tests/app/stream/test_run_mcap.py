@@ -206,6 +206,7 @@ for k in range(10_000):
 """
 
 
+@pytest.mark.real_time
 def test_a_killed_process_leaves_all_but_the_last_second(tmp_path):
     path = tmp_path / "run.mcap"
     here = Path(__file__).parent

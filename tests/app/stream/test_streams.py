@@ -19,12 +19,13 @@ from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 
+pytestmark = pytest.mark.real_time  # readers have threads of their own, and zenoh gives a connection a second
 SHOT = ShotDatum(Shot("s0", None, None, 2.5), Missed("too dark"), 2.52)
 
 
 def publish_until(sink, condition, datum=SHOT):
-    """Publish again and again until something has arrived."""
-    for _ in range(400):
+    """Publish again and again until something has arrived; a minute and more, for a computer that is busy."""
+    for _ in range(6000):
         sink.put(datum)
         if condition():
             return
@@ -75,7 +76,7 @@ def test_a_tcp_reader_that_does_not_read_is_not_waited_for():
 def test_json_over_udp_is_one_datagram_a_datum():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(5.0)
+        receiver.settimeout(60.0)
         streams = open_streams([f"json+udp:127.0.0.1:{receiver.getsockname()[1]}"], Published(), pytest.fail)
         streams.put(NoteDatum(1.0, "hello"))
         assert json.loads(receiver.recv(65536)) == {"kind": "log", "t_s": 1.0, "level": "info", "text": "hello"}
@@ -153,7 +154,7 @@ def test_foxglove_s_server_listens_and_takes_everything():
     sink = open_foxglove("0", Published(RIG, BODY))
     sink.start()
     with socket.create_connection(("127.0.0.1", sink.port)) as connection:
-        connection.settimeout(5.0)
+        connection.settimeout(60.0)
         connection.sendall(
             b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
             b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
@@ -222,12 +223,13 @@ def test_ros2_messages_over_zenoh_are_decoded_by_the_definitions_of_ros(monkeypa
         router.liveliness().declare_subscriber("@ros2_lv/7/**", lambda s: tokens.append(str(s.key_expr)))
         sink = open_ros2(str(port), published())
         sink.start()
-        publish_until(sink, lambda: any("/armsight/shot/" in key for key in got), shot)
+        topics = {"armsight/shot", "odometry", "right/image_raw/compressed", "right/camera_info"}
+        publish_until(sink, lambda: topics <= {"/".join(key.split("/")[1:-2]) for key in list(got)}, shot)
         sink.close()
         assert sink.problem is None
     store = get_typestore(Stores.ROS2_JAZZY)
     decoded = {}
-    for key, sample in got.items():
+    for key, sample in list(got.items()):  # more may still arrive
         _, *topic, mangled, hashed = key.split("/")
         kind = mangled.replace("::dds_::", "/").replace("::", "/").removesuffix("_")
         assert hashed == store.hash_rihs01(kind)

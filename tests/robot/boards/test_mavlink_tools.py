@@ -14,7 +14,10 @@ from armsight.robot.boards.codes import BoardState, Rejection
 from armsight.robot.boards.opening import open_board
 
 mavutil = pytest.importorskip("pymavlink.mavutil", reason="needs pymavlink: pip install 'armsight[test]'")
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals"),
+]
 ARM, TERMINATE, STORAGE, REBOOT, INTERVAL = 400, 185, 245, 246, 511
 ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
 OURS = (
