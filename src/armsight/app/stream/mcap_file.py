@@ -44,7 +44,9 @@ TOPICS: dict[type, str] = {
 #: A shot that is younger by its own stamp was stamped by a live camera, s.
 _LIVE_S = 10.0
 _WAKES = 64  # data that are written together, where they come fast
-_BEGUN_S = 60.0  # by then a process has begun to write, on a computer under load
+#: By then a process has begun to write, on a computer under load, s; so many data, of some kB each, wait for it at most.
+_BEGUN_S, _WAITING = 60.0, 8192
+_BATCH = 16  # data that are sent to a process at once: a third of a millisecond
 _SCHEMA = json.dumps({"type": "object"}).encode()
 
 
@@ -135,36 +137,54 @@ class McapBeside(Sink):
 
     def __init__(self, path: Path, published: Published) -> None:
         require_foxglove("run.mcap", "record")
-        super().__init__(wakes=_WAKES, close_s=_BEGUN_S)
-        self._process, self._looked_at = Process(_methods, path, published), LookedAt()
+        super().__init__(_WAITING, _WAKES, _BEGUN_S)
+        self._process, self._looked_at = Process(_written, path, published), LookedAt()
+        self._batch: list[Datum] = []
 
-    def write(self, datum: Datum) -> None:
-        """Have a datum written; images that are not recorded stay here."""
+    def put(self, datum: Datum) -> None:
+        """Take a datum without the images that are not recorded, and return at once."""
         if isinstance(datum, ShotDatum):
             shot = datum.shot
             if shot.encoded is not None or (shot.left is not None and not self._looked_at.take(shot)):
                 datum = replace(datum, shot=replace(shot, left=None, right=None))
-        self._process("write", datum)
+        super().put(datum)
+
+    def write(self, datum: Datum) -> None:
+        """Have a datum written, with the next ones: a call of the process takes longer than a datum."""
+        self._batch.append(datum)
+        if len(self._batch) >= _BATCH:
+            self._send()
 
     def tick(self) -> None:
         """Write the chunk out."""
-        self._process("tick")
+        self._send("tick")
 
     def finish(self) -> None:
         """Write the index and close the file; end the process."""
         try:
             if self.problem is None:
                 if self.dropped:
-                    self._process("write", _dropped(self))
-                self._process("finish")
+                    self._batch.append(_dropped(self))
+                self._send("finish")
         finally:
             self._process.close()
 
+    def _send(self, then: str = "") -> None:
+        batch, self._batch = self._batch, []
+        self._process(batch, then)
 
-def _methods(path: Path, published: Published) -> Callable[..., None]:
-    """Return what calls a method of a new file by its name."""
+
+def _written(path: Path, published: Published) -> Callable[[list[Datum], str], None]:
+    """Return what writes data to a new file, and calls a method of it by its name."""
     sink = McapSink(path, published)
-    return lambda name, *arguments: getattr(sink, name)(*arguments)
+
+    def write(data: list[Datum], then: str) -> None:
+        for datum in data:
+            sink.write(datum)
+        if then:
+            getattr(sink, then)()
+
+    return write
 
 
 def _dropped(sink: Sink) -> NoteDatum:
