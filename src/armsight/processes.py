@@ -1,4 +1,4 @@
-"""Functions that run in a second interpreter, on another core: threads of one interpreter run Python by turns.
+"""Functions that run in a second interpreter, on another core: threads of one interpreter run Python one at a time.
 
 In: a function that makes what is called there, and its arguments. Out: what each call returns. Both sides exchange pickles
 over the pipes of a child, arrays beside them without a copy. The child imports what it is asked for and nothing of the
@@ -22,6 +22,7 @@ from armsight.errors import ArmsightError
 
 _SERVE = "from armsight.processes import serve; serve()"
 _PIPE_BYTES = 1 << 20  # an image passes at once, where the system allows it
+_SMALL_BYTES = 1 << 14
 _LENGTH = struct.Struct("<q")
 
 
@@ -116,8 +117,16 @@ def serve() -> None:
 
 def _send(pipe: IO[bytes], content: object) -> None:
     """Write an object: the number and the sizes of its parts, its pickle, its arrays."""
-    arrays: list[pickle.PickleBuffer] = []
-    parts = [memoryview(pickle.dumps(content, 5, buffer_callback=arrays.append)), *(each.raw() for each in arrays)]
+    parts = [memoryview(b"")]
+
+    def within(array: pickle.PickleBuffer) -> bool:
+        """Leave a small array within the pickle."""
+        raw = array.raw()
+        if raw.nbytes >= _SMALL_BYTES:
+            parts.append(raw)
+        return raw.nbytes < _SMALL_BYTES
+
+    parts[0] = memoryview(pickle.dumps(content, 5, buffer_callback=within))
     head = b"".join(_LENGTH.pack(size) for size in (len(parts), *(len(part) for part in parts)))
     for part in (memoryview(head), *parts):
         rest = part

@@ -10,6 +10,8 @@ import pytest
 
 from armsight.app.demo import demo
 from armsight.app.demo.demo import Demo, run_demo
+from armsight.app.run import calibrate
+from armsight.app.stream.mcap_file import LazyMcap
 from armsight.errors import ArmsightError
 from armsight.geometry.rotation import from_quaternion_wxyz, log_so3
 from armsight.loop.identify.read import read_poses
@@ -114,11 +116,25 @@ def broken(tmp_path, monkeypatch, mend):
     class Mended(Workcell):
         @classmethod
         def open(cls, **options):
-            workcell = super().open(**options)
+            workcell = super().open(**options | {"processes": False})
             mend(workcell)
             return workcell
 
+    class Here:
+        """No second process: it would take longer to begin than the run lasts."""
+
+        def __init__(self, make, *modules):
+            self._call = make()
+
+        def __call__(self, *arguments):
+            return self._call(*arguments)
+
+        def close(self):
+            pass
+
     monkeypatch.setattr(demo, "Workcell", Mended)
+    monkeypatch.setattr(demo, "Process", Here)
+    monkeypatch.setattr(demo, "LazyMcap", lambda *given, process: LazyMcap(*given))
     monkeypatch.setattr(demo, "_AMOUNTS", {True: (6, 12, 0)})
     with pytest.raises(ArmsightError) as caught:
         run_demo(Demo(tmp_path, emulator="host", cameras="640x360@30", quick=True, seed=1))

@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from armsight.app.stream.datum import EventDatum, JointsDatum, NoteDatum, Published, ShotDatum, json_text, quaternion
-from armsight.app.stream.mcap_file import LazyMcap, McapSink, arm_of, properties
+from armsight.app.stream.mcap_file import LazyMcap, McapBeside, McapSink, arm_of, properties
 from armsight.data import Body, Dropped, JointStates, Missed, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
@@ -69,8 +69,8 @@ def protobuf(path, topic):
         return [each.decoded_message for each in reader.iter_decoded_messages(topics=[topic])]
 
 
-def write(path, data):
-    sink = McapSink(path, published())
+def write(path, data, kind=McapSink):
+    sink = kind(path, published())
     sink.start()
     for datum in data:
         sink.put(datum)
@@ -196,7 +196,7 @@ import sys, time
 from pathlib import Path
 from test_run_mcap import published
 from armsight.app.stream.datum import NoteDatum
-from armsight.app.stream.mcap_file import McapSink
+from armsight.app.stream.mcap_file import McapBeside, McapSink
 sink = McapSink(Path(sys.argv[1]), published())
 sink.start()
 for k in range(10_000):
@@ -204,6 +204,21 @@ for k in range(10_000):
     print(time.time(), flush=True)
     time.sleep(0.01)
 """
+
+
+def test_a_process_of_its_own_writes_the_same_file(tmp_path):
+    result, image = measured(), np.zeros((4, 6), np.uint8)
+    states = JointStates(np.array([1.0, 1.001]), np.arange(12.0).reshape(2, 6) * 0.01)
+    data = [JointsDatum(states, np.eye(4), np.eye(6) * 1e-6, 0.02), NoteDatum(1.2, "the rig has moved", "warning")]
+    data += [ShotDatum(Shot(f"s{k}", image, image, 1.0 + 0.3 * k), result, 1.02 + 0.3 * k) for k in range(6)]
+    write(tmp_path / "a.mcap", data)
+    write(tmp_path / "b.mcap", data, McapBeside)
+    (one, its_metadata), (other, metadata) = (read(tmp_path / name) for name in ("a.mcap", "b.mcap"))
+    assert metadata == its_metadata
+    assert {topic: [(row[1].log_time, row[1].data) for row in rows] for topic, rows in other.items()} == {
+        topic: [(row[1].log_time, row[1].data) for row in rows] for topic, rows in one.items()
+    }
+    assert len(one["/left/image"]) == 2  # one pair a second
 
 
 @pytest.mark.real_time

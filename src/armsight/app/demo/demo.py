@@ -111,7 +111,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
         setup = setup_of(workcell)
         texts = properties(calibration.rig, workcell.body_text, setup.arm, command="demo")
         published = Published(calibration.rig, setup.target.body, setup.arm, texts)
-        with contextlib.closing(LazyMcap(demo.folder, published, progress)) as file:
+        with contextlib.closing(LazyMcap(demo.folder, published, progress, process=True)) as file:
             outcome = run_experiment(
                 setup,
                 calibration.rig,
@@ -129,6 +129,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
         except (ArmsightError, KeyboardInterrupt) as error:  # the run itself is complete, and is written
             outcome.interrupted = isinstance(error, KeyboardInterrupt)
             outcome.ended_by = error if isinstance(error, ArmsightError) else None
+        workcell.source.close()  # its processes hold 300 MB
         progress("plotting")
         of_run = {
             "seed": demo.seed,

@@ -391,11 +391,17 @@ def _drawn(report: RunReport, second: Callable[..., Any] | None) -> dict[str, tu
     """Return the figures by name, in their order: as PNG, and as SVG where the page shows them."""
     if second is None:
         return _files(report, NAMES)
-    beside = replace(report, workcell=None, notes=())
+    before, after = (None if run is None else _without_ways(run) for run in (report.before, report.after))
+    beside = replace(report, run=_without_ways(report.run), before=before, after=after, workcell=None, notes=())
     with ThreadPoolExecutor(1) as pool:
         others = pool.submit(second, _files, beside, _BESIDE)
         found = _files(report, [name for name in NAMES if name not in _BESIDE]) | others.result()
     return {name: found[name] for name in NAMES if name in found}
+
+
+def _without_ways(run: RunData) -> RunData:
+    """Return a run without its trajectories: another process gets none, and no figure shows one."""
+    return replace(run, segments=tuple(replace(segment, trajectory=None) for segment in run.segments))
 
 
 def _files(report: RunReport, names: Sequence[str]) -> dict[str, tuple[bytes, bytes | None]]:

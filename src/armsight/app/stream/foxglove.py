@@ -43,6 +43,20 @@ def require_foxglove(what: str, extra: str) -> None:
         ) from None
 
 
+class LookedAt:
+    """Chooses of shots that are pixels those whose images are sent, to be looked at: one pair a second."""
+
+    def __init__(self) -> None:
+        self._newest_s = -np.inf
+
+    def take(self, shot: Shot) -> bool:
+        """Return whether the images of this shot are sent, and remember it."""
+        if shot.t_s is not None and 0.0 <= shot.t_s - self._newest_s < _COMPRESS_EVERY_S:
+            return False
+        self._newest_s = -np.inf if shot.t_s is None else shot.t_s
+        return True
+
+
 class Messages:
     """Makes messages; it remembers what is sent once.
 
@@ -76,7 +90,7 @@ class Messages:
         self._Scene: Message = SceneUpdate_pb2.SceneUpdate
         self._Timestamp: Message = Timestamp
         self._calibrated = False
-        self._compressed_s = -np.inf
+        self._looked_at = LookedAt()
         self._joints_s = -np.inf
         self._T_base_rig: Array | None = None
 
@@ -121,10 +135,7 @@ class Messages:
     def _images(self, shot: Shot, stamp: Message) -> Iterator[tuple[str, Message]]:
         """Yield both images as the cameras delivered them; of pixels one pair a second, to look at, as JPEG."""
         encoded = shot.encoded
-        if encoded is None and shot.left is not None and shot.right is not None:
-            if shot.t_s is not None and 0.0 <= shot.t_s - self._compressed_s < _COMPRESS_EVERY_S:
-                return
-            self._compressed_s = -np.inf if shot.t_s is None else shot.t_s
+        if encoded is None and shot.left is not None and shot.right is not None and self._looked_at.take(shot):
             encoded = (_jpeg(shot.left), _jpeg(shot.right))
         if encoded is None:
             return

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -21,11 +21,12 @@ import numpy as np
 
 from armsight import __version__
 from armsight.app.stream.datum import Datum, EventDatum, JointsDatum, NoteDatum, Published, ShotDatum, json_text
-from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove
+from armsight.app.stream.foxglove import LookedAt, Messages, nanoseconds, require_foxglove
 from armsight.app.stream.mcap_writer import McapWriter
 from armsight.app.stream.sink import Sink
 from armsight.data import Shot
 from armsight.errors import InputError
+from armsight.processes import Process
 from armsight.robot.arm import Arm
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources.bag.camera_info import METADATA, RIG
@@ -43,6 +44,9 @@ TOPICS: dict[type, str] = {
 #: A shot that is younger by its own stamp was stamped by a live camera, s.
 _LIVE_S = 10.0
 _WAKES = 64  # data that are written together, where they come fast
+#: By then a process has begun to write, on a computer under load, s; so many data, of some kB each, wait for it at most.
+_BEGUN_S, _WAITING = 60.0, 8192
+_BATCH = 16  # data that are sent to a process at once: a third of a millisecond
 _SCHEMA = json.dumps({"type": "object"}).encode()
 
 
@@ -114,13 +118,78 @@ class McapSink(Sink):
         try:
             if self.problem is None:
                 if self.dropped:
-                    note = NoteDatum(
-                        0.0, f"{self.dropped} of {self.taken} data were dropped: the disk is too slow", "warning"
-                    )
-                    self.write(note)
+                    self.write(_dropped(self))
                 self._writer.finish()
         finally:
             self._file.close()
+
+
+class McapBeside(Sink):
+    """Writes run.mcap as :class:`McapSink` does, in a process of its own: its Python takes nothing of this one's time.
+
+    Args:
+        path: the file, which must not exist.
+        published: what all data have in common.
+
+    Raises:
+        InputError: a package is missing. What is wrong with the file ends the writing, and is its ``problem``.
+    """
+
+    def __init__(self, path: Path, published: Published) -> None:
+        require_foxglove("run.mcap", "record")
+        super().__init__(_WAITING, _WAKES, _BEGUN_S)
+        self._process, self._looked_at = Process(_written, path, published), LookedAt()
+        self._batch: list[Datum] = []
+
+    def put(self, datum: Datum) -> None:
+        """Take a datum without the images that are not recorded, and return at once."""
+        if isinstance(datum, ShotDatum):
+            shot = datum.shot
+            if shot.encoded is not None or (shot.left is not None and not self._looked_at.take(shot)):
+                datum = replace(datum, shot=replace(shot, left=None, right=None))
+        super().put(datum)
+
+    def write(self, datum: Datum) -> None:
+        """Have a datum written, with the next ones: a call of the process takes longer than a datum."""
+        self._batch.append(datum)
+        if len(self._batch) >= _BATCH:
+            self._send()
+
+    def tick(self) -> None:
+        """Write the chunk out."""
+        self._send("tick")
+
+    def finish(self) -> None:
+        """Write the index and close the file; end the process."""
+        try:
+            if self.problem is None:
+                if self.dropped:
+                    self._batch.append(_dropped(self))
+                self._send("finish")
+        finally:
+            self._process.close()
+
+    def _send(self, then: str = "") -> None:
+        batch, self._batch = self._batch, []
+        self._process(batch, then)
+
+
+def _written(path: Path, published: Published) -> Callable[[list[Datum], str], None]:
+    """Return what writes data to a new file, and calls a method of it by its name."""
+    sink = McapSink(path, published)
+
+    def write(data: list[Datum], then: str) -> None:
+        for datum in data:
+            sink.write(datum)
+        if then:
+            getattr(sink, then)()
+
+    return write
+
+
+def _dropped(sink: Sink) -> NoteDatum:
+    """Return the note that data were dropped."""
+    return NoteDatum(0.0, f"{sink.dropped} of {sink.taken} data were dropped: the disk is too slow", "warning")
 
 
 class LazyMcap:
@@ -131,12 +200,21 @@ class LazyMcap:
         published: what all data have in common.
         say: is given a line where the packages are missing, and then nothing is written; and what ended the writing early.
         name: of the file.
+        process: whether it is written in a process of its own, which takes a second to begin: for long runs.
     """
 
-    def __init__(self, folder: Path, published: Published, say: Callable[[str], None], name: str = RUN_MCAP) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        published: Published,
+        say: Callable[[str], None],
+        name: str = RUN_MCAP,
+        *,
+        process: bool = False,
+    ) -> None:
         self._path, self._published, self._say = folder / name, published, say
-        self._began = False
-        self.sink: McapSink | None = None
+        self._began, self._writes = False, McapBeside if process else McapSink
+        self.sink: McapSink | McapBeside | None = None
 
     def put(self, datum: Datum) -> None:
         """Take a datum and return at once."""
@@ -152,7 +230,7 @@ class LazyMcap:
                 self._path.unlink(missing_ok=True)
             except OSError as error:
                 raise InputError(f"{self._path}: cannot be written: {error.strerror}") from None
-            self.sink = McapSink(self._path, self._published)
+            self.sink = self._writes(self._path, self._published)
             self.sink.start()
         if self.sink is not None:
             self.sink.put(datum)

@@ -18,7 +18,7 @@ from armsight.app.stream.datum import Datum
 TICK_S = 0.25
 #: A sink that has this share of what may wait does not pause: before data are dropped a command may come late.
 _BEHIND = 0.25
-#: How long :meth:`Sink.close` waits for the thread, s.
+#: How long :meth:`Sink.close` waits for the thread, s, where nothing else is said.
 _CLOSE_S = 10.0
 
 
@@ -49,6 +49,7 @@ class Sink:
         limit: how many data may wait.
         wakes: so many that wait wake the thread; fewer wait for at most ``TICK_S``. A thread that is woken for every datum
             takes the interpreter from the loop as often.
+        close_s: how long :meth:`close` waits for the thread, s.
 
     Attributes:
         taken: how many data were taken.
@@ -57,11 +58,11 @@ class Sink:
         problem: what ended the publishing early; None where nothing did.
     """
 
-    def __init__(self, limit: int = 512, wakes: int = 1) -> None:
+    def __init__(self, limit: int = 512, wakes: int = 1, close_s: float = _CLOSE_S) -> None:
         self.taken = self.dropped = 0
         self.cpu_s = 0.0
         self.problem: str | None = None
-        self._limit, self._wakes = limit, wakes
+        self._limit, self._wakes, self._close_s = limit, wakes, close_s
         self._queue: deque[Datum] = deque()
         self._changed = threading.Condition()
         self._closing = False
@@ -104,7 +105,7 @@ class Sink:
             self._closing = True
             self._changed.notify()
         if self._thread.is_alive():
-            self._thread.join(_CLOSE_S)
+            self._thread.join(self._close_s)
 
     def _run(self) -> None:
         ticked = time.monotonic()

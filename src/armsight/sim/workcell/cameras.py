@@ -260,7 +260,7 @@ class _Exposed(NamedTuple):
     led: LedSeen | None
 
 
-class _Side:
+class _OneCamera:
     """One of the two cameras: what is before it becomes an image.
 
     Args:
@@ -397,7 +397,9 @@ class WorkcellSource:
         self._threads = (ThreadPoolExecutor(1), ThreadPoolExecutor(1))
         self._led = None if led is None else ([camera.led(led[0], *_LED) for camera in cameras], led[1])
         given = (cameras, plant.arm, plant.parts, body, seed, pipeline)
-        self._sides = [Process(_Side, side, *given) if processes else _Side(side, *given) for side in range(2)]
+        self._sides = [
+            Process(_OneCamera, side, *given) if processes else _OneCamera(side, *given) for side in range(2)
+        ]
         #: Name of each shot that was handed out -> when it was taken, for evaluation only.
         self.taken: dict[str, ShotTimes] = {}
 
