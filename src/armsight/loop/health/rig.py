@@ -708,7 +708,10 @@ def _lens_finding(lens: LensError) -> HealthFinding:
 
 def _of_one_pose(found: HealthFinding) -> HealthFinding:
     """Return a finding that rests on one pose, with what looks the same."""
-    same = "or the two images do not belong together (another pair's, or the body moved between them): one pose cannot tell"
+    same = (
+        "or the two images do not belong together (another pair's, or the body moved between them); one pose leaves both "
+        "open"
+    )
     advice = f"measure more poses; if all say so, {found.advice}"
     return replace(found, what=f"{found.what}; {same}", advice=advice, alternatives=("time",))
 
