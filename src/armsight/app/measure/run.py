@@ -464,7 +464,7 @@ def _nothing_measured(records: list[ShotPose], mistake: str, contradicted: Healt
     """Return why no shot could be measured: what was done to the images, or the first reason and what explains it."""
     why = mistake or f"{records[0].shot}: {records[0].reason}"
     if contradicted is not None and contradicted.cause == "rig" and not mistake:
-        why += f". {contradicted.what}; {contradicted.advice}"
+        why += f"; {contradicted.what}; {contradicted.advice}"
     return f"none of {len(records)} shots could be measured: {why}"
 
 
