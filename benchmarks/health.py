@@ -324,12 +324,12 @@ def with_plates(case: str) -> tuple[Target, ...]:
     plates = [fixed_plate(*each) for each in PLATES]
     image = WorkcellSource._image
 
-    def seen(self, side, t_s, frames, body, shutter, number, held):
+    def seen(self, side, t_s, frames, body, shutter, number, held, led):
         if number < 0:
-            return image(self, side, t_s, frames, body, shutter, number, held)
+            return image(self, side, t_s, frames, body, shutter, number, held, led)
         moved = inverse(exp_se3(BUMP)) if t_s >= KNOCK_S else np.eye(4)
         every = tuple(p.on_body(moved @ each.T_camera_body) for _, each in plates for p in each.patterns)
-        return image(self, side, t_s, frames, body, shutter, number, PosedBody(every, np.eye(4)))
+        return image(self, side, t_s, frames, body, shutter, number, PosedBody(every, np.eye(4)), led)
 
     WorkcellSource._image = seen
     return tuple(target for target, _ in plates)

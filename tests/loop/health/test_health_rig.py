@@ -107,7 +107,9 @@ def test_images_that_do_not_belong_together_in_one_shot_are_no_moved_camera():
     for period_s in (None, 1 / 3, 2.0):
         one_of_several = [*good[:4], moved[4], *good[5:]]
         assert findings(one_of_several, period_s) == findings(good[:4] + moved[4:5], period_s) == []
-        assert findings(moved, period_s) == findings(good[:4] + moved[4:], period_s) == [("rig", ())]
+        assert findings(moved, period_s) == [("rig", ())]
+        if period_s is not None:  # else they are of one test
+            assert findings(good[:4] + moved[4:], period_s) == [("rig", ())]
         # One pose alone leaves both open.
         assert findings(moved[:1], period_s) == [("rig", ("time",))]
 

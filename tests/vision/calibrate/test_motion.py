@@ -68,6 +68,24 @@ def test_boards_that_stood_still_have_no_motion():
     assert not any("synchronised" in w for w in c.weaknesses)
 
 
+def test_a_rippled_lens_is_not_called_unsynchronised():
+    true, board, Ts = rig_and_board(count=12)
+
+    def rippled(side, found):
+        angle = 2 * np.pi * (found.uv / SIZES[side]) @ [1.2, 0.9] + 0.4 + side
+        return replace(found, uv=found.uv + 0.6 * np.stack([np.sin(angle), np.cos(angle)], axis=1))
+
+    pairs = [
+        replace(p, left=rippled(0, p.left), right=rippled(1, p.right))
+        for p in unsynchronised(true, board, Ts, np.zeros((12, 6)))
+    ]
+    c = calibrate_boards(board, pairs, SIZES, models=("brown5",), folds=2, flat=True)
+    assert c.motion is not None  # which fits as far as a motion can
+    (said,) = (w for w in c.weaknesses if "exposures" in w)
+    assert "depend on the position in the images" in said
+    assert "synchronised" not in said
+
+
 def test_motion_is_learned_and_stated(moved):
     _, motions, c = moved
     factor = c.heldout.normalised_rms

@@ -46,7 +46,7 @@ from armsight.vision.sources.video import VideoSource
 #: Standard deviation of the time between the two exposures of a shot, s: of cameras that nothing synchronises to better.
 _SYNC_S = 1e-3
 #: Shots that were missed are measured again with detections of this standard deviation, px, so many of them.
-_WIDE_PX, _AGAIN = 2.0, 200
+_WIDE_PX, _AGAIN = 2.0, 60
 #: So many shots that fit badly are named.
 _NAMED = 3
 #: A shot that is younger by its own stamp was stamped by a live camera, s.
@@ -464,7 +464,7 @@ def _nothing_measured(records: list[ShotPose], mistake: str, contradicted: Healt
     """Return why no shot could be measured: what was done to the images, or the first reason and what explains it."""
     why = mistake or f"{records[0].shot}: {records[0].reason}"
     if contradicted is not None and contradicted.cause == "rig" and not mistake:
-        why += f". {contradicted.what}; {contradicted.advice}"
+        why += f"; {contradicted.what}; {contradicted.advice}"
     return f"none of {len(records)} shots could be measured: {why}"
 
 

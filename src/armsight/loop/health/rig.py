@@ -45,8 +45,9 @@ MOST_POINTS = 24
 #: Shots that differ less than this share their errors (where a point is within its pixels, how it is lit) and count as one:
 #: translation over distance, and rotation, rad.
 _SAME = 0.01
-#: While nothing is suspected, shots closer in time than this are left out, s: they would cost time and add little.
-_LEAST_S = 0.025
+#: While nothing is suspected, shots closer in time than this are left out, s, and those that hardly differ from the newest:
+#: they would cost time and add little.
+_LEAST_S, _LIKE_S = 0.025, 0.1
 #: Fewer points than this say nothing of these numbers; shots further apart in time than this give no speed, s.
 _LEAST_POINTS, _APART_S = 4, 0.5
 #: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
@@ -96,7 +97,7 @@ class ResidualSums:
 
     def add(self, other: ResidualSums, weight: float) -> None:
         """Add another's."""
-        self.H += weight * other.H
+        self.H += other.H if weight == 1.0 else weight * other.H
         self.b += weight * other.b
         self.square += weight * other.square
         self.freedom += weight * other.freedom
@@ -193,6 +194,7 @@ class RigWatch:
         self._row_of = np.full(len(body.points), -1)
         self._row_of[self._points] = np.arange(len(self._points))
         self._last = (-np.inf, np.eye(4))
+        self._taken_s = -np.inf
         self._began: Array | None = None
         # What the seven numbers do to the newest poses, and the covariances of these.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
@@ -225,8 +227,10 @@ class RigWatch:
         """
         now_s, self._timed = (float(self._shots), False) if t_s is None else (t_s, True)
         self._shots += 1
-        if self.suspected is None and self.lens is None and self._timed and 0.0 <= now_s - self._last[0] < _LEAST_S:
+        if self._redundant(estimate.T_left_body, now_s):
+            self._last = (now_s, estimate.T_left_body)
             return np.zeros((6, 6))
+        self._taken_s = now_s
         found = self._residuals(estimate, now_s)
         self._last = (now_s, estimate.T_left_body)
         if found is None:
@@ -244,6 +248,13 @@ class RigWatch:
             added += np.outer(shift, shift) + by_fault @ self.suspected.cov @ by_fault.T
         return added
 
+    def _redundant(self, T: Array, now_s: float) -> bool:
+        """Return whether a shot adds too little to what was taken just before it."""
+        passed_s = now_s - self._taken_s
+        if self.suspected is not None or self.lens is not None or not self._timed or not 0.0 <= passed_s < _LIKE_S:
+            return False
+        return passed_s < _LEAST_S or (self._began is not None and not differ(self._began, T))
+
     def information(self, estimates: Sequence[PoseEstimate]) -> tuple[ResidualSums, int]:
         """Return the sums of measured poses, and how many of these differ: consecutive ones that are alike count as one."""
         self._test = ResidualSums(self._full, 0.0)
@@ -254,8 +265,9 @@ class RigWatch:
                 continue
             if began is None or differ(began, estimate.T_left_body):
                 self._close_stay()
-                self._stay, self._stay_shots, began = ResidualSums(self._full, float(k)), 0, estimate.T_left_body
+                self._stay, self._stay_shots, began = found[0], 1, estimate.T_left_body
                 stays += 1
+                continue
             assert self._stay is not None
             self._stay.add(found[0], 1.0)
             self._stay_shots += 1
@@ -311,10 +323,10 @@ class RigWatch:
         rest[:, -1] = (W @ fit.residuals_px[:, :, None]).ravel()
         gain = np.linalg.solve(A.T @ A, A.T @ rest)
         rest -= A @ gain
-        late *= self._sync_s
-        along, k2 = late @ rest, float(late @ late) - float((A.T @ late) @ np.linalg.solve(A.T @ A, A.T @ late))
+        whole = rest.T @ rest
         # The shot's own skew, of variance 1, is eliminated (Sherman and Morrison).
-        whole = rest.T @ rest - np.outer(along, along) / (1.0 + k2)
+        along = self._sync_s * whole[self._size - 1]
+        whole -= np.outer(along, along / (1.0 + self._sync_s * float(along[self._size - 1])))
         sums = ResidualSums(self._full, now_s)
         sums.H, sums.b, sums.square, sums.freedom = whole[:-1, :-1], whole[:-1, -1], float(whole[-1, -1]), n - 6.0
         return sums, -gain[:, : self._size] @ self._by_fault, np.asarray(-gain[:, self._size : self._full])
@@ -333,9 +345,10 @@ class RigWatch:
         """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
         if self._stay is None or self._began is None or differ(self._began, T):
             self._close_stay()
-            self._stay, self._stay_shots, self._began = ResidualSums(self._full, now_s), 0, T
-        self._stay.add(sums, 1.0)
-        self._stay_shots += 1
+            self._stay, self._stay_shots, self._began = sums, 1, T
+        else:
+            self._stay.add(sums, 1.0)
+            self._stay_shots += 1
         begin_s = self._test.begin_s if self._test.freedom else self._stay.begin_s
         if now_s - begin_s >= (TEST_S if self._timed else TEST_SHOTS):
             self._close_stay()
@@ -695,7 +708,10 @@ def _lens_finding(lens: LensError) -> HealthFinding:
 
 def _of_one_pose(found: HealthFinding) -> HealthFinding:
     """Return a finding that rests on one pose, with what looks the same."""
-    same = "or the two images do not belong together (another pair's, or the body moved between them): one pose cannot tell"
+    same = (
+        "or the two images do not belong together (another pair's, or the body moved between them); one pose leaves both "
+        "open"
+    )
     advice = f"measure more poses; if all say so, {found.advice}"
     return replace(found, what=f"{found.what}; {same}", advice=advice, alternatives=("time",))
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebvander2d
+from scipy.special import chdtri
 
 from armsight.data import Array
 from armsight.vision.calibrate.motion import ExposureMotion
@@ -18,6 +20,9 @@ _FOCUS_RATIO = 2.0
 _SCALE_SIGMAS = 4.0
 _REJECTED_SHARE = 0.2
 _FAR_MOTION = 2.0
+#: Degree of the polynomials of the position in an image that residuals may follow, beyond which share of their square and
+#: which chance they show a lens that the model cannot express.
+_FIELD_DEGREE, _FIELD_SHARE, _FIELD_CHANCE = 4, 0.04, 1e-4
 
 
 def weaknesses(calibration: Calibration) -> tuple[str, ...]:
@@ -113,7 +118,33 @@ def _synchrony(calibration: Calibration) -> str | None:
     return None
 
 
+def _by_position(calibration: Calibration) -> float | None:
+    """Return the RMS residual, px, that follows the position in the images; None where it is small, or chance.
+
+    A motion of the board is another one in each pair: its residuals do not depend on the position.
+    """
+    observations, residuals = calibration.observations, calibration.solution.residuals_px
+    powers = [(i, k) for i in range(_FIELD_DEGREE + 1) for k in range(_FIELD_DEGREE + 1 - i)]
+    explained = 0.0
+    for side, camera in enumerate(calibration.rig.cameras):
+        rows = observations.camera == side
+        x, y = ((observations.uv[rows] + 0.5) * 2.0 / np.array(camera.image_size_px) - 1.0).T
+        fields = chebvander2d(x, y, (_FIELD_DEGREE, _FIELD_DEGREE)).reshape(len(x), _FIELD_DEGREE + 1, -1)
+        basis = np.stack([fields[:, i, k] for i, k in powers], axis=1)
+        explained += float(((basis @ np.linalg.lstsq(basis, residuals[rows])[0]) ** 2).sum())
+    whole = float((residuals**2).sum())
+    by_chance = float(chdtri(4 * len(powers), _FIELD_CHANCE)) / residuals.size
+    return float(np.sqrt(explained / len(residuals))) if explained > max(_FIELD_SHARE, by_chance) * whole else None
+
+
 def _moved(calibration: Calibration, motion: ExposureMotion) -> str:
+    if (field_px := _by_position(calibration)) is not None:
+        return (
+            f"residuals of {field_px:.2f} px RMS depend on the position in the images, as of lenses that the model cannot "
+            "express; what looks like boards that moved between the two exposures, by "
+            f"{1e3 * motion.rms_m:.2f} mm RMS along each axis, may be the lenses too: try a richer --lens-model, look for "
+            "a lens that is loose or behind a window, and hold the board still to distinguish the two"
+        )
     state = calibration.solution.state
     distance = float(np.linalg.norm(state.Ts_left_body[:, :3, 3], axis=1).mean())
     way_px = calibration.rig.right.intrinsics[0] * motion.rms_m / distance
