@@ -26,7 +26,7 @@ from armsight.errors import CalibrationError, InputError
 from armsight.files import check_writable, read_columns, read_table, write_text
 from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
 from armsight.loop.identify.corrected import Corrected, zeros_text
-from armsight.loop.identify.diagnose import check_plausible, without_tool
+from armsight.loop.identify.diagnose import check_plausible, find_step, without_tool
 from armsight.loop.identify.identify import Identified, contributions, identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model, Parameter
@@ -288,6 +288,12 @@ def _notes(found: Identified, measured: Measured, lines: Array) -> tuple[str, ..
         shown = ", ".join(f"{lines[k]:.0f}" for k in found.left_out[:8]) + (", .." if len(found.left_out) > 8 else "")
         poses = f"{len(found.left_out)} pose{'s' if len(found.left_out) > 1 else ''}"
         notes.append(f"{poses} taken for mistakes and left out: line {shown}")
+    step = find_step(without_tool(found.nominal), measured)
+    if step is not None:
+        notes.append(
+            f"from line {lines[step.row]:.0f} on the poses seem to be of another state: {step.text} (off by "
+            f"{1e3 * step.before:.1f} mm together, {1e3 * step.left:.1f} mm so); identify from one of both parts"
+        )
     numbers = len(measured) * measured.size
     free = int(found.solution.free.sum())
     if numbers < 3 * len(found.model.nominal()):

@@ -30,6 +30,7 @@ from armsight.geometry.rotation import skew
 from armsight.loop.handeye.handeye import (
     CHANCE,
     CLEARLY,
+    MIDDLE,
     MIN_POSES,
     PART,
     PARTS,
@@ -313,9 +314,10 @@ def _first(problem: _Problem) -> list[_Guess]:
 
 
 def _middle_sigmas(e: Array) -> tuple[float, float]:
-    """Return sigmas along one axis of position and rotation, from the median."""
-    middle = np.sqrt(chdtri(3, 0.5))
-    position, rotation = (max(float(np.median(np.linalg.norm(p, axis=1))) / middle, 1e-9) for p in (e[:, :3], e[:, 3:]))
+    """Return sigmas along one axis of position and rotation, from the length below which the share MIDDLE is."""
+    middle = np.sqrt(chdtri(3, 1 - MIDDLE))
+    lengths = (np.quantile(np.linalg.norm(p, axis=1), MIDDLE) for p in (e[:, :3], e[:, 3:]))
+    position, rotation = (max(float(length) / middle, 1e-9) for length in lengths)
     return position, rotation
 
 
