@@ -375,7 +375,7 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
 def scale_between(poses: Poses) -> float:
     """Return true lengths over those of the measured body, by closed forms from small parts of the poses.
 
-    Of the parts' answers it is that of the smallest median residual.
+    Of the parts' answers it is that whose best residuals, of the share MIDDLE, are smallest.
     """
     p = poses.rows(_spread(np.arange(len(poses.A)), 300))
     A, B = p.A, p.right_side
@@ -388,7 +388,7 @@ def scale_between(poses: Poses) -> float:
             [A[:, :3, :3], np.broadcast_to(-np.eye(3), (len(A), 3, 3)), -(B[:, :3, 3] @ Z[:3, :3].T)[..., None]], axis=2
         )
         found = np.linalg.lstsq(M[part].reshape(-1, 7), -A[part, :3, 3].ravel(), rcond=None)[0]
-        left = float(np.median(np.linalg.norm(M @ found + A[:, :3, 3], axis=1)))
+        left = float(np.quantile(np.linalg.norm(M @ found + A[:, :3, 3], axis=1), MIDDLE))
         if found[6] > 0 and left < best[0]:
             best = (left, float(found[6]))
     return best[1]
