@@ -367,7 +367,7 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
         _middle_sigmas(p.rows(rows).linear(g).e) for p, g in ((problem, known), (free, found))
     )
     gained = 3 * float(np.log(before_m / after_m * before_rad / after_rad))  # log density of a pose
-    if (sure or gained > 1) and 1e-4 < found.per_m < 1e4:
+    if ((sure and gained > -1) or gained > 1) and 1e-4 < found.per_m < 1e4:  # sure, but far worse: of blunders
         return free, found, used
     return problem, known, used_known
 
