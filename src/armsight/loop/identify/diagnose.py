@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import orth
 from scipy.stats import f as f_distribution
 
@@ -346,7 +347,7 @@ def find_step(arm: Arm, measured: Measured) -> Step | None:
     if np.sqrt(total / (n * K)) < LEAST_M:
         return None
 
-    def explained(ways: list[Array], order: Array) -> tuple[float, int, Array]:
+    def explained(ways: list[Array], order: NDArray[np.int64]) -> tuple[float, int, Array]:
         best = (0.0, 0, np.zeros(len(ways)))
         for at in range(FEWEST_A_PART, n - FEWEST_A_PART + 1):
             after = np.isin(np.arange(n), order[at:])[:, None, None]
