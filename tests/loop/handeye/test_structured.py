@@ -282,3 +282,16 @@ def test_streams_give_the_offset_within_its_sigma():
     assert found.sigma_offset_s < 1e-3
     assert abs(found.offset_s - 0.3217) < 4 * found.sigma_offset_s
     assert nees(found.handeye, Z, X) < chi2.isf(1e-4, 12)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_half_of_the_poses_may_be_wrong(seed):
+    poses, Z, X, _ = made(seed, n=24, in_hand=True, camera=(3e-4, 1e-3, 1e-3))
+    rng = np.random.default_rng([seed, 1])
+    B = poses.B.copy()
+    wrong = rng.permutation(24)[:12]
+    about = exp_se3(rng.normal(0, [0.05] * 3 + [0.6] * 3, (12, 6)))
+    B[wrong] = B[wrong] @ about
+    found = calibrate_structured(replace(poses, B=B), structures=("camera, depth apart",))
+    assert set(np.flatnonzero(~found.used)) == set(wrong)
+    assert nees(found, Z, X) < chi2.ppf(0.999, 12)

@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 from worn_arm import poses, worn
 
 from armsight.errors import InputError
+from armsight.geometry.pose import exp_se3, inverse
 from armsight.loop.identify import ROTATIONS
-from armsight.loop.identify.diagnose import check_plausible, misfit, without_tool
+from armsight.loop.identify.diagnose import check_plausible, find_step, misfit, without_tool
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.read import read_poses
 from armsight.robot.arm_file import open_arm
@@ -181,3 +182,34 @@ def test_rows_that_are_shifted_are_reported(shift):
     )
     assert f"shifted by {abs(shift)}" in text
     assert rows in text
+
+
+def test_inverse_poses_are_reported():
+    w, measured = made("ur5", 1, n=60)
+    poses_seen = np.tile(np.eye(4), (60, 1, 1))
+    poses_seen[:, :3, :3], poses_seen[:, :3, 3] = measured.R_rig_body, measured.p_rig[:, 0]
+    back = inverse(poses_seen)
+    assert "inverse transforms" in said(w, replace(measured, p_rig=back[:, None, :3, 3], R_rig_body=back[:, :3, :3]))
+
+
+@pytest.mark.parametrize("joint", [1, 2, 3])
+def test_a_joint_that_slipped_between_two_poses_is_found(joint):
+    w, measured = made("ur5", 2)
+    assert find_step(without_tool(w.nominal), measured) is None
+    q = measured.q.copy()
+    q[25:, joint - 1] -= np.radians(1.5)
+    step = find_step(without_tool(w.nominal), replace(measured, q=q))
+    assert step is not None
+    assert f"joint {joint} changed by +1." in step.text
+    assert abs(step.row - 25) <= 1
+
+
+def test_a_base_that_was_displaced_between_two_poses_is_found():
+    w, measured = made("ur5", 3)
+    by = exp_se3(np.array([0.006, -0.004, 0.004, 0.01, 0.005, -0.01]))
+    p, R = measured.p_rig.copy(), measured.R_rig_body.copy()
+    p[15:], R[15:] = p[15:] @ by[:3, :3].T + by[:3, 3], by[:3, :3] @ R[15:]
+    step = find_step(without_tool(w.nominal), replace(measured, p_rig=p, R_rig_body=R))
+    assert step is not None
+    assert "base, or the instrument, was displaced" in step.text
+    assert abs(step.row - 15) <= 1

@@ -26,7 +26,7 @@ from armsight.errors import CalibrationError, InputError
 from armsight.files import check_writable, read_columns, read_table, write_text
 from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
 from armsight.loop.identify.corrected import Corrected, zeros_text
-from armsight.loop.identify.diagnose import check_plausible, without_tool
+from armsight.loop.identify.diagnose import check_plausible, find_step, without_tool
 from armsight.loop.identify.identify import Identified, contributions, identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model, Parameter
@@ -223,7 +223,9 @@ def run_identify(
     else:
         held_out, poses, how = _left_out(arm, measured.rows(found.solution.used), priors, progress)
         how += f", {len(found.left_out)} taken for mistakes apart" if len(found.left_out) else ""
-    return Identification(arm, measured, found, held_out, poses, how, lines, (*notes, *_notes(found, measured, lines)))
+    return Identification(
+        arm, measured, found, held_out, poses, how, lines, (*notes, *_notes(arm, found, measured, lines))
+    )
 
 
 def check_other(arm: Arm, measured: Measured, other: Measured) -> None:
@@ -281,13 +283,19 @@ def _joined(errors: list[Errors]) -> Errors:
     return Errors(*(np.concatenate(parts) for parts in zip(*errors, strict=True)))
 
 
-def _notes(found: Identified, measured: Measured, lines: Array) -> tuple[str, ...]:
+def _notes(arm: Arm, found: Identified, measured: Measured, lines: Array) -> tuple[str, ...]:
     """Return what a person should know about the data."""
     notes = []
     if len(found.left_out):
         shown = ", ".join(f"{lines[k]:.0f}" for k in found.left_out[:8]) + (", .." if len(found.left_out) > 8 else "")
         poses = f"{len(found.left_out)} pose{'s' if len(found.left_out) > 1 else ''}"
         notes.append(f"{poses} taken for mistakes and left out: line {shown}")
+    step = find_step(without_tool(arm), measured)
+    if step is not None:
+        notes.append(
+            f"from line {lines[step.row]:.0f} on the poses seem to be of another state: {step.text} (off by "
+            f"{1e3 * step.before:.1f} mm together, {1e3 * step.left:.1f} mm so); identify from one of both parts"
+        )
     numbers = len(measured) * measured.size
     free = int(found.solution.free.sum())
     if numbers < 3 * len(found.model.nominal()):

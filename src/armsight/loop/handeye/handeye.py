@@ -236,6 +236,12 @@ _CV: Any = cv2
 PART = 6
 #: How many parts: with 20 % gross errors all of them would hold one with a chance of (1 - 0.8^6)^24, 0.1 %.
 PARTS = 24
+#: Share of the poses that must be good: the scale of residuals is that of the best so many. A median breaks down where half
+#: are blunders.
+MIDDLE = 0.4
+#: Share of the pairs of rows that count as agreeing: where half of the rows are good, a quarter does. With more rows than
+#: this none are looked for.
+AGREE, MOST_AGREEING = 0.15, 300
 #: Weight of a rotation in the score, m/rad: 1 mrad counts as 0.3 mm, as it does at a tool 0.3 m from the wrist.
 LEVER_M = 0.3
 #: OpenCV's solvers of A X = Z B, by the names it gives them; 5.0 has none of them.
@@ -263,10 +269,26 @@ def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
         for _ in range(PARTS):
             rows = rng.choice(len(A), PART, replace=False)
             found.append(kronecker(A[rows], B[rows]))
+    if len(rows := _agreeing(A, B)) >= MIN_POSES:
+        found.append(kronecker(A[rows], B[rows]))
     found = [
         (X, Z) for X, Z in found if np.isfinite(X).all() and np.isfinite(Z).all() and _is_rigid(X) and _is_rigid(Z)
     ]
     return sorted(found, key=lambda XZ: _score(A, B, *XZ))
+
+
+def _agreeing(A: Array, B: Array) -> NDArray[np.int64]:
+    """Return the rows that agree with that with which most do: between two rows both sides rotate by one angle.
+
+    Blunders hardly agree with anything, so these are good ones though half of the rows are not.
+    """
+    if len(A) > MOST_AGREEING:
+        return np.zeros(0, np.int64)
+    cosines = (np.einsum("iab,jab->ij", T[:, :3, :3], T[:, :3, :3]) for T in (A, B))
+    angles_A, angles_B = (np.arccos(np.clip((cosine - 1) / 2, -1, 1)) for cosine in cosines)
+    off = np.abs(angles_A - angles_B)
+    near = off < np.quantile(off[np.triu_indices(len(A), 1)], AGREE)
+    return np.flatnonzero(near[near.sum(axis=1).argmax()])
 
 
 def kronecker(A: Array, B: Array) -> tuple[Array, Array]:
@@ -319,9 +341,10 @@ def _is_rigid(T: Array) -> bool:
 
 
 def _score(A: Array, B: Array, X: Array, Z: Array) -> float:
-    """Return the median size of the residual motions, m."""
+    """Return the size of the residual motions below which the share MIDDLE is, m."""
     e = log_se3(inverse(Z @ B) @ A @ X)
-    return float(np.median(np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1))))
+    sizes = np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1))
+    return float(np.quantile(sizes, MIDDLE))
 
 
 Eye = Literal["to_hand", "in_hand"]

@@ -30,6 +30,7 @@ from armsight.geometry.rotation import skew
 from armsight.loop.handeye.handeye import (
     CHANCE,
     CLEARLY,
+    MIDDLE,
     MIN_POSES,
     PART,
     PARTS,
@@ -313,9 +314,10 @@ def _first(problem: _Problem) -> list[_Guess]:
 
 
 def _middle_sigmas(e: Array) -> tuple[float, float]:
-    """Return sigmas along one axis of position and rotation, from the median."""
-    middle = np.sqrt(chdtri(3, 0.5))
-    position, rotation = (max(float(np.median(np.linalg.norm(p, axis=1))) / middle, 1e-9) for p in (e[:, :3], e[:, 3:]))
+    """Return sigmas along one axis of position and rotation, from the length below which the share MIDDLE is."""
+    middle = np.sqrt(chdtri(3, 1 - MIDDLE))
+    lengths = (np.quantile(np.linalg.norm(p, axis=1), MIDDLE) for p in (e[:, :3], e[:, 3:]))
+    position, rotation = (max(float(length) / middle, 1e-9) for length in lengths)
     return position, rotation
 
 
@@ -365,7 +367,7 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
         _middle_sigmas(p.rows(rows).linear(g).e) for p, g in ((problem, known), (free, found))
     )
     gained = 3 * float(np.log(before_m / after_m * before_rad / after_rad))  # log density of a pose
-    if (sure or gained > 1) and 1e-4 < found.per_m < 1e4:
+    if ((sure and gained > -1) or gained > 1) and 1e-4 < found.per_m < 1e4:  # sure, but far worse: of blunders
         return free, found, used
     return problem, known, used_known
 
@@ -373,7 +375,7 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
 def scale_between(poses: Poses) -> float:
     """Return true lengths over those of the measured body, by closed forms from small parts of the poses.
 
-    Of the parts' answers it is that of the smallest median residual.
+    Of the parts' answers it is that whose best residuals, of the share MIDDLE, are smallest.
     """
     p = poses.rows(_spread(np.arange(len(poses.A)), 300))
     A, B = p.A, p.right_side
@@ -386,7 +388,7 @@ def scale_between(poses: Poses) -> float:
             [A[:, :3, :3], np.broadcast_to(-np.eye(3), (len(A), 3, 3)), -(B[:, :3, 3] @ Z[:3, :3].T)[..., None]], axis=2
         )
         found = np.linalg.lstsq(M[part].reshape(-1, 7), -A[part, :3, 3].ravel(), rcond=None)[0]
-        left = float(np.median(np.linalg.norm(M @ found + A[:, :3, 3], axis=1)))
+        left = float(np.quantile(np.linalg.norm(M @ found + A[:, :3, 3], axis=1), MIDDLE))
         if found[6] > 0 and left < best[0]:
             best = (left, float(found[6]))
     return best[1]

@@ -17,6 +17,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import orth
+from scipy.stats import f as f_distribution
 
 from armsight.data import Array
 from armsight.errors import InputError
@@ -55,6 +58,12 @@ _ANGLES = (
 )
 #: Rows by which the two sides of a table may be shifted against each other.
 SHIFTS = (1, -1, 2, -2, 3, -3)
+#: Poses on either side of a step, RMS of what is looked into, m, length of a body's axes, m, and step of differences, rad.
+FEWEST_A_PART, LEAST_M, AXES_M, STEP_RAD = 6, 2e-4, 0.1, 1e-6
+#: One joint is preferred to the whole base where it explains all but this many times as well.
+SIMPLER = 1.2
+#: A step is one where chance explains as much with this probability at most, by one row and one joint.
+CHANCE = 1e-8
 #: Orders whose signs are tried, best first.
 MAX_JOINT_ORDERS = 40
 _SCALES = {1e-3: "m, not mm", 1e3: "mm, not m", 1e-1: "dm or cm", 10.0: "cm", 1 / 25.4: "inches", 25.4: "inches"}
@@ -135,8 +144,14 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
     good = off < max(BAD_SHARE * _span(p), BAD_M * (scale if scaled else 1.0))
     if good and not scaled:
         _check_rotations(arm, measured, rows)
+        step = find_step(arm, measured)
+        if step is not None and step.clear:
+            raise InputError(
+                f"the first {step.row} poses and those from there on are of different states (off by "
+                f"{1e3 * step.before:.1f} mm together, {1e3 * step.left:.1f} mm so): {step.text}; use one of both parts"
+            )
         return
-    explanation = _shifted(arm, measured, off) or _angles(arm, q, p, off)
+    explanation = _shifted(arm, measured, off) or _inverse(arm, measured, rows, off) or _angles(arm, q, p, off)
     if explanation is None:
         explanation = _unit(scale) if good else _proposal(arm, q, p, off)
     raise InputError(explanation or _no_arm(off))
@@ -187,6 +202,20 @@ def _shifted(arm: Arm, measured: Measured, off: float) -> str | None:
                 "is too much at either end, or join the tables by names or times"
             )
     return None
+
+
+def _inverse(arm: Arm, measured: Measured, rows: Array, off: float) -> str | None:
+    """Return that the poses are those of the instrument in the body, if the data fit so, or None."""
+    if measured.R_rig_body is None:
+        return None
+    p = -np.einsum("nji,nkj->nki", measured.R_rig_body, measured.p_rig)[rows]
+    better, _, scale = misfit(arm, measured.q[rows], p)
+    if abs(np.log(scale)) > np.log1p(SCALE_OFF) or better > min(off / BETTER, max(BAD_SHARE * _span(p), BAD_M)):
+        return None
+    return (
+        f"the poses are inverse transforms: they fit as those of the instrument in the body (off by {1e3 * off:.0f} mm as "
+        f"they are, {1e3 * better:.1f} mm so): invert them; the body in the instrument's frame is needed"
+    )
 
 
 def _angles(arm: Arm, q: Array, p: Array, off: float) -> str | None:
@@ -268,6 +297,90 @@ def _fitting(arm: Arm, q: Array, p: Array, tried: list[Mistakes], limit: float) 
     if best > limit:
         return []
     return sorted((m for m in every if m.off < CLEAR * best), key=lambda m: (m.number, m.off))
+
+
+class Step(NamedTuple):
+    """A change of state between two poses.
+
+    Attributes:
+        row: the first pose after it, in the order of the rows.
+        text: what changed.
+        before, left: RMS of the points off the arm without and with it, m.
+    """
+
+    row: int
+    text: str
+    before: float
+    left: float
+
+    @property
+    def clear(self) -> bool:
+        """Whether the poses cannot be taken together."""
+        return self.left < self.before / CLEAR
+
+
+def find_step(arm: Arm, measured: Measured) -> Step | None:
+    """Return the pose from which on a joint's zero, or the base, is another, in the order of the rows; None without.
+
+    Base, tool and zeros are fitted to all, linearised; then the step that explains most is looked for. It must explain
+    twice what steps explain where the poses are ordered by a joint's angle: those show what else is wrong with the arm.
+    """
+    rows = np.linspace(0, len(measured) - 1, min(POSES, len(measured))).astype(int)
+    if len(rows) < 2 * FEWEST_A_PART:
+        return None
+    q, p = measured.q[rows], measured.p_rig[rows]
+    if measured.R_rig_body is not None:
+        p = np.concatenate([p, p + AXES_M * measured.R_rig_body[rows].swapaxes(1, 2)], axis=1)
+    n, K = p.shape[:2]
+    T = arm.forward(q)
+    M, _, t = linear_placement(T[:, :3, :3], T[:, :3, 3], p)
+    here, there = p @ nearest_rotation(M).T, _points(T, t)
+    here += (there - here).mean(axis=(0, 1))
+    joints = [(_points(arm.forward(q + STEP_RAD * one), t) - there) / STEP_RAD for one in np.eye(arm.joints)]
+    base = [*np.broadcast_to(np.eye(3)[:, None, None], (3, n, K, 3)), *(np.cross(axis, here) for axis in np.eye(3))]
+    tool = [np.eye(K)[k][:, None] * T[:, None, :3, i] for k in range(K) for i in range(3)]
+    common = np.stack([*base, *tool, *joints]).reshape(-1, n * K * 3).T
+    Q = orth(common / np.maximum(np.linalg.norm(common, axis=0), 1e-12), rcond=1e-6)
+    e = (here - there).ravel()
+    e -= Q @ (Q.T @ e)
+    total = float(e @ e)
+    if np.sqrt(total / (n * K)) < LEAST_M:
+        return None
+
+    def explained(ways: list[Array], order: NDArray[np.int64]) -> tuple[float, int, Array]:
+        best = (0.0, 0, np.zeros(len(ways)))
+        for at in range(FEWEST_A_PART, n - FEWEST_A_PART + 1):
+            after = np.isin(np.arange(n), order[at:])[:, None, None]
+            C = np.stack([np.where(after, way, 0.0) for way in ways]).reshape(len(ways), -1).T
+            C -= Q @ (Q.T @ C)
+            x = np.linalg.lstsq(C, e, rcond=1e-6)[0]
+            best = max(best, (float(e @ C @ x), at, x), key=lambda one: one[0])
+        return best
+
+    steps = [explained([joint], np.arange(n)) for joint in joints]
+    joint = max(range(arm.joints), key=lambda k: steps[k][0])
+    whole = explained(base, np.arange(n))
+    one = total - steps[joint][0] < SIMPLER**2 * (total - whole[0])
+    by, at, x = steps[joint] if one else whole
+    free = n * min(3 * K, 6) - Q.shape[1] - len(x)
+    if f_distribution.sf(by / len(x) / (total - by) * free, len(x), free) > CHANCE:
+        return None
+    ways = [joints[joint]] if one else base
+    if any(2 * explained(ways, np.argsort(angles))[0] > by for angles in q.T):
+        return None
+    text = "the base, or the instrument, was displaced"
+    if one:
+        either = ", or the base was rotated" if joint == 0 else ""
+        text = (
+            f"the zero of joint {joint + 1} changed by {np.degrees(x[0]):+.2f} deg (it slipped, or lost steps){either}"
+        )
+    before, left = (float(np.sqrt(squares / (n * K))) for squares in (total, total - by))
+    return Step(int(rows[at]), text, before, left)
+
+
+def _points(T: Array, t: Array) -> Array:
+    """Return points t (K, 3) of frames (N, 4, 4): (N, K, 3)."""
+    return np.asarray(T[:, None, :3, 3] + (T[:, :3, :3] @ t.T).swapaxes(1, 2))
 
 
 def _check_rotations(arm: Arm, measured: Measured, rows: Array) -> None:
