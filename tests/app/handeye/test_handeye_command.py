@@ -96,6 +96,20 @@ def test_every_form_of_a_table_gives_the_same(armsight, tmp_path, seen, form):
     assert all(pose["used"] for pose in document["poses"])
 
 
+def test_the_poses_that_measure_wrote_are_read_with_the_shots_it_missed(armsight, tmp_path):
+    _, A, B = motion()
+    rows = [
+        [f"s{k}", "ok", "", "", *map(repr, map(float, (*T[:3, 3], *q)))]
+        for k, (T, q) in enumerate(zip(B, quaternions(B), strict=True))
+    ]
+    rows[4] = ["s4", "missed", "no board", *[""] * 8]
+    seen = named(tmp_path / "poses.csv", "shot,status,reason,t_s,x_m,y_m,z_m,qw,qx,qy,qz", rows)
+    document, said = found(armsight, matrices(tmp_path / "robot.txt", A), seen)
+    assert_right(document)
+    assert len(document["poses"]) == len(A) - 1
+    assert "no target in s4 (no board)" in said
+
+
 def test_people_read_sigma_whose_error_blunders_and_a_plan_and_get_a_page(armsight, tmp_path):
     _, A, B = motion(20)
     B[7] = B[7] @ exp_se3(np.array([0.05, 0, 0, 0.3, 0, 0]))

@@ -13,6 +13,7 @@ In: a CSV, TSV or text file. Out: :class:`PoseTable`. Known forms:
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from armsight.app.measure.poses import CSV_COLUMNS, SHUTTER_COLUMNS
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import columns_unused, read_columns, read_table, read_text
@@ -45,6 +47,8 @@ FAR_M, NEAR_M = 20.0, 0.02
 MOST_RAD = 4 * np.pi
 #: How far a matrix may be from a rotation: what six digits leave.
 LOOSE = 2e-3
+#: Columns that tell the poses that `armsight measure -o` wrote.
+_MEASURED = {"shot", "status", "reason", "x_m"}
 _UR = re.compile(r"p\[([^\]]*)\]")
 _JOINT = re.compile(r"q(\d+)_(rad|deg)")
 
@@ -64,6 +68,7 @@ class PoseTable(Record):
         names: of the rows, or of their images; None where there are none.
         unit_m: the unit that lengths were read in, m.
         notes: what was found out while reading.
+        missed: (N,) why a shot that `armsight measure` wrote has no pose, and another's stands there; "" where it has one.
     """
 
     path: Path
@@ -76,6 +81,7 @@ class PoseTable(Record):
     names: tuple[str, ...] | None
     unit_m: float
     notes: tuple[str, ...]
+    missed: tuple[str, ...]
 
 
 def read_pose_table(
@@ -103,6 +109,8 @@ def read_pose_table(
     if rotation is not None and rotation not in CONVENTIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
     head, rows = _cells(path, columns)
+    measured = set(head) >= _MEASURED
+    rows, missed = _shown(path, head, rows) if measured else (rows, ("",) * len(rows))
     table = _Columns(path, head, rows)
     lines = np.array([line for line, _ in rows])
     unit_m, q = 1.0, None
@@ -119,10 +127,24 @@ def read_pose_table(
         p, unit_m, notes = _positions(table, unit, detect_units)
         R, numbers, convention = table.rotations(rotation)
         Ts = stacked(R, p)
-    t_s, names = table.times(), table.names()
+    t_s, names = table.times(), table.names(("image", "name", *(["shot"] if measured else [])))
+    table.used.update((*CSV_COLUMNS, *SHUTTER_COLUMNS) if measured else ())
     if unused := [name for name in head if name and name not in table.used and not re.fullmatch(r"_[0-3]", name)]:
         notes = (*notes, f"{path}: {columns_unused(unused)}")
-    return PoseTable(path, lines, Ts, numbers, convention, q, t_s, names, unit_m, notes)
+    return PoseTable(path, lines, Ts, numbers, convention, q, t_s, names, unit_m, notes, missed)
+
+
+def _shown(
+    path: Path, head: list[str], rows: list[tuple[int, list[str]]]
+) -> tuple[list[tuple[int, list[str]]], tuple[str, ...]]:
+    """Return the rows of `armsight measure`, some pose in those without one, and why they have none."""
+    status, reason, first = head.index("status"), head.index("reason"), head.index("x_m")
+    some = next((row for _, row in rows if row[status] == "ok"), None)
+    if some is None:
+        raise InputError(f"{path}: none of {len(rows)} shots was measured; {rows[0][1][reason]}")
+    missed = tuple("" if row[status] == "ok" else row[reason] or row[status] for _, row in rows)
+    filled = [row[:first] + some[first:] if why else row for (_, row), why in zip(rows, missed, strict=True)]
+    return [(line, row) for (line, _), row in zip(rows, filled, strict=True)], missed
 
 
 def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, list[str]]]]:
@@ -151,6 +173,8 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
     if not _is_number(head[0]) or any(re.fullmatch(r"[A-Za-z_]\w*", cell) and not _is_number(cell) for cell in head):
         if len(set(head)) != len(head):
             raise InputError(f"{path}: line {rows[0][0]} names a column twice")
+        if set(head) >= _MEASURED:  # a shot without a pose ends with empty fields
+            rows = [(line, row + [""] * (len(head) - len(row))) for line, row in rows]
         return head, _even(path, rows[1:], len(head))
     matrix = [f"{letter}" for i in "123" for letter in (f"r{i}1", f"r{i}2", f"r{i}3", "xyz"[int(i) - 1])]
     forms = {
@@ -242,11 +266,12 @@ class _Columns:
 
     def times(self) -> Array | None:
         """Return the times (N,), s."""
-        return self.numbers(["t_s"])[:, 0] if "t_s" in self.at else None
+        known = "t_s" in self.at and any(row[self.at["t_s"]] for _, row in self.rows)
+        return self.numbers(["t_s"])[:, 0] if known else None
 
-    def names(self) -> tuple[str, ...] | None:
-        """Return the names of the rows, or of their images."""
-        key = next((key for key in ("image", "name") if key in self.at), None)
+    def names(self, keys: Sequence[str]) -> tuple[str, ...] | None:
+        """Return the names of the rows, or of their images; ``keys`` are the columns that may have them."""
+        key = next((key for key in keys if key in self.at), None)
         if key is None:
             return None
         self.used.add(key)
@@ -336,7 +361,10 @@ def _positions(table: _Columns, unit: str | None, detect: bool) -> tuple[Array, 
     """Return positions (N, 3), m, the unit they were read in, and notes."""
     suffix = next((s for s in ("_m", "_mm", "") if f"x{s}" in table.at), None)
     if suffix is None:
-        raise InputError(f"{table.path}: line 1: no positions: x_m y_m z_m or x_mm y_mm z_mm are needed")
+        raise InputError(
+            f"{table.path}: line 1: no positions: x_m y_m z_m or x_mm y_mm z_mm are needed, or, with "
+            "--model, joints q1_rad .. or q1_deg ..; --columns x_m=NAME,... gives yours"
+        )
     p = table.numbers([f"{axis}{suffix}" for axis in "xyz"])
     given = suffix[1:] or unit
     unit_m = 1e-3 if given == "mm" else 1.0
