@@ -47,7 +47,7 @@ FAR_M, NEAR_M = 20.0, 0.02
 MOST_RAD = 4 * np.pi
 #: How far a matrix may be from a rotation: what six digits leave.
 LOOSE = 2e-3
-#: Columns that tell the poses that `armsight measure -o` wrote.
+#: Columns of the poses that `armsight measure -o` wrote.
 _MEASURED = {"shot", "status", "reason", "x_m"}
 _UR = re.compile(r"p\[([^\]]*)\]")
 _JOINT = re.compile(r"q(\d+)_(rad|deg)")
