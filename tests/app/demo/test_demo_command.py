@@ -10,7 +10,6 @@ import pytest
 
 from armsight.app.demo import demo
 from armsight.app.demo.demo import Demo, run_demo
-from armsight.app.run import calibrate
 from armsight.app.stream.mcap_file import LazyMcap
 from armsight.errors import ArmsightError
 from armsight.geometry.rotation import from_quaternion_wxyz, log_so3

@@ -100,6 +100,20 @@ def test_every_form_of_a_table_gives_the_same(armsight, tmp_path, seen, form):
     assert all(pose["used"] for pose in document["poses"])
 
 
+def test_the_poses_that_measure_wrote_are_read_with_the_shots_it_missed(armsight, tmp_path):
+    _, A, B = motion()
+    rows = [
+        [f"s{k}", "ok", "", "", *map(repr, map(float, (*T[:3, 3], *q)))]
+        for k, (T, q) in enumerate(zip(B, quaternions(B), strict=True))
+    ]
+    rows[4] = ["s4", "missed", "no board", *[""] * 8]
+    seen = named(tmp_path / "poses.csv", "shot,status,reason,t_s,x_m,y_m,z_m,qw,qx,qy,qz", rows)
+    document, said = found(armsight, matrices(tmp_path / "robot.txt", A), seen)
+    assert_right(document)
+    assert len(document["poses"]) == len(A) - 1
+    assert "no target in s4 (no board)" in said
+
+
 def test_people_read_sigma_whose_error_blunders_and_a_plan_and_get_a_page(armsight, tmp_path):
     _, A, B = motion(20)
     B[7] = B[7] @ exp_se3(np.array([0.05, 0, 0, 0.3, 0, 0]))
@@ -237,7 +251,7 @@ def test_what_does_not_fit_is_named(armsight, tmp_path, seen):
         matrices(path, displaced),
         "those from line 8",
         "fit one mounting each, but not the same",
-        "TCP changed, by 99 mm and 28.6 deg",
+        "TCP changed, by 100 mm and 28.6 deg",
     )
     displaced[7:] = exp_se3(np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.1])) @ A[7:]
     rejected(matrices(path, displaced), "those from line 8", "the robot's base, or the target, was displaced by")
@@ -343,11 +357,11 @@ def test_what_measure_wrote_is_joined_by_the_names_of_its_shots(tmp_path):
     rows[4][1:] = ["missed", "no body", 2.0, *[""] * 7]
     path = named(tmp_path / "measured.csv", "shot,status,reason,t_s,x_m,y_m,z_m,qw,qx,qy,qz", rows)
     table = read_pose_table(path)
-    np.testing.assert_allclose(table.Ts, np.delete(B, 4, axis=0), atol=1e-9)
-    assert table.names == tuple(f"{k:04d}" for k in range(14) if k != 4)
-    assert len(table.notes) == 1
-    assert "1 of 14 shots were missed" in table.notes[0]
+    np.testing.assert_allclose(np.delete(table.Ts, 4, axis=0), np.delete(B, 4, axis=0), atol=1e-9)
+    assert table.names == tuple(f"{k:04d}" for k in range(14))
+    assert table.missed == tuple("no body" if k == 4 else "" for k in range(14))
+    assert table.notes == ()
     images = replace(table, names=tuple(f"img/{name}.png" for name in table.names[::-1]))
     of_robot, of_seen = matched_rows(images, table.names)
     assert [table.names[k] for k in of_seen] == [Path(images.names[k]).stem for k in of_robot]
-    assert of_seen[0] == 12
+    assert of_seen[0] == 13

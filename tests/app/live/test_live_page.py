@@ -255,5 +255,6 @@ def test_the_arm_is_held_when_the_page_that_commands_is_closed(session, server, 
     until(lambda: not session.arm.busy)
     until(lambda: session.arm.state.state.startswith("held at rest"))
     assert "the page" in session.sections()["overview"].held
+    assert "--board emulated:unicorn --rig" in session.arm.state.command  # as it can be typed
     until(lambda: (session.folder / "run" / "summary.json").exists())
     assert (session.folder / "run" / "run.mcap").stat().st_size > 10000

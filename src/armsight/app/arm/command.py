@@ -143,7 +143,8 @@ def ik(arm_name: str, tool_link: str | None, numbers: tuple[str, ...], as_json: 
 @click.option(
     "-o", "--output", required=True, metavar="ARM.urdf", type=click.Path(path_type=Path), help="The file to write."
 )
-def urdf(arm_name: str, tool_link: str | None, output: Path) -> None:
+@_JSON
+def urdf(arm_name: str, tool_link: str | None, output: Path, as_json: bool) -> None:
     """Write an arm as a URDF file."""
     check_suffix(output, ".urdf", "an arm")
     check_writable(output, apart_from=(arm_name,))
@@ -151,8 +152,9 @@ def urdf(arm_name: str, tool_link: str | None, output: Path) -> None:
     from armsight.robot.arm_file import open_arm
     from armsight.robot.urdf_write import write_urdf
 
-    write_urdf(open_arm(arm_name, tool_link=tool_link), output)
-    click.echo(str(output))
+    arm = open_arm(arm_name, tool_link=tool_link)
+    write_urdf(arm, output)
+    click.echo(json.dumps({"arm": arm.name, "output": str(output)}) if as_json else str(output))
 
 
 @command.command()
@@ -222,7 +224,17 @@ def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | N
 @click.option(
     "-o", "--output", required=True, metavar="FILE.toml", type=click.Path(path_type=Path), help="The motions to write."
 )
-def plan(arm_name: str, tool_link: str | None, around: Path, poses: int, cycles: int, seed: int, output: Path) -> None:
+@_JSON
+def plan(
+    arm_name: str,
+    tool_link: str | None,
+    around: Path,
+    poses: int,
+    cycles: int,
+    seed: int,
+    output: Path,
+    as_json: bool,
+) -> None:
     """Plan the recording of `arm report`: motions for `armsight run --open-loop --motion FILE.toml`.
 
     Poses all over where the body is seen, each from both sides of every joint, and five of them again and again.
@@ -237,7 +249,8 @@ def plan(arm_name: str, tool_link: str | None, around: Path, poses: int, cycles:
     arm = open_arm(arm_name, tool_link=tool_link)
     q = seen_angles(around, arm)
     write_text(output, plan_report(arm, q, seen_by(around), poses=poses, cycles=cycles, seed=seed))
-    click.echo(str(output))
+    answer = {"arm": arm.name, "poses": poses, "cycles": cycles, "output": str(output)}
+    click.echo(json.dumps(answer) if as_json else str(output))
 
 
 @command.command()

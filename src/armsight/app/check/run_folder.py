@@ -136,6 +136,8 @@ def segments_of(folder: Path, closed: bool) -> list[PathSegment]:
     file = _reference_file(folder)
     for name in (file.name, "vision.csv", "motion.toml"):
         if not (folder / name).is_file():
+            if (folder / "summary.json").is_file():
+                raise InputError(f"{folder}: {name} is missing: the run ended before its motions; run it to the end")
             raise InputError(f"{folder}: is no run, {name} is missing: give a folder of armsight run or demo, or a CSV")
     reference, _ = read_track(file, ())
     seen, sigma = read_track(folder / "vision.csv", _SIGMAS)

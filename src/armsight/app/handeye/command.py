@@ -214,6 +214,8 @@ def _streams(
     options: Options, robot: PoseTable, seen: Seen, arm: Arm | None, progress: Callable[[str], None]
 ) -> HandEyeAnswer:
     """Calibrate two streams with an unknown clock offset."""
+    import numpy as np
+
     from armsight.app.handeye.plan import plan_poses
     from armsight.app.handeye.recording import links_between, of_streams
     from armsight.app.handeye.result import HandEyeAnswer
@@ -226,8 +228,12 @@ def _streams(
             raise InputError(f"{path}: line 1: --streams needs a column t_s, seconds")
     assert robot.t_s is not None
     assert seen.t_s is not None
+    shown = np.array([not why for why in seen.missed])
+    names = tuple(name for name, why in zip(seen.names, seen.missed, strict=True) if not why)
+    t_s = seen.t_s[shown]
+    seen = replace(seen, Ts=seen.Ts[shown], covs=seen.covs[shown], names=names, missed=("",) * len(names), t_s=t_s)
     hand = PoseStream.of(robot.t_s, robot.Ts, str(options.robot))
-    eye_stream = PoseStream.of(seen.t_s, seen.Ts, str(options.seen))
+    eye_stream = PoseStream.of(t_s, seen.Ts, str(options.seen))
     eye: Literal["in_hand", "to_hand"] = "in_hand" if options.eye == "in-hand" else "to_hand"
     notes = (*robot.notes, *seen.notes)
     progress("looking at whether both sides fit")

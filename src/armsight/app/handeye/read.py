@@ -8,7 +8,7 @@ In: a CSV, TSV or text file. Out: :class:`PoseTable`. Known forms:
 - named columns: ``x_m y_m z_m`` (or ``x_mm``, or ``x`` with ``unit``); ``qw qx qy qz``; or ``rx_deg ry_deg rz_deg`` (or
   ``rx_rad``, ``rx``); or ``r11 .. r33``; or joints ``q1_deg ..`` (``q1_rad``) for a model, also by LeRobot's names. ``t_s``
   is a time, ``image`` the image that belongs to a row, ``name`` (``shot`` in what ``armsight measure`` writes) a name that
-  both tables share; rows whose ``status`` is missed are left out.
+  both tables share; rows whose ``status`` is missed count as shots without a pose.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from armsight.app.measure.poses import CSV_COLUMNS, SHUTTER_COLUMNS
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import columns_unused, read_columns, read_table, read_text
@@ -48,6 +49,8 @@ FAR_M, NEAR_M = 20.0, 0.02
 MOST_RAD = 4 * np.pi
 #: How far a matrix may be from a rotation: what six digits leave.
 LOOSE = 2e-3
+#: Columns of the poses that `armsight measure -o` wrote.
+_MEASURED = {"shot", "status", "reason", "x_m"}
 _UR = re.compile(r"p\[([^\]]*)\]")
 _JOINT = re.compile(r"q(\d+)_(rad|deg)")
 
@@ -67,6 +70,7 @@ class PoseTable(Record):
         names: of the rows, or of their images; None where there are none.
         unit_m: the unit that lengths were read in, m.
         notes: what was found out while reading.
+        missed: (N,) why a shot that `armsight measure` wrote has no pose, and another's stands there; "" where it has one.
     """
 
     path: Path
@@ -79,6 +83,7 @@ class PoseTable(Record):
     names: tuple[str, ...] | None
     unit_m: float
     notes: tuple[str, ...]
+    missed: tuple[str, ...]
 
 
 def read_pose_table(
@@ -108,7 +113,8 @@ def read_pose_table(
     if rotation is not None and rotation not in CONVENTIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
     head, rows = _cells(path, columns)
-    rows, left_out = _without_missed(path, head, rows)
+    measured = set(head) >= _MEASURED
+    rows, missed = _shown(path, head, rows) if measured else (rows, ("",) * len(rows))
     table = _Columns(path, head, rows)
     lines = np.array([line for line, _ in rows])
     unit_m, q = 1.0, None
@@ -130,14 +136,24 @@ def read_pose_table(
         R, numbers, convention = table.rotations(rotation)
         Ts = stacked(R, p)
     t_s, names = table.times(), table.names()
-    notes = (*left_out, *notes)
-    if (
-        not only_joints
-        and "reason" not in head
-        and (unused := [name for name in head if name and name not in table.used and not re.fullmatch(r"_[0-3]", name)])
-    ):
+    table.used.update((*CSV_COLUMNS, *SHUTTER_COLUMNS) if measured else ())
+    unused = [name for name in head if name and name not in table.used and not re.fullmatch(r"_[0-3]", name)]
+    if unused and not only_joints:
         notes = (*notes, f"{path}: {columns_unused(unused)}")
-    return PoseTable(path, lines, Ts, numbers, convention, q, t_s, names, unit_m, notes)
+    return PoseTable(path, lines, Ts, numbers, convention, q, t_s, names, unit_m, notes, missed)
+
+
+def _shown(
+    path: Path, head: list[str], rows: list[tuple[int, list[str]]]
+) -> tuple[list[tuple[int, list[str]]], tuple[str, ...]]:
+    """Return the rows of `armsight measure`, some pose in those without one, and why they have none."""
+    status, reason, first = head.index("status"), head.index("reason"), head.index("x_m")
+    some = next((row for _, row in rows if row[status] == "ok"), None)
+    if some is None:
+        raise InputError(f"{path}: none of {len(rows)} shots was measured; {rows[0][1][reason]}")
+    missed = tuple("" if row[status] == "ok" else row[reason] or row[status] for _, row in rows)
+    filled = [row[:first] + some[first:] if why else row for (_, row), why in zip(rows, missed, strict=True)]
+    return [(line, row) for (line, _), row in zip(rows, filled, strict=True)], missed
 
 
 def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, list[str]]]]:
@@ -182,19 +198,6 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
             "position, quaternion), 7 (position, quaternion), 6 (position, three numbers of a rotation); or name columns"
         )
     return forms[len(head)], _even(path, rows, len(head))
-
-
-def _without_missed(
-    path: Path, head: list[str], rows: list[tuple[int, list[str]]]
-) -> tuple[list[tuple[int, list[str]]], tuple[str, ...]]:
-    """Return the rows but those of shots that ``armsight measure`` missed, and a note that counts these."""
-    if "status" not in head or "reason" not in head:
-        return rows, ()
-    kept = [(line, row) for line, row in rows if row[head.index("status")] != "missed"]
-    if not kept:
-        raise InputError(f"{path}: all of its {len(rows)} shots were missed; the column reason says why")
-    missed = len(rows) - len(kept)
-    return kept, (f"{path}: {missed} of {len(rows)} shots were missed, and are left out",) if missed else ()
 
 
 def _even(path: Path, rows: list[tuple[int, list[str]]], count: int) -> list[tuple[int, list[str]]]:
@@ -271,7 +274,8 @@ class _Columns:
 
     def times(self) -> Array | None:
         """Return the times (N,), s."""
-        return self.numbers(["t_s"])[:, 0] if "t_s" in self.at else None
+        known = "t_s" in self.at and any(row[self.at["t_s"]] for _, row in self.rows)
+        return self.numbers(["t_s"])[:, 0] if known else None
 
     def names(self) -> tuple[str, ...] | None:
         """Return the names of the rows, or of their images."""
@@ -365,7 +369,10 @@ def _positions(table: _Columns, unit: str | None, detect: bool) -> tuple[Array, 
     """Return positions (N, 3), m, the unit they were read in, and notes."""
     suffix = next((s for s in ("_m", "_mm", "") if f"x{s}" in table.at), None)
     if suffix is None:
-        raise InputError(f"{table.path}: line 1: no positions: x_m y_m z_m or x_mm y_mm z_mm are needed")
+        raise InputError(
+            f"{table.path}: line 1: no positions: x_m y_m z_m or x_mm y_mm z_mm are needed, or, with "
+            "--model, joints q1_rad .. or q1_deg ..; --columns x_m=NAME,... gives yours"
+        )
     p = table.numbers([f"{axis}{suffix}" for axis in "xyz"])
     given = suffix[1:] or unit
     unit_m = 1e-3 if given == "mm" else 1.0

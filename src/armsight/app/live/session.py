@@ -43,7 +43,7 @@ from armsight.vision.sources.v4l2 import VideoDevice, find_cameras
 
 SIM = "sim:"
 #: The workcell's cameras where ``sim:`` names none, and its arm.
-_SIM_CAMERAS, _SIM_ARM = "1280x720@15", "worn"
+_SIM_CAMERAS, _SIM_ARM, _EMULATOR = "1280x720@15", "worn", "unicorn"
 _DEFAULT_BOARD = "chessboard:9x6:25mm"
 _EVENTS = 200
 #: How often the images' quality is looked at, s; images older than this are late, s.
@@ -277,7 +277,7 @@ class LiveSession:
         self.calibration = self._calibration(spec, CalibrationAim())
         self.body = BodyStep(self.folder, self.say)
         motion = options.motion or (QUICK if simulated else DEFAULT_MOTION)
-        board = options.board or ("emulated:" if simulated else None)
+        board = options.board or (f"{EMULATED}{_EMULATOR}" if simulated else None)
         self.arm = ArmStep(
             self.folder,
             ArmOptions(
@@ -313,7 +313,7 @@ class LiveSession:
     def _workcell(self, options: SessionOptions) -> SimulatedCameras:
         assert options.source is not None
         cameras = options.source.removeprefix(SIM) or _SIM_CAMERAS
-        simulated = SimulatedCameras(cameras, _SIM_ARM, options.seed, "unicorn", open_arm(options.arm))
+        simulated = SimulatedCameras(cameras, _SIM_ARM, options.seed, _EMULATOR, open_arm(options.arm))
         simulated.outline = lambda: self.calibration.outline_uv if self.calibration.state.running else None
         return simulated
 

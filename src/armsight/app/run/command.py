@@ -201,20 +201,23 @@ def command(
     open_folder(output)
     plan = RunPlan(rig, motions, targets, not open_loop, follow_rig, stream, time.perf_counter())
     devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms, calibration, sync_led)
-    with steps() as progress:
-        progress("opening the devices")
-        with open_devices(devices) as setup:
-            setup = replace(setup, fixed=fixed_targets)
-            require_start(setup, motions, targets)
-            make_room(output)
-            for name, text in files.items():
-                write_text(output / name, text)
-            rig.save(output / "rig.json")
-            try:
+    begun = False
+    try:
+        with steps() as progress:
+            progress("opening the devices")
+            with open_devices(devices) as setup:
+                setup = replace(setup, fixed=fixed_targets)
+                require_start(setup, motions, targets)
+                make_room(output)
+                for name, text in files.items():
+                    write_text(output / name, text)
+                rig.save(output / "rig.json")
+                begun = True
                 summary = _run(setup, plan, output, files["body.toml"], progress)
-            except KeyboardInterrupt:
-                click.echo(f"the arm was stopped; what was measured until then is in {output}", err=True)
-                raise
+    except KeyboardInterrupt:
+        if begun:  # said once the progress is off the terminal
+            click.echo(f"the arm was stopped; what was measured until then is in {output}", err=True)
+        raise
     if as_json:
         click.echo(json.dumps(summary.to_json()))
     else:
