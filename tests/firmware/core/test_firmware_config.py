@@ -214,11 +214,11 @@ WRONG_ENCODER = {
 def test_a_value_of_an_encoder_outside_its_range_makes_the_configuration_invalid(library, path):
     kinds, values = WRONG_ENCODER[path]
     for kind in kinds:
-        turn = 16384 if kind == c.SENSOR_ABSOLUTE else 4096
+        counts_per_rev = 16384 if kind == c.SENSOR_ABSOLUTE else 4096
         for value in values:
             config = lab_config(library)
             config.joint[3].encoder = c.encoder_config(c.SENSOR_QUADRATURE, 4, 16384, 1, 0, 0.0)
-            config.joint[4].encoder = c.encoder_config(kind, 5, turn, -1, 16383, 0.5)
+            config.joint[4].encoder = c.encoder_config(kind, 5, counts_per_rev, -1, 16383, 0.5)
             assert library.config_is_valid(ctypes.byref(config))
             put(config.joint[4], path, value)
             assert not library.config_is_valid(ctypes.byref(config)), (kind, value)
@@ -232,7 +232,7 @@ def test_the_ends_of_a_range_belong_to_it(library, path, value):
 
 
 @pytest.mark.parametrize(("angles", "direction"), [((-2.6, 2.6), -1), ((2.6, -2.6), 1), ((2.6, -2.6), -1)])
-def test_a_table_may_fall_and_its_direction_be_turned_round(library, angles, direction):
+def test_a_table_may_fall_and_its_direction_be_reversed(library, angles, direction):
     config = lab_config(library)
     pot = config.joint[4].pot
     pot.angle_rad[: pot.node_count], pot.direction = angles, direction
