@@ -174,19 +174,6 @@ WRONG_ARM = {
 }
 
 
-WRONG_ENCODER = {
-    "input": [0, 7],
-    "counts_per_rev": [15, 2e7, NAN],  # and steps that no jump may be
-    "direction": [0, 2, -2],
-    "home_rad": [-13.5, NAN, INF],
-}
-WRONG_ABSOLUTE = {
-    "zero_counts": [16384],
-    "counts_per_rev": [200.0],  # a step of 0.03 rad: more than half of what counts as a jump
-    "home_rad": [2.0, -2.0],  # a soft limit is half a revolution away from it
-}
-
-
 def put(record, path, value):
     *folders, last = path.split(".")
     for name in folders:
@@ -209,37 +196,47 @@ def test_a_value_outside_its_range_makes_the_configuration_invalid(library, path
         assert arm.core.config.silence_ticks == 100
 
 
-@pytest.mark.parametrize(
-    ("sensor", "wrong"), [(c.SENSOR_QUADRATURE, WRONG_ENCODER), (c.SENSOR_ABSOLUTE, WRONG_ABSOLUTE)]
-)
-def test_a_value_of_an_encoder_outside_its_range_makes_the_configuration_invalid(library, sensor, wrong):
-    for name, values in wrong.items():
+# Of an encoder: the kinds whose range it is, and what each may not be. Its limits are 3.14 rad to either side of its home.
+BOTH = (c.SENSOR_QUADRATURE, c.SENSOR_ABSOLUTE)
+WRONG_ENCODER = {
+    "encoder.input": ((c.SENSOR_QUADRATURE,), [0, 7, 4]),  # 4: the other one's
+    "encoder.zero_counts": ((c.SENSOR_ABSOLUTE,), [16384]),
+    "encoder.counts_per_rev": (BOTH, [15, 64, 2e7, NAN]),  # 64: a step is larger than a jump
+    "encoder.direction": (BOTH, [0, 2]),
+    "encoder.home_rad": (BOTH, [-13.5, 13.5, NAN]),
+    "pot.frozen_rad": ((c.SENSOR_QUADRATURE,), [0.001]),
+    "soft_min_rad": ((c.SENSOR_ABSOLUTE,), [-2.9]),
+    "soft_max_rad": ((c.SENSOR_ABSOLUTE,), [3.9]),
+}
+
+
+@pytest.mark.parametrize("path", WRONG_ENCODER)
+def test_a_value_of_an_encoder_outside_its_range_makes_the_configuration_invalid(library, path):
+    kinds, values = WRONG_ENCODER[path]
+    for kind in kinds:
+        counts_per_rev = 16384 if kind == c.SENSOR_ABSOLUTE else 4096
         for value in values:
             config = lab_config(library)
-            config.sync_led_pin = 16
-            config.joint[4].pot.direction = -1  # of a table that no longer counts
-            config.joint[4].encoder = c.encoder_config(sensor, 2, 16384.0, -1, 100, 0.0)
+            config.joint[3].encoder = c.encoder_config(c.SENSOR_QUADRATURE, 4, 16384, 1, 0, 0.0)
+            config.joint[4].encoder = c.encoder_config(kind, 5, counts_per_rev, -1, 16383, 0.5)
             assert library.config_is_valid(ctypes.byref(config))
-            setattr(config.joint[4].encoder, name, value)
-            assert not library.config_is_valid(ctypes.byref(config)), (name, value)
+            put(config.joint[4], path, value)
+            assert not library.config_is_valid(ctypes.byref(config)), (kind, value)
 
 
-def test_two_quadrature_encoders_on_one_input_make_the_configuration_invalid(library):
+@pytest.mark.parametrize(("path", "value"), [("sync_led_pin", 16), ("sync_led_pin", 143), ("sync_led_ticks", 100)])
+def test_the_ends_of_a_range_belong_to_it(library, path, value):
     config = lab_config(library)
-    for joint, timer in (1, 2), (3, 4):
-        config.joint[joint].encoder = c.encoder_config(c.SENSOR_QUADRATURE, timer, 16384.0, 1, 0, 0.0)
+    put(config, path, value)
     assert library.config_is_valid(ctypes.byref(config))
-    config.joint[3].encoder.input = 2
-    assert not library.config_is_valid(ctypes.byref(config))
 
 
-def test_a_table_that_falls_serves_a_joint_that_turns_the_other_way(library):
+@pytest.mark.parametrize(("angles", "direction"), [((-2.6, 2.6), -1), ((2.6, -2.6), 1), ((2.6, -2.6), -1)])
+def test_a_table_may_fall_and_its_direction_be_reversed(library, angles, direction):
     config = lab_config(library)
     pot = config.joint[4].pot
-    pot.direction = -1
+    pot.angle_rad[: pot.node_count], pot.direction = angles, direction
     assert library.config_is_valid(ctypes.byref(config))
-    pot.angle_rad[pot.node_count - 1] = 0.5 * config.joint[4].soft_max_rad  # now its reach is too short on one side
-    assert not library.config_is_valid(ctypes.byref(config))
 
 
 def test_every_value_has_its_range_tried(library):
@@ -251,4 +248,5 @@ def test_every_value_has_its_range_tried(library):
     }
     leaves |= {f"gains.{name}" for name, _ in c.joint_gains._fields_}
     assert leaves <= set(WRONG)
+    assert {f"encoder.{name}" for name, _ in c.encoder_config._fields_} <= {*WRONG, *WRONG_ENCODER}
     assert {name for name, _ in c.core_config._fields_} - {"joint", "supply_max_mv"} == set(WRONG_ARM)
