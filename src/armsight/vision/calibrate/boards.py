@@ -543,41 +543,36 @@ def calibrate_recording(
         CalibrationError: fewer than three usable pairs, or views that do not determine the cameras.
         InputError: the times do not rise.
     """
-    given, several = _spread(pairs), tuple(m for m in ("brown4", "fisheye") if m in models) or models[:1]
-    first = calibrate_boards(
-        board, given, sizes, models=several, flat=flat, folds=2, singles=singles, progress=progress
-    )
+    seen = [pair for pair in pairs if min(len(pair.left.ids), len(pair.right.ids)) >= LEAST_CORNERS]
+    _enough(len(seen), len(pairs), _usable(pairs)[1])
+    given, several = _spread(seen), tuple(m for m in ("brown4", "fisheye") if m in models) or models[:1]
+    first = calibrate_boards(board, given, sizes, models=several, flat=flat, folds=2, singles=singles, progress=progress)
     progress("looking for the skew of the cameras")
     found = _Recording(board, tuple(pairs), t_s, first, not singles).one_time()
+    shutters = None
     if isinstance(found, Missed):
         said = f"no skew of the cameras is taken into account: {found.reason}"
-        moved, dropped, shutters = given, len(pairs) - len(given), None
     else:
         shutters, moved = found
+        given = _spread(moved)
         said = f"the cameras do not expose at one time: {shutters}; the detections were moved to one time"
-        dropped = len(moved) - len(moved := _spread(moved))
     calibration = calibrate_boards(
-        board, moved, sizes, models=models, flat=flat, folds=folds, singles=singles, progress=progress
+        board, given, sizes, models=models, flat=flat, folds=folds, singles=singles, progress=progress
     )
-    notes = [said] + ([f"{len(moved)} pairs spread over the recording were used"] if dropped else [])
+    used = f"{len(seen)} of {len(pairs)} shots show the board to both cameras; {len(given)} were used"
     calibration = replace(
         calibration,
         rig=replace(calibration.rig, shutters=shutters),
-        pairs_found=len(pairs),
-        notes=(*calibration.notes, *notes),
+        notes=(*calibration.notes, used, said),
         recorded=True,
     )
     return replace(calibration, weaknesses=weaknesses(calibration))
 
 
 def _spread(pairs: Sequence[Pair]) -> list[Pair]:
-    """Return at most _PAIRS_MOST pairs in which both cameras see the board, evenly spread; all where there are few."""
-    if len(pairs) <= _PAIRS_MOST:
-        return list(pairs)
-    seen = [pair for pair in pairs if min(len(pair.left.ids), len(pair.right.ids)) >= LEAST_CORNERS]
-    if len(seen) <= _PAIRS_MOST:
-        return seen
-    return [seen[k] for k in np.linspace(0, len(seen) - 1, _PAIRS_MOST).round().astype(int)]
+    """Return at most _PAIRS_MOST pairs, evenly spread."""
+    count = min(len(pairs), _PAIRS_MOST)
+    return [pairs[k] for k in np.linspace(0, len(pairs) - 1, count).round().astype(int)]
 
 
 @dataclass(frozen=True, eq=False)
