@@ -546,7 +546,9 @@ def calibrate_recording(
     seen = [pair for pair in pairs if min(len(pair.left.ids), len(pair.right.ids)) >= LEAST_CORNERS]
     _enough(len(seen), len(pairs), _usable(pairs)[1])
     given, several = _spread(seen), tuple(m for m in ("brown4", "fisheye") if m in models) or models[:1]
-    first = calibrate_boards(board, given, sizes, models=several, flat=flat, folds=2, singles=singles, progress=progress)
+    first = calibrate_boards(
+        board, given, sizes, models=several, flat=flat, folds=2, singles=singles, progress=progress
+    )
     progress("looking for the skew of the cameras")
     found = _Recording(board, tuple(pairs), t_s, first, not singles).one_time()
     shutters = None

@@ -201,6 +201,8 @@ OUTCOMES = (
 )
 #: Fewer corners do not show what of their residuals is odd, nor how the noise of neighbouring pixels is correlated.
 _MANY = 8
+#: Least share of the noise's variance that is believed to move a corner where neighbours' noise is opposite.
+_EFFECTIVE = 0.5
 _KEPT, _BORDER, _DIVERGED, _MOVED, _FAINT, _MISFIT = range(6)
 
 
@@ -302,7 +304,7 @@ def _fit_one(
 
 @kernel(
     "const u1[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8, b1, b1[::1], f8[:, ::1], f8[:, :, ::1], "
-    "f8[::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], i8[::1]",
+    "f8[:, :, ::1], f8[:, :, ::1], f8[::1], i8[::1]",
 )
 def _refine(
     image: NDArray[np.uint8],
@@ -314,7 +316,6 @@ def _refine(
     known: NDArray[np.bool_],
     models: Array,
     cov: Array,
-    odd: Array,
     noise: Array,
     gains: Array,
     residual: Array,
@@ -332,7 +333,7 @@ def _refine(
         if rough:
             residual[i] = np.sqrt(rough_noise(n, w))
         else:
-            residual[i] = np.sqrt(edge_noise(n, w, L, q[:2] - origin, cov[i], odd, noise, gains[i]))
+            residual[i] = np.sqrt(edge_noise(n, w, L, q[:2] - origin, cov[i], noise, gains[i]))
         reach = reach_px(squares[i])
         moved = np.hypot(q[0] - uv0[i, 0], q[1] - uv0[i, 1])
         if not moved <= min(MOVED_SHARE / WINDOW_SHARE * reach, MOVED_MAX_PX):
@@ -425,24 +426,27 @@ def refine_corners(
     else:
         known, models = like.kept, np.array(like.models)
     cov, residual, outcome = np.zeros((n, 2, 2)), np.zeros(n), np.zeros(n, np.int64)
-    odd, noise, gains = np.zeros(2), np.zeros((2, LAGS + 1, 2 * LAGS + 1)), np.zeros((n, LAGS + 1, 2 * LAGS + 1))
-    _refine(_pixels(image), uv, squares, bows, arm, rough, known, models, cov, odd, noise, gains, residual, outcome)
-    if not rough and n >= _MANY and odd[1] > 0:
-        cov *= (odd[0] / odd[1] * _correlated(noise, gains))[:, None, None]
+    noise, gains = np.zeros((3, LAGS + 1, 2 * LAGS + 1)), np.zeros((n, LAGS + 1, 2 * LAGS + 1))
+    _refine(_pixels(image), uv, squares, bows, arm, rough, known, models, cov, noise, gains, residual, outcome)
+    if not rough and n >= _MANY and residual.any():
+        variances = np.maximum(_effective(noise, gains), 1.0 / 12.0)
+        cov *= (variances / np.mean(residual[residual > 0] ** 2))[:, None, None]
     return CornerFits(models, cov, residual, outcome)
 
 
-def _correlated(noise: Array, gains: Array) -> Array:
-    """Return (N,) by how much the correlation of neighbouring pixels' noise raises the corners' variances, 1 at least.
+def _effective(noise: Array, gains: Array) -> Array:
+    """Return the variance of white noise that would move each corner as far as the image's noise does, grey levels squared.
+
+    What the fits absorb of the noise lowers the residuals' products at all lags; white noise shows by how much.
 
     Args:
-        noise: (2, LAGS + 1, 2 LAGS + 1) products of the residuals of all corners at each lag, and their weights.
+        noise: (3, LAGS + 1, 2 LAGS + 1) of all corners: products of odd residuals at each lag, their weights, and what
+            white noise of unit variance leaves of the products.
         gains: (N, LAGS + 1, 2 LAGS + 1) autocorrelation of each corner's derivatives by grey levels.
     """
-    if noise[0, 0, LAGS] <= 0:
-        return np.ones(len(gains))
-    rho = noise[0] / np.maximum(noise[1], 1e-300)
-    rho /= rho[0, LAGS]
-    both = np.full(rho.shape, 2.0)  # each lag below the first row is that of two neighbours, above and below
+    both = np.full(gains.shape[1:], 2.0)  # each lag below the first row is that of two neighbours, above and below
     both[0, :LAGS], both[0, LAGS] = 0.0, 1.0
-    return np.maximum((both * rho * gains).sum(axis=(1, 2)), 1.0)
+    found, white = both * noise[0::2] / np.maximum(noise[1], 1e-300)
+    least = _EFFECTIVE * found[0, LAGS] / max(white[0, LAGS], 1e-300)
+    seen, expected = (gains * found).sum(axis=(1, 2)), (gains * white).sum(axis=(1, 2))
+    return np.maximum(seen / np.maximum(expected, 0.1 * white[0, LAGS]), least)

@@ -263,7 +263,7 @@ def rough_noise(n: int, w: Work) -> float:
 
 
 @kernel(fastmath=True)
-def edge_noise(n: int, w: Work, L: Array, middle: Array, cov: Array, odd: Array, noise: Array, gain: Array) -> float:
+def edge_noise(n: int, w: Work, L: Array, middle: Array, cov: Array, noise: Array, gain: Array) -> float:
     """Return the variance of the residuals and fill cov (2, 2), the covariance of the corner; derivatives are overwritten.
 
     The noise is that of the pixels that determine the corner, as in ``normal.edge_noise``. Leverage is the squared
@@ -279,9 +279,9 @@ def edge_noise(n: int, w: Work, L: Array, middle: Array, cov: Array, odd: Array,
         L: (PARAMETERS, PARAMETERS) Cholesky factor of the normal equations.
         middle: (2,) the corner, as the pixels relative to the window's origin.
         cov: (2, 2) receives the covariance for white noise of the residuals' variance.
-        odd: (2,) to which the variance of the noise by the odd part is added, and the residuals'.
-        noise: (2, LAGS + 1, 2 LAGS + 1) to whose first part the weighted products of odd residuals at lags (row, column)
-            are added, and to the second the weights.
+        noise: (3, LAGS + 1, 2 LAGS + 1) to whose first part the weighted products of odd residuals at lags (row, column)
+            are added, to the second the weights, to the third the products that white noise of unit variance leaves
+            after the fit.
         gain: (LAGS + 1, 2 LAGS + 1) receives the autocorrelation of the corner's derivatives by grey levels, 1 at lag 0.
     """
     H, inverse = np.empty((PARAMETERS + 2, PARAMETERS + 2)), np.zeros((PARAMETERS, PARAMETERS))
@@ -297,7 +297,7 @@ def edge_noise(n: int, w: Work, L: Array, middle: Array, cov: Array, odd: Array,
         for j in range(PARAMETERS):
             for m in range(max(i, j), PARAMETERS):
                 A[i, j] += inverse[m, i] * inverse[m, j]
-    odd2, paired = _odd_noise(n, w, A, middle, noise, gain)
+    _odd_noise(n, w, A, middle, noise, gain)
     n = (n + SIMD_WIDTH - 1) // SIMD_WIDTH * SIMD_WIDTH  # derivatives and residuals are zero to the end of a vector
     jx, jy, root = w[JACOBIAN : JACOBIAN + n], w[JACOBIAN + ROOM : JACOBIAN + ROOM + n], w[:n]
     weight = np.float32(0.0)
@@ -311,17 +311,11 @@ def edge_noise(n: int, w: Work, L: Array, middle: Array, cov: Array, odd: Array,
         for m in range(n):
             row[m] *= root[m]
     products(n, rows(w), H)
-    leverage, own = 0.0, 0.0
+    leverage = 0.0
     for i in range(PARAMETERS):
         for j in range(i + 1):
-            each = (2.0 if j < i else 1.0) * A[i, j] * H[i, j]
-            leverage += each
-            if (i < 2 or i >= PARAMETERS - 2) and (j < 2 or j >= PARAMETERS - 2):  # position and gradient are odd
-                own += each
+            leverage += (2.0 if j < i else 1.0) * A[i, j] * H[i, j]
     variance = max(H[PARAMETERS, PARAMETERS] / (float(weight) - leverage), 1.0 / 12.0)
-    if paired > 0.5 * weight:  # else too much of the window lies beyond the image
-        odd[0] += max(odd2 / (0.5 * paired - own * paired / float(weight)), 1.0 / 12.0)
-        odd[1] += variance
     for i in range(2):
         for j in range(2):
             cov[i, j] = variance * A[i, j]
@@ -329,10 +323,11 @@ def edge_noise(n: int, w: Work, L: Array, middle: Array, cov: Array, odd: Array,
 
 
 @kernel(fastmath=True)
-def _odd_noise(n: int, w: Work, A: Array, middle: Array, noise: Array, gain: Array) -> tuple[float, float]:
-    """Return the weighted squares of the odd residuals and the weight; add to ``noise``, fill ``gain`` (:func:`edge_noise`).
+def _odd_noise(n: int, w: Work, A: Array, middle: Array, noise: Array, gain: Array) -> None:
+    """Add to ``noise`` and fill ``gain`` as in :func:`edge_noise`; A (PARAMETERS, PARAMETERS) inverts the normal matrix.
 
-    A pixel's partner is the one nearest to its reflection; A (PARAMETERS, PARAMETERS) is the inverse of the normal matrix.
+    A pixel's partner is the one nearest to its reflection. With S the projection on odd fields and P that on the
+    derivatives by the odd parameters (position and gradient), the odd residuals of white noise have covariance S - P.
     """
     at = np.full((2 * REACH + 1, 2 * REACH + 1), -1, np.int64)
     for i in range(n):
@@ -340,35 +335,37 @@ def _odd_noise(n: int, w: Work, A: Array, middle: Array, noise: Array, gain: Arr
         if 0 <= x <= 2 * REACH and 0 <= y <= 2 * REACH:
             at[y, x] = i
     x2, y2 = int(np.rint(2.0 * middle[0])), int(np.rint(2.0 * middle[1]))
-    odd, root, g = np.zeros(n), np.zeros(n), np.zeros((2, n))
-    odd2 = paired = 0.0
+    odd, root, g, partner = np.zeros(n), np.zeros(n), np.zeros((4, n)), np.full(n, -1, np.int64)
     for i in range(n):
-        for m in range(PARAMETERS):
-            derivative = w[JACOBIAN + m * ROOM + i]
-            g[0, i] += A[0, m] * derivative
-            g[1, i] += A[1, m] * derivative
+        for a in range(4):
+            for m in range(PARAMETERS):
+                g[a, i] += A[a if a < 2 else PARAMETERS - 4 + a, m] * w[JACOBIAN + m * ROOM + i]
         x, y = x2 - int(w[i]) + REACH, y2 - int(w[Y + i]) + REACH
         if not (0 <= x <= 2 * REACH and 0 <= y <= 2 * REACH) or at[y, x] < 0:
             continue
-        v = w[JACOBIAN + i] ** 2 + w[JACOBIAN + ROOM + i] ** 2
-        odd[i], root[i] = 0.5 * (w[RESIDUAL + i] - w[RESIDUAL + at[y, x]]), np.sqrt(v)
-        odd2 += v * odd[i] ** 2
-        paired += v
+        partner[i] = at[y, x]
+        odd[i] = 0.5 * (w[RESIDUAL + i] - w[RESIDUAL + at[y, x]])
+        root[i] = np.sqrt(w[JACOBIAN + i] ** 2 + w[JACOBIAN + ROOM + i] ** 2)
     for dy in range(LAGS + 1):
         for dx in range(-LAGS, LAGS + 1):
-            products_, weights, gains = 0.0, 0.0, 0.0
+            found, weights, white, gains = 0.0, 0.0, 0.0, 0.0
             for i in range(n):
                 x, y = int(w[i]) + REACH + dx, int(w[Y + i]) + REACH + dy
                 if not (0 <= x <= 2 * REACH and 0 <= y <= 2 * REACH):
                     continue
                 j = at[y, x]
-                if j >= 0:
-                    both = root[i] * root[j]
-                    products_ += both * odd[i] * odd[j]
-                    weights += both
-                    gains += g[0, i] * g[0, j] + g[1, i] * g[1, j]
-            noise[0, dy, LAGS + dx] += products_
+                if j < 0:
+                    continue
+                gains += g[0, i] * g[0, j] + g[1, i] * g[1, j]
+                both = root[i] * root[j]
+                expected = 0.5 * (i == j) - 0.5 * (j == partner[i])
+                for a in range(4):
+                    expected -= w[JACOBIAN + (a if a < 2 else PARAMETERS - 4 + a) * ROOM + i] * g[a, j]
+                found += both * odd[i] * odd[j]
+                weights += both
+                white += both * expected
+            noise[0, dy, LAGS + dx] += found
             noise[1, dy, LAGS + dx] += weights
+            noise[2, dy, LAGS + dx] += white
             gain[dy, LAGS + dx] = gains
     gain /= max(gain[0, LAGS], 1e-300)
-    return odd2, paired
