@@ -29,10 +29,7 @@ from armsight.vision.image import grey, read_image
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import load_body_csv
 from armsight.vision.sources import Source, notes_of, open_source
-from armsight.vision.sources.bag import BagSource
-from armsight.vision.sources.lerobot import LeRobotSource
 from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files
-from armsight.vision.sources.video import VideoSource
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 
@@ -80,16 +77,15 @@ def open_recording(spec: str) -> Source:
     Raises:
         InputError: live cameras, or a recording without times.
     """
+    if spec.startswith(("usb:", "url:")):
+        raise InputError(
+            f"{spec}: is live: `armsight record {spec} -o DIR` stores a recording, and --source DIR takes it"
+        )
     opened = open_source(spec)
-    if isinstance(opened, StoredSource | VideoSource | BagSource | LeRobotSource):
-        if not isinstance(opened, StoredSource) or any(pair.t_s is not None for pair in opened.pairs):
-            return opened
+    if isinstance(opened, StoredSource) and all(pair.t_s is None for pair in opened.pairs):
         opened.close()
         raise InputError(f"{spec}: its shots have no times (shots.csv): give the images as --left and --right")
-    opened.close()
-    raise InputError(
-        f"{spec}: are live cameras: `armsight record {spec} -o DIR` stores a recording, and --source DIR takes it"
-    )
+    return opened
 
 
 def calibrate_images(
@@ -133,13 +129,24 @@ def calibrate_images(
         if not pairs:
             raise InputError("the recording has no shots")
         raise InputError(f"none of {len(pairs)} pairs can be read; {pairs[0].name}: {pairs[0].left.problem}")
-    options = {"models": models, "flat": flat, "folds": folds, "singles": singles}
     with steps() as progress:
         if not recorded:
-            return calibrate_boards(target, pairs, sizes, progress=progress, **options)
+            return calibrate_boards(
+                target, pairs, sizes, models=models, flat=flat, folds=folds, singles=singles, progress=progress
+            )
         known = [(pair, t) for pair, t in zip(pairs, times, strict=True) if t is not None]
         t_s = np.array([t for _, t in known])
-        calibration = calibrate_recording(target, [pair for pair, _ in known], t_s, sizes, progress=progress, **options)
+        calibration = calibrate_recording(
+            target,
+            [pair for pair, _ in known],
+            t_s,
+            sizes,
+            models=models,
+            flat=flat,
+            folds=folds,
+            singles=singles,
+            progress=progress,
+        )
         return replace(calibration, notes=(*notes_of(source), *calibration.notes))
 
 
