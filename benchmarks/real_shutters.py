@@ -1,4 +1,4 @@
-"""Metric 8: free-running web cameras (caliscope-charuco): what ``armsight calibrate --source`` makes of each pair of videos."""
+"""Metric 8: free-running web cameras (caliscope-charuco): each pair by ``armsight calibrate --source``."""
 
 from __future__ import annotations
 
