@@ -71,8 +71,8 @@ _NOISE_ROUNDS, _MOTION_ROUNDS = 4, 8
 #: Rounds of the discs' radius and the poses; a radius given may differ by this factor from what the images show: print and
 #: lens widen or narrow what is dark.
 _RADIUS_ROUNDS, _RADIUS_RATIO = 2, 1.1
-#: Rounds of skew and cameras, alternately; the skew has settled where it changes by less than this share of its sigma. In the
-#: first rounds only the relative pose of the cameras is adjusted.
+#: Rounds of skew and cameras, alternately; the skew has settled where it changes by less than this share of its sigma.
+#: In the first rounds only the relative pose of the cameras is adjusted.
 _SKEW_ROUNDS, _SETTLED, _POSE_ROUNDS = 40, 0.03, 2
 #: Least sigma of a detection meanwhile, px: with a smaller one the robust loss would give up on shots that move far. What
 #: the detections scatter by is measured.
@@ -520,8 +520,8 @@ def calibrate_recording(
 ) -> Calibration:
     """Calibrate two cameras that may expose at different times, from a recording of a board that moves.
 
-    Skew and cameras are estimated alternately (:mod:`armsight.vision.shutter`), then every detection is moved to the time of
-    its left image, and the pairs are calibrated as simultaneous ones. Alternating leaves the sigma of the skew at given
+    Skew and cameras are estimated alternately (:mod:`armsight.vision.shutter`), then every detection is moved to the time
+    of its left image, and the pairs are calibrated as simultaneous ones. Alternating leaves the sigma of the skew at given
     cameras; with rho its correlation with them an error shrinks by rho^2 each round, so the sigma of both together is
     that over sqrt(1 - shrinkage).
 

@@ -201,7 +201,7 @@ OUTCOMES = (
 )
 #: Fewer corners do not show what of their residuals is odd, nor how the noise of neighbouring pixels is correlated.
 _MANY = 8
-#: Least share of the noise's variance that is believed to move a corner where neighbours' noise is opposite.
+#: Least share of the noise's variance that is taken to move a corner where neighbours' noise is opposite.
 _EFFECTIVE = 0.5
 _KEPT, _BORDER, _DIVERGED, _MOVED, _FAINT, _MISFIT = range(6)
 
@@ -449,4 +449,4 @@ def _effective(noise: Array, gains: Array) -> Array:
     found, white = both * noise[0::2] / np.maximum(noise[1], 1e-300)
     least = _EFFECTIVE * found[0, LAGS] / max(white[0, LAGS], 1e-300)
     seen, expected = (gains * found).sum(axis=(1, 2)), (gains * white).sum(axis=(1, 2))
-    return np.maximum(seen / np.maximum(expected, 0.1 * white[0, LAGS]), least)
+    return np.asarray(np.maximum(seen / np.maximum(expected, 0.1 * white[0, LAGS]), least))
