@@ -30,10 +30,7 @@ from armsight.vision.image import grey, read_image
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import load_body_csv
 from armsight.vision.sources import Source, notes_of, open_source
-from armsight.vision.sources.bag import BagSource
-from armsight.vision.sources.lerobot import LeRobotSource
 from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files
-from armsight.vision.sources.video import VideoSource
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 
@@ -79,15 +76,13 @@ def open_stored(spec: str) -> Source:
     """Open a folder or a recording.
 
     Raises:
-        InputError: live cameras.
+        InputError: live cameras, or no such source.
     """
-    opened = open_source(spec)
-    if isinstance(opened, StoredSource | VideoSource | BagSource | LeRobotSource):
-        return opened
-    opened.close()
-    raise InputError(
-        f"{spec}: are live cameras: `armsight record {spec} -o DIR` stores a recording, and --source DIR takes it"
-    )
+    if spec.startswith(("usb:", "url:")):
+        raise InputError(
+            f"{spec}: is live: `armsight record {spec} -o DIR` stores a recording, and --source DIR takes it"
+        )
+    return open_source(spec)
 
 
 def calibrate_images(
@@ -130,13 +125,24 @@ def calibrate_images(
         if not pairs:
             raise InputError("the recording has no shots")
         raise InputError(f"none of {len(pairs)} pairs can be read; {pairs[0].name}: {pairs[0].left.problem}")
-    options: dict[str, Any] = {"models": models, "flat": flat, "folds": folds, "singles": singles}
     with steps() as progress:
         known = [(pair, t) for pair, t in zip(pairs, times, strict=True) if t is not None]
         if not known:
-            return calibrate_boards(target, pairs, sizes, progress=progress, **options)
+            return calibrate_boards(
+                target, pairs, sizes, models=models, flat=flat, folds=folds, singles=singles, progress=progress
+            )
         t_s = np.array([t for _, t in known])
-        calibration = calibrate_recording(target, [pair for pair, _ in known], t_s, sizes, progress=progress, **options)
+        calibration = calibrate_recording(
+            target,
+            [pair for pair, _ in known],
+            t_s,
+            sizes,
+            models=models,
+            flat=flat,
+            folds=folds,
+            singles=singles,
+            progress=progress,
+        )
         return replace(calibration, notes=(*notes_of(source), *calibration.notes))
 
 

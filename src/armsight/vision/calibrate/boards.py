@@ -74,8 +74,8 @@ _NOISE_ROUNDS, _MOTION_ROUNDS = 4, 8
 #: Rounds of the discs' radius and the poses; a radius given may differ by this factor from what the images show: print and
 #: lens widen or narrow what is dark.
 _RADIUS_ROUNDS, _RADIUS_RATIO = 2, 1.1
-#: Rounds of skew and cameras in turns; the skew has settled where it changes by less than this share of its sigma. In the
-#: first rounds only the relative pose of the cameras is adjusted.
+#: Rounds of skew and cameras, alternately; the skew has settled where it changes by less than this share of its sigma.
+#: In the first rounds only the relative pose of the cameras is adjusted.
 _SKEW_ROUNDS, _SETTLED, _POSE_ROUNDS = 40, 0.03, 2
 #: Least sigma of a detection meanwhile, px: with a smaller one the robust loss would give up on shots that move far. What
 #: the detections scatter by is measured.
@@ -586,8 +586,8 @@ def calibrate_recording(
 ) -> Calibration:
     """Calibrate two cameras that may expose at different times, from a recording of a board that moves.
 
-    Skew and cameras are estimated in turns (:mod:`armsight.vision.shutter`), then every detection is moved to the time of
-    its left image, and the pairs are calibrated as simultaneous ones. Alternating leaves the sigma of the skew at given
+    Skew and cameras are estimated alternately (:mod:`armsight.vision.shutter`), then every detection is moved to the time
+    of its left image, and the pairs are calibrated as simultaneous ones. Alternating leaves the sigma of the skew at given
     cameras; with rho its correlation with them an error shrinks by rho^2 each round, so the sigma of both together is
     that over sqrt(1 - shrinkage).
 
@@ -609,41 +609,38 @@ def calibrate_recording(
         CalibrationError: fewer than three usable pairs, or views that do not determine the cameras.
         InputError: the times do not rise.
     """
-    given, several = _spread(pairs), tuple(m for m in ("brown4", "fisheye") if m in models) or models[:1]
+    seen = [pair for pair in pairs if min(len(pair.left.ids), len(pair.right.ids)) >= LEAST_CORNERS]
+    _enough(len(seen), len(pairs), _usable(pairs)[1])
+    given, several = _spread(seen), tuple(m for m in ("brown4", "fisheye") if m in models) or models[:1]
     first = calibrate_boards(
         board, given, sizes, models=several, flat=flat, folds=2, singles=singles, progress=progress
     )
     progress("looking for the skew of the cameras")
     found = _Recording(board, tuple(pairs), t_s, first, not singles).one_time()
+    shutters = None
     if isinstance(found, Missed):
         said = f"no skew of the cameras is taken into account: {found.reason}"
-        moved, dropped, shutters = given, len(pairs) - len(given), None
     else:
         shutters, moved = found
+        given = _spread(moved)
         said = f"the cameras do not expose at one time: {shutters}; the detections were moved to one time"
-        dropped = len(moved) - len(moved := _spread(moved))
     calibration = calibrate_boards(
-        board, moved, sizes, models=models, flat=flat, folds=folds, singles=singles, progress=progress
+        board, given, sizes, models=models, flat=flat, folds=folds, singles=singles, progress=progress
     )
-    notes = [said] + ([f"{len(moved)} pairs spread over the recording were used"] if dropped else [])
+    used = f"{len(seen)} of {len(pairs)} shots show the board to both cameras; {len(given)} were used"
     calibration = replace(
         calibration,
         rig=replace(calibration.rig, shutters=shutters),
-        pairs_found=len(pairs),
-        notes=(*calibration.notes, *notes),
+        notes=(*calibration.notes, used, said),
         recorded=True,
     )
     return replace(calibration, weaknesses=weaknesses(calibration))
 
 
 def _spread(pairs: Sequence[Pair]) -> list[Pair]:
-    """Return at most _PAIRS_MOST pairs in which both cameras see the board, evenly spread; all where there are few."""
-    if len(pairs) <= _PAIRS_MOST:
-        return list(pairs)
-    seen = [pair for pair in pairs if min(len(pair.left.ids), len(pair.right.ids)) >= LEAST_CORNERS]
-    if len(seen) <= _PAIRS_MOST:
-        return seen
-    return [seen[k] for k in np.linspace(0, len(seen) - 1, _PAIRS_MOST).round().astype(int)]
+    """Return at most _PAIRS_MOST pairs, evenly spread."""
+    count = min(len(pairs), _PAIRS_MOST)
+    return [pairs[k] for k in np.linspace(0, len(pairs) - 1, count).round().astype(int)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -667,25 +664,25 @@ class _Recording(Record):
         interval = float(np.median(np.diff(self.t_s))) if len(self.t_s) > 1 else 1.0
         later, steps = 0, [0.0]
         shots = self.shots(rig, later)
-        found: Shutters | Missed = Shutters(0.0, 0.0, np.zeros((2, 2)))
-        for turn in range(_SKEW_ROUNDS):
-            before = found
-            some = _busiest(shots)
-            found = estimate_shutters(rig, self.body, list(some.values()), known=before, sigma_most=np.inf)
-            if isinstance(found, Missed):
-                return found
-            steps.append(found.skew_s - before.skew_s)
+        found = Shutters(0.0, 0.0, np.zeros((2, 2)))
+        for step in range(_SKEW_ROUNDS):
+            some = list(_busiest(shots).values())
+            estimate = estimate_shutters(rig, self.body, some, known=found, sigma_most=np.inf)
+            if isinstance(estimate, Missed):
+                return estimate
+            steps.append(estimate.skew_s - found.skew_s)
+            found = estimate
             settled = abs(steps[-1]) < _SETTLED * found.sigmas[0]
             if abs(found.skew_s + later * interval) > _REPAIR * interval and not self.board.symmetries:
                 later = -round(found.skew_s / interval)
                 shots = self.shots(rig, later)
                 if abs(later) * 4 > len(self.pairs) or len(shots) < LEAST_PAIRS:
                     return Missed("the shots do not agree with one skew: are these recordings of one time?")
-            elif settled and turn > _POSE_ROUNDS:
+            elif settled and step > _POSE_ROUNDS:
                 break
             else:
                 rig = self.adjusted(
-                    rig, _busiest(shots), found, free_cameras=self.free_cameras and turn >= _POSE_ROUNDS
+                    rig, _busiest(shots), found, free_cameras=self.free_cameras and step >= _POSE_ROUNDS
                 )
         shutters = replace(found, cov=found.cov / (1.0 - _shrinkage(steps, float(found.sigmas[0]))))
         sigma = float(shutters.sigmas[0])

@@ -30,6 +30,7 @@ from armsight.data import Array, Ids, Record
 from armsight.kernels import kernel
 from armsight.vision.markers.crossing import (
     GREY,
+    LAGS,
     MOMENTS,
     PARAMETERS,
     ROOM,
@@ -198,6 +199,10 @@ OUTCOMES = (
     "low contrast",
     "does not look like a corner",
 )
+#: Fewer corners do not show what of their residuals is odd, nor how the noise of neighbouring pixels is correlated.
+_MANY = 8
+#: Least share of the noise's variance that is taken to move a corner where neighbours' noise is opposite.
+_EFFECTIVE = 0.5
 _KEPT, _BORDER, _DIVERGED, _MOVED, _FAINT, _MISFIT = range(6)
 
 
@@ -208,7 +213,8 @@ class CornerFits(Record):
     Attributes:
         models: (N, 10) the model's parameters: c (2), the angles of the edges' normals (2), squared blurs (2), a, b, k
             (2).
-        cov_uv: (N, 2, 2) covariance from each fit's own residuals, px^2.
+        cov_uv: (N, 2, 2) covariance from each fit's own residuals; from those of all, what part of them can move a corner,
+            and the correlation of neighbours, px^2.
         residual: (N,) standard deviation of the residuals at the edges, grey levels.
         outcome: (N,) index into OUTCOMES; 0 is kept.
     """
@@ -250,8 +256,11 @@ def _fit_one(
     w: Work,
     q: Array,
     L: Array,
+    origin: Array,
 ) -> int:
     """Fit one corner, from q where that is known, else from a given blur; q, w and L are left at the solution.
+
+    origin (2,) receives the pixel to which those of w are relative.
 
     Return the number of pixels near the edges that were fitted, or minus the outcome.
     """
@@ -285,7 +294,8 @@ def _fit_one(
         if n < _FEWEST or n + flat[0, 0] + flat[1, 0] < 3 * PARAMETERS:
             return -_DIVERGED
         fill_up(n, w)
-        if not fit_crossing(n, w, flat, np.rint(centre[0]), np.rint(centre[1]), q, sides, bow, L, STOP, SLIGHT):
+        origin[0], origin[1] = np.rint(centre[0]), np.rint(centre[1])
+        if not fit_crossing(n, w, flat, origin[0], origin[1], q, sides, bow, L, STOP, SLIGHT):
             return -_DIVERGED
         if np.hypot(q[0] - centre[0], q[1] - centre[1]) < RECENTRE_PX:
             break
@@ -294,7 +304,7 @@ def _fit_one(
 
 @kernel(
     "const u1[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8, b1, b1[::1], f8[:, ::1], f8[:, :, ::1], "
-    "f8[::1], i8[::1]",
+    "f8[:, :, ::1], f8[:, :, ::1], f8[::1], i8[::1]",
 )
 def _refine(
     image: NDArray[np.uint8],
@@ -306,18 +316,24 @@ def _refine(
     known: NDArray[np.bool_],
     models: Array,
     cov: Array,
+    noise: Array,
+    gains: Array,
     residual: Array,
     outcome: Ids,
 ) -> None:
     """Fit every corner; models (N, PARAMETERS) holds the starts of those that are known, and receives the solutions."""
     w, L, blur = np.zeros(WORK, np.float32), np.zeros((PARAMETERS, PARAMETERS)), START_BLUR_PX
+    origin = np.zeros(2)
     for i in range(uv0.shape[0]):
         q = models[i]
-        n = _fit_one(image, uv0[i], squares[i], bows[i], arm, rough, known[i], blur, w, q, L)
+        n = _fit_one(image, uv0[i], squares[i], bows[i], arm, rough, known[i], blur, w, q, L, origin)
         if n < 0:
             outcome[i] = -n
             continue
-        residual[i] = np.sqrt(rough_noise(n, w) if rough else edge_noise(n, w, L, cov[i]))
+        if rough:
+            residual[i] = np.sqrt(rough_noise(n, w))
+        else:
+            residual[i] = np.sqrt(edge_noise(n, w, L, q[:2] - origin, cov[i], noise, gains[i]))
         reach = reach_px(squares[i])
         moved = np.hypot(q[0] - uv0[i, 0], q[1] - uv0[i, 1])
         if not moved <= min(MOVED_SHARE / WINDOW_SHARE * reach, MOVED_MAX_PX):
@@ -410,5 +426,27 @@ def refine_corners(
     else:
         known, models = like.kept, np.array(like.models)
     cov, residual, outcome = np.zeros((n, 2, 2)), np.zeros(n), np.zeros(n, np.int64)
-    _refine(_pixels(image), uv, squares, bows, arm, rough, known, models, cov, residual, outcome)
+    noise, gains = np.zeros((3, LAGS + 1, 2 * LAGS + 1)), np.zeros((n, LAGS + 1, 2 * LAGS + 1))
+    _refine(_pixels(image), uv, squares, bows, arm, rough, known, models, cov, noise, gains, residual, outcome)
+    if not rough and n >= _MANY and residual.any():
+        variances = np.maximum(_effective(noise, gains), 1.0 / 12.0)
+        cov *= (variances / np.mean(residual[residual > 0] ** 2))[:, None, None]
     return CornerFits(models, cov, residual, outcome)
+
+
+def _effective(noise: Array, gains: Array) -> Array:
+    """Return the variance of white noise that would move each corner as far as the image's noise does, grey levels squared.
+
+    What the fits absorb of the noise lowers the residuals' products at all lags; white noise shows by how much.
+
+    Args:
+        noise: (3, LAGS + 1, 2 LAGS + 1) of all corners: products of odd residuals at each lag, their weights, and what
+            white noise of unit variance leaves of the products.
+        gains: (N, LAGS + 1, 2 LAGS + 1) autocorrelation of each corner's derivatives by grey levels.
+    """
+    both = np.full(gains.shape[1:], 2.0)  # each lag below the first row is that of two neighbours, above and below
+    both[0, :LAGS], both[0, LAGS] = 0.0, 1.0
+    found, white = both * noise[0::2] / np.maximum(noise[1], 1e-300)
+    least = _EFFECTIVE * found[0, LAGS] / max(white[0, LAGS], 1e-300)
+    seen, expected = (gains * found).sum(axis=(1, 2)), (gains * white).sum(axis=(1, 2))
+    return np.asarray(np.maximum(seen / np.maximum(expected, 0.1 * white[0, LAGS]), least))

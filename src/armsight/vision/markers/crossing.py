@@ -28,6 +28,8 @@ WORK = (5 + PARAMETERS) * ROOM
 #: Moments of the pixels of plain squares of one colour: n, x, y, xx, xy, yy, I, Ix, Iy, II.
 MOMENTS = 10
 _STEPS = 25
+#: Neighbours up to so many pixels away have correlated noise; pixels of a window are at most so far from its origin.
+LAGS, REACH = 3, 20
 _LAMBDA = 1e-3
 _BLUR2_MIN = 0.03  # px^2; below it a pixel's width hides the blur, and the cost gets kinks
 #: Weak prior on a squared blur, mean and sigma, px^2, as strong as one pixel with a noise of one grey level. It acts
@@ -261,11 +263,26 @@ def rough_noise(n: int, w: Work) -> float:
 
 
 @kernel(fastmath=True)
-def edge_noise(n: int, w: Work, L: Array, cov: Array) -> float:
-    """Return the variance of the noise and fill cov (2, 2), the covariance of the corner; derivatives are overwritten.
+def edge_noise(n: int, w: Work, L: Array, middle: Array, cov: Array, noise: Array, gain: Array) -> float:
+    """Return the variance of the residuals and fill cov (2, 2), the covariance of the corner; derivatives are overwritten.
 
     The noise is that of the pixels that determine the corner, as in ``normal.edge_noise``. Leverage is the squared
     length of L^-1 times a pixel's derivatives, so its weighted sum needs only the weighted products of the derivatives.
+
+    An X corner has a point symmetry: what a camera's processing does to both sides alike (the halo of sharpening, a tone
+    curve) is even under reflection in the corner and cannot move it, for the derivatives by its position are odd. The noise
+    that moves it is the odd part of the residuals, (r(d) - r(-d)) / 2, which has half of white noise's variance.
+
+    Args:
+        n: number of pixels near the edges.
+        w: their columns, rows, grey levels, derivatives and residuals.
+        L: (PARAMETERS, PARAMETERS) Cholesky factor of the normal equations.
+        middle: (2,) the corner, as the pixels relative to the window's origin.
+        cov: (2, 2) receives the covariance for white noise of the residuals' variance.
+        noise: (3, LAGS + 1, 2 LAGS + 1) to whose first part the weighted products of odd residuals at lags (row, column)
+            are added, to the second the weights, to the third the products that white noise of unit variance leaves
+            after the fit.
+        gain: (LAGS + 1, 2 LAGS + 1) receives the autocorrelation of the corner's derivatives by grey levels, 1 at lag 0.
     """
     H, inverse = np.empty((PARAMETERS + 2, PARAMETERS + 2)), np.zeros((PARAMETERS, PARAMETERS))
     for j in range(PARAMETERS):
@@ -275,6 +292,12 @@ def edge_noise(n: int, w: Work, L: Array, cov: Array) -> float:
             for m in range(j, i):
                 s -= L[i, m] * inverse[m, j]
             inverse[i, j] = s * L[i, i]
+    A = np.zeros((PARAMETERS, PARAMETERS))
+    for i in range(PARAMETERS):
+        for j in range(PARAMETERS):
+            for m in range(max(i, j), PARAMETERS):
+                A[i, j] += inverse[m, i] * inverse[m, j]
+    _odd_noise(n, w, A, middle, noise, gain)
     n = (n + SIMD_WIDTH - 1) // SIMD_WIDTH * SIMD_WIDTH  # derivatives and residuals are zero to the end of a vector
     jx, jy, root = w[JACOBIAN : JACOBIAN + n], w[JACOBIAN + ROOM : JACOBIAN + ROOM + n], w[:n]
     weight = np.float32(0.0)
@@ -291,15 +314,58 @@ def edge_noise(n: int, w: Work, L: Array, cov: Array) -> float:
     leverage = 0.0
     for i in range(PARAMETERS):
         for j in range(i + 1):
-            s = 0.5 * inverse[i, j] * H[j, j]
-            for k in range(j):
-                s += inverse[i, k] * H[j, k]
-            leverage += 2.0 * inverse[i, j] * s
+            leverage += (2.0 if j < i else 1.0) * A[i, j] * H[i, j]
     variance = max(H[PARAMETERS, PARAMETERS] / (float(weight) - leverage), 1.0 / 12.0)
     for i in range(2):
         for j in range(2):
-            s = 0.0
-            for m in range(PARAMETERS):
-                s += inverse[m, i] * inverse[m, j]
-            cov[i, j] = variance * s
+            cov[i, j] = variance * A[i, j]
     return float(variance)
+
+
+@kernel(fastmath=True)
+def _odd_noise(n: int, w: Work, A: Array, middle: Array, noise: Array, gain: Array) -> None:
+    """Add to ``noise`` and fill ``gain`` as in :func:`edge_noise`; A (PARAMETERS, PARAMETERS) inverts the normal matrix.
+
+    A pixel's partner is the one nearest to its reflection. With S the projection on odd fields and P that on the
+    derivatives by the odd parameters (position and gradient), the odd residuals of white noise have covariance S - P.
+    """
+    at = np.full((2 * REACH + 1, 2 * REACH + 1), -1, np.int64)
+    for i in range(n):
+        x, y = int(w[i]) + REACH, int(w[Y + i]) + REACH
+        if 0 <= x <= 2 * REACH and 0 <= y <= 2 * REACH:
+            at[y, x] = i
+    x2, y2 = int(np.rint(2.0 * middle[0])), int(np.rint(2.0 * middle[1]))
+    odd, root, g, partner = np.zeros(n), np.zeros(n), np.zeros((4, n)), np.full(n, -1, np.int64)
+    for i in range(n):
+        for a in range(4):
+            for m in range(PARAMETERS):
+                g[a, i] += A[a if a < 2 else PARAMETERS - 4 + a, m] * w[JACOBIAN + m * ROOM + i]
+        x, y = x2 - int(w[i]) + REACH, y2 - int(w[Y + i]) + REACH
+        if not (0 <= x <= 2 * REACH and 0 <= y <= 2 * REACH) or at[y, x] < 0:
+            continue
+        partner[i] = at[y, x]
+        odd[i] = 0.5 * (w[RESIDUAL + i] - w[RESIDUAL + at[y, x]])
+        root[i] = np.sqrt(w[JACOBIAN + i] ** 2 + w[JACOBIAN + ROOM + i] ** 2)
+    for dy in range(LAGS + 1):
+        for dx in range(-LAGS, LAGS + 1):
+            found, weights, white, gains = 0.0, 0.0, 0.0, 0.0
+            for i in range(n):
+                x, y = int(w[i]) + REACH + dx, int(w[Y + i]) + REACH + dy
+                if not (0 <= x <= 2 * REACH and 0 <= y <= 2 * REACH):
+                    continue
+                j = at[y, x]
+                if j < 0:
+                    continue
+                gains += g[0, i] * g[0, j] + g[1, i] * g[1, j]
+                both = root[i] * root[j]
+                expected = 0.5 * (i == j) - 0.5 * (j == partner[i])
+                for a in range(4):
+                    expected -= w[JACOBIAN + (a if a < 2 else PARAMETERS - 4 + a) * ROOM + i] * g[a, j]
+                found += both * odd[i] * odd[j]
+                weights += both
+                white += both * expected
+            noise[0, dy, LAGS + dx] += found
+            noise[1, dy, LAGS + dx] += weights
+            noise[2, dy, LAGS + dx] += white
+            gain[dy, LAGS + dx] = gains
+    gain /= max(gain[0, LAGS], 1e-300)
