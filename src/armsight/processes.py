@@ -16,12 +16,13 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import IO, Any
 
 from armsight.errors import ArmsightError
 
 _SERVE = "from armsight.processes import serve; serve()"
-_PIPE_BYTES = 1 << 20  # an image passes at once, where the system allows it
+_PIPE_BYTES = 1 << 20  # an image passes at once
 _SMALL_BYTES = 1 << 14
 _LENGTH = struct.Struct("<q")
 
@@ -38,11 +39,12 @@ class Process:
 
     def __init__(self, make: Callable[..., Callable[..., Any]], *arguments: object) -> None:
         command = [sys.executable, "-P", "-c", _SERVE]
-        self._child = subprocess.Popen(
-            command, bufsize=0, pipesize=_PIPE_BYTES, stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
+        self._child = subprocess.Popen(command, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self._lock = threading.Lock()
         assert self._child.stdin is not None
+        assert self._child.stdout is not None
+        for pipe in (self._child.stdin, self._child.stdout):
+            _widen(pipe)
         _send(self._child.stdin, (make, arguments))
 
     def __call__(self, *arguments: object) -> Any:  # noqa: ANN401 - what the function returns
@@ -113,6 +115,14 @@ def serve() -> None:
             _send(answers, answer)
         except OSError:
             return
+
+
+def _widen(pipe: IO[bytes]) -> None:
+    """Make a pipe hold an image, where the system knows how and its user may; smaller ones serve as well."""
+    with suppress(ImportError, AttributeError, OSError):
+        import fcntl
+
+        fcntl.fcntl(pipe.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
 
 
 def _send(pipe: IO[bytes], content: object) -> None:
