@@ -78,10 +78,10 @@ def test_errors_are_red_on_a_terminal_without_no_color():
     ("module", "arguments", "extra"),
     [
         ("mujoco", ("demo", "--quick"), "sim"),
-        ("matplotlib.figure", ("demo",), "report"),
+        ("matplotlib", ("demo",), "sim"),
         ("matplotlib.figure", ("check", "a.csv", "-o", "a"), "report"),
         ("matplotlib.figure", ("arm", "show", "six_r", "-o", "a.png"), "report"),
-        ("pyarrow", ("demo",), "run"),
+        ("pyarrow", ("demo",), "sim"),
         ("serial", ("board", "monitor", "--board", "serial:/dev/none"), "board"),
         ("unicorn", ("board", "monitor", "--board", "emulated:unicorn"), "board"),
         ("distributed", ("batch", "measure", "*.bag", "-o", "out"), "batch"),

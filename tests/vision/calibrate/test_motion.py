@@ -69,7 +69,7 @@ def test_boards_that_stood_still_have_no_motion():
 
 
 def test_a_rippled_lens_is_not_called_unsynchronised():
-    true, board, Ts = rig_and_board(count=12)
+    true, board, Ts = rig_and_board(count=16)
 
     def rippled(side, found):
         angle = 2 * np.pi * (found.uv / SIZES[side]) @ [1.2, 0.9] + 0.4 + side
@@ -77,7 +77,7 @@ def test_a_rippled_lens_is_not_called_unsynchronised():
 
     pairs = [
         replace(p, left=rippled(0, p.left), right=rippled(1, p.right))
-        for p in unsynchronised(true, board, Ts, np.zeros((12, 6)))
+        for p in unsynchronised(true, board, Ts, np.zeros((16, 6)))
     ]
     c = calibrate_boards(board, pairs, SIZES, models=("brown5",), folds=2, flat=True)
     assert c.motion is not None  # which fits as far as a motion can
