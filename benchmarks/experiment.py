@@ -7,6 +7,7 @@ python experiment.py 3          three of them
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -38,22 +39,28 @@ METRICS = {
 }
 
 
+def run(seed: int, quick: bool, found: dict[str, list[float]]) -> None:
+    """Run a seed and add its metrics."""
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        s = run_demo(Demo(Path(folder), seed=seed, quick=quick)).to_json()
+    for name, (part, key, factor, _, _) in METRICS.items():
+        found[name].append(factor * s[part][key])
+    c = s["closed_loop"]
+    found["vision, RMS over sigma"].append(s["vision"]["position_rms_m"] / s["vision"]["position_sigma_rms_m"])
+    found["rest, times smaller"].append(c["rest_error_before_m"] / c["rest_error_after_m"])
+    found["path, times smaller"].append(c["path_error_before_m"] / c["path_error_after_m"])
+    print(f"seed {seed}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
+
+
 def main(seeds: int, quick: bool) -> None:
     """Run and print."""
     found: dict[str, list[float]] = {
         name: [] for name in (*METRICS, "vision, RMS over sigma", "rest, times smaller", "path, times smaller")
     }
-    for seed in range(seeds):
-        began = time.perf_counter()
-        with tempfile.TemporaryDirectory() as folder:
-            s = run_demo(Demo(Path(folder), seed=seed, quick=quick)).to_json()
-        for name, (part, key, factor, _, _) in METRICS.items():
-            found[name].append(factor * s[part][key])
-        c = s["closed_loop"]
-        found["vision, RMS over sigma"].append(s["vision"]["position_rms_m"] / s["vision"]["position_sigma_rms_m"])
-        found["rest, times smaller"].append(c["rest_error_before_m"] / c["rest_error_after_m"])
-        found["path, times smaller"].append(c["path_error_before_m"] / c["path_error_after_m"])
-        print(f"seed {seed}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
+    with suppress(KeyboardInterrupt):  # what was measured until then is printed
+        for seed in range(seeds):
+            run(seed, quick, found)
     print(f"{'':34s} {'median':>8s} {'least':>8s} {'most':>8s}  required at most")
     for name, values in found.items():
         unit, most = METRICS[name][3:] if name in METRICS else ("", None)
