@@ -27,6 +27,8 @@ from armsight.vision.markers.spec import Fields
 SEARCH_SIDE_PX = 1600
 #: OpenCV's finders raise errors on images smaller than their filters.
 IMAGE_SIDE_MIN_PX = 32
+#: A chessboard of another size is named only if it has at least this many inner corners a side: fewer may be a part.
+OTHER_SIDE_MIN = 4
 #: Fewer corners than this share of the board do not count as the board.
 KEPT_SHARE = 0.5
 #: A board is larger than its spec if at least this share of a further row consists of corners too.
@@ -95,7 +97,9 @@ class Chessboard(Record, Target):
         """Find the board in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
         rough = find_grid(image, self.columns, self.rows)
         if rough is None:
-            return Detections.none(f"no chessboard of {self.columns}x{self.rows} inner corners found")
+            return Detections.none(
+                f"no chessboard of {self.columns}x{self.rows} inner corners found{_other_size(image)}"
+            )
         fits = fit_grid(image, rough)
         colours = np.sign(fits.contrast * self._parity)
         first = np.sign(colours[fits.kept].sum())  # -1 where the first square is dark
@@ -142,8 +146,7 @@ def find_grid(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None
     """
     if min(image.shape) < IMAGE_SIDE_MIN_PX:
         return None
-    scale = min(1.0, SEARCH_SIDE_PX / max(image.shape))
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
+    small, scale = _search_copy(image)
     size, flags = (columns, rows), cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     found, corners = cv2.findChessboardCorners(small, size, flags=flags)
     if not found:
@@ -156,6 +159,26 @@ def find_grid(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None
     uv = (corners.reshape(rows, columns, 2).astype(np.float64) + 0.5) / scale - 0.5
     across, down = (uv[0, -1] - uv[0, 0]).tolist(), (uv[-1, 0] - uv[0, 0]).tolist()
     return uv if across[0] * down[1] - across[1] * down[0] > 0 else np.ascontiguousarray(uv[:, ::-1])
+
+
+def _other_size(image: NDArray[np.uint8]) -> str:
+    """Return ", but one of 9x6" where an image shows a chessboard of that size, else an empty text."""
+    if min(image.shape) < IMAGE_SIDE_MIN_PX:
+        return ""
+    small, _ = _search_copy(image)
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+    found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags=flags)
+    if not found or min(meta.shape) < OTHER_SIDE_MIN:
+        return ""
+    return f", but one of {max(meta.shape)}x{min(meta.shape)}"
+
+
+def _search_copy(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
+    """Return the copy of an image in which a board is looked for first, and its scale."""
+    scale = min(1.0, SEARCH_SIDE_PX / max(image.shape))
+    if scale == 1.0:
+        return image, scale
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), scale  # type: ignore[return-value]
 
 
 def fit_grid(image: NDArray[np.uint8], rough: Array, arm: float = 1.0) -> CornerFits:
