@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -127,6 +128,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
                 publisher=file,
                 follow_rig=demo.follow_rig,
             )
+        workcell.source.close()  # its processes hold 300 MB
         studies: list[Study] = []
         try:
             if demo.model == DEFAULT_ARM:
@@ -134,7 +136,6 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
         except (ArmsightError, KeyboardInterrupt) as error:  # the run itself is complete, and is written
             outcome.interrupted = isinstance(error, KeyboardInterrupt)
             outcome.ended_by = error if isinstance(error, ArmsightError) else None
-        workcell.source.close()  # its processes hold 300 MB
         progress("plotting")
         of_run = {
             "seed": demo.seed,
@@ -257,5 +258,15 @@ def _studies(
     def at_rate(rate_hz: float) -> Workcell:
         return _workcell(demo, cameras_at(cameras, rate_hz), workcell)
 
-    found = vision_studies(seed=demo.seed, shots=shots, progress=progress)
-    return [*found, rate_study(at_rate, setup_of, calibration.rig, outcome, plan, progress)]
+    # The rate's loops are mostly Python, which runs one at a time in a process: those of vision take the other core.
+    with (
+        contextlib.closing(Process(caller, "armsight.app.demo.studies")) as other,
+        ThreadPoolExecutor(1) as beside,
+    ):
+        of_vision = beside.submit(other, partial(vision_studies, seed=demo.seed, shots=shots))
+        try:
+            of_rate = rate_study(at_rate, setup_of, calibration.rig, outcome, plan, progress)
+            progress("studies of vision")
+            return [*of_vision.result(), of_rate]
+        finally:  # after an interrupt nobody waits for what it computes
+            other.kill()
