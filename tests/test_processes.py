@@ -2,6 +2,8 @@
 
 import operator
 import os
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -48,4 +50,15 @@ def test_a_child_that_ended_is_an_error():
         process(os._exit, 3)
     with pytest.raises(ArmsightError, match="has ended"):
         process(abs, -1)
+    process.close()
+
+
+def test_a_call_that_nobody_waits_for_any_more_is_ended():
+    process = Process(caller)
+    assert process(abs, -1) == 1
+    with ThreadPoolExecutor(1) as beside:
+        called = beside.submit(process, time.sleep, 600.0)
+        process.kill()
+        with pytest.raises(ArmsightError, match="has ended"):
+            called.result()
     process.close()

@@ -66,6 +66,10 @@ class Process:
             raise result
         return result
 
+    def kill(self) -> None:
+        """End the child at once, also in the middle of a call, which raises then; :meth:`close` it afterwards."""
+        self._child.kill()
+
     def close(self) -> None:
         """End the child; harmless when called twice."""
         with self._lock:

@@ -1,5 +1,6 @@
 """A rendered recording with truth, made and calibrated once for all tests of the command line."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +13,9 @@ from made_once import made_once
 
 
 @pytest.fixture
-def armsight(capsys):
-    """Run the command line; returns a :class:`Said`."""
+def armsight(capsys, monkeypatch):
+    """Run the command line, which does not say how far it is; returns a :class:`Said`."""
+    monkeypatch.setattr("armsight.app.progress._EVERY_S", math.inf)
 
     def said(*arguments):
         capsys.readouterr()

@@ -1,20 +1,46 @@
-"""Progress on stderr: a bar where that is a terminal, nothing elsewhere."""
+"""Progress on stderr: a bar where that is a terminal, a line every few seconds elsewhere."""
 
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
 
+import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+_EVERY_S = 5.0
+
+
+def _lines() -> Callable[[str], None]:
+    """Return a function that prints a line if a few seconds have passed since the last one, or since the beginning."""
+    last_s = time.monotonic()
+
+    def say(line: str) -> None:
+        nonlocal last_s
+        if time.monotonic() - last_s >= _EVERY_S:
+            last_s = time.monotonic()
+            click.echo(line, err=True)
+
+    return say
 
 
 @contextlib.contextmanager
 def bar(what: str, total: int | None) -> Iterator[Callable[[], None]]:
     """Show a progress bar; the block is given a function that advances it by one."""
-    console = Console(stderr=True)
+    console, say, done = Console(stderr=True), _lines(), 0
+
+    def one_more() -> None:
+        nonlocal done
+        done += 1
+        say(f"{what}: {done}" if total is None else f"{what}: {done} of {total}")
+
+    if not console.is_terminal:
+        yield one_more
+        return
     columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+    with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task(what, total=total)
         yield lambda: progress.advance(task)
 
@@ -23,7 +49,10 @@ def bar(what: str, total: int | None) -> Iterator[Callable[[], None]]:
 def steps() -> Iterator[Callable[[str], None]]:
     """Show what is being done; the block is given a function that sets the line."""
     console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines()
+        return
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+    with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("", total=None)
         yield lambda line: progress.update(task, description=line)

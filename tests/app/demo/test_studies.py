@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from armsight.app.demo import studies
+from armsight.app.demo import demo, studies
+from armsight.app.demo.demo import Demo
 from armsight.app.demo.studies import vision_studies
 from armsight.data import Missed, PoseEstimate
 from armsight.geometry.pose import pose
@@ -118,3 +119,22 @@ def test_rendered_shots_are_measured_as_well_as_predicted():
         assert (np.sign(POWERS[study.name]) * np.diff(study.predicted_m) > 0).all()
         # One shot: |error|^2 is at most chi-square of three degrees of freedom, 5.54^2 in 1 of 1e6, times the variance.
         assert (study.position_rms_m < 5.54 * study.predicted_m).all()
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_vision_is_studied_in_a_process_beside_the_rates(monkeypatch, tmp_path, interrupted):
+    def rate_study(*given):
+        if interrupted:
+            raise KeyboardInterrupt
+        return "rate"
+
+    monkeypatch.setattr(demo, "vision_studies", dict)  # returns what it is asked for
+    monkeypatch.setattr(demo, "rate_study", rate_study)
+    whole = SimpleNamespace(closed_s=(0.0, 1.0), ended_by=None, interrupted=False)
+    rig = SimpleNamespace(rig=None)
+    given = (Demo(tmp_path, seed=3), "1280x720@60", None, rig, whole, None, 8, lambda line: None)
+    if interrupted:
+        with pytest.raises(KeyboardInterrupt):
+            demo._studies(*given)
+    else:
+        assert demo._studies(*given) == ["seed", "shots", "rate"]

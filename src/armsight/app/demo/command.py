@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 from pathlib import Path
 
@@ -93,6 +94,7 @@ def command(
     from armsight.app.run.summary import print_summary
     from armsight.robot.arm_file import open_arm
 
+    gc.freeze()  # what was imported stays: no collection has to look at it
     nominal = None if nominal_arm is None else open_arm(nominal_arm)
     demo = Demo(output, arm, cameras, seed, emulator, layout, model, quick, nominal, nominal_arm, follow_rig, sync_led)
     try:

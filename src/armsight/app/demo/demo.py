@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +27,7 @@ from armsight.app.run.setup import setup_of
 from armsight.app.run.summary import RunSummary
 from armsight.app.stream.datum import Published
 from armsight.app.stream.mcap_file import LazyMcap, properties
-from armsight.data import Array
+from armsight.data import Array, Shot
 from armsight.errors import ArmsightError
 from armsight.files import write_text
 from armsight.geometry.pose import inverse
@@ -97,13 +100,16 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
     open_folder(demo.folder)
     progress("building the workcell")
     cameras = demo.cameras or (_SLOW_CAMERAS if demo.model in CONTROLLED else _CAMERAS)
-    with _workcell(demo, cameras) as workcell, contextlib.closing(Process(caller, *_SECOND)) as second:
+    with _workcell(demo, cameras) as workcell, contextlib.ExitStack() as ended:
         motion = _motion_text(demo, workcell)
         make_room(demo.folder)
         write_text(demo.folder / "motion.toml", motion)
         plan = read_motions(workcell.model, demo.folder / "motion.toml")
         progress("rendering the calibration target")
-        calibration = calibrated(workcell.chessboard_spec, workcell.chessboard_shots(pairs), progress, second)
+        shots = _ahead(workcell.chessboard_shots(pairs))
+        first = next(shots)  # begun before, the second process would take a core from those that render it
+        second = ended.enter_context(contextlib.closing(Process(caller, *_SECOND)))
+        calibration = calibrated(workcell.chessboard_spec, chain([first], shots), progress, second)
         calibration.rig.save(demo.folder / "rig.json")
         write_text(demo.folder / "body.toml", workcell.body_text)
         poses = np.vstack([workcell.model.home, workcell.poses])
@@ -122,6 +128,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
                 publisher=file,
                 follow_rig=demo.follow_rig,
             )
+        workcell.source.close()  # its processes hold 300 MB
         studies: list[Study] = []
         try:
             if demo.model == DEFAULT_ARM:
@@ -129,7 +136,6 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
         except (ArmsightError, KeyboardInterrupt) as error:  # the run itself is complete, and is written
             outcome.interrupted = isinstance(error, KeyboardInterrupt)
             outcome.ended_by = error if isinstance(error, ArmsightError) else None
-        workcell.source.close()  # its processes hold 300 MB
         progress("plotting")
         of_run = {
             "seed": demo.seed,
@@ -146,6 +152,16 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
                 workcell.model, calibration.rig, outcome, plan, truth, of_run, began, studies, overview.result, second
             )
             return finish(finished, demo.folder)
+
+
+def _ahead(shots: Iterator[Shot]) -> Iterator[Shot]:
+    """Yield shots, and render the next one while what is done with one is done."""
+    with ThreadPoolExecutor(1) as beside:
+        shot = next(shots, None)
+        while shot is not None:
+            begun = beside.submit(next, shots, None)
+            yield shot
+            shot = begun.result()
 
 
 def _motion_text(demo: Demo, workcell: Workcell) -> str:
@@ -242,5 +258,15 @@ def _studies(
     def at_rate(rate_hz: float) -> Workcell:
         return _workcell(demo, cameras_at(cameras, rate_hz), workcell)
 
-    found = vision_studies(seed=demo.seed, shots=shots, progress=progress)
-    return [*found, rate_study(at_rate, setup_of, calibration.rig, outcome, plan, progress)]
+    # The rate's loops are mostly Python, which runs one at a time in a process: those of vision take the other core.
+    with (
+        contextlib.closing(Process(caller, "armsight.app.demo.studies")) as other,
+        ThreadPoolExecutor(1) as beside,
+    ):
+        of_vision = beside.submit(other, partial(vision_studies, seed=demo.seed, shots=shots))
+        try:
+            of_rate = rate_study(at_rate, setup_of, calibration.rig, outcome, plan, progress)
+            progress("studies of vision")
+            return [*of_vision.result(), of_rate]
+        finally:  # after an interrupt nobody waits for what it computes
+            other.kill()

@@ -34,7 +34,7 @@ from armsight.app.run.experiment import RunResult
 from armsight.app.run.metrics import Study
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import Log, RunData, ToolTrack, assembled, cut, joints_of, write_columns, write_track
-from armsight.app.run.report import NAMES, RunReport, write_run_report
+from armsight.app.run.report import NAMES, Beside, RunReport, drawn_beside, write_run_report
 from armsight.app.run.summary import RunSummary, summary_of
 from armsight.app.stream.mcap_file import RUN_MCAP
 from armsight.data import Array, Correspondences, Image, Missed, PoseEstimate, Shot
@@ -220,18 +220,23 @@ def write_run(finished: Finished, folder: Path) -> RunSummary:
         KeyboardInterrupt: the keyboard interrupted the writing.
     """
     with uninterrupted() as came:
-        summary, report = _write_measured(finished, folder)
+        summary, report, beside = _write_measured(finished, folder)
     if came:
         raise KeyboardInterrupt
     if report is not None:
-        write_run_report(report, folder, finished.second)
+        write_run_report(report, folder, beside)
         summary = replace(summary, wall_s=_wall_s(finished))  # with the time that plotting took
         _write_summary(folder, summary)
     return summary
 
 
-def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunReport | None]:
-    """Write the tables and the summary; return the summary, and the contents of the report if there is enough for one."""
+def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunReport | None, Beside | None]:
+    """Write the tables and the summary.
+
+    Returns:
+        The summary; the contents of the report, if there is enough for one; what waits for the figures that the second
+        process draws meanwhile.
+    """
     outcome, wall_s = finished.outcome, _wall_s(finished)
     with _as_much_as_fits() as keep:
         keep(write_text, folder / "poses.csv", csv_text(_shot_poses(finished)))
@@ -255,26 +260,28 @@ def _write_measured(finished: Finished, folder: Path) -> tuple[RunSummary, RunRe
                 sync_led=None if outcome.led is None else outcome.led.to_json(),
             )
             keep(_write_summary, folder, summary)
-            return summary, None
+            return summary, None, None
         keep(write_handeye, folder, outcome.handeye, outcome.log.mountings)
         if outcome.shutters is not None:
             keep(replace(finished.rig, shutters=outcome.shutters).save, folder / "rig.json")
         mounting = outcome.handeye.mounting
         run = assembled(outcome.log, finished.arm, mounting, outcome.delay, finished.truth, outcome.changes)
-        keep(write_columns, folder, "joints", joint_columns(run.t_s, run.q, run.q_ref))
-        for name, track in _tracks(run).items():
-            keep(write_track, folder, name, track)
         before, after = (None if span is None else cut(run, *span) for span in (outcome.open_s, outcome.closed_s))
         summary = summary_of(
             finished.arm, outcome, finished.plan, run, before, after, finished.studies, finished.properties, wall_s
         )
         notes = _notes(finished, run)
+        shown = run if outcome.open_s is None else cut(run, outcome.open_s[0], run.t_s[-1])
+        report = RunReport(summary, shown, before, after, _picture(finished), None, notes)
+        beside = None if finished.second is None else drawn_beside(report, finished.second)
+        keep(write_columns, folder, "joints", joint_columns(run.t_s, run.q, run.q_ref))
+        for name, track in _tracks(run).items():
+            keep(write_track, folder, name, track)
         keep(_write_summary, folder, summary)
         keep(write_text, folder / "run.log", "\n".join([*notes, *_segment_lines(run)]) + "\n")
         keep(write_shots, folder / _SHOTS, outcome.kept)
-    shown = run if outcome.open_s is None else cut(run, outcome.open_s[0], run.t_s[-1])
     overview = None if finished.overview is None else finished.overview()
-    return summary, RunReport(summary, shown, before, after, _picture(finished), overview, notes)
+    return summary, replace(report, workcell=overview), beside
 
 
 @contextlib.contextmanager

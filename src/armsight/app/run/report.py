@@ -337,6 +337,11 @@ _BOX = '<div class="zoom" style="overflow:hidden;cursor:grab;touch-action:none">
 _ZOOMED = 'style="transform-origin:0 0" draggable="false"'
 
 
+#: Figures by name, as PNG and as SVG; and what waits for some of them.
+_Files = dict[str, tuple[bytes, bytes | None]]
+Beside = Callable[[], _Files]
+
+
 @dataclass(frozen=True)
 class RunReport:
     """The contents of a report.
@@ -360,13 +365,13 @@ class RunReport:
     notes: Sequence[str]
 
 
-def write_run_report(report: RunReport, folder: Path, second: Callable[..., Any] | None = None) -> Path:
+def write_run_report(report: RunReport, folder: Path, beside: Beside | None = None) -> Path:
     """Write the page and its PNGs.
 
     Args:
         report: the contents.
         folder: of the run.
-        second: calls a function in another process, which draws about half of the figures; None without one.
+        beside: waits for the figures that :func:`drawn_beside` has begun; None without one.
 
     Returns:
         The page, report.html.
@@ -380,22 +385,36 @@ def write_run_report(report: RunReport, folder: Path, second: Callable[..., Any]
         if image is not None:
             files[f"{name}.png"] = cv2.imencode(".png", image)[1].tobytes()
             embedded[name] = _box("png", files[f"{name}.png"], name)
-    for name, (pixels, lines) in _drawn(report, second).items():
+    for name, (pixels, lines) in _drawn(report, beside).items():
         files[f"{name}.png"] = pixels
         embedded[name] = "" if lines is None else _box("svg+xml", lines, name)
     put_files(folder, {**files, PAGE: _page(report, embedded).encode()})
     return folder / PAGE
 
 
-def _drawn(report: RunReport, second: Callable[..., Any] | None) -> dict[str, tuple[bytes, bytes | None]]:
-    """Return the figures by name, in their order: as PNG, and as SVG where the page shows them."""
-    if second is None:
-        return _files(report, NAMES)
+def drawn_beside(report: RunReport, second: Callable[..., Any]) -> Beside:
+    """Begin to draw about half of the figures in another process.
+
+    Args:
+        report: the contents; the picture of the workcell is not needed.
+        second: calls a function in that process.
+
+    Returns:
+        What waits for them.
+    """
     before, after = (None if run is None else _without_ways(run) for run in (report.before, report.after))
-    beside = replace(report, run=_without_ways(report.run), before=before, after=after, workcell=None, notes=())
-    with ThreadPoolExecutor(1) as pool:
-        others = pool.submit(second, _files, beside, _BESIDE)
-        found = _files(report, [name for name in NAMES if name not in _BESIDE]) | others.result()
+    shown = replace(report, run=_without_ways(report.run), before=before, after=after, workcell=None, notes=())
+    pool = ThreadPoolExecutor(1)
+    others = pool.submit(second, _files, shown, _BESIDE)
+    pool.shutdown(wait=False)
+    return others.result
+
+
+def _drawn(report: RunReport, beside: Beside | None) -> _Files:
+    """Return the figures by name, in their order: as PNG, and as SVG where the page shows them."""
+    if beside is None:
+        return _files(report, NAMES)
+    found = _files(report, [name for name in NAMES if name not in _BESIDE]) | beside()
     return {name: found[name] for name in NAMES if name in found}
 
 
@@ -404,9 +423,9 @@ def _without_ways(run: RunData) -> RunData:
     return replace(run, segments=tuple(replace(segment, trajectory=None) for segment in run.segments))
 
 
-def _files(report: RunReport, names: Sequence[str]) -> dict[str, tuple[bytes, bytes | None]]:
+def _files(report: RunReport, names: Sequence[str]) -> _Files:
     """Draw figures by their names; those that the run has nothing for are left out."""
-    found = dict[str, tuple[bytes, bytes | None]]()
+    found: _Files = {}
     with drawing():
         for name in names:
             figure = _figure(report, name)
