@@ -231,13 +231,13 @@ def _understood(path: Path, head: list[str], arm: Arm | None) -> tuple[list[str]
     """
     bare = [re.sub(r"\s*[\[(](mm|m|deg|rad|s)[\])]$", r"_\1", name.strip().strip('"').strip().lower()) for name in head]
     ros = [_ROS.fullmatch(name) for name in bare]
-    turned = {found[2] for found in ros if found and not found[1]}  # without w they are no quaternion
+    parts = {found[2] for found in ros if found and not found[1]}  # without w they are no quaternion
     links = {} if arm is None else {name.lower(): f"q{k}_rad" for k, name in enumerate(arm.joint_names, 1)}
     out = []
     for given, name, found in zip(head, bare, ros, strict=True):
         axis, mark, unit = name.partition("_")
         ours = _THEIRS.get(axis, axis) + mark + unit
-        if found and (found[1] or turned == set("xyzw")):
+        if found and (found[1] or parts == set("xyzw")):
             ours = f"{found[2]}_m" if found[1] else f"q{found[2]}"
         elif (joint := re.sub(r"_joint$", "", name)) in links:
             ours = links[joint]
