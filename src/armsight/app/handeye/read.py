@@ -125,7 +125,7 @@ def read_pose_table(
     if rotation is not None and rotation not in CONVENTIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
     head, rows = _cells(path, columns)
-    head, usual, notes = _understood(path, head, arm)
+    head, usual, notes = _understood(path, head, arm, unit or "mm")
     rotation = rotation or usual
     measured = set(head) >= _MEASURED
     rows, missed = _shown(path, head, rows) if measured else (rows, ("",) * len(rows))
@@ -222,8 +222,10 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
     return forms[len(head)], _even(path, rows, len(head))
 
 
-def _understood(path: Path, head: list[str], arm: Arm | None) -> tuple[list[str], str | None, tuple[str, ...]]:
-    """Return our names for those of ROS, of robots' makers and of spreadsheets.
+def _understood(
+    path: Path, head: list[str], arm: Arm | None, unit: str
+) -> tuple[list[str], str | None, tuple[str, ...]]:
+    """Return our names for those of ROS, of robots' makers, whose lengths are in a unit, and of spreadsheets.
 
     Returns:
         The names; the convention of the rotation that goes with them, None where there is none; and a note where something
@@ -245,17 +247,14 @@ def _understood(path: Path, head: list[str], arm: Arm | None) -> tuple[list[str]
     maker = next((m for m, angles in _MAKERS.items() if sorted(bare) == sorted(("x", "y", "z", *angles))), None)
     if maker is not None:
         of = dict(zip(_MAKERS[maker], ("rx_deg", "ry_deg", "rz_deg"), strict=True))
-        out = [of.get(name, f"{name}_mm") for name in bare]
+        out = [of.get(name, f"{name}_{unit}") for name in bare]
         said = ", ".join(f"{name.upper()} about {ours[1]}" for name, ours in of.items())
-        return out, "xyz", (f"{path}: read as {maker}'s: mm; degrees, {said}; --columns says otherwise",)
-    if any(name.startswith("roll") for name in bare):
-        return (
-            out,
-            "xyz",
-            (f"{path}: roll, pitch, yaw read as rotations about the fixed x, y and z; --rotation says otherwise",),
-        )
+        return out, "xyz", (f"{path}: read as {maker}'s: {unit}; degrees, {said}; --columns says otherwise",)
     if len(set(out)) < len(out):
         return head, None, ()
+    if any(name.startswith("roll") for name in bare):
+        note = f"{path}: roll, pitch, yaw read as rotations about the fixed x, y and z; --rotation says otherwise"
+        return out, "xyz", (note,)
     return out, None, ()
 
 
