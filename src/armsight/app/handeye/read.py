@@ -237,8 +237,8 @@ def _understood(
     links = {} if arm is None else {name.lower(): f"q{k}_rad" for k, name in enumerate(arm.joint_names, 1)}
     out = []
     for given, name, found in zip(head, bare, ros, strict=True):
-        axis, mark, unit = name.partition("_")
-        ours = _THEIRS.get(axis, axis) + mark + unit
+        axis, mark, rest = name.partition("_")
+        ours = _THEIRS.get(axis, axis) + mark + rest
         if found and (found[1] or parts == set("xyzw")):
             ours = f"{found[2]}_m" if found[1] else f"q{found[2]}"
         elif (joint := re.sub(r"_joint$", "", name)) in links:
