@@ -253,7 +253,7 @@ def ur3a(data: Path, work: Path) -> list[str]:
     rows = [f"cam1_{int(row.split(',')[0]):02d}.png{row[row.index(',') :]}" for row in rows]
     (work / "joints.csv").write_text("\n".join([names.replace("pose", "image"), *rows]))
     robot = ["--robot", work / "joints.csv", "--model", "ur3e", "--eye", "to-hand", "--rig", work / "rig.json"]
-    return [*robot, *pairs]
+    return [*robot, *pairs[:4], "--target", work / "rig.board.toml"]
 
 
 #: Recording -> its folder, its arguments, what is said of it, m, under which name, and its target, mm.

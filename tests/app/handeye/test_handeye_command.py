@@ -85,11 +85,34 @@ def table(tmp_path, form, A, q):
     if form == "joints":
         head = ",".join(f"q{i}_deg" for i in range(1, 7))
         return named(path, head, np.degrees(q)), ("--model", "six_r")
+    if form == "ros":
+        head = [f"pose.position.{axis}" for axis in "xyz"] + [f"pose.orientation.{axis}" for axis in "xyzw"]
+        return named(path, ",".join(["%time", *head]), np.hstack([np.arange(len(A))[:, None], p, angles.as_quat()])), ()
+    if form in ("KUKA", "Fanuc"):  # A, B, C rotate about z, y' and x''; W, P, R about the fixed x, y, z
+        order = angles.as_euler("ZYX" if form == "KUKA" else "xyz", degrees=True)
+        return named(path, "X,Y,Z,A,B,C" if form == "KUKA" else "X,Y,Z,W,P,R", np.hstack([1e3 * p, order])), ()
+    if form == "lists":
+        path.write_text("".join(f"{list(map(float, row))}\n" for row in np.hstack([p, angles.as_rotvec()])))
+        return path, ()
+    if form == "four lines":
+        np.savetxt(path, A.reshape(-1, 4))
+        return path, ()
+    if form == "units in brackets":
+        xyz = np.hstack([1e3 * p, angles.as_euler("xyz", degrees=True)])
+        return named(path, "X [mm],Y [mm],Z [mm],Roll [deg],Pitch [deg],Yaw [deg]", xyz), ()
+    if form == "names of joints":
+        arm = open_arm("six_r")
+        order = [2, 0, 1, 5, 4, 3]
+        return named(path, ",".join(arm.joint_names[k] for k in order), q[:, order]), ("--model", "six_r")
     return matrices(path, A), ()
 
 
 @pytest.mark.parametrize(
-    "form", ["matrix", "quaternion", "bare quaternion", "ur", "euler, mm", "rotation vector, mm", "joints"]
+    "form",
+    [
+        *("matrix", "quaternion", "bare quaternion", "ur", "euler, mm", "rotation vector, mm", "joints", "ros", "KUKA"),
+        *("Fanuc", "lists", "four lines", "units in brackets", "names of joints"),
+    ],
 )
 def test_every_form_of_a_table_gives_the_same(armsight, tmp_path, seen, form):
     q, A, _ = motion()
@@ -98,6 +121,23 @@ def test_every_form_of_a_table_gives_the_same(armsight, tmp_path, seen, form):
     assert_right(document)
     assert document["held_out_rms_m"] < 2e-3
     assert all(pose["used"] for pose in document["poses"])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("DECL E6POS XP1={X 1.0,Y 2.0,Z 3.0,A 0.0,B 0.0,C 0.0}\n", "begins no table"),
+        ("- effector_wrt_world: [1, 0, 0, 0]\n", "begins no table"),
+        ("[[[1, 0, 0, 0.1], [0, 1, 0, 0.2]]]\n", "begins no table"),
+        ("j1,j2,j3,j4,j5,j6\n1,2,3,4,5,6\n", "joints without a unit: name them q1_deg"),
+    ],
+)
+def test_what_is_no_table_is_said_in_one_line(armsight, tmp_path, seen, text, said):
+    (tmp_path / "robot.txt").write_text(text)
+    result = armsight("handeye", "--robot", tmp_path / "robot.txt", "--seen", seen, "--eye", "in-hand")
+    assert result.code == 2
+    assert said in result.err
+    assert len(result.err.strip().splitlines()) == 1
 
 
 def test_the_poses_that_measure_wrote_are_read_with_the_shots_it_missed(armsight, tmp_path):

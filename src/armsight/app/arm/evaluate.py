@@ -492,7 +492,7 @@ def _joint(
     lag, side = rests.q[:, i] - rests.q_ref[:, i], rests.approach[:, i]
     loaded = float(np.abs(lever).max()) > _LEVER_M
     columns = [np.ones(len(lag)), *([side] if side.any() else []), *([lever] if loaded else [])]
-    fitted, sigmas = _least_squares(np.column_stack(columns), lag)
+    fitted, sigmas = least_squares(np.column_stack(columns), lag, rests.groups(rests.visits()[0], by_side=False))
     hysteresis = (-2 * deg * fitted[1], 2 * deg * sigmas[1]) if side.any() else None
     droop = (deg * fitted[-1], deg * sigmas[-1]) if loaded else None
     most = None if droop is None else droop[0] * float(lever[np.argmax(np.abs(lever))])
@@ -521,12 +521,25 @@ def _zero(arm: Arm, i: int, rests: RestPoses, found: Identified) -> tuple[float,
 _LEVER_M = 0.02
 
 
-def _least_squares(A: Array, y: Array) -> tuple[list[float], list[float]]:
-    """Return the coefficients of a fit and their sigmas, by the scatter of what is left."""
+def least_squares(A: Array, y: Array, groups: list[NDArray[np.int64]]) -> tuple[list[float], list[float]]:
+    """Return the coefficients of a fit and their sigmas, by the scatter of what is left.
+
+    What the columns lack is the same at every visit of a pose: visits do not average it out. The sigma is the larger
+    one of that of independent rests and that of independent poses (clustered: Liang and Zeger, Biometrika 73, 1986, for
+    G poses times G / (G - P)).
+
+    Args:
+        A: (N, P) columns.
+        y: (N,) what is explained.
+        groups: rows of each pose.
+    """
     x, *_ = np.linalg.lstsq(A, y, rcond=None)
     left = y - A @ x
-    cov = np.linalg.pinv(A.T @ A) * float(left @ left) / max(len(y) - A.shape[1], 1)
-    return x.tolist(), np.sqrt(np.diag(cov)).tolist()
+    inverse = np.linalg.pinv(A.T @ A)
+    rests = np.diag(inverse) * float(left @ left) / max(len(y) - A.shape[1], 1)
+    pulls = np.array([A[rows].T @ left[rows] for rows in groups]) @ inverse
+    poses = (pulls**2).sum(axis=0) * len(groups) / max(len(groups) - A.shape[1], 1)
+    return x.tolist(), np.sqrt(np.maximum(rests, poses)).tolist()
 
 
 def _one_side(rests: RestPoses, which: NDArray[np.int64]) -> float | None:
@@ -569,7 +582,7 @@ def _drift(rests: RestPoses) -> tuple[Array, tuple[float, float] | None]:
 
 
 def _slope(t: Array, y: Array) -> tuple[float, float]:
-    fitted, sigmas = _least_squares(np.column_stack([np.ones(len(t)), t]), y)
+    fitted, sigmas = least_squares(np.column_stack([np.ones(len(t)), t]), y, list(np.arange(len(t))[:, None]))
     return fitted[1], sigmas[1]
 
 

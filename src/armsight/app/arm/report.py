@@ -42,13 +42,13 @@ def tables(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> list[Text
         (title, *(_one(each.get(key), unit) for each in columns))
         for title, key, unit in (
             ("distance from the command, RMS", "accuracy_rms_mm", "mm"),
-            ("  largest", "accuracy_max_mm", "mm"),
-            ("  RMS, base and tool fitted", "placed_mm", "mm"),
+            ("distance from the command, largest", "accuracy_max_mm", "mm"),
+            ("RMS after base and tool were fitted", "placed_mm", "mm"),
             ("repeatability RP, from one side", "one_side_mm", "mm"),
-            ("from both sides, mean distance", "both_sides_mean_mm", "mm"),
-            ("  largest", "both_sides_max_mm", "mm"),
+            ("between both sides, mean distance", "both_sides_mean_mm", "mm"),
+            ("between both sides, largest", "both_sides_max_mm", "mm"),
             ("drift", "drift_mm_per_h", "mm/h"),
-            ("  sigma", "drift_sigma_mm_per_h", "mm/h"),
+            ("sigma of the drift", "drift_sigma_mm_per_h", "mm/h"),
             ("command to motion", "latency_s", "s"),
             ("noise of vision, one shot", "noise_mm", "mm"),
         )
@@ -137,7 +137,8 @@ def _parts_figure(report: ArmReport, figure: FigureBase) -> None:
     left.barh(rows, [100 * report.parts[name].share for name in names], color=BLUE, height=0.65)
     left.set_yticks(rows, names)
     left.set_xlabel("share of the mean square error, %")
-    right.barh(rows, [report.parts[name].without_mm for name in names], color=ORANGE, height=0.65)
+    left_over = [part.without_mm if part.remedy else 0.0 for part in (report.parts[name] for name in names)]
+    right.barh(rows, left_over, color=ORANGE, height=0.65)
     right.axvline(report.placed_mm, color=MUTED, linewidth=1)
     right.set_yticks(rows, [""] * len(rows))
     right.set_xlabel("RMS error with its remedy alone, mm (line: as it is)")

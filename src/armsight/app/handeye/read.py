@@ -4,7 +4,9 @@ In: a CSV, TSV or text file. Out: :class:`PoseTable`. Known forms:
 
 - no first line of names: 16 (or 12) numbers a row, a matrix row by row; 7: x, y, z and a quaternion; 6: x, y, z and three
   numbers of a rotation; the option ``rotation`` names its convention.
-- Universal Robots' ``p[x, y, z, rx, ry, rz]``, metres and a rotation vector, one a line.
+- Universal Robots' ``p[x, y, z, rx, ry, rz]``, metres and a rotation vector, one a line, also without the p.
+- columns of ROS's messages (``pose.position.x``, ``transform.rotation.w``, joints by the model's names, rad), KUKA's
+  ``X,Y,Z,A,B,C``, Fanuc's ``X,Y,Z,W,P,R``, units in brackets (``x [mm]``); matrices of four lines each.
 - named columns: ``x_m y_m z_m`` (or ``x_mm``, or ``x`` with ``unit``); ``qw qx qy qz``; or ``rx_deg ry_deg rz_deg`` (or
   ``rx_rad``, ``rx``); or ``r11 .. r33``; or joints ``q1_deg ..`` (``q1_rad``) for a model, also by LeRobot's names. ``t_s``
   is a time, ``image`` the image that belongs to a row, ``name`` (``shot`` in what ``armsight measure`` writes) a name that
@@ -51,7 +53,17 @@ MOST_RAD = 4 * np.pi
 LOOSE = 2e-3
 #: Columns of the poses that `armsight measure -o` wrote.
 _MEASURED = {"shot", "status", "reason", "x_m"}
-_UR = re.compile(r"p\[([^\]]*)\]")
+_UR = re.compile(r"p?\[([^\[\]]*)\],?")
+#: ROS's messages as columns, in metres (REP 103): pose.position.x, field.pose.orientation.w, transform.translation.x ...
+_ROS = re.compile(r"(?:.*[./_])?(?:(position|translation)|orientation|rotation)[._]([xyzw])")
+#: Names of others for ours, in small letters; roll, pitch and yaw rotate about the fixed x, y and z.
+_THEIRS = {"tx": "x", "ty": "y", "tz": "z", "roll": "rx", "pitch": "ry", "yaw": "rz"}
+#: Angles of robots' makers: the columns beside X, Y and Z, mm, whose rotations about fixed x, y and z they are, degrees.
+_MAKERS = {"KUKA": ("c", "b", "a"), "Fanuc": ("w", "p", "r")}
+#: A joint without a unit.
+_UNITLESS = re.compile(r"(?:q|j|joint)_?([1-7])")
+#: What begins a line of something else than a table.
+_NO_TABLE = re.compile(r"[{<]|\[\s*[\[{]|- |.*(?::=|=|:$|:\s*[\[{\d-])")
 _JOINT = re.compile(r"q(\d+)_(rad|deg)")
 
 
@@ -113,12 +125,13 @@ def read_pose_table(
     if rotation is not None and rotation not in CONVENTIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
     head, rows = _cells(path, columns)
+    head, usual, notes = _understood(path, head, arm, unit or "mm")
+    rotation = rotation or usual
     measured = set(head) >= _MEASURED
     rows, missed = _shown(path, head, rows) if measured else (rows, ("",) * len(rows))
     table = _Columns(path, head, rows)
     lines = np.array([line for line, _ in rows])
     unit_m, q = 1.0, None
-    notes: tuple[str, ...] = ()
     numbers, convention = np.zeros((len(rows), 0)), ""
     joints = sorted((int(found[1]), name) for name in head if (found := _JOINT.fullmatch(name)))
     if joints:
@@ -132,7 +145,8 @@ def read_pose_table(
     elif q is not None and not table.has_position():
         raise InputError(f"{path}: joint angles need the arm: give --model, a name (armsight arm list) or a .urdf file")
     else:
-        p, unit_m, notes = _positions(table, unit, detect_units)
+        p, unit_m, found_out = _positions(table, unit, detect_units)
+        notes = (*notes, *found_out)
         R, numbers, convention = table.rotations(rotation)
         Ts = stacked(R, p)
     t_s, names = table.times(), table.names()
@@ -159,7 +173,8 @@ def _shown(
 def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Return the names of the columns, made up where there are none, and the rows with their lines."""
     text = read_text(path).removeprefix("\ufeff")
-    if "p[" in text:
+    first = next((row.strip() for row in text.splitlines() if row.strip() and not row.startswith("#")), "")
+    if "p[" in text or _UR.fullmatch(first):
         rows = []
         for line, row in enumerate(text.splitlines(), 1):
             found = _UR.search(row)
@@ -168,7 +183,11 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
             if found is not None:
                 rows.append((line, [cell.strip() for cell in found[1].split(",")]))
         return ["x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"], _even(path, rows, 6)
-    first = text.partition("\n")[0]
+    if _NO_TABLE.match(first):
+        raise InputError(
+            f"{path}: {first[:40]!r} begins no table: write one pose a line, a matrix of 16 numbers or columns such as "
+            "x_mm,y_mm,z_mm,qw,qx,qy,qz"
+        )
     if any(mark in first for mark in ",;\t"):
         cells = degree_columns(path, read_table(path, read_columns(columns, COLUMNS)))
     else:
@@ -192,12 +211,51 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
         6: ["x", "y", "z", "n1", "n2", "n3"],
         8: ["t_s", "x", "y", "z", "n1", "n2", "n3", "n4"],
     }
+    if len(head) == 4 and len(rows) % 4 == 0:  # matrices of four lines
+        rows = [(rows[k][0], [cell for _, row in rows[k : k + 4] for cell in row]) for k in range(0, len(rows), 4)]
+        return forms[16], _even(path, rows, 16)
     if len(head) not in forms:
         raise InputError(
             f"{path}: line {rows[0][0]}: {len(head)} numbers without names; known are 16 or 12 (a matrix), 8 (time, "
             "position, quaternion), 7 (position, quaternion), 6 (position, three numbers of a rotation); or name columns"
         )
     return forms[len(head)], _even(path, rows, len(head))
+
+
+def _understood(
+    path: Path, head: list[str], arm: Arm | None, unit: str
+) -> tuple[list[str], str | None, tuple[str, ...]]:
+    """Return our names for those of ROS, of robots' makers, whose lengths are in a unit, and of spreadsheets.
+
+    Returns:
+        The names; the convention of the rotation that goes with them, None where there is none; and a note where something
+        was taken for granted.
+    """
+    bare = [re.sub(r"\s*[\[(](mm|m|deg|rad|s)[\])]$", r"_\1", name.strip().strip('"').strip().lower()) for name in head]
+    ros = [_ROS.fullmatch(name) for name in bare]
+    parts = {found[2] for found in ros if found and not found[1]}  # without w they are no quaternion
+    links = {} if arm is None else {name.lower(): f"q{k}_rad" for k, name in enumerate(arm.joint_names, 1)}
+    out = []
+    for given, name, found in zip(head, bare, ros, strict=True):
+        axis, mark, rest = name.partition("_")
+        ours = _THEIRS.get(axis, axis) + mark + rest
+        if found and (found[1] or parts == set("xyzw")):
+            ours = f"{found[2]}_m" if found[1] else f"q{found[2]}"
+        elif (joint := re.sub(r"_joint$", "", name)) in links:
+            ours = links[joint]
+        out.append(ours if ours in COLUMNS else given.strip().strip('"').strip())
+    maker = next((m for m, angles in _MAKERS.items() if sorted(bare) == sorted(("x", "y", "z", *angles))), None)
+    if maker is not None:
+        of = dict(zip(_MAKERS[maker], ("rx_deg", "ry_deg", "rz_deg"), strict=True))
+        out = [of.get(name, f"{name}_{unit}") for name in bare]
+        said = ", ".join(f"{name.upper()} about {ours[1]}" for name, ours in of.items())
+        return out, "xyz", (f"{path}: read as {maker}'s: {unit}; degrees, {said}; --columns says otherwise",)
+    if len(set(out)) < len(out):
+        return head, None, ()
+    if any(name.startswith("roll") for name in bare):
+        note = f"{path}: roll, pitch, yaw read as rotations about the fixed x, y and z; --rotation says otherwise"
+        return out, "xyz", (note,)
+    return out, None, ()
 
 
 def _even(path: Path, rows: list[tuple[int, list[str]]], count: int) -> list[tuple[int, list[str]]]:
@@ -369,6 +427,10 @@ def _positions(table: _Columns, unit: str | None, detect: bool) -> tuple[Array, 
     """Return positions (N, 3), m, the unit they were read in, and notes."""
     suffix = next((s for s in ("_m", "_mm", "") if f"x{s}" in table.at), None)
     if suffix is None:
+        if any(_UNITLESS.fullmatch(name.lower()) for name in table.at):
+            raise InputError(
+                f"{table.path}: line 1: joints without a unit: name them q1_deg .. or q1_rad .., and give --model"
+            )
         raise InputError(
             f"{table.path}: line 1: no positions: x_m y_m z_m or x_mm y_mm z_mm are needed, or, with "
             "--model, joints q1_rad .. or q1_deg ..; --columns x_m=NAME,... gives yours"

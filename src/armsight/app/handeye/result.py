@@ -14,7 +14,7 @@ from armsight.app.report.table import TextTable, plain_text
 from armsight.data import Array, Record
 from armsight.geometry.pose import log_se3, mean_pose
 from armsight.loop.handeye.noise import OF_THE_ARM
-from armsight.loop.handeye.structured import POSITIONS, StructuredHandEye
+from armsight.loop.handeye.structured import GEOMETRY, POSITIONS, StructuredHandEye
 
 #: A structure whose mean log density is within this of the best is not distinguished from it.
 DISTINGUISHED = 0.2
@@ -133,6 +133,12 @@ def statements(run: HandEyeAnswer) -> list[str]:
             f"with the geometry of the arm that the other poses show, poses left out come to {geometry:.2f} mm in place of "
             f"{plain:.2f}; armsight identify finds it"
         )
+        as_found = 1e3 * found.held_out_found.rms()[0]
+        if found.structure in GEOMETRY:
+            lines.append(
+                f"the transforms go with that geometry: with the arm as its model is they leave {as_found:.2f} mm, and "
+                f"those that suit the model best {plain:.2f}"
+            )
     elif run.recording.robot.q is None:
         lines.append(
             "without joints and --model the sigmas leave out what the arm's own geometry is off by in all poses alike"
@@ -203,6 +209,7 @@ def as_json(run: HandEyeAnswer) -> dict[str, Any]:
         "held_out_rms_m": position,
         "held_out_rms_rad": angle,
         "held_out_mean_m": found.held_out.mean()[0],
+        "held_out_found_rms_m": found.held_out_found.rms()[0],
         "held_out_geometry_rms_m": None if found.held_out_geometry is None else found.held_out_geometry.rms()[0],
         "rig_calibration_rms_m": found.common_m,
         "arm_rms_m": found.arm_m,

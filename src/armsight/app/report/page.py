@@ -45,7 +45,8 @@ table.headline td:nth-child(-n+4), table.headline th { white-space: nowrap; }
 table.headline td { font-variant-numeric: tabular-nums; } table.headline td:last-child { color: var(--muted); }
 table.headline { font-weight: 400; font-size: .95rem; }
 table.prose th { font-weight: 400; } table.prose td { min-width: 18rem; }
-table.numbers tbody th { white-space: nowrap; } table.numbers td { font-variant-numeric: tabular-nums; }
+table.numbers tbody th { white-space: nowrap; } table.numbers thead th { overflow-wrap: normal; }
+table.numbers td { font-variant-numeric: tabular-nums; }
 figure { margin: 0 0 1rem; } figure img { width: 100%; height: auto; display: block; }
 figcaption { background: var(--soft); padding: .6rem 1.1rem; margin-top: .6rem; font-size: .95rem; }
 figcaption p { margin: .3rem 0; }

@@ -100,6 +100,28 @@ def printed_board(points: Array) -> BundleModel:
     return BundleModel(points, smooth(points, BOARD_DEGREE), BOARD_SIGMA_SHARE * diagonal, True)
 
 
+def with_second_print(
+    model: BundleModel, observations: Observations, pair_count: int
+) -> tuple[BundleModel, Observations]:
+    """Let the images of one camera alone show another print of the drawing than the pairs do.
+
+    A sheet on a desk and the plate that the arm carries bow differently; one shape for both would bend the cameras.
+
+    Args:
+        model: the printed board, M points, K modes.
+        observations: the detections, those of one camera alone last.
+        pair_count: shots that are pairs.
+
+    Returns:
+        Both prints as one body, (2 M) points and (2 K) modes, and the detections with the points of their own print.
+    """
+    none = np.zeros_like(model.modes)
+    modes = np.block([[[model.modes], [none]], [[none], [model.modes]]])
+    point = observations.point + len(model.points) * (observations.shot >= pair_count)
+    both = replace(model, points=np.vstack([model.points, model.points]), modes=modes)
+    return both, replace(observations, point=point)
+
+
 def motion_of(model: BundleModel, screened: Screened, count: int) -> tuple[ExposureMotion, dict[int, str]] | None:
     """Test whether the board moved between the exposures: each camera agrees with itself better than with the other.
 
@@ -333,8 +355,8 @@ def calibrate_boards(
         models: distortion models to choose from by held-out error.
         flat: hold the board to its drawing.
         folds: how many parts the pairs are split into for the held-out errors.
-        singles: detections of further images of the same board by one camera alone, the other side empty and with a
-            reason: they help to determine what is inside the camera.
+        singles: detections of further images by one camera alone, the other side empty and with a reason: they help to
+            determine what is inside the camera. Their board has the same drawing, and may be another print.
         progress: called with a line about what is being done.
         second: calls a function in another process, which takes its share of the distortion models; None without one.
 
@@ -357,6 +379,8 @@ def calibrate_boards(
     model = rigid_board(points) if flat else printed_board(points)
     radius_m, first = _disc_radius(board, usable, first, observations)
     model = replace(model, disc_radius_m=radius_m or 0.0)
+    if alone and not flat:
+        model, observations = with_second_print(model, observations, pair_count)
     selection = _Selection(
         model, observations, tuple(pair.name for pair in usable), sizes, folds, pair_count, len(pairs), progress
     )
@@ -376,7 +400,7 @@ def calibrate_boards(
     names = tuple(usable[j].name for j in screened.kept if j < pair_count)
     rig = scaled(rig_of(trial.solution), trial.heldout)
     state = trial.solution.state
-    found = trial.model.body(state.shape)
+    found = trial.model.body(state.shape)[: len(points)]
     found = transform(fit_rigid(found, points), found)
     calibration = Calibration(
         rig,
