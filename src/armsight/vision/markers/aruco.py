@@ -172,7 +172,7 @@ def _cells_seen(image: NDArray[np.uint8], corners: NDArray[np.float32], size: in
     )
     H = cv2.getPerspectiveTransform(corners, ends)
     fine = cv2.warpPerspective(image, H, (samples * count, samples * count), borderMode=cv2.BORDER_REPLICATE)
-    return fine.reshape(count, samples, count, samples).mean(axis=(1, 3), dtype=np.float32)
+    return np.asarray(fine.reshape(count, samples, count, samples).mean(axis=(1, 3), dtype=np.float32))
 
 
 def _without_repeats(corners: Array, identities: NDArray[Any]) -> list[int]:
