@@ -108,7 +108,7 @@ def detect_markers(
 
 
 #: A contour's corners are off by so much: factors of its size that are tried.
-_GROWN = (0.95, 1.0, 1.05, 1.1)
+_SCALES = (0.95, 1.0, 1.05, 1.1)
 #: Blurs of the codes, sigma in cells.
 _CODE_BLURS = (0.3, 0.5)
 #: A code's correlation with the image is at least this, and what it leaves unexplained at most this share of what the next
@@ -140,8 +140,8 @@ def _nearest_code(image: NDArray[np.uint8], quad: Array, family: str, border: in
     """Return identity and corners (4, 2), in OpenCV's order, of the marker that a quadrilateral (4, 2) shows, if any."""
     size, best = len(cells(family, 0, border)), (_CODE_FIT, -1, 0, quad)
     middle = quad.mean(axis=0)
-    for grown in _GROWN:
-        about = (middle + grown * (quad - middle)).astype(np.float32)
+    for scale in _SCALES:
+        about = (middle + scale * (quad - middle)).astype(np.float32)
         seen = _cells_seen(image, about, size)
         rim, dark = np.ones(seen.shape, bool), np.zeros(seen.shape, bool)
         rim[1:-1, 1:-1], dark[1:-1, 1:-1] = False, True
@@ -155,11 +155,11 @@ def _nearest_code(image: NDArray[np.uint8], quad: Array, family: str, border: in
             continue
         inner /= np.linalg.norm(inner)
         for codes in _blurred_codes(family, border):
-            likeness = codes @ inner
-            row = int(likeness.argmax())
-            first = float(likeness[row])
-            likeness[row - row % 4 : row - row % 4 + 4] = 0.0  # the same marker, rotated
-            if first > best[0] and 1 - first**2 < _CODE_LEAD * (1 - float(likeness.max()) ** 2):
+            correlation = codes @ inner
+            row = int(correlation.argmax())
+            first = float(correlation[row])
+            correlation[row - row % 4 : row - row % 4 + 4] = 0.0  # the same marker, rotated
+            if first > best[0] and 1 - first**2 < _CODE_LEAD * (1 - float(correlation.max()) ** 2):
                 best = (first, row // 4, row % 4, about)
     return None if best[1] < 0 else (best[1], np.roll(best[3], -best[2], axis=0))
 
