@@ -1,4 +1,4 @@
-"""Random scenes with a body of discs before a stereo rig, seen through a camera of ``armsight.sim.camera``, with truth."""
+"""Random scenes with a body before a stereo rig, seen through a camera of ``armsight.sim.camera``, with truth."""
 
 from __future__ import annotations
 
@@ -8,55 +8,70 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from armsight.geometry.pose import inverse, pose
+from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.camera.pipeline import SimulatedCamera
 from armsight.sim.camera.stages import CameraPipeline, preset_names
 from armsight.sim.example_rig import example_rig, in_view
 from armsight.sim.render.background import BACKGROUNDS
 from armsight.sim.render.render import radiance
-from armsight.sim.render.scene import Pattern, PosedBody, plate
+from armsight.sim.render.scene import Pattern, PosedBody, chessboard, marker_bits, plate, tag
 from armsight.sim.workcell.body import body_patterns, body_target
+from armsight.vision.markers.chessboard import Chessboard
 from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.marker import Target
+from armsight.vision.markers.tag import Tag, TagTarget
 from armsight.vision.rig import StereoRig
-from marker_plate import MARGIN_M, ellipses
+from marker_plate import MARGIN_M, ellipses, project
 from marker_report import disc_target
 
 #: Tilt of the body, up to.
 TILT_DEG = 40.0
 #: Pairs that a camera has seen of a scene before the one that counts: automatic gain and temporal filter have settled.
 BEFORE = 4
+#: Inner corners of the chessboard and its squares' side, m; four tags' side and where they are about the plate's middle.
+CHESSBOARD = (9, 6, 0.020)
+TAG_M, TAGS_M = 0.045, ((-0.045, -0.045), (0.045, -0.045), (0.045, 0.045), (-0.045, 0.045))
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Two images of a body of discs and what is true of them.
+    """Two images of a body and what is true of them.
 
     Attributes:
         images: left and right, (H, W) uint8.
         rig: the true cameras.
-        target: the body's discs.
+        target: the body's markers.
         T_left_body: (4, 4) its pose in the middle of the left exposure's middle row, m.
-        uv: left and right, (N, 2) centres of the discs' images, px: the centroids of their projected rims.
-        shapes: left and right, (N, 3) S11, S12, S22 of the discs' images, px^2: rim x^T S^-1 x = 1.
+        uv: left and right, (N, 2) images of its points, px; of discs the centroids of their projected rims.
+        shapes: left and right, (N, 3) S11, S12, S22 of the discs' images, px^2: rim x^T S^-1 x = 1; none of other markers.
         patterns: what was painted.
     """
 
     images: tuple[np.ndarray, np.ndarray]
     rig: StereoRig
-    target: DiscTarget
+    target: Target | DiscTarget
     T_left_body: np.ndarray
     uv: tuple[np.ndarray, np.ndarray]
     shapes: tuple[np.ndarray, np.ndarray]
     patterns: tuple[Pattern, ...]
 
 
-def body(kind: str) -> tuple[DiscTarget, tuple[Pattern, ...]]:
+def body(kind: str) -> tuple[Target | DiscTarget, tuple[Pattern, ...]]:
     """Return a target and its patterns.
 
     Args:
-        kind: ``nine`` for the workcell's body of nine bright discs, ``three`` or ``four`` for a plate with so many.
+        kind: ``nine`` for the workcell's body of nine bright discs, ``three`` or ``four`` for a plate with so many,
+            ``tags`` for a plate of four AprilTags, ``chessboard``.
     """
+    if kind == "chessboard":
+        columns, rows, square_m = CHESSBOARD
+        return Chessboard(columns, rows, square_m), (chessboard(columns, rows, square_m),)
+    if kind == "tags":
+        at = [pose(np.eye(3), np.array([x, y, 0.0])) for x, y in TAGS_M]
+        tags = tuple(Tag(f"T{k}", "tag36h11", k, TAG_M, T) for k, T in enumerate(at))
+        painted = [tag(marker_bits("tag36h11", k), TAG_M).on_body(T) for k, T in enumerate(at)]
+        return TagTarget("tags", tags), (plate(0.16, 0.16, 0.85), *painted)
     if kind == "nine":
         target = body_target().discs
         assert target is not None
@@ -87,7 +102,7 @@ def placed(
     kind: str = "nine",
     distance_m: float | None = None,
     size: tuple[int, int] = (1280, 720),
-) -> tuple[StereoRig, DiscTarget, tuple[Pattern, ...], np.ndarray, np.random.Generator]:
+) -> tuple[StereoRig, Target | DiscTarget, tuple[Pattern, ...], np.ndarray, np.random.Generator]:
     """Return rig, target, patterns and T_left_body (4, 4) of a scene, and the generator that its backgrounds come from."""
     rng = np.random.default_rng([seed, 1])
     rig = example_rig(size, 900 / 1280 * size[0])
@@ -97,9 +112,19 @@ def placed(
 
 
 def smallest_px(seed: int, kind: str) -> float:
-    """Return the smaller diameter of the smallest disc of both images of a scene, px; nothing is rendered."""
+    """Return the size of the smallest marker of both images of a scene, px; nothing is rendered.
+
+    It is the smaller diameter of a disc, the shortest side of a tag or a board's square.
+    """
     rig, target, _, T, _ = placed(seed, kind)
     at = (T, inverse(rig.T_left_right) @ T)
+    if not isinstance(target, DiscTarget):
+        step = 4 if isinstance(target, TagTarget) else 1
+        sides = [
+            np.linalg.norm(np.diff(project(camera, transform(A, target.body.points)), axis=0), axis=1)
+            for camera, A in zip(rig.cameras, at, strict=True)
+        ]
+        return float(min(s[i] for s in sides for i in range(len(s)) if step == 1 or i % step != 3))
     shapes = np.vstack([ellipses(camera, target, A)[1] for camera, A in zip(rig.cameras, at, strict=True)])
     half, root = (shapes[:, 0] + shapes[:, 2]) / 2, np.hypot((shapes[:, 0] - shapes[:, 2]) / 2, shapes[:, 1])
     return float(2 * np.sqrt((half - root).min()))
@@ -142,7 +167,10 @@ def scene(
             if twist is None:
                 device.expose(light, k / 30)
         images.append(device.expose(light, BEFORE / 30))
-        centres, shape = ellipses(camera, target, view.T_camera_body)
+        if isinstance(target, DiscTarget):
+            centres, shape = ellipses(camera, target, view.T_camera_body)
+        else:
+            centres, shape = project(camera, transform(view.T_camera_body, target.body.points)), np.zeros((0, 3))
         uv.append(centres)
         shapes.append(shape)
     return Scene((images[0], images[1]), rig, target, T, (uv[0], uv[1]), (shapes[0], shapes[1]), patterns)

@@ -189,3 +189,39 @@ def test_photographs_agree_with_the_apriltag_library(data_dir):
     assert (
         np.abs(np.median(np.mean(ours, axis=1), axis=0)).max() < 0.25
     )  # half a pixel, had the conventions been mixed up
+
+
+def processed(painted, quality):
+    """Return what a cheap camera makes of a painting: a soft lens, a wide halo of sharpening, JPEG blocks."""
+    image = np.clip(110 + 130 * painted, 0, 255).astype(np.float32)
+    soft = cv2.GaussianBlur(image, (0, 0), 1.9)
+    sharp = np.clip(soft + 1.3 * (soft - cv2.GaussianBlur(soft, (0, 0), 1.5)), 0, 255).astype(np.uint8)
+    written = cv2.imencode(".jpg", sharp, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return cv2.imdecode(written, cv2.IMREAD_GRAYSCALE)
+
+
+def test_blurred_and_sharpened_small_tags_are_read_by_the_nearest_code():
+    plain = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11))
+    by_threshold, missed = 0, 0
+    for k in range(12):
+        painted, truth = scene(30, 0.3, 0.3 + 0.5 * k, 0.8, cells("tag36h11", k), samples=4)
+        image = np.pad(processed(painted, 55), 20, mode="edge")
+        read = plain.detectMarkers(image)[1]
+        by_threshold += read is not None and k in read
+        found = find_squares(image, "tag36h11")
+        assert all(identity == k for identity, _ in found)
+        missed += not found
+        for _, corners in found:
+            assert np.abs(corners - truth - 20).max() < 30 / 8  # a cell: upright, and near enough for the fit
+    assert missed == 0
+    assert by_threshold < 9  # otherwise these images test nothing
+
+
+def test_squares_without_a_code_are_no_markers():
+    rng = np.random.default_rng(7)
+    for family in ("tag36h11", "DICT_4X4_50"):
+        for _ in range(20):
+            code = np.full((8, 8), -1.0)
+            code[2:-2, 2:-2] = rng.uniform(-1, 1, (4, 4))  # any greys, within a dark border and a white plate
+            painted, _ = scene(40, 0.3, rng.uniform(-3, 3), 0.8, code, samples=4)
+            assert find_squares(np.pad(processed(painted, 80), 20, mode="edge"), family) == []

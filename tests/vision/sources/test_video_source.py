@@ -156,3 +156,20 @@ def test_what_moves_stops_and_rests_repeats_no_frames(film):
         while source.read() is not None:
             pass
         assert notes_of(source) == (), name
+
+
+@pytest.mark.parametrize(("rates", "share"), [((15, 30), 50), ((10, 30), 67)])
+def test_interpolated_frames_are_said(film, rates, share):
+    rng = np.random.default_rng(3)
+    own = [moving(k, rng).astype(float) for k in range(38)]
+    converted = []
+    for k in range(36):
+        at = k * rates[0] / rates[1]
+        converted.append(((1 - at % 1) * own[int(at)] + at % 1 * own[int(at) + 1]).astype(np.uint8))
+    left, right = film("left.avi", converted), film("right.avi", [moving(k, rng) for k in range(36)])
+    source = open_source(f"video:{left},{right}")
+    while source.read() is not None:
+        pass
+    (note,) = notes_of(source)
+    assert note.startswith(f"{left}: ")
+    assert int(note.split(" % of the frames are interpolated")[0].split()[-1]) == pytest.approx(share, abs=8)

@@ -1,5 +1,9 @@
 """Square code markers of every family OpenCV knows, found roughly: identities and corners to a pixel or so.
 
+OpenCV finds quadrilaterals and reads their cells by a threshold. Blur and sharpening mix neighbouring cells of small
+markers, and some are not read. Those quadrilaterals are compared with all codes of the family instead, each blurred: the
+nearest code is taken where the next one explains the image much worse.
+
 AprilTag families carry their own names (``tag36h11``) and are then upright as the AprilTag project prints them; markers
 of OpenCV's names (``DICT_APRILTAG_36h11``, ``DICT_4X4_50``) are upright as OpenCV prints them. The two conventions
 print the same AprilTag upside down to each other, so the name of the family states which one is used.
@@ -90,12 +94,85 @@ def detect_markers(
         (1, 4, 2) corners of each marker, in OpenCV's order whatever the family; (n, 1) identities.
     """
     share = round(4.0 * SIDE_MIN_PX / max(image.shape), 4)
-    corners, identities, _ = _detector(family, share, border).detectMarkers(image)
-    if identities is None:
+    found, read, unread = _detector(family, share, border).detectMarkers(image)
+    corners = list(found)
+    identities = [] if read is None else np.ravel(read).tolist()
+    for quad in unread:
+        if (code := _nearest_code(image, np.reshape(quad, (4, 2)), family, border)) is not None:
+            identities.append(code[0])
+            corners.append(code[1][None])
+    if not identities:
         return (), np.zeros((0, 1), np.int32)
-    identities = np.asarray(identities).reshape(-1, 1)
-    kept = _without_repeats(np.reshape(corners, (-1, 4, 2)), identities[:, 0])
-    return [corners[i] for i in kept], identities[kept]
+    kept = _without_repeats(np.reshape(corners, (-1, 4, 2)), np.array(identities))
+    return [corners[i] for i in kept], np.array(identities, np.int32)[kept, None]
+
+
+#: A contour's corners are off by so much: factors of its size that are tried.
+_SCALES = (0.95, 1.0, 1.05, 1.1)
+#: Blurs of the codes, sigma in cells.
+_CODE_BLURS = (0.3, 0.5)
+#: A code's correlation with the image is at least this, and what it leaves unexplained at most this share of what the next
+#: code leaves.
+_CODE_FIT, _CODE_LEAD = 0.85, 0.5
+#: The white ring around a marker exceeds its dark border by this many grey levels at least, and by this many times the
+#: border's own deviation.
+_RING_STEP, _RING_CLEAR = 10.0, 2.0
+#: The cells of the code vary by this share of that step at least, RMS; half of it where there is no blur.
+_CODE_DEPTH = 0.25
+
+
+@lru_cache(maxsize=16)
+def _blurred_codes(family: str, border: int) -> tuple[NDArray[np.float32], ...]:
+    """Return a family's codes (4 M, cells) for each blur, each in its four rotations, without mean and of length one."""
+    name = APRILTAGS.get(family, family)
+    whole = [cells(name, k, border) for k in range(family_size(family))]
+    grids = np.array([np.rot90(np.pad(c, 1, constant_values=1), -r) for c in whole for r in range(4)], np.float32)
+    codes = []
+    for sigma in _CODE_BLURS:
+        soft = np.array([cv2.GaussianBlur(grid, (5, 5), sigma, borderType=cv2.BORDER_REPLICATE) for grid in grids])
+        inner = soft[:, border + 1 : -border - 1, border + 1 : -border - 1].reshape(len(grids), -1)
+        inner = inner - inner.mean(axis=1, keepdims=True)
+        codes.append(inner / np.maximum(np.linalg.norm(inner, axis=1, keepdims=True), 1e-9))
+    return tuple(codes)
+
+
+def _nearest_code(image: NDArray[np.uint8], quad: Array, family: str, border: int) -> tuple[int, Array] | None:
+    """Return identity and corners (4, 2), in OpenCV's order, of the marker that a quadrilateral (4, 2) shows, if any."""
+    size, best = len(cells(family, 0, border)), (_CODE_FIT, -1, 0, quad)
+    middle = quad.mean(axis=0)
+    for scale in _SCALES:
+        about = (middle + scale * (quad - middle)).astype(np.float32)
+        seen = _cells_seen(image, about, size)
+        rim, dark = np.ones(seen.shape, bool), np.zeros(seen.shape, bool)
+        rim[1:-1, 1:-1], dark[1:-1, 1:-1] = False, True
+        dark[border + 1 : -border - 1, border + 1 : -border - 1] = False
+        step = float(np.median(seen[rim]) - seen[dark].mean())
+        if step < max(_RING_STEP, _RING_CLEAR * float(seen[dark].std())):
+            continue
+        inner = seen[border + 1 : -border - 1, border + 1 : -border - 1].ravel()
+        inner = inner - inner.mean()
+        if inner.std() < _CODE_DEPTH * step:
+            continue
+        inner /= np.linalg.norm(inner)
+        for codes in _blurred_codes(family, border):
+            correlation = codes @ inner
+            row = int(correlation.argmax())
+            first = float(correlation[row])
+            correlation[row - row % 4 : row - row % 4 + 4] = 0.0  # the same marker, rotated
+            if first > best[0] and 1 - first**2 < _CODE_LEAD * (1 - float(correlation.max()) ** 2):
+                best = (first, row // 4, row % 4, about)
+    return None if best[1] < 0 else (best[1], np.roll(best[3], -best[2], axis=0))
+
+
+def _cells_seen(image: NDArray[np.uint8], corners: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Return the mean grey of a marker's cells and of a ring of cells around it, (size + 2, size + 2)."""
+    count, samples = size + 2, 3
+    ends = np.array([[1, 1], [size + 1, 1], [size + 1, size + 1], [1, size + 1]], np.float32) * samples - np.float32(
+        0.5
+    )
+    H = cv2.getPerspectiveTransform(corners, ends)
+    fine = cv2.warpPerspective(image, H, (samples * count, samples * count), borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(fine.reshape(count, samples, count, samples).mean(axis=(1, 3), dtype=np.float32))
 
 
 def _without_repeats(corners: Array, identities: NDArray[Any]) -> list[int]:

@@ -25,8 +25,14 @@ _EVERY = 4
 #: frames before it and after it; re-encoding leaves some difference. Where frames nearby differ by less, nothing changes,
 #: grey levels squared.
 _REPEAT_SHARE, _NEARBY, _LEAST_CHANGE = 1 / 16, 3, 0.25
-#: Repeated frames are said from this share on: what moves and stops has a few that look like it.
+#: Repeated and interpolated frames are said from this share on: what moves and stops has a few that look like it.
 _REPEATS_SAID = 0.15
+#: A frame is interpolated if a mixture of its neighbours is so much nearer to it than mixtures are to frames nearby. The
+#: share of one neighbour in it is at least this, otherwise it is a repeated one. Only pixels count that differ by so many
+#: grey levels between the neighbours: noise where nothing moves is averaged by codecs, too.
+_MIXED, _MOVED_GREY = 0.08, 12.0
+#: Share of such pixels below which nothing is said to move.
+_MOVED_LEAST = 0.002
 
 
 class VideoSource:
@@ -49,8 +55,9 @@ class VideoSource:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is odd about the files: different rates, and frames that repeat among those that were read."""
-        return (*self._rates, *(said for file in self._files if (said := file.repeats()) is not None))
+        """What is odd about the files: different rates, and frames that repeat or are interpolated among those read."""
+        said = (text for file in self._files for text in (file.repeats(), file.interpolated()))
+        return (*self._rates, *(text for text in said if text is not None))
 
     @staticmethod
     def open(left: str | Path, right: str | Path | None = None) -> VideoSource:
@@ -143,7 +150,11 @@ class _File:
         self.t_s = 0.0
         self.held = False  # the current frame waits for a partner: the next grab keeps it
         self._before: Array | None = None
+        self._two_before: Array | None = None
         self._changes: list[float] = []  # mean squared differences from the frame before, grey levels squared
+        # Of each frame between two others what is left of it without the best mixture of both, as a share of the square
+        # of their difference, and the first one's share in the mixture; infinite and 0 where nothing moves.
+        self._mixtures: list[tuple[float, float]] = []
 
     def grab(self) -> bool:
         """Go to the next frame; False at the end."""
@@ -163,7 +174,9 @@ class _File:
         some = np.asarray(image[::_EVERY, ::_EVERY], np.float64)
         if self._before is not None:
             self._changes.append(float(np.mean((some - self._before) ** 2)))
-        self._before = some
+        if self._before is not None and self._two_before is not None:
+            self._mixtures.append(_mixture(self._two_before, self._before, some))
+        self._two_before, self._before = self._before, some
         return np.asarray(image)
 
     def repeats(self) -> str | None:
@@ -171,8 +184,7 @@ class _File:
         changes = np.array(self._changes)
         if len(changes) <= 2 * _NEARBY:
             return None
-        runs = np.lib.stride_tricks.sliding_window_view(changes, _NEARBY).max(axis=1)
-        nearby = np.minimum(runs[: -_NEARBY - 1], runs[_NEARBY + 1 :])
+        nearby = _largest_nearby(changes)
         changing = nearby > _LEAST_CHANGE
         same = changing & (changes[_NEARBY:-_NEARBY] < _REPEAT_SHARE * nearby)
         if same.sum() <= _REPEATS_SAID * max(changing.sum(), 1):
@@ -183,6 +195,43 @@ class _File:
             f"{self.path}: {100 * share:.0f} % of the frames repeat the one before: the camera gave about {given:.0f} "
             f"images a second and the file has {rate:.0f}; a repeated image is no new measurement, and its time is late"
         )
+
+    def interpolated(self) -> str | None:
+        """Return what to say where frames are mixtures of their neighbours, as a converted rate's are."""
+        if len(self._mixtures) <= 2 * _NEARBY:
+            return None
+        left, first = np.array(self._mixtures).T
+        nearby = _largest_nearby(left)
+        moving = np.isfinite(nearby) & np.isfinite(left[_NEARBY:-_NEARBY])
+        mixed = (np.abs(first - 0.5) < 0.5 - _MIXED)[_NEARBY:-_NEARBY] & (
+            left[_NEARBY:-_NEARBY] < _REPEAT_SHARE * nearby
+        )
+        if (mixed & moving).sum() <= _REPEATS_SAID * max(moving.sum(), 1):
+            return None
+        share = float((mixed & moving).sum() / moving.sum())
+        return (
+            f"{self.path}: {100 * share:.0f} % of the frames are interpolated, mixtures of those before and after: they "
+            "show markers twice, or where they never were; record at the camera's own rate, or leave them out"
+        )
+
+
+def _largest_nearby(values: Array) -> Array:
+    """Return the smaller of the largest of a few values before and after each that has so many, (N - 2 NEARBY,)."""
+    runs = np.lib.stride_tricks.sliding_window_view(values, _NEARBY).max(axis=1)
+    return np.asarray(np.minimum(runs[: -_NEARBY - 1], runs[_NEARBY + 1 :]))
+
+
+def _mixture(before: Array, frame: Array, after: Array) -> tuple[float, float]:
+    """Return what the best mixture of two frames leaves of the one between them, and the first one's share in it.
+
+    The former is a share of the square of their difference, over the pixels that differ; infinite where nothing moves.
+    """
+    moved = np.abs(before - after) > _MOVED_GREY
+    if moved.sum() < _MOVED_LEAST * moved.size:
+        return np.inf, 0.0
+    step, own = (before - after)[moved], (frame - after)[moved]
+    share = float(own @ step / (step @ step))
+    return float(np.sum((own - share * step) ** 2) / (step @ step)), share
 
 
 def open_video(rest: str) -> VideoSource:
