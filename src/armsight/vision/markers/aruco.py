@@ -1,8 +1,8 @@
 """Square code markers of every family OpenCV knows, found roughly: identities and corners to a pixel or so.
 
 OpenCV finds quadrilaterals and reads their cells by a threshold. Blur and sharpening mix neighbouring cells of small
-markers, and some are not read. Those quadrilaterals are compared with all codes of the family instead, each blurred: the
-nearest code is taken where the next one explains the image much worse.
+markers, and some are not read. In families of 5x5 cells and more, those quadrilaterals are compared with all codes, each
+blurred: the nearest code is taken where the next one explains the image much worse.
 
 AprilTag families carry their own names (``tag36h11``) and are then upright as the AprilTag project prints them; markers
 of OpenCV's names (``DICT_APRILTAG_36h11``, ``DICT_4X4_50``) are upright as OpenCV prints them. The two conventions
@@ -97,7 +97,7 @@ def detect_markers(
     found, read, unread = _detector(family, share, border).detectMarkers(image)
     corners = list(found)
     identities = [] if read is None else np.ravel(read).tolist()
-    for quad in unread:
+    for quad in unread if _dictionary(family).markerSize >= _CODE_CELLS else ():
         if (code := _nearest_code(image, np.reshape(quad, (4, 2)), family, border)) is not None:
             identities.append(code[0])
             corners.append(code[1][None])
@@ -107,6 +107,8 @@ def detect_markers(
     return [corners[i] for i in kept], np.array(identities, np.int32)[kept, None]
 
 
+#: Families with fewer cells a side are not compared: what is no marker resembles one of their codes too often.
+_CODE_CELLS = 5
 #: A contour's corners are off by so much: factors of its size that are tried.
 _SCALES = (0.95, 1.0, 1.05, 1.1)
 #: Blurs of the codes, sigma in cells.
