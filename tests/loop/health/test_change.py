@@ -7,7 +7,16 @@ import pytest
 from arm_rig import ARM, adjoint_of, off, small
 
 from armsight.loop.estimators import PoseMeasurement
-from armsight.loop.health.change import Change, doubtful, finding, probabilities, ranked, suspected, suspects
+from armsight.loop.health.change import (
+    Change,
+    doubtful,
+    finding,
+    happened_besides,
+    probabilities,
+    ranked,
+    suspected,
+    suspects,
+)
 
 SUSPECTS = {(each.kind, each.joint): each for each in suspects(6)}
 T, T_LATER = small(np.array([0.4, 0.1, 0.3, 0.2, -0.5, 1.0])), small(np.array([0.2, -0.3, 0.5, -1.0, 0.4, 0.3]))
@@ -44,6 +53,20 @@ def test_a_pose_is_widened_by_the_mixture_of_what_cannot_be_distinguished():
     np.testing.assert_allclose(suspected(measurement, [rig, body]), np.mean(both, axis=0))
     assert suspected(replace(measurement, t_s=9.0), [rig, body]) is None
     assert suspected(measurement, [change("joint", 2)]) is None
+
+
+def test_what_was_reported_is_not_undone_by_another_change_at_another_time():
+    measurement = PoseMeasurement(30.0, T, np.eye(6), np.zeros((6, 6)))
+    rig, joint = change("rig", score=5.0), change("joint", 2, 90.0, begin_s=25.0, end_s=29.0)
+    (besides,) = happened_besides([rig], joint)
+    # The joint explains far more, but the rig's motion still displaces every pose, in full.
+    np.testing.assert_allclose(suspected(measurement, [joint, besides]), suspected(measurement, [rig]))
+    assert doubtful([joint, besides])
+    assert finding([joint, besides], ARM.joint_names).alternatives == ("fixed",)
+    # The same change seen otherwise: at about the same time, or of the same cause; or one that moves no pose.
+    assert not happened_besides([rig], replace(joint, begin_s=11.0))
+    assert not happened_besides([rig], change("drift", begin_s=25.0, end_s=29.0))
+    assert not happened_besides([joint], rig)
 
 
 @pytest.mark.parametrize(

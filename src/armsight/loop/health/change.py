@@ -21,6 +21,8 @@ from armsight.loop.health.record import Cause, HealthFinding
 
 #: Hypotheses whose scores differ by less than this from the best cannot be distinguished from it.
 ALIKE = 12.0
+#: A change that begins so much later than another is not the same one, s: beginnings are known to about a second.
+LATER_S = 3.0
 #: The errors of an arm have longer tails than Gaussian ones: chi-squares count by this factor less.
 MARGIN = 1.4
 
@@ -114,6 +116,7 @@ class Change(Record):
         effect: (6, D) what a unit of it does to the newest measured pose of the tool, right tangent.
         T_base_tool: (4, 4) that pose.
         until_s: when it was put right, s.
+        besides: whether it is taken to have happened besides the best one, at another time.
     """
 
     suspect: Suspect
@@ -126,6 +129,7 @@ class Change(Record):
     effect: Array
     T_base_tool: Array
     until_s: float = np.inf
+    besides: bool = False
 
     def displacement(self, T_base_tool: Array, t_s: float) -> tuple[Array, Array]:
         """Return what it does to a measured pose of the tool (4, 4) at a time, s: right tangent (6,), covariance."""
@@ -148,6 +152,17 @@ def ranked(changes: Sequence[Change]) -> tuple[Change, ...]:
     return tuple(each for each in sorted(changes, key=lambda each: -each.score) if each.score > best - ALIKE)
 
 
+def happened_besides(changes: Sequence[Change], best: Change) -> tuple[Change, ...]:
+    """Return those that move poses, began at another time than the best one and are of another cause: both happened."""
+    return tuple(
+        replace(each, besides=True)
+        for each in changes
+        if each.suspect.moves
+        and each.suspect.cause != best.suspect.cause
+        and abs(each.begin_s - best.begin_s) > LATER_S
+    )
+
+
 def probabilities(changes: Sequence[Change]) -> Array:
     """Return the probabilities (N,) of hypotheses, equally probable before: their likelihoods, normalised."""
     scores = np.array([each.score for each in changes])
@@ -163,16 +178,18 @@ def doubtful(changes: Sequence[Change]) -> bool:
 def suspected(measurement: PoseMeasurement, changes: Sequence[Change]) -> Array | None:
     """Return the covariance (6, 6) of what hypotheses do to a pose measurement of the tool; None where they do nothing.
 
-    It is that of their mixture: of each the square of what it does, and its covariance. Those that were put right before
-    say nothing.
+    It is that of their mixture: of each the square of what it does, and its covariance; what happened besides adds to it.
+    Those that were put right before say nothing.
     """
     until_s = min((each.until_s for each in changes if each.until_s > measurement.t_s), default=np.inf)
     changes = [each for each in changes if each.until_s == until_s]
     extra, t_s, T = np.zeros((6, 6)), measurement.t_s, measurement.T_base_tool
-    for each, share in zip(changes, probabilities(changes) if changes else (), strict=True):
-        if each.suspect.moves and t_s >= each.begin_s:
-            shift, cov = each.displacement(T, t_s)
-            extra += share * (np.outer(shift, shift) + cov)
+    for besides in (False, True):
+        some = [each for each in changes if each.besides is besides]
+        for each, share in zip(some, probabilities(some) if some else (), strict=True):
+            if each.suspect.moves and t_s >= each.begin_s:
+                shift, cov = each.displacement(T, t_s)
+                extra += share * (np.outer(shift, shift) + cov)
     return extra if extra.any() else None
 
 

@@ -29,7 +29,7 @@ from scipy.linalg import solve_triangular
 from armsight.data import Array
 from armsight.loop.estimators import Innovation, Outcome
 from armsight.loop.estimators.armerror import layout
-from armsight.loop.health.change import MARGIN, RAMPS, Change, Suspect, changing, ranked, suspects
+from armsight.loop.health.change import MARGIN, RAMPS, Change, Suspect, changing, happened_besides, ranked, suspects
 from armsight.loop.health.record import alarm_limit
 
 #: A block lasts so long, s, and until all joints together have travelled so far, rad, but at most so long, s: an arm that
@@ -296,7 +296,12 @@ class ClosureWatch:
         changes = self.explained = ranked([self._change(each, left) for each in finest])
         # Once something was reported, what explains it best replaces it, also where it is smaller than is reported first.
         if self.changes or _matters(changes[0]):
-            self.changes = changes
+            # What was reported before is not undone by something else that began later.
+            self.changes = (*changes, *happened_besides(self._reported(), changes[0]))
+
+    def _reported(self) -> tuple[Change, ...]:
+        """Return what was reported to have happened first, as alternatives of each other."""
+        return tuple(each for each in self.changes if each.besides) or self.changes
 
     def _finest_of(self, between: Array, hypotheses: Sequence[Suspect]) -> list[_Tested]:
         """Return hypotheses, each at the best of some beginnings, the block into which the change fell left out."""

@@ -11,7 +11,7 @@ import numpy as np
 from armsight.data import Array, Body, PoseEstimate
 from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement, Remembered
 from armsight.loop.estimators.clock import ClockFollower
-from armsight.loop.health.change import Change, doubtful, finding, suspected
+from armsight.loop.health.change import Change, doubtful, finding, happened_besides, suspected
 from armsight.loop.health.clock import clock_findings
 from armsight.loop.health.closure import ClosureWatch
 from armsight.loop.health.fixed import FixedWatch
@@ -242,7 +242,11 @@ class HealthMonitor:
         if self._closure is None or self._fixed is None:
             return ()
         noticed = self._fixed.changes or self._fixed.reopened[0]
-        return self._closure.changes or (noticed and self._closure.explained) or self._fixed.changes
+        changes = self._closure.changes or (noticed and self._closure.explained) or self._fixed.changes
+        if not changes or any(each.besides for each in changes):
+            return changes
+        later = [each for each in self._fixed.changes if each.begin_s > changes[0].begin_s]
+        return (*changes, *happened_besides(later, changes[0]))
 
     def _clocks(self, changes: Sequence[Change]) -> bool:
         """Return whether a clock that is followed explains hypotheses as well."""
