@@ -366,7 +366,9 @@ typedef struct motor_state {
     float window_rad;        /* the reading at its beginning */
     uint32_t window_ticks;
     uint32_t sampled;        /* samples taken */
-    float agreed_rad;        /* the motor's way on which the reading went along */
+    float trust;             /* of the speed limit: what the joint may use; 1 once motor and reading went the same way */
+    float way_read_rad;      /* the way since the joint last rested, by the reading */
+    float way_motor_rad;     /* and by the motor with the configured constant */
     int32_t swing_side;      /* which side of the reference's speed the motor's was on last */
     uint32_t swing_since;    /* driven_ticks when it changed */
     uint32_t swings;         /* changes in quick succession */
