@@ -17,7 +17,7 @@
 #define AGREED 4.0f           /* of apart_rad: so much way together proves that wiring and scale are right, */
 #define SAME_LOW 0.75f        /* if the motor's is as much of the reading's: */
 #define SAME_HIGH 1.3f        /* its constant is off by 15 %, the rest are resistance, backlash and noise */
-#define CAREFUL 0.3f          /* of the speed limit until then: a reading of a third of the true speed is no faster joint */
+#define CAREFUL 0.5f          /* of the speed limit until then: a reading of a third of the true speed is no faster joint */
 #define UNKNOWN_RAD_S 1000.0f
 #define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
 #define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
@@ -135,6 +135,7 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     const float variance = motor->variance_rr * ir_v * ir_v + 2.0f * motor->variance_rk * ir_v * emf_v +
                            motor->variance_kk * emf_v * emf_v;
     motor->unsure_rad_s = SIGMAS * number_root(variance > 0.0f ? variance : 0.0f) / config->constant_v_s;
+    motor->doubt_rad_s = motor->trust == 1.0f ? motor->unsure_rad_s : motor->unsure_rad_s * (1.0f / SIGMAS);
     const uint32_t at = motor->sampled % MOTOR_SAMPLES;
     motor->sample_read_rad[at] = angle_rad;
     motor->sample_motor_rad[at] = motor->travel_rad;
@@ -169,7 +170,7 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     const float size_rad_s = number_size(motor->speed_rad_s);
     const bool known = motor->current_a * config->resistance_ohm > DEAD_SHARE * config->constant_v_s * size_rad_s;
     motor->known = known ? 1u : 0u;
-    motor->sure_rad_s = known ? size_rad_s - motor->unsure_rad_s : 0.0f;
+    motor->sure_rad_s = known ? size_rad_s - motor->doubt_rad_s : 0.0f;
 }
 
 uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v)
@@ -184,7 +185,7 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
     const float motor_rad = motor->travel_rad - motor->sample_motor_rad[at];
     const float read_rad = motor->last_rad - motor->sample_read_rad[at];
     const bool agreed = motor->trust == 1.0f;
-    if (number_size(read_rad) < 0.25f * number_size(motor_rad)) {
+    if (number_size(read_rad) < 0.25f * number_size(motor_rad) + WINDOW_NOISE_RAD) {
         return FAULT_POT_FROZEN;
     }
     if (!agreed && read_rad * motor_rad < 0.0f) {

@@ -349,7 +349,8 @@ typedef struct motor_state {
     float duty;              /* put out in the last tick, direction of the joint */
     float speed_rad_s;       /* by the back-EMF */
     float unsure_rad_s;      /* how far that may be off */
-    float sure_rad_s;        /* the size it has at least; 0 where it is not known */
+    float doubt_rad_s;       /* the same, as far as it excuses a speed beyond the limit */
+    float sure_rad_s;        /* the size it has at least but for the doubt; 0 where it is not known */
     uint32_t known;          /* not 0: a current is seen, without which its sensor may be broken */
     float travel_rad;        /* since the joint was enabled */
     float current_a;         /* the largest of late */
