@@ -18,6 +18,7 @@
 #define SAME_LOW 0.75f        /* if the motor's is as much of the reading's: */
 #define SAME_HIGH 1.3f        /* its constant is off by 15 %, the rest are resistance, backlash and noise */
 #define CAREFUL 0.5f          /* of the speed limit until then: a reading of a third of the true speed is no faster joint */
+#define CONSTANT_OFF 0.15f    /* by so much a motor's constant may be off */
 #define UNKNOWN_RAD_S 1000.0f
 #define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
 #define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
@@ -135,7 +136,12 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     const float variance = motor->variance_rr * ir_v * ir_v + 2.0f * motor->variance_rk * ir_v * emf_v +
                            motor->variance_kk * emf_v * emf_v;
     motor->unsure_rad_s = SIGMAS * number_root(variance > 0.0f ? variance : 0.0f) / config->constant_v_s;
-    motor->doubt_rad_s = motor->trust == 1.0f ? motor->unsure_rad_s : motor->unsure_rad_s * (1.0f / SIGMAS);
+    if (motor->trust == 1.0f) {
+        motor->doubt_rad_s = motor->unsure_rad_s;
+    } else { /* nobody contradicts a constant that is too large: the joint is as fast as it may be */
+        const float by_resistance_v = SIGMAS * number_root(motor->variance_rr) * number_size(ir_v);
+        motor->doubt_rad_s = (by_resistance_v - CONSTANT_OFF * number_size(emf_v)) / config->constant_v_s;
+    }
     const uint32_t at = motor->sampled % MOTOR_SAMPLES;
     motor->sample_read_rad[at] = angle_rad;
     motor->sample_motor_rad[at] = motor->travel_rad;
