@@ -26,8 +26,7 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[name] = "1"
 ROOT = Path(__file__).resolve().parent.parent
 # The law in float64 is the tests' own.
-sys.path.insert(0, str(ROOT / "tests" / "firmware"))
-sys.path.insert(0, str(ROOT / "tests" / "firmware" / "core"))
+sys.path[:0] = [str(ROOT / "tests" / part) for part in ("firmware/core", "firmware", "")]
 
 import firmware_arm  # noqa: E402
 import numpy as np  # noqa: E402

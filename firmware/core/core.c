@@ -76,8 +76,9 @@ static bool advance(joint_state *joint, const joint_config *config, bool slowing
         joint->limited |= LIMITED_SOFT;
         path_rad_s2 = 0.0f;
     }
-    joint->limited |=
-        governor_step(&joint->reference, &joint->setpoint, path_rad_s2, config, joint->low_rad, joint->high_rad);
+    const float fastest = joint->motor.trust * config->speed_limit_rad_s;
+    joint->limited |= governor_step(&joint->reference, &joint->setpoint, path_rad_s2, config, fastest, joint->low_rad,
+                                    joint->high_rad);
     if (resting && number_size(joint->reference.speed_rad_s) < 0.01f * config->speed_limit_rad_s) {
         settle(joint);
     } else {

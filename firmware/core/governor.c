@@ -28,12 +28,11 @@ static inline float limit_speed(float twice_rad_s2, float distance_rad, float la
 }
 
 uint32_t governor_step(governor_state *reference, const setpoint_state *path, float path_rad_s2,
-                       const joint_config *config, float low_rad, float high_rad)
+                       const joint_config *config, float fastest, float low_rad, float high_rad)
 {
     uint32_t limited = 0u;
     const float faster_rad_s2 = config->acceleration_rad_s2;
     const float slower_rad_s2 = config->deceleration_rad_s2;
-    const float fastest = config->speed_limit_rad_s;
     const float before_rad = reference->position_rad;
     const float before_rad_s = reference->speed_rad_s;
     const float error_rad = path->position_rad - before_rad;

@@ -14,7 +14,11 @@
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
 #define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
 #define SAMPLE_TICKS 8u
-#define AGREED 3.0f           /* of apart_rad: so much way together proves that the wiring was right */
+#define AGREED 4.0f           /* of apart_rad: so much way together proves that wiring and scale are right, */
+#define SAME_LOW 0.75f        /* if the motor's is as much of the reading's: */
+#define SAME_HIGH 1.3f        /* its constant is off by 15 %, the rest are resistance, backlash and noise */
+#define CAREFUL 0.5f          /* of the speed limit until then: a reading of a third of the true speed is no faster joint */
+#define CONSTANT_OFF 0.15f    /* by so much a motor's constant may be off */
 #define UNKNOWN_RAD_S 1000.0f
 #define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
 #define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
@@ -31,7 +35,28 @@ void motor_start(motor_state *motor, float angle_rad, uint32_t phase)
                            .variance_rr = PRIOR_VARIANCE,
                            .variance_kk = PRIOR_VARIANCE,
                            .unsure_rad_s = UNKNOWN_RAD_S,
+                           .trust = CAREFUL,
                            .phase = phase};
+}
+
+/* Take a window's way of both into that since the joint last rested: once it is long and the same, the reading is trusted. */
+static void earn(motor_state *motor, const motor_config *config, float way_rad)
+{
+    if (number_size(way_rad) <= WINDOW_WAY_RAD) {
+        motor->way_read_rad = 0.0f;
+        motor->way_motor_rad = 0.0f;
+        return;
+    }
+    const float emf_v = motor->window_v - motor->resistance_scale * motor->window_ir_v;
+    motor->way_motor_rad += emf_v * TICK_S / config->constant_v_s;
+    motor->way_read_rad += way_rad;
+    if (number_size(motor->way_read_rad) < AGREED * config->apart_rad) {
+        return;
+    }
+    const float same = motor->way_motor_rad / motor->way_read_rad;
+    motor->trust = same > SAME_LOW && same < SAME_HIGH ? 1.0f : motor->trust;
+    motor->way_read_rad = 0.0f;
+    motor->way_motor_rad = 0.0f;
 }
 
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
@@ -52,9 +77,7 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
     const float off_v = motor->window_v * per_tick - motor->resistance_scale * ir_v - motor->constant_scale * kw_v;
     if (off_v * off_v <= SURPRISE * variance) {
         const float per_variance = 1.0f / variance;
-        const float way_rad = number_size(angle_rad - motor->window_rad);
-        const bool moved = way_rad > WINDOW_WAY_RAD;
-        motor->agreed_rad += moved ? way_rad : 0.0f;
+        const bool moved = number_size(angle_rad - motor->window_rad) > WINDOW_WAY_RAD;
         motor->resistance_scale =
             number_clamp(motor->resistance_scale + gain_r * off_v * per_variance, SCALE_LOW, SCALE_HIGH);
         if (moved) { /* else the constant is only taken into account (Schmidt's form) */
@@ -88,6 +111,9 @@ static void window(motor_state *motor, const motor_config *config, float voltage
         reach_rad <= WINDOW_WAY_RAD) {
         return; /* neither the reading nor the motor moves: the longer the window, the better */
     }
+    if (motor->trust != 1.0f) {
+        earn(motor, config, angle_rad - motor->window_rad);
+    }
     /* A gap that R and K may explain must be learnt from: else they would stay wrong for good. */
     if (number_size(motor->gap_rad) < 0.5f * config->apart_rad + motor->band_rad) {
         learn(motor, config, angle_rad);
@@ -110,6 +136,12 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     const float variance = motor->variance_rr * ir_v * ir_v + 2.0f * motor->variance_rk * ir_v * emf_v +
                            motor->variance_kk * emf_v * emf_v;
     motor->unsure_rad_s = SIGMAS * number_root(variance > 0.0f ? variance : 0.0f) / config->constant_v_s;
+    if (motor->trust == 1.0f) {
+        motor->doubt_rad_s = motor->unsure_rad_s;
+    } else { /* nobody contradicts a constant that is too large: the joint is as fast as it may be */
+        const float by_resistance_v = SIGMAS * number_root(motor->variance_rr) * number_size(ir_v);
+        motor->doubt_rad_s = (by_resistance_v - CONSTANT_OFF * number_size(emf_v)) / config->constant_v_s;
+    }
     const uint32_t at = motor->sampled % MOTOR_SAMPLES;
     motor->sample_read_rad[at] = angle_rad;
     motor->sample_motor_rad[at] = motor->travel_rad;
@@ -123,6 +155,7 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     motor->driven_ticks = number_count(motor->driven_ticks);
     if (config->resistance_ohm <= 0.0f || motor->driven_ticks <= SETTLE_TICKS) {
         motor->window_rad = angle_rad;
+        motor->trust = config->resistance_ohm <= 0.0f ? 1.0f : motor->trust; /* no witness, no trust to earn */
         return;
     }
     const float voltage_v = motor->duty * supply_v;
@@ -143,7 +176,7 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     const float size_rad_s = number_size(motor->speed_rad_s);
     const bool known = motor->current_a * config->resistance_ohm > DEAD_SHARE * config->constant_v_s * size_rad_s;
     motor->known = known ? 1u : 0u;
-    motor->sure_rad_s = known ? size_rad_s - motor->unsure_rad_s : 0.0f;
+    motor->sure_rad_s = known ? size_rad_s - motor->doubt_rad_s : 0.0f;
 }
 
 uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v)
@@ -157,8 +190,8 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
     const uint32_t at = (motor->sampled - back) % MOTOR_SAMPLES;
     const float motor_rad = motor->travel_rad - motor->sample_motor_rad[at];
     const float read_rad = motor->last_rad - motor->sample_read_rad[at];
-    const bool agreed = motor->agreed_rad > AGREED * config->apart_rad;
-    if (number_size(read_rad) < 0.25f * number_size(motor_rad)) {
+    const bool agreed = motor->trust == 1.0f;
+    if (number_size(read_rad) < 0.25f * number_size(motor_rad) + WINDOW_NOISE_RAD) {
         return FAULT_POT_FROZEN;
     }
     if (!agreed && read_rad * motor_rad < 0.0f) {
@@ -239,7 +272,7 @@ static bool jumped(const motor_state *motor, uint32_t count)
     return largest > 10.0f * NAME_NOISE_RAD && largest > JUMP_SHARE * (high - low);
 }
 
-uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect)
+uint32_t motor_names(const motor_state *motor, uint32_t suspect)
 {
     const uint32_t count = motor->sampled < NAME_SAMPLES ? motor->sampled : NAME_SAMPLES;
     if (count < NAME_SAMPLES / 2u) {
@@ -269,7 +302,7 @@ uint32_t motor_names(const motor_state *motor, const motor_config *config, uint3
     if (share < 0.15f) {
         return FAULT_POT_FROZEN;
     }
-    const bool agreed = motor->agreed_rad > AGREED * config->apart_rad;
+    const bool agreed = motor->trust == 1.0f;
     return agreed && share < 1.0f ? FAULT_POT_SLIP : FAULT_POT_SCALE;
 }
 

@@ -38,7 +38,7 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
 
 /* Return the fault by what motor and reading did in the last 192 ms; suspect where that does not show it. A motor that was
  * let go of changes its speed by itself: only then a reading that drifts can be distinguished from one that slips. */
-uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect);
+uint32_t motor_names(const motor_state *motor, uint32_t suspect);
 
 #define MOTOR_SWING 0.2f /* of the speed limit: so far from the reference's speed a swing goes at least */
 

@@ -5,6 +5,7 @@
 
 #define INLINE static inline __attribute__((always_inline))
 #define BEYOND 2.0f       /* so much more is a speed damped beyond its limit */
+#define BRAKE_S 0.003f    /* a few ticks: less, and a motor's speed measured a tick late swings */
 #define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up */
 #define CREEP_RAD_S 0.005f /* from here on dry friction is compensated by half and more */
 
@@ -69,14 +70,14 @@ float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *deman
     return step(pid, gains, demand, limited);
 }
 
-/* Return the duty of kp and kv that moves a free joint at its speed limit and a little more: what back-EMF (own_s_per_rad)
+/* Return the duty of kp and kv that moves a free joint at fastest_rad_s and a little more: what back-EMF (own_s_per_rad)
  * and damping take there. Without a known motor nothing bounds it. */
-static float spring_limit(const joint_config *config, float own_s_per_rad)
+static float spring_limit(const joint_config *config, float fastest_rad_s, float own_s_per_rad)
 {
     if (config->motor.resistance_ohm <= 0.0f) {
         return FLT_MAX;
     }
-    return SPARE_SPEED * config->speed_limit_rad_s * (config->gains.kd_s_per_rad + own_s_per_rad);
+    return SPARE_SPEED * fastest_rad_s * (config->gains.kd_s_per_rad + own_s_per_rad);
 }
 
 void pid_control(joint_state *joint, const joint_config *config, float per_nominal_v)
@@ -93,11 +94,13 @@ void pid_control(joint_state *joint, const joint_config *config, float per_nomin
     float duty_high = joint->duty_cap;
     const float own_s_per_rad = config->motor.constant_v_s * per_nominal_v;
     const float free_duty = config->speed_limit_rad_s * own_s_per_rad;
-    if (joint->motor.sure_rad_s > config->speed_limit_rad_s && joint->duty_cap > free_duty) {
-        if (joint->motor.speed_rad_s > 0.0f) { /* it is driven on as a free motor at its limit, and braked by all there is */
-            duty_high = free_duty;
+    const float faster_rad_s = joint->motor.sure_rad_s - config->speed_limit_rad_s;
+    if (faster_rad_s > 0.0f) { /* it is driven on as a free motor at its limit, less what brings it back there in BRAKE_S */
+        const float left_duty = free_duty - config->gains.ka_s2_per_rad * (1.0f / BRAKE_S) * faster_rad_s;
+        if (joint->motor.speed_rad_s > 0.0f) {
+            duty_high = number_clamp(left_duty, duty_low, duty_high);
         } else {
-            duty_low = -free_duty;
+            duty_low = number_clamp(-left_duty, duty_low, duty_high);
         }
         joint->limited |= LIMITED_SPEED;
     }
@@ -108,7 +111,7 @@ void pid_control(joint_state *joint, const joint_config *config, float per_nomin
                                .reference_rad_s = joint->reference.speed_rad_s,
                                .reference_rad_s2 = joint->reference.acceleration_rad_s2,
                                .damped_rad_s = seen_rad_s + (seen_rad_s > 0.0f ? more_rad_s : -more_rad_s),
-                               .spring_limit = spring_limit(config, own_s_per_rad),
+                               .spring_limit = spring_limit(config, config->speed_limit_rad_s, own_s_per_rad),
                                .gravity_duty = joint->gravity_duty,
                                .duty_limit = config->duty_limit,
                                .duty_low = duty_low,

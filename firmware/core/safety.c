@@ -247,14 +247,14 @@ static void watch_motor(core_state *core, joint_state *joint, const joint_config
 }
 
 /* Give a fault of a joint that was let go of its right name, once the motion since then shows it. */
-static void name_suspect(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
+static void name_suspect(core_state *core, joint_state *joint, uint32_t i)
 {
     joint->suspect_ticks = in_a_row(joint->suspect_ticks, joint->suspect != FAULT_NONE);
     if (joint->suspect_ticks < NAME_TICKS) {
         return;
     }
     const uint32_t suspect = joint->suspect;
-    const uint32_t fault = motor_names(&joint->motor, &config->motor, suspect);
+    const uint32_t fault = motor_names(&joint->motor, suspect);
     joint->suspect = FAULT_NONE;
     core->joint_faults[i] &= ~(1u << suspect);
     core->joint_faults[i] |= 1u << fault;
@@ -272,7 +272,7 @@ static void name_suspect(core_state *core, joint_state *joint, const joint_confi
 static void watch_joint(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
     if (joint->released != 0u) {
-        name_suspect(core, joint, config, i);
+        name_suspect(core, joint, i);
         return;
     }
     const float off_rad = number_size(joint->pid.error_rad);

@@ -349,7 +349,8 @@ typedef struct motor_state {
     float duty;              /* put out in the last tick, direction of the joint */
     float speed_rad_s;       /* by the back-EMF */
     float unsure_rad_s;      /* how far that may be off */
-    float sure_rad_s;        /* the size it has at least; 0 where it is not known */
+    float doubt_rad_s;       /* the same, as far as it excuses a speed beyond the limit */
+    float sure_rad_s;        /* the size it has at least but for the doubt; 0 where it is not known */
     uint32_t known;          /* not 0: a current is seen, without which its sensor may be broken */
     float travel_rad;        /* since the joint was enabled */
     float current_a;         /* the largest of late */
@@ -366,7 +367,9 @@ typedef struct motor_state {
     float window_rad;        /* the reading at its beginning */
     uint32_t window_ticks;
     uint32_t sampled;        /* samples taken */
-    float agreed_rad;        /* the motor's way on which the reading went along */
+    float trust;             /* of the speed limit: what the joint may use; 1 once motor and reading went the same way */
+    float way_read_rad;      /* the way since the joint last rested, by the reading */
+    float way_motor_rad;     /* and by the motor with the configured constant */
     int32_t swing_side;      /* which side of the reference's speed the motor's was on last */
     uint32_t swing_since;    /* driven_ticks when it changed */
     uint32_t swings;         /* changes in quick succession */

@@ -73,6 +73,19 @@ def test_an_inverted_potentiometer_is_named_from_the_first_motion(arms, library)
     assert arm.first == (Fault.POT_INVERTED, 2)
 
 
+@pytest.mark.parametrize(("share", "most"), [(1.0, 1.05), (0.35, 1.15)])
+def test_a_joint_is_careful_until_motor_and_reading_went_the_same_way(arms, library, share, most):
+    for seed in (930, 931, 932):
+        arm = arms.Arm(library, seed)
+        arm.plant.break_pot(2, PotFault.SCALED, share)
+        arm.enable()
+        motor = arm.core.joint[2].motor
+        assert motor.trust == pytest.approx(0.5)
+        arm.swing(1500)
+        assert (motor.trust == 1.0) == (share == 1.0)
+        assert arm.fastest < most
+
+
 def test_a_motor_whose_resistance_is_not_known_is_not_watched(arms, library):
     arm = swinging(arms, library, 900)
     for joint in arm.core.config.joint:
