@@ -141,22 +141,24 @@ def test_calibrate(page, session):
     assert len(list((session.folder / "calibration").glob("left*.png"))) >= 6
 
 
+def of_true_rig(now):
+    """Return the pose that a page shows if it can be one by the true rig: the first may still be by the rig before."""
+    pose = now and now["rig"].endswith("true.json") and now["pose"]
+    return pose if pose and pose["points"] == 9 and max(pose["sigma_mm"]) < 0.5 else None
+
+
 def test_body_and_measure(page, session):
-    until(lambda: session.measuring.rig_path == session.folder / "rig.json")
+    rigs = (session.folder / "rig.json", session.folder / "true.json")  # the second: this test ran before
+    until(lambda: session.measuring.rig_path in rigs)
     truth = session._simulated.workcell.truth
     truth.rig.save(session.folder / "true.json")  # a rig of six shots is good or poor by chance
     session.measuring.use_rig(truth.rig, session.folder / "true.json")
     click(page, "step-body")
     until(lambda: state(page, "body.grade") == "usable")
     click(page, "step-measure")
-    measured = until(
-        lambda: (now := state(page, "measure")) and now["rig"].endswith("true.json") and now["pose"] and now
-    )
-    pose = measured["pose"]
+    pose = until(lambda: of_true_rig(state(page, "measure")))
     distance_m = float(sum(x**2 for x in pose["position_mm"]) ** 0.5) / 1e3
     assert 0.6 < distance_m < 1.1
-    assert pose["points"] == 9
-    assert max(pose["sigma_mm"]) < 0.5
     click(page, "m-zero")
     until(lambda: state(page, "measure.relative") and abs(state(page, "measure.pose.position_mm[0]")) < 1.0)
     click(page, "m-mark")
