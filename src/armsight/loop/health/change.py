@@ -214,12 +214,13 @@ _OTHER: dict[Kind, str] = {
 def finding(changes: Sequence[Change], names: Sequence[str]) -> HealthFinding:
     """Return the finding of hypotheses that cannot be distinguished, the best first; names are those of the joints."""
     best, kind, joint = changes[0], changes[0].suspect.kind, changes[0].suspect.joint
-    others = [
-        each.suspect for each in changes[1:] if {each.suspect.kind, kind} not in ({"rig", "drift"}, {"time", "rate"})
-    ]
-    named = dict.fromkeys(_OTHER[each.kind].format(name=names[each.joint]) for each in others)
-    unsure = f"; {' or '.join(named)} cannot be excluded" if named else ""
-    causes = [each.cause for each in others]
+    others = [each for each in changes[1:] if {each.suspect.kind, kind} not in ({"rig", "drift"}, {"time", "rate"})]
+    unsure = ""
+    for besides, says in ((False, "cannot be excluded"), (True, "was reported before, and stays")):
+        suspected = [each.suspect for each in others if each.besides is besides]
+        named = dict.fromkeys(_OTHER[each.kind].format(name=names[each.joint]) for each in suspected)
+        unsure += f"; {' or '.join(named)} {says}" if named else ""
+    causes = [each.suspect.cause for each in others]
     if (kind, joint) == ("joint", 0):
         causes.append("fixed")
     alternatives = tuple(cause for cause in dict.fromkeys(causes) if cause != best.suspect.cause)

@@ -247,7 +247,8 @@ class RigFollower:
             T_base_rig: (4, 4) the rig as it was calibrated, m.
             at_s: the time, s.
         """
-        best, others = changes[0], [each for each in changes[1:] if each.suspect.cause != "fixed"]
+        best = changes[0]
+        others = [each for each in changes[1:] if each.suspect.cause != "fixed" and not each.besides]
         if best.suspect.cause != "fixed":
             self.rejected = f"base: a change of the {best.suspect.cause} explains the poses of the arm better"
             return None

@@ -243,7 +243,7 @@ class HealthMonitor:
             return ()
         noticed = self._fixed.changes or self._fixed.reopened[0]
         changes = self._closure.changes or (noticed and self._closure.explained) or self._fixed.changes
-        if not changes or any(each.besides for each in changes):
+        if not changes or changes is self._fixed.changes or any(each.besides for each in changes):
             return changes
         later = [each for each in self._fixed.changes if each.begin_s > changes[0].begin_s]
         return (*changes, *happened_besides(later, changes[0]))

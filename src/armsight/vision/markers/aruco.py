@@ -1,7 +1,7 @@
 """Square code markers of every family OpenCV knows, found roughly: identities and corners to a pixel or so.
 
 OpenCV finds quadrilaterals and reads their cells by a threshold. Blur and sharpening mix neighbouring cells of small
-markers, and some are not read. In families of 5x5 cells and more, those quadrilaterals are compared with all codes, each
+markers, and some are not read. In families of 6x6 cells and more, those quadrilaterals are compared with all codes, each
 blurred: the nearest code is taken where the next one explains the image much worse.
 
 AprilTag families carry their own names (``tag36h11``) and are then upright as the AprilTag project prints them; markers
@@ -108,7 +108,7 @@ def detect_markers(
 
 
 #: Families with fewer cells a side are not compared: what is no marker resembles one of their codes too often.
-_CODE_CELLS = 5
+_CODE_CELLS = 6
 #: A contour's corners are off by so much: factors of its size that are tried.
 _SCALES = (0.95, 1.0, 1.05, 1.1)
 #: Blurs of the codes, sigma in cells.

@@ -98,7 +98,7 @@ class Chessboard(Record, Target):
         rough = find_grid(image, self.columns, self.rows)
         if rough is None:
             return Detections.none(
-                f"no chessboard of {self.columns}x{self.rows} inner corners found{_other_size(image)}"
+                f"no chessboard of {self.columns}x{self.rows} inner corners found{self._other_size(image)}"
             )
         fits = fit_grid(image, rough)
         colours = np.sign(fits.contrast * self._parity)
@@ -114,6 +114,16 @@ class Chessboard(Record, Target):
         order = self._canonical_order(fits, first < 0)
         kept = kept[order]
         return Detections(np.flatnonzero(kept), fits.uv[order][kept], fits.cov_uv[order][kept])
+
+    def _other_size(self, image: NDArray[np.uint8]) -> str:
+        """Return ", but corners of 8x6: ..." where an image shows a chessboard of another size or a part of one."""
+        if min(image.shape) < IMAGE_SIDE_MIN_PX:
+            return ""
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(_search_copy(image)[0], (3, 3), flags=flags)
+        if not found or min(meta.shape) < OTHER_SIDE_MIN or sorted(meta.shape) == sorted((self.columns, self.rows)):
+            return ""
+        return f", but corners of {max(meta.shape)}x{min(meta.shape)}: a board of that size, or not the whole board"
 
     @cached_property
     def _parity(self) -> Array:
@@ -159,18 +169,6 @@ def find_grid(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None
     uv = (corners.reshape(rows, columns, 2).astype(np.float64) + 0.5) / scale - 0.5
     across, down = (uv[0, -1] - uv[0, 0]).tolist(), (uv[-1, 0] - uv[0, 0]).tolist()
     return uv if across[0] * down[1] - across[1] * down[0] > 0 else np.ascontiguousarray(uv[:, ::-1])
-
-
-def _other_size(image: NDArray[np.uint8]) -> str:
-    """Return ", but one of 9x6" where an image shows a chessboard of that size, else an empty text."""
-    if min(image.shape) < IMAGE_SIDE_MIN_PX:
-        return ""
-    small, _ = _search_copy(image)
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-    found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags=flags)
-    if not found or min(meta.shape) < OTHER_SIDE_MIN:
-        return ""
-    return f", but one of {max(meta.shape)}x{min(meta.shape)}"
 
 
 def _search_copy(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
