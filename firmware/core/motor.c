@@ -39,24 +39,33 @@ void motor_start(motor_state *motor, float angle_rad, uint32_t phase)
                            .phase = phase};
 }
 
+static void way_begin(motor_state *motor)
+{
+    motor->way_motor_rad = 0.0f;
+    motor->way_read_rad = 0.0f;
+    motor->way_mark_rad = 0.0f;
+    motor->way_ticks = 0u;
+}
+
 /* Take a window's way of both into that since the joint last rested: once it is long and the same, the reading is trusted. */
 static void earn(motor_state *motor, const motor_config *config, float way_rad)
 {
-    if (number_size(way_rad) <= WINDOW_WAY_RAD) {
-        motor->way_read_rad = 0.0f;
-        motor->way_motor_rad = 0.0f;
-        return;
-    }
     const float emf_v = motor->window_v - motor->resistance_scale * motor->window_ir_v;
     motor->way_motor_rad += emf_v * TICK_S / config->constant_v_s;
     motor->way_read_rad += way_rad;
+    motor->way_ticks += motor->window_ticks;
+    if (number_size(motor->way_read_rad - motor->way_mark_rad) > WINDOW_WAY_RAD) { /* it goes on, be it slowly */
+        motor->way_mark_rad = motor->way_read_rad;
+        motor->way_ticks = 0u;
+    } else if (motor->way_ticks >= REST_TICKS) {
+        way_begin(motor);
+    }
     if (number_size(motor->way_read_rad) < AGREED * config->apart_rad) {
         return;
     }
     const float same = motor->way_motor_rad / motor->way_read_rad;
     motor->trust = same > SAME_LOW && same < SAME_HIGH ? 1.0f : motor->trust;
-    motor->way_read_rad = 0.0f;
-    motor->way_motor_rad = 0.0f;
+    way_begin(motor);
 }
 
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */

@@ -70,14 +70,14 @@ float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *deman
     return step(pid, gains, demand, limited);
 }
 
-/* Return the duty of kp and kv that moves a free joint at fastest_rad_s and a little more: what back-EMF (own_s_per_rad)
+/* Return the duty of kp and kv that moves a free joint at its speed limit and a little more: what back-EMF (own_s_per_rad)
  * and damping take there. Without a known motor nothing bounds it. */
-static float spring_limit(const joint_config *config, float fastest_rad_s, float own_s_per_rad)
+static float spring_limit(const joint_config *config, float own_s_per_rad)
 {
     if (config->motor.resistance_ohm <= 0.0f) {
         return FLT_MAX;
     }
-    return SPARE_SPEED * fastest_rad_s * (config->gains.kd_s_per_rad + own_s_per_rad);
+    return SPARE_SPEED * config->speed_limit_rad_s * (config->gains.kd_s_per_rad + own_s_per_rad);
 }
 
 void pid_control(joint_state *joint, const joint_config *config, float per_nominal_v)
@@ -111,7 +111,7 @@ void pid_control(joint_state *joint, const joint_config *config, float per_nomin
                                .reference_rad_s = joint->reference.speed_rad_s,
                                .reference_rad_s2 = joint->reference.acceleration_rad_s2,
                                .damped_rad_s = seen_rad_s + (seen_rad_s > 0.0f ? more_rad_s : -more_rad_s),
-                               .spring_limit = spring_limit(config, config->speed_limit_rad_s, own_s_per_rad),
+                               .spring_limit = spring_limit(config, own_s_per_rad),
                                .gravity_duty = joint->gravity_duty,
                                .duty_limit = config->duty_limit,
                                .duty_low = duty_low,

@@ -370,6 +370,8 @@ typedef struct motor_state {
     float trust;             /* of the speed limit: what the joint may use; 1 once motor and reading went the same way */
     float way_read_rad;      /* the way since the joint last rested, by the reading */
     float way_motor_rad;     /* and by the motor with the configured constant */
+    float way_mark_rad;      /* the reading's when it last got on */
+    uint32_t way_ticks;      /* since then */
     int32_t swing_side;      /* which side of the reference's speed the motor's was on last */
     uint32_t swing_since;    /* driven_ticks when it changed */
     uint32_t swings;         /* changes in quick succession */

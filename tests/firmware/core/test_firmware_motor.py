@@ -86,6 +86,18 @@ def test_a_joint_is_careful_until_motor_and_reading_went_the_same_way(arms, libr
         assert arm.fastest < most
 
 
+def test_a_slow_joint_earns_its_speed_too(arms, library):
+    arm = arms.Arm(library, 960, load=0.05)  # hardly any current: its resistance remains unknown
+    for joint in arm.core.config.joint:
+        joint.speed_limit_rad_s = 0.4
+    arm.core.crc, arm.core.crc_at, arm.core.crc_known = 0xFFFFFFFF, 0, 0
+    arm.enable()
+    aim = np.linspace(arm.start, arm.start + 1.0, 1000)  # at 0.25 rad/s
+    arm.follow(aim, np.full_like(aim, 0.25))
+    assert arm.first == (None, None)
+    assert [joint.motor.trust for joint in arm.core.joint] == [1.0] * 6
+
+
 def test_a_motor_whose_resistance_is_not_known_is_not_watched(arms, library):
     arm = swinging(arms, library, 900)
     for joint in arm.core.config.joint:
