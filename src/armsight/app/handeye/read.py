@@ -132,11 +132,8 @@ def read_pose_table(
     if rotation is not None and rotation not in CONVENTIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
     head, rows, listed = _cells(path, columns)
-    notes: tuple[str, ...] = ()
     if listed:
-        _require_no_joints(path, rows[0], rotation, arm)
-        how = f"{unit or 'm'} and {rotation or 'rotation vector'}"
-        notes = (f"{path}: lists read as UR's pose: {how}, rad",) if "rx_rad" in head else ()
+        notes = _notes_of_lists(path, rows[0], arm, unit, rotation)
     else:
         head, rotation, notes = _understood(path, head, arm, unit, rotation)
     measured = set(head) >= _MEASURED
@@ -238,14 +235,19 @@ def _lists(path: Path, written: list[tuple[int, str]]) -> list[tuple[int, list[s
     return rows
 
 
-def _require_no_joints(path: Path, row: tuple[int, list[str]], rotation: str | None, arm: Arm | None) -> None:
-    """Reject lists that may be the joints of an arm as well as poses."""
-    line, cells = row
+def _notes_of_lists(
+    path: Path, first: tuple[int, list[str]], arm: Arm | None, unit: str | None, rotation: str | None
+) -> tuple[str, ...]:
+    """Return what lists of six numbers are read as; reject those that may be the joints of an arm as well."""
+    line, cells = first
     if arm is not None and rotation is None and len(cells) in (6, len(arm.joint_names)):
         raise InputError(
             f"{path}: line {line}: is this list a pose, or joint angles of {arm.name}? write poses as p[x, y, z, rx, "
             "ry, rz], or name columns of joints q1_rad .. or q1_deg .."
         )
+    what = "UR's pose" if rotation is None else "poses"
+    how = f"{unit or 'm'} and {rotation or 'rotation vector'}, rad"
+    return (f"{path}: lists read as {what}: {how}",) if len(cells) == 6 else ()
 
 
 def _without_names(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[str], list[tuple[int, list[str]]]]:
