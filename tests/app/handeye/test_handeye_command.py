@@ -1,7 +1,7 @@
 """``armsight handeye``: forms of tables, what it says, and what it rejects."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import cv2
@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from armsight.app.handeye.command import Options, calibrate
 from armsight.app.handeye.images import upright
 from armsight.app.handeye.read import read_pose_table
 from armsight.app.handeye.recording import matched_rows
+from armsight.app.handeye.result import as_json, headline, statements
+from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.robot.arm_file import open_arm
 from cli_runs import assert_rejected
@@ -123,6 +126,63 @@ def test_every_form_of_a_table_gives_the_same(armsight, tmp_path, seen, form):
     assert all(pose["used"] for pose in document["poses"])
 
 
+@pytest.mark.parametrize("form", ["q=[{q}] pose=p[{p}]", "movej([{q}]) # p[{p}]", "p[{p}],", "[{p}]", "[{p}],"])
+def test_joints_beside_a_pose_are_not_taken_for_it(tmp_path, form):
+    q, A, _ = motion()
+    vectors = np.hstack([A[:, :3, 3], Rotation.from_matrix(A[:, :3, :3]).as_rotvec()])
+    path, arm = tmp_path / "robot.txt", open_arm("six_r")
+    written = [[", ".join(f"{v:.9f}" for v in row) for row in both] for both in zip(q, vectors, strict=True)]
+    path.write_text("".join(["# of a UR\n", *(form.format(q=joints, p=pose) + "\n" for joints, pose in written)]))
+    table = read_pose_table(path)
+    np.testing.assert_allclose(table.Ts, A, atol=1e-8)
+    if "p[" in form:
+        assert table.notes == ()
+        np.testing.assert_allclose(read_pose_table(path, arm=arm).Ts, A, atol=1e-8)
+    else:
+        assert "read as UR's pose: m and rotation vector" in table.notes[0]
+        with pytest.raises(InputError, match="line 2: is this list a pose, or joint angles of six_r"):
+            read_pose_table(path, arm=arm)
+
+
+def test_lists_and_blocks_of_matrices_are_read_by_how_many_numbers_they_have(tmp_path):
+    A = motion(8)[1]
+    path = tmp_path / "robot.txt"
+    np.savetxt(path, A[:, :3].reshape(-1, 4))  # 24 lines, a multiple of four
+    np.testing.assert_allclose(read_pose_table(path).Ts, A, atol=1e-9)
+    path.write_text("".join(f"{row.tolist()}\n" for row in A.reshape(-1, 16)))
+    np.testing.assert_allclose(read_pose_table(path).Ts, A, atol=1e-9)
+    path.write_text("".join(f"{row.tolist()}\n" for row in np.hstack([1e3 * A[:, :3, 3], quaternions(A)])))
+    np.testing.assert_allclose(read_pose_table(path, rotation="wxyz", unit="mm").Ts, A, atol=1e-9)
+
+
+@pytest.mark.parametrize("maker", ["KUKA", "Fanuc"])
+def test_columns_beside_those_of_a_robots_maker_change_nothing(tmp_path, maker):
+    _, A, _ = motion()
+    angles = Rotation.from_matrix(A[:, :3, :3]).as_euler("ZYX" if maker == "KUKA" else "xyz", degrees=True)
+    head = "image,t_s,S,X [mm],Y [mm],Z [mm]," + ("A [deg],B [deg],C [deg]" if maker == "KUKA" else "W,P,R")
+    rows = [(f"{k}.png", k, 6, *row) for k, row in enumerate(np.hstack([1e3 * A[:, :3, 3], angles]))]
+    table = read_pose_table(named(tmp_path / "robot.csv", head, rows))
+    np.testing.assert_allclose(table.Ts, A, atol=1e-8)
+    assert table.names[3] == "3.png"
+    assert table.t_s[3] == 3
+    assert f"read as {maker}'s: mm; degrees" in table.notes[0]
+    assert "S" in table.notes[1]
+
+
+def test_a_unit_or_a_rotation_that_is_given_counts(tmp_path):
+    _, A, _ = motion()
+    angles = Rotation.from_matrix(A[:, :3, :3])
+    head = [f"position_{axis}" for axis in "xyz"] + [f"orientation_{axis}" for axis in "xyzw"]
+    ros = named(tmp_path / "ros.csv", ",".join(head), np.hstack([1e3 * A[:, :3, 3], angles.as_quat()]))
+    np.testing.assert_allclose(read_pose_table(ros, unit="mm").Ts, A, atol=1e-8)
+    turned = np.hstack([A[:, :3, 3], angles.as_euler("XYZ", degrees=True)])
+    euler = named(tmp_path / "euler.csv", "x,y,z,roll_deg,pitch_deg,yaw_deg", turned)
+    table = read_pose_table(euler, rotation="XYZ")
+    np.testing.assert_allclose(table.Ts, A, atol=1e-8)
+    assert table.notes == ()
+    assert "about the fixed x, y and z" in read_pose_table(euler).notes[0]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -152,6 +212,30 @@ def test_the_poses_that_measure_wrote_are_read_with_the_shots_it_missed(armsight
     assert_right(document)
     assert len(document["poses"]) == len(A) - 1
     assert "no target in s4 (no board)" in said
+
+
+def test_where_the_arms_geometry_is_off_the_error_is_of_the_transforms_that_are_given(tmp_path):
+    q, _, _ = motion(16)
+    off = q + np.array([0.0, 0.02, -0.02, 0.02, -0.02, 0.0])
+    B = inverse(open_arm("six_r").forward(off) @ X) @ Z
+    B = B @ exp_se3(np.random.default_rng(1).normal(0, [2e-4] * 3 + [5e-4] * 3, (16, 6)))
+    nothing = dict.fromkeys(one.name for one in fields(Options))
+    given = {
+        "robot": named(tmp_path / "q.csv", ",".join(f"q{i}_rad" for i in range(1, 7)), q),
+        "seen": matrices(tmp_path / "b.txt", B),
+        "eye": "in-hand",
+        "model": "six_r",
+    }
+    run = calibrate(Options(**(nothing | given)), lambda line: None)
+    document, said = as_json(run), "\n".join(statements(run))
+    assert document["noise"]["structure"] == "robot's geometry off"
+    poses = np.array([pose["held_out_m"] for pose in document["poses"] if pose["used"]])
+    assert document["held_out_rms_m"] == pytest.approx(np.sqrt((poses**2).mean()))
+    held_out, nominal = (f"{1e3 * document[f'held_out_{of}rms_m']:.2f} mm" for of in ("", "nominal_"))
+    assert nominal != held_out
+    assert f"poses left out: {held_out}" in headline(run)
+    assert f"with the arm's nominal model they leave {held_out}" in said
+    assert f"suits the arm's nominal model: {nominal}" in said
 
 
 def test_people_read_sigma_whose_error_blunders_and_a_plan_and_get_a_page(armsight, tmp_path):
@@ -317,7 +401,14 @@ def test_a_tcp_taken_for_the_flange_is_noted_where_the_joints_are_known(armsight
         ("x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,2,0,0,0\n", ["quaternion has length 2"]),
         ("1 2 3\n", ["line 1", "3 numbers without names"]),
         ("p[0, 0, 0, 0, 0]\n", ["line 1", "5 fields where 6"]),
-        ("p[0, 0, 0, 0, 0, 0]\nhello\n", ["line 2", "expected p[x, y, z, rx, ry, rz]"]),
+        ("p[0, 0, 0, 0, 0, 0]\nhello\n", ["line 2", "expected one p[x, y, z, rx, ry, rz]"]),
+        ("p[0, 0, 0, 0, 0, 0] p[0, 0, 0, 0, 0, 1]\n", ["line 1", "expected one p[x, y, z, rx, ry, rz]"]),
+        ("[0, 0, 0, 0, 0, 0]\nq=[0, 0, 0, 0, 0, 0]\n", ["line 2", "expected a list"]),
+        ("[0, 0, 0]\n", ["line 1", "3 numbers without names; known are 16"]),
+        ("[0, 0, 0, 1, 0, 0, 0]\n", ["--rotation wxyz or --rotation xyzw"]),
+        ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 2\n", ["line 8", "expected 0 0 0 1"]),
+        ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n1 0 0 0\n", ["line 5", "ends within a matrix"]),
+        ("X,Y,Z,A,B\n0,0,0,0,0\n", ["line 1", "no rotation"]),
         ("1 0 0 0 0 1 0 0 0 0 1.5 0\n", ["line 1", "no rotation"]),
         ("0 0 0 1 0 0 0\n", ["--rotation wxyz or --rotation xyzw"]),
         ("", ["no rows"]),

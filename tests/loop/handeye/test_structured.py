@@ -84,7 +84,7 @@ def test_an_arm_whose_geometry_is_off_is_recognised_and_the_covariance_allows_fo
         poses, Z, X, links = made(seed, n=30, camera=(2e-4, 5e-4, 5e-4), links=(3e-4, 1e-3))
         found = calibrate_structured(poses, links=links, structures=("robot and camera", "robot's geometry off"))
         assert found.structure == "robot's geometry off"
-        errors = (found.held_out_geometry, found.held_out, found.held_out_found)
+        errors = (found.held_out_geometry, found.held_out_nominal, found.held_out)
         left_out.append([error.rms()[0] for error in errors])
         of_links.append(nees(found, Z, X))
         white.append(nees(calibrate_structured(poses, structures=("robot and camera",)), Z, X))

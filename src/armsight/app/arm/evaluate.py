@@ -521,22 +521,24 @@ def _zero(arm: Arm, i: int, rests: RestPoses, found: Identified) -> tuple[float,
 _LEVER_M = 0.02
 
 
-def least_squares(A: Array, y: Array, groups: list[NDArray[np.int64]]) -> tuple[list[float], list[float]]:
+def least_squares(A: Array, y: Array, groups: list[NDArray[np.int64]] | None) -> tuple[list[float], list[float]]:
     """Return the coefficients of a fit and their sigmas, by the scatter of what is left.
 
-    What the columns lack is the same at every visit of a pose: visits do not average it out. The sigma is the larger
-    one of that of independent rests and that of independent poses (clustered: Liang and Zeger, Biometrika 73, 1986, for
-    G poses times G / (G - P)).
+    Without groups the rows are independent. What the columns lack is the same at every visit of a pose: visits do not
+    average it out. The sigma is the larger one of that of independent rests and that of independent poses (clustered:
+    Liang and Zeger, Biometrika 73, 1986, for G poses times G / (G - P)).
 
     Args:
         A: (N, P) columns.
         y: (N,) what is explained.
-        groups: rows of each pose.
+        groups: rows of each pose; None: rows have nothing in common.
     """
     x, *_ = np.linalg.lstsq(A, y, rcond=None)
     left = y - A @ x
     inverse = np.linalg.pinv(A.T @ A)
     rests = np.diag(inverse) * float(left @ left) / max(len(y) - A.shape[1], 1)
+    if groups is None:
+        return x.tolist(), np.sqrt(rests).tolist()
     pulls = np.array([A[rows].T @ left[rows] for rows in groups]) @ inverse
     poses = (pulls**2).sum(axis=0) * len(groups) / max(len(groups) - A.shape[1], 1)
     return x.tolist(), np.sqrt(np.maximum(rests, poses)).tolist()
@@ -582,7 +584,7 @@ def _drift(rests: RestPoses) -> tuple[Array, tuple[float, float] | None]:
 
 
 def _slope(t: Array, y: Array) -> tuple[float, float]:
-    fitted, sigmas = least_squares(np.column_stack([np.ones(len(t)), t]), y, list(np.arange(len(t))[:, None]))
+    fitted, sigmas = least_squares(np.column_stack([np.ones(len(t)), t]), y, None)
     return fitted[1], sigmas[1]
 
 

@@ -4,9 +4,12 @@ In: a CSV, TSV or text file. Out: :class:`PoseTable`. Known forms:
 
 - no first line of names: 16 (or 12) numbers a row, a matrix row by row; 7: x, y, z and a quaternion; 6: x, y, z and three
   numbers of a rotation; the option ``rotation`` names its convention.
-- Universal Robots' ``p[x, y, z, rx, ry, rz]``, metres and a rotation vector, one a line, also without the p.
+- Universal Robots' ``p[x, y, z, rx, ry, rz]``, metres and a rotation vector, one a line, among other text too; without the
+  p the line is the list alone, with a note, and none where a model is given: it may be joints. Lists of more numbers are
+  read as rows of them.
 - columns of ROS's messages (``pose.position.x``, ``transform.rotation.w``, joints by the model's names, rad), KUKA's
-  ``X,Y,Z,A,B,C``, Fanuc's ``X,Y,Z,W,P,R``, units in brackets (``x [mm]``); matrices of four lines each.
+  ``X,Y,Z,A,B,C``, Fanuc's ``X,Y,Z,W,P,R``, among others too, units in brackets (``x [mm]``); matrices of four lines each,
+  or of three without 0 0 0 1.
 - named columns: ``x_m y_m z_m`` (or ``x_mm``, or ``x`` with ``unit``); ``qw qx qy qz``; or ``rx_deg ry_deg rz_deg`` (or
   ``rx_rad``, ``rx``); or ``r11 .. r33``; or joints ``q1_deg ..`` (``q1_rad``) for a model, also by LeRobot's names. ``t_s``
   is a time, ``image`` the image that belongs to a row, ``name`` (``shot`` in what ``armsight measure`` writes) a name that
@@ -53,13 +56,17 @@ MOST_RAD = 4 * np.pi
 LOOSE = 2e-3
 #: Columns of the poses that `armsight measure -o` wrote.
 _MEASURED = {"shot", "status", "reason", "x_m"}
-_UR = re.compile(r"p?\[([^\[\]]*)\],?")
+_UR = re.compile(r"\bp\[([^\[\]]*)\]")
+#: A list alone in its line.
+_LIST = re.compile(r"\[([^\[\]]*)\],?")
 #: ROS's messages as columns, in metres (REP 103): pose.position.x, field.pose.orientation.w, transform.translation.x ...
 _ROS = re.compile(r"(?:.*[./_])?(?:(position|translation)|orientation|rotation)[._]([xyzw])")
 #: Names of others for ours, in small letters; roll, pitch and yaw rotate about the fixed x, y and z.
 _THEIRS = {"tx": "x", "ty": "y", "tz": "z", "roll": "rx", "pitch": "ry", "yaw": "rz"}
 #: Angles of robots' makers: the columns beside X, Y and Z, mm, whose rotations about fixed x, y and z they are, degrees.
 _MAKERS = {"KUKA": ("c", "b", "a"), "Fanuc": ("w", "p", "r")}
+#: A column of theirs, in small letters.
+_OF_A_MAKER = re.compile(r"(?:([xyz])(?:_(m|mm))?|([abcwpr])(?:_(deg|rad))?)")
 #: A joint without a unit.
 _UNITLESS = re.compile(r"(?:q|j|joint)_?([1-7])")
 #: What begins a line of something else than a table.
@@ -124,9 +131,11 @@ def read_pose_table(
     """
     if rotation is not None and rotation not in CONVENTIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
-    head, rows = _cells(path, columns)
-    head, usual, notes = _understood(path, head, arm, unit or "mm")
-    rotation = rotation or usual
+    head, rows, listed = _cells(path, columns)
+    if listed:
+        notes = _notes_of_lists(path, rows[0], arm, unit, rotation)
+    else:
+        head, rotation, notes = _understood(path, head, arm, unit, rotation)
     measured = set(head) >= _MEASURED
     rows, missed = _shown(path, head, rows) if measured else (rows, ("",) * len(rows))
     table = _Columns(path, head, rows)
@@ -170,19 +179,17 @@ def _shown(
     return [(line, row) for (line, _), row in zip(rows, filled, strict=True)], missed
 
 
-def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the names of the columns, made up where there are none, and the rows with their lines."""
+def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, list[str]]], bool]:
+    """Return the names of the columns, the rows with their lines, and whether they are lists."""
     text = read_text(path).removeprefix("\ufeff")
-    first = next((row.strip() for row in text.splitlines() if row.strip() and not row.startswith("#")), "")
-    if "p[" in text or _UR.fullmatch(first):
-        rows = []
-        for line, row in enumerate(text.splitlines(), 1):
-            found = _UR.search(row)
-            if found is None and row.strip():
-                raise InputError(f"{path}: line {line}: expected p[x, y, z, rx, ry, rz], found {row.strip()[:40]!r}")
-            if found is not None:
-                rows.append((line, [cell.strip() for cell in found[1].split(",")]))
-        return ["x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"], _even(path, rows, 6)
+    written = [(line, row.strip()) for line, row in enumerate(text.splitlines(), 1)]
+    written = [(line, row) for line, row in written if row and not row.startswith("#")]
+    first = written[0][1] if written else ""
+    if any(_UR.search(row) for _, row in written):
+        return ["x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"], _even(path, _poses_of_ur(path, written), 6), False
+    if _LIST.fullmatch(first):
+        head, rows = _without_names(path, _lists(path, written))
+        return ["x", "y", "z", "rx_rad", "ry_rad", "rz_rad"] if len(head) == 6 else head, rows, True
     if _NO_TABLE.match(first):
         raise InputError(
             f"{path}: {first[:40]!r} begins no table: write one pose a line, a matrix of 16 numbers or columns such as "
@@ -202,7 +209,49 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
     if not _is_number(head[0]) or any(re.fullmatch(r"[A-Za-z_]\w*", cell) and not _is_number(cell) for cell in head):
         if len(set(head)) != len(head):
             raise InputError(f"{path}: line {rows[0][0]} names a column twice")
-        return head, _even(path, rows[1:], len(head))
+        return head, _even(path, rows[1:], len(head)), False
+    return *_without_names(path, rows), False
+
+
+def _poses_of_ur(path: Path, written: list[tuple[int, str]]) -> list[tuple[int, list[str]]]:
+    """Return the numbers of the one p[...] that each line has."""
+    rows = []
+    for line, row in written:
+        found = _UR.findall(row)
+        if len(found) != 1:
+            raise InputError(f"{path}: line {line}: expected one p[x, y, z, rx, ry, rz], found {row[:40]!r}")
+        rows.append((line, [cell.strip() for cell in found[0].split(",")]))
+    return rows
+
+
+def _lists(path: Path, written: list[tuple[int, str]]) -> list[tuple[int, list[str]]]:
+    """Return the numbers of lists, one a line."""
+    rows = []
+    for line, row in written:
+        found = _LIST.fullmatch(row)
+        if found is None:
+            raise InputError(f"{path}: line {line}: expected a list [..] as before, found {row[:40]!r}")
+        rows.append((line, re.split(r"\s*,\s*|\s+", found[1].strip())))
+    return rows
+
+
+def _notes_of_lists(
+    path: Path, first: tuple[int, list[str]], arm: Arm | None, unit: str | None, rotation: str | None
+) -> tuple[str, ...]:
+    """Return what lists of six numbers are read as; reject those that may be the joints of an arm as well."""
+    line, cells = first
+    if arm is not None and rotation is None and len(cells) in (6, len(arm.joint_names)):
+        raise InputError(
+            f"{path}: line {line}: is this list a pose, or joint angles of {arm.name}? write poses as p[x, y, z, rx, "
+            "ry, rz], or name columns of joints q1_rad .. or q1_deg .."
+        )
+    what = "UR's pose" if rotation is None else "poses"
+    how = f"{unit or 'm'} and {rotation or 'rotation vector'}, rad"
+    return (f"{path}: lists read as {what}: {how}",) if len(cells) == 6 else ()
+
+
+def _without_names(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return names for columns that have none, by how many they are, and the rows."""
     matrix = [f"{letter}" for i in "123" for letter in (f"r{i}1", f"r{i}2", f"r{i}3", "xyz"[int(i) - 1])]
     forms = {
         16: [*matrix, "_0", "_1", "_2", "_3"],
@@ -211,25 +260,53 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
         6: ["x", "y", "z", "n1", "n2", "n3"],
         8: ["t_s", "x", "y", "z", "n1", "n2", "n3", "n4"],
     }
-    if len(head) == 4 and len(rows) % 4 == 0:  # matrices of four lines
-        rows = [(rows[k][0], [cell for _, row in rows[k : k + 4] for cell in row]) for k in range(0, len(rows), 4)]
-        return forms[16], _even(path, rows, 16)
-    if len(head) not in forms:
+    line, first = rows[0]
+    if len(first) == 4:
+        rows = _matrices(path, _even(path, rows, 4))
+    count = len(rows[0][1])
+    if count not in forms:
         raise InputError(
-            f"{path}: line {rows[0][0]}: {len(head)} numbers without names; known are 16 or 12 (a matrix), 8 (time, "
+            f"{path}: line {line}: {count} numbers without names; known are 16 or 12 (a matrix), 8 (time, "
             "position, quaternion), 7 (position, quaternion), 6 (position, three numbers of a rotation); or name columns"
         )
-    return forms[len(head)], _even(path, rows, len(head))
+    return forms[count], _even(path, rows, count)
+
+
+def _matrices(path: Path, rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+    """Return matrices of four lines each, or of three without the last one, as a row each."""
+
+    def is_last(row: list[str]) -> bool:
+        return all(map(_is_number, row)) and np.allclose([float(cell) for cell in row], [0, 0, 0, 1], atol=1e-6)
+
+    count = 4 if any(is_last(row) for _, row in rows) else 3  # three of [R p], whose rows have length 1, never end so
+    for line, row in rows[3::4] if count == 4 else ():
+        if not is_last(row):
+            raise InputError(
+                f"{path}: line {line}: expected 0 0 0 1, the last of a matrix's four lines, found {' '.join(row)[:40]!r}"
+            )
+    if len(rows) % count:
+        raise InputError(
+            f"{path}: line {rows[-1][0]}: ends within a matrix: four numbers a line are matrices of four lines each, the "
+            "last 0 0 0 1, or of three without it"
+        )
+    return [(rows[k][0], [cell for _, row in rows[k : k + count] for cell in row]) for k in range(0, len(rows), count)]
 
 
 def _understood(
-    path: Path, head: list[str], arm: Arm | None, unit: str
+    path: Path, head: list[str], arm: Arm | None, unit: str | None, rotation: str | None
 ) -> tuple[list[str], str | None, tuple[str, ...]]:
-    """Return our names for those of ROS, of robots' makers, whose lengths are in a unit, and of spreadsheets.
+    """Return our names for those of ROS, of robots' makers and of spreadsheets.
+
+    Args:
+        path: the file.
+        head: its names.
+        arm: the model whose joints it may name.
+        unit: of lengths whose columns name none; None: ROS's, m, and the makers', mm.
+        rotation: its convention where it is given.
 
     Returns:
-        The names; the convention of the rotation that goes with them, None where there is none; and a note where something
-        was taken for granted.
+        The names; the convention, the usual one where none is given, None where there is none either; and a note where
+        something was taken for granted.
     """
     bare = [re.sub(r"\s*[\[(](mm|m|deg|rad|s)[\])]$", r"_\1", name.strip().strip('"').strip().lower()) for name in head]
     ros = [_ROS.fullmatch(name) for name in bare]
@@ -240,22 +317,40 @@ def _understood(
         axis, mark, rest = name.partition("_")
         ours = _THEIRS.get(axis, axis) + mark + rest
         if found and (found[1] or parts == set("xyzw")):
-            ours = f"{found[2]}_m" if found[1] else f"q{found[2]}"
+            ours = f"{found[2]}_{unit or 'm'}" if found[1] else f"q{found[2]}"
         elif (joint := re.sub(r"_joint$", "", name)) in links:
             ours = links[joint]
         out.append(ours if ours in COLUMNS else given.strip().strip('"').strip())
-    maker = next((m for m, angles in _MAKERS.items() if sorted(bare) == sorted(("x", "y", "z", *angles))), None)
-    if maker is not None:
-        of = dict(zip(_MAKERS[maker], ("rx_deg", "ry_deg", "rz_deg"), strict=True))
-        out = [of.get(name, f"{name}_{unit}") for name in bare]
-        said = ", ".join(f"{name.upper()} about {ours[1]}" for name, ours in of.items())
-        return out, "xyz", (f"{path}: read as {maker}'s: {unit}; degrees, {said}; --columns says otherwise",)
+    theirs, said = _of_a_maker(bare, out, unit or "mm")
+    out = [theirs.get(k, name) for k, name in enumerate(out)]
     if len(set(out)) < len(out):
-        return head, None, ()
-    if any(name.startswith("roll") for name in bare):
+        return head, rotation, ()
+    if theirs:
+        return out, rotation or "xyz", (f"{path}: {said}; --columns says otherwise",)
+    if rotation is None and any(name.startswith("roll") for name in bare):
         note = f"{path}: roll, pitch, yaw read as rotations about the fixed x, y and z; --rotation says otherwise"
         return out, "xyz", (note,)
-    return out, None, ()
+    return out, rotation, ()
+
+
+def _of_a_maker(bare: list[str], ours: list[str], unit: str) -> tuple[dict[int, str], str]:
+    """Return our names for the six columns of KUKA or Fanuc, by their places, and what they are read as.
+
+    Other columns may stand beside them, but for another rotation: which one counts would be a guess.
+    """
+    found = {
+        one[1] or one[3]: (k, one[2] or one[4]) for k, name in enumerate(bare) if (one := _OF_A_MAKER.fullmatch(name))
+    }
+    makers = [maker for maker, angles in _MAKERS.items() if {*"xyz", *angles} <= set(found)]
+    if len(makers) != 1 or {"qw", "r11", "rx", "rx_deg", "rx_rad"} & set(ours):
+        return {}, ""
+    angles = _MAKERS[makers[0]]
+    lengths, turned = found["x"][1] or unit, found[angles[0]][1] or "deg"
+    names = {found[axis][0]: f"{axis}_{found[axis][1] or unit}" for axis in "xyz"}
+    names |= {found[name][0]: f"r{axis}_{found[name][1] or 'deg'}" for name, axis in zip(angles, "xyz", strict=True)}
+    about = ", ".join(f"{name.upper()} about {axis}" for name, axis in zip(angles, "xyz", strict=True))
+    degrees = "degrees" if turned == "deg" else "radians"
+    return names, f"read as {makers[0]}'s: {lengths}; {degrees}, {about}"
 
 
 def _even(path: Path, rows: list[tuple[int, list[str]]], count: int) -> list[tuple[int, list[str]]]:

@@ -128,16 +128,16 @@ def statements(run: HandEyeAnswer) -> list[str]:
             f"clock offset {1e3 * run.offset_s:.2f} ± {1e3 * run.sigma_offset_s:.2f} ms, to be added to the camera's times"
         )
     if found.held_out_geometry is not None:
-        plain, geometry = (1e3 * of.rms()[0] for of in (found.held_out, found.held_out_geometry))
+        errors = (found.held_out, found.held_out_nominal, found.held_out_geometry)
+        plain, nominal, geometry = (1e3 * of.rms()[0] for of in errors)
         lines.append(
             f"with the geometry of the arm that the other poses show, poses left out come to {geometry:.2f} mm in place of "
-            f"{plain:.2f}; armsight identify finds it"
+            f"{nominal:.2f}; armsight identify finds it"
         )
-        as_found = 1e3 * found.held_out_found.rms()[0]
         if found.structure in GEOMETRY:
             lines.append(
-                f"the transforms go with that geometry: with the arm as its model is they leave {as_found:.2f} mm, and "
-                f"those that suit the model best {plain:.2f}"
+                f"the transforms go with that geometry: with the arm's nominal model they leave {plain:.2f} mm; with the "
+                f"mounting that suits the arm's nominal model: {nominal:.2f} mm"
             )
     elif run.recording.robot.q is None:
         lines.append(
@@ -209,7 +209,7 @@ def as_json(run: HandEyeAnswer) -> dict[str, Any]:
         "held_out_rms_m": position,
         "held_out_rms_rad": angle,
         "held_out_mean_m": found.held_out.mean()[0],
-        "held_out_found_rms_m": found.held_out_found.rms()[0],
+        "held_out_nominal_rms_m": found.held_out_nominal.rms()[0],
         "held_out_geometry_rms_m": None if found.held_out_geometry is None else found.held_out_geometry.rms()[0],
         "rig_calibration_rms_m": found.common_m,
         "arm_rms_m": found.arm_m,

@@ -111,10 +111,10 @@ class StructuredHandEye(Record):
         likelihoods: structure -> mean logarithm of the probability density of a pose left out.
         arm_m: what the arm's error moves the body's middle by, RMS of the distance, m.
         camera_m: what vision's error does, m.
-        held_out: the error on poses left out of the fit, the arm as its model is. Where the structure says that its
-            geometry is off, with the mounting that suits the model best.
-        held_out_found: the same with a mounting found as T_flange_held was: where the geometry is off, it goes with the
-            true arm, and not with the model.
+        held_out: the error on poses left out of the fit, of transforms found as these were, the arm as its model is. Where
+            the structure says that its geometry is off they go with the true arm, and not with the model.
+        held_out_nominal: the same with the mounting that suits the arm's nominal model; another only where the structure
+            says that its geometry is off.
         held_out_geometry: the same as held_out where the arm's geometry, as the other poses show it, is taken into
             account; None without ``links``, or from too few poses.
         used: (N,) whether a pose was used, and not taken for a blunder.
@@ -137,7 +137,7 @@ class StructuredHandEye(Record):
     arm_m: float
     camera_m: float
     held_out: HeldOut
-    held_out_found: HeldOut
+    held_out_nominal: HeldOut
     held_out_geometry: HeldOut | None
     used: NDArray[np.bool_]
     distance: Array
@@ -286,7 +286,7 @@ def calibrate_structured(
         used=used_rows,
         distance=distance,
         held_out=_unsorted(found.held_out, order),
-        held_out_found=_unsorted(found.held_out_found, order),
+        held_out_nominal=_unsorted(found.held_out_nominal, order),
         held_out_geometry=geometry,
     )
 
@@ -555,8 +555,8 @@ def _chosen(
         likelihoods={name: float(trial.density.mean()) for name, trial in trials.items()},
         arm_m=arm,
         camera_m=camera,
-        held_out=_held_out_errors(whole, guess, nominal.residual, nominal.rows),
-        held_out_found=_held_out_errors(whole, guess, trials[best].residual, trials[best].rows),
+        held_out=_held_out_errors(whole, guess, trials[best].residual, trials[best].rows),
+        held_out_nominal=_held_out_errors(whole, guess, nominal.residual, nominal.rows),
         held_out_geometry=None if geometry is None else _held_out_errors(whole, guess, geometry.left, geometry.rows),
         used=used,
         distance=distance,
