@@ -42,12 +42,12 @@ docs: $(VENV)/.armsight-test  ## the site, into docs/_build/html; runs the tutor
 	$(BIN)/python -m sphinx -W --keep-going -n -q -j auto -D plot_gallery=1 docs docs/_build/html
 
 # Fewer repetitions than a script makes alone: docs/measured.md names the command of each table.
-BENCH := calibration.py "markers.py --fixed-only" "kinematics.py 100000" motions.py "board.py 1000" dense.py identify.py \
+SCRIPTS := calibration.py "markers.py --fixed-only" "kinematics.py 100000" motions.py "board.py 1000" dense.py identify.py \
 	"experiment.py 3 quick" "health.py --seeds 2100:2102" speed.py
 
 bench: $(VENV)/.armsight-test  ## every figure, peers beside; real recordings are looked for at ARMSIGHT_DATA
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[bench]"
-	cd benchmarks && for each in $(BENCH); do echo "== $$each"; ../$(BIN)/python $$each || exit 1; done
+	cd benchmarks && for each in $(SCRIPTS); do echo "== $$each"; ../$(BIN)/python $$each || exit 1; done
 
 # The firmware is built with the package, with zig from PyPI; ARMSIGHT_FIRMWARE_COMPILER=gcc asks for arm-none-eabi-gcc.
 $(VENV)/.armsight: pyproject.toml setup.py $(shell find firmware -type f)

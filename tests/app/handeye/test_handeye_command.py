@@ -175,8 +175,8 @@ def test_a_unit_or_a_rotation_that_is_given_counts(tmp_path):
     head = [f"position_{axis}" for axis in "xyz"] + [f"orientation_{axis}" for axis in "xyzw"]
     ros = named(tmp_path / "ros.csv", ",".join(head), np.hstack([1e3 * A[:, :3, 3], angles.as_quat()]))
     np.testing.assert_allclose(read_pose_table(ros, unit="mm").Ts, A, atol=1e-8)
-    turned = np.hstack([A[:, :3, 3], angles.as_euler("XYZ", degrees=True)])
-    euler = named(tmp_path / "euler.csv", "x,y,z,roll_deg,pitch_deg,yaw_deg", turned)
+    columns = np.hstack([A[:, :3, 3], angles.as_euler("XYZ", degrees=True)])
+    euler = named(tmp_path / "euler.csv", "x,y,z,roll_deg,pitch_deg,yaw_deg", columns)
     table = read_pose_table(euler, rotation="XYZ")
     np.testing.assert_allclose(table.Ts, A, atol=1e-8)
     assert table.notes == ()

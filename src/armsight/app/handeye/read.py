@@ -334,7 +334,7 @@ def _understood(
 
 
 def _of_a_maker(bare: list[str], ours: list[str], unit: str) -> tuple[dict[int, str], str]:
-    """Return our names for the six columns of KUKA or Fanuc, by their places, and what they are read as.
+    """Return our names for the six columns of KUKA or Fanuc, by their positions, and what they are read as.
 
     Other columns may stand beside them, but for another rotation: which one counts would be a guess.
     """
@@ -345,11 +345,11 @@ def _of_a_maker(bare: list[str], ours: list[str], unit: str) -> tuple[dict[int, 
     if len(makers) != 1 or {"qw", "r11", "rx", "rx_deg", "rx_rad"} & set(ours):
         return {}, ""
     angles = _MAKERS[makers[0]]
-    lengths, turned = found["x"][1] or unit, found[angles[0]][1] or "deg"
+    lengths, angle_unit = found["x"][1] or unit, found[angles[0]][1] or "deg"
     names = {found[axis][0]: f"{axis}_{found[axis][1] or unit}" for axis in "xyz"}
     names |= {found[name][0]: f"r{axis}_{found[name][1] or 'deg'}" for name, axis in zip(angles, "xyz", strict=True)}
     about = ", ".join(f"{name.upper()} about {axis}" for name, axis in zip(angles, "xyz", strict=True))
-    degrees = "degrees" if turned == "deg" else "radians"
+    degrees = "degrees" if angle_unit == "deg" else "radians"
     return names, f"read as {makers[0]}'s: {lengths}; {degrees}, {about}"
 
 
