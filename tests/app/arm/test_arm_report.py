@@ -121,6 +121,7 @@ def test_page_pdf_and_json_are_written_and_another_arm_is_compared(armsight, run
 
 
 def test_mistakes_are_one_line(armsight, run, tmp_path):
+    assert_rejected(armsight("arm", "report", tmp_path / "no.json"), "no.json: no such folder")
     assert_rejected(armsight("arm", "report", tmp_path), "does not name its arm")
     assert_rejected(armsight("arm", "report", tmp_path, "--arm", "so101"), "is no run")
     (tmp_path / "summary.json").touch()

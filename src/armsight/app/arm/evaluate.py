@@ -677,8 +677,12 @@ def nominal_arm(folder: Path, name: str | None) -> Arm:
     """Return the nominal arm of a run: the one of this name, or the one that the run names.
 
     Raises:
-        InputError: the run names none that is known.
+        InputError: there is no such folder, or the run names no arm that is known.
     """
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder}: {'is no folder' if folder.exists() else 'no such folder'}: give one of armsight run or demo"
+        )
     if name is not None:
         return open_arm(name)
     summary = _summary(folder)

@@ -198,7 +198,8 @@ def measure_shots(
     contradicted = missed.finding()
     if records and not any(record.ok for record in records):
         mistake = _mistaken(stereo, found, first) if detections is None else ""
-        raise ArmsightError(_nothing_measured(records, mistake, contradicted))
+        written = "" if output is None else f" (the reason of each is in {output})"
+        raise ArmsightError(_nothing_measured(records, mistake, contradicted) + written)
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
     moved = next((r.shutters for r in records if r.shutters is not None), None)
     saved = _keep_noise(stereo, noise, bool(skewed), moved, save_rig)
