@@ -5,8 +5,8 @@ away, before clutter, 1280x720. Seeds of the scenes begin where no scene of the 
 that a file has already are not made again, so a long run can be interrupted, and goes on where it ended.
 
 The peers: for discs thresholded contours (adaptive threshold, contours of an ellipse's shape: area within 10 % of that of
-the fitted ellipse, centre of the fitted ellipse); for tags OpenCV's aruco with the better of its sub-pixel and its AprilTag
-refinement; for chessboards ``findChessboardCornersSB``, exhaustive and accurate.
+the fitted ellipse, centre of the fitted ellipse); for tags OpenCV's aruco with its sub-pixel and with its AprilTag
+refinement, less half a pixel; for chessboards ``findChessboardCornersSB``, exhaustive and accurate.
 """
 
 from __future__ import annotations
@@ -74,7 +74,8 @@ def peers(image: np.ndarray, kind: str) -> dict[str, np.ndarray]:
     if kind == "tags":
         return {
             "aruco, sub-pixel": aruco(image, cv2.aruco.CORNER_REFINE_SUBPIX),
-            "aruco, AprilTag": aruco(image, cv2.aruco.CORNER_REFINE_APRILTAG),
+            # It puts the origin at the pixel's corner, as the AprilTag library does.
+            "aruco, AprilTag": aruco(image, cv2.aruco.CORNER_REFINE_APRILTAG) - 0.5,
         }
     if kind == "chessboard":
         return {"findChessboardCornersSB": squares(image)}
