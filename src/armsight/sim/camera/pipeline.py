@@ -169,7 +169,7 @@ class SimulatedCamera:
         """Return what the converter gives, the dark level subtracted and the white balance applied, uint16."""
         stages, shape = self.pipeline, light.shape
         start = noise_start(self._seed, 0, number)
-        noise = _strip(0, self._native)[start : start + light.size].reshape(shape)
+        noise = noise_strip(0, self._native)[start : start + light.size].reshape(shape)
         balance = _mosaic(stages.mosaic.white_balance if stages.mosaic else (1.0, 1.0, 1.0), (_BAND, shape[1]))
         if stages.sensor is None:
             sigma = np.float32(stages.white_noise.sigma_grey / 255 if stages.white_noise else 0.0)
@@ -242,9 +242,6 @@ class SimulatedCamera:
             return image
         method = _METHODS[self.pipeline.resizing.method]
         return np.asarray(cv2.resize(image, (self._width, self._height), interpolation=method))
-
-
-_strip = lru_cache(maxsize=2)(noise_strip)
 
 
 def _mosaic(rgb: tuple[float, float, float], shape: tuple[int, ...]) -> Radiance:

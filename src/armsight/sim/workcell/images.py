@@ -13,6 +13,7 @@ for measuring.
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -204,6 +205,8 @@ def moving(
 LENS = Optics(0.7, vignetting=0.08, light_gradient=(0.04, -0.04))
 #: Points around a pattern or a disc that bound it in the image, and by how much those around a disc are further out.
 EDGE, _OUT = 16, 1.02
+#: One room at a time is looked at: it takes ten times the memory of what it leaves, and workcells may share a camera.
+_LOOKING = threading.Lock()
 _STILL_PX = 0.05  # what moves less is painted once
 
 
@@ -322,8 +325,9 @@ class WorkcellCamera:
     @property
     def _room(self) -> _Room:
         """What it sees while nothing moves: found when it looks for the first time, in a second; some 40 MB."""
-        if self._seen_room is None:
-            self._seen_room = self._look()
+        with _LOOKING:
+            if self._seen_room is None:
+                self._seen_room = self._look()
         return self._seen_room
 
     def _look(self) -> _Room:
@@ -589,7 +593,9 @@ def picture(
     housing = np.append(False, plant.parts.housing[plant.parts.link > 0][:-1])
     tint[ids > 0] = np.where(housing[ids[ids > 0]][:, None], _HOUSING, _LINK)
     tint[np.abs(grey.astype(int) - bare) > _SAME] = 1.0  # the body is black and white
-    return np.asarray(np.clip(np.rint(tint * grey[..., None]), 0, 255).astype(np.uint8))
+    tint *= grey[..., None]
+    np.clip(np.rint(tint, out=tint), 0, 255, out=tint)
+    return tint.astype(np.uint8)
 
 
 def _tints(count: int, more: int) -> Array:
