@@ -283,7 +283,7 @@ def test_what_is_not_the_body_is_missed_and_a_bad_print_is_reported():
         np.testing.assert_allclose(scaled.cov, sharp.cov, rtol=1e-3, atol=1e-3 * np.abs(sharp.cov).max())
 
 
-def test_markers_of_another_size_at_the_right_places_are_named_with_the_size_that_fits():
+def test_markers_of_another_size_at_the_right_positions_are_named_with_the_size_that_fits():
     rig, rng = replace(rig_of(), sigma_px=0.02), np.random.default_rng(12)
     middles = np.array([[-45, -45, 0], [45, -45, 0], [45, 45, 0], [-45, 45, 0]]) / 1e3
     names = tuple(f"T{k}.{i}" for k in range(4) for i in range(4))

@@ -91,7 +91,7 @@ def _unlike(body: Body, points: Points, fit: PoseFit, used: PixelObservations) -
 def _wrong_size(rig: StereoRig, body: Body, points: Points, T_left_body: Array) -> str | None:
     """Report that the points are closer together or further apart than the body's, beyond the rig's errors, or None.
 
-    Markers of another size, at the right places, change the whole by less than themselves: these are named then.
+    Markers of another size, at the right positions, change the whole by less than themselves: these are named then.
     """
     scale = _other_scale(rig, body.points[points.ids], points, T_left_body)
     wrong = _wrong_markers(rig, body, points, T_left_body)
