@@ -1,5 +1,6 @@
 """Locating: scipy on OpenCV's projection is the oracle of the pose, Monte Carlo of its covariance."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -7,11 +8,12 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from armsight.data import Correspondences, Missed
+from armsight.data import Body, Correspondences, Missed
 from armsight.geometry.pose import exp_se3, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.camera import Camera
 from armsight.vision.locate import locate
+from armsight.vision.markers.tag import CORNERS
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import triangulate
 from asserts import numeric_jacobian
@@ -279,3 +281,24 @@ def test_what_is_not_the_body_is_missed_and_a_bad_print_is_reported():
         sharp = located(replace(rig, sigma_px=scaled.misfit * SIGMA_PX), 1.01 * points, shot)
         assert sharp.misfit == 1
         np.testing.assert_allclose(scaled.cov, sharp.cov, rtol=1e-3, atol=1e-3 * np.abs(sharp.cov).max())
+
+
+def test_markers_of_another_size_at_the_right_positions_are_named_with_the_size_that_fits():
+    rig, rng = replace(rig_of(), sigma_px=0.02), np.random.default_rng(12)
+    middles = np.array([[-45, -45, 0], [45, -45, 0], [45, 45, 0], [-45, 45, 0]]) / 1e3
+    names = tuple(f"T{k}.{i}" for k in range(4) for i in range(4))
+
+    def tags(size_m, spread=1.0):
+        return np.concatenate([spread * m + CORNERS * size_m / 2 for m in middles])
+
+    for _ in range(5):
+        shot = seen(rig, tags(0.045), somewhere(rng), sigma=0.02, rng=rng)
+        found = [
+            locate(rig, Body("plate", names, points), triangulate(rig, body_of(points), shot))
+            for points in (tags(0.045), tags(0.0525), tags(0.0525, 0.0525 / 0.045))
+        ]
+        assert found[0].misfit == 1
+        assert re.search(
+            r"have another size than its file says: T0 (44\.9\d*|45[.0-9]*) mm instead of 52\.5,", found[1].reason
+        )
+        assert "its points lie 0.857 times as far apart" in found[2].reason  # all of it is larger

@@ -33,6 +33,8 @@ _COLLINEAR = 1e-3
 _ALIKE = 0.2
 #: A body whose points are too far apart or too close together by this share, and by so many sigmas, is another body.
 _SIZE_TOLERANCE, _SIZE_SIGMAS = 0.02, 6.0
+#: Markers whose size is wrong by the same share as the whole body's, within this, are not named; nor more than so many.
+_SAME_SCALE, _NAMED = 0.01, 3
 #: Residuals beyond this quantile of their chi-square distribution are a misfit, not chance.
 _MISFIT_QUANTILE = 0.999
 
@@ -89,10 +91,43 @@ def _unlike(body: Body, points: Points, fit: PoseFit, used: PixelObservations) -
 def _wrong_size(rig: StereoRig, body: Body, points: Points, T_left_body: Array) -> str | None:
     """Report that the points are closer together or further apart than the body's, beyond the rig's errors, or None.
 
+    Markers of another size, at the right positions, change the whole by less than themselves: these are named then.
+    """
+    scale = _other_scale(rig, body.points[points.ids], points, T_left_body)
+    wrong = _wrong_markers(rig, body, points, T_left_body)
+    if wrong and (scale is None or abs(np.median([s for s, _ in wrong]) - scale) > _SAME_SCALE):
+        more = f" and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else ""
+        named = ", ".join(said for _, said in wrong[:_NAMED])
+        return f"markers of {body.name} have another size than its file says: {named}{more}; correct the file"
+    if scale is None:
+        return None
+    return (
+        f"its points lie {scale:.3f} times as far apart as those of {body.name}: is the size in the target right (of a "
+        "square, a tag, the body file's unit), and is it the target the rig sees?"
+    )
+
+
+def _wrong_markers(rig: StereoRig, body: Body, points: Points, T_left_body: Array) -> list[tuple[float, str]]:
+    """Return by how much each marker with a wrong size (points NAME.0, NAME.1, ...) is larger, and what it measures."""
+    wrong, markers = [], np.array([body.point_names[i].rpartition(".")[0] for i in points.ids])
+    for name in dict.fromkeys(markers[markers != ""].tolist()):
+        rows = markers == name
+        if rows.sum() < 3:
+            continue
+        p_body = body.points[points.ids[rows]]
+        arrays = (points.ids[rows], points.p_left[rows], points.cov[rows], points.calibration[rows])
+        if (scale := _other_scale(rig, p_body, Points(*arrays, points.seen), T_left_body)) is not None:
+            apart = 1e3 * float(np.linalg.norm(p_body[1] - p_body[0]))
+            wrong.append((scale, f"{name} {scale * apart:.4g} mm instead of {apart:.4g}"))
+    return wrong
+
+
+def _other_scale(rig: StereoRig, p_body: Array, points: Points, T_left_body: Array) -> float | None:
+    """Return by how many times points (N) lie further apart than p_body (N, 3), m, where that is not chance; or None.
+
     The scale is that of a similarity fit, ``T_left_body`` being the rigid one; its sigma includes pixel noise and the
     rig's calibration.
     """
-    p_body = body.points[points.ids]
     p = (p_body - p_body.sum(axis=0) / len(p_body)) @ T_left_body[:3, :3].T
     spread = float(np.vdot(p, p))
     scale = float(np.vdot(p, points.p_left)) / spread
@@ -100,12 +135,7 @@ def _wrong_size(rig: StereoRig, body: Body, points: Points, T_left_body: Array) 
         return None
     by_rig = np.einsum("ni,nip->p", p, points.calibration) / spread
     variance = float(np.einsum("ni,nij,nj->", p, points.cov, p)) / spread**2 + float(by_rig @ rig.cov @ by_rig)
-    if abs(scale - 1) <= _SIZE_SIGMAS * np.sqrt(variance):
-        return None
-    return (
-        f"its points lie {scale:.3f} times as far apart as those of {body.name}: is the size in the target right (of a "
-        "square, a tag, the body file's unit), and is it the target the rig sees?"
-    )
+    return scale if abs(scale - 1) > _SIZE_SIGMAS * np.sqrt(variance) else None
 
 
 @lru_cache(maxsize=256)

@@ -86,6 +86,10 @@ def test_a_side_by_side_file_is_split_in_the_middle(film, picture, read_back):
         (("left", k), ("right", k)) for k in range(5)
     ]
     assert found[0].left.shape == found[0].right.shape == (48, 64, 3)
+    assert notes_of(open_source(f"video:{film('both.avi', images)}")) == ()
+    one = film("one.avi", [np.zeros((48, 64, 3), np.uint8)] * 3)
+    (note,) = notes_of(open_source(f"video:{one}"))
+    assert note.startswith(f"{one}: frames of 64x48 px have the shape of one picture, and are taken as two of 32x48")
 
 
 def test_a_file_that_is_cut_short_says_so(film, picture):
@@ -173,3 +177,7 @@ def test_interpolated_frames_are_said(film, rates, share):
     (note,) = notes_of(source)
     assert note.startswith(f"{left}: ")
     assert int(note.split(" % of the frames are interpolated")[0].split()[-1]) == pytest.approx(share, abs=8)
+    ((path, odd),) = source.odd_frames.items()
+    assert path == str(left)
+    assert {k * rates[0] % rates[1] != 0 for k in odd["interpolated"]} == {True}
+    assert f"frames {odd['interpolated'][0]}, {odd['interpolated'][1]}, " in note

@@ -31,6 +31,7 @@ from armsight.vision.follow.follower import Follower, follows, measurer
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_fixed, open_target
+from armsight.vision.match import gate
 from armsight.vision.measure import measure, measure_seen, size_problem
 from armsight.vision.noise import DiscNoise
 from armsight.vision.rig import Shutters, StereoRig
@@ -49,6 +50,8 @@ _SYNC_S = 1e-3
 _WIDE_PX, _AGAIN = 2.0, 60
 #: So many shots that fit badly are named.
 _NAMED = 3
+#: What to do about repeated shots of a recording.
+_RECORDED = "they are no new measurements: leave them out, and record at the rate that the cameras really give"
 #: A shot that is younger by its own stamp was stamped by a live camera, s.
 _LIVE_S = 10.0
 
@@ -153,6 +156,7 @@ def measure_shots(
             if output is not None and isinstance(opened, StoredSource):
                 check_writable(output, apart_from=opened.files)
             total, timed = opened.count, _timed(opened)
+            recorded = timed or isinstance(opened, StoredSource)
             if requested is not None and not timed:
                 raise InputError("--skew and --readout need a recording with times: they show the motion of the body")
             if requested is None and stereo.shutters is not None:
@@ -195,6 +199,8 @@ def measure_shots(
             raise
         if detections is None:  # what only the images showed
             _say(note for note in notes_of(opened) if note not in said)
+            if as_json and isinstance(opened, VideoSource) and (odd := opened.odd_frames):
+                click.echo(json.dumps({"odd_frames": odd}))
     contradicted = missed.finding()
     if records and not any(record.ok for record in records):
         mistake = _mistaken(stereo, found, first) if detections is None else ""
@@ -203,7 +209,10 @@ def measure_shots(
     _close(records, time.perf_counter() - started, output, view, _board_file(rig, stereo, target))
     moved = next((r.shutters for r in records if r.shutters is not None), None)
     saved = _keep_noise(stereo, noise, bool(skewed), moved, save_rig)
-    health = monitor.findings()
+    health = tuple(
+        replace(each, advice=_RECORDED) if each.cause == "host" and (detections is not None or recorded) else each
+        for each in monitor.findings()
+    )
     for line in unseen_lines(monitor.fixed_never_seen):
         click.echo(f"note: {line}", err=True)
     if contradicted is not None:
@@ -279,9 +288,14 @@ class _Contradicting:
                 self._missed += 1
                 if self._tried < _AGAIN:
                     self._tried += 1
-                    if isinstance(wide := self._again(self._wide, shot), PoseEstimate):
+                    if isinstance(wide := self._again(self._wide, shot), PoseEstimate) and self._apart(wide):
                         self._found.append(wide)
             yield result
+
+    def _apart(self, found: PoseEstimate) -> bool:
+        """Whether rays of a shot miss each other by more than the rig allows; a body of another size does not do that."""
+        seen = found.points.seen
+        return bool(gate(self._rig, self._body, seen).paired.sum() < seen.paired.sum())
 
     def finding(self) -> HealthFinding | None:
         """Return what explains them, where they are more than those that were measured; None elsewhere."""

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array, Image, Shot
 from armsight.errors import InputError
@@ -27,6 +28,8 @@ _EVERY = 4
 _REPEAT_SHARE, _NEARBY, _LEAST_CHANGE = 1 / 16, 3, 0.25
 #: Repeated and interpolated frames are said from this share on: what moves and stops has a few that look like it.
 _REPEATS_SAID = 0.15
+#: So many of them are named.
+_LISTED = 8
 #: A frame is interpolated if a mixture of its neighbours is so much nearer to it than mixtures are to frames nearby. The
 #: share of one neighbour in it is at least this, otherwise it is a repeated one. Only pixels count that differ by so many
 #: grey levels between the neighbours: noise where nothing moves is averaged by codecs, too.
@@ -44,11 +47,17 @@ class VideoSource:
         self._files = list(files)
         first, last = self._files[0], self._files[-1]
         rates = [1 / file.period_s for file in (first, last)]
-        self._rates: tuple[str, ...] = ()
+        self._odd: tuple[str, ...] = ()
         if min(rates) > 0 and abs(rates[0] - rates[1]) > _RATES * max(rates):
-            self._rates = (
+            self._odd = (
                 f"{first.path} has {rates[0]:.4g} frames a second and {last.path} {rates[1]:.4g}: only those of nearly the "
                 "same time are paired, up to half a frame apart; set both cameras to one rate, or use what stands still",
+            )
+        width, height = first.size_px
+        if len(self._files) == 1 and width < 2 * height:
+            self._odd = (
+                f"{first.path}: frames of {width}x{height} px have the shape of one picture, and are taken as two of "
+                f"{width // 2}x{height} side by side; two files are video:LEFT,RIGHT",
             )
         self._shots = 0
         self._ended = False
@@ -57,7 +66,14 @@ class VideoSource:
     def notes(self) -> tuple[str, ...]:
         """What is odd about the files: different rates, and frames that repeat or are interpolated among those read."""
         said = (text for file in self._files for text in (file.repeats(), file.interpolated()))
-        return (*self._rates, *(text for text in said if text is not None))
+        return (*self._odd, *(text for text in said if text is not None))
+
+    @property
+    def odd_frames(self) -> dict[str, dict[str, list[int]]]:
+        """File -> ``repeated``, ``interpolated`` -> numbers of such frames among those read; only where there are."""
+        found = {file.path: {"repeated": file.repeated[0], "interpolated": file.mixed[0]} for file in self._files}
+        some = {path: {kind: numbers for kind, numbers in kinds.items() if numbers} for path, kinds in found.items()}
+        return {path: kinds for path, kinds in some.items() if kinds}
 
     @staticmethod
     def open(left: str | Path, right: str | Path | None = None) -> VideoSource:
@@ -73,7 +89,7 @@ class VideoSource:
         if right is not None and Path(left).resolve() == Path(right).resolve():
             raise InputError(f"{left}: given as both left and right video; a side-by-side video is video:{left}")
         files = [_File.open(path) for path in (left, right) if path is not None]
-        width = int(files[0].capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        width, _ = files[0].size_px
         if right is None and width % 2:
             files[0].capture.release()
             raise InputError(f"{left}: a side-by-side video must have an even width, this one is {width} px wide")
@@ -146,11 +162,13 @@ class _File:
         fps = self.capture.get(cv2.CAP_PROP_FPS)
         self.period_s = 1 / fps if fps > 0 else np.inf
         self.promised = int(self.capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.size_px = tuple(int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         self.frames = 0
         self.t_s = 0.0
         self.held = False  # the current frame waits for a partner: the next grab keeps it
         self._before: Array | None = None
         self._two_before: Array | None = None
+        self._numbers: list[int] = []  # of the frames that were decoded, from 0
         self._changes: list[float] = []  # mean squared differences from the frame before, grey levels squared
         # Of each frame between two others what is left of it without the best mixture of both, as a share of the square
         # of their difference, and the first one's share in the mixture; infinite and 0 where nothing moves.
@@ -171,6 +189,7 @@ class _File:
         ok, image = self.capture.retrieve()
         if not ok:
             return None
+        self._numbers.append(self.frames - 1)
         some = np.asarray(image[::_EVERY, ::_EVERY], np.float64)
         if self._before is not None:
             self._changes.append(float(np.mean((some - self._before) ** 2)))
@@ -179,40 +198,61 @@ class _File:
         self._two_before, self._before = self._before, some
         return np.asarray(image)
 
-    def repeats(self) -> str | None:
-        """Return what to say where frames repeat the ones before them, as a slower camera's do in a faster file."""
+    @property
+    def repeated(self) -> tuple[list[int], float]:
+        """Numbers of the frames that repeat the ones before them, and their share; none where they are few."""
         changes = np.array(self._changes)
         if len(changes) <= 2 * _NEARBY:
-            return None
+            return [], 0.0
         nearby = _largest_nearby(changes)
         changing = nearby > _LEAST_CHANGE
-        same = changing & (changes[_NEARBY:-_NEARBY] < _REPEAT_SHARE * nearby)
-        if same.sum() <= _REPEATS_SAID * max(changing.sum(), 1):
+        return self._said(changing & (changes[_NEARBY:-_NEARBY] < _REPEAT_SHARE * nearby), changing)
+
+    @property
+    def mixed(self) -> tuple[list[int], float]:
+        """Numbers of the frames that are mixtures of their neighbours, and their share; none where they are few."""
+        if len(self._mixtures) <= 2 * _NEARBY:
+            return [], 0.0
+        left, first = np.array(self._mixtures).T
+        nearby = _largest_nearby(left)
+        moving = np.isfinite(nearby) & np.isfinite(left[_NEARBY:-_NEARBY])
+        between = (np.abs(first - 0.5) < 0.5 - _MIXED)[_NEARBY:-_NEARBY]
+        return self._said(moving & between & (left[_NEARBY:-_NEARBY] < _REPEAT_SHARE * nearby), moving)
+
+    def _said(self, odd: NDArray[np.bool_], of: NDArray[np.bool_]) -> tuple[list[int], float]:
+        """Return the numbers of odd frames (N,), and their share of others (N,), if it is large enough to be said."""
+        share = float(odd.sum() / max(of.sum(), 1))
+        numbers = np.array(self._numbers)[1 + _NEARBY :][: len(odd)]
+        return (numbers[odd].tolist(), share) if share > _REPEATS_SAID else ([], 0.0)
+
+    def repeats(self) -> str | None:
+        """Return what to say where frames repeat the ones before them, as a slower camera's do in a faster file."""
+        numbers, share = self.repeated
+        if not numbers:
             return None
-        share = float(same.sum() / changing.sum())
         given, rate = (1 - share) / self.period_s, 1 / self.period_s
         return (
             f"{self.path}: {100 * share:.0f} % of the frames repeat the one before: the camera gave about {given:.0f} "
-            f"images a second and the file has {rate:.0f}; a repeated image is no new measurement, and its time is late"
+            f"images a second and the file has {rate:.0f}; a repeated image is no new measurement, and its time is late: "
+            f"{_listed(numbers)}"
         )
 
     def interpolated(self) -> str | None:
         """Return what to say where frames are mixtures of their neighbours, as a converted rate's are."""
-        if len(self._mixtures) <= 2 * _NEARBY:
+        numbers, share = self.mixed
+        if not numbers:
             return None
-        left, first = np.array(self._mixtures).T
-        nearby = _largest_nearby(left)
-        moving = np.isfinite(nearby) & np.isfinite(left[_NEARBY:-_NEARBY])
-        mixed = (np.abs(first - 0.5) < 0.5 - _MIXED)[_NEARBY:-_NEARBY] & (
-            left[_NEARBY:-_NEARBY] < _REPEAT_SHARE * nearby
-        )
-        if (mixed & moving).sum() <= _REPEATS_SAID * max(moving.sum(), 1):
-            return None
-        share = float((mixed & moving).sum() / moving.sum())
         return (
             f"{self.path}: {100 * share:.0f} % of the frames are interpolated, mixtures of those before and after: they "
-            "show markers twice, or where they never were; record at the camera's own rate, or leave them out"
+            "show markers twice, or where they never were; record at the camera's own rate, or leave them out: "
+            f"{_listed(numbers)}"
         )
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    """Name the first few frames of many."""
+    more = f" and {len(numbers) - _LISTED} more" if len(numbers) > _LISTED else ""
+    return f"frames {', '.join(map(str, numbers[:_LISTED]))}{more} (from 0)"
 
 
 def _largest_nearby(values: Array) -> Array:

@@ -1,5 +1,6 @@
 """Discs in images: centres against truth and against the bound of the model, what is no disc, and images of all kinds."""
 
+import cv2
 import numpy as np
 import pytest
 from disc_painter import grey, outline, share
@@ -122,6 +123,25 @@ def test_noise_that_is_correlated_and_grows_with_contrast_is_that_of_each_discs_
     # 54 chi-squares each: 0.14; taken as white, 4 and more. The covariance is never below that of white noise.
     assert 0.6 < np.mean(normed[30.0]) < 1.35
     assert 0.6 < np.mean(normed[130.0]) < 1.35
+
+
+def test_an_edge_that_is_skewed_leaves_a_centre_as_uncertain_as_blur_moves_it():
+    rng = np.random.default_rng(31)
+    size, light = 44, np.full((132, 132), 50.0)
+    for k in range(9):
+        at, c = np.array([k % 3, k // 3]) * size, size / 2 + rng.uniform(-0.5, 0.5, 2)
+        light[at[1] : at[1] + size, at[0] : at[0] + size] += 130 * share(
+            [outline(c, 11, 10, 0.3)], 0.7, np.zeros(2), size
+        )
+    sigmas = {}
+    for name, part in (("even", 0.0), ("skewed", 0.15)):  # so much of the light arrives 2 px further right
+        image = grey((1 - part) * light + part * np.roll(light, 2, 1), 0.5, rng)
+        sharp, soft = BRIGHT.find(image), BRIGHT.find(cv2.GaussianBlur(image, (0, 0), 1.2))
+        e, cov = soft.uv - sharp.uv, soft.cov_uv + sharp.cov_uv
+        assert np.mean(np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov), e)) / 2 < 1.5
+        sigmas[name] = np.sqrt(sharp.cov_uv[:, [0, 1], [0, 1]].mean(axis=0))
+    assert sigmas["skewed"][0] > 10 * sigmas["even"][0]
+    assert sigmas["skewed"][0] > 3 * sigmas["skewed"][1]  # and not down
 
 
 def test_motion_smears_a_disc_about_its_middle_or_is_reported():

@@ -27,6 +27,7 @@ from armsight.vision.markers.disc.fit import (
     HARMONICS,
     LIGHT,
     PARAMETERS,
+    SKEWED,
     SURROUND,
     UNKNOWNS,
     FitBuffers,
@@ -51,6 +52,8 @@ _WHITE = 4.0
 _VIGNETTING = 0.3
 #: Chi-square of two degrees from which a disc or its surround may have a gradient: chance exceeds it in 1% and 10%.
 _SLOPE_INSIDE, _SLOPE_OUTSIDE = 9.2, 4.6
+#: Chi-square of two degrees from which an edge is skewed, beyond that of noise: chance exceeds it in 0.1%.
+_SKEW = 13.8
 #: How likely each kind of gradient is where there is one (LIGHT, SURROUND, GLARE).
 _KINDS = (0.6, 0.3, 0.1)
 
@@ -139,7 +142,8 @@ def correct(
     """Correct a disc's centre by what the image's discs have in common, and enlarge its covariance.
 
     A rim that deviates significantly more than others, because a little of it is covered perhaps, may have shifted the
-    centre as much.
+    centre as much. So may an edge that is steeper on one side: where its middle is depends on the profile, and sharpening
+    or blur that is the same on all sides moves it.
 
     Args:
         image: (H, W) grey.
@@ -149,7 +153,7 @@ def correct(
         cov: (2, 2) covariance of the centre, px^2, of the fit, replaced.
         work: buffers.
     """
-    factor, theta = disc[2], disc[PARAMETERS:]
+    factor, theta = disc[2], disc[PARAMETERS : PARAMETERS + UNKNOWNS]
     u, v = _from_middle(image, disc, 0), _from_middle(image, disc, 1)
     du, dv = disc[8] * u + disc[10] * v, disc[9] * u + disc[11] * v
     a, b = disc[3] - shared[1] * u, disc[4] - shared[1] * v
@@ -170,6 +174,11 @@ def correct(
     if off > 0.0 and disc[0] > _RIM_CHANCE:
         cov[0, 0] += off
         cov[1, 1] += off
+    if disc[SKEWED + 2] > _SKEW * factor:
+        skew, share = disc[SKEWED : SKEWED + 2], 1.0 - _SKEW * factor / disc[SKEWED + 2]
+        for i in range(2):
+            for j in range(2):
+                cov[i, j] += share * skew[i] * skew[j]
 
 
 @kernel

@@ -38,8 +38,8 @@ MOST_PIXELS = 3072
 MOST_DISCS = 16384
 #: Unknowns: c (2), M (3), s, C, B, g (2).
 UNKNOWNS = 10
-#: What a fit shows of noise and light, and where its parameters are in it.
-SHOWN, PARAMETERS = 24, 14
+#: What a fit shows of noise and light, and where its parameters are in it, and what a skewed edge does.
+SHOWN, PARAMETERS, SKEWED = 27, 14, 24
 #: Floats in a cache line.
 _LINE = 16
 
@@ -86,7 +86,8 @@ class FitBuffers(NamedTuple):
         shown: (SHOWN,) what the last fit shows of noise and light: its rim (power, see :func:`rim_power`; mean
             square of the sectors' deviations beyond white noise, px^2; 1 / power of white noise), a gradient inside
             (9, see :func:`slope_inside`), one outside (chi-square; of a textured surround minus :func:`texture_factor`),
-            by how much the other unknowns enlarge the variance of the centre, its parameters (10).
+            by how much the other unknowns enlarge the variance of the centre, its parameters (10), a skewed edge (3, see
+            :func:`skewed_edge`).
         discs: (MOST_DISCS, SHOWN) the same for each disc of an image.
     """
 
@@ -607,6 +608,69 @@ def slope_inside(n: int, theta: Array, x0: float, y0: float, variance: float, wo
     shown[5], shown[6], shown[7] = k00 * information, k01 * information, k11 * information
 
 
+@kernel(fastmath=True)
+def _skew_products(n: int, work: FitBuffers) -> None:
+    """Fill ``work.products`` with the products of the two columns of :func:`skewed_edge`, as for a gradient inside.
+
+    The columns are (z^2 - 1) times the derivatives by the centre. The pixels' grey levels are overwritten.
+    """
+    J, left, weight, out = work.J, work.left, work.level, work.products
+    for i in range(n):
+        weight[i] = J[5, i] * J[5, i] / (J[0, i] * J[0, i] + J[1, i] * J[1, i] + F(1e-12)) - _ONE
+    for a in range(UNKNOWNS):
+        total_u, total_v = _ZERO, _ZERO
+        for i in range(n):
+            weighed = weight[i] * J[a, i]
+            total_u += weighed * J[0, i]
+            total_v += weighed * J[1, i]
+        out[0, a], out[1, a] = total_u, total_v
+    uu, uv, vv, ru, rv = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+    for i in range(n):
+        u, v = weight[i] * J[0, i], weight[i] * J[1, i]
+        ru += u * left[i]
+        rv += v * left[i]
+        uu += u * u
+        uv += u * v
+        vv += v * v
+    out[0, 10], out[1, 10] = ru, rv
+    out[0, 11], out[0, 12], out[1, 11], out[1, 12] = uu, uv, uv, vv
+
+
+@kernel
+def skewed_edge(n: int, variance: float, work: FitBuffers) -> None:
+    """Estimate by how much the centre would move if the edge's profile were skewed towards one side of the image.
+
+    A lens with coma, a shaken exposure or a lens model that the rim bends makes the edge steeper on one side. To first
+    order (Edgeworth) the profile Phi(z) then has -k (z^2 - 1) phi(z) besides, with k the part of a vector along the rim's
+    normal. One step of the twelve unknowns, as in :func:`slope_inside`. ``work.shown`` is filled from SKEWED on: the
+    centre's shift, px (2); by how much chi-square falls, in the noise's variance.
+
+    Args:
+        n: pixels.
+        variance: of the noise, as the residuals have it.
+        work: the pixels, linearised, with what is left of the residuals in ``work.left``; their grey is overwritten.
+    """
+    g, L, scale, x, out, shown = work.g, work.L, work.scale, work.x, work.products, work.shown
+    _skew_products(n, work)
+    s0, s1, k00, k01, k11 = out[0, 10], out[1, 10], out[0, 11], out[0, 12], out[1, 12]
+    g[:] = out[0, :UNKNOWNS]
+    solve(L, scale, g, x)
+    u0, v0 = x[0], x[1]
+    for a in range(UNKNOWNS):
+        k00 -= out[0, a] * x[a]
+        k01 -= out[1, a] * x[a]
+    g[:] = out[1, :UNKNOWNS]
+    solve(L, scale, g, x)
+    for a in range(UNKNOWNS):
+        k11 -= out[1, a] * x[a]
+    det = k00 * k11 - k01 * k01
+    shown[SKEWED:] = 0.0
+    if det > 0.0:
+        along, across = (k11 * s0 - k01 * s1) / det, (k00 * s1 - k01 * s0) / det
+        shown[SKEWED], shown[SKEWED + 1] = -(u0 * along + x[0] * across), -(v0 * along + x[1] * across)
+        shown[SKEWED + 2] = (along * s0 + across * s1) / variance
+
+
 @kernel
 def slope_outside(theta: Array, work: FitBuffers) -> float:
     """Return by how much chi-square would rise without the surround's gradient, in units of the noise's variance."""
@@ -782,7 +846,8 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     power, information = rim_power(n, theta, x0, y0, variance, work)
     work.shown[0], work.shown[1], work.shown[2] = power, off / max(count, 1), information / variance
     work.shown[12] = slope_outside(theta, work) / variance
-    work.shown[PARAMETERS:] = theta
+    work.shown[PARAMETERS : PARAMETERS + UNKNOWNS] = theta
+    skewed_edge(n, variance, work)
     of_centre(work, cov)
     radius = det**-0.25
     work.shown[13] = max(0.25 * (cov[0, 0] + cov[1, 1]) * information * radius, 1.0)
