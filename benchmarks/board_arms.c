@@ -24,8 +24,8 @@ typedef struct arm_loop {
     core_state *core;
     core_inputs *inputs;
     core_outputs *outputs;
-    double fastest_rad_s; /* while it is enabled: of any joint, */
-    double apart_rad;     /* from its reference */
+    double fastest;   /* while it is enabled: of any joint, of its limit, */
+    double apart_rad; /* from its reference */
     uint32_t supply_mv, ticks, sequence, unused;
     double way[SPEED_TICKS][JOINTS]; /* where the joints were of late */
 } arm_loop;
@@ -132,8 +132,9 @@ uint32_t arm_run(arm_loop *arm, uint32_t ticks)
         if (arm->outputs->state == STATE_ENABLED) {
             for (uint32_t i = 0u; i < JOINTS; i++) {
                 const double before = arm->way[(arm->ticks + 1u) % SPEED_TICKS][i];
-                const double speed = fabs(arm->link[i] - before) / (TICK * (SPEED_TICKS - 1u));
-                arm->fastest_rad_s = arm->ticks > SPEED_TICKS ? fmax(arm->fastest_rad_s, speed) : 0.0;
+                const double limit_rad_s = (double)arm->core->config.joint[i].speed_limit_rad_s;
+                const double share = fabs(arm->link[i] - before) / (TICK * (SPEED_TICKS - 1u)) / limit_rad_s;
+                arm->fastest = arm->ticks > SPEED_TICKS ? fmax(arm->fastest, share) : 0.0;
                 arm->apart_rad = fmax(arm->apart_rad, fabs(arm->link[i] - (double)arm->outputs->reference_rad[i]));
             }
         }

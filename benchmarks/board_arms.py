@@ -35,9 +35,10 @@ from armsight.firmware import build  # noqa: E402
 from armsight.robot.boards.codes import Fault  # noqa: E402
 from armsight.robot.boards.configuration import GAINS, lab_configuration  # noqa: E402
 from armsight.robot.boards.frames import OUTPUTS  # noqa: E402
-from armsight.robot.boards.tuning import MotorFigures, tuned_gains  # noqa: E402
+from armsight.robot.boards.tuning import MotorFigures, motion_limits, quiet_bandwidth, tuned_gains  # noqa: E402
 from armsight.sim.joints import (  # noqa: E402
     CONSTANT_V_S,
+    COUNTS_PER_RAD,
     DRY_N_M,
     RESISTANCE_OHM,
     SUPPLY_V,
@@ -95,12 +96,37 @@ def arm_configuration(model, rng):
     return config
 
 
+def brought_up_configuration(model, rng):
+    """What a bring-up finds and stores: R to 3 %, K to 1.5 %, a current's gain with both; gains and limits by its rules."""
+    config = arm_configuration(model, rng)
+    seen_ohm = model.resistance_ohm / model.current_gain * rng.uniform(0.97, 1.03, 6)
+    seen_v_s = model.constant_v_s * rng.uniform(0.985, 1.015, 6)
+    for i, joint in enumerate(config["joint"]):
+        noise_rad = float(model.noise_counts[i]) / COUNTS_PER_RAD
+        motor = MotorFigures(
+            float(seen_ohm[i]),
+            float(seen_v_s[i]),
+            float(model.inertia_kg_m2[i] * model.current_gain[i]),
+            float(model.viscous_n_m_s[i]),
+            float(model.dry_n_m[i]),
+        )
+        joint["gains"] = np.array(
+            tuple(tuned_gains(motor, SUPPLY_V, quiet_bandwidth(motor, SUPPLY_V, noise_rad))), GAINS
+        )
+        apart_rad = max(0.03, 10 * noise_rad + 1.5 * float(model.backlash_rad[i]))
+        joint["motor"] = (motor.resistance_ohm, motor.constant_v_s, apart_rad)
+        speed, acceleration = motion_limits(motor, SUPPLY_V, abs(float(model.gravity_n_m[i])))
+        joint["speed_limit_rad_s"], joint["jerk_rad_s3"] = speed, 100 * acceleration
+        joint["acceleration_rad_s2"] = joint["deceleration_rad_s2"] = acceleration
+    return config
+
+
 class Loop(ctypes.Structure):
     """``arm_loop`` of board_arms.c."""
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in (*PLANT_ARRAYS, "core_tick", "core", "inputs", "outputs")),
-        ("fastest_rad_s", ctypes.c_double),
+        ("fastest", ctypes.c_double),
         ("apart_rad", ctypes.c_double),
         *((name, ctypes.c_uint32) for name in ("supply_mv", "ticks", "sequence", "unused")),
         ("way", ctypes.c_double * 48),
@@ -159,7 +185,7 @@ class Arm:
     @property
     def fastest(self):
         """Of the limit, while it was enabled."""
-        return self.loop.fastest_rad_s / float(self.config["joint"]["speed_limit_rad_s"][0])
+        return self.loop.fastest
 
     @property
     def apart(self):
@@ -311,6 +337,30 @@ def pushed(library, seed, table):
     table.add("push 2 N m 0.1 s", arm, ())
 
 
+def loaded_suddenly(library, seed, table):
+    """As a bring-up leaves an arm: it hangs, swings for five seconds and rests; then 1 N m pulls at every joint."""
+    rng = np.random.default_rng([seed, 9])
+    model = drawn_model(seed)
+    hangs = -np.sign(model.gravity_n_m) * np.pi / 2
+    config = brought_up_configuration(model, rng)
+    arm = Arm(library, seed, model=model, config=config, supply_v=SUPPLY_V, start=hangs)
+    limits = config["joint"]
+    arm.hz, arm.phase = 0.4, np.zeros(6)
+    w = 2 * math.pi * arm.hz
+    arm.speed_rad_s = np.minimum(
+        0.5 * w, np.minimum(limits["speed_limit_rad_s"], limits["acceleration_rad_s2"] / w) / 1.15
+    )
+    arm.enable()
+    arm.rest(200)
+    arm.swing(7500)
+    arm.rest(1500)
+    arm.plant.hand_n_m[:] = 1.0
+    arm.rest(1500)
+    arm.plant.hand_n_m[:] = 0.0
+    arm.rest(1000)
+    table.add("unloaded, then 1 N m", arm, ())
+
+
 def soft_limit(library, seed, table):
     start = np.random.default_rng([seed, 8]).uniform(1.6, 2.2)
     arm = Arm(library, seed, load=0.4, start=np.full(6, start))
@@ -373,6 +423,7 @@ def main():
     classes = {
         "healthy": healthy,
         "pushed": pushed,
+        "loaded": loaded_suddenly,
         "soft": soft_limit,
         "jumping": jumping_host,
     }

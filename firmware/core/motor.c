@@ -6,11 +6,11 @@
 #define SIGMAS 3.0f
 #define SCALE_LOW 0.8f        /* further off than so is no tolerance of a motor */
 #define SCALE_HIGH 1.25f
-#define WINDOW_TICKS 32u      /* over which R and K are learnt; while the reading rests, its noise is that of the ends, */
-#define REST_TICKS 256u       /* so that a longer window says more, */
-#define ROUGH_VARIANCE 4e-4f  /* only once R is known to 2 %: else a hand that lets go teaches a wrong one for good */
-#define REST_NOISE_RAD 0.0035f /* but the motor may move within its backlash */
-#define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
+#define WINDOW_TICKS 32u      /* R and K are learnt from a window: until the reading has moved, looked at as often, */
+#define REST_TICKS 256u       /* or has rested for so long */
+#define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer; */
+#define REST_NOISE_RAD 0.0035f /* that and what a resting motor may still move; */
+#define PLAY_NOISE_RAD 0.01f  /* and the gear's backlash, wherever the motor may have crossed it */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
 #define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
 #define SAMPLE_TICKS 8u
@@ -68,8 +68,23 @@ static void earn(motor_state *motor, const motor_config *config, float way_rad)
     way_begin(motor);
 }
 
+/* Return how far the motor's way over a window may be from the reading's, and remember which way it went. Only a gear that
+ * goes on to the side where its teeth lie already, or a motor that goes on resting, tells nothing of the backlash. */
+static float window_noise(motor_state *motor, const motor_config *config, float way_rad)
+{
+    const bool moved = number_size(way_rad) > WINDOW_WAY_RAD;
+    const int32_t side = moved ? (way_rad > 0.0f ? 1 : -1) : 0;
+    const bool goes_on = side == motor->window_side;
+    motor->window_side = side;
+    if (moved) {
+        return goes_on ? WINDOW_NOISE_RAD : PLAY_NOISE_RAD;
+    }
+    const float emf_v = motor->window_v - motor->resistance_scale * motor->window_ir_v;
+    return goes_on && number_size(emf_v) * TICK_S < WINDOW_WAY_RAD * config->constant_v_s ? REST_NOISE_RAD : PLAY_NOISE_RAD;
+}
+
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
-static void learn(motor_state *motor, const motor_config *config, float angle_rad)
+static void learn(motor_state *motor, const motor_config *config, float angle_rad, float noise_rad)
 {
     const float ticks = (float)motor->window_ticks;
     const float per_tick = 1.0f / ticks;
@@ -78,7 +93,6 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
     const float per_s = (float)TICKS_PER_S * per_tick;
     const float ir_v = motor->window_ir_v * per_tick;
     const float kw_v = config->constant_v_s * (angle_rad - motor->window_rad) * per_s;
-    const float noise_rad = motor->window_ticks > WINDOW_TICKS ? REST_NOISE_RAD : WINDOW_NOISE_RAD;
     const float noise_v = config->constant_v_s * noise_rad * per_s;
     const float gain_r = motor->variance_rr * ir_v + motor->variance_rk * kw_v;
     const float gain_k = motor->variance_rk * ir_v + motor->variance_kk * kw_v;
@@ -115,17 +129,17 @@ static void window(motor_state *motor, const motor_config *config, float voltage
     if (motor->window_ticks % WINDOW_TICKS != 0u) {
         return;
     }
-    const float reach_rad = motor->sure_rad_s * (TICK_S * (float)WINDOW_TICKS);
-    if (motor->window_ticks < REST_TICKS && motor->variance_rr < ROUGH_VARIANCE && number_size(angle_rad - motor->window_rad) <= WINDOW_WAY_RAD &&
-        reach_rad <= WINDOW_WAY_RAD) {
-        return; /* neither the reading nor the motor moves: the longer the window, the better */
+    const float way_rad = angle_rad - motor->window_rad;
+    if (motor->window_ticks < REST_TICKS && number_size(way_rad) <= WINDOW_WAY_RAD) {
+        return;
     }
+    const float noise_rad = window_noise(motor, config, way_rad);
     if (motor->trust != 1.0f) {
-        earn(motor, config, angle_rad - motor->window_rad);
+        earn(motor, config, way_rad);
     }
     /* A gap that R and K may explain must be learnt from: else they would stay wrong for good. */
     if (number_size(motor->gap_rad) < 0.5f * config->apart_rad + motor->band_rad) {
-        learn(motor, config, angle_rad);
+        learn(motor, config, angle_rad, noise_rad);
     }
     window_begin(motor, angle_rad);
 }

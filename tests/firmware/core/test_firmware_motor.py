@@ -205,3 +205,10 @@ def test_gains_that_make_a_joint_swing_are_noticed(arms, library):
     arm.enable()
     arm.swing(3000)
     assert arm.first[0] is Fault.OSCILLATION
+
+
+def test_backlash_teaches_no_resistance(arms, library):
+    table = arms.Table()
+    for seed in (61000774, 61000871, 62001844, 63003108):
+        arms.loaded_suddenly(library, seed, table)
+    assert not table.false["unloaded, then 1 N m"]

@@ -21,14 +21,13 @@ from armsight.robot.boards.codes import Reaction, SensorKind
 from armsight.robot.boards.configuration import (
     CONFIG_VERSION,
     ENCODER_REV,
-    GAIN_RANGES,
     GAINS,
     JOINTS,
     POT_NODES,
     Configuration,
     lab_configuration,
 )
-from armsight.robot.boards.tuning import MotorFigures, motion_limits, quiet_bandwidth, tuned_gains
+from armsight.robot.boards.tuning import GAIN_RANGES, MotorFigures, motion_limits, quiet_bandwidth, tuned_gains
 
 _MARGIN_RAD = 0.05
 

@@ -21,8 +21,9 @@ from armsight.errors import InputError
 from armsight.files import read_text
 from armsight.firmware.elf import read_elf
 from armsight.robot.boards.codes import STATE_TEXTS, ConfigSource
-from armsight.robot.boards.configuration import GAIN_RANGES, JOINTS, Configuration
+from armsight.robot.boards.configuration import JOINTS, Configuration
 from armsight.robot.boards.contract import MotionBoard
+from armsight.robot.boards.tuning import GAIN_RANGES
 
 _SOURCES = {
     ConfigSource.NEWEST: "its newest configuration",

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.robot.boards.codes import Reaction, SensorKind
-from armsight.robot.boards.tuning import MotorFigures, tuned_gains
+from armsight.robot.boards.tuning import GAIN_RANGES, MotorFigures, tuned_gains
 
 Configuration = NDArray[np.void]
 JOINTS, POT_NODES = 6, 9
@@ -110,16 +110,6 @@ CONFIG = np.dtype(
 )
 
 #: Name -> smallest and largest value, as config.c holds them.
-GAIN_RANGES = {
-    "kp_per_rad": (0.0, 100.0),
-    "ki_per_rad_s": (0.0, 1000.0),
-    "kd_s_per_rad": (0.0, 100.0),
-    "kv_s_per_rad": (0.0, 100.0),
-    "ka_s2_per_rad": (0.0, 10.0),
-    "kf_duty": (0.0, 1.0),
-    "derivative_filter_s": (0.0, 1.0),
-    "anti_windup_per_s": (0.0, 1000.0),
-}
 _POT_RANGES = {
     "jump_rad": (1e-4, 1.0),
     "frozen_rad": (1e-3, 1.0),

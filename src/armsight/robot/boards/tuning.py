@@ -26,6 +26,17 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError
 
+#: Gain -> smallest and largest value, as config.c holds them.
+GAIN_RANGES = {
+    "kp_per_rad": (0.0, 100.0),
+    "ki_per_rad_s": (0.0, 1000.0),
+    "kd_s_per_rad": (0.0, 100.0),
+    "kv_s_per_rad": (0.0, 100.0),
+    "ka_s2_per_rad": (0.0, 10.0),
+    "kf_duty": (0.0, 1.0),
+    "derivative_filter_s": (0.0, 1.0),
+    "anti_windup_per_s": (0.0, 1000.0),
+}
 #: The slower pair of poles over the faster one.
 _PAIRS = 0.35
 #: Dry friction is compensated by a little less than it is, so that it never drives.
@@ -95,7 +106,7 @@ _MOST_SPEED_RAD_S, _MOST_RAD_S2 = 2.0, 10.0
 
 
 def quiet_bandwidth(motor: MotorFigures, supply_v: float, noise_rad: float, duty_noise: float = 0.08) -> float:
-    """Return the greatest bandwidth, rad/s, that is not too stiff and at which noise hardly moves the duty.
+    """Return the greatest bandwidth, rad/s, not too stiff, with gains a board takes, at which noise hardly moves the duty.
 
     Args:
         motor: its motor.
@@ -103,9 +114,12 @@ def quiet_bandwidth(motor: MotorFigures, supply_v: float, noise_rad: float, duty
         noise_rad: standard deviation of a reading.
         duty_noise: standard deviation of the duty that this noise may cause.
     """
-    most = min(_MOST_RAD_S, round(np.sqrt(_MOST_N_M / motor.inertia_kg_m2)))
-    for bandwidth in range(most, _LEAST_RAD_S, -1):
-        kp, _, kd, *_, filter_s, _ = tuned_gains(motor, supply_v, bandwidth)
+    stiffest = min(_MOST_RAD_S, round(np.sqrt(_MOST_N_M / motor.inertia_kg_m2)))
+    for bandwidth in range(stiffest, _LEAST_RAD_S, -1):
+        gains = tuned_gains(motor, supply_v, bandwidth)
+        if any(gain > most for gain, (_, most) in zip(gains, GAIN_RANGES.values(), strict=True)):
+            continue
+        kp, _, kd, *_, filter_s, _ = gains
         share = _TICK_S / (filter_s + _TICK_S)
         speed_noise = noise_rad * share / _TICK_S * np.sqrt(2 / (2 - share))
         if np.hypot(kp * noise_rad, kd * speed_noise) <= duty_noise:
