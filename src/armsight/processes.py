@@ -24,7 +24,7 @@ from armsight.errors import ArmsightError
 _SERVE = "from armsight.processes import serve; serve()"
 _PIPE_BYTES = 1 << 20  # an image passes at once
 _SMALL_BYTES = 1 << 14
-#: A child gives way to who started it: with fewer cores than processes, what is measured does not wait for what is rendered.
+#: A child gives way to who started it: with few cores, measuring does not wait for rendering.
 _NICE = 5
 _LENGTH = struct.Struct("<q")
 
