@@ -69,7 +69,7 @@ static void earn(motor_state *motor, const motor_config *config, float way_rad)
 }
 
 /* Return how far the motor's way over a window may be from the reading's, and remember which way it went. Only a gear that
- * goes on to the side where its teeth lie already, or a motor that goes on resting, tells nothing of the backlash. */
+ * goes on to the side where its teeth lie already, or a motor that goes on resting, says nothing of the backlash. */
 static float window_noise(motor_state *motor, const motor_config *config, float way_rad)
 {
     const bool moved = number_size(way_rad) > WINDOW_WAY_RAD;
