@@ -10,7 +10,7 @@
 #define REST_TICKS 256u       /* or has rested for so long */
 #define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer; */
 #define REST_NOISE_RAD 0.0035f /* that and what a resting motor may still move; */
-#define BACKLASH_NOISE_RAD 0.01f  /* and the gear's backlash, wherever the motor may have crossed it */
+#define BACKLASH_NOISE_RAD 0.01f /* and the gear's backlash, wherever the motor may have crossed it */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
 #define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
 #define SAMPLE_TICKS 8u
@@ -68,8 +68,8 @@ static void earn(motor_state *motor, const motor_config *config, float way_rad)
     way_begin(motor);
 }
 
-/* Return how far the motor's way over a window may be from the reading's, and remember which way it went. Only a gear that
- * goes on to the side where its teeth lie already, or a motor that goes on resting, says nothing of the backlash. */
+/* Return how far the motor's way over a window may be from the reading's, and remember which way it went. A gear that goes
+ * on to the side where its teeth lie already, and a motor that goes on resting, cross no backlash. */
 static float window_noise(motor_state *motor, const motor_config *config, float way_rad)
 {
     const bool moved = number_size(way_rad) > WINDOW_WAY_RAD;
@@ -80,7 +80,8 @@ static float window_noise(motor_state *motor, const motor_config *config, float 
         return goes_on ? WINDOW_NOISE_RAD : BACKLASH_NOISE_RAD;
     }
     const float emf_v = motor->window_v - motor->resistance_scale * motor->window_ir_v;
-    return goes_on && number_size(emf_v) * TICK_S < WINDOW_WAY_RAD * config->constant_v_s ? REST_NOISE_RAD : BACKLASH_NOISE_RAD;
+    const bool rests = number_size(emf_v) * TICK_S < WINDOW_WAY_RAD * config->constant_v_s;
+    return goes_on && rests ? REST_NOISE_RAD : BACKLASH_NOISE_RAD;
 }
 
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */

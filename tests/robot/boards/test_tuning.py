@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from armsight.errors import InputError
-from armsight.robot.boards.tuning import MotorFigures, tuned_gains
+from armsight.robot.boards.tuning import GAIN_RANGES, MotorFigures, quiet_bandwidth, tuned_gains
 
 MOTOR = MotorFigures(resistance_ohm=6.0, constant_v_s=2.4, inertia_kg_m2=0.03, viscous_n_m_s=0.02, dry_n_m=0.2)
 STALL, OWN = 2.4 * 12.0 / 6.0, 2.4**2 / 6.0 + 0.02
@@ -40,3 +40,10 @@ def test_a_number_that_is_not_positive_is_rejected_by_name(what):
     motor = MOTOR if what in given else MotorFigures(6.0, 2.4, 0.0, 0.02, 0.2)
     with pytest.raises(InputError, match=f"{what} is 0; it must be positive"):
         tuned_gains(motor, **{name: 0.0 if name == what else value for name, value in given.items()})
+
+
+def test_the_quiet_bandwidth_gives_gains_that_a_board_takes():
+    motor = MotorFigures(resistance_ohm=6.8, constant_v_s=2.08, inertia_kg_m2=0.04, viscous_n_m_s=0.02, dry_n_m=0.2)
+    most = GAIN_RANGES["ki_per_rad_s"][1]
+    assert tuned_gains(motor, 12.0, 40.0)[1] > most  # by stiffness and noise alone it would be so
+    assert tuned_gains(motor, 12.0, quiet_bandwidth(motor, 12.0, 0.0003))[1] <= most
