@@ -15,6 +15,7 @@ from armsight.sim.render.scene import BLACK, WHITE, PosedBody, circle_grid
 from armsight.vision.camera import Camera
 from armsight.vision.discs.bias import disc_bias
 from armsight.vision.markers.board import open_board
+from armsight.vision.markers.circle_grid import skips_line
 from armsight.vision.measure import measure
 
 SIZE = (640, 480)
@@ -136,6 +137,19 @@ def test_a_covered_disc_is_left_out_and_dirt_is_no_disc():
     found = board.detect(image)
     assert set(clean.ids) - set(found.ids) == {16}
     assert np.abs(off_middles(board, found, LONG, T, 0.004)).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("columns", "skipped"), [((0, 1, 2), False), ((0, 2, 3), True), ((0, 1, 3), True), ((1, 2, 3, 4), False)]
+)
+def test_a_column_that_is_missing_between_others_is_noticed(columns, skipped):
+    cells = np.array([(x, y) for x in range(len(columns)) for y in range(3)])
+    theta = np.zeros((len(cells), 10))
+    x, y = np.array(columns)[cells[:, 0]], cells[:, 1]
+    depth = 1.0 + 0.1 * x  # in perspective the discs shrink as their distances do
+    theta[:, 0], theta[:, 1] = 100.0 * x / depth, 100.0 * y / depth
+    theta[:, 2], theta[:, 4] = (depth**2 / 35.0) ** 2, (depth / 35.0) ** 2
+    assert skips_line(cells, theta) is skipped
 
 
 @pytest.mark.parametrize("spec", ["circles:6x6:12mm", "circles:7x5:12mm", "circles:8x6:12mm"])

@@ -254,6 +254,8 @@ _PREDICTED_CELLS = 3
 #: Largest share of the discs in view that may be missing or too many; how much worse the next best placement must be, and
 #: what a ring in the wrong position counts.
 _MOST_WRONG, _WORSE, _RING_COST = 0.25, 2, 3
+#: A step across a missing line is twice as long as others; from this on it is one.
+_SKIPPED = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,6 +347,29 @@ def _unambiguous(placements: list[Placement], layout: GridLayout) -> Placement |
             + ("" if layout.rings.any() else ", or use a board with rings")
         )
     return best
+
+
+def skips_line(cells: Ids, theta: Array) -> bool:
+    """Return whether a whole row or column of discs between others was not found.
+
+    Three lines left of four fit a projection as well, one numbered wrongly. Steps are measured by the discs they lead to, as
+    lengths in coordinates in which these are unit circles: across a line that is missing they are twice as long as others.
+
+    Args:
+        cells: (N, 2) the lattice's cells.
+        theta: (N, 10) its discs, as in :class:`~armsight.vision.markers.circle_blobs.Blobs`.
+    """
+    at = {(x, y): i for i, (x, y) in enumerate(cells.tolist())}
+    steps: dict[tuple[int, int], list[float]] = {}
+    for (x, y), i in at.items():
+        for axis, (dx, dy) in enumerate(_SIDES[:2]):
+            j = at.get((x + dx, y + dy))
+            if j is not None:
+                u, v = theta[j, :2] - theta[i, :2]
+                both = [m11 * u * u + 2.0 * m12 * u * v + m22 * v * v for m11, m12, m22 in theta[[i, j], 2:5]]
+                steps.setdefault((axis, (x, y)[axis]), []).append(float(np.sqrt(both[0] * both[1])))
+    squares = [median(each) for each in steps.values()]
+    return bool(squares) and max(squares) > _SKIPPED**2 * median(squares)
 
 
 def positions(cells: Ids, uv: Array) -> dict[Cell, complex]:

@@ -37,6 +37,7 @@ from armsight.vision.markers.circle_grid import (
     grow_lattices,
     number_cells,
     positions,
+    skips_line,
 )
 from armsight.vision.markers.disc.search import Grey
 from armsight.vision.markers.grid import grid_points, rotations
@@ -177,6 +178,8 @@ class CircleGrid(Record, Target):
         cells, starts, hollow = _completed(
             image, grid.cells, blobs.theta[grid.blobs], sign, size, rings=bool(self.rings)
         )
+        if skips_line(cells, starts):
+            return f"{len(cells)} of its discs were found, but between them a whole row or column was not"
         placement = number_cells(cells, starts, hollow, self._layout, size)
         if isinstance(placement, str):
             return placement
