@@ -33,6 +33,7 @@ from armsight.loop.handeye.pivot import MIN_POSES, Pivot, calibrate_pivot
 from armsight.loop.health import HealthMonitor
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.locate import by_rig
+from armsight.vision.markers.calibrated_board import is_print
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_target
 from armsight.vision.measure import measure
@@ -272,7 +273,7 @@ class MeasureStep:
             return
         rig, target = self.rig, open_target(self.target_spec)
         self._target, self._measure = target, _measuring(rig, target, self._sync_s)
-        self._monitor = HealthMonitor(rig, target.body, self._sync_s)
+        self._monitor = HealthMonitor(rig, target.body, self._sync_s, printed=is_print(target))
         try:
             self._streams = open_streams(self._specs, Published(rig, target.body), self._said)
         except InputError as error:

@@ -28,6 +28,7 @@ from armsight.loop.health import HealthFinding, HealthMonitor, health_lines, uns
 from armsight.loop.health.update import contradiction
 from armsight.vision.detections import SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows, measurer
+from armsight.vision.markers.calibrated_board import is_print
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_fixed, open_target
@@ -180,7 +181,8 @@ def measure_shots(
             stack.callback(view.finish, records)
         if output is not None:
             stack.callback(_write, output, records)
-        monitor = HealthMonitor(stereo, body, _SYNC_S)
+        printed = detections is None and is_print(found)
+        monitor = HealthMonitor(stereo, body, _SYNC_S, printed=printed)
         publisher = stack.enter_context(contextlib.closing(_streams(streams, stereo, body)))
         try:
             _run(

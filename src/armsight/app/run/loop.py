@@ -45,6 +45,7 @@ from armsight.loop.health.follow import RigCorrection, RigFollower, remeasured
 from armsight.loop.sync_led import SyncLedWatch
 from armsight.robot.boards.codes import BoardState
 from armsight.vision.follow.follower import Follower, measurer
+from armsight.vision.markers.calibrated_board import is_print
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.shutter import Motion, TimedShot, measure_with_motion
 
@@ -236,7 +237,7 @@ class Loop:
         self._shot_s = -np.inf
         self._frames = FrameClock()
         self._stamp_s: float | None = None  # of the shot that is measured, as it was stamped
-        self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s)
+        self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s, printed=is_print(setup.target))
         self.rig_follower: RigFollower | None = None
         self._rig_work: Future[RigCorrection | None] | None = None
         self._rig_s = -np.inf

@@ -38,11 +38,12 @@ class HealthMonitor:
         rig: the calibrated pair; the pose of its cameras cannot be tested if it has no covariance.
         body: the body that is measured.
         sync_s: standard deviation of the time between the two exposures of a shot, s.
+        printed: whether the body is a print whose shape a calibration found: its points are not tested.
     """
 
-    def __init__(self, rig: StereoRig, body: Body, sync_s: float) -> None:
-        self._body, self._sync_s = body, sync_s
-        self._rig = RigWatch(rig, body, sync_s) if rig.cov.any() else None
+    def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
+        self._body, self._sync_s, self._printed = body, sync_s, printed
+        self._rig = RigWatch(rig, body, sync_s, printed=printed) if rig.cov.any() else None
         self._host = HostWatch()
         self._landmarks: LandmarkWatch | None = None
         self._fixed: FixedWatch | None = None
@@ -217,7 +218,7 @@ class HealthMonitor:
     def _renew(self, correction: RigCorrection) -> None:
         """Begin the tests of cameras and bodies anew."""
         if correction.update is not None:
-            self._rig = RigWatch(correction.update.rig, self._body, self._sync_s)
+            self._rig = RigWatch(correction.update.rig, self._body, self._sync_s, printed=self._printed)
             self._suspected = np.zeros((6, 6))
         if self._landmarks is not None:
             self._landmarks = LandmarkWatch(self._fixed_names)

@@ -25,14 +25,17 @@ from collections import deque
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtri
 
 from armsight.data import Array, Body, Ids, PoseEstimate, Record
 from armsight.loop.health.record import HealthFinding, alarm_limit
+from armsight.loop.health.shape import FURTHEST_M, ShapeWatch
+from armsight.loop.health.sums import ResidualSums
 from armsight.vision.posefit import PixelObservations, fit_pose, whitened
 from armsight.vision.rig import StereoRig
 
@@ -48,6 +51,9 @@ _SAME = 0.01
 #: While nothing is suspected, shots closer in time than this are left out, s, and those that hardly differ from the newest:
 #: they would cost time and add little.
 _LEAST_S, _LIKE_S = 0.025, 0.1
+#: A point that a pose was measured without is another thing also where its two detections disagree by more than chance
+#: explains once in so many shots.
+_PAIRED = float(chdtri(1, 1e-4))
 #: Fewer points than this say nothing of these numbers; shots further apart in time than this give no speed, s.
 _LEAST_POINTS, _APART_S = 4, 0.5
 #: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
@@ -86,35 +92,6 @@ _LENS_TESTS, _LENS_POSES = 4, 8
 #: It is named where it explains so much more than a change of the seven numbers, as a share of what that explains.
 _LENS_SHARE = 0.5
 _LENS_ALARM = alarm_limit(_LENS, 1.0 / (TEST_S * _LENS_TESTS))
-
-
-class ResidualSums:
-    """Information (K, K), right side (K,), sum of squares and degrees of freedom of residuals, and when they began."""
-
-    def __init__(self, size: int, begin_s: float) -> None:
-        self.H, self.b, self.square, self.freedom = np.zeros((size, size)), np.zeros(size), 0.0, 0.0
-        self.begin_s = begin_s
-
-    def add(self, other: ResidualSums, weight: float) -> None:
-        """Add another's."""
-        self.H += other.H if weight == 1.0 else weight * other.H
-        self.b += weight * other.b
-        self.square += weight * other.square
-        self.freedom += weight * other.freedom
-
-    def of(self, size: int) -> ResidualSums:
-        """Return those of the first parameters alone."""
-        found = ResidualSums(size, self.begin_s)
-        found.H, found.b = self.H[:size, :size].copy(), self.b[:size].copy()
-        found.square, found.freedom = self.square, self.freedom
-        return found
-
-    def less(self, other: ResidualSums) -> ResidualSums:
-        """Return these sums without another's."""
-        rest = ResidualSums(len(self.b), self.begin_s)
-        rest.add(self, 1.0)
-        rest.add(other, -1.0)
-        return rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,13 +138,29 @@ class LensError(Record):
     needed: tuple[Part, ...]
 
 
+class _Residuals(NamedTuple):
+    """What a shot says, its pose eliminated: its sums, also those with points that do not fit, and what changes the pose.
+
+    That is the pose's derivatives (6, 7) by the seven numbers, (6, M) by what the camera models lack, and (6, C) by what
+    the watch of the shape tests: of the pose as it was measured, and of one measured with all points.
+    """
+
+    sums: ResidualSums
+    by_fault: Array
+    by_lens: Array
+    every: ResidualSums
+    by_shape: Array
+    by_shape_with_all: Array
+
+
 class RigWatch:
-    """Watches the calibrated pose of the cameras and the size of the body.
+    """Watches the calibrated pose of the cameras and the size and shape of the body.
 
     Args:
         rig: the calibrated pair; without a covariance nothing can be tested.
         body: the body that is measured.
         sync_s: standard deviation of the time between the two exposures of a shot, s.
+        printed: whether the body is a print whose shape a calibration found: its points are not tested.
 
     Attributes:
         prior: (K, K) square root of the covariance of all parameters: the rig's, scale and points of the body, skew. The
@@ -178,7 +171,7 @@ class RigWatch:
         lens: what the camera models lack, where that is certain and matters.
     """
 
-    def __init__(self, rig: StereoRig, body: Body, sync_s: float) -> None:
+    def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
         self._rig, self._body, self._sync_s = rig, body, sync_s
         self._points = np.unique(np.linspace(0, len(body.points) - 1, MOST_POINTS).astype(int))
         count, shape = rig.parameter_count, 3 * len(self._points)
@@ -189,6 +182,11 @@ class RigWatch:
         rest = np.arange(count, self._size - 1)
         self.prior[rest, rest] = np.append(SCALE, np.full(shape, SHAPE_M))
         self._by_fault = _fault_directions(rig, self._size)
+        names = tuple(body.point_names[k] for k in self._points)
+        wide, many = self._by_fault * _WIDE, len(body.points) > MOST_POINTS
+        self._shape = ShapeWatch(
+            self.prior, wide, _focal_changes(rig, self._size), count + 1, names, printed or many, TEST_S
+        )
         self._stay: ResidualSums | None = None
         self._stay_shots, self._shots = 0, 0
         self._row_of = np.full(len(body.points), -1)
@@ -235,23 +233,34 @@ class RigWatch:
         self._last = (now_s, estimate.T_left_body)
         if found is None:
             return np.zeros((6, 6))
-        sums, by_fault, by_lens = found
-        self._effects.append((by_fault, estimate.cov))
-        self._by_lens.append(by_lens)
-        self._sum(sums, estimate.T_left_body, now_s)
-        added = np.zeros((6, 6))
+        self._effects.append((found.by_fault, estimate.cov))
+        self._by_lens.append(found.by_lens)
+        self._sum(found, estimate)
+        return self._added(found)
+
+    def _added(self, found: _Residuals) -> Array:
+        """Return what the suspected errors add to the covariance (6, 6) of a pose."""
+        shape = self._shape.found
+        added = self._shape.added(found.by_shape)
         if self.lens is not None:
-            shift = by_lens @ self.lens.beta
-            added += np.outer(shift, shift) + by_lens @ self.lens.cov @ by_lens.T
-        if self.suspected is not None and (self.lens is None or self.lens.needed):
-            shift = by_fault @ self.suspected.f
-            added += np.outer(shift, shift) + by_fault @ self.suspected.cov @ by_fault.T
+            shift = found.by_lens @ self.lens.beta
+            added += np.outer(shift, shift) + found.by_lens @ self.lens.cov @ found.by_lens.T
+        besides = (self.lens is None or bool(self.lens.needed)) and (shape is None or shape.seven_needed)
+        if self.suspected is not None and besides:
+            shift = found.by_fault @ self.suspected.f
+            added += np.outer(shift, shift) + found.by_fault @ self.suspected.cov @ found.by_fault.T
         return added
 
     def _redundant(self, T: Array, now_s: float) -> bool:
         """Return whether a shot adds too little to what was taken just before it."""
         passed_s = now_s - self._taken_s
-        if self.suspected is not None or self.lens is not None or not self._timed or not 0.0 <= passed_s < _LIKE_S:
+        if (
+            self.suspected is not None
+            or self.lens is not None
+            or self._shape.found is not None
+            or not self._timed
+            or not 0.0 <= passed_s < _LIKE_S
+        ):
             return False
         return passed_s < _LEAST_S or (self._began is not None and not differ(self._began, T))
 
@@ -265,11 +274,11 @@ class RigWatch:
                 continue
             if began is None or differ(began, estimate.T_left_body):
                 self._close_stay()
-                self._stay, self._stay_shots, began = found[0], 1, estimate.T_left_body
+                self._stay, self._stay_shots, began = found.sums, 1, estimate.T_left_body
                 stays += 1
                 continue
             assert self._stay is not None
-            self._stay.add(found[0], 1.0)
+            self._stay.add(found.sums, 1.0)
             self._stay_shots += 1
         self._close_stay()
         return self._test.of(self._size), stays
@@ -286,16 +295,14 @@ class RigWatch:
         body = replace(self._body, points=(1.0 + change.f[_SCALED]) * self._body.points)
         return rig, body, found if self._poses > 1 else _of_one_pose(found)
 
-    def _residuals(self, estimate: PoseEstimate, now_s: float) -> tuple[ResidualSums, Array, Array] | None:
-        """Return the sums of one shot, its pose eliminated, and what changes the pose.
-
-        That is its derivatives (6, 7) by the seven numbers, and (6, M) by what the camera models lack.
-        """
+    def _residuals(self, estimate: PoseEstimate, now_s: float) -> _Residuals | None:
+        """Return what one shot says; None where too few of its points were measured."""
         seen, rig, points = estimate.points.seen, self._rig, self._body.points
         good = np.zeros(len(points), bool)
         good[estimate.points.ids] = True
-        rows = np.flatnonzero(seen.paired & (good & (self._row_of >= 0))[seen.ids])
-        if len(rows) < _LEAST_POINTS:
+        rows = np.flatnonzero(seen.paired & (self._row_of >= 0)[seen.ids])
+        fits = good[seen.ids[rows]]
+        if np.count_nonzero(fits) < _LEAST_POINTS:
             return None
         ids = np.repeat(seen.ids[rows], 2)
         cov = seen.cov_uv[rows].reshape(-1, 2, 2) + max(rig.sigma_px, 1e-6) ** 2 * np.eye(2)
@@ -321,15 +328,49 @@ class RigWatch:
         self._noise_px = float(np.sqrt(np.trace(cov.mean(axis=0)) / 2.0))
         rest[:, self._size : self._full] = (W @ field).reshape(n, -1)
         rest[:, -1] = (W @ fit.residuals_px[:, :, None]).ravel()
+        if fits.all():
+            sums, gain = self._eliminated(A, rest, now_s)
+            return self._shot(sums, gain, sums, gain)
+        kept, every = np.repeat(fits, 4), np.repeat(fits | self._displaced(A, rest[:, -1]), 4)
+        return self._shot(
+            *self._eliminated(A[kept], rest[kept], now_s), *self._eliminated(A[every], rest[every], now_s)
+        )
+
+    def _shot(self, sums: ResidualSums, gain: Array, every: ResidualSums, gain_every: Array) -> _Residuals:
+        """Return what a shot says, from the sums, and the responses of the pose to everything, without and with all."""
+        size, shape = self._size, self._shape.by_candidate
+        return _Residuals(
+            sums,
+            gain[:, :size] @ self._by_fault,
+            np.asarray(gain[:, size : self._full]),
+            every,
+            gain[:, :size] @ shape,
+            gain_every[:, :size] @ shape,
+        )
+
+    @staticmethod
+    def _displaced(A: Array, residuals: Array) -> NDArray[np.bool_]:
+        """Return (N,) whether a point may be the body's, displaced on it: what its four residuals say of the pose (4 N, 6).
+
+        Not one that is too far off, nor one of which the two cameras see different things.
+        """
+        J, r = A[:, :3].reshape(-1, 4, 3), residuals.reshape(-1, 4)
+        H, b = np.einsum("nki,nkj->nij", J, J), np.einsum("nki,nk->ni", J, r)
+        d = np.linalg.solve(H, b[..., None])[..., 0]
+        left = np.einsum("ni,ni->n", r, r) - np.einsum("ni,ni->n", b, d)
+        return np.asarray((left < _PAIRED) & (np.linalg.norm(d, axis=1) < FURTHEST_M))
+
+    def _eliminated(self, A: Array, rest: Array, now_s: float) -> tuple[ResidualSums, Array]:
+        """Return the sums of whitened residuals, the last column of rest, and the response (6, K) of the pose."""
         gain = np.linalg.solve(A.T @ A, A.T @ rest)
-        rest -= A @ gain
+        rest = rest - A @ gain
         whole = rest.T @ rest
         # The shot's own skew, of variance 1, is eliminated (Sherman and Morrison).
         along = self._sync_s * whole[self._size - 1]
         whole -= np.outer(along, along / (1.0 + self._sync_s * float(along[self._size - 1])))
         sums = ResidualSums(self._full, now_s)
-        sums.H, sums.b, sums.square, sums.freedom = whole[:-1, :-1], whole[:-1, -1], float(whole[-1, -1]), n - 6.0
-        return sums, -gain[:, : self._size] @ self._by_fault, np.asarray(-gain[:, self._size : self._full])
+        sums.H, sums.b, sums.square, sums.freedom = whole[:-1, :-1], whole[:-1, -1], float(whole[-1, -1]), len(A) - 6.0
+        return sums, np.asarray(-gain, float)
 
     def _velocity(self, T: Array, now_s: float) -> Array:
         """Return the velocity (6,) of the body between the shot before and this one, 1/s; zero where it is unknown."""
@@ -341,9 +382,12 @@ class RigWatch:
         shift = T[:3, :3].T @ (T[:3, 3] - before[:3, 3])
         return np.asarray(np.concatenate([shift, rotation]) / (now_s - before_s))
 
-    def _sum(self, sums: ResidualSums, T: Array, now_s: float) -> None:
+    def _sum(self, shot: _Residuals, estimate: PoseEstimate) -> None:
         """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
-        if self._stay is None or self._began is None or differ(self._began, T):
+        T, sums, now_s = estimate.T_left_body, shot.sums, shot.sums.begin_s
+        begins = self._stay is None or self._began is None or differ(self._began, T)
+        self._shape.take(shot.every, T, shot.by_shape_with_all, estimate.cov, begins)
+        if begins or self._stay is None:
             self._close_stay()
             self._stay, self._stay_shots, self._began = sums, 1, T
         else:
@@ -370,6 +414,7 @@ class RigWatch:
         """Test for a change with the newest sums; weigh the older ones down."""
         if not self._test.freedom:
             return
+        self._shape.decide()
         whole, self._test = self._test, ResidualSums(self._full, 0.0)
         test, moments, self._moments = whole.of(self._size), self._moments, []
         weight = float(np.exp(-1.0 / FORGET_TESTS))
@@ -472,7 +517,7 @@ class RigWatch:
     def wrong_at_rest(self) -> bool:
         """Whether what is suspected makes poses wrong also where nothing moves."""
         parts = [] if self.suspected is None else self._to_blame(self.suspected)
-        return self.alarm and not set(parts) <= {"time"}
+        return self._shape.found is not None or (self.alarm and not set(parts) <= {"time"})
 
     def _matters(self, change: RigChange, part: slice) -> bool:
         """Return whether a part of the seven numbers moves one of the newest poses by so many of its sigmas."""
@@ -539,22 +584,36 @@ class RigWatch:
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far, the shots of the running test included: nothing where no test gave an alarm."""
         ended = self._ended()
-        if ended.lens is not None:
-            return (_lens_finding(ended.lens),)
-        if not ended.alarmed:
-            return ()
-        began_s, change = ended._since()
+        shape, lens = ended._shape.said, ended.lens
+        if shape is not None and (lens is None or shape.chi_square > lens.chi_square):
+            found = ended._shape.finding(shape, shape.begin_s if self._timed else None)
+            return (found, *(ended._changed() if ended.alarmed and shape.seven_needed else ()))
+        if lens is not None:
+            return (_lens_finding(lens),)
+        return ended._changed() if ended.alarmed else ()
+
+    def _changed(self) -> tuple[HealthFinding, ...]:
+        """Return what the newest test found of the seven numbers."""
+        began_s, change = self._since()
         since_s = began_s if self._timed else None
         parts = self._to_blame(change)
         found = (_FINDINGS[part](change, since_s, len(parts) == 1 and not self._needed(change, part)) for part in parts)
-        return (
-            tuple(found) if ended._poses > 1 or (self._timed and self._shots > 1) else tuple(map(_of_one_pose, found))
-        )
+        several = self._poses > 1 or (self._timed and self._shots > 1)
+        return tuple(found) if several else tuple(map(_of_one_pose, found))
+
+    @property
+    def _shaped(self) -> bool:
+        """Whether displaced points or focal lengths explain what the seven numbers would."""
+        return self._shape.found is not None and not self._shape.found.seven_needed
 
     def copied(self) -> RigWatch:
         """Return a copy that says what was found so far; this one goes on."""
         copied = copy(self)
-        copied._history, copied._moments = self._history.copy(), self._moments.copy()
+        copied._history, copied._moments, copied._shape = (
+            self._history.copy(),
+            self._moments.copy(),
+            self._shape.copied(),
+        )
         return copied
 
     def _ended(self) -> RigWatch:
@@ -572,7 +631,7 @@ class RigWatch:
 
     def moved_since_s(self) -> float | None:
         """Return since when the cameras alone are found to have moved, s; None where nothing or more was found."""
-        if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None:
+        if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None or self._shaped:
             return None
         since_s, change = self._since()
         return since_s if self._to_blame(change) == ["rig"] else None
@@ -627,6 +686,13 @@ def _fault_directions(rig: StereoRig, size: int) -> Array:
     by_fault[: rig.parameter_count, :5] = free_directions(rig)
     by_fault[rig.parameter_count, _SCALED] = by_fault[-1, _SKEWED] = 1.0
     return by_fault
+
+
+def _focal_changes(rig: StereoRig, size: int) -> Array:
+    """Return (size, 2) what relative changes of the focal lengths change: against each other by half each, and of both."""
+    changes, right = np.zeros((size, 2)), rig.left.parameters.size
+    changes[:2], changes[right : right + 2] = rig.left.intrinsics[:2, None], rig.right.intrinsics[:2, None]
+    return changes * [0.5, 1.0] * np.where(np.arange(size) < right, 1.0, [[-1.0], [1.0]]).T
 
 
 def differ(T: Array, other: Array) -> bool:

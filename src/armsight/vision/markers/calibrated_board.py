@@ -109,3 +109,8 @@ def load_board_file(path: str | Path) -> EstimatedBoard:
             "in the order of the board's points?"
         )
     return EstimatedBoard(drawing, points)
+
+
+def is_print(target: Target) -> bool:
+    """Whether a target is a calibration board: a print whose shape a calibration finds, if it is not flat."""
+    return isinstance(target, EstimatedBoard) or hasattr(target, "y_up")

@@ -1,0 +1,423 @@
+"""Points of the body that are not where its file says, and focal lengths that changed: found in what seven numbers leave.
+
+In: the sums of the shots' residuals as in :mod:`~armsight.loop.health.rig`, those of points included that a pose was
+measured without because they did not fit. Out: which points moved on the body, by how much, or by how much the focal length
+of one camera changed against that of the other.
+
+Score test (Rao, 1948): with everything else estimated, the seven numbers among it, a displacement d of a point k explains
+r^T S^-1 r of the sum of squares, with
+
+    S = J^T H J - A^T C^-1 A + I / w^2,    A = M^T H J,    C = M^T H M + I,    r = J^T b - A^T C^-1 M^T b
+
+where H and b are the sums, J selects the point, and M has the standard deviations of everything else as its columns. The
+point that explains most is taken, then the next one besides it, while one explains more than chance: a body that is bent.
+
+Only what lasts is reported. A reflection, or another light of the scene that is taken for a disc, stays in the scene or in
+the image while the body rotates. So a point counts only if the median of what single shots say agrees with what all say
+together, seen from directions that differ.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import chdtri
+
+from armsight.data import Array, Ids, Record
+from armsight.loop.health.record import HealthFinding, alarm_limit
+from armsight.loop.health.sums import ResidualSums
+
+#: A displacement may be so large, m: what is further off is another thing. So much may a focal length change, as a share.
+FURTHEST_M, _FOCAL = 5e-3, 0.05
+#: Less than this is not reported, m and as a share: paint and glue are not more exact.
+_LEAST_M, _LEAST_FOCAL = 1e-4, 4e-4
+#: Single shots agree with all together if the median of their share of the displacement is between these.
+_AGREE = (0.5, 2.0)
+#: So many of the newest shots are asked, at the least so many; all together are of so many poses that differ at the least.
+_ASKED, _LEAST_SHOTS, _LEAST_POSES = 30, 8, 6
+#: The directions from which the body was seen must differ from their mean by so much, rad.
+_VIEWS_RAD = 0.05
+#: Tests that are kept; in so many after an alarm it is dated anew.
+_KEPT, _FRESH = 30, 6
+#: A displacement matters that moves a pose by so many of its claimed sigmas, of so many newest poses.
+_MATTERS, _POSES = 2.0, 60
+#: Explanations whose chi-squares differ by less are not distinguished; one is needed besides another beyond this chance.
+_ALIKE, _NECESSARY = 12.0, 1e-4
+_BESIDES = float(chdtri(3, _NECESSARY))
+#: The newest test agrees with all together unless chance explains their difference more rarely than this.
+_UNLIKE = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeError(Record):
+    """Points that are displaced on the body, or focal lengths that changed.
+
+    Attributes:
+        chosen: what is wrong: rows of the tested points, in the order of what they explain, or FOCAL alone.
+        value: (C,) of all candidates, m for each coordinate of a point, as a share for the focal lengths. Of one point
+            that is displaced the others are zero; of a bent body they are as uncertain as the displacements are large.
+        cov: (C, C) its covariance.
+        chi_square: by how much the first explains more than a change of the seven numbers does.
+        seven: by how much the seven numbers explain more than they all do.
+        alike: what explains nearly as much as the first.
+        begin_s: since when, s.
+    """
+
+    chosen: tuple[int, ...]
+    value: Array
+    cov: Array
+    chi_square: float
+    seven: float
+    alike: tuple[int, ...]
+    begin_s: float
+
+    @property
+    def seven_needed(self) -> bool:
+        """Whether a change of the seven numbers is needed besides."""
+        return bool(self.seven > chdtri(7, _NECESSARY))
+
+
+#: Stands for the focal lengths among the rows of the points.
+FOCAL = -1
+
+
+class _Shot(NamedTuple):
+    """What a shot says of each point by itself: information (N, 3, 3) and right side (N, 3)."""
+
+    H: Array
+    b: Array
+
+
+class _Reduced(NamedTuple):
+    """Sums with everything but the candidates eliminated: G (C, C), r (C,), and the sum of squares and freedom."""
+
+    G: Array
+    r: Array
+    square: float
+    freedom: float
+
+    def gain(self, columns: Ids) -> float:
+        """Return what candidates explain of the sum of squares."""
+        r = self.r[columns]
+        return float(r @ np.linalg.solve(self.G[np.ix_(columns, columns)], r))
+
+    def excess(self, gain: float) -> float:
+        """Return by how much the variance of what is left exceeds the noise (Birge ratio), 1 at the least."""
+        return max((self.square - gain) / max(self.freedom, 1.0), 1.0)
+
+
+@dataclass
+class _Test:
+    """The sums of one test, and the directions from which its poses saw the body."""
+
+    sums: ResidualSums
+    views: list[Array] = field(default_factory=list)
+
+
+class ShapeWatch:
+    """Watches the shape of the body, and the focal lengths of the cameras against each other.
+
+    Args:
+        prior: (K, K) square root of the covariance of all parameters.
+        seven: (K, 7) what the seven numbers change of these, in their wide prior.
+        focal: (K, 2) what relative changes of the focal lengths change of these: of the left one by a half and of the right
+            one by minus a half, and of both.
+        first: row of the first parameter of the points.
+        names: of the N points that have parameters.
+        rigid: whether the points are not tested: a print whose shape a calibration found.
+        test_s: how often it is tested, s.
+
+    Attributes:
+        found: what the newest test found for certain.
+        said: what was found last.
+    """
+
+    def __init__(
+        self, prior: Array, seven: Array, focal: Array, first: int, names: tuple[str, ...], rigid: bool, test_s: float
+    ) -> None:
+        K, n = len(prior), len(names)
+        self._first, self._names = first, names
+        self._known = np.hstack([prior, seven])
+        self._prior = prior
+        #: (K, 2 + 3 N) what a unit of each candidate changes of the parameters: of the focal lengths against each other,
+        #: of both together, of each coordinate of each point.
+        self.by_candidate = np.zeros((K, 2 + 3 * n))
+        self.by_candidate[:, :2] = focal
+        self.by_candidate[first : first + 3 * n, 2:] = np.eye(3 * n)
+        self._wide = np.append([_FOCAL, _FOCAL], np.full(3 * n, FURTHEST_M))
+        self._candidates = () if rigid else tuple(range(n))
+        self._limit_focal, self._limit = (alarm_limit(size, 1.0 / test_s, 2 * (n + 1)) for size in (1, 3))
+        self._stay: ResidualSums | None = None
+        self._stay_shots = 0
+        self._test = _Test(ResidualSums(K, 0.0))
+        self._history: deque[_Test] = deque(maxlen=_KEPT)
+        self._shots: deque[_Shot] = deque(maxlen=_ASKED)
+        # What the candidates do to the newest poses, and the covariances of these.
+        self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
+        self._alarms = 0  # in a row
+        self._suspect: ShapeError | None = None
+        self.found: ShapeError | None = None
+        self.said: ShapeError | None = None
+
+    def take(self, sums: ResidualSums, T: Array, effect: Array, cov: Array, begins: bool) -> None:
+        """Take a shot.
+
+        Args:
+            sums: of its residuals, all points included, its pose eliminated.
+            T: (4, 4) pose T_left_body.
+            effect: (6, C) what the candidates do to a pose measured with all points.
+            cov: (6, 6) covariance of the pose.
+            begins: whether it begins a stay at a pose, or goes on with one.
+        """
+        n, rows = len(self._names), slice(self._first, self._first + 3 * len(self._names))
+        H = sums.H[rows, rows].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+        self._shots.append(_Shot(H, sums.b[rows].reshape(n, 3)))
+        self._effects.append((effect, cov))
+        if self._stay is not None and not begins:
+            self._stay.add(sums.of(len(self._prior)), 1.0)
+            self._stay_shots += 1
+            return
+        self._close()
+        self._stay, self._stay_shots = sums.of(len(self._prior)), 1
+        self._test.views.append(T[:3, :3].T @ T[:3, 3] / np.linalg.norm(T[:3, 3]))
+
+    def _close(self) -> None:
+        """Add the mean of a stay's shots to the sums of the next test."""
+        if self._stay is not None:
+            if not self._test.sums.freedom:
+                self._test.sums.begin_s = self._stay.begin_s
+            self._test.sums.add(self._stay, 1.0 / self._stay_shots)
+        self._stay = None
+
+    def decide(self) -> None:
+        """Test with the newest sums."""
+        self._close()
+        if not self._test.sums.freedom:
+            return
+        self._history.append(self._test)
+        self._test = _Test(ResidualSums(len(self._prior), 0.0))
+        tests, before = list(self._history), self._suspect
+        if before is None:
+            self._suspect = self._shown(tests[-1:]) or self._shown(tests)
+        else:
+            since = [each for each in tests if each.sums.begin_s >= before.begin_s] or tests[-1:]
+            self._suspect = self._shown(since)
+        self._alarms = 0 if self._suspect is None else self._alarms + 1
+        if self._suspect is not None and self._alarms <= _FRESH:
+            self._suspect = self._dated(self._suspect, tests)
+        # What a change leaves in the test in which it began may look like a displaced point, once.
+        again = self._suspect is not None and before is not None and before.chosen[0] == self._suspect.chosen[0]
+        self.found = self._suspect if again or len(tests) == 1 else None
+        self.said = self.found or self.said
+
+    def _shown(self, tests: Sequence[_Test]) -> ShapeError | None:
+        """Return what tests show for certain; None where that is nothing."""
+        views = [view for each in tests for view in each.views]
+        if len(views) < _LEAST_POSES or not _differ(np.array(views)):
+            return None
+        sums = _total(tests)
+        whole, without = self._reduced(sums, self._known), self._reduced(sums, self._prior)
+        if (error := self._focal_alone(whole, without, sums.begin_s)) is not None:
+            return error
+        if not any(whole.gain(_columns([each])) > self._limit for each in self._candidates):
+            return None
+        newest = whole if len(tests) == 1 else self._reduced(tests[-1].sums, self._known)
+        steady = [each for each in self._candidates if self._steady(whole, newest, each)]
+        chosen = list[int]()
+        scores = dict[int, float]()
+        most = max(1, len(self._names) // 2)
+        while len(chosen) < most and (left := [each for each in steady if each not in chosen]):
+            now = whole.gain(_columns(chosen)) if chosen else 0.0
+            gains = {each: whole.gain(_columns([*chosen, each])) for each in left}
+            best = max(gains, key=gains.__getitem__)
+            excess = whole.excess(gains[best])
+            if (gains[best] - now) / excess <= (_BESIDES if chosen else self._limit):
+                break
+            scores = scores or {each: gain / excess for each, gain in gains.items()}
+            chosen.append(best)
+        return self._error(whole, without, tuple(chosen), scores, sums.begin_s) if chosen else None
+
+    def _focal_alone(self, whole: _Reduced, without: _Reduced, begin_s: float) -> ShapeError | None:
+        """Return the focal lengths' change where that one number explains as much as the seven do; else None."""
+        columns = _columns([FOCAL])
+        gain, seven = without.gain(columns), without.square - whole.square
+        excess = without.excess(max(gain, seven))
+        if gain / excess < self._limit_focal or gain < seven - _ALIKE * excess:
+            return None
+        value, cov = self._values(without, columns, 0.0)
+        if abs(value[0]) < _LEAST_FOCAL:
+            return None
+        cov[1, 1] = (value[0] / 2.0) ** 2 / excess  # one of the two may have changed alone
+        return ShapeError((FOCAL,), value, excess * cov, gain / excess, 0.0, (), begin_s)
+
+    def _error(
+        self, whole: _Reduced, without: _Reduced, chosen: tuple[int, ...], scores: dict[int, float], begin_s: float
+    ) -> ShapeError | None:
+        """Return the record of what was chosen; None where it is too small to matter."""
+        columns = _columns(chosen)
+        gain = whole.gain(columns)
+        excess = whole.excess(gain)
+        value, cov = self._values(whole, columns, 0.0)
+        if len(chosen) > 1:
+            value, cov = self._values(whole, columns, float(np.sqrt(np.mean(value[columns] ** 2))))
+        if np.linalg.norm(value[_columns(chosen[:1])]) < _LEAST_M or not self._matters(value):
+            return None
+        seven = (without.square - without.gain(columns) - (whole.square - gain)) / excess
+        best = chosen[0]
+        alike = tuple(each for each, score in scores.items() if each != best and score > scores[best] - _ALIKE)
+        return ShapeError(chosen, value, excess * cov, scores[best], seven, alike, begin_s)
+
+    def _values(self, whole: _Reduced, columns: Ids, others_m: float) -> tuple[Array, Array]:
+        """Return the displacements (C,) of columns, and of all other points if these have a prior, and cov (C, C)."""
+        wide = self._wide.copy()
+        free = columns if others_m == 0.0 else np.arange(2, len(wide))
+        wide[np.setdiff1d(free, columns)] = others_m
+        G = whole.G - np.eye(len(wide))
+        narrow = wide / self._wide
+        G, r = G * np.outer(narrow, narrow) + np.eye(len(wide)), whole.r * narrow
+        value, cov = np.zeros(len(wide)), np.zeros((len(wide), len(wide)))
+        inverse = np.linalg.inv(G[np.ix_(free, free)])
+        value[free] = wide[free] * (inverse @ r[free])
+        cov[np.ix_(free, free)] = inverse * np.outer(wide[free], wide[free])
+        return value, cov
+
+    def _reduced(self, sums: ResidualSums, M: Array) -> _Reduced:
+        """Eliminate parameters (K, P), in their standard deviations, from sums."""
+        HM, X = sums.H @ M, self.by_candidate * self._wide
+        inner = cho_factor(M.T @ HM + np.eye(M.shape[1]))
+        A, b = HM.T @ X, M.T @ sums.b
+        solved, found = cho_solve(inner, A), cho_solve(inner, b)
+        G = X.T @ sums.H @ X - A.T @ solved + np.eye(X.shape[1])
+        return _Reduced(G, X.T @ sums.b - solved.T @ b, sums.square - float(b @ found), sums.freedom)
+
+    def _steady(self, whole: _Reduced, newest: _Reduced, which: int) -> bool:
+        """Return whether the newest test, and the median of single shots, agree on a point with all tests together."""
+        columns = _columns([which])
+        (d, cov), (now, cov_now) = (self._values(each, columns, 0.0) for each in (whole, newest))
+        d, off = d[columns], (now - d)[columns]
+        each = (cov + cov_now)[np.ix_(columns, columns)]
+        if float(off @ np.linalg.solve(each, off)) > newest.excess(newest.gain(columns)) * chdtri(len(off), _UNLIKE):
+            return False
+        H, b = np.array([shot.H[which] for shot in self._shots]), np.array([shot.b[which] for shot in self._shots])
+        information = np.einsum("i,nij,j->n", d, H, d)
+        seen = information > 0.0
+        if np.count_nonzero(seen) < _LEAST_SHOTS:
+            return False
+        return bool(_AGREE[0] < np.median((b[seen] @ d) / information[seen]) < _AGREE[1])
+
+    def _matters(self, value: Array) -> bool:
+        """Return whether a displacement moves a new pose by so many of its sigmas, were it measured with that point."""
+        effects, covs = map(np.array, zip(*self._effects, strict=True))
+        shift = effects @ value
+        squares = np.einsum("ni,ni->n", shift, np.linalg.solve(covs, shift[..., None])[..., 0])
+        return float(np.max(squares)) > _MATTERS**2
+
+    def _dated(self, found: ShapeError, tests: Sequence[_Test]) -> ShapeError:
+        """Return what was found with the beginning that leaves least unexplained, estimated from then on.
+
+        The test before its beginning may be of both times: it is left out, and counts as noise.
+        """
+        columns, best, least = _columns(found.chosen), found, np.inf
+        for k in range(len(tests)):
+            after = self._reduced(_total(tests[k:]), self._known)
+            left = after.square - after.gain(columns)
+            if k:
+                left += tests[k - 1].sums.freedom
+            if k > 1:
+                left += self._reduced(_total(tests[: k - 1]), self._known).square
+            if left < least:
+                error = self._shown(tests[k:])
+                if error is not None and error.chosen[0] == found.chosen[0]:
+                    best, least = error, left
+        return best
+
+    def added(self, effect: Array) -> Array:
+        """Return the covariance (6, 6) of what was found, of a pose that candidates move by ``effect`` (6, C)."""
+        found = self.found
+        if found is None:
+            return np.zeros((6, 6))
+        shift = effect @ found.value
+        return np.asarray(np.outer(shift, shift) + effect @ found.cov @ effect.T)
+
+    def copied(self) -> ShapeWatch:
+        """Return a copy that says what was found so far; this one goes on."""
+        other = copy(self)
+        other._history, other._shots, other._effects = self._history.copy(), self._shots.copy(), self._effects.copy()
+        other._test = _Test(_total([self._test]), list(self._test.views))
+        if self._stay is not None:
+            other._stay = _total([_Test(self._stay)])
+        return other
+
+    def finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
+        """Return the finding of what was found."""
+        return _focal_finding(error, since_s) if error.chosen[0] == FOCAL else self._points_finding(error, since_s)
+
+    def _points_finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
+        """Return the finding of points that are displaced."""
+        points = [(each, _columns([each])) for each in error.chosen]
+        largest = max((rows for _, rows in points), key=lambda rows: float(np.linalg.norm(error.value[rows])))
+        size = float(np.linalg.norm(error.value[largest]))
+        along = error.value[largest] / size
+        sigma = float(np.sqrt(along @ error.cov[np.ix_(largest, largest)] @ along))
+        names = ", ".join(
+            f"{self._names[each]} by {1e3 * np.linalg.norm(error.value[rows]):.2f} mm" for each, rows in points
+        )
+        others = [self._names[each] for each in error.alike]
+        unsure = f"; it may be {' or '.join(others)} instead" if others and len(points) == 1 else ""
+        what = (
+            f"the body is bent, or points of it moved: against the others {names} are not where its file says"
+            if len(points) > 1
+            else f"{self._names[error.chosen[0]]} is displaced by {1e3 * size:.2f} mm on the body against its file: it "
+            f"moved, or is partly covered{unsure}"
+        )
+        return HealthFinding(
+            "body",
+            what,
+            since_s,
+            1e3 * size,
+            1e3 * sigma,
+            "mm",
+            "look at these points; clean or fasten them, and measure the body again (armsight body)",
+        )
+
+
+def _columns(chosen: Sequence[int]) -> Ids:
+    """Return the columns of candidates."""
+    return np.concatenate([[0] if each == FOCAL else np.arange(2 + 3 * each, 5 + 3 * each) for each in chosen])
+
+
+def _total(tests: Sequence[_Test]) -> ResidualSums:
+    """Return the sums of tests."""
+    total = ResidualSums(len(tests[0].sums.b), tests[0].sums.begin_s)
+    for each in tests:
+        total.add(each.sums, 1.0)
+    return total
+
+
+def _differ(views: Array) -> bool:
+    """Return whether directions (N, 3) differ enough from their mean."""
+    mean = views.mean(axis=0)
+    return bool(np.min(views @ mean) < np.cos(_VIEWS_RAD) * np.linalg.norm(mean))
+
+
+def _focal_finding(error: ShapeError, since_s: float | None) -> HealthFinding:
+    """Return the finding of a focal length that changed."""
+    share, sigma = 100.0 * float(error.value[0]), 100.0 * float(np.sqrt(error.cov[0, 0]))
+    longer, shorter = ("left", "right") if share > 0 else ("right", "left")
+    return HealthFinding(
+        "lens",
+        f"the focal length of the {longer} camera is {abs(share):.3f} % longer against that of the {shorter} one than "
+        "calibrated; which of the two changed cannot be distinguished",
+        since_s,
+        abs(share),
+        sigma,
+        "%",
+        "fasten focus and zoom of both lenses, let the cameras warm up, and calibrate the rig again",
+        ("rig",),
+    )

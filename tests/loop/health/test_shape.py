@@ -1,0 +1,106 @@
+"""Points that moved on the body and focal lengths that changed: named and sized, and what does not last is not named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from faults import BODY, RATE_HZ, SIGMA_PX, SIGMAS, SYNC_S, TRUE, measured
+
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import exp_so3
+from armsight.loop.health import HealthMonitor
+from armsight.loop.health.rig import RigWatch
+from armsight.vision.locate import locate
+from armsight.vision.triangulate import triangulate
+from views import both_pixels
+
+DISC = 2
+
+
+def watched(seed, *, shift=None, image_px=None, true=TRUE, printed=False, seconds=4.0):
+    """Watch a moving body as vision gates it.
+
+    Args:
+        shift: (N, 3) displacement of its points, m.
+        image_px: what of a time, s, displaces the disc in both images, px.
+        true: the cameras as they are.
+
+    Returns:
+        The findings, and in which share of the shots the disc was left out.
+    """
+    rng = np.random.default_rng(seed)
+    given = TRUE.perturbed(SIGMAS * rng.normal(size=len(SIGMAS)))
+    given = replace(given, cov=np.diag(SIGMAS**2), sigma_px=0.0)
+    points = BODY.points + 2e-5 * rng.normal(size=BODY.points.shape) + (0.0 if shift is None else shift)
+    monitor, dropped = HealthMonitor(given, BODY, SYNC_S, printed=printed), []
+    rates, phases = rng.uniform(0.1, 0.2, 6), rng.uniform(0, 2 * np.pi, 6)
+    for k in range(round(seconds * RATE_HZ)):
+        u = np.sin(2 * np.pi * rates * k / RATE_HZ + phases)
+        T = pose(exp_so3(0.3 * u[3:]), np.array([0.1, 0.0, 0.9]) + np.array([0.12, 0.08, 0.12]) * u[:3])
+        uv = both_pixels(true, points @ T[:3, :3].T + T[:3, 3]) + SIGMA_PX * rng.normal(size=(len(points), 2, 2))
+        if image_px is not None:
+            uv[DISC] += image_px(k / RATE_HZ)
+        estimate = locate(given, BODY, triangulate(given, BODY, measured(given, BODY, T, uv).points.seen))
+        dropped.append(DISC not in estimate.points.ids)
+        monitor.measured(estimate, k / RATE_HZ)
+    return monitor.findings(), np.mean(dropped)
+
+
+def displaced(mm):
+    """A displacement of the disc along x."""
+    shift = np.zeros(BODY.points.shape)
+    shift[DISC, 0] = 1e-3 * mm
+    return shift
+
+
+def test_a_disc_that_moved_is_named_and_sized_though_poses_are_measured_without_it():
+    (found,), dropped = watched(51, shift=displaced(1.0))
+    assert dropped > 0.9
+    assert (found.cause, found.unit) == ("body", "mm")
+    assert found.what.startswith(f"{BODY.point_names[DISC]} is displaced")
+    assert abs(found.size - 1.0) < 3 * found.sigma < 0.25
+
+
+def test_the_same_disc_on_a_print_whose_shape_was_calibrated_is_not_named():
+    assert watched(51, shift=displaced(1.0), printed=True)[0] == ()
+
+
+def test_a_bent_body_is_named_with_several_points():
+    (found,), _ = watched(52, shift=5e-4 * np.outer(np.arange(len(BODY.points)) % 2, [0, 0, 1]), seconds=6.0)
+    assert found.cause == "body"
+    assert "bent" in found.what
+
+
+@pytest.mark.parametrize(
+    "image_px",
+    [
+        lambda t: np.array([2.0, 0.0]) if t % 1.0 < 0.2 else np.zeros(2),  # a reflection now and then
+        lambda t: 3.0 * np.array([np.cos(3 * t), 0.0]),  # another light that passes by
+        lambda t: np.array([[0.0, 3.0], [0.0, -3.0]]),  # the cameras see two different things
+    ],
+)
+def test_what_does_not_stay_on_the_body_is_not_named(image_px):
+    assert watched(53, image_px=image_px)[0] == ()
+
+
+def test_the_focal_length_of_one_camera_is_told_from_its_rotation():
+    k = np.array(TRUE.left.intrinsics)
+    k[:2] *= 1.001
+    (found,), _ = watched(54, true=replace(TRUE, left=replace(TRUE.left, intrinsics=k)))
+    assert (found.cause, found.alternatives, found.unit) == ("lens", ("rig",), "%")
+    assert "left camera" in found.what
+    assert abs(found.size - 0.1) < 4 * found.sigma
+
+
+def test_points_that_do_not_fit_change_nothing_of_the_other_tests():
+    rig = replace(TRUE, cov=np.diag(SIGMAS**2), sigma_px=0.0)
+    T = pose(exp_so3(np.array([0.1, 0.2, 0.0])), np.array([0.1, 0.0, 0.9]))
+    uv = both_pixels(TRUE, BODY.points @ T[:3, :3].T + T[:3, 3])
+    uv[DISC] += [2.0, 0.0]
+    estimate = locate(rig, BODY, triangulate(rig, BODY, measured(rig, BODY, T, uv).points.seen))
+    assert DISC not in estimate.points.ids
+    watch = RigWatch(rig, BODY, SYNC_S)
+    found = watch._residuals(estimate, 0.0)
+    column = rig.parameter_count + 1 + 3 * DISC
+    assert not found.sums.H[column : column + 3].any()
+    assert found.every.H[column : column + 3].any()
