@@ -87,7 +87,7 @@ class ShapeError(Record):
 FOCAL = -1
 
 
-class _Shot(NamedTuple):
+class _PointShot(NamedTuple):
     """What a shot says of each point by itself: information (N, 3, 3) and right side (N, 3)."""
 
     H: Array
@@ -157,7 +157,7 @@ class ShapeWatch:
         self._stay_shots = 0
         self._test = _Test(ResidualSums(K, 0.0))
         self._history: deque[_Test] = deque(maxlen=_KEPT)
-        self._shots: deque[_Shot] = deque(maxlen=_ASKED)
+        self._shots: deque[_PointShot] = deque(maxlen=_ASKED)
         # What the candidates do to the newest poses, and the covariances of these.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
         self._alarms = 0  # in a row
@@ -177,7 +177,7 @@ class ShapeWatch:
         """
         n, rows = len(self._names), slice(self._first, self._first + 3 * len(self._names))
         H = sums.H[rows, rows].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
-        self._shots.append(_Shot(H, sums.b[rows].reshape(n, 3)))
+        self._shots.append(_PointShot(H, sums.b[rows].reshape(n, 3)))
         self._effects.append((effect, cov))
         if self._stay is not None and not begins:
             self._stay.add(sums.of(len(self._prior)), 1.0)
@@ -244,11 +244,11 @@ class ShapeWatch:
         return self._error(whole, without, tuple(chosen), scores, sums.begin_s) if chosen else None
 
     def _focal_alone(self, whole: _Reduced, without: _Reduced, begin_s: float) -> ShapeError | None:
-        """Return the focal lengths' change where that one number explains as much as the seven do; else None."""
+        """Return the focal lengths' change where that one number explains more than the seven do; else None."""
         columns = _columns([FOCAL])
         gain, seven = without.gain(columns), without.square - whole.square
         excess = without.excess(max(gain, seven))
-        if gain / excess < self._limit_focal or gain < seven - _ALIKE * excess:
+        if gain / excess < self._limit_focal or gain < seven:
             return None
         value, cov = self._values(without, columns, 0.0)
         if abs(value[0]) < _LEAST_FOCAL:

@@ -352,8 +352,8 @@ def _unambiguous(placements: list[Placement], layout: GridLayout) -> Placement |
 def skips_line(cells: Ids, theta: Array) -> bool:
     """Return whether a whole row or column of discs between others was not found.
 
-    Three lines left of four fit a projection as well, one numbered wrongly. Steps are measured by the discs they lead to: in
-    coordinates in which these are unit circles, one across a line that is missing is twice as long as others.
+    Three lines left of four fit a projection as well, one numbered wrongly. Steps are measured by the discs they lead to:
+    in coordinates in which these are unit circles, one across a line that is missing is twice as long as others.
 
     Args:
         cells: (N, 2) the lattice's cells.
