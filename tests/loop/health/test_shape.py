@@ -83,7 +83,7 @@ def test_what_does_not_stay_on_the_body_is_not_named(image_px):
     assert watched(53, image_px=image_px)[0] == ()
 
 
-def test_the_focal_length_of_one_camera_is_told_from_its_rotation():
+def test_the_focal_length_of_one_camera_is_distinguished_from_its_rotation():
     k = np.array(TRUE.left.intrinsics)
     k[:2] *= 1.001
     (found,), _ = watched(54, true=replace(TRUE, left=replace(TRUE.left, intrinsics=k)))

@@ -223,11 +223,13 @@ class ShapeWatch:
             return None
         sums = _total(tests)
         whole, without = self._reduced(sums, self._known), self._reduced(sums, self._prior)
+        newest = whole if len(tests) == 1 else self._reduced(tests[-1].sums, self._known)
         if (error := self._focal_alone(whole, without, sums.begin_s)) is not None:
-            return error
+            alone = without if len(tests) == 1 else self._reduced(tests[-1].sums, self._prior)
+            if _one_is_enough(newest, alone):
+                return error
         if not any(whole.gain(_columns([each])) > self._limit for each in self._candidates):
             return None
-        newest = whole if len(tests) == 1 else self._reduced(tests[-1].sums, self._known)
         steady = [each for each in self._candidates if self._steady(whole, newest, each)]
         chosen = list[int]()
         scores = dict[int, float]()
@@ -246,9 +248,9 @@ class ShapeWatch:
     def _focal_alone(self, whole: _Reduced, without: _Reduced, begin_s: float) -> ShapeError | None:
         """Return the focal lengths' change where that one number explains as much as the seven do; else None."""
         columns = _columns([FOCAL])
-        gain, seven = without.gain(columns), without.square - whole.square
-        excess = without.excess(max(gain, seven))
-        if gain / excess < self._limit_focal or gain < seven - _ALIKE * excess:
+        gain = without.gain(columns)
+        excess = without.excess(gain)
+        if gain / excess < self._limit_focal or not _one_is_enough(whole, without):
             return None
         value, cov = self._values(without, columns, 0.0)
         if abs(value[0]) < _LEAST_FOCAL:
@@ -390,6 +392,12 @@ class ShapeWatch:
 def _columns(chosen: Sequence[int]) -> Ids:
     """Return the columns of candidates."""
     return np.concatenate([[0] if each == FOCAL else np.arange(2 + 3 * each, 5 + 3 * each) for each in chosen])
+
+
+def _one_is_enough(whole: _Reduced, without: _Reduced) -> bool:
+    """Return whether the change of one focal length explains about as much as the seven numbers do."""
+    gain, seven = without.gain(_columns([FOCAL])), without.square - whole.square
+    return gain >= seven - _ALIKE * without.excess(max(gain, seven))
 
 
 def _total(tests: Sequence[_Test]) -> ResidualSums:
