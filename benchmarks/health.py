@@ -79,6 +79,18 @@ def body_cases() -> Iterator[Case]:
         yield Case(f"right camera {share:g} ms late", {"skew_s": 1e-3 * share}, "time", share)
 
 
+def shape_cases() -> Iterator[Case]:
+    """Discs that moved on the body, in other directions each, and a bent body; all of its discs are used for its poses."""
+    count = len(faults.BODY.points)
+    for mm in (0.3, 0.5, 1.0, 2.0):
+        for disc, along in ((1, (1.0, 0.0, 0.0)), (4, (0.0, 0.6, 0.8))):
+            shift = 1e-3 * mm * np.outer(np.arange(count) == disc, along)
+            name = f"disc {faults.BODY.point_names[disc]} moved by {mm:g} mm after 5 s"
+            yield Case(name, {"shift": shift, "at_s": 5.0}, "body", mm)
+    bent = 5e-4 * np.outer(np.arange(count) % 2, [0.0, 0.0, 1.0])
+    yield Case("body bent: each second disc by 0.5 mm after 5 s", {"shift": bent, "at_s": 5.0}, "body")
+
+
 def lens_cases() -> Iterator[Case]:
     """Lenses and sensors that the model of the cameras cannot express, on two patches."""
     for px in (0.15, 0.3, 0.6):
@@ -146,7 +158,8 @@ def body_run(case: Case, seed: int) -> dict:
     named_s, squares, mm, errors = np.nan, [], [], []
     begin_s = case.options.get("at_s", 0.0)
     for monitor, t_s, T, measured, given in faults.watched_body(seed, seconds=BODY_S, **case.options):
-        if np.isnan(named_s) and (monitor._rig.alarm or monitor._rig.lens is not None):
+        rig = monitor._rig
+        if np.isnan(named_s) and (rig.alarm or rig.lens is not None or rig._shape.found is not None):
             named_s = t_s
         error, sigma = (inverse(T) @ measured.T_left_body)[:3, 3], np.sqrt(np.trace(measured.cov[:3, :3]))
         errors.append(np.append(error, sigma) if t_s >= begin_s else np.zeros(4))
@@ -157,7 +170,7 @@ def body_run(case: Case, seed: int) -> dict:
     shifts = np.apply_along_axis(np.convolve, 0, errors, np.full(AVERAGED, 1.0 / AVERAGED), mode="valid")
     matters = np.flatnonzero(np.linalg.norm(shifts[:, :3], axis=1) > 2.0 * np.maximum(shifts[:, 3], 1e-9))
     matters_s = float(matters[0]) / faults.RATE_HZ if len(matters) else np.nan  # where these shots begin
-    return row_of(case, seed, monitor.findings(), (named_s, max(begin_s, matters_s)), squares, mm)
+    return row_of(case, seed, monitor.findings(), (named_s, float(np.maximum(begin_s, matters_s))), squares, mm)
 
 
 def arm_run(case: Case, seed: int) -> dict:
@@ -236,6 +249,7 @@ def main(words: list[str], seeds: range, results: Path | None) -> None:
     )
     for make, cases in (
         (body_run, body_cases()),
+        (body_run, shape_cases()),
         (body_run, lens_cases()),
         (arm_run, arm_cases()),
         (arm_run, bump_cases()),

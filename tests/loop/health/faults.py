@@ -91,8 +91,11 @@ def calibrated_with(lens, rng):
     return replace(given, cov=np.diag((wider * SIGMAS) ** 2), sigma_px=sigma_px), mean
 
 
-def watched_body(seed, *, rotated=None, scale=1.0, skew_s=0.0, at_s=0.0, seconds=12.0, lens=None):
-    """Watch a body that moves and rests; yield the monitor, the time, the true pose, and what it returned for each shot."""
+def watched_body(seed, *, rotated=None, scale=1.0, skew_s=0.0, at_s=0.0, seconds=12.0, lens=None, shift=0.0):
+    """Watch a body that moves and rests; yield the monitor, the time, the true pose, and what it returned for each shot.
+
+    From ``at_s`` on cameras and points of the body are displaced.
+    """
     rng = np.random.default_rng(seed)
     if lens is None:
         given, frame = TRUE.perturbed(SIGMAS * rng.normal(size=len(SIGMAS))), np.eye(4)
@@ -117,7 +120,8 @@ def watched_body(seed, *, rotated=None, scale=1.0, skew_s=0.0, at_s=0.0, seconds
         t = k / RATE_HZ
         T, late = body_at(t), body_at(t + skew_s * (t >= at_s))
         true = moved if t >= at_s else TRUE
-        uv, uv_late = (both_pixels(true, points @ each[:3, :3].T + each[:3, 3]) for each in (T, late))
+        there = points + shift * (t >= at_s)
+        uv, uv_late = (both_pixels(true, there @ each[:3, :3].T + each[:3, 3]) for each in (T, late))
         uv[:, 1] = uv_late[:, 1]
         if lens is not None:
             uv = np.stack([lens(side, uv[:, side]) for side in range(2)], axis=1)

@@ -34,8 +34,7 @@ from scipy.special import chdtri
 
 from armsight.data import Array, Body, Ids, PoseEstimate, Record
 from armsight.loop.health.record import HealthFinding, alarm_limit
-from armsight.loop.health.shape import FURTHEST_M, ShapeWatch
-from armsight.loop.health.sums import ResidualSums
+from armsight.loop.health.shape import FURTHEST_M, ResidualSums, ShapeWatch
 from armsight.vision.posefit import PixelObservations, fit_pose, whitened
 from armsight.vision.rig import StereoRig
 
@@ -138,7 +137,7 @@ class LensError(Record):
     needed: tuple[Part, ...]
 
 
-class _Residuals(NamedTuple):
+class _ShotResiduals(NamedTuple):
     """What a shot says, its pose eliminated: its sums, also those with points that do not fit, and what changes the pose.
 
     That is the pose's derivatives (6, 7) by the seven numbers, (6, M) by what the camera models lack, and (6, C) by what
@@ -238,7 +237,7 @@ class RigWatch:
         self._sum(found, estimate)
         return self._added(found)
 
-    def _added(self, found: _Residuals) -> Array:
+    def _added(self, found: _ShotResiduals) -> Array:
         """Return what the suspected errors add to the covariance (6, 6) of a pose."""
         shape = self._shape.found
         added = self._shape.added(found.by_shape)
@@ -295,7 +294,7 @@ class RigWatch:
         body = replace(self._body, points=(1.0 + change.f[_SCALED]) * self._body.points)
         return rig, body, found if self._poses > 1 else _of_one_pose(found)
 
-    def _residuals(self, estimate: PoseEstimate, now_s: float) -> _Residuals | None:
+    def _residuals(self, estimate: PoseEstimate, now_s: float) -> _ShotResiduals | None:
         """Return what one shot says; None where too few of its points were measured."""
         seen, rig, points = estimate.points.seen, self._rig, self._body.points
         good = np.zeros(len(points), bool)
@@ -336,10 +335,10 @@ class RigWatch:
             *self._eliminated(A[kept], rest[kept], now_s), *self._eliminated(A[every], rest[every], now_s)
         )
 
-    def _shot(self, sums: ResidualSums, gain: Array, every: ResidualSums, gain_every: Array) -> _Residuals:
+    def _shot(self, sums: ResidualSums, gain: Array, every: ResidualSums, gain_every: Array) -> _ShotResiduals:
         """Return what a shot says, from the sums, and the responses of the pose to everything, without and with all."""
         size, shape = self._size, self._shape.by_candidate
-        return _Residuals(
+        return _ShotResiduals(
             sums,
             gain[:, :size] @ self._by_fault,
             np.asarray(gain[:, size : self._full]),
@@ -382,7 +381,7 @@ class RigWatch:
         shift = T[:3, :3].T @ (T[:3, 3] - before[:3, 3])
         return np.asarray(np.concatenate([shift, rotation]) / (now_s - before_s))
 
-    def _sum(self, shot: _Residuals, estimate: PoseEstimate) -> None:
+    def _sum(self, shot: _ShotResiduals, estimate: PoseEstimate) -> None:
         """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
         T, sums, now_s = estimate.T_left_body, shot.sums, shot.sums.begin_s
         begins = self._stay is None or self._began is None or differ(self._began, T)

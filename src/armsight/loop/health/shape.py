@@ -31,7 +31,6 @@ from scipy.special import chdtri
 
 from armsight.data import Array, Ids, Record
 from armsight.loop.health.record import HealthFinding, alarm_limit
-from armsight.loop.health.sums import ResidualSums
 
 #: A displacement may be so large, m: what is further off is another thing. So much may a focal length change, as a share.
 FURTHEST_M, _FOCAL = 5e-3, 0.05
@@ -52,6 +51,35 @@ _ALIKE, _NECESSARY = 12.0, 1e-4
 _BESIDES = float(chdtri(3, _NECESSARY))
 #: The newest test agrees with all together unless chance explains their difference more rarely than this.
 _UNLIKE = 0.01
+
+
+class ResidualSums:
+    """Information (K, K), right side (K,), sum of squares and degrees of freedom of residuals, and when they began."""
+
+    def __init__(self, size: int, begin_s: float) -> None:
+        self.H, self.b, self.square, self.freedom = np.zeros((size, size)), np.zeros(size), 0.0, 0.0
+        self.begin_s = begin_s
+
+    def add(self, other: ResidualSums, weight: float) -> None:
+        """Add another's."""
+        self.H += other.H if weight == 1.0 else weight * other.H
+        self.b += weight * other.b
+        self.square += weight * other.square
+        self.freedom += weight * other.freedom
+
+    def of(self, size: int) -> ResidualSums:
+        """Return those of the first parameters alone."""
+        found = ResidualSums(size, self.begin_s)
+        found.H, found.b = self.H[:size, :size].copy(), self.b[:size].copy()
+        found.square, found.freedom = self.square, self.freedom
+        return found
+
+    def less(self, other: ResidualSums) -> ResidualSums:
+        """Return these sums without another's."""
+        rest = ResidualSums(len(self.b), self.begin_s)
+        rest.add(self, 1.0)
+        rest.add(other, -1.0)
+        return rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +115,14 @@ class ShapeError(Record):
 FOCAL = -1
 
 
-class _PointShot(NamedTuple):
+class _ByPoint(NamedTuple):
     """What a shot says of each point by itself: information (N, 3, 3) and right side (N, 3)."""
 
     H: Array
     b: Array
 
 
-class _Reduced(NamedTuple):
+class _ShapeSums(NamedTuple):
     """Sums with everything but the candidates eliminated: G (C, C), r (C,), and the sum of squares and freedom."""
 
     G: Array
@@ -113,7 +141,7 @@ class _Reduced(NamedTuple):
 
 
 @dataclass
-class _Test:
+class _ShapeTest:
     """The sums of one test, and the directions from which its poses saw the body."""
 
     sums: ResidualSums
@@ -155,9 +183,9 @@ class ShapeWatch:
         self._limit_focal, self._limit = (alarm_limit(size, 1.0 / test_s, 2 * (n + 1)) for size in (1, 3))
         self._stay: ResidualSums | None = None
         self._stay_shots = 0
-        self._test = _Test(ResidualSums(K, 0.0))
-        self._history: deque[_Test] = deque(maxlen=_KEPT)
-        self._shots: deque[_PointShot] = deque(maxlen=_ASKED)
+        self._test = _ShapeTest(ResidualSums(K, 0.0))
+        self._history: deque[_ShapeTest] = deque(maxlen=_KEPT)
+        self._shots: deque[_ByPoint] = deque(maxlen=_ASKED)
         # What the candidates do to the newest poses, and the covariances of these.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
         self._alarms = 0  # in a row
@@ -177,7 +205,7 @@ class ShapeWatch:
         """
         n, rows = len(self._names), slice(self._first, self._first + 3 * len(self._names))
         H = sums.H[rows, rows].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
-        self._shots.append(_PointShot(H, sums.b[rows].reshape(n, 3)))
+        self._shots.append(_ByPoint(H, sums.b[rows].reshape(n, 3)))
         self._effects.append((effect, cov))
         if self._stay is not None and not begins:
             self._stay.add(sums.of(len(self._prior)), 1.0)
@@ -201,7 +229,7 @@ class ShapeWatch:
         if not self._test.sums.freedom:
             return
         self._history.append(self._test)
-        self._test = _Test(ResidualSums(len(self._prior), 0.0))
+        self._test = _ShapeTest(ResidualSums(len(self._prior), 0.0))
         tests, before = list(self._history), self._suspect
         if before is None:
             self._suspect = self._shown(tests[-1:]) or self._shown(tests)
@@ -216,18 +244,20 @@ class ShapeWatch:
         self.found = self._suspect if again or len(tests) == 1 else None
         self.said = self.found or self.said
 
-    def _shown(self, tests: Sequence[_Test]) -> ShapeError | None:
+    def _shown(self, tests: Sequence[_ShapeTest]) -> ShapeError | None:
         """Return what tests show for certain; None where that is nothing."""
         views = [view for each in tests for view in each.views]
         if len(views) < _LEAST_POSES or not _differ(np.array(views)):
             return None
         sums = _total(tests)
         whole, without = self._reduced(sums, self._known), self._reduced(sums, self._prior)
+        newest = whole if len(tests) == 1 else self._reduced(tests[-1].sums, self._known)
         if (error := self._focal_alone(whole, without, sums.begin_s)) is not None:
-            return error
+            alone = without if len(tests) == 1 else self._reduced(tests[-1].sums, self._prior)
+            if _one_is_enough(newest, alone):
+                return error
         if not any(whole.gain(_columns([each])) > self._limit for each in self._candidates):
             return None
-        newest = whole if len(tests) == 1 else self._reduced(tests[-1].sums, self._known)
         steady = [each for each in self._candidates if self._steady(whole, newest, each)]
         chosen = list[int]()
         scores = dict[int, float]()
@@ -243,12 +273,12 @@ class ShapeWatch:
             chosen.append(best)
         return self._error(whole, without, tuple(chosen), scores, sums.begin_s) if chosen else None
 
-    def _focal_alone(self, whole: _Reduced, without: _Reduced, begin_s: float) -> ShapeError | None:
-        """Return the focal lengths' change where that one number explains more than the seven do; else None."""
+    def _focal_alone(self, whole: _ShapeSums, without: _ShapeSums, begin_s: float) -> ShapeError | None:
+        """Return the focal lengths' change where that one number explains as much as the seven do; else None."""
         columns = _columns([FOCAL])
-        gain, seven = without.gain(columns), without.square - whole.square
-        excess = without.excess(max(gain, seven))
-        if gain / excess < self._limit_focal or gain < seven:
+        gain = without.gain(columns)
+        excess = without.excess(gain)
+        if gain / excess < self._limit_focal or not _one_is_enough(whole, without):
             return None
         value, cov = self._values(without, columns, 0.0)
         if abs(value[0]) < _LEAST_FOCAL:
@@ -257,7 +287,7 @@ class ShapeWatch:
         return ShapeError((FOCAL,), value, excess * cov, gain / excess, 0.0, (), begin_s)
 
     def _error(
-        self, whole: _Reduced, without: _Reduced, chosen: tuple[int, ...], scores: dict[int, float], begin_s: float
+        self, whole: _ShapeSums, without: _ShapeSums, chosen: tuple[int, ...], scores: dict[int, float], begin_s: float
     ) -> ShapeError | None:
         """Return the record of what was chosen; None where it is too small to matter."""
         columns = _columns(chosen)
@@ -273,7 +303,7 @@ class ShapeWatch:
         alike = tuple(each for each, score in scores.items() if each != best and score > scores[best] - _ALIKE)
         return ShapeError(chosen, value, excess * cov, scores[best], seven, alike, begin_s)
 
-    def _values(self, whole: _Reduced, columns: Ids, others_m: float) -> tuple[Array, Array]:
+    def _values(self, whole: _ShapeSums, columns: Ids, others_m: float) -> tuple[Array, Array]:
         """Return the displacements (C,) of columns, and of all other points if these have a prior, and cov (C, C)."""
         wide = self._wide.copy()
         free = columns if others_m == 0.0 else np.arange(2, len(wide))
@@ -287,16 +317,16 @@ class ShapeWatch:
         cov[np.ix_(free, free)] = inverse * np.outer(wide[free], wide[free])
         return value, cov
 
-    def _reduced(self, sums: ResidualSums, M: Array) -> _Reduced:
+    def _reduced(self, sums: ResidualSums, M: Array) -> _ShapeSums:
         """Eliminate parameters (K, P), in their standard deviations, from sums."""
         HM, X = sums.H @ M, self.by_candidate * self._wide
         inner = cho_factor(M.T @ HM + np.eye(M.shape[1]))
         A, b = HM.T @ X, M.T @ sums.b
         solved, found = cho_solve(inner, A), cho_solve(inner, b)
         G = X.T @ sums.H @ X - A.T @ solved + np.eye(X.shape[1])
-        return _Reduced(G, X.T @ sums.b - solved.T @ b, sums.square - float(b @ found), sums.freedom)
+        return _ShapeSums(G, X.T @ sums.b - solved.T @ b, sums.square - float(b @ found), sums.freedom)
 
-    def _steady(self, whole: _Reduced, newest: _Reduced, which: int) -> bool:
+    def _steady(self, whole: _ShapeSums, newest: _ShapeSums, which: int) -> bool:
         """Return whether the newest test, and the median of single shots, agree on a point with all tests together."""
         columns = _columns([which])
         (d, cov), (now, cov_now) = (self._values(each, columns, 0.0) for each in (whole, newest))
@@ -318,7 +348,7 @@ class ShapeWatch:
         squares = np.einsum("ni,ni->n", shift, np.linalg.solve(covs, shift[..., None])[..., 0])
         return float(np.max(squares)) > _MATTERS**2
 
-    def _dated(self, found: ShapeError, tests: Sequence[_Test]) -> ShapeError:
+    def _dated(self, found: ShapeError, tests: Sequence[_ShapeTest]) -> ShapeError:
         """Return what was found with the beginning that leaves least unexplained, estimated from then on.
 
         The test before its beginning may be of both times: it is left out, and counts as noise.
@@ -349,9 +379,9 @@ class ShapeWatch:
         """Return a copy that says what was found so far; this one goes on."""
         other = copy(self)
         other._history, other._shots, other._effects = self._history.copy(), self._shots.copy(), self._effects.copy()
-        other._test = _Test(_total([self._test]), list(self._test.views))
+        other._test = _ShapeTest(_total([self._test]), list(self._test.views))
         if self._stay is not None:
-            other._stay = _total([_Test(self._stay)])
+            other._stay = _total([_ShapeTest(self._stay)])
         return other
 
     def finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
@@ -392,7 +422,13 @@ def _columns(chosen: Sequence[int]) -> Ids:
     return np.concatenate([[0] if each == FOCAL else np.arange(2 + 3 * each, 5 + 3 * each) for each in chosen])
 
 
-def _total(tests: Sequence[_Test]) -> ResidualSums:
+def _one_is_enough(whole: _ShapeSums, without: _ShapeSums) -> bool:
+    """Return whether the change of one focal length explains about as much as the seven numbers do."""
+    gain, seven = without.gain(_columns([FOCAL])), without.square - whole.square
+    return gain >= seven - _ALIKE * without.excess(max(gain, seven))
+
+
+def _total(tests: Sequence[_ShapeTest]) -> ResidualSums:
     """Return the sums of tests."""
     total = ResidualSums(len(tests[0].sums.b), tests[0].sums.begin_s)
     for each in tests:

@@ -26,7 +26,7 @@ from armsight.data import Array, Body, Correspondences, Missed, PoseEstimate, Re
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.health.record import HealthFinding
 from armsight.loop.health.rig import RigWatch, free_directions
-from armsight.loop.health.sums import ResidualSums
+from armsight.loop.health.shape import ResidualSums
 from armsight.vision.detections import SeenShot
 from armsight.vision.locate import locate
 from armsight.vision.match import epipolar_distances, gate
