@@ -33,8 +33,8 @@ _COLLINEAR = 1e-3
 _ALIKE = 0.2
 #: A body whose points are too far apart or too close together by this share, and by so many sigmas, is another body.
 _SIZE_TOLERANCE, _SIZE_SIGMAS = 0.02, 6.0
-#: Markers whose size is wrong by the same share as the whole body's, within this, are not named; nor more than so many.
-_SAME_SCALE, _NAMED = 0.01, 3
+#: Of markers with a wrong size so many are named.
+_NAMED = 3
 #: Residuals beyond this quantile of their chi-square distribution are a misfit, not chance.
 _MISFIT_QUANTILE = 0.999
 
@@ -93,13 +93,12 @@ def _wrong_size(rig: StereoRig, body: Body, points: Points, T_left_body: Array) 
 
     Markers of another size, at the right positions, change the whole by less than themselves: these are named then.
     """
-    scale = _other_scale(rig, body.points[points.ids], points, T_left_body)
-    wrong = _wrong_markers(rig, body, points, T_left_body)
-    if wrong and (scale is None or abs(np.median([s for s, _ in wrong]) - scale) > _SAME_SCALE):
+    scale, sigma = _scale(rig, body.points[points.ids], points, T_left_body)
+    if wrong := _wrong_markers(rig, body, points, T_left_body, scale):
         more = f" and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else ""
-        named = ", ".join(said for _, said in wrong[:_NAMED])
+        named = ", ".join(wrong[:_NAMED])
         return f"markers of {body.name} have another size than its file says: {named}{more}; correct the file"
-    if scale is None:
+    if abs(scale - 1) <= max(_SIZE_TOLERANCE, _SIZE_SIGMAS * sigma):
         return None
     return (
         f"its points lie {scale:.3f} times as far apart as those of {body.name}: is the size in the target right (of a "
@@ -107,35 +106,34 @@ def _wrong_size(rig: StereoRig, body: Body, points: Points, T_left_body: Array) 
     )
 
 
-def _wrong_markers(rig: StereoRig, body: Body, points: Points, T_left_body: Array) -> list[tuple[float, str]]:
-    """Return by how much each marker with a wrong size (points NAME.0, NAME.1, ...) is larger, and what it measures."""
-    wrong, markers = [], np.array([body.point_names[i].rpartition(".")[0] for i in points.ids])
+def _wrong_markers(rig: StereoRig, body: Body, points: Points, T_left_body: Array, whole: float) -> list[str]:
+    """Return what each marker measures (points NAME.0, NAME.1, ...) whose size is neither its own nor the whole's."""
+    wrong, markers = list[str](), np.array([body.point_names[i].rpartition(".")[0] for i in points.ids])
     for name in dict.fromkeys(markers[markers != ""].tolist()):
         rows = markers == name
         if rows.sum() < 3:
             continue
-        p_body = body.points[points.ids[rows]]
         arrays = (points.ids[rows], points.p_left[rows], points.cov[rows], points.calibration[rows])
-        if (scale := _other_scale(rig, p_body, Points(*arrays, points.seen), T_left_body)) is not None:
-            apart = 1e3 * float(np.linalg.norm(p_body[1] - p_body[0]))
-            wrong.append((scale, f"{name} {scale * apart:.4g} mm instead of {apart:.4g}"))
+        scale, sigma = _scale(rig, body.points[points.ids[rows]], Points(*arrays, points.seen), T_left_body)
+        least = max(_SIZE_TOLERANCE, _SIZE_SIGMAS * sigma)
+        if min(abs(scale - 1), abs(scale - whole)) > least:
+            first, second, *_ = (k for k, each in enumerate(body.point_names) if each.rpartition(".")[0] == name)
+            apart = 1e3 * float(np.linalg.norm(body.points[second] - body.points[first]))
+            wrong.append(f"{name} {scale * apart:.4g} mm instead of {apart:.4g}")
     return wrong
 
 
-def _other_scale(rig: StereoRig, p_body: Array, points: Points, T_left_body: Array) -> float | None:
-    """Return by how many times points (N) lie further apart than p_body (N, 3), m, where that is not chance; or None.
+def _scale(rig: StereoRig, p_body: Array, points: Points, T_left_body: Array) -> tuple[float, float]:
+    """Return by how many times points (N) lie further apart than p_body (N, 3), m, and its sigma.
 
     The scale is that of a similarity fit, ``T_left_body`` being the rigid one; its sigma includes pixel noise and the
     rig's calibration.
     """
     p = (p_body - p_body.sum(axis=0) / len(p_body)) @ T_left_body[:3, :3].T
     spread = float(np.vdot(p, p))
-    scale = float(np.vdot(p, points.p_left)) / spread
-    if abs(scale - 1) <= _SIZE_TOLERANCE:
-        return None
     by_rig = np.einsum("ni,nip->p", p, points.calibration) / spread
     variance = float(np.einsum("ni,nij,nj->", p, points.cov, p)) / spread**2 + float(by_rig @ rig.cov @ by_rig)
-    return scale if abs(scale - 1) > _SIZE_SIGMAS * np.sqrt(variance) else None
+    return float(np.vdot(p, points.p_left)) / spread, float(np.sqrt(variance))
 
 
 @lru_cache(maxsize=256)

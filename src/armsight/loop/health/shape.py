@@ -205,7 +205,7 @@ class ShapeWatch:
         """
         n, rows = len(self._names), slice(self._first, self._first + 3 * len(self._names))
         H = sums.H[rows, rows].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
-        self._shots.append(_ByPoint(H, sums.b[rows].reshape(n, 3)))
+        self._shots.append(_ByPoint(H, sums.b[rows].reshape(n, 3).copy()))
         self._effects.append((effect, cov))
         if self._stay is not None and not begins:
             self._stay.add(sums.of(len(self._prior)), 1.0)

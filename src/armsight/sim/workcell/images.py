@@ -325,9 +325,10 @@ class WorkcellCamera:
     @property
     def _room(self) -> _Room:
         """What it sees while nothing moves: found when it looks for the first time, in a second; some 40 MB."""
-        with _LOOKING:
-            if self._seen_room is None:
-                self._seen_room = self._look()
+        if self._seen_room is None:
+            with _LOOKING:
+                if self._seen_room is None:
+                    self._seen_room = self._look()
         return self._seen_room
 
     def _look(self) -> _Room:
