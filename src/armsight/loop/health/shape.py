@@ -183,6 +183,7 @@ class ShapeWatch:
         self._limit_focal, self._limit = (alarm_limit(size, 1.0 / test_s, 2 * (n + 1)) for size in (1, 3))
         self._stay: ResidualSums | None = None
         self._stay_shots = 0
+        self._view: Array | None = None  # the newest direction that differs from the one before
         self._test = _ShapeTest(ResidualSums(K, 0.0))
         self._history: deque[_ShapeTest] = deque(maxlen=_KEPT)
         self._shots: deque[_ByPoint] = deque(maxlen=_ASKED)
@@ -213,7 +214,10 @@ class ShapeWatch:
             return
         self._close()
         self._stay, self._stay_shots = sums.of(len(self._prior)), 1
-        self._test.views.append(T[:3, :3].T @ T[:3, 3] / np.linalg.norm(T[:3, 3]))
+        view = T[:3, :3].T @ T[:3, 3] / np.linalg.norm(T[:3, 3])
+        if self._view is None or np.linalg.norm(view - self._view) > _VIEWS_RAD / _LEAST_POSES:  # else it rests
+            self._test.views.append(view)
+            self._view = view
 
     def _close(self) -> None:
         """Add the mean of a stay's shots to the sums of the next test."""
