@@ -283,6 +283,17 @@ def test_what_is_not_the_body_is_missed_and_a_bad_print_is_reported():
         np.testing.assert_allclose(scaled.cov, sharp.cov, rtol=1e-3, atol=1e-3 * np.abs(sharp.cov).max())
 
 
+def test_a_print_that_is_a_little_too_large_is_not_taken_for_single_markers_of_another_size():
+    rig, rng = replace(rig_of(), sigma_px=0.02), np.random.default_rng(13)
+    middles = np.array([(x, y, 0) for x in (-60, 0, 60) for y in (-60, 0, 60)]) / 1e3
+    points = np.concatenate([m + CORNERS * 0.015 for m in middles])
+    body = Body("plate", tuple(f"T{k}.{i}" for k in range(9) for i in range(4)), points)
+    for _ in range(20):
+        shot = seen(rig, 1.018 * points, somewhere(rng), sigma=0.02, rng=rng)
+        found = locate(rig, body, triangulate(rig, body_of(points), shot))
+        assert not isinstance(found, Missed), found.reason
+
+
 def test_markers_of_another_size_at_the_right_positions_are_named_with_the_size_that_fits():
     rig, rng = replace(rig_of(), sigma_px=0.02), np.random.default_rng(12)
     middles = np.array([[-45, -45, 0], [45, -45, 0], [45, 45, 0], [-45, 45, 0]]) / 1e3

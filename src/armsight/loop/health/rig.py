@@ -409,11 +409,11 @@ class RigWatch:
                 self._moments.append(self._stay)
         self._stay, self._stay_shots = None, 0
 
-    def _decide(self) -> None:
+    def _decide(self, *, ends: bool = False) -> None:
         """Test for a change with the newest sums; weigh the older ones down."""
         if not self._test.freedom:
             return
-        self._shape.decide()
+        self._shape.decide(ends=ends)
         whole, self._test = self._test, ResidualSums(self._full, 0.0)
         test, moments, self._moments = whole.of(self._size), self._moments, []
         weight = float(np.exp(-1.0 / FORGET_TESTS))
@@ -625,7 +625,7 @@ class RigWatch:
         ended._test.add(self._test, 1.0)
         ended._window.add(self._window, 1.0)
         ended._close_stay()
-        ended._decide()
+        ended._decide(ends=True)
         return ended
 
     def moved_since_s(self) -> float | None:

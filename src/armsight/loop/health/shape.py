@@ -227,8 +227,8 @@ class ShapeWatch:
             self._test.sums.add(self._stay, 1.0 / self._stay_shots)
         self._stay = None
 
-    def decide(self) -> None:
-        """Test with the newest sums."""
+    def decide(self, *, ends: bool) -> None:
+        """Test with the newest sums; the first test is enough by itself only where it ends all (``ends``)."""
         self._close()
         if not self._test.sums.freedom:
             return
@@ -245,7 +245,7 @@ class ShapeWatch:
             self._suspect = self._dated(self._suspect, tests)
         # What a change leaves in the test in which it began may look like a displaced point, once.
         again = self._suspect is not None and before is not None and before.chosen[0] == self._suspect.chosen[0]
-        self.found = self._suspect if again or len(tests) == 1 else None
+        self.found = self._suspect if again or (ends and len(tests) == 1) else None
         self.said = self.found or self.said
 
     def _shown(self, tests: Sequence[_ShapeTest]) -> ShapeError | None:
