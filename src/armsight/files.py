@@ -296,7 +296,7 @@ def check_folder(
         The folder, ``~`` expanded.
 
     Raises:
-        InputError: it cannot be made or written to, or one of its files is one of ``apart_from``.
+        InputError: it cannot be made or written to, or it or one of its files is one of ``apart_from``.
     """
     _check_name(path)
     folder = Path(path).expanduser()
@@ -309,10 +309,10 @@ def check_folder(
     except OSError as error:
         raise InputError(f"{folder}: {problem}: {error.strerror}{advice}") from None
     others = [other for other in apart_from if other is not None]
-    for name in holding:
-        if any(_same_file(other, folder / name) for other in others):
+    for part in (folder, *(folder / name for name in holding)):
+        if any(_same_file(other, part) for other in others):
             raise InputError(
-                f"{folder / name}: is given twice, or is read as well as written; choose another folder for the results"
+                f"{part}: is given twice, or is read as well as written; choose another folder for the results"
             )
     return folder
 

@@ -124,7 +124,7 @@ def measure_shots(
     stereo = open_rig(rig)
     folder = None if view_dir is None else view_folder(view_dir)
     if output is not None:
-        check_writable(output, apart_from=(rig, target, detections, folder and folder / CHART))
+        check_writable(output, apart_from=(rig, target, detections, folder, folder and folder / CHART))
     if not stereo.cov.any():
         click.echo(f"note: {rig} has no covariance: every ± is the share of the pixel noise alone", err=True)
     records: list[ShotPose] = []
