@@ -543,6 +543,10 @@ def _close(
         summary += "; " + ", ".join(f"{count} {way} ({took[way]:.1f} ms each)" for way, count in ways.most_common())
     if jumps := [r.shot for r in records if r.jump]:
         summary += f"; jumped in {', '.join(jumps[:5])}" + (f" and {len(jumps) - 5} more" if len(jumps) > 5 else "")
+    if few := [r.shot for r in good if len(r.dropped) > len(r.points_m)]:
+        which = ", ".join(few[:_NAMED]) + (f" and {len(few) - _NAMED} more" if len(few) > _NAMED else "")
+        summary += f"; in {which} most points contradict each other: do not use it; the body moved between the two "
+        summary += "exposures, or the images do not belong together"
     if odd := [r.shot for r in good if r.misfit > 1]:
         which = f" ({', '.join(odd)})" if len(odd) <= _NAMED else ""
         summary += f"; {len(odd)} fit the body worse than the noise allows{which}"
