@@ -101,6 +101,6 @@ def test_points_that_do_not_fit_change_nothing_of_the_other_tests():
     assert DISC not in estimate.points.ids
     watch = RigWatch(rig, BODY, SYNC_S)
     found = watch._residuals(estimate, 0.0)
-    column = rig.parameter_count + 1 + 3 * DISC
-    assert not found.sums.H[column : column + 3].any()
-    assert found.every.H[column : column + 3].any()
+    column = 1 + rig.parameter_count + 1 + 3 * DISC
+    assert not found.rows[:, column : column + 3].any()
+    assert found.every[:, column : column + 3].any()

@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -54,24 +54,51 @@ _UNLIKE = 0.01
 
 
 class ResidualSums:
-    """Information (K, K), right side (K,), sum of squares and degrees of freedom of residuals, and when they began."""
+    """What whitened residuals say of K parameters: sums over their rows, degrees of freedom, and when they began.
+
+    Attributes:
+        M: (1 + K, 1 + K) sum of the outer products of rows [residual; derivatives].
+        freedom: degrees of freedom.
+        begin_s: when the first shot was, s.
+    """
 
     def __init__(self, size: int, begin_s: float) -> None:
-        self.H, self.b, self.square, self.freedom = np.zeros((size, size)), np.zeros(size), 0.0, 0.0
-        self.begin_s = begin_s
+        self.M, self.freedom, self.begin_s = np.zeros((1 + size, 1 + size)), 0.0, begin_s
+
+    @property
+    def H(self) -> Array:
+        """(K, K) information."""
+        return self.M[1:, 1:]
+
+    @property
+    def b(self) -> Array:
+        """(K,) right side."""
+        return self.M[1:, 0]
+
+    @property
+    def square(self) -> float:
+        """Sum of squares of the residuals."""
+        return float(self.M[0, 0])
 
     def add(self, other: ResidualSums, weight: float) -> None:
         """Add another's."""
-        self.H += other.H if weight == 1.0 else weight * other.H
-        self.b += weight * other.b
-        self.square += weight * other.square
+        self.M += other.M if weight == 1.0 else weight * other.M
         self.freedom += weight * other.freedom
+
+    def take(self, rows: Array, freedom: float) -> None:
+        """Add rows (N, 1 + K)."""
+        self.M += rows.T @ rows
+        self.freedom += freedom
+
+    def scale(self, weight: float) -> None:
+        """Weigh down what there is."""
+        self.M *= weight
+        self.freedom *= weight
 
     def of(self, size: int) -> ResidualSums:
         """Return those of the first parameters alone."""
         found = ResidualSums(size, self.begin_s)
-        found.H, found.b = self.H[:size, :size].copy(), self.b[:size].copy()
-        found.square, found.freedom = self.square, self.freedom
+        found.M, found.freedom = self.M[: 1 + size, : 1 + size].copy(), self.freedom
         return found
 
     def less(self, other: ResidualSums) -> ResidualSums:
@@ -115,13 +142,6 @@ class ShapeError(Record):
 FOCAL = -1
 
 
-class _ByPoint(NamedTuple):
-    """What a shot says of each point by itself: information (N, 3, 3) and right side (N, 3)."""
-
-    H: Array
-    b: Array
-
-
 class _ShapeSums(NamedTuple):
     """Sums with everything but the candidates eliminated: G (C, C), r (C,), and the sum of squares and freedom."""
 
@@ -140,12 +160,11 @@ class _ShapeSums(NamedTuple):
         return max((self.square - gain) / max(self.freedom, 1.0), 1.0)
 
 
-@dataclass
-class _ShapeTest:
+class _ShapeTest(NamedTuple):
     """The sums of one test, and the directions from which its poses saw the body."""
 
     sums: ResidualSums
-    views: list[Array] = field(default_factory=list)
+    views: list[Array]
 
 
 class ShapeWatch:
@@ -173,67 +192,49 @@ class ShapeWatch:
         self._first, self._names = first, names
         self._known = np.hstack([prior, seven])
         self._prior = prior
-        #: (K, 2 + 3 N) what a unit of each candidate changes of the parameters: of the focal lengths against each other,
-        #: of both together, of each coordinate of each point.
-        self.by_candidate = np.zeros((K, 2 + 3 * n))
-        self.by_candidate[:, :2] = focal
-        self.by_candidate[first : first + 3 * n, 2:] = np.eye(3 * n)
+        # (K, 2 + 3 N) what a unit of each candidate changes of the parameters: of the focal lengths against each other,
+        # of both together, of each coordinate of each point.
+        self._by_candidate = np.zeros((K, 2 + 3 * n))
+        self._by_candidate[:, :2] = focal
+        self._by_candidate[first : first + 3 * n, 2:] = np.eye(3 * n)
         self._wide = np.append([_FOCAL, _FOCAL], np.full(3 * n, FURTHEST_M))
         self._candidates = () if rigid else tuple(range(n))
         self._limit_focal, self._limit = (alarm_limit(size, 1.0 / test_s, 2 * (n + 1)) for size in (1, 3))
-        self._stay: ResidualSums | None = None
-        self._stay_shots = 0
         self._view: Array | None = None  # the newest direction that differs from the one before
-        self._test = _ShapeTest(ResidualSums(K, 0.0))
+        self._views: list[Array] = []  # of the running test
         self._history: deque[_ShapeTest] = deque(maxlen=_KEPT)
-        self._shots: deque[_ByPoint] = deque(maxlen=_ASKED)
-        # What the candidates do to the newest poses, and the covariances of these.
+        self._shots: deque[Array] = deque(maxlen=_ASKED)  # rows, as they were taken
+        # The response of the newest poses to the parameters, and the covariances of these poses.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
         self._alarms = 0  # in a row
         self._suspect: ShapeError | None = None
         self.found: ShapeError | None = None
         self.said: ShapeError | None = None
 
-    def take(self, sums: ResidualSums, T: Array, effect: Array, cov: Array, begins: bool) -> None:
+    def take(self, rows: Array, T: Array, response: Array, cov: Array, begins: bool) -> None:
         """Take a shot.
 
         Args:
-            sums: of its residuals, all points included, its pose eliminated.
+            rows: (n, 1 + K) its residuals and their derivatives, all points included, its pose eliminated.
             T: (4, 4) pose T_left_body.
-            effect: (6, C) what the candidates do to a pose measured with all points.
+            response: (6, K) of a pose measured with all points to the parameters.
             cov: (6, 6) covariance of the pose.
             begins: whether it begins a stay at a pose, or goes on with one.
         """
-        n, rows = len(self._names), slice(self._first, self._first + 3 * len(self._names))
-        H = sums.H[rows, rows].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
-        self._shots.append(_ByPoint(H, sums.b[rows].reshape(n, 3).copy()))
-        self._effects.append((effect, cov))
-        if self._stay is not None and not begins:
-            self._stay.add(sums.of(len(self._prior)), 1.0)
-            self._stay_shots += 1
+        self._shots.append(rows)
+        self._effects.append((response, cov))
+        if not begins:
             return
-        self._close()
-        self._stay, self._stay_shots = sums.of(len(self._prior)), 1
-        view = T[:3, :3].T @ T[:3, 3] / np.linalg.norm(T[:3, 3])
+        view = T[:3, :3].T @ T[:3, 3]
+        view /= np.sqrt(view @ view)
         if self._view is None or np.linalg.norm(view - self._view) > _VIEWS_RAD / _LEAST_POSES:  # else it rests
-            self._test.views.append(view)
+            self._views.append(view)
             self._view = view
 
-    def _close(self) -> None:
-        """Add the mean of a stay's shots to the sums of the next test."""
-        if self._stay is not None:
-            if not self._test.sums.freedom:
-                self._test.sums.begin_s = self._stay.begin_s
-            self._test.sums.add(self._stay, 1.0 / self._stay_shots)
-        self._stay = None
-
-    def decide(self, *, ends: bool) -> None:
-        """Test with the newest sums; the first test is enough by itself only where it ends all (``ends``)."""
-        self._close()
-        if not self._test.sums.freedom:
-            return
-        self._history.append(self._test)
-        self._test = _ShapeTest(ResidualSums(len(self._prior), 0.0))
+    def decide(self, sums: ResidualSums, *, ends: bool) -> None:
+        """Test with the sums since the last test; the first test is enough by itself only where it ends all (``ends``)."""
+        self._history.append(_ShapeTest(sums, self._views))
+        self._views = []
         tests, before = list(self._history), self._suspect
         if before is None:
             self._suspect = self._shown(tests[-1:]) or self._shown(tests)
@@ -323,7 +324,7 @@ class ShapeWatch:
 
     def _reduced(self, sums: ResidualSums, M: Array) -> _ShapeSums:
         """Eliminate parameters (K, P), in their standard deviations, from sums."""
-        HM, X = sums.H @ M, self.by_candidate * self._wide
+        HM, X = sums.H @ M, self._by_candidate * self._wide
         inner = cho_factor(M.T @ HM + np.eye(M.shape[1]))
         A, b = HM.T @ X, M.T @ sums.b
         solved, found = cho_solve(inner, A), cho_solve(inner, b)
@@ -338,17 +339,15 @@ class ShapeWatch:
         each = (cov + cov_now)[np.ix_(columns, columns)]
         if float(off @ np.linalg.solve(each, off)) > newest.excess(newest.gain(columns)) * chdtri(len(off), _UNLIKE):
             return False
-        H, b = np.array([shot.H[which] for shot in self._shots]), np.array([shot.b[which] for shot in self._shots])
-        information = np.einsum("i,nij,j->n", d, H, d)
-        seen = information > 0.0
-        if np.count_nonzero(seen) < _LEAST_SHOTS:
-            return False
-        return bool(_AGREE[0] < np.median((b[seen] @ d) / information[seen]) < _AGREE[1])
+        first = 1 + self._first + 3 * which
+        along = [(rows[:, first : first + 3] @ d, rows[:, 0]) for rows in self._shots]
+        shares = [(j @ r) / (j @ j) for j, r in along if j.any()]
+        return len(shares) >= _LEAST_SHOTS and bool(_AGREE[0] < np.median(shares) < _AGREE[1])
 
     def _matters(self, value: Array) -> bool:
         """Return whether a displacement moves a new pose by so many of its sigmas, were it measured with that point."""
-        effects, covs = map(np.array, zip(*self._effects, strict=True))
-        shift = effects @ value
+        responses, covs = map(np.array, zip(*self._effects, strict=True))
+        shift = responses @ (self._by_candidate @ value)
         squares = np.einsum("ni,ni->n", shift, np.linalg.solve(covs, shift[..., None])[..., 0])
         return float(np.max(squares)) > _MATTERS**2
 
@@ -371,11 +370,12 @@ class ShapeWatch:
                     best, least = error, left
         return best
 
-    def added(self, effect: Array) -> Array:
-        """Return the covariance (6, 6) of what was found, of a pose that candidates move by ``effect`` (6, C)."""
+    def added(self, response: Array) -> Array:
+        """Return the covariance (6, 6) of what was found, of a pose with a response (6, K) to the parameters."""
         found = self.found
         if found is None:
             return np.zeros((6, 6))
+        effect = response @ self._by_candidate
         shift = effect @ found.value
         return np.asarray(np.outer(shift, shift) + effect @ found.cov @ effect.T)
 
@@ -383,9 +383,7 @@ class ShapeWatch:
         """Return a copy that says what was found so far; this one goes on."""
         other = copy(self)
         other._history, other._shots, other._effects = self._history.copy(), self._shots.copy(), self._effects.copy()
-        other._test = _ShapeTest(_total([self._test]), list(self._test.views))
-        if self._stay is not None:
-            other._stay = _total([_ShapeTest(self._stay)])
+        other._views = self._views.copy()
         return other
 
     def finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
