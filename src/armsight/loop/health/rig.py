@@ -37,7 +37,7 @@ from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import inverse
 from armsight.kernels import kernel
 from armsight.loop.health.record import HealthFinding, alarm_limit
-from armsight.loop.health.shape import FURTHEST_M, ResidualSums, ShapeWatch
+from armsight.loop.health.shape import FURTHEST_M, ResidualSums, ShapeWatch, eliminated, total
 from armsight.vision.camera import pair_arguments
 from armsight.vision.posefit import differentiate
 from armsight.vision.rig import StereoRig
@@ -189,10 +189,11 @@ class RigWatch:
         self.prior[rest, rest] = np.append(SCALE, np.full(shape, SHAPE_M))
         self._by_fault = _fault_directions(rig, self._size)
         names = tuple(body.point_names[k] for k in self._points)
-        wide, many = self._by_fault * _WIDE, len(body.points) > MOST_POINTS
-        self._shape = ShapeWatch(
-            self.prior, wide, _focal_changes(rig, self._size), count + 1, names, printed or many, TEST_S
-        )
+        many = len(body.points) > MOST_POINTS
+        self._shape = ShapeWatch(self._size, _focal_changes(rig, self._size), count + 1, names, printed or many, TEST_S)
+        # (K, K + 7 + C) what the parameters, the seven numbers and the candidates of the shape change of the parameters, in
+        # units of their priors: a test has sums of these.
+        self._scaled = np.hstack([self.prior, self._by_fault * _WIDE, self._shape.by_wide])
         self._shots = 0
         self._row_of = np.full(len(body.points), -1)
         self._row_of[self._points] = np.arange(len(self._points))
@@ -208,7 +209,7 @@ class RigWatch:
         self._half_px = np.array([camera.image_size_px for camera in rig.cameras]) / 2.0
         # Shots of the running test, in stays; sums since the beginning are for what the camera models lack.
         self._stays: list[list[_ShotResiduals]] = []
-        self._window, self._whole = ResidualSums(self._size, 0.0), ResidualSums(self._full, 0.0)
+        self._window, self._whole = ResidualSums(self._size + len(_WIDE), 0.0), ResidualSums(self._full, 0.0)
         self.lens: LensError | None = None
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
         self._timed = False
@@ -272,7 +273,7 @@ class RigWatch:
 
     def information(self, estimates: Sequence[PoseEstimate]) -> tuple[ResidualSums, int]:
         """Return the sums of measured poses, and how many of these differ: consecutive ones that are alike count as one."""
-        total, stays = ResidualSums(self._size, 0.0), list[list[_ShotResiduals]]()
+        sums, stays = ResidualSums(self._size, 0.0), list[list[_ShotResiduals]]()
         count, began = 0, None
         for k, estimate in enumerate(estimates):
             found = self._residuals(estimate, float(k))
@@ -280,17 +281,17 @@ class RigWatch:
                 continue
             if began is None or differ(began, estimate.T_left_body):
                 began = estimate.T_left_body
-                total.add(self._summed(stays).of(self._size), 1.0)
+                sums.add(self._summed(stays).of(self._size), 1.0)
                 stays = [[]]
                 count += 1
             stays[-1].append(found)
-        total.add(self._summed(stays).of(self._size), 1.0)
-        return total, count
+        sums.add(self._summed(stays).of(self._size), 1.0)
+        return sums, count
 
     def explained(self, estimates: Sequence[PoseEstimate]) -> tuple[StereoRig, Body, HealthFinding]:
         """Return the rig and the body with the change that poses show, which are known to be wrong, and what it is."""
         sums, self._poses = self.information(estimates)
-        change = self._estimated(sums)
+        change = self._estimated(self._in_priors(sums))
         more = {part: change.chi_square - change.without[part] for part in ("rig", "body")}
         part: Part = max(("rig", "body"), key=lambda each: (more[each], change.alone[each]))
         sure = more[part] > chdtri(_PARTS[part].stop - _PARTS[part].start, _NECESSARY)
@@ -370,7 +371,7 @@ class RigWatch:
     def _summed(self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool = False) -> ResidualSums:
         """Return the sums of stays, of each the mean of its shots; ``every``: with points that do not fit, no lens."""
         size = self._size if every else self._full
-        total = ResidualSums(size, stays[0][0].t_s if stays else 0.0)
+        sums = ResidualSums(size, stays[0][0].t_s if stays else 0.0)
         for alone in (True, False):  # those of one shot are summed at once
             shots = [
                 (each.every if every else each.rows, len(stay))
@@ -379,9 +380,9 @@ class RigWatch:
                 if (len(stay) == 1) is alone
             ]
             if shots:
-                rows = [each[:, : 1 + size] / np.sqrt(count) for each, count in shots]
-                total.take(np.concatenate(rows), sum((len(each) - 6.0) / count for each, count in shots))
-        return total
+                rows = [each if alone else each / np.sqrt(count) for each, count in shots]
+                sums.take(np.concatenate(rows)[:, : 1 + size], sum((len(each) - 6.0) / count for each, count in shots))
+        return sums
 
     def _decide(self, *, ends: bool = False) -> None:
         """Test for a change with the newest sums; weigh the older ones down."""
@@ -390,9 +391,11 @@ class RigWatch:
             return
         self._poses += len(stays)
         whole = self._summed(stays)
-        test = whole.of(self._size)
-        displaced = any(each.every is not each.rows for stay in stays for each in stay)
-        self._shape.decide(self._summed(stays, every=True) if displaced else test, ends=ends)
+        every = whole.of(self._size).by(self._scaled)
+        test = every.of(len(self._window.b))
+        if any(each.every is not each.rows for stay in stays for each in stay):
+            every = self._summed(stays, every=True).by(self._scaled)
+        self._shape.decide(every, ends=ends)
         moments = [stay[0] for stay in stays if len(stay) == 1]
         weight = float(np.exp(-1.0 / FORGET_TESTS))
         self._window.scale(weight)
@@ -402,14 +405,15 @@ class RigWatch:
         doubted, self._doubted = self._doubted, None
         if alarm and moments and not self._alarms and self._poses > 1:
             worst = self._worst(moments)
-            without = self._window.less(worst.of(self._size))
+            left_out = self._in_priors(worst.of(self._size))
+            without = self._window.less(left_out)
             if not _certain(estimated := self._estimated(without)):
                 # Images that do not belong together are no moved camera; newer shots that agree with them are.
                 if doubted is not None:
                     self._window.add(doubted, 1.0)
                 else:
-                    whole, test = whole.less(worst), test.less(worst.of(self._size))
-                    self._window, self._doubted, change, alarm = without, worst.of(self._size), estimated, False
+                    whole, test = whole.less(worst), test.less(left_out)
+                    self._window, self._doubted, change, alarm = without, left_out, estimated, False
         if len(self._history) < _KEPT:
             self._whole.add(whole, 1.0)
         self._history.append(test)
@@ -423,6 +427,10 @@ class RigWatch:
         due = 0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0
         if due and len(self._history) < _KEPT and self._poses >= _LENS_POSES:
             self.lens = self._lens()
+
+    def _in_priors(self, sums: ResidualSums) -> ResidualSums:
+        """Return sums of the parameters and the seven numbers, in units of their priors, from those of the parameters."""
+        return sums.by(self._scaled[:, : self._size + len(_WIDE)])
 
     def _worst(self, moments: list[_ShotResiduals]) -> ResidualSums:
         """Return the sums of the moments that fit worst: of one, or where shots have no times of a tenth of them."""
@@ -501,15 +509,9 @@ class RigWatch:
         return float(np.max(squares)) > _MATTERS**2
 
     def _estimated(self, sums: ResidualSums) -> RigChange:
-        """Return the seven numbers from sums, everything else eliminated."""
-        L, F = self.prior, self._by_fault * _WIDE
-        LH = L.T @ sums.H
-        inner = cho_factor(LH @ L + np.eye(self._size))
-        across, right = LH @ F, L.T @ sums.b
-        solved, from_right = cho_solve(inner, across), cho_solve(inner, right)
-        S = F.T @ sums.H @ F - across.T @ solved + np.eye(len(_WIDE))
-        s = F.T @ sums.b - solved.T @ right
-        square = sums.square - float(right @ from_right)
+        """Return the seven numbers from sums of the parameters and them, everything else eliminated."""
+        M = eliminated(sums.M, slice(1, 1 + self._size))
+        S, s, square = np.asarray(M[1:, 1:] + np.eye(len(_WIDE)), float), M[1:, 0], float(M[0, 0])
         f = np.linalg.solve(S, s)
         # What the model leaves unexplained widens the noise (Birge ratio); it never narrows it.
         excess = max((square - float(s @ f)) / max(sums.freedom, 1.0), 1.0)
@@ -537,23 +539,29 @@ class RigWatch:
 
         The test before its beginning may be of both times: it is left out, and counts as noise.
         """
-        after, found, least = ResidualSums(self._size, 0.0), None, np.inf
-        before = ResidualSums(self._size, 0.0)
-        for sums in tests:
-            before.add(sums, 1.0)
+        size = len(self._window.b)
+        after, before = ResidualSums(size, 0.0), total(tests)  # less the test in which it began
+        least, best = np.inf, len(tests) - 1
         for k in reversed(range(len(tests))):
             after.add(tests[k], 1.0)
             before.add(tests[k], -1.0)
-            mixed = tests[k - 1] if k else ResidualSums(self._size, tests[0].begin_s)
+            mixed = tests[k - 1] if k else ResidualSums(size, tests[0].begin_s)
             before.add(mixed, -1.0)
-            change, none = self._estimated(after), self._estimated(before)
+            (_, left), (gained, none) = self._gained(after), self._gained(before)
             before.add(mixed, 1.0)
-            left = change.left + none.left + none.gained + mixed.freedom
+            left += none + gained + mixed.freedom
             if left < least:
-                least, found = left, (ResidualSums(self._size, mixed.begin_s), change)
-                found[0].add(after, 1.0)
-        assert found is not None
-        return *found, float(least)
+                least, best = left, k
+        found = ResidualSums(size, tests[max(best - 1, 0)].begin_s)
+        for test in reversed(tests[best:]):
+            found.add(test, 1.0)
+        return found, self._estimated(found), float(least)
+
+    def _gained(self, sums: ResidualSums) -> tuple[float, float]:
+        """Return what the seven numbers explain of a sum of squares, and what nothing does."""
+        M = eliminated(sums.M, slice(1, 1 + self._size))
+        gained = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(_WIDE)), M[1:, 0]))
+        return gained, float(M[0, 0]) - gained
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far, the shots of the running test included: nothing where no test gave an alarm."""
@@ -590,7 +598,7 @@ class RigWatch:
     def _ended(self) -> RigWatch:
         """Return a copy whose running test was made; this one goes on with it."""
         ended = self.copied()
-        ended._window, ended._whole = self._window.of(self._size), self._whole.of(self._full)
+        ended._window, ended._whole = self._window.of(len(self._window.b)), self._whole.of(self._full)
         ended._decide(ends=True)
         return ended
 

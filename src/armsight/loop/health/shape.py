@@ -101,12 +101,27 @@ class ResidualSums:
         found.M, found.freedom = self.M[: 1 + size, : 1 + size].copy(), self.freedom
         return found
 
+    def by(self, T: Array) -> ResidualSums:
+        """Return those of P other parameters, of which these K are T (K, P) times."""
+        found = ResidualSums(T.shape[1], self.begin_s)
+        found.M[0, 0], found.M[0, 1:], found.freedom = self.square, self.b @ T, self.freedom
+        found.M[1:, 0], found.M[1:, 1:] = found.M[0, 1:], T.T @ self.H @ T
+        return found
+
     def less(self, other: ResidualSums) -> ResidualSums:
         """Return these sums without another's."""
         rest = ResidualSums(len(self.b), self.begin_s)
         rest.add(self, 1.0)
         rest.add(other, -1.0)
         return rest
+
+
+def eliminated(M: Array, rows: slice) -> Array:
+    """Return sums M (N, N) with parameters eliminated, of which each has a prior of variance 1."""
+    keep = np.delete(np.arange(len(M)), rows)
+    across = M[rows, keep]
+    inner = cho_factor(M[rows, rows] + np.eye(len(across)), check_finite=False)
+    return np.asarray(M[np.ix_(keep, keep)] - across.T @ cho_solve(inner, across, check_finite=False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +155,8 @@ class ShapeError(Record):
 
 #: Stands for the focal lengths among the rows of the points.
 FOCAL = -1
+#: Rows of the seven numbers once the parameters are eliminated.
+_SEVEN = slice(1, 8)
 
 
 class _ShapeSums(NamedTuple):
@@ -160,10 +177,18 @@ class _ShapeSums(NamedTuple):
         return max((self.square - gain) / max(self.freedom, 1.0), 1.0)
 
 
+class _Reduced(NamedTuple):
+    """What sums say of the candidates: with the seven numbers eliminated, and with these zero."""
+
+    whole: _ShapeSums
+    without: _ShapeSums
+
+
 class _ShapeTest(NamedTuple):
-    """The sums of one test, and the directions from which its poses saw the body."""
+    """The sums of one test, what they say alone, and the directions from which its poses saw the body."""
 
     sums: ResidualSums
+    alone: _Reduced
     views: list[Array]
 
 
@@ -171,8 +196,7 @@ class ShapeWatch:
     """Watches the shape of the body, and the focal lengths of the cameras against each other.
 
     Args:
-        prior: (K, K) square root of the covariance of all parameters.
-        seven: (K, 7) what the seven numbers change of these, in their wide prior.
+        size: K, of the parameters.
         focal: (K, 2) what relative changes of the focal lengths change of these: of the left one by a half and of the right
             one by minus a half, and of both.
         first: row of the first parameter of the points.
@@ -181,23 +205,21 @@ class ShapeWatch:
         test_s: how often it is tested, s.
 
     Attributes:
+        by_wide: (K, C) what the standard deviations of the candidates' priors change of the parameters.
         found: what the newest test found for certain.
         said: what was found last.
     """
 
-    def __init__(
-        self, prior: Array, seven: Array, focal: Array, first: int, names: tuple[str, ...], rigid: bool, test_s: float
-    ) -> None:
-        K, n = len(prior), len(names)
-        self._first, self._names = first, names
-        self._known = np.hstack([prior, seven])
-        self._prior = prior
+    def __init__(self, size: int, focal: Array, first: int, names: tuple[str, ...], rigid: bool, test_s: float) -> None:
+        K, n = size, len(names)
+        self._size, self._first, self._names = K, first, names
         # (K, 2 + 3 N) what a unit of each candidate changes of the parameters: of the focal lengths against each other,
         # of both together, of each coordinate of each point.
         self._by_candidate = np.zeros((K, 2 + 3 * n))
         self._by_candidate[:, :2] = focal
         self._by_candidate[first : first + 3 * n, 2:] = np.eye(3 * n)
         self._wide = np.append([_FOCAL, _FOCAL], np.full(3 * n, FURTHEST_M))
+        self.by_wide = self._by_candidate * self._wide
         self._candidates = () if rigid else tuple(range(n))
         self._limit_focal, self._limit = (alarm_limit(size, 1.0 / test_s, 2 * (n + 1)) for size in (1, 3))
         self._view: Array | None = None  # the newest direction that differs from the one before
@@ -232,8 +254,13 @@ class ShapeWatch:
             self._view = view
 
     def decide(self, sums: ResidualSums, *, ends: bool) -> None:
-        """Test with the sums since the last test; the first test is enough by itself only where it ends all (``ends``)."""
-        self._history.append(_ShapeTest(sums, self._views))
+        """Test once more; the first test is enough by itself only where it ends all.
+
+        Args:
+            sums: since the last test: of the K parameters, the seven numbers and the candidates, in units of their priors.
+            ends: whether it ends all.
+        """
+        self._history.append(_ShapeTest(sums, self._reduced(sums), self._views))
         self._views = []
         tests, before = list(self._history), self._suspect
         if before is None:
@@ -254,13 +281,16 @@ class ShapeWatch:
         views = [view for each in tests for view in each.views]
         if len(views) < _LEAST_POSES or not _differ(np.array(views)):
             return None
-        sums = _total(tests)
-        whole, without = self._reduced(sums, self._known), self._reduced(sums, self._prior)
-        newest = whole if len(tests) == 1 else self._reduced(tests[-1].sums, self._known)
-        if (error := self._focal_alone(whole, without, sums.begin_s)) is not None:
-            alone = without if len(tests) == 1 else self._reduced(tests[-1].sums, self._prior)
-            if _one_is_enough(newest, alone):
-                return error
+        sums, newest = total([each.sums for each in tests]), tests[-1].alone
+        found = newest if len(tests) == 1 else self._reduced(sums)
+        error = self._focal_alone(found, sums.begin_s)
+        if error is not None and _one_is_enough(newest):
+            return error
+        return self._displaced(found, newest.whole, sums.begin_s)
+
+    def _displaced(self, found: _Reduced, newest: _ShapeSums, begin_s: float) -> ShapeError | None:
+        """Return the points that are displaced by what all tests together say, and the newest; None where none is."""
+        whole = found.whole
         if not any(whole.gain(_columns([each])) > self._limit for each in self._candidates):
             return None
         steady = [each for each in self._candidates if self._steady(whole, newest, each)]
@@ -276,14 +306,14 @@ class ShapeWatch:
                 break
             scores = scores or {each: gain / excess for each, gain in gains.items()}
             chosen.append(best)
-        return self._error(whole, without, tuple(chosen), scores, sums.begin_s) if chosen else None
+        return self._error(found, tuple(chosen), scores, begin_s) if chosen else None
 
-    def _focal_alone(self, whole: _ShapeSums, without: _ShapeSums, begin_s: float) -> ShapeError | None:
+    def _focal_alone(self, found: _Reduced, begin_s: float) -> ShapeError | None:
         """Return the focal lengths' change where that one number explains as much as the seven do; else None."""
-        columns = _columns([FOCAL])
+        columns, without = _columns([FOCAL]), found.without
         gain = without.gain(columns)
         excess = without.excess(gain)
-        if gain / excess < self._limit_focal or not _one_is_enough(whole, without):
+        if gain / excess < self._limit_focal or not _one_is_enough(found):
             return None
         value, cov = self._values(without, columns, 0.0)
         if abs(value[0]) < _LEAST_FOCAL:
@@ -292,10 +322,10 @@ class ShapeWatch:
         return ShapeError((FOCAL,), value, excess * cov, gain / excess, 0.0, (), begin_s)
 
     def _error(
-        self, whole: _ShapeSums, without: _ShapeSums, chosen: tuple[int, ...], scores: dict[int, float], begin_s: float
+        self, found: _Reduced, chosen: tuple[int, ...], scores: dict[int, float], begin_s: float
     ) -> ShapeError | None:
         """Return the record of what was chosen; None where it is too small to matter."""
-        columns = _columns(chosen)
+        (whole, without), columns = found, _columns(chosen)
         gain = whole.gain(columns)
         excess = whole.excess(gain)
         value, cov = self._values(whole, columns, 0.0)
@@ -322,14 +352,11 @@ class ShapeWatch:
         cov[np.ix_(free, free)] = inverse * np.outer(wide[free], wide[free])
         return value, cov
 
-    def _reduced(self, sums: ResidualSums, M: Array) -> _ShapeSums:
-        """Eliminate parameters (K, P), in their standard deviations, from sums."""
-        HM, X = sums.H @ M, self._by_candidate * self._wide
-        inner = cho_factor(M.T @ HM + np.eye(M.shape[1]))
-        A, b = HM.T @ X, M.T @ sums.b
-        solved, found = cho_solve(inner, A), cho_solve(inner, b)
-        G = X.T @ sums.H @ X - A.T @ solved + np.eye(X.shape[1])
-        return _ShapeSums(G, X.T @ sums.b - solved.T @ b, sums.square - float(b @ found), sums.freedom)
+    def _reduced(self, sums: ResidualSums) -> _Reduced:
+        """Eliminate the parameters from sums, and the seven numbers."""
+        without = eliminated(sums.M, slice(1, 1 + self._size))
+        whole, candidates = eliminated(without, _SEVEN), np.delete(np.arange(len(without)), _SEVEN)
+        return _Reduced(*(_of_candidates(M, sums.freedom) for M in (whole, without[np.ix_(candidates, candidates)])))
 
     def _steady(self, whole: _ShapeSums, newest: _ShapeSums, which: int) -> bool:
         """Return whether the newest test, and the median of single shots, agree on a point with all tests together."""
@@ -340,8 +367,11 @@ class ShapeWatch:
         if float(off @ np.linalg.solve(each, off)) > newest.excess(newest.gain(columns)) * chdtri(len(off), _UNLIKE):
             return False
         first = 1 + self._first + 3 * which
-        along = [(rows[:, first : first + 3] @ d, rows[:, 0]) for rows in self._shots]
-        shares = [(j @ r) / (j @ j) for j, r in along if j.any()]
+        begins = np.cumsum([0, *map(len, self._shots)])[:-1]
+        rows = np.concatenate(self._shots)
+        along = rows[:, first : first + 3] @ d
+        squares, right = (np.add.reduceat(along * other, begins) for other in (along, rows[:, 0]))
+        shares = right[squares > 0.0] / squares[squares > 0.0]
         return len(shares) >= _LEAST_SHOTS and bool(_AGREE[0] < np.median(shares) < _AGREE[1])
 
     def _matters(self, value: Array) -> bool:
@@ -356,19 +386,23 @@ class ShapeWatch:
 
         The test before its beginning may be of both times: it is left out, and counts as noise.
         """
-        columns, best, least = _columns(found.chosen), found, np.inf
-        for k in range(len(tests)):
-            after = self._reduced(_total(tests[k:]), self._known)
-            left = after.square - after.gain(columns)
-            if k:
-                left += tests[k - 1].sums.freedom
+        columns, lefts = _columns(found.chosen), list[float]()
+        after, before = (
+            total([each.sums for each in tests]),
+            ResidualSums(len(tests[0].sums.b), 0.0),
+        )  # less the test in which it began
+        for k, test in enumerate(tests):
+            whole = self._reduced(after).whole
+            lefts.append(whole.square - whole.gain(columns) + (tests[k - 1].sums.freedom if k else 0.0))
             if k > 1:
-                left += self._reduced(_total(tests[: k - 1]), self._known).square
-            if left < least:
-                error = self._shown(tests[k:])
-                if error is not None and error.chosen[0] == found.chosen[0]:
-                    best, least = error, left
-        return best
+                before.add(tests[k - 2].sums, 1.0)
+                lefts[k] += self._reduced(before).whole.square
+            after.add(test.sums, -1.0)
+        for k in np.argsort(lefts, kind="stable"):
+            error = self._shown(tests[k:])
+            if error is not None and error.chosen[0] == found.chosen[0]:
+                return error
+        return found
 
     def added(self, response: Array) -> Array:
         """Return the covariance (6, 6) of what was found, of a pose with a response (6, K) to the parameters."""
@@ -419,23 +453,29 @@ class ShapeWatch:
         )
 
 
+def _of_candidates(M: Array, freedom: float) -> _ShapeSums:
+    """Return sums M (1 + C, 1 + C) with the candidates' priors."""
+    return _ShapeSums(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0], float(M[0, 0]), freedom)
+
+
 def _columns(chosen: Sequence[int]) -> Ids:
     """Return the columns of candidates."""
     return np.concatenate([[0] if each == FOCAL else np.arange(2 + 3 * each, 5 + 3 * each) for each in chosen])
 
 
-def _one_is_enough(whole: _ShapeSums, without: _ShapeSums) -> bool:
+def _one_is_enough(found: _Reduced) -> bool:
     """Return whether the change of one focal length explains about as much as the seven numbers do."""
+    whole, without = found
     gain, seven = without.gain(_columns([FOCAL])), without.square - whole.square
     return gain >= seven - _ALIKE * without.excess(max(gain, seven))
 
 
-def _total(tests: Sequence[_ShapeTest]) -> ResidualSums:
+def total(tests: Sequence[ResidualSums]) -> ResidualSums:
     """Return the sums of tests."""
-    total = ResidualSums(len(tests[0].sums.b), tests[0].sums.begin_s)
-    for each in tests:
-        total.add(each.sums, 1.0)
-    return total
+    found = tests[0].of(len(tests[0].b))
+    for each in tests[1:]:
+        found.add(each, 1.0)
+    return found
 
 
 def _differ(views: Array) -> bool:
