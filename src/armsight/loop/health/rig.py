@@ -251,6 +251,10 @@ class RigWatch:
         if self.lens is not None:
             shift = by_lens @ self.lens.beta
             added += np.outer(shift, shift) + by_lens @ self.lens.cov @ by_lens.T
+        if (doubt := self._shape.doubt) is not None and self.lens is None:
+            effect = by_parameter @ self._scaled[:, self._size :]
+            first = 0 if self.suspected is None else len(_WIDE)  # these are known better
+            added += effect[:, first:] @ doubt[first:, first:] @ effect[:, first:].T
         besides = (self.lens is None or bool(self.lens.needed)) and (shape is None or shape.seven_needed)
         if self.suspected is not None and besides:
             by_fault = by_parameter @ self._by_fault
@@ -265,6 +269,7 @@ class RigWatch:
             self.suspected is not None
             or self.lens is not None
             or self._shape.found is not None
+            or self._shape.doubt is not None
             or not self._timed
             or not 0.0 <= passed_s < _LIKE_S
         ):

@@ -12,6 +12,11 @@ r^T S^-1 r of the sum of squares, with
 where H and b are the sums, J selects the point, and M has the standard deviations of everything else as its columns. The
 point that explains most is taken, then the next one besides it, while one explains more than chance: a body that is bent.
 
+What may have changed and is not told apart yet widens the poses: of each hypothesis (the seven numbers, the focal lengths,
+a point, all points a little) the evidence against none (MacKay, 1992), of the newest test and of some newest ones together.
+Where the hypotheses together are more probable than that nothing changed, the second moment of their mixture is what poses
+may be off by. Chance exceeds an evidence of 1 / p in p of the tests at most (Markov), whatever the hypotheses.
+
 Only what lasts is reported. A reflection, or another light of the scene that is taken for a disc, stays in the scene or in
 the image while the body rotates. So a point counts only if the median of what single shots say agrees with what all say
 together, seen from directions that differ.
@@ -49,6 +54,10 @@ _MATTERS, _POSES = 2.0, 60
 #: Explanations whose chi-squares differ by less are not distinguished; one is needed besides another beyond this chance.
 _ALIKE, _NECESSARY = 12.0, 1e-4
 _BESIDES = float(chdtri(3, _NECESSARY))
+#: Probability, before a test, that it is the first one after any change.
+_RARE = 1e-4
+#: So many newest tests, together, may be those after a change; all points may be displaced by about so much, m.
+_AFTER, _BENT_M = (1, 2, 4, _KEPT), (2e-4, 1e-3)
 #: The newest test agrees with all together unless chance explains their difference more rarely than this.
 _UNLIKE = 0.01
 
@@ -184,6 +193,22 @@ class _Reduced(NamedTuple):
     without: _ShapeSums
 
 
+class _Hypothesis(NamedTuple):
+    """Rows (D,) of the seven numbers and the candidates that may have changed, and by how much of their priors."""
+
+    rows: Ids
+    scale: float
+
+
+class _Explained(NamedTuple):
+    """What a hypothesis explains of a sum of squares, log-evidence against none, sizes (D,) and cov (D, D)."""
+
+    gain: float
+    evidence: float
+    size: Array
+    cov: Array
+
+
 class _ShapeTest(NamedTuple):
     """The sums of one test, what they say alone, and the directions from which its poses saw the body."""
 
@@ -206,6 +231,8 @@ class ShapeWatch:
 
     Attributes:
         by_wide: (K, C) what the standard deviations of the candidates' priors change of the parameters.
+        doubt: (7 + C, 7 + C) second moment of the seven numbers and the candidates, in units of their priors, by all that
+            may have changed; None where that is improbable, or known.
         found: what the newest test found for certain.
         said: what was found last.
     """
@@ -221,6 +248,7 @@ class ShapeWatch:
         self._wide = np.append([_FOCAL, _FOCAL], np.full(3 * n, FURTHEST_M))
         self.by_wide = self._by_candidate * self._wide
         self._candidates = () if rigid else tuple(range(n))
+        self._hypotheses = _hypotheses(len(self._candidates))
         self._limit_focal, self._limit = (alarm_limit(size, 1.0 / test_s, 2 * (n + 1)) for size in (1, 3))
         self._view: Array | None = None  # the newest direction that differs from the one before
         self._views: list[Array] = []  # of the running test
@@ -230,6 +258,7 @@ class ShapeWatch:
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
         self._alarms = 0  # in a row
         self._suspect: ShapeError | None = None
+        self.doubt: Array | None = None
         self.found: ShapeError | None = None
         self.said: ShapeError | None = None
 
@@ -275,6 +304,30 @@ class ShapeWatch:
         again = self._suspect is not None and before is not None and before.chosen[0] == self._suspect.chosen[0]
         self.found = self._suspect if again or (ends and len(tests) == 1) else None
         self.said = self.found or self.said
+        self.doubt = self._doubted([each.sums for each in tests]) if self.found is None else None
+
+    def _doubted(self, tests: Sequence[ResidualSums]) -> Array | None:
+        """Return the second moment (7 + C, 7 + C) of what may have changed; None where nothing did, more probably."""
+        found = [self._mixture(total(tests[-count:])) for count in _AFTER if count <= len(tests) or count == _KEPT]
+        probability, moment = max(found, key=lambda each: each[0])
+        return moment if probability > 0.5 else None
+
+    def _mixture(self, sums: ResidualSums) -> tuple[float, Array]:
+        """Return the probability that anything changed before the tests of sums, and the second moment of what did."""
+        M, prior = eliminated(sums.M, slice(1, 1 + self._size)), _RARE / len(self._hypotheses)
+        moment = np.zeros((len(M) - 1, len(M) - 1))
+        if float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(moment)), M[1:, 0])) < -2.0 * np.log(prior):
+            return 0.0, moment
+        left = float(M[0, 0]) - max(_explained(M, each, 1.0).gain for each in self._hypotheses)
+        excess = max(left / max(sums.freedom, 1.0), 1.0)  # what none explains is noise
+        explained = [_explained(M, each, excess) for each in self._hypotheses]
+        logs = np.log(prior) + np.array([each.evidence for each in explained])
+        most = max(float(np.max(logs)), 0.0)
+        likely = np.exp(logs - most)
+        total_likely = float(np.sum(likely)) + float(np.exp(-most))
+        for (rows, _), share, each in zip(self._hypotheses, likely / total_likely, explained, strict=True):
+            moment[np.ix_(rows, rows)] += share * (np.outer(each.size, each.size) + each.cov)
+        return 1.0 - float(np.exp(-most)) / total_likely, moment
 
     def _shown(self, tests: Sequence[_ShapeTest]) -> ShapeError | None:
         """Return what tests show for certain; None where that is nothing."""
@@ -456,6 +509,25 @@ class ShapeWatch:
 def _of_candidates(M: Array, freedom: float) -> _ShapeSums:
     """Return sums M (1 + C, 1 + C) with the candidates' priors."""
     return _ShapeSums(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0], float(M[0, 0]), freedom)
+
+
+def _hypotheses(points: int) -> tuple[_Hypothesis, ...]:
+    """Return what may have changed: the seven numbers, one focal length, a point, all points a little."""
+    every = 9 + np.arange(3 * points)
+    alone = (_Hypothesis(np.arange(7), 1.0), _Hypothesis(np.array([7]), 1.0))
+    single = (_Hypothesis(rows, 1.0) for rows in every.reshape(points, 3))
+    bent = (_Hypothesis(every, size / FURTHEST_M) for size in _BENT_M) if points else ()
+    return (*alone, *single, *bent)
+
+
+def _explained(M: Array, hypothesis: _Hypothesis, excess: float) -> _Explained:
+    """Return what a hypothesis explains of sums M (1 + N, 1 + N), of a noise whose variance is so many times larger."""
+    rows, scale = hypothesis
+    G = M[np.ix_(1 + rows, 1 + rows)] * (scale**2 / excess) + np.eye(len(rows))
+    r, inverse = M[1 + rows, 0] * (scale / excess), np.asarray(np.linalg.inv(G), float)
+    gain = float(r @ inverse @ r)
+    evidence = 0.5 * gain - 0.5 * float(np.linalg.slogdet(G)[1])
+    return _Explained(gain, evidence, scale * (inverse @ r), scale**2 * inverse)
 
 
 def _columns(chosen: Sequence[int]) -> Ids:
