@@ -245,18 +245,18 @@ class RigWatch:
 
     def _added(self, found: _ShotResiduals) -> Array:
         """Return what the suspected errors add to the covariance (6, 6) of a pose."""
-        shape = self._shape.found
         by_parameter, by_lens = found.response[:, : self._size], found.response[:, self._size :]
-        added = self._shape.added(by_parameter)
+        added, shape, known = self._shape.added(by_parameter), self._shape.found, 0
+        if self.suspected is not None and (shape is None or shape.seven_needed):
+            known = len(_WIDE)
         if self.lens is not None:
+            known = known if self.lens.needed else 0
             shift = by_lens @ self.lens.beta
             added += np.outer(shift, shift) + by_lens @ self.lens.cov @ by_lens.T
-        if (doubt := self._shape.doubt) is not None and self.lens is None:
-            effect = by_parameter @ self._scaled[:, self._size :]
-            first = 0 if self.suspected is None else len(_WIDE)  # these are known better
-            added += effect[:, first:] @ doubt[first:, first:] @ effect[:, first:].T
-        besides = (self.lens is None or bool(self.lens.needed)) and (shape is None or shape.seven_needed)
-        if self.suspected is not None and besides:
+        elif (doubt := self._shape.doubt) is not None:
+            effect = by_parameter @ self._scaled[:, self._size + known :]
+            added += effect @ doubt[known:, known:] @ effect.T
+        if known and self.suspected is not None:
             by_fault = by_parameter @ self._by_fault
             shift = by_fault @ self.suspected.f
             added += np.outer(shift, shift) + by_fault @ self.suspected.cov @ by_fault.T

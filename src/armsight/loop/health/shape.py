@@ -57,7 +57,9 @@ _BESIDES = float(chdtri(3, _NECESSARY))
 #: Probability, before a test, that it is the first one after any change.
 _RARE = 1e-4
 #: So many newest tests, together, may be those after a change; all points may be displaced by about so much, m.
-_AFTER, _BENT_M = (1, 2, 4, _KEPT), (2e-4, 1e-3)
+_AFTER, _BENT_M = (1, 2, 4, 8, 16), (2e-4, 1e-3)
+#: The seven numbers are expected to change by such shares of their priors, which are wide.
+_SEVEN_SCALES = (1.0, 0.03, 0.003)
 #: The newest test agrees with all together unless chance explains their difference more rarely than this.
 _UNLIKE = 0.01
 
@@ -304,30 +306,37 @@ class ShapeWatch:
         again = self._suspect is not None and before is not None and before.chosen[0] == self._suspect.chosen[0]
         self.found = self._suspect if again or (ends and len(tests) == 1) else None
         self.said = self.found or self.said
-        self.doubt = self._doubted([each.sums for each in tests]) if self.found is None else None
+        self.doubt = self._doubted([each.sums for each in tests])
 
     def _doubted(self, tests: Sequence[ResidualSums]) -> Array | None:
         """Return the second moment (7 + C, 7 + C) of what may have changed; None where nothing did, more probably."""
-        found = [self._mixture(total(tests[-count:])) for count in _AFTER if count <= len(tests) or count == _KEPT]
-        probability, moment = max(found, key=lambda each: each[0])
-        return moment if probability > 0.5 else None
+        if self.found is None:
+            sums = (total(tests[-count:]) for count in _AFTER if count <= len(tests))
+            evidence, moment = max((self._mixture(each, self._hypotheses) for each in sums), key=lambda each: each[0])
+            return moment if evidence > np.log(2.0) else None
+        if self.found.chosen != (FOCAL,):
+            return None
+        # Cameras that moved cannot be excluded.
+        since = [each for each in tests if each.begin_s >= self.found.begin_s]
+        return self._mixture(total(since or tests[-1:]), self._hypotheses[: len(_SEVEN_SCALES)])[1]
 
-    def _mixture(self, sums: ResidualSums) -> tuple[float, Array]:
-        """Return the probability that anything changed before the tests of sums, and the second moment of what did."""
-        M, prior = eliminated(sums.M, slice(1, 1 + self._size)), _RARE / len(self._hypotheses)
+    def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypothesis]) -> tuple[float, Array]:
+        """Return the log-evidence that anything changed before the tests of sums, and the second moment of what did.
+
+        Nothing is one of the hypotheses, and its evidence is 1.
+        """
+        M, prior = eliminated(sums.M, slice(1, 1 + self._size)), _RARE / len(hypotheses)
         moment = np.zeros((len(M) - 1, len(M) - 1))
         if float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(moment)), M[1:, 0])) < -2.0 * np.log(prior):
             return 0.0, moment
-        left = float(M[0, 0]) - max(_explained(M, each, 1.0).gain for each in self._hypotheses)
+        left = float(M[0, 0]) - max(_explained(M, each, 1.0).gain for each in hypotheses)
         excess = max(left / max(sums.freedom, 1.0), 1.0)  # what none explains is noise
-        explained = [_explained(M, each, excess) for each in self._hypotheses]
+        explained = [_explained(M, each, excess) for each in hypotheses]
         logs = np.log(prior) + np.array([each.evidence for each in explained])
-        most = max(float(np.max(logs)), 0.0)
-        likely = np.exp(logs - most)
-        total_likely = float(np.sum(likely)) + float(np.exp(-most))
-        for (rows, _), share, each in zip(self._hypotheses, likely / total_likely, explained, strict=True):
+        evidence = float(np.logaddexp.reduce(np.append(logs, 0.0)))
+        for (rows, _), share, each in zip(hypotheses, np.exp(logs - evidence), explained, strict=True):
             moment[np.ix_(rows, rows)] += share * (np.outer(each.size, each.size) + each.cov)
-        return 1.0 - float(np.exp(-most)) / total_likely, moment
+        return evidence, moment
 
     def _shown(self, tests: Sequence[_ShapeTest]) -> ShapeError | None:
         """Return what tests show for certain; None where that is nothing."""
@@ -514,7 +523,8 @@ def _of_candidates(M: Array, freedom: float) -> _ShapeSums:
 def _hypotheses(points: int) -> tuple[_Hypothesis, ...]:
     """Return what may have changed: the seven numbers, one focal length, a point, all points a little."""
     every = 9 + np.arange(3 * points)
-    alone = (_Hypothesis(np.arange(7), 1.0), _Hypothesis(np.array([7]), 1.0))
+    seven = (_Hypothesis(np.arange(7), scale) for scale in _SEVEN_SCALES)
+    alone = (*seven, _Hypothesis(np.array([7]), 1.0))
     single = (_Hypothesis(rows, 1.0) for rows in every.reshape(points, 3))
     bent = (_Hypothesis(every, size / FURTHEST_M) for size in _BENT_M) if points else ()
     return (*alone, *single, *bent)
