@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from faults import BODY, RATE_HZ, SIGMA_PX, SIGMAS, SYNC_S, TRUE, measured
+from faults import BODY, RATE_HZ, SIGMA_PX, SIGMAS, SYNC_S, TRUE, measured, watched_body
 
-from armsight.geometry.pose import pose
+from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.health import HealthMonitor
 from armsight.loop.health.rig import RigWatch
@@ -65,6 +65,22 @@ def test_the_same_disc_on_a_print_whose_shape_was_calibrated_is_not_named():
     assert watched(51, shift=displaced(1.0), printed=True)[0] == ()
 
 
+def test_the_covariance_covers_a_disc_that_moved_before_it_is_named():
+    """All discs are used for the poses; the first whole test after the move ends 1.3 s after it."""
+    squares = []
+    for monitor, t_s, T, measured_pose, given in watched_body(55, shift=displaced(1.0), at_s=5.0, seconds=6.9):
+        assert monitor._rig._shape.found is None
+        assert (given is measured_pose) is (monitor._rig._shape.doubt is None)
+        if t_s > 6.4:
+            off = log_se3(inverse(T) @ given.T_left_body)
+            squares.append([off @ np.linalg.solve(each.cov, off) for each in (measured_pose, given)])
+        elif t_s < 5.0:
+            assert given is measured_pose
+    before, after = np.mean(squares, axis=0)
+    assert before > 30.0
+    assert after < 12.0
+
+
 def test_a_bent_body_is_named_with_several_points():
     (found,), _ = watched(52, shift=5e-4 * np.outer(np.arange(len(BODY.points)) % 2, [0, 0, 1]), seconds=6.0)
     assert found.cause == "body"
@@ -101,6 +117,6 @@ def test_points_that_do_not_fit_change_nothing_of_the_other_tests():
     assert DISC not in estimate.points.ids
     watch = RigWatch(rig, BODY, SYNC_S)
     found = watch._residuals(estimate, 0.0)
-    column = rig.parameter_count + 1 + 3 * DISC
-    assert not found.sums.H[column : column + 3].any()
-    assert found.every.H[column : column + 3].any()
+    column = 1 + rig.parameter_count + 1 + 3 * DISC
+    assert not found.rows[:, column : column + 3].any()
+    assert found.every[:, column : column + 3].any()
