@@ -20,6 +20,7 @@
 #define CAREFUL 0.5f          /* of the speed limit until then: a reading of a third of the true speed is no faster joint */
 #define CONSTANT_OFF 0.15f    /* by so much a motor's constant may be off */
 #define UNKNOWN_RAD_S 1000.0f
+#define SIDE_UNKNOWN 2
 #define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
 #define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
 
@@ -30,6 +31,7 @@ void motor_start(motor_state *motor, float angle_rad, uint32_t phase)
                            .last_rad = angle_rad,
                            .window_rad = angle_rad,
                            .window_ticks = phase,
+                           .window_side = SIDE_UNKNOWN,
                            .resistance_scale = 1.0f,
                            .constant_scale = 1.0f,
                            .variance_rr = PRIOR_VARIANCE,
@@ -151,6 +153,7 @@ void motor_pause(motor_state *motor, float angle_rad)
     motor->last_rad = angle_rad;
     motor->unsure_rad_s = UNKNOWN_RAD_S;
     motor->sure_rad_s = 0.0f;
+    motor->window_side = SIDE_UNKNOWN; /* backlash may be crossed meanwhile */
     window_begin(motor, angle_rad);
 }
 

@@ -1,11 +1,14 @@
 """The motor as a witness: on drawn arms under load a healthy potentiometer is left alone, a broken one is named."""
 
+import ctypes
 import importlib.util
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from firmware_layout import c
 
 from armsight.robot.boards.codes import BoardState, Fault
 from armsight.sim.joints import PotFault
@@ -212,3 +215,24 @@ def test_backlash_teaches_no_resistance(arms, library):
     for seed in (61000774, 61000871, 62001844, 63003108):
         arms.loaded_suddenly(library, seed, table)
     assert not table.false["unloaded, then 1 N m"]
+
+
+def test_backlash_crossed_in_a_pause_teaches_no_resistance(library):
+    config, motor = c.motor_config(6.0, 2.4, 0.03), c.motor_state()
+    library.motor_start(ctypes.byref(motor), ctypes.c_float(0.0), 0)
+
+    def window(angle_rad, way_rad, ahead_rad):  # 32 ms at 1 A, in which the motor goes on further than the reading
+        for _ in range(32):
+            angle_rad += way_rad / 32
+            motor.duty = (6.0 + 2.4 * (way_rad + ahead_rad) / 0.032) / 12.0
+            numbers = (ctypes.c_float(each) for each in (12.0, 1.0, angle_rad))
+            library.motor_measure(ctypes.byref(motor), ctypes.byref(config), *numbers)
+        return angle_rad
+
+    angle_rad = 0.0
+    for _ in range(3):
+        angle_rad = window(angle_rad, 0.03, 0.0)
+    library.motor_pause(ctypes.byref(motor), ctypes.c_float(angle_rad))
+    before = motor.resistance_scale
+    window(angle_rad, 0.03, 0.007)
+    assert motor.resistance_scale - before < 0.01
