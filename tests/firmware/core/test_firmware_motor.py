@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from firmware_layout import c
 
 from armsight.robot.boards.codes import BoardState, Fault
