@@ -8,9 +8,8 @@
 #define SCALE_HIGH 1.25f
 #define WINDOW_TICKS 32u      /* R and K are learnt from a window: until the reading has moved, looked at as often, */
 #define REST_TICKS 256u       /* or has rested for so long */
-#define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer; */
-#define REST_NOISE_RAD 0.0035f /* that and what a resting motor may still move; */
-#define BACKLASH_NOISE_RAD 0.01f /* and the gear's backlash, wherever the motor may have crossed it */
+#define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
+#define BACKLASH_NOISE_RAD 0.01f /* that and the gear's backlash, wherever the motor may have crossed it */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
 #define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
 #define SAMPLE_TICKS 8u
@@ -20,7 +19,8 @@
 #define CAREFUL 0.5f          /* of the speed limit until then: a reading of a third of the true speed is no faster joint */
 #define CONSTANT_OFF 0.15f    /* by so much a motor's constant may be off */
 #define UNKNOWN_RAD_S 1000.0f
-#define SIDE_UNKNOWN 2
+#define SIDE_UNKNOWN 0
+#define TURN_TICKS 64u        /* in a longer window than so a joint may have turned and come back */
 #define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
 #define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
 
@@ -70,20 +70,15 @@ static void earn(motor_state *motor, const motor_config *config, float way_rad)
     way_begin(motor);
 }
 
-/* Return how far the motor's way over a window may be from the reading's, and remember which way it went. A gear that goes
- * on to the side where its teeth lie already, and a motor that goes on resting, cross no backlash. */
-static float window_noise(motor_state *motor, const motor_config *config, float way_rad)
+/* Return how far the motor's way over a window may be from the reading's, and remember which way it went. Only a gear that
+ * goes on to the side where its teeth lie already crosses no backlash: a motor that rests may be anywhere between them. */
+static float window_noise(motor_state *motor, float way_rad)
 {
     const bool moved = number_size(way_rad) > WINDOW_WAY_RAD;
-    const int32_t side = moved ? (way_rad > 0.0f ? 1 : -1) : 0;
-    const bool goes_on = side == motor->window_side;
+    const int32_t side = moved ? (way_rad > 0.0f ? 1 : -1) : SIDE_UNKNOWN;
+    const bool goes_on = side == motor->window_side && moved && motor->window_ticks <= TURN_TICKS;
     motor->window_side = side;
-    if (moved) {
-        return goes_on ? WINDOW_NOISE_RAD : BACKLASH_NOISE_RAD;
-    }
-    const float emf_v = motor->window_v - motor->resistance_scale * motor->window_ir_v;
-    const bool rests = number_size(emf_v) * TICK_S < WINDOW_WAY_RAD * config->constant_v_s;
-    return goes_on && rests ? REST_NOISE_RAD : BACKLASH_NOISE_RAD;
+    return goes_on ? WINDOW_NOISE_RAD : BACKLASH_NOISE_RAD;
 }
 
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
@@ -136,7 +131,7 @@ static void window(motor_state *motor, const motor_config *config, float voltage
     if (motor->window_ticks < REST_TICKS && number_size(way_rad) <= WINDOW_WAY_RAD) {
         return;
     }
-    const float noise_rad = window_noise(motor, config, way_rad);
+    const float noise_rad = window_noise(motor, way_rad);
     if (motor->trust != 1.0f) {
         earn(motor, config, way_rad);
     }

@@ -366,7 +366,7 @@ typedef struct motor_state {
     float window_ir_v;       /* what the configured resistance takes of it, */
     float window_rad;        /* the reading at its beginning */
     uint32_t window_ticks;
-    int32_t window_side;     /* which way the last one went, 1 or -1; 0: it rested; 2: not known */
+    int32_t window_side;     /* which way the last one went, 1 or -1; 0: not known where in its backlash it ended */
     uint32_t sampled;        /* samples taken */
     float trust;             /* of the speed limit: what the joint may use; 1 once motor and reading went the same way */
     float way_read_rad;      /* the way since the joint last rested, by the reading */

@@ -211,27 +211,40 @@ def test_gains_that_make_a_joint_swing_are_noticed(arms, library):
 
 def test_backlash_teaches_no_resistance(arms, library):
     table = arms.Table()
-    for seed in (61000774, 61000871, 62001844, 63003108):
+    for seed in (61000774, 61000871, 62001844, 63003108, 871027156, 871045392):
         arms.loaded_suddenly(library, seed, table)
     assert not table.false["unloaded, then 1 N m"]
 
 
-def test_backlash_crossed_in_a_pause_teaches_no_resistance(library):
+@pytest.fixture
+def watched(library):
+    """A motor of 6 ohm and 2.4 V s/rad that is driven at 1 A, and a function that lets a window of it pass."""
     config, motor = c.motor_config(6.0, 2.4, 0.03), c.motor_state()
     library.motor_start(ctypes.byref(motor), ctypes.c_float(0.0), 0)
 
-    def window(angle_rad, way_rad, ahead_rad):  # 32 ms at 1 A, in which the motor goes on further than the reading
-        for _ in range(32):
-            angle_rad += way_rad / 32
-            motor.duty = (6.0 + 2.4 * (way_rad + ahead_rad) / 0.032) / 12.0
-            numbers = (ctypes.c_float(each) for each in (12.0, 1.0, angle_rad))
+    def window(way_rad, ahead_rad=0.0, *, ticks=32, current_a=1.0):  # the motor goes on further than the reading
+        start_rad = motor.last_rad
+        for tick in range(1, ticks + 1):
+            motor.duty = (6.0 * current_a + 2.4e3 * (way_rad + ahead_rad) / ticks) / 12.0
+            numbers = (ctypes.c_float(each) for each in (12.0, current_a, start_rad + way_rad * tick / ticks))
             library.motor_measure(ctypes.byref(motor), ctypes.byref(config), *numbers)
-        return angle_rad
 
-    angle_rad = 0.0
+    window(0.0, ticks=3)  # currents settle
+    return motor, window
+
+
+def test_backlash_crossed_in_a_pause_teaches_no_resistance(library, watched):
+    motor, window = watched
     for _ in range(3):
-        angle_rad = window(angle_rad, 0.03, 0.0)
-    library.motor_pause(ctypes.byref(motor), ctypes.c_float(angle_rad))
+        window(0.03)
     before = motor.resistance_scale
-    window(angle_rad, 0.03, 0.007)
+    library.motor_pause(ctypes.byref(motor), ctypes.c_float(motor.last_rad))
+    window(0.03, 0.007)
     assert motor.resistance_scale - before < 0.01
+
+
+def test_a_motor_that_moves_within_its_backlash_at_rest_teaches_no_resistance(watched):
+    motor, window = watched
+    window(0.0, ticks=256, current_a=0.15)
+    window(0.0, 0.008, ticks=256, current_a=0.15)
+    assert motor.resistance_scale - 1.0 < 0.035
