@@ -38,7 +38,7 @@ static const joint_config factory_joint = {
             .jump_rad = 0.02f,
             .frozen_rad = 0.1f,
             .inverted_rad = 0.1f},
-    .motor = {.constant_v_s = 1.0f, .apart_rad = 0.03f},
+    .motor = {.constant_v_s = 1.0f, .apart_rad = 0.03f, .backlash_rad = 0.01f},
     .soft_min_rad = -2.4f,
     .soft_max_rad = 2.4f,
     .speed_limit_rad_s = 0.5f,
@@ -117,7 +117,7 @@ static bool sensor_is_valid(const joint_config *joint)
 static bool motor_is_valid(const motor_config *motor)
 {
     return number_within(motor->resistance_ohm, 0.0f, 1000.0f) && number_within(motor->constant_v_s, 1e-3f, 1e3f) &&
-           number_within(motor->apart_rad, 1e-3f, 1.0f);
+           number_within(motor->apart_rad, 1e-3f, 1.0f) && number_within(motor->backlash_rad, 0.0f, 1.0f);
 }
 
 /* Return whether a potentiometer's table reaches the soft limits, within its band. */
@@ -143,11 +143,12 @@ static bool encoder_is_consistent(const joint_config *joint)
     return within && step_rad <= 0.5f * joint->pot.jump_rad && step_rad <= 0.5f * joint->pot.frozen_rad;
 }
 
-/* Return whether the numbers fit each other: a stall shows below the duty's limit, the sensor reaches the soft limits. */
+/* Return whether the numbers fit each other: a stall shows below the duty's limit, the sensor reaches the soft limits, a
+ * healthy gear's backlash leaves motor and sensor together. */
 static bool joint_is_consistent(const joint_config *joint)
 {
     const bool own = joint->encoder.sensor == SENSOR_POTENTIOMETER ? table_is_consistent(joint) : encoder_is_consistent(joint);
-    return own && joint->stall_duty <= joint->duty_limit && joint->speed_limit_rad_s * TICK_S < joint->pot.jump_rad;
+    return own && joint->motor.backlash_rad < joint->motor.apart_rad && joint->stall_duty <= joint->duty_limit && joint->speed_limit_rad_s * TICK_S < joint->pot.jump_rad;
 }
 
 /* Return whether no two quadrature encoders are on one timer. */

@@ -9,7 +9,6 @@
 #define WINDOW_TICKS 32u      /* R and K are learnt from a window: until the reading has moved, looked at as often, */
 #define REST_TICKS 256u       /* or has rested for so long */
 #define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
-#define BACKLASH_NOISE_RAD 0.01f /* that and the gear's backlash, wherever the motor may have crossed it */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
 #define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
 #define SAMPLE_TICKS 8u
@@ -72,13 +71,13 @@ static void earn(motor_state *motor, const motor_config *config, float way_rad)
 
 /* Return how far the motor's way over a window may be from the reading's, and remember which way it went. Only a gear that
  * goes on to the side where its teeth lie already crosses no backlash: a motor that rests may be anywhere between them. */
-static float window_noise(motor_state *motor, float way_rad)
+static float window_noise(motor_state *motor, const motor_config *config, float way_rad)
 {
     const bool moved = number_size(way_rad) > WINDOW_WAY_RAD;
     const int32_t side = moved ? (way_rad > 0.0f ? 1 : -1) : SIDE_UNKNOWN;
     const bool goes_on = side == motor->window_side && moved && motor->window_ticks <= TURN_TICKS;
     motor->window_side = side;
-    return goes_on ? WINDOW_NOISE_RAD : BACKLASH_NOISE_RAD;
+    return goes_on ? WINDOW_NOISE_RAD : WINDOW_NOISE_RAD + config->backlash_rad;
 }
 
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
@@ -131,7 +130,7 @@ static void window(motor_state *motor, const motor_config *config, float voltage
     if (motor->window_ticks < REST_TICKS && number_size(way_rad) <= WINDOW_WAY_RAD) {
         return;
     }
-    const float noise_rad = window_noise(motor, way_rad);
+    const float noise_rad = window_noise(motor, config, way_rad);
     if (motor->trust != 1.0f) {
         earn(motor, config, way_rad);
     }

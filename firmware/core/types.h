@@ -177,6 +177,7 @@ typedef struct motor_config {
     float resistance_ohm; /* 0 to 1000; 0: the motor is not watched */
     float constant_v_s;   /* 0.001 to 1000: V s/rad, gear included */
     float apart_rad;      /* 1e-3 to 1: how far motor and potentiometer may be apart: noise and backlash */
+    float backlash_rad;   /* 0 to 1, below apart_rad: of the gear between them, from stop to stop */
 } motor_config;
 
 /* The encoder of one joint. The joint is at home_rad where its counts are those of the zero: an absolute one's

@@ -139,7 +139,8 @@ WRONG = {
     "pot.inverted_rad": [0, 1.1, NAN],
     "motor.resistance_ohm": [-1, 1001, NAN],
     "motor.constant_v_s": [0, 1001, NAN],
-    "motor.apart_rad": [0, 1.1, NAN],
+    "motor.apart_rad": [0, 1.1, 0.01, NAN],
+    "motor.backlash_rad": [-0.001, 0.03, 1.1, NAN],
     "soft_min_rad": [2.4, -13.1, -2.7, NAN],
     "soft_max_rad": [-2.4, 13.1, 2.7, NAN],
     "speed_limit_rad_s": [0, 20.0, 20.1, NAN],
@@ -247,6 +248,7 @@ def test_every_value_has_its_range_tried(library):
         if name not in ("gains", "pot", "motor", "encoder", "current_limit_ma")
     }
     leaves |= {f"gains.{name}" for name, _ in c.joint_gains._fields_}
+    leaves |= {f"motor.{name}" for name, _ in c.motor_config._fields_}
     assert leaves <= set(WRONG)
     assert {f"encoder.{name}" for name, _ in c.encoder_config._fields_} <= {*WRONG, *WRONG_ENCODER}
     assert {name for name, _ in c.core_config._fields_} - {"joint", "supply_max_mv"} == set(WRONG_ARM)

@@ -219,7 +219,7 @@ def test_backlash_teaches_no_resistance(arms, library):
 @pytest.fixture
 def watched(library):
     """A motor of 6 ohm and 2.4 V s/rad that is driven at 1 A, and a function that lets a window of it pass."""
-    config, motor = c.motor_config(6.0, 2.4, 0.03), c.motor_state()
+    config, motor = c.motor_config(6.0, 2.4, 0.03, 0.01), c.motor_state()
     library.motor_start(ctypes.byref(motor), ctypes.c_float(0.0), 0)
 
     def window(way_rad, ahead_rad=0.0, *, ticks=32, current_a=1.0):  # the motor goes on further than the reading
