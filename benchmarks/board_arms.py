@@ -327,6 +327,21 @@ def healthy(library, seed, table):
     table.add("swing", arm, ())
 
 
+def slow(library, seed, table):
+    """Joints with speed limits of 0.1 to 0.7 rad/s, which swing at 0.8 of them and rest."""
+    rng = np.random.default_rng([seed, 10])
+    model = drawn_model(seed)
+    config = arm_configuration(model, rng)
+    limits = config["joint"]["speed_limit_rad_s"] = rng.uniform(0.1, 0.7, 6)
+    arm = Arm(library, seed, model=model, config=config)
+    arm.speed_rad_s = 0.8 * np.minimum(arm.speed_rad_s, limits)
+    arm.enable()
+    arm.rest(200)
+    arm.swing(4000)
+    arm.rest(800)
+    table.add("slow swing", arm, ())
+
+
 def pushed(library, seed, table):
     arm = Arm(library, seed)
     arm.enable()
@@ -428,6 +443,7 @@ def main():
         "loaded": loaded_suddenly,
         "soft": soft_limit,
         "jumping": jumping_host,
+        "slow": slow,
     }
     sizes = {
         PotFault.STUCK: lambda r: 0.0,

@@ -18,15 +18,17 @@
 #define CAREFUL 0.5f          /* of the speed limit until then: a reading of a third of the true speed is no faster joint */
 #define CONSTANT_OFF 0.15f    /* by so much a motor's constant may be off */
 #define UNKNOWN_RAD_S 1000.0f
+#define SEEN_RAD_S 0.5f       /* above a motor's speed in one tick by noise: no slower joint is held to its limit by it */
 #define SIDE_UNKNOWN 0
 #define TURN_TICKS 64u        /* in a longer window than so a joint may have turned and come back */
 #define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
 #define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
 
-void motor_start(motor_state *motor, float angle_rad, uint32_t phase)
+void motor_start(motor_state *motor, float angle_rad, float speed_limit_rad_s, uint32_t phase)
 {
     const float duty = motor->duty;
     *motor = (motor_state){.duty = duty,
+                           .fastest_rad_s = speed_limit_rad_s > SEEN_RAD_S ? speed_limit_rad_s : SEEN_RAD_S,
                            .last_rad = angle_rad,
                            .window_rad = angle_rad,
                            .window_ticks = phase,
@@ -329,7 +331,7 @@ uint32_t motor_names(const motor_state *motor, uint32_t suspect)
 
 #define SWING_TICKS 60u   /* a swing of 8 Hz and faster changes its side as often */
 #define SWINGS 8u         /* so many changes are no answer to anything */
-#define SWING_RAD_S 0.3f  /* as far from the reference's speed at least */
+#define SWING_RAD_S 0.4f  /* as far from the reference's speed at least */
 
 bool motor_swings_far(motor_state *motor, float off_rad_s)
 {
@@ -347,12 +349,12 @@ bool motor_swings_far(motor_state *motor, float off_rad_s)
 }
 
 #define FAST_TICKS 30u
-#define FAST 1.08f /* of the limit: by both witnesses */
+#define FAST 1.08f /* of what it is held to: by both witnesses */
 
-bool motor_is_fast(motor_state *motor, float reading_rad_s, float speed_limit_rad_s)
+bool motor_is_fast(motor_state *motor, float reading_rad_s)
 {
-    const float fast_rad_s = FAST * speed_limit_rad_s;
-    const bool fast = number_size(motor->speed_rad_s) > fast_rad_s && number_size(reading_rad_s) > speed_limit_rad_s;
+    const float fast_rad_s = FAST * motor->fastest_rad_s;
+    const bool fast = number_size(motor->speed_rad_s) > fast_rad_s && number_size(reading_rad_s) > motor->fastest_rad_s;
     motor->fast_ticks = fast ? number_add(motor->fast_ticks, WATCH_TICKS) : 0u;
     return motor->fast_ticks >= FAST_TICKS;
 }

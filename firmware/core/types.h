@@ -320,6 +320,7 @@ typedef struct pid_demand {
     float duty_high;       /* 0 to duty_limit: likewise */
     float duty_slew_per_s;
     float damped_rad_s;    /* the speed that is damped: the measured one, or the motor's where the reading is wrong */
+    float own_s_per_rad;   /* duty that back-EMF takes per rad/s */
 } pid_demand;
 
 /* The reference of one joint: a cubic from one point to the next, then straight on. */
@@ -351,6 +352,7 @@ typedef struct motor_state {
     float speed_rad_s;       /* by the back-EMF */
     float unsure_rad_s;      /* how far that may be off */
     float doubt_rad_s;       /* the same, as far as it excuses a speed beyond the limit */
+    float fastest_rad_s;     /* what it is held to: the speed limit, or what can be told from its noise */
     float sure_rad_s;        /* the size it has at least but for the doubt; 0 where it is not known */
     uint32_t known;          /* not 0: a current is seen, without which its sensor may be broken */
     float travel_rad;        /* since the joint was enabled */

@@ -100,6 +100,15 @@ def test_a_slow_joint_earns_its_speed_too(arms, library):
     assert [joint.motor.trust for joint in arm.core.joint] == [1.0] * 6
 
 
+def test_slow_joints_carry_their_loads(arms, library):
+    """Fell before: what drove a joint to its reference was bounded by its speed limit, and a load was not taken up."""
+    table = arms.Table()
+    for seed in (711000291, 711000388, 711000485, 711000873, 703008216):
+        arms.slow(library, seed, table)
+    assert not table.false["slow swing"]
+    assert table.apart["slow swing"] < 0.12
+
+
 def test_a_motor_whose_resistance_is_not_known_is_not_watched(arms, library):
     arm = swinging(arms, library, 900)
     for joint in arm.core.config.joint:
@@ -220,7 +229,7 @@ def test_backlash_teaches_no_resistance(arms, library):
 def watched(library):
     """A motor of 6 ohm and 2.4 V s/rad that is driven at 1 A, and a function that lets a window of it pass."""
     config, motor = c.motor_config(6.0, 2.4, 0.03, 0.01), c.motor_state()
-    library.motor_start(ctypes.byref(motor), ctypes.c_float(0.0), 0)
+    library.motor_start(ctypes.byref(motor), ctypes.c_float(0.0), ctypes.c_float(2.0), 0)
 
     def window(way_rad, ahead_rad=0.0, *, ticks=32, current_a=1.0):  # the motor goes on further than the reading
         start_rad = motor.last_rad
