@@ -9,6 +9,7 @@
 #define WINDOW_TICKS 32u      /* R and K are learnt from a window: until the reading has moved, looked at as often, */
 #define REST_TICKS 256u       /* or has rested for so long */
 #define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
+#define RESTING 0.5f          /* of the backlash: two places in it are a sigma of 0.41 apart */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
 #define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
 #define SAMPLE_TICKS 8u
@@ -79,7 +80,8 @@ static float window_noise(motor_state *motor, const motor_config *config, float 
     const int32_t side = moved ? (way_rad > 0.0f ? 1 : -1) : SIDE_UNKNOWN;
     const bool goes_on = side == motor->window_side && moved && motor->window_ticks <= TURN_TICKS;
     motor->window_side = side;
-    return goes_on ? WINDOW_NOISE_RAD : WINDOW_NOISE_RAD + config->backlash_rad;
+    const float crossed = goes_on ? 0.0f : moved ? 1.0f : RESTING;
+    return WINDOW_NOISE_RAD + crossed * config->backlash_rad;
 }
 
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */

@@ -7,6 +7,7 @@
 #define BEYOND 2.0f       /* so much more is a speed damped beyond its limit */
 #define BRAKE_S 0.003f    /* a few ticks: less, and a motor's speed measured a tick late swings */
 #define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up */
+#define LOADED 0.25f      /* of the speed limit: a joint far from its reference that is slower is held back by a load */
 #define CREEP_RAD_S 0.005f /* from here on dry friction is compensated by half and more */
 
 void pid_reset(pid_state *pid, float measured_rad)
@@ -37,15 +38,18 @@ INLINE float limited_duty(const pid_state *pid, const pid_demand *demand, float 
 /* Return a direction, -1 to 1, without a jump where it changes. */
 static float direction_of(float speed_rad_s) { return speed_rad_s / (number_size(speed_rad_s) + CREEP_RAD_S); }
 
-/* Return the error that the integral gathers while the spring is bounded: what the joint lacks of its speed limit. So it
- * takes the load up, and does not make the joint faster. */
+/* Return the error that the integral gathers while the spring is bounded: what a joint that a load holds back or drives
+ * away lacks of a share of its speed limit, by whichever is faster, reading or motor. A joint that moves on gathers none. */
 static float bounded_error(const joint_gains *gains, const pid_demand *demand, float spring)
 {
     if (gains->kp_per_rad <= 0.0f) {
         return 0.0f;
     }
-    const float taken = (gains->kd_s_per_rad + demand->own_s_per_rad) * demand->damped_rad_s;
-    return (spring - taken) / gains->kp_per_rad;
+    const float damped_rad_s = demand->damped_rad_s;
+    const float motor_rad_s = demand->motor_rad_s;
+    const float fast_rad_s = number_size(motor_rad_s) > number_size(damped_rad_s) ? motor_rad_s : damped_rad_s;
+    const float lacking = LOADED * spring - (gains->kd_s_per_rad + demand->own_s_per_rad) * fast_rad_s;
+    return lacking * spring > 0.0f ? lacking / gains->kp_per_rad : 0.0f;
 }
 
 /* The law; inline, so that pid_control needs no demand in memory. */
@@ -129,6 +133,7 @@ void pid_control(joint_state *joint, const joint_config *config, float per_nomin
                                .damped_rad_s = seen_rad_s + (seen_rad_s > 0.0f ? more_rad_s : -more_rad_s),
                                .spring_limit = spring_limit(config, own_s_per_rad),
                                .own_s_per_rad = own_s_per_rad,
+                               .motor_rad_s = joint->motor.speed_rad_s,
                                .gravity_duty = joint->gravity_duty,
                                .duty_limit = config->duty_limit,
                                .duty_low = duty_low,

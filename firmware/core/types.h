@@ -321,6 +321,7 @@ typedef struct pid_demand {
     float duty_slew_per_s;
     float damped_rad_s;    /* the speed that is damped: the measured one, or the motor's where the reading is wrong */
     float own_s_per_rad;   /* duty that back-EMF takes per rad/s */
+    float motor_rad_s;     /* the motor's speed by it, 0 where it is not watched */
 } pid_demand;
 
 /* The reference of one joint: a cubic from one point to the next, then straight on. */
