@@ -4,8 +4,10 @@
 #define PRIOR_VARIANCE 0.005625f /* of R and K over the configuration's: 0.075^2, so that three sigma of both cover 15 % */
 #define WANDER_VARIANCE 6e-9f /* by which each becomes less certain per tick: windings get warm */
 #define SIGMAS 3.0f
-#define SCALE_LOW 0.8f        /* further off than so is no tolerance of a motor */
+#define SCALE_LOW 0.8f        /* further off than so is no resistance's tolerance, warm or cold */
 #define SCALE_HIGH 1.25f
+#define CONSTANT_LOW (1.0f - CONSTANT_OFF)
+#define CONSTANT_HIGH (1.0f + CONSTANT_OFF)
 #define WINDOW_TICKS 32u      /* R and K are learnt from a window: until the reading has moved, looked at as often, */
 #define REST_TICKS 256u       /* or has rested for so long */
 #define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
@@ -106,7 +108,7 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
             number_clamp(motor->resistance_scale + gain_r * off_v * per_variance, SCALE_LOW, SCALE_HIGH);
         if (moved) { /* else the constant is only taken into account (Schmidt's form) */
             motor->constant_scale =
-                number_clamp(motor->constant_scale + gain_k * off_v * per_variance, SCALE_LOW, SCALE_HIGH);
+                number_clamp(motor->constant_scale + gain_k * off_v * per_variance, CONSTANT_LOW, CONSTANT_HIGH);
             motor->variance_kk += wander - gain_k * gain_k * per_variance;
         }
         motor->variance_rr -= gain_r * gain_r * per_variance;
