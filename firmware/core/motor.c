@@ -188,13 +188,17 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     const float voltage_v = motor->duty * supply_v;
     const float ir_v = current_a * config->resistance_ohm;
     const float emf_v = voltage_v - motor->resistance_scale * ir_v;
-    motor->speed_rad_s = emf_v / (motor->constant_scale * config->constant_v_s);
+    const bool sampled = (motor->driven_ticks + motor->phase) % SAMPLE_TICKS == 0u || motor->unsure_rad_s == UNKNOWN_RAD_S;
+    if (sampled) {
+        motor->per_constant = 1.0f / (motor->constant_scale * config->constant_v_s);
+    }
+    motor->speed_rad_s = emf_v * motor->per_constant;
     const float keep = 1.0f - TICK_S / FADE_S;
     const float travelled_rad = motor->speed_rad_s * TICK_S;
     motor->travel_rad += travelled_rad;
     const float seen_a = number_size(current_a);
     motor->current_a = seen_a > keep * motor->current_a ? seen_a : keep * motor->current_a;
-    if ((motor->driven_ticks + motor->phase) % SAMPLE_TICKS == 0u || motor->unsure_rad_s == UNKNOWN_RAD_S) {
+    if (sampled) {
         sample(motor, config, ir_v, emf_v, angle_rad);
     }
     motor->gap_rad = keep * motor->gap_rad + moved_rad - travelled_rad;

@@ -363,6 +363,7 @@ typedef struct motor_state {
     float last_rad;          /* the reading of the last tick */
     float resistance_scale;  /* learnt: over the configuration's */
     float constant_scale;
+    float per_constant;      /* rad/s per V by the learnt constant, as of the last sample */
     float variance_rr;       /* of both scales */
     float variance_rk;
     float variance_kk;
