@@ -166,6 +166,8 @@ static bool inputs_differ(const core_config *config)
     return true;
 }
 
+static bool word_within(uint32_t word, uint32_t least, uint32_t most) { return word >= least && word <= most; }
+
 static bool joint_is_valid(const joint_config *joint)
 {
     return pid_gains_in_range(&joint->gains) && sensor_is_valid(joint) && motor_is_valid(&joint->motor) &&
@@ -178,10 +180,9 @@ static bool joint_is_valid(const joint_config *joint)
            number_within(joint->current_cut_per_a_s, 0.0f, 1000.0f) &&
            number_within(joint->following_rad, 1e-3f, 13.0f) && number_within(joint->stall_duty, 0.01f, 1.0f) &&
            number_within(joint->stall_rad, 1e-4f, 1.0f) &&
+           word_within(joint->current_limit_ma, 10u, 100000u) &&
            (joint->motor_direction == 1 || joint->motor_direction == -1) && joint_is_consistent(joint);
 }
-
-static bool ticks_within(uint32_t ticks, uint32_t least, uint32_t most) { return ticks >= least && ticks <= most; }
 
 bool config_is_valid(const core_config *config)
 {
@@ -193,13 +194,14 @@ bool config_is_valid(const core_config *config)
             return false;
         }
     }
-    return inputs_differ(config) && config->supply_min_mv < config->supply_max_mv && ticks_within(config->supply_nominal_mv, 1000u, 100000u) &&
-           ticks_within(config->overload_ticks, 1u, 10000u) && ticks_within(config->brake_release_ticks, 0u, 1000u) &&
-           ticks_within(config->brake_engage_ticks, 0u, 1000u) && ticks_within(config->supply_ticks, 1u, 1000u) &&
-           ticks_within(config->pot_ticks, 1u, 100u) && ticks_within(config->following_ticks, 1u, 10000u) &&
-           ticks_within(config->stall_ticks, 1u, 10000u) && ticks_within(config->silence_ticks, 2u, 60000u) &&
-           (config->sync_led_pin == 0u || ticks_within(config->sync_led_pin, 16u, 143u)) &&
-           ticks_within(config->sync_led_ticks, 1u, 100u) &&
+    return inputs_differ(config) && config->supply_min_mv < config->supply_max_mv &&
+           config->supply_min_mv >= config->supply_nominal_mv / 2u && word_within(config->supply_nominal_mv, 1000u, 100000u) &&
+           word_within(config->overload_ticks, 1u, 10000u) && word_within(config->brake_release_ticks, 0u, 1000u) &&
+           word_within(config->brake_engage_ticks, 0u, 1000u) && word_within(config->supply_ticks, 1u, 1000u) &&
+           word_within(config->pot_ticks, 1u, 100u) && word_within(config->following_ticks, 1u, 10000u) &&
+           word_within(config->stall_ticks, 1u, 10000u) && word_within(config->silence_ticks, 2u, 60000u) &&
+           (config->sync_led_pin == 0u || word_within(config->sync_led_pin, 16u, 143u)) &&
+           word_within(config->sync_led_ticks, 1u, 100u) &&
            (config->silence_reaction == REACTION_HOLD || config->silence_reaction == REACTION_RELEASE);
 }
 

@@ -209,7 +209,7 @@ typedef struct joint_config {
     float following_rad;       /* 1e-3 to 13: largest distance from the reference */
     float stall_duty;          /* 0.01 to 1: from here on the motor must rotate the joint */
     float stall_rad;           /* 1e-4 to 1: rotating less than this within stall_ticks is standing still */
-    uint32_t current_limit_ma; /* motor current from which the duty is cut */
+    uint32_t current_limit_ma; /* 10 to 100000: motor current from which the duty is cut */
     int32_t motor_direction;   /* 1 or -1, multiplies the duty on its way out */
     encoder_config encoder;    /* what reads the joint, where it is no potentiometer */
 } joint_config;
@@ -218,7 +218,7 @@ typedef struct joint_config {
 typedef struct core_config {
     joint_config joint[JOINTS]; /* the first joint_count are used, the others are not looked at */
     uint32_t joint_count;       /* 1 to JOINTS */
-    uint32_t supply_min_mv;
+    uint32_t supply_min_mv;     /* half of supply_nominal_mv or more, below supply_max_mv */
     uint32_t supply_max_mv;
     uint32_t supply_nominal_mv; /* duties and gains are those at this supply; 1000 to 100000 */
     uint32_t supply_ticks;     /* 1 to 1000: a supply fault must last as long */

@@ -36,6 +36,14 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path):
     ("change", "said"),
     [
         (("supply_min_mv = 10000", "supply_min_v = 10"), "nothing is called arm.supply_min_v; is it arm.supply_min_mv"),
+        (
+            ("supply_min_mv = 10000", "supply_min_mv = 10"),
+            "supply_min_mv is 10; half of supply_nominal_mv or more is needed",
+        ),
+        (
+            ("current_limit_ma = 1600", "current_limit_ma = 2"),
+            "joint 1: current_limit_ma is 2; 10 to 100000 is allowed",
+        ),
         (("[joint.2]", "[joint.1]"), "no board.toml: .*joint"),
         (("soft_max_rad = 2.4", "soft_max_rad = 24.0"), "joint 1: soft_max_rad is 24; -13 to 13 is allowed"),
         (("soft_max_rad = 2.4", "soft_max_rad = '2.4'"), "joint.1.soft_max_rad is '2.4'; a number is needed"),

@@ -148,6 +148,7 @@ _JOINT_RANGES = {
     "following_rad": (1e-3, 13.0),
     "stall_duty": (0.01, 1.0),
     "stall_rad": (1e-4, 1.0),
+    "current_limit_ma": (10, 100000),
 }
 _ARM_RANGES = {
     "joint_count": (1, JOINTS),
@@ -326,6 +327,8 @@ def _problems(config: Configuration) -> Iterator[str]:
             yield f"joints {taken + 1} and {j + 1} are both on encoder input {encoder['input']}; each timer counts for one"
     if config["supply_min_mv"] >= config["supply_max_mv"]:
         yield "supply_min_mv must be below supply_max_mv"
+    if config["supply_min_mv"] < config["supply_nominal_mv"] // 2:
+        yield f"supply_min_mv is {config['supply_min_mv']}; half of supply_nominal_mv or more is needed, in millivolts"
     if config["sync_led_pin"] and not PIN_NUMBERS[0] <= config["sync_led_pin"] <= PIN_NUMBERS[1]:
         yield f"sync_led_pin is {config['sync_led_pin']}; {_PIN_FORM}"
     if config["silence_reaction"] not in tuple(Reaction):
