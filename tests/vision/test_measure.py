@@ -5,8 +5,11 @@ import pytest
 from scipy.stats import chi2
 
 from armsight.data import Detections, Missed, PoseEstimate, Shot
-from armsight.geometry.pose import inverse, log_se3
+from armsight.geometry.pose import inverse, log_se3, pose, transform
+from armsight.sim.example_rig import example_rig
 from armsight.vision.detections import SeenShot
+from armsight.vision.discs.bias import project_discs
+from armsight.vision.markers.board import open_board
 from armsight.vision.markers.marker import Target
 from armsight.vision.match import renamed
 from armsight.vision.measure import measure, measure_detections, measure_seen, size_problem
@@ -18,8 +21,9 @@ SIGMA = 0.1
 class Scripted(Target):
     """A target that says it detects what the test asks for."""
 
-    def __init__(self, body, left, right, symmetries=()):
+    def __init__(self, body, left, right, symmetries=(), radius_m=None):
         self._body, self._symmetries, self._rest = body, symmetries, [left, right]
+        self._radius_m = radius_m
 
     @property
     def body(self):
@@ -28,6 +32,10 @@ class Scripted(Target):
     @property
     def symmetries(self):
         return self._symmetries
+
+    @property
+    def disc_radius_m(self):
+        return self._radius_m
 
     def detect(self, image):
         return self._rest.pop(0)
@@ -42,7 +50,7 @@ def known(spec="chessboard:9x6:25mm"):
 
 
 def grey_shot(width=SIZE[0]):
-    return Shot("s", *(np.zeros((SIZE[1], width), np.uint8) for _ in "lr"))
+    return Shot("s", *(np.full((SIZE[1], width), 80, np.uint8) for _ in "lr"))
 
 
 def test_the_pose_is_found_within_its_covariance():
@@ -74,6 +82,30 @@ def test_what_was_not_detected_is_named_by_side():
     nothing = Detections.none("no board")
     assert measure(rig, Scripted(board.body, nothing, pair.right), grey_shot()).reason == "left: no board"
     assert measure(rig, Scripted(board.body, nothing, nothing), grey_shot()).reason == "left: no board; right: no board"
+
+
+def test_images_in_the_dark_are_named():
+    rig, board, _, pair = known()
+    nothing = Detections.none("no board")
+    night = replace(grey_shot(), right=np.full(SIZE[::-1], 5, np.uint8))
+    missed = measure(rig, Scripted(board.body, pair.left, nothing), night)
+    assert isinstance(missed, Missed)
+    assert missed.reason.startswith("right: no board; right: the image is dark")
+    assert "left" not in missed.reason
+
+
+@pytest.mark.parametrize(("given_mm", "right"), [(38.0, True), (44.5, False)])
+def test_a_given_radius_of_discs_that_contradicts_the_images_names_both(given_mm, right):
+    rig, T = example_rig(SIZE, focal_px=300.0), pose(np.eye(3), np.array([-0.1, -0.1, 0.4]))
+    board = open_board(f"circles:4x3:90mm:radius={given_mm}mm")
+    points, seen = board.body.points, []
+    for camera, T_camera in zip(rig.cameras, (T, inverse(rig.T_left_right) @ T), strict=True):
+        normals = np.tile(T_camera[:3, 2], (len(points), 1))
+        uv, shape, _, _ = project_discs(camera, transform(T_camera, points), normals, np.full(len(points), 0.04))
+        seen.append(Detections(np.arange(len(points)), uv, np.tile(1e-4 * np.eye(2), (len(points), 1, 1)), shape=shape))
+    result = measure(rig, Scripted(board.body, *seen, radius_m=board.disc_radius_m), grey_shot())
+    assert isinstance(result, PoseEstimate) is right
+    assert right or "a radius of 44.5 mm is given, and the images show 40" in result.reason
 
 
 def test_exchanged_cameras_are_reported():

@@ -109,6 +109,19 @@ def read_image(path: str | Path) -> Image:
     return np.ascontiguousarray(image)
 
 
+#: An image is dark where all but this share of its pixels are below so many of 255 grey levels.
+_DARK, _LIT_SHARE = 32, 1e-3
+
+
+def darkness(image: NDArray[np.uint8]) -> str:
+    """Return "the image is dark: ..." where a grey image (H, W) shows next to nothing, else an empty string."""
+    lit = np.count_nonzero(image >= _DARK)
+    if lit > _LIT_SHARE * image.size:
+        return ""
+    level = float(np.percentile(image, 100.0 * (1.0 - _LIT_SHARE)))
+    return f"the image is dark: 99.9% of it below {level:.0f} of 255 grey levels: light the scene, or expose longer"
+
+
 def grey(image: Image) -> NDArray[np.uint8]:
     """Convert an image to 8-bit grey.
 

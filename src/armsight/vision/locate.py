@@ -102,7 +102,8 @@ def _wrong_size(rig: StereoRig, body: Body, points: Points, T_left_body: Array) 
         return None
     return (
         f"its points lie {scale:.3f} times as far apart as those of {body.name}: is the size in the target right (of a "
-        "square, a tag, the body file's unit), and is it the target the rig sees?"
+        "square, a tag, the body file's unit), is it the target the rig sees, and are the images as the calibration had "
+        "them, not cropped, shifted or scaled since?"
     )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import SIDES, Body, Correspondences, Detections, Image, Missed, PoseEstimate, Shot
 from armsight.geometry.pose import inverse
@@ -17,7 +18,7 @@ from armsight.vision.assign import candidates, instances, plain
 from armsight.vision.detections import SeenShot
 from armsight.vision.discs.bias import apparent_radii
 from armsight.vision.discs.locate import locate_composite, locate_discs
-from armsight.vision.image import grey
+from armsight.vision.image import darkness, grey
 from armsight.vision.locate import locate
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
@@ -27,6 +28,9 @@ from armsight.vision.triangulate import triangulate
 
 #: Fewest common points with which exchanged cameras are distinguishable from bad detections.
 _POINTS_MIN = 4
+#: A given radius of a board's discs that differs from the images' by more than this share, and by more than so many
+#: pixels (tone curves and saturation make discs larger by up to half a pixel), is a mistake.
+_RADIUS_SHARE, _RADIUS_PX = 0.1, 1.0
 
 
 def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed:
@@ -47,6 +51,17 @@ def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed
         if (problem := size_problem(camera.image_size_px, image, side)) is not None:
             return Missed(problem)
     left, right = (grey(image) for image in images)
+    result = _measured(rig, target, left, right)
+    if isinstance(result, PoseEstimate):
+        return result
+    dark = [f"{side}: {d}" for side, d in zip(SIDES, map(darkness, (left, right)), strict=True) if d]
+    return replace(result, reason="; ".join([result.reason, *dark]))
+
+
+def _measured(
+    rig: StereoRig, target: Target, left: NDArray[np.uint8], right: NDArray[np.uint8]
+) -> PoseEstimate | Missed:
+    """Measure one shot, given as grey images of the rig's size."""
     found = target.detect(left), target.detect(right)
     if target.discs is not None:
         factors = rig.disc_variance_factors
@@ -66,15 +81,22 @@ def _without_bias(
     rig: StereoRig, target: Target, left: Detections, right: Detections, rough: PoseEstimate
 ) -> PoseEstimate | Missed:
     """Measure a board of discs again from a rough pose: the centres of ellipses are not the images of the middles."""
-    points, radius_m = target.body.points, target.disc_radius_m
-    if radius_m is None:
-        Ts = rough.T_left_body, inverse(rig.T_left_right) @ rough.T_left_body
-        about_m = 0.25 * float(np.linalg.norm(points[1] - points[0]))
-        radii = [
-            apparent_radii(camera, T, points[d.ids], d.shape, about_m)
-            for camera, T, d in zip(rig.cameras, Ts, (left, right), strict=True)
-        ]
-        radius_m = float(np.nanmedian(np.concatenate(radii)))
+    points = target.body.points
+    Ts = rough.T_left_body, inverse(rig.T_left_right) @ rough.T_left_body
+    about_m = 0.25 * float(np.linalg.norm(points[1] - points[0]))
+    radii = [
+        apparent_radii(camera, T, points[d.ids], d.shape, about_m)
+        for camera, T, d in zip(rig.cameras, Ts, (left, right), strict=True)
+    ]
+    seen_m = float(np.nanmedian(np.concatenate(radii)))
+    radius_m = seen_m if target.disc_radius_m is None else target.disc_radius_m
+    shape = np.concatenate([left.shape, right.shape])
+    radius_px = float(np.median((shape[:, 0] * shape[:, 2] - shape[:, 1] ** 2) ** 0.25))
+    if abs(radius_m / seen_m - 1.0) > max(_RADIUS_SHARE, _RADIUS_PX / radius_px):
+        return Missed(
+            f"{target.body.name}: a radius of {1e3 * radius_m:.4g} mm is given, and the images show {1e3 * seen_m:.4g} mm: "
+            "measure pitch and radius (not the diameter), or leave the radius out"
+        )
     count = len(points)
     discs = DiscTarget(
         target.body, np.full(count, radius_m), np.zeros(count, bool), np.tile([0.0, 0.0, -1.0], (count, 1))

@@ -11,6 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
+from armsight.geometry.pose import pose
+from armsight.sim.example_rig import example_rig
+from armsight.sim.render.background import plain
+from armsight.sim.render.render import render
+from armsight.sim.render.scene import PosedBody, charuco
 from armsight.vision.rig import StereoRig
 from board_views import rig_error
 from cli_runs import assert_rejected, listening
@@ -188,6 +193,53 @@ def test_the_same_images_on_both_sides(few, armsight, tmp_path):
         "calibrate", "--left", few / "left*.png", "--right", few / "left*.png", *CHESS, "-o", tmp_path / "rig.json"
     )
     assert_rejected(said, "both a left and a right image")
+
+
+def test_copies_of_one_cameras_images_are_no_pair(few, armsight, tmp_path):
+    for left in few.glob("left*.png"):
+        shutil.copy(left, few / left.name.replace("left", "right"))
+    said = armsight("calibrate", *images(few), *CHESS, "-o", tmp_path / "rig.json")
+    assert_rejected(said, few / "left000.png", few / "right000.png", "are the same")
+
+
+def test_one_camera_opened_twice_has_no_baseline(few, armsight, tmp_path):
+    rng = np.random.default_rng(3)
+    for left in sorted(few.glob("left*.png")):
+        image = cv2.imread(str(left), cv2.IMREAD_GRAYSCALE)
+        noisy = np.clip(np.rint(image + rng.normal(0, 2, image.shape)), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(few / left.name.replace("left", "right")), noisy)
+    said = armsight("calibrate", *images(few), *CHESS, *QUICK, "-o", tmp_path / "rig.json")
+    assert_rejected(said, "which is no baseline", "one camera")
+
+
+def test_images_of_one_camera_that_are_rotated_are_named(few, armsight, tmp_path):
+    for right in few.glob("right*.png"):
+        cv2.imwrite(str(right), cv2.rotate(cv2.imread(str(right)), cv2.ROTATE_90_CLOCKWISE))
+    said = armsight("calibrate", *images(few), *CHESS, *QUICK, "-o", tmp_path / "rig.json", "--json")
+    assert said.code == 0, said.err
+    assert any("rotated against each other by 90 degrees" in weak for weak in said.lines[0]["weaknesses"])
+
+
+def test_a_camera_in_the_dark_is_named(few, armsight, tmp_path):
+    rng = np.random.default_rng(4)
+    for right in few.glob("right*.png"):
+        cv2.imwrite(str(right), np.clip(rng.normal(3, 3, (360, 640)), 0, 255).astype(np.uint8))
+    said = armsight("calibrate", *images(few), *CHESS, "-o", tmp_path / "rig.json")
+    assert_rejected(said, "0 of 5 pairs are usable", "The right images: the image is dark")
+    assert "The left images" not in said.err
+
+
+def test_a_board_that_is_not_its_own_mirror_image_shows_a_driver_that_mirrors(armsight, tmp_path):
+    pattern, rng = charuco(4, 5, 0.05, 0.037, "DICT_4X4_50"), np.random.default_rng(1)
+    T = pose(np.eye(3), np.array([-0.1, -0.1, 0.6]))
+    image = render(example_rig((640, 360)).left, [PosedBody((pattern,), T)], plain((640, 360), rng), rng=rng)
+    for n in range(3):
+        cv2.imwrite(str(tmp_path / f"left{n}.png"), np.roll(image, n, axis=1)[:, ::-1])
+        cv2.imwrite(str(tmp_path / f"right{n}.png"), np.roll(image, n + 9, axis=1))
+    spec = "charuco:4x5:50mm:37mm:DICT_4X4_50"
+    said = armsight("calibrate", *images(tmp_path), "--target", spec, "-o", tmp_path / "rig.json")
+    assert_rejected(said, "The left images: the target is found once they are mirrored")
+    assert "The right images" not in said.err
 
 
 def test_left_and_right_exchanged_is_reported(few, armsight, tmp_path):

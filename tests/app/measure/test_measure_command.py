@@ -222,6 +222,15 @@ def test_images_that_a_driver_flipped_are_named(start, arm, armsight, tmp_path, 
     assert f"none of 1 shots could be measured: the {what} against those of the calibration" in said.err
 
 
+def test_a_print_of_the_other_polarity_is_named(start, arm, armsight, tmp_path):
+    for side in ("left", "right"):
+        image = cv2.imread(str(next(arm.glob(f"{side}*.png"))), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(tmp_path / f"{side}0.png"), 255 - image)
+    said = armsight(*start, "--left", tmp_path / "left*.png", "--right", tmp_path / "right*.png")
+    assert said.code == 2
+    assert "none of 1 shots could be measured: it is in view inverted" in said.err
+
+
 def test_left_and_right_exchanged_is_the_reason(start, arm, armsight):
     said = armsight(*start, "--left", arm / "right*.png", "--right", arm / "left*.png", "--json")
     assert said.code == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import itertools
 from collections.abc import Iterator, Sequence
@@ -12,6 +13,7 @@ from typing import Any
 import click
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.app.calibrate.report import MOTION_FITTED
 from armsight.app.messages import weak
@@ -19,19 +21,20 @@ from armsight.app.progress import bar, steps
 from armsight.app.report.page import PAGE
 from armsight.app.report.table import TextTable, print_table
 from armsight.data import SIDES, Detections, Shot
-from armsight.errors import InputError
+from armsight.errors import CalibrationError, InputError
 from armsight.vision.calibrate.boards import Pair, calibrate_boards, calibrate_recording
 from armsight.vision.calibrate.bodies import calibrate_bodies
 from armsight.vision.calibrate.result import Calibration, RejectedPair
 from armsight.vision.calibrate.screen import merged_notes
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
-from armsight.vision.image import grey, read_image
+from armsight.vision.image import darkness, grey, read_image
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import load_body_csv
 from armsight.vision.sources import Source, notes_of, open_source
 from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files
 
+Grey = NDArray[np.uint8]
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 
@@ -103,6 +106,7 @@ def calibrate_images(
     times: list[float | None] = []
     singles: list[Pair] = []
     sizes: Sizes | None = None
+    unseen = _Unseen(target)
     total = None if source.count is None else source.count + sum(map(len, alone))
     with bar("detecting the target", total) as advance:
         for shot, files in _shots(source):
@@ -114,7 +118,10 @@ def calibrate_images(
             else:
                 now = tuple((image.shape[1], image.shape[0]) for image in (shot.left, shot.right))
                 sizes = _same(sizes, (now[0], now[1]), *files)
-                pairs.append(Pair(shot.name, target.detect(grey(shot.left)), target.detect(grey(shot.right))))
+                images = grey(shot.left), grey(shot.right)
+                _differ(*images, *files)
+                pairs.append(Pair(shot.name, target.detect(images[0]), target.detect(images[1])))
+                unseen.keep(images, pairs[-1])
             times.append(shot.t_s)
             advance()
         for side, paths in enumerate(alone if sizes is not None else ()):
@@ -125,7 +132,7 @@ def calibrate_images(
         if not pairs:
             raise InputError("the recording has no shots")
         raise InputError(f"none of {len(pairs)} pairs can be read; {pairs[0].name}: {pairs[0].left.problem}")
-    with steps() as progress:
+    with steps() as progress, unseen.explained(source):
         known = [(pair, t) for pair, t in zip(pairs, times, strict=True) if t is not None]
         if not known:
             return calibrate_boards(
@@ -144,6 +151,53 @@ def calibrate_images(
             progress=progress,
         )
         return replace(calibration, notes=(*notes_of(source), *calibration.notes))
+
+
+def _differ(left: Grey, right: Grey, left_name: Path | str, right_name: Path | str) -> None:
+    """Raise an InputError if both grey images of a pair are the same one."""
+    if left.shape == right.shape and np.ptp(left) > 0 and np.array_equal(left, right):
+        raise InputError(
+            f"{left_name}, {right_name}: the left and the right image are the same: give the images of two cameras"
+        )
+
+
+class _Unseen:
+    """Images in which the target was not found, a few of each camera, to say why."""
+
+    def __init__(self, target: CalibrationBoard) -> None:
+        self._target = target
+        self._kept: tuple[list[Grey], list[Grey]] = [], []
+        self._missed = [0, 0]
+
+    def keep(self, images: tuple[Grey, Grey], pair: Pair) -> None:
+        """Keep the images without the target: of each camera the first one, the second, the fourth, the eighth, ..."""
+        for side, found in enumerate((pair.left, pair.right)):
+            if found.problem is not None:
+                self._missed[side] += 1
+                if self._missed[side].bit_count() == 1:
+                    self._kept[side].append(images[side])
+
+    @contextlib.contextmanager
+    def explained(self, source: Source) -> Iterator[None]:
+        """Add to a CalibrationError what is odd about the images without the target, and the notes of their source."""
+        try:
+            yield
+        except CalibrationError as error:
+            odd = [
+                f"The {SIDES[side]} images: {why}." for side, kept in enumerate(self._kept) if (why := self._why(kept))
+            ]
+            raise CalibrationError(
+                " ".join([str(error), *odd, *(f"Note: {note}." for note in notes_of(source))])
+            ) from None
+
+    def _why(self, images: list[Grey]) -> str:
+        """Return what is odd about images, or an empty string."""
+        if images and all(darkness(image) for image in images):
+            return darkness(images[0])
+        for image in images:
+            if self._target.detect(np.ascontiguousarray(image[:, ::-1])).problem is None:
+                return "the target is found once they are mirrored: does the driver mirror them? Switch it off"
+        return ""
 
 
 def _shots(source: Source) -> Iterator[tuple[Shot, tuple[Path | str, Path | str]]]:

@@ -495,7 +495,13 @@ _FLIPS: dict[str, Callable[[Image], Image]] = {
 
 def _undone(left: Image, right: Image) -> dict[str, tuple[Image, Image]]:
     """Return the images with each mistake undone that may have been made with them, by what to say of it."""
-    undone = {"left and right are exchanged: the images fit the rig the other way round": (right, left)}
+    undone = {
+        "left and right are exchanged: the images fit the rig the other way round": (right, left),
+        "it is in view inverted, light where its file or spec has dark: correct that (`bright` of a disc), or the print": (
+            np.iinfo(left.dtype).max - left,
+            np.iinfo(right.dtype).max - right,
+        ),
+    }
     for what, undo in _FLIPS.items():
         sides = {
             "images": (undo(left), undo(right)),
@@ -516,6 +522,8 @@ def _mistaken(rig: StereoRig, target: Target, shots: list[Shot]) -> str:
     for shot in shots:
         assert shot.left is not None
         assert shot.right is not None
+        if np.array_equal(shot.left, shot.right):
+            return "the left and the right image are the same: give the images of two cameras"
         fits = {}
         for what, images in _undone(shot.left, shot.right).items():
             left, right = map(np.ascontiguousarray, images)

@@ -74,6 +74,8 @@ _NOISE_ROUNDS, _MOTION_ROUNDS = 4, 8
 #: Rounds of the discs' radius and the poses; a radius given may differ by this factor from what the images show: print and
 #: lens widen or narrow what is dark.
 _RADIUS_ROUNDS, _RADIUS_RATIO = 2, 1.1
+#: Cameras that are less than so many sigmas apart, or than this share of the boards' distance, are one camera.
+_BASELINE_SIGMAS, _BASELINE_SHARE = 5.0, 1e-3
 #: Rounds of skew and cameras, alternately; the skew has settled where it changes by less than this share of its sigma.
 #: In the first rounds only the relative pose of the cameras is adjusted.
 _SKEW_ROUNDS, _SETTLED, _POSE_ROUNDS = 40, 0.03, 2
@@ -400,6 +402,7 @@ def calibrate_boards(
     names = tuple(usable[j].name for j in screened.kept if j < pair_count)
     rig = scaled(rig_of(trial.solution), trial.heldout)
     state = trial.solution.state
+    _apart(rig, state)
     found = trial.model.body(state.shape)[: len(points)]
     found = transform(fit_rigid(found, points), found)
     calibration = Calibration(
@@ -421,6 +424,17 @@ def calibrate_boards(
         radius_m,
     )
     return replace(calibration, weaknesses=weaknesses(calibration))
+
+
+def _apart(rig: StereoRig, state: BundleState) -> None:
+    """Raise a CalibrationError where both cameras stand at one position, so that nothing can be triangulated."""
+    sigma_m = float(np.sqrt(np.trace(rig.cov[-6:-3, -6:-3])))
+    distance_m = float(np.median(np.linalg.norm(state.Ts_left_body[:, :3, 3], axis=1)))
+    if rig.baseline_m < max(_BASELINE_SIGMAS * sigma_m, _BASELINE_SHARE * distance_m):
+        raise CalibrationError(
+            f"the cameras are {1e3 * rig.baseline_m:.3g} ± {1e3 * sigma_m:.2g} mm apart, which is no baseline: are left "
+            "and right images of one camera?"
+        )
 
 
 def _disc_radius(
@@ -493,7 +507,10 @@ def _enough(usable: int, given: int, rejected: list[RejectedPair]) -> None:
     """Raise unless there are enough pairs, with the first reasons why not."""
     if usable >= LEAST_PAIRS:
         return
-    why = "; ".join(f"{r.pair}: {r.reason}" for r in rejected[:2])
+    shown = sorted(
+        rejected, key=lambda r: r.reason.startswith(("left:", "right:"))
+    )  # what both cameras saw comes first
+    why = "; ".join(f"{r.pair}: {r.reason}" for r in shown[:2])
     more = f" (and {len(rejected) - 2} more)" if len(rejected) > 2 else ""
     raise CalibrationError(
         f"{usable} of {given} pairs are usable, at least {LEAST_PAIRS} are needed, 15 or more are better"

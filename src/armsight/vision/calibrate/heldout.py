@@ -218,7 +218,10 @@ def summary(errors: PairErrors, folds: int, motion: ExposureMotion | None = None
         motion: how far the board was expected to move between the exposures.
     """
     if not len(errors.pair):
-        raise CalibrationError("no left-out shot has three points seen by both cameras, so the rig cannot be evaluated")
+        raise CalibrationError(
+            "no left-out shot has three points on which the cameras agree, so the rig cannot be evaluated: do the left and "
+            "the right images belong together, one by one in this order, and were they taken at one moment?"
+        )
     w = errors.weight / errors.weight.sum()
     rms = {name: float(np.sqrt(w @ getattr(errors, name) ** 2)) for name in _FIELDS}
     return HeldOutErrors(

@@ -20,6 +20,7 @@ _FOCUS_RATIO = 2.0
 _SCALE_SIGMAS = 4.0
 _REJECTED_SHARE = 0.2
 _FAR_MOTION, _FARTHEST = 2.0, 4
+_ROLLED_DEG = 60.0
 #: Degree of the polynomials of the position in an image that residuals may follow, beyond which share of their square and
 #: which chance they show a lens that the model cannot express.
 _FIELD_DEGREE, _FIELD_SHARE, _FIELD_CHANCE = 4, 0.04, 1e-4
@@ -171,6 +172,13 @@ def _hint(calibration: Calibration) -> str:
 
 
 def _sides(calibration: Calibration) -> str | None:
+    R = calibration.rig.T_left_right[:3, :3]
+    roll_deg = float(np.degrees(np.arctan2(R[1, 0], R[0, 0])))
+    if abs(roll_deg) > _ROLLED_DEG:
+        return (
+            f"the left and the right images are rotated against each other by {abs(roll_deg):.0f} degrees: is a camera "
+            "mounted so, or does a driver rotate its images? (the result is valid for images as they were given)"
+        )
     x, y, _ = calibration.rig.T_left_right[:3, 3]
     if x < 0 and abs(x) > abs(y):
         return (
