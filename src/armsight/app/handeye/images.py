@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from armsight.app.handeye.read import PoseTable
 from armsight.data import Array, Detections, Missed, Record
 from armsight.errors import InputError
 from armsight.files import read_text
@@ -58,6 +59,7 @@ class Seen(Record):
         scatter_px: RMS of the reprojection; 0 where there are no images.
         notes: what was found out.
         common: (N, 6, K) what K independent errors of the rig of one sigma do to the poses; None where unknown.
+        table: the table that the poses are from; None where they are from images.
     """
 
     Ts: Array
@@ -70,6 +72,7 @@ class Seen(Record):
     scatter_px: float = 0.0
     notes: tuple[str, ...] = ()
     common: Array | None = None
+    table: PoseTable | None = None
 
 
 def see_with_camera(

@@ -55,7 +55,7 @@ def seen_in_table(table: PoseTable) -> Seen:
     """Return the target's poses of a table as what was seen."""
     n = len(table.Ts)
     names = table.names or tuple(f"line {line}" for line in table.lines)
-    return Seen(table.Ts, np.zeros((n, 6, 6)), names, table.missed, table.t_s, np.zeros(3))
+    return Seen(table.Ts, np.zeros((n, 6, 6)), names, table.missed, table.t_s, np.zeros(3), table=table)
 
 
 def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> PairedPoses:
