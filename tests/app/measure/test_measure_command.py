@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from armsight.app.measure.poses import CSV_COLUMNS
+from armsight.app.measure.run import _detected
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.vision.markers.body_file import save_body_csv
 from armsight.vision.markers.targets import open_body
@@ -346,6 +347,15 @@ def test_detections_are_measured_and_too_few_points_missed(rendered, seen, armsi
     for record in said.lines[:2]:
         # Pixels are written to a millionth: 1e-6 px is below a nanometre here, three decimals of room.
         assert record["position_m"] == pytest.approx(rendered.of_arm.Ts_left_body[int(record["shot"])][:3, 3], abs=1e-6)
+
+
+def test_a_board_of_which_detections_are_given_is_known_to_be_a_print(rendered, tmp_path):
+    """Its shape is a calibration's: the test of single points leaves it out, however few they are."""
+    for target, printed in (("chessboard:4x3:30mm", True), (str(rendered.plate), False)):
+        name = open_body(target).point_names[0]
+        rows = [f"1,{side},{name},100,100" for side in ("left", "right")]
+        (tmp_path / "d.csv").write_text("\n".join(["shot,camera,marker,u_px,v_px", *rows]) + "\n")
+        assert _detected(tmp_path / "d.csv", target)[2] is printed
 
 
 @pytest.mark.parametrize(

@@ -264,7 +264,7 @@ class ShapeWatch:
         self.found: ShapeError | None = None
         self.said: ShapeError | None = None
 
-    def take(self, rows: Array, T: Array, response: Array, cov: Array, begins: bool) -> None:
+    def take(self, rows: Array, T: Array, response: Array, cov: Array, moved: bool) -> None:
         """Take a shot.
 
         Args:
@@ -272,12 +272,12 @@ class ShapeWatch:
             T: (4, 4) pose T_left_body.
             response: (6, K) of a pose measured with all points to the parameters.
             cov: (6, 6) covariance of the pose.
-            begins: whether it begins a stay at a pose, or goes on with one.
+            moved: whether its pose differs from the one before; single shots are asked only then.
         """
-        self._shots.append(rows)
         self._effects.append((response, cov))
-        if not begins:
+        if not moved:
             return
+        self._shots.append(rows)
         view = T[:3, :3].T @ T[:3, 3]
         view /= np.sqrt(view @ view)
         if self._view is None or np.linalg.norm(view - self._view) > _VIEWS_RAD / _LEAST_POSES:  # else it rests
@@ -429,6 +429,8 @@ class ShapeWatch:
         if float(off @ np.linalg.solve(each, off)) > newest.excess(newest.gain(columns)) * chdtri(len(off), _UNLIKE):
             return False
         first = 1 + self._first + 3 * which
+        if len(self._shots) < _LEAST_SHOTS:
+            return False
         begins = np.cumsum([0, *map(len, self._shots)])[:-1]
         rows = np.concatenate(self._shots)
         along = rows[:, first : first + 3] @ d
