@@ -203,9 +203,8 @@ class _Hypothesis(NamedTuple):
 
 
 class _Explained(NamedTuple):
-    """What a hypothesis explains of a sum of squares, log-evidence against none, sizes (D,) and cov (D, D)."""
+    """Log-evidence of a hypothesis against none, the sizes (D,) of what changed, and their covariance (D, D)."""
 
-    gain: float
     evidence: float
     size: Array
     cov: Array
@@ -327,10 +326,10 @@ class ShapeWatch:
         """
         M, prior = eliminated(sums.M, slice(1, 1 + self._size)), _RARE / len(hypotheses)
         moment = np.zeros((len(M) - 1, len(M) - 1))
-        if float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(moment)), M[1:, 0])) < -2.0 * np.log(prior):
+        gain = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(moment)), M[1:, 0]))
+        if gain < -2.0 * np.log(prior):
             return 0.0, moment
-        left = float(M[0, 0]) - max(_explained(M, each, 1.0).gain for each in hypotheses)
-        excess = max(left / max(sums.freedom, 1.0), 1.0)  # what none explains is noise
+        excess = max((float(M[0, 0]) - gain) / max(sums.freedom, 1.0), 1.0)  # what all together do not explain is noise
         explained = [_explained(M, each, excess) for each in hypotheses]
         logs = np.log(prior) + np.array([each.evidence for each in explained])
         evidence = float(np.logaddexp.reduce(np.append(logs, 0.0)))
@@ -533,13 +532,12 @@ def _hypotheses(points: int) -> tuple[_Hypothesis, ...]:
 
 
 def _explained(M: Array, hypothesis: _Hypothesis, excess: float) -> _Explained:
-    """Return what a hypothesis explains of sums M (1 + N, 1 + N), of a noise whose variance is so many times larger."""
+    """Return what a hypothesis says of sums M (1 + N, 1 + N), of a noise whose variance is so many times larger."""
     rows, scale = hypothesis
     G = M[np.ix_(1 + rows, 1 + rows)] * (scale**2 / excess) + np.eye(len(rows))
     r, inverse = M[1 + rows, 0] * (scale / excess), np.asarray(np.linalg.inv(G), float)
-    gain = float(r @ inverse @ r)
-    evidence = 0.5 * gain - 0.5 * float(np.linalg.slogdet(G)[1])
-    return _Explained(gain, evidence, scale * (inverse @ r), scale**2 * inverse)
+    evidence = 0.5 * float(r @ inverse @ r) - 0.5 * float(np.linalg.slogdet(G)[1])
+    return _Explained(evidence, scale * (inverse @ r), scale**2 * inverse)
 
 
 def _columns(chosen: Sequence[int]) -> Ids:
