@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from armsight.app.measure.poses import CSV_COLUMNS
+from armsight.app.measure.run import _detected
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.vision.markers.body_file import save_body_csv
 from armsight.vision.markers.targets import open_body
@@ -367,6 +368,15 @@ def test_a_shot_of_which_most_points_contradict_each_other_is_named(rendered, se
     said = armsight(*by_detections(rendered, seen))
     assert "12 points dropped" in next(line for line in said.out.splitlines() if line.startswith("7:"))
     assert "in 7 most points contradict each other: do not use it" in said.err
+
+
+def test_a_board_of_which_detections_are_given_is_known_to_be_a_print(rendered, tmp_path):
+    """Its shape is a calibration's: the test of single points leaves it out, however few they are."""
+    for target, printed in (("chessboard:4x3:30mm", True), (str(rendered.plate), False)):
+        name = open_body(target).point_names[0]
+        rows = [f"1,{side},{name},100,100" for side in ("left", "right")]
+        (tmp_path / "d.csv").write_text("\n".join(["shot,camera,marker,u_px,v_px", *rows]) + "\n")
+        assert _detected(tmp_path / "d.csv", target)[2] is printed
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,7 @@ def test_the_compiled_rows_of_a_shot_are_those_of_a_dense_elimination():
     """Pose and own skew as parameters of the normal equations, the skew with its prior; polynomials by numpy."""
     rig = replace(TRUE, cov=np.diag(SIGMAS**2), sigma_px=0.02)
     (_, t, _, before, _), (_, now_s, _, estimate, _) = list(islice(watched_body(9), 0, 6, 5))
-    watch = RigWatch(rig, BODY, sync_s := 2e-3)
+    watch = RigWatch(rig, replace(BODY, points=np.asfortranarray(BODY.points)), sync_s := 2e-3)
     watch.take(before, t)
     found, velocity = watch._residuals(estimate, now_s), watch._velocity(estimate.T_left_body, now_s)
     seen, points = PixelObservations.of(estimate.points.seen, rig.sigma_px), BODY.points

@@ -206,6 +206,7 @@ class RigWatch:
         # What the kernels take of the cameras, and half of the size of their images, px.
         counts = np.array([camera.distortion.size for camera in rig.cameras])
         self._pair = (*pair_arguments(rig.cameras), counts, inverse(rig.T_left_right))
+        self._p_body = np.array(body.points, float, order="C")
         self._half_px = np.array([camera.image_size_px for camera in rig.cameras]) / 2.0
         # Shots of the running test, in stays; sums since the beginning are for what the camera models lack.
         self._stays: list[list[_ShotResiduals]] = []
@@ -307,8 +308,8 @@ class RigWatch:
 
     def _residuals(self, estimate: PoseEstimate, now_s: float) -> _ShotResiduals | None:
         """Return what one shot says; None where too few of its points were measured."""
-        seen, points = estimate.points.seen, self._body.points
-        good = np.zeros(len(points), bool)
+        seen = estimate.points.seen
+        good = np.zeros(len(self._p_body), bool)
         good[estimate.points.ids] = True
         rows = np.flatnonzero(seen.paired & (self._row_of >= 0)[seen.ids])
         ids = seen.ids[rows]
@@ -317,8 +318,9 @@ class RigWatch:
             return None
         A, whole = np.empty((4 * len(ids), 6)), np.zeros((4 * len(ids), 1 + self._full))
         noise_px2 = _differentiate(
-            *self._pair, self._half_px, points, self._row_of, ids, seen.uv[rows], seen.cov_uv[rows],
-            max(self._rig.sigma_px, 1e-6), np.array(estimate.T_left_body),
+            *self._pair, self._half_px, self._p_body, self._row_of, np.asarray(ids, np.int64),
+            np.ascontiguousarray(seen.uv[rows]), np.ascontiguousarray(seen.cov_uv[rows]),
+            max(self._rig.sigma_px, 1e-6), np.array(estimate.T_left_body, order="C"),
             self._velocity(estimate.T_left_body, now_s), A, whole,
         )  # fmt: skip
         if not np.isfinite(noise_px2):
@@ -363,10 +365,10 @@ class RigWatch:
     def _sum(self, shot: _ShotResiduals, estimate: PoseEstimate) -> None:
         """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
         T = estimate.T_left_body
-        begins = self._began is None or differ(self._began, T)
+        moved = self._began is None or differ(self._began, T)
         size = 1 + self._size
-        self._shape.take(shot.every[:, :size], T, shot.response_with_all[:, : self._size], estimate.cov, begins)
-        if begins:
+        self._shape.take(shot.every[:, :size], T, shot.response_with_all[:, : self._size], estimate.cov, moved)
+        if moved or not self._stays:
             self._stays.append([])
             self._began = T
         self._stays[-1].append(shot)
@@ -391,7 +393,7 @@ class RigWatch:
 
     def _decide(self, *, ends: bool = False) -> None:
         """Test for a change with the newest sums; weigh the older ones down."""
-        stays, self._stays, self._began = self._stays, [], None
+        stays, self._stays = self._stays, []
         if not stays:
             return
         self._poses += len(stays)

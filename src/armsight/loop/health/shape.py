@@ -203,9 +203,8 @@ class _Hypothesis(NamedTuple):
 
 
 class _Explained(NamedTuple):
-    """What a hypothesis explains of a sum of squares, log-evidence against none, sizes (D,) and cov (D, D)."""
+    """Log-evidence of a hypothesis against none, the sizes (D,) of what changed, and their covariance (D, D)."""
 
-    gain: float
     evidence: float
     size: Array
     cov: Array
@@ -264,7 +263,7 @@ class ShapeWatch:
         self.found: ShapeError | None = None
         self.said: ShapeError | None = None
 
-    def take(self, rows: Array, T: Array, response: Array, cov: Array, begins: bool) -> None:
+    def take(self, rows: Array, T: Array, response: Array, cov: Array, moved: bool) -> None:
         """Take a shot.
 
         Args:
@@ -272,12 +271,12 @@ class ShapeWatch:
             T: (4, 4) pose T_left_body.
             response: (6, K) of a pose measured with all points to the parameters.
             cov: (6, 6) covariance of the pose.
-            begins: whether it begins a stay at a pose, or goes on with one.
+            moved: whether its pose differs from the one before; single shots are asked only then.
         """
-        self._shots.append(rows)
         self._effects.append((response, cov))
-        if not begins:
+        if not moved:
             return
+        self._shots.append(rows)
         view = T[:3, :3].T @ T[:3, 3]
         view /= np.sqrt(view @ view)
         if self._view is None or np.linalg.norm(view - self._view) > _VIEWS_RAD / _LEAST_POSES:  # else it rests
@@ -327,10 +326,10 @@ class ShapeWatch:
         """
         M, prior = eliminated(sums.M, slice(1, 1 + self._size)), _RARE / len(hypotheses)
         moment = np.zeros((len(M) - 1, len(M) - 1))
-        if float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(moment)), M[1:, 0])) < -2.0 * np.log(prior):
+        gain = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(moment)), M[1:, 0]))
+        if gain < -2.0 * np.log(prior):
             return 0.0, moment
-        left = float(M[0, 0]) - max(_explained(M, each, 1.0).gain for each in hypotheses)
-        excess = max(left / max(sums.freedom, 1.0), 1.0)  # what none explains is noise
+        excess = max((float(M[0, 0]) - gain) / max(sums.freedom, 1.0), 1.0)  # what all together do not explain is noise
         explained = [_explained(M, each, excess) for each in hypotheses]
         logs = np.log(prior) + np.array([each.evidence for each in explained])
         evidence = float(np.logaddexp.reduce(np.append(logs, 0.0)))
@@ -429,6 +428,8 @@ class ShapeWatch:
         if float(off @ np.linalg.solve(each, off)) > newest.excess(newest.gain(columns)) * chdtri(len(off), _UNLIKE):
             return False
         first = 1 + self._first + 3 * which
+        if len(self._shots) < _LEAST_SHOTS:
+            return False
         begins = np.cumsum([0, *map(len, self._shots)])[:-1]
         rows = np.concatenate(self._shots)
         along = rows[:, first : first + 3] @ d
@@ -531,13 +532,12 @@ def _hypotheses(points: int) -> tuple[_Hypothesis, ...]:
 
 
 def _explained(M: Array, hypothesis: _Hypothesis, excess: float) -> _Explained:
-    """Return what a hypothesis explains of sums M (1 + N, 1 + N), of a noise whose variance is so many times larger."""
+    """Return what a hypothesis says of sums M (1 + N, 1 + N), of a noise whose variance is so many times larger."""
     rows, scale = hypothesis
     G = M[np.ix_(1 + rows, 1 + rows)] * (scale**2 / excess) + np.eye(len(rows))
     r, inverse = M[1 + rows, 0] * (scale / excess), np.asarray(np.linalg.inv(G), float)
-    gain = float(r @ inverse @ r)
-    evidence = 0.5 * gain - 0.5 * float(np.linalg.slogdet(G)[1])
-    return _Explained(gain, evidence, scale * (inverse @ r), scale**2 * inverse)
+    evidence = 0.5 * float(r @ inverse @ r) - 0.5 * float(np.linalg.slogdet(G)[1])
+    return _Explained(evidence, scale * (inverse @ r), scale**2 * inverse)
 
 
 def _columns(chosen: Sequence[int]) -> Ids:
