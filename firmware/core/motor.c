@@ -11,7 +11,7 @@
 #define WINDOW_TICKS 32u      /* R and K are learnt from a window: until the reading has moved, looked at as often, */
 #define REST_TICKS 256u       /* or has rested for so long */
 #define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
-#define RESTING 0.5f          /* of the backlash: two places in it are a sigma of 0.41 apart */
+#define RESTING 0.5f          /* of the backlash: two positions in it are a sigma of 0.41 apart */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
 #define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
 #define SAMPLE_TICKS 8u
@@ -23,7 +23,7 @@
 #define UNKNOWN_RAD_S 1000.0f
 #define SEEN_RAD_S 0.5f       /* above a motor's speed in one tick by noise: no slower joint is held to its limit by it */
 #define SIDE_UNKNOWN 0
-#define TURN_TICKS 64u        /* in a longer window than so a joint may have turned and come back */
+#define REVERSAL_TICKS 64u    /* in a longer window than so a joint may have reversed and come back */
 #define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
 #define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
 
@@ -80,7 +80,7 @@ static float window_noise(motor_state *motor, const motor_config *config, float 
 {
     const bool moved = number_size(way_rad) > WINDOW_WAY_RAD;
     const int32_t side = moved ? (way_rad > 0.0f ? 1 : -1) : SIDE_UNKNOWN;
-    const bool goes_on = side == motor->window_side && moved && motor->window_ticks <= TURN_TICKS;
+    const bool goes_on = side == motor->window_side && moved && motor->window_ticks <= REVERSAL_TICKS;
     motor->window_side = side;
     const float crossed = goes_on ? 0.0f : moved ? 1.0f : RESTING;
     return WINDOW_NOISE_RAD + crossed * config->backlash_rad;

@@ -353,7 +353,7 @@ typedef struct motor_state {
     float speed_rad_s;       /* by the back-EMF */
     float unsure_rad_s;      /* how far that may be off */
     float doubt_rad_s;       /* the same, as far as it excuses a speed beyond the limit */
-    float fastest_rad_s;     /* what it is held to: the speed limit, or what can be told from its noise */
+    float fastest_rad_s;     /* what it is held to: the speed limit, or what its noise lets show */
     float sure_rad_s;        /* the size it has at least but for the doubt; 0 where it is not known */
     uint32_t known;          /* not 0: a current is seen, without which its sensor may be broken */
     float travel_rad;        /* since the joint was enabled */
