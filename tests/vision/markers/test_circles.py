@@ -140,12 +140,21 @@ def test_a_covered_disc_is_left_out_and_dirt_is_no_disc():
 
 
 @pytest.mark.parametrize(
-    ("columns", "skipped"), [((0, 1, 2), False), ((0, 2, 3), True), ((0, 1, 3), True), ((1, 2, 3, 4), False)]
+    ("columns", "rows", "skipped"),
+    [
+        ((0, 1, 2), (0, 1, 2), False),
+        ((0, 2, 3), (0, 1, 2), True),
+        ((0, 1, 3), (0, 1, 2), True),
+        ((1, 2, 3, 4), (0, 1, 2), False),
+        ((0, 1, 2), (0, 2, 4), True),
+        ((0, 1), (0, 2), True),
+        ((0, 1), (0, 1), False),
+    ],
 )
-def test_a_column_that_is_missing_between_others_is_noticed(columns, skipped):
-    cells = np.array([(x, y) for x in range(len(columns)) for y in range(3)])
+def test_a_line_that_is_missing_between_others_is_noticed(columns, rows, skipped):
+    cells = np.array([(x, y) for x in range(len(columns)) for y in range(len(rows))])
     theta = np.zeros((len(cells), 10))
-    x, y = np.array(columns)[cells[:, 0]], cells[:, 1]
+    x, y = np.array(columns)[cells[:, 0]], np.array(rows)[cells[:, 1]]
     depth = 1.0 + 0.1 * x  # in perspective the discs shrink as their distances do
     theta[:, 0], theta[:, 1] = 100.0 * x / depth, 100.0 * y / depth
     theta[:, 2], theta[:, 4] = (depth**2 / 35.0) ** 2, (depth / 35.0) ** 2

@@ -369,7 +369,8 @@ def skips_line(cells: Ids, theta: Array) -> bool:
                 both = [m11 * u * u + 2.0 * m12 * u * v + m22 * v * v for m11, m12, m22 in theta[[i, j], 2:5]]
                 steps.setdefault((axis, (x, y)[axis]), []).append(float(np.sqrt(both[0] * both[1])))
     squares = [median(each) for each in steps.values()]
-    return bool(squares) and max(squares) > _SKIPPED**2 * median(squares)
+    sure = [median(each) for each in steps.values() if len(each) > 1]  # one step alone may be short by chance
+    return bool(sure) and max(squares) > _SKIPPED**2 * min(sure)
 
 
 def positions(cells: Ids, uv: Array) -> dict[Cell, complex]:
