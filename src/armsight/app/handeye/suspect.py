@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.handeye.read import CONVENTIONS, PoseTable, rotations_by, stacked
+from armsight.app.handeye.read import CONVENTIONS, MIXED, PoseTable, rotations_by, stacked
 from armsight.app.handeye.recording import PairedPoses
 from armsight.data import Array
 from armsight.errors import InputError
@@ -41,8 +41,8 @@ BETTER, PLAUSIBLE_M = 4.0, 0.02
 SMALLER = 0.99
 #: Poses that a reading is evaluated by at most.
 EVALUATED = 60
-#: Rows that poses and images have in common at least where they are shifted, and shifts that are tried: those for which
-#: both sides rotate alike.
+#: Rows that poses and images have in common at least where they are shifted (half of them besides: few rows fit anything),
+#: and shifts that are tried: those for which both sides rotate alike.
 COMMON, SHIFTS = 6, 4
 #: Rows at least on either side of where something may have been displaced, and rows that are tried first.
 PART, TRIED = 6, 12
@@ -301,7 +301,7 @@ def _other_rows(recording: PairedPoses) -> Iterator[_Reading]:
     """Yield rows shifted against the images, from the first on or from a later one, or in reverse."""
     p, n = recording.poses, len(recording.poses.A)
     hand, eye = _angles(p.A), _angles(p.right_side)
-    shifts = [shift for k in range(1, n - COMMON + 1) for shift in (k, -k)]
+    shifts = [shift for k in range(1, n - max(COMMON, n // 2) + 1) for shift in (k, -k)]
     off = [np.median(np.abs(hand[max(s, 0) : n - 1 + min(s, 0)] - eye[max(-s, 0) : n - 1 - max(s, 0)])) for s in shifts]
     for shift in dict.fromkeys([*shifts[:2], *(shifts[k] for k in np.argsort(off)[:SHIFTS])]):
         if (found := _shifted(p, shift)) is None:
@@ -393,6 +393,12 @@ def _scaled(recording: PairedPoses) -> Iterator[_Reading]:
     sides += [("B", "target", seen.unit_m, "--seen-units", seen.path)] if seen is not None else []
     for side, whose, unit_m, option, path in sides:
         given = next(name for name, length in UNITS.items() if length == unit_m)
+        T = getattr(p, side).copy()
+        lengths = np.linalg.norm(T[:, :3, 3], axis=1)
+        if (short := lengths < lengths.max() / MIXED).any():
+            T[short, :3, 3] *= 1e3
+            said = f"{short.sum()} of {len(short)} rows of the {whose} are in metres, the others in mm: correct them"
+            yield _Reading(_with(p, side, T), said, path)
         for name, length in UNITS.items():
             if name != given:
                 T = getattr(p, side).copy()
