@@ -428,6 +428,13 @@ def test_readings_of_rotations_axes_and_units(armsight, tmp_path, seen):
     rejected(matrices(path, other), "are some rows in millimetres?", more=("--detect-units",))
     head, arm = ",".join(f"q{i}_deg" for i in range(1, 7)), ("--model", "six_r")
     rejected(named(path, head, np.degrees(q + np.pi / 2 * np.eye(6)[2])), "another zero", "add -90 deg to q3", more=arm)
+    ur = open_arm("ur3").home + q
+    flange = open_arm("ur3").forward(ur)
+    by = matrices(tmp_path / "ur.txt", inverse(flange @ X) @ Z @ exp_se3(np.full((14, 6), 1e-4)))
+    said = armsight(
+        "handeye", "--robot", named(path, head, np.degrees(ur)), "--seen", by, "--eye", "in-hand", "--model", "ur3e"
+    )
+    assert "fit --model ur3" in said.err
     names = ",".join(open_arm("six_r").joint_names)
     wrong = names.replace("joint5", "jont5")
     rejected(named(path, wrong, q), "is not known: is it", more=arm)

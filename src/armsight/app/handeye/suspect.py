@@ -172,13 +172,36 @@ def require_plausible(
             "and no other reading fits: robot and images are not of the same motion, or which row belongs to which, a "
             "rotation or the joints are read wrongly; check one row by hand, or take the poses again"
         )
+    notes = _nearer_models(recording, arm, as_given[0])
     if as_given[0] > PLAUSIBLE_M:
-        note = (
+        notes.append(
             f"{recording.robot.path}: half of the rows are off by more than {1e3 * as_given[0]:.0f} mm in any mounting, "
             "and no other reading fits: check one row by hand"
         )
-        return replace(recording, notes=(*recording.notes, note))
-    return recording
+    return replace(recording, notes=(*recording.notes, *notes))
+
+
+def _nearer_models(recording: PairedPoses, arm: Arm | None, as_given: float) -> list[str]:
+    """Return notes of models of other arms that fit better by half: a generation of an arm differs little from the next."""
+    table, p = recording.robot, recording.poses
+    if arm is None or table.q is None or table.numbers.shape[1]:
+        return []
+    q = table.q[recording.rows]
+    found = {other: float(misfit(replace(p, A=A))[0]) for other, A in _models(arm, q)}
+    best = min(found, key=lambda other: found[other], default="")
+    if not best or found[best] > as_given / 2:
+        return []
+    return [
+        f"{table.path}: the joints fit --model {best} better than {arm.name}: half of the rows are within "
+        f"{1e3 * found[best]:.1f} mm, not {1e3 * as_given:.1f}: which is it?"
+    ]
+
+
+def _models(arm: Arm, q: Array) -> Iterator[tuple[str, Array]]:
+    """Yield the names of other models of as many joints, and the flange (N, 4, 4) by them."""
+    for other in MODELS.values():
+        if len(other.joint_names) == q.shape[1] and other.name != arm.name:
+            yield other.name, np.asarray(other.forward(q))
 
 
 def _spread(p: Poses) -> float:
@@ -432,9 +455,8 @@ def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Array, str]]:
             )
     for named, at in _orders(p, arm, q):
         yield np.asarray(arm.forward(q[:, at])), f"the joints are in another order: {arm.name}'s are {named} here"
-    for other in MODELS.values():
-        if len(other.joint_names) == n and other.name != arm.name:
-            yield np.asarray(other.forward(q)), f"the joints fit --model {other.name}, not {arm.name}"
+    for other, A in _models(arm, q):
+        yield A, f"the joints fit --model {other}, not {arm.name}"
 
 
 def _orders(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[str, NDArray[np.int64]]]:
