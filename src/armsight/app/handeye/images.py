@@ -92,6 +92,8 @@ def see_with_camera(
     files = sorted(map(Path, glob.glob(str(Path(pattern).expanduser()))), key=_natural)
     if not files:
         raise InputError(f"{pattern}: no such images; quote the glob")
+    if len(files) == 1 and files[0].is_dir():
+        raise InputError(f"{pattern}: a folder; give a glob of its images, quoted: '{files[0]}/*.png'")
     found = open_target(target)
     camera = None if camera_file == "fit" else read_camera(Path(camera_file))
     detections: list[Detections] = []
@@ -275,7 +277,9 @@ def see_with_rig(
         missed.append("")
         squares.append(result.reprojection_rms_px**2)
     if not squares:
-        raise InputError(f"the target was found in none of {len(names)} pairs ({missed[0]}): is --target right?")
+        raise InputError(
+            f"none of {len(names)} pairs was measured: are --target, --left and --right right? {missed[0]}"
+        )
     return Seen(
         np.array(Ts),
         np.array(covs),

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.handeye.read import CONVENTIONS, PoseTable, rotations_by, stacked
+from armsight.app.handeye.read import CONVENTIONS, MIXED, PoseTable, rotations_by, stacked
 from armsight.app.handeye.recording import PairedPoses
 from armsight.data import Array
 from armsight.errors import InputError
@@ -41,8 +41,8 @@ BETTER, PLAUSIBLE_M = 4.0, 0.02
 SMALLER = 0.99
 #: Poses that a reading is evaluated by at most.
 EVALUATED = 60
-#: Rows that poses and images have in common at least where they are shifted, and shifts that are tried: those for which
-#: both sides rotate alike.
+#: Rows that poses and images have in common at least where they are shifted (half of them besides: few rows fit anything),
+#: and shifts that are tried: those for which both sides rotate alike.
 COMMON, SHIFTS = 6, 4
 #: Rows at least on either side of where something may have been displaced, and rows that are tried first.
 PART, TRIED = 6, 12
@@ -172,13 +172,36 @@ def require_plausible(
             "and no other reading fits: robot and images are not of the same motion, or which row belongs to which, a "
             "rotation or the joints are read wrongly; check one row by hand, or take the poses again"
         )
+    notes = _nearer_models(recording, arm, as_given[0])
     if as_given[0] > PLAUSIBLE_M:
-        note = (
+        notes.append(
             f"{recording.robot.path}: half of the rows are off by more than {1e3 * as_given[0]:.0f} mm in any mounting, "
             "and no other reading fits: check one row by hand"
         )
-        return replace(recording, notes=(*recording.notes, note))
-    return recording
+    return replace(recording, notes=(*recording.notes, *notes))
+
+
+def _nearer_models(recording: PairedPoses, arm: Arm | None, as_given: float) -> list[str]:
+    """Return notes of models of other arms that fit better by half: a generation of an arm differs little from the next."""
+    table, p = recording.robot, recording.poses
+    if arm is None or table.q is None or table.numbers.shape[1]:
+        return []
+    q = table.q[recording.rows]
+    found = {other: float(misfit(replace(p, A=A))[0]) for other, A in _models(arm, q)}
+    best = min(found, key=lambda other: found[other], default="")
+    if not best or found[best] > as_given / 2:
+        return []
+    return [
+        f"{table.path}: the joints fit --model {best} better than {arm.name}: half of the rows are within "
+        f"{1e3 * found[best]:.1f} mm, not {1e3 * as_given:.1f}: which is it?"
+    ]
+
+
+def _models(arm: Arm, q: Array) -> Iterator[tuple[str, Array]]:
+    """Yield the names of other models of as many joints, and the flange (N, 4, 4) by them."""
+    for other in MODELS.values():
+        if len(other.joint_names) == q.shape[1] and other.name != arm.name:
+            yield other.name, np.asarray(other.forward(q))
 
 
 def _spread(p: Poses) -> float:
@@ -301,7 +324,7 @@ def _other_rows(recording: PairedPoses) -> Iterator[_Reading]:
     """Yield rows shifted against the images, from the first on or from a later one, or in reverse."""
     p, n = recording.poses, len(recording.poses.A)
     hand, eye = _angles(p.A), _angles(p.right_side)
-    shifts = [shift for k in range(1, n - COMMON + 1) for shift in (k, -k)]
+    shifts = [shift for k in range(1, n - max(COMMON, n // 2) + 1) for shift in (k, -k)]
     off = [np.median(np.abs(hand[max(s, 0) : n - 1 + min(s, 0)] - eye[max(-s, 0) : n - 1 - max(s, 0)])) for s in shifts]
     for shift in dict.fromkeys([*shifts[:2], *(shifts[k] for k in np.argsort(off)[:SHIFTS])]):
         if (found := _shifted(p, shift)) is None:
@@ -393,6 +416,12 @@ def _scaled(recording: PairedPoses) -> Iterator[_Reading]:
     sides += [("B", "target", seen.unit_m, "--seen-units", seen.path)] if seen is not None else []
     for side, whose, unit_m, option, path in sides:
         given = next(name for name, length in UNITS.items() if length == unit_m)
+        T = getattr(p, side).copy()
+        lengths = np.linalg.norm(T[:, :3, 3], axis=1)
+        if (short := lengths < lengths.max() / MIXED).any():
+            T[short, :3, 3] *= 1e3
+            said = f"{short.sum()} of {len(short)} rows of the {whose} are in metres, the others in mm: correct them"
+            yield _Reading(_with(p, side, T), said, path)
         for name, length in UNITS.items():
             if name != given:
                 T = getattr(p, side).copy()
@@ -426,9 +455,8 @@ def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Array, str]]:
             )
     for named, at in _orders(p, arm, q):
         yield np.asarray(arm.forward(q[:, at])), f"the joints are in another order: {arm.name}'s are {named} here"
-    for other in MODELS.values():
-        if len(other.joint_names) == n and other.name != arm.name:
-            yield np.asarray(other.forward(q)), f"the joints fit --model {other.name}, not {arm.name}"
+    for other, A in _models(arm, q):
+        yield A, f"the joints fit --model {other}, not {arm.name}"
 
 
 def _orders(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[str, NDArray[np.int64]]]:
