@@ -205,7 +205,7 @@ def _models(arm: Arm, q: Array) -> Iterator[tuple[str, Array]]:
 
 
 def _spread(p: Poses) -> float:
-    """Return the median distance of the target's poses from their mean: what would be left if the arm told nothing, m."""
+    """Return the median distance of the target's poses from their mean, m: what an unknown arm would leave."""
     return float(np.median(_sizes(log_se3(inverse(mean_pose(p.B)) @ p.B))))
 
 
