@@ -610,10 +610,13 @@ class RigWatch:
         return ended
 
     def moved_since_s(self) -> float | None:
-        """Return since when the cameras alone are found to have moved, s; None where nothing or more was found."""
+        """Return since when the cameras alone are found to have moved, s; None where nothing or more was found, or when
+        the next test must show."""
         if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None or self._shaped:
             return None
         since_s, change = self._since()
+        if len(self._history) > 1 and since_s >= self._history[-2].begin_s:
+            return None  # they may have moved within the newest test, which is then no test of one pose
         return since_s if self._to_blame(change) == ["rig"] else None
 
     def _needed(self, change: RigChange, part: Part) -> bool:
