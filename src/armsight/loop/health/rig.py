@@ -610,8 +610,10 @@ class RigWatch:
         return ended
 
     def moved_since_s(self) -> float | None:
-        """Return since when the cameras alone are found to have moved, s; None where nothing or more was found, or when
-        the next test must show."""
+        """Return since when the cameras alone are found to have moved, s.
+
+        None where nothing or more was found, or only the newest test shows it.
+        """
         if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None or self._shaped:
             return None
         since_s, change = self._since()
