@@ -39,17 +39,18 @@ INLINE float limited_duty(const pid_state *pid, const pid_demand *demand, float 
 static float direction_of(float speed_rad_s) { return speed_rad_s / (number_size(speed_rad_s) + CREEP_RAD_S); }
 
 /* Return the error that the integral gathers while the spring is bounded: what a joint that a load holds back or drives
- * away lacks of a share of its speed limit, by whichever is faster, reading or motor. A joint that moves on gathers none. */
-static float bounded_error(const joint_gains *gains, const pid_demand *demand, float spring)
+ * away lacks of a share of its speed limit, by whichever is faster, reading or motor, and never more than its error. A joint
+ * that moves on gathers none. */
+static float bounded_error(const joint_gains *gains, const pid_demand *demand, float spring, float error_rad)
 {
-    if (gains->kp_per_rad <= 0.0f) {
+    if (gains->kp_per_rad <= 0.0f || spring * error_rad <= 0.0f) {
         return 0.0f;
     }
     const float damped_rad_s = demand->damped_rad_s;
     const float motor_rad_s = demand->motor_rad_s;
     const float fast_rad_s = number_size(motor_rad_s) > number_size(damped_rad_s) ? motor_rad_s : damped_rad_s;
     const float lacking = LOADED * spring - (gains->kd_s_per_rad + demand->own_s_per_rad) * fast_rad_s;
-    return lacking * spring > 0.0f ? lacking / gains->kp_per_rad : 0.0f;
+    return lacking * spring > 0.0f ? number_bound(lacking / gains->kp_per_rad, number_size(error_rad)) : 0.0f;
 }
 
 /* The law; inline, so that pid_control needs no demand in memory. */
@@ -59,7 +60,7 @@ INLINE float step(pid_state *pid, const joint_gains *gains, const pid_demand *de
     /* However far the reference is away: the joint is not driven to it faster than its speed limit. */
     const float requested = gains->kp_per_rad * error_rad + gains->kv_s_per_rad * demand->reference_rad_s;
     const float spring = number_bound(requested, demand->spring_limit);
-    const float gathered_rad = spring == requested ? error_rad : bounded_error(gains, demand, spring);
+    const float gathered_rad = spring == requested ? error_rad : bounded_error(gains, demand, spring, error_rad);
     const float forward = gains->ka_s2_per_rad * demand->reference_rad_s2 +
                           gains->kf_duty * direction_of(demand->reference_rad_s) + demand->gravity_duty;
     const float asked = spring + pid->integral_duty - gains->kd_s_per_rad * demand->damped_rad_s + forward;

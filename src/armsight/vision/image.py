@@ -119,7 +119,7 @@ def darkness(image: NDArray[np.uint8]) -> str:
     if lit > _LIT_SHARE * image.size:
         return ""
     level = float(np.percentile(image, 100.0 * (1.0 - _LIT_SHARE)))
-    return f"the image is dark: 99.9% of it below {level:.0f} of 255 grey levels: light the scene, or expose longer"
+    return f"the image is dark: 99.9% of it at most {level:.0f} of 255 grey levels: light the scene, or expose longer"
 
 
 def grey(image: Image) -> NDArray[np.uint8]:

@@ -31,6 +31,22 @@ def follower():
     return RigFollower(faults.TRUE, faults.BODY)
 
 
+def test_cameras_that_moved_in_the_newest_test_are_put_right_after_the_next_one():
+    """A large rotation is found by the few shots after it that the running test has: it may have begun at any of them."""
+    one, poses, found, rotated = None, [], None, np.radians([0.0, 0.0, 0.2])
+    for monitor, t_s, _, estimate, _ in faults.watched_body(5100, rotated=rotated, at_s=5.0, seconds=20.0):
+        one = one or RigFollower(monitor._rig._rig, faults.BODY)
+        poses.append((t_s, estimate))
+        if (watch := monitor.cameras_moved()) is not None and (since_s := watch.moved_since_s()) is not None:
+            found = one.cameras(since_s, poses, t_s)
+        if found is not None:
+            break
+    true = faults.TRUE.T_left_right @ exp_se3(np.append(np.zeros(3), rotated))
+    left = np.linalg.norm(log_se3(inverse(found.update.rig.T_left_right) @ true)[3:])
+    assert left < 4 * found.update.sigma_rad
+    assert found.at_s < 8.0
+
+
 def test_few_shots_are_rejected_with_the_reason():
     *_, (_, t_s, _, estimate, _) = faults.watched_body(7002, seconds=0.2)
     one = follower()

@@ -167,7 +167,8 @@ class RigFollower:
         """Return the cameras put right, where nothing else is found to have changed."""
         since_s = watch.moved_since_s()
         if since_s is None:
-            self.rejected = "cameras: their pose alone does not explain what the body's detections show"
+            if not watch.only_newest():
+                self.rejected = "cameras: their pose alone does not explain what the body's detections show"
             return None
         return self.cameras(since_s, poses, at_s, mounted=True)
 

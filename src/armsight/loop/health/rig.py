@@ -54,6 +54,8 @@ _SAME = 0.01
 #: While nothing is suspected, shots closer in time than this are left out, s, and those that hardly differ from the newest:
 #: they would cost time and add little.
 _LEAST_S, _LIKE_S = 0.025, 0.1
+#: One of so many shots, those that fit worst, is no usual one.
+_ODD = 4
 #: A point that a pose was measured without is another thing also where its two detections disagree by more than chance
 #: explains once in so many shots.
 _PAIRED = float(chdtri(1, 1e-4))
@@ -402,7 +404,9 @@ class RigWatch:
         test = every.of(len(self._window.b))
         if any(each.every is not each.rows for stay in stays for each in stay):
             every = self._summed(stays, every=True).by(self._scaled)
-        self._shape.decide(every, ends=ends)
+        odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
+        usual = every.less(self._summed(odd, every=True).by(self._scaled)) if odd else every
+        self._shape.decide(every, usual, ends=ends)
         moments = [stay[0] for stay in stays if len(stay) == 1]
         weight = float(np.exp(-1.0 / FORGET_TESTS))
         self._window.scale(weight)
@@ -617,9 +621,11 @@ class RigWatch:
         if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None or self._shaped:
             return None
         since_s, change = self._since()
-        if len(self._history) > 1 and since_s >= self._history[-2].begin_s:
-            return None  # they may have moved within the newest test, which is then no test of one pose
-        return since_s if self._to_blame(change) == ["rig"] else None
+        return since_s if self._to_blame(change) == ["rig"] and not self.only_newest() else None
+
+    def only_newest(self) -> bool:
+        """Return whether only the newest test shows a change: cameras may have moved within it, so the next one decides."""
+        return len(self._history) > 1 and self._since()[0] >= self._history[-2].begin_s
 
     def _needed(self, change: RigChange, part: Part) -> bool:
         """Return whether the other parts do not explain what was found."""
@@ -632,6 +638,11 @@ class RigWatch:
         if self.lens is not None:
             return list(self.lens.needed)
         return [part for part in _PARTS if self._needed(change, part)] or [max(_PARTS, key=change.alone.__getitem__)]
+
+
+def _misfit(stay: Sequence[_ShotResiduals]) -> float:
+    """Return by how much the squared residuals of a stay exceed their number, mean of its shots."""
+    return sum(float(each.every[:, 0] @ each.every[:, 0]) - len(each.every) for each in stay) / len(stay)
 
 
 @kernel

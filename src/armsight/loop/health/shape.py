@@ -15,7 +15,8 @@ point that explains most is taken, then the next one besides it, while one expla
 What may have changed and is not told apart yet widens the poses: of each hypothesis (the seven numbers, the focal lengths,
 a point, all points a little) the evidence against none (MacKay, 1992), of the newest test and of some newest ones together.
 Where the hypotheses together are more probable than that nothing changed, the second moment of their mixture is what poses
-may be off by. Chance exceeds an evidence of 1 / p in p of the tests at most (Markov), whatever the hypotheses.
+may be off by. Shots that fit worst, a quarter of them, do not count: what changed shows in all that follow, an edge before
+the body in few. Chance exceeds an evidence of 1 / p in p of the tests at most (Markov), whatever the hypotheses.
 
 Only what lasts is reported. A reflection, or another light of the scene that is taken for a disc, stays in the scene or in
 the image while the body rotates. So a point counts only if the median of what single shots say agrees with what all say
@@ -211,9 +212,10 @@ class _Explained(NamedTuple):
 
 
 class _ShapeTest(NamedTuple):
-    """The sums of one test, what they say alone, and the directions from which its poses saw the body."""
+    """The sums of one test, of its usual shots, what all say alone, and the directions from which it saw the body."""
 
     sums: ResidualSums
+    usual: ResidualSums
     alone: _Reduced
     views: list[Array]
 
@@ -283,14 +285,15 @@ class ShapeWatch:
             self._views.append(view)
             self._view = view
 
-    def decide(self, sums: ResidualSums, *, ends: bool) -> None:
+    def decide(self, sums: ResidualSums, usual: ResidualSums, *, ends: bool) -> None:
         """Test once more; the first test is enough by itself only where it ends all.
 
         Args:
             sums: since the last test: of the K parameters, the seven numbers and the candidates, in units of their priors.
+            usual: the same without the shots that fit worst.
             ends: whether it ends all.
         """
-        self._history.append(_ShapeTest(sums, self._reduced(sums), self._views))
+        self._history.append(_ShapeTest(sums, usual, self._reduced(sums), self._views))
         self._views = []
         tests, before = list(self._history), self._suspect
         if before is None:
@@ -305,7 +308,7 @@ class ShapeWatch:
         again = self._suspect is not None and before is not None and before.chosen[0] == self._suspect.chosen[0]
         self.found = self._suspect if again or (ends and len(tests) == 1) else None
         self.said = self.found or self.said
-        self.doubt = self._doubted([each.sums for each in tests])
+        self.doubt = self._doubted([each.usual for each in tests])
 
     def _doubted(self, tests: Sequence[ResidualSums]) -> Array | None:
         """Return the second moment (7 + C, 7 + C) of what may have changed; None where nothing did, more probably."""

@@ -428,7 +428,8 @@ def calibrate_boards(
 
 def _apart(rig: StereoRig, state: BundleState) -> None:
     """Raise a CalibrationError where both cameras stand at one position, so that nothing can be triangulated."""
-    sigma_m = float(np.sqrt(np.trace(rig.cov[-6:-3, -6:-3])))
+    along = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3] / max(rig.baseline_m, 1e-12)
+    sigma_m = float(np.sqrt(along @ rig.cov[-6:-3, -6:-3] @ along))
     distance_m = float(np.median(np.linalg.norm(state.Ts_left_body[:, :3, 3], axis=1)))
     if rig.baseline_m < max(_BASELINE_SIGMAS * sigma_m, _BASELINE_SHARE * distance_m):
         raise CalibrationError(
