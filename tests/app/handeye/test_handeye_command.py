@@ -329,6 +329,9 @@ def test_millimetres_are_rejected_or_detected(armsight, tmp_path, seen):
     document, notes = found(armsight, robot, seen, "--detect-units")
     assert "read as millimetres" in notes
     assert_right(document)
+    p_mm = np.array([[600, 10, 500], [500, 0, 400], [1, 1.5, 2]])  # one near the base's origin
+    near = named(tmp_path / "near.csv", "x,y,z,qw,qx,qy,qz", np.hstack([p_mm, np.tile([1, 0, 0, 0], (3, 1))]))
+    np.testing.assert_allclose(read_pose_table(near, detect_units=True).Ts[:, :3, 3], 1e-3 * p_mm)
     B = B.copy()
     B[:, :3, 3] *= 0.5
     half = matrices(tmp_path / "half.txt", B)
@@ -366,6 +369,8 @@ def test_what_does_not_fit_is_named(armsight, tmp_path, seen):
     rejected(named(tmp_path / "u.csv", head, q), "the joints are in radians", more=arm)
     gripper = np.column_stack([np.degrees(q), q[:, 0]])
     rejected(named(tmp_path / "g.csv", head + ",q7_deg", gripper), "six_r has 6", "gripper", more=arm)
+    speed = named(tmp_path / "v.csv", head + ",q7_deg,speed", np.column_stack([gripper, q[:, 0]]))
+    rejected(speed, "six_r has 6", "gripper", more=arm)
     units = named(tmp_path / "t.csv", head.replace("q6_deg", "q6_rad"), q)
     rejected(units, "has q6_rad where q6_deg is expected", more=arm)
     rejected(named(tmp_path / "d.csv", head.replace("deg", "rad"), 90 + q), "are these degrees?", more=arm)
@@ -448,16 +453,20 @@ def test_points_in_kukas_language(tmp_path):
         for k, (x, y, z, a, b, c) in enumerate(np.hstack([1e3 * A[:, :3, 3], angles]))
     ]
     path = tmp_path / "points.dat"
-    path.write_text("\n".join(["DEFDAT POINTS PUBLIC", *points, "ENDDAT"]))
+    motions = "DECL PDAT PPDAT1={VEL 100.000,ACC 100.000,APO_DIST 100.000}"
+    path.write_text("\n".join(["DEFDAT POINTS PUBLIC", motions, points[0], motions, *points[1:], motions, "ENDDAT"]))
     table = read_pose_table(path)
     np.testing.assert_allclose(table.Ts, A, atol=1e-7)
+    assert table.lines.tolist() == [3, 5, 6]
     assert "KUKA" in table.notes[0]
     path.write_text("{A1 10,A2 -90,A3 90,A4 0,A5 45,A6 0}")
     np.testing.assert_allclose(np.degrees(read_pose_table(path, arm=open_arm("six_r")).q), [[10, -90, 90, 0, 45, 0]])
     path.write_text("{X 1,Y 2,Z 3,A 4,B 5}")
     with pytest.raises(InputError, match="line 1: a point needs"):
         read_pose_table(path)
-    path.write_text("412,5 1129,8 0,5 1 0 0 0\n")
+    path.write_text("0 412,5 606,3 1 0 0 0\n1,5 412,5 606,3 1 0 0 0\n")
+    some_whole = read_pose_table(path, rotation="wxyz", unit="mm")
+    np.testing.assert_allclose(some_whole.Ts[:, :3, 3], [[0.0, 0.4125, 0.6063], [0.0015, 0.4125, 0.6063]])
     commas = "412,5 1129,8 606,3 1,0 0,0 0,0 0,0\n"
     path.write_text(commas)
     bare = read_pose_table(path, rotation="wxyz", unit="mm")

@@ -65,6 +65,8 @@ _UR = re.compile(r"\bp\[([^\[\]]*)\]")
 _KRL = re.compile(r"\{\s*(?:\w+\s*:\s*)?([A-Z]\w*\s+[-+.\deE]+(?:\s*,\s*[A-Z]\w*\s+[-+.\deE]+)*)\s*\}")
 #: What of it is read: a point, mm and degrees, or its axes.
 _KRL_KEYS = (("X", "Y", "Z", "A", "B", "C"), ("A1", "A2", "A3", "A4", "A5", "A6"))
+#: What only points have; motions between them have other names ({VEL 100.0,ACC 100.0}).
+_OF_A_POINT = {"X", "Y", "Z", *_KRL_KEYS[1]}
 #: A list alone in its line.
 _LIST = re.compile(r"\[([^\[\]]*)\],?")
 #: ROS's messages as columns, in metres (REP 103): pose.position.x, field.pose.orientation.w, transform.translation.x ...
@@ -199,7 +201,7 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
     first = written[0][1] if written else ""
     if any(_UR.search(row) for _, row in written):
         return ["x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"], _even(path, _poses_of_ur(path, written), 6), False
-    if any(_KRL.search(row) for _, row in written):
+    if any(_points_in(row) for _, row in written):
         return *_points_of_krl(path, written), False
     if _LIST.fullmatch(first):
         head, rows = _without_names(path, _lists(path, written))
@@ -209,7 +211,7 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
             f"{path}: {first[:40]!r} begins no table: write one pose a line, a matrix of 16 numbers or columns such as "
             "x_mm,y_mm,z_mm,qw,qx,qy,qz"
         )
-    if len(first.split()) > 1 and all(DECIMAL_COMMA.fullmatch(cell) for cell in first.split()):
+    if _has_decimal_commas(first.split()):
         cells = [line.replace(",", ".").split() for line in text.splitlines()]
     elif any(mark in first for mark in ",;\t"):
         cells = degree_columns(path, read_table(path, read_columns(columns, COLUMNS)))
@@ -240,15 +242,20 @@ def _poses_of_ur(path: Path, written: list[tuple[int, str]]) -> list[tuple[int, 
     return rows
 
 
+def _points_in(row: str) -> list[dict[str, str]]:
+    """Return the numbers of the points of a line in KUKA's language by their names, without other structures (speeds)."""
+    found = (dict(part.split() for part in re.split(r"\s*,\s*", one)) for one in _KRL.findall(row))
+    return [point for point in found if _OF_A_POINT & set(point)]
+
+
 def _points_of_krl(path: Path, written: list[tuple[int, str]]) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Return the columns, and the numbers of the point that a line in KUKA's language has; other lines are passed over."""
     rows = []
     for line, row in written:
-        found = _KRL.findall(row)
+        found = _points_in(row)
         if len(found) > 1:
             raise InputError(f"{path}: line {line}: has {len(found)} points; one a line is needed")
-        if found:
-            rows.append((line, dict(part.split() for part in re.split(r"\s*,\s*", found[0]))))
+        rows += [(line, point) for point in found]
     keys = next((keys for keys in _KRL_KEYS if set(keys) <= set(rows[0][1])), None)
     if keys is None:
         raise InputError(f"{path}: line {rows[0][0]}: a point needs X, Y, Z, A, B, C, and axes A1 to A6")
@@ -427,6 +434,13 @@ def _is_number(cell: str) -> bool:
     return True
 
 
+def _has_decimal_commas(cells: list[str]) -> bool:
+    """Return whether cells that blanks separate are numbers with decimal commas; whole ones have none, points are none."""
+    commas = [bool(DECIMAL_COMMA.fullmatch(cell)) for cell in cells]
+    whole = [_is_number(cell) and "." not in cell for cell in cells]
+    return len(cells) > 1 and any(commas) and all(a or b for a, b in zip(commas, whole, strict=True))
+
+
 class _Columns:
     """Columns of a table by their names."""
 
@@ -460,10 +474,10 @@ class _Columns:
         if arm is not None and len(names) != len(arm.joint_names):
             advice = "; is the last one a gripper? remove its column" if len(names) == len(arm.joint_names) + 1 else ""
             known = [*arm.joint_names, *(f"{name}_joint" for name in arm.joint_names), *COLUMNS]
-            for name in (name for name in self.at if name not in COLUMNS):
-                near = get_close_matches(name, known, 1)
-                advice = f"; column {name!r} is not known" + (f": is it {near[0]}?" if near else "")
-                break
+            unknown = next((name for name in self.at if name not in COLUMNS), None)
+            if unknown is not None and not advice:
+                near = get_close_matches(unknown, known, 1)
+                advice = f"; column {unknown!r} is not known" + (f": is it {near[0]}?" if near else "")
             raise InputError(
                 f"{self.path}: line 1: {len(names)} joints ({names[0]}..{names[-1]}); {arm.name} has "
                 f"{len(arm.joint_names)}{advice}"
@@ -602,8 +616,8 @@ def _positions(table: _Columns, unit: str | None, detect: bool) -> tuple[Array, 
     far = float(np.abs(p).max()) * unit_m
     if unit_m == 1.0 and far > FAR_M:
         lengths = np.linalg.norm(p, axis=1)
-        near = np.flatnonzero((lengths < lengths.max() / MIXED) & (lengths > NEAR_M))
-        if len(near) and (given is None or suffix == "_m"):
+        near = np.flatnonzero((lengths < min(lengths.max() / MIXED, FAR_M)) & (lengths > NEAR_M))
+        if len(near) > 1 and (given is None or suffix == "_m"):  # one alone may be at the base's origin
             large, small = (table.rows[k][0] for k in (int(lengths.argmax()), near[0]))
             raise InputError(
                 f"{table.path}: line {large} is {lengths.max():.0f} m from the base, {small} {lengths[near[0]]:.2g} m: "
