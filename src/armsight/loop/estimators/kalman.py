@@ -145,7 +145,7 @@ class KalmanEstimator:
         self._waiting, self._backlash_set = [], False
 
     def as_before(self, state: Remembered) -> KalmanEstimator:
-        """Return an estimator at the newest reading that knows of the arm what this one knew earlier; it takes nothing more."""
+        """Return an estimator at the newest reading that knows what this one knew of the arm earlier; it takes nothing."""
         other = copy(self)
         other.clock = other.on_innovation = None
         other.restore(state)

@@ -26,7 +26,8 @@ ALIKE = 12.0
 LATER_S = 3.0
 #: The errors of an arm have longer tails than Gaussian ones: chi-squares count by this factor less.
 MARGIN = 1.4
-#: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone, by chance once in a hundred.
+#: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone: beyond it by chance once in
+#: a hundred.
 _ALONG = float(chdtri(5, 0.01))
 #: What the pair alone cannot distinguish from that.
 FOCAL = "; both focal lengths that changed alike look the same to the pair"
@@ -254,10 +255,10 @@ def finding(changes: Sequence[Change], names: Sequence[str], axis: Array | None 
     causes = [each.suspect.cause for each in others]
     if (kind, joint) == ("joint", 0):
         causes.append("fixed")
-    if best.suspect.cause == "fixed" and axis is not None:
-        if along_axis(*best.newest, best.T_base_tool[:3, :3].T @ axis):
-            causes.append("lens")
-            unsure += FOCAL
+    is_fixed = best.suspect.cause == "fixed" and axis is not None
+    if is_fixed and along_axis(*best.newest, best.T_base_tool[:3, :3].T @ axis):
+        causes.append("lens")
+        unsure += FOCAL
     alternatives = tuple(cause for cause in dict.fromkeys(causes) if cause != best.suspect.cause)
     if best.suspect.moves:
         found = _moved_finding(best, unsure)
