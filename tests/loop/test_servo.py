@@ -229,6 +229,11 @@ def test_what_must_not_be_trusted_is_taken_back_and_what_is_doubted_is_held():
     assert held.mode is Mode.HELD
     assert np.abs(held.correction - closed.correction).max() < 1e-12
     assert np.abs(held.correction).max() > 1e-3
+    before = workcell.estimator.as_before(workcell.estimator.remembered())
+    for _ in range(60):
+        kept = servo.step(servo.aim(still, 1.0), workcell.estimator, Trust.NONE, before)
+    assert kept.mode is Mode.DISTRUSTED
+    assert np.abs(kept.correction - closed.correction).max() < 0.1 * np.abs(closed.correction).max()
     for _ in range(60):
         back = servo.step(servo.aim(still, 1.0), workcell.estimator, Trust.NONE)
     assert back.mode is Mode.DISTRUSTED

@@ -71,7 +71,7 @@ class Mode(Enum):
     BRIDGED = "bridged: no measurement lately, the potentiometers carry on with what was learned"
     POTENTIOMETERS = "potentiometers alone: vision is lost, the last correction is held"
     HELD = "held: vision contradicts what was learned; the correction stays until the cause is known"
-    DISTRUSTED = "potentiometers alone: what vision measures is wrong, the correction is taken back"
+    DISTRUSTED = "what vision measures is wrong: the potentiometers, with what was learned before that, if anything was"
 
 
 @dataclass(frozen=True)
@@ -218,24 +218,29 @@ class PoseServo:
         passed_s = passed_s if passed_s > 0.0 else self.timing.period_s
         return Aim(ahead, q, qd, self._arm.forward(q), most, duty, jacobian, U, s, Vt, passed_s)
 
-    def step(self, aim: Aim, estimator: Estimator, trust: Trust = Trust.FULL) -> ServoStep:
+    def step(
+        self, aim: Aim, estimator: Estimator, trust: Trust = Trust.FULL, before: Estimator | None = None
+    ) -> ServoStep:
         """Make the next command.
 
         Args:
             aim: its reference, of this period.
             estimator: where the tool is.
             trust: how far what the estimator took from vision may be relied on.
+            before: where that is not at all, an estimator that knows what was learned before; None where nothing was.
         """
         estimate = estimator.estimate()
         error = behind(aim.Ts_base_tool[0], estimate.T_base_tool)
         mode = self._mode(estimate, trust)
         resting = self._resting(estimate, aim)
-        change = -self._correction if mode is Mode.DISTRUSTED else np.zeros(self._arm.joints)
-        if mode in (Mode.VISION, Mode.BRIDGED):
-            last, following = self._missing(estimator, aim)
+        distrusted = mode is Mode.DISTRUSTED
+        change = -self._correction if distrusted else np.zeros(self._arm.joints)
+        source = before if distrusted else estimator
+        if source is not None and mode in (Mode.VISION, Mode.BRIDGED, Mode.DISTRUSTED):
+            last, following = self._missing(source, aim)
             push = following - last
-            if mode is Mode.VISION:
-                push += self.timing.gain * error if resting else self._follow * last
+            if mode is not Mode.BRIDGED:
+                push += self.timing.gain * error if resting and not distrusted else self._follow * last
             change = self._joints(aim, push)
         if mode is Mode.VISION and resting:
             if self._joint_loops is None:

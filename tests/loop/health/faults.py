@@ -166,7 +166,7 @@ class Moved:
     def vision(self, measurement):
         t_s, T = measurement.t_s, self.T_base_rig
         if t_s >= LEARNED_S and self.estimator.on_innovation is None:
-            self.monitor.follow(self.estimator, ARM)
+            self.monitor.follow(self.estimator, ARM, T[:3, 2])
         if t_s >= AT_S:
             D = T @ np.linalg.inv(small(self.motion(t_s - AT_S))) @ np.linalg.inv(T)
             measurement = replace(measurement, T_base_tool=D @ measurement.T_base_tool)
@@ -221,8 +221,8 @@ def closed_loop(seed, motion=lambda t_s: np.zeros(6), *, closes=True, follows=Fa
         way, begin_s = point_to_point(ARM, goals[-2], goals[-1]), workcell.t_s
         while workcell.t_s < begin_s + way.duration_s + 1.0:
             t_s = workcell.t_s - begin_s
-            trust = moved.monitor.trust
-            step = servo.step(servo.aim(way, t_s), moved, trust)
+            health = moved.monitor
+            step = servo.step(servo.aim(way, t_s), moved, health.trust, health.before)
             ahead = way.at(t_s + 0.016)
             alone = JointCommand(ahead.q, ahead.qd, np.zeros(6), 0.016)
             T = workcell.advance(step.command if closes else alone, 16)[-1]

@@ -55,6 +55,9 @@ def test_cameras_that_moved_together_are_named_and_sized(count):
     assert watch.cameras_moved
     assert abs(found.size - 1e3 * np.linalg.norm(CAMERAS[:3])) < 4 * found.sigma
     assert found.since_s == pytest.approx(AT_S, abs=1.0)
+    assert found.alternatives == ()
+    (found,) = watched(11, count, cameras=np.array([0.0, 0.0, 9e-4, 0.0, 0.0, 0.0])).findings()
+    assert found.alternatives == ("lens",)
 
 
 @pytest.mark.parametrize("count", [2, 3])

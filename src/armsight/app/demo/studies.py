@@ -272,9 +272,7 @@ def _circle(workcell: Workcell, setup: Setup, rig: StereoRig, outcome: RunResult
     first = max(kinds.index("line") - 1, 0)  # the motion to its start
     last = kinds.index("circle") + 1
     part = replace(plan, motions=tuple(replace(motion, rest_s=0.0) for motion in plan.motions[first:last]))
-    drive(
-        loop, part, closed_on(servo, lambda: loop.health.trust, setup.gravity), closed=True, progress=lambda line: None
-    )
+    drive(loop, part, closed_on(servo, lambda: loop.health, setup.gravity), closed=True, progress=lambda line: None)
     loop.close_record()
     truth, mounting = workcell.truth, outcome.handeye.mounting
     T_left_body = inverse(truth.T_base_rig) @ truth.T_base_tool @ truth.T_tool_body

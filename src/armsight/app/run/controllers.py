@@ -16,7 +16,7 @@ from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import RunSegment
 from armsight.data import Array, JointCommand
 from armsight.loop.estimators import Estimator
-from armsight.loop.health import Trust
+from armsight.loop.health import HealthMonitor, Trust
 from armsight.loop.servo import Aim, PoseServo
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Joints, Tabled, Trajectory
@@ -86,7 +86,7 @@ class Closed:
 
     Args:
         servo: the outer loop; one for all motions, as its correction continues from one to the next.
-        trust: returns how far vision may be relied on.
+        health: returns what says how far vision may be relied on.
         trajectory: joint angles over time.
         start_s: when it begins, board's clock, s.
         gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
@@ -95,14 +95,14 @@ class Closed:
     def __init__(
         self,
         servo: PoseServo,
-        trust: Callable[[], Trust],
+        health: Callable[[], HealthMonitor],
         trajectory: Trajectory,
         start_s: float,
         gravity: Callable[[Array], Array],
     ) -> None:
-        self._servo, self._trust, self._trajectory, self._start_s, self._gravity = (
+        self._servo, self._health, self._trajectory, self._start_s, self._gravity = (
             servo,
-            trust,
+            health,
             trajectory,
             start_s,
             gravity,
@@ -116,7 +116,10 @@ class Closed:
     def command(self, estimator: Estimator) -> tuple[JointCommand, str]:
         """Return the corrected reference of the joints, and its basis: vision, bridged, planned."""
         assert self._aim is not None
-        step = self._servo.step(self._aim, estimator, self._trust())
+        health = self._health()
+        trust = health.trust
+        before = health.before if trust is Trust.NONE else None
+        step = self._servo.step(self._aim, estimator, trust, before)
         return step.command, step.mode.name.lower()
 
 
@@ -165,6 +168,6 @@ def planned(gravity: Callable[[Array], Array]) -> Control:
     return lambda trajectory, start_s: Planned(trajectory, start_s, gravity)
 
 
-def closed_on(servo: PoseServo, trust: Callable[[], Trust], gravity: Callable[[Array], Array]) -> Control:
+def closed_on(servo: PoseServo, health: Callable[[], HealthMonitor], gravity: Callable[[Array], Array]) -> Control:
     """Return the control that follows the plan with the loop closed on vision, as far as that may be relied on."""
-    return lambda trajectory, start_s: Closed(servo, trust, trajectory, start_s, gravity)
+    return lambda trajectory, start_s: Closed(servo, health, trajectory, start_s, gravity)

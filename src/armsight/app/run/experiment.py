@@ -391,7 +391,7 @@ def _passes(
     servo = PoseServo(setup.arm, timing(setup, outcome.delay), joint_loops(setup))
     begin = loop.t_s
     try:
-        drive(loop, plan, closed_on(servo, lambda: loop.health.trust, setup.gravity), closed=True, progress=progress)
+        drive(loop, plan, closed_on(servo, lambda: loop.health, setup.gravity), closed=True, progress=progress)
     finally:
         outcome.closed_s = (begin, loop.t_s)
 

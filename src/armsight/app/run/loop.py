@@ -302,7 +302,7 @@ class Loop:
         learn(self.log.joints[len(received) :])  # what arrived meanwhile
         self._write()
         self.estimator = estimator  # its memory covers what is not recorded yet
-        self.health.follow(estimator, self.setup.arm)
+        self.health.follow(estimator, self.setup.arm, mounting.T_base_rig[:3, 2])
 
     def compute(self, work: Callable[[], _Result]) -> _Result:
         """Run a long computation; on hardware the loop continues meanwhile and holds the arm.

@@ -12,6 +12,7 @@ docs/concepts/loop.md.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -142,6 +143,13 @@ class KalmanEstimator:
         P[np.diag_indices(self._at.size)] += np.where(np.diag(P) > 0.0, 0.0, self._model.sigmas**2)
         self._states, self._outliers, self._newest, self._here = [newest._replace(x=x, P=P)], [], None, None
         self._waiting, self._backlash_set = [], False
+
+    def as_before(self, state: Remembered) -> KalmanEstimator:
+        """Return an estimator at the newest reading that knows what this one knew of the arm earlier; it takes nothing."""
+        other = copy(self)
+        other.clock = other.on_innovation = None
+        other.restore(state)
+        return other
 
     def joints(self, states: JointStates) -> None:
         """Take readings of the potentiometers, in order of time."""

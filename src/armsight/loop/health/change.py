@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.special import chdtri
 
 from armsight.data import Array, Record
 from armsight.geometry.pose import adjoint, inverse
@@ -25,6 +26,11 @@ ALIKE = 12.0
 LATER_S = 3.0
 #: The errors of an arm have longer tails than Gaussian ones: chi-squares count by this factor less.
 MARGIN = 1.4
+#: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone: beyond it by chance once in
+#: a hundred.
+_ALONG = float(chdtri(5, 0.01))
+#: What the pair alone cannot distinguish from that.
+FOCAL = "; both focal lengths that changed alike look the same to the pair"
 
 Kind = Literal["rig", "drift", "body", "joint", "backlash", "time", "rate"]
 _CAUSES: dict[Kind, Cause] = {
@@ -213,8 +219,32 @@ _OTHER: dict[Kind, str] = {
 }
 
 
-def finding(changes: Sequence[Change], names: Sequence[str]) -> HealthFinding:
-    """Return the finding of hypotheses that cannot be distinguished, the best first; names are those of the joints."""
+def along_axis(motion: Array, cov: Array, axis: Array) -> bool:
+    """Return whether a motion is one along an axis alone, within its sigma.
+
+    Both focal lengths that are longer by the same share displace all points along the optical axis, in proportion to their
+    depth, and rotate nothing: at one depth that is such a motion of the cameras.
+
+    Args:
+        motion: (6,) tangent [m; rad].
+        cov: (6, 6) its covariance.
+        axis: (3,) unit vector in the same frame.
+    """
+    across = np.zeros((5, 6))
+    across[:2, :3], across[2:, 3:] = np.linalg.svd(axis[None])[2][1:], np.eye(3)
+    off, along = across @ motion, float(axis @ motion[:3])
+    chi_square = float(off @ np.linalg.solve(across @ cov @ across.T, off))
+    return chi_square < _ALONG and along**2 > 4.0 * float(axis @ cov[:3, :3] @ axis)
+
+
+def finding(changes: Sequence[Change], names: Sequence[str], axis: Array | None = None) -> HealthFinding:
+    """Return the finding of hypotheses that cannot be distinguished, the best first.
+
+    Args:
+        changes: they.
+        names: of the joints.
+        axis: (3,) optical axis of the left camera, unit vector in the base's frame; None where that is not known.
+    """
     best, kind, joint = changes[0], changes[0].suspect.kind, changes[0].suspect.joint
     others = [each for each in changes[1:] if {each.suspect.kind, kind} not in ({"rig", "drift"}, {"time", "rate"})]
     unsure = ""
@@ -225,6 +255,10 @@ def finding(changes: Sequence[Change], names: Sequence[str]) -> HealthFinding:
     causes = [each.suspect.cause for each in others]
     if (kind, joint) == ("joint", 0):
         causes.append("fixed")
+    is_fixed = best.suspect.cause == "fixed" and axis is not None
+    if is_fixed and along_axis(*best.newest, best.T_base_tool[:3, :3].T @ axis):
+        causes.append("lens")
+        unsure += FOCAL
     alternatives = tuple(cause for cause in dict.fromkeys(causes) if cause != best.suspect.cause)
     if best.suspect.moves:
         found = _moved_finding(best, unsure)

@@ -21,6 +21,7 @@ from scipy.special import chdtri
 
 from armsight.data import Array, PoseEstimate
 from armsight.geometry.pose import adjoint, inverse, log_se3
+from armsight.loop.health.change import FOCAL, along_axis
 from armsight.loop.health.record import FALSE_ALARMS_PER_MINUTE, HealthFinding
 
 #: Poses of a mean.
@@ -196,16 +197,18 @@ def _cameras(common: tuple[Array, Array], marks: Sequence[_Landmark]) -> HealthF
     m, cov = common
     size = float(np.linalg.norm(m[:3]))
     along = m[:3] / max(size, 1e-12)
+    lens = along_axis(m, cov, np.array([0.0, 0.0, 1.0]))
     begins = [each.newest[2] for each in marks if each.newest is not None and each.newest[2] is not None]
     return HealthFinding(
         "fixed",
         f"both cameras moved together: by {1e3 * size:.2f} mm and {np.degrees(np.linalg.norm(m[3:])):.3f} deg, as "
-        f"{len(marks)} fixed bodies show",
+        f"{len(marks)} fixed bodies show{FOCAL if lens else ''}",
         min(begins) if begins else None,
         1e3 * size,
         1e3 * float(np.sqrt(along @ cov[:3, :3] @ along)),
         "mm",
         "fasten the rig, and run again: that repeats the hand-eye calibration",
+        ("lens",) if lens else (),
     )
 
 

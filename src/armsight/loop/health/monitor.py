@@ -19,7 +19,7 @@ from armsight.loop.health.follow import RigCorrection
 from armsight.loop.health.host import HostWatch
 from armsight.loop.health.landmarks import LandmarkWatch
 from armsight.loop.health.record import HealthFinding, Trust
-from armsight.loop.health.rig import RigWatch
+from armsight.loop.health.rig import TEST_S, RigWatch
 from armsight.robot.arm import Arm
 from armsight.vision.rig import StereoRig
 
@@ -56,6 +56,8 @@ class HealthMonitor:
         self._names: tuple[str, ...] = ()
         self._estimator: KalmanEstimator | None = None
         self._arm: Arm | None = None
+        self._axis: Array | None = None  # optical axis of the left camera (3,), in the base's frame
+        self._cameras_s = np.inf  # since when the cameras are found to have moved, s
         self._known: deque[tuple[float, Remembered]] = deque(maxlen=_KEPT)
         # What was found before a correction: what it put right, and what else.
         self._kept: tuple[HealthFinding, ...] = ()
@@ -74,13 +76,17 @@ class HealthMonitor:
         for pose, t_s in self._poses:
             self._take(pose, t_s)
         self._poses.clear()
-        if self._estimator is not None and (not self._known or self._newest_s - self._known[-1][0] >= _KEEP_S):
+        due = not self._known or self._newest_s - self._known[-1][0] >= _KEEP_S
+        if self._estimator is not None and due and self.trust is not Trust.NONE:
             self._known.append((self._newest_s, self._estimator.remembered()))
         if self._fixed is not None and self._closure is not None:
             for innovation in self._innovations:
                 self._fixed.take(innovation)
                 self._closure.take(innovation)
             self._innovations.clear()
+        if self._rig is not None and self._rig.wrong_at_rest and self._cameras_s == np.inf:
+            begins = [each.since_s for each in self._rig.findings() if each.since_s is not None]
+            self._cameras_s = min(begins, default=-np.inf) - TEST_S
 
     def measured(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
         """Take a measured pose, in order of time; return it with what is suspected added to its covariance.
@@ -118,9 +124,15 @@ class HealthMonitor:
         """Names of the fixed bodies that were seen too rarely to say anything."""
         return () if self._landmarks is None else self._landmarks.never_seen
 
-    def follow(self, estimator: KalmanEstimator, arm: Arm) -> None:
-        """Watch from now on, by what an estimator makes of the poses, whether rig, body and joints stay as they are."""
-        self._estimator, self._arm = estimator, arm
+    def follow(self, estimator: KalmanEstimator, arm: Arm, axis: Array | None = None) -> None:
+        """Watch from now on, by what an estimator makes of the poses, whether rig, body and joints stay as they are.
+
+        Args:
+            estimator: it.
+            arm: the arm.
+            axis: (3,) optical axis of the left camera, unit vector in the base's frame; None where that is not known.
+        """
+        self._estimator, self._arm, self._axis = estimator, arm, axis
         self._known.clear()
         self._begin(estimator, arm)
 
@@ -220,7 +232,7 @@ class HealthMonitor:
         """Begin the tests of cameras and bodies anew."""
         if correction.update is not None:
             self._rig = RigWatch(correction.update.rig, self._body, self._sync_s, printed=self._printed)
-            self._suspected = None
+            self._suspected, self._cameras_s = None, np.inf
         if self._landmarks is not None:
             self._landmarks = LandmarkWatch(self._fixed_names)
 
@@ -231,6 +243,19 @@ class HealthMonitor:
         if doubtful(self.changes) or cameras_moved or (self._rig is not None and self._rig.wrong_at_rest):
             return Trust.NONE
         return Trust.DOUBTED if self._newest_s - self._doubted_s < DOUBT_S else Trust.FULL
+
+    @property
+    def before(self) -> KalmanEstimator | None:
+        """The estimator with what it knew before measured poses became wrong; None where that is not known."""
+        since_s = [each.begin_s for each in self.changes if doubtful([each])]
+        marks = self._landmarks
+        if marks is not None and marks.cameras_moved and marks.of_cameras is not None:
+            since_s.append(-np.inf if marks.of_cameras.since_s is None else marks.of_cameras.since_s)
+        if self._rig is not None and self._rig.wrong_at_rest:
+            since_s.append(self._cameras_s)
+        until_s = min(since_s, default=np.inf) - _DATED_S
+        known = next((state for t_s, state in reversed(self._known) if t_s < until_s), None)
+        return None if known is None or self._estimator is None else self._estimator.as_before(known)
 
     @property
     def changes(self) -> tuple[Change, ...]:
@@ -259,7 +284,7 @@ class HealthMonitor:
         """Return what the estimator saw of a change: its hypotheses, or that it dropped what it had learned."""
         changes = self._every_change
         if changes:
-            return () if self._clocks(changes) else (finding(changes, self._names),)
+            return () if self._clocks(changes) else (finding(changes, self._names, self._axis),)
         return () if self._fixed is None else self._fixed.findings()
 
     def _moved(self) -> tuple[HealthFinding, ...]:
