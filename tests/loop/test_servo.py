@@ -10,7 +10,16 @@ from armsight.data import JointCommand
 from armsight.errors import InputError
 from armsight.loop.estimators import ESTIMATORS, ArmEstimate, Delay, Mounting
 from armsight.loop.health import Trust
-from armsight.loop.servo import MAX_CORRECTION_RAD, RATE_SHARE, STEP_LEVER_M, LoopTiming, Mode, PoseServo, whole_steps
+from armsight.loop.servo import (
+    MAX_CORRECTION_RAD,
+    RATE_SHARE,
+    STEP_LEVER_M,
+    JointLoops,
+    LoopTiming,
+    Mode,
+    PoseServo,
+    whole_steps,
+)
 from armsight.robot.arm_file import open_arm
 from armsight.robot.trajectories import point_to_point
 
@@ -303,3 +312,26 @@ def test_backlash_is_crossed_by_whole_steps_where_that_is_worth_it_and_not_known
     np.testing.assert_allclose(alone, [-17e-3], atol=1e-12)  # 17 steps less 5.2 of backlash
     none = whole_steps(J[:, :1], np.array([-2e-3]), steps[:1], gaps[:, :1])
     np.testing.assert_array_equal(none, 0.0)  # half of 5.2 is more than 2
+
+
+@pytest.mark.parametrize(("rest_s", "moves"), [(0.9, False), (1.5, True)])
+def test_no_change_of_whole_steps_is_begun_that_would_not_be_over_when_the_arm_moves_on(rest_s, moves):
+    class Off:
+        """Sees a tool that is 2 mm from where its joints would bring it."""
+
+        def estimate(self):
+            return ArmEstimate(0.0, self.tool(GOAL[None], None)[0], *[np.eye(6) * 1e-12] * 2, GOAL, np.zeros(6), 0.01)
+
+        def tool(self, q, qd, *, pressed=False):
+            Ts = ARM.forward(q)
+            Ts[:, :3, 3] += 0.002
+            return Ts
+
+    servo = PoseServo(ARM, timing(60, 0.3), JointLoops((np.radians(0.02),) * 6, 0.055))
+    motion, seen, at_rest = point_to_point(ARM, MIDDLE, GOAL), Off(), []
+    for k in range(round((motion.duration_s + rest_s) / PERIOD_S)):
+        aim = servo.aim(motion, k * PERIOD_S, rest_s=rest_s)
+        correction = servo.step(aim, seen).correction
+        if aim.left_s < rest_s - 0.2:
+            at_rest.append(correction)
+    assert (np.ptp(at_rest, axis=0).max() > 0) == moves

@@ -142,6 +142,7 @@ class Aim(Record):
         s: (k,).
         Vt: (k, n).
         passed_s: since the last command, s; the period where that is not known.
+        left_s: until the arm moves on, s.
     """
 
     ahead: Joints
@@ -155,6 +156,7 @@ class Aim(Record):
     s: Array
     Vt: Array
     passed_s: float
+    left_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,13 +199,21 @@ class PoseServo:
         self._look_s, self._looks, self._stepped_to = 0.0, 0, np.zeros(arm.joints)
         self._last: tuple[Trajectory, float] | None = None  # the motion and its time at the last aim
 
-    def aim(self, motion: Trajectory, t_s: float, gravity: Callable[[Array], ArrayLike] = np.zeros_like) -> Aim:
+    def aim(
+        self,
+        motion: Trajectory,
+        t_s: float,
+        gravity: Callable[[Array], ArrayLike] = np.zeros_like,
+        *,
+        rest_s: float = math.inf,
+    ) -> Aim:
         """Return the reference of the next command.
 
         Args:
             motion: the motion under way; a next one must start where the last one ended.
             t_s: time since its start, on the clock of the estimator's newest reading, s.
             gravity: returns the duty (n,) that holds the arm against gravity at joint angles (n,), passed on.
+            rest_s: how long the arm rests after the motion, s, where that is known.
         """
         passed_s = t_s - self._last[1] if self._last is not None and self._last[0] is motion else 0.0
         self._last = motion, t_s
@@ -216,7 +226,8 @@ class PoseServo:
         fastest = self._arm.qd_max * self.timing.period_s
         most = np.minimum(RATE_SHARE * fastest, np.maximum(fastest - np.abs(q[1] - q[0]), 0.0))
         passed_s = passed_s if passed_s > 0.0 else self.timing.period_s
-        return Aim(ahead, q, qd, self._arm.forward(q), most, duty, jacobian, U, s, Vt, passed_s)
+        left_s = motion.duration_s + rest_s - t_s
+        return Aim(ahead, q, qd, self._arm.forward(q), most, duty, jacobian, U, s, Vt, passed_s, left_s)
 
     def step(
         self, aim: Aim, estimator: Estimator, trust: Trust = Trust.FULL, before: Estimator | None = None
@@ -310,6 +321,8 @@ class PoseServo:
         """Return the change (n,) over joints that move by steps: look, move by whole steps, let the joints arrive.
 
         An integral would ask for parts of steps, which their controllers do not make, or make at once when they add up.
+        Some joints go away from their goal first, to come to it from one side: no change is begun after which there is no
+        time left to look.
         """
         assert self._joint_loops is not None
         arrived_s = self.timing.latency_s + self.timing.vision_period_s + self.timing.response_s
@@ -324,10 +337,12 @@ class PoseServo:
             change = whole_steps(
                 aim.jacobian, requested, np.array(self._joint_loops.steps_rad), self._gaps(estimator, aim)
             )
+            takes_s = float((np.abs(change) / (RATE_SHARE * self._arm.qd_max)).max())
+            if takes_s + arrived_s + LOOK_S > aim.left_s:
+                change[:], takes_s = 0.0, 0.0
             self._stepped_to, self._look_s = self._correction + change, arrived_s
             if change.any():  # what the rate lets it take comes on top
-                most = RATE_SHARE * self._arm.qd_max
-                self._look_s, self._looks, self._lasting = -float((np.abs(change) / most).max()), 0, np.zeros(6)
+                self._look_s, self._looks, self._lasting = -takes_s, 0, np.zeros(6)
         return self._stepped_to - self._correction
 
     def _droops(self, estimate: ArmEstimate, aim: Aim) -> None:

@@ -7,6 +7,7 @@ delay is measured with. :func:`drive` makes all motions of a plan with either co
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -90,6 +91,7 @@ class Closed:
         trajectory: joint angles over time.
         start_s: when it begins, board's clock, s.
         gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
+        rest_s: how long the arm rests at its end, s.
     """
 
     def __init__(
@@ -99,19 +101,15 @@ class Closed:
         trajectory: Trajectory,
         start_s: float,
         gravity: Callable[[Array], Array],
+        rest_s: float = math.inf,
     ) -> None:
-        self._servo, self._health, self._trajectory, self._start_s, self._gravity = (
-            servo,
-            health,
-            trajectory,
-            start_s,
-            gravity,
-        )
+        self._servo, self._health, self._trajectory, self._start_s = servo, health, trajectory, start_s
+        self._gravity, self._rest_s = gravity, rest_s
         self._aim: Aim | None = None
 
     def prepare(self, t_s: float) -> None:
         """Compute the reference of the tool one period from now."""
-        self._aim = self._servo.aim(self._trajectory, t_s - self._start_s, self._gravity)
+        self._aim = self._servo.aim(self._trajectory, t_s - self._start_s, self._gravity, rest_s=self._rest_s)
 
     def command(self, estimator: Estimator) -> tuple[JointCommand, str]:
         """Return the corrected reference of the joints, and its basis: vision, bridged, planned."""
@@ -125,8 +123,8 @@ class Closed:
 
 #: Longest rest in open loop, s, beyond what the board lags: there is no correction that has to settle.
 OPEN_REST_S = 0.5
-#: Makes a controller from a trajectory and the time at which it begins, board's clock, s.
-Control = Callable[[Trajectory, float], Controller]
+#: Makes a controller from a trajectory, the time at which it begins, board's clock, s, and how long the arm then rests, s.
+Control = Callable[[Trajectory, float, float], Controller]
 
 
 def drive(
@@ -155,7 +153,7 @@ def drive(
     open_s = OPEN_REST_S + 2.0 * loop.setup.board.abilities.latency_s
     for motion in plan.motions:
         progress(f"{'loop closed on vision' if closed else 'potentiometers alone'}: {motion.name}")
-        controller = control(Tabled(motion.trajectory), loop.t_s)
+        controller = control(Tabled(motion.trajectory), loop.t_s, motion.rest_s)
         segment = RunSegment(phase, motion.name, motion.kind, closed, trajectory=motion.trajectory)
         started(motion.name, motion.kind, motion.trajectory.duration_s)
         loop.run(controller, motion.trajectory.duration_s, segment)
@@ -165,9 +163,9 @@ def drive(
 
 def planned(gravity: Callable[[Array], Array]) -> Control:
     """Return the control that follows the plan with potentiometers alone."""
-    return lambda trajectory, start_s: Planned(trajectory, start_s, gravity)
+    return lambda trajectory, start_s, rest_s: Planned(trajectory, start_s, gravity)
 
 
 def closed_on(servo: PoseServo, health: Callable[[], HealthMonitor], gravity: Callable[[Array], Array]) -> Control:
     """Return the control that follows the plan with the loop closed on vision, as far as that may be relied on."""
-    return lambda trajectory, start_s: Closed(servo, health, trajectory, start_s, gravity)
+    return lambda trajectory, start_s, rest_s: Closed(servo, health, trajectory, start_s, gravity, rest_s)

@@ -212,7 +212,7 @@ _OTHER: dict[Kind, str] = {
     "rig": "a rig that moved",
     "drift": "a rig that drifts",
     "body": "a body that slipped on the tool",
-    "joint": "a potentiometer of {name} that slipped",
+    "joint": "a sensor of {name} that slipped",
     "backlash": "more backlash of {name}",
     "time": "a clock that jumped",
     "rate": "a clock of another rate",
@@ -276,8 +276,8 @@ def _joint_finding(change: Change, names: Sequence[str], unsure: str) -> HealthF
         what, advice = f"the backlash of {names[joint]} {grew} by {abs(size):.2f} deg", "look at the gear of this joint"
     else:
         same = ", or the rig rotated about the axis of this joint: the two look alike" if joint == 0 else ""
-        what = f"the potentiometer of {names[joint]} slipped by {size:.2f} deg{same}"
-        advice = "fasten the potentiometer on its shaft, and set its zero"
+        what = f"the sensor of {names[joint]} slipped by {size:.2f} deg against its link{same}"
+        advice = "fasten the potentiometer, or the belt behind a motor's encoder, and set its zero (an AR4: home it)"
     return HealthFinding("joint", what + unsure, change.begin_s, size, sigma, "deg", advice)
 
 
