@@ -24,6 +24,7 @@ from marker_report import Report
 SIZE = (1280, 720)
 SKEW_S, READOUT_S = 5e-3, 14e-3
 SPEEDS, SHOTS, SEEDS, RATE_HZ = (0.3, 0.1, 0.5), 20, 20, 30.0
+STEP_S = 1e-3
 NOTHING = Shutters(0.0, 0.0, np.zeros((2, 2)))
 
 
@@ -59,8 +60,8 @@ def recorded(seed: int, speed: float, skew_s: float, readout_s: float) -> tuple[
         images = []
         for side, camera in enumerate(rig.cameras):
             t = k / RATE_HZ + side * skew_s
-            twist = log_se3(inverse(at(t - 1e-4)) @ at(t + 1e-4)) / 2e-4
-            view = PosedBody(patterns, at(t), twist)
+            before, after = (log_se3(inverse(at(t)) @ at(t + h)) for h in (-STEP_S, STEP_S))
+            view = PosedBody(patterns, at(t), (after - before) / (2 * STEP_S), (after + before) / STEP_S**2)
             view = view.seen_from(inverse(rig.T_left_right)) if side else view
             light = radiance(
                 camera, [view], behind[side], psf_sigma_px=pipeline.psf_sigma_px, shutter=pipeline.shutter(SIZE[1])

@@ -202,12 +202,17 @@ def test_motion_blur_is_the_mean_over_the_exposure():
 def test_each_row_of_a_rolling_shutter_sees_its_own_moment():
     cam, board = camera("brown5", (120, 90), 110.0), chessboard(4, 3, 0.03)
     T, twist = at_pose(-0.04, -0.02, 0.3, 0.1, 0.2, 0.1), np.array([0.8, 0.0, 0.1, 0.0, 1.0, 2.0])
+    acceleration = np.array([20.0, -30.0, 0.0, 0.0, 0.0, 40.0])
     row_s = 1e-3
     light = radiance(
-        cam, [PosedBody((board,), T, twist)], psf_sigma_px=0.0, shutter=Shutter(exposure_s=0.0, row_s=row_s)
+        cam,
+        [PosedBody((board,), T, twist, acceleration)],
+        psf_sigma_px=0.0,
+        shutter=Shutter(exposure_s=0.0, row_s=row_s),
     )
     for v in (10, 44, 70):
-        at = T @ exp_se3((v - 44.5) * row_s * twist)
+        time = (v - 44.5) * row_s
+        at = T @ exp_se3(time * twist + 0.5 * time**2 * acceleration)
         row = brute(cam, [(board, at)], (0, v, 120, v + 1), 0.0, samples=64)[0]
         np.testing.assert_allclose(light[v], row, atol=0.5 / 64 + 1e-3)
 

@@ -180,7 +180,8 @@ def radiance(
         canvas = _Canvas(camera, background)
         for body in ordered:
             moving = shutter.row_s and body.twist.any()
-            Ts = body.T_camera_body @ exp_se3(np.outer((rows if moving else np.zeros(1)) + time, body.twist))
+            t = (rows if moving else np.zeros(1)) + time
+            Ts = body.T_camera_body @ exp_se3(np.outer(t, body.twist) + np.outer(0.5 * t * t, body.acceleration))
             for pattern in body.patterns:
                 canvas.paint(pattern, Ts)
         total += np.float32(weight) * blurred(canvas.coarse, canvas.slot, canvas.fine[: canvas.count], psf_sigma_px)

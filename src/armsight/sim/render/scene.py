@@ -9,7 +9,7 @@ Reflectance is the grey a sensor of unit gain would read, 0 black to 1 white; mo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -65,16 +65,19 @@ class PosedBody(Record):
     Attributes:
         patterns: what is on the body, painted in this order: a tag comes after the plate it is stuck on.
         T_camera_body: (4, 4) pose in the camera's frame in the middle of the exposure of the middle row, m.
-        twist: (6,) velocity [m/s; rad/s] in the body's axes: at time t the pose is T_camera_body @ exp_se3(t twist).
+        twist: (6,) velocity [m/s; rad/s] in the body's axes.
+        acceleration: (6,) its change, m/s^2 and rad/s^2: at time t the pose is T_camera_body @ exp_se3(t twist +
+            t^2 acceleration / 2).
     """
 
     patterns: tuple[Pattern, ...]
     T_camera_body: Array
     twist: Array = field(default_factory=lambda: np.zeros(6))
+    acceleration: Array = field(default_factory=lambda: np.zeros(6))
 
     def seen_from(self, T_other_camera: Array) -> PosedBody:
-        """Return the body in another camera's frame; the twist is the body's own and stays."""
-        return PosedBody(self.patterns, T_other_camera @ self.T_camera_body, self.twist)
+        """Return the body in another camera's frame; its motion is the body's own and stays."""
+        return replace(self, T_camera_body=T_other_camera @ self.T_camera_body)
 
 
 def plate(
