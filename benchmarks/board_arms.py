@@ -97,10 +97,11 @@ def arm_configuration(model, rng):
 
 
 def brought_up_configuration(model, rng):
-    """What a bring-up finds and stores: R to 3 %, K to 1.5 %, a current's gain with both; gains and limits by its rules."""
+    """What a bring-up stores: R to 3 %, K to 1.5 %, backlash to a third, a current's gain with them; the rest by rules."""
     config = arm_configuration(model, rng)
     seen_ohm = model.resistance_ohm / model.current_gain * rng.uniform(0.97, 1.03, 6)
     seen_v_s = model.constant_v_s * rng.uniform(0.985, 1.015, 6)
+    seen_rad = model.backlash_rad * rng.uniform(0.67, 1.33, 6)
     for i, joint in enumerate(config["joint"]):
         noise_rad = float(model.noise_counts[i]) / COUNTS_PER_RAD
         motor = MotorFigures(
@@ -113,8 +114,9 @@ def brought_up_configuration(model, rng):
         joint["gains"] = np.array(
             tuple(tuned_gains(motor, SUPPLY_V, quiet_bandwidth(motor, SUPPLY_V, noise_rad))), GAINS
         )
-        apart_rad = max(0.03, 10 * noise_rad + 1.5 * float(model.backlash_rad[i]))
-        joint["motor"] = (motor.resistance_ohm, motor.constant_v_s, apart_rad)
+        backlash_rad = 1.5 * float(seen_rad[i])
+        apart_rad = max(0.03, 10 * noise_rad + backlash_rad)
+        joint["motor"] = (motor.resistance_ohm, motor.constant_v_s, apart_rad, backlash_rad)
         speed, acceleration = motion_limits(motor, SUPPLY_V, abs(float(model.gravity_n_m[i])))
         joint["speed_limit_rad_s"], joint["jerk_rad_s3"] = speed, 100 * acceleration
         joint["acceleration_rad_s2"] = joint["deceleration_rad_s2"] = acceleration
@@ -325,6 +327,21 @@ def healthy(library, seed, table):
     table.add("swing", arm, ())
 
 
+def slow(library, seed, table):
+    """Joints with speed limits of 0.1 to 0.7 rad/s, which swing at 0.8 of them and rest."""
+    rng = np.random.default_rng([seed, 10])
+    model = drawn_model(seed)
+    config = arm_configuration(model, rng)
+    limits = config["joint"]["speed_limit_rad_s"] = rng.uniform(0.1, 0.7, 6)
+    arm = Arm(library, seed, model=model, config=config)
+    arm.speed_rad_s = 0.8 * np.minimum(arm.speed_rad_s, limits)
+    arm.enable()
+    arm.rest(200)
+    arm.swing(4000)
+    arm.rest(800)
+    table.add("slow swing", arm, ())
+
+
 def pushed(library, seed, table):
     arm = Arm(library, seed)
     arm.enable()
@@ -426,6 +443,7 @@ def main():
         "loaded": loaded_suddenly,
         "soft": soft_limit,
         "jumping": jumping_host,
+        "slow": slow,
     }
     sizes = {
         PotFault.STUCK: lambda r: 0.0,

@@ -177,7 +177,8 @@ def test_a_name_that_is_too_long_is_reported(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "said"), [(None, "no such file"), (b"\xff\xfe", "not a text file"), (..., "cannot be read: Is a dir")]
+    ("content", "said"),
+    [(None, "no such file"), (b"\xff\xfe\x00\xd8", "not a text file"), (..., "cannot be read: Is a dir")],
 )
 def test_reading_says_what_is_wrong(tmp_path, content, said):
     path = tmp_path / "file"

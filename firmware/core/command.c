@@ -18,7 +18,7 @@ static void start_joint(joint_state *joint, const joint_config *config, uint32_t
     joint->pid.speed_rad_s = speed_rad_s; /* the filter runs on: a coasting joint is braked from the first tick */
     setpoint_hold(&joint->setpoint, angle_rad);
     governor_hold(&joint->reference, angle_rad);
-    motor_start(&joint->motor, angle_rad, i);
+    motor_start(&joint->motor, angle_rad, config->speed_limit_rad_s, i);
     joint->released = 0u;
     joint->suspect = FAULT_NONE;
     pot_watch(&joint->pot, angle_rad);
@@ -111,20 +111,17 @@ static uint32_t clear_stop(core_state *core, bool pressed)
 static uint32_t check_move(const core_state *core, const move_command *move)
 {
     const bool lasts = move->duration_ticks >= 1u && move->duration_ticks <= 10000u;
-    uint32_t rejection = lasts ? REJECTION_NONE : REJECTION_OUT_OF_RANGE;
+    float nothing = 0.0f; /* stays so unless a number is none */
+    float most_duty = 0.0f;
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {
-        const float gravity_duty = move->gravity_duty[i];
-        if (!number_finite(move->position_rad[i]) || !number_finite(move->speed_rad_s[i])) {
-            return REJECTION_NOT_FINITE;
-        }
-        if (!(number_size(gravity_duty) <= 1.0f)) {
-            if (!number_finite(gravity_duty)) {
-                return REJECTION_NOT_FINITE;
-            }
-            rejection = REJECTION_OUT_OF_RANGE;
-        }
+        const float duty = number_size(move->gravity_duty[i]);
+        nothing += 0.0f * move->position_rad[i] + 0.0f * move->speed_rad_s[i] + 0.0f * duty;
+        most_duty = duty > most_duty ? duty : most_duty;
     }
-    return rejection;
+    if (nothing != 0.0f) {
+        return REJECTION_NOT_FINITE;
+    }
+    return lasts && most_duty <= 1.0f ? REJECTION_NONE : REJECTION_OUT_OF_RANGE;
 }
 
 static void move_joint(joint_state *joint, const joint_config *config, const move_command *move, uint32_t i)

@@ -38,7 +38,7 @@ static const joint_config factory_joint = {
             .jump_rad = 0.02f,
             .frozen_rad = 0.1f,
             .inverted_rad = 0.1f},
-    .motor = {.constant_v_s = 1.0f, .apart_rad = 0.03f},
+    .motor = {.constant_v_s = 1.0f, .apart_rad = 0.03f, .backlash_rad = 0.01f},
     .soft_min_rad = -2.4f,
     .soft_max_rad = 2.4f,
     .speed_limit_rad_s = 0.5f,
@@ -117,7 +117,7 @@ static bool sensor_is_valid(const joint_config *joint)
 static bool motor_is_valid(const motor_config *motor)
 {
     return number_within(motor->resistance_ohm, 0.0f, 1000.0f) && number_within(motor->constant_v_s, 1e-3f, 1e3f) &&
-           number_within(motor->apart_rad, 1e-3f, 1.0f);
+           number_within(motor->apart_rad, 1e-3f, 1.0f) && number_within(motor->backlash_rad, 0.0f, 1.0f);
 }
 
 /* Return whether a potentiometer's table reaches the soft limits, within its band. */
@@ -143,11 +143,12 @@ static bool encoder_is_consistent(const joint_config *joint)
     return within && step_rad <= 0.5f * joint->pot.jump_rad && step_rad <= 0.5f * joint->pot.frozen_rad;
 }
 
-/* Return whether the numbers fit each other: a stall shows below the duty's limit, the sensor reaches the soft limits. */
+/* Return whether the numbers fit each other: a stall shows below the duty's limit, the sensor reaches the soft limits, a
+ * healthy gear's backlash leaves motor and sensor together. */
 static bool joint_is_consistent(const joint_config *joint)
 {
     const bool own = joint->encoder.sensor == SENSOR_POTENTIOMETER ? table_is_consistent(joint) : encoder_is_consistent(joint);
-    return own && joint->stall_duty <= joint->duty_limit && joint->speed_limit_rad_s * TICK_S < joint->pot.jump_rad;
+    return own && joint->motor.backlash_rad < joint->motor.apart_rad && joint->stall_duty <= joint->duty_limit && joint->speed_limit_rad_s * TICK_S < joint->pot.jump_rad;
 }
 
 /* Return whether no two quadrature encoders are on one timer. */
@@ -165,6 +166,8 @@ static bool inputs_differ(const core_config *config)
     return true;
 }
 
+static bool word_within(uint32_t word, uint32_t least, uint32_t most) { return word >= least && word <= most; }
+
 static bool joint_is_valid(const joint_config *joint)
 {
     return pid_gains_in_range(&joint->gains) && sensor_is_valid(joint) && motor_is_valid(&joint->motor) &&
@@ -177,10 +180,9 @@ static bool joint_is_valid(const joint_config *joint)
            number_within(joint->current_cut_per_a_s, 0.0f, 1000.0f) &&
            number_within(joint->following_rad, 1e-3f, 13.0f) && number_within(joint->stall_duty, 0.01f, 1.0f) &&
            number_within(joint->stall_rad, 1e-4f, 1.0f) &&
+           word_within(joint->current_limit_ma, 10u, 100000u) &&
            (joint->motor_direction == 1 || joint->motor_direction == -1) && joint_is_consistent(joint);
 }
-
-static bool ticks_within(uint32_t ticks, uint32_t least, uint32_t most) { return ticks >= least && ticks <= most; }
 
 bool config_is_valid(const core_config *config)
 {
@@ -192,13 +194,14 @@ bool config_is_valid(const core_config *config)
             return false;
         }
     }
-    return inputs_differ(config) && config->supply_min_mv < config->supply_max_mv && ticks_within(config->supply_nominal_mv, 1000u, 100000u) &&
-           ticks_within(config->overload_ticks, 1u, 10000u) && ticks_within(config->brake_release_ticks, 0u, 1000u) &&
-           ticks_within(config->brake_engage_ticks, 0u, 1000u) && ticks_within(config->supply_ticks, 1u, 1000u) &&
-           ticks_within(config->pot_ticks, 1u, 100u) && ticks_within(config->following_ticks, 1u, 10000u) &&
-           ticks_within(config->stall_ticks, 1u, 10000u) && ticks_within(config->silence_ticks, 2u, 60000u) &&
-           (config->sync_led_pin == 0u || ticks_within(config->sync_led_pin, 16u, 143u)) &&
-           ticks_within(config->sync_led_ticks, 1u, 100u) &&
+    return inputs_differ(config) && config->supply_min_mv < config->supply_max_mv &&
+           config->supply_min_mv >= config->supply_nominal_mv / 2u && word_within(config->supply_nominal_mv, 1000u, 100000u) &&
+           word_within(config->overload_ticks, 1u, 10000u) && word_within(config->brake_release_ticks, 0u, 1000u) &&
+           word_within(config->brake_engage_ticks, 0u, 1000u) && word_within(config->supply_ticks, 1u, 1000u) &&
+           word_within(config->pot_ticks, 1u, 100u) && word_within(config->following_ticks, 1u, 10000u) &&
+           word_within(config->stall_ticks, 1u, 10000u) && word_within(config->silence_ticks, 2u, 60000u) &&
+           (config->sync_led_pin == 0u || word_within(config->sync_led_pin, 16u, 143u)) &&
+           word_within(config->sync_led_ticks, 1u, 100u) &&
            (config->silence_reaction == REACTION_HOLD || config->silence_reaction == REACTION_RELEASE);
 }
 

@@ -8,7 +8,7 @@
 #include "types.h"
 
 #define CONFIG_MAGIC 0x31435341u /* "ASC1" as bytes in memory */
-#define CONFIG_VERSION 4u        /* goes up whenever core_config changes its layout or meaning */
+#define CONFIG_VERSION 5u        /* goes up whenever core_config changes its layout or meaning */
 
 /* Return the CRC-32 (IEEE 802.3, as zlib's) of length bytes. */
 uint32_t config_crc(const void *bytes, uint32_t length);

@@ -4,13 +4,14 @@
 #define PRIOR_VARIANCE 0.005625f /* of R and K over the configuration's: 0.075^2, so that three sigma of both cover 15 % */
 #define WANDER_VARIANCE 6e-9f /* by which each becomes less certain per tick: windings get warm */
 #define SIGMAS 3.0f
-#define SCALE_LOW 0.8f        /* further off than so is no tolerance of a motor */
+#define SCALE_LOW 0.8f        /* further off than so is no resistance's tolerance, warm or cold */
 #define SCALE_HIGH 1.25f
+#define CONSTANT_LOW (1.0f - CONSTANT_OFF)
+#define CONSTANT_HIGH (1.0f + CONSTANT_OFF)
 #define WINDOW_TICKS 32u      /* R and K are learnt from a window: until the reading has moved, looked at as often, */
 #define REST_TICKS 256u       /* or has rested for so long */
-#define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer; */
-#define REST_NOISE_RAD 0.0035f /* that and what a resting motor may still move; */
-#define BACKLASH_NOISE_RAD 0.01f /* and the gear's backlash, wherever the motor may have crossed it */
+#define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
+#define RESTING 0.5f          /* of the backlash: two positions in it are a sigma of 0.41 apart */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
 #define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
 #define SAMPLE_TICKS 8u
@@ -20,16 +21,21 @@
 #define CAREFUL 0.5f          /* of the speed limit until then: a reading of a third of the true speed is no faster joint */
 #define CONSTANT_OFF 0.15f    /* by so much a motor's constant may be off */
 #define UNKNOWN_RAD_S 1000.0f
+#define SEEN_RAD_S 0.5f       /* above a motor's speed in one tick by noise: no slower joint is held to its limit by it */
+#define SIDE_UNKNOWN 0
+#define REVERSAL_TICKS 64u    /* in a longer window than so a joint may have reversed and come back */
 #define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
 #define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
 
-void motor_start(motor_state *motor, float angle_rad, uint32_t phase)
+void motor_start(motor_state *motor, float angle_rad, float speed_limit_rad_s, uint32_t phase)
 {
     const float duty = motor->duty;
     *motor = (motor_state){.duty = duty,
+                           .fastest_rad_s = speed_limit_rad_s > SEEN_RAD_S ? speed_limit_rad_s : SEEN_RAD_S,
                            .last_rad = angle_rad,
                            .window_rad = angle_rad,
                            .window_ticks = phase,
+                           .window_side = SIDE_UNKNOWN,
                            .resistance_scale = 1.0f,
                            .constant_scale = 1.0f,
                            .variance_rr = PRIOR_VARIANCE,
@@ -68,20 +74,16 @@ static void earn(motor_state *motor, const motor_config *config, float way_rad)
     way_begin(motor);
 }
 
-/* Return how far the motor's way over a window may be from the reading's, and remember which way it went. A gear that goes
- * on to the side where its teeth lie already, and a motor that goes on resting, cross no backlash. */
+/* Return how far the motor's way over a window may be from the reading's, and remember which way it went. Only a gear that
+ * goes on to the side where its teeth lie already crosses no backlash: a motor that rests may be anywhere between them. */
 static float window_noise(motor_state *motor, const motor_config *config, float way_rad)
 {
     const bool moved = number_size(way_rad) > WINDOW_WAY_RAD;
-    const int32_t side = moved ? (way_rad > 0.0f ? 1 : -1) : 0;
-    const bool goes_on = side == motor->window_side;
+    const int32_t side = moved ? (way_rad > 0.0f ? 1 : -1) : SIDE_UNKNOWN;
+    const bool goes_on = side == motor->window_side && moved && motor->window_ticks <= REVERSAL_TICKS;
     motor->window_side = side;
-    if (moved) {
-        return goes_on ? WINDOW_NOISE_RAD : BACKLASH_NOISE_RAD;
-    }
-    const float emf_v = motor->window_v - motor->resistance_scale * motor->window_ir_v;
-    const bool rests = number_size(emf_v) * TICK_S < WINDOW_WAY_RAD * config->constant_v_s;
-    return goes_on && rests ? REST_NOISE_RAD : BACKLASH_NOISE_RAD;
+    const float crossed = goes_on ? 0.0f : moved ? 1.0f : RESTING;
+    return WINDOW_NOISE_RAD + crossed * config->backlash_rad;
 }
 
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
@@ -106,7 +108,7 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
             number_clamp(motor->resistance_scale + gain_r * off_v * per_variance, SCALE_LOW, SCALE_HIGH);
         if (moved) { /* else the constant is only taken into account (Schmidt's form) */
             motor->constant_scale =
-                number_clamp(motor->constant_scale + gain_k * off_v * per_variance, SCALE_LOW, SCALE_HIGH);
+                number_clamp(motor->constant_scale + gain_k * off_v * per_variance, CONSTANT_LOW, CONSTANT_HIGH);
             motor->variance_kk += wander - gain_k * gain_k * per_variance;
         }
         motor->variance_rr -= gain_r * gain_r * per_variance;
@@ -151,6 +153,7 @@ void motor_pause(motor_state *motor, float angle_rad)
     motor->last_rad = angle_rad;
     motor->unsure_rad_s = UNKNOWN_RAD_S;
     motor->sure_rad_s = 0.0f;
+    motor->window_side = SIDE_UNKNOWN; /* backlash may be crossed meanwhile */
     window_begin(motor, angle_rad);
 }
 
@@ -185,13 +188,17 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     const float voltage_v = motor->duty * supply_v;
     const float ir_v = current_a * config->resistance_ohm;
     const float emf_v = voltage_v - motor->resistance_scale * ir_v;
-    motor->speed_rad_s = emf_v / (motor->constant_scale * config->constant_v_s);
+    const bool sampled = (motor->driven_ticks + motor->phase) % SAMPLE_TICKS == 0u || motor->unsure_rad_s == UNKNOWN_RAD_S;
+    if (sampled) {
+        motor->per_constant = 1.0f / (motor->constant_scale * config->constant_v_s);
+    }
+    motor->speed_rad_s = emf_v * motor->per_constant;
     const float keep = 1.0f - TICK_S / FADE_S;
     const float travelled_rad = motor->speed_rad_s * TICK_S;
     motor->travel_rad += travelled_rad;
     const float seen_a = number_size(current_a);
     motor->current_a = seen_a > keep * motor->current_a ? seen_a : keep * motor->current_a;
-    if ((motor->driven_ticks + motor->phase) % SAMPLE_TICKS == 0u || motor->unsure_rad_s == UNKNOWN_RAD_S) {
+    if (sampled) {
         sample(motor, config, ir_v, emf_v, angle_rad);
     }
     motor->gap_rad = keep * motor->gap_rad + moved_rad - travelled_rad;
@@ -332,7 +339,7 @@ uint32_t motor_names(const motor_state *motor, uint32_t suspect)
 
 #define SWING_TICKS 60u   /* a swing of 8 Hz and faster changes its side as often */
 #define SWINGS 8u         /* so many changes are no answer to anything */
-#define SWING_RAD_S 0.3f  /* as far from the reference's speed at least */
+#define SWING_RAD_S 0.4f  /* as far from the reference's speed at least */
 
 bool motor_swings_far(motor_state *motor, float off_rad_s)
 {
@@ -350,12 +357,12 @@ bool motor_swings_far(motor_state *motor, float off_rad_s)
 }
 
 #define FAST_TICKS 30u
-#define FAST 1.08f /* of the limit: by both witnesses */
+#define FAST 1.08f /* of what it is held to: by both witnesses */
 
-bool motor_is_fast(motor_state *motor, float reading_rad_s, float speed_limit_rad_s)
+bool motor_is_fast(motor_state *motor, float reading_rad_s)
 {
-    const float fast_rad_s = FAST * speed_limit_rad_s;
-    const bool fast = number_size(motor->speed_rad_s) > fast_rad_s && number_size(reading_rad_s) > speed_limit_rad_s;
+    const float fast_rad_s = FAST * motor->fastest_rad_s;
+    const bool fast = number_size(motor->speed_rad_s) > fast_rad_s && number_size(reading_rad_s) > motor->fastest_rad_s;
     motor->fast_ticks = fast ? number_add(motor->fast_ticks, WATCH_TICKS) : 0u;
     return motor->fast_ticks >= FAST_TICKS;
 }

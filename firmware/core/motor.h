@@ -8,10 +8,11 @@
 #include "number.h"
 #include "types.h"
 
-#define MOTOR_WITNESS 0.1f /* of the speed limit: so much faster than the reading it must be to count */
+#define MOTOR_WITNESS 0.1f /* of the speed it is held to: so much faster than the reading it must be to count */
 
-/* Begin to watch a joint that reads angle_rad; phase differs from joint to joint, so that not all are sampled at once. */
-void motor_start(motor_state *motor, float angle_rad, uint32_t phase);
+/* Begin to watch a joint that reads angle_rad and has this speed limit; phase differs from joint to joint, so that not
+ * all are sampled at once. */
+void motor_start(motor_state *motor, float angle_rad, float speed_limit_rad_s, uint32_t phase);
 
 /* Let a tick pass in which the voltage at the motor is not known. */
 void motor_pause(motor_state *motor, float angle_rad);
@@ -21,9 +22,9 @@ void motor_pause(motor_state *motor, float angle_rad);
 void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad);
 
 /* Return the joint's speed: the reading's, or the motor's where that is faster beyond all its uncertainty. */
-static inline float motor_witness(const motor_state *motor, float reading_rad_s, float speed_limit_rad_s)
+static inline float motor_witness(const motor_state *motor, float reading_rad_s)
 {
-    const float faster_rad_s = motor->sure_rad_s - MOTOR_WITNESS * speed_limit_rad_s;
+    const float faster_rad_s = motor->sure_rad_s - MOTOR_WITNESS * motor->fastest_rad_s;
     return faster_rad_s > number_size(reading_rad_s) ? motor->speed_rad_s : reading_rad_s;
 }
 
@@ -52,8 +53,8 @@ static inline bool motor_swings(motor_state *motor, float reference_rad_s, float
     return number_size(off_rad_s) > MOTOR_SWING * speed_limit_rad_s && motor_swings_far(motor, off_rad_s);
 }
 
-/* Return whether the joint has been faster than its limit (rad/s) long enough to be sure; fast_rad_s is what the reading
- * says of it. To be asked each WATCH_TICKS. */
-bool motor_is_fast(motor_state *motor, float reading_rad_s, float speed_limit_rad_s);
+/* Return whether the joint has been faster than it may be long enough to be sure; reading_rad_s is what the reading says
+ * of it. To be asked each WATCH_TICKS. */
+bool motor_is_fast(motor_state *motor, float reading_rad_s);
 
 #endif

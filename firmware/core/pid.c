@@ -7,6 +7,7 @@
 #define BEYOND 2.0f       /* so much more is a speed damped beyond its limit */
 #define BRAKE_S 0.003f    /* a few ticks: less, and a motor's speed measured a tick late swings */
 #define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up */
+#define LOADED 0.25f      /* of the speed limit: a joint far from its reference that is slower is held back by a load */
 #define CREEP_RAD_S 0.005f /* from here on dry friction is compensated by half and more */
 
 void pid_reset(pid_state *pid, float measured_rad)
@@ -19,11 +20,15 @@ extern inline void pid_measure(pid_state *, const joint_gains *, float);
 /* Return the duty asked for held to the limits, and say which of them held it. */
 INLINE float limited_duty(const pid_state *pid, const pid_demand *demand, float asked, uint32_t *limited)
 {
+    const float slew_duty = demand->duty_slew_per_s * TICK_S;
+    if (asked >= demand->duty_low && asked <= demand->duty_high && number_size(asked - pid->duty) <= slew_duty) {
+        return asked;
+    }
     const float within = number_clamp(asked, demand->duty_low, demand->duty_high);
     if (within != asked) {
         *limited |= number_size(within) < demand->duty_limit ? LIMITED_CURRENT : LIMITED_DUTY;
     }
-    const float reached = number_towards(pid->duty, within, demand->duty_slew_per_s * TICK_S);
+    const float reached = number_towards(pid->duty, within, slew_duty);
     if (reached != within) {
         *limited |= LIMITED_SLEW;
     }
@@ -33,6 +38,20 @@ INLINE float limited_duty(const pid_state *pid, const pid_demand *demand, float 
 /* Return a direction, -1 to 1, without a jump where it changes. */
 static float direction_of(float speed_rad_s) { return speed_rad_s / (number_size(speed_rad_s) + CREEP_RAD_S); }
 
+/* Return the error that the integral gathers while the spring is bounded: what a joint that a load holds back or drives
+ * away lacks of a share of its speed limit, by whichever is faster, reading or motor. A joint that moves on gathers none. */
+static float bounded_error(const joint_gains *gains, const pid_demand *demand, float spring)
+{
+    if (gains->kp_per_rad <= 0.0f) {
+        return 0.0f;
+    }
+    const float damped_rad_s = demand->damped_rad_s;
+    const float motor_rad_s = demand->motor_rad_s;
+    const float fast_rad_s = number_size(motor_rad_s) > number_size(damped_rad_s) ? motor_rad_s : damped_rad_s;
+    const float lacking = LOADED * spring - (gains->kd_s_per_rad + demand->own_s_per_rad) * fast_rad_s;
+    return lacking * spring > 0.0f ? lacking / gains->kp_per_rad : 0.0f;
+}
+
 /* The law; inline, so that pid_control needs no demand in memory. */
 INLINE float step(pid_state *pid, const joint_gains *gains, const pid_demand *demand, uint32_t *limited)
 {
@@ -40,7 +59,7 @@ INLINE float step(pid_state *pid, const joint_gains *gains, const pid_demand *de
     /* However far the reference is away: the joint is not driven to it faster than its speed limit. */
     const float requested = gains->kp_per_rad * error_rad + gains->kv_s_per_rad * demand->reference_rad_s;
     const float spring = number_bound(requested, demand->spring_limit);
-    const float gathered_rad = spring == requested ? error_rad : 0.0f; /* nor does the integral make it faster */
+    const float gathered_rad = spring == requested ? error_rad : bounded_error(gains, demand, spring);
     const float forward = gains->ka_s2_per_rad * demand->reference_rad_s2 +
                           gains->kf_duty * direction_of(demand->reference_rad_s) + demand->gravity_duty;
     const float asked = spring + pid->integral_duty - gains->kd_s_per_rad * demand->damped_rad_s + forward;
@@ -93,8 +112,9 @@ void pid_control(joint_state *joint, const joint_config *config, float per_nomin
     float duty_low = -joint->duty_cap;
     float duty_high = joint->duty_cap;
     const float own_s_per_rad = config->motor.constant_v_s * per_nominal_v;
-    const float free_duty = config->speed_limit_rad_s * own_s_per_rad;
-    const float faster_rad_s = joint->motor.sure_rad_s - config->speed_limit_rad_s;
+    const float fastest_rad_s = joint->motor.fastest_rad_s;
+    const float free_duty = fastest_rad_s * own_s_per_rad;
+    const float faster_rad_s = joint->motor.sure_rad_s - fastest_rad_s;
     if (faster_rad_s > 0.0f) { /* it is driven on as a free motor at its limit, less what brings it back there in BRAKE_S */
         const float left_duty = free_duty - config->gains.ka_s2_per_rad * (1.0f / BRAKE_S) * faster_rad_s;
         if (joint->motor.speed_rad_s > 0.0f) {
@@ -104,14 +124,16 @@ void pid_control(joint_state *joint, const joint_config *config, float per_nomin
         }
         joint->limited |= LIMITED_SPEED;
     }
-    const float seen_rad_s = motor_witness(&joint->motor, joint->pid.speed_rad_s, config->speed_limit_rad_s);
-    const float beyond_rad_s = number_size(seen_rad_s) - config->speed_limit_rad_s;
+    const float seen_rad_s = motor_witness(&joint->motor, joint->pid.speed_rad_s);
+    const float beyond_rad_s = number_size(seen_rad_s) - fastest_rad_s;
     const float more_rad_s = beyond_rad_s > 0.0f ? BEYOND * beyond_rad_s : 0.0f;
     const pid_demand demand = {.reference_rad = joint->reference.position_rad,
                                .reference_rad_s = joint->reference.speed_rad_s,
                                .reference_rad_s2 = joint->reference.acceleration_rad_s2,
                                .damped_rad_s = seen_rad_s + (seen_rad_s > 0.0f ? more_rad_s : -more_rad_s),
                                .spring_limit = spring_limit(config, own_s_per_rad),
+                               .own_s_per_rad = own_s_per_rad,
+                               .motor_rad_s = joint->motor.speed_rad_s,
                                .gravity_duty = joint->gravity_duty,
                                .duty_limit = config->duty_limit,
                                .duty_low = duty_low,

@@ -236,7 +236,7 @@ static void watch_motor(core_state *core, joint_state *joint, const joint_config
         joint->suspect_ticks = 0u;
         return;
     }
-    if (motor_is_fast(motor, joint->pid.speed_rad_s, config->speed_limit_rad_s)) {
+    if (motor_is_fast(motor, joint->pid.speed_rad_s)) {
         safety_raise(core, FAULT_OVERSPEED, i);
     }
     const bool hot = 2.0f * joint->over_a > number_size(joint->current_a); /* more than twice the limit */

@@ -177,6 +177,7 @@ typedef struct motor_config {
     float resistance_ohm; /* 0 to 1000; 0: the motor is not watched */
     float constant_v_s;   /* 0.001 to 1000: V s/rad, gear included */
     float apart_rad;      /* 1e-3 to 1: how far motor and potentiometer may be apart: noise and backlash */
+    float backlash_rad;   /* 0 to 1, below apart_rad: of the gear between them, from stop to stop */
 } motor_config;
 
 /* The encoder of one joint. The joint is at home_rad where its counts are those of the zero: an absolute one's
@@ -208,7 +209,7 @@ typedef struct joint_config {
     float following_rad;       /* 1e-3 to 13: largest distance from the reference */
     float stall_duty;          /* 0.01 to 1: from here on the motor must rotate the joint */
     float stall_rad;           /* 1e-4 to 1: rotating less than this within stall_ticks is standing still */
-    uint32_t current_limit_ma; /* motor current from which the duty is cut */
+    uint32_t current_limit_ma; /* 10 to 100000: motor current from which the duty is cut */
     int32_t motor_direction;   /* 1 or -1, multiplies the duty on its way out */
     encoder_config encoder;    /* what reads the joint, where it is no potentiometer */
 } joint_config;
@@ -217,7 +218,7 @@ typedef struct joint_config {
 typedef struct core_config {
     joint_config joint[JOINTS]; /* the first joint_count are used, the others are not looked at */
     uint32_t joint_count;       /* 1 to JOINTS */
-    uint32_t supply_min_mv;
+    uint32_t supply_min_mv;     /* half of supply_nominal_mv or more, below supply_max_mv */
     uint32_t supply_max_mv;
     uint32_t supply_nominal_mv; /* duties and gains are those at this supply; 1000 to 100000 */
     uint32_t supply_ticks;     /* 1 to 1000: a supply fault must last as long */
@@ -319,6 +320,8 @@ typedef struct pid_demand {
     float duty_high;       /* 0 to duty_limit: likewise */
     float duty_slew_per_s;
     float damped_rad_s;    /* the speed that is damped: the measured one, or the motor's where the reading is wrong */
+    float own_s_per_rad;   /* duty that back-EMF takes per rad/s */
+    float motor_rad_s;     /* the motor's speed by it, 0 where it is not watched */
 } pid_demand;
 
 /* The reference of one joint: a cubic from one point to the next, then straight on. */
@@ -350,6 +353,7 @@ typedef struct motor_state {
     float speed_rad_s;       /* by the back-EMF */
     float unsure_rad_s;      /* how far that may be off */
     float doubt_rad_s;       /* the same, as far as it excuses a speed beyond the limit */
+    float fastest_rad_s;     /* what it is held to: the speed limit, or what its noise lets show */
     float sure_rad_s;        /* the size it has at least but for the doubt; 0 where it is not known */
     uint32_t known;          /* not 0: a current is seen, without which its sensor may be broken */
     float travel_rad;        /* since the joint was enabled */
@@ -359,6 +363,7 @@ typedef struct motor_state {
     float last_rad;          /* the reading of the last tick */
     float resistance_scale;  /* learnt: over the configuration's */
     float constant_scale;
+    float per_constant;      /* rad/s per V by the learnt constant, as of the last sample */
     float variance_rr;       /* of both scales */
     float variance_rk;
     float variance_kk;
@@ -366,7 +371,7 @@ typedef struct motor_state {
     float window_ir_v;       /* what the configured resistance takes of it, */
     float window_rad;        /* the reading at its beginning */
     uint32_t window_ticks;
-    int32_t window_side;     /* which way the last one went; 0: it rested */
+    int32_t window_side;     /* which way the last one went, 1 or -1; 0: not known where in its backlash it ended */
     uint32_t sampled;        /* samples taken */
     float trust;             /* of the speed limit: what the joint may use; 1 once motor and reading went the same way */
     float way_read_rad;      /* the way since the joint last rested, by the reading */

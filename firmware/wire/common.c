@@ -79,6 +79,7 @@ static const param_kind joint_params[] = {
     LIMIT("DUTY", duty_limit),
     LIMIT("DUTYSLEW", duty_slew_per_s),
     LIMIT("FOLLOWING", following_rad),
+    LIMIT("BACKLASH", motor.backlash_rad),
     {"CURRENT_MA", (uint32_t)offsetof(joint_config, current_limit_ma), 1u},
 };
 static const param_kind arm_params[] = {

@@ -20,17 +20,21 @@ if TYPE_CHECKING:
 
 
 def read_text(path: str | Path) -> str:
-    """Read a UTF-8 text file.
+    """Read a text file, UTF-8, or UTF-16 with its byte-order mark.
 
     Raises:
         InputError: missing, unreadable or not text.
     """
     try:
-        return Path(path).read_text(encoding="utf-8")
+        data = Path(path).read_bytes()
+        # Spreadsheets' "Unicode text" is UTF-16, and says so in its first two bytes.
+        return io.TextIOWrapper(
+            io.BytesIO(data), "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
+        ).read()
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file") from None
+        raise InputError(f"{path}: not a text file; save text as UTF-8, a table as CSV") from None
     except ValueError:  # it holds a NUL
         raise InputError(f"{str(path)!r}: not the name of a file") from None
     except OSError as error:
@@ -38,7 +42,7 @@ def read_text(path: str | Path) -> str:
 
 
 #: A number as half of the world writes it: 0,25 or -1,5e-3.
-_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 
 
 def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> list[list[str]]:
@@ -71,7 +75,7 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> li
 
 def _with_points(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
     """Return rows with decimal points for decimal commas; a table has one or the other."""
-    found = [(line, cell) for line, row in enumerate(rows, 1) for cell in row if _DECIMAL_COMMA.fullmatch(cell.strip())]
+    found = [(line, cell) for line, row in enumerate(rows, 1) for cell in row if DECIMAL_COMMA.fullmatch(cell.strip())]
     if not found:
         return rows
     for line, row in enumerate(rows[1:], 2):
@@ -81,9 +85,7 @@ def _with_points(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
                     f"{path}: line {line} has {cell.strip()} and line {found[0][0]} {found[0][1].strip()}: is the comma "
                     "the decimal mark, or the point? save it with one of them"
                 )
-    return [
-        [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell.strip()) else cell for cell in row] for row in rows
-    ]
+    return [[cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell.strip()) else cell for cell in row] for row in rows]
 
 
 def _renamed(path: str | Path, header: list[str], columns: Mapping[str, str]) -> list[str]:
@@ -296,7 +298,7 @@ def check_folder(
         The folder, ``~`` expanded.
 
     Raises:
-        InputError: it cannot be made or written to, or one of its files is one of ``apart_from``.
+        InputError: it cannot be made or written to, or it or one of its files is one of ``apart_from``.
     """
     _check_name(path)
     folder = Path(path).expanduser()
@@ -309,10 +311,10 @@ def check_folder(
     except OSError as error:
         raise InputError(f"{folder}: {problem}: {error.strerror}{advice}") from None
     others = [other for other in apart_from if other is not None]
-    for name in holding:
-        if any(_same_file(other, folder / name) for other in others):
+    for part in (folder, *(folder / name for name in holding)):
+        if any(_same_file(other, part) for other in others):
             raise InputError(
-                f"{folder / name}: is given twice, or is read as well as written; choose another folder for the results"
+                f"{part}: is given twice, or is read as well as written; choose another folder for the results"
             )
     return folder
 

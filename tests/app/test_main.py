@@ -20,6 +20,11 @@ from strategies import ordinary_rig
     ("arguments", "words"),
     [
         (("nothing",), ["no such command 'nothing'", "armsight -h"]),
+        (("calibrte",), ["no such command 'calibrte': did you mean calibrate?"]),
+        (("arm", "shw", "ur3"), ["no such command 'shw': did you mean show?", "armsight arm -h"]),
+        (("arm", "show", "ur33"), ["arm 'ur33' is unknown: did you mean ur3", "known are"]),
+        (("identify", "poses.csv"), ["no such command 'poses.csv': a file follows an option, --data poses.csv"]),
+        (("demo", "--seed", "abc"), ["'abc' is not a whole number", "armsight demo -h"]),
         (("--nothing",), ["no such option", "--nothing"]),
         (("measure", "--nothing"), ["no such option", "armsight measure -h"]),
         (("measure",), ["RIG.json", "armsight measure -h"]),

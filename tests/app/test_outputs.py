@@ -154,6 +154,8 @@ def test_no_input_is_written_over(here, armsight, arguments, file):
     [
         ("rig", "export", "rig.json", "--format", "ros", "-o", "a.yaml", "./a.yaml"),
         ("measure", *FILE_WRITERS["measure"], "-o", "run.png", "--view", "."),
+        ("measure", *FILE_WRITERS["measure"], "-o", "one", "--view", "one"),
+        ("calibrate", *FILE_WRITERS["calibrate"], "-o", "one", "--report", "one"),
         ("calibrate", *FILE_WRITERS["calibrate"], "-o", "r.json", "--report", ".", "-o", "report.html"),
     ],
 )

@@ -6,6 +6,7 @@ is one line on stderr and exit code 2; a result that must not be trusted is exit
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import os
 import re
@@ -131,11 +132,25 @@ def _usage_text(error: click.ClickException) -> str:
     """Return what click found wrong with the command line, as one line that ends with what to do."""
     text = " ".join(error.format_message().split()).replace("'. (", "' (").rstrip(".")
     text = text[:1].lower() + text[1:]
+    text = text.replace("a valid integer range", "a whole number").replace("a valid float range", "a number")
     if "extra argument" in text and {"--left", "--right"} & set(sys.argv):
         text = re.sub(r"\((\S+) .+\)", r"(\1 ..)", text)
         return f"{text}; quote a glob, --left 'DIR/left*.png', or the shell puts every file name there"
     context = error.ctx if isinstance(error, click.UsageError) else None
+    if context is not None and (unknown := re.match(r"no such command '(.*?)'", text)):
+        text = unknown[0] + _meant(unknown[1], context)
     return text if context is None else f"{text}; the usage is in: {' '.join(context.command_path.split())} -h"
+
+
+def _meant(name: str, context: click.Context) -> str:
+    """Return what was likely meant by a word that is no command: a near one, or a file, which follows an option."""
+    known = context.command.list_commands(context) if isinstance(context.command, click.Group) else []
+    if near := difflib.get_close_matches(name, known, 1):
+        return f": did you mean {near[0]}?"
+    options = [option.opts[0] for option in context.command.params if isinstance(option.type, click.Path)]
+    if options and ("." in name or os.sep in name):
+        return f": a file follows an option, {options[0]} {name}"
+    return ""
 
 
 def _silence_stdout() -> None:

@@ -26,6 +26,7 @@ reader passes over them: the board and :func:`~armsight.loop.identify.corrected.
 
 from __future__ import annotations
 
+import difflib
 import tomllib
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -84,7 +85,9 @@ def open_arm(name_or_path: str | Path, *, tool_link: str | None = None) -> Arm:
     if text.lower().endswith(".toml"):
         return read_arm_toml(text)
     if text not in MODELS:
-        raise InputError(f"arm {text!r} is unknown; known are {', '.join(MODELS)}, or give a .toml or .urdf file")
+        near = difflib.get_close_matches(text, MODELS, 2)
+        meant = f": did you mean {' or '.join(near)}?" if near else ";"
+        raise InputError(f"arm {text!r} is unknown{meant} known are {', '.join(MODELS)}, or give a .toml or .urdf file")
     return MODELS[text]
 
 

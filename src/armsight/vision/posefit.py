@@ -130,9 +130,10 @@ def whitened(
     """
     n, counts = len(observations.point), np.array([camera.distortion.size for camera in cameras])
     W, by_pose, by_rig = np.zeros((n, 2, 2)), np.empty((2 * n, 6)), np.zeros((2 * n, 8 + counts.sum() + 6))
-    _differentiate(
+    differentiate(
         *pair_arguments(cameras), counts, inverse(T_left_right), np.ascontiguousarray(points[observations.point]),
-        np.array(observations.camera), np.array(observations.cov_uv), np.array(T_left_body), W, by_pose, by_rig,
+        np.array(observations.camera), np.array(observations.uv), np.array(observations.cov_uv), np.array(T_left_body),
+        W, np.empty((n, 2)), by_pose, by_rig,
     )  # fmt: skip
     return W, by_pose, by_rig
 
@@ -162,23 +163,26 @@ def _by_rotation(J: Array, p: Array) -> None:
 
 
 @kernel(
-    "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], "
-    "f8[:, :, ::1], f8[:, ::1], f8[:, ::1]",
+    "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], "
+    "f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]",
 )
-def _differentiate(
-    fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, p: Array, camera: Ids, cov: Array,
-    T: Array, W: Array, by_pose: Array, by_rig: Array,
-) -> None:  # fmt: skip
-    """Fill what :func:`whitened` returns."""
+def differentiate(
+    fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, p: Array, camera: Ids, uv: Array,
+    cov: Array, T: Array, W: Array, residuals: Array, by_pose: Array, by_rig: Array,
+) -> bool:  # fmt: skip
+    """Fill what :func:`whitened` returns, and the residuals (N, 2), px; return whether all points are before them."""
     xy, J_p, J_d, q = np.empty(2), np.empty((2, 3)), np.empty((2, 8)), np.empty(3)
     Ts, starts, rig = np.stack((T, product(T_right_left, T))), (0, 4 + counts[0]), 8 + counts[0] + counts[1]
     for n in range(len(p)):
         c = camera[n]
         M = Ts[c]
         _to_camera(M, p[n], q)
+        if q[2] <= 0.0:
+            return False
         distort(fisheye[c], d[c], q, xy, J_p, J_d)
         pose, shared = by_pose[2 * n : 2 * n + 2], by_rig[2 * n : 2 * n + 2]
         for i in range(2):
+            residuals[n, i] = uv[n, i] - k[c, i] * xy[i] - k[c, 2 + i]
             J_p[i] *= k[c, i]
             for j in range(3):
                 pose[i, j] = J_p[i, 0] * M[0, j] + J_p[i, 1] * M[1, j] + J_p[i, 2] * M[2, j]
@@ -201,6 +205,7 @@ def _differentiate(
             for j in range(J.shape[1]):
                 J[1, j] = W[n, 1, 0] * J[0, j] + W[n, 1, 1] * J[1, j]
                 J[0, j] *= W[n, 0, 0]
+    return True
 
 
 @kernel

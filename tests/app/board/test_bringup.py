@@ -18,6 +18,7 @@ from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.board_file import read_configuration
 from armsight.robot.boards.codes import Reaction, SensorKind
+from armsight.robot.boards.configuration import check_configuration
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.identification import dead_spots, fit_swing
 from armsight.robot.boards.opening import open_emulator
@@ -272,6 +273,15 @@ def test_the_command_prints_what_was_found(tmp_path):
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     assert all(1 < each["noise_counts"] < 30 for each in found["joints"])
+
+
+@pytest.mark.parametrize(("found_rad", "stored_rad"), [(None, 0.015), (0.0, 0.0), (0.004, 0.006)])
+def test_the_backlash_that_was_found_is_configured_with_a_margin(found_rad, stored_rad):
+    joint = JointFound(5.0, resistance_ohm=6.0, constant_v_s=2.4, inertia_kg_m2=0.05, viscous_n_m_s=0.02, dry_n_m=0.2)
+    joint.backlash_rad = found_rad
+    config = Found("pil", [joint] * 6).configuration(2.0, Reaction.HOLD, gains=True)
+    assert config["joint"]["motor"]["backlash_rad"] == pytest.approx([stored_rad] * 6)
+    check_configuration(config)
 
 
 def test_a_foreign_file_of_what_was_found_is_rejected(tmp_path):

@@ -381,6 +381,7 @@ def test_figures_that_look_like_contradictions_are_explained(data_dir, armsight,
     assert epipolar > 2 * reprojection
     assert "the reprojection follows the board, which moved between the two exposures" in fit
     assert "pairs dropped as gross errors; most in left" in said.out
+    assert re.search(r"the board moved between the two exposures of a pair.* px, left\d+ by \d\.\d mm", said.out)
     (share,) = re.findall(r"weak: (\d+%) of the left image never saw the board \(counted in 8 x 8 cells\)", said.out)
     rig = StereoRig.load(tmp_path / "rig.json")
     assert rig.provenance["board"] == "rig.board.toml"

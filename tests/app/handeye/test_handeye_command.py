@@ -381,6 +381,116 @@ def test_what_does_not_fit_is_named(armsight, tmp_path, seen):
     rejected(matrices(path, displaced), "those from line 8", "the robot's base, or the target, was displaced by")
 
 
+def test_rows_shifted_where_an_arm_moves_in_equal_steps_are_no_blunders(armsight, tmp_path):
+    """Two of three rows then fit another mounting exactly: the median of the residuals says nothing."""
+    _, first, _ = motion(9, seed=4)
+    step = exp_se3(np.array([0.02, 0.01, 0.0, 0.1, 0.3, 0.0]))
+    A = np.concatenate([[T, T @ step, T @ step @ step] for T in first])
+    B = inverse(A @ X) @ Z @ exp_se3(np.random.default_rng(1).normal(0, [2e-4] * 3 + [5e-4] * 3, (27, 6)))
+    seen, path = matrices(tmp_path / "seen.txt", B), tmp_path / "robot.txt"
+
+    def rejected(Ts, *words):
+        said = armsight("handeye", "--robot", matrices(path, Ts), "--seen", seen, "--eye", "in-hand")
+        assert_rejected(said, path, *words)
+
+    rejected(np.roll(A, 1, axis=0), "shifted by 1 against the images; robot.txt line 2 belongs to line 1")
+    rejected(np.roll(A, -5, axis=0), "shifted by 5 against the images; robot.txt line 1 belongs to line 6")
+    rejected(A[[*range(10), *range(11, 27), 0]], "from line 11 (line 11) on: a row is missing", "belongs to line 12")
+    rejected(A[::-1], "in reverse order")
+    rejected(A[np.random.default_rng(0).permutation(27)], "no other reading fits")
+
+
+def test_readings_of_rotations_axes_and_units(armsight, tmp_path, seen):
+    q, A, B = motion()
+    path = tmp_path / "robot.txt"
+
+    def rejected(robot, *words, more=(), by=seen):
+        said = armsight("handeye", "--robot", robot, "--seen", by, "--eye", "in-hand", *more)
+        assert_rejected(said, *words)
+
+    other = A.copy()
+    other[:, :3, :3] = np.swapaxes(A[:, :3, :3], 1, 2)
+    rejected(matrices(path, other), "the rotations are inverse")
+    other = A.copy()
+    other[:, :2, 3] = A[:, [1, 0], 3]
+    rejected(matrices(path, other), "the positions fit as y, x, z")
+    rejected(matrices(path, np.swapaxes(A, 1, 2)), "line 1", "column by column")
+    angles = Rotation.from_matrix(A[:, :3, :3]).as_euler("ZYX", degrees=True)
+    rejected(named(path, "X,Y,Z,W,P,R", np.hstack([1e3 * A[:, :3, 3], angles])), "about x and z are exchanged")
+    rejected(named(path, "x_m,y_m,z_m,rx_rad,ry_rad,rz_rad", np.hstack([A[:, :3, 3], angles])), "are these degrees?")
+    x = Rotation.from_matrix(B[:, :3, :3]).as_quat()
+    bare = tmp_path / "bare.csv"
+    np.savetxt(bare, np.hstack([B[:, :3, 3], x]), delimiter=",")
+    by = ("--seen-rotation", "wxyz")
+    rejected(matrices(path, A), bare, "the rotations are xyzw, not wxyz: --seen-rotation xyzw", more=by, by=bare)
+    other = A.copy()
+    other[5, :3, 3] *= 1e3
+    rejected(matrices(path, other), "are some rows in millimetres?", more=("--detect-units",))
+    head, arm = ",".join(f"q{i}_deg" for i in range(1, 7)), ("--model", "six_r")
+    rejected(named(path, head, np.degrees(q + np.pi / 2 * np.eye(6)[2])), "another zero", "add -90 deg to q3", more=arm)
+    ur = open_arm("ur3").home + q
+    flange = open_arm("ur3").forward(ur)
+    by = matrices(tmp_path / "ur.txt", inverse(flange @ X) @ Z @ exp_se3(np.full((14, 6), 1e-4)))
+    said = armsight(
+        "handeye", "--robot", named(path, head, np.degrees(ur)), "--seen", by, "--eye", "in-hand", "--model", "ur3e"
+    )
+    assert "fit --model ur3" in said.err
+    names = ",".join(open_arm("six_r").joint_names)
+    wrong = names.replace("joint5", "jont5")
+    rejected(named(path, wrong, q), "is not known: is it", more=arm)
+
+
+def test_points_in_kukas_language(tmp_path):
+    _, A, _ = motion(3)
+    angles = Rotation.from_matrix(A[:, :3, :3]).as_euler("ZYX", degrees=True)
+    points = [
+        f"DECL E6POS XP{k}={{X {x:.6f},Y {y:.6f}, Z {z:.6f},A {a:.7f},B {b:.7f},C {c:.7f},S 6,T 27,E1 0.0}}"
+        for k, (x, y, z, a, b, c) in enumerate(np.hstack([1e3 * A[:, :3, 3], angles]))
+    ]
+    path = tmp_path / "points.dat"
+    path.write_text("\n".join(["DEFDAT POINTS PUBLIC", *points, "ENDDAT"]))
+    table = read_pose_table(path)
+    np.testing.assert_allclose(table.Ts, A, atol=1e-7)
+    assert "KUKA" in table.notes[0]
+    path.write_text("{A1 10,A2 -90,A3 90,A4 0,A5 45,A6 0}")
+    np.testing.assert_allclose(np.degrees(read_pose_table(path, arm=open_arm("six_r")).q), [[10, -90, 90, 0, 45, 0]])
+    path.write_text("{X 1,Y 2,Z 3,A 4,B 5}")
+    with pytest.raises(InputError, match="line 1: a point needs"):
+        read_pose_table(path)
+    path.write_text("412,5 1129,8 0,5 1 0 0 0\n")
+    commas = "412,5 1129,8 606,3 1,0 0,0 0,0 0,0\n"
+    path.write_text(commas)
+    bare = read_pose_table(path, rotation="wxyz", unit="mm")
+    np.testing.assert_allclose(bare.Ts[0, :3, 3], [0.4125, 1.1298, 0.6063])
+    path.write_bytes(commas.replace(",", ".").encode("utf-16"))  # as spreadsheets write "Unicode text"
+    np.testing.assert_allclose(read_pose_table(path, rotation="wxyz", unit="mm").Ts, bare.Ts)
+
+
+def test_rows_without_an_image_and_rows_twice_are_noted(armsight, tmp_path, seen):
+    _, A, B = motion()
+    head = "name,x_m,y_m,z_m,qw,qx,qy,qz"
+
+    def rows(Ts, names):
+        return [(name, *T[:3, 3], *quaternions(T[None])[0]) for name, T in zip(names, Ts, strict=True)]
+
+    names = [f"p{k}" for k in range(14)]
+    by = named(tmp_path / "b.csv", head, rows(B, names))
+    robot = named(tmp_path / "a.csv", head, rows(A[[*range(12), 0]], [*("C:\\a\\" + name for name in names[:12]), "x"]))
+    _, notes = found(armsight, robot, by)
+    assert "1 rows of" in notes
+    assert "2 images without a row" in notes
+    assert "p12, p13" in notes
+    again = [*range(14), 3]
+    twice = matrices(tmp_path / "t.txt", A[again])
+    one, notes = found(armsight, twice, matrices(tmp_path / "u.txt", B[again]))
+    assert "1 rows repeat another" in notes
+    assert len(one["poses"]) == 14
+    frozen = B.copy()
+    frozen[6] = B[5]
+    _, notes = found(armsight, matrices(tmp_path / "t.txt", A), matrices(tmp_path / "u.txt", frozen))
+    assert "the very same view in line 6, line 7" in notes
+
+
 def test_a_tcp_taken_for_the_flange_is_noted_where_the_joints_are_known(armsight, tmp_path, seen):
     q, A, _ = motion()
     tool = exp_se3(np.array([0.0, 0.0, 0.12, 0.0, 0.0, 0.3]))

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from armsight.app.measure.poses import CSV_COLUMNS
+from armsight.app.measure.run import _detected
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.vision.markers.body_file import save_body_csv
 from armsight.vision.markers.targets import open_body
@@ -355,6 +356,27 @@ def test_detections_are_measured_and_too_few_points_missed(rendered, seen, armsi
     for record in said.lines[:2]:
         # Pixels are written to a millionth: 1e-6 px is below a nanometre here, three decimals of room.
         assert record["position_m"] == pytest.approx(rendered.of_arm.Ts_left_body[int(record["shot"])][:3, 3], abs=1e-6)
+
+
+def test_a_shot_of_which_most_points_contradict_each_other_is_named(rendered, seen, armsight):
+    """The right image of shot 7 shows the body 4 px higher, but for four points."""
+    lines = (seen / "d.csv").read_text().splitlines()
+    for row in [k for k, line in enumerate(lines) if line.startswith("7,right,")][:12]:
+        *start, v = lines[row].split(",")
+        lines[row] = ",".join([*start, str(float(v) - 4)])
+    (seen / "d.csv").write_text("\n".join(lines) + "\n")
+    said = armsight(*by_detections(rendered, seen))
+    assert "12 points dropped" in next(line for line in said.out.splitlines() if line.startswith("7:"))
+    assert "in 7 most points contradict each other: do not use it" in said.err
+
+
+def test_a_board_of_which_detections_are_given_is_known_to_be_a_print(rendered, tmp_path):
+    """Its shape is a calibration's: the test of single points leaves it out, however few they are."""
+    for target, printed in (("chessboard:4x3:30mm", True), (str(rendered.plate), False)):
+        name = open_body(target).point_names[0]
+        rows = [f"1,{side},{name},100,100" for side in ("left", "right")]
+        (tmp_path / "d.csv").write_text("\n".join(["shot,camera,marker,u_px,v_px", *rows]) + "\n")
+        assert _detected(tmp_path / "d.csv", target)[2] is printed
 
 
 @pytest.mark.parametrize(

@@ -139,7 +139,8 @@ WRONG = {
     "pot.inverted_rad": [0, 1.1, NAN],
     "motor.resistance_ohm": [-1, 1001, NAN],
     "motor.constant_v_s": [0, 1001, NAN],
-    "motor.apart_rad": [0, 1.1, NAN],
+    "motor.apart_rad": [0, 1.1, 0.01, NAN],
+    "motor.backlash_rad": [-0.001, 0.03, 1.1, NAN],
     "soft_min_rad": [2.4, -13.1, -2.7, NAN],
     "soft_max_rad": [-2.4, 13.1, 2.7, NAN],
     "speed_limit_rad_s": [0, 20.0, 20.1, NAN],
@@ -153,12 +154,13 @@ WRONG = {
     "following_rad": [0, 14, NAN],
     "stall_duty": [0, 0.81, 1.01, NAN],
     "stall_rad": [0, 1.01, NAN],
+    "current_limit_ma": [0, 9, 100001],
     "motor_direction": [0, 3],
     "encoder.sensor": [3],
 }
 WRONG_ARM = {
     "joint_count": [0, 7],
-    "supply_min_mv": [14000],
+    "supply_min_mv": [14000, 10],
     "supply_nominal_mv": [999, 100001],
     "overload_ticks": [0, 10001],
     "brake_release_ticks": [1001],
@@ -241,12 +243,9 @@ def test_a_table_may_fall_and_its_direction_be_reversed(library, angles, directi
 
 def test_every_value_has_its_range_tried(library):
     """A field added to the configuration must be added here."""
-    leaves = {
-        name
-        for name, _ in c.joint_config._fields_
-        if name not in ("gains", "pot", "motor", "encoder", "current_limit_ma")
-    }
+    leaves = {name for name, _ in c.joint_config._fields_ if name not in ("gains", "pot", "motor", "encoder")}
     leaves |= {f"gains.{name}" for name, _ in c.joint_gains._fields_}
+    leaves |= {f"motor.{name}" for name, _ in c.motor_config._fields_}
     assert leaves <= set(WRONG)
     assert {f"encoder.{name}" for name, _ in c.encoder_config._fields_} <= {*WRONG, *WRONG_ENCODER}
     assert {name for name, _ in c.core_config._fields_} - {"joint", "supply_max_mv"} == set(WRONG_ARM)

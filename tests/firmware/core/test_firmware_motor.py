@@ -1,11 +1,13 @@
 """The motor as a witness: on drawn arms under load a healthy potentiometer is left alone, a broken one is named."""
 
+import ctypes
 import importlib.util
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from firmware_layout import c
 
 from armsight.robot.boards.codes import BoardState, Fault
 from armsight.sim.joints import PotFault
@@ -96,6 +98,15 @@ def test_a_slow_joint_earns_its_speed_too(arms, library):
     arm.follow(aim, np.full_like(aim, 0.25))
     assert arm.first == (None, None)
     assert [joint.motor.trust for joint in arm.core.joint] == [1.0] * 6
+
+
+def test_slow_joints_carry_their_loads(arms, library):
+    """Fell before: what drove a joint to its reference was bounded by its speed limit, and a load was not taken up."""
+    table = arms.Table()
+    for seed in (711000291, 711000388, 711000485, 711000873, 703008216):
+        arms.slow(library, seed, table)
+    assert not table.false["slow swing"]
+    assert table.apart["slow swing"] < 0.12
 
 
 def test_a_motor_whose_resistance_is_not_known_is_not_watched(arms, library):
@@ -209,6 +220,40 @@ def test_gains_that_make_a_joint_swing_are_noticed(arms, library):
 
 def test_backlash_teaches_no_resistance(arms, library):
     table = arms.Table()
-    for seed in (61000774, 61000871, 62001844, 63003108):
+    for seed in (61000774, 61000871, 62001844, 63003108, 871027156, 871045392):
         arms.loaded_suddenly(library, seed, table)
     assert not table.false["unloaded, then 1 N m"]
+
+
+@pytest.fixture
+def watched(library):
+    """A motor of 6 ohm and 2.4 V s/rad that is driven at 1 A, and a function that lets a window of it pass."""
+    config, motor = c.motor_config(6.0, 2.4, 0.03, 0.01), c.motor_state()
+    library.motor_start(ctypes.byref(motor), ctypes.c_float(0.0), ctypes.c_float(2.0), 0)
+
+    def window(way_rad, ahead_rad=0.0, *, ticks=32, current_a=1.0):  # the motor goes on further than the reading
+        start_rad = motor.last_rad
+        for tick in range(1, ticks + 1):
+            motor.duty = (6.0 * current_a + 2.4e3 * (way_rad + ahead_rad) / ticks) / 12.0
+            numbers = (ctypes.c_float(each) for each in (12.0, current_a, start_rad + way_rad * tick / ticks))
+            library.motor_measure(ctypes.byref(motor), ctypes.byref(config), *numbers)
+
+    window(0.0, ticks=3)  # currents settle
+    return motor, window
+
+
+def test_backlash_crossed_in_a_pause_teaches_no_resistance(library, watched):
+    motor, window = watched
+    for _ in range(3):
+        window(0.03)
+    before = motor.resistance_scale
+    library.motor_pause(ctypes.byref(motor), ctypes.c_float(motor.last_rad))
+    window(0.03, 0.007)
+    assert motor.resistance_scale - before < 0.01
+
+
+def test_a_motor_that_moves_within_its_backlash_at_rest_teaches_no_resistance(watched):
+    motor, window = watched
+    window(0.0, ticks=256, current_a=0.15)
+    window(0.0, 0.008, ticks=256, current_a=0.15)
+    assert motor.resistance_scale - 1.0 < 0.035

@@ -1,5 +1,7 @@
 """Changes of rig, body and joints that a filter would follow: found by closure, named, sized; none where none is."""
 
+from functools import partial
+
 import faults
 import numpy as np
 import pytest
@@ -43,7 +45,8 @@ def watched(seed, kind=None, size=0.0, joint=0, seconds=45.0):
                 column = H[:, COLUMNS.get(kind, [PARTS.zeros[joint]])]
             e += column @ np.atleast_1d(size) * ((t_s - AT_S) if kind == "drift" else 1.0)
         none = np.zeros((PARTS.size, 6))
-        watch.take(Innovation(t_s, T, e, np.diag(SHOT**2), H, kept, none, Outcome.USED, None, (e, H)))
+        reference = partial(tuple, (e, H))
+        watch.take(Innovation(t_s, T, e, np.diag(SHOT**2), H, kept, none, Outcome.USED, None, reference))
     return watch
 
 

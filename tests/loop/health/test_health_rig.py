@@ -1,14 +1,17 @@
 """Cameras that moved against each other and bodies of another size: found, sized, and not found where nothing is wrong."""
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
 from faults import BODY, SIGMAS, SYNC_S, TRUE, ended, ripple, watched_body
+from numpy.polynomial.chebyshev import chebval
 
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.health import HealthMonitor, Trust
 from armsight.loop.health.rig import RigWatch
+from armsight.vision.posefit import PixelObservations, fit_pose, whitened
 
 
 def test_nothing_is_found_where_nothing_is_wrong():
@@ -123,12 +126,41 @@ def test_the_estimate_is_what_dense_least_squares_gives():
     watch = RigWatch(rig, BODY, 0.0)
     for t, estimate in rows:
         watch.take(estimate, t)
-    watch._close_stay()
-    found, size = watch._estimated(watch._test.of(watch._size)), watch._size
-    sums, L, F = watch._test.of(size), watch.prior, watch._by_fault
+    sums, size = watch._summed(watch._stays).of(watch._size), watch._size
+    found, L, F = watch._estimated(watch._in_priors(sums)), watch.prior, watch._by_fault
     wide = np.diag(np.array([0.1, 0.1, 1, 1, 1, 1, 0.1]) ** 2.0)
     L = L + 1e-9 * np.eye(size)  # the skew's prior is none
     prior = np.linalg.inv(np.block([[L @ L.T, np.zeros((size, 7))], [np.zeros((7, size)), wide]]))
     G = np.hstack([np.eye(size), F])
     both = np.linalg.solve(G.T @ sums.H @ G + prior, G.T @ sums.b)
     assert found.f == pytest.approx(both[size:], rel=1e-3, abs=1e-6)
+
+
+def test_the_compiled_rows_of_a_shot_are_those_of_a_dense_elimination():
+    """Pose and own skew as parameters of the normal equations, the skew with its prior; polynomials by numpy."""
+    rig = replace(TRUE, cov=np.diag(SIGMAS**2), sigma_px=0.02)
+    (_, t, _, before, _), (_, now_s, _, estimate, _) = list(islice(watched_body(9), 0, 6, 5))
+    watch = RigWatch(rig, replace(BODY, points=np.asfortranarray(BODY.points)), sync_s := 2e-3)
+    watch.take(before, t)
+    found, velocity = watch._residuals(estimate, now_s), watch._velocity(estimate.T_left_body, now_s)
+    seen, points = PixelObservations.of(estimate.points.seen, rig.sigma_px), BODY.points
+    fit = fit_pose(rig.cameras, rig.T_left_right, points, seen, estimate.T_left_body, robust=False, steps=0)
+    W, A, B = whitened(rig.cameras, rig.T_left_right, points, seen, estimate.T_left_body)
+    dense, P = np.zeros((len(A), found.rows.shape[1])), rig.parameter_count
+    dense[:, 0] = (W @ fit.residuals_px[:, :, None]).ravel()
+    dense[:, 1 : 1 + P] = B
+    dense[:, 1 + P] = np.einsum("nij,nj->ni", A[:, :3].reshape(-1, 2, 3), points[seen.point]).ravel()
+    dense[:, watch._size] = A @ velocity * np.repeat(seen.camera, 2)
+    for k, (side, point) in enumerate(zip(seen.camera, seen.point, strict=True)):
+        dense[2 * k : 2 * k + 2, 2 + P + 3 * point :][:, :3] = A[2 * k : 2 * k + 2, :3]
+        x, y = 2.0 * (seen.uv[k] + 0.5) / rig.cameras[side].image_size_px - 1.0
+        each = [chebval(x, np.eye(5)[i]) * chebval(y, np.eye(5)[j]) for i in range(5) for j in range(5 - i)]
+        for axis in range(2):
+            dense[2 * k : 2 * k + 2, watch._size + 1 + 15 * (2 * side + axis) :][:, :15] = np.outer(W[k, :, axis], each)
+    first = np.column_stack([A, sync_s * dense[:, watch._size]])
+    prior = np.diag([0.0] * 6 + [1.0])
+    cross = first.T @ dense
+    expected = dense.T @ dense - cross.T @ np.linalg.solve(first.T @ first + prior, cross)
+    scale = np.sqrt(np.outer(*2 * [np.diag(dense.T @ dense) + 1e-12]))
+    assert found.rows.T @ found.rows / scale == pytest.approx(expected / scale, abs=1e-9)
+    assert found.response == pytest.approx(-np.linalg.solve(A.T @ A, A.T @ dense[:, 1:]), rel=1e-6, abs=1e-12)

@@ -79,7 +79,7 @@ def test_a_tool_reads_and_sets_every_parameter(tool):
     while len(params) < count:
         message = heard(tool, "PARAM_VALUE")
         params[message.param_id], count = message.param_value, message.param_count
-    assert count == 111
+    assert count == 117
     assert params["J3_KP"] == params["J1_KP"] > 1.0
     assert params["J6_CURRENT_MA"] == 1600
     for name, value in params.items():

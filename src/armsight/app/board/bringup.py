@@ -194,6 +194,10 @@ class Bringup:
                     self._keep()
         except _Quit:
             self._person.say("ended; what was found is kept")
+        except KeyboardInterrupt:
+            self._off()
+            self._person.say(f"motors off; what was found is kept in {self._folder}: the same command goes on there")
+            raise
         except DeviceError as error:
             raise DeviceError(
                 f"{error}; what was found is kept in {self._folder}: the same command goes on there"

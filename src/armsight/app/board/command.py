@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from armsight.app.board.config import config_group
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
@@ -129,6 +130,8 @@ def monitor(
 
     if seconds is None and not is_real(name):
         seconds = _WATCH_S
+    if click.get_current_context().get_parameter_source("name") is ParameterSource.DEFAULT:
+        click.echo(f"note: no --board: this one is {name}, a program; --board serial:PORT is a board", err=True)
     with _open_any(name, baud, calibration) as board:
         click.echo(text.welcome_text(board), err=True)
         passed = 0.0

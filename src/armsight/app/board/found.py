@@ -23,6 +23,7 @@ from armsight.robot.boards.configuration import (
     ENCODER_REV,
     GAINS,
     JOINTS,
+    LAB_BACKLASH_RAD,
     POT_NODES,
     Configuration,
     lab_configuration,
@@ -277,7 +278,9 @@ def _put_motor(
     bandwidth = quiet_bandwidth(motor, supply_v, found.noise_rad)
     joint["gains"] = np.array(tuple(tuned_gains(motor, supply_v, bandwidth)), GAINS)
     joint["motor"]["resistance_ohm"], joint["motor"]["constant_v_s"] = motor.resistance_ohm, motor.constant_v_s
-    joint["motor"]["apart_rad"] = max(0.03, 10 * found.noise_rad + 1.5 * (found.backlash_rad or 0.0))
+    backlash_rad = 1.5 * (LAB_BACKLASH_RAD if found.backlash_rad is None else found.backlash_rad)
+    joint["motor"]["apart_rad"] = max(0.03, 10 * found.noise_rad + backlash_rad)
+    joint["motor"]["backlash_rad"] = backlash_rad
     speed, acceleration = motion_limits(motor, supply_v, found.gravity_n_m or 0.0)
     speed = min(speed, 0.9e3 * float(joint["pot"]["jump_rad"]))
     for name, value in {

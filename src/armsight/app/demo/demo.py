@@ -136,6 +136,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
         except (ArmsightError, KeyboardInterrupt) as error:  # the run itself is complete, and is written
             outcome.interrupted = isinstance(error, KeyboardInterrupt)
             outcome.ended_by = error if isinstance(error, ArmsightError) else None
+        workcell.forget_room()  # drawing takes as much
         progress("plotting")
         of_run = {
             "seed": demo.seed,

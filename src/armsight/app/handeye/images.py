@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from armsight.app.handeye.read import PoseTable
 from armsight.data import Array, Detections, Missed, Record
 from armsight.errors import InputError
 from armsight.files import read_text
@@ -58,6 +59,7 @@ class Seen(Record):
         scatter_px: RMS of the reprojection; 0 where there are no images.
         notes: what was found out.
         common: (N, 6, K) what K independent errors of the rig of one sigma do to the poses; None where unknown.
+        table: the table that the poses are from; None where they are from images.
     """
 
     Ts: Array
@@ -70,6 +72,7 @@ class Seen(Record):
     scatter_px: float = 0.0
     notes: tuple[str, ...] = ()
     common: Array | None = None
+    table: PoseTable | None = None
 
 
 def see_with_camera(
@@ -89,6 +92,8 @@ def see_with_camera(
     files = sorted(map(Path, glob.glob(str(Path(pattern).expanduser()))), key=_natural)
     if not files:
         raise InputError(f"{pattern}: no such images; quote the glob")
+    if len(files) == 1 and files[0].is_dir():
+        raise InputError(f"{pattern}: a folder; give a glob of its images, quoted: '{files[0]}/*.png'")
     found = open_target(target)
     camera = None if camera_file == "fit" else read_camera(Path(camera_file))
     detections: list[Detections] = []
@@ -272,7 +277,9 @@ def see_with_rig(
         missed.append("")
         squares.append(result.reprojection_rms_px**2)
     if not squares:
-        raise InputError(f"the target was found in none of {len(names)} pairs ({missed[0]}): is --target right?")
+        raise InputError(
+            f"none of {len(names)} pairs was measured: are --target, --left and --right right? {missed[0]}"
+        )
     return Seen(
         np.array(Ts),
         np.array(covs),

@@ -7,6 +7,7 @@ In: a CSV, TSV or text file. Out: :class:`PoseTable`. Known forms:
 - Universal Robots' ``p[x, y, z, rx, ry, rz]``, metres and a rotation vector, one a line, among other text too; without the
   p the line is the list alone, with a note, and none where a model is given: it may be joints. Lists of more numbers are
   read as rows of them.
+- KUKA's ``{X 1,Y 2,Z 3,A 4,B 5,C 6}`` and ``{A1 1,..,A6 6}``, one a line, among other text too (.dat files).
 - columns of ROS's messages (``pose.position.x``, ``transform.rotation.w``, joints by the model's names, rad), KUKA's
   ``X,Y,Z,A,B,C``, Fanuc's ``X,Y,Z,W,P,R``, among others too, units in brackets (``x [mm]``); matrices of four lines each,
   or of three without 0 0 0 1.
@@ -20,6 +21,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +31,7 @@ from scipy.spatial.transform import Rotation
 from armsight.app.measure.poses import CSV_COLUMNS, SHUTTER_COLUMNS
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import columns_unused, read_columns, read_table, read_text
+from armsight.files import DECIMAL_COMMA, columns_unused, read_columns, read_table, read_text
 from armsight.geometry.rotation import nearest_rotation
 from armsight.loop.identify import ROTATIONS
 from armsight.robot.arm import Arm
@@ -50,6 +52,8 @@ COLUMNS = (
 )
 #: Lengths beyond this, m, are no robot's: they are mm; below the other, all of them, they are m taken for mm.
 FAR_M, NEAR_M = 20.0, 0.02
+#: Lengths that differ by more than this factor in one table are not in one unit.
+MIXED = 200.0
 #: No joint rotates further, rad; larger numbers of radians are degrees.
 MOST_RAD = 4 * np.pi
 #: How far a matrix may be from a rotation: what six digits leave.
@@ -57,6 +61,10 @@ LOOSE = 2e-3
 #: Columns of the poses that `armsight measure -o` wrote.
 _MEASURED = {"shot", "status", "reason", "x_m"}
 _UR = re.compile(r"\bp\[([^\[\]]*)\]")
+#: A point or the axes in KUKA's language: {X 1.5,Y 2, ..}, with or without the name of its type.
+_KRL = re.compile(r"\{\s*(?:\w+\s*:\s*)?([A-Z]\w*\s+[-+.\deE]+(?:\s*,\s*[A-Z]\w*\s+[-+.\deE]+)*)\s*\}")
+#: What of it is read: a point, mm and degrees, or its axes.
+_KRL_KEYS = (("X", "Y", "Z", "A", "B", "C"), ("A1", "A2", "A3", "A4", "A5", "A6"))
 #: A list alone in its line.
 _LIST = re.compile(r"\[([^\[\]]*)\],?")
 #: ROS's messages as columns, in metres (REP 103): pose.position.x, field.pose.orientation.w, transform.translation.x ...
@@ -139,6 +147,8 @@ def read_pose_table(
     measured = set(head) >= _MEASURED
     rows, missed = _shown(path, head, rows) if measured else (rows, ("",) * len(rows))
     table = _Columns(path, head, rows)
+    if "_3" in head:
+        _require_row_major(path, table, rows)
     lines = np.array([line for line, _ in rows])
     unit_m, q = 1.0, None
     numbers, convention = np.zeros((len(rows), 0)), ""
@@ -161,6 +171,8 @@ def read_pose_table(
     t_s, names = table.times(), table.names()
     table.used.update((*CSV_COLUMNS, *SHUTTER_COLUMNS) if measured else ())
     unused = [name for name in head if name and name not in table.used and not re.fullmatch(r"_[0-3]", name)]
+    if arm is not None and q is None:
+        notes = (*notes, f"{path}: has no joint angles: --model {arm.name} is not used")
     if unused and not only_joints:
         notes = (*notes, f"{path}: {columns_unused(unused)}")
     return PoseTable(path, lines, Ts, numbers, convention, q, t_s, names, unit_m, notes, missed)
@@ -187,6 +199,8 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
     first = written[0][1] if written else ""
     if any(_UR.search(row) for _, row in written):
         return ["x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"], _even(path, _poses_of_ur(path, written), 6), False
+    if any(_KRL.search(row) for _, row in written):
+        return *_points_of_krl(path, written), False
     if _LIST.fullmatch(first):
         head, rows = _without_names(path, _lists(path, written))
         return ["x", "y", "z", "rx_rad", "ry_rad", "rz_rad"] if len(head) == 6 else head, rows, True
@@ -195,7 +209,9 @@ def _cells(path: Path, columns: str | None) -> tuple[list[str], list[tuple[int, 
             f"{path}: {first[:40]!r} begins no table: write one pose a line, a matrix of 16 numbers or columns such as "
             "x_mm,y_mm,z_mm,qw,qx,qy,qz"
         )
-    if any(mark in first for mark in ",;\t"):
+    if len(first.split()) > 1 and all(DECIMAL_COMMA.fullmatch(cell) for cell in first.split()):
+        cells = [line.replace(",", ".").split() for line in text.splitlines()]
+    elif any(mark in first for mark in ",;\t"):
         cells = degree_columns(path, read_table(path, read_columns(columns, COLUMNS)))
     else:
         cells = [line.split() for line in text.splitlines()]
@@ -222,6 +238,25 @@ def _poses_of_ur(path: Path, written: list[tuple[int, str]]) -> list[tuple[int, 
             raise InputError(f"{path}: line {line}: expected one p[x, y, z, rx, ry, rz], found {row[:40]!r}")
         rows.append((line, [cell.strip() for cell in found[0].split(",")]))
     return rows
+
+
+def _points_of_krl(path: Path, written: list[tuple[int, str]]) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the columns, and the numbers of the point that a line in KUKA's language has; other lines are passed over."""
+    rows = []
+    for line, row in written:
+        found = _KRL.findall(row)
+        if len(found) > 1:
+            raise InputError(f"{path}: line {line}: has {len(found)} points; one a line is needed")
+        if found:
+            rows.append((line, dict(part.split() for part in re.split(r"\s*,\s*", found[0]))))
+    keys = next((keys for keys in _KRL_KEYS if set(keys) <= set(rows[0][1])), None)
+    if keys is None:
+        raise InputError(f"{path}: line {rows[0][0]}: a point needs X, Y, Z, A, B, C, and axes A1 to A6")
+    for line, point in rows:
+        if missing := [key for key in keys if key not in point]:
+            raise InputError(f"{path}: line {line}: {missing[0]} is missing, which line {rows[0][0]} has")
+    head = [f"q{key[1]}_deg" for key in keys] if keys[0] == "A1" else list(keys)
+    return head, [(line, [point[key] for key in keys]) for line, point in rows]
 
 
 def _lists(path: Path, written: list[tuple[int, str]]) -> list[tuple[int, list[str]]]:
@@ -292,6 +327,21 @@ def _matrices(path: Path, rows: list[tuple[int, list[str]]]) -> list[tuple[int, 
     return [(rows[k][0], [cell for _, row in rows[k : k + count] for cell in row]) for k in range(0, len(rows), count)]
 
 
+def _require_row_major(path: Path, table: _Columns, rows: list[tuple[int, list[str]]]) -> None:
+    """Reject matrices of 16 numbers that do not end with 0 0 0 1."""
+    for (line, row), last in zip(rows, table.numbers([f"_{k}" for k in range(4)]), strict=True):
+        if not np.allclose(last, [0, 0, 0, 1], atol=1e-6):
+            columns = [row[k] for k in (3, 7, 11, 15)]
+            transposed = all(map(_is_number, columns)) and np.allclose(
+                np.array(columns, float), [0, 0, 0, 1], atol=1e-6
+            )
+            why = "they are written column by column: write them row by row" if transposed else "or name columns"
+            raise InputError(
+                f"{path}: line {line}: 16 numbers are a matrix row by row, which ends with 0 0 0 1, not "
+                f"{' '.join(row[12:])[:40]}; {why}"
+            )
+
+
 def _understood(
     path: Path, head: list[str], arm: Arm | None, unit: str | None, rotation: str | None
 ) -> tuple[list[str], str | None, tuple[str, ...]]:
@@ -308,7 +358,8 @@ def _understood(
         The names; the convention, the usual one where none is given, None where there is none either; and a note where
         something was taken for granted.
     """
-    bare = [re.sub(r"\s*[\[(](mm|m|deg|rad|s)[\])]$", r"_\1", name.strip().strip('"').strip().lower()) for name in head]
+    bare = [name.strip().strip('"').strip().lower().replace("°", "deg") for name in head]
+    bare = [re.sub(r"\s*[\[(](mm|m|deg|rad|s)[\])]$", r"_\1", name) for name in bare]
     ros = [_ROS.fullmatch(name) for name in bare]
     parts = {found[2] for found in ros if found and not found[1]}  # without w they are no quaternion
     links = {} if arm is None else {name.lower(): f"q{k}_rad" for k, name in enumerate(arm.joint_names, 1)}
@@ -357,8 +408,11 @@ def _even(path: Path, rows: list[tuple[int, list[str]]], count: int) -> list[tup
     """Return the rows if all have as many fields as there are columns."""
     for line, row in rows:
         if len(row) != count:
+            commas = (
+                "are there decimal commas between commas? separate by semicolons, or " if len(row) == 2 * count else ""
+            )
             raise InputError(
-                f"{path}: line {line}: {len(row)} fields where {count} are expected; correct or remove the line"
+                f"{path}: line {line}: {len(row)} fields where {count} are expected; {commas}correct or remove the line"
             )
     if not rows:
         raise InputError(f"{path}: no rows; one line a pose is needed")
@@ -405,6 +459,11 @@ class _Columns:
         """Return joint angles (N, J), rad."""
         if arm is not None and len(names) != len(arm.joint_names):
             advice = "; is the last one a gripper? remove its column" if len(names) == len(arm.joint_names) + 1 else ""
+            known = [*arm.joint_names, *(f"{name}_joint" for name in arm.joint_names), *COLUMNS]
+            for name in (name for name in self.at if name not in COLUMNS):
+                near = get_close_matches(name, known, 1)
+                advice = f"; column {name!r} is not known" + (f": is it {near[0]}?" if near else "")
+                break
             raise InputError(
                 f"{self.path}: line 1: {len(names)} joints ({names[0]}..{names[-1]}); {arm.name} has "
                 f"{len(arm.joint_names)}{advice}"
@@ -475,6 +534,12 @@ class _Columns:
                 f"{self.path}: what do the three numbers of a rotation mean? give --rotation rotvec, or the order of the "
                 "angles: xyz (about fixed axes), XYZ (about the rotated axes), zyx ..."
             )
+        if unit == "_rad" and np.abs(found).max() > MOST_RAD:
+            row, column = np.unravel_index(int(np.abs(found).argmax()), found.shape)
+            raise InputError(
+                f"{self.path}: line {self.rows[row][0]}: {names[column]} is {found[row, column]:g}: are these degrees? "
+                "name the columns rx_deg ry_deg rz_deg"
+            )
         radians = unit == "_rad" or (unit != "_deg" and bool((np.abs(found) <= 2 * np.pi + 1e-3).all()))
         return (np.degrees(found) if radians else found), convention
 
@@ -528,13 +593,22 @@ def _positions(table: _Columns, unit: str | None, detect: bool) -> tuple[Array, 
             )
         raise InputError(
             f"{table.path}: line 1: no positions: x_m y_m z_m or x_mm y_mm z_mm are needed, or, with "
-            "--model, joints q1_rad .. or q1_deg ..; --columns x_m=NAME,... gives yours"
+            f"--model, joints q1_rad .. or q1_deg ..; there are {', '.join(list(table.at)[:10])}: --columns x_m=NAME,... "
+            "gives yours"
         )
     p = table.numbers([f"{axis}{suffix}" for axis in "xyz"])
     given = suffix[1:] or unit
     unit_m = 1e-3 if given == "mm" else 1.0
     far = float(np.abs(p).max()) * unit_m
     if unit_m == 1.0 and far > FAR_M:
+        lengths = np.linalg.norm(p, axis=1)
+        near = np.flatnonzero((lengths < lengths.max() / MIXED) & (lengths > NEAR_M))
+        if len(near) and (given is None or suffix == "_m"):
+            large, small = (table.rows[k][0] for k in (int(lengths.argmax()), near[0]))
+            raise InputError(
+                f"{table.path}: line {large} is {lengths.max():.0f} m from the base, {small} {lengths[near[0]]:.2g} m: "
+                f"are some rows in millimetres? {len(near)} of {len(p)} rows are near; write all in one unit"
+            )
         if not detect:
             raise InputError(
                 f"{table.path}: positions of up to {far:.0f} m: are they millimetres? name the columns x_mm y_mm z_mm, or "

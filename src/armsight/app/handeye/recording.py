@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +55,7 @@ def seen_in_table(table: PoseTable) -> Seen:
     """Return the target's poses of a table as what was seen."""
     n = len(table.Ts)
     names = table.names or tuple(f"line {line}" for line in table.lines)
-    return Seen(table.Ts, np.zeros((n, 6, 6)), names, table.missed, table.t_s, np.zeros(3))
+    return Seen(table.Ts, np.zeros((n, 6, 6)), names, table.missed, table.t_s, np.zeros(3), table=table)
 
 
 def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> PairedPoses:
@@ -66,6 +66,8 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
     """
     notes = [*robot.notes, *seen.notes]
     rows, matched = matched_rows(robot, seen.names)
+    notes += _alone(robot, seen, rows, matched)
+    rows, matched = _once(robot, seen, rows, matched, notes)
     shown = np.array([not seen.missed[k] for k in matched])
     lost = [f"{seen.names[k]} ({seen.missed[k]})" for k in matched[~shown]]
     if lost:
@@ -107,14 +109,16 @@ def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[NDArray[np.int6
     """
     if robot.names is not None:
         there = {name: k for k, name in enumerate(seen)} | {Path(name).stem: k for k, name in enumerate(seen)}
+        paths = [PureWindowsPath(name) for name in robot.names]  # its separators are / too
         keys = [
-            next((key for key in (name, Path(name).name, Path(name).stem) if key in there), None)
-            for name in robot.names
+            next((key for key in (name, path.name, path.stem) if key in there), None)
+            for name, path in zip(robot.names, paths, strict=True)
         ]
         found = [(r, there[key]) for r, key in enumerate(keys) if key is not None]
         if not found:
             raise InputError(
-                f"{robot.path}: none of its names ({robot.names[0]}, ...) is among those seen ({seen[0]}, ...)"
+                f"{robot.path}: none of its names ({robot.names[0]}, ...) is among those seen ({seen[0]}, ...): write in "
+                "that column what the images are called"
             )
         rows, matched = (np.array(part) for part in zip(*found, strict=True))
         return rows, matched
@@ -124,6 +128,39 @@ def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[NDArray[np.int6
             "image (or name), or t_s on both sides and --streams, so that they can be determined apart"
         )
     return np.arange(len(robot.Ts)), np.arange(len(seen))
+
+
+def _alone(robot: PoseTable, seen: Seen, rows: NDArray[np.int64], matched: NDArray[np.int64]) -> list[str]:
+    """Return notes of rows and images that have no other side."""
+    sides = (
+        (np.setdiff1d(np.arange(len(robot.Ts)), rows), robot.names or (), f"rows of {robot.path} without an image"),
+        (np.setdiff1d(np.arange(len(seen.names)), matched), seen.names, f"images without a row in {robot.path}"),
+    )
+    return [
+        f"{len(alone)} {what}, left out: {', '.join(names[k] for k in alone[:3])}{', ...' if len(alone) > 3 else ''}"
+        for alone, names, what in sides
+        if len(alone)
+    ]
+
+
+def _once(
+    robot: PoseTable, seen: Seen, rows: NDArray[np.int64], matched: NDArray[np.int64], notes: list[str]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows without those that repeat another on both sides; views that repeat while the arm moved are noted."""
+    hands = np.unique(robot.Ts[rows].reshape(-1, 16), axis=0, return_inverse=True)[1].ravel()
+    eyes = np.unique(seen.Ts[matched].reshape(-1, 16), axis=0, return_inverse=True)[1].ravel()
+    eyes = np.where([bool(seen.missed[k]) for k in matched], len(eyes) + np.arange(len(eyes)), eyes)
+    first = np.sort(np.unique(np.stack([hands, eyes], axis=1), axis=0, return_index=True)[1])
+    if len(first) < len(rows):
+        again = [seen.names[k] for k in np.delete(matched, first)]
+        more = ", ..." if len(again) > 3 else ""
+        notes.append(f"{len(again)} rows repeat another, pose and view, and are left out: {', '.join(again[:3])}{more}")
+    rows, matched, eyes = rows[first], matched[first], eyes[first]
+    frozen = [k for k in range(len(eyes)) if (eyes == eyes[k]).sum() > 1]
+    if frozen:
+        named = ", ".join(seen.names[matched[k]] for k in frozen[:4])
+        notes.append(f"the very same view in {named}, while the robot moved: a copied or frozen image?")
+    return rows, matched
 
 
 def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:

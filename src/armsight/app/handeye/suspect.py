@@ -1,62 +1,100 @@
 """What is wrong with hand-eye data that do not fit: other readings of the same numbers are tried.
 
 In: a recording. Out: nothing where it fits as given; an InputError in one line where another reading fits far better: rows
-shifted against the images, the other mounting or inverse transforms, another unit, another order of angles, quaternions or
-joints.
+shifted against the images, from the first on or from where one is missing, the other mounting or inverse transforms,
+another unit, another order of angles, quaternions, axes or joints, another arm, or where something was displaced.
 
-How well a reading fits is the median residual of the closed forms
-(:func:`~armsight.loop.handeye.handeye.starts`): of a position, m, or of a rotation as it moves a point at 0.3 m.
+How well a reading fits is given by two quantiles of the residuals of the closed forms
+(:func:`~armsight.loop.handeye.handeye.starts`): of a position, m, or of a rotation as it moves a point at 0.3 m. The
+median alone does not do: where an arm moves in equal steps, rows that are shifted by one fit another mounting but where the
+steps change, a third of the rows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations, permutations
+from itertools import combinations, permutations, product
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.handeye.read import CONVENTIONS, rotations_by, stacked
+from armsight.app.handeye.read import CONVENTIONS, MIXED, PoseTable, rotations_by, stacked
 from armsight.app.handeye.recording import PairedPoses
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.geometry.pose import inverse, log_se3
+from armsight.geometry.pose import inverse, log_se3, mean_pose
 from armsight.loop.handeye.handeye import LEVER_M, Poses, residuals, starts
 from armsight.loop.handeye.structured import scale_between
 from armsight.robot.arm import Arm
+from armsight.robot.models import MODELS
 
-#: Data whose median residual is below this, m, are taken as they are.
+#: Of the residuals that are looked at: their median, and what nine of ten are below.
+QUANTILES = (0.5, 0.9)
+#: Data whose median residual is below this, m, are taken as they are, if nine of ten are plausible.
 FITS_M = 2e-3
-#: Another reading must fit better by this factor, and its median residual be below this, m.
+#: Another reading must fit better by this factor in either quantile, and be below this, m, in it.
 BETTER, PLAUSIBLE_M = 4.0, 0.02
 #: A reading is preferred to those before it where its residual is smaller by this: xyz and ZYX are the same.
 SMALLER = 0.99
-#: Poses that a reading is evaluated by at most, and the rows by which poses are looked for against the images.
-EVALUATED, SHIFTS = 60, (1, -1, 2, -2)
+#: Poses that a reading is evaluated by at most.
+EVALUATED = 60
+#: Rows that poses and images have in common at least where they are shifted (half of them besides: few rows fit anything),
+#: and shifts that are tried: those for which both sides rotate alike.
+COMMON, SHIFTS = 6, 4
 #: Rows at least on either side of where something may have been displaced, and rows that are tried first.
 PART, TRIED = 6, 12
 #: Orders of the joints that are looked at: the angles between poses do not distinguish parallel axes.
 ORDERS = 12
 #: Mirrors one axis; the other two are this one rotated.
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
-#: Scales that mistaken units make: mm for m, cm, inches.
-UNITS = {
-    1000.0: "millimetres taken for metres",
-    100.0: "centimetres taken for metres",
-    39.37: "inches taken for metres",
-}
+#: Units that lengths may be in, m.
+UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "metres": 1.0}
+
+#: Scales that differ from a unit's by less than this part are the unit.
+A_UNIT = 0.1
 
 
-def misfit(poses: Poses) -> float:
-    """Return the median residual, m, of the best closed form."""
+class _Reading(NamedTuple):
+    """The data read in another way.
+
+    Attributes:
+        poses: what they are then.
+        said: what it would mean, and what to do.
+        path: the file that it is about; None: the robot's table.
+        of_length: how long 1 m of the robot's is in this reading, m.
+    """
+
+    poses: Poses
+    said: str
+    path: Path | None = None
+    of_length: float = 1.0
+
+
+def misfit(poses: Poses) -> Array:
+    """Return the quantiles (2,) of the residuals, m, of the best closed form."""
     rows = np.linspace(0, len(poses.A) - 1, min(EVALUATED, len(poses.A))).round().astype(np.int64)
     part = poses.rows(rows)
     found = starts(part.A, part.right_side)
     if not found:
-        return float("inf")
+        return np.full(2, np.inf)
     X, Z = found[0]
-    return float(np.median(_sizes(residuals(part, Z, X)[0])))
+    return np.quantile(_sizes(residuals(part, Z, X)[0]), QUANTILES)
+
+
+def _better(off: Array, as_given: Array, *, length: float = 1.0) -> bool:
+    """Return whether other residuals are those of data that fit, and far smaller than as given.
+
+    Args:
+        off: (2,) quantiles, m.
+        as_given: (2,) quantiles, m.
+        length: how long 1 m of the robot's is in the other reading, m: residuals of a world that is read smaller are
+            smaller.
+    """
+    fits = (off < PLAUSIBLE_M) & (off / length < as_given / BETTER)
+    return bool(fits.any() and off[0] < max(FITS_M, as_given[0]))
 
 
 def _sizes(e: Array) -> Array:
@@ -108,48 +146,94 @@ def require_plausible(
     """
     p = recording.poses
     as_given = misfit(_resized(p) if scale else p)
-    if as_given < FITS_M:
+    if as_given[0] < FITS_M and as_given[1] < PLAUSIBLE_M:
         return recording
-    best, advice, converted = as_given, "", None
-    units = {said for _, said in _scaled(p)}
-    for poses, said in _readings(recording, arm, () if streams else SHIFTS):
-        try:
-            other = misfit(_resized(poses) if scale else poses)
-        except np.linalg.LinAlgError:
-            continue
-        if other < SMALLER * best:
-            best, advice = other, said
-            converted = poses if said in units else None
-    if best < as_given / BETTER and best < PLAUSIBLE_M:
-        if detect_units and converted is not None:
-            note = f"{advice.partition(':')[0]}; converted"
-            return replace(recording, poses=converted, notes=(*recording.notes, note))
+    reading = _best(recording, arm, as_given, scale=scale, streams=streams)
+    if reading is not None:
+        if detect_units and reading.of_length != 1.0:
+            note = f"{reading.said.partition(':')[0]}; converted"
+            return replace(recording, poses=reading.poses, notes=(*recording.notes, note))
+        off = misfit(_resized(reading.poses) if scale else reading.poses)
         raise InputError(
-            f"{recording.robot.path}: {advice} (median residual {1e3 * best:.1f} mm; as given {1e3 * as_given:.1f})"
+            f"{reading.path or recording.robot.path}: {reading.said} (half of the rows then within {1e3 * off[0]:.1f} mm, "
+            f"nine of ten {1e3 * off[1]:.1f}; as given {1e3 * as_given[0]:.1f} and {1e3 * as_given[1]:.1f})"
         )
     displaced = _displaced(p, as_given) if not scale else None
     if displaced is not None:
         first, what = _moved(p, displaced)
         raise InputError(
             f"{recording.robot.path}: the rows up to {recording.names[first - 1]} and those from "
-            f"{recording.names[first]} on fit one mounting each, but not the same (as given, median residual "
-            f"{1e3 * as_given:.1f} mm): {what} about there: use one of both parts"
+            f"{recording.names[first]} on fit one mounting each, but not the same (as given, half of the rows are within "
+            f"{1e3 * as_given[0]:.1f} mm, nine of ten {1e3 * as_given[1]:.1f}): {what} about there: use one of both parts"
         )
-    if as_given > PLAUSIBLE_M:
-        note = (
-            f"{recording.robot.path}: half of the rows are off by more than {1e3 * as_given:.0f} mm in any mounting, and "
-            "no other reading fits: what is found is no calibration; check one row by hand, or take the poses again"
+    if as_given[0] > max(PLAUSIBLE_M, _spread(p) / BETTER):
+        raise InputError(
+            f"{recording.robot.path}: half of the rows are off by more than {1e3 * as_given[0]:.0f} mm in any mounting, "
+            "and no other reading fits: robot and images are not of the same motion, or which row belongs to which, a "
+            "rotation or the joints are read wrongly; check one row by hand, or take the poses again"
         )
-        return replace(recording, notes=(*recording.notes, note))
-    return recording
+    notes = _nearer_models(recording, arm, as_given[0])
+    if as_given[0] > PLAUSIBLE_M:
+        notes.append(
+            f"{recording.robot.path}: half of the rows are off by more than {1e3 * as_given[0]:.0f} mm in any mounting, "
+            "and no other reading fits: check one row by hand"
+        )
+    return replace(recording, notes=(*recording.notes, *notes))
 
 
-def _displaced(p: Poses, as_given: float) -> int | None:
+def _nearer_models(recording: PairedPoses, arm: Arm | None, as_given: float) -> list[str]:
+    """Return notes of models of other arms that fit better by half: a generation of an arm differs little from the next."""
+    table, p = recording.robot, recording.poses
+    if arm is None or table.q is None or table.numbers.shape[1]:
+        return []
+    q = table.q[recording.rows]
+    found = {other: float(misfit(replace(p, A=A))[0]) for other, A in _models(arm, q)}
+    best = min(found, key=lambda other: found[other], default="")
+    if not best or found[best] > as_given / 2:
+        return []
+    return [
+        f"{table.path}: the joints fit --model {best} better than {arm.name}: half of the rows are within "
+        f"{1e3 * found[best]:.1f} mm, not {1e3 * as_given:.1f}: which is it?"
+    ]
+
+
+def _models(arm: Arm, q: Array) -> Iterator[tuple[str, Array]]:
+    """Yield the names of other models of as many joints, and the flange (N, 4, 4) by them."""
+    for other in MODELS.values():
+        if len(other.joint_names) == q.shape[1] and other.name != arm.name:
+            yield other.name, np.asarray(other.forward(q))
+
+
+def _spread(p: Poses) -> float:
+    """Return the median distance of the target's poses from their mean, m: what an unknown arm would leave."""
+    return float(np.median(_sizes(log_se3(inverse(mean_pose(p.B)) @ p.B))))
+
+
+def _best(recording: PairedPoses, arm: Arm | None, as_given: Array, *, scale: bool, streams: bool) -> _Reading | None:
+    """Return the reading that fits best of those that fit far better than as given; None where none does."""
+    best, found = np.inf, None
+    for reading in _readings(recording, arm, streams):
+        try:
+            off = misfit(_resized(reading.poses) if scale else reading.poses)
+        except np.linalg.LinAlgError:
+            continue
+        if not _better(off, as_given, length=reading.of_length):
+            continue
+        left = (off[0] + min(off[1], PLAUSIBLE_M)) / reading.of_length
+        if left < SMALLER * best:
+            best, found = left, reading
+    return found
+
+
+def _displaced(p: Poses, as_given: Array) -> int | None:
     """Return the first row after which another mounting fits, where either part alone fits far better than the whole."""
     n = len(p.A)
 
-    def worse(k: int) -> float:
-        return max(misfit(p.rows(np.arange(k))), misfit(p.rows(np.arange(k, n))))
+    def worse(k: int) -> Array:
+        return np.maximum(misfit(p.rows(np.arange(k))), misfit(p.rows(np.arange(k, n))))
+
+    def left(k: int) -> float:
+        return float(found[k].sum())
 
     if n < 2 * PART:
         return None
@@ -158,12 +242,12 @@ def _displaced(p: Poses, as_given: float) -> int | None:
     step = int(np.diff(tried).max()) if len(tried) > 1 else 1
     while step > 1:
         step = (step + 1) // 2
-        best = min(found, key=lambda k: found[k])
+        best = min(found, key=left)
         for k in (best - step, best + step):
             if PART <= k <= n - PART and k not in found:
                 found[k] = worse(k)
-    best = min(found, key=lambda k: found[k])
-    return best if found[best] < min(as_given / BETTER, PLAUSIBLE_M) else None
+    best = min(found, key=left)
+    return best if _better(found[best], as_given) else None
 
 
 def _moved(p: Poses, row: int) -> tuple[int, str]:
@@ -188,86 +272,198 @@ def _moved(p: Poses, row: int) -> tuple[int, str]:
     return first, f"{what} by {1e3 * np.linalg.norm(e[:3]):.0f} mm and {np.degrees(np.linalg.norm(e[3:])):.1f} deg"
 
 
-def _readings(recording: PairedPoses, arm: Arm | None, shifts: tuple[int, ...]) -> Iterator[tuple[Poses, str]]:
-    """Yield other readings of the same data, with what it would mean."""
+def _readings(recording: PairedPoses, arm: Arm | None, streams: bool) -> Iterator[_Reading]:
+    """Yield other readings of the same data, with what they would mean."""
     p = recording.poses
-    n = len(p.A)
-    for shift in shifts:
-        if n - abs(shift) >= 6:
-            first, second = (
-                (slice(shift, None), slice(None, -shift)) if shift > 0 else (slice(None, shift), slice(-shift, None))
-            )
-            rows = np.arange(n)
-            yield (
-                replace(p.rows(rows[second]), A=p.A[first]),
-                f"the rows are shifted by {abs(shift)} against the images: row {1 + max(shift, 0)} of the robot belongs to "
-                f"image {1 + max(-shift, 0)}; remove what is too much at either end, or add a column image",
-            )
+    if not streams:
+        yield from _other_rows(recording)
     mountings = ("in_hand", "to_hand")
     given, other = mountings if p.in_hand else mountings[::-1]
-    yield (
+    yield _Reading(
         replace(p, in_hand=not p.in_hand),
         f"these poses fit --eye {other.replace('_', '-')}, not {given.replace('_', '-')}: either the mounting is the other "
         "one, or one of the tables holds inverse transforms (base in flange, or rig in target)",
     )
-    yield from _scaled(p)
-    whose = "" if arm is None else f", and --model {arm.name} the arm"
-    yield (
-        _resized(p),
-        f"the target seems to be {scale_between(p):.3g} times as large as given: is --target's size right{whose}? --scale "
-        "fits it",
-    )
-    yield (
+    units = list(_scaled(recording))
+    yield from units
+    if all(abs(np.log(scale_between(one.poses))) > A_UNIT for one in units):
+        whose = "" if arm is None else f", and --model {arm.name} the arm"
+        yield _Reading(
+            _resized(p),
+            f"the target seems to be {scale_between(p):.3g} times as large as given: is --target's size right{whose}? "
+            "--scale fits it",
+        )
+    yield _Reading(
         replace(p, A=MIRROR @ p.A @ MIRROR),
         "one of the tables is of a left-handed frame: one axis is mirrored, in positions and rotations; robot and camera "
         "poses are right-handed: change the sign of one axis, and of the rotations about the two others",
     )
-    table = recording.robot
-    if table.convention:
-        position = p.A[:, :3, 3]
-        for convention in CONVENTIONS:
-            width = 4 if convention in ("wxyz", "xyzw") else 3
-            if convention == table.convention or width != table.numbers.shape[1]:
-                continue
-            R = rotations_by(table.numbers[recording.rows], convention, table.path)
-            yield (
-                replace(p, A=stacked(R, position)),
-                f"the rotations are {convention}, not {table.convention}: --rotation {convention}",
-            )
-        if table.numbers.shape[1] == 3:
-            R = rotations_by(np.degrees(table.numbers[recording.rows]), table.convention, table.path)
-            yield (
-                replace(p, A=stacked(R, position)),
-                "the rotations are in radians, not degrees: name the columns rx_rad ry_rad rz_rad",
+    table, seen = recording.robot, recording.seen.table
+    sides = [(table, recording.rows, "A", "")]
+    sides += [] if seen is None else [(seen, recording.matched, "B", "seen-")]
+    for one, rows, side, option in sides:
+        poses = getattr(p, side)
+        for R, said in _rotations(one, rows, poses[:, :3, :3], option):
+            yield _Reading(_with(p, side, stacked(R, poses[:, :3, 3])), said, one.path)
+        for named, position in _axes(poses[:, :3, 3]):
+            yield _Reading(
+                _with(p, side, stacked(poses[:, :3, :3], position)),
+                f"the axes of the positions are not those of the rotations: the positions fit as {named}",
+                one.path,
             )
     if arm is not None and table.q is not None and table.numbers.shape[1] == 0:
-        yield from _joints(p, arm, table.q[recording.rows])
+        yield from (_Reading(replace(p, A=A), said) for A, said in _joints(p, arm, table.q[recording.rows]))
 
 
-def _scaled(p: Poses) -> Iterator[tuple[Poses, str]]:
-    """Yield readings of the target's lengths in other units."""
-    for factor, said in UNITS.items():
-        for scale, whose in (
-            (factor, f"the robot's lengths are {said}"),
-            (1 / factor, f"the target's lengths are {said}"),
+def _with(p: Poses, side: str, Ts: Array) -> Poses:
+    """Return the poses with other ones on one side, A or B."""
+    return replace(p, A=Ts) if side == "A" else replace(p, B=Ts)
+
+
+def _other_rows(recording: PairedPoses) -> Iterator[_Reading]:
+    """Yield rows shifted against the images, from the first on or from a later one, or in reverse."""
+    p, n = recording.poses, len(recording.poses.A)
+    hand, eye = _angles(p.A), _angles(p.right_side)
+    shifts = [shift for k in range(1, n - max(COMMON, n // 2) + 1) for shift in (k, -k)]
+    off = [np.median(np.abs(hand[max(s, 0) : n - 1 + min(s, 0)] - eye[max(-s, 0) : n - 1 - max(s, 0)])) for s in shifts]
+    for shift in dict.fromkeys([*shifts[:2], *(shifts[k] for k in np.argsort(off)[:SHIFTS])]):
+        if (found := _shifted(p, shift)) is None:
+            continue
+        hands, eyes, first = found
+        where = f"{recording.robot.path.name} line {recording.robot.lines[recording.rows[hands[first]]]} belongs to "
+        where += recording.seen.names[recording.matched[eyes[first]]]
+        why = "a row is missing" if shift < 0 else "a row is too much"
+        since = f", from {recording.names[first]} on: {why} before it" if first else ""
+        todo = "add a column image" if recording.robot.names is None else "correct its column of names"
+        yield _Reading(
+            replace(p.rows(eyes), A=p.A[hands]),
+            f"the rows are shifted by {abs(shift)} against the images{since}; {where}; remove what is too much, or {todo}",
+        )
+    yield _Reading(replace(p, A=p.A[::-1]), "the rows are in reverse order against the images")
+
+
+def _shifted(p: Poses, shift: int) -> tuple[NDArray[np.int64], NDArray[np.int64], int] | None:
+    """Return rows of the robot and of the images that belong together where later rows are shifted.
+
+    Returns:
+        Both, and how many rows at the beginning are not shifted; None where those that are do not fit better.
+    """
+    n, most = len(p.A), PLAUSIBLE_M
+    hands = np.arange(max(shift, 0), n + min(shift, 0))
+    whole = replace(p.rows(hands - shift), A=p.A[hands])
+    best, first = np.inf, 0
+    for part in (whole, p):
+        X, Z = starts(part.A, part.right_side)[0]
+        as_given, shifted = (np.minimum(_sizes(residuals(one, Z, X)[0]), most) for one in (p, whole))
+        later = np.full(n, most)
+        later[hands] = shifted
+        costs = np.append(0.0, np.cumsum(as_given)) + np.append(np.cumsum(later[::-1])[::-1], 0.0)
+        k = int(np.argmin(costs[: n - abs(shift) - 2]))
+        if costs[k] < SMALLER * best and (k <= max(shift, 0) or np.median(later[k:]) < most / BETTER):
+            best, first = float(costs[k]), k
+    if np.isinf(best):
+        return None
+    first = first if first > max(shift, 0) else 0  # rows before the first that has an image are not shifted either
+    later_hands = hands[hands >= first + (max(shift, 0) if first else 0)]
+    earlier = np.arange(first)
+    return np.append(earlier, later_hands), np.append(earlier, later_hands - shift), first
+
+
+def _rotations(table: PoseTable, rows: NDArray[np.int64], R: Array, option: str) -> Iterator[tuple[Array, str]]:
+    """Yield other readings of a table's rotations (N, 3, 3), and what they would mean."""
+    numbers = table.numbers[rows]
+    width = numbers.shape[1]
+    for convention in CONVENTIONS if width else ():
+        if convention != table.convention and width == (4 if convention in ("wxyz", "xyzw") else 3):
+            yield (
+                rotations_by(numbers, convention, table.path),
+                f"the rotations are {convention}, not {table.convention}: --{option}rotation {convention}",
+            )
+    if width == 3:
+        for unit, other, given in (
+            (np.degrees(numbers), "radians", "degrees"),
+            (np.radians(numbers), "degrees", "radians"),
         ):
-            B = p.B.copy()
-            B[:, :3, 3] *= scale
-            A = p.A.copy()
-            if scale > 1:
-                A[:, :3, 3] /= scale
-                B = p.B
-            yield replace(p, A=A, B=B), f"{whose}: give --units or --seen-units, or --detect-units"
+            yield (
+                rotations_by(unit, table.convention, table.path),
+                f"the rotations are in {other}, not {given}: name the columns rx_{other[:3]} ry_{other[:3]} rz_{other[:3]}",
+            )
+        yield (
+            rotations_by(numbers[:, ::-1], table.convention, table.path),
+            "the rotations about x and z are exchanged: KUKA's A is about z, Fanuc's W about x: exchange the names of the "
+            "first and the last angle",
+        )
+    yield (
+        np.swapaxes(R, 1, 2),
+        "the rotations are inverse (matrices column by column, or quaternions conjugate), the positions are not",
+    )
 
 
-def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
-    """Yield readings of the joints: in another unit, one with another sense, in another order.
+def _axes(position: Array) -> Iterator[tuple[str, Array]]:
+    """Yield positions (N, 3) with axes exchanged and mirrored, and how they are named."""
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        if order != (0, 1, 2) or min(signs) < 0:
+            named = ", ".join(f"{'-' if sign < 0 else ''}{'xyz'[k]}" for k, sign in zip(order, signs, strict=True))
+            yield named, position[:, order] * signs
+
+
+def _scaled(recording: PairedPoses) -> Iterator[_Reading]:
+    """Yield readings of the robot's and of the target's lengths in other units."""
+    p, robot, seen = recording.poses, recording.robot, recording.seen.table
+    sides: list[tuple[str, str, float, str, Path | None]] = []
+    sides += [("A", "robot", robot.unit_m, "--units", robot.path)] if robot.q is None or robot.numbers.shape[1] else []
+    sides += [("B", "target", 1.0, "--target's size", None)] if seen is None else []
+    sides += [("B", "target", seen.unit_m, "--seen-units", seen.path)] if seen is not None else []
+    for side, whose, unit_m, option, path in sides:
+        given = next(name for name, length in UNITS.items() if length == unit_m)
+        T = getattr(p, side).copy()
+        lengths = np.linalg.norm(T[:, :3, 3], axis=1)
+        if (short := lengths < lengths.max() / MIXED).any():
+            T[short, :3, 3] *= 1e3
+            said = f"{short.sum()} of {len(short)} rows of the {whose} are in metres, the others in mm: correct them"
+            yield _Reading(_with(p, side, T), said, path)
+        for name, length in UNITS.items():
+            if name != given:
+                T = getattr(p, side).copy()
+                T[:, :3, 3] *= length / unit_m
+                yield _Reading(
+                    _with(p, side, T),
+                    f"the {whose}'s lengths are {name} taken for {given}: correct {option}, or give --detect-units",
+                    path,
+                    length / unit_m if side == "A" else 1.0,
+                )
+
+
+def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Array, str]]:
+    """Yield the flange (N, 4, 4) by other readings of the joints: another unit, sense, zero or order, or another arm.
 
     Of all permutations those that the angles between poses support.
     """
     n = q.shape[1]
+    if np.abs(radians := np.degrees(q)).max() < 2 * np.pi:
+        yield np.asarray(arm.forward(radians)), "the joints are in radians, not degrees: name their columns q1_rad .."
+    for joint, one in enumerate(np.eye(n)):
+        said = f"joint {joint + 1} ({arm.joint_names[joint]})"
+        yield (
+            np.asarray(arm.forward(q * (1 - 2 * one))),
+            f"{said} counts the other way than {arm.name}'s: change the sign of q{joint + 1}",
+        )
+        for degrees in (90, -90, 180) if 0 < joint < n - 1 else ():
+            yield (
+                np.asarray(arm.forward(q + np.radians(degrees) * one)),
+                f"{said} has another zero than {arm.name}'s: add {degrees} deg to q{joint + 1}",
+            )
+    for named, at in _orders(p, arm, q):
+        yield np.asarray(arm.forward(q[:, at])), f"the joints are in another order: {arm.name}'s are {named} here"
+    for other, A in _models(arm, q):
+        yield A, f"the joints fit --model {other}, not {arm.name}"
+
+
+def _orders(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[str, NDArray[np.int64]]]:
+    """Yield the orders of the joints that the angles between poses support best, and how they are named."""
+    n = q.shape[1]
     rows = np.linspace(0, len(q) - 1, min(EVALUATED, len(q))).round().astype(np.int64)
-    seen = _angles(inverse(p.B[rows]) if p.in_hand else p.B[rows])
+    seen = _angles(p.right_side[rows])
     orders: list[tuple[int, ...]] = [
         tuple(j if k == i else i if k == j else k for k in range(n)) for i, j in combinations(range(n), 2)
     ]
@@ -278,21 +474,5 @@ def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Poses, str]]:
     for order in orders:
         rotated = _angles(np.asarray(arm.forward(q[rows][:, order])))
         scored.append((float(np.median(np.abs(rotated - seen))), np.array(order)))
-    if np.abs(radians := np.degrees(q)).max() < 2 * np.pi:
-        yield (
-            replace(p, A=np.asarray(arm.forward(radians))),
-            "the joints are in radians, not degrees: name their columns q1_rad ..",
-        )
-    for joint in range(n):
-        reversal = q * np.where(np.arange(n) == joint, -1.0, 1.0)
-        yield (
-            replace(p, A=np.asarray(arm.forward(reversal))),
-            f"joint {joint + 1} ({arm.joint_names[joint]}) counts the other way than {arm.name}'s: change the sign of "
-            f"q{joint + 1}",
-        )
     for _, at in sorted(scored, key=lambda one: one[0])[:ORDERS]:
-        named = ", ".join(f"q{k + 1}" for k in at)
-        yield (
-            replace(p, A=np.asarray(arm.forward(q[:, at]))),
-            f"the joints are in another order: {arm.name}'s are {named} here",
-        )
+        yield ", ".join(f"q{k + 1}" for k in at), at

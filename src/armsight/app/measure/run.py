@@ -124,7 +124,7 @@ def measure_shots(
     stereo = open_rig(rig)
     folder = None if view_dir is None else view_folder(view_dir)
     if output is not None:
-        check_writable(output, apart_from=(rig, target, detections, folder and folder / CHART))
+        check_writable(output, apart_from=(rig, target, detections, folder, folder and folder / CHART))
     if not stereo.cov.any():
         click.echo(f"note: {rig} has no covariance: every ± is the share of the pixel noise alone", err=True)
     records: list[ShotPose] = []
@@ -137,14 +137,14 @@ def measure_shots(
     noise: DiscNoise | None = None
     with contextlib.ExitStack() as stack:
         if detections is not None:
-            body, shots = _detected(detections, target)
+            body, shots, printed = _detected(detections, target)
             results = ((Shot(s.name, None, None, s.t_s), measure_seen(stereo, body, s), None, None) for s in shots)
             total = len(shots)
             by_name = {s.name: s for s in shots}
             missed = _Contradicting(stereo, body, lambda rig, shot: measure_seen(rig, body, by_name[shot.name]))
         else:
             found = open_target(target)
-            body, discs = found.body, found.discs
+            body, discs, printed = found.body, found.discs, is_print(found)
             if discs is not None:
                 noise = DiscNoise(stereo, found)
             elif save_rig is not None and requested is None:
@@ -181,7 +181,6 @@ def measure_shots(
             stack.callback(view.finish, records)
         if output is not None:
             stack.callback(_write, output, records)
-        printed = detections is None and is_print(found)
         monitor = HealthMonitor(stereo, body, _SYNC_S, printed=printed)
         publisher = stack.enter_context(contextlib.closing(_streams(streams, stereo, body)))
         try:
@@ -326,15 +325,15 @@ def _opened(left: str | None, right: str | None, source: str | None) -> Source:
     return PairsSource.open(left, right) if left is not None and right is not None else open_source(str(source))
 
 
-def _detected(detections: Path, target: str) -> tuple[Body, list[SeenShot]]:
-    """Return the body, and what was detected of it: from a table, or from a recording of tags, bag:FILE."""
+def _detected(detections: Path, target: str) -> tuple[Body, list[SeenShot], bool]:
+    """Return the body, and what was detected of it, in a table or a recording of tags (bag:FILE); whether it is a print."""
+    opened = open_body(target) if target.lower().endswith(".csv") else open_target(target)
+    body, printed = (opened, False) if isinstance(opened, Body) else (opened.body, is_print(opened))
     if not str(detections).startswith("bag:"):
-        body = open_body(target)
-        return body, read_detections(detections, body)
-    tagged = open_body(target) if target.lower().endswith(".csv") else open_target(target)
-    shots, notes = read_tags(str(detections), tagged)
+        return body, read_detections(detections, body), printed
+    shots, notes = read_tags(str(detections), opened)
     _say(notes)
-    return tagged if isinstance(tagged, Body) else tagged.body, shots
+    return body, shots, printed
 
 
 def _say(notes: Iterable[str]) -> None:
@@ -551,6 +550,10 @@ def _close(
         summary += "; " + ", ".join(f"{count} {way} ({took[way]:.1f} ms each)" for way, count in ways.most_common())
     if jumps := [r.shot for r in records if r.jump]:
         summary += f"; jumped in {', '.join(jumps[:5])}" + (f" and {len(jumps) - 5} more" if len(jumps) > 5 else "")
+    if few := [r.shot for r in good if len(r.dropped) > len(r.points_m)]:
+        which = ", ".join(few[:_NAMED]) + (f" and {len(few) - _NAMED} more" if len(few) > _NAMED else "")
+        summary += f"; in {which} most points contradict each other: do not use it; the body moved between the two "
+        summary += "exposures, or the images do not belong together"
     if odd := [r.shot for r in good if r.misfit > 1]:
         which = f" ({', '.join(odd)})" if len(odd) <= _NAMED else ""
         summary += f"; {len(odd)} fit the body worse than the noise allows{which}"

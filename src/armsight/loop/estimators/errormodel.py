@@ -208,8 +208,8 @@ class ErrorModel:
 
     def innovation(
         self, x: Array, joints: Smoothed, pose_measurement: PoseMeasurement, jitter_s: float
-    ) -> tuple[Array, Array, Array]:
-        """Return the innovation (6,) of a measurement, the model's derivative (6, size) by x, and the noise (6, 6).
+    ) -> tuple[Array, Array]:
+        """Return the innovation (6,) of a measurement, and the model's derivative (6, size) by x.
 
         Args:
             x: the state.
@@ -217,10 +217,10 @@ class ErrorModel:
             pose_measurement: the measurement.
             jitter_s: standard deviation of its time, s.
         """
-        z, H, R = np.empty(6), np.empty((6, self.layout.size)), np.empty((6, 6))
+        z, H = np.empty(6), np.empty((6, self.layout.size))
         seen = pose_measurement.T_base_tool, pose_measurement.cov_noise, jitter_s
-        _innovation(self._table, x, joints.q[0], joints.qd[0], joints.unseen[0], *seen, z, H, R)
-        return z, H, R
+        _innovation(self._table, x, joints.q[0], joints.qd[0], joints.unseen[0], *seen, z, H, np.empty((6, 6)))
+        return z, H
 
     def predicted(
         self,

@@ -9,6 +9,7 @@ you; add it to the registry in ``__init__``. All times are on one clock, the boa
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple, Protocol
@@ -82,8 +83,8 @@ class Innovation(Record):
         gain: (K, 6) what of z was added to the state; zero where the measurement was rejected.
         outcome: what became of it.
         clock: what is known of an error of the camera's clock; None where nothing is.
-        reference: (6,) as z, from the pose predicted by a state that stays, and its derivative (6, K); None where none is
-            kept (:meth:`KalmanEstimator.keep_reference`).
+        reference: returns (6,) as z, from the pose predicted by a state that stays, and its derivative (6, K), where they
+            are asked for; None where none is kept (:meth:`KalmanEstimator.keep_reference`).
     """
 
     t_s: float
@@ -95,7 +96,7 @@ class Innovation(Record):
     gain: Array
     outcome: Outcome
     clock: ClockEffect | None = None
-    reference: tuple[Array, Array] | None = None
+    reference: Callable[[], tuple[Array, Array]] | None = None
 
 
 @dataclass(frozen=True)

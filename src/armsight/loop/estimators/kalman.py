@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -339,7 +340,7 @@ class KalmanEstimator:
         """Return what became of a measurement: the state at it; what was kept, and the gain; the outcome."""
         reference = None
         if self._reference is not None and self.on_innovation is not None:
-            reference = self._model.innovation(self._reference, joints, pose_measurement, self._delay.jitter_s)[:2]
+            reference = partial(self._model.innovation, self._reference, joints, pose_measurement, self._delay.jitter_s)
         return Innovation(t_s, pose_measurement.T_base_tool, at.z, at.S, at.H, *how, outcome, None, reference)
 
     def _gate(self, at: Predicted, chi: float) -> Outcome:

@@ -181,6 +181,8 @@ def suspected(measurement: PoseMeasurement, changes: Sequence[Change]) -> Array 
     It is that of their mixture: of each the square of what it does, and its covariance; what happened besides adds to it.
     Those that were put right before say nothing.
     """
+    if not changes:
+        return None
     until_s = min((each.until_s for each in changes if each.until_s > measurement.t_s), default=np.inf)
     changes = [each for each in changes if each.until_s == until_s]
     extra, t_s, T = np.zeros((6, 6)), measurement.t_s, measurement.T_base_tool

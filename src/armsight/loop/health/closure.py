@@ -172,7 +172,7 @@ class ClosureWatch:
         """Add a measurement to its block; test when the block is full."""
         if innovation.reference is None:
             return
-        (e, H), clock = innovation.reference, innovation.clock
+        (e, H), clock = innovation.reference(), innovation.clock
         if clock is not None:
             e = e - clock.offset_s * H[:, self._parts.delay]
         block = self._block = self._block or _Block(innovation.t_s, self._parts.size)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from armsight.data import Array, Ids, PoseEstimate
+from armsight.data import PoseEstimate
 from armsight.loop.health.record import HealthFinding
 
 #: So many repeated shots, and this share of all, are reported.
@@ -23,7 +23,7 @@ class HostWatch:
     """Watches for repeated images and stalls."""
 
     def __init__(self) -> None:
-        self._last: tuple[Ids, Array] | None = None
+        self._last: tuple[bytes, bytes] | None = None  # of the detections of the shot before
         self._shots = self._repeated = 0
         self._first_s: float | None = None
         self._stalls = self._periods = 0
@@ -40,10 +40,10 @@ class HostWatch:
     def take(self, estimate: PoseEstimate, t_s: float) -> None:
         """Take a measured pose with the time of its shot, s, in order of time."""
         seen = estimate.points.seen
-        now, last = (seen.ids, seen.uv), self._last
+        now, last = (seen.ids.tobytes(), seen.uv.tobytes()), self._last
         self._last = now
         self._shots += 1
-        if last is None or not np.array_equal(now[0], last[0]) or not np.array_equal(now[1], last[1], equal_nan=True):
+        if now != last:
             return
         self._repeated += 1
         self._first_s = t_s if self._first_s is None else self._first_s

@@ -48,7 +48,7 @@ class HealthMonitor:
         self._landmarks: LandmarkWatch | None = None
         self._fixed: FixedWatch | None = None
         self._closure: ClosureWatch | None = None
-        self._suspected = np.zeros((6, 6))  # what the newest tested shot adds to the covariance of a pose
+        self._suspected: Array | None = None  # what the newest tested shot adds to the covariance of a pose
         self._newest_s, self._doubted_s = 0.0, -np.inf
         self._poses: list[tuple[PoseEstimate, float | None]] = []
         self._innovations: list[Innovation] = []
@@ -67,7 +67,7 @@ class HealthMonitor:
         What is suspected is that of the shots before.
         """
         self._poses.append((pose, t_s))
-        return replace(pose, cov=pose.cov + self._suspected) if self._suspected.any() else pose
+        return pose if self._suspected is None else replace(pose, cov=pose.cov + self._suspected)
 
     def work(self) -> None:
         """Make the tests of everything that was received since the last call."""
@@ -90,14 +90,15 @@ class HealthMonitor:
             t_s: time of its shot, s; None where it has none.
         """
         self._take(pose, t_s)
-        return replace(pose, cov=pose.cov + self._suspected) if self._suspected.any() else pose
+        return pose if self._suspected is None else replace(pose, cov=pose.cov + self._suspected)
 
     def _take(self, pose: PoseEstimate, t_s: float | None) -> None:
         """Test a measured pose."""
         if t_s is not None:
             self._host.take(pose, t_s)
         if self._rig is not None:
-            self._suspected = self._rig.take(pose, t_s)
+            added = self._rig.take(pose, t_s)
+            self._suspected = added if added.any() else None
 
     def period_began(self, t_s: float, late_s: float) -> None:
         """Take by how much, s, a period of the control loop began late, at a time, s."""
@@ -219,7 +220,7 @@ class HealthMonitor:
         """Begin the tests of cameras and bodies anew."""
         if correction.update is not None:
             self._rig = RigWatch(correction.update.rig, self._body, self._sync_s, printed=self._printed)
-            self._suspected = np.zeros((6, 6))
+            self._suspected = None
         if self._landmarks is not None:
             self._landmarks = LandmarkWatch(self._fixed_names)
 

@@ -33,9 +33,13 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtri
 
 from armsight.data import Array, Body, Ids, PoseEstimate, Record
+from armsight.geometry.matrix import product, solved
+from armsight.geometry.pose import inverse
+from armsight.kernels import kernel
 from armsight.loop.health.record import HealthFinding, alarm_limit
-from armsight.loop.health.shape import FURTHEST_M, ResidualSums, ShapeWatch
-from armsight.vision.posefit import PixelObservations, fit_pose, whitened
+from armsight.loop.health.shape import FURTHEST_M, ResidualSums, ShapeWatch, eliminated, total
+from armsight.vision.camera import pair_arguments
+from armsight.vision.posefit import differentiate
 from armsight.vision.rig import StereoRig
 
 Part = Literal["rig", "body", "time"]
@@ -79,11 +83,11 @@ _ALARM, _ALARMS = (
 _POSES = 60
 #: Chi-square from which on a change that matters widens the poses: chance exceeds it in one of fifty tests.
 _SUSPECTED = float(chdtri(len(_WIDE), 0.02))
-#: Powers (x, y) of the polynomials of the position in an image: all products up to this degree.
+#: The polynomials of the position in an image are all products of x and y up to this degree; their count.
 _DEGREE = 4
-_POWERS = np.array([(i, k) for i in range(_DEGREE + 1) for k in range(_DEGREE + 1 - i)])
+_POLYNOMIALS = (_DEGREE + 1) * (_DEGREE + 2) // 2
 #: Numbers of what the camera models lack: of two cameras, along u and v; and how wide their prior is, px.
-_LENS, _LENS_PX = 4 * len(_POWERS), 1.0
+_LENS, _LENS_PX = 4 * _POLYNOMIALS, 1.0
 #: Standard deviations of its prior that are tried: the one of the largest evidence is taken (MacKay, 1992).
 _LENS_SCALES_PX = tuple(2.0**k for k in range(-6, 2))
 #: It is tested in every so many tests, from so many poses that differ; its chi-square of an alarm.
@@ -138,18 +142,21 @@ class LensError(Record):
 
 
 class _ShotResiduals(NamedTuple):
-    """What a shot says, its pose eliminated: its sums, also those with points that do not fit, and what changes the pose.
+    """What a shot says, its pose eliminated, of K parameters and M coefficients of what the camera models lack.
 
-    That is the pose's derivatives (6, 7) by the seven numbers, (6, M) by what the camera models lack, and (6, C) by what
-    the watch of the shape tests: of the pose as it was measured, and of one measured with all points.
+    Attributes:
+        t_s: its time.
+        rows: (n, 1 + K + M) residuals and their derivatives, in standard deviations.
+        response: (6, K + M) of its pose to these.
+        every: as ``rows``, with points that do not fit, which may be displaced.
+        response_with_all: (6, K + M) of a pose measured with these.
     """
 
-    sums: ResidualSums
-    by_fault: Array
-    by_lens: Array
-    every: ResidualSums
-    by_shape: Array
-    by_shape_with_all: Array
+    t_s: float
+    rows: Array
+    response: Array
+    every: Array
+    response_with_all: Array
 
 
 class RigWatch:
@@ -182,31 +189,32 @@ class RigWatch:
         self.prior[rest, rest] = np.append(SCALE, np.full(shape, SHAPE_M))
         self._by_fault = _fault_directions(rig, self._size)
         names = tuple(body.point_names[k] for k in self._points)
-        wide, many = self._by_fault * _WIDE, len(body.points) > MOST_POINTS
-        self._shape = ShapeWatch(
-            self.prior, wide, _focal_changes(rig, self._size), count + 1, names, printed or many, TEST_S
-        )
-        self._stay: ResidualSums | None = None
-        self._stay_shots, self._shots = 0, 0
+        many = len(body.points) > MOST_POINTS
+        self._shape = ShapeWatch(self._size, _focal_changes(rig, self._size), count + 1, names, printed or many, TEST_S)
+        # (K, K + 7 + C) what the parameters, the seven numbers and the candidates of the shape change of the parameters, in
+        # units of their priors: a test has sums of these.
+        self._scaled = np.hstack([self.prior, self._by_fault * _WIDE, self._shape.by_wide])
+        self._shots = 0
         self._row_of = np.full(len(body.points), -1)
         self._row_of[self._points] = np.arange(len(self._points))
         self._last = (-np.inf, np.eye(4))
         self._taken_s = -np.inf
         self._began: Array | None = None
-        # What the seven numbers do to the newest poses, and the covariances of these.
+        # The response of the newest poses to everything, and the covariances of these poses.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
         self._full = self._size + _LENS
-        self._test, self._window = ResidualSums(self._full, 0.0), ResidualSums(self._size, 0.0)
-        # Since the beginning, for what the camera models lack, and what that does to the newest poses.
-        self._whole, self._by_lens = ResidualSums(self._full, 0.0), deque[Array](maxlen=_POSES)
-        # Mean of the squares of the polynomials, of so many shots.
-        self._seen, self._looked = np.zeros((_LENS, _LENS)), 0
+        # What the kernels take of the cameras, and half of the size of their images, px.
+        counts = np.array([camera.distortion.size for camera in rig.cameras])
+        self._pair = (*pair_arguments(rig.cameras), counts, inverse(rig.T_left_right))
+        self._p_body = np.array(body.points, float, order="C")
+        self._half_px = np.array([camera.image_size_px for camera in rig.cameras]) / 2.0
+        # Shots of the running test, in stays; sums since the beginning are for what the camera models lack.
+        self._stays: list[list[_ShotResiduals]] = []
+        self._window, self._whole = ResidualSums(self._size + len(_WIDE), 0.0), ResidualSums(self._full, 0.0)
         self.lens: LensError | None = None
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
         self._timed = False
-        # What each moment of the running test says, and what the alarm of the test before it would have rested on.
-        self._moments: list[ResidualSums] = []
-        self._doubted: ResidualSums | None = None
+        self._doubted: ResidualSums | None = None  # what the alarm of the test before would have rested on
         self._poses = 0  # that differ
         self.alarm = self.alarmed = False
         self._alarms = 0  # in a row
@@ -232,22 +240,27 @@ class RigWatch:
         self._last = (now_s, estimate.T_left_body)
         if found is None:
             return np.zeros((6, 6))
-        self._effects.append((found.by_fault, estimate.cov))
-        self._by_lens.append(found.by_lens)
+        self._effects.append((found.response, estimate.cov))
         self._sum(found, estimate)
         return self._added(found)
 
     def _added(self, found: _ShotResiduals) -> Array:
         """Return what the suspected errors add to the covariance (6, 6) of a pose."""
-        shape = self._shape.found
-        added = self._shape.added(found.by_shape)
+        by_parameter, by_lens = found.response[:, : self._size], found.response[:, self._size :]
+        added, shape, known = self._shape.added(by_parameter), self._shape.found, 0
+        if self.suspected is not None and (shape is None or shape.seven_needed):
+            known = len(_WIDE)
         if self.lens is not None:
-            shift = found.by_lens @ self.lens.beta
-            added += np.outer(shift, shift) + found.by_lens @ self.lens.cov @ found.by_lens.T
-        besides = (self.lens is None or bool(self.lens.needed)) and (shape is None or shape.seven_needed)
-        if self.suspected is not None and besides:
-            shift = found.by_fault @ self.suspected.f
-            added += np.outer(shift, shift) + found.by_fault @ self.suspected.cov @ found.by_fault.T
+            known = known if self.lens.needed else 0
+            shift = by_lens @ self.lens.beta
+            added += np.outer(shift, shift) + by_lens @ self.lens.cov @ by_lens.T
+        elif (doubt := self._shape.doubt) is not None:
+            effect = by_parameter @ self._scaled[:, self._size + known :]
+            added += effect @ doubt[known:, known:] @ effect.T
+        if known and self.suspected is not None:
+            by_fault = by_parameter @ self._by_fault
+            shift = by_fault @ self.suspected.f
+            added += np.outer(shift, shift) + by_fault @ self.suspected.cov @ by_fault.T
         return added
 
     def _redundant(self, T: Array, now_s: float) -> bool:
@@ -257,6 +270,7 @@ class RigWatch:
             self.suspected is not None
             or self.lens is not None
             or self._shape.found is not None
+            or self._shape.doubt is not None
             or not self._timed
             or not 0.0 <= passed_s < _LIKE_S
         ):
@@ -265,27 +279,25 @@ class RigWatch:
 
     def information(self, estimates: Sequence[PoseEstimate]) -> tuple[ResidualSums, int]:
         """Return the sums of measured poses, and how many of these differ: consecutive ones that are alike count as one."""
-        self._test = ResidualSums(self._full, 0.0)
-        stays, began = 0, None
+        sums, stays = ResidualSums(self._size, 0.0), list[list[_ShotResiduals]]()
+        count, began = 0, None
         for k, estimate in enumerate(estimates):
             found = self._residuals(estimate, float(k))
             if found is None:
                 continue
             if began is None or differ(began, estimate.T_left_body):
-                self._close_stay()
-                self._stay, self._stay_shots, began = found.sums, 1, estimate.T_left_body
-                stays += 1
-                continue
-            assert self._stay is not None
-            self._stay.add(found.sums, 1.0)
-            self._stay_shots += 1
-        self._close_stay()
-        return self._test.of(self._size), stays
+                began = estimate.T_left_body
+                sums.add(self._summed(stays).of(self._size), 1.0)
+                stays = [[]]
+                count += 1
+            stays[-1].append(found)
+        sums.add(self._summed(stays).of(self._size), 1.0)
+        return sums, count
 
     def explained(self, estimates: Sequence[PoseEstimate]) -> tuple[StereoRig, Body, HealthFinding]:
         """Return the rig and the body with the change that poses show, which are known to be wrong, and what it is."""
         sums, self._poses = self.information(estimates)
-        change = self._estimated(sums)
+        change = self._estimated(self._in_priors(sums))
         more = {part: change.chi_square - change.without[part] for part in ("rig", "body")}
         part: Part = max(("rig", "body"), key=lambda each: (more[each], change.alone[each]))
         sure = more[part] > chdtri(_PARTS[part].stop - _PARTS[part].start, _NECESSARY)
@@ -296,56 +308,37 @@ class RigWatch:
 
     def _residuals(self, estimate: PoseEstimate, now_s: float) -> _ShotResiduals | None:
         """Return what one shot says; None where too few of its points were measured."""
-        seen, rig, points = estimate.points.seen, self._rig, self._body.points
-        good = np.zeros(len(points), bool)
+        seen = estimate.points.seen
+        good = np.zeros(len(self._p_body), bool)
         good[estimate.points.ids] = True
         rows = np.flatnonzero(seen.paired & (self._row_of >= 0)[seen.ids])
-        fits = good[seen.ids[rows]]
+        ids = seen.ids[rows]
+        fits = good[ids]
         if np.count_nonzero(fits) < _LEAST_POINTS:
             return None
-        ids = np.repeat(seen.ids[rows], 2)
-        cov = seen.cov_uv[rows].reshape(-1, 2, 2) + max(rig.sigma_px, 1e-6) ** 2 * np.eye(2)
-        sides = np.arange(len(ids)) % 2
-        observations = PixelObservations(sides, ids, seen.uv[rows].reshape(-1, 2), cov)
-        T, cameras = estimate.T_left_body, rig.cameras
-        fit = fit_pose(cameras, rig.T_left_right, points, observations, T, robust=False, steps=0)
-        if fit is None:
+        A, whole = np.empty((4 * len(ids), 6)), np.zeros((4 * len(ids), 1 + self._full))
+        noise_px2 = _differentiate(
+            *self._pair, self._half_px, self._p_body, self._row_of, np.asarray(ids, np.int64),
+            np.ascontiguousarray(seen.uv[rows]), np.ascontiguousarray(seen.cov_uv[rows]),
+            max(self._rig.sigma_px, 1e-6), np.array(estimate.T_left_body, order="C"),
+            self._velocity(estimate.T_left_body, now_s), A, whole,
+        )  # fmt: skip
+        if not np.isfinite(noise_px2):
             return None
-        W, A, B = whitened(cameras, rig.T_left_right, points, observations, T)
-        count, n = rig.parameter_count, len(A)
-        rest = np.zeros((n, self._full + 1))
-        rest[:, :count] = B
-        by_point = A[:, :3].reshape(-1, 2, 3)
-        rest[:, count] = (by_point @ points[ids][:, :, None]).ravel()
-        columns = count + 1 + 3 * np.repeat(self._row_of[ids], 2)
-        rest[np.arange(n)[:, None], columns[:, None] + np.arange(3)] = A[:, :3]
-        # What the body's motion of a second does to the right image: one of a later exposure.
-        late = A @ self._velocity(estimate.T_left_body, now_s)
-        late.reshape(-1, 2, 2)[:, 0] = 0.0  # of the right camera alone
-        rest[:, self._size - 1] = late
-        field = _polynomials(rig, sides, observations.uv)
-        self._noise_px = float(np.sqrt(np.trace(cov.mean(axis=0)) / 2.0))
-        rest[:, self._size : self._full] = (W @ field).reshape(n, -1)
-        rest[:, -1] = (W @ fit.residuals_px[:, :, None]).ravel()
+        self._noise_px = float(np.sqrt(noise_px2))
         if fits.all():
-            sums, gain = self._eliminated(A, rest, now_s)
-            return self._shot(sums, gain, sums, gain)
-        kept, every = np.repeat(fits, 4), np.repeat(fits | self._displaced(A, rest[:, -1]), 4)
-        return self._shot(
-            *self._eliminated(A[kept], rest[kept], now_s), *self._eliminated(A[every], rest[every], now_s)
-        )
+            response = self._eliminated(A, whole)
+            return _ShotResiduals(now_s, whole, response, whole, response)
+        kept, every = np.repeat(fits, 4), np.repeat(fits | self._displaced(A, whole[:, 0]), 4)
+        found, with_all = whole[kept], whole[every]
+        response, response_with_all = self._eliminated(A[kept], found), self._eliminated(A[every], with_all)
+        return _ShotResiduals(now_s, found, response, with_all, response_with_all)
 
-    def _shot(self, sums: ResidualSums, gain: Array, every: ResidualSums, gain_every: Array) -> _ShotResiduals:
-        """Return what a shot says, from the sums, and the responses of the pose to everything, without and with all."""
-        size, shape = self._size, self._shape.by_candidate
-        return _ShotResiduals(
-            sums,
-            gain[:, :size] @ self._by_fault,
-            np.asarray(gain[:, size : self._full]),
-            every,
-            gain[:, :size] @ shape,
-            gain_every[:, :size] @ shape,
-        )
+    def _eliminated(self, A: Array, rows: Array) -> Array:
+        """Eliminate the pose and the shot's own skew from rows (n, 1 + K + M); return the pose's response (6, K + M)."""
+        response = np.empty((6, rows.shape[1]))
+        _eliminate(A, rows, self._size, self._sync_s, response)
+        return response[:, 1:]
 
     @staticmethod
     def _displaced(A: Array, residuals: Array) -> NDArray[np.bool_]:
@@ -359,18 +352,6 @@ class RigWatch:
         left = np.einsum("ni,ni->n", r, r) - np.einsum("ni,ni->n", b, d)
         return np.asarray((left < _PAIRED) & (np.linalg.norm(d, axis=1) < FURTHEST_M))
 
-    def _eliminated(self, A: Array, rest: Array, now_s: float) -> tuple[ResidualSums, Array]:
-        """Return the sums of whitened residuals, the last column of rest, and the response (6, K) of the pose."""
-        gain = np.linalg.solve(A.T @ A, A.T @ rest)
-        rest = rest - A @ gain
-        whole = rest.T @ rest
-        # The shot's own skew, of variance 1, is eliminated (Sherman and Morrison).
-        along = self._sync_s * whole[self._size - 1]
-        whole -= np.outer(along, along / (1.0 + self._sync_s * float(along[self._size - 1])))
-        sums = ResidualSums(self._full, now_s)
-        sums.H, sums.b, sums.square, sums.freedom = whole[:-1, :-1], whole[:-1, -1], float(whole[-1, -1]), len(A) - 6.0
-        return sums, np.asarray(-gain, float)
-
     def _velocity(self, T: Array, now_s: float) -> Array:
         """Return the velocity (6,) of the body between the shot before and this one, 1/s; zero where it is unknown."""
         before_s, before = self._last
@@ -383,56 +364,63 @@ class RigWatch:
 
     def _sum(self, shot: _ShotResiduals, estimate: PoseEstimate) -> None:
         """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
-        T, sums, now_s = estimate.T_left_body, shot.sums, shot.sums.begin_s
-        begins = self._stay is None or self._began is None or differ(self._began, T)
-        self._shape.take(shot.every, T, shot.by_shape_with_all, estimate.cov, begins)
-        if begins or self._stay is None:
-            self._close_stay()
-            self._stay, self._stay_shots, self._began = sums, 1, T
-        else:
-            self._stay.add(sums, 1.0)
-            self._stay_shots += 1
-        begin_s = self._test.begin_s if self._test.freedom else self._stay.begin_s
-        if now_s - begin_s >= (TEST_S if self._timed else TEST_SHOTS):
-            self._close_stay()
-            self._began = None
+        T = estimate.T_left_body
+        moved = self._began is None or differ(self._began, T)
+        size = 1 + self._size
+        self._shape.take(shot.every[:, :size], T, shot.response_with_all[:, : self._size], estimate.cov, moved)
+        if moved or not self._stays:
+            self._stays.append([])
+            self._began = T
+        self._stays[-1].append(shot)
+        if shot.t_s - self._stays[0][0].t_s >= (TEST_S if self._timed else TEST_SHOTS):
             self._decide()
 
-    def _close_stay(self) -> None:
-        """Add the mean of a stay's shots to the sums of the next test."""
-        if self._stay is not None and self._stay_shots:
-            if not self._test.freedom:
-                self._test.begin_s = self._stay.begin_s
-            self._test.add(self._stay, 1.0 / self._stay_shots)
-            self._poses += 1
-            if self._stay_shots == 1:
-                self._moments.append(self._stay)
-        self._stay, self._stay_shots = None, 0
+    def _summed(self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool = False) -> ResidualSums:
+        """Return the sums of stays, of each the mean of its shots; ``every``: with points that do not fit, no lens."""
+        size = self._size if every else self._full
+        sums = ResidualSums(size, stays[0][0].t_s if stays else 0.0)
+        for alone in (True, False):  # those of one shot are summed at once
+            shots = [
+                (each.every if every else each.rows, len(stay))
+                for stay in stays
+                for each in stay
+                if (len(stay) == 1) is alone
+            ]
+            if shots:
+                rows = [each if alone else each / np.sqrt(count) for each, count in shots]
+                sums.take(np.concatenate(rows)[:, : 1 + size], sum((len(each) - 6.0) / count for each, count in shots))
+        return sums
 
     def _decide(self, *, ends: bool = False) -> None:
         """Test for a change with the newest sums; weigh the older ones down."""
-        if not self._test.freedom:
+        stays, self._stays = self._stays, []
+        if not stays:
             return
-        self._shape.decide(ends=ends)
-        whole, self._test = self._test, ResidualSums(self._full, 0.0)
-        test, moments, self._moments = whole.of(self._size), self._moments, []
+        self._poses += len(stays)
+        whole = self._summed(stays)
+        every = whole.of(self._size).by(self._scaled)
+        test = every.of(len(self._window.b))
+        if any(each.every is not each.rows for stay in stays for each in stay):
+            every = self._summed(stays, every=True).by(self._scaled)
+        self._shape.decide(every, ends=ends)
+        moments = [stay[0] for stay in stays if len(stay) == 1]
         weight = float(np.exp(-1.0 / FORGET_TESTS))
-        for name in ("H", "b", "square", "freedom"):
-            setattr(self._window, name, weight * getattr(self._window, name))
+        self._window.scale(weight)
         self._window.add(test, 1.0)
         change = self._estimated(self._window)
         alarm = _certain(change) and self._matters(change, slice(None))
         doubted, self._doubted = self._doubted, None
         if alarm and moments and not self._alarms and self._poses > 1:
             worst = self._worst(moments)
-            without = self._window.less(worst.of(self._size))
+            left_out = self._in_priors(worst.of(self._size))
+            without = self._window.less(left_out)
             if not _certain(estimated := self._estimated(without)):
                 # Images that do not belong together are no moved camera; newer shots that agree with them are.
                 if doubted is not None:
                     self._window.add(doubted, 1.0)
                 else:
-                    whole, test = whole.less(worst), test.less(worst.of(self._size))
-                    self._window, self._doubted, change, alarm = without, worst.of(self._size), estimated, False
+                    whole, test = whole.less(worst), test.less(left_out)
+                    self._window, self._doubted, change, alarm = without, left_out, estimated, False
         if len(self._history) < _KEPT:
             self._whole.add(whole, 1.0)
         self._history.append(test)
@@ -447,13 +435,15 @@ class RigWatch:
         if due and len(self._history) < _KEPT and self._poses >= _LENS_POSES:
             self.lens = self._lens()
 
-    def _worst(self, moments: list[ResidualSums]) -> ResidualSums:
+    def _in_priors(self, sums: ResidualSums) -> ResidualSums:
+        """Return sums of the parameters and the seven numbers, in units of their priors, from those of the parameters."""
+        return sums.by(self._scaled[:, : self._size + len(_WIDE)])
+
+    def _worst(self, moments: list[_ShotResiduals]) -> ResidualSums:
         """Return the sums of the moments that fit worst: of one, or where shots have no times of a tenth of them."""
         count = 1 if self._timed else max(1, len(moments) // 10)
-        worst = ResidualSums(self._full, 0.0)
-        for moment in sorted(moments, key=lambda each: each.square - each.freedom)[-count:]:
-            worst.add(moment, 1.0)
-        return worst
+        worst = sorted(moments, key=lambda each: float(each.rows[:, 0] @ each.rows[:, 0]) - len(each.rows))[-count:]
+        return self._summed([[each] for each in worst])
 
     def _lens(self) -> LensError | None:
         """Return what the camera models lack; None where a change of the seven explains as much, or it hardly matters."""
@@ -488,8 +478,8 @@ class RigWatch:
         sigma = size * float(np.sqrt(_LENS / 2.0 + explained)) / explained
         beta, cov = max((self._of_lens(sums, scale, excess) for scale in _LENS_SCALES_PX), key=lambda each: each[2])[:2]
         found = LensError(beta, cov, (size, sigma), more, needed)
-        shifts = np.array(self._by_lens) @ beta
-        covs = np.array([cov for _, cov in self._effects])
+        responses, covs = map(np.array, zip(*self._effects, strict=True))
+        shifts = responses[:, :, K:] @ beta
         squares = np.einsum("ni,ni->n", shifts, np.linalg.solve(covs, shifts[..., None])[..., 0])
         return found if self.alarm or float(np.max(squares)) > _MATTERS**2 else None
 
@@ -520,21 +510,15 @@ class RigWatch:
 
     def _matters(self, change: RigChange, part: slice) -> bool:
         """Return whether a part of the seven numbers moves one of the newest poses by so many of its sigmas."""
-        by_fault, cov = map(np.array, zip(*self._effects, strict=True))
-        shift = by_fault[:, :, part] @ change.f[part]
+        responses, cov = map(np.array, zip(*self._effects, strict=True))
+        shift = responses[:, :, : self._size] @ (self._by_fault[:, part] @ change.f[part])
         squares = np.einsum("ni,ni->n", shift, np.linalg.solve(cov, shift[..., None])[..., 0])
         return float(np.max(squares)) > _MATTERS**2
 
     def _estimated(self, sums: ResidualSums) -> RigChange:
-        """Return the seven numbers from sums, everything else eliminated."""
-        L, F = self.prior, self._by_fault * _WIDE
-        LH = L.T @ sums.H
-        inner = cho_factor(LH @ L + np.eye(self._size))
-        across, right = LH @ F, L.T @ sums.b
-        solved, from_right = cho_solve(inner, across), cho_solve(inner, right)
-        S = F.T @ sums.H @ F - across.T @ solved + np.eye(len(_WIDE))
-        s = F.T @ sums.b - solved.T @ right
-        square = sums.square - float(right @ from_right)
+        """Return the seven numbers from sums of the parameters and them, everything else eliminated."""
+        M = eliminated(sums.M, slice(1, 1 + self._size))
+        S, s, square = np.asarray(M[1:, 1:] + np.eye(len(_WIDE)), float), M[1:, 0], float(M[0, 0])
         f = np.linalg.solve(S, s)
         # What the model leaves unexplained widens the noise (Birge ratio); it never narrows it.
         excess = max((square - float(s @ f)) / max(sums.freedom, 1.0), 1.0)
@@ -562,23 +546,29 @@ class RigWatch:
 
         The test before its beginning may be of both times: it is left out, and counts as noise.
         """
-        after, found, least = ResidualSums(self._size, 0.0), None, np.inf
-        before = ResidualSums(self._size, 0.0)
-        for sums in tests:
-            before.add(sums, 1.0)
+        size = len(self._window.b)
+        after, before = ResidualSums(size, 0.0), total(tests)  # less the test in which it began
+        least, best = np.inf, len(tests) - 1
         for k in reversed(range(len(tests))):
             after.add(tests[k], 1.0)
             before.add(tests[k], -1.0)
-            mixed = tests[k - 1] if k else ResidualSums(self._size, tests[0].begin_s)
+            mixed = tests[k - 1] if k else ResidualSums(size, tests[0].begin_s)
             before.add(mixed, -1.0)
-            change, none = self._estimated(after), self._estimated(before)
+            (_, left), (gained, none) = self._gained(after), self._gained(before)
             before.add(mixed, 1.0)
-            left = change.left + none.left + none.gained + mixed.freedom
+            left += none + gained + mixed.freedom
             if left < least:
-                least, found = left, (ResidualSums(self._size, mixed.begin_s), change)
-                found[0].add(after, 1.0)
-        assert found is not None
-        return *found, float(least)
+                least, best = left, k
+        found = ResidualSums(size, tests[max(best - 1, 0)].begin_s)
+        for test in reversed(tests[best:]):
+            found.add(test, 1.0)
+        return found, self._estimated(found), float(least)
+
+    def _gained(self, sums: ResidualSums) -> tuple[float, float]:
+        """Return what the seven numbers explain of a sum of squares, and what nothing does."""
+        M = eliminated(sums.M, slice(1, 1 + self._size))
+        gained = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(_WIDE)), M[1:, 0]))
+        return gained, float(M[0, 0]) - gained
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far, the shots of the running test included: nothing where no test gave an alarm."""
@@ -608,31 +598,25 @@ class RigWatch:
     def copied(self) -> RigWatch:
         """Return a copy that says what was found so far; this one goes on."""
         copied = copy(self)
-        copied._history, copied._moments, copied._shape = (
-            self._history.copy(),
-            self._moments.copy(),
-            self._shape.copied(),
-        )
+        copied._history, copied._shape = self._history.copy(), self._shape.copied()
+        copied._stays = [stay.copy() for stay in self._stays]
         return copied
 
     def _ended(self) -> RigWatch:
         """Return a copy whose running test was made; this one goes on with it."""
         ended = self.copied()
-        ended._test, ended._window, ended._whole = (
-            ResidualSums(len(each.b), each.begin_s) for each in (self._test, self._window, self._whole)
-        )
-        ended._whole.add(self._whole, 1.0)
-        ended._test.add(self._test, 1.0)
-        ended._window.add(self._window, 1.0)
-        ended._close_stay()
+        ended._window, ended._whole = self._window.of(len(self._window.b)), self._whole.of(self._full)
         ended._decide(ends=True)
         return ended
 
     def moved_since_s(self) -> float | None:
-        """Return since when the cameras alone are found to have moved, s; None where nothing or more was found."""
+        """Return since when the cameras alone are found to have moved, s; None where nothing or more was found, or when
+        the next test must show."""
         if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None or self._shaped:
             return None
         since_s, change = self._since()
+        if len(self._history) > 1 and since_s >= self._history[-2].begin_s:
+            return None  # they may have moved within the newest test, which is then no test of one pose
         return since_s if self._to_blame(change) == ["rig"] else None
 
     def _needed(self, change: RigChange, part: Part) -> bool:
@@ -648,21 +632,91 @@ class RigWatch:
         return [part for part in _PARTS if self._needed(change, part)] or [max(_PARTS, key=change.alone.__getitem__)]
 
 
-def _polynomials(rig: StereoRig, sides: Ids, uv: Array) -> Array:
-    """Return (N, 2, M) what each coefficient displaces a detection of a camera by: Chebyshev polynomials of its uv."""
-    half = np.array([camera.image_size_px for camera in rig.cameras])[sides] / 2.0
-    x = np.clip((uv + 0.5) / half - 1.0, -1.0, 1.0)
-    T = [np.ones_like(x), x]
-    while len(T) <= _DEGREE:
-        T.append(2.0 * x * T[-1] - T[-2])
-    each = np.array(T)
-    values = each[_POWERS[:, 0], :, 0] * each[_POWERS[:, 1], :, 1]
-    count = len(_POWERS)
-    found = np.zeros((len(uv), 2, 2, 2, count))  # detection, along u or v; camera, along u or v, polynomial
-    rows = np.arange(len(uv))
-    for axis in range(2):
-        found[rows, axis, sides, axis] = values.T
-    return found.reshape(len(uv), 2, _LENS)
+@kernel
+def _polynomials(x: float, y: float, values: Array) -> None:
+    """Fill values (P,) of the products of Chebyshev polynomials of a position in an image with edges at -1 and 1."""
+    T = np.empty((2, _DEGREE + 1))
+    T[:, 0], T[0, 1], T[1, 1] = 1.0, min(max(x, -1.0), 1.0), min(max(y, -1.0), 1.0)
+    for i in range(2, _DEGREE + 1):
+        for axis in range(2):
+            T[axis, i] = 2.0 * T[axis, 1] * T[axis, i - 1] - T[axis, i - 2]
+    n = 0
+    for i in range(_DEGREE + 1):
+        for k in range(_DEGREE + 1 - i):
+            values[n] = T[0, i] * T[1, k]
+            n += 1
+
+
+@kernel(
+    "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], const f8[:, ::1], i8[::1], const i8[::1], "
+    "const f8[:, :, ::1], const f8[:, :, :, ::1], f8, f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1]"
+)
+def _differentiate(
+    fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, half_px: Array, points: Array,
+    row_of: Ids, ids: Ids, uv: Array, cov: Array, sigma_px: float, T: Array, velocity: Array, A: Array, rows: Array,
+) -> float:  # fmt: skip
+    """Fill the derivatives A (4 N, 6) by the pose, and rows (4 N, 1 + K + M), of N points in both images; they hold zeros.
+
+    Return the mean variance of a coordinate, px^2; NaN where a point is behind a camera.
+    """
+    n, P = 2 * len(ids), 14 + counts[0] + counts[1]
+    p, side, seen, covs = np.empty((n, 3)), np.empty(n, np.int64), np.empty((n, 2)), np.empty((n, 2, 2))
+    variance = 0.0
+    for i in range(n):
+        side[i] = i % 2
+        p[i], seen[i], covs[i] = points[ids[i // 2]], uv[i // 2, i % 2], cov[i // 2, i % 2]
+        for axis in range(2):
+            covs[i, axis, axis] += sigma_px * sigma_px
+            variance += covs[i, axis, axis] / (2.0 * n)
+    W, left, B, values = np.zeros((n, 2, 2)), np.empty((n, 2)), np.zeros((2 * n, P)), np.empty(_POLYNOMIALS)
+    if not differentiate(fisheye, k, d, counts, T_right_left, p, side, seen, covs, T, W, left, A, B):
+        return np.nan
+    lens = rows.shape[1] - _LENS
+    for i in range(n):
+        c, first = side[i], 2 + P + 3 * row_of[ids[i // 2]]
+        _polynomials((seen[i, 0] + 0.5) / half_px[c, 0] - 1.0, (seen[i, 1] + 0.5) / half_px[c, 1] - 1.0, values)
+        for axis in range(2):
+            row, J = rows[2 * i + axis], A[2 * i + axis]
+            row[0] = W[i, axis, 0] * left[i, 0] + W[i, axis, 1] * left[i, 1]
+            row[1 : 1 + P] = B[2 * i + axis]
+            for j in range(3):
+                row[1 + P] += J[j] * p[i, j]
+                row[first + j] = J[j]
+            if c == 1:  # what the body's motion of a second does to the right image: one of a later exposure
+                for j in range(6):
+                    row[lens - 1] += J[j] * velocity[j]
+            for along in range(2):
+                begin = lens + (2 * c + along) * _POLYNOMIALS
+                for j in range(_POLYNOMIALS):
+                    row[begin + j] = W[i, axis, along] * values[j]
+    return variance
+
+
+@kernel("f8[:, ::1], f8[:, ::1], i8, f8, f8[:, ::1]")
+def _eliminate(A: Array, rows: Array, skew: int, sync_s: float, response: Array) -> None:
+    """Eliminate the pose, of derivatives A (n, 6), and the shot's own skew from rows (n, K); fill its response (6, K).
+
+    The skew, of column ``skew`` and standard deviation ``sync_s``, s, is eliminated by a symmetric factor of what Sherman
+    and Morrison give: (1 - g u u^T)^2 = 1 - u u^T / (1 / sync_s^2 + u^T u).
+    """
+    gain = solved(product(A.T, A), product(A.T, rows))
+    for i in range(len(rows)):
+        for j in range(6):
+            for c in range(rows.shape[1]):
+                rows[i, c] -= A[i, j] * gain[j, c]
+    response[:, :] = -gain
+    u, square = rows[:, skew].copy(), 0.0
+    for i in range(len(u)):
+        square += u[i] * u[i]
+    share = sync_s * sync_s / (1.0 + sync_s * sync_s * square)
+    along = np.zeros(rows.shape[1])
+    for i in range(len(u)):
+        for c in range(len(along)):
+            along[c] += u[i] * rows[i, c]
+    along *= share / (1.0 + np.sqrt(1.0 - share * square))
+    for i in range(len(u)):
+        for c in range(len(along)):
+            rows[i, c] -= u[i] * along[c]
 
 
 def _certain(change: RigChange) -> bool:

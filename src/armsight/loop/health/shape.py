@@ -12,6 +12,11 @@ r^T S^-1 r of the sum of squares, with
 where H and b are the sums, J selects the point, and M has the standard deviations of everything else as its columns. The
 point that explains most is taken, then the next one besides it, while one explains more than chance: a body that is bent.
 
+What may have changed and is not told apart yet widens the poses: of each hypothesis (the seven numbers, the focal lengths,
+a point, all points a little) the evidence against none (MacKay, 1992), of the newest test and of some newest ones together.
+Where the hypotheses together are more probable than that nothing changed, the second moment of their mixture is what poses
+may be off by. Chance exceeds an evidence of 1 / p in p of the tests at most (Markov), whatever the hypotheses.
+
 Only what lasts is reported. A reflection, or another light of the scene that is taken for a disc, stays in the scene or in
 the image while the body rotates. So a point counts only if the median of what single shots say agrees with what all say
 together, seen from directions that differ.
@@ -22,7 +27,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -49,29 +54,69 @@ _MATTERS, _POSES = 2.0, 60
 #: Explanations whose chi-squares differ by less are not distinguished; one is needed besides another beyond this chance.
 _ALIKE, _NECESSARY = 12.0, 1e-4
 _BESIDES = float(chdtri(3, _NECESSARY))
+#: Probability, before a test, that it is the first one after any change.
+_RARE = 1e-4
+#: So many newest tests, together, may be those after a change; all points may be displaced by about so much, m.
+_AFTER, _BENT_M = (1, 2, 4, 8, 16), (2e-4, 1e-3)
+#: The seven numbers are expected to change by such shares of their priors, which are wide.
+_SEVEN_SCALES = (1.0, 0.03, 0.003)
 #: The newest test agrees with all together unless chance explains their difference more rarely than this.
 _UNLIKE = 0.01
 
 
 class ResidualSums:
-    """Information (K, K), right side (K,), sum of squares and degrees of freedom of residuals, and when they began."""
+    """What whitened residuals say of K parameters: sums over their rows, degrees of freedom, and when they began.
+
+    Attributes:
+        M: (1 + K, 1 + K) sum of the outer products of rows [residual; derivatives].
+        freedom: degrees of freedom.
+        begin_s: when the first shot was, s.
+    """
 
     def __init__(self, size: int, begin_s: float) -> None:
-        self.H, self.b, self.square, self.freedom = np.zeros((size, size)), np.zeros(size), 0.0, 0.0
-        self.begin_s = begin_s
+        self.M, self.freedom, self.begin_s = np.zeros((1 + size, 1 + size)), 0.0, begin_s
+
+    @property
+    def H(self) -> Array:
+        """(K, K) information."""
+        return self.M[1:, 1:]
+
+    @property
+    def b(self) -> Array:
+        """(K,) right side."""
+        return self.M[1:, 0]
+
+    @property
+    def square(self) -> float:
+        """Sum of squares of the residuals."""
+        return float(self.M[0, 0])
 
     def add(self, other: ResidualSums, weight: float) -> None:
         """Add another's."""
-        self.H += other.H if weight == 1.0 else weight * other.H
-        self.b += weight * other.b
-        self.square += weight * other.square
+        self.M += other.M if weight == 1.0 else weight * other.M
         self.freedom += weight * other.freedom
+
+    def take(self, rows: Array, freedom: float) -> None:
+        """Add rows (N, 1 + K)."""
+        self.M += rows.T @ rows
+        self.freedom += freedom
+
+    def scale(self, weight: float) -> None:
+        """Weigh down what there is."""
+        self.M *= weight
+        self.freedom *= weight
 
     def of(self, size: int) -> ResidualSums:
         """Return those of the first parameters alone."""
         found = ResidualSums(size, self.begin_s)
-        found.H, found.b = self.H[:size, :size].copy(), self.b[:size].copy()
-        found.square, found.freedom = self.square, self.freedom
+        found.M, found.freedom = self.M[: 1 + size, : 1 + size].copy(), self.freedom
+        return found
+
+    def by(self, T: Array) -> ResidualSums:
+        """Return those of P other parameters, of which these K are T (K, P) times."""
+        found = ResidualSums(T.shape[1], self.begin_s)
+        found.M[0, 0], found.M[0, 1:], found.freedom = self.square, self.b @ T, self.freedom
+        found.M[1:, 0], found.M[1:, 1:] = found.M[0, 1:], T.T @ self.H @ T
         return found
 
     def less(self, other: ResidualSums) -> ResidualSums:
@@ -80,6 +125,14 @@ class ResidualSums:
         rest.add(self, 1.0)
         rest.add(other, -1.0)
         return rest
+
+
+def eliminated(M: Array, rows: slice) -> Array:
+    """Return sums M (N, N) with parameters eliminated, of which each has a prior of variance 1."""
+    keep = np.delete(np.arange(len(M)), rows)
+    across = M[rows, keep]
+    inner = cho_factor(M[rows, rows] + np.eye(len(across)), check_finite=False)
+    return np.asarray(M[np.ix_(keep, keep)] - across.T @ cho_solve(inner, across, check_finite=False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,13 +166,8 @@ class ShapeError(Record):
 
 #: Stands for the focal lengths among the rows of the points.
 FOCAL = -1
-
-
-class _ByPoint(NamedTuple):
-    """What a shot says of each point by itself: information (N, 3, 3) and right side (N, 3)."""
-
-    H: Array
-    b: Array
+#: Rows of the seven numbers once the parameters are eliminated.
+_SEVEN = slice(1, 8)
 
 
 class _ShapeSums(NamedTuple):
@@ -140,20 +188,41 @@ class _ShapeSums(NamedTuple):
         return max((self.square - gain) / max(self.freedom, 1.0), 1.0)
 
 
-@dataclass
-class _ShapeTest:
-    """The sums of one test, and the directions from which its poses saw the body."""
+class _Reduced(NamedTuple):
+    """What sums say of the candidates: with the seven numbers eliminated, and with these zero."""
+
+    whole: _ShapeSums
+    without: _ShapeSums
+
+
+class _Hypothesis(NamedTuple):
+    """Rows (D,) of the seven numbers and the candidates that may have changed, and by how much of their priors."""
+
+    rows: Ids
+    scale: float
+
+
+class _Explained(NamedTuple):
+    """Log-evidence of a hypothesis against none, the sizes (D,) of what changed, and their covariance (D, D)."""
+
+    evidence: float
+    size: Array
+    cov: Array
+
+
+class _ShapeTest(NamedTuple):
+    """The sums of one test, what they say alone, and the directions from which its poses saw the body."""
 
     sums: ResidualSums
-    views: list[Array] = field(default_factory=list)
+    alone: _Reduced
+    views: list[Array]
 
 
 class ShapeWatch:
     """Watches the shape of the body, and the focal lengths of the cameras against each other.
 
     Args:
-        prior: (K, K) square root of the covariance of all parameters.
-        seven: (K, 7) what the seven numbers change of these, in their wide prior.
+        size: K, of the parameters.
         focal: (K, 2) what relative changes of the focal lengths change of these: of the left one by a half and of the right
             one by minus a half, and of both.
         first: row of the first parameter of the points.
@@ -162,78 +231,67 @@ class ShapeWatch:
         test_s: how often it is tested, s.
 
     Attributes:
+        by_wide: (K, C) what the standard deviations of the candidates' priors change of the parameters.
+        doubt: (7 + C, 7 + C) second moment of the seven numbers and the candidates, in units of their priors, by all that
+            may have changed; None where that is improbable, or known.
         found: what the newest test found for certain.
         said: what was found last.
     """
 
-    def __init__(
-        self, prior: Array, seven: Array, focal: Array, first: int, names: tuple[str, ...], rigid: bool, test_s: float
-    ) -> None:
-        K, n = len(prior), len(names)
-        self._first, self._names = first, names
-        self._known = np.hstack([prior, seven])
-        self._prior = prior
-        #: (K, 2 + 3 N) what a unit of each candidate changes of the parameters: of the focal lengths against each other,
-        #: of both together, of each coordinate of each point.
-        self.by_candidate = np.zeros((K, 2 + 3 * n))
-        self.by_candidate[:, :2] = focal
-        self.by_candidate[first : first + 3 * n, 2:] = np.eye(3 * n)
+    def __init__(self, size: int, focal: Array, first: int, names: tuple[str, ...], rigid: bool, test_s: float) -> None:
+        K, n = size, len(names)
+        self._size, self._first, self._names = K, first, names
+        # (K, 2 + 3 N) what a unit of each candidate changes of the parameters: of the focal lengths against each other,
+        # of both together, of each coordinate of each point.
+        self._by_candidate = np.zeros((K, 2 + 3 * n))
+        self._by_candidate[:, :2] = focal
+        self._by_candidate[first : first + 3 * n, 2:] = np.eye(3 * n)
         self._wide = np.append([_FOCAL, _FOCAL], np.full(3 * n, FURTHEST_M))
+        self.by_wide = self._by_candidate * self._wide
         self._candidates = () if rigid else tuple(range(n))
+        self._hypotheses = _hypotheses(len(self._candidates))
         self._limit_focal, self._limit = (alarm_limit(size, 1.0 / test_s, 2 * (n + 1)) for size in (1, 3))
-        self._stay: ResidualSums | None = None
-        self._stay_shots = 0
         self._view: Array | None = None  # the newest direction that differs from the one before
-        self._test = _ShapeTest(ResidualSums(K, 0.0))
+        self._views: list[Array] = []  # of the running test
         self._history: deque[_ShapeTest] = deque(maxlen=_KEPT)
-        self._shots: deque[_ByPoint] = deque(maxlen=_ASKED)
-        # What the candidates do to the newest poses, and the covariances of these.
+        self._shots: deque[Array] = deque(maxlen=_ASKED)  # rows, as they were taken
+        # The response of the newest poses to the parameters, and the covariances of these poses.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
         self._alarms = 0  # in a row
         self._suspect: ShapeError | None = None
+        self.doubt: Array | None = None
         self.found: ShapeError | None = None
         self.said: ShapeError | None = None
 
-    def take(self, sums: ResidualSums, T: Array, effect: Array, cov: Array, begins: bool) -> None:
+    def take(self, rows: Array, T: Array, response: Array, cov: Array, moved: bool) -> None:
         """Take a shot.
 
         Args:
-            sums: of its residuals, all points included, its pose eliminated.
+            rows: (n, 1 + K) its residuals and their derivatives, all points included, its pose eliminated.
             T: (4, 4) pose T_left_body.
-            effect: (6, C) what the candidates do to a pose measured with all points.
+            response: (6, K) of a pose measured with all points to the parameters.
             cov: (6, 6) covariance of the pose.
-            begins: whether it begins a stay at a pose, or goes on with one.
+            moved: whether its pose differs from the one before; single shots are asked only then.
         """
-        n, rows = len(self._names), slice(self._first, self._first + 3 * len(self._names))
-        H = sums.H[rows, rows].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
-        self._shots.append(_ByPoint(H, sums.b[rows].reshape(n, 3).copy()))
-        self._effects.append((effect, cov))
-        if self._stay is not None and not begins:
-            self._stay.add(sums.of(len(self._prior)), 1.0)
-            self._stay_shots += 1
+        self._effects.append((response, cov))
+        if not moved:
             return
-        self._close()
-        self._stay, self._stay_shots = sums.of(len(self._prior)), 1
-        view = T[:3, :3].T @ T[:3, 3] / np.linalg.norm(T[:3, 3])
+        self._shots.append(rows)
+        view = T[:3, :3].T @ T[:3, 3]
+        view /= np.sqrt(view @ view)
         if self._view is None or np.linalg.norm(view - self._view) > _VIEWS_RAD / _LEAST_POSES:  # else it rests
-            self._test.views.append(view)
+            self._views.append(view)
             self._view = view
 
-    def _close(self) -> None:
-        """Add the mean of a stay's shots to the sums of the next test."""
-        if self._stay is not None:
-            if not self._test.sums.freedom:
-                self._test.sums.begin_s = self._stay.begin_s
-            self._test.sums.add(self._stay, 1.0 / self._stay_shots)
-        self._stay = None
+    def decide(self, sums: ResidualSums, *, ends: bool) -> None:
+        """Test once more; the first test is enough by itself only where it ends all.
 
-    def decide(self, *, ends: bool) -> None:
-        """Test with the newest sums; the first test is enough by itself only where it ends all (``ends``)."""
-        self._close()
-        if not self._test.sums.freedom:
-            return
-        self._history.append(self._test)
-        self._test = _ShapeTest(ResidualSums(len(self._prior), 0.0))
+        Args:
+            sums: since the last test: of the K parameters, the seven numbers and the candidates, in units of their priors.
+            ends: whether it ends all.
+        """
+        self._history.append(_ShapeTest(sums, self._reduced(sums), self._views))
+        self._views = []
         tests, before = list(self._history), self._suspect
         if before is None:
             self._suspect = self._shown(tests[-1:]) or self._shown(tests)
@@ -247,19 +305,53 @@ class ShapeWatch:
         again = self._suspect is not None and before is not None and before.chosen[0] == self._suspect.chosen[0]
         self.found = self._suspect if again or (ends and len(tests) == 1) else None
         self.said = self.found or self.said
+        self.doubt = self._doubted([each.sums for each in tests])
+
+    def _doubted(self, tests: Sequence[ResidualSums]) -> Array | None:
+        """Return the second moment (7 + C, 7 + C) of what may have changed; None where nothing did, more probably."""
+        if self.found is None:
+            sums = (total(tests[-count:]) for count in _AFTER if count <= len(tests))
+            evidence, moment = max((self._mixture(each, self._hypotheses) for each in sums), key=lambda each: each[0])
+            return moment if evidence > np.log(2.0) else None
+        if self.found.chosen != (FOCAL,):
+            return None
+        # Cameras that moved cannot be excluded.
+        since = [each for each in tests if each.begin_s >= self.found.begin_s]
+        return self._mixture(total(since or tests[-1:]), self._hypotheses[: len(_SEVEN_SCALES)])[1]
+
+    def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypothesis]) -> tuple[float, Array]:
+        """Return the log-evidence that anything changed before the tests of sums, and the second moment of what did.
+
+        Nothing is one of the hypotheses, and its evidence is 1.
+        """
+        M, prior = eliminated(sums.M, slice(1, 1 + self._size)), _RARE / len(hypotheses)
+        moment = np.zeros((len(M) - 1, len(M) - 1))
+        gain = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(moment)), M[1:, 0]))
+        if gain < -2.0 * np.log(prior):
+            return 0.0, moment
+        excess = max((float(M[0, 0]) - gain) / max(sums.freedom, 1.0), 1.0)  # what all together do not explain is noise
+        explained = [_explained(M, each, excess) for each in hypotheses]
+        logs = np.log(prior) + np.array([each.evidence for each in explained])
+        evidence = float(np.logaddexp.reduce(np.append(logs, 0.0)))
+        for (rows, _), share, each in zip(hypotheses, np.exp(logs - evidence), explained, strict=True):
+            moment[np.ix_(rows, rows)] += share * (np.outer(each.size, each.size) + each.cov)
+        return evidence, moment
 
     def _shown(self, tests: Sequence[_ShapeTest]) -> ShapeError | None:
         """Return what tests show for certain; None where that is nothing."""
         views = [view for each in tests for view in each.views]
         if len(views) < _LEAST_POSES or not _differ(np.array(views)):
             return None
-        sums = _total(tests)
-        whole, without = self._reduced(sums, self._known), self._reduced(sums, self._prior)
-        newest = whole if len(tests) == 1 else self._reduced(tests[-1].sums, self._known)
-        if (error := self._focal_alone(whole, without, sums.begin_s)) is not None:
-            alone = without if len(tests) == 1 else self._reduced(tests[-1].sums, self._prior)
-            if _one_is_enough(newest, alone):
-                return error
+        sums, newest = total([each.sums for each in tests]), tests[-1].alone
+        found = newest if len(tests) == 1 else self._reduced(sums)
+        error = self._focal_alone(found, sums.begin_s)
+        if error is not None and _one_is_enough(newest):
+            return error
+        return self._displaced(found, newest.whole, sums.begin_s)
+
+    def _displaced(self, found: _Reduced, newest: _ShapeSums, begin_s: float) -> ShapeError | None:
+        """Return the points that are displaced by what all tests together say, and the newest; None where none is."""
+        whole = found.whole
         if not any(whole.gain(_columns([each])) > self._limit for each in self._candidates):
             return None
         steady = [each for each in self._candidates if self._steady(whole, newest, each)]
@@ -275,14 +367,14 @@ class ShapeWatch:
                 break
             scores = scores or {each: gain / excess for each, gain in gains.items()}
             chosen.append(best)
-        return self._error(whole, without, tuple(chosen), scores, sums.begin_s) if chosen else None
+        return self._error(found, tuple(chosen), scores, begin_s) if chosen else None
 
-    def _focal_alone(self, whole: _ShapeSums, without: _ShapeSums, begin_s: float) -> ShapeError | None:
+    def _focal_alone(self, found: _Reduced, begin_s: float) -> ShapeError | None:
         """Return the focal lengths' change where that one number explains as much as the seven do; else None."""
-        columns = _columns([FOCAL])
+        columns, without = _columns([FOCAL]), found.without
         gain = without.gain(columns)
         excess = without.excess(gain)
-        if gain / excess < self._limit_focal or not _one_is_enough(whole, without):
+        if gain / excess < self._limit_focal or not _one_is_enough(found):
             return None
         value, cov = self._values(without, columns, 0.0)
         if abs(value[0]) < _LEAST_FOCAL:
@@ -291,10 +383,10 @@ class ShapeWatch:
         return ShapeError((FOCAL,), value, excess * cov, gain / excess, 0.0, (), begin_s)
 
     def _error(
-        self, whole: _ShapeSums, without: _ShapeSums, chosen: tuple[int, ...], scores: dict[int, float], begin_s: float
+        self, found: _Reduced, chosen: tuple[int, ...], scores: dict[int, float], begin_s: float
     ) -> ShapeError | None:
         """Return the record of what was chosen; None where it is too small to matter."""
-        columns = _columns(chosen)
+        (whole, without), columns = found, _columns(chosen)
         gain = whole.gain(columns)
         excess = whole.excess(gain)
         value, cov = self._values(whole, columns, 0.0)
@@ -321,14 +413,11 @@ class ShapeWatch:
         cov[np.ix_(free, free)] = inverse * np.outer(wide[free], wide[free])
         return value, cov
 
-    def _reduced(self, sums: ResidualSums, M: Array) -> _ShapeSums:
-        """Eliminate parameters (K, P), in their standard deviations, from sums."""
-        HM, X = sums.H @ M, self.by_candidate * self._wide
-        inner = cho_factor(M.T @ HM + np.eye(M.shape[1]))
-        A, b = HM.T @ X, M.T @ sums.b
-        solved, found = cho_solve(inner, A), cho_solve(inner, b)
-        G = X.T @ sums.H @ X - A.T @ solved + np.eye(X.shape[1])
-        return _ShapeSums(G, X.T @ sums.b - solved.T @ b, sums.square - float(b @ found), sums.freedom)
+    def _reduced(self, sums: ResidualSums) -> _Reduced:
+        """Eliminate the parameters from sums, and the seven numbers."""
+        without = eliminated(sums.M, slice(1, 1 + self._size))
+        whole, candidates = eliminated(without, _SEVEN), np.delete(np.arange(len(without)), _SEVEN)
+        return _Reduced(*(_of_candidates(M, sums.freedom) for M in (whole, without[np.ix_(candidates, candidates)])))
 
     def _steady(self, whole: _ShapeSums, newest: _ShapeSums, which: int) -> bool:
         """Return whether the newest test, and the median of single shots, agree on a point with all tests together."""
@@ -338,17 +427,20 @@ class ShapeWatch:
         each = (cov + cov_now)[np.ix_(columns, columns)]
         if float(off @ np.linalg.solve(each, off)) > newest.excess(newest.gain(columns)) * chdtri(len(off), _UNLIKE):
             return False
-        H, b = np.array([shot.H[which] for shot in self._shots]), np.array([shot.b[which] for shot in self._shots])
-        information = np.einsum("i,nij,j->n", d, H, d)
-        seen = information > 0.0
-        if np.count_nonzero(seen) < _LEAST_SHOTS:
+        first = 1 + self._first + 3 * which
+        if len(self._shots) < _LEAST_SHOTS:
             return False
-        return bool(_AGREE[0] < np.median((b[seen] @ d) / information[seen]) < _AGREE[1])
+        begins = np.cumsum([0, *map(len, self._shots)])[:-1]
+        rows = np.concatenate(self._shots)
+        along = rows[:, first : first + 3] @ d
+        squares, right = (np.add.reduceat(along * other, begins) for other in (along, rows[:, 0]))
+        shares = right[squares > 0.0] / squares[squares > 0.0]
+        return len(shares) >= _LEAST_SHOTS and bool(_AGREE[0] < np.median(shares) < _AGREE[1])
 
     def _matters(self, value: Array) -> bool:
         """Return whether a displacement moves a new pose by so many of its sigmas, were it measured with that point."""
-        effects, covs = map(np.array, zip(*self._effects, strict=True))
-        shift = effects @ value
+        responses, covs = map(np.array, zip(*self._effects, strict=True))
+        shift = responses @ (self._by_candidate @ value)
         squares = np.einsum("ni,ni->n", shift, np.linalg.solve(covs, shift[..., None])[..., 0])
         return float(np.max(squares)) > _MATTERS**2
 
@@ -357,25 +449,30 @@ class ShapeWatch:
 
         The test before its beginning may be of both times: it is left out, and counts as noise.
         """
-        columns, best, least = _columns(found.chosen), found, np.inf
-        for k in range(len(tests)):
-            after = self._reduced(_total(tests[k:]), self._known)
-            left = after.square - after.gain(columns)
-            if k:
-                left += tests[k - 1].sums.freedom
+        columns, lefts = _columns(found.chosen), list[float]()
+        after, before = (
+            total([each.sums for each in tests]),
+            ResidualSums(len(tests[0].sums.b), 0.0),
+        )  # less the test in which it began
+        for k, test in enumerate(tests):
+            whole = self._reduced(after).whole
+            lefts.append(whole.square - whole.gain(columns) + (tests[k - 1].sums.freedom if k else 0.0))
             if k > 1:
-                left += self._reduced(_total(tests[: k - 1]), self._known).square
-            if left < least:
-                error = self._shown(tests[k:])
-                if error is not None and error.chosen[0] == found.chosen[0]:
-                    best, least = error, left
-        return best
+                before.add(tests[k - 2].sums, 1.0)
+                lefts[k] += self._reduced(before).whole.square
+            after.add(test.sums, -1.0)
+        for k in np.argsort(lefts, kind="stable"):
+            error = self._shown(tests[k:])
+            if error is not None and error.chosen[0] == found.chosen[0]:
+                return error
+        return found
 
-    def added(self, effect: Array) -> Array:
-        """Return the covariance (6, 6) of what was found, of a pose that candidates move by ``effect`` (6, C)."""
+    def added(self, response: Array) -> Array:
+        """Return the covariance (6, 6) of what was found, of a pose with a response (6, K) to the parameters."""
         found = self.found
         if found is None:
             return np.zeros((6, 6))
+        effect = response @ self._by_candidate
         shift = effect @ found.value
         return np.asarray(np.outer(shift, shift) + effect @ found.cov @ effect.T)
 
@@ -383,9 +480,7 @@ class ShapeWatch:
         """Return a copy that says what was found so far; this one goes on."""
         other = copy(self)
         other._history, other._shots, other._effects = self._history.copy(), self._shots.copy(), self._effects.copy()
-        other._test = _ShapeTest(_total([self._test]), list(self._test.views))
-        if self._stay is not None:
-            other._stay = _total([_ShapeTest(self._stay)])
+        other._views = self._views.copy()
         return other
 
     def finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
@@ -421,23 +516,48 @@ class ShapeWatch:
         )
 
 
+def _of_candidates(M: Array, freedom: float) -> _ShapeSums:
+    """Return sums M (1 + C, 1 + C) with the candidates' priors."""
+    return _ShapeSums(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0], float(M[0, 0]), freedom)
+
+
+def _hypotheses(points: int) -> tuple[_Hypothesis, ...]:
+    """Return what may have changed: the seven numbers, one focal length, a point, all points a little."""
+    every = 9 + np.arange(3 * points)
+    seven = (_Hypothesis(np.arange(7), scale) for scale in _SEVEN_SCALES)
+    alone = (*seven, _Hypothesis(np.array([7]), 1.0))
+    single = (_Hypothesis(rows, 1.0) for rows in every.reshape(points, 3))
+    bent = (_Hypothesis(every, size / FURTHEST_M) for size in _BENT_M) if points else ()
+    return (*alone, *single, *bent)
+
+
+def _explained(M: Array, hypothesis: _Hypothesis, excess: float) -> _Explained:
+    """Return what a hypothesis says of sums M (1 + N, 1 + N), of a noise whose variance is so many times larger."""
+    rows, scale = hypothesis
+    G = M[np.ix_(1 + rows, 1 + rows)] * (scale**2 / excess) + np.eye(len(rows))
+    r, inverse = M[1 + rows, 0] * (scale / excess), np.asarray(np.linalg.inv(G), float)
+    evidence = 0.5 * float(r @ inverse @ r) - 0.5 * float(np.linalg.slogdet(G)[1])
+    return _Explained(evidence, scale * (inverse @ r), scale**2 * inverse)
+
+
 def _columns(chosen: Sequence[int]) -> Ids:
     """Return the columns of candidates."""
     return np.concatenate([[0] if each == FOCAL else np.arange(2 + 3 * each, 5 + 3 * each) for each in chosen])
 
 
-def _one_is_enough(whole: _ShapeSums, without: _ShapeSums) -> bool:
+def _one_is_enough(found: _Reduced) -> bool:
     """Return whether the change of one focal length explains about as much as the seven numbers do."""
+    whole, without = found
     gain, seven = without.gain(_columns([FOCAL])), without.square - whole.square
     return gain >= seven - _ALIKE * without.excess(max(gain, seven))
 
 
-def _total(tests: Sequence[_ShapeTest]) -> ResidualSums:
+def total(tests: Sequence[ResidualSums]) -> ResidualSums:
     """Return the sums of tests."""
-    total = ResidualSums(len(tests[0].sums.b), tests[0].sums.begin_s)
-    for each in tests:
-        total.add(each.sums, 1.0)
-    return total
+    found = tests[0].of(len(tests[0].b))
+    for each in tests[1:]:
+        found.add(each, 1.0)
+    return found
 
 
 def _differ(views: Array) -> bool:

@@ -2,7 +2,7 @@
 
 In: a :data:`~armsight.robot.boards.configuration.Configuration`. Out: TOML text, and back, to the last bit::
 
-    version = 4                  # layout of the configuration
+    version = 5                  # layout of the configuration
     board = "nucleo-f446re"      # the board it belongs to
 
     [arm]

@@ -27,7 +27,7 @@ JOINTS, POT_NODES = 6, 9
 #: Counts of an absolute encoder's revolution.
 ENCODER_REV = 16384
 #: Layout of the configuration this armsight knows: ``firmware/core/config.h``.
-CONFIG_VERSION = 4
+CONFIG_VERSION = 5
 
 GAINS = np.dtype(
     [
@@ -54,7 +54,7 @@ POT = np.dtype(
         ("inverted_rad", "<f4"),
     ]
 )
-MOTOR = np.dtype([("resistance_ohm", "<f4"), ("constant_v_s", "<f4"), ("apart_rad", "<f4")])
+MOTOR = np.dtype([("resistance_ohm", "<f4"), ("constant_v_s", "<f4"), ("apart_rad", "<f4"), ("backlash_rad", "<f4")])
 ENCODER = np.dtype(
     [
         ("sensor", "<u4"),
@@ -119,6 +119,7 @@ _MOTOR_RANGES = {
     "resistance_ohm": (0.0, 1000.0),
     "constant_v_s": (1e-3, 1e3),
     "apart_rad": (1e-3, 1.0),
+    "backlash_rad": (0.0, 1.0),
 }
 _TABLE_RANGES = {"node_count": (2, POT_NODES)}
 _ENCODER_RANGES = {
@@ -147,6 +148,7 @@ _JOINT_RANGES = {
     "following_rad": (1e-3, 13.0),
     "stall_duty": (0.01, 1.0),
     "stall_rad": (1e-4, 1.0),
+    "current_limit_ma": (10, 100000),
 }
 _ARM_RANGES = {
     "joint_count": (1, JOINTS),
@@ -228,8 +230,8 @@ RANGES: Mapping[str, tuple[float, float]] = {
 
 #: The simulated arm's motors (:mod:`armsight.sim.joints`), and how stiffly they are driven.
 _LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S = MotorFigures(6.0, 2.4, 0.03, 0.02, 0.2), 12.0, 24.0
-#: 10 mrad of backlash and five sigma of 20 counts of noise.
-_LAB_APART_RAD = 0.02
+#: At most 10 mrad of backlash; it and five sigma of 20 counts of noise.
+LAB_BACKLASH_RAD, _LAB_APART_RAD = 0.01, 0.02
 
 
 def lab_configuration() -> Configuration:
@@ -237,7 +239,8 @@ def lab_configuration() -> Configuration:
     config = np.zeros((), CONFIG)
     joint = config["joint"]
     joint["gains"] = np.array(tuple(tuned_gains(_LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S)), GAINS)
-    joint["motor"] = np.array((_LAB_MOTOR.resistance_ohm, _LAB_MOTOR.constant_v_s, _LAB_APART_RAD), MOTOR)
+    motor = (_LAB_MOTOR.resistance_ohm, _LAB_MOTOR.constant_v_s, _LAB_APART_RAD, LAB_BACKLASH_RAD)
+    joint["motor"] = np.array(motor, MOTOR)
     pot = joint["pot"]
     pot["node_count"], pot["short_counts"], pot["open_counts"], pot["direction"] = 2, 1000, 64500, 1
     pot["counts"][:, :2], pot["angle_rad"][:, :2] = (3277, 62258), (-2.6, 2.6)
@@ -324,6 +327,8 @@ def _problems(config: Configuration) -> Iterator[str]:
             yield f"joints {taken + 1} and {j + 1} are both on encoder input {encoder['input']}; each timer counts for one"
     if config["supply_min_mv"] >= config["supply_max_mv"]:
         yield "supply_min_mv must be below supply_max_mv"
+    if config["supply_min_mv"] < config["supply_nominal_mv"] // 2:
+        yield f"supply_min_mv is {config['supply_min_mv']}; half of supply_nominal_mv or more is needed, in millivolts"
     if config["sync_led_pin"] and not PIN_NUMBERS[0] <= config["sync_led_pin"] <= PIN_NUMBERS[1]:
         yield f"sync_led_pin is {config['sync_led_pin']}; {_PIN_FORM}"
     if config["silence_reaction"] not in tuple(Reaction):
@@ -357,6 +362,8 @@ def _joint_problems(joint: Configuration) -> Iterator[str]:
         yield f"motor_direction is {joint['motor_direction']}; 1 or -1 is allowed"
     if joint["stall_duty"] > joint["duty_limit"]:
         yield "stall_duty must not be beyond duty_limit"
+    if joint["motor"]["backlash_rad"] >= joint["motor"]["apart_rad"]:
+        yield "backlash_rad must be below apart_rad, which is backlash and noise"
     if np.float32(joint["speed_limit_rad_s"]) * np.float32(1e-3) >= joint["pot"]["jump_rad"]:
         yield "jump_rad must be further than the joint moves in a tick at its speed limit"
 

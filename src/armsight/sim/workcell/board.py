@@ -71,7 +71,7 @@ def configuration(model: Arm, parts: Solids, motors: Motors, *, sync_led: bool =
     motor = joint["motor"]
     motor["resistance_ohm"] = motors.resistance_ohm
     motor["constant_v_s"] = motors.gear_ratio * motors.torque_constant
-    motor["apart_rad"] = 0.03
+    motor["apart_rad"], motor["backlash_rad"] = 0.03, 0.001
     # A narrower slew limit would cut the noise unevenly in motion, which brakes.
     joint["duty_limit"], joint["duty_slew_per_s"], joint["current_cut_per_a_s"] = 1.0, 1000.0, 20.0
     joint["current_limit_ma"] = np.rint(900.0 * motors.current_max_a)

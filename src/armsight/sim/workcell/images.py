@@ -349,6 +349,10 @@ class WorkcellCamera:
             (to_lamp / np.linalg.norm(to_lamp)).astype(np.float32),
         )
 
+    def forget(self) -> None:
+        """Drop what it sees while nothing moves; the next image finds it anew."""
+        self._seen_room = None
+
     @property
     def still(self) -> StillView:
         """What stands still before it."""

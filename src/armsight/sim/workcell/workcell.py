@@ -390,6 +390,11 @@ class Workcell:
             taken,
         )
 
+    def forget_room(self) -> None:
+        """Drop what the cameras see of the room, 80 MB each at 1280 x 720; the next image takes a second longer."""
+        for camera in self._cameras:
+            camera.forget()
+
     def close(self) -> None:
         """End the firmware and the threads; harmless when called twice."""
         self.board.close()

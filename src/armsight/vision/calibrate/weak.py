@@ -19,7 +19,7 @@ _LEAST_COVERED = 0.6
 _FOCUS_RATIO = 2.0
 _SCALE_SIGMAS = 4.0
 _REJECTED_SHARE = 0.2
-_FAR_MOTION = 2.0
+_FAR_MOTION, _FARTHEST = 2.0, 4
 _ROLLED_DEG = 60.0
 #: Degree of the polynomials of the position in an image that residuals may follow, beyond which share of their square and
 #: which chance they show a lens that the model cannot express.
@@ -139,19 +139,19 @@ def _by_position(calibration: Calibration) -> float | None:
 
 
 def _moved(calibration: Calibration, motion: ExposureMotion) -> str:
+    state = calibration.solution.state
+    ways = np.linalg.norm(state.motions[:, :3], axis=1)
+    far = [int(j) for j in np.argsort(-ways) if ways[j] > _FAR_MOTION * np.sqrt(3) * motion.rms_m][:_FARTHEST]
+    most = "".join(f", {calibration.pairs[j]} by {1e3 * ways[j]:.1f} mm" for j in far)
     if (field_px := _by_position(calibration)) is not None:
         return (
             f"residuals of {field_px:.2f} px RMS depend on the position in the images, as of lenses that the model cannot "
             "express; what looks like boards that moved between the two exposures, by "
-            f"{1e3 * motion.rms_m:.2f} mm RMS along each axis, may be the lenses too: try a richer --lens-model, look for "
-            "a lens that is loose or behind a window, and hold the board still to distinguish the two"
+            f"{1e3 * motion.rms_m:.2f} mm RMS along each axis{most}, may be the lenses too: try a richer --lens-model, "
+            "look for a lens that is loose or behind a window, and hold the board still to distinguish the two"
         )
-    state = calibration.solution.state
     distance = float(np.linalg.norm(state.Ts_left_body[:, :3, 3], axis=1).mean())
     way_px = calibration.rig.right.intrinsics[0] * motion.rms_m / distance
-    ways = np.linalg.norm(state.motions[:, :3], axis=1)
-    far = [j for j in np.argsort(-ways) if ways[j] > _FAR_MOTION * np.sqrt(3) * motion.rms_m]
-    most = f"; furthest: {', '.join(calibration.pairs[int(j)] for j in far[:4])}" if far else ""
     return (
         f"the board moved between the two exposures of a pair, by {1e3 * motion.rms_m:.2f} mm and "
         f"{1e3 * motion.rms_rad:.1f} mrad RMS along and about each axis ({way_px:.2f} px{most}): the cameras are not "
