@@ -119,6 +119,7 @@ class Detections(Record):
         cov_uv: (N, 2, 2) covariance of the positions from the image's own noise, px^2; zero where unknown.
         problem: why nothing was found; None when something was.
         shape: (N, 3) S11, S12, S22 of the ellipses of a board's discs, px^2, as in :class:`Discs`; (0, 3) for other points.
+        common: (3,) as in :class:`Discs`; zero for other points.
     """
 
     ids: Ids
@@ -126,6 +127,7 @@ class Detections(Record):
     cov_uv: Array
     problem: str | None = None
     shape: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    common: Array = field(default_factory=lambda: np.zeros(3))
 
     @staticmethod
     def none(problem: str) -> Detections:
@@ -156,6 +158,8 @@ class Discs(Record):
         shape: (N, 3) S11, S12, S22 of each ellipse, px^2: its rim is uv + x with x^T S^-1 x = 1.
         bright: (N,) whether a disc is brighter than its surround.
         rejected: what was looked at and is no disc.
+        common: (3,) c (2), px, and k of the shift c + k x, at a pixel x, by which blur or sharpening may have moved all of
+            them together: one standard deviation, beyond ``cov_uv``.
     """
 
     uv: Array
@@ -163,6 +167,7 @@ class Discs(Record):
     shape: Array
     bright: NDArray[np.bool_]
     rejected: tuple[Rejected, ...] = ()
+    common: Array = field(default_factory=lambda: np.zeros(3))
 
     @property
     def radius_px(self) -> Array:
@@ -188,12 +193,14 @@ class Correspondences(Record):
         uv: (N, 2, 2) point, camera, raw pixel; NaN where that camera did not see the point.
         cov_uv: (N, 2, 2, 2) covariance of each position, px^2.
         dropped: what was thrown away, and why.
+        common: (2, 3) camera; what may have moved its detections together, as in :class:`Discs`.
     """
 
     ids: Ids
     uv: Array
     cov_uv: Array
     dropped: tuple[Dropped, ...] = ()
+    common: Array = field(default_factory=lambda: np.zeros((2, 3)))
 
     @property
     def seen(self) -> NDArray[np.bool_]:

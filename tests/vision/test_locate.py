@@ -102,6 +102,26 @@ def test_it_is_the_minimum_and_the_covariance_of_a_slow_solver(model):
     assert found.residual_rms_m == pytest.approx(np.sqrt((gap**2).sum(axis=1).mean()), rel=1e-9)
 
 
+@pytest.mark.parametrize("model", CAMERAS)
+def test_what_may_move_an_images_detections_together_is_in_the_covariance_and_no_noise(model):
+    rig, rng = rig_of(model), np.random.default_rng(4)
+    common = np.array([[0.02, -0.01, 1e-4], [-0.03, 0.02, -5e-5]])
+    for _ in range(3):
+        shot = seen(rig, CLOUD, somewhere(rng))
+        plain, found = located(rig, CLOUD, shot), located(rig, CLOUD, replace(shot, common=common))
+        expected = np.zeros((6, 6))  # as the pose moves when they do
+        for side, (*c, k) in enumerate(common):
+            uv = shot.uv.copy()
+            uv[:, side] += c + k * uv[:, side]
+            xi = error(plain, located(rig, CLOUD, replace(shot, uv=uv)).T_left_body)
+            expected += np.outer(xi, xi)
+        gain = found.cov - plain.cov
+        # What is not linear is of the shifts' share in the distance between the points: 0.1 px of 50 px and more.
+        assert np.linalg.norm(gain - expected) < 0.01 * np.linalg.norm(expected)
+        assert (found.cov_noise == plain.cov_noise).all()
+        assert (found.T_left_body == plain.T_left_body).all()
+
+
 def draws(points, n, seed, share):
     """Measure shots that rigs sampled from the covariance see with noise, with the one rig we assume."""
     assumed, rng = rig_of(known=False), np.random.default_rng(seed)

@@ -282,19 +282,19 @@ def _distances(rig: StereoRig, body: Body, T: Array, observations: PixelObservat
 def _estimate(
     rig: StereoRig, body: Body, points: Points, fit: PoseFit, observations: PixelObservations, good: NDArray[np.bool_]
 ) -> PoseEstimate:
-    """Assemble the estimate with its covariance: pixel noise, and the rig's calibration through the same fit."""
+    """Assemble the estimate with its covariance: pixel noise; calibration and common shifts through the same fit."""
     used, T = _chosen(observations, good), fit.T_left_body
     W, A, B = whitened(rig.cameras, rig.T_left_right, body.points, used, T)
     noise = np.linalg.inv(fit.information).astype(np.float64)
-    gain = noise @ (A.T @ B)
+    gain, cov_rig = noise @ (A.T @ B), rig.cov_with(points.seen.common)
     misfit = 1.0
     if fit.cost > misfit_limit(2 * len(used.point) - 6):
-        misfit = _misfit((W @ fit.residuals_px[..., None]).ravel(), B - A @ gain, rig.cov)
+        misfit = _misfit((W @ fit.residuals_px[..., None]).ravel(), B - A @ gain, cov_rig)
     points, dropped = (points, ()) if good.all() else _thinned(rig, body, points, T, observations, good)
     gap = points.p_left - (body.points[points.ids] @ T[:3, :3].T + T[:3, 3])
     return PoseEstimate(
         T,
-        noise * misfit + gain @ rig.cov @ gain.T,
+        noise * misfit + gain @ cov_rig @ gain.T,
         noise * misfit,
         _rms(gap),
         _rms(fit.residuals_px),

@@ -6,6 +6,8 @@ contradict the rig. Distances are measured in undistorted pixels of each camera.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from armsight.data import Array, Body, Correspondences, Detections, Dropped, Ids
@@ -27,7 +29,7 @@ def join(left: Detections, right: Detections) -> Correspondences:
     for side, found in enumerate((left, right)):
         rows = np.searchsorted(ids, found.ids)
         uv[rows, side], cov[rows, side] = found.uv, found.cov_uv
-    return Correspondences(ids, uv, cov)
+    return Correspondences(ids, uv, cov, common=np.stack([left.common, right.common]))
 
 
 def epipolar_distances(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:
@@ -94,7 +96,7 @@ def gate(rig: StereoRig, body: Body, seen: Correspondences) -> Correspondences:
         Dropped(body.point_names[i], f"{d:.1f} px off its epipolar line (gate {g:.1f} px)")
         for i, d, g in zip(seen.ids[rows[bad]], distance[bad], limit[bad], strict=True)
     )
-    return Correspondences(seen.ids[keep], seen.uv[keep], seen.cov_uv[keep], seen.dropped + dropped)
+    return Correspondences(seen.ids[keep], seen.uv[keep], seen.cov_uv[keep], seen.dropped + dropped, seen.common)
 
 
 def match(
@@ -134,4 +136,4 @@ def renamed(detections: Detections, permutation: Ids) -> Detections:
     """Return detections whose point ``i`` is called ``permutation[i]``."""
     ids = permutation[detections.ids]
     order = np.argsort(ids)
-    return Detections(ids[order], detections.uv[order], detections.cov_uv[order], detections.problem)
+    return replace(detections, ids=ids[order], uv=detections.uv[order], cov_uv=detections.cov_uv[order])

@@ -166,6 +166,20 @@ class StereoRig(Record):
         """Left and right."""
         return self.left, self.right
 
+    def cov_with(self, common: Array) -> Array:
+        """Return the covariance (P, P) of the rig's parameters as an image shows them.
+
+        What moves all points of an image by c + k x is another principal point and focal length.
+
+        Args:
+            common: (2, 3) of each camera, as :class:`~armsight.data.Correspondences` have it.
+        """
+        cov = np.array(self.cov)
+        for first, camera, shift in zip((0, 4 + len(self.left.distortion)), self.cameras, common, strict=True):
+            by = shift[2] * camera.intrinsics + np.append([0.0, 0.0], shift[:2])
+            cov[first : first + 4, first : first + 4] += np.outer(by, by)
+        return cov
+
     @property
     def disc_variance_factors(self) -> tuple[float, float]:
         """By which the variances of discs' centres in left and right images are multiplied; 1 where it is unknown.

@@ -264,5 +264,5 @@ def triangulate(rig: StereoRig, body: Body, seen: Correspondences) -> Points:
         Dropped(body.point_names[i], "its rays do not meet before both cameras") for i in seen.ids[rows[~good]]
     )
     keep = ~np.isin(seen.ids, seen.ids[rows[~good]])
-    kept = Correspondences(seen.ids[keep], seen.uv[keep], seen.cov_uv[keep], seen.dropped + dropped)
+    kept = Correspondences(seen.ids[keep], seen.uv[keep], seen.cov_uv[keep], seen.dropped + dropped, seen.common)
     return Points(seen.ids[rows[good]], p[good], cov[good], by_rig[good], kept, kept.dropped)

@@ -69,7 +69,11 @@ def _single(path: Path, target: CalibrationBoard, side: int, size: tuple[int, in
         )
     found = target.detect(image)
     found = replace(
-        found, uv=(found.uv + 0.5) * scale - 0.5, cov_uv=found.cov_uv * scale**2, shape=found.shape * scale**2
+        found,
+        uv=(found.uv + 0.5) * scale - 0.5,
+        cov_uv=found.cov_uv * scale**2,
+        shape=found.shape * scale**2,
+        common=found.common * [scale, scale, 1.0],
     )
     nothing = Detections.none(f"{path.name} is of the {SIDES[side]} camera alone")
     return Pair(str(path), *((found, nothing) if side == 0 else (nothing, found)))

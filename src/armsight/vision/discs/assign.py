@@ -79,7 +79,7 @@ def correspondences(view: DiscView, found: Assigned) -> Correspondences:
         rows = found.rows[ids, side]
         there = rows >= 0
         uv[there, side], cov[there, side] = seen.uv[rows[there]], seen.cov_uv[rows[there]]
-    return Correspondences(ids, uv, cov, found.dropped)
+    return Correspondences(ids, uv, cov, found.dropped, np.stack([seen.common for seen in view.discs]))
 
 
 def settle(view: DiscView, T_left_body: Array, cov: Array, rows: Ids) -> Assigned:

@@ -22,7 +22,7 @@ optical axis e that lies in the disc, e - (n e) n, which over all directions n h
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -410,7 +410,7 @@ def centred(rig: StereoRig, target: DiscTarget, T_left_body: Array, seen: Corres
     expected = expect(rig, target, T_left_body)
     cov = seen.cov_uv + expected.cov_bias[seen.ids]
     uv = seen.uv - expected.bias[seen.ids]
-    return Correspondences(seen.ids, uv, np.where(np.isfinite(uv)[..., None], cov, 0.0), seen.dropped)
+    return replace(seen, uv=uv, cov_uv=np.where(np.isfinite(uv)[..., None], cov, 0.0))
 
 
 def visible(rig: StereoRig, expected: Expected) -> NDArray[np.bool_]:

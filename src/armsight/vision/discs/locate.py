@@ -94,6 +94,7 @@ def locate_discs(
             np.concatenate([coded.uv, centres.uv]),
             np.concatenate([coded.cov_uv, centres.cov_uv]),
             coded.dropped + centres.dropped,
+            centres.common,
         )
         result = locate(rig, body, triangulate(rig, body, together))
         if isinstance(result, Missed):

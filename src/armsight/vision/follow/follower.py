@@ -327,7 +327,9 @@ class Follower:
             math.sqrt(found.squares[0] / len(both)),
             math.sqrt(found.squares[1] / count),
             math.sqrt(misfit),
-            Points(both, p_left, cov_p, by_rig, Correspondences(seen, uv, cov_uv, dropped), dropped),
+            Points(
+                both, p_left, cov_p, by_rig, Correspondences(seen, uv, cov_uv, dropped, found.common.copy()), dropped
+            ),
             dropped,
         )
 
@@ -370,4 +372,5 @@ def _buffers(count: int, parameters: int) -> DiscMeasurement:
         np.zeros((4 * count, parameters)),
         np.zeros((count, 2, 2)),
         np.zeros(2),
+        np.zeros((2, 3)),
     )

@@ -27,7 +27,7 @@ from armsight.geometry.matrix import (
 from armsight.kernels import kernel, kernel_types
 from armsight.vision.camera import distort
 from armsight.vision.discs.bias import disc_image
-from armsight.vision.markers.disc.common import common, correct
+from armsight.vision.markers.disc.common import SHARED, common, correct
 from armsight.vision.markers.disc.fit import PARAMETERS, FitBuffers, factor, fit, shape_of, solve
 from armsight.vision.markers.disc.search import Room, outline
 from armsight.vision.posefit import moved
@@ -86,7 +86,7 @@ class DiscScene(NamedTuple):
 @kernel_types(
     "i8[:, ::1], f8[:, :, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], "
     "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1], "
-    "f8[:, ::1], f8[:, :, ::1], f8[::1]"
+    "f8[:, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1]"
 )
 class DiscMeasurement(NamedTuple):
     """The measurement of one pair; M discs, two cameras.
@@ -101,7 +101,7 @@ class DiscMeasurement(NamedTuple):
         residual: (M, 2, 2) of the centres at the pose, px.
         T: (4, 4) pose T_left_body; the prediction at first.
         H: (6, 6) information.
-        cov: (6, 6) the rig's share of the covariance; the noise's share is the inverse of H.
+        cov: (6, 6) the share of the rig and of ``common`` in the covariance; the noise's share is the inverse of H.
         p_left: (M, 3) points, m, of the discs that both cameras saw.
         cov_p: (M, 3, 3) their covariance from the pixel noise, m^2.
         by_rig: (M, 3, P) their derivative by the rig.
@@ -110,6 +110,7 @@ class DiscMeasurement(NamedTuple):
         J_rig: (4 M, P) whitened.
         bias: (M, 2, 2) centre of ellipse less image of centre, px.
         squares: (2,) sums of the points' squared distances from the body, m^2, and of the residuals, px^2.
+        common: (2, 3) camera; what may have moved its centres together, as in ``Discs``.
     """
 
     codes: NDArray[np.int64]
@@ -130,6 +131,7 @@ class DiscMeasurement(NamedTuple):
     J_rig: Array
     bias: Array
     squares: Array
+    common: Array
 
 
 @kernel
@@ -233,23 +235,30 @@ def settle(scene: DiscScene, found: DiscMeasurement) -> float:
 def uncertainty(scene: DiscScene, found: DiscMeasurement, cov_noise: Array, chi_square: float, limit: float) -> float:
     """Fill covariances; return the residuals' chi-square, above ``limit`` less the part that a wrong calibration explains.
 
-    The rig's share propagates through the same fit: gain = H^-1 J^T J_rig. Chi-square: residuals weighted by the
-    inverse of I + B cov_rig B^T with B the part of J_rig that no pose explains (Woodbury's identity), as in ``locate``.
+    The rig's share propagates through the same fit: gain = H^-1 J^T J_rig. What moves an image's centres together is
+    another principal point and focal length. Chi-square: residuals weighted by the inverse of I + B cov_rig B^T, with B the
+    part of J_rig that no pose explains (Woodbury's identity), as in ``locate``.
     """
-    J, J_rig = found.J, found.J_rig
+    J, J_rig, cov_rig = found.J, found.J_rig, scene.cov_rig.copy()
+    for side in range(2):
+        first, by = scene.first[side], found.common[side, 2] * scene.k[side]
+        by[2:] += found.common[side, :2]
+        for i in range(4):
+            for j in range(4):
+                cov_rig[first + i, first + j] += by[i] * by[j]
     for row in range(len(found.whitened)):
         if found.codes[row // 4, (row // 2) % 2] != SEEN:
             J_rig[row] = 0.0
     found.H[:, :] = product(J.T, J)
     cov_noise[:, :] = solved(found.H, np.eye(6))
     gain = product(cov_noise, product(J.T, J_rig))
-    found.cov[:, :] = product(product(gain, scene.cov_rig), gain.T)
+    found.cov[:, :] = product(product(gain, cov_rig), gain.T)
     if chi_square <= limit:
         return chi_square
     B = J_rig - product(J, gain)
     v = applied(B.T, found.whitened)
-    M = np.eye(len(scene.cov_rig)) + product(scene.cov_rig, product(B.T, B))
-    return chi_square - dot(v, solved_vector(M, applied(scene.cov_rig, v)))
+    M = np.eye(len(cov_rig)) + product(cov_rig, product(B.T, B))
+    return chi_square - dot(v, solved_vector(M, applied(cov_rig, v)))
 
 
 @kernel
@@ -472,8 +481,9 @@ def look(
             found.contrast[m, side] = abs(theta[6])
             work.discs[count, :] = work.shown
             count += 1
-    shared = np.empty(4)
+    shared = np.empty(SHARED)
     common(image, count, work, shared)
+    found.common[side] = shared[3:]
     count = 0
     for m in range(len(scene.radii)):
         if found.codes[m, side] == SEEN:

@@ -95,14 +95,15 @@ class BoardTarget(Record, Target):
         for mounted in self.boards:
             seen = mounted.board.detect(image)
             if seen.problem is None:
-                found.append(Detections(seen.ids + first, seen.uv, seen.cov_uv))
+                found.append(Detections(seen.ids + first, seen.uv, seen.cov_uv, common=seen.common))
             else:
                 problems.append(f"{mounted.name}: {seen.problem}")
             first += len(mounted.board.body.point_names)
         if not found:
             return Detections.none("; ".join(problems))
         ids, uv, cov = zip(*((seen.ids, seen.uv, seen.cov_uv) for seen in found), strict=True)
-        return Detections(np.concatenate(ids), np.concatenate(uv), np.concatenate(cov))
+        common = max((seen.common for seen in found), key=np.linalg.norm)
+        return Detections(np.concatenate(ids), np.concatenate(uv), np.concatenate(cov), common=common)
 
 
 def _checked(spec: str) -> str:

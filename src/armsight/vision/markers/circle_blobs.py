@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 
 from armsight.data import Array, Record
 from armsight.kernels import kernel
-from armsight.vision.markers.disc.common import common, correct
+from armsight.vision.markers.disc.common import SHARED, common, correct
 from armsight.vision.markers.disc.fit import (
     PARAMETERS,
     REASONS,
@@ -236,8 +236,10 @@ HARMLESS = (5, 8, 10)
 _ODD_SHARE = 0.3
 
 
-@kernel("const u1[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], FitBuffers")
-def _fit_each(image: Grey, theta: Array, cov: Array, shape: Array, codes: NDArray[np.int64], work: FitBuffers) -> None:
+@kernel("const u1[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], f8[::1], FitBuffers")
+def _fit_each(
+    image: Grey, theta: Array, cov: Array, shape: Array, codes: NDArray[np.int64], shared: Array, work: FitBuffers
+) -> None:
     """Fit discs.
 
     Args:
@@ -246,6 +248,7 @@ def _fit_each(image: Grey, theta: Array, cov: Array, shape: Array, codes: NDArra
         cov: (N, 2, 2) filled with the covariance of the centres, px^2; also of those with a harmless reason.
         shape: (N, 3) filled with the ellipses S11, S12, S22, px^2.
         codes: (N,) filled with 0 or the reason why it is not a disc (``fit.REASONS``).
+        shared: (SHARED,) filled with what they have in common (``disc.common``).
         work: buffers.
     """
     noise, count = noise_of(image), 0
@@ -273,7 +276,6 @@ def _fit_each(image: Grey, theta: Array, cov: Array, shape: Array, codes: NDArra
         if codes[i] == 0:
             work.discs[count, :] = work.shown
             count += 1
-    shared = np.empty(3)
     common(image, count, work, shared)
     count = 0
     for i in range(len(theta)):
@@ -293,12 +295,14 @@ class Fits(Record):
         cov: (N, 2, 2) covariance of the centres, px^2.
         shape: (N, 3) their ellipses S11, S12, S22, px^2.
         codes: (N,) 0 or the reason why it is not a disc (``fit.REASONS``).
+        common: (3,) as in :class:`~armsight.data.Discs`.
     """
 
     theta: Array
     cov: Array
     shape: Array
     codes: NDArray[np.int64]
+    common: Array
 
     @property
     def uv(self) -> Array:
@@ -367,11 +371,11 @@ def like_neighbours(uv: Array, theta: Array) -> Array:
 def fit_discs(image: Grey, starts: Array, before: Fits | None = None, which: NDArray[np.bool_] | None = None) -> Fits:
     """Fit discs in a grey image (H, W) from starts (N, 10); with ``before``, only those ``which`` (N,), the others stay."""
     theta, n = np.array(starts, order="C"), len(starts)
-    cov, shape, codes = np.zeros((n, 2, 2)), np.ones((n, 3)), np.zeros(n, np.int64)
+    cov, shape, codes, shared = np.zeros((n, 2, 2)), np.ones((n, 3)), np.zeros(n, np.int64), np.empty(SHARED)
     if not hasattr(_KEPT, "work"):
         _KEPT.work = workspace_of_fits()
-    _fit_each(np.ascontiguousarray(image), theta, cov, shape, codes, _KEPT.work)
+    _fit_each(np.ascontiguousarray(image), theta, cov, shape, codes, shared, _KEPT.work)
     if before is not None and which is not None:
         for now, then in ((theta, before.theta), (cov, before.cov), (shape, before.shape), (codes, before.codes)):
             now[~which] = then[~which]
-    return Fits(theta, cov, shape, codes)
+    return Fits(theta, cov, shape, codes, shared[3:])

@@ -198,7 +198,7 @@ class CircleGrid(Record, Target):
         if good.sum() < least:
             return f"{len(ids)} of its discs were found, but only {good.sum()} can be measured{fits.why_not()}"
         rows = np.flatnonzero(good)[np.argsort(ids[good])]
-        return Detections(ids[rows], fits.uv[rows], fits.cov[rows], shape=fits.shape[rows])
+        return Detections(ids[rows], fits.uv[rows], fits.cov[rows], shape=fits.shape[rows], common=fits.common)
 
     def _upright(self, ids: Ids, uv: Array) -> Ids:
         """Return the numbering, of those that look the same, whose rows run most to the right."""

@@ -66,7 +66,7 @@ class Composite(Record, Target):
         for part in self.parts:
             seen = part.detect(image)
             if seen.problem is None:
-                found.append(Detections(seen.ids + first, seen.uv, seen.cov_uv))
+                found.append(Detections(seen.ids + first, seen.uv, seen.cov_uv, common=seen.common))
             else:
                 problems.append(seen.problem)
             first += len(part.body.point_names)
@@ -75,7 +75,8 @@ class Composite(Record, Target):
                 "; ".join(problems) or "plain discs carry no codes: one image alone cannot identify them"
             )
         ids, uv, cov = zip(*((seen.ids, seen.uv, seen.cov_uv) for seen in found), strict=True)
-        return Detections(np.concatenate(ids), np.concatenate(uv), np.concatenate(cov))
+        common = max((seen.common for seen in found), key=np.linalg.norm)
+        return Detections(np.concatenate(ids), np.concatenate(uv), np.concatenate(cov), common=common)
 
 
 def load_body_toml(path: str | Path) -> Target:

@@ -134,14 +134,28 @@ def test_an_edge_that_is_skewed_leaves_a_centre_as_uncertain_as_blur_moves_it():
             [outline(c, 11, 10, 0.3)], 0.7, np.zeros(2), size
         )
     sigmas = {}
-    for name, part in (("even", 0.0), ("skewed", 0.15)):  # so much of the light arrives 2 px further right
-        image = grey((1 - part) * light + part * np.roll(light, 2, 1), 0.5, rng)
+    skewed = 0.85 * light + 0.15 * np.roll(light, 2, 1)  # so much of the light arrives 2 px further right
+    one = light.copy()
+    one[:size, :size] = skewed[:size, :size]
+    for name, part in (("even", light), ("skewed", skewed), ("one", one)):
+        image = grey(part, 0.5, rng)
         sharp, soft = BRIGHT.find(image), BRIGHT.find(cv2.GaussianBlur(image, (0, 0), 1.2))
         e, cov = soft.uv - sharp.uv, soft.cov_uv + sharp.cov_uv
+        own = np.sqrt(sharp.cov_uv[:, [0, 1], [0, 1]])
+        shift = sharp.common[:2] + sharp.common[2] * sharp.uv  # a standard deviation
+        for each in (sharp, soft):
+            field = each.common[:2] + each.common[2] * each.uv
+            cov = cov + field[:, :, None] * field[:, None, :]
         assert np.mean(np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov), e)) / 2 < 1.5
-        sigmas[name] = np.sqrt(sharp.cov_uv[:, [0, 1], [0, 1]].mean(axis=0))
-    assert sigmas["skewed"][0] > 10 * sigmas["even"][0]
-    assert sigmas["skewed"][0] > 3 * sigmas["skewed"][1]  # and not down
+        sigmas[name] = own, np.abs(shift).mean(axis=0)
+    (even, together), (own, shift), (odd, least) = (sigmas[name] for name in ("even", "skewed", "one"))
+    assert not together.any()
+    assert not least.any()
+    assert shift[0] > 10 * even[:, 0].mean()
+    assert shift[0] > 3 * shift[1]  # and not down
+    assert own[:, 0].mean() < 1.5 * own[:, 1].mean()  # what all have in common weighs none less
+    first = np.linalg.norm(BRIGHT.find(image).uv - size / 2, axis=1).argmin()
+    assert odd[first, 0] > 10 * np.delete(odd, first, axis=0)[:, 0].max()
 
 
 def test_motion_smears_a_disc_about_its_middle_or_is_reported():

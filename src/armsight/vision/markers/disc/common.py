@@ -13,6 +13,11 @@ the one unknown, a. Behind a tone curve a is another one, and the same for discs
 
 A disc whose gradient, or whose surround's, is significant beyond that, measured by the noise of the image, is fitted with
 other kinds of gradient, too; they are averaged by their likelihood (model averaging).
+
+An edge that is steeper on one side moves its disc under blur or sharpening. A shaken exposure and a lens off its axis do so
+to all discs of an image alike, coma in proportion to the distance from the middle (Seidel): c + k x at pixel x. No fit of a
+pose or a calibration sees such a field, which is another principal point and another focal length: it stands apart from the
+discs' own covariances, and these have what a disc deviates from it.
 """
 
 from __future__ import annotations
@@ -21,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
+from armsight.geometry.matrix import solved_vector
 from armsight.kernels import kernel
 from armsight.vision.markers.disc.fit import (
     GLARE,
@@ -37,7 +43,7 @@ from armsight.vision.markers.disc.fit import (
     of_centre,
 )
 
-#: From so many discs on, vignetting is estimated.
+#: From so many discs on, vignetting and a common skew are estimated.
 _LEAST_DISCS = 3
 #: Contrasts of discs whose rims have the same noise, one over the other: what processing makes of a rim grows with it.
 _ALIKE = 1.6
@@ -54,6 +60,12 @@ _VIGNETTING = 0.3
 _SLOPE_INSIDE, _SLOPE_OUTSIDE = 9.2, 4.6
 #: Chi-square of two degrees from which an edge is skewed, beyond that of noise: chance exceeds it in 0.1%.
 _SKEW = 13.8
+#: The same of three degrees; variance of a spatial median in a plane over that of a mean; rounds until it has converged.
+_FIELD, _MEDIAN, _ROUNDS = 16.3, 1.27, 12
+#: Coma as it is to be expected: standard deviation of the shift in the corners, px.
+_COMA = 0.2
+#: What the discs of an image have in common: see :func:`common`.
+SHARED = 6
 #: How likely each kind of gradient is where there is one (LIGHT, SURROUND, GLARE).
 _KINDS = (0.6, 0.3, 0.1)
 
@@ -96,17 +108,19 @@ def common(image: NDArray[np.uint8], n: int, work: FitBuffers, shared: Array) ->
         image: (H, W) grey.
         n: number of discs.
         work: what they show; power and its third column become ratios, see :func:`_rim_noise`.
-        shared: (3,) filled: mean square of the deviations of the rims' sectors beyond white noise, px^2; the vignetting a,
-            1/px^2; n / 2 times its variance. Medians, so that a few discs that are none do not count. An error of a moves
-            all centres alike: in three of the six degrees of freedom of a pose it counts n times as much as if it were
-            independent, in the others hardly.
+        shared: (SHARED,) filled: mean square of the deviations of the rims' sectors beyond white noise, px^2; the
+            vignetting a, 1/px^2; n / 2 times its variance; c (2), px, and k of the shift c + k x that skewed edges make
+            together at a pixel x, one standard deviation. Medians, so that a few discs that are none do not count. An error
+            of a moves all centres alike: in three of the six degrees of freedom of a pose it counts n times as much as if
+            it were independent, in the others hardly.
     """
     discs = work.discs
-    shared[0], shared[1], shared[2] = 0.0, 0.0, 0.0
+    shared[:] = 0.0
     _rim_noise(n, discs)
     if n < _LEAST_DISCS:
         return
     shared[0] = max(np.median(discs[:n, 1]), 0.0)
+    _common_skew(image, n, discs, shared[3:6])
     slope, weight, total = np.empty(n), np.empty(n), 0.0
     for i in range(n):
         u, v, k = _from_middle(image, discs[i], 0), _from_middle(image, discs[i], 1), discs[i, 5:8] / discs[i, 2]
@@ -130,6 +144,47 @@ def common(image: NDArray[np.uint8], n: int, work: FitBuffers, shared: Array) ->
 
 
 @kernel
+def _common_skew(image: NDArray[np.uint8], n: int, discs: Array, field: Array) -> None:
+    """Fill by how much skewed edges move the first n discs together, field (3,) as in :func:`common`.
+
+    The field is the one with the least sum of distances (a spatial median, by weighted least squares), less what chance
+    makes of it.
+    """
+    H, g, noise, square = np.empty((3, 3)), np.empty(3), np.empty(n), 0.0
+    for i in range(n):
+        noise[i] = discs[i, 2] * _skew_variance(discs[i])
+    variance = max(np.median(noise), 1e-12)
+    expected = 2.0 * _COMA / np.sqrt(float(image.shape[0] ** 2 + image.shape[1] ** 2))
+    middle = np.array([0.5 * (image.shape[1] - 1), 0.5 * (image.shape[0] - 1)])
+    for _ in range(_ROUNDS):
+        H[:, :], g[:] = 0.0, 0.0
+        H[2, 2] = np.sqrt(variance) / (expected * expected)
+        for i in range(n):
+            x, s = discs[i, PARAMETERS : PARAMETERS + 2] - middle, discs[i, SKEWED : SKEWED + 2]
+            d = s - field[:2] - field[2] * x
+            w = 1.0 / np.sqrt(d[0] * d[0] + d[1] * d[1] + variance)
+            for j in range(2):
+                H[j, j] += w
+                H[j, 2] += w * x[j]
+                H[2, j] += w * x[j]
+                H[2, 2] += w * x[j] * x[j]
+                g[j] += w * s[j]
+                g[2] += w * x[j] * s[j]
+        field[:] = solved_vector(H, g)
+    for i in range(n):
+        s = field[:2] + field[2] * (discs[i, PARAMETERS : PARAMETERS + 2] - middle)
+        square += (s[0] * s[0] + s[1] * s[1]) / n
+    field[:2] -= field[2] * middle
+    field *= np.sqrt(max(1.0 - _FIELD * _MEDIAN * variance / (n * max(square, 1e-300)), 0.0))
+
+
+@kernel
+def _skew_variance(disc: Array) -> float:
+    """Return the variance, along itself, of a disc's shift by a skewed edge, px^2, in white noise."""
+    return float((disc[SKEWED] ** 2 + disc[SKEWED + 1] ** 2) / max(disc[SKEWED + 2], 1e-12))
+
+
+@kernel
 def _from_middle(image: NDArray[np.uint8], disc: Array, axis: int) -> float:
     """Return how far right of the image's middle (axis 0) or below it (axis 1) a disc is, px."""
     return float(disc[PARAMETERS + axis] - 0.5 * (image.shape[1 - axis] - 1))
@@ -143,13 +198,13 @@ def correct(
 
     A rim that deviates significantly more than others, because a little of it is covered perhaps, may have shifted the
     centre as much. So may an edge that is steeper on one side: where its middle is depends on the profile, and sharpening
-    or blur that is the same on all sides moves it.
+    or blur that is the same on all sides moves it; here as far as it moves this disc otherwise than all.
 
     Args:
         image: (H, W) grey.
         noise_sigma: of the image, grey levels.
         disc: (SHOWN,) what the disc's fit shows; the parameters in it are replaced.
-        shared: (3,) of :func:`common`.
+        shared: (SHARED,) of :func:`common`.
         cov: (2, 2) covariance of the centre, px^2, of the fit, replaced.
         work: buffers.
     """
@@ -174,11 +229,12 @@ def correct(
     if off > 0.0 and disc[0] > _RIM_CHANCE:
         cov[0, 0] += off
         cov[1, 1] += off
-    if disc[SKEWED + 2] > _SKEW * factor:
-        skew, share = disc[SKEWED : SKEWED + 2], 1.0 - _SKEW * factor / disc[SKEWED + 2]
+    skew = disc[SKEWED : SKEWED + 2] - shared[3:5] - shared[5] * disc[PARAMETERS : PARAMETERS + 2]
+    square, chance = skew[0] * skew[0] + skew[1] * skew[1], _SKEW * factor * _skew_variance(disc)
+    if square > chance:
         for i in range(2):
             for j in range(2):
-                cov[i, j] += share * skew[i] * skew[j]
+                cov[i, j] += (1.0 - chance / square) * skew[i] * skew[j]
 
 
 @kernel

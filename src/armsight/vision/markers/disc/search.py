@@ -384,11 +384,11 @@ def _again(n: int, starts: Array, signs: NDArray[np.int64], cells: NDArray[np.in
 
 @kernel(
     "const u1[:, ::1], const u8[:, ::1], b1, b1, f8[:, ::1], i8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], "
-    "(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1]), FitBuffers",
+    "f8[::1], (f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1]), FitBuffers",
 )
 def find(
     image: Grey, words: Words64, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
-    signs: NDArray[np.int64], cov: Array, shape: Array, room: Room, work: FitBuffers,
+    signs: NDArray[np.int64], cov: Array, shape: Array, shared: Array, room: Room, work: FitBuffers,
 ) -> tuple[int, int]:  # fmt: skip
     """Search an image and fit every candidate.
 
@@ -402,6 +402,7 @@ def find(
         signs: see there; in the same order.
         cov: (N, 2, 2) filled with the covariances of the discs' centres, px^2.
         shape: (N, 3) filled with the discs' ellipses, px^2.
+        shared: (SHARED,) filled with what they have in common, see :func:`~armsight.vision.markers.disc.common.common`.
         room: see there.
         work: buffers for fits.
 
@@ -410,8 +411,6 @@ def find(
     """
     noise = noise_of(image)
     n = search(image, words, noise, bright, dark, starts, codes, signs, room)
-    if n == 0:
-        return 0, 0
     good = 0
     cells = np.full((image.shape[0] // 8 + 1, image.shape[1] // 8 + 1), -1, np.int16)
     for i in range(n):
@@ -429,7 +428,6 @@ def find(
             shape_of(starts[good], shape[good])
             work.discs[good, :] = work.shown
             good += 1
-    shared = np.empty(3)
     common(image, good, work, shared)
     for i in range(good):
         correct(image, noise, work.discs[i], shared, cov[i], work)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Body, Discs, Record, Rejected
 from armsight.vision.markers.body_file import Marker, check_discs
 from armsight.vision.markers.disc import fit, search
+from armsight.vision.markers.disc.common import SHARED
 
 #: Most rejected candidates of an image that are reported.
 MOST_REPORTED = 100
@@ -76,16 +77,23 @@ class DiscTarget(Record):
         room = _room()
         bright, dark = self._kinds
         good, n = search.find(image, image.view(np.uint64), bright, dark, *room)
-        theta, codes, signs, cov, shape = room[:5]
+        theta, codes, signs, cov, shape, shared = room[:6]
         rejected = _rejected(theta[good:n], codes[good:n]) if n > good else ()
         if n == _MOST_CANDIDATES:  # rows are searched from the top
             row = float(min(np.nanmax(theta[:n, 1]), len(image) - 1))
             reason = f"{n} candidates, and no more are examined: below about row {row:.0f} discs were not searched"
             rejected = (Rejected((0.0, row), reason), *rejected)
-        return Discs(theta[:good, :2].copy(), cov[:good].copy(), shape[:good].copy(), signs[:good] > 0, rejected)
+        return Discs(
+            theta[:good, :2].copy(),
+            cov[:good].copy(),
+            shape[:good].copy(),
+            signs[:good] > 0,
+            rejected,
+            shared[3:].copy(),
+        )
 
 
-def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Array, search.Room, fit.FitBuffers]:
+def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Array, Array, search.Room, fit.FitBuffers]:
     """Return this thread's buffers; they are kept, for new memory each time costs as much as the search."""
     if not hasattr(_KEPT, "room"):
         _KEPT.room = (
@@ -94,6 +102,7 @@ def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Array, 
             np.empty(_MOST_CANDIDATES, np.int64),
             np.empty((_MOST_CANDIDATES, 2, 2)),
             np.empty((_MOST_CANDIDATES, 3)),
+            np.empty(SHARED),
             search.workspace(),
             fit.workspace(),
         )
