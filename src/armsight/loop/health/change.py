@@ -255,8 +255,8 @@ def finding(changes: Sequence[Change], names: Sequence[str], axis: Array | None 
     causes = [each.suspect.cause for each in others]
     if (kind, joint) == ("joint", 0):
         causes.append("fixed")
-    is_fixed = best.suspect.cause == "fixed" and axis is not None
-    if is_fixed and along_axis(*best.newest, best.T_base_tool[:3, :3].T @ axis):
+    in_tool = None if axis is None else best.T_base_tool[:3, :3].T @ axis
+    if best.suspect.cause == "fixed" and in_tool is not None and along_axis(*best.newest, in_tool):
         causes.append("lens")
         unsure += FOCAL
     alternatives = tuple(cause for cause in dict.fromkeys(causes) if cause != best.suspect.cause)
