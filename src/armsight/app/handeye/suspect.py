@@ -27,7 +27,7 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, log_se3, mean_pose
 from armsight.loop.handeye.handeye import LEVER_M, Poses, residuals, starts
-from armsight.loop.handeye.structured import scale_between
+from armsight.loop.handeye.structured import CONTRADICTS, rotations_of, scale_between
 from armsight.robot.arm import Arm
 from armsight.robot.models import MODELS
 
@@ -65,23 +65,40 @@ class _Reading(NamedTuple):
         said: what it would mean, and what to do.
         path: the file that it is about; None: the robot's table.
         of_length: how long 1 m of the robot's is in this reading, m.
+        of_units: whether all lengths of one side are in another unit: they can be converted.
     """
 
     poses: Poses
     said: str
     path: Path | None = None
     of_length: float = 1.0
+    of_units: bool = False
 
 
-def misfit(poses: Poses) -> Array:
-    """Return the quantiles (2,) of the residuals, m, of the best closed form."""
+def misfit(poses: Poses, *, scale: bool = False) -> Array:
+    """Return the quantiles (2,) of the residuals, m, of the best closed form; with scale, of a target as large as fits."""
+    _, e = _evaluated(_sized(poses, scale_between(poses)) if scale else poses)
+    return np.quantile(_sizes(e), QUANTILES) if len(e) else np.full(2, np.inf)
+
+
+def _evaluated(poses: Poses) -> tuple[Poses, Array]:
+    """Return the poses that are looked at, and their residuals (N, 6) of the best closed form, (0, 6) if there is none."""
     rows = np.linspace(0, len(poses.A) - 1, min(EVALUATED, len(poses.A))).round().astype(np.int64)
     part = poses.rows(rows)
     found = starts(part.A, part.right_side)
-    if not found:
-        return np.full(2, np.inf)
-    X, Z = found[0]
-    return np.quantile(_sizes(residuals(part, Z, X)[0]), QUANTILES)
+    return part, residuals(part, *found[0][::-1])[0] if found else np.zeros((0, 6))
+
+
+def _determined(poses: Poses) -> bool:
+    """Return whether the flange rotates about two axes, as a calibration demands: closed forms say nothing otherwise.
+
+    Where the rotations of both sides contradict each other it is not the motion that is wrong.
+    """
+    part, e = _evaluated(poses)
+    if not len(e):
+        return True
+    spread, _, noise, least = rotations_of(part, e)
+    return bool(noise > CONTRADICTS or spread[1] >= least)
 
 
 def _better(off: Array, as_given: Array, *, length: float = 1.0) -> bool:
@@ -104,16 +121,21 @@ def _sizes(e: Array) -> Array:
 
 def resized(Ts: Array, before: Array, after: Array) -> Array:
     """Return poses with their lengths converted as those of others were, (N, 4, 4) all."""
+    return _longer(Ts, float(np.linalg.norm(after[:, :3, 3]) / max(float(np.linalg.norm(before[:, :3, 3])), 1e-12)))
+
+
+def _longer(Ts: Array, by: float) -> Array:
+    """Return poses (N, 4, 4) with their lengths multiplied."""
     out = Ts.copy()
-    out[:, :3, 3] *= np.linalg.norm(after[:, :3, 3]) / max(float(np.linalg.norm(before[:, :3, 3])), 1e-12)
+    out[:, :3, 3] *= by
     return out
 
 
-def _resized(p: Poses) -> Poses:
-    """Return the poses with the target's lengths multiplied by what fits."""
-    B = p.B.copy()
-    B[:, :3, 3] *= scale_between(p)
-    return replace(p, B=B)
+def _sized(p: Poses, by: float) -> Poses:
+    """Return the poses with the target's lengths multiplied."""
+    unit = np.repeat([by, 1.0], 3)
+    common = None if p.common is None else unit[:, None] * p.common
+    return replace(p, B=_longer(p.B, by), cov=p.cov * np.outer(unit, unit), centre=by * p.centre, common=common)
 
 
 def _angles(Ts: Array) -> Array:
@@ -145,19 +167,21 @@ def require_plausible(
         InputError: what is likely wrong, and what to do.
     """
     p = recording.poses
-    as_given = misfit(_resized(p) if scale else p)
+    as_given = misfit(p, scale=scale)
     if as_given[0] < FITS_M and as_given[1] < PLAUSIBLE_M:
         return recording
     reading = _best(recording, arm, as_given, scale=scale, streams=streams)
     if reading is not None:
-        if detect_units and reading.of_length != 1.0:
+        if detect_units and reading.of_units:
             note = f"{reading.said.partition(':')[0]}; converted"
             return replace(recording, poses=reading.poses, notes=(*recording.notes, note))
-        off = misfit(_resized(reading.poses) if scale else reading.poses)
+        off = misfit(reading.poses, scale=scale)
         raise InputError(
             f"{reading.path or recording.robot.path}: {reading.said} (half of the rows then within {1e3 * off[0]:.1f} mm, "
             f"nine of ten {1e3 * off[1]:.1f}; as given {1e3 * as_given[0]:.1f} and {1e3 * as_given[1]:.1f})"
         )
+    if not _determined(p):  # the calibration says so
+        return recording
     displaced = _displaced(p, as_given) if not scale else None
     if displaced is not None:
         first, what = _moved(p, displaced)
@@ -172,7 +196,7 @@ def require_plausible(
             "and no other reading fits: robot and images are not of the same motion, or which row belongs to which, a "
             "rotation or the joints are read wrongly; check one row by hand, or take the poses again"
         )
-    notes = _nearer_models(recording, arm, as_given[0])
+    notes = _nearer_models(recording, arm, as_given[0], scale=scale)
     if as_given[0] > PLAUSIBLE_M:
         notes.append(
             f"{recording.robot.path}: half of the rows are off by more than {1e3 * as_given[0]:.0f} mm in any mounting, "
@@ -181,13 +205,13 @@ def require_plausible(
     return replace(recording, notes=(*recording.notes, *notes))
 
 
-def _nearer_models(recording: PairedPoses, arm: Arm | None, as_given: float) -> list[str]:
+def _nearer_models(recording: PairedPoses, arm: Arm | None, as_given: float, *, scale: bool) -> list[str]:
     """Return notes of models of other arms that fit better by half: a generation of an arm differs little from the next."""
     table, p = recording.robot, recording.poses
     if arm is None or table.q is None or table.numbers.shape[1]:
         return []
     q = table.q[recording.rows]
-    found = {other: float(misfit(replace(p, A=A))[0]) for other, A in _models(arm, q)}
+    found = {other: float(misfit(replace(p, A=A), scale=scale)[0]) for other, A in _models(arm, q)}
     best = min(found, key=lambda other: found[other], default="")
     if not best or found[best] > as_given / 2:
         return []
@@ -214,13 +238,13 @@ def _best(recording: PairedPoses, arm: Arm | None, as_given: Array, *, scale: bo
     best, found = np.inf, None
     for reading in _readings(recording, arm, streams):
         try:
-            off = misfit(_resized(reading.poses) if scale else reading.poses)
+            off = misfit(reading.poses, scale=scale)
         except np.linalg.LinAlgError:
             continue
         if not _better(off, as_given, length=reading.of_length):
             continue
         left = (off[0] + min(off[1], PLAUSIBLE_M)) / reading.of_length
-        if left < SMALLER * best:
+        if left < SMALLER * best and _determined(reading.poses):
             best, found = left, reading
     return found
 
@@ -288,9 +312,10 @@ def _readings(recording: PairedPoses, arm: Arm | None, streams: bool) -> Iterato
     yield from units
     if all(abs(np.log(scale_between(one.poses))) > A_UNIT for one in units):
         whose = "" if arm is None else f", and --model {arm.name} the arm"
+        size = scale_between(p)
         yield _Reading(
-            _resized(p),
-            f"the target seems to be {scale_between(p):.3g} times as large as given: is --target's size right{whose}? "
+            _sized(p, size),
+            f"the target seems to be {size:.3g} times as large as given: is --target's size right{whose}? "
             "--scale fits it",
         )
     yield _Reading(
@@ -424,13 +449,13 @@ def _scaled(recording: PairedPoses) -> Iterator[_Reading]:
             yield _Reading(_with(p, side, T), said, path)
         for name, length in UNITS.items():
             if name != given:
-                T = getattr(p, side).copy()
-                T[:, :3, 3] *= length / unit_m
+                by = length / unit_m
                 yield _Reading(
-                    _with(p, side, T),
+                    replace(p, A=_longer(p.A, by)) if side == "A" else _sized(p, by),
                     f"the {whose}'s lengths are {name} taken for {given}: correct {option}, or give --detect-units",
                     path,
-                    length / unit_m if side == "A" else 1.0,
+                    by if side == "A" else 1.0,
+                    of_units=True,
                 )
 
 

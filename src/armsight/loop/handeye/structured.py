@@ -399,6 +399,23 @@ def scale_between(poses: Poses) -> float:
     return best[1]
 
 
+def rotations_of(poses: Poses, e: Array) -> tuple[Array, Array, float, float]:
+    """Return how far the flange rotates, and how far it must for both transforms to be determined.
+
+    Args:
+        poses: the poses used.
+        e: (N, 6) their residuals, which say how large the noise of rotations is.
+
+    Returns:
+        Root mean squares (3,) of the rotations about each principal axis, rad, largest first; these axes (3, 3), columns,
+        smallest first, in the flange; the noise of rotations about one axis, rad; the least that the second must be, rad.
+    """
+    rotated = log_se3(inverse(mean_pose(poses.A)) @ poses.A)[:, 3:]
+    values, axes = np.linalg.eigh(rotated.T @ rotated / len(rotated))
+    noise = _middle_sigmas(e)[1]
+    return np.sqrt(np.maximum(values[::-1], 0.0)), axes, noise, max(CLEARLY_ROTATED * noise, LEAST_ROTATION)
+
+
 def require_rotations(poses: Poses, e: Array) -> None:
     """Reject motions whose rotations are about one axis only, as far as the noise shows.
 
@@ -409,12 +426,7 @@ def require_rotations(poses: Poses, e: Array) -> None:
     Raises:
         CalibrationError: the open direction, by name.
     """
-    mean = mean_pose(poses.A)
-    rotated = log_se3(inverse(mean) @ poses.A)[:, 3:]
-    values, axes = np.linalg.eigh(rotated.T @ rotated / len(rotated))
-    noise = _middle_sigmas(e)[1]
-    least = max(CLEARLY_ROTATED * noise, LEAST_ROTATION)
-    spread = np.sqrt(np.maximum(values[::-1], 0.0))
+    spread, axes, noise, least = rotations_of(poses, e)
     held = _held(poses)
     if noise > CONTRADICTS and spread[0] > LEAST_ROTATION:
         raise CalibrationError(
