@@ -35,7 +35,7 @@ _POINTS = 4000  # of a line in a figure: more cannot be seen
 
 
 def joints_figure(run: RunData) -> Figure:
-    """Plot the joint angles over time: potentiometers and reference."""
+    """Plot the joint angles over time: their sensors and reference."""
     joints = run.q.shape[1]
     down = (joints + 1) // 2
     figure = new_figure(0.2 + 2.0 * down)
@@ -45,11 +45,12 @@ def joints_figure(run: RunData) -> Figure:
         plot.set_visible(False)
     for joint, plot in enumerate(plots[:joints]):
         plot.plot(run.t_s[rows], _DEG * run.q_ref[rows, joint], color=ORANGE, lw=2.4, label="reference")
-        plot.plot(run.t_s[rows], _DEG * run.q[rows, joint], color=BLUE, lw=0.9, label="potentiometer")
+        plot.plot(run.t_s[rows], _DEG * run.q[rows, joint], color=BLUE, lw=0.9, label="joint sensor")
         plot.set_ylabel(f"joint {joint + 1}, deg")
         _shade(plot, run, named=joint in (0, down))
         if joint in (down - 1, joints - 1):
             plot.set_xlabel("time, s")
+            plot.tick_params(labelbottom=True)  # also where the plot below is left out
     figure.legend(*figure.axes[0].get_legend_handles_labels(), fontsize=7, ncols=2, loc="outside upper left")
     return figure
 
@@ -482,7 +483,7 @@ def _page(report: RunReport, figures: Mapping[str, str]) -> str:
         ),
         "motion": (
             "Joint angles and tool path",
-            shown("joints", "The joint angles over time, potentiometers and reference; shaded: the arm rests.")
+            shown("joints", "The joint angles over time, by their sensors, and reference; shaded: the arm rests.")
             + shown("path", "The tool's path: from potentiometers, from vision, from both fused, and the truth."),
         ),
         "errors": (

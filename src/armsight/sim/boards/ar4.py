@@ -262,4 +262,4 @@ class Ar4Teensy:
         data = line.encode() + b"\r\n"
         begin = max(self.t_s, self._free_s)
         self._free_s = begin + _BYTE_S * len(data)
-        self._out.append((self._free_s, data))
+        self._out += [(begin + _BYTE_S * k, data[k - 1 : k]) for k in range(1, len(data) + 1)]

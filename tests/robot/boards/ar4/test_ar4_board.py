@@ -266,3 +266,26 @@ def test_a_motion_that_begins_right_after_such_a_goal_is_followed_by_all_joints(
         follow(board, q, 1.5)
     assert reached[0] > 0.2
     assert reached[1] == pytest.approx(reached[0], abs=0.1)
+
+
+def test_a_reading_is_stamped_when_the_encoders_were_read_and_not_when_the_answer_had_come():
+    device = Ar4Teensy(homing_s=1.0)
+    board, _ = opened(device)
+    board.home()
+    board.enable()
+    angles, step = {}, device.step
+
+    def noted():
+        step()
+        angles[round(1e3 * device.t_s)] = device.truth[0][0]
+
+    device.step = noted
+    board.send(JointCommand(np.radians([15.0, 0, 0, 0, 0, 0]), REST, REST, 0.02))
+    read = board.receive(3.0)
+    times, true = 1e-3 * np.array(list(angles)), np.array(list(angles.values()))
+    zero = true[-1] - read.q[-1, 0]
+    steepest = np.abs(np.diff(read.q[:, 0])).argmax()  # 15 deg/s and more: 1 ms is 0.015 deg, a step 0.022
+    rows = slice(steepest - 3, steepest + 4)
+    late = np.interp(read.t_s[rows], times, true) - zero - read.q[rows, 0]
+    speed = np.ptp(read.q[rows, 0]) / np.ptp(read.t_s[rows])
+    assert abs(np.median(late) / speed) < 1.5e-3
