@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from armsight.app.handeye.command import Options, calibrate
 from armsight.app.handeye.images import upright
 from armsight.app.handeye.read import read_pose_table
-from armsight.app.handeye.recording import matched_rows
+from armsight.app.handeye.recording import matched_rows, paired, seen_in_table
 from armsight.app.handeye.result import as_json, headline, statements
+from armsight.app.handeye.suspect import _nearer_models
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.robot.arm_file import open_arm
@@ -329,6 +330,23 @@ def test_millimetres_are_rejected_or_detected(armsight, tmp_path, seen):
     document, notes = found(armsight, robot, seen, "--detect-units")
     assert "read as millimetres" in notes
     assert_right(document)
+    cm = B.copy()
+    cm[:, :3, 3] *= 10  # of a world a tenth as large: no length is beyond what metres may be
+    tenth = A.copy()
+    tenth[:, :3, 3] *= 1e-4
+    given = (
+        "handeye",
+        "--robot",
+        matrices(robot, tenth),
+        "--seen",
+        matrices(tmp_path / "cm.txt", cm),
+        "--eye",
+        "in-hand",
+    )
+    assert_rejected(armsight(*given), "centimetres taken for metres: correct --seen-units, or give --detect-units")
+    document, notes = found(armsight, robot, tmp_path / "cm.txt", "--detect-units")
+    assert "the target's lengths are centimetres taken for metres; converted" in notes
+    np.testing.assert_allclose(np.array(document["T_flange_rig"])[:3, 3], X[:3, 3] / 10, atol=1e-3)
     p_mm = np.array([[600, 10, 500], [500, 0, 400], [1, 1.5, 2]])  # one near the base's origin
     near = named(tmp_path / "near.csv", "x,y,z,qw,qx,qy,qz", np.hstack([p_mm, np.tile([1, 0, 0, 0], (3, 1))]))
     np.testing.assert_allclose(read_pose_table(near, detect_units=True).Ts[:, :3, 3], 1e-3 * p_mm)
@@ -386,6 +404,24 @@ def test_what_does_not_fit_is_named(armsight, tmp_path, seen):
     rejected(matrices(path, displaced), "those from line 8", "the robot's base, or the target, was displaced by")
 
 
+def test_motions_that_leave_a_direction_open_are_told_so_and_nothing_else(armsight, tmp_path):
+    """Closed forms are undetermined there, so consistent data fit badly, and so do parts and other readings."""
+    rng = np.random.default_rng(1)
+    _, A, B = motion(16)
+    noise, path = inverse(inverse(A @ X) @ Z) @ B, tmp_path / "robot.txt"
+    shifted = A.copy()
+    shifted[:, :3, :3] = A[0, :3, :3]
+    about_z = shifted.copy()
+    turns = np.random.default_rng(1).uniform(-1, 1, 16)[:, None] * [0, 0, 1]
+    about_z[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    about_z[:, :3, 3] = np.random.default_rng(10).uniform(-0.3, 0.3, (16, 3)) + np.array([0.4, 0.0, 0.3])
+    two = A[np.arange(16) % 2].copy()
+    two[:, :3, 3] += rng.normal(0, 0.1, (16, 3))
+    for Ts, said in ((shifted, "hardly rotates"), (about_z, "about one axis only"), (two, "about one axis only")):
+        seen = matrices(tmp_path / "seen.txt", inverse(Ts @ X) @ Z @ noise)
+        assert_rejected(armsight("handeye", "--robot", matrices(path, Ts), "--seen", seen, "--eye", "in-hand"), said)
+
+
 def test_rows_shifted_where_an_arm_moves_in_equal_steps_are_no_blunders(armsight, tmp_path):
     """Two of three rows then fit another mounting exactly: the median of the residuals says nothing."""
     _, first, _ = motion(9, seed=4)
@@ -440,6 +476,12 @@ def test_readings_of_rotations_axes_and_units(armsight, tmp_path, seen):
         "handeye", "--robot", named(path, head, np.degrees(ur)), "--seen", by, "--eye", "in-hand", "--model", "ur3e"
     )
     assert "fit --model ur3" in said.err
+    half = np.loadtxt(by).reshape(-1, 4, 4)
+    half[:, :3, 3] *= 0.5
+    half_seen = seen_in_table(read_pose_table(matrices(tmp_path / "half.txt", half)))
+    ur3e = open_arm("ur3e")
+    recording = paired(read_pose_table(tmp_path / "robot.txt", arm=ur3e), half_seen, True, ur3e)
+    assert "fit --model ur3" in _nearer_models(recording, ur3e, 2e-3, scale=True)[0]
     names = ",".join(open_arm("six_r").joint_names)
     wrong = names.replace("joint5", "jont5")
     rejected(named(path, wrong, q), "is not known: is it", more=arm)
