@@ -12,7 +12,7 @@ r^T S^-1 r of the sum of squares, with
 where H and b are the sums, J selects the point, and M has the standard deviations of everything else as its columns. The
 point that explains most is taken, then the next one besides it, while one explains more than chance: a body that is bent.
 
-What may have changed and cannot be distinguished yet widens the poses: of each hypothesis (the seven numbers, the focal lengths,
+What may have changed and is not distinguished yet widens the poses: of each hypothesis (the seven numbers, focal lengths,
 a point, all points a little) the evidence against none (MacKay, 1992), of the newest test and of some newest ones together.
 Where the hypotheses together are more probable than that nothing changed, the second moment of their mixture is what poses
 may be off by. Shots that fit worst, a quarter of them, do not count: what changed shows in all that follow, an edge before
