@@ -311,7 +311,7 @@ def check_folder(
     except OSError as error:
         raise InputError(f"{folder}: {problem}: {error.strerror}{advice}") from None
     others = [other for other in apart_from if other is not None]
-    for part in (folder, *(folder / name for name in holding)):
+    for part in (*(() if folder.is_dir() else (folder,)), *(folder / name for name in holding)):
         if any(_same_file(other, part) for other in others):
             raise InputError(
                 f"{part}: is given twice, or is read as well as written; choose another folder for the results"

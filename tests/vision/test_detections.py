@@ -63,7 +63,7 @@ def test_what_a_table_may_not_hold(read, tmp_path, text, texts):
 def test_a_table_that_is_not_there_or_not_text(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_detections(tmp_path / "d.csv", BODY)
-    (tmp_path / "d.csv").write_bytes(b"\xff\xfe")
+    (tmp_path / "d.csv").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="not a text file"):
         read_detections(tmp_path / "d.csv", BODY)
 

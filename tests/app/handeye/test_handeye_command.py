@@ -187,7 +187,6 @@ def test_a_unit_or_a_rotation_that_is_given_counts(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("DECL E6POS XP1={X 1.0,Y 2.0,Z 3.0,A 0.0,B 0.0,C 0.0}\n", "begins no table"),
         ("- effector_wrt_world: [1, 0, 0, 0]\n", "begins no table"),
         ("[[[1, 0, 0, 0.1], [0, 1, 0, 0.2]]]\n", "begins no table"),
         ("j1,j2,j3,j4,j5,j6\n1,2,3,4,5,6\n", "joints without a unit: name them q1_deg"),
