@@ -180,7 +180,7 @@ static bool joint_is_valid(const joint_config *joint)
            number_within(joint->current_cut_per_a_s, 0.0f, 1000.0f) &&
            number_within(joint->following_rad, 1e-3f, 13.0f) && number_within(joint->stall_duty, 0.01f, 1.0f) &&
            number_within(joint->stall_rad, 1e-4f, 1.0f) &&
-           word_within(joint->current_limit_ma, 10u, 200000u) &&
+           word_within(joint->current_limit_ma, 10u, 500000u) &&
            (joint->motor_direction == 1 || joint->motor_direction == -1) && joint_is_consistent(joint);
 }
 

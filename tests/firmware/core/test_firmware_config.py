@@ -154,7 +154,7 @@ WRONG = {
     "following_rad": [0, 14, NAN],
     "stall_duty": [0, 0.81, 1.01, NAN],
     "stall_rad": [0, 1.01, NAN],
-    "current_limit_ma": [0, 9, 200001],
+    "current_limit_ma": [0, 9, 500001],
     "motor_direction": [0, 3],
     "encoder.sensor": [3],
 }

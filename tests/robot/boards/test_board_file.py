@@ -42,7 +42,7 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path):
         ),
         (
             ("current_limit_ma = 1600", "current_limit_ma = 2"),
-            "joint 1: current_limit_ma is 2; 10 to 200000 is allowed",
+            "joint 1: current_limit_ma is 2; 10 to 500000 is allowed",
         ),
         (("[joint.2]", "[joint.1]"), "no board.toml: .*joint"),
         (("soft_max_rad = 2.4", "soft_max_rad = 24.0"), "joint 1: soft_max_rad is 24; -13 to 13 is allowed"),

@@ -148,7 +148,7 @@ _JOINT_RANGES = {
     "following_rad": (1e-3, 13.0),
     "stall_duty": (0.01, 1.0),
     "stall_rad": (1e-4, 1.0),
-    "current_limit_ma": (10, 200000),
+    "current_limit_ma": (10, 500000),
 }
 _ARM_RANGES = {
     "joint_count": (1, JOINTS),
