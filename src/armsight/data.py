@@ -178,10 +178,17 @@ class Discs(Record):
 
 @dataclass(frozen=True)
 class Dropped:
-    """A point that was seen and not used, and why."""
+    """A point that was seen and not used, and why.
+
+    Attributes:
+        point: its name.
+        reason: why, for people.
+        contradicts: whether it was seen well, but where neither the other camera nor the body's other points allow it.
+    """
 
     point: str
     reason: str
+    contradicts: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -122,6 +122,11 @@ def darkness(image: NDArray[np.uint8]) -> str:
     return f"the image is dark: 99.9% of it at most {level:.0f} of 255 grey levels: light the scene, or expose longer"
 
 
+def one_image(left: Image, right: Image) -> bool:
+    """Return whether two images are one and the same, and show something."""
+    return np.array_equal(left, right) and bool(np.ptp(left) > 0)
+
+
 def grey(image: Image) -> NDArray[np.uint8]:
     """Convert an image to 8-bit grey.
 

@@ -313,6 +313,7 @@ def _thinned(
         Dropped(
             body.point_names[observations.point[i]],
             f"{distance[i]:.1f} px off the body in the {SIDES[observations.camera[i]]} image",
+            contradicts=True,
         )
         for i in np.flatnonzero(~good)
     )

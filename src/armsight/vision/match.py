@@ -93,7 +93,7 @@ def gate(rig: StereoRig, body: Body, seen: Correspondences) -> Correspondences:
     keep = np.ones(len(seen.ids), bool)
     keep[rows[bad]] = False
     dropped = tuple(
-        Dropped(body.point_names[i], f"{d:.1f} px off its epipolar line (gate {g:.1f} px)")
+        Dropped(body.point_names[i], f"{d:.1f} px off its epipolar line (gate {g:.1f} px)", contradicts=True)
         for i, d, g in zip(seen.ids[rows[bad]], distance[bad], limit[bad], strict=True)
     )
     return Correspondences(seen.ids[keep], seen.uv[keep], seen.cov_uv[keep], seen.dropped + dropped, seen.common)

@@ -261,7 +261,8 @@ def triangulate(rig: StereoRig, body: Body, seen: Correspondences) -> Points:
     if good.all():
         return Points(seen.ids[rows], p, cov, by_rig, seen, seen.dropped)
     dropped = tuple(
-        Dropped(body.point_names[i], "its rays do not meet before both cameras") for i in seen.ids[rows[~good]]
+        Dropped(body.point_names[i], "its rays do not meet before both cameras", contradicts=True)
+        for i in seen.ids[rows[~good]]
     )
     keep = ~np.isin(seen.ids, seen.ids[rows[~good]])
     kept = Correspondences(seen.ids[keep], seen.uv[keep], seen.cov_uv[keep], seen.dropped + dropped, seen.common)

@@ -28,7 +28,7 @@ from armsight.vision.calibrate.result import Calibration, RejectedPair
 from armsight.vision.calibrate.screen import merged_notes
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
-from armsight.vision.image import darkness, grey, read_image
+from armsight.vision.image import darkness, grey, one_image, read_image
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import load_body_csv
 from armsight.vision.sources import Source, notes_of, open_source
@@ -159,7 +159,7 @@ def calibrate_images(
 
 def _differ(left: Grey, right: Grey, left_name: Path | str, right_name: Path | str) -> None:
     """Raise an InputError if both grey images of a pair are the same one."""
-    if left.shape == right.shape and np.ptp(left) > 0 and np.array_equal(left, right):
+    if one_image(left, right):
         raise InputError(
             f"{left_name}, {right_name}: the left and the right image are the same: give the images of two cameras"
         )
@@ -188,7 +188,9 @@ class _Unseen:
             yield
         except CalibrationError as error:
             odd = [
-                f"The {SIDES[side]} images: {why}." for side, kept in enumerate(self._kept) if (why := self._why(kept))
+                f"The {missed} {SIDES[side]} images without the target: {why}."
+                for side, (kept, missed) in enumerate(zip(self._kept, self._missed, strict=True))
+                if (why := self._why(kept))
             ]
             raise CalibrationError(
                 " ".join([str(error), *odd, *(f"Note: {note}." for note in notes_of(source))])

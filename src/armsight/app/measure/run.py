@@ -28,6 +28,7 @@ from armsight.loop.health import HealthFinding, HealthMonitor, health_lines, uns
 from armsight.loop.health.update import contradiction
 from armsight.vision.detections import SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows, measurer
+from armsight.vision.image import one_image
 from armsight.vision.markers.calibrated_board import is_print
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
@@ -51,8 +52,6 @@ _SYNC_S = 1e-3
 _WIDE_PX, _AGAIN = 2.0, 60
 #: So many shots that fit badly are named.
 _NAMED = 3
-#: What the reasons of points have in common that two images, or image and body, contradict.
-_OFF = " px off "
 #: What to do about repeated shots of a recording.
 _RECORDED = "they are no new measurements: leave them out, and record at the rate that the cameras really give"
 #: A shot that is younger by its own stamp was stamped by a live camera, s.
@@ -523,7 +522,7 @@ def _mistaken(rig: StereoRig, target: Target, shots: list[Shot]) -> str:
     for shot in shots:
         assert shot.left is not None
         assert shot.right is not None
-        if np.ptp(shot.left) > 0 and np.array_equal(shot.left, shot.right):
+        if one_image(shot.left, shot.right):
             return "the left and the right image are the same: give the images of two cameras"
         fits = {}
         for what, images in _undone(shot.left, shot.right).items():
@@ -552,7 +551,7 @@ def _close(
         summary += "; " + ", ".join(f"{count} {way} ({took[way]:.1f} ms each)" for way, count in ways.most_common())
     if jumps := [r.shot for r in records if r.jump]:
         summary += f"; jumped in {', '.join(jumps[:5])}" + (f" and {len(jumps) - 5} more" if len(jumps) > 5 else "")
-    if few := [r.shot for r in good if sum(_OFF in each.reason for each in r.dropped) > len(r.points_m)]:
+    if few := [r.shot for r in good if len({each.point for each in r.dropped if each.contradicts}) > len(r.points_m)]:
         which = ", ".join(few[:_NAMED]) + (f" and {len(few) - _NAMED} more" if len(few) > _NAMED else "")
         summary += f"; in {which} most points contradict each other: do not use it; the body moved between the two "
         summary += "exposures, or the images do not belong together"

@@ -621,11 +621,14 @@ class RigWatch:
         if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None or self._shaped:
             return None
         since_s, change = self._since()
-        return since_s if self._to_blame(change) == ["rig"] and not self.only_newest() else None
+        return None if self._in_newest(since_s) or self._to_blame(change) != ["rig"] else since_s
 
     def only_newest(self) -> bool:
         """Return whether only the newest test shows a change: cameras may have moved within it, so the next one decides."""
-        return len(self._history) > 1 and self._since()[0] >= self._history[-2].begin_s
+        return self._in_newest(self._since()[0])
+
+    def _in_newest(self, since_s: float) -> bool:
+        return len(self._history) > 1 and since_s >= self._history[-2].begin_s
 
     def _needed(self, change: RigChange, part: Part) -> bool:
         """Return whether the other parts do not explain what was found."""
