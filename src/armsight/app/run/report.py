@@ -106,7 +106,7 @@ def errors_figure(run: RunData) -> Figure | None:
         _own(plot, seen, part, factor)
         plot.set_ylabel(f"{'position' if name == 'mm' else 'orientation'}, {name}")
     for plot in plots:
-        _shade(plot, run, named=plot is plots[0])
+        _shade(plot, run, named=plot is plots[-1])  # the one without a title
     plots[1].set_title(
         "vision and fused; shaded: at least 95% of the fused estimate's errors should lie below", fontsize=9
     )
