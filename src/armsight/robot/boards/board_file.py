@@ -170,6 +170,10 @@ def _flat(data: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
 
 def _unknown(path: str, config: Configuration) -> str:
     """Return that a configuration has no such path, and which it may be."""
+    first, *more = path.split(".")
+    count = int(config["joint_count"])
+    if first == "joint" and more and more[0] in map(str, range(count + 1, JOINTS + 1)):
+        return f"there is {path}, but arm.joint_count is {count}: leave that joint out, or count it"
     near = difflib.get_close_matches(path, dict(entries(config)), 1)
     return f"nothing is called {path}" + (f"; is it {near[0]}?" if near else "")
 
@@ -212,10 +216,12 @@ def put(config: Configuration, path: str, value: object) -> None:
         record[name] = numbers + [0] * (POT_NODES - len(numbers))
         record["node_count"] = len(numbers)
     else:
-        limits = np.iinfo(record.dtype[name]) if whole else None
         number = _checked(path, value, whole)
-        if limits is not None and not limits.min <= number <= limits.max:
-            raise InputError(f"{path} is {number}; {limits.min} to {limits.max} is allowed")
+        if whole:
+            limits = np.iinfo(record.dtype[name])
+            low, high = RANGES.get(name, (limits.min, limits.max))
+            if not limits.min <= number <= limits.max:
+                raise InputError(f"{path} is {number}; {low:g} to {high:g} is allowed")
         record[name] = number
 
 
