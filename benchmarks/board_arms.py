@@ -35,7 +35,7 @@ from armsight.firmware import build  # noqa: E402
 from armsight.robot.boards.codes import Fault  # noqa: E402
 from armsight.robot.boards.configuration import GAINS, lab_configuration  # noqa: E402
 from armsight.robot.boards.frames import OUTPUTS  # noqa: E402
-from armsight.robot.boards.tuning import MotorFigures, motion_limits, quiet_bandwidth, tuned_gains  # noqa: E402
+from armsight.robot.boards.tuning import MotorFigures, motion_limits, quiet_gains, tuned_gains  # noqa: E402
 from armsight.sim.joints import (  # noqa: E402
     CONSTANT_V_S,
     COUNTS_PER_RAD,
@@ -111,13 +111,12 @@ def brought_up_configuration(model, rng):
             float(model.viscous_n_m_s[i]),
             float(model.dry_n_m[i]),
         )
-        joint["gains"] = np.array(
-            tuple(tuned_gains(motor, SUPPLY_V, quiet_bandwidth(motor, SUPPLY_V, noise_rad))), GAINS
-        )
+        gravity_n_m = abs(float(model.gravity_n_m[i]))
+        joint["gains"] = np.array(tuple(quiet_gains(motor, SUPPLY_V, noise_rad, gravity_n_m)), GAINS)
         backlash_rad = 1.5 * float(seen_rad[i])
         apart_rad = max(0.03, 10 * noise_rad + backlash_rad)
         joint["motor"] = (motor.resistance_ohm, motor.constant_v_s, apart_rad, backlash_rad)
-        speed, acceleration = motion_limits(motor, SUPPLY_V, abs(float(model.gravity_n_m[i])))
+        speed, acceleration = motion_limits(motor, SUPPLY_V, gravity_n_m)
         joint["speed_limit_rad_s"], joint["jerk_rad_s3"] = speed, 100 * acceleration
         joint["acceleration_rad_s2"] = joint["deceleration_rad_s2"] = acceleration
     return config

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from armsight.errors import InputError
-from armsight.robot.boards.tuning import GAIN_RANGES, MotorFigures, quiet_bandwidth, tuned_gains
+from armsight.robot.boards.tuning import GAIN_RANGES, MotorFigures, quiet_bandwidth, quiet_gains, tuned_gains
 
 MOTOR = MotorFigures(resistance_ohm=6.0, constant_v_s=2.4, inertia_kg_m2=0.03, viscous_n_m_s=0.02, dry_n_m=0.2)
 STALL, OWN = 2.4 * 12.0 / 6.0, 2.4**2 / 6.0 + 0.02
@@ -46,4 +46,24 @@ def test_the_quiet_bandwidth_gives_gains_that_a_board_takes():
     motor = MotorFigures(resistance_ohm=6.8, constant_v_s=2.08, inertia_kg_m2=0.04, viscous_n_m_s=0.02, dry_n_m=0.2)
     most = GAIN_RANGES["ki_per_rad_s"][1]
     assert tuned_gains(motor, 12.0, 40.0)[1] > most  # by stiffness and noise alone it would be so
-    assert tuned_gains(motor, 12.0, quiet_bandwidth(motor, 12.0, 0.0003))[1] <= most
+    assert tuned_gains(motor, 12.0, quiet_bandwidth(motor, 12.0, 0.0003, 0.08))[1] <= most
+
+
+def test_quiet_gains_hold_against_gravity_that_changes_better_than_a_bandwidth_as_quiet():
+    noise_rad = 0.0018
+    known = tuned_gains(MOTOR, 12.0, quiet_bandwidth(MOTOR, 12.0, noise_rad, 0.08))
+    free, loaded = (quiet_gains(MOTOR, 12.0, noise_rad, gravity) for gravity in (0.0, 2.5))
+    assert free[1] > 1.3 * known[1]
+    assert loaded[1] > 1.1 * free[1]  # more noise is admitted where gravity asks for it
+
+
+def test_quiet_gains_are_robust_within_what_a_board_takes():
+    for noise_rad in (0.0003, 0.0018):
+        for inertia in (0.015, 0.03, 0.18):
+            motor = MotorFigures(6.0, 2.4, inertia, 0.02, 0.2)
+            gains = quiet_gains(motor, 12.0, noise_rad, 2.5)
+            assert all(low <= gain <= high for gain, (low, high) in zip(gains, GAIN_RANGES.values(), strict=True))
+            kp, ki, kd, *_, t, _ = gains
+            s = 1j * np.geomspace(1.0, 1000.0, 400)
+            loop = STALL * (kp + ki / s + kd * s / (t * s + 1)) / (inertia * s * s + OWN * s) * np.exp(-1.5e-3 * s)
+            assert np.abs(1 / (1 + loop)).max() < 1.85  # greatest sensitivity, a tick and a half late

@@ -28,7 +28,7 @@ from armsight.robot.boards.configuration import (
     Configuration,
     lab_configuration,
 )
-from armsight.robot.boards.tuning import GAIN_RANGES, MotorFigures, motion_limits, quiet_bandwidth, tuned_gains
+from armsight.robot.boards.tuning import GAIN_RANGES, MotorFigures, motion_limits, quiet_gains
 
 _MARGIN_RAD = 0.05
 
@@ -275,8 +275,8 @@ def _put_motor(
     joint: Configuration, found: JointFound, motor: MotorFigures, supply_v: float, most_current_a: float
 ) -> None:
     """Put gains, limits and the motor's numbers."""
-    bandwidth = quiet_bandwidth(motor, supply_v, found.noise_rad)
-    joint["gains"] = np.array(tuple(tuned_gains(motor, supply_v, bandwidth)), GAINS)
+    gains = quiet_gains(motor, supply_v, found.noise_rad, found.gravity_n_m or 0.0)
+    joint["gains"] = np.array(tuple(gains), GAINS)
     joint["motor"]["resistance_ohm"], joint["motor"]["constant_v_s"] = motor.resistance_ohm, motor.constant_v_s
     backlash_rad = 1.5 * (LAB_BACKLASH_RAD if found.backlash_rad is None else found.backlash_rad)
     joint["motor"]["apart_rad"] = max(0.03, 10 * found.noise_rad + backlash_rad)

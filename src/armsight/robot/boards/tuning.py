@@ -3,8 +3,8 @@
 With the torque ``K (u V - K w) / R`` and ``J``, ``B`` and ``C`` the inertia, viscous and dry friction at the joint, the
 stall torque is ``S = K V / R`` and the motor damps itself by ``D = K^2 / R + B``. The speed that kd damps is filtered by a
 time constant t, which is part of the loop: its four poles are placed as two pairs of one damping z, the slower one at the
-bandwidth w, the faster one at v = w / 0.35, ``(s^2 + 2 z w s + w^2) (s^2 + 2 z v s + v^2) = s^4 + c3 s^3 + c2 s^2 + c1 s +
-c0``:
+bandwidth w, the faster one at v = w / 0.35 (or another ratio), ``(s^2 + 2 z w s + w^2) (s^2 + 2 z v s + v^2) = s^4 + c3 s^3
++ c2 s^2 + c1 s + c0``:
 
     t = 1 / c3,  ki = t J c0 / S,  kp = t J c1 / S - ki t,  kd = t J c2 / S - kp t - D / (2 S)
 
@@ -13,8 +13,11 @@ how hard a joint is held against a push.) For the noise that a potentiometer put
 lets the bandwidth be half again as great as one beside it.
 The feed-forward gives what the motion itself takes, so that nothing is left to the error: ``kv = D / S + kd``,
 ``ka = J / S - kd t``, ``kf = C / S``; t is by how much the filtered speed is late, which damps the less while the motion
-accelerates. (Åström and Murray, "Feedback Systems", 2008, sections 10.2 and 10.5; Ellis, "Control System
-Design Guide", 2012, chapter 6.)
+accelerates.
+
+A load that changes by P N m a second leaves the error ``P / (S ki)``: :func:`quiet_gains` looks for the greatest ki that
+the noise of the readings admits. (Åström and Murray, "Feedback Systems", 2008, sections 10.2 and 10.5; Ellis, "Control
+System Design Guide", 2012, chapter 6.)
 """
 
 from __future__ import annotations
@@ -37,7 +40,6 @@ GAIN_RANGES = {
     "derivative_filter_s": (0.0, 1.0),
     "anti_windup_per_s": (0.0, 1000.0),
 }
-#: The slower pair of poles over the faster one.
 _PAIRS = 0.35
 #: Dry friction is compensated by a little less than it is, so that it never drives.
 _FRICTION_SHARE = 0.9
@@ -64,7 +66,9 @@ class MotorFigures:
     dry_n_m: float
 
 
-def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 0.7) -> Array:
+def tuned_gains(
+    motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 0.7, pairs: float = _PAIRS
+) -> Array:
     """Return the gains of a joint by the rule above.
 
     Args:
@@ -72,6 +76,7 @@ def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, da
         supply_v: nominal supply, V.
         bandwidth_rad_s: natural frequency of the slower pair of poles, rad/s.
         damping: of both pairs, of critical.
+        pairs: natural frequency of the slower pair over that of the faster one, 0 to 1.
 
     Returns:
         (8,) kp, ki, kd, kv, ka, kf, derivative filter, anti-windup.
@@ -87,7 +92,7 @@ def tuned_gains(motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, da
     stall = motor.constant_v_s * supply_v / motor.resistance_ohm
     own = motor.constant_v_s**2 / motor.resistance_ohm + motor.viscous_n_m_s
     per_rad_s2 = motor.inertia_kg_m2 / stall
-    slow, fast = ((1.0, 2 * damping * w, w * w) for w in (bandwidth_rad_s, bandwidth_rad_s / _PAIRS))
+    slow, fast = ((1.0, 2 * damping * w, w * w) for w in (bandwidth_rad_s, bandwidth_rad_s / pairs))
     _, c3, c2, c1, c0 = np.polymul(slow, fast)
     filter_s = 1 / c3
     ki = filter_s * c0 * per_rad_s2
@@ -105,7 +110,7 @@ _USED, _MOVING = 0.95, 0.8
 _MOST_SPEED_RAD_S, _MOST_RAD_S2 = 2.0, 10.0
 
 
-def quiet_bandwidth(motor: MotorFigures, supply_v: float, noise_rad: float, duty_noise: float = 0.08) -> float:
+def quiet_bandwidth(motor: MotorFigures, supply_v: float, noise_rad: float, duty_noise: float) -> float:
     """Return the greatest bandwidth, rad/s, not too stiff, with gains a board takes, at which noise hardly moves the duty.
 
     Args:
@@ -114,17 +119,63 @@ def quiet_bandwidth(motor: MotorFigures, supply_v: float, noise_rad: float, duty
         noise_rad: standard deviation of a reading.
         duty_noise: standard deviation of the duty that this noise may cause.
     """
-    stiffest = min(_MOST_RAD_S, round(np.sqrt(_MOST_N_M / motor.inertia_kg_m2)))
-    for bandwidth in range(stiffest, _LEAST_RAD_S, -1):
-        gains = tuned_gains(motor, supply_v, bandwidth)
-        if any(gain > most for gain, (_, most) in zip(gains, GAIN_RANGES.values(), strict=True)):
-            continue
-        kp, _, kd, *_, filter_s, _ = gains
-        share = _TICK_S / (filter_s + _TICK_S)
-        speed_noise = noise_rad * share / _TICK_S * np.sqrt(2 / (2 - share))
-        if np.hypot(kp * noise_rad, kd * speed_noise) <= duty_noise:
-            return float(bandwidth)
+    for bandwidth in _bandwidths(motor, 1.0):
+        if _is_quiet(tuned_gains(motor, supply_v, bandwidth), noise_rad, duty_noise):
+            return bandwidth
     return float(_LEAST_RAD_S)
+
+
+#: Damping of quiet gains, and standard deviation of the duty that a reading's noise may cause: the first ones with which
+#: gravity's change leaves little error. With a damping of 0.5 joints with backlash swing by themselves.
+_QUIET = ((0.7, 0.08), (0.6, 0.08), (0.6, 0.1), (0.6, 0.12))
+_QUIET_PAIRS, _QUIET_STEP_RAD_S = (0.35, 0.42, 0.5, 0.6), 0.5
+#: RMS error that gravity's change may leave in a swing of this amplitude and frequency, or of what the motor reaches.
+_GRAVITY_RAD, _SWING_RAD, _SWING_HZ = 0.001, 0.5, 0.4
+
+
+def quiet_gains(motor: MotorFigures, supply_v: float, noise_rad: float, gravity_n_m: float) -> Array:
+    """Return the gains with the greatest ki, not too stiff, that a board takes, at which noise hardly moves the duty.
+
+    Args:
+        motor: its motor.
+        supply_v: nominal supply, V.
+        noise_rad: standard deviation of a reading.
+        gravity_n_m: greatest torque of gravity: where it is great, damping may be less, noise greater.
+
+    Returns:
+        (8,) as those of :func:`tuned_gains`.
+    """
+    stall = motor.constant_v_s * supply_v / motor.resistance_ohm
+    speed_rad_s, acceleration_rad_s2 = motion_limits(motor, supply_v, gravity_n_m)
+    w = 2 * np.pi * _SWING_HZ
+    gravity_n_m_s = gravity_n_m * min(_SWING_RAD * w, speed_rad_s, acceleration_rad_s2 / w) / np.sqrt(2)
+    best = tuned_gains(motor, supply_v, _LEAST_RAD_S)
+    for damping, duty_noise in _QUIET:
+        for pairs in _QUIET_PAIRS:
+            for bandwidth in _bandwidths(motor, _QUIET_STEP_RAD_S):
+                gains = tuned_gains(motor, supply_v, bandwidth, damping, pairs)
+                if _is_quiet(gains, noise_rad, duty_noise):
+                    best = max(best, gains, key=lambda each: float(each[1]))
+                    break
+        if gravity_n_m_s <= _GRAVITY_RAD * stall * best[1]:
+            break
+    return best
+
+
+def _bandwidths(motor: MotorFigures, step_rad_s: float) -> list[float]:
+    """Return the bandwidths to be tried, falling, rad/s: none so stiff that a gear with backlash chatters."""
+    stiffest = min(_MOST_RAD_S, round(np.sqrt(_MOST_N_M / motor.inertia_kg_m2)))
+    return [float(each) for each in np.arange(stiffest, _LEAST_RAD_S, -step_rad_s)]
+
+
+def _is_quiet(gains: Array, noise_rad: float, duty_noise: float) -> bool:
+    """Return whether a board takes the gains (8,) and noise of the readings moves the duty by no more than duty_noise."""
+    if any(gain > most for gain, (_, most) in zip(gains, GAIN_RANGES.values(), strict=True)):
+        return False
+    kp, _, kd, *_, filter_s, _ = gains
+    share = _TICK_S / (filter_s + _TICK_S)
+    speed_noise = noise_rad * share / _TICK_S * np.sqrt(2 / (2 - share))
+    return bool(np.hypot(kp * noise_rad, kd * speed_noise) <= duty_noise)
 
 
 def motion_limits(motor: MotorFigures, supply_v: float, gravity_n_m: float) -> tuple[float, float]:
