@@ -284,6 +284,25 @@ def test_the_backlash_that_was_found_is_configured_with_a_margin(found_rad, stor
     check_configuration(config)
 
 
+def test_an_angle_that_no_joint_has_is_asked_for_again(tmp_path, monkeypatch):
+    evening = Evening(tmp_path)
+    evening.joints[0].noise_counts = 10.0
+    said, wrong = [], ["inf", "nan", "12 deg", "7000"]
+    say, answer = evening.person.say, evening.person.answer
+    marking = []
+    monkeypatch.setattr(evening.person, "say", lambda line: (said.append(line), say(line)))
+    ask = evening.person.ask
+    monkeypatch.setattr(evening.person, "ask", lambda kind, *rest: (marking.append(kind), ask(kind, *rest)))
+    monkeypatch.setattr(
+        evening.person, "answer", lambda: wrong.pop(0) if wrong and marking[-1:] == ["mark"] else answer()
+    )
+    evening.bringup.run(["potentiometers"])
+    assert [line for line in said if "is no angle" in line] == [
+        f"{each!r} is no angle in degrees" for each in ("inf", "nan", "12 deg", "7000")
+    ]
+    assert np.isfinite(evening.joints[0].marks).all()
+
+
 def test_a_foreign_file_of_what_was_found_is_rejected(tmp_path):
     (tmp_path / "bringup.json").write_text("[]")
     with pytest.raises(InputError, match=r"bringup\.json: not what a bring-up kept"):
@@ -291,6 +310,31 @@ def test_a_foreign_file_of_what_was_found_is_rejected(tmp_path):
     Found("nucleo-f446re", [JointFound() for _ in range(6)]).write(tmp_path / "bringup.json")
     with pytest.raises(InputError, match="is of board nucleo-f446re; this one is pil"):
         Evening(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("noise_counts", "abc"), ("noise_counts", -1.0), ("marks", 5), ("marks", [[1.0]]), ("motor_direction", 3)),
+        *(("resistance_ohm", -2.0), ("constant_v_s", float("nan")), ("sensor", "laser"), ("range_counts", [9.0, 1.0])),
+        *(("counts_per_rev", 0.0), ("zero_counts", None), ("encoder_input", "1")),
+    ],
+)
+def test_a_value_that_cannot_have_been_found_is_rejected_by_name(tmp_path, name, value):
+    joints = [JointFound() for _ in range(6)]
+    setattr(joints[2], name, value)
+    Found("pil", joints).write(tmp_path / "bringup.json")
+    with pytest.raises(InputError, match=rf"joint 3: {name} is .*remove it, or name another folder"):
+        Found.read(tmp_path / "bringup.json")
+
+
+@pytest.mark.parametrize(("name", "value"), [("supply_v", "x"), ("supply_v", -1.0), ("joint_count", 9)])
+def test_a_supply_or_count_that_cannot_be_is_rejected_by_name(tmp_path, name, value):
+    found = Found("pil", [JointFound() for _ in range(6)])
+    setattr(found, name, value)
+    found.write(tmp_path / "bringup.json")
+    with pytest.raises(InputError, match=f"{name} is "):
+        Found.read(tmp_path / "bringup.json")
 
 
 def test_a_motor_is_identified_exactly_without_noise_also_from_currents_without_a_sign():

@@ -50,6 +50,7 @@ _SHORT_COUNTS, _OPEN_COUNTS = 300, 65000
 _MOST_NOISE_COUNTS = 200.0
 _HAND_COUNTS, _HAND_ENCODER_COUNTS = 1500.0, 40.0  # a hand that moves a joint changes its reading by more
 _UNEVEN_RAD = 0.1
+_MOST_ANGLE_RAD = 13.0  # of a joint, as config.c holds it
 _UNSOUND, _MAGNET = 0x4000, 0x8000  # beside an absolute encoder's angle (ENCODER_... of types.h)
 _JOG_RAD, _JOG_DUTY, _JOG_DUTY_PER_S, _JOG_MOST_RAD = 0.010, 0.6, 0.15, 0.05
 _DEAD_DUTY, _DEAD_A = 0.25, 0.02
@@ -324,8 +325,7 @@ class Bringup:
                 question = (
                     f"joint {j + 1}: its encoder counts from where it was switched on. At which angle is it, degrees"
                 )
-                with contextlib.suppress(ValueError):
-                    angle = float(np.radians(float(self._wait("angle", j, question))))
+                angle = _angle(self._wait("angle", j, question))
             zero = self._last[j] - angle * found.counts_per_rev / (2 * np.pi)
             shift, found.zero_counts = zero - found.zero_counts, zero
             found.range_counts = [each + shift for each in found.range_counts]
@@ -435,9 +435,8 @@ class Bringup:
             answer = self._wait("mark", joint, f"joint {joint + 1}: angle in degrees, or nothing at the other end")
             if not answer:
                 break
-            try:
-                angle = float(np.radians(float(answer)))
-            except ValueError:
+            angle = _angle(answer)
+            if angle is None:
                 person.say(f"{answer!r} is no angle in degrees")
                 continue
             self._motion.extend(every)
@@ -749,6 +748,15 @@ class Bringup:
         if missing:
             self._person.say(f"joints {', '.join(missing)} were not identified: they are stored without gains")
         self._person.say(f"stored, and written to {self._folder / CONFIG_FILE}; figures: {self._folder / PAGE}")
+
+
+def _angle(answer: str) -> float | None:
+    """Return an angle typed in degrees, rad; None where it is none that a joint can have."""
+    try:
+        angle = float(np.radians(float(answer)))
+    except ValueError:
+        return None
+    return angle if abs(angle) <= _MOST_ANGLE_RAD else None
 
 
 def _swing_at(t_s: float, seconds: float) -> tuple[float, float]:

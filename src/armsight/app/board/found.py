@@ -31,6 +31,19 @@ from armsight.robot.boards.configuration import (
 from armsight.robot.boards.tuning import GAIN_RANGES, MotorFigures, motion_limits, quiet_gains
 
 _MARGIN_RAD = 0.05
+_POSITIVE = ("resistance_ohm", "constant_v_s", "inertia_kg_m2")
+_NOT_NEGATIVE = (
+    *("noise_counts", "breakaway_duty", "viscous_n_m_s", "dry_n_m"),
+    *("backlash_rad", "gravity_n_m", "fit_rms_v", "following_rms_rad"),
+)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def _is_pair(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
 
 
 @dataclass
@@ -97,6 +110,25 @@ class JointFound:
             "verify": self.following_rms_rad,
         }
         return looked_for.get(step) is not None
+
+    def impossible(self) -> str | None:
+        """Return the name of a value that cannot have been found, None where all can."""
+        for name in (*_POSITIVE, *_NOT_NEGATIVE):
+            value = getattr(self, name)
+            if value is not None and not (_is_number(value) and (value > 0 if name in _POSITIVE else value >= 0)):
+                return name
+        can_be = {
+            "motor_direction": self.motor_direction in (None, 1, -1),
+            "sensor": self.sensor in [kind.name.lower() for kind in SensorKind],
+            "encoder_input": _is_number(self.encoder_input) and self.encoder_input in range(JOINTS + 1),
+            "counts_per_rev": self.counts_per_rev is None
+            or (_is_number(self.counts_per_rev) and self.counts_per_rev != 0),
+            "zero_counts": _is_number(self.zero_counts),
+            "marks": isinstance(self.marks, list) and all(map(_is_pair, self.marks)),
+            "range_counts": self.range_counts is None
+            or (_is_pair(self.range_counts) and self.range_counts[0] < self.range_counts[1]),
+        }
+        return next((name for name, holds in can_be.items() if not holds), None)
 
     @property
     def kind(self) -> SensorKind:
@@ -206,14 +238,28 @@ class Found:
         try:
             data = json.loads(read_text(path))
             names = {each.name for each in fields(JointFound)}
-            if data.pop("version") != CONFIG_VERSION or len(data["joints"]) != JOINTS:
+            joints = data["joints"]
+            if data.pop("version") != CONFIG_VERSION or not isinstance(joints, list) or len(joints) != JOINTS:
                 raise ValueError("it is of another version")
             joints = [JointFound(**{k: v for k, v in each.items() if k in names}) for each in data.pop("joints")]
-            return cls(joints=joints, **data)
+            found = cls(joints=joints, **data)
+            found.check()
+            return found
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(
                 f"{path}: not what a bring-up kept ({error}): remove it, or name another folder with -o"
             ) from None
+
+    def check(self) -> None:
+        """Raise ValueError where a value cannot have been found: its file was changed by hand."""
+        if not _is_number(self.supply_v) or self.supply_v < 0:
+            raise ValueError(f"supply_v is {self.supply_v!r}")
+        if isinstance(self.joint_count, bool) or self.joint_count not in range(1, JOINTS + 1):
+            raise ValueError(f"joint_count is {self.joint_count!r}")
+        for j, joint in enumerate(self.joints):
+            wrong = joint.impossible()
+            if wrong is not None:
+                raise ValueError(f"joint {j + 1}: {wrong} is {getattr(joint, wrong)!r}")
 
     def write(self, path: Path) -> None:
         """Keep it."""
