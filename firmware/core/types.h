@@ -209,7 +209,7 @@ typedef struct joint_config {
     float following_rad;       /* 1e-3 to 13: largest distance from the reference */
     float stall_duty;          /* 0.01 to 1: from here on the motor must rotate the joint */
     float stall_rad;           /* 1e-4 to 1: rotating less than this within stall_ticks is standing still */
-    uint32_t current_limit_ma; /* 10 to 100000: motor current from which the duty is cut */
+    uint32_t current_limit_ma; /* 10 to 500000: motor current from which the duty is cut */
     int32_t motor_direction;   /* 1 or -1, multiplies the duty on its way out */
     encoder_config encoder;    /* what reads the joint, where it is no potentiometer */
 } joint_config;
