@@ -183,7 +183,7 @@ def _shortened(
                 if not misfit:
                     motion[0, i], variance[i], bad = short[0, i], share * ratio, bad - 1
     if bad:
-        k = first + min(max(np.searchsorted(t[first : first + count], at, side="right"), 1), count - 1)
+        k = first + min(max(int(np.searchsorted(t[first : first + count], at, side="right")), 1), count - 1)
         part = (at - t[k - 1]) / (t[k] - t[k - 1])
         for i in range(q.shape[1]):
             if variance[i] < 0.0:
