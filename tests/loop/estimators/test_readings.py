@@ -143,3 +143,43 @@ def test_few_readings_are_averaged_and_one_is_itself():
     out = readings.at(np.array([1.0]))
     assert (out.q == 0.2).all()
     assert (out.variance[0] == 1).all()
+
+
+def test_a_joint_that_crosses_its_backlash_at_once_is_not_smoothed_across_it():
+    """Another joint, which moves smoothly, is smoothed as before."""
+    rng = np.random.default_rng(5)
+    t = np.arange(250) * 4e-3
+    moves = np.stack([0.5 * t] * 6, axis=1)
+    moves[:, 1] += np.deg2rad(1.0) * np.clip((t - 0.503) / 0.009, 0.0, 1.0)
+    readings = Readings(SIGMA, ARM)
+    readings.add(states(t, moves + SIGMA * rng.normal(size=moves.shape)))
+    at = np.arange(0.42, 0.6, 1e-3)
+    out = readings.at(at)
+    true = 0.5 * at + np.deg2rad(1.0) * np.clip((at - 0.503) / 0.009, 0.0, 1.0)
+    sigma = SIGMA * np.sqrt(out.variance[:, 1])
+    assert np.abs(out.q[:, 1] - true).max() < np.deg2rad(0.2)  # across it, half a degree
+    assert (np.abs(out.q[:, 1] - true) < 3.5 * sigma).mean() > 0.95
+    assert out.variance[:, 0].max() < 0.12
+
+
+def test_noise_greater_than_is_said_is_smoothed_all_the_same_and_counted():
+    rng = np.random.default_rng(6)
+    readings, t = filled(lambda t: 0.5 * t, 0.4, SIGMA, 4.0 * SIGMA * rng.normal(size=(400, 6)))
+    assert np.median(readings.at(t[150:250]).variance) == pytest.approx(16 * 2.25 / (LONG_SPAN_S * 1000), rel=0.2)
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.01, 0.03, 0.1])
+def test_rounded_readings_are_as_uncertain_as_rounding_leaves_them(speed):
+    rng = np.random.default_rng(7)
+    step = np.deg2rad(0.088)
+    off, said = [], []
+    for _ in range(200):
+        readings = Readings(np.deg2rad(0.02), ARM, step)
+        t = np.arange(200) * 4e-3
+        true = speed * t[:, None] + rng.uniform(-step, step, 6)
+        readings.add(states(t, step * np.round(true / step)))
+        out = readings.at(np.array([t[120]]))
+        off.append((out.q[0] - true[120]) / (np.deg2rad(0.02) * np.sqrt(out.variance[0])))
+        said.append(out.lasts_s[0])
+    assert 0.2 < np.mean(np.square(off)) < 1.5
+    assert np.median(said) > 1.0 if speed == 0.0 else np.median(said) < 0.2

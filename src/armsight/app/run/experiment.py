@@ -10,7 +10,7 @@ the drives on.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -281,7 +281,7 @@ def _run(
         follower = Follower(rig, setup.target, setup.sync_s)
         if setup.clock is not None:
             setup.board.receive(_STALE_S)  # what arrived in the port's buffer meanwhile
-        first = KalmanEstimator(setup.arm, prior=PRIOR, delay=_UNKNOWN_DELAY)
+        first = KalmanEstimator(setup.arm, prior=prior_of(setup.board), delay=_UNKNOWN_DELAY)
         publisher.put(EventDatum(0.0, estimator_event(first, anew=False)))
         loop = Loop.open(setup, follower, outcome.log, first, publisher)
         begun(loop)
@@ -350,7 +350,7 @@ def _prepare(
     outcome.shutters = loop.shutters
     back = point_to_point(arm, middle, plan.start)
     there = RunSegment("calibration", "to the start", "joints", False, trajectory=back)
-    loop.begin(KalmanEstimator(arm, prior=PRIOR, delay=outcome.delay, learns_delay=False))
+    loop.begin(KalmanEstimator(arm, prior=prior_of(setup.board), delay=outcome.delay, learns_delay=False))
     loop.run(Planned(back, loop.t_s, gravity), back.duration_s + 0.5, there)
 
 
@@ -405,6 +405,11 @@ def _to_start(loop: Loop, setup: Setup, plan: MotionPlan) -> None:
     back = point_to_point(setup.arm, end, plan.start)
     there = RunSegment("calibration", "back to the start", "joints", False, trajectory=back)
     loop.run(Planned(back, loop.t_s + PERIOD_S, setup.gravity), back.duration_s + 0.5, there)
+
+
+def prior_of(board: MotionBoard) -> Prior:
+    """Return how far an arm may be off whose joints a board reads."""
+    return replace(PRIOR, step_rad=board.abilities.rounded_rad)
 
 
 def timing(setup: Setup, delay: Delay) -> LoopTiming:

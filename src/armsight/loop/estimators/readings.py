@@ -44,8 +44,14 @@ MIN_GAP_RAD = np.deg2rad(0.05)
 _STILL = 4.0
 #: So often links float anew through the rows that are not settled yet, s.
 _AGAIN_S = 0.012
+#: Residuals of a parabola show motion that it does not follow (backlash that is crossed, a stop at once) where their sum
+#: of squares exceeds its mean by so many standard deviations, and that of their differences is less than so many times it:
+#: 2 is white noise, however large.
+_MISFIT, _WHITE = 4.0, 1.5
 #: The period that counts where a reading stands alone, s.
 _MIN_PERIOD_S = 1e-3
+#: So long the error of rounding lasts at most, s: a joint at rest.
+_LONGEST_S = 100.0
 #: Rows of the memory; at 1 kHz twice what is kept.
 _ROWS = 4096
 
@@ -125,8 +131,86 @@ def _rest(
             speeds[i] = 2 * drift / (t[high] - t[low]) if abs(drift) > noise else 0.0
 
 
+@kernel
+def _misfit(
+    t: Array, q: Array, i: int, low: int, high: int, at: float, sigma: float, motion: Array
+) -> tuple[bool, float]:
+    """Return whether joint ``i`` moved otherwise from row low to high than by the parabola of ``motion`` (3, n) at a time.
+
+    And the variance of its residuals, in those of a reading, where it is more by more than chance; 1 where not.
+    The ratio of the two sums is that of von Neumann (Ann. Math. Statist. 12, 1941): noise of any size is no misfit.
+    """
+    square = apart = before = 0.0
+    for k in range(low, high + 1):
+        u = t[k] - at
+        left = q[k, i] - (motion[0, i] + (motion[1, i] + 0.5 * motion[2, i] * u) * u)
+        square += left * left
+        if k > low:
+            apart += (left - before) ** 2
+        before = left
+    free = max(high - low - 2, 1)
+    if square <= sigma**2 * (free + _MISFIT * math.sqrt(2.0 * free)):
+        return False, 1.0
+    return apart < _WHITE * square, square / (sigma**2 * free)
+
+
+@kernel
+def _shortened(
+    t: Array, q: Array, first: int, count: int, at: float, length: float, sigma: float, motion: Array, variance: Array
+) -> None:
+    """Replace angles ``motion[0]`` and ``variance`` (n,) of joints whose motion no parabola follows over a span of time, s.
+
+    Those of parabolas over half of the span, a quarter of it and so on, and at last of a line between the two readings
+    around the time. Speeds stay those of the whole span. Noise that residuals show is counted.
+    """
+    low, high = window(t, first, count, at, length)
+    bad = 0
+    for i in range(q.shape[1]):
+        if high - low + 1 >= PARABOLA:
+            misfit, ratio = _misfit(t, q, i, low, high, at, sigma, motion)
+            variance[i] = -1.0 if misfit else variance[i] * ratio
+            bad += 1 if misfit else 0
+    short = np.empty_like(motion)
+    while bad:
+        length *= 0.5
+        low, high = window(t, first, count, at, length)
+        if high - low + 1 < PARABOLA:
+            break
+        share = fit(t, q, low, high, at, short)
+        for i in range(q.shape[1]):
+            if variance[i] < 0.0:
+                misfit, ratio = _misfit(t, q, i, low, high, at, sigma, short)
+                if not misfit:
+                    motion[0, i], variance[i], bad = short[0, i], share * ratio, bad - 1
+    if bad:
+        k = first + min(max(int(np.searchsorted(t[first : first + count], at, side="right")), 1), count - 1)
+        part = (at - t[k - 1]) / (t[k] - t[k - 1])
+        for i in range(q.shape[1]):
+            if variance[i] < 0.0:
+                step = q[k, i] - q[k - 1, i]  # where between them the joint was is known no better
+                motion[0, i], variance[i] = q[k - 1, i] + part * step, 1.0 + (step / sigma) ** 2 / 12.0
+
+
+@kernel
+def _round(variance: Array, lasts: Array, speeds: Array, step: float, sigma: float) -> None:
+    """Add to variances (n,) and times (n,) that noise lasts what rounding readings to whole steps leaves of its own.
+
+    Its error is a sawtooth of the angle. Slow ones pass a parabola, as that of a joint at rest does; of one that passes D
+    steps meanwhile about 1 / (1 + 40 D^4) of the variance is left. It lasts until the joint has moved by a step.
+    """
+    if step == 0.0:
+        return
+    for i in range(len(variance)):
+        speed, white = abs(speeds[i]), variance[i]
+        steps = 2.0 * lasts[i] * speed / step  # in the time over which the mean is taken
+        rounded = (step / sigma) ** 2 / 12.0 / (1.0 + 40.0 * steps**4)
+        until = min(step / max(speed, 1e-9), _LONGEST_S)
+        lasts[i] = (white * lasts[i] + rounded * until) / (white + rounded)
+        variance[i] = white + rounded
+
+
 @kernel(
-    "f8[::1], f8[:, ::1], f8[:, :, ::1], i8, i8, f8[::1], f8, f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], "
+    "f8[::1], f8[:, ::1], f8[:, :, ::1], i8, i8, f8[::1], f8, f8, f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], "
     "f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1]",
 )
 def _smooth(
@@ -137,6 +221,7 @@ def _smooth(
     count: int,
     at: Array,
     sigma: float,
+    step: float,
     qs: Array,
     qds: Array,
     variance: Array,
@@ -150,8 +235,10 @@ def _smooth(
     for n in range(len(at)):
         if not t[first] <= at[n] <= newest:
             return False
-        low, high = window(t, first, count, at[n], span(at[n], newest))
+        length = span(at[n], newest)
+        low, high = window(t, first, count, at[n], length)
         variance[n] = fit(t, q, low, high, at[n], motion)
+        _shortened(t, q, first, count, at[n], length, sigma, motion, variance[n])
         qs[n], qds[n] = motion[0], motion[1]
         period = (t[high] - t[low]) / max(high - low, 1)
         low, high = window(t, first, count, at[n], STILL_SPAN_S)
@@ -159,6 +246,7 @@ def _smooth(
             _rest(t, q, low, high, at[n], sigma, qs[n], qds[n], variance[n])
         # The correlation's integral over all lags is, of any weights w that sum to one, the period over the sum of w^2.
         lasts[n] = 0.5 * max(period, _MIN_PERIOD_S) / variance[n]
+        _round(variance[n], lasts[n], qds[n], step, sigma)
         k = first + max(np.searchsorted(t[first : first + count], at[n], side="right") - 1, 0)
         for i in range(q.shape[1]):
             unseen[n, 0, i], unseen[n, 1, i], unseen[n, 2, i] = memory[k, 2, i], -memory[k, 4, i], memory[k, 7, i]
@@ -208,12 +296,14 @@ class Readings:
     Args:
         sigma_rad: noise of one reading, rad.
         arm: whose joints they are.
+        step_rad: what readings are rounded to where their noise does not exceed it, rad; 0: to nothing.
     """
 
-    def __init__(self, sigma_rad: float, arm: Arm) -> None:
+    def __init__(self, sigma_rad: float, arm: Arm, step_rad: float = 0.0) -> None:
         # The variance that a parabola leaves at its end is 9/N.
         self._dead = _DEAD * sigma_rad * np.sqrt(9 / (SPAN_S * 1000))
         self._gap, self._sigma, self._joints = np.full(arm.joints, GAP_RAD), sigma_rad, arm.joints
+        self._step = step_rad
         # Beside each reading: travel, flips, side, position behind the dead zone; then what ``backlash_dynamics`` writes.
         self._t, self._q, self._memory = (
             np.empty(_ROWS),
@@ -296,7 +386,7 @@ class Readings:
         one, sides, unseen, empty = (n, j), (n, 2, j), (n, 3, j), np.empty
         joints = Smoothed(empty(one), empty(one), empty(one), empty(one), empty(unseen), empty(one), empty(sides))
         kept = (self._t, self._q, self._memory, self._first, self._count)
-        if not _smooth(*kept, at, self._sigma, *joints):
+        if not _smooth(*kept, at, self._sigma, self._step, *joints):
             raise InputError(
                 f"times {at.min():.4f} to {at.max():.4f} s were asked for; readings are kept from {oldest:.4f} to "
                 f"{newest:.4f} s"

@@ -37,6 +37,7 @@ class Abilities:
         own_controller: whether the joints are controlled by a controller that armsight cannot tune, configure or test.
         releases: whether the drives can be switched off.
         reading_age_s: by how much a reading is older than its stamp, and its standard deviation, s.
+        rounded_rad: what readings are rounded to where their noise does not exceed it, rad; 0: to nothing that matters.
     """
 
     joints: int
@@ -51,6 +52,7 @@ class Abilities:
     own_controller: bool = False
     releases: bool = True
     reading_age_s: tuple[float, float] = (0.0, 0.0)
+    rounded_rad: float = 0.0
 
     def slowed(self, arm: Arm) -> Arm:
         """Return an arm whose motions are planned no faster than the controller follows them."""

@@ -67,6 +67,7 @@ class So101Servos:
 
     Attributes:
         shaft: (6,) angles of the output shafts, rad.
+        rate: (6,) how fast the shafts move, rad/s; ``shaft_speed`` is the same as a servo measures it, filtered.
         on: (6,) whether the torque is on.
         celsius: (6,) temperatures.
     """
@@ -81,7 +82,7 @@ class So101Servos:
         self._ticks = 0
         self.on = np.zeros(SERVOS, bool)
         self.effort = np.zeros(SERVOS)
-        self.shaft_speed = np.zeros(SERVOS)
+        self.shaft_speed, self.rate = np.zeros(SERVOS), np.zeros(SERVOS)
         self.celsius = np.full(SERVOS, 30.0)
 
     @property
@@ -145,7 +146,8 @@ class So101Servos:
         fall = motor - pulls * half - shaft if pulls else 0.0
         moved = shaft + min(max(fall, -_FALL_RAD_S * h), _FALL_RAD_S * h)
         moved = min(max(moved, motor - half), motor + half)
-        self.shaft_speed[k] += 0.05 * ((moved - shaft) / h - self.shaft_speed[k])
+        self.rate[k] = (moved - shaft) / h
+        self.shaft_speed[k] += 0.05 * (self.rate[k] - self.shaft_speed[k])
         self.shaft[k], self._motor[k], self.effort[k] = moved, motor, effort
 
     def _advance(self, k: int) -> float:
@@ -262,6 +264,7 @@ class So101Bus:
                 del self._in[0]
                 continue
             del self._in[:end]
+            self._free_s = max(self.t_s, self._free_s) + _BYTE_S * end
             self._do(body[0], body[2], body[3:])
 
     def _do(self, to: int, instruction: int, parameters: bytes) -> None:
@@ -276,7 +279,8 @@ class So101Bus:
                 self._store(k, parameters[0], parameters[1:])
             self._answer([(k, b"") for k in servos if to != _BROADCAST])
         elif instruction == 0x82 and len(parameters) > 2:
-            for each in parameters[2:]:
+            for each in parameters[2:]:  # one answers after the other, with what it measures then
+                self._refresh(max(self.t_s, self._free_s) - self.t_s)
                 self._answer([(k, self._bytes(k, *parameters[:2])) for k, own in enumerate(self.ids) if own == each])
         elif instruction == 0x83 and len(parameters) > 2:
             address, count = parameters[:2]
@@ -324,11 +328,11 @@ class So101Bus:
             speed = (self._word(servo, 46) or 3400) * RAD_PER_COUNT
             self.servos.goal(servo, goal, speed)
 
-    def _refresh(self) -> None:
-        """Write the states into the registers."""
+    def _refresh(self, ahead_s: float = 0.0) -> None:
+        """Write the states into the registers, as they will be after less than some steps."""
         servos = self.servos
         for k, table in enumerate(self.tables):
-            count = round(servos.shaft[k] / RAD_PER_COUNT) + MIDDLE - self._offset(k)
+            count = round((servos.shaft[k] + ahead_s * servos.rate[k]) / RAD_PER_COUNT) + MIDDLE - self._offset(k)
             speed = round(servos.shaft_speed[k] / RAD_PER_COUNT)
             load = round(1000 * servos.effort[k] / servos.mechanics.torque_n_m)
             drop_v = 0.04 * float(np.abs(servos.effort).sum())

@@ -306,3 +306,32 @@ def test_columns_of_lerobot_are_degrees_where_no_percent_can_be():
     ):  # named already, or others'
         table = [names, ["1"] * len(names)]
         assert degree_columns("log.csv", table) == table
+
+
+def test_a_reading_is_stamped_in_the_middle_of_the_servos_answers(folded):
+    _, device = folded
+    link = SteppedLink(device)
+    board = FeetechBoard.connect(ServoBus(link, "feetech:PORT", now=lambda: device.t_s), begin_s=0.0)
+    board.enable()
+    times, true, step = [], [], device.step
+
+    def noted():
+        step()
+        times.append(device.t_s)
+        true.append(device.truth[0].copy())
+
+    device.step = noted
+    q, begin = board.receive(0.0).q[-1], device.t_s
+    read_s, read = [], []
+    while device.t_s < begin + 3.0:
+        ahead = np.radians(15.0) * np.sin(np.pi * (device.t_s - begin))
+        board.send(JointCommand(q + ahead, REST, REST, 0.005))
+        states = board.receive(0.004)
+        read_s, read = [*read_s, *states.t_s], [*read, *states.q]
+    true, late = np.array(true), []
+    for k in range(5):
+        speed = np.interp(read_s, times, np.gradient(true[:, k], times))
+        off = np.interp(read_s, times, true[:, k]) - np.array(read)[:, k]
+        late.append((off @ speed) / (speed @ speed))
+    assert (np.diff(late) < 0).all()  # one after the other
+    assert abs(np.mean(late)) < 2e-4

@@ -61,6 +61,7 @@ ABILITIES = Abilities(
     _MOST_ACCELERATION,
     takes_duty=False,
     own_controller=True,
+    rounded_rad=RAD_PER_COUNT,
 )
 
 
