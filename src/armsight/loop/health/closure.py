@@ -64,6 +64,19 @@ def _limits(joints: int) -> dict[int, float]:
     return {freedom: MARGIN * alarm_limit(freedom, 1.0 / BLOCK_S, hypotheses) for freedom in (1, 6)}
 
 
+@lru_cache
+def _unsure(joints: int, blocks: int) -> dict[int, float]:
+    """Return by how much chi-square must exceed its limit before a change of so many parameters is reported at first.
+
+    A side of a backlash that is wrongly known displaces some blocks along one joint, and the covariance of the blocks'
+    errors is estimated from so many of them: what one number explains has the tails of Student's t. Six numbers are not
+    mimicked by one joint.
+    """
+    hypotheses = len(suspects(joints)) * _BEGINS
+    single = MARGIN * alarm_limit(1, 1.0 / BLOCK_S, hypotheses, blocks)
+    return {1: single - _limits(joints)[1], 6: 0.0}
+
+
 class _Tested(NamedTuple):
     """A hypothesis at its best beginning, a block; size, covariance, chi-square, how far that is above its limit.
 
@@ -146,7 +159,7 @@ class ClosureWatch:
         self._wide[:6] = self._wide[RAMPS : RAMPS + 6] = _WIDE
         self._wide[6] = _WIDE_S
         self._rejected: list[Innovation] = []
-        self._cov = np.diag(_BLOCK_SIGMA**2)
+        self._cov, self._unsure = np.diag(_BLOCK_SIGMA**2), _unsure(joints, int(_BLOCKS))
         self._clear()
         self.changes: tuple[Change, ...] = ()
         self.explained: tuple[Change, ...] = ()
@@ -244,7 +257,9 @@ class ClosureWatch:
             along = left @ np.linalg.cholesky(np.linalg.inv(own))
             # Neighbours of like errors count as fewer (first-order autoregression).
             rho = float(np.vdot(along[1:], along[:-1]) / np.vdot(along, along))
-            self._cov = own * max((1.0 + rho) / (1.0 - rho), 1.0)
+            alike = max((1.0 + rho) / (1.0 - rho), 1.0)
+            self._cov = own * alike
+            self._unsure = _unsure(self._parts.joints, int(_BLOCKS + freedom / 6.0 / alike))
             self._clear()
             for k in range(len(e)):
                 self._sum(k)
@@ -277,7 +292,7 @@ class ClosureWatch:
         """Test all hypotheses at some beginnings, and the best of them at those between."""
         begins, everything = _begins(len(self._t)), suspects(self._parts.joints)
         found = self._tested(begins, everything)
-        limits = _limits(self._parts.joints)
+        limits = {n: limit + self._unsure[n] for n, limit in _limits(self._parts.joints).items()}
         self.strongest = max(self.strongest, *(each.chi_square / limits[len(each.size)] for each in found))
         best = max(found, key=lambda each: each.above)
         if best.above <= 0.0:
@@ -292,10 +307,10 @@ class ClosureWatch:
             pairs = zip(finest, self._finest_of(np.array(beside), everything), strict=True)
             finest = [max(pair, key=lambda each: each.above) for pair in pairs]
         # The errors are what the best one leaves, not what is left while nothing is taken to have changed.
-        left = max(finest, key=lambda each: each.above).left
-        changes = self.explained = ranked([self._change(each, left) for each in finest])
+        best = max(finest, key=lambda each: each.above)
+        changes = self.explained = ranked([self._change(each, best.left) for each in finest])
         # Once something was reported, what explains it best replaces it, also where it is smaller than is reported first.
-        if self.changes or _matters(changes[0]):
+        if self.changes or (best.above > self._unsure[len(best.size)] and _matters(changes[0])):
             # What was reported before is not undone by something else that began later.
             self.changes = (*changes, *happened_besides(self._reported(), changes[0]))
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import Any, Literal
 
-from scipy.special import chdtri
+from scipy.special import chdtri, fdtri
 
 #: rig: one camera against the other; body: the body, or what looks the same; fixed: the rig against the arm's base;
 #: time: shots that are not of one time; lens: what the model of the cameras cannot express; joint: a potentiometer that
@@ -79,12 +79,18 @@ def unseen_lines(names: Sequence[str]) -> list[str]:
     ]
 
 
-def alarm_limit(freedom: int, tests_per_s: float, hypotheses: int = 1) -> float:
+def alarm_limit(freedom: int, tests_per_s: float, hypotheses: int = 1, estimated: int | None = None) -> float:
     """Return the chi-square of an alarm, so that FALSE_ALARMS_PER_MINUTE bounds the false ones (Bonferroni).
 
     Args:
         freedom: degrees of freedom.
         tests_per_s: how often the test is made.
         hypotheses: how many are tested each time.
+        estimated: degrees of freedom from which the noise was estimated; None where it is known.
     """
-    return float(chdtri(freedom, FALSE_ALARMS_PER_MINUTE / (60.0 * tests_per_s * hypotheses)))
+    chance = FALSE_ALARMS_PER_MINUTE / (60.0 * tests_per_s * hypotheses)
+    if estimated is None:
+        return float(chdtri(freedom, chance))
+    return freedom / float(
+        fdtri(estimated, freedom, chance)
+    )  # the reciprocal of F: chance is far below what 1 resolves
