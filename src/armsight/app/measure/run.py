@@ -21,7 +21,7 @@ from armsight.app.messages import colour, weak
 from armsight.app.progress import bar
 from armsight.app.stream.datum import Published, ShotDatum
 from armsight.app.stream.sink import Fanout, Publisher
-from armsight.data import SIDES, Body, Image, Missed, PoseEstimate, Shot
+from armsight.data import SIDES, Body, Dropped, Image, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines, unseen_lines
@@ -272,8 +272,13 @@ def _keeping(results: Iterator[Result], first: list[Shot], noise: DiscNoise | No
         yield result
 
 
+def _contradicts(dropped: Sequence[Dropped], used: int) -> bool:
+    """Whether more points of a shot contradict each other than were used."""
+    return len({each.point for each in dropped if each.contradicts}) > used
+
+
 class _Contradicting:
-    """Shots that show the target and contradict the rig: their poses, measured with a wide gate."""
+    """Shots that show the target and contradict the rig, all of it or most: their poses, measured with a wide gate."""
 
     def __init__(self, rig: StereoRig, body: Body, again: Callable[[StereoRig, Shot], PoseEstimate | Missed]) -> None:
         self._rig, self._body, self._again = rig, body, again
@@ -285,8 +290,9 @@ class _Contradicting:
         """Yield the results; keep what those that were missed show."""
         for result in results:
             shot, measured = result[:2]
-            self._measured += isinstance(measured, PoseEstimate)
-            if isinstance(measured, Missed) and shot.problem is None:
+            few = isinstance(measured, PoseEstimate) and _contradicts(measured.dropped, len(measured.points.ids))
+            self._measured += isinstance(measured, PoseEstimate) and not few
+            if (few or isinstance(measured, Missed)) and shot.problem is None:
                 self._missed += 1
                 if self._tried < _AGAIN:
                     self._tried += 1
@@ -551,7 +557,7 @@ def _close(
         summary += "; " + ", ".join(f"{count} {way} ({took[way]:.1f} ms each)" for way, count in ways.most_common())
     if jumps := [r.shot for r in records if r.jump]:
         summary += f"; jumped in {', '.join(jumps[:5])}" + (f" and {len(jumps) - 5} more" if len(jumps) > 5 else "")
-    if few := [r.shot for r in good if len({each.point for each in r.dropped if each.contradicts}) > len(r.points_m)]:
+    if few := [r.shot for r in good if _contradicts(r.dropped, len(r.points_m))]:
         which = ", ".join(few[:_NAMED]) + (f" and {len(few) - _NAMED} more" if len(few) > _NAMED else "")
         summary += f"; in {which} most points contradict each other: do not use it; the body moved between the two "
         summary += "exposures, or the images do not belong together"
