@@ -284,13 +284,14 @@ class _Contradicting:
         self._rig, self._body, self._again = rig, body, again
         self._wide = replace(rig, sigma_px=max(rig.sigma_px, _WIDE_PX))
         self._found: list[PoseEstimate] = []
-        self._missed = self._tried = self._measured = 0
+        self._missed = self._tried = self._measured = self._few = 0
 
     def keeping(self, results: Iterator[Result]) -> Iterator[Result]:
         """Yield the results; keep what those that were missed show."""
         for result in results:
             shot, measured = result[:2]
             few = isinstance(measured, PoseEstimate) and _contradicts(measured.dropped, len(measured.points.ids))
+            self._few += few
             self._measured += isinstance(measured, PoseEstimate) and not few
             if (few or isinstance(measured, Missed)) and shot.problem is None:
                 self._missed += 1
@@ -308,8 +309,25 @@ class _Contradicting:
     def finding(self) -> HealthFinding | None:
         """Return what explains them, where they are more than those that were measured; None elsewhere."""
         count = round(len(self._found) / max(self._tried, 1) * self._missed)
-        if not self._found or count <= self._measured:
+        if self._found and count > self._measured:
+            return self._explained(count)
+        if self._few <= self._measured:
             return None
+        return HealthFinding(
+            "rig",
+            f"in {self._few} of {self._few + self._measured} shots that were measured most points contradict each other, "
+            "and no motion of the cameras explains them: one of them has another zoom or focus, or shows a part of its "
+            "image, or left and right images do not belong together",
+            None,
+            float(self._few),
+            0.0,
+            "measurements",
+            "look at the pairs of images; calibrate the rig again with images as they are now",
+            ("lens", "time"),
+        )
+
+    def _explained(self, count: int) -> HealthFinding:
+        """Return what explains that so many shots contradict the rig."""
         return contradiction(self._rig, self._body, self._found, (count, count + self._measured))
 
 
