@@ -124,6 +124,7 @@ def estimate_shutters(
     known: Shutters | None = None,
     readout: bool = False,
     sigma_most: float = _SIGMA_MOST,
+    calibrated: bool = True,
 ) -> Shutters | Missed:
     """Estimate the skew of two cameras, and the readout time of their rolling shutters, from a moving body.
 
@@ -134,6 +135,8 @@ def estimate_shutters(
         known: the readout that is given, and where to begin; nothing by default.
         readout: estimate the readout too.
         sigma_most: largest sigma that counts as found, as a share of the median time between shots.
+        calibrated: whether the rig is; residuals of one that is not yet are its own errors, not those of the detections,
+            and what persists of them is in no sigma.
 
     Returns:
         Both with covariance, or why they cannot be found: too few shots that move, or too slow.
@@ -199,7 +202,8 @@ def estimate_shutters(
         for k, share in zip(rows, shares, strict=True)
         if (motion := moving[k]) is not None
     ]
-    scatter += _persistent([each for each in scored if each is not None], count, len(body.points))
+    if calibrated:
+        scatter += _persistent([each for each in scored if each is not None], count, len(body.points))
     cov[:count, :count] = inverted @ scatter @ inverted
     sigma = np.sqrt(np.diag(cov))
     for name, value, s in zip(("skew", "readout"), theta[:count], sigma, strict=False):
