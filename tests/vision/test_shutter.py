@@ -38,7 +38,7 @@ def at(t, speed, phase):
     return T
 
 
-def recorded(seed, speed, skew_s=SKEW_S, readout_s=READOUT_S, *, count=24, stamped_s=0.0):
+def recorded(seed, speed, skew_s=SKEW_S, readout_s=READOUT_S, *, count=24, stamped_s=0.0, sigma_px=SIGMA_PX):
     """Shots of a moving body with their noise, and its true poses; the stamps of the right camera vary by ``stamped_s``."""
     rng = np.random.default_rng(seed)
     phase, shots = rng.uniform(0, 2 * np.pi, 6), []
@@ -52,8 +52,8 @@ def recorded(seed, speed, skew_s=SKEW_S, readout_s=READOUT_S, *, count=24, stamp
                 p = np.einsum("nij,nj->ni", T[:, :3, :3], POINTS) + T[:, :3, 3]
                 uv[:, c] = camera.project(transform(inverse(RIG.T_left_right), p) if c else p)
                 late = ((uv[:, c, 1] + 0.5) / 720 - 0.5) * readout_s
-        uv += SIGMA_PX * rng.standard_normal(uv.shape)
-        seen = Correspondences(np.arange(20), uv, np.tile(SIGMA_PX**2 * np.eye(2), (20, 2, 1, 1)))
+        uv += sigma_px * rng.standard_normal(uv.shape)
+        seen = Correspondences(np.arange(20), uv, np.tile(sigma_px**2 * np.eye(2), (20, 2, 1, 1)))
         shots.append(TimedShot(float(t), seen, at(t + 1e-3, speed, phase)[0], apart_s))
     return shots, at(t_s, speed, phase)
 
@@ -67,6 +67,25 @@ def test_skew_and_readout_are_found_and_their_sigma_is_honest():
         z.append((np.array([found.skew_s, found.readout_s]) - [SKEW_S, READOUT_S]) / found.sigmas)
     rms = np.sqrt(np.mean(np.square(z), axis=0))
     assert ((rms > 0.5) & (rms < 1.5)).all(), rms
+
+
+@pytest.mark.parametrize("both", [False, True])
+def test_errors_of_points_that_persist_from_shot_to_shot_are_in_the_sigma(both):
+    z, motion_only = [], []
+    for seed in range(12):
+        shots = recorded(seed, 0.3, sigma_px=0.02)[0]
+        off = np.random.default_rng([seed, 1]).normal(0, 0.05, (20, 2, 2))  # of each point in each camera, in all shots
+        if both:
+            off[:, 1] = off[:, 0]
+        persistent = [replace(shot, seen=replace(shot.seen, uv=shot.seen.uv + off)) for shot in shots]
+        found = [estimate_shutters(RIG, BODY, some, readout=True) for some in (persistent, shots)]
+        assert all(isinstance(each, Shutters) for each in found)
+        error = np.array([found[0].skew_s, found[0].readout_s]) - [SKEW_S, READOUT_S]
+        z.append(error / found[0].sigmas)
+        motion_only.append(error / found[1].sigmas)
+    rms = np.sqrt(np.mean(np.square(z), axis=0))
+    assert ((rms > 0.5) & (rms < 1.5)).all(), rms
+    assert np.sqrt(np.mean(np.square(motion_only), axis=0)).max() > 3  # they matter
 
 
 @pytest.mark.parametrize("skew_s", [-8e-3, 0.0, 15e-3])

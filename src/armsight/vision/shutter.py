@@ -9,8 +9,9 @@ motion of the body is a cubic through the poses of up to five shots around each.
 parameters through the velocity; what a wrong pose explains as well is projected out, so no more than the epipolar residual
 and the shape of the body remain. Gauss-Newton over all shots with Cauchy weights. The curvature is taken less what noise
 of the velocity adds to it (Fuller, "Measurement Error Models", 1987, section 1.2); the covariance grows where the scores of
-the shots scatter more than their curvature predicts (Birge ratio). Where the skews of the shots differ by more than chance,
-the skew of each is a normal random effect.
+the shots scatter more than their curvature predicts (Birge ratio), and where the errors of a point's detections persist:
+a body moves little between two shots, so what shifts a detection shifts the next one, too. Where the skews of the shots
+differ by more than chance, the skew of each is a normal random effect.
 """
 
 from __future__ import annotations
@@ -123,6 +124,7 @@ def estimate_shutters(
     known: Shutters | None = None,
     readout: bool = False,
     sigma_most: float = _SIGMA_MOST,
+    calibrated: bool = True,
 ) -> Shutters | Missed:
     """Estimate the skew of two cameras, and the readout time of their rolling shutters, from a moving body.
 
@@ -133,6 +135,8 @@ def estimate_shutters(
         known: the readout that is given, and where to begin; nothing by default.
         readout: estimate the readout too.
         sigma_most: largest sigma that counts as found, as a share of the median time between shots.
+        calibrated: whether the rig is; residuals of one that is not yet are its own errors, not those of the detections,
+            and what persists of them is in no sigma.
 
     Returns:
         Both with covariance, or why they cannot be found: too few shots that move, or too slow.
@@ -192,7 +196,15 @@ def estimate_shutters(
             break
     cov = np.zeros((2, 2))
     inverted = np.linalg.inv(H - noise)
-    cov[:count, :count] = _birge(marginal - step @ H / len(marginal), H) * inverted @ H @ inverted
+    scatter = _birge(marginal - step @ H / len(marginal), H) * H
+    scored = [
+        _scored(rig, body, observed[k], Ts[k], motion, _exposed(rig, observed[k], apart[k], theta), share, scale2)
+        for k, share in zip(rows, shares, strict=True)
+        if (motion := moving[k]) is not None
+    ]
+    if calibrated:
+        scatter += _persistent([each for each in scored if each is not None], count, len(body.points))
+    cov[:count, :count] = inverted @ scatter @ inverted
     sigma = np.sqrt(np.diag(cov))
     for name, value, s in zip(("skew", "readout"), theta[:count], sigma, strict=False):
         if s > sigma_most * float(np.median(np.diff(t_s))):
@@ -229,6 +241,86 @@ def _birge(scores: Array, H: Array) -> float:
     count, size = scores.shape
     ratio = np.einsum("si,ij,sj", scores, np.linalg.inv(H), scores) / size * count / (count - size)
     return max(1.0, float(ratio))
+
+
+@dataclass(frozen=True, eq=False)
+class _Scored(Record):
+    """What the N observations of one shot add to the score.
+
+    Attributes:
+        row: (N,) 2 point + camera.
+        residual: (N, 2) whitened residuals, weighted.
+        by: (N, 2, 2) whitened derivatives by skew and readout, less what a wrong pose and the shot's own skew explain.
+        weight: (N,) of robust loss, 1 for a residual of zero.
+    """
+
+    row: Ids
+    residual: Array
+    by: Array
+    weight: Array
+
+
+def _scored(
+    rig: StereoRig,
+    body: Body,
+    o: PixelObservations,
+    T: Array,
+    motion: Motion,
+    exposed: tuple[Array, Array],
+    share: float,
+    scale2: float,
+) -> _Scored | None:
+    """Return what each observation of a shot adds to the score; None where they fit no pose."""
+    dt, by = exposed
+    moved = _at_one_time(rig, body, o, T, motion, dt)
+    fit = fit_pose(rig.cameras, rig.T_left_right, body.points, moved, T, robust=True)
+    if fit is None:
+        return None
+    W, A, _ = whitened(rig.cameras, rig.T_left_right, body.points, o, fit.T_left_body)
+    weight = 1.0 / (1.0 + fit.distance2 / (CAUCHY_SCALE**2 * scale2))
+    rates = motion.twist + np.outer(dt, motion.acceleration)
+    M = (np.einsum("nij,nj->ni", A.reshape(len(dt), 2, 6), rates)[..., None] * by[:, None]).reshape(-1, 2)
+    weighted = np.repeat(weight / scale2, 2)[:, None]
+    M -= A @ np.linalg.solve(A.T @ (weighted * A), A.T @ (weighted * M))
+    M -= share * np.outer(M[:, 0], (weighted * M).T @ M[:, 0])
+    residual = (weight / scale2)[:, None] * np.einsum("nij,nj->ni", W, fit.residuals_px)
+    return _Scored(2 * o.point + o.camera, residual, M.reshape(-1, 2, 2), weight)
+
+
+def _persistent(scored: Sequence[_Scored], count: int, points: int) -> Array:
+    """Return the (P, P) covariance that errors of detections which persist from shot to shot add to that of the score.
+
+    Of each lag between shots the covariance of a point's residuals, in the same camera and in the other, is estimated from
+    all points together: the errors of a body's points are in both. That of the other camera in the same shot is taken from
+    the next one, where a pose that follows the noise has no part in it. The sandwich of an M-estimator has the mean weight
+    over that of its square (Huber, "Robust Statistics", 1981, section 6.3, for Cauchy's loss in two dimensions).
+    """
+    shots = len(scored)
+    by, residual = np.zeros((shots, 2 * points, 2, count)), np.zeros((shots, 2 * points, 2, 1))
+    seen, weights = np.zeros((shots, 2 * points, 1, 1)), np.concatenate([each.weight for each in scored])
+    for k, each in enumerate(scored):
+        by[k, each.row], residual[k, each.row] = each.by[..., :count], each.residual[..., None]
+        seen[k, each.row] = 1.0
+    freedom = 2 * len(weights) / (2 * len(weights) - 6 * shots) * (weights.sum() / (weights**2).sum()) ** 2
+    added = np.zeros((count, count))
+    for other in (False, True):
+        partner = np.arange(2 * points) ^ int(other)
+        pairs = 2 * _lagged(seen, seen[:, partner])[:, 0, 0]
+        covs = freedom * _lagged(residual, residual[:, partner])[:, 0, 0] / np.maximum(pairs, 1.0)
+        products = _lagged(by, by[:, partner])
+        later = np.einsum("l,lpq->pq", covs[1:], products[1:])
+        added += later + later.T
+        if other:
+            added += covs[1] * products[0]
+    values, axes = np.linalg.eigh(added)
+    return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)
+
+
+def _lagged(a: Array, b: Array) -> Array:
+    """Return the sums of a[k] b[k + l] (S, P, Q) for each lag l from zero on, of (S, N, 2, P) and (S, N, 2, Q)."""
+    length = 2 * len(a)
+    A, B = (np.fft.rfft(x.reshape(len(x), -1, x.shape[-1]), length, axis=0) for x in (a, b))
+    return np.asarray(np.fft.irfft(np.swapaxes(A.conj(), 1, 2) @ B, length, axis=0)[: len(a)])
 
 
 def _exposed(rig: StereoRig, o: PixelObservations, apart_s: float, theta: Array) -> tuple[Array, Array]:

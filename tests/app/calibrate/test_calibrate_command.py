@@ -242,6 +242,25 @@ def test_a_board_that_is_not_its_own_mirror_image_shows_a_driver_that_mirrors(ar
     assert "right images without" not in said.err
 
 
+@pytest.mark.parametrize(
+    ("spec", "named"),
+    [
+        ("charuco:4x5:50mm:37mm:DICT_5X5_50", "markers of DICT_4X4_50, not of DICT_5X5_50"),
+        ("charuco:4x5:50mm:25mm:DICT_4X4_50", "in squares of 50 mm, not of 25 mm"),
+        ("charuco:5x4:50mm:37mm:DICT_4X4_50", "check its counts of squares"),
+    ],
+)
+def test_a_charuco_board_of_another_family_size_or_counts_is_named(armsight, tmp_path, spec, named):
+    pattern, rng = charuco(4, 5, 0.05, 0.037, "DICT_4X4_50"), np.random.default_rng(1)
+    T = pose(np.eye(3), np.array([-0.1, -0.1, 0.6]))
+    image = render(example_rig((640, 360)).left, [PosedBody((pattern,), T)], plain((640, 360), rng), rng=rng)
+    for n in range(3):
+        cv2.imwrite(str(tmp_path / f"left{n}.png"), np.roll(image, n, axis=1))
+        cv2.imwrite(str(tmp_path / f"right{n}.png"), np.roll(image, n + 9, axis=1))
+    said = armsight("calibrate", *images(tmp_path), "--target", spec, "-o", tmp_path / "rig.json")
+    assert_rejected(said, named)
+
+
 def test_left_and_right_exchanged_is_reported(few, armsight, tmp_path):
     said = armsight(
         "calibrate", "--left", few / "right*.png", "--right", few / "left*.png", *CHESS, *QUICK,

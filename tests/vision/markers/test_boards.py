@@ -1,6 +1,7 @@
 """The laws of every board, and each board found in brute-force paintings of it."""
 
 import dataclasses
+import re
 from functools import lru_cache
 
 import cv2
@@ -233,6 +234,25 @@ def test_both_layouts_of_charuco_are_read():
         np.testing.assert_allclose(inverted.uv, found.uv, atol=1e-3)
         truth = 50.0 * (target.body.points[found.ids, :2] / 0.03 + 1) - 0.5
         assert np.abs(found.uv - truth).max() < 0.05
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_markers_of_another_size_and_boards_of_other_counts_are_named(legacy):
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    layout = cv2.aruco.CharucoBoard((8, 6), 0.03, 0.022, dictionary)
+    layout.setLegacyPattern(legacy)
+    plain = np.pad(layout.generateImage((8 * 40, 6 * 40), marginSize=0), 40, constant_values=255)
+    plain = cv2.GaussianBlur(plain, (0, 0), 0.7)
+    for image in (plain, 255 - plain):
+        for given in ("15mm", "18mm", "25mm"):
+            found = open_board(f"charuco:8x6:30mm:{given}:DICT_5X5_100").detect(image)
+            assert found.problem is not None
+            assert re.search(f"markers of 2[12][.0-9]* mm in squares of 30 mm, not of {given[:2]} mm", found.problem)
+        assert open_board("charuco:8x6:30mm:22mm:DICT_5X5_100").detect(image).problem is None
+        for counts in ("9x6", "6x8"):
+            other = open_board(f"charuco:{counts}:30mm:22mm:DICT_5X5_100").detect(image)
+            assert other.problem is not None
+            assert "check its counts" in other.problem
 
 
 def test_boards_are_frozen():

@@ -29,10 +29,14 @@ from armsight.vision.calibrate.screen import merged_notes
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
 from armsight.vision.image import darkness, grey, one_image, read_image
+from armsight.vision.markers.aruco import FAMILIES, detect_markers, family_size
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import load_body_csv
 from armsight.vision.sources import Source, notes_of, open_source
 from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files
+
+#: Fewest markers of a family by which it is named as the one in view; in families of few cells less are chance.
+_LEAST_CODES = 4
 
 Grey = NDArray[np.uint8]
 Sizes = tuple[tuple[int, int], tuple[int, int]]
@@ -203,7 +207,18 @@ class _Unseen:
         for image in images:
             if self._target.detect(np.ascontiguousarray(image[:, ::-1])).problem is None:
                 return "the target is found once they are mirrored: does the driver mirror them? Switch it off"
-        return ""
+        return self._codes(images[0]) if images else ""
+
+    def _codes(self, image: Grey) -> str:
+        """Return whose codes an image shows in place of the target, or an empty string."""
+        family, count = self._target.codes
+        if not family or len(detect_markers(image, family)[1]) >= _LEAST_CODES:
+            return ""
+        most, least = "", max(_LEAST_CODES, count // 4) - 1
+        for name in sorted(FAMILIES, key=family_size):  # of families that begin alike the smallest one is named
+            if (found := len(detect_markers(image, name)[1])) > least:
+                most, least = name, found
+        return f"the first shows {least} markers of {most}, not of {family}" if most else ""
 
 
 def _shots(source: Source) -> Iterator[tuple[Shot, tuple[Path | str, Path | str]]]:

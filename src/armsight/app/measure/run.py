@@ -21,7 +21,7 @@ from armsight.app.messages import colour, weak
 from armsight.app.progress import bar
 from armsight.app.stream.datum import Published, ShotDatum
 from armsight.app.stream.sink import Fanout, Publisher
-from armsight.data import SIDES, Body, Image, Missed, PoseEstimate, Shot
+from armsight.data import SIDES, Body, Dropped, Image, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines, unseen_lines
@@ -272,21 +272,28 @@ def _keeping(results: Iterator[Result], first: list[Shot], noise: DiscNoise | No
         yield result
 
 
+def _contradicts(dropped: Sequence[Dropped], used: int) -> bool:
+    """Whether more points of a shot contradict each other than were used."""
+    return len({each.point for each in dropped if each.contradicts}) > used
+
+
 class _Contradicting:
-    """Shots that show the target and contradict the rig: their poses, measured with a wide gate."""
+    """Shots that show the target and contradict the rig, all of it or most: their poses, measured with a wide gate."""
 
     def __init__(self, rig: StereoRig, body: Body, again: Callable[[StereoRig, Shot], PoseEstimate | Missed]) -> None:
         self._rig, self._body, self._again = rig, body, again
         self._wide = replace(rig, sigma_px=max(rig.sigma_px, _WIDE_PX))
         self._found: list[PoseEstimate] = []
-        self._missed = self._tried = self._measured = 0
+        self._missed = self._tried = self._measured = self._few = 0
 
     def keeping(self, results: Iterator[Result]) -> Iterator[Result]:
         """Yield the results; keep what those that were missed show."""
         for result in results:
             shot, measured = result[:2]
-            self._measured += isinstance(measured, PoseEstimate)
-            if isinstance(measured, Missed) and shot.problem is None:
+            few = isinstance(measured, PoseEstimate) and _contradicts(measured.dropped, len(measured.points.ids))
+            self._few += few
+            self._measured += isinstance(measured, PoseEstimate) and not few
+            if (few or isinstance(measured, Missed)) and shot.problem is None:
                 self._missed += 1
                 if self._tried < _AGAIN:
                     self._tried += 1
@@ -302,8 +309,25 @@ class _Contradicting:
     def finding(self) -> HealthFinding | None:
         """Return what explains them, where they are more than those that were measured; None elsewhere."""
         count = round(len(self._found) / max(self._tried, 1) * self._missed)
-        if not self._found or count <= self._measured:
+        if self._found and count > self._measured:
+            return self._explained(count)
+        if self._few <= self._measured:
             return None
+        return HealthFinding(
+            "rig",
+            f"in {self._few} of {self._few + self._measured} shots that were measured most points contradict each other, "
+            "and no motion of the cameras explains them: one of them has another zoom or focus, or shows a part of its "
+            "image, or left and right images do not belong together",
+            None,
+            float(self._few),
+            0.0,
+            "measurements",
+            "look at the pairs of images; calibrate the rig again with images as they are now",
+            ("lens", "time"),
+        )
+
+    def _explained(self, count: int) -> HealthFinding:
+        """Return what explains that so many shots contradict the rig."""
         return contradiction(self._rig, self._body, self._found, (count, count + self._measured))
 
 
@@ -551,7 +575,7 @@ def _close(
         summary += "; " + ", ".join(f"{count} {way} ({took[way]:.1f} ms each)" for way, count in ways.most_common())
     if jumps := [r.shot for r in records if r.jump]:
         summary += f"; jumped in {', '.join(jumps[:5])}" + (f" and {len(jumps) - 5} more" if len(jumps) > 5 else "")
-    if few := [r.shot for r in good if len({each.point for each in r.dropped if each.contradicts}) > len(r.points_m)]:
+    if few := [r.shot for r in good if _contradicts(r.dropped, len(r.points_m))]:
         which = ", ".join(few[:_NAMED]) + (f" and {len(few) - _NAMED} more" if len(few) > _NAMED else "")
         summary += f"; in {which} most points contradict each other: do not use it; the body moved between the two "
         summary += "exposures, or the images do not belong together"

@@ -709,7 +709,7 @@ class _Recording(Record):
         found = Shutters(0.0, 0.0, np.zeros((2, 2)))
         for step in range(_SKEW_ROUNDS):
             some = list(_busiest(shots).values())
-            estimate = estimate_shutters(rig, self.body, some, known=found, sigma_most=np.inf)
+            estimate = estimate_shutters(rig, self.body, some, known=found, sigma_most=np.inf, calibrated=False)
             if isinstance(estimate, Missed):
                 return estimate
             steps.append(estimate.skew_s - found.skew_s)

@@ -214,6 +214,20 @@ def charuco_detector(
     size: tuple[int, int], square_m: float, marker_m: float, family: str, legacy: bool
 ) -> cv2.aruco.CharucoDetector:
     """Make OpenCV's detector of a charuco board: squares columns x rows, and whether the layout is that before 4.6."""
+    return cv2.aruco.CharucoDetector(_charuco(size, square_m, marker_m, family, legacy))
+
+
+@lru_cache(maxsize=16)
+def marker_corners(size: tuple[int, int], square_m: float, marker_m: float, family: str, legacy: bool) -> Array:
+    """Return where the markers of a charuco board have their corners (n, 4, 2), m, from the board's upper left."""
+    corners = _charuco(size, square_m, marker_m, family, legacy).getObjPoints()
+    return np.asarray(corners, dtype=float)[..., :2]
+
+
+def _charuco(
+    size: tuple[int, int], square_m: float, marker_m: float, family: str, legacy: bool
+) -> cv2.aruco.CharucoBoard:
+    """Return OpenCV's charuco board; arguments as :func:`charuco_detector`."""
     board = cv2.aruco.CharucoBoard(size, square_m, marker_m, _dictionary(family))
     board.setLegacyPattern(legacy)
-    return cv2.aruco.CharucoDetector(board)
+    return board

@@ -18,11 +18,21 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Record
 from armsight.errors import InputError
-from armsight.vision.markers.aruco import charuco_detector, detect_markers, family_name, family_size
+from armsight.vision.markers.aruco import charuco_detector, detect_markers, family_name, family_size, marker_corners
 from armsight.vision.markers.chessboard import fit_grid, misfits
 from armsight.vision.markers.grid import completed, grid_points
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.spec import Fields
+
+#: Markers from whose neighbours the image's scale at one follows, it included; of more the perspective bends the fit.
+_NEIGHBOURS = 5
+#: Markers that are off their layout by more than this share of a square have another one.
+_OFF = 0.2
+#: OpenCV's outline of a marker runs through the middles of its outermost pixels: it is this much smaller, px.
+_OUTLINE_PX = 1.0
+#: A given side of the markers that differs from the image's by more than this share, and by more than so many pixels
+#: (blur and tone curves shift the edges), is a mistake.
+_SIDE_SHARE, _SIDE_PX = 0.08, 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +88,11 @@ class Charuco(Record, Target):
         name = f"charuco:{self.columns}x{self.rows}:{lengths}:{self.family}"
         return Body(name, tuple(str(i) for i in range(len(points))), points)
 
+    @property
+    def _absent(self) -> str:
+        """What is said of an image in which nothing of the board was seen."""
+        return f"no {self.body.name} found, or fewer than 4 of its corners"
+
     def detect(self, image: NDArray[np.uint8]) -> Detections:
         """Find the board in one grey image; see :class:`~armsight.vision.markers.marker.Target`.
 
@@ -86,16 +101,18 @@ class Charuco(Record, Target):
         found = self._found(image)
         if found.problem is not None:
             inverted = self._found(255 - image)
-            return found if inverted.problem is not None else inverted
+            return found if inverted.problem is not None and found.problem != self._absent else inverted
         return found
 
     def _found(self, image: NDArray[np.uint8]) -> Detections:
         """Find the board with dark markers on light squares."""
         markers = detect_markers(image, self.family)
+        if (wrong := self._contradiction(*markers)) is not None:
+            return Detections.none(wrong)
         layouts = [self._rough(image, *markers, legacy) for legacy in (False, True)]
         rough = max(layouts, key=lambda uv: np.isfinite(uv).sum())
         if np.isfinite(rough[..., 0]).sum() < 4:
-            return Detections.none(f"no {self.body.name} found, or fewer than 4 of its corners")
+            return Detections.none(self._absent)
         plain = 0.5 * (1.0 - self.marker_m / self.square_m)
         fits = fit_grid(image, completed(rough), arm=plain)  # a marker that was not read hides corners that are there
         y, x = np.mgrid[: self.rows - 1, : self.columns - 1]
@@ -119,3 +136,52 @@ class Charuco(Record, Target):
         if ids is not None and uv is not None:
             rough[np.ravel(ids)] = uv.reshape(-1, 2)
         return rough.reshape(self.rows - 1, self.columns - 1, 2)
+
+    def _contradiction(self, markers: Sequence[NDArray[Any]], identities: NDArray[Any]) -> str | None:
+        """Return a message where an image's markers do not lie as the board has them, or have another side, in squares."""
+        sides = [self._sides(markers, identities, legacy) for legacy in (False, True)]
+        off, seen_m, px = min(sides, key=lambda found: found[0])
+        if _OFF < off < np.inf:
+            return (
+                f"{len(markers)} markers of {self.family} are in view, but not where {self.body.name} has them: check its "
+                "counts of squares (columns x rows)"
+            )
+        if not abs(seen_m - self.marker_m) > max(_SIDE_SHARE * seen_m, _SIDE_PX / px):
+            return None
+        return (
+            f"{self.body.name}: the image shows markers of {seen_m * 1e3:.3g} mm in squares of {self.square_m * 1e3:g} mm, "
+            f"not of {self.marker_m * 1e3:g} mm: measure the squares and the markers (with their dark border) again"
+        )
+
+    def _sides(
+        self, markers: Sequence[NDArray[Any]], identities: NDArray[Any], legacy: bool
+    ) -> tuple[float, float, float]:
+        """Compare the markers with where one of OpenCV's layouts has them.
+
+        Returns:
+            How far off the middles of the markers are, squares; the side of a marker, m; pixels a metre: medians of all
+            markers that have neighbours. Infinite, NaN and NaN where none has.
+        """
+        layout = marker_corners((self.columns, self.rows), self.square_m, self.marker_m, self.family, legacy)
+        known = [k for k, identity in enumerate(identities.ravel()) if identity < len(layout)]
+        if len(known) < _NEIGHBOURS:
+            return np.inf, np.nan, np.nan
+        corners = np.reshape([markers[k] for k in known], (-1, 4, 2)).astype(float)
+        middles = corners.mean(axis=1)
+        board = layout[identities.ravel()[known]].mean(axis=1)
+        found = []
+        for p in board:
+            near = np.argsort(np.linalg.norm(board - p, axis=1), kind="stable")[:_NEIGHBOURS]
+            X = np.column_stack([np.ones(_NEIGHBOURS), board[near] - p])
+            if np.linalg.matrix_rank(X, tol=0.5 * self.square_m) < 3:
+                continue  # in one line
+            fit, *_ = np.linalg.lstsq(X, middles[near], rcond=None)
+            scale = np.sqrt(abs(np.linalg.det(fit[1:])))
+            off = np.sqrt(np.mean((X @ fit - middles[near]) ** 2)) / max(scale * self.square_m, 1e-9)
+            (x, y), (z, w) = np.diff(corners[near[0]][[0, 2, 1, 3]], axis=0)[::2]
+            side_px = np.sqrt(0.5 * abs(x * w - y * z)) + _OUTLINE_PX
+            found.append((off, side_px / max(scale, 1e-9), scale))
+        if not found:
+            return np.inf, np.nan, np.nan
+        off, side, scale = np.median(found, axis=0)
+        return float(off), float(side), float(scale)
