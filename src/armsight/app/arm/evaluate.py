@@ -502,7 +502,8 @@ def _joint(
 def _zero(arm: Arm, i: int, rests: RestPoses, found: Identified) -> tuple[float, float] | None:
     """Return by how much a joint really is further than it reads, deg, on the mean over the rests, and its sigma.
 
-    The sensor's curve has a mean over these poses, which hardly differs from another zero: the two count together.
+    The sensor's curve has a mean over these poses, which hardly differs from another zero: the two count together. Sigma
+    is that of the fitted numbers, and how far leaving out the others (a length, a compliance) has moved the zero.
     """
     model, solution = found.model, found.solution
     weight = np.zeros(len(solution.x))
@@ -514,7 +515,8 @@ def _zero(arm: Arm, i: int, rests: RestPoses, found: Identified) -> tuple[float,
         if feature.joint == i and feature.kind in SENSOR:
             weight[model.sources_at + k] = phi[k]
     value = float(weight @ (solution.x - model.nominal()))
-    return float(np.degrees(value)), float(np.degrees(np.sqrt(weight @ solution.cov @ weight)))
+    sigma = np.hypot(np.sqrt(weight @ solution.cov @ weight), weight @ found.moved)
+    return float(np.degrees(value)), float(np.degrees(sigma))
 
 
 #: A joint whose gravity load has a lever below this at all poses carries none, m.

@@ -55,6 +55,7 @@ class Identified(Record):
         cov: (P, P) covariance of all that may be off, fitted or not: a fitted number's sigma includes what the error
             sources that were not selected, or hardly show, could still be, and how far leaving them out has moved it.
             ``solution.cov`` is that of the fitted ones, the rest taken for nominal.
+        moved: (P,) fitted numbers less those of the fit of everything that can be observed: what the selection has moved.
     """
 
     model: Model
@@ -65,6 +66,7 @@ class Identified(Record):
     singular_values: Array
     prior: Array
     cov: Array
+    moved: Array
     joint_sigma_rad: Array
 
     @property
@@ -180,11 +182,10 @@ def _identified(
     reasons = {**{n: why for n, why in observable.reasons.items() if n not in kept_together}, **selection.reasons}
     model = model.with_seen(measured.q[solution.used])
     cov = _whole(model, solution, measured, observable.possible, prior)
-    between = np.where(selection.free, solution.x - whole.x, 0.0)  # what the choice of the model moves
-    cov = np.where(selection.free[:, None] & selection.free, cov + np.diag(between**2), 0.0)
-    return Identified(
-        model, nominal.x, solution, reasons, selection.steps, observable.singular_values, prior, cov, scatter.sigma_rad
-    )
+    moved = solution.x - whole.x
+    cov = np.where(selection.free[:, None] & selection.free, cov + np.diag(moved**2), 0.0)
+    found = (model, nominal.x, solution, reasons, selection.steps, observable.singular_values)
+    return Identified(*found, prior, cov, moved, scatter.sigma_rad)
 
 
 def _everything(
