@@ -55,6 +55,14 @@ def test_a_pose_is_widened_by_the_mixture_of_what_cannot_be_distinguished():
     assert suspected(measurement, [change("joint", 2)]) is None
 
 
+def test_beside_a_drift_some_of_it_is_suspected_in_every_direction():
+    measurement = PoseMeasurement(18.0, T, np.eye(6), np.zeros((6, 6)))
+    drift = change("drift")
+    extra, (shift, cov) = suspected(measurement, [drift]), drift.displacement(T, 18.0)
+    sizes = 0.15 * np.repeat([np.linalg.norm(shift[:3]), np.linalg.norm(shift[3:])], 3)
+    np.testing.assert_allclose(extra, np.outer(shift, shift) + cov + np.diag(sizes**2), rtol=1e-12)
+
+
 def test_what_was_reported_is_not_undone_by_another_change_at_another_time():
     measurement = PoseMeasurement(30.0, T, np.eye(6), np.zeros((6, 6)))
     rig, joint = change("rig", score=5.0), change("joint", 2, 90.0, begin_s=25.0, end_s=29.0)

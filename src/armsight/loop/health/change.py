@@ -26,6 +26,8 @@ ALIKE = 12.0
 LATER_S = 3.0
 #: The errors of an arm have longer tails than Gaussian ones: chi-squares count by this factor less.
 MARGIN = 1.4
+#: A drift deviates from the constant motion that is estimated by about this share of it, in any direction.
+_OTHERWISE = 0.15
 #: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone: beyond it by chance once in
 #: a hundred.
 _ALONG = float(chdtri(5, 0.01))
@@ -197,8 +199,16 @@ def suspected(measurement: PoseMeasurement, changes: Sequence[Change]) -> Array 
         for each, share in zip(some, probabilities(some) if some else (), strict=True):
             if each.suspect.moves and t_s >= each.begin_s:
                 shift, cov = each.displacement(T, t_s)
+                if each.suspect.kind == "drift":
+                    cov = cov + _otherwise(shift)
                 extra += share * (np.outer(shift, shift) + cov)
     return extra if extra.any() else None
+
+
+def _otherwise(shift: Array) -> Array:
+    """Return the covariance (6, 6) of what a drift does beside a shift (6,): its rate and direction are not constant."""
+    sizes = _OTHERWISE * np.linalg.norm(shift.reshape(2, 3), axis=1)
+    return np.diag(np.repeat(sizes**2, 3))
 
 
 def widened(measurement: PoseMeasurement, changes: Sequence[Change]) -> PoseMeasurement:
