@@ -197,12 +197,12 @@ def estimate_shutters(
     cov = np.zeros((2, 2))
     inverted = np.linalg.inv(H - noise)
     scatter = _birge(marginal - step @ H / len(marginal), H) * H
-    scored = [
-        _scored(rig, body, observed[k], Ts[k], motion, _exposed(rig, observed[k], apart[k], theta), share, scale2)
-        for k, share in zip(rows, shares, strict=True)
-        if (motion := moving[k]) is not None
-    ]
     if calibrated:
+        scored = [
+            _scored(rig, body, observed[k], Ts[k], motion, _exposed(rig, observed[k], apart[k], theta), share, scale2)
+            for k, share in zip(rows, shares, strict=True)
+            if (motion := moving[k]) is not None
+        ]
         scatter += _persistent([each for each in scored if each is not None], count, len(body.points))
     cov[:count, :count] = inverted @ scatter @ inverted
     sigma = np.sqrt(np.diag(cov))

@@ -27,6 +27,7 @@ from armsight.geometry.pose import pose
 from armsight.loop.estimators import Delay, KalmanEstimator
 from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.codes import BoardState
+from armsight.robot.boards.contract import Abilities
 from armsight.robot.trajectories import point_to_point
 
 ARM = open_arm("six_r")
@@ -38,7 +39,7 @@ class Standing:
     """A board whose arm stands at home, whatever it is commanded."""
 
     def __init__(self):
-        self.t_s, self.sent = 0.0, []
+        self.t_s, self.sent, self.abilities = 0.0, [], Abilities(6, 1000.0)
         self.status = SimpleNamespace(state=BoardState.DISABLED, faults=(), t_s=0.0)
         self.joints = SimpleNamespace(reference_rad=ARM.home)
 

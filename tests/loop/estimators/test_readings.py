@@ -165,7 +165,9 @@ def test_a_joint_that_crosses_its_backlash_at_once_is_not_smoothed_across_it():
 def test_noise_greater_than_is_said_is_smoothed_all_the_same_and_counted():
     rng = np.random.default_rng(6)
     readings, t = filled(lambda t: 0.5 * t, 0.4, SIGMA, 4.0 * SIGMA * rng.normal(size=(400, 6)))
-    assert np.median(readings.at(t[150:250]).variance) == pytest.approx(16 * 2.25 / (LONG_SPAN_S * 1000), rel=0.2)
+    out = readings.at(t[150:250])
+    assert np.median(out.variance) == pytest.approx(16 * 2.25 / (LONG_SPAN_S * 1000), rel=0.2)
+    assert np.median(out.lasts_s) == pytest.approx(LONG_SPAN_S / 4.5, rel=0.1)  # as long as that of any white noise
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.01, 0.03, 0.1])

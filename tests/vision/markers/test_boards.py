@@ -255,6 +255,27 @@ def test_markers_of_another_size_and_boards_of_other_counts_are_named(legacy):
             assert "check its counts" in other.problem
 
 
+def test_a_few_markers_of_a_right_charuco_board_from_close_by_contradict_nothing():
+    """Where few are seen they lie far apart, and perspective bends what is fitted through them."""
+    rng = np.random.default_rng(8)
+    layout = cv2.aruco.CharucoBoard((8, 6), 0.03, 0.022, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100))
+    target, shape = open_board("charuco:8x6:30mm:22mm:DICT_5X5_100"), np.array([640, 480])
+    for _ in range(40):
+        plain = layout.generateImage((640, 480), marginSize=0)
+        for identity in rng.permutation(24)[: rng.integers(14, 19)]:
+            u, v = (layout.getObjPoints()[identity].mean(axis=0)[:2] / 0.03 * 80).astype(int)
+            plain[v - 30 : v + 30, u - 30 : u + 30] = 160
+        plain = np.pad(plain, 80, constant_values=255)
+        axis, size = rng.normal(size=2), shape + 160.0
+        R = exp_so3(np.radians(rng.uniform(20, 60)) * np.append(axis / np.linalg.norm(axis), 0.0))
+        K = np.array([[620.0, 0, 640], [0, 620.0, 360], [0, 0, 1]])
+        p = np.array([0, 0, rng.uniform(0.5, 0.9) * 640]) - 0.5 * R[:, :2] @ size
+        H = K @ np.column_stack([R[:, 0], R[:, 1], p])
+        image = cv2.GaussianBlur(cv2.warpPerspective(plain, H, (1280, 720), borderValue=120), (0, 0), 0.8)
+        problem = target.detect(image).problem or ""
+        assert not re.search("image shows markers|check its counts", problem), problem
+
+
 def test_boards_are_frozen():
     with pytest.raises(dataclasses.FrozenInstanceError):
         open_board(SPECS["chessboard"]).columns = 3

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from armsight.app.run.controllers import closed_on, drive
-from armsight.app.run.experiment import PRIOR, Progress, RunResult, timing
+from armsight.app.run.experiment import Progress, RunResult, prior_of, timing
 from armsight.app.run.loop import Loop
 from armsight.app.run.metrics import Study, track_metrics
 from armsight.app.run.motion_file import MotionPlan
@@ -264,7 +264,7 @@ def _circle(workcell: Workcell, setup: Setup, rig: StereoRig, outcome: RunResult
         setup,
         Follower(rig, setup.target, setup.sync_s),
         log,
-        KalmanEstimator(setup.arm, prior=PRIOR, delay=outcome.delay, learns_delay=False),
+        KalmanEstimator(setup.arm, prior=prior_of(setup.board), delay=outcome.delay, learns_delay=False),
     )
     loop.mounting, loop.delay_s, loop.shutters = outcome.handeye.mounting, outcome.delay.delay_s, outcome.shutters
     servo = PoseServo(setup.arm, timing(setup, outcome.delay))

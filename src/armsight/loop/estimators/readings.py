@@ -110,7 +110,16 @@ def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, d
 
 @kernel
 def _rest(
-    t: Array, q: Array, low: int, high: int, at: float, sigma: float, angles: Array, speeds: Array, variance: Array
+    t: Array,
+    q: Array,
+    low: int,
+    high: int,
+    at: float,
+    sigma: float,
+    angles: Array,
+    speeds: Array,
+    variance: Array,
+    noise: Array,
 ) -> None:
     """Replace fitted angles (n,) by the means of rows low to high for joints that stand still meanwhile.
 
@@ -124,11 +133,11 @@ def _rest(
             early += q[low + k, i]
             late += q[high - k, i]
         mean, drift = (early + late) / (2 * half), (late - early) / half
-        noise = _MOTION * sigma * math.sqrt(2.0 / half)
-        stands = abs(drift) * aside <= noise and abs(drift) <= max(noise, sigma)
+        chance = _MOTION * sigma * math.sqrt(2.0 / half)
+        stands = abs(drift) * aside <= chance and abs(drift) <= max(chance, sigma)
         if stands and abs(angles[i] - mean) < _MOTION * sigma * math.sqrt(variance[i]):
-            angles[i], variance[i] = mean, 1.0 / n
-            speeds[i] = 2 * drift / (t[high] - t[low]) if abs(drift) > noise else 0.0
+            angles[i], variance[i], noise[i] = mean, 1.0 / n, 1.0
+            speeds[i] = 2 * drift / (t[high] - t[low]) if abs(drift) > chance else 0.0
 
 
 @kernel
@@ -156,19 +165,30 @@ def _misfit(
 
 @kernel
 def _shortened(
-    t: Array, q: Array, first: int, count: int, at: float, length: float, sigma: float, motion: Array, variance: Array
+    t: Array,
+    q: Array,
+    first: int,
+    count: int,
+    at: float,
+    length: float,
+    sigma: float,
+    motion: Array,
+    variance: Array,
+    noise: Array,
 ) -> None:
     """Replace angles ``motion[0]`` and ``variance`` (n,) of joints whose motion no parabola follows over a span of time, s.
 
     Those of parabolas over half of the span, a quarter of it and so on, and at last of a line between the two readings
-    around the time. Speeds stay those of the whole span. Noise that residuals show is counted.
+    around the time. Speeds stay those of the whole span. Noise that residuals show is counted; ``noise`` (n,) becomes its
+    variance, in those of a reading.
     """
+    noise[:] = 1.0
     low, high = window(t, first, count, at, length)
     bad = 0
     for i in range(q.shape[1]):
         if high - low + 1 >= PARABOLA:
-            misfit, ratio = _misfit(t, q, i, low, high, at, sigma, motion)
-            variance[i] = -1.0 if misfit else variance[i] * ratio
+            misfit, noise[i] = _misfit(t, q, i, low, high, at, sigma, motion)
+            variance[i] = -1.0 if misfit else variance[i] * noise[i]
             bad += 1 if misfit else 0
     short = np.empty_like(motion)
     while bad:
@@ -179,16 +199,17 @@ def _shortened(
         share = fit(t, q, low, high, at, short)
         for i in range(q.shape[1]):
             if variance[i] < 0.0:
-                misfit, ratio = _misfit(t, q, i, low, high, at, sigma, short)
+                misfit, noise[i] = _misfit(t, q, i, low, high, at, sigma, short)
                 if not misfit:
-                    motion[0, i], variance[i], bad = short[0, i], share * ratio, bad - 1
+                    motion[0, i], variance[i], bad = short[0, i], share * noise[i], bad - 1
     if bad:
         k = first + min(max(int(np.searchsorted(t[first : first + count], at, side="right")), 1), count - 1)
         part = (at - t[k - 1]) / (t[k] - t[k - 1])
         for i in range(q.shape[1]):
             if variance[i] < 0.0:
                 step = q[k, i] - q[k - 1, i]  # where between them the joint was is known no better
-                motion[0, i], variance[i] = q[k - 1, i] + part * step, 1.0 + (step / sigma) ** 2 / 12.0
+                motion[0, i], noise[i] = q[k - 1, i] + part * step, 1.0 + (step / sigma) ** 2 / 12.0
+                variance[i] = noise[i]
 
 
 @kernel
@@ -231,21 +252,21 @@ def _smooth(
     flips: Array,
 ) -> bool:
     """Write the joints at times (N,) into the parts of a :class:`Smoothed`; return whether all are within those kept."""
-    motion, newest = np.empty((3, q.shape[1])), t[first + count - 1]
+    motion, noise, newest = np.empty((3, q.shape[1])), np.empty(q.shape[1]), t[first + count - 1]
     for n in range(len(at)):
         if not t[first] <= at[n] <= newest:
             return False
         length = span(at[n], newest)
         low, high = window(t, first, count, at[n], length)
         variance[n] = fit(t, q, low, high, at[n], motion)
-        _shortened(t, q, first, count, at[n], length, sigma, motion, variance[n])
+        _shortened(t, q, first, count, at[n], length, sigma, motion, variance[n], noise)
         qs[n], qds[n] = motion[0], motion[1]
         period = (t[high] - t[low]) / max(high - low, 1)
         low, high = window(t, first, count, at[n], STILL_SPAN_S)
         if high - low > 4 * PARABOLA:
-            _rest(t, q, low, high, at[n], sigma, qs[n], qds[n], variance[n])
+            _rest(t, q, low, high, at[n], sigma, qs[n], qds[n], variance[n], noise)
         # The correlation's integral over all lags is, of any weights w that sum to one, the period over the sum of w^2.
-        lasts[n] = 0.5 * max(period, _MIN_PERIOD_S) / variance[n]
+        lasts[n] = 0.5 * max(period, _MIN_PERIOD_S) * noise / variance[n]
         _round(variance[n], lasts[n], qds[n], step, sigma)
         k = first + max(np.searchsorted(t[first : first + count], at[n], side="right") - 1, 0)
         for i in range(q.shape[1]):

@@ -221,7 +221,7 @@ def put(config: Configuration, path: str, value: object) -> None:
             limits = np.iinfo(record.dtype[name])
             low, high = RANGES.get(name, (limits.min, limits.max))
             if not limits.min <= number <= limits.max:
-                raise InputError(f"{path} is {number}; {low:g} to {high:g} is allowed")
+                raise InputError(f"{path} is {number}; {low:.0f} to {high:.0f} is allowed")
         record[name] = number
 
 

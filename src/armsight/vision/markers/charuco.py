@@ -24,15 +24,17 @@ from armsight.vision.markers.grid import completed, grid_points
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.spec import Fields
 
-#: Markers from whose neighbours the image's scale at one follows, it included; of more the perspective bends the fit.
-_NEIGHBOURS = 5
+#: Markers from whose neighbours the image's scale at one follows, it included, and how far they may be from it, squares;
+#: of more, or of those further off, the perspective bends the fit. Fewest markers that have such neighbours.
+_NEIGHBOURS, _REACH, _FITS = 5, 2.1, 3
 #: Markers that are off their layout by more than this share of a square have another one.
 _OFF = 0.2
 #: OpenCV's outline of a marker runs through the middles of its outermost pixels: it is this much smaller, px.
 _OUTLINE_PX = 1.0
 #: A given side of the markers that differs from the image's by more than this share, and by more than so many pixels
-#: (blur and tone curves shift the edges), is a mistake.
-_SIDE_SHARE, _SIDE_PX = 0.08, 1.5
+#: (blur and tone curves shift the edges), is a mistake; so where it is more than so many times by how much the markers
+#: are off their layout, squares: perspective and distortion bend the fit.
+_SIDE_SHARE, _SIDE_PX, _SIDE_OFF = 0.08, 1.5, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +143,14 @@ class Charuco(Record, Target):
         """Return a message where an image's markers do not lie as the board has them, or have another side, in squares."""
         sides = [self._sides(markers, identities, legacy) for legacy in (False, True)]
         off, seen_m, px = min(sides, key=lambda found: found[0])
-        if _OFF < off < np.inf:
+        if off > _OFF:
+            if max(sides)[0] == np.inf:
+                return None  # nothing is known of one layout
             return (
                 f"{len(markers)} markers of {self.family} are in view, but not where {self.body.name} has them: check its "
                 "counts of squares (columns x rows)"
             )
-        if not abs(seen_m - self.marker_m) > max(_SIDE_SHARE * seen_m, _SIDE_PX / px):
+        if not abs(seen_m - self.marker_m) > max(_SIDE_SHARE * seen_m, _SIDE_PX / px, _SIDE_OFF * off * seen_m):
             return None
         return (
             f"{self.body.name}: the image shows markers of {seen_m * 1e3:.3g} mm in squares of {self.square_m * 1e3:g} mm, "
@@ -160,7 +164,7 @@ class Charuco(Record, Target):
 
         Returns:
             How far off the middles of the markers are, squares; the side of a marker, m; pixels a metre: medians of all
-            markers that have neighbours. Infinite, NaN and NaN where none has.
+            markers that have neighbours. Infinite, NaN and NaN where too few have.
         """
         layout = marker_corners((self.columns, self.rows), self.square_m, self.marker_m, self.family, legacy)
         known = [k for k, identity in enumerate(identities.ravel()) if identity < len(layout)]
@@ -171,7 +175,10 @@ class Charuco(Record, Target):
         board = layout[identities.ravel()[known]].mean(axis=1)
         found = []
         for p in board:
-            near = np.argsort(np.linalg.norm(board - p, axis=1), kind="stable")[:_NEIGHBOURS]
+            apart = np.linalg.norm(board - p, axis=1)
+            near = np.argsort(apart, kind="stable")[:_NEIGHBOURS]
+            if apart[near[-1]] > _REACH * self.square_m:
+                continue
             X = np.column_stack([np.ones(_NEIGHBOURS), board[near] - p])
             if np.linalg.matrix_rank(X, tol=0.5 * self.square_m) < 3:
                 continue  # in one line
@@ -181,7 +188,7 @@ class Charuco(Record, Target):
             (x, y), (z, w) = np.diff(corners[near[0]][[0, 2, 1, 3]], axis=0)[::2]
             side_px = np.sqrt(0.5 * abs(x * w - y * z)) + _OUTLINE_PX
             found.append((off, side_px / max(scale, 1e-9), scale))
-        if not found:
+        if len(found) < _FITS:
             return np.inf, np.nan, np.nan
         off, side, scale = np.median(found, axis=0)
         return float(off), float(side), float(scale)
