@@ -177,7 +177,7 @@ def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:
         return [
             f"{robot.path}: its poses are not those of the joints by {arm.name}, at no constant offset; the poses count"
         ]
-    p = 1e3 * mean[:3, 3]
+    p = np.round(1e3 * mean[:3, 3], 1) + 0.0  # without the sign of a zero
     angle = float(np.degrees(np.linalg.norm(log_se3(mean)[3:])))
     if np.linalg.norm(p) < 1.0 and angle < 0.5:
         return []

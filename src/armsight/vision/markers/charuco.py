@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,6 +36,9 @@ _OUTLINE_PX = 1.0
 #: (blur and tone curves shift the edges), is a mistake; so where it is more than so many times by how much the markers
 #: are off their layout, squares: perspective and distortion bend the fit.
 _SIDE_SHARE, _SIDE_PX, _SIDE_OFF = 0.08, 1.5, 2.0
+#: So far outside and inside of its outline, share of its side and px, a marker's grey differs by more than this share of
+#: the range within it.
+_GAP_SHARE, _GAP_PX, _STEP = 0.04, 1.5, 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +113,7 @@ class Charuco(Record, Target):
     def _found(self, image: NDArray[np.uint8]) -> Detections:
         """Find the board with dark markers on light squares."""
         markers = detect_markers(image, self.family)
-        if (wrong := self._contradiction(*markers)) is not None:
+        if (wrong := self._contradiction(image, *markers)) is not None:
             return Detections.none(wrong)
         layouts = [self._rough(image, *markers, legacy) for legacy in (False, True)]
         rough = max(layouts, key=lambda uv: np.isfinite(uv).sum())
@@ -139,9 +143,13 @@ class Charuco(Record, Target):
             rough[np.ravel(ids)] = uv.reshape(-1, 2)
         return rough.reshape(self.rows - 1, self.columns - 1, 2)
 
-    def _contradiction(self, markers: Sequence[NDArray[Any]], identities: NDArray[Any]) -> str | None:
+    def _contradiction(
+        self, image: NDArray[np.uint8], markers: Sequence[NDArray[Any]], identities: NDArray[Any]
+    ) -> str | None:
         """Return a message where an image's markers do not lie as the board has them, or have another side, in squares."""
-        sides = [self._sides(markers, identities, legacy) for legacy in (False, True)]
+        corners = np.reshape(markers, (-1, 4, 2)).astype(float)
+        outlined = _outlined(image, corners)
+        sides = [self._sides(corners, outlined, identities, legacy) for legacy in (False, True)]
         off, seen_m, px = min(sides, key=lambda found: found[0])
         if off > _OFF:
             if max(sides)[0] == np.inf:
@@ -158,19 +166,19 @@ class Charuco(Record, Target):
         )
 
     def _sides(
-        self, markers: Sequence[NDArray[Any]], identities: NDArray[Any], legacy: bool
+        self, corners: Array, outlined: NDArray[np.bool_], identities: NDArray[Any], legacy: bool
     ) -> tuple[float, float, float]:
         """Compare the markers with where one of OpenCV's layouts has them.
 
         Returns:
             How far off the middles of the markers are, squares; the side of a marker, m; pixels a metre: medians of all
-            markers that have neighbours. Infinite, NaN and NaN where too few have.
+            markers that have neighbours, the side of those that are outlined. Infinite and NaN where too few are.
         """
         layout = marker_corners((self.columns, self.rows), self.square_m, self.marker_m, self.family, legacy)
         known = [k for k, identity in enumerate(identities.ravel()) if identity < len(layout)]
         if len(known) < _NEIGHBOURS:
             return np.inf, np.nan, np.nan
-        corners = np.reshape([markers[k] for k in known], (-1, 4, 2)).astype(float)
+        corners, outlined = corners[known], outlined[known]
         middles = corners.mean(axis=1)
         board = layout[identities.ravel()[known]].mean(axis=1)
         found = []
@@ -187,8 +195,34 @@ class Charuco(Record, Target):
             off = np.sqrt(np.mean((X @ fit - middles[near]) ** 2)) / max(scale * self.square_m, 1e-9)
             (x, y), (z, w) = np.diff(corners[near[0]][[0, 2, 1, 3]], axis=0)[::2]
             side_px = np.sqrt(0.5 * abs(x * w - y * z)) + _OUTLINE_PX
-            found.append((off, side_px / max(scale, 1e-9), scale))
+            found.append((off, side_px / max(scale, 1e-9), scale, outlined[near[0]]))
         if len(found) < _FITS:
             return np.inf, np.nan, np.nan
-        off, side, scale = np.median(found, axis=0)
-        return float(off), float(side), float(scale)
+        offs, sides, scales, has = np.transpose(found)
+        side = float(np.median(sides[has > 0])) if has.sum() >= _FITS else np.nan
+        return float(np.median(offs)), side, float(np.median(scales))
+
+
+def _outlined(image: NDArray[np.uint8], corners: Array) -> NDArray[np.bool_]:
+    """Return which markers' corners (n, 4, 2) are those of their outlines (n,): bright just outside, dark just inside.
+
+    Where cells are larger than OpenCV's threshold reaches, it may give the inner edge of the dark rim that this leaves.
+    """
+    if not len(corners):
+        return np.zeros(0, bool)
+    middles, share = corners.mean(axis=1, keepdims=True), np.linspace(0.0, 1.0, 9)[:, None]
+    following = np.roll(corners, -1, axis=1)
+    edges = (corners[:, :, None] + share[1:-1] * (following - corners)[:, :, None]).reshape(len(corners), -1, 2)
+    across = corners[:, [0]] + share * (corners[:, [1]] - corners[:, [0]])
+    down = corners[:, [3]] + share * (corners[:, [2]] - corners[:, [3]])
+    cells = (across[:, :, None] + share * (down - across)[:, :, None]).reshape(len(corners), -1, 2)
+    gap = np.maximum(_GAP_SHARE, _GAP_PX / np.linalg.norm(following - corners, axis=2).mean(axis=1))[:, None, None]
+
+    def grey(uv: Array) -> Array:
+        uv = uv.astype(np.float32)
+        return cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
+
+    outside, inside = (
+        np.median(grey(middles + (1.0 + sign * gap) * (edges - middles)), axis=1) for sign in (1.0, -1.0)
+    )
+    return np.asarray(outside - inside > _STEP * np.ptp(grey(cells), axis=1))
