@@ -316,8 +316,8 @@ class _Contradicting:
         return HealthFinding(
             "rig",
             f"in {self._few} of {self._few + self._measured} shots that were measured most points contradict each other, "
-            "and no motion of the cameras explains them: one of them has another zoom or focus, or shows a part of its "
-            "image, or left and right images do not belong together",
+            "and no motion of the cameras explains most of them: one camera has another zoom or focus, or shows a part of "
+            "its image, or left and right images do not belong together",
             None,
             float(self._few),
             0.0,

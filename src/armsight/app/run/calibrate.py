@@ -293,7 +293,7 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
     assert loop.mounting is not None
     seen = [loop.mounting.pose_measurement(pose, t) for t, pose in shots]
     sync_s = loop.setup.sync_s if shutters is None else 0.0  # what is not known of the shutters is in the covariances
-    prior = replace(STEADY, step_rad=loop.setup.board.abilities.rounded_rad)
+    prior = replace(STEADY, rounded_rad=loop.setup.board.abilities.rounded_rad)
     delay = loop.compute(lambda: estimate_delay(arm, swept, seen, prior=prior, sync_s=sync_s))
     blinked = None if loop.led is None else loop.led.pooled()
     if loop.led is not None and blinked is not None and loop.led.row_shares is not None:

@@ -409,7 +409,7 @@ def _to_start(loop: Loop, setup: Setup, plan: MotionPlan) -> None:
 
 def prior_of(board: MotionBoard) -> Prior:
     """Return how far an arm may be off whose joints a board reads."""
-    return replace(PRIOR, step_rad=board.abilities.rounded_rad)
+    return replace(PRIOR, rounded_rad=board.abilities.rounded_rad)
 
 
 def timing(setup: Setup, delay: Delay) -> LoopTiming:

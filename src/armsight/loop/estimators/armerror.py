@@ -113,7 +113,7 @@ class Prior:
         pose_rad: the same of the rotation, rad.
         pose_travel_rad: travel of all joints together in which that is forgotten, rad.
         reading_rad: noise of one reading of a potentiometer, rad.
-        step_rad: what readings are rounded to where their noise does not exceed it, as counts of an encoder, rad.
+        rounded_rad: what readings are rounded to where their noise does not exceed it, as counts of an encoder, rad.
     """
 
     link_m: float = 1e-3
@@ -135,7 +135,7 @@ class Prior:
     pose_rad: float = float(np.deg2rad(0.01))
     pose_travel_rad: float = 1.0
     reading_rad: float = float(np.deg2rad(0.02))
-    step_rad: float = 0.0
+    rounded_rad: float = 0.0
 
     def sigmas(self, sigma_delay_s: float, joints: int = 6) -> Array:
         """Return the standard deviations (size,) of the vector of an arm of so many joints."""

@@ -79,7 +79,7 @@ class KalmanEstimator:
 
     def __init__(self, arm: Arm, *, prior: Prior | None = None, delay: Delay, learns_delay: bool = True) -> None:
         self._arm, self._prior, self._delay, self._learns_delay = arm, prior or Prior(), delay, learns_delay
-        self._readings = Readings(self._prior.reading_rad, arm, self._prior.step_rad)
+        self._readings = Readings(self._prior.reading_rad, arm, self._prior.rounded_rad)
         self._model = ErrorModel(arm, self._prior, delay.sigma_s)
         joints = arm.joints
         none, ones = np.zeros((1, joints)), np.ones((1, joints))

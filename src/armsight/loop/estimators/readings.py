@@ -317,14 +317,14 @@ class Readings:
     Args:
         sigma_rad: noise of one reading, rad.
         arm: whose joints they are.
-        step_rad: what readings are rounded to where their noise does not exceed it, rad; 0: to nothing.
+        rounded_rad: what readings are rounded to where their noise does not exceed it, rad; 0: to nothing.
     """
 
-    def __init__(self, sigma_rad: float, arm: Arm, step_rad: float = 0.0) -> None:
+    def __init__(self, sigma_rad: float, arm: Arm, rounded_rad: float = 0.0) -> None:
         # The variance that a parabola leaves at its end is 9/N.
         self._dead = _DEAD * sigma_rad * np.sqrt(9 / (SPAN_S * 1000))
         self._gap, self._sigma, self._joints = np.full(arm.joints, GAP_RAD), sigma_rad, arm.joints
-        self._step = step_rad
+        self._step = rounded_rad
         # Beside each reading: travel, flips, side, position behind the dead zone; then what ``backlash_dynamics`` writes.
         self._t, self._q, self._memory = (
             np.empty(_ROWS),

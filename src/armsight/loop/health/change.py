@@ -26,7 +26,8 @@ ALIKE = 12.0
 LATER_S = 3.0
 #: The errors of an arm have longer tails than Gaussian ones: chi-squares count by this factor less.
 MARGIN = 1.4
-#: A drift deviates from the constant motion that is estimated by about this share of it, in any direction.
+#: The estimate of a drift is off by about this share of it, in any direction: seen in simulated drifts of constant rate;
+#: real ones do not keep their rate.
 _OTHERWISE = 0.15
 #: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone: beyond it by chance once in
 #: a hundred.
@@ -206,7 +207,7 @@ def suspected(measurement: PoseMeasurement, changes: Sequence[Change]) -> Array 
 
 
 def _otherwise(shift: Array) -> Array:
-    """Return the covariance (6, 6) of what a drift does beside a shift (6,): its rate and direction are not constant."""
+    """Return the covariance (6, 6) of what a drift does beside the shift (6,) that was estimated."""
     sizes = _OTHERWISE * np.linalg.norm(shift.reshape(2, 3), axis=1)
     return np.diag(np.repeat(sizes**2, 3))
 

@@ -91,6 +91,5 @@ def alarm_limit(freedom: int, tests_per_s: float, hypotheses: int = 1, estimated
     chance = FALSE_ALARMS_PER_MINUTE / (60.0 * tests_per_s * hypotheses)
     if estimated is None:
         return float(chdtri(freedom, chance))
-    return freedom / float(
-        fdtri(estimated, freedom, chance)
-    )  # the reciprocal of F: chance is far below what 1 resolves
+    # The reciprocal of F, since chance is far below what 1 resolves.
+    return freedom / float(fdtri(estimated, freedom, chance))
