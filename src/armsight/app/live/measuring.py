@@ -284,7 +284,10 @@ class MeasureStep:
         with self._lock:
             work = self._measure
         if work is not None:
-            self.take(live, work(live))
+            result = work(live)
+            with self._lock:
+                if self._measure is work:  # else another rig or target was chosen meanwhile
+                    self.take(live, result)
         if (second := self._second) is not None and second.measure is not None:
             second.newest = live.number, second.measure(live)
 
