@@ -69,3 +69,16 @@ def test_a_wire_hears_what_the_parser_hears(monkeypatch, disturbed):
             assert list(map(reported, fast.receive(0.0))) == list(map(reported, slow.receive(0.0)))
             assert (fast.heard, fast.broken, fast.lost) == (slow.heard, slow.broken, slow.lost)
         assert fast.broken == 0 or disturbed
+
+
+def test_a_frame_whose_kind_nobody_knows_counts_as_missing():
+    spoken = dialect()
+    mav, wire = spoken.MAVLink(None), Wire(Pipe())
+    frames = []
+    for tick in range(3):
+        frames.append(bytearray(spoken.MAVLink_angles_message(tick, [0.1] * 6).pack(mav)))
+        mav.seq += 1
+    frames[1][8] ^= 8  # in the middle of the message's number: what its CRC begins with is not known
+    wire._link.waiting = b"".join(map(bytes, frames))
+    assert [message.tick for message in wire.receive(0.0)] == [0, 2]
+    assert (wire.broken, wire.lost) == (0, 1)

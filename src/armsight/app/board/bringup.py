@@ -716,8 +716,8 @@ class Bringup:
         q = self._q(readings)[last]
         for j in joints:
             error = np.interp(readings.t_s[last], at[:, 0], at[:, j + 1]) - q[:, j]
-            rms = float(np.sqrt(max(np.mean(error**2) - self.found.joints[j].noise_rad ** 2, 0.0)))
-            if rms > _VERIFY_MOST_RAD:
+            rms, noise = float(np.sqrt(np.mean(error**2))), self.found.joints[j].noise_rad
+            if rms > np.hypot(_VERIFY_MOST_RAD, noise):
                 raise _Mistake(
                     f"joint {j + 1}: it follows a small swing with an error of {np.degrees(rms):.2f} degrees RMS."
                 )
@@ -725,7 +725,9 @@ class Bringup:
             self.found.joints[j].traces |= _traces(
                 verify_t_s=readings.t_s[last] - readings.t_s[0], verify_error_rad=error
             )
-            self._person.say(f"joint {j + 1}: follows to {1e3 * rms:.1f} mrad RMS")
+            self._person.say(
+                f"joint {j + 1}: follows to {1e3 * rms:.2f} mrad RMS as read; its sensor's noise is {1e3 * noise:.2f}"
+            )
         self.found.verified = True
 
     def _store(self) -> None:

@@ -64,7 +64,7 @@ class JointFound:
         backlash_rad: from stop to stop.
         gravity_n_m: greatest torque of gravity.
         fit_rms_v: by how much the fit misses the motor's voltage.
-        following_rms_rad: error of the small swing that verified the gains.
+        following_rms_rad: error of the small swing that verified the gains, as read: the sensor's noise is in it.
         sensor: what reads it: potentiometer, quadrature or absolute.
         encoder_input: of a quadrature encoder: which.
         counts_per_rev: of its encoder, a revolution of the joint; negative where counts fall with the angle.
@@ -375,7 +375,8 @@ _NUMBERS: tuple[tuple[str, str, float, str], ...] = (
     ("dry_n_m", "dry friction, N m", 1, ".3f"),
     ("backlash_rad", "backlash, mrad", 1e3, ".1f"),
     ("gravity_n_m", "gravity at most, N m", 1, ".2f"),
-    ("following_rms_rad", "follows to, mrad RMS", 1e3, ".2f"),
+    ("following_rms_rad", "follows to, as read, mrad RMS", 1e3, ".2f"),
+    ("noise_rad", "noise, mrad", 1e3, ".2f"),
 )
 
 
@@ -387,13 +388,14 @@ def report(found: Found, gains: Array) -> str:
     """
     rows = []
     for j, each in enumerate(found.joints):
-        values = [(getattr(each, name), scale, form) for name, _, scale, form in _NUMBERS]
+        known = {**vars(each), "noise_rad": None if each.range_counts is None else each.noise_rad}
+        values = [(known[name], scale, form) for name, _, scale, form in _NUMBERS]
         rows.append([f"joint {j + 1}", *("" if v is None else format(v * s, f) for v, s, f in values)])
-    gain_rows = [[f"joint {j + 1}", *(f"{value:.4g}" for value in row)] for j, row in enumerate(gains)]
+    gain_rows = [[name, *(f"{value:.4g}" for value in row)] for name, row in zip(GAIN_RANGES, gains.T, strict=True)]
     problems = [[f"joint {j + 1}", text(line)] for j, each in enumerate(found.joints) for line in each.problems]
     sections = {
         "joints": ("Joints", table(["", *(title for _, title, _, _ in _NUMBERS)], rows, "numbers")),
-        "gains": ("Gains", table(["", *GAIN_RANGES], gain_rows, "numbers")),
+        "gains": ("Gains", table(["", *(f"joint {j + 1}" for j in range(len(gains)))], gain_rows, "numbers")),
         "figures": ("Figures", _figures(found)),
     }
     if problems:
@@ -425,7 +427,8 @@ def _figures(found: Found) -> str:
             if "verify_t_s" in lines:
                 right.plot(lines["verify_t_s"], 1e3 * np.array(lines["verify_error_rad"]), color=BLUE, lw=0.8)
             right.set(title="error of the small swing, with noise", xlabel="s", ylabel="mrad")
-        return picture(png(figure), "For every joint: potentiometer table, motor voltage, following error")
+        plots = picture(png(figure), "For every joint: table of its sensor, motor voltage, following error")
+        return f"<figure>{plots}</figure>"
 
 
 def found_json(found: Found) -> dict[str, Any]:

@@ -89,6 +89,7 @@ class Wire:
             for number, kind in spoken.mavlink_map.items()
             if "s" not in kind.unpacker.format and "c" not in kind.unpacker.format
         }
+        self._kinds = frozenset(spoken.mavlink_map)
         self._mav.robust_parsing = True
         self._close = link.close
         self.heard = False
@@ -150,7 +151,7 @@ class Wire:
                 self.broken += 1
                 if message.data[0] in _MARKERS:
                     self._search_on(message.data)
-            else:
+            elif message.get_msgId() in self._kinds:  # else nothing says how its CRC begins: the next one's count misses it
                 self._count_frame(message.get_seq())
                 found.append(message)
 
