@@ -151,7 +151,9 @@ class Wire:
                 self.broken += 1
                 if message.data[0] in _MARKERS:
                     self._search_on(message.data)
-            elif message.get_msgId() in self._kinds:  # else nothing says how its CRC begins: the next one's count misses it
+            elif (
+                message.get_msgId() in self._kinds
+            ):  # else nothing says how its CRC begins: the next one's count misses it
                 self._count_frame(message.get_seq())
                 found.append(message)
 
