@@ -38,14 +38,25 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
     reports = runtestprotocol(item, log=False, nextitem=nextitem)
     if failed := [each for each in reports if each.failed]:
-        item._initrequest()  # type: ignore[attr-defined]
-        reports = runtestprotocol(item, log=False, nextitem=nextitem)
+        reports = _again(item, nextitem)
         for each in reports:  # shown where the second run fails, too
             each.sections.extend(("the first run", one.longreprtext) for one in failed)
     for each in reports:
         item.ihook.pytest_runtest_logreport(report=each)
     item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
     return True
+
+
+def _again(item: pytest.Item, nextitem: pytest.Item | None) -> list[pytest.TestReport]:
+    """Run a test again as if it were for the first time: with new fixtures of its module, after the tests before it."""
+    elsewhere = next((each for each in item.session.items if each.path != item.path), None)
+    item.session._setupstate.teardown_exact(elsewhere)
+    module = [each for each in item.session.items if each.path == item.path]
+    run = module[: module.index(item) + 1]
+    for each, following in zip(run, [*run[1:], nextitem], strict=True):
+        each._initrequest()  # type: ignore[attr-defined]
+        reports = runtestprotocol(each, log=False, nextitem=following)
+    return reports
 
 
 @pytest.fixture(scope="session")
