@@ -119,7 +119,7 @@ class Detections(Record):
         cov_uv: (N, 2, 2) covariance of the positions from the image's own noise, px^2; zero where unknown.
         problem: why nothing was found; None when something was.
         shape: (N, 3) S11, S12, S22 of the ellipses of a board's discs, px^2, as in :class:`Discs`; (0, 3) for other points.
-        common: (3,) as in :class:`Discs`; zero for other points.
+        common: (2, 3) as in :class:`Discs`; zero for other points.
     """
 
     ids: Ids
@@ -127,7 +127,7 @@ class Detections(Record):
     cov_uv: Array
     problem: str | None = None
     shape: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    common: Array = field(default_factory=lambda: np.zeros(3))
+    common: Array = field(default_factory=lambda: np.zeros((2, 3)))
 
     @staticmethod
     def none(problem: str) -> Detections:
@@ -158,8 +158,8 @@ class Discs(Record):
         shape: (N, 3) S11, S12, S22 of each ellipse, px^2: its rim is uv + x with x^T S^-1 x = 1.
         bright: (N,) whether a disc is brighter than its surround.
         rejected: what was looked at and is no disc.
-        common: (3,) c (2), px, and k of the shift c + k x, at a pixel x, by which blur or sharpening may have moved all of
-            them together: one standard deviation, beyond ``cov_uv``.
+        common: (2, 3) c (2), px, and k of two shifts c + k x, at a pixel x, by which all of them may have been moved
+            together, beyond ``cov_uv``: by blur or sharpening, and by vignetting; each one standard deviation.
     """
 
     uv: Array
@@ -167,7 +167,7 @@ class Discs(Record):
     shape: Array
     bright: NDArray[np.bool_]
     rejected: tuple[Rejected, ...] = ()
-    common: Array = field(default_factory=lambda: np.zeros(3))
+    common: Array = field(default_factory=lambda: np.zeros((2, 3)))
 
     @property
     def radius_px(self) -> Array:
@@ -200,14 +200,14 @@ class Correspondences(Record):
         uv: (N, 2, 2) point, camera, raw pixel; NaN where that camera did not see the point.
         cov_uv: (N, 2, 2, 2) covariance of each position, px^2.
         dropped: what was thrown away, and why.
-        common: (2, 3) camera; what may have moved its detections together, as in :class:`Discs`.
+        common: (2, 2, 3) camera; what may have moved its detections together, as in :class:`Discs`.
     """
 
     ids: Ids
     uv: Array
     cov_uv: Array
     dropped: tuple[Dropped, ...] = ()
-    common: Array = field(default_factory=lambda: np.zeros((2, 3)))
+    common: Array = field(default_factory=lambda: np.zeros((2, 2, 3)))
 
     @property
     def seen(self) -> NDArray[np.bool_]:

@@ -105,12 +105,12 @@ def test_it_is_the_minimum_and_the_covariance_of_a_slow_solver(model):
 @pytest.mark.parametrize("model", CAMERAS)
 def test_what_may_move_an_images_detections_together_is_in_the_covariance_and_no_noise(model):
     rig, rng = rig_of(model), np.random.default_rng(4)
-    common = np.array([[0.02, -0.01, 1e-4], [-0.03, 0.02, -5e-5]])
+    common = np.array([[[0.02, -0.01, 1e-4], [0.0, 0.0, 0.0]], [[-0.03, 0.02, -5e-5], [0.01, 0.01, -2e-5]]])
     for _ in range(3):
         shot = seen(rig, CLOUD, somewhere(rng))
         plain, found = located(rig, CLOUD, shot), located(rig, CLOUD, replace(shot, common=common))
         expected = np.zeros((6, 6))  # as the pose moves when they do
-        for side, (*c, k) in enumerate(common):
+        for side, (*c, k) in ((n, shift) for n in (0, 1) for shift in common[n]):
             uv = shot.uv.copy()
             uv[:, side] += c + k * uv[:, side]
             xi = error(plain, located(rig, CLOUD, replace(shot, uv=uv)).T_left_body)

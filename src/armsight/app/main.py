@@ -54,6 +54,19 @@ SECTIONS: dict[str, dict[str, str]] = {
     },
 }
 COMMANDS = tuple(sorted(name for names in SECTIONS.values() for name in names))
+#: Options of one command -> what others call the same.
+_ALSO = {
+    "--model": ("--arm", "--lens-model"),
+    "--arm": ("--model", "--robot"),
+    "--robot": ("--arm", "--model"),
+    "--board": ("--target",),
+    "--body": ("--target",),
+    "--target": ("--body",),
+    "--images": ("--source",),
+    "--cameras": ("--source",),
+    "--folder": ("--source",),
+    "--port": ("--board", "--source"),
+}
 
 
 class _Sections(click.Group):
@@ -137,6 +150,10 @@ def _usage_text(error: click.ClickException) -> str:
         text = re.sub(r"\((\S+) .+\)", r"(\1 ..)", text)
         return f"{text}; quote a glob, --left 'DIR/left*.png', or the shell puts every file name there"
     context = error.ctx if isinstance(error, click.UsageError) else None
+    if context is not None and isinstance(error, click.NoSuchOption):
+        text = f"no such option: {error.option_name}{_meant_option(error.option_name, context)}"
+    if context is not None and (extra := re.search(r"unexpected extra argument \((.+)\)$", text)):
+        text += "" if _option(context, "--source") is None else f": images follow an option, --source {extra[1]}"
     if context is not None and (unknown := re.match(r"no such command '(.*?)'", text)):
         text = unknown[0] + _meant(unknown[1], context)
     return text if context is None else f"{text}; the usage is in: {' '.join(context.command_path.split())} -h"
@@ -151,6 +168,20 @@ def _meant(name: str, context: click.Context) -> str:
     if options and ("." in name or os.sep in name):
         return f": a file follows an option, {options[0]} {name}"
     return ""
+
+
+def _option(context: click.Context, name: str) -> click.Option | None:
+    """Return a command's option, or None where it has none of this name."""
+    return next((p for p in context.command.params if isinstance(p, click.Option) and name in p.opts), None)
+
+
+def _meant_option(name: str, context: click.Context) -> str:
+    """Return what was likely meant by an option that a command does not have: another name of it, or one spelt alike."""
+    known = [o for p in context.command.params if isinstance(p, click.Option) for o in p.opts if o.startswith("--")]
+    also = [other for other in _ALSO.get(name, ()) if other in known]
+    alike = difflib.get_close_matches(name.lstrip("-"), [each.lstrip("-") for each in known], 1)
+    near = [*also, *(f"--{each}" for each in alike)]
+    return f": did you mean {near[0]}?" if near else ""
 
 
 def _silence_stdout() -> None:

@@ -172,12 +172,12 @@ class StereoRig(Record):
         What moves all points of an image by c + k x is another principal point and focal length.
 
         Args:
-            common: (2, 3) of each camera, as :class:`~armsight.data.Correspondences` have it.
+            common: (2, 2, 3) of each camera, as :class:`~armsight.data.Correspondences` have it.
         """
         cov = np.array(self.cov)
-        for first, camera, shift in zip((0, 4 + len(self.left.distortion)), self.cameras, common, strict=True):
-            by = shift[2] * camera.intrinsics + np.append([0.0, 0.0], shift[:2])
-            cov[first : first + 4, first : first + 4] += np.outer(by, by)
+        for first, camera, shifts in zip((0, 4 + len(self.left.distortion)), self.cameras, common, strict=True):
+            by = shifts[:, 2:] * camera.intrinsics + np.pad(shifts[:, :2], ((0, 0), (2, 0)))
+            cov[first : first + 4, first : first + 4] += by.T @ by
         return cov
 
     @property

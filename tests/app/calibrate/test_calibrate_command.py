@@ -16,6 +16,7 @@ from armsight.sim.example_rig import example_rig
 from armsight.sim.render.background import plain
 from armsight.sim.render.render import render
 from armsight.sim.render.scene import PosedBody, charuco
+from armsight.vision.calibrate import weak
 from armsight.vision.rig import StereoRig
 from board_views import rig_error
 from cli_runs import assert_rejected, listening
@@ -259,6 +260,14 @@ def test_a_charuco_board_of_another_family_size_or_counts_is_named(armsight, tmp
         cv2.imwrite(str(tmp_path / f"right{n}.png"), np.roll(image, n + 9, axis=1))
     said = armsight("calibrate", *images(tmp_path), "--target", spec, "-o", tmp_path / "rig.json")
     assert_rejected(said, named)
+
+
+def test_images_that_contradict_each_other_are_not_to_be_trusted(few, armsight, tmp_path, monkeypatch):
+    monkeypatch.setattr(weak, "_CONTRADICTION", 0.0)
+    said = armsight("calibrate", *images(few), *CHESS, *QUICK, "-o", tmp_path / "rig.json")
+    assert said.code == 3
+    assert "contradict each other" in said.out
+    assert "mirror" in said.out
 
 
 def test_left_and_right_exchanged_is_reported(few, armsight, tmp_path):

@@ -137,6 +137,35 @@ def test_reversed_corners_of_a_symmetric_board_are_mended_by_name():
     assert (np.abs(rig_error(c.rig, best.rig)) < 0.01 * sigma).all()
 
 
+def test_a_camera_upside_down_before_a_symmetric_board_names_its_other_end():
+    true, board, Ts = rig_and_board(spec="chessboard:9x7:25mm")
+    clean = board_pairs(true, board.body.points, Ts)
+    dirty = [
+        pair if n in (2, 7) else replace(pair, right=renamed(pair.right, board.symmetries[0]))
+        for n, pair in enumerate(clean)
+    ]
+    c, best = (
+        calibrate_boards(board, pairs, SIZES, models=("brown5",), folds=2, flat=True) for pairs in (dirty, clean)
+    )
+    assert any(f"{len(clean) - 2} right images name" in note for note in c.notes)
+    sigma = np.sqrt(np.diag(best.rig.cov))
+    assert (np.abs(rig_error(c.rig, best.rig)) < 0.01 * sigma).all()
+
+
+def test_frames_that_repeat_are_no_further_pairs():
+    true, board, Ts = rig_and_board()
+    pairs = board_pairs(true, board.body.points, Ts)
+    pairs[3] = replace(pairs[3], right=pairs[2].right)
+    pairs[5] = replace(pairs[4], name="p05")
+    c = calibrate_boards(board, pairs, SIZES, models=("brown5",), folds=2, flat=True)
+    assert {r.pair: r.reason for r in c.rejected} == {
+        "p03": "the right image is that of p02: a frame that repeats shows nothing new",
+        "p05": "both images are those of p04: a frame that repeats shows nothing new",
+    }
+    with pytest.raises(CalibrationError, match=r"1 of 8 pairs are usable.*p1: both images are those of p0: a frame"):
+        calibrate_boards(board, [replace(pairs[0], name=f"p{n}") for n in range(8)], SIZES)
+
+
 def test_pairs_without_a_board_are_rejected_with_their_reason():
     true, board, Ts = rig_and_board()
     pairs = board_pairs(true, board.body.points, Ts)

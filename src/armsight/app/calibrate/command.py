@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from armsight.app.messages import UNTRUSTED
 from armsight.errors import InputError
 from armsight.files import check_folder, check_outputs
 from armsight.vision.calibrate import FOLDS, MODELS
@@ -75,7 +76,7 @@ def command(
 
     From images: --left, --right and --target. From a recording of a board that moves before cameras that may not expose
     at one time: --source and --target. From detections of a known body with known intrinsics: --detections, --cameras
-    and --body.
+    and --body. Exit code 3: the images contradict each other, and the rig must not be used.
     """
     globs, points = (left, right), (detections, cameras, body)
     images = (source, target) if source is not None else (*globs, target)
@@ -100,6 +101,7 @@ def command(
         with_radius,
     )
     from armsight.app.report.plotting import require_matplotlib
+    from armsight.vision.calibrate.weak import contradicted
     from armsight.vision.markers.body_file import save_body_csv
     from armsight.vision.markers.calibrated_board import save_board_file
     from armsight.vision.sources import PairsSource
@@ -150,3 +152,5 @@ def command(
         click.echo(json.dumps(summary(calibration, output, board_file, report, time.perf_counter() - started)))
     else:
         print_result(calibration, output, board_file, report)
+    if contradicted(calibration):
+        click.get_current_context().exit(UNTRUSTED)

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Body, Detections, Missed, Record
+from armsight.data import Array, Body, Detections, Ids, Missed, Record
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid
@@ -43,7 +43,7 @@ from armsight.vision.calibrate.screen import (
     robust_sigma,
     screen,
 )
-from armsight.vision.calibrate.start import fits, imitated, start_board
+from armsight.vision.calibrate.start import agreed_symmetries, fits, imitated, residual_rms_px, start_board
 from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.camera import DISTORTION_MODELS, Camera
 from armsight.vision.discs.bias import apparent_radii
@@ -71,6 +71,8 @@ BOARD_DEGREE = 4
 BOARD_SIGMA_SHARE, BOARD_SIGMA_LEAST_M = 1e-3, 1e-7
 #: Rounds in which noise and tolerances settle; motion, which competes with them, takes longer.
 _NOISE_ROUNDS, _MOTION_ROUNDS = 4, 8
+#: A start that leaves more than this, px RMS, may have names of a symmetric board that contradict each other.
+_MISNAMED_PX = 2.0
 #: Rounds of the discs' radius and the poses; a radius given may differ by this factor from what the images show: print and
 #: lens widen or narrow what is dark.
 _RADIUS_ROUNDS, _RADIUS_RATIO = 2, 1.1
@@ -477,9 +479,10 @@ def _disc_radius(
 
 def _usable(pairs: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:
     """Split the pairs into those that show the board in both images and those that do not, with reasons."""
-    usable, rejected = [], []
+    usable, rejected = list[Pair](), []
     for pair in pairs:
         common = np.intersect1d(pair.left.ids, pair.right.ids)
+        repeated = next((r for before in usable if (r := _repeated(before, pair)) is not None), None)
         problems = [f"{side}: {d.problem}" for side, d in (("left", pair.left), ("right", pair.right)) if d.problem]
         if problems:
             rejected.append(RejectedPair(pair.name, "; ".join(problems)))
@@ -487,9 +490,24 @@ def _usable(pairs: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:
             rejected.append(
                 RejectedPair(pair.name, f"{len(common)} points seen by both cameras, {LEAST_CORNERS} are needed")
             )
+        elif repeated is not None:
+            rejected.append(RejectedPair(pair.name, repeated))
         else:
             usable.append(pair)
     return usable, rejected
+
+
+def _repeated(before: Pair, pair: Pair) -> str | None:
+    """Say which image of a pair is that of an earlier one, to the last digit of its detections; None where none is."""
+    same = [
+        side
+        for side, a, b in (("left", before.left, pair.left), ("right", before.right, pair.right))
+        if np.array_equal(a.uv, b.uv) and np.array_equal(a.cov_uv, b.cov_uv)
+    ]
+    if not same:
+        return None
+    which = "both images are those" if len(same) == 2 else f"the {same[0]} image is that"
+    return f"{which} of {before.name}: a frame that repeats shows nothing new"
 
 
 def _usable_alone(singles: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:
@@ -541,19 +559,29 @@ def _start(
                 break
         return min(found, key=lambda s: s.cost)
 
-    first = attempt(usable)
+    def sorted_by(orders: dict[int, Ids]) -> list[Pair]:
+        return [
+            replace(pair, right=renamed(pair.right, orders[j])) if j in orders else pair
+            for j, pair in enumerate(usable)
+        ]
+
+    found, names = attempt(usable), usable
+    notes: list[str] = []
     observations = Observations.from_shots([join(pair.left, pair.right) for pair in usable])
-    corrected = correct_symmetries(points, first.state, observations, board.symmetries)
-    if not corrected:
-        return first, usable, []
-    notes = [
-        f"{usable[j].name}: the right image names the corners in another order; corrected" for j in sorted(corrected)
-    ]
-    usable = [
-        replace(pair, right=renamed(pair.right, corrected[j])) if j in corrected else pair
-        for j, pair in enumerate(usable)
-    ]
-    return attempt(usable), usable, notes
+    corrected = correct_symmetries(points, found.state, observations, board.symmetries)
+    if corrected:
+        names = sorted_by(corrected)
+        found = attempt(names)
+        notes = [
+            f"{usable[j].name}: the right image names the corners in another order; corrected"
+            for j in sorted(corrected)
+        ]
+    if board.symmetries and residual_rms_px(found) > _MISNAMED_PX:
+        agreed = agreed_symmetries(points, sizes, observations, board.symmetries, next(iter(families)))
+        if agreed and (again := attempt(sorted_by(agreed))).cost < found.cost:
+            found, names = again, sorted_by(agreed)
+            notes = [f"{len(agreed)} right images name the corners in another order; corrected"]
+    return found, names, notes
 
 
 @dataclass(frozen=True, eq=False)

@@ -220,7 +220,8 @@ def summary(errors: PairErrors, folds: int, motion: ExposureMotion | None = None
     if not len(errors.pair):
         raise CalibrationError(
             "no left-out shot has three points on which the cameras agree, so the rig cannot be evaluated: do the left and "
-            "the right images belong together, one by one in this order, and were they taken at one moment?"
+            "the right images belong together, one by one in this order, and were they taken at one moment? Does a driver "
+            "mirror the images of one camera?"
         )
     w = errors.weight / errors.weight.sum()
     rms = {name: float(np.sqrt(w @ getattr(errors, name) ** 2)) for name in _FIELDS}

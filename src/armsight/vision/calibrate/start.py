@@ -11,7 +11,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array
+from armsight.data import Array, Ids
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, log_se3
 from armsight.vision.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
@@ -135,6 +135,58 @@ def _assemble(points: Array, cameras: tuple[Camera, Camera], observations: Obser
     return None if poses is None else BundleState(cameras, hypotheses[0], np.stack(poses), np.zeros(0))
 
 
+def agreed_symmetries(
+    points: Array,
+    sizes: tuple[tuple[int, int], tuple[int, int]],
+    observations: Observations,
+    symmetries: tuple[Ids, ...],
+    model: str,
+) -> dict[int, Ids]:
+    """Find pairs whose right image names the points in another order than the left one, where most pairs may be such.
+
+    A camera that is mounted upside down sees the other end of a symmetric board as its first. One order of each pair gives
+    the relative pose that the others give, too; wrong ones give another one wherever the board is.
+
+    Args:
+        points: (M, 3) points of the board, m.
+        sizes: image size of the left and of the right camera, px.
+        observations: the detections of all shots.
+        symmetries: permutations (M,) under which the board looks the same.
+        model: distortion model of the cameras.
+
+    Returns:
+        Shot -> the permutation that sorts its right detections into the left's order.
+    """
+    candidates: list[list[list[list[Array]]]] = []  # by camera, order and shot
+    for side, orders in enumerate(((), symmetries)):
+        camera = pinhole(sizes[side], _focal_candidates(points, sizes[side], observations, side, model)[0], model)
+        candidates.append(
+            [
+                [
+                    [T for T, _ in body_poses(points[order[observations.point[rows]]], camera, observations.uv[rows])]
+                    for rows in _views(observations, side)
+                ]
+                for order in (np.arange(len(points)), *orders)
+            ]
+        )
+    left, right = candidates[0][0], candidates[1]
+    depths = [T[2, 3] for views in left for T in views]
+    every = [[T for views in shot for T in views] for shot in zip(*right, strict=True)]
+    hypotheses = relative_poses(left, every, float(np.median(depths))) if depths else []
+    found: dict[int, Ids] = {}
+    for shot, ls in enumerate(left if hypotheses else []):
+        gaps = [
+            min(
+                (float(np.linalg.norm(log_se3(inverse(a) @ hypotheses[0] @ b))) for a in ls for b in views[shot]),
+                default=np.inf,
+            )
+            for views in right
+        ]
+        if best := int(np.argmin(gaps)):
+            found[shot] = symmetries[best - 1]
+    return found
+
+
 def start_board(
     points: Array, sizes: tuple[tuple[int, int], tuple[int, int]], observations: Observations, model: str
 ) -> BundleSolution:
@@ -172,7 +224,12 @@ def start_board(
 
 def fits(solution: BundleSolution) -> bool:
     """Whether a solution leaves no doubt that it is the right minimum: no other start needs to be tried."""
-    return float((solution.residuals_px**2).sum(axis=1).mean()) < _FITS_PX**2
+    return residual_rms_px(solution) < _FITS_PX
+
+
+def residual_rms_px(solution: BundleSolution) -> float:
+    """Return the RMS distance of all detections from their projections, px."""
+    return float(np.sqrt((solution.residuals_px**2).sum(axis=1).mean()))
 
 
 def imitated(camera: Camera, model: str, uv: Array) -> Camera | None:

@@ -19,6 +19,8 @@ _LEAST_COVERED = 0.6
 _FOCUS_RATIO = 2.0
 _SCALE_SIGMAS = 4.0
 _REJECTED_SHARE = 0.2
+#: Held-out epipolar RMS, as a share of an image's longer side, beyond which the images do not belong to two cameras.
+_CONTRADICTION = 0.005
 _FAR_MOTION, _FARTHEST = 2.0, 4
 _ROLLED_DEG = 60.0
 #: Degree of the polynomials of the position in an image that residuals may follow, beyond which share of their square and
@@ -32,10 +34,26 @@ def weaknesses(calibration: Calibration) -> tuple[str, ...]:
     Returns:
         One sentence per weakness: what it is and what to do; empty where nothing stands out.
     """
-    checks = [_pairs, _focus, _synchrony, _sides]
+    checks = [_agreement, _pairs, _focus, _synchrony, _sides]
     if calibration.rig.cov[0, 0] > 0:  # intrinsics were estimated, not given
         checks += [_tilts, _coverage, _focal, _scale]
     return tuple(message for check in checks if (message := check(calibration)) is not None)
+
+
+def contradicted(calibration: Calibration) -> bool:
+    """Whether held-out pairs contradict the rig so that nothing must be measured with it."""
+    longest = max(max(camera.image_size_px) for camera in calibration.rig.cameras)
+    return calibration.heldout.epipolar_rms_px > _CONTRADICTION * longest
+
+
+def _agreement(calibration: Calibration) -> str | None:
+    if not contradicted(calibration):
+        return None
+    return (
+        f"the images of both cameras contradict each other by {calibration.heldout.epipolar_rms_px:.0f} px: do not measure "
+        "with this rig. Does a driver mirror the images of one camera, do left and right images belong to different "
+        "moments, or do they show different boards?"
+    )
 
 
 def _pairs(calibration: Calibration) -> str | None:

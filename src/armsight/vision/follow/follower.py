@@ -372,5 +372,5 @@ def _buffers(count: int, parameters: int) -> DiscMeasurement:
         np.zeros((4 * count, parameters)),
         np.zeros((count, 2, 2)),
         np.zeros(2),
-        np.zeros((2, 3)),
+        np.zeros((2, 2, 3)),
     )

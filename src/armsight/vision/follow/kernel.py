@@ -27,7 +27,7 @@ from armsight.geometry.matrix import (
 from armsight.kernels import kernel, kernel_types
 from armsight.vision.camera import distort
 from armsight.vision.discs.bias import disc_image
-from armsight.vision.markers.disc.common import SHARED, common, correct
+from armsight.vision.markers.disc.common import FIELDS, SHARED, common, correct
 from armsight.vision.markers.disc.fit import PARAMETERS, FitBuffers, factor, fit, shape_of, solve
 from armsight.vision.markers.disc.search import Room, outline
 from armsight.vision.posefit import moved
@@ -86,7 +86,7 @@ class DiscScene(NamedTuple):
 @kernel_types(
     "i8[:, ::1], f8[:, :, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], "
     "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1], "
-    "f8[:, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1]"
+    "f8[:, ::1], f8[:, :, ::1], f8[::1], f8[:, :, ::1]"
 )
 class DiscMeasurement(NamedTuple):
     """The measurement of one pair; M discs, two cameras.
@@ -110,7 +110,7 @@ class DiscMeasurement(NamedTuple):
         J_rig: (4 M, P) whitened.
         bias: (M, 2, 2) centre of ellipse less image of centre, px.
         squares: (2,) sums of the points' squared distances from the body, m^2, and of the residuals, px^2.
-        common: (2, 3) camera; what may have moved its centres together, as in ``Discs``.
+        common: (2, 2, 3) camera; what may have moved its centres together, as in ``Discs``.
     """
 
     codes: NDArray[np.int64]
@@ -241,11 +241,13 @@ def uncertainty(scene: DiscScene, found: DiscMeasurement, cov_noise: Array, chi_
     """
     J, J_rig, cov_rig = found.J, found.J_rig, scene.cov_rig.copy()
     for side in range(2):
-        first, by = scene.first[side], found.common[side, 2] * scene.k[side]
-        by[2:] += found.common[side, :2]
-        for i in range(4):
-            for j in range(4):
-                cov_rig[first + i, first + j] += by[i] * by[j]
+        first = scene.first[side]
+        for shift in found.common[side]:
+            by = shift[2] * scene.k[side]
+            by[2:] += shift[:2]
+            for i in range(4):
+                for j in range(4):
+                    cov_rig[first + i, first + j] += by[i] * by[j]
     for row in range(len(found.whitened)):
         if found.codes[row // 4, (row // 2) % 2] != SEEN:
             J_rig[row] = 0.0
@@ -483,7 +485,7 @@ def look(
             count += 1
     shared = np.empty(SHARED)
     common(image, count, work, shared)
-    found.common[side] = shared[3:]
+    found.common[side] = shared[FIELDS:].reshape(2, 3)
     count = 0
     for m in range(len(scene.radii)):
         if found.codes[m, side] == SEEN:

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 
 from armsight.data import Array, Record
 from armsight.kernels import kernel
-from armsight.vision.markers.disc.common import SHARED, common, correct
+from armsight.vision.markers.disc.common import FIELDS, SHARED, common, correct
 from armsight.vision.markers.disc.fit import (
     PARAMETERS,
     REASONS,
@@ -295,7 +295,7 @@ class Fits(Record):
         cov: (N, 2, 2) covariance of the centres, px^2.
         shape: (N, 3) their ellipses S11, S12, S22, px^2.
         codes: (N,) 0 or the reason why it is not a disc (``fit.REASONS``).
-        common: (3,) as in :class:`~armsight.data.Discs`.
+        common: (2, 3) as in :class:`~armsight.data.Discs`.
     """
 
     theta: Array
@@ -378,4 +378,4 @@ def fit_discs(image: Grey, starts: Array, before: Fits | None = None, which: NDA
     if before is not None and which is not None:
         for now, then in ((theta, before.theta), (cov, before.cov), (shape, before.shape), (codes, before.codes)):
             now[~which] = then[~which]
-    return Fits(theta, cov, shape, codes, shared[3:])
+    return Fits(theta, cov, shape, codes, shared[FIELDS:].reshape(2, 3))

@@ -85,16 +85,22 @@ def test_vignetting_that_no_single_disc_shows_does_not_pull_all_of_them():
         c = size / 2 + rng.uniform(-0.5, 0.5, 2)
         light[y : y + size, x : x + size] += 130 * share([outline(c, 12, 12, 0)], 0.8, np.zeros(2), size)
         true.append(c + np.array([x, y]))
-    errors, normed = [], []
+    errors, normed, along = [], [], []
+    p = np.array(true) - [(width - 1) / 2, (height - 1) / 2]
     for _ in range(12):
         found = BRIGHT.find(grey(light * shade, 3.0, rng))
         order = [int(np.argmin(np.linalg.norm(found.uv - c, axis=1))) for c in true]
-        e = found.uv[order] - true
+        e, cov, together = found.uv[order] - true, found.cov_uv[order], found.common[1]
         errors.append(e.mean(axis=0))
-        normed += list(np.einsum("ni,nij,nj->n", e, np.linalg.inv(found.cov_uv[order]), e) / 2)
+        normed += list(np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov), e) / 2)
+        np.testing.assert_allclose(together[:2] + together[2] * np.array(true), together[2] * p, atol=1e-12)
+        own = np.einsum("ni,nij,nj->", p, cov, p) / (p**2).sum() ** 2
+        along.append(((e * p).sum() / (p**2).sum()) ** 2 / (own + together[2] ** 2))
+        assert together[2] ** 2 > 0.2 * own
     # Fitted as flat, all nine are 0.005 px nearer to the middle; noise leaves 0.001 px of that mean.
     assert np.linalg.norm(np.mean(errors, axis=0)) < 0.0025
     assert 0.7 < np.mean(normed) < 1.3
+    assert 0.35 < np.mean(along) < 2.0  # chi-square of 12 over 12
 
 
 def test_noise_that_is_correlated_and_grows_with_contrast_is_that_of_each_discs_like():
@@ -142,9 +148,9 @@ def test_an_edge_that_is_skewed_leaves_a_centre_as_uncertain_as_blur_moves_it():
         sharp, soft = BRIGHT.find(image), BRIGHT.find(cv2.GaussianBlur(image, (0, 0), 1.2))
         e, cov = soft.uv - sharp.uv, soft.cov_uv + sharp.cov_uv
         own = np.sqrt(sharp.cov_uv[:, [0, 1], [0, 1]])
-        shift = sharp.common[:2] + sharp.common[2] * sharp.uv  # a standard deviation
-        for each in (sharp, soft):
-            field = each.common[:2] + each.common[2] * each.uv
+        shift = sharp.common[0, :2] + sharp.common[0, 2] * sharp.uv  # a standard deviation
+        for c in (*sharp.common, *soft.common):
+            field = c[:2] + c[2] * sharp.uv
             cov = cov + field[:, :, None] * field[:, None, :]
         assert np.mean(np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov), e)) / 2 < 1.5
         sigmas[name] = own, np.abs(shift).mean(axis=0)
@@ -308,3 +314,19 @@ def test_a_saturated_disc_does_not_claim_too_much():
         e = found.uv[0] - (31.3, 30.8)
         squares.append(e @ np.linalg.solve(found.cov_uv[0], e) / 2)
     assert np.mean(squares) < 1.3  # a clipped edge is not that of the model, and the covariance holds it
+
+
+def test_what_in_the_background_is_skewed_and_faint_moves_no_disc():
+    rng = np.random.default_rng(41)
+    size = 44
+    for _ in range(6):
+        light = np.full((4 * size, 4 * size), 50.0)
+        for k in range(8):
+            at, c = np.array([k % 4, k // 4 * 2]) * size, size / 2 + rng.uniform(-0.5, 0.5, 2)
+            part = share([outline(c, 11, 10, 0.3)], 0.7, np.zeros(2), size)
+            if k >= 5:
+                part = 0.2 * (0.7 * part + 0.3 * np.roll(part, 3, k % 2))
+            light[at[1] : at[1] + size, at[0] : at[0] + size] += 130 * part
+        found = BRIGHT.find(grey(light, 1.0, rng))
+        assert len(found.uv) == 8
+        assert not found.common[0].any()

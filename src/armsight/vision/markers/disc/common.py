@@ -9,7 +9,8 @@ about the same contrast, is the noise that the centres have.
 A lens darkens its image with the square of the distance from the middle (cos^4, and vignetting): at x the light has the
 relative gradient a (x - m), in 1/px, with m the image's middle. A disc that is fitted as flat is off by up to 0.01 px then,
 and all discs of a body alike, so that it does not average out. No single disc shows the gradient; all together determine
-the one unknown, a. Behind a tone curve a is another one, and the same for discs of one level.
+the one unknown, a. Behind a tone curve a is another one, and the same for discs of one level. An error of a moves the
+centres in proportion to their distance from the middle, as coma does: it is what they share, not each one's noise.
 
 A disc whose gradient, or whose surround's, is significant beyond that, measured by the noise of the image, is fitted with
 other kinds of gradient, too; they are averaged by their likelihood (model averaging).
@@ -60,12 +61,13 @@ _VIGNETTING = 0.3
 _SLOPE_INSIDE, _SLOPE_OUTSIDE = 9.2, 4.6
 #: Chi-square of two degrees from which an edge is skewed, beyond that of noise: chance exceeds it in 0.1%.
 _SKEW = 13.8
-#: The same of three degrees; variance of a spatial median in a plane over that of a mean; rounds until it has converged.
-_FIELD, _MEDIAN, _ROUNDS = 16.3, 1.27, 12
+#: The same of three degrees; mean weight of a spatial median in a plane times its variance; rounds until it has converged.
+_FIELD, _MEDIAN, _ROUNDS = 16.3, 0.8, 12
 #: Coma as it is to be expected: standard deviation of the shift in the corners, px.
 _COMA = 0.2
-#: What the discs of an image have in common: see :func:`common`.
-SHARED = 6
+#: What the discs of an image have in common, and where in it the shifts are that may have moved all of them: a field
+#: c + k x of skewed edges, and one of vignetting. See :func:`common`.
+SHARED, FIELDS, VIGNETTING = 9, 3, 6
 #: How likely each kind of gradient is where there is one (LIGHT, SURROUND, GLARE).
 _KINDS = (0.6, 0.3, 0.1)
 
@@ -109,10 +111,9 @@ def common(image: NDArray[np.uint8], n: int, work: FitBuffers, shared: Array) ->
         n: number of discs.
         work: what they show; power and its third column become ratios, see :func:`_rim_noise`.
         shared: (SHARED,) filled: mean square of the deviations of the rims' sectors beyond white noise, px^2; the
-            vignetting a, 1/px^2; n / 2 times its variance; c (2), px, and k of the shift c + k x that skewed edges make
-            together at a pixel x, one standard deviation. Medians, so that a few discs that are none do not count. An error
-            of a moves all centres alike: in three of the six degrees of freedom of a pose it counts n times as much as if
-            it were independent, in the others hardly.
+            vignetting a and its standard deviation, 1/px^2; from FIELDS on c (2), px, and k of the shift c + k x that
+            skewed edges make together at a pixel x, one standard deviation; from VIGNETTING on the same of an error of
+            a, for discs of about the same size. Medians, so that a few discs that are none do not count.
     """
     discs = work.discs
     shared[:] = 0.0
@@ -120,7 +121,7 @@ def common(image: NDArray[np.uint8], n: int, work: FitBuffers, shared: Array) ->
     if n < _LEAST_DISCS:
         return
     shared[0] = max(np.median(discs[:n, 1]), 0.0)
-    _common_skew(image, n, discs, shared[3:6])
+    _common_skew(image, n, discs, shared[FIELDS:VIGNETTING])
     slope, weight, total = np.empty(n), np.empty(n), 0.0
     for i in range(n):
         u, v, k = _from_middle(image, discs[i], 0), _from_middle(image, discs[i], 1), discs[i, 5:8] / discs[i, 2]
@@ -140,29 +141,32 @@ def common(image: NDArray[np.uint8], n: int, work: FitBuffers, shared: Array) ->
         if (slope[i] - middle) ** 2 * weight[i] < _SLOPE_INSIDE:
             information += weight[i]
             sum_ += weight[i] * slope[i]
-    shared[1], shared[2] = sum_ / information, 0.5 * n / information
+    shared[1], shared[2] = sum_ / information, 1.0 / np.sqrt(information)
+    shared[VIGNETTING + 2] = shared[2] * 0.5 * (np.median(discs[:n, 8]) + np.median(discs[:n, 11]))
+    for axis in range(2):
+        shared[VIGNETTING + axis] = -shared[VIGNETTING + 2] * 0.5 * (image.shape[1 - axis] - 1)
 
 
 @kernel
 def _common_skew(image: NDArray[np.uint8], n: int, discs: Array, field: Array) -> None:
     """Fill by how much skewed edges move the first n discs together, field (3,) as in :func:`common`.
 
-    The field is the one with the least sum of distances (a spatial median, by weighted least squares), less what chance
-    makes of it.
+    The field is the one with the least sum of distances, each in the noise of its disc (a spatial median, by weighted least
+    squares), less what chance makes of it. Faint discs, and what in the background is none, have more noise or lie far off
+    it: they count little, also for its significance.
     """
-    H, g, noise, square = np.empty((3, 3)), np.empty(3), np.empty(n), 0.0
+    H, g, noise = np.empty((3, 3)), np.empty(3), np.empty(n)
     for i in range(n):
-        noise[i] = discs[i, 2] * _skew_variance(discs[i])
-    variance = max(np.median(noise), 1e-12)
+        noise[i] = max(discs[i, 2] * _skew_variance(discs[i]), 1e-12)
     expected = 2.0 * _COMA / np.sqrt(float(image.shape[0] ** 2 + image.shape[1] ** 2))
     middle = np.array([0.5 * (image.shape[1] - 1), 0.5 * (image.shape[0] - 1)])
     for _ in range(_ROUNDS):
         H[:, :], g[:] = 0.0, 0.0
-        H[2, 2] = np.sqrt(variance) / (expected * expected)
+        H[2, 2] = 1.0 / (expected * expected)
         for i in range(n):
             x, s = discs[i, PARAMETERS : PARAMETERS + 2] - middle, discs[i, SKEWED : SKEWED + 2]
             d = s - field[:2] - field[2] * x
-            w = 1.0 / np.sqrt(d[0] * d[0] + d[1] * d[1] + variance)
+            w = 1.0 / np.sqrt(noise[i] * (d[0] * d[0] + d[1] * d[1] + noise[i]))
             for j in range(2):
                 H[j, j] += w
                 H[j, 2] += w * x[j]
@@ -171,11 +175,9 @@ def _common_skew(image: NDArray[np.uint8], n: int, discs: Array, field: Array) -
                 g[j] += w * s[j]
                 g[2] += w * x[j] * s[j]
         field[:] = solved_vector(H, g)
-    for i in range(n):
-        s = field[:2] + field[2] * (discs[i, PARAMETERS : PARAMETERS + 2] - middle)
-        square += (s[0] * s[0] + s[1] * s[1]) / n
+    square = (field[0] * g[0] + field[1] * g[1] + field[2] * g[2]) / _MEDIAN
     field[:2] -= field[2] * middle
-    field *= np.sqrt(max(1.0 - _FIELD * _MEDIAN * variance / (n * max(square, 1e-300)), 0.0))
+    field *= np.sqrt(max(1.0 - _FIELD / max(square, 1e-300), 0.0))
 
 
 @kernel
@@ -221,15 +223,17 @@ def correct(
         for i in range(2):
             for j in range(2):
                 cov[i, j] *= factor if texture == 1.0 else max(factor / texture, 1.0)
-    cov[0, 0] += shared[2] * du * du
-    cov[0, 1] += shared[2] * du * dv
-    cov[1, 0] += shared[2] * du * dv
-    cov[1, 1] += shared[2] * dv * dv
+    own_u = shared[2] * du - shared[VIGNETTING + 2] * u  # a larger disc is moved by more than the field has
+    own_v = shared[2] * dv - shared[VIGNETTING + 2] * v
+    cov[0, 0] += own_u * own_u
+    cov[0, 1] += own_u * own_v
+    cov[1, 0] += own_u * own_v
+    cov[1, 1] += own_v * own_v
     off = disc[1] - shared[0]
     if off > 0.0 and disc[0] > _RIM_CHANCE:
         cov[0, 0] += off
         cov[1, 1] += off
-    skew = disc[SKEWED : SKEWED + 2] - shared[3:5] - shared[5] * disc[PARAMETERS : PARAMETERS + 2]
+    skew = disc[SKEWED : SKEWED + 2] - shared[FIELDS : FIELDS + 2] - shared[FIELDS + 2] * theta[:2]
     square, chance = skew[0] * skew[0] + skew[1] * skew[1], _SKEW * factor * _skew_variance(disc)
     if square > chance:
         for i in range(2):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Body, Discs, Record, Rejected
 from armsight.vision.markers.body_file import Marker, check_discs
 from armsight.vision.markers.disc import fit, search
-from armsight.vision.markers.disc.common import SHARED
+from armsight.vision.markers.disc.common import FIELDS, SHARED
 
 #: Most rejected candidates of an image that are reported.
 MOST_REPORTED = 100
@@ -89,7 +89,7 @@ class DiscTarget(Record):
             shape[:good].copy(),
             signs[:good] > 0,
             rejected,
-            shared[3:].copy(),
+            shared[FIELDS:].reshape(2, 3).copy(),
         )
 
 
