@@ -51,6 +51,7 @@ MOST_POINTS = 24
 #: Shots that differ less than this share their errors (where a point is within its pixels, how it is lit) and count as one:
 #: translation over distance, and rotation, rad.
 _SAME = 0.01
+_SAME_COSINE = float(np.cos(_SAME))
 #: While nothing is suspected, shots closer in time than this are left out, s, and those that hardly differ from the newest:
 #: they would cost time and add little.
 _LEAST_S, _LIKE_S = 0.025, 0.1
@@ -766,9 +767,9 @@ def _focal_changes(rig: StereoRig, size: int) -> Array:
 
 def differ(T: Array, other: Array) -> bool:
     """Return whether two poses (4, 4) are so far apart that their errors count as independent."""
-    apart = float(np.linalg.norm(T[:3, 3] - other[:3, 3]))
+    by = T[:3, 3] - other[:3, 3]
     cosine = (float(np.vdot(T[:3, :3], other[:3, :3])) - 1.0) / 2.0
-    return apart > _SAME * abs(float(T[2, 3])) or cosine < np.cos(_SAME)
+    return float(by @ by) > (_SAME * float(T[2, 3])) ** 2 or cosine < _SAME_COSINE
 
 
 def _rig_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:

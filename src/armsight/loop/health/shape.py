@@ -32,7 +32,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtri
 
 from armsight.data import Array, Ids, Record
@@ -130,10 +129,9 @@ class ResidualSums:
 
 def eliminated(M: Array, rows: slice) -> Array:
     """Return sums M (N, N) with parameters eliminated, of which each has a prior of variance 1."""
-    keep = np.delete(np.arange(len(M)), rows)
-    across = M[rows, keep]
-    inner = cho_factor(M[rows, rows] + np.eye(len(across)), check_finite=False)
-    return np.asarray(M[np.ix_(keep, keep)] - across.T @ cho_solve(inner, across, check_finite=False))
+    across = np.delete(M[rows], rows, axis=1)
+    kept = np.delete(np.delete(M, rows, axis=0), rows, axis=1)
+    return np.asarray(kept - across.T @ np.linalg.solve(M[rows, rows] + np.eye(len(across)), across))
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +182,13 @@ class _ShapeSums(NamedTuple):
         r = self.r[columns]
         return float(r @ np.linalg.solve(self.G[np.ix_(columns, columns)], r))
 
+    def gains(self, points: Sequence[int]) -> Array:
+        """Return what each of some points (P,) explains alone, as :meth:`gain` does."""
+        rows = 2 + 3 * np.array(points, int)[:, None] + np.arange(3)
+        r = self.r[rows]
+        solved = np.linalg.solve(self.G[rows[:, :, None], rows[:, None, :]], r[..., None])[..., 0]
+        return np.asarray(np.einsum("pi,pi->p", r, solved))
+
     def excess(self, gain: float) -> float:
         """Return by how much the variance of what is left exceeds the noise (Birge ratio), 1 at the least."""
         return max((self.square - gain) / max(self.freedom, 1.0), 1.0)
@@ -196,17 +201,17 @@ class _Reduced(NamedTuple):
     without: _ShapeSums
 
 
-class _Hypothesis(NamedTuple):
-    """Rows (D,) of the seven numbers and the candidates that may have changed, and by how much of their priors."""
+class _Hypotheses(NamedTuple):
+    """Hypotheses of D numbers each: rows (N, D) of seven numbers and candidates, and by how much of their priors (N,)."""
 
     rows: Ids
-    scale: float
+    scales: Array
 
 
 class _Explained(NamedTuple):
-    """Log-evidence of a hypothesis against none, the sizes (D,) of what changed, and their covariance (D, D)."""
+    """Log-evidence (N,) of hypotheses against none, the sizes (N, D) of what changed, and their covariances (N, D, D)."""
 
-    evidence: float
+    evidence: Array
     size: Array
     cov: Array
 
@@ -320,24 +325,26 @@ class ShapeWatch:
             return None
         # Cameras that moved cannot be excluded.
         since = [each for each in tests if each.begin_s >= self.found.begin_s]
-        return self._mixture(total(since or tests[-1:]), self._hypotheses[: len(_SEVEN_SCALES)])[1]
+        return self._mixture(total(since or tests[-1:]), self._hypotheses[:1])[1]
 
-    def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypothesis]) -> tuple[float, Array]:
+    def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypotheses]) -> tuple[float, Array]:
         """Return the log-evidence that anything changed before the tests of sums, and the second moment of what did.
 
         Nothing is one of the hypotheses, and its evidence is 1.
         """
-        M, prior = eliminated(sums.M, slice(1, 1 + self._size)), _RARE / len(hypotheses)
+        M = eliminated(sums.M, slice(1, 1 + self._size))
+        prior = _RARE / sum(len(each.scales) for each in hypotheses)
         moment = np.zeros((len(M) - 1, len(M) - 1))
         gain = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(moment)), M[1:, 0]))
         if gain < -2.0 * np.log(prior):
             return 0.0, moment
         excess = max((float(M[0, 0]) - gain) / max(sums.freedom, 1.0), 1.0)  # what all together do not explain is noise
         explained = [_explained(M, each, excess) for each in hypotheses]
-        logs = np.log(prior) + np.array([each.evidence for each in explained])
-        evidence = float(np.logaddexp.reduce(np.append(logs, 0.0)))
-        for (rows, _), share, each in zip(hypotheses, np.exp(logs - evidence), explained, strict=True):
-            moment[np.ix_(rows, rows)] += share * (np.outer(each.size, each.size) + each.cov)
+        logs = [np.log(prior) + each.evidence for each in explained]
+        evidence = float(np.logaddexp.reduce(np.concatenate([*logs, [0.0]])))
+        for (rows, _), log, each in zip(hypotheses, logs, explained, strict=True):
+            moments = each.size[:, :, None] * each.size[:, None, :] + each.cov
+            np.add.at(moment, (rows[:, :, None], rows[:, None, :]), np.exp(log - evidence)[:, None, None] * moments)
         return evidence, moment
 
     def _shown(self, tests: Sequence[_ShapeTest]) -> ShapeError | None:
@@ -355,7 +362,7 @@ class ShapeWatch:
     def _displaced(self, found: _Reduced, newest: _ShapeSums, begin_s: float) -> ShapeError | None:
         """Return the points that are displaced by what all tests together say, and the newest; None where none is."""
         whole = found.whole
-        if not any(whole.gain(_columns([each])) > self._limit for each in self._candidates):
+        if not self._candidates or not (whole.gains(self._candidates) > self._limit).any():
             return None
         steady = [each for each in self._candidates if self._steady(whole, newest, each)]
         chosen = list[int]()
@@ -524,23 +531,26 @@ def _of_candidates(M: Array, freedom: float) -> _ShapeSums:
     return _ShapeSums(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0], float(M[0, 0]), freedom)
 
 
-def _hypotheses(points: int) -> tuple[_Hypothesis, ...]:
+def _hypotheses(points: int) -> tuple[_Hypotheses, ...]:
     """Return what may have changed: the seven numbers, one focal length, a point, all points a little."""
     every = 9 + np.arange(3 * points)
-    seven = (_Hypothesis(np.arange(7), scale) for scale in _SEVEN_SCALES)
-    alone = (*seven, _Hypothesis(np.array([7]), 1.0))
-    single = (_Hypothesis(rows, 1.0) for rows in every.reshape(points, 3))
-    bent = (_Hypothesis(every, size / FURTHEST_M) for size in _BENT_M) if points else ()
-    return (*alone, *single, *bent)
+    seven = _Hypotheses(np.tile(np.arange(7), (len(_SEVEN_SCALES), 1)), np.array(_SEVEN_SCALES))
+    alone = (seven, _Hypotheses(np.array([[7]]), np.ones(1)))
+    if not points:
+        return alone
+    single = _Hypotheses(every.reshape(points, 3), np.ones(points))
+    return (*alone, single, _Hypotheses(np.tile(every, (len(_BENT_M), 1)), np.array(_BENT_M) / FURTHEST_M))
 
 
-def _explained(M: Array, hypothesis: _Hypothesis, excess: float) -> _Explained:
-    """Return what a hypothesis says of sums M (1 + N, 1 + N), of a noise whose variance is so many times larger."""
-    rows, scale = hypothesis
-    G = M[np.ix_(1 + rows, 1 + rows)] * (scale**2 / excess) + np.eye(len(rows))
-    r, inverse = M[1 + rows, 0] * (scale / excess), np.asarray(np.linalg.inv(G), float)
-    evidence = 0.5 * float(r @ inverse @ r) - 0.5 * float(np.linalg.slogdet(G)[1])
-    return _Explained(evidence, scale * (inverse @ r), scale**2 * inverse)
+def _explained(M: Array, hypotheses: _Hypotheses, excess: float) -> _Explained:
+    """Return what hypotheses say of sums M (1 + K, 1 + K), of a noise whose variance is so many times larger."""
+    rows, scales = 1 + hypotheses.rows, hypotheses.scales[:, None]
+    variances = scales[..., None] ** 2
+    G = M[rows[:, :, None], rows[:, None, :]] * (variances / excess) + np.eye(rows.shape[1])
+    r, inverse = M[rows, 0] * (scales / excess), np.linalg.inv(G)
+    d = np.einsum("nij,nj->ni", inverse, r)
+    evidence = 0.5 * np.einsum("ni,ni->n", r, d) - 0.5 * np.linalg.slogdet(G)[1]
+    return _Explained(evidence, scales * d, variances * inverse)
 
 
 def _columns(chosen: Sequence[int]) -> Ids:
