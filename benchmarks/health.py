@@ -9,8 +9,8 @@ python health.py rendered knock          one rendered run of a fault in the work
                                          "fixed" two fixed bodies are in view (run --fixed) while the rig is bumped by 2 mm
 
 python health.py follow                  a rig that is followed (run --follow-rig): when it is put right, what that leaves
-python health.py cost                    computing time of the tests a shot, at 60 Hz, and of what a loop that falls back takes
-                                         a command (set OPENBLAS_NUM_THREADS=1, as armsight does)
+python health.py cost                    computing time of the tests a shot, at 60 Hz, and of falling back, a command (set
+                                         OPENBLAS_NUM_THREADS=1, as armsight does)
 
 A run of a camera or a body takes about 1 s of computing, one of an arm 5 s. Delays count from when the fault displaces the
 measured pose (of a joint: the pose that the potentiometers give) by twice the claimed sigma; "matters" counts the runs in
