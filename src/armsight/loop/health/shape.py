@@ -12,6 +12,9 @@ r^T S^-1 r of the sum of squares, with
 where H and b are the sums, J selects the point, and M has the standard deviations of everything else as its columns. The
 point that explains most is taken, then the next one besides it, while one explains more than chance: a body that is bent.
 
+What the sums from before a change say of everything else (M) is added to those from after it: a body may be off by its
+tolerance, but by the same all the time, so a point that moves is found where it moved by less than that.
+
 What may have changed and is not distinguished yet widens the poses: of each hypothesis (the seven numbers, focal lengths,
 a point, all points a little) the evidence against none (MacKay, 1992), of the newest test and of some newest ones together.
 Where the hypotheses together are more probable than that nothing changed, the second moment of their mixture is what poses
@@ -56,8 +59,10 @@ _ALIKE, _NECESSARY = 12.0, 1e-4
 _BESIDES = float(chdtri(3, _NECESSARY))
 #: Probability, before a test, that it is the first one after any change.
 _RARE = 1e-4
-#: So many newest tests, together, may be those after a change; all points may be displaced by about so much, m.
+#: So many newest tests, together, may be those after a change, or all; all points may be displaced by about so much, m.
 _AFTER, _BENT_M = (1, 2, 4, 8, 16), (2e-4, 1e-3)
+#: Tests that are not kept are forgotten with this time constant, in tests.
+_SETTLED = 30.0
 #: The seven numbers are expected to change by such shares of their priors, which are wide.
 _SEVEN_SCALES = (1.0, 0.03, 0.003)
 #: The newest test agrees with all together unless chance explains their difference more rarely than this.
@@ -105,6 +110,13 @@ class ResidualSums:
         """Weigh down what there is."""
         self.M *= weight
         self.freedom *= weight
+
+    def besides(self, before: ResidualSums, size: int) -> ResidualSums:
+        """Return these with what sums from before say of the first parameters, the others being zero then."""
+        found = ResidualSums(len(self.b), self.begin_s)
+        found.M, found.freedom = self.M.copy(), self.freedom + before.freedom
+        found.M[: 1 + size, : 1 + size] += before.M[: 1 + size, : 1 + size]
+        return found
 
     def of(self, size: int) -> ResidualSums:
         """Return those of the first parameters alone."""
@@ -261,6 +273,9 @@ class ShapeWatch:
         self._view: Array | None = None  # the newest direction that differs from the one before
         self._views: list[Array] = []  # of the running test
         self._history: deque[_ShapeTest] = deque(maxlen=_KEPT)
+        every = 1 + K + 7 + 2 + 3 * n
+        # Of older tests, of all shots and of the usual ones, while nothing was suspected.
+        self._settled = ResidualSums(every - 1, 0.0), ResidualSums(every - 1, 0.0)
         self._shots: deque[Array] = deque(maxlen=_ASKED)  # rows, as they were taken
         # The response of the newest poses to the parameters, and the covariances of these poses.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
@@ -298,34 +313,53 @@ class ShapeWatch:
             usual: the same without the shots that fit worst.
             ends: whether it ends all.
         """
+        if len(self._history) == _KEPT and self.doubt is None and self.found is None:
+            oldest = self._history[0]
+            self._settled = _settled(self._settled[0], oldest.sums), _settled(self._settled[1], oldest.usual)
         self._history.append(_ShapeTest(sums, usual, self._reduced(sums), self._views))
         self._views = []
         tests, before = list(self._history), self._suspect
         if before is None:
-            self._suspect = self._shown(tests[-1:]) or self._shown(tests)
+            counts = (1, len(tests)) if self.doubt is None else (*self._counts(), 1)
+            self._suspect = next(filter(None, (self._shown(len(tests) - count) for count in counts)), None)
         else:
-            since = [each for each in tests if each.sums.begin_s >= before.begin_s] or tests[-1:]
-            self._suspect = self._shown(since)
+            later = sum(each.sums.begin_s >= before.begin_s for each in tests)
+            self._suspect = self._shown(len(tests) - max(later, 1))
+        if self._suspect is not None and self._alarms < _FRESH:
+            self._suspect = self._dated()
         self._alarms = 0 if self._suspect is None else self._alarms + 1
-        if self._suspect is not None and self._alarms <= _FRESH:
-            self._suspect = self._dated(self._suspect, tests)
         # What a change leaves in the test in which it began may look like a displaced point, once.
         again = self._suspect is not None and before is not None and before.chosen[0] == self._suspect.chosen[0]
         self.found = self._suspect if again or (ends and len(tests) == 1) else None
         self.said = self.found or self.said
-        self.doubt = self._doubted([each.usual for each in tests])
+        self.doubt = self._doubted()
 
-    def _doubted(self, tests: Sequence[ResidualSums]) -> Array | None:
+    def _counts(self) -> tuple[int, ...]:
+        """Return how many newest tests may be those after a change."""
+        tests = len(self._history)
+        return (*(count for count in _AFTER if count < tests), tests)
+
+    def _since(self, begin: int, *, usual: bool = False) -> ResidualSums:
+        """Return the sums of the tests from one on, with what those before it say of what does not change.
+
+        The test before may be of both times: it is left out.
+        """
+        tests = [each.usual if usual else each.sums for each in self._history]
+        before = self._settled[usual] if begin < 2 else total([*tests[: begin - 1], self._settled[usual]])
+        return total(tests[begin:]).besides(before, self._size)
+
+    def _doubted(self) -> Array | None:
         """Return the second moment (7 + C, 7 + C) of what may have changed; None where nothing did, more probably."""
+        tests = len(self._history)
         if self.found is None:
-            sums = (total(tests[-count:]) for count in _AFTER if count <= len(tests))
+            sums = (self._since(tests - count, usual=True) for count in self._counts())
             evidence, moment = max((self._mixture(each, self._hypotheses) for each in sums), key=lambda each: each[0])
             return moment if evidence > np.log(2.0) else None
         if self.found.chosen != (FOCAL,):
             return None
         # Cameras that moved cannot be excluded.
-        since = [each for each in tests if each.begin_s >= self.found.begin_s]
-        return self._mixture(total(since or tests[-1:]), self._hypotheses[:1])[1]
+        later = sum(each.usual.begin_s >= self.found.begin_s for each in self._history)
+        return self._mixture(self._since(tests - max(later, 1), usual=True), self._hypotheses[:1])[1]
 
     def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypotheses]) -> tuple[float, Array]:
         """Return the log-evidence that anything changed before the tests of sums, and the second moment of what did.
@@ -347,13 +381,14 @@ class ShapeWatch:
             np.add.at(moment, (rows[:, :, None], rows[:, None, :]), np.exp(log - evidence)[:, None, None] * moments)
         return evidence, moment
 
-    def _shown(self, tests: Sequence[_ShapeTest]) -> ShapeError | None:
-        """Return what tests show for certain; None where that is nothing."""
+    def _shown(self, begin: int) -> ShapeError | None:
+        """Return what the tests from one on show for certain; None where that is nothing."""
+        tests = list(self._history)[begin:]
         views = [view for each in tests for view in each.views]
         if len(views) < _LEAST_POSES or not _differ(np.array(views)):
             return None
-        sums, newest = total([each.sums for each in tests]), tests[-1].alone
-        found = newest if len(tests) == 1 else self._reduced(sums)
+        sums, newest = self._since(begin), tests[-1].alone
+        found = self._reduced(sums)
         error = self._focal_alone(found, sums.begin_s)
         if error is not None and _one_is_enough(newest):
             return error
@@ -454,28 +489,17 @@ class ShapeWatch:
         squares = np.einsum("ni,ni->n", shift, np.linalg.solve(covs, shift[..., None])[..., 0])
         return float(np.max(squares)) > _MATTERS**2
 
-    def _dated(self, found: ShapeError, tests: Sequence[_ShapeTest]) -> ShapeError:
-        """Return what was found with the beginning that leaves least unexplained, estimated from then on.
+    def _dated(self) -> ShapeError | None:
+        """Return what is shown from the beginning on that leaves least unexplained, whichever points moved then.
 
         The test before its beginning may be of both times: it is left out, and counts as noise.
         """
-        columns, lefts = _columns(found.chosen), list[float]()
-        after, before = (
-            total([each.sums for each in tests]),
-            ResidualSums(len(tests[0].sums.b), 0.0),
-        )  # less the test in which it began
-        for k, test in enumerate(tests):
-            whole = self._reduced(after).whole
-            lefts.append(whole.square - whole.gain(columns) + (tests[k - 1].sums.freedom if k else 0.0))
-            if k > 1:
-                before.add(tests[k - 2].sums, 1.0)
-                lefts[k] += self._reduced(before).whole.square
-            after.add(test.sums, -1.0)
-        for k in np.argsort(lefts, kind="stable"):
-            error = self._shown(tests[k:])
-            if error is not None and error.chosen[0] == found.chosen[0]:
-                return error
-        return found
+        lefts, free = list[float](), np.concatenate([[0, 1], *(_columns([each]) for each in self._candidates)])
+        for k in range(len(self._history)):
+            whole = self._reduced(self._since(k)).whole
+            mixed = self._history[k - 1].sums.freedom if k else 0.0
+            lefts.append(whole.square - whole.gain(free) + mixed)
+        return self._shown(int(np.argmin(lefts)))
 
     def added(self, response: Array) -> Array:
         """Return the covariance (6, 6) of what was found, of a pose with a response (6, K) to the parameters."""
@@ -570,6 +594,14 @@ def total(tests: Sequence[ResidualSums]) -> ResidualSums:
     found = tests[0].of(len(tests[0].b))
     for each in tests[1:]:
         found.add(each, 1.0)
+    return found
+
+
+def _settled(sums: ResidualSums, test: ResidualSums) -> ResidualSums:
+    """Return sums of older tests with one more."""
+    found = total([sums])
+    found.scale(float(np.exp(-1.0 / _SETTLED)))
+    found.add(test, 1.0)
     return found
 
 
