@@ -88,7 +88,7 @@ class Predicted(NamedTuple):
 def opened(joints: int) -> Array:
     """Return the variances (size,) that are added when the filter of an arm of so many joints reopens.
 
-    What a moved rig, a slipped body or sensor, or a gear that grew looser changes: base, tool, zeros, widths of the backlash.
+    What a moved rig, a slipped body or sensor, or a gear that grew looser changes: base, tool, zeros, backlash.
     """
     at = layout(joints)
     sigmas = np.zeros(at.size)
