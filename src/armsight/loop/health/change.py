@@ -26,9 +26,9 @@ ALIKE = 12.0
 LATER_S = 3.0
 #: The errors of an arm have longer tails than Gaussian ones: chi-squares count by this factor less.
 MARGIN = 1.4
-#: The estimate of a drift is off by about this share of it, in any direction: seen in simulated drifts of constant rate;
-#: real ones do not keep their rate.
-_OTHERWISE = 0.15
+#: The estimate of a drift is off by about this share of it, in any direction: seen in simulated drifts of constant rate,
+#: whose beginning is not known exactly; real ones do not keep their rate.
+_OTHERWISE = 0.08
 #: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone: beyond it by chance once in
 #: a hundred.
 _ALONG = float(chdtri(5, 0.01))

@@ -336,7 +336,9 @@ class ClosureWatch:
     def _change(self, found: _Tested, left: float) -> Change:
         """Return a hypothesis as a record; the errors' variance is so many times what it was tested with."""
         assert self._newest is not None
-        effect = changing(self._parts, self._newest.by_state)[:, found.suspect.columns]
+        assert self._newest.reference is not None
+        # What the sizes were estimated with: the filter's own state may have followed the change, base against zeros.
+        effect = changing(self._parts, self._newest.reference()[1])[:, found.suspect.columns]
         begin_s = (self._t[found.begin - 1] + self._t[found.begin]) / 2
         end_s, T = self._t[-1], self._newest.T_base_tool
         limit = _limits(self._parts.joints)[len(found.size)]
