@@ -276,6 +276,8 @@ class ShapeWatch:
         every = 1 + K + 7 + 2 + 3 * n
         # Of older tests, of all shots and of the usual ones, while nothing was suspected.
         self._settled = ResidualSums(every - 1, 0.0), ResidualSums(every - 1, 0.0)
+        # Of both, what was settled and the tests before each one that is kept, all of them last.
+        self._running: tuple[list[ResidualSums], list[ResidualSums]] = [], []
         self._shots: deque[Array] = deque(maxlen=_ASKED)  # rows, as they were taken
         # The response of the newest poses to the parameters, and the covariances of these poses.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
@@ -319,6 +321,10 @@ class ShapeWatch:
         self._history.append(_ShapeTest(sums, usual, self._reduced(sums), self._views))
         self._views = []
         tests, before = list(self._history), self._suspect
+        self._running = (
+            _running(self._settled[0], [each.sums for each in tests]),
+            _running(self._settled[1], [each.usual for each in tests]),
+        )
         if before is None:
             counts = (1, len(tests)) if self.doubt is None else (*self._counts(), 1)
             self._suspect = next(filter(None, (self._shown(len(tests) - count) for count in counts)), None)
@@ -344,9 +350,10 @@ class ShapeWatch:
 
         The test before may be of both times: it is left out.
         """
-        tests = [each.usual if usual else each.sums for each in self._history]
-        before = self._settled[usual] if begin < 2 else total([*tests[: begin - 1], self._settled[usual]])
-        return total(tests[begin:]).besides(before, self._size)
+        running = self._running[usual]
+        after = running[-1].less(running[begin])
+        after.begin_s = self._history[begin].sums.begin_s
+        return after.besides(running[max(begin - 1, 0)], self._size)
 
     def _doubted(self) -> Array | None:
         """Return the second moment (7 + C, 7 + C) of what may have changed; None where nothing did, more probably."""
@@ -602,6 +609,14 @@ def _settled(sums: ResidualSums, test: ResidualSums) -> ResidualSums:
     found = total([sums])
     found.scale(float(np.exp(-1.0 / _SETTLED)))
     found.add(test, 1.0)
+    return found
+
+
+def _running(settled: ResidualSums, tests: Sequence[ResidualSums]) -> list[ResidualSums]:
+    """Return the sums before each of some tests, and those of all."""
+    found = [settled]
+    for each in tests:
+        found.append(total([found[-1], each]))
     return found
 
 
