@@ -9,6 +9,8 @@ python health.py rendered knock          one rendered run of a fault in the work
                                          "fixed" two fixed bodies are in view (run --fixed) while the rig is bumped by 2 mm
 
 python health.py follow                  a rig that is followed (run --follow-rig): when it is put right, what that leaves
+python health.py cost                    computing time of the tests a shot, at 60 Hz, and of falling back, a command (set
+                                         OPENBLAS_NUM_THREADS=1, as armsight does)
 
 A run of a camera or a body takes about 1 s of computing, one of an arm 5 s. Delays count from when the fault displaces the
 measured pose (of a joint: the pose that the potentiometers give) by twice the claimed sigma; "matters" counts the runs in
@@ -36,6 +38,7 @@ import armsight.app.demo.demo as demo  # noqa: E402
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose  # noqa: E402
 from armsight.geometry.rotation import exp_so3  # noqa: E402
 from armsight.loop.estimators import Mounting  # noqa: E402
+from armsight.loop.health import HealthMonitor, Trust  # noqa: E402
 from armsight.loop.health.follow import RigFollower  # noqa: E402
 from armsight.sim.example_rig import PLATE_M, TAG_FAMILY, TAG_M, TAG_MIDDLES_M  # noqa: E402
 from armsight.sim.render.scene import PosedBody, marker_bits, plate, tag  # noqa: E402
@@ -314,6 +317,60 @@ def followed(seeds: range) -> None:
             print(f"{name}: {seed}; {times}; {rest:.2f}; {moving:.2f}; {sizes}", flush=True)
 
 
+def cost(seed: int) -> None:
+    """Print the computing time (the thread's own) of the tests a shot, quiet and after faults."""
+    disc = 1e-3 * np.outer(np.arange(len(faults.BODY.points)) == 4, (0.0, 0.6, 0.8))
+    faults.RATE_HZ, faults.LEARNED_S, faults.AT_S = 60.0, 5.0, 15.0
+    for name, options in (
+        ("cameras, nothing wrong", {}),
+        ("cameras, right one rotated by 0.05 deg", {"rotated": 0.05 * DEG * np.eye(3)[1], "at_s": 5.0}),
+        ("cameras, disc moved by 1 mm", {"shift": disc, "at_s": 5.0}),
+    ):
+        took = timed(HealthMonitor, "measured", lambda options=options: list(faults.watched_body(seed, **options)))
+        print(f"{name:44s} {spread(took)}", flush=True)
+    arm = {
+        "arm, nothing wrong": {},
+        "arm, rig bumped by 2 mm": {"motion": lambda t: BUMP},
+        "arm, joint 3 slipped by 0.5 deg": {"joint": 2, "slip_rad": 0.5 * DEG},
+    }
+    for name, options in arm.items():
+        moved: list[faults.Moved] = []
+        run = lambda options=options, into=moved: into.append(faults.watched_arm(seed, seconds=45.0, **options))  # noqa: E731
+        took = timed(HealthMonitor, "work", run)
+        shots = round(faults.RATE_HZ * (45.0 - faults.LEARNED_S))
+        print(f"{name:44s} {np.sum(took) / shots:.3f} ms a shot", flush=True)
+        if moved[0].monitor.trust is Trust.NONE:
+            before = []
+            for _ in range(200):
+                began = time.thread_time_ns()
+                moved[0].monitor.before.estimate()
+                before.append(1e-6 * (time.thread_time_ns() - began))
+            print(f"{'    the estimator before, a command':44s} {spread(before)}", flush=True)
+
+
+def timed(thing: type, name: str, run: Callable) -> list[float]:
+    """Return the time of each call of a method in a run, ms."""
+    took, method = [], getattr(thing, name)
+
+    def measured(*args: object, **options: object) -> object:
+        began = time.thread_time_ns()
+        found = method(*args, **options)
+        took.append(1e-6 * (time.thread_time_ns() - began))
+        return found
+
+    setattr(thing, name, measured)
+    try:
+        run()
+    finally:
+        setattr(thing, name, method)
+    return took
+
+
+def spread(ms: list[float]) -> str:
+    """Return mean and largest time as text."""
+    return f"{np.mean(ms):.3f} ms, at most {np.max(ms):.1f} ms"
+
+
 def followed_cameras(seed: int, rotated: np.ndarray) -> str:
     """Rotate the right camera in mid-run; return what putting it right leaves."""
     poses, follower, rig, squares, at_s = [], None, None, [], np.nan
@@ -419,7 +476,9 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", default="2100:2120")
     parser.add_argument("--results", type=Path)
     given = parser.parse_args()
-    if given.words[:1] == ["follow"]:
+    if given.words[:1] == ["cost"]:
+        cost(range(*map(int, given.seeds.split(":")))[0])
+    elif given.words[:1] == ["follow"]:
         followed(range(*map(int, given.seeds.split(":"))))
     elif given.words[:1] == ["rendered"]:
         for each in given.words[1:] or ("none", "rig", "body", "knock", "bump"):

@@ -59,7 +59,7 @@ def test_beside_a_drift_some_of_it_is_suspected_in_every_direction():
     measurement = PoseMeasurement(18.0, T, np.eye(6), np.zeros((6, 6)))
     drift = change("drift")
     extra, (shift, cov) = suspected(measurement, [drift]), drift.displacement(T, 18.0)
-    sizes = 0.15 * np.repeat([np.linalg.norm(shift[:3]), np.linalg.norm(shift[3:])], 3)
+    sizes = 0.08 * np.repeat([np.linalg.norm(shift[:3]), np.linalg.norm(shift[3:])], 3)
     np.testing.assert_allclose(extra, np.outer(shift, shift) + cov + np.diag(sizes**2), rtol=1e-12)
 
 

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm_rig import off
+from arm_rig import off, small
 from faults import AT_S, watched_arm
 
+from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.health.change import widened
 
 
@@ -43,10 +44,23 @@ def test_a_knock_widens_what_is_given_out_from_then_on():
     assert np.mean(squares) < 6.0
 
 
+@pytest.mark.parametrize("seed", [5516, 5517])
+def test_what_is_given_out_of_an_arm_whose_backlash_grew_is_as_uncertain_as_it_is_wrong(seed):
+    moved = watched_arm(seed, seconds=20.0, joint=1, more_rad=np.radians(1.0))
+    rows = np.flatnonzero(moved.tracked.t_s > AT_S + 1.0)[::50]
+    error = off(moved.tracked.Ts_base_tool[rows], moved.Ts_true[rows])
+    squares = np.einsum("ni,ni->n", error, np.linalg.solve(moved.tracked.covs[rows], error[..., None])[..., 0])
+    assert np.mean(squares) < 9.5
+
+
 def test_what_is_given_out_of_a_rig_that_drifts_far_is_as_uncertain_as_it_is_wrong():
     drift = np.array([20e-3, 0.0, 0.0, 0.0, np.radians(2.0), 0.0]) / 60.0
     moved = watched_arm(36, lambda age_s: drift * age_s, 30.0)
     assert {found.cause for found in moved.monitor.findings()} == {"fixed"}
+    best, T_base_rig = moved.monitor.changes[0], moved.T_base_rig
+    D = T_base_rig @ inverse(small(drift * (best.end_s - AT_S))) @ inverse(T_base_rig)
+    shift = log_se3(inverse(best.T_base_tool) @ D @ best.T_base_tool)[:3]
+    assert np.linalg.norm(best.newest[0][:3] - shift) < 0.08 * np.linalg.norm(shift)
     rows = np.flatnonzero(moved.tracked.t_s > moved.found_s + 1.0)[::50]
     error = off(moved.tracked.Ts_base_tool[rows], moved.Ts_true[rows])
     squares = np.einsum("ni,ni->n", error, np.linalg.solve(moved.tracked.covs[rows], error[..., None])[..., 0])

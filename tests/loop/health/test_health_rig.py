@@ -164,3 +164,10 @@ def test_the_compiled_rows_of_a_shot_are_those_of_a_dense_elimination():
     scale = np.sqrt(np.outer(*2 * [np.diag(dense.T @ dense) + 1e-12]))
     assert found.rows.T @ found.rows / scale == pytest.approx(expected / scale, abs=1e-9)
     assert found.response == pytest.approx(-np.linalg.solve(A.T @ A, A.T @ dense[:, 1:]), rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1.05, 1.2, 1.0 / 1.2])
+def test_a_body_file_that_is_far_off_is_a_body_of_another_size_alone(scale):
+    (found,) = ended(5520, scale=scale)
+    assert (found.cause, found.alternatives, found.unit) == ("body", (), "%")
+    assert abs(found.size - 100.0 * (1.0 / scale - 1.0)) < 3 * found.sigma < 0.3

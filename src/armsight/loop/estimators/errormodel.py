@@ -86,11 +86,14 @@ class Predicted(NamedTuple):
 
 
 def opened(joints: int) -> Array:
-    """Return the variances (size,) that are added when the filter of an arm of so many joints reopens."""
+    """Return the variances (size,) that are added when the filter of an arm of so many joints reopens.
+
+    What a moved rig, a slipped body or sensor, or a gear that grew looser changes: base, tool, zeros, backlash.
+    """
     at = layout(joints)
     sigmas = np.zeros(at.size)
     sigmas[:6] = sigmas[6 * joints : at.linearity] = np.repeat([OPEN_M, OPEN_RAD], 3)
-    sigmas[at.zeros] = OPEN_RAD
+    sigmas[at.zeros] = sigmas[at.backlash : at.compliance] = OPEN_RAD
     return np.asarray(sigmas**2)
 
 

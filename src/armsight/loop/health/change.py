@@ -26,9 +26,9 @@ ALIKE = 12.0
 LATER_S = 3.0
 #: The errors of an arm have longer tails than Gaussian ones: chi-squares count by this factor less.
 MARGIN = 1.4
-#: The estimate of a drift is off by about this share of it, in any direction: seen in simulated drifts of constant rate;
-#: real ones do not keep their rate.
-_OTHERWISE = 0.15
+#: The estimate of a drift is off by about this share of it, in any direction: seen in simulated drifts of constant rate,
+#: whose beginning is not known exactly; real ones do not keep their rate.
+_OTHERWISE = 0.08
 #: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone: beyond it by chance once in
 #: a hundred.
 _ALONG = float(chdtri(5, 0.01))
@@ -48,16 +48,16 @@ _CAUSES: dict[Kind, Cause] = {
 
 
 def changing(parts: ErrorLayout, H: Array) -> Array:
-    """Return the columns (6, 13 + 2 n - 1) of what may change, of the derivative (6, K) of the tool's pose by the state.
+    """Return the columns (..., 6, 13 + 2 n - 1) of what may change, of derivatives (..., 6, K) of the tool's pose.
 
     Base (6) and delay (1), which may change slowly, too; tool (6), zeros of the joints after the first (its own is a
     rotation of the base), widths of the backlash.
     """
     # Of a gear that grew looser half is taken for each of the two that decide on the side: mostly they agree.
     n, tool = parts.joints, 6 * parts.joints
-    widths = 0.5 * (H[:, parts.backlash : parts.backlash + n] + H[:, parts.floats : parts.floats + n])
-    delay = H[:, parts.delay : parts.delay + 1]
-    return np.concatenate([H[:, :6], delay, H[:, tool : tool + 6], H[:, parts.zeros[1:]], widths], axis=1)
+    widths = 0.5 * (H[..., parts.backlash : parts.backlash + n] + H[..., parts.floats : parts.floats + n])
+    delay = H[..., parts.delay : parts.delay + 1]
+    return np.concatenate([H[..., :6], delay, H[..., tool : tool + 6], H[..., parts.zeros[1:]], widths], axis=-1)
 
 
 #: Of these columns those that may change slowly; and how many there are without the backlash, of n joints.

@@ -109,12 +109,17 @@ class _RunningSums:
     def __init__(self) -> None:
         self.rows: list[tuple[Array, ...]] = []
 
-    def add(self, t_s: float, across: Array, inner: Array, right: Array) -> None:
-        """Add a block's information between the model's parameters and the changes, among the changes, and right side."""
-        ramp, half, push = across[:, :RAMPS], inner[:RAMPS, :RAMPS], right[:RAMPS]
-        new = (across, t_s * ramp, inner, t_s * half, t_s**2 * half, right, t_s * push)
-        last = self.rows[-1] if self.rows else tuple(np.zeros_like(each) for each in new)
-        self.rows.append(tuple(a + b for a, b in zip(last, new, strict=True)))
+    def add(self, t_s: Array, across: Array, inner: Array, right: Array) -> None:
+        """Add blocks' (B, ...) information between the model's parameters and the changes, among these, and right sides."""
+        t = t_s[:, None, None]
+        ramp, half, push = across[:, :, :RAMPS], inner[:, :RAMPS, :RAMPS], right[:, :RAMPS]
+        new = (across, t * ramp, inner, t * half, t**2 * half, right, t[:, 0] * push)
+        for k in range(len(t_s)):
+            self.rows.append(
+                tuple(each[k] + last for each, last in zip(new, self.rows[-1], strict=True))
+                if self.rows
+                else tuple(each[k] for each in new)
+            )
 
     def since(self, rows: Array, starts_s: Array, end_s: float) -> tuple[Array, ...]:
         """Return (S, ...) across, inner and right side of steps at rows (S,), then those of ramps from times (S,), s."""
@@ -211,33 +216,29 @@ class ClosureWatch:
         if _LEAST_BLOCKS <= count <= _MOST_BLOCKS and count % _AGAIN == 0:
             self._estimate_noise()
         else:
-            self._sum(count - 1)
+            self._sum(slice(count - 1, count))
         if count >= _LEAST_BLOCKS:
             self._decide()
 
-    def _information(self, k: int) -> tuple[Array, ...]:
-        """Return of block k the information on the model, its right side and square, then what concerns the changes."""
+    def _whitened(self, blocks: slice) -> tuple[Array, Array, Array]:
+        """Return of B blocks the derivatives (B, 6, K) by the model, by what may change (B, 6, D), and residuals (B, 6)."""
         # What is not known of a clock that is followed is an error along the velocity that a whole block has in common.
-        late = self._clock_s[k] * self._H[k][:, self._parts.delay]
-        changes, white = changing(self._parts, self._H[k]), np.linalg.inv(self._cov + np.outer(late, late))
-        H = self._H[k][:, : self._parts.rest] * self._sigmas
-        e, H_white, changes_white = self._e[k], H.T @ white, changes.T @ white
-        return (
-            H_white @ H,
-            H_white @ e,
-            e @ white @ e,
-            H_white @ changes,
-            changes_white @ changes,
-            changes_white @ e,
-        )
+        H, e = np.array(self._H[blocks]), np.array(self._e[blocks])
+        late = np.array(self._clock_s[blocks])[:, None] * H[:, :, self._parts.delay]
+        white = np.linalg.inv(np.linalg.cholesky(self._cov + late[:, :, None] * late[:, None, :]))
+        model, changes = H[:, :, : self._parts.rest] * self._sigmas, changing(self._parts, H)
+        return white @ model, white @ changes, (white @ e[..., None])[..., 0]
 
-    def _sum(self, k: int) -> None:
-        """Add block k to the information."""
-        N, b, square, *of_changes = self._information(k)
-        self._N += N
-        self._b += b
-        self._square += float(square)
-        self._sums.add(self._t[k], *of_changes)
+    def _sum(self, blocks: slice) -> None:
+        """Add blocks to the information."""
+        H, changes, e = self._whitened(blocks)
+        flat = H.reshape(-1, H.shape[2])
+        self._N += flat.T @ flat
+        self._b += flat.T @ e.ravel()
+        self._square += float(np.vdot(e, e))
+        changes_T, H_T = np.swapaxes(changes, 1, 2), np.swapaxes(H, 1, 2)
+        right = (changes_T @ e[..., None])[..., 0]
+        self._sums.add(np.array(self._t[blocks]), H_T @ changes, changes_T @ changes, right)
 
     def _estimate_noise(self) -> None:
         """Estimate the covariance of the blocks' errors from what the model leaves of them; sum all blocks anew with it.
@@ -261,8 +262,7 @@ class ClosureWatch:
             self._cov = own * alike
             self._unsure = _unsure(self._parts.joints, int(_BLOCKS + freedom / 6.0 / alike))
             self._clear()
-            for k in range(len(e)):
-                self._sum(k)
+            self._sum(slice(0, len(e)))
             if not last:
                 # Akaike's criterion: by as much as it explains, less what its parameters explain by chance.
                 begins = _begins(len(e))
@@ -285,7 +285,7 @@ class ClosureWatch:
         after = (t > begin_s).astype(float)
         if found.suspect.slow:
             after *= (t - begin_s) / (t[-1] - begin_s)
-        columns = np.array([changing(self._parts, H)[:, part] for H in self._H])
+        columns = changing(self._parts, np.array(self._H))[:, :, part]
         return np.asarray(columns * self._wide[part] * after[:, None, None])
 
     def _decide(self) -> None:
@@ -320,7 +320,9 @@ class ClosureWatch:
 
     def _finest_of(self, between: Array, hypotheses: Sequence[Suspect]) -> list[_Tested]:
         """Return hypotheses, each at the best of some beginnings, the block into which the change fell left out."""
-        tested = [self._tested(np.array([k]), hypotheses, without=k - 1) for k in between]
+        solved = solve_triangular(np.linalg.cholesky(self._N), self._b, lower=True, check_finite=False)
+        with_all = self._square - float(solved @ solved)
+        tested = [self._tested(np.array([k]), hypotheses, (k - 1, with_all)) for k in between]
         return [max(each, key=lambda one: one.above) for each in zip(*tested, strict=True)]
 
     def _between(self, begins: Array, row: int) -> Array:
@@ -334,29 +336,32 @@ class ClosureWatch:
     def _change(self, found: _Tested, left: float) -> Change:
         """Return a hypothesis as a record; the errors' variance is so many times what it was tested with."""
         assert self._newest is not None
-        effect = changing(self._parts, self._newest.by_state)[:, found.suspect.columns]
+        assert self._newest.reference is not None
+        # What the sizes were estimated with: the filter's own state may have followed the change, base against zeros.
+        effect = changing(self._parts, self._newest.reference()[1])[:, found.suspect.columns]
         begin_s = (self._t[found.begin - 1] + self._t[found.begin]) / 2
         end_s, T = self._t[-1], self._newest.T_base_tool
         limit = _limits(self._parts.joints)[len(found.size)]
         score, chi_square = (found.above + limit) / left - limit, found.chi_square / left
         return Change(found.suspect, begin_s, end_s, found.size, left * found.cov, chi_square, score, effect, T)
 
-    def _tested(self, begins: Array, hypotheses: Sequence[Suspect], without: int | None = None) -> list[_Tested]:
+    def _tested(
+        self, begins: Array, hypotheses: Sequence[Suspect], without: tuple[int, float] | None = None
+    ) -> list[_Tested]:
         """Test hypotheses at beginnings (S,); return each at the one of largest chi-square.
 
         Args:
             begins: blocks.
             hypotheses: to test.
-            without: a block that is left out, as the change fell into it; what that explains counts for the beginning.
+            without: a block that is left out, as the change fell into it, and what the model leaves unexplained with it;
+                what leaving it out explains counts for the beginning.
         """
         t = np.array(self._t)
         N, b, square, gained = self._N, self._b, self._square, 0.0
         if without is not None:
-            out = self._information(without)
-            N, b, square = N - out[0], b - out[1], square - float(out[2])
-            L = np.linalg.cholesky(self._N)
-            whole = solve_triangular(L, self._b, lower=True, check_finite=False)
-            gained = self._square - float(whole @ whole)
+            k, gained = without
+            (H,), _, (e,) = self._whitened(slice(k, k + 1))
+            N, b, square = N - H.T @ H, b - H.T @ e, square - float(e @ e)
         L = np.linalg.cholesky(N)
         steps, step_C, step_b, ramps, ramp_C, ramp_b = self._sums.since(begins, t[begins - 1], t[-1])
         whole = np.moveaxis(np.concatenate([steps, ramps], axis=2), 1, 0).reshape(self._parts.rest, -1)
@@ -367,25 +372,31 @@ class ClosureWatch:
         excess = max(left / max(6.0 * len(t), 1.0), 1.0)
         gained = 0.0 if without is None else (gained - left) / excess
         limits, found = _limits(self._parts.joints), list[_Tested]()
+        wide = np.append(self._wide, self._wide[:RAMPS])
+        right = (np.concatenate([step_b, ramp_b], axis=1) - b @ white) * wide / excess
+        first = steps.shape[2]  # of the ramps
+        # Of single numbers, whose information is one number each.
+        own = np.concatenate([np.einsum("scc->sc", step_C), np.einsum("scc->sc", ramp_C)], axis=1)
+        own = (own - np.einsum("skc,skc->sc", white, white)) * (wide**2 / excess) + 1.0
+        best = np.argmax(right**2 / own, axis=0)
         for each in hypotheses:
-            part = each.columns
-            if each.slow:
-                n = steps.shape[2] + np.arange(part.start, part.stop)
-                G, C, right = white[:, :, n], ramp_C[:, part, part], ramp_b[:, part]
+            part = slice(each.columns.start + first * each.slow, each.columns.stop + first * each.slow)
+            by = wide[part]
+            if len(by) == 1:
+                n = int(best[part.start])
+                cov = (by**2 / own[n, part])[:, None]
             else:
-                G, C, right = white[:, :, part], step_C[:, part, part], step_b[:, part]
-            wide = self._wide[part]
-            across = np.swapaxes(G, 1, 2)
-            C = (C - across @ G) * np.outer(wide, wide) / excess + np.eye(len(wide))
-            right = (right - across @ b) * wide / excess
-            d = np.linalg.solve(C, right[..., None])[..., 0]
-            chi_squares = np.einsum("sc,sc->s", right, d)
-            n = int(np.argmax(chi_squares))
-            cov, chi_square = np.linalg.inv(C[n]) * np.outer(wide, wide), float(chi_squares[n])
-            above = chi_square + gained - limits[len(wide)] - (_RARER if each.slow else 0.0)
+                G, inner = white[:, :, part], (ramp_C if each.slow else step_C)[:, each.columns, each.columns]
+                inner = (inner - np.swapaxes(G, 1, 2) @ G) * (by[:, None] * (by / excess)) + np.eye(6)
+                solved = np.linalg.solve(inner, right[:, part, None])[..., 0]
+                n = int(np.argmax(np.einsum("sc,sc->s", right[:, part], solved)))
+                cov = np.linalg.inv(inner[n]) * (by[:, None] * by)
+            size = cov @ (right[n, part] / by)
+            chi_square = float(right[n, part] @ (size / by))
+            above = chi_square + gained - limits[len(by)] - (_RARER if each.slow else 0.0)
             rest = (left / excess - chi_square) / max(6.0 * len(t), 1.0)
             share = max(rest, 1.0 / excess)  # the errors are no smaller than the blocks'
-            found.append(_Tested(each, int(begins[n]), wide * d[n], cov, chi_square, above, share))
+            found.append(_Tested(each, int(begins[n]), size, cov, chi_square, above, share))
         return found
 
 

@@ -16,6 +16,8 @@ which of them is named.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.linalg import solve_triangular
 
@@ -36,6 +38,15 @@ _WIDE_M, _WIDE_RAD, _WIDE_S = 0.05, 0.1, 0.05
 #: A drift must explain so much more than a jump to be preferred.
 _RARER = 10.0
 _LIMITS = {freedom: alarm_limit(freedom, _TESTS_HZ, 2 * MOST) for freedom in (1, 6)}
+
+
+class _Fitted(NamedTuple):
+    """A change at S beginnings: size (S, D), information (S, D, D) over the priors, Birge ratios and chi-squares (S,)."""
+
+    size: Array
+    information: Array
+    excess: Array
+    chi_squares: Array
 
 
 class FixedWatch:
@@ -174,7 +185,7 @@ class FixedWatch:
     def _decide(self, innovation: Innovation) -> None:
         """Test all beginnings; the hypotheses are what they are at the newest measurement."""
         moving = [each for each in self._suspects if each.cause == "fixed"]
-        explained = [self._fitted(each)[2] for each in moving]
+        explained = [self._fitted(each).chi_squares for each in moving]
         alarms = np.array(
             [gained - (_RARER if each.slow else 0.0) for each, gained in zip(moving, explained, strict=True)]
         )
@@ -186,18 +197,20 @@ class FixedWatch:
         near = slice(max(int(n) - 1, 0), int(n) + 2)
         columns, changes = changing(self._parts, innovation.by_state), list[Change]()
         for each in self._suspects:
-            d, cov, chi_squares = self._fitted(each)
+            d, C, excess, chi_squares = self._fitted(each)
             k = near.start + int(np.argmax(chi_squares[near]))
+            wide = self._wide[self._of(each)]
+            cov = excess[k] * np.linalg.inv(C[k]) * np.outer(wide, wide)
             begin_s, chi_square = float(self._begins[k]), float(chi_squares[k])
             length = (innovation.t_s - begin_s) if each.slow else 1.0
             score = chi_square - _LIMITS[d.shape[1]] - (_RARER if each.slow else 0.0)
             effect, T = columns[:, each.columns], innovation.T_base_tool
-            size, spread = length * d[k], length**2 * cov[k]
+            size, spread = length * d[k], length**2 * cov
             changes.append(Change(each, begin_s, innovation.t_s, size, spread, chi_square, score, effect, T))
         self.changes = ranked(changes)
 
-    def _fitted(self, suspect: Suspect) -> tuple[Array, Array, Array]:
-        """Return a change (S, D) at all beginnings with covariance (S, D, D) and chi-square (S,)."""
+    def _fitted(self, suspect: Suspect) -> _Fitted:
+        """Return a change that is fitted at all beginnings."""
         rows = self._of(suspect)
         wide = self._wide[rows]
         C = self._C[:, rows[:, None], rows] * np.outer(wide, wide) + np.eye(len(rows))
@@ -205,7 +218,7 @@ class FixedWatch:
         d = np.linalg.solve(C, b[..., None])[..., 0]
         gained = np.einsum("nk,nk->n", b, d)
         excess = np.maximum((self._squares - gained) / np.maximum(6.0 * self._weights, 1.0), 1.0)
-        return wide * d, excess[:, None, None] * np.linalg.inv(C) * np.outer(wide, wide), gained / excess
+        return _Fitted(wide * d, C, excess, gained / excess)
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return that the estimator dropped what it had learned; nothing where it did not."""

@@ -34,7 +34,7 @@ from scipy.special import chdtri
 
 from armsight.data import Array, Body, Ids, PoseEstimate, Record
 from armsight.geometry.matrix import product, solved
-from armsight.geometry.pose import inverse
+from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.kernels import kernel
 from armsight.loop.health.record import HealthFinding, alarm_limit
 from armsight.loop.health.shape import FURTHEST_M, ResidualSums, ShapeWatch, eliminated, total
@@ -51,6 +51,7 @@ MOST_POINTS = 24
 #: Shots that differ less than this share their errors (where a point is within its pixels, how it is lit) and count as one:
 #: translation over distance, and rotation, rad.
 _SAME = 0.01
+_SAME_COSINE = float(np.cos(_SAME))
 #: While nothing is suspected, shots closer in time than this are left out, s, and those that hardly differ from the newest:
 #: they would cost time and add little.
 _LEAST_S, _LIKE_S = 0.025, 0.1
@@ -63,6 +64,8 @@ _PAIRED = float(chdtri(1, 1e-4))
 _LEAST_POINTS, _APART_S = 4, 0.5
 #: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
 TEST_S, TEST_SHOTS, FORGET_TESTS = 1.0, 60, 30.0
+#: Residuals are not linear in the size of a body that is off by more than this share of it.
+_LINEAR = 0.02
 #: In so many tests after an alarm what was before the change is dropped; it began at most so many tests before the alarm.
 _FRESH, _BEFORE = 6, 3
 #: Tests that are kept, to find since when.
@@ -244,7 +247,11 @@ class RigWatch:
             return np.zeros((6, 6))
         self._effects.append((found.response, estimate.cov))
         self._sum(found, estimate)
-        return self._added(found)
+        added = self._added(found)
+        if added.any():  # of a body that is far off more than what is linear
+            off = log_se3(inverse(estimate.T_left_body) @ self._linear_about(estimate)[1])
+            added += np.outer(off, off)
+        return added
 
     def _added(self, found: _ShotResiduals) -> Array:
         """Return what the suspected errors add to the covariance (6, 6) of a pose."""
@@ -319,14 +326,19 @@ class RigWatch:
         if np.count_nonzero(fits) < _LEAST_POINTS:
             return None
         A, whole = np.empty((4 * len(ids), 6)), np.zeros((4 * len(ids), 1 + self._full))
+        size, T = self._linear_about(estimate)
         noise_px2 = _differentiate(
-            *self._pair, self._half_px, self._p_body, self._row_of, np.asarray(ids, np.int64),
+            *self._pair, self._half_px, size * self._p_body, self._row_of, np.asarray(ids, np.int64),
             np.ascontiguousarray(seen.uv[rows]), np.ascontiguousarray(seen.cov_uv[rows]),
-            max(self._rig.sigma_px, 1e-6), np.array(estimate.T_left_body, order="C"),
+            max(self._rig.sigma_px, 1e-6), np.array(T, order="C"),
             self._velocity(estimate.T_left_body, now_s), A, whole,
         )  # fmt: skip
         if not np.isfinite(noise_px2):
             return None
+        if size != 1.0:  # the residuals of a body as its file says, were they linear
+            by_size = 1 + self._rig.parameter_count
+            whole[:, by_size] /= size
+            whole[:, 0] += (size - 1.0) * whole[:, by_size]
         self._noise_px = float(np.sqrt(noise_px2))
         if fits.all():
             response = self._eliminated(A, whole)
@@ -335,6 +347,21 @@ class RigWatch:
         found, with_all = whole[kept], whole[every]
         response, response_with_all = self._eliminated(A[kept], found), self._eliminated(A[every], with_all)
         return _ShotResiduals(now_s, found, response, with_all, response_with_all)
+
+    def _linear_about(self, estimate: PoseEstimate) -> tuple[float, Array]:
+        """Return the size of the body over that of its file, and the pose (4, 4), about which residuals are linear.
+
+        Those of the file and of the estimate, unless the triangulated points are of another size (Umeyama, 1991).
+        """
+        p_body, p_left = self._p_body[estimate.points.ids], estimate.points.p_left
+        middle_body, middle_left = p_body.mean(axis=0), p_left.mean(axis=0)
+        from_body, from_left = p_body - middle_body, p_left - middle_left
+        size = float(np.sqrt(np.vdot(from_left, from_left) / np.vdot(from_body, from_body)))
+        if abs(size - 1.0) <= _LINEAR:
+            return 1.0, estimate.T_left_body
+        U, _, Vt = np.linalg.svd(from_left.T @ from_body)
+        R = (U * [1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
+        return size, pose(R, middle_left - size * (R @ middle_body))
 
     def _eliminated(self, A: Array, rows: Array) -> Array:
         """Eliminate the pose and the shot's own skew from rows (n, 1 + K + M); return the pose's response (6, K + M)."""
@@ -766,9 +793,9 @@ def _focal_changes(rig: StereoRig, size: int) -> Array:
 
 def differ(T: Array, other: Array) -> bool:
     """Return whether two poses (4, 4) are so far apart that their errors count as independent."""
-    apart = float(np.linalg.norm(T[:3, 3] - other[:3, 3]))
+    by = T[:3, 3] - other[:3, 3]
     cosine = (float(np.vdot(T[:3, :3], other[:3, :3])) - 1.0) / 2.0
-    return apart > _SAME * abs(float(T[2, 3])) or cosine < np.cos(_SAME)
+    return float(by @ by) > (_SAME * float(T[2, 3])) ** 2 or cosine < _SAME_COSINE
 
 
 def _rig_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:

@@ -12,6 +12,9 @@ r^T S^-1 r of the sum of squares, with
 where H and b are the sums, J selects the point, and M has the standard deviations of everything else as its columns. The
 point that explains most is taken, then the next one besides it, while one explains more than chance: a body that is bent.
 
+What the sums from before a change say of everything else (M) is added to those from after it: a body may be off by its
+tolerance, but by the same all the time, so a point that moves is found where it moved by less than that.
+
 What may have changed and is not distinguished yet widens the poses: of each hypothesis (the seven numbers, focal lengths,
 a point, all points a little) the evidence against none (MacKay, 1992), of the newest test and of some newest ones together.
 Where the hypotheses together are more probable than that nothing changed, the second moment of their mixture is what poses
@@ -32,7 +35,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtri
 
 from armsight.data import Array, Ids, Record
@@ -57,8 +59,10 @@ _ALIKE, _NECESSARY = 12.0, 1e-4
 _BESIDES = float(chdtri(3, _NECESSARY))
 #: Probability, before a test, that it is the first one after any change.
 _RARE = 1e-4
-#: So many newest tests, together, may be those after a change; all points may be displaced by about so much, m.
+#: So many newest tests, together, may be those after a change, or all; all points may be displaced by about so much, m.
 _AFTER, _BENT_M = (1, 2, 4, 8, 16), (2e-4, 1e-3)
+#: Tests that are not kept are forgotten with this time constant, in tests.
+_SETTLED = 30.0
 #: The seven numbers are expected to change by such shares of their priors, which are wide.
 _SEVEN_SCALES = (1.0, 0.03, 0.003)
 #: The newest test agrees with all together unless chance explains their difference more rarely than this.
@@ -107,6 +111,13 @@ class ResidualSums:
         self.M *= weight
         self.freedom *= weight
 
+    def besides(self, before: ResidualSums, size: int) -> ResidualSums:
+        """Return these with what sums from before say of the first parameters, the others being zero then."""
+        found = ResidualSums(len(self.b), self.begin_s)
+        found.M, found.freedom = self.M.copy(), self.freedom + before.freedom
+        found.M[: 1 + size, : 1 + size] += before.M[: 1 + size, : 1 + size]
+        return found
+
     def of(self, size: int) -> ResidualSums:
         """Return those of the first parameters alone."""
         found = ResidualSums(size, self.begin_s)
@@ -130,10 +141,9 @@ class ResidualSums:
 
 def eliminated(M: Array, rows: slice) -> Array:
     """Return sums M (N, N) with parameters eliminated, of which each has a prior of variance 1."""
-    keep = np.delete(np.arange(len(M)), rows)
-    across = M[rows, keep]
-    inner = cho_factor(M[rows, rows] + np.eye(len(across)), check_finite=False)
-    return np.asarray(M[np.ix_(keep, keep)] - across.T @ cho_solve(inner, across, check_finite=False))
+    across = np.delete(M[rows], rows, axis=1)
+    kept = np.delete(np.delete(M, rows, axis=0), rows, axis=1)
+    return np.asarray(kept - across.T @ np.linalg.solve(M[rows, rows] + np.eye(len(across)), across))
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +194,13 @@ class _ShapeSums(NamedTuple):
         r = self.r[columns]
         return float(r @ np.linalg.solve(self.G[np.ix_(columns, columns)], r))
 
+    def gains(self, points: Sequence[int]) -> Array:
+        """Return what each of some points (P,) explains alone, as :meth:`gain` does."""
+        rows = 2 + 3 * np.array(points, int)[:, None] + np.arange(3)
+        r = self.r[rows]
+        solved = np.linalg.solve(self.G[rows[:, :, None], rows[:, None, :]], r[..., None])[..., 0]
+        return np.asarray(np.einsum("pi,pi->p", r, solved))
+
     def excess(self, gain: float) -> float:
         """Return by how much the variance of what is left exceeds the noise (Birge ratio), 1 at the least."""
         return max((self.square - gain) / max(self.freedom, 1.0), 1.0)
@@ -196,17 +213,17 @@ class _Reduced(NamedTuple):
     without: _ShapeSums
 
 
-class _Hypothesis(NamedTuple):
-    """Rows (D,) of the seven numbers and the candidates that may have changed, and by how much of their priors."""
+class _Hypotheses(NamedTuple):
+    """Hypotheses of D numbers each: rows (N, D) of seven numbers and candidates, and by how much of their priors (N,)."""
 
     rows: Ids
-    scale: float
+    scales: Array
 
 
 class _Explained(NamedTuple):
-    """Log-evidence of a hypothesis against none, the sizes (D,) of what changed, and their covariance (D, D)."""
+    """Log-evidence (N,) of hypotheses against none, the sizes (N, D) of what changed, and their covariances (N, D, D)."""
 
-    evidence: float
+    evidence: Array
     size: Array
     cov: Array
 
@@ -256,6 +273,11 @@ class ShapeWatch:
         self._view: Array | None = None  # the newest direction that differs from the one before
         self._views: list[Array] = []  # of the running test
         self._history: deque[_ShapeTest] = deque(maxlen=_KEPT)
+        every = 1 + K + 7 + 2 + 3 * n
+        # Of older tests, of all shots and of the usual ones, while nothing was suspected.
+        self._settled = ResidualSums(every - 1, 0.0), ResidualSums(every - 1, 0.0)
+        # Of both, what was settled and the tests before each one that is kept, all of them last.
+        self._running: tuple[list[ResidualSums], list[ResidualSums]] = [], []
         self._shots: deque[Array] = deque(maxlen=_ASKED)  # rows, as they were taken
         # The response of the newest poses to the parameters, and the covariances of these poses.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
@@ -293,60 +315,87 @@ class ShapeWatch:
             usual: the same without the shots that fit worst.
             ends: whether it ends all.
         """
+        if len(self._history) == _KEPT and self.doubt is None and self.found is None:
+            oldest = self._history[0]
+            self._settled = _settled(self._settled[0], oldest.sums), _settled(self._settled[1], oldest.usual)
         self._history.append(_ShapeTest(sums, usual, self._reduced(sums), self._views))
         self._views = []
         tests, before = list(self._history), self._suspect
+        self._running = (
+            _running(self._settled[0], [each.sums for each in tests]),
+            _running(self._settled[1], [each.usual for each in tests]),
+        )
         if before is None:
-            self._suspect = self._shown(tests[-1:]) or self._shown(tests)
+            counts = (1, len(tests)) if self.doubt is None else (*self._counts(), 1)
+            self._suspect = next(filter(None, (self._shown(len(tests) - count) for count in counts)), None)
         else:
-            since = [each for each in tests if each.sums.begin_s >= before.begin_s] or tests[-1:]
-            self._suspect = self._shown(since)
+            later = sum(each.sums.begin_s >= before.begin_s for each in tests)
+            self._suspect = self._shown(len(tests) - max(later, 1))
+        if self._suspect is not None and self._alarms < _FRESH:
+            self._suspect = self._dated()
         self._alarms = 0 if self._suspect is None else self._alarms + 1
-        if self._suspect is not None and self._alarms <= _FRESH:
-            self._suspect = self._dated(self._suspect, tests)
         # What a change leaves in the test in which it began may look like a displaced point, once.
         again = self._suspect is not None and before is not None and before.chosen[0] == self._suspect.chosen[0]
         self.found = self._suspect if again or (ends and len(tests) == 1) else None
         self.said = self.found or self.said
-        self.doubt = self._doubted([each.usual for each in tests])
+        self.doubt = self._doubted()
 
-    def _doubted(self, tests: Sequence[ResidualSums]) -> Array | None:
+    def _counts(self) -> tuple[int, ...]:
+        """Return how many newest tests may be those after a change."""
+        tests = len(self._history)
+        return (*(count for count in _AFTER if count < tests), tests)
+
+    def _since(self, begin: int, *, usual: bool = False) -> ResidualSums:
+        """Return the sums of the tests from one on, with what those before it say of what does not change.
+
+        The test before may be of both times: it is left out.
+        """
+        running = self._running[usual]
+        after = running[-1].less(running[begin])
+        after.begin_s = self._history[begin].sums.begin_s
+        return after.besides(running[max(begin - 1, 0)], self._size)
+
+    def _doubted(self) -> Array | None:
         """Return the second moment (7 + C, 7 + C) of what may have changed; None where nothing did, more probably."""
+        tests = len(self._history)
         if self.found is None:
-            sums = (total(tests[-count:]) for count in _AFTER if count <= len(tests))
+            sums = (self._since(tests - count, usual=True) for count in self._counts())
             evidence, moment = max((self._mixture(each, self._hypotheses) for each in sums), key=lambda each: each[0])
             return moment if evidence > np.log(2.0) else None
         if self.found.chosen != (FOCAL,):
             return None
         # Cameras that moved cannot be excluded.
-        since = [each for each in tests if each.begin_s >= self.found.begin_s]
-        return self._mixture(total(since or tests[-1:]), self._hypotheses[: len(_SEVEN_SCALES)])[1]
+        later = sum(each.usual.begin_s >= self.found.begin_s for each in self._history)
+        return self._mixture(self._since(tests - max(later, 1), usual=True), self._hypotheses[:1])[1]
 
-    def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypothesis]) -> tuple[float, Array]:
+    def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypotheses]) -> tuple[float, Array]:
         """Return the log-evidence that anything changed before the tests of sums, and the second moment of what did.
 
         Nothing is one of the hypotheses, and its evidence is 1.
         """
-        M, prior = eliminated(sums.M, slice(1, 1 + self._size)), _RARE / len(hypotheses)
+        M = eliminated(sums.M, slice(1, 1 + self._size))
+        prior = _RARE / sum(len(each.scales) for each in hypotheses)
         moment = np.zeros((len(M) - 1, len(M) - 1))
         gain = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(moment)), M[1:, 0]))
         if gain < -2.0 * np.log(prior):
             return 0.0, moment
         excess = max((float(M[0, 0]) - gain) / max(sums.freedom, 1.0), 1.0)  # what all together do not explain is noise
         explained = [_explained(M, each, excess) for each in hypotheses]
-        logs = np.log(prior) + np.array([each.evidence for each in explained])
-        evidence = float(np.logaddexp.reduce(np.append(logs, 0.0)))
-        for (rows, _), share, each in zip(hypotheses, np.exp(logs - evidence), explained, strict=True):
-            moment[np.ix_(rows, rows)] += share * (np.outer(each.size, each.size) + each.cov)
+        logs = [np.log(prior) + each.evidence for each in explained]
+        evidence = float(np.logaddexp.reduce(np.concatenate([*logs, [0.0]])))
+        for (rows, _), log, each in zip(hypotheses, logs, explained, strict=True):
+            moments = each.size[:, :, None] * each.size[:, None, :] + each.cov
+            np.add.at(moment, (rows[:, :, None], rows[:, None, :]), np.exp(log - evidence)[:, None, None] * moments)
         return evidence, moment
 
-    def _shown(self, tests: Sequence[_ShapeTest]) -> ShapeError | None:
-        """Return what tests show for certain; None where that is nothing."""
+    def _shown(self, begin: int) -> ShapeError | None:
+        """Return what the tests from one on show for certain; None where that is nothing."""
+        tests = list(self._history)[begin:]
         views = [view for each in tests for view in each.views]
         if len(views) < _LEAST_POSES or not _differ(np.array(views)):
             return None
-        sums, newest = total([each.sums for each in tests]), tests[-1].alone
-        found = newest if len(tests) == 1 else self._reduced(sums)
+        sums, newest = self._since(begin), tests[-1].alone
+        found = self._reduced(sums)
         error = self._focal_alone(found, sums.begin_s)
         if error is not None and _one_is_enough(newest):
             return error
@@ -355,7 +404,7 @@ class ShapeWatch:
     def _displaced(self, found: _Reduced, newest: _ShapeSums, begin_s: float) -> ShapeError | None:
         """Return the points that are displaced by what all tests together say, and the newest; None where none is."""
         whole = found.whole
-        if not any(whole.gain(_columns([each])) > self._limit for each in self._candidates):
+        if not self._candidates or not (whole.gains(self._candidates) > self._limit).any():
             return None
         steady = [each for each in self._candidates if self._steady(whole, newest, each)]
         chosen = list[int]()
@@ -447,28 +496,17 @@ class ShapeWatch:
         squares = np.einsum("ni,ni->n", shift, np.linalg.solve(covs, shift[..., None])[..., 0])
         return float(np.max(squares)) > _MATTERS**2
 
-    def _dated(self, found: ShapeError, tests: Sequence[_ShapeTest]) -> ShapeError:
-        """Return what was found with the beginning that leaves least unexplained, estimated from then on.
+    def _dated(self) -> ShapeError | None:
+        """Return what is shown from the beginning on that leaves least unexplained, whichever points moved then.
 
         The test before its beginning may be of both times: it is left out, and counts as noise.
         """
-        columns, lefts = _columns(found.chosen), list[float]()
-        after, before = (
-            total([each.sums for each in tests]),
-            ResidualSums(len(tests[0].sums.b), 0.0),
-        )  # less the test in which it began
-        for k, test in enumerate(tests):
-            whole = self._reduced(after).whole
-            lefts.append(whole.square - whole.gain(columns) + (tests[k - 1].sums.freedom if k else 0.0))
-            if k > 1:
-                before.add(tests[k - 2].sums, 1.0)
-                lefts[k] += self._reduced(before).whole.square
-            after.add(test.sums, -1.0)
-        for k in np.argsort(lefts, kind="stable"):
-            error = self._shown(tests[k:])
-            if error is not None and error.chosen[0] == found.chosen[0]:
-                return error
-        return found
+        lefts, free = list[float](), np.concatenate([[0, 1], *(_columns([each]) for each in self._candidates)])
+        for k in range(len(self._history)):
+            whole = self._reduced(self._since(k)).whole
+            mixed = self._history[k - 1].sums.freedom if k else 0.0
+            lefts.append(whole.square - whole.gain(free) + mixed)
+        return self._shown(int(np.argmin(lefts)))
 
     def added(self, response: Array) -> Array:
         """Return the covariance (6, 6) of what was found, of a pose with a response (6, K) to the parameters."""
@@ -524,23 +562,26 @@ def _of_candidates(M: Array, freedom: float) -> _ShapeSums:
     return _ShapeSums(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0], float(M[0, 0]), freedom)
 
 
-def _hypotheses(points: int) -> tuple[_Hypothesis, ...]:
+def _hypotheses(points: int) -> tuple[_Hypotheses, ...]:
     """Return what may have changed: the seven numbers, one focal length, a point, all points a little."""
     every = 9 + np.arange(3 * points)
-    seven = (_Hypothesis(np.arange(7), scale) for scale in _SEVEN_SCALES)
-    alone = (*seven, _Hypothesis(np.array([7]), 1.0))
-    single = (_Hypothesis(rows, 1.0) for rows in every.reshape(points, 3))
-    bent = (_Hypothesis(every, size / FURTHEST_M) for size in _BENT_M) if points else ()
-    return (*alone, *single, *bent)
+    seven = _Hypotheses(np.tile(np.arange(7), (len(_SEVEN_SCALES), 1)), np.array(_SEVEN_SCALES))
+    alone = (seven, _Hypotheses(np.array([[7]]), np.ones(1)))
+    if not points:
+        return alone
+    single = _Hypotheses(every.reshape(points, 3), np.ones(points))
+    return (*alone, single, _Hypotheses(np.tile(every, (len(_BENT_M), 1)), np.array(_BENT_M) / FURTHEST_M))
 
 
-def _explained(M: Array, hypothesis: _Hypothesis, excess: float) -> _Explained:
-    """Return what a hypothesis says of sums M (1 + N, 1 + N), of a noise whose variance is so many times larger."""
-    rows, scale = hypothesis
-    G = M[np.ix_(1 + rows, 1 + rows)] * (scale**2 / excess) + np.eye(len(rows))
-    r, inverse = M[1 + rows, 0] * (scale / excess), np.asarray(np.linalg.inv(G), float)
-    evidence = 0.5 * float(r @ inverse @ r) - 0.5 * float(np.linalg.slogdet(G)[1])
-    return _Explained(evidence, scale * (inverse @ r), scale**2 * inverse)
+def _explained(M: Array, hypotheses: _Hypotheses, excess: float) -> _Explained:
+    """Return what hypotheses say of sums M (1 + K, 1 + K), of a noise whose variance is so many times larger."""
+    rows, scales = 1 + hypotheses.rows, hypotheses.scales[:, None]
+    variances = scales[..., None] ** 2
+    G = M[rows[:, :, None], rows[:, None, :]] * (variances / excess) + np.eye(rows.shape[1])
+    r, inverse = M[rows, 0] * (scales / excess), np.linalg.inv(G)
+    d = np.einsum("nij,nj->ni", inverse, r)
+    evidence = 0.5 * np.einsum("ni,ni->n", r, d) - 0.5 * np.linalg.slogdet(G)[1]
+    return _Explained(evidence, scales * d, variances * inverse)
 
 
 def _columns(chosen: Sequence[int]) -> Ids:
@@ -560,6 +601,22 @@ def total(tests: Sequence[ResidualSums]) -> ResidualSums:
     found = tests[0].of(len(tests[0].b))
     for each in tests[1:]:
         found.add(each, 1.0)
+    return found
+
+
+def _settled(sums: ResidualSums, test: ResidualSums) -> ResidualSums:
+    """Return sums of older tests with one more."""
+    found = total([sums])
+    found.scale(float(np.exp(-1.0 / _SETTLED)))
+    found.add(test, 1.0)
+    return found
+
+
+def _running(settled: ResidualSums, tests: Sequence[ResidualSums]) -> list[ResidualSums]:
+    """Return the sums before each of some tests, and those of all."""
+    found = [settled]
+    for each in tests:
+        found.append(total([found[-1], each]))
     return found
 
 
