@@ -8,9 +8,10 @@ from handeye_motions import error
 from scipy.stats import chi2
 
 from armsight.errors import CalibrationError, InputError
-from armsight.geometry.pose import exp_se3, inverse
+from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.handeye.handeye import Poses
 from armsight.loop.handeye.noise import (
+    STRUCTURES,
     Blocks,
     Linear,
     _value_and_gradient,
@@ -96,6 +97,18 @@ def test_an_arm_whose_geometry_is_off_is_recognised_and_the_covariance_allows_fo
     assert np.median(white) > 10 * np.median(of_links)  # what noise that changes from pose to pose would have claimed
 
 
+def test_lengths_of_links_that_no_residual_shows_are_allowed_for():
+    squares = []
+    for seed in range(8):
+        poses, _, X, links = made(
+            seed, n=20, in_hand=True, flange=(5e-4, 1e-3), camera=(1e-3, 3e-3, 2e-3), links=(1e-3, 2e-4)
+        )
+        found = calibrate_structured(poses, links=links, structures=("robot's geometry off",))
+        e = log_se3(inverse(found.T_flange_held) @ X)
+        squares.append(float(e @ np.linalg.solve(found.cov[6:, 6:], e)))
+    assert sum(squares) < chi2.isf(1e-3, 48)  # 95 where the most likely variance of links is taken, which may be zero
+
+
 def test_poses_left_out_distinguish_the_arms_error_from_the_cameras():
     both = ("robot", "camera, depth apart")
     arm = calibrate_structured(made(1, n=60, flange=(1e-4, 5e-3))[0], structures=both)
@@ -124,6 +137,29 @@ def test_errors_that_vision_shares_between_poses_are_found_by_the_arm():
     assert nees(found, Z, X) < chi2.isf(1e-3, 12)
     assert found.held_out.rms()[0] < 0.9 * without.held_out.rms()[0]
     assert without.common_m == 0 < found.common_m
+
+
+@pytest.mark.parametrize("steps", [(0.0, 0.0), (5e-4, 5e-4)], ids=["eye-seen", "eye-walking"])
+def test_a_scale_that_walks_is_recognised_and_the_covariance_allows_for_it(steps):
+    squares, off = [], []
+    without = tuple(name for name in STRUCTURES if "scale" not in name)
+    for seed in range(2):
+        poses, _, X, _ = made(seed, n=60, in_hand=True, flange=(5e-5, 5e-5), camera=(1e-4, 1e-4, 1e-4), walk=steps)
+        walked = np.cumsum(np.random.default_rng(seed).normal(0, 4e-3, 60))
+        eye = inverse(poses.B)
+        eye[:, :3, 3] *= 2 * np.exp(walked - walked[0])[:, None]
+        poses = replace(poses, B=inverse(eye))
+        found, before = (
+            calibrate_structured(poses, t_s=np.arange(60.0), scale=True, structures=names)
+            for names in (tuple(STRUCTURES), without)
+        )
+        assert found.structure == ("camera and its scale walking" if any(steps) else "camera's scale walking")
+        assert found.sigmas["scale_walk"] == pytest.approx(4e-3 * np.sqrt(59), rel=0.4)
+        e = log_se3(inverse(found.T_flange_held) @ X)
+        squares.append(float(e @ np.linalg.solve(found.cov[6:, 6:], e)))
+        off.append([np.linalg.norm(each.T_flange_held[:3, 3] - X[:3, 3]) for each in (found, before)])
+    assert sum(squares) < chi2.isf(1e-3, 12)
+    assert sum(found for found, _ in off) < 0.5 * sum(before for _, before in off)
 
 
 def test_a_walk_of_the_eye_is_recognised():

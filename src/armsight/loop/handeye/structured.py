@@ -44,6 +44,7 @@ from armsight.loop.handeye.handeye import (
 from armsight.loop.handeye.noise import (
     OF_THE_ARM,
     SHARED,
+    SHARED_MAPS,
     STRUCTURES,
     Linear,
     blocks,
@@ -88,6 +89,8 @@ HANGING = 1.0
 POSITIONS, SURELY_LOWER = "positions alone", 3.0
 #: The structures whose links are off.
 GEOMETRY = ("robot's geometry off", "robot's geometry and time stamps off")
+#: Those whose scale walks.
+SCALE_WALKING = ("camera's scale walking", "camera and its scale walking")
 #: Draws by which structures are weighted, and the weight below which one is not true.
 DRAWS, HARDLY_TRUE = 400, 0.02
 #: Rounds of least squares and of leaving out.
@@ -234,7 +237,8 @@ class _Problem(Record):
         kernel = {"robot drifting over its poses": pose_kernel(self.poses.A)}
         if self.t_s is not None:
             kernel["robot drifting over time"] = time_kernel(self.t_s)
-            kernel["robot walking over time"] = wiener_kernel(self.t_s)
+            walked = wiener_kernel(self.t_s)
+            kernel |= {"robot walking over time": walked, **dict.fromkeys(SCALE_WALKING, walked)}
         return replace(linear, kernel=kernel, walk=gathered)
 
 
@@ -485,7 +489,8 @@ def _start_variances(linear: Linear, structure: str) -> Array:
     """Return variances to begin at: what the residuals are, shared evenly between the sources."""
     position, rotation = _middle_sigmas(linear.e)
     sources = STRUCTURES[structure]
-    small = {"time_s": 1e-6, "image": 1.0, "walk_m": 0.01 * position**2, "walk_rad": 0.01 * rotation**2}
+    small = {"time_s": 1e-6, "image": 1.0, "scale_walk": 1e-4}
+    small |= {"walk_m": 0.01 * position**2, "walk_rad": 0.01 * rotation**2}
     even = {name: (position if name.endswith("_m") else rotation) ** 2 / 2 for name in sources}
     return np.asarray(np.maximum([small.get(name, even[name]) for name in sources], 1e-13))
 
@@ -502,9 +507,10 @@ def _allowed(structure: str, problem: _Problem, count: int, covered: bool) -> bo
         return problem.links is not None and count >= MIN_SHARED and timed
     if "time_s" in sources:
         return problem.speed is not None
-    if structure in ("robot drifting over time", "robot walking over time") or "walk_m" in sources:
+    if structure in SHARED and structure != "robot drifting over its poses":
         walks = "walk_m" not in sources or problem.poses.in_hand
-        return problem.t_s is not None and count >= MIN_SHARED and walks
+        scaled = "scale_walk" not in sources or problem.free[0]
+        return problem.t_s is not None and count >= MIN_SHARED and walks and scaled
     return structure not in SHARED or count >= MIN_SHARED
 
 
@@ -697,8 +703,8 @@ def _hanging(
     beside = np.asarray(np.abs(index[:, None] - index[None]) == 1, dtype=float)
     if gathered:
         kernels["camera walking"] = beside
-    if "robot walking over time" in kernels:  # the fit takes the mean away, and with it what all have in common
-        kernels["robot walking over time"] = beside
+    # Of what walks the fit takes the mean away, and with it what all have in common.
+    kernels |= dict.fromkeys(kernels.keys() & {"robot walking over time", *SCALE_WALKING}, beside)
     found = set()
     for name, K in kernels.items():
         others = K - np.diag(np.diag(K))
@@ -767,7 +773,7 @@ def _distances(whole: _Problem, guess: _Guess, structure: str, variances: Array,
         elif name in gathered:
             C += variance * gathered[name]
         else:
-            M = linear.maps[name.replace("drift", "flange")]
+            M = linear.maps[SHARED_MAPS.get(name, name)]
             C += variance * M @ np.swapaxes(M, 1, 2)
     C += 1e-16 * np.eye(6)
     return np.asarray(np.einsum("ni,ni->n", linear.e, np.linalg.solve(C, linear.e[..., None])[..., 0]) / 6)
@@ -809,7 +815,7 @@ def _displacements(
         elif name in linear.walk:
             size = float(np.einsum("ai,nij,aj->n", middle, linear.walk[name], middle).mean())
         else:
-            M = middle @ linear.maps[name.replace("drift", "flange")]
+            M = middle @ linear.maps[SHARED_MAPS.get(name, name)]
             size = float(np.einsum("nij,nij->n", M, M).mean())
         if name in OF_THE_ARM:
             arm += variance * size
