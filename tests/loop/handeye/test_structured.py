@@ -24,18 +24,28 @@ from armsight.loop.handeye.noise import (
     walk_gathered,
 )
 from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams
-from armsight.loop.handeye.structured import calibrate_structured
+from armsight.loop.handeye.structured import SMOOTH, calibrate_structured
 from armsight.robot.arm_file import open_arm
 from asserts import numeric_jacobian
 
 CENTRE = np.array([0.05, 0.03, 0.0])
 
 
-def made(seed, *, n=25, in_hand=False, flange=(0.0, 0.0), camera=(0.0, 0.0, 0.0), links=(0.0, 0.0), walk=(0.0, 0.0)):
+def made(
+    seed,
+    *,
+    n=25,
+    in_hand=False,
+    flange=(0.0, 0.0),
+    camera=(0.0, 0.0, 0.0),
+    links=(0.0, 0.0),
+    walk=(0.0, 0.0),
+    spread=0.6,
+):
     """Poses whose noise is known, the true Z and X, and T_link_flange; sigmas in m and rad."""
     rng = np.random.default_rng(seed)
     arm = open_arm("six_r")
-    q = arm.home + rng.uniform(-0.6, 0.6, (n, 6))
+    q = arm.home + rng.uniform(-spread, spread, (n, 6))
     frames = np.array([arm.links(one) for one in q])
     to_flange = inverse(frames) @ frames[:, -1:]
     X, Z = exp_se3(rng.normal(0, [0.05] * 3 + [1] * 3)), exp_se3(rng.normal(0, [0.5] * 3 + [1] * 3))
@@ -95,6 +105,20 @@ def test_an_arm_whose_geometry_is_off_is_recognised_and_the_covariance_allows_fo
     # Eight links say little about their variances: the median, of which a draw of three sigmas takes nothing.
     assert chi2.ppf(0.05, 12) < np.median(of_links) < chi2.isf(0.05, 12)
     assert np.median(white) > 10 * np.median(of_links)  # what noise that changes from pose to pose would have claimed
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_arms_smooth_error_is_found_where_the_poses_are_near_each_other(seed):
+    # A correlation that is wide beside their spread is nearly the same for all, and its mean is what the fit takes away.
+    poses, _, X, _ = made(
+        seed, n=40, in_hand=True, flange=(3e-5, 5e-5), camera=(5e-5, 1e-4, 1e-4), links=(5e-4, 3e-3), spread=0.25
+    )
+    found = calibrate_structured(poses)
+    assert found.structure == SMOOTH
+    e = log_se3(inverse(found.T_flange_held) @ X)
+    assert float(e @ np.linalg.solve(found.cov[6:, 6:], e)) < chi2.isf(1e-3, 6)  # 446 to 751 without the drift
+    assert found.held_out_geometry is not None
+    assert found.held_out_geometry.rms()[0] < 0.75 * found.held_out_nominal.rms()[0]
 
 
 def test_lengths_of_links_that_no_residual_shows_are_allowed_for():
@@ -160,6 +184,22 @@ def test_a_scale_that_walks_is_recognised_and_the_covariance_allows_for_it(steps
         off.append([np.linalg.norm(each.T_flange_held[:3, 3] - X[:3, 3]) for each in (found, before)])
     assert sum(squares) < chi2.isf(1e-3, 12)
     assert sum(found for found, _ in off) < 0.5 * sum(before for _, before in off)
+
+
+def test_a_scale_that_runs_away_is_not_taken():
+    # The wrist alone rotates: the flange hardly moves, and lengths of zero explain that, too.
+    rng = np.random.default_rng(5)
+    arm = open_arm("irb120")
+    q = np.tile(arm.home, (80, 1))
+    q[:, 3:] += rng.uniform(-0.5, 0.5, (80, 3))
+    A = np.array([arm.forward(one) for one in q]) @ exp_se3(rng.normal(0, [5e-4] * 3 + [3e-4] * 3, (80, 6)))
+    X, Z = exp_se3(np.array([0.02, -0.05, 0.06, 0.1, 0.2, -0.3])), exp_se3(np.array([0.6, 0.1, 0.0, 0.5, -1.0, 0.2]))
+    B = inverse(A @ X) @ Z
+    B[:, :3, 3] += rng.normal(0, [1e-3, 1e-3, 3e-3], (80, 3))
+    B[:, :3, :3] = B[:, :3, :3] @ exp_se3(np.c_[np.zeros((80, 3)), rng.normal(0, 2e-3, (80, 3))])[:, :3, :3]
+    found = calibrate_structured(Poses(A, B, np.zeros((80, 6, 6)), True, np.zeros(3)), scale=True)
+    assert abs(found.scale - 1) < 0.05
+    assert nees(found, Z, X) < chi2.isf(1e-3, 12)
 
 
 def test_a_walk_of_the_eye_is_recognised():
