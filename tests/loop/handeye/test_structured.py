@@ -188,17 +188,17 @@ def test_a_scale_that_walks_is_recognised_and_the_covariance_allows_for_it(steps
 
 def test_a_scale_that_runs_away_is_not_taken():
     # The wrist alone rotates: the flange hardly moves, and lengths of zero explain that, too.
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(2)
     arm = open_arm("irb120")
     q = np.tile(arm.home, (80, 1))
-    q[:, 3:] += rng.uniform(-0.5, 0.5, (80, 3))
+    q[:, 3:] += rng.uniform(-0.2, 0.2, (80, 3))
     A = np.array([arm.forward(one) for one in q]) @ exp_se3(rng.normal(0, [5e-4] * 3 + [3e-4] * 3, (80, 6)))
     X, Z = exp_se3(np.array([0.02, -0.05, 0.06, 0.1, 0.2, -0.3])), exp_se3(np.array([0.6, 0.1, 0.0, 0.5, -1.0, 0.2]))
     B = inverse(A @ X) @ Z
-    B[:, :3, 3] += rng.normal(0, [1e-3, 1e-3, 3e-3], (80, 3))
+    B[:, :3, 3] += rng.normal(0, [3e-3, 3e-3, 9e-3], (80, 3))
     B[:, :3, :3] = B[:, :3, :3] @ exp_se3(np.c_[np.zeros((80, 3)), rng.normal(0, 2e-3, (80, 3))])[:, :3, :3]
     found = calibrate_structured(Poses(A, B, np.zeros((80, 6, 6)), True, np.zeros(3)), scale=True)
-    assert abs(found.scale - 1) < 0.05
+    assert found.scale == 1  # 0.35 was taken
     assert nees(found, Z, X) < chi2.isf(1e-3, 12)
 
 
