@@ -132,7 +132,8 @@ def statements(run: HandEyeAnswer) -> list[str]:
         plain, nominal, geometry = (1e3 * of.rms()[0] for of in errors)
         what, found_by = "geometry of the arm", "armsight identify finds it"
         if found.structure == SMOOTH:
-            what, found_by = "arm's own error", "with joints and --model armsight identify finds its geometry"
+            joints = "" if run.recording.robot.q is not None else "with joints and --model "
+            what, found_by = "smooth error of the arm", f"{joints}armsight identify finds its geometry"
         lines.append(
             f"with the {what} that the other poses show, poses left out come to {geometry:.2f} mm in place of "
             f"{nominal:.2f}; {found_by}"
