@@ -12,8 +12,8 @@ from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.feetech import bus as feetech
 from armsight.robot.boards.feetech.bus import ServoBus
-from armsight.robot.boards.feetech.calibration import NAMES, uncalibrated
-from armsight.robot.boards.feetech.offsets import corrected_offsets, write_changes
+from armsight.robot.boards.feetech.calibration import NAMES, read_calibration, uncalibrated, write_offsets
+from armsight.robot.boards.feetech.offsets import OffsetChange, corrected_offsets, doubts, write_changes
 from armsight.robot.boards.feetech.registers import RAD_PER_COUNT
 from armsight.sim.boards.device import SteppedLink, serve
 from armsight.sim.boards.so101 import So101Bus, So101Mechanics
@@ -118,6 +118,48 @@ def test_mistakes_are_one_line_and_nothing_is_written(armsight, arm, tmp_path):
     said = armsight("board", "release", "--board", name)
     assert said.out == "DISABLED\n", said.err
     assert not device.servos.on.any()
+
+
+def test_a_correction_that_looks_like_a_mistake_is_asked_about_and_never_written_with_yes(
+    armsight, arm, tmp_path, monkeypatch
+):
+    device, name = arm
+    options = ("--board", name, "--further", "0,179.9,0,0,0", "--keep", tmp_path / "old.json")
+    tooth = "shoulder_lift (id 2): 179.9 deg is more than a tooth of the horn (14.4 deg)"
+    assert_rejected(armsight("board", "offsets", *options, "--yes"), tooth)
+    assert registers(device) == [0] * 6
+    assert not (tmp_path / "old.json").exists()
+    asked = []
+    monkeypatch.setattr("click.confirm", lambda text, abort, err: asked.append(text))
+    said = armsight("board", "offsets", *options)
+    assert said.code == 0, said.err
+    assert asked
+    assert f"note: {tooth}" in said.err
+    assert registers(device) == [0, -2047, 0, 0, 0, 0]
+    restored = armsight(
+        "board", "offsets", *options[:2], "--restore", options[-1], "--keep", tmp_path / "2.json", "--yes"
+    )
+    assert restored.code == 0, restored.err  # as large, but what was there before
+    assert registers(device) == [0] * 6
+    options[-1].write_text(json.dumps({"homing_offsets": {str(k): 3000 for k in range(1, 6)}}))
+    assert_rejected(
+        armsight("board", "offsets", *options[:2], "--restore", options[-1], "--yes"),
+        "the offset of id 1 is 3000; the register holds -2047 to 2047",
+    )
+
+
+def test_an_offset_at_the_end_of_its_register_and_a_count_that_would_jump_are_said(tmp_path):
+    calibration = read_calibration(lerobot(tmp_path / "follower.json"))  # counts 700 to 3396
+    assert doubts([OffsetChange("elbow_flex", 3, 2040, 2040), OffsetChange("wrist_flex", 4, 0, 100)], calibration) == []
+    (end,) = doubts([OffsetChange("elbow_flex", 3, -2000, -2030)], calibration)
+    assert "its offset -2030 is at the end of what the register holds, -2047 to 2047" in end
+    narrow = uncalibrated(np.full(5, 20.0), np.full(5, 3000.0))
+    (jump,) = doubts([OffsetChange("elbow_flex", 3, 0, 50)], narrow)
+    assert "its lower end would be at count -30; counts are 0 to 4095" in jump
+    assert doubts([OffsetChange("wrist_roll", 5, 0, 50)], uncalibrated(np.zeros(5), np.full(5, 4095.0))) == []
+    with pytest.raises(InputError, match="elbow_flex: homing_offset is 2048; allowed is -2047 to 2047"):
+        write_offsets(tmp_path / "new.json", tmp_path / "follower.json", {3: 2048})
+    assert not (tmp_path / "new.json").exists()
 
 
 def test_where_one_servo_fails_the_others_get_their_old_offsets_back():

@@ -8,9 +8,10 @@ from handeye_motions import error
 from scipy.stats import chi2
 
 from armsight.errors import CalibrationError, InputError
-from armsight.geometry.pose import exp_se3, inverse
+from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.handeye.handeye import Poses
 from armsight.loop.handeye.noise import (
+    STRUCTURES,
     Blocks,
     Linear,
     _value_and_gradient,
@@ -23,18 +24,28 @@ from armsight.loop.handeye.noise import (
     walk_gathered,
 )
 from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams
-from armsight.loop.handeye.structured import calibrate_structured
+from armsight.loop.handeye.structured import SMOOTH, calibrate_structured
 from armsight.robot.arm_file import open_arm
 from asserts import numeric_jacobian
 
 CENTRE = np.array([0.05, 0.03, 0.0])
 
 
-def made(seed, *, n=25, in_hand=False, flange=(0.0, 0.0), camera=(0.0, 0.0, 0.0), links=(0.0, 0.0), walk=(0.0, 0.0)):
+def made(
+    seed,
+    *,
+    n=25,
+    in_hand=False,
+    flange=(0.0, 0.0),
+    camera=(0.0, 0.0, 0.0),
+    links=(0.0, 0.0),
+    walk=(0.0, 0.0),
+    spread=0.6,
+):
     """Poses whose noise is known, the true Z and X, and T_link_flange; sigmas in m and rad."""
     rng = np.random.default_rng(seed)
     arm = open_arm("six_r")
-    q = arm.home + rng.uniform(-0.6, 0.6, (n, 6))
+    q = arm.home + rng.uniform(-spread, spread, (n, 6))
     frames = np.array([arm.links(one) for one in q])
     to_flange = inverse(frames) @ frames[:, -1:]
     X, Z = exp_se3(rng.normal(0, [0.05] * 3 + [1] * 3)), exp_se3(rng.normal(0, [0.5] * 3 + [1] * 3))
@@ -96,6 +107,32 @@ def test_an_arm_whose_geometry_is_off_is_recognised_and_the_covariance_allows_fo
     assert np.median(white) > 10 * np.median(of_links)  # what noise that changes from pose to pose would have claimed
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_an_arms_smooth_error_is_found_where_the_poses_are_near_each_other(seed):
+    # A correlation that is wide beside their spread is nearly the same for all, and its mean is what the fit takes away.
+    poses, _, X, _ = made(
+        seed, n=40, in_hand=True, flange=(3e-5, 5e-5), camera=(5e-5, 1e-4, 1e-4), links=(5e-4, 3e-3), spread=0.25
+    )
+    found = calibrate_structured(poses)
+    assert found.structure == SMOOTH
+    e = log_se3(inverse(found.T_flange_held) @ X)
+    assert float(e @ np.linalg.solve(found.cov[6:, 6:], e)) < chi2.isf(1e-3, 6)  # 446 to 751 without the drift
+    assert found.held_out_geometry is not None
+    assert found.held_out_geometry.rms()[0] < 0.75 * found.held_out_nominal.rms()[0]
+
+
+def test_lengths_of_links_that_no_residual_shows_are_allowed_for():
+    squares = []
+    for seed in range(8):
+        poses, _, X, links = made(
+            seed, n=20, in_hand=True, flange=(5e-4, 1e-3), camera=(1e-3, 3e-3, 2e-3), links=(1e-3, 2e-4)
+        )
+        found = calibrate_structured(poses, links=links, structures=("robot's geometry off",))
+        e = log_se3(inverse(found.T_flange_held) @ X)
+        squares.append(float(e @ np.linalg.solve(found.cov[6:, 6:], e)))
+    assert sum(squares) < chi2.isf(1e-3, 48)  # 95 where the most likely variance of links is taken, which may be zero
+
+
 def test_poses_left_out_distinguish_the_arms_error_from_the_cameras():
     both = ("robot", "camera, depth apart")
     arm = calibrate_structured(made(1, n=60, flange=(1e-4, 5e-3))[0], structures=both)
@@ -124,6 +161,45 @@ def test_errors_that_vision_shares_between_poses_are_found_by_the_arm():
     assert nees(found, Z, X) < chi2.isf(1e-3, 12)
     assert found.held_out.rms()[0] < 0.9 * without.held_out.rms()[0]
     assert without.common_m == 0 < found.common_m
+
+
+@pytest.mark.parametrize("steps", [(0.0, 0.0), (5e-4, 5e-4)], ids=["eye-seen", "eye-walking"])
+def test_a_scale_that_walks_is_recognised_and_the_covariance_allows_for_it(steps):
+    squares, off = [], []
+    without = tuple(name for name in STRUCTURES if "scale" not in name)
+    for seed in range(2):
+        poses, _, X, _ = made(seed, n=60, in_hand=True, flange=(5e-5, 5e-5), camera=(1e-4, 1e-4, 1e-4), walk=steps)
+        walked = np.cumsum(np.random.default_rng(seed).normal(0, 4e-3, 60))
+        eye = inverse(poses.B)
+        eye[:, :3, 3] *= 2 * np.exp(walked - walked[0])[:, None]
+        poses = replace(poses, B=inverse(eye))
+        found, before = (
+            calibrate_structured(poses, t_s=np.arange(60.0), scale=True, structures=names)
+            for names in (tuple(STRUCTURES), without)
+        )
+        assert found.structure == ("camera and its scale walking" if any(steps) else "camera's scale walking")
+        assert found.sigmas["scale_walk"] == pytest.approx(4e-3 * np.sqrt(59), rel=0.4)
+        e = log_se3(inverse(found.T_flange_held) @ X)
+        squares.append(float(e @ np.linalg.solve(found.cov[6:, 6:], e)))
+        off.append([np.linalg.norm(each.T_flange_held[:3, 3] - X[:3, 3]) for each in (found, before)])
+    assert sum(squares) < chi2.isf(1e-3, 12)
+    assert sum(found for found, _ in off) < 0.5 * sum(before for _, before in off)
+
+
+def test_a_scale_that_runs_away_is_not_taken():
+    # The wrist alone rotates: the flange hardly moves, and lengths of zero explain that, too.
+    rng = np.random.default_rng(2)
+    arm = open_arm("irb120")
+    q = np.tile(arm.home, (80, 1))
+    q[:, 3:] += rng.uniform(-0.2, 0.2, (80, 3))
+    A = np.array([arm.forward(one) for one in q]) @ exp_se3(rng.normal(0, [5e-4] * 3 + [3e-4] * 3, (80, 6)))
+    X, Z = exp_se3(np.array([0.02, -0.05, 0.06, 0.1, 0.2, -0.3])), exp_se3(np.array([0.6, 0.1, 0.0, 0.5, -1.0, 0.2]))
+    B = inverse(A @ X) @ Z
+    B[:, :3, 3] += rng.normal(0, [3e-3, 3e-3, 9e-3], (80, 3))
+    B[:, :3, :3] = B[:, :3, :3] @ exp_se3(np.c_[np.zeros((80, 3)), rng.normal(0, 2e-3, (80, 3))])[:, :3, :3]
+    found = calibrate_structured(Poses(A, B, np.zeros((80, 6, 6)), True, np.zeros(3)), scale=True)
+    assert found.scale == 1  # 0.35 was taken
+    assert nees(found, Z, X) < chi2.isf(1e-3, 12)
 
 
 def test_a_walk_of_the_eye_is_recognised():

@@ -438,13 +438,15 @@ def offsets(
 
     feetech:PORT: the homing offsets of the servos (register 31); LeRobot's calibration, where given, gets the same. A board
     with armsight's firmware: the tables of its potentiometers. --ar4-offsets: a file of ar4_ros_driver. The drives must be
-    off (`armsight board release`).
+    off (`armsight board release`). A servo's offset is -2047 to 2047 counts; what looks like a mistake, such as
+    more than a tooth of the horn (14.4 degrees), is not written with --yes.
     """
     import numpy as np
 
     from armsight.app.board import offsets as changed
     from armsight.robot.arm_file import open_arm
     from armsight.robot.boards.feetech.board import FeetechBoard
+    from armsight.robot.boards.feetech.offsets import doubts
 
     given = [each for each in (identified, further, restore) if each is not None]
     if len(given) > 1 or (identified is None) != (nominal is None):
@@ -465,8 +467,13 @@ def offsets(
             none = np.zeros(board.abilities.joints)
             changes = changed.planned_changes(board, none if angles is None else angles)
         if given:
+            doubtful = [] if restore is not None else doubts(changes, board.calibration)
+            if doubtful and yes:
+                raise InputError(f"{doubtful[0]}; --yes does not write this: without it you are asked")
             if not yes:
-                click.echo(changed.changes_text(changes), err=True)
+                click.echo(
+                    "\n".join([changed.changes_text(changes), *(f"note: {each}" for each in doubtful)]), err=True
+                )
                 click.confirm("write the new offsets to the servos?", abort=True, err=True)
             changed.apply(board, changes, keep, calibration)
     click.echo(json.dumps(changed.changes_json(changes, bool(given))) if as_json else changed.changes_text(changes))

@@ -71,7 +71,12 @@ def restored_changes(board: FeetechBoard, path: Path) -> list[OffsetChange]:
         wished = {int(id): int(value) for id, value in kept.items()}
     except (json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError):
         raise InputError(f"{path}: not a file of old offsets that `armsight board offsets` kept") from None
-    if set(wished) != set(board.calibration.ids) or any(abs(value) > MOST_OFFSET for value in wished.values()):
+    for id, value in wished.items():
+        if abs(value) > MOST_OFFSET:
+            raise InputError(
+                f"{path}: the offset of id {id} is {value}; the register holds -{MOST_OFFSET} to {MOST_OFFSET}"
+            )
+    if set(wished) != set(board.calibration.ids):
         raise InputError(
             f"{path}: its offsets are of ids {sorted(wished)}, the arm's are {sorted(board.calibration.ids)}"
         )

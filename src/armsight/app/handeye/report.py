@@ -57,7 +57,8 @@ def sigma_figure(run: HandEyeAnswer) -> Figure:
         ax.bar(at + 0.2, factor * sigma[:6][rows], width=0.38, color=ORANGE, label=still)
         ax.set_xticks(at, ["x", "y", "z"])
         ax.set_title(f"sigma along or about the frame's own axes, {unit}")
-    axes[0].legend()
+    axes[0].margins(y=0.25)  # room above the bars
+    axes[0].legend(loc="upper center", ncols=2)
     return figure
 
 

@@ -14,7 +14,7 @@ from armsight.app.report.table import TextTable, plain_text
 from armsight.data import Array, Record
 from armsight.geometry.pose import log_se3, mean_pose
 from armsight.loop.handeye.noise import OF_THE_ARM
-from armsight.loop.handeye.structured import GEOMETRY, POSITIONS, StructuredHandEye
+from armsight.loop.handeye.structured import NOT_AS_MODELLED, POSITIONS, SMOOTH, StructuredHandEye
 
 #: A structure whose mean log density is within this of the best is not distinguished from it.
 DISTINGUISHED = 0.2
@@ -130,13 +130,17 @@ def statements(run: HandEyeAnswer) -> list[str]:
     if found.held_out_geometry is not None:
         errors = (found.held_out, found.held_out_nominal, found.held_out_geometry)
         plain, nominal, geometry = (1e3 * of.rms()[0] for of in errors)
+        what, found_by = "geometry of the arm", "armsight identify finds it"
+        if found.structure == SMOOTH:
+            joints = "" if run.recording.robot.q is not None else "with joints and --model "
+            what, found_by = "smooth error of the arm", f"{joints}armsight identify finds its geometry"
         lines.append(
-            f"with the geometry of the arm that the other poses show, poses left out come to {geometry:.2f} mm in place of "
-            f"{nominal:.2f}; armsight identify finds it"
+            f"with the {what} that the other poses show, poses left out come to {geometry:.2f} mm in place of "
+            f"{nominal:.2f}; {found_by}"
         )
-        if found.structure in GEOMETRY:
+        if found.structure in NOT_AS_MODELLED:
             lines.append(
-                f"the transforms go with that geometry: with the arm's nominal model they leave {plain:.2f} mm; with the "
+                f"the transforms go with the true arm: with the arm's nominal model they leave {plain:.2f} mm; with the "
                 f"mounting that suits the arm's nominal model: {nominal:.2f} mm"
             )
     elif run.recording.robot.q is None:
@@ -210,7 +214,9 @@ def as_json(run: HandEyeAnswer) -> dict[str, Any]:
         "held_out_rms_rad": angle,
         "held_out_mean_m": found.held_out.mean()[0],
         "held_out_nominal_rms_m": found.held_out_nominal.rms()[0],
+        "held_out_nominal_mean_m": found.held_out_nominal.mean()[0],
         "held_out_geometry_rms_m": None if found.held_out_geometry is None else found.held_out_geometry.rms()[0],
+        "held_out_geometry_mean_m": None if found.held_out_geometry is None else found.held_out_geometry.mean()[0],
         "rig_calibration_rms_m": found.common_m,
         "arm_rms_m": found.arm_m,
         "camera_rms_m": found.camera_m,

@@ -20,8 +20,11 @@ those that neighbours share (a drift) one block (1, 6N, 6N): the same functions 
   "Gaussian Processes for Machine Learning", 2006, eq. 2.31); or a random walk over time (an arm that slips, settles or
   loses steps: what it has gained stays), a Wiener process.
 - ``walk_m``, ``walk_rad``: steps of a random walk of the eye's own pose, from frame to frame (visual odometry).
+- ``scale_walk``: the scale of one moving camera, which has none of its own, walks over time: the eye's way from the body's
+  origin is too long by a share that is a Wiener process.
 
-Restricted likelihood: Patterson and Thompson, Biometrika 58, 1971; its gradient: Harville, JASA 72, 1977.
+Restricted likelihood: Patterson and Thompson, Biometrika 58, 1971; its gradient: Harville, JASA 72, 1977. Links' sigmas,
+which few poses hardly show, are kept from zero: Chung et al., Psychometrika 78, 2013.
 """
 
 from __future__ import annotations
@@ -70,6 +73,8 @@ STRUCTURES: dict[str, tuple[str, ...]] = {
     "robot drifting over time": ("flange_m", "flange_rad", "seen_m", "seen_rad", "drift_m", "drift_rad"),
     "robot walking over time": ("flange_m", "flange_rad", "seen_m", "seen_rad", "drift_m", "drift_rad"),
     "camera walking": ("flange_m", "flange_rad", "walk_m", "walk_rad"),
+    "camera's scale walking": ("flange_m", "flange_rad", "seen_m", "seen_rad", "scale_walk"),
+    "camera and its scale walking": ("flange_m", "flange_rad", "walk_m", "walk_rad", "scale_walk"),
     "positions alone": ("seen_m", "hardly_rad"),
 }
 #: Structures whose errors are shared between poses, and are no unknowns.
@@ -78,7 +83,11 @@ SHARED = (
     "robot drifting over time",
     "robot walking over time",
     "camera walking",
+    "camera's scale walking",
+    "camera and its scale walking",
 )
+#: Shared source -> the map that says what it does to a pose.
+SHARED_MAPS = {"drift_m": "flange_m", "drift_rad": "flange_rad", "scale_walk": "scale"}
 #: Sources that are the arm's.
 OF_THE_ARM = ("flange_m", "flange_rad", "link_m", "link_rad", "drift_m", "drift_rad")
 #: Where a drift over poses has forgotten itself: this rotation, rad, or this way, m; and over time, a share of the whole.
@@ -160,6 +169,7 @@ def error_maps(
         "depth_m": axes[..., 2:],
         "seen_rad": about,
         "hardly_rad": about,
+        "scale": np.concatenate([inverse(poses.B)[:, :3, 3:], np.zeros((n, 3, 1))], axis=1),
     }
     if speed is not None:
         maps["time_s"] = carry @ speed[..., None]
@@ -262,8 +272,10 @@ def blocks(linear: Linear, structure: str) -> Blocks:
             first = np.minimum(np.arange(n)[:, None], np.arange(n)[None])
             shared.append(_joined(linear.walk[name][first]))
         else:
-            M = linear.maps["flange_m" if name == "drift_m" else "flange_rad"]
-            K = 1 + linear.kernel[structure]  # what changes by so much from pose to pose has a constant part as large
+            M = linear.maps[SHARED_MAPS[name]]
+            K = linear.kernel[structure]
+            if name != "scale_walk":  # what changes by so much from pose to pose has a constant part as large
+                K = 1 + K
             shared.append(_joined(K[..., None, None] * np.einsum("iak,jbk->ijab", M, M)))
     return Blocks(
         linear.e.reshape(1, -1),
@@ -363,7 +375,7 @@ def left_out_squares(b: Blocks, s: Solved) -> Array:
 
 
 def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
-    """Return minus the restricted log-likelihood, with the prior of pairs, and its gradient by the logarithms."""
+    """Return minus the restricted log-likelihood, with priors of pairs and links, and its gradient by the logarithms."""
     variances = np.exp(logs)
     s = solve(b, variances)
     n, m = b.e.shape
@@ -383,6 +395,11 @@ def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
         cost += 0.5 * LIKE_EACH_OTHER**2 * off**2
         gradient[m] += off
         gradient[rad] -= off
+    for k in np.unique(
+        b.links[b.links >= 0]
+    ):  # of sigma: Gamma(2, 0), so that what no residual shows is not taken for zero
+        cost -= 0.5 * float(logs[k])
+        gradient[k] -= 0.5
     return cost, gradient
 
 

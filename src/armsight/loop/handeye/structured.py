@@ -44,6 +44,7 @@ from armsight.loop.handeye.handeye import (
 from armsight.loop.handeye.noise import (
     OF_THE_ARM,
     SHARED,
+    SHARED_MAPS,
     STRUCTURES,
     Linear,
     blocks,
@@ -80,14 +81,20 @@ CONTRADICTS = np.radians(10.0)
 OPEN_M, OPEN_RAD = 0.1, 0.1
 #: Degrees of freedom of Student's t in the robust start.
 FREEDOM = 4.0
-#: A scale must be off by this many sigmas to be taken.
-SURELY = 5.0
+#: A scale must be off by this many sigmas to be taken, and has settled where a step is below this share of one: where the
+#: flange hardly moves it runs away.
+SURELY, SETTLED = 5.0, 0.1
 #: Neighbours' residuals hang together where Moran's statistic, in sigmas of chance, is above this.
 HANGING = 1.0
 #: The structure that weights positions alone, and by how many sigmas its squared errors must be lower.
 POSITIONS, SURELY_LOWER = "positions alone", 3.0
-#: The structures whose links are off.
+#: The structures whose links are off; that of an arm whose error is a smooth function of the pose; and all of an arm that
+#: is not as its model, whose transforms go with the true arm.
 GEOMETRY = ("robot's geometry off", "robot's geometry and time stamps off")
+SMOOTH = "robot drifting over its poses"
+NOT_AS_MODELLED = (*GEOMETRY, SMOOTH)
+#: Those whose scale walks.
+SCALE_WALKING = ("camera's scale walking", "camera and its scale walking")
 #: Draws by which structures are weighted, and the weight below which one is not true.
 DRAWS, HARDLY_TRUE = 400, 0.02
 #: Rounds of least squares and of leaving out.
@@ -112,11 +119,12 @@ class StructuredHandEye(Record):
         arm_m: what the arm's error moves the body's middle by, RMS of the distance, m.
         camera_m: what vision's error does, m.
         held_out: the error on poses left out of the fit, of transforms found as these were, the arm as its model is. Where
-            the structure says that its geometry is off they go with the true arm, and not with the model.
+            the structure says that the arm is not (``NOT_AS_MODELLED``) they go with the true arm, and not with the model.
         held_out_nominal: the same with the mounting that suits the arm's nominal model; another only where the structure
-            says that its geometry is off.
-        held_out_geometry: the same as held_out where the arm's geometry, as the other poses show it, is taken into
-            account; None without ``links``, or from too few poses.
+            says that the arm is not as its model.
+        held_out_geometry: the same as held_out where the arm's error, as the other poses show it, is taken into account:
+            its geometry with ``links``, else, where the structure has it, its smooth error over its poses; None where
+            there is neither, or from too few poses.
         used: (N,) whether a pose was used, and not taken for a blunder.
         distance: (N,) Mahalanobis distance of each pose's residual, in units of its expectation.
         common: (K,) the errors that all poses share (``Poses.common``), as found, in sigmas.
@@ -231,10 +239,11 @@ class _Problem(Record):
 
     def shared(self, linear: Linear, guess: _Guess, gathered: dict[str, Array]) -> Linear:
         """Add the correlations of shared sources to residuals of the same rows."""
-        kernel = {"robot drifting over its poses": pose_kernel(self.poses.A)}
+        kernel = {SMOOTH: pose_kernel(self.poses.A)}
         if self.t_s is not None:
             kernel["robot drifting over time"] = time_kernel(self.t_s)
-            kernel["robot walking over time"] = wiener_kernel(self.t_s)
+            walked = wiener_kernel(self.t_s)
+            kernel |= {"robot walking over time": walked, **dict.fromkeys(SCALE_WALKING, walked)}
         return replace(linear, kernel=kernel, walk=gathered)
 
 
@@ -364,10 +373,15 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
     guesses = [replace(guess, per_m=per_m) for guess in _first(scaled)]
     found, used = _robust(free, guesses)
     rows = _spread(np.flatnonzero(used), MAX_FIT)
-    linear = free.rows(rows).linear(found)
-    b = blocks(linear, "robot and camera")
-    solved = solve(b, reml(b, _start_variances(linear, "robot and camera")))
-    sure = abs(np.log(found.per_m) + solved.x[12]) > SURELY * np.sqrt(solved.cov[12, 12])
+    at, sure = found, False
+    for _ in range(ROUNDS):
+        linear = free.rows(rows).linear(at)
+        b = blocks(linear, "robot and camera")
+        solved = solve(b, reml(b, _start_variances(linear, "robot and camera")))
+        at, sigma = at.moved(solved.x, free.free), np.sqrt(solved.cov[12, 12])
+        sure = abs(np.log(at.per_m)) > SURELY * sigma and abs(solved.x[12]) < sigma
+        if abs(solved.x[12]) < SETTLED * sigma:
+            break
     (before_m, before_rad), (after_m, after_rad) = (
         _middle_sigmas(p.rows(rows).linear(g).e) for p, g in ((problem, known), (free, found))
     )
@@ -485,7 +499,8 @@ def _start_variances(linear: Linear, structure: str) -> Array:
     """Return variances to begin at: what the residuals are, shared evenly between the sources."""
     position, rotation = _middle_sigmas(linear.e)
     sources = STRUCTURES[structure]
-    small = {"time_s": 1e-6, "image": 1.0, "walk_m": 0.01 * position**2, "walk_rad": 0.01 * rotation**2}
+    small = {"time_s": 1e-6, "image": 1.0, "scale_walk": 1e-4}
+    small |= {"walk_m": 0.01 * position**2, "walk_rad": 0.01 * rotation**2}
     even = {name: (position if name.endswith("_m") else rotation) ** 2 / 2 for name in sources}
     return np.asarray(np.maximum([small.get(name, even[name]) for name in sources], 1e-13))
 
@@ -502,9 +517,10 @@ def _allowed(structure: str, problem: _Problem, count: int, covered: bool) -> bo
         return problem.links is not None and count >= MIN_SHARED and timed
     if "time_s" in sources:
         return problem.speed is not None
-    if structure in ("robot drifting over time", "robot walking over time") or "walk_m" in sources:
+    if structure in SHARED and structure != SMOOTH:
         walks = "walk_m" not in sources or problem.poses.in_hand
-        return problem.t_s is not None and count >= MIN_SHARED and walks
+        scaled = "scale_walk" not in sources or problem.free[0]
+        return problem.t_s is not None and count >= MIN_SHARED and walks and scaled
     return structure not in SHARED or count >= MIN_SHARED
 
 
@@ -531,9 +547,11 @@ def _chosen(
         progress(f"hand-eye: poses left out ({name})")
         trials[name] = _trial(whole, guess, used, name, gathered)
     best, geometries = _best(whole, trials), [trials[name] for name in GEOMETRY if name in trials]
+    if best == SMOOTH:
+        geometries.append(trials[best])
     geometry = max(geometries, key=lambda trial: float(trial.density.mean()), default=None)
-    as_modelled = {name: trial for name, trial in trials.items() if name not in GEOMETRY}
-    nominal = trials[best] if best not in GEOMETRY or not as_modelled else trials[_best(whole, as_modelled)]
+    as_modelled = {name: trial for name, trial in trials.items() if name not in NOT_AS_MODELLED}
+    nominal = trials[best] if best not in NOT_AS_MODELLED or not as_modelled else trials[_best(whole, as_modelled)]
     progress(f"hand-eye: fitting ({best})")
     guess, used, variances = _settled(whole, guess, used, best, gathered)
     rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
@@ -685,24 +703,32 @@ def _hanging(
     variances: Array,
     gathered: dict[str, Array],
 ) -> set[str]:
-    """Return the structures with shared errors that the residuals of neighbours speak for (Moran's test)."""
+    """Return the structures with shared errors that the residuals of neighbours speak for.
+
+    Moran's test of the residuals of a regression, which have lost what the unknowns fit (Cliff and Ord, "Spatial
+    Processes", 1981, chapter 8): a kernel that is wide beside the poses' spread is mostly lost so.
+    """
     rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT)
     if structure in SHARED or len(rows) < MIN_SHARED:
         return set(SHARED)
     part = whole.rows(rows)
     linear = part.shared(part.linear(guess), guess, {})
-    C = blocks(linear, structure).covariance(variances)
-    white = np.linalg.solve(np.linalg.cholesky(C), linear.e[..., None])[..., 0]
-    kernels, index = dict(linear.kernel), np.arange(len(rows))
+    n, C = len(rows), blocks(linear, structure).covariance(variances)
+    L = np.linalg.cholesky(C)
+    white = np.linalg.solve(L, linear.e[..., None]).reshape(-1)
+    fitted, _ = np.linalg.qr(np.linalg.solve(L, linear.J).reshape(6 * n, -1))
+    white = white - fitted @ (fitted.T @ white)
+    kernels, index = dict(linear.kernel), np.arange(n)
     beside = np.asarray(np.abs(index[:, None] - index[None]) == 1, dtype=float)
     if gathered:
         kernels["camera walking"] = beside
-    if "robot walking over time" in kernels:  # the fit takes the mean away, and with it what all have in common
-        kernels["robot walking over time"] = beside
+    kernels |= dict.fromkeys(kernels.keys() & {"robot walking over time", *SCALE_WALKING}, beside)
     found = set()
     for name, K in kernels.items():
-        others = K - np.diag(np.diag(K))
-        moran = float(np.einsum("ik,ij,jk->", white, others, white)) / np.sqrt(2 * 6 * float((others**2).sum()))
+        W = np.kron(K - np.diag(np.diag(K)), np.eye(6))
+        W = W - fitted @ (fitted.T @ W)
+        W = W - (W @ fitted) @ fitted.T
+        moran = float(white @ W @ white - np.trace(W)) / np.sqrt(2 * float((W**2).sum()))
         if moran > HANGING:
             found.add(name)
     return found
@@ -767,7 +793,7 @@ def _distances(whole: _Problem, guess: _Guess, structure: str, variances: Array,
         elif name in gathered:
             C += variance * gathered[name]
         else:
-            M = linear.maps[name.replace("drift", "flange")]
+            M = linear.maps[SHARED_MAPS.get(name, name)]
             C += variance * M @ np.swapaxes(M, 1, 2)
     C += 1e-16 * np.eye(6)
     return np.asarray(np.einsum("ni,ni->n", linear.e, np.linalg.solve(C, linear.e[..., None])[..., 0]) / 6)
@@ -809,7 +835,7 @@ def _displacements(
         elif name in linear.walk:
             size = float(np.einsum("ai,nij,aj->n", middle, linear.walk[name], middle).mean())
         else:
-            M = middle @ linear.maps[name.replace("drift", "flange")]
+            M = middle @ linear.maps[SHARED_MAPS.get(name, name)]
             size = float(np.einsum("nij,nij->n", M, M).mean())
         if name in OF_THE_ARM:
             arm += variance * size

@@ -136,12 +136,14 @@ def write_offsets(path: str | Path, source: str | Path, offsets: dict[int, int])
         offsets: by id of the servo.
 
     Raises:
-        InputError: the source is none, or the file cannot be written.
+        InputError: the source is none, an offset is none that a servo holds, or the file cannot be written.
     """
     read_calibration(source)
     entries = _entries(source)
-    for entry in entries.values():
+    for name, entry in entries.items():
         entry["homing_offset"] = offsets.get(entry["id"], entry["homing_offset"])
+        if name != GRIPPER:
+            _row(path, name, entry)
     write_text(path, json.dumps(entries, indent=4) + "\n")
 
 

@@ -2,7 +2,8 @@
 
 A servo reports ``actual - offset``. A joint that really is further by an angle than it reports needs an offset that is
 smaller by as many counts. The register holds -2047 to 2047. The torque must be off: an offset that changes under torque
-moves the joint.
+moves the joint. What looks like a mistake is said first (:func:`doubts`): a correction larger than a tooth of the horn, or
+a count that would jump within the joint's travel.
 """
 
 from __future__ import annotations
@@ -15,7 +16,13 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.robot.boards.feetech.bus import ServoBus
 from armsight.robot.boards.feetech.calibration import ServoCalibration
-from armsight.robot.boards.feetech.registers import HOMING_OFFSET, MOST_OFFSET, RAD_PER_COUNT, TORQUE
+from armsight.robot.boards.feetech.registers import COUNTS, HOMING_OFFSET, MOST_OFFSET, RAD_PER_COUNT, TORQUE
+
+#: The horn's teeth: a joint's zero is off by less than one, unless the horn is mounted wrongly; and in counts.
+HORN_TEETH = 25
+TOOTH_COUNTS = COUNTS / HORN_TEETH
+#: Counts that are to be left to the end of the register: two degrees, for the next correction.
+SPARE_COUNTS = 23
 
 
 class OffsetChange(NamedTuple):
@@ -61,6 +68,37 @@ def corrected_offsets(bus: ServoBus, calibration: ServoCalibration, further_rad:
             )
         changes.append(OffsetChange(name, id, old, new))
     return changes
+
+
+def doubts(changes: list[OffsetChange], calibration: ServoCalibration) -> list[str]:
+    """Return why changes look like mistakes, a sentence each; none where they do not.
+
+    Args:
+        changes: of the offsets.
+        calibration: the ranges of the joints, counts. One that has the whole revolution has no ends that are known.
+    """
+    said = []
+    for change in changes:
+        lower, of = change.old - change.new, f"{change.name} (id {change.id})"  # by so many counts it reports more
+        row = calibration.ids.index(change.id)
+        low, high = calibration.lowest[row], calibration.highest[row]
+        if abs(lower) > TOOTH_COUNTS:
+            said.append(
+                f"{of}: {np.degrees(lower * RAD_PER_COUNT):.1f} deg is more than a tooth of the horn"
+                f" ({360 / HORN_TEETH:.1f} deg): a wrong number, or a horn to be mounted anew"
+            )
+        elif lower and abs(change.new) > MOST_OFFSET - SPARE_COUNTS:
+            said.append(
+                f"{of}: its offset {change.new} is at the end of what the register holds, -{MOST_OFFSET} to {MOST_OFFSET}:"
+                " mount the horn by some teeth further round, and calibrate anew"
+            )
+        if lower and high - low < COUNTS - 1 and not 0 <= low + lower <= high + lower <= COUNTS - 1:
+            end, where = (low, "lower") if low + lower < 0 else (high, "upper")
+            said.append(
+                f"{of}: its {where} end would be at count {end + lower:.0f}; counts are 0 to {COUNTS - 1}, and its reading"
+                " would jump by a revolution there"
+            )
+    return said
 
 
 def require_released(bus: ServoBus, changes: list[OffsetChange]) -> None:
