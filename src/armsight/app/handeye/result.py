@@ -14,7 +14,7 @@ from armsight.app.report.table import TextTable, plain_text
 from armsight.data import Array, Record
 from armsight.geometry.pose import log_se3, mean_pose
 from armsight.loop.handeye.noise import OF_THE_ARM
-from armsight.loop.handeye.structured import NOT_AS_MODELLED, POSITIONS, SMOOTH, StructuredHandEye
+from armsight.loop.handeye.structured import GEOMETRY, POSITIONS, SMOOTH, StructuredHandEye
 
 #: A structure whose mean log density is within this of the best is not distinguished from it.
 DISTINGUISHED = 0.2
@@ -138,7 +138,7 @@ def statements(run: HandEyeAnswer) -> list[str]:
             f"with the {what} that the other poses show, poses left out come to {geometry:.2f} mm in place of "
             f"{nominal:.2f}; {found_by}"
         )
-        if found.structure in NOT_AS_MODELLED:
+        if found.structure in GEOMETRY:
             lines.append(
                 f"the transforms go with the true arm: with the arm's nominal model they leave {plain:.2f} mm; with the "
                 f"mounting that suits the arm's nominal model: {nominal:.2f} mm"

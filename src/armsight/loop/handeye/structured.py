@@ -88,8 +88,8 @@ SURELY, SETTLED = 5.0, 0.1
 HANGING = 1.0
 #: The structure that weights positions alone, and by how many sigmas its squared errors must be lower.
 POSITIONS, SURELY_LOWER = "positions alone", 3.0
-#: The structures whose links are off; that of an arm whose error is a smooth function of the pose; and all of an arm that
-#: is not as its model, whose transforms go with the true arm.
+#: The structures whose links are off, whose transforms go with the true arm; that of an arm whose error is a smooth
+#: function of the pose, whose transforms are the mounting that suits its model; and all of an arm that is not as its model.
 GEOMETRY = ("robot's geometry off", "robot's geometry and time stamps off")
 SMOOTH = "robot drifting over its poses"
 NOT_AS_MODELLED = (*GEOMETRY, SMOOTH)
@@ -119,9 +119,8 @@ class StructuredHandEye(Record):
         arm_m: what the arm's error moves the body's middle by, RMS of the distance, m.
         camera_m: what vision's error does, m.
         held_out: the error on poses left out of the fit, of transforms found as these were, the arm as its model is. Where
-            the structure says that the arm is not (``NOT_AS_MODELLED``) they go with the true arm, and not with the model.
-        held_out_nominal: the same with the mounting that suits the arm's nominal model; another only where the structure
-            says that the arm is not as its model.
+            the structure says that the arm's geometry is off (``GEOMETRY``) they go with the true arm, not with the model.
+        held_out_nominal: the same with the mounting that suits the arm's nominal model; another only with ``GEOMETRY``.
         held_out_geometry: the same as held_out where the arm's error, as the other poses show it, is taken into account:
             its geometry with ``links``, else, where the structure has it, its smooth error over its poses; None where
             there is neither, or from too few poses.
@@ -552,6 +551,7 @@ def _chosen(
     geometry = max(geometries, key=lambda trial: float(trial.density.mean()), default=None)
     as_modelled = {name: trial for name, trial in trials.items() if name not in NOT_AS_MODELLED}
     nominal = trials[best] if best not in NOT_AS_MODELLED or not as_modelled else trials[_best(whole, as_modelled)]
+    given = nominal if best == SMOOTH else trials[best]
     progress(f"hand-eye: fitting ({best})")
     guess, used, variances = _settled(whole, guess, used, best, gathered)
     rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
@@ -563,6 +563,12 @@ def _chosen(
         other, spread = _student(whole, guess, used, name, trials[name].variances, gathered)
         mixed = mixed + weights[name] * (spread + np.outer(other - x, other - x))
     cov = mixed
+    if (
+        best == SMOOTH and as_modelled
+    ):  # the arm is used by its model: how far its mounting is from the true one is in cov
+        name = _best(whole, as_modelled)
+        suits, _ = _student(whole, guess, used, name, trials[name].variances, gathered)
+        cov, x = cov + np.outer(suits - x, suits - x), suits
     guess = guess.moved(x, whole.free)
     metric, cov = whole.metric(guess, cov)
     require_known(whole.poses, metric.Z, metric.X, cov)
@@ -585,7 +591,7 @@ def _chosen(
         likelihoods={name: float(trial.density.mean()) for name, trial in trials.items()},
         arm_m=arm,
         camera_m=camera,
-        held_out=_held_out_errors(whole, guess, trials[best].residual, trials[best].rows),
+        held_out=_held_out_errors(whole, guess, given.residual, given.rows),
         held_out_nominal=_held_out_errors(whole, guess, nominal.residual, nominal.rows),
         held_out_geometry=None if geometry is None else _held_out_errors(whole, guess, geometry.left, geometry.rows),
         used=used,
