@@ -303,7 +303,7 @@ class Campaign:
                 break
         self.plant.break_pot(joint, PotFault.NONE)
         reported_at_once = broken in (PotFault.OPEN, PotFault.SHORT, PotFault.JUMP)
-        # The board begins to count with the last reading that changed, and judges a reference a tick after it was there.
+        # The board begins to count with the last reading that changed, and compares a reference a tick after it was there.
         far_rad = self.config["joint"]["pot"]["frozen_rad"][joint] + 2e-3 * self.limits.speed_rad_s
         far_enough = broken == PotFault.FROZEN and travel_rad > far_rad
         must = (

@@ -10,14 +10,14 @@ from pathlib import Path
 # As the commands set it, before numpy is imported: small matrices are ten times slower where OpenBLAS's threads wait.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import cv2  # noqa: E402
-import pytest  # noqa: E402
-from _pytest.runner import runtestprotocol  # noqa: E402
-from hypothesis import settings  # noqa: E402
+import cv2
+import pytest
+from _pytest.runner import runtestprotocol
+from hypothesis import settings
 
-from armsight.errors import DeviceError, InputError  # noqa: E402
-from armsight.robot.boards.opening import open_emulator  # noqa: E402
-from made_once import begin, made_once  # noqa: E402
+from armsight.errors import DeviceError, InputError
+from armsight.robot.boards.opening import open_emulator
+from made_once import begin, made_once
 
 ROOT = Path(__file__).resolve().parent.parent
 
