@@ -152,7 +152,7 @@ def _usage_text(error: click.ClickException) -> str:
     context = error.ctx if isinstance(error, click.UsageError) else None
     if context is not None and isinstance(error, click.NoSuchOption):
         text = f"no such option: {error.option_name}{_meant_option(error.option_name, context)}"
-    if context is not None and (extra := re.search(r"unexpected extra argument \((.+)\)$", text)):
+    if context is not None and (extra := re.search(r"unexpected extra arguments? \((\S+).*\)$", text)):
         text += "" if _option(context, "--source") is None else f": images follow an option, --source {extra[1]}"
     if context is not None and (unknown := re.match(r"no such command '(.*?)'", text)):
         text = unknown[0] + _meant(unknown[1], context)
@@ -177,6 +177,9 @@ def _option(context: click.Context, name: str) -> click.Option | None:
 
 def _meant_option(name: str, context: click.Context) -> str:
     """Return what was likely meant by an option that a command does not have: another name of it, or one spelt alike."""
+    for each in context.command.params:
+        if isinstance(each, click.Argument) and (given := each.metavar or "").lower().startswith(name.lstrip("-")):
+            return f": {given} is given without an option"
     known = [o for p in context.command.params if isinstance(p, click.Option) for o in p.opts if o.startswith("--")]
     also = [other for other in _ALSO.get(name, ()) if other in known]
     alike = difflib.get_close_matches(name.lstrip("-"), [each.lstrip("-") for each in known], 1)

@@ -151,6 +151,7 @@ def test_a_correction_that_looks_like_a_mistake_is_asked_about_and_never_written
 def test_an_offset_at_the_end_of_its_register_and_a_count_that_would_jump_are_said(tmp_path):
     calibration = read_calibration(lerobot(tmp_path / "follower.json"))  # counts 700 to 3396
     assert doubts([OffsetChange("elbow_flex", 3, 2040, 2040), OffsetChange("wrist_flex", 4, 0, 100)], calibration) == []
+    assert doubts([OffsetChange("elbow_flex", 3, 2047, 2030)], calibration) == []  # away from the end
     (end,) = doubts([OffsetChange("elbow_flex", 3, -2000, -2030)], calibration)
     assert "its offset -2030 is at the end of what the register holds, -2047 to 2047" in end
     narrow = uncalibrated(np.full(5, 20.0), np.full(5, 3000.0))

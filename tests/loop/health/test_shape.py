@@ -97,6 +97,19 @@ def test_a_disc_that_moves_by_a_few_tolerances_is_named_by_what_the_body_was_bef
     assert given_square < 10.0
 
 
+def test_what_a_body_was_before_it_changed_is_kept_however_long_ago():
+    """The tests of then are among the newest thirty no longer after half a minute."""
+    squares, shots = [], list(watched_body(5501, shift=displaced(0.3, 1), at_s=5.0, seconds=45.0))
+    for _, t_s, T, _, given in shots:
+        if t_s > 38.0:
+            off = log_se3(inverse(T) @ given.T_left_body)
+            squares.append(off @ np.linalg.solve(given.cov, off))
+    monitor = shots[-1][0]
+    (found,) = monitor.findings()
+    assert abs(found.since_s - 5.0) < 1.5
+    assert np.mean(squares) < 10.0
+
+
 def test_a_bent_body_is_named_with_several_points():
     (found,), _ = watched(52, shift=5e-4 * np.outer(np.arange(len(BODY.points)) % 2, [0, 0, 1]), seconds=6.0)
     assert found.cause == "body"

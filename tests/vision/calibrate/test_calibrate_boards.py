@@ -159,7 +159,7 @@ def test_frames_that_repeat_are_no_further_pairs():
     pairs[5] = replace(pairs[4], name="p05")
     c = calibrate_boards(board, pairs, SIZES, models=("brown5",), folds=2, flat=True)
     assert {r.pair: r.reason for r in c.rejected} == {
-        "p03": "the right image is that of p02: a frame that repeats shows nothing new",
+        "p03": "the right image is that of p02: a frame that repeats is of another moment than its pair",
         "p05": "both images are those of p04: a frame that repeats shows nothing new",
     }
     with pytest.raises(CalibrationError, match=r"1 of 8 pairs are usable.*p1: both images are those of p0: a frame"):

@@ -204,8 +204,9 @@ class JointFound:
 
     @property
     def noise_rad(self) -> float:
-        """Noise of a reading."""
-        return (self.noise_counts or 10.0) * self.rad_per_count
+        """Noise of a reading, no less than its rounding; 10 counts where it was not measured."""
+        counts = 10.0 if self.noise_counts is None else max(self.noise_counts, 12**-0.5)
+        return counts * self.rad_per_count
 
 
 @dataclass

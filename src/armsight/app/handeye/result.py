@@ -14,7 +14,7 @@ from armsight.app.report.table import TextTable, plain_text
 from armsight.data import Array, Record
 from armsight.geometry.pose import log_se3, mean_pose
 from armsight.loop.handeye.noise import OF_THE_ARM
-from armsight.loop.handeye.structured import GEOMETRY, POSITIONS, SMOOTH, StructuredHandEye
+from armsight.loop.handeye.structured import GEOMETRY, POSITIONS, SCALE_WALKING, SMOOTH, StructuredHandEye
 
 #: A structure whose mean log density is within this of the best is not distinguished from it.
 DISTINGUISHED = 0.2
@@ -152,7 +152,12 @@ def statements(run: HandEyeAnswer) -> list[str]:
             f"the rig's calibration was fitted too: {1e3 * found.common_m:.2f} mm RMS at the target, at most "
             f"{np.abs(found.common).max():.1f} of its own sigmas; poses used and left out are corrected by it"
         )
-    if found.sigma_scale:
+    if found.structure in SCALE_WALKING:
+        lines.append(
+            f"the camera's scale walks by {100 * found.sigmas['scale_walk']:.2g} % over all poses (sigma): the "
+            f"target's lengths are {found.scale:.5f} ± {found.sigma_scale:.5f} of those given at the first pose alone"
+        )
+    elif found.sigma_scale:
         lines.append(
             f"the target's lengths are {found.scale:.5f} ± {found.sigma_scale:.5f} of those given: correct --target's size"
         )

@@ -288,8 +288,14 @@ class MeasureStep:
             with self._lock:
                 if self._measure is work:  # else another rig or target was chosen meanwhile
                     self.take(live, result)
-        if (second := self._second) is not None and second.measure is not None:
-            second.newest = live.number, second.measure(live)
+        with self._lock:
+            second = self._second
+            work = None if second is None else second.measure
+        if second is not None and work is not None:
+            result = work(live)
+            with self._lock:
+                if second.measure is work:
+                    second.newest = live.number, result
 
     def take(self, live: LiveShot, result: PoseEstimate | Missed) -> None:
         """Take in what was measured in a shot, here or in a control loop."""

@@ -395,9 +395,8 @@ def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
         cost += 0.5 * LIKE_EACH_OTHER**2 * off**2
         gradient[m] += off
         gradient[rad] -= off
-    for k in np.unique(
-        b.links[b.links >= 0]
-    ):  # of sigma: Gamma(2, 0), so that what no residual shows is not taken for zero
+    # Gamma(2, 0) of each link's sigma, so that what no residual shows is not taken for zero.
+    for k in np.unique(b.links[b.links >= 0]):
         cost -= 0.5 * float(logs[k])
         gradient[k] -= 0.5
     return cost, gradient

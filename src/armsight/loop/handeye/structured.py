@@ -842,7 +842,8 @@ def _displacements(
             size = float(np.einsum("ai,nij,aj->n", middle, linear.walk[name], middle).mean())
         else:
             M = middle @ linear.maps[SHARED_MAPS.get(name, name)]
-            size = float(np.einsum("nij,nij->n", M, M).mean())
+            walked = np.diag(linear.kernel[structure]) if name == "scale_walk" else 1.0
+            size = float((walked * np.einsum("nij,nij->n", M, M)).mean())
         if name in OF_THE_ARM:
             arm += variance * size
         else:

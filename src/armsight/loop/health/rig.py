@@ -65,7 +65,7 @@ _LEAST_POINTS, _APART_S = 4, 0.5
 #: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
 TEST_S, TEST_SHOTS, FORGET_TESTS = 1.0, 60, 30.0
 #: Residuals are not linear in the size of a body that is off by more than this share of it.
-_LINEAR = 0.02
+_LINEAR = 0.005
 #: In so many tests after an alarm what was before the change is dropped; it began at most so many tests before the alarm.
 _FRESH, _BEFORE = 6, 3
 #: Tests that are kept, to find since when.

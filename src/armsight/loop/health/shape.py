@@ -31,7 +31,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -274,13 +274,14 @@ class ShapeWatch:
         self._views: list[Array] = []  # of the running test
         self._history: deque[_ShapeTest] = deque(maxlen=_KEPT)
         every = 1 + K + 7 + 2 + 3 * n
-        # Of older tests, of all shots and of the usual ones, while nothing was suspected.
+        # Of older tests, of all shots and of the usual ones; of those before what is suspected to have changed.
         self._settled = ResidualSums(every - 1, 0.0), ResidualSums(every - 1, 0.0)
         # Of both, what was settled and the tests before each one that is kept, all of them last.
         self._running: tuple[list[ResidualSums], list[ResidualSums]] = [], []
         self._shots: deque[Array] = deque(maxlen=_ASKED)  # rows, as they were taken
         # The response of the newest poses to the parameters, and the covariances of these poses.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
+        self._changed_s: float | None = None  # since when something may have changed
         self._alarms = 0  # in a row
         self._suspect: ShapeError | None = None
         self.doubt: Array | None = None
@@ -315,7 +316,8 @@ class ShapeWatch:
             usual: the same without the shots that fit worst.
             ends: whether it ends all.
         """
-        if len(self._history) == _KEPT and self.doubt is None and self.found is None:
+        # The test before the first one after a change is of both times.
+        if len(self._history) == _KEPT and (self._changed_s is None or self._history[1].sums.begin_s < self._changed_s):
             oldest = self._history[0]
             self._settled = _settled(self._settled[0], oldest.sums), _settled(self._settled[1], oldest.usual)
         self._history.append(_ShapeTest(sums, usual, self._reduced(sums), self._views))
@@ -333,12 +335,21 @@ class ShapeWatch:
             self._suspect = self._shown(len(tests) - max(later, 1))
         if self._suspect is not None and self._alarms < _FRESH:
             self._suspect = self._dated()
+        elif self._suspect is not None and before is not None and before.chosen[0] == self._suspect.chosen[0]:
+            # Though the tests of that time are no longer kept.
+            self._suspect = replace(self._suspect, begin_s=before.begin_s)
         self._alarms = 0 if self._suspect is None else self._alarms + 1
         # What a change leaves in the test in which it began may look like a displaced point, once.
         again = self._suspect is not None and before is not None and before.chosen[0] == self._suspect.chosen[0]
         self.found = self._suspect if again or (ends and len(tests) == 1) else None
         self.said = self.found or self.said
-        self.doubt = self._doubted()
+        doubted_s, self.doubt = self._doubted()
+        if self.found is not None:
+            self._changed_s = self.found.begin_s
+        elif self.doubt is None:
+            self._changed_s = None
+        elif self._changed_s is None:
+            self._changed_s = doubted_s
 
     def _counts(self) -> tuple[int, ...]:
         """Return how many newest tests may be those after a change."""
@@ -355,18 +366,25 @@ class ShapeWatch:
         after.begin_s = self._history[begin].sums.begin_s
         return after.besides(running[max(begin - 1, 0)], self._size)
 
-    def _doubted(self) -> Array | None:
-        """Return the second moment (7 + C, 7 + C) of what may have changed; None where nothing did, more probably."""
+    def _doubted(self) -> tuple[float, Array | None]:
+        """Return since when something may have changed, s, and its second moment (7 + C, 7 + C).
+
+        None where nothing did, more probably.
+        """
         tests = len(self._history)
         if self.found is None:
-            sums = (self._since(tests - count, usual=True) for count in self._counts())
-            evidence, moment = max((self._mixture(each, self._hypotheses) for each in sums), key=lambda each: each[0])
-            return moment if evidence > np.log(2.0) else None
+            sums = [self._since(tests - count, usual=True) for count in self._counts()]
+            mixtures = [self._mixture(each, self._hypotheses) for each in sums]
+            best = max(range(len(sums)), key=lambda n: mixtures[n][0])
+            evidence, moment = mixtures[best]
+            return sums[best].begin_s, moment if evidence > np.log(2.0) else None
         if self.found.chosen != (FOCAL,):
-            return None
+            return self.found.begin_s, None
         # Cameras that moved cannot be excluded.
         later = sum(each.usual.begin_s >= self.found.begin_s for each in self._history)
-        return self._mixture(self._since(tests - max(later, 1), usual=True), self._hypotheses[:1])[1]
+        return self.found.begin_s, self._mixture(self._since(tests - max(later, 1), usual=True), self._hypotheses[:1])[
+            1
+        ]
 
     def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypotheses]) -> tuple[float, Array]:
         """Return the log-evidence that anything changed before the tests of sums, and the second moment of what did.

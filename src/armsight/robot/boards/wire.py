@@ -151,9 +151,8 @@ class Wire:
                 self.broken += 1
                 if message.data[0] in _MARKERS:
                     self._search_on(message.data)
-            elif (
-                message.get_msgId() in self._kinds
-            ):  # else nothing says how its CRC begins: the next one's count misses it
+            # Of a kind that nobody knows nothing says what its CRC begins with: it is left out, and missed in the count.
+            elif message.get_msgId() in self._kinds:
                 self._count_frame(message.get_seq())
                 found.append(message)
 

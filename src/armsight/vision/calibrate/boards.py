@@ -480,9 +480,9 @@ def _disc_radius(
 def _usable(pairs: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:
     """Split the pairs into those that show the board in both images and those that do not, with reasons."""
     usable, rejected = list[Pair](), []
+    first: dict[tuple[str, bytes, bytes], str] = {}  # the pair of each image that was seen
     for pair in pairs:
         common = np.intersect1d(pair.left.ids, pair.right.ids)
-        repeated = next((r for before in usable if (r := _repeated(before, pair)) is not None), None)
         problems = [f"{side}: {d.problem}" for side, d in (("left", pair.left), ("right", pair.right)) if d.problem]
         if problems:
             rejected.append(RejectedPair(pair.name, "; ".join(problems)))
@@ -490,24 +490,24 @@ def _usable(pairs: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:
             rejected.append(
                 RejectedPair(pair.name, f"{len(common)} points seen by both cameras, {LEAST_CORNERS} are needed")
             )
-        elif repeated is not None:
+        elif (repeated := _repeated(first, pair)) is not None:
             rejected.append(RejectedPair(pair.name, repeated))
         else:
             usable.append(pair)
     return usable, rejected
 
 
-def _repeated(before: Pair, pair: Pair) -> str | None:
-    """Say which image of a pair is that of an earlier one, to the last digit of its detections; None where none is."""
-    same = [
-        side
-        for side, a, b in (("left", before.left, pair.left), ("right", before.right, pair.right))
-        if np.array_equal(a.uv, b.uv) and np.array_equal(a.cov_uv, b.cov_uv)
-    ]
-    if not same:
-        return None
-    which = "both images are those" if len(same) == 2 else f"the {same[0]} image is that"
-    return f"{which} of {before.name}: a frame that repeats shows nothing new"
+def _repeated(first: dict[tuple[str, bytes, bytes], str], pair: Pair) -> str | None:
+    """Say which image of a pair is an earlier one's, to the last digit of its detections; remember both where none is."""
+    keys = [(name, d.uv.tobytes(), d.cov_uv.tobytes()) for name, d in (("left", pair.left), ("right", pair.right))]
+    same = [(key[0], first[key]) for key in keys if key in first]
+    if len(same) == 2 and same[0][1] == same[1][1]:
+        return f"both images are those of {same[0][1]}: a frame that repeats shows nothing new"
+    if same:
+        images = " and ".join(f"the {side} image is that of {name}" for side, name in same)
+        return f"{images}: a frame that repeats is of another moment than its pair"
+    first |= dict.fromkeys(keys, pair.name)
+    return None
 
 
 def _usable_alone(singles: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:
@@ -680,7 +680,8 @@ def calibrate_recording(
         InputError: the times do not rise.
     """
     seen = [pair for pair in pairs if min(len(pair.left.ids), len(pair.right.ids)) >= LEAST_CORNERS]
-    _enough(len(seen), len(pairs), _usable(pairs)[1])
+    if len(seen) < LEAST_PAIRS:
+        _enough(len(seen), len(pairs), _usable(pairs)[1])
     given, several = _spread(seen), tuple(m for m in ("brown4", "fisheye") if m in models) or models[:1]
     first = calibrate_boards(
         board, given, sizes, models=several, flat=flat, folds=2, singles=singles, progress=progress

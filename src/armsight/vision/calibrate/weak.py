@@ -41,7 +41,12 @@ def weaknesses(calibration: Calibration) -> tuple[str, ...]:
 
 
 def contradicted(calibration: Calibration) -> bool:
-    """Whether held-out pairs contradict the rig so that nothing must be measured with it."""
+    """Whether held-out pairs contradict the rig so that nothing must be measured with it.
+
+    What boards moved between the exposures of a pair is in the rig's covariance.
+    """
+    if calibration.motion is not None:
+        return False
     longest = max(max(camera.image_size_px) for camera in calibration.rig.cameras)
     return calibration.heldout.epipolar_rms_px > _CONTRADICTION * longest
 
@@ -57,7 +62,8 @@ def _agreement(calibration: Calibration) -> str | None:
 
 
 def _pairs(calibration: Calibration) -> str | None:
-    used, found = len(calibration.pairs), calibration.pairs_found
+    used = len(calibration.pairs)
+    found = calibration.pairs_found - sum("frame that repeats" in each.reason for each in calibration.rejected)
     if used < _GOOD_PAIRS:
         hidden = (
             ", and one whose board moved between the images may go unnoticed among so few" if used < _TESTED else ""

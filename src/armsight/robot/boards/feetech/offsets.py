@@ -87,7 +87,7 @@ def doubts(changes: list[OffsetChange], calibration: ServoCalibration) -> list[s
                 f"{of}: {np.degrees(lower * RAD_PER_COUNT):.1f} deg is more than a tooth of the horn"
                 f" ({360 / HORN_TEETH:.1f} deg): a wrong number, or a horn to be mounted anew"
             )
-        elif lower and abs(change.new) > MOST_OFFSET - SPARE_COUNTS:
+        elif abs(change.new) > max(abs(change.old), MOST_OFFSET - SPARE_COUNTS):
             said.append(
                 f"{of}: its offset {change.new} is at the end of what the register holds, -{MOST_OFFSET} to {MOST_OFFSET}:"
                 " mount the horn by some teeth further round, and calibrate anew"
