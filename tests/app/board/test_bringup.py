@@ -6,6 +6,7 @@ import os
 import pty
 import re
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -70,6 +71,14 @@ def test_one_joint_is_identified_verified_and_stored(tmp_path):
     evening.plant.drives_s = 0.0
     Bringup(evening.board, evening.person, tmp_path, [0]).run(["potentiometers", "motors", "swing"])
     assert evening.plant.drives_s == 0.0
+    # Of another arm it is refuted, and nothing is stored.
+    signs = evening.plant.wiring.motor_signs
+    other = Evening(tmp_path, replace(evening.plant.wiring, motor_signs=tuple(-sign for sign in signs)))
+    (tmp_path / "board.toml").unlink()
+    other.bringup.run(["verify", "store"])
+    assert other.bringup.refuted
+    assert not other.bringup.found.verified
+    assert not (tmp_path / "board.toml").exists()
 
 
 @pytest.fixture

@@ -690,6 +690,9 @@ class Bringup:
         ):
             self._person.say("left out: it was not allowed to move")
             return
+        self.found.verified = False
+        for j in ready:
+            self.found.joints[j].following_rms_rad = None
         self._use(self._configuration(Reaction.RELEASE, gains=True))
         self._mended("verify", ready[0], lambda _: self._follow(ready))
         self._off()
@@ -730,7 +733,18 @@ class Bringup:
             )
         self.found.verified = True
 
+    @property
+    def refuted(self) -> bool:
+        """Whether the arm did not follow the small swing with what was found."""
+        return any(step == "verify" for step, _ in self._skipped)
+
     def _store(self) -> None:
+        if self.refuted:
+            self._person.say(
+                f"nothing is stored: the arm did not follow with what was found. Is {self._folder / FOUND_FILE} of another arm"
+                " (-o another folder), or was the arm changed since (--again)?"
+            )
+            return
         if not any(each.done("swing") for each in self.found.joints):
             self._person.say("nothing is stored: no joint was identified")
             return

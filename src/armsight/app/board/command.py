@@ -14,6 +14,7 @@ from click.core import ParameterSource
 
 from armsight.app.board.config import config_group
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
+from armsight.app.messages import UNTRUSTED
 from armsight.errors import DeviceError, InputError
 
 if TYPE_CHECKING:
@@ -287,6 +288,8 @@ def bringup(
         session.run(steps or STEPS)
     if as_json:
         click.echo(json.dumps(found_json(session.found)))
+    if session.refuted:
+        click.get_current_context().exit(UNTRUSTED)
 
 
 def _encoders(given: tuple[str, ...]) -> dict[int, tuple[SensorKind, int]]:

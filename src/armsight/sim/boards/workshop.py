@@ -231,6 +231,7 @@ class WorkshopPerson:
             self._returns = workshop.hold[1] == self._rest_rad
         if kind == "problem":
             self.problems.append(text)
+            self.say(text)
         self._kind, self._joint, self._since_s, self._text = kind, joint or 0, workshop.t_s, text
 
     def answer(self) -> str | None:
