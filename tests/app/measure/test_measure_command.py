@@ -431,7 +431,7 @@ def test_a_bowed_board_is_measured_as_its_calibration_found_it(data_dir, armsigh
     given = ("--left", folder / "left*.jpg", "--right", folder / "right*.jpg")
     rig, board, spec = tmp_path / "rig.json", tmp_path / "rig.board.toml", "chessboard:9x6:25mm"
     said = armsight("calibrate", *given, "--target", spec, "-o", rig)
-    assert f"armsight measure --target {board}" in said.out
+    assert f"--target {board}" in said.out
     drawn = armsight("measure", rig, *given, "--target", spec, "--json")
     found = armsight("measure", rig, *given, "--target", board, "--json")
     misfits = [[shot["misfit"] for shot in run.lines if shot["status"] == "ok"] for run in (drawn, found)]

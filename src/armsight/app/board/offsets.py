@@ -153,7 +153,7 @@ def pot_changes(config: Configuration, further_rad: Array) -> list[ZeroChange]:
 def _checked(further_rad: Array, count: int) -> Array:
     further = np.asarray(further_rad, float)
     if further.shape != (count,) or not np.isfinite(further).all():
-        raise InputError(f"{count} corrections are needed, one a joint")
+        raise InputError(f"{count} corrections are needed, one a joint, and finite numbers all")
     return further
 
 

@@ -251,7 +251,7 @@ def graded_metrics(calibration: Calibration) -> tuple[GradedMetric, ...]:
         GradedMetric(
             "epipolar RMS",
             f"{h.epipolar_rms_px:.3g} px",
-            f"{fit:.3g} px",
+            f"{fit:.3g} px" if math.isfinite(fit) else "unknown",
             f"Disagreement of the two cameras on a point; good up to {epipolar[0]:.2g} px for images of this size.",
             _grade(h.epipolar_rms_px, epipolar),
             f"the two cameras disagree: hold the {what} still, take both images at the same moment, check that the pairs "

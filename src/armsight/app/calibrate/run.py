@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from armsight.app.calibrate.assessment import graded_metrics
 from armsight.app.calibrate.report import MOTION_FITTED
 from armsight.app.messages import weak
 from armsight.app.progress import bar, steps
@@ -26,6 +28,7 @@ from armsight.vision.calibrate.boards import Pair, calibrate_boards, calibrate_r
 from armsight.vision.calibrate.bodies import calibrate_bodies
 from armsight.vision.calibrate.result import Calibration, RejectedPair
 from armsight.vision.calibrate.screen import merged_notes
+from armsight.vision.calibrate.weak import contradicted
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
 from armsight.vision.image import darkness, grey, one_image, read_image
@@ -264,6 +267,11 @@ def provenance(given: dict[str, str], calibration: Calibration) -> dict[str, Any
     }
 
 
+def _number(value: float) -> float | None:
+    """Return a number as JSON has it, which knows no NaN."""
+    return value if math.isfinite(value) else None
+
+
 def summary(
     calibration: Calibration, output: Path, board_file: Path | None, report: Path | None, seconds: float
 ) -> dict[str, Any]:
@@ -275,7 +283,7 @@ def summary(
         "rejected": [{"pair": r.pair, "reason": r.reason} for r in c.rejected],
         "notes": list(c.notes),
         "weaknesses": list(c.weaknesses),
-        "fit": {"epipolar_rms_px": c.epipolar_rms_px, "reprojection_rms_px": c.reprojection_rms_px},
+        "fit": {"epipolar_rms_px": _number(c.epipolar_rms_px), "reprojection_rms_px": c.reprojection_rms_px},
         "heldout": vars(c.heldout),
         "models": {name: vars(heldout) for name, heldout in c.models.items()},
         "baseline_m": c.rig.baseline_m,
@@ -314,9 +322,12 @@ def print_result(calibration: Calibration, output: Path, board_file: Path | None
     print_table(
         TextTable(f"Held-out errors: {h.folds} folds, each measured with the fit to the others", ("", ""), rows)
     )
+    poor = [f"{row.name} {row.heldout}" for row in graded_metrics(c) if row.grade == "poor"]
+    use = "" if contradicted(c) else f"; to measure it: armsight measure {output} --target {board_file}"
+    fit_px = f"{c.epipolar_rms_px:.3f} px" if math.isfinite(c.epipolar_rms_px) else "unknown"
     fitted = "" if c.motion is None else f" ({MOTION_FITTED[0].lower()}{MOTION_FITTED[1:].rstrip('.')})"
     lines = [
-        f"fit: epipolar {c.epipolar_rms_px:.3f} px, reprojection {c.reprojection_rms_px:.3f} px RMS{fitted}; "
+        f"fit: epipolar {fit_px}, reprojection {c.reprojection_rms_px:.3f} px RMS{fitted}; "
         f"{len(c.pairs)} of {c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px",
         f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg; the body differs from its "
         f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
@@ -324,11 +335,8 @@ def print_result(calibration: Calibration, output: Path, board_file: Path | None
         *_rejected_lines(c.rejected),
         *(f"note: {note}" for note in merged_notes(c.notes)),
         *(weak(weakness) for weakness in c.weaknesses),
+        *([weak(f"do not rely on this calibration yet: {', '.join(poor)}")] if poor else []),
         f"rig written to {output}" + (f", report to {report / PAGE}" if report is not None else ""),
-        *(
-            [f"board as found written to {board_file}; to measure this board: armsight measure --target {board_file}"]
-            if board_file is not None
-            else []
-        ),
+        *([] if board_file is None else [f"board as found written to {board_file}{use}"]),
     ]
     click.echo("\n".join(lines))

@@ -134,6 +134,8 @@ def _require_one_way(options: Options) -> None:
         "--images with --camera": options.images is not None or options.camera is not None,
         _BY_RIG: any(given is not None for given in (options.rig, options.left, options.right, options.source)),
     }
+    if options.seen is not None and options.seen.resolve() == options.robot.resolve():
+        raise InputError(f"{options.seen}: one file for both: --robot has the arm's poses, --seen what the camera saw")
     if sum(ways.values()) != 1:
         raise InputError(f"give what the camera saw in one way: {', or '.join(ways)}")
     if (options.images is None) != (options.camera is None):

@@ -626,14 +626,14 @@ def _positions(table: _Columns, unit: str | None, detect: bool) -> tuple[Array, 
         if not detect:
             raise InputError(
                 f"{table.path}: positions of up to {far:.0f} m: are they millimetres? name the columns x_mm y_mm z_mm, or "
-                "give --units mm, or --detect-units"
+                f"give {'' if suffix else '--units mm, or '}--detect-units"
             )
         return 1e-3 * p, 1e-3, (f"{table.path}: positions read as millimetres: as metres they would reach {far:.0f} m",)
     if unit_m == 1e-3 and far < NEAR_M:
         if not detect:
             raise InputError(
                 f"{table.path}: positions of at most {1e3 * far:.2g} mm: are they metres? name the columns x_m y_m z_m, or "
-                "give --units m, or --detect-units"
+                f"give {'' if suffix else '--units m, or '}--detect-units"
             )
         return (
             p,

@@ -13,7 +13,7 @@ from armsight.app.handeye.recording import PairedPoses
 from armsight.app.report.table import TextTable, plain_text
 from armsight.data import Array, Record
 from armsight.geometry.pose import log_se3, mean_pose
-from armsight.loop.handeye.noise import OF_THE_ARM
+from armsight.loop.handeye.noise import OF_THE_ARM, SHARED
 from armsight.loop.handeye.structured import GEOMETRY, POSITIONS, SCALE_WALKING, SMOOTH, StructuredHandEye
 
 #: A structure whose mean log density is within this of the best is not distinguished from it.
@@ -171,6 +171,10 @@ def text(run: HandEyeAnswer) -> str:
     lines += [f"blunders, left out: {len(out)}", *(f"  {line}" for line in out[:10])] if out else ["no blunders"]
     if run.plan is not None:
         lines += ["", plain_text(plan_table(run.plan))]
+        if run.found.structure in SHARED:
+            lines.append(
+                f"these sigmas are lower bounds: with {run.found.structure} new poses share errors with the others"
+            )
     return "\n".join(lines)
 
 

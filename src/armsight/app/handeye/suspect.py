@@ -402,7 +402,8 @@ def _rotations(table: PoseTable, rows: NDArray[np.int64], R: Array, option: str)
         if convention != table.convention and width == (4 if convention in ("wxyz", "xyzw") else 3):
             yield (
                 rotations_by(numbers, convention, table.path),
-                f"the rotations are {convention}, not {table.convention}: --{option}rotation {convention}",
+                f"the rotations are {convention}, not {table.convention}: --{option}rotation {convention}, or exchange the "
+                "columns' names where they have any",
             )
     if width == 3:
         for unit, other, given in (

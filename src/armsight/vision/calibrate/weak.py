@@ -21,6 +21,8 @@ _SCALE_SIGMAS = 4.0
 _REJECTED_SHARE = 0.2
 #: Held-out epipolar RMS, as a share of an image's longer side, beyond which the images do not belong to two cameras.
 _CONTRADICTION = 0.005
+#: How many times as large as what boards moved between exposures it may be.
+_OF_MOTION = 3.0
 _FAR_MOTION, _FARTHEST = 2.0, 4
 _ROLLED_DEG = 60.0
 #: Degree of the polynomials of the position in an image that residuals may follow, beyond which share of their square and
@@ -43,12 +45,17 @@ def weaknesses(calibration: Calibration) -> tuple[str, ...]:
 def contradicted(calibration: Calibration) -> bool:
     """Whether held-out pairs contradict the rig so that nothing must be measured with it.
 
-    What boards moved between the exposures of a pair is in the rig's covariance.
+    What boards moved between the exposures of a pair is in the rig's covariance, and no contradiction.
     """
-    if calibration.motion is not None:
-        return False
     longest = max(max(camera.image_size_px) for camera in calibration.rig.cameras)
-    return calibration.heldout.epipolar_rms_px > _CONTRADICTION * longest
+    motion_px = 0.0 if calibration.motion is None else _way_px(calibration, calibration.motion)
+    return calibration.heldout.epipolar_rms_px > max(_CONTRADICTION * longest, _OF_MOTION * motion_px)
+
+
+def _way_px(calibration: Calibration, motion: ExposureMotion) -> float:
+    """Return what a motion between exposures moves a board by in the right image, RMS along an axis, px."""
+    distance = float(np.linalg.norm(calibration.solution.state.Ts_left_body[:, :3, 3], axis=1).mean())
+    return float(calibration.rig.right.intrinsics[0] * motion.rms_m / distance)
 
 
 def _agreement(calibration: Calibration) -> str | None:
@@ -174,8 +181,7 @@ def _moved(calibration: Calibration, motion: ExposureMotion) -> str:
             f"{1e3 * motion.rms_m:.2f} mm RMS along each axis{most}, may be the lenses too: try a richer --lens-model, "
             "look for a lens that is loose or behind a window, and hold the board still to distinguish the two"
         )
-    distance = float(np.linalg.norm(state.Ts_left_body[:, :3, 3], axis=1).mean())
-    way_px = calibration.rig.right.intrinsics[0] * motion.rms_m / distance
+    way_px = _way_px(calibration, motion)
     return (
         f"the board moved between the two exposures of a pair, by {1e3 * motion.rms_m:.2f} mm and "
         f"{1e3 * motion.rms_rad:.1f} mrad RMS along and about each axis ({way_px:.2f} px{most}): the cameras are not "

@@ -332,7 +332,7 @@ def odd_sized(theta: Array, factor: float, good: NDArray[np.bool_] | None = None
     keep = np.ones(len(area), bool) if good is None else good.copy()
     basis = np.column_stack([np.ones(len(area)), (uv - uv.mean(axis=0)) / max(float(np.ptp(uv)), 1.0)])
     odd = np.zeros(len(area), bool)
-    for _ in range(3):
+    for _ in range(3 if keep.any() else 0):
         plane, *_ = np.linalg.lstsq(basis[keep], area[keep], rcond=None)
         off = np.abs(area - basis @ plane)
         odd = off > np.log(factor) + 2.0 * np.median(off[keep])
