@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,10 +16,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from armsight.app.measure.poses import CSV_COLUMNS
-from armsight.app.measure.run import _detected
+from armsight.app.measure.run import _detected, reversed_notes
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.vision.markers.body_file import save_body_csv
-from armsight.vision.markers.targets import open_body
+from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.rig import StereoRig
 from cli_runs import assert_rejected
 
@@ -526,3 +527,14 @@ def test_cameras_that_moved_so_far_that_most_shots_are_missed_are_asked_about(re
     assert said.code == 2
     assert "none of 15 shots could be measured: " in said.err
     assert "did the cameras move?" in said.err
+
+
+def test_a_board_that_looks_the_same_upside_down_is_noted_where_it_flips():
+    ways = [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+    shots = [SimpleNamespace(ok=True, shot=f"s{k}", quaternion_wxyz=ways[k in (2, 3)]) for k in range(5)]
+    shots.insert(1, SimpleNamespace(ok=False, shot="missed"))
+    assert reversed_notes(SimpleNamespace(symmetries=()), shots) == []
+    same = open_target("circles:4x3:30mm")
+    (note,) = reversed_notes(same, shots)
+    assert note.startswith("s2, s4: rotated by 180 degrees or so")
+    assert reversed_notes(same, shots[:2]) == reversed_notes(same, []) == []

@@ -52,6 +52,8 @@ _SYNC_S = 1e-3
 _WIDE_PX, _AGAIN = 2.0, 60
 #: So many shots that fit badly are named.
 _NAMED = 3
+#: So much a board that looks the same when it is rotated may be rotated less than by that, degrees.
+_ROTATED_SPARE_DEG = 35.0
 #: What to do about repeated shots of a recording.
 _RECORDED = "they are no new measurements: leave them out, and record at the rate that the cameras really give"
 #: A shot that is younger by its own stamp was stamped by a live camera, s.
@@ -203,6 +205,7 @@ def measure_shots(
             _say(note for note in notes_of(opened) if note not in said)
             if as_json and isinstance(opened, VideoSource) and (odd := opened.odd_frames):
                 click.echo(json.dumps({"odd_frames": odd}))
+            _say(reversed_notes(found, records))
     contradicted = missed.finding()
     if records and not any(record.ok for record in records):
         mistake = _mistaken(stereo, found, first) if detections is None else ""
@@ -536,6 +539,25 @@ def _undone(left: Image, right: Image) -> dict[str, tuple[Image, Image]]:
             said = f"the {which} are {what} against those of the calibration; the cameras must deliver both alike"
             undone[said] = images
     return undone
+
+
+def reversed_notes(target: Target, records: list[ShotPose]) -> list[str]:
+    """Say which shots show a board that looks the same when it is rotated, rotated so against the shot before."""
+    if not target.symmetries:
+        return []
+    least = (90.0 if len(target.symmetries) > 1 else 180.0) - _ROTATED_SPARE_DEG
+    measured = [record for record in records if record.ok]
+    q = np.array([record.quaternion_wxyz for record in measured]).reshape(-1, 4)
+    angles = np.degrees(2.0 * np.arccos(np.clip(np.abs((q[1:] * q[:-1]).sum(axis=1)), 0.0, 1.0)))
+    names = [record.shot for record, angle in zip(measured[1:], angles, strict=True) if angle > least]
+    if not names:
+        return []
+    shown = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+    return [
+        f"{shown}: rotated by {least + _ROTATED_SPARE_DEG:.0f} degrees or so against the shot before; this board looks the "
+        "same then, and its origin is the corner most to the upper left in the image: codes, rings, or one even and one "
+        "odd count of a chessboard distinguish its ends"
+    ]
 
 
 def _mistaken(rig: StereoRig, target: Target, shots: list[Shot]) -> str:
