@@ -127,6 +127,7 @@ def monitor(
     Nothing is commanded: the drives stay as they are.
     """
     from armsight.app.board import text
+    from armsight.robot.boards.ar4.board import Ar4Board
     from armsight.robot.boards.opening import is_real
 
     if seconds is None and not is_real(name):
@@ -135,6 +136,11 @@ def monitor(
         click.echo(f"note: no --board: this one is {name}, a program; --board serial:PORT is a board", err=True)
     with _open_any(name, baud, calibration) as board:
         click.echo(text.welcome_text(board), err=True)
+        if isinstance(board, Ar4Board) and not board.homed:
+            click.echo(
+                "note: not homed since switched on: these are not the arm's angles (armsight board home)",
+                err=True,
+            )
         passed = 0.0
         while seconds is None or passed < seconds - 1e-9:
             states = board.receive(every)

@@ -103,7 +103,7 @@ FIGURES: dict[str, tuple[Callable[[HandEyeAnswer], Figure], str, str]] = {
     "errors": (
         errors_figure,
         "Errors on poses left out",
-        "Each was predicted by a fit to others. Good: no pose stands out, and nothing drifts from the first to the last.",
+        "Each was predicted by a fit to others. Where all is well none stands out, and nothing drifts from first to last.",
     ),
     "sigma": (
         sigma_figure,

@@ -31,7 +31,6 @@ from armsight.app.run.angles import LoggedAngles, read_angles
 from armsight.app.run.calibrate import VisitedPose, handeye_poses
 from armsight.app.run.controllers import Planned
 from armsight.app.run.experiment import (
-    START_RAD,
     RunResult,
     passed,
     require_followed,
@@ -39,6 +38,7 @@ from armsight.app.run.experiment import (
     require_start,
     run_experiment,
     run_visits,
+    start_rad,
 )
 from armsight.app.run.folder import Finished, finish, make_room
 from armsight.app.run.loop import Loop
@@ -804,7 +804,9 @@ class ArmStep:
             lacks=board.abilities.missing,
             faults=faults,
             running=self._running,
-            away=q is not None and self._start is not None and bool(np.abs(q - self._start).max() > START_RAD),
+            away=q is not None
+            and self._start is not None
+            and bool(np.abs(q - self._start).max() > start_rad(board.abilities)),
             phase="" if segment is None else segment.phase,
             motion="" if segment is None else segment.motion,
             error_mm=tuple((round(t, 3), round(e, 4), c) for t, e, c in list(self._chart)),
