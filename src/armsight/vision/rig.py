@@ -29,6 +29,8 @@ VERSION = 1
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 #: How far a rotation may be from orthonormal, and the last row of a transform from 0 0 0 1.
 _ROTATION_TOLERANCE = 1e-6
+#: In the provenance of a rig that must not be used: by how much held-out pairs contradict it, px.
+CONTRADICTED = "contradicted_by_px"
 #: How far a covariance may be from symmetric, as a share of the two standard deviations.
 _SYMMETRY_TOLERANCE = 1e-5
 TANGENT = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
@@ -281,6 +283,21 @@ class StereoRig(Record):
             InputError: missing, not a rig, of a newer version, or inconsistent; the message names the file.
         """
         return StereoRig.from_text(read_text(path), path)
+
+    @staticmethod
+    def load_trusted(path: str | Path) -> StereoRig:
+        """Return the rig of a file to measure with.
+
+        Raises:
+            InputError: as :meth:`load`, or its calibration said that its images contradict each other.
+        """
+        rig = StereoRig.load(path)
+        if (by_px := rig.provenance.get(CONTRADICTED)) is not None:
+            raise InputError(
+                f"{path}: the images that it was calibrated from contradict each other by {by_px} px:"
+                " calibrate again as armsight calibrate advised"
+            )
+        return rig
 
     @staticmethod
     def from_text(text: str, path: str | Path) -> StereoRig:

@@ -269,6 +269,9 @@ def test_images_that_contradict_each_other_are_not_to_be_trusted(rendered, armsi
     assert said.code == 3, said.err
     assert "contradict each other" in said.out
     assert "mirror" in said.out
+    assert_rejected(
+        armsight("measure", tmp_path / "rig.json", *images(tmp_path), *CHESS), "rig.json", "contradict each other by"
+    )
 
 
 def test_left_and_right_exchanged_is_reported(few, armsight, tmp_path):

@@ -35,6 +35,7 @@ from armsight.vision.image import darkness, grey, one_image, read_image
 from armsight.vision.markers.aruco import FAMILIES, detect_markers, family_size
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import load_body_csv
+from armsight.vision.rig import CONTRADICTED
 from armsight.vision.sources import Source, notes_of, open_source
 from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files
 
@@ -264,6 +265,7 @@ def provenance(given: dict[str, str], calibration: Calibration) -> dict[str, Any
         "heldout_epipolar_rms_px": h.epipolar_rms_px,
         "heldout_rigid_rms_m": h.rigid_rms_m,
         "heldout_scale_error": h.scale_error,
+        **({CONTRADICTED: round(h.epipolar_rms_px, 2)} if contradicted(calibration) else {}),
     }
 
 

@@ -131,7 +131,7 @@ def _arguments(
     if len(paths) != needed:
         form = ("" if rectified else "RIG.json ") + ("and --source" if source is not None else "LEFT RIGHT")
         raise InputError(f"expected {form.strip()}, got {len(paths)} path{'' if len(paths) == 1 else 's'}")
-    rig = None if rectified else StereoRig.load(paths[0])
+    rig = None if rectified else StereoRig.load_trusted(paths[0])
     if rig is not None and not rig.cov.any():
         click.echo(f"note: {paths[0]} does not say how well it is known: sigma is the matching's share alone", err=True)
     pair = None if source is not None else (paths[-2], paths[-1])

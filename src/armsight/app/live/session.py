@@ -325,7 +325,7 @@ class LiveSession:
             write_text(self.folder / "body.toml", self._simulated.workcell.body_text)
             options = replace(options, target=str(self.folder / "body.toml"))
         if options.rig is not None:
-            self.measuring.use_rig(StereoRig.load(options.rig), options.rig)
+            self.measuring.use_rig(StereoRig.load_trusted(options.rig), options.rig)
             self._step = "measure"
         if options.target is not None:
             self.measuring.use_target(options.target)

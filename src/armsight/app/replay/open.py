@@ -146,7 +146,7 @@ def _of_images(request: Request, source: Source, bag: Bag | None, say: Callable[
 def _rig(request: Request, bag: Bag | None, named: dict[str, str]) -> StereoRig:
     """Return the rig that was given, or that of the recording."""
     if request.rig is not None:
-        return StereoRig.load(request.rig)
+        return StereoRig.load_trusted(request.rig)
     if bag is None:
         raise InputError(f"{request.recording}: holds no rig: give --rig")
     return bag_rig(bag, named)

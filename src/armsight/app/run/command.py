@@ -185,7 +185,7 @@ def command(
 
     require("a run", "run", "matplotlib", "pyarrow", *(["unicorn"] if board_spec == "emulated:unicorn" else []))
     arm = planned_for(open_arm(arm_spec), board_spec)
-    rig, target = StereoRig.load(rig_path), open_target(target_spec)
+    rig, target = StereoRig.load_trusted(rig_path), open_target(target_spec)
     if follow_rig:
         require_followed(rig, rig_path)
     fixed_targets = open_fixed(fixed, target_spec)
@@ -245,7 +245,7 @@ def _run_logged(
     from armsight.vision.sources import open_source
 
     require_matplotlib()
-    arm, rig, target = open_arm(arm_spec), StereoRig.load(rig_path), open_target(target_spec)
+    arm, rig, target = open_arm(arm_spec), StereoRig.load_trusted(rig_path), open_target(target_spec)
     angles = read_angles(path, arm)
     if angles.unused:
         click.echo(f"note: {path}: {columns_unused(angles.unused)}", err=True)
