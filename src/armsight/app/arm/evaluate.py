@@ -40,6 +40,8 @@ from armsight.robot.arm_file import open_arm
 
 #: Directions of parameters that differ by less than this share are one.
 _RANK = 1e-3
+#: So many rests that were left out are named.
+_NAMED = 5
 #: Version of report.json.
 VERSION = 1
 #: Fewest rests, and shots of one; a joint was elsewhere from this on, rad; commands that are looked at before a rest.
@@ -370,7 +372,11 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
     found = identify(arm, measured, priors=_PRIORS, progress=progress)
     progress("evaluating")
     kept = rests.rows(found.solution.used)
-    notes = [f"{len(found.left_out)} rests were left out as mistakes"] if len(found.left_out) else []
+    notes = []
+    if len(found.left_out):
+        times = ", ".join(f"{t:.0f}" for t in rests.t_s[found.left_out][:_NAMED])
+        more = ", ..." if len(found.left_out) > _NAMED else ""
+        notes.append(f"{len(found.left_out)} rests were left out as mistakes: at {times}{more} s of the run")
     off, parts = _split(arm, kept, found, measured.rows(found.solution.used))
     lever = gravity_levers(arm, kept.q)
     seen_off = rests.T_seen[:, :3, 3] - rests.T_ref[:, :3, 3]

@@ -108,6 +108,7 @@ def remarks(report: ArmReport) -> list[str]:
         "Zero: true angle less reading; that of the first and of the last joint looks like another base and another tool.",
         "Backlash: behind the joint's sensor. Sides: reading from above less from below, at the same command. Droop: "
         "reading less command for a metre of the gravity load's lever.",
+        "What is smaller than twice its sigma is not distinguished from zero.",
         "Each part of the error is what it explains beyond those above it; beside it stands what its remedy alone leaves.",
         "Drift has no temperature beside it: runs do not record any." if report.drift_mm_per_h else "",
     ]
