@@ -37,7 +37,7 @@ FOLDER_WRITERS = {
     "board bringup": ("--board", "serial:/dev/none"),
     "record": ("usb:97,98",),
     "demo": ("--arm", "no such arm"),
-    "handeye": ("--robot", "poses.csv", "--eye", "in-hand", "--seen", "poses.csv"),
+    "handeye": ("--robot", "poses.csv", "--eye", "in-hand", "--seen", "seen.csv"),
     "replay": (".",),
     "export": (".", "--to", "csv"),
     "batch": ("measure", "f.yml"),
