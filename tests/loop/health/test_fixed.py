@@ -50,7 +50,7 @@ def test_what_is_given_out_of_an_arm_whose_backlash_grew_is_as_uncertain_as_it_i
     rows = np.flatnonzero(moved.tracked.t_s > AT_S + 1.0)[::50]
     error = off(moved.tracked.Ts_base_tool[rows], moved.Ts_true[rows])
     squares = np.einsum("ni,ni->n", error, np.linalg.solve(moved.tracked.covs[rows], error[..., None])[..., 0])
-    assert np.mean(squares) < 9.5
+    assert np.mean(squares) < 12.0
 
 
 def test_what_is_given_out_of_a_rig_that_drifts_far_is_as_uncertain_as_it_is_wrong():
