@@ -50,8 +50,8 @@ _WIDE, _WIDE_S, _WIDE_RAD = np.repeat([0.05, 0.1], 3), 0.05, 0.1
 _LEAST_M, _LEAST_RAD = 2e-4, float(np.radians(0.3))
 #: By so much the chi-square of a drift must exceed that of a jump.
 _RARER = 5.0
-#: Of a change that was found so many beginnings are tried at most.
-_FINE = 8
+#: Of a change that was found so many beginnings are tried at most; and of one that lacks at most this share of the limit.
+_FINE, _NEAR = 8, 0.5
 
 
 @lru_cache
@@ -61,7 +61,7 @@ def _limits(joints: int) -> dict[int, float]:
     All suspects and the beginnings that are tried share the probability of a false alarm.
     """
     hypotheses = len(suspects(joints)) * _BEGINS
-    return {freedom: MARGIN * alarm_limit(freedom, 1.0 / BLOCK_S, hypotheses) for freedom in (1, 6)}
+    return {freedom: MARGIN * alarm_limit(freedom, 1.0 / BLOCK_S, hypotheses) for freedom in (1, 6, 7, 12)}
 
 
 @lru_cache
@@ -213,10 +213,9 @@ class ClosureWatch:
         self._H.append(block.H / block.count)
         self._clock_s.append(block.clock_s / block.count)
         count = len(self._t)
+        self._sum(slice(count - 1, count))
         if _LEAST_BLOCKS <= count <= _MOST_BLOCKS and count % _AGAIN == 0:
             self._estimate_noise()
-        else:
-            self._sum(slice(count - 1, count))
         if count >= _LEAST_BLOCKS:
             self._decide()
 
@@ -243,16 +242,27 @@ class ClosureWatch:
     def _estimate_noise(self) -> None:
         """Estimate the covariance of the blocks' errors from what the model leaves of them; sum all blocks anew with it.
 
-        The second time the change that explains most is fitted as well: it must not be taken for errors.
+        The change that explains most is fitted as well: it must not be taken for errors. Which one that is depends on the
+        errors, and these on it: it is looked for with the covariance as it was, then with the one that it leaves.
         """
-        A, e = np.array(self._H)[:, :, : self._parts.rest] * self._sigmas, np.array(self._e)
-        for last in (False, True):
+        blocks, errors = np.array(self._H)[:, :, : self._parts.rest] * self._sigmas, np.array(self._e)
+        for _ in range(2):
+            # Akaike's criterion: by as much as it explains, less what its parameters explain by chance.
+            begins = _begins(len(errors))
+            tested = self._tested(begins, suspects(self._parts.joints))
+            best = max(tested, key=lambda each: each.chi_square - 2.0 * len(each.size))
+            A, e, numbers = blocks.copy(), errors.copy(), errors.size
+            closest = max(self._closest(begins, tested), key=lambda each: each.above, default=best)
+            if closest.above > 0.0:  # the block into which it fell has errors of its own
+                best = closest
+                A[best.begin - 1], e[best.begin - 1], numbers = 0.0, 0.0, numbers - 6
+            A = np.concatenate([A, self._by_change(best)], axis=2)
             whiten = np.linalg.cholesky(np.linalg.inv(self._cov)).T
             flat = (whiten @ A).reshape(len(A) * 6, -1)
             whole = flat.T @ flat
             N = whole + np.eye(len(whole))
             x = np.linalg.solve(N, flat.T @ (e @ whiten.T).ravel())
-            freedom = max(e.size - float(np.trace(np.linalg.solve(N, whole))), 0.0)
+            freedom = max(numbers - float(np.trace(np.linalg.solve(N, whole))), 0.0)
             left = e - A @ x
             own = (_BLOCKS * np.diag(_BLOCK_SIGMA**2) + left.T @ left) / (_BLOCKS + freedom / 6.0)
             along = left @ np.linalg.cholesky(np.linalg.inv(own))
@@ -263,20 +273,28 @@ class ClosureWatch:
             self._unsure = _unsure(self._parts.joints, int(_BLOCKS + freedom / 6.0 / alike))
             self._clear()
             self._sum(slice(0, len(e)))
-            if not last:
-                # Akaike's criterion: by as much as it explains, less what its parameters explain by chance.
-                begins = _begins(len(e))
-                tested = self._tested(begins, suspects(self._parts.joints))
-                best = max(tested, key=lambda each: each.chi_square - 2.0 * len(each.size))
-                if best.above > 0.0:  # the block into which it fell has errors of its own
-                    best = self._finest(begins, best)
-                    A[best.begin - 1], e[best.begin - 1] = 0.0, 0.0
-                A = np.concatenate([A, self._by_change(best)], axis=2)
 
-    def _finest(self, begins: Array, found: _Tested) -> _Tested:
-        """Return a hypothesis at the best beginning between the neighbours of the one that was found for it."""
-        between = self._between(begins, int(np.searchsorted(begins, found.begin)))
-        return self._finest_of(between, (found.suspect,))[0]
+    def _closest(self, begins: Array, found: Sequence[_Tested]) -> list[_Tested]:
+        """Return all hypotheses at beginnings between the neighbours of those at which some come near their limits.
+
+        The block into which a change falls has an error that no beginning explains, beside which the others look small:
+        without it a change may be clear that was not with it. A jump between two beginnings looks like a drift. Nothing is
+        returned where no hypothesis comes near.
+        """
+        limits = _limits(self._parts.joints)
+        near = [each for each in found if each.above > -_NEAR * limits[len(each.size)]]
+        if not near:
+            return []
+        rows = {int(np.searchsorted(begins, each.begin)) for each in near}
+        between = np.unique(np.concatenate([self._between(begins, row) for row in rows]))
+        everything = suspects(self._parts.joints)
+        finest = self._finest_of(between, everything)
+        first = max(finest, key=lambda each: each.above).begin
+        beside = [k for k in (first - 1, first + 1) if 1 <= k < len(self._t) and k not in between]
+        if beside:
+            pairs = zip(finest, self._finest_of(np.array(beside), everything), strict=True)
+            finest = [max(pair, key=lambda each: each.above) for pair in pairs]
+        return finest
 
     def _by_change(self, found: _Tested) -> Array:
         """Return the derivative (N, 6, D) of the blocks by a change, over the width of its prior."""
@@ -290,24 +308,20 @@ class ClosureWatch:
 
     def _decide(self) -> None:
         """Test all hypotheses at some beginnings, and the best of them at those between."""
-        begins, everything = _begins(len(self._t)), suspects(self._parts.joints)
-        found = self._tested(begins, everything)
-        limits = {n: limit + self._unsure[n] for n, limit in _limits(self._parts.joints).items()}
-        self.strongest = max(self.strongest, *(each.chi_square / limits[len(each.size)] for each in found))
-        best = max(found, key=lambda each: each.above)
-        if best.above <= 0.0:
+        begins = _begins(len(self._t))
+        found = self._tested(begins, suspects(self._parts.joints))
+        limits = _limits(self._parts.joints)
+        at_first = {n: limits[n] + more for n, more in self._unsure.items()}
+        self.strongest = max(self.strongest, *(each.chi_square / at_first[len(each.size)] for each in found))
+        finest = self._closest(begins, found)
+        if not finest:
             return
-        # A jump between two beginnings looks like a drift: both are tried at those between.
-        rows = {int(np.searchsorted(begins, each.begin)) for each in found if each is best or each.above > 0.0}
-        between = np.unique(np.concatenate([self._between(begins, row) for row in rows]))
-        finest = self._finest_of(between, everything)
-        first = max(finest, key=lambda each: each.above).begin
-        beside = [k for k in (first - 1, first + 1) if 1 <= k < len(self._t) and k not in between]
-        if beside:
-            pairs = zip(finest, self._finest_of(np.array(beside), everything), strict=True)
-            finest = [max(pair, key=lambda each: each.above) for pair in pairs]
         # The errors are what the best one leaves, not what is left while nothing is taken to have changed.
         best = max(finest, key=lambda each: each.above)
+        # Where none is above its limit with all blocks, the block that is left out is six more numbers that explain.
+        clear = max(each.above for each in found) > 0.0
+        if best.above <= (0.0 if clear else limits[len(best.size) + 6] - limits[len(best.size)]):
+            return
         changes = self.explained = ranked([self._change(each, best.left) for each in finest])
         # Once something was reported, what explains it best replaces it, also where it is smaller than is reported first.
         if self.changes or (best.above > self._unsure[len(best.size)] and _matters(changes[0])):
