@@ -422,6 +422,17 @@ def test_motions_that_leave_a_direction_open_are_rejected_as_such(armsight, tmp_
         assert_rejected(armsight("handeye", "--robot", matrices(path, Ts), "--seen", seen, "--eye", "in-hand"), said)
 
 
+def test_many_blunders_ask_whether_the_rows_belong_together(armsight, tmp_path):
+    _, A, B = motion(20)
+    for k, off in zip((2, 5, 8, 11, 14, 17), np.random.default_rng(3).normal(0, 1, (6, 6)), strict=True):
+        B[k] = B[k] @ exp_se3(off * np.repeat([0.1, 0.5], 3))
+    robot, seen = matrices(tmp_path / "robot.txt", A), matrices(tmp_path / "seen.txt", B)
+    said = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand")
+    assert said.code == 0, said.err
+    assert "blunders, left out: 6" in said.out
+    assert "6 of 20 poses are more than slips: do the rows belong together?" in said.out
+
+
 def test_rows_shifted_where_an_arm_moves_in_equal_steps_are_no_blunders(armsight, tmp_path):
     """Two of three rows then fit another mounting exactly: the median of the residuals says nothing."""
     _, first, _ = motion(9, seed=4)

@@ -16,6 +16,8 @@ from armsight.geometry.pose import log_se3, mean_pose
 from armsight.loop.handeye.noise import OF_THE_ARM, SHARED
 from armsight.loop.handeye.structured import GEOMETRY, POSITIONS, SCALE_WALKING, SMOOTH, StructuredHandEye
 
+#: More blunders than this share of the poses ask for another look at the tables.
+_MANY = 0.25
 #: A structure whose mean log density is within this of the best is not distinguished from it.
 DISTINGUISHED = 0.2
 #: A scale that differs from 1 by this many sigmas is said.
@@ -169,6 +171,11 @@ def text(run: HandEyeAnswer) -> str:
     lines = [headline(run), "", plain_text(transforms_table(run)), "", *statements(run)]
     out = blunders(run)
     lines += [f"blunders, left out: {len(out)}", *(f"  {line}" for line in out[:10])] if out else ["no blunders"]
+    if len(out) > _MANY * len(run.found.used):
+        lines.append(
+            f"{len(out)} of {len(run.found.used)} poses are more than slips: do the rows belong together? One that is "
+            "missing on one side shifts all after it"
+        )
     if run.plan is not None:
         lines += ["", plain_text(plan_table(run.plan))]
         if run.found.structure in SHARED:
