@@ -10,8 +10,6 @@ import pytest
 from armsight.app.progress import steps
 from armsight.app.run import calibrate as run_calibrate
 from armsight.app.run import command
-from armsight.app.run.experiment import start_rad
-from armsight.robot.boards.contract import Abilities
 from armsight.sim.workcell.workcell import Workcell
 from cli_runs import assert_rejected
 
@@ -96,11 +94,6 @@ def test_another_arm_than_the_boards(armsight, files, tmp_path):
     (tmp_path / "far.toml").write_text("start_deg = [40, 0, 0, 0, -90, 0]\n" + MOTION)
     said = armsight(*arguments(files, tmp_path / "run", "--motion", tmp_path / "far.toml"))
     assert_rejected(said, "joint 1 reads", "the motion starts at 40.0", "--arm six_r")
-
-
-def test_an_arm_that_droops_before_its_own_controller_holds_it_is_at_the_start():
-    by_it, by_us = (start_rad(Abilities(6, 100.0, own_controller=own)) for own in (True, False))
-    assert by_us < np.radians(2.6) < by_it < np.radians(6.0)  # an SO-101 droops by 2.6 degrees
 
 
 def test_a_run_where_a_file_stands_and_one_over_a_strangers_shots(armsight, files, tmp_path):

@@ -13,6 +13,7 @@ from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import BoardState, Fault, Reaction
 from armsight.robot.boards.configuration import lab_configuration
+from armsight.robot.boards.contract import Abilities
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.opening import configured, open_emulator
 from armsight.sim.joints import JointPlant, PotFault
@@ -108,10 +109,12 @@ def test_an_emergency_stop_is_not_undone(made):
     assert board.status.state is BoardState.STOPPED
 
 
-def stands(q):
+def stands(q, own=False):
     """A board whose joints stand somewhere, with the lab's limits."""
     states = SimpleNamespace(q=q, t_s=np.ones(len(q)))
-    return SimpleNamespace(receive=lambda wait_s: states, soft_limits=lambda: (np.full(6, -2.4), np.full(6, 2.4)))
+    limits = np.full(6, -2.4), np.full(6, 2.4)
+    able = Abilities(6, 100.0, own_controller=own)
+    return SimpleNamespace(receive=lambda wait_s: states, soft_limits=lambda: limits, abilities=able)
 
 
 @pytest.mark.parametrize(
@@ -128,6 +131,13 @@ def test_an_arm_that_does_not_fit_the_board_is_rejected(shift_deg, target, said)
     with pytest.raises(InputError, match=said) as caught:
         require_start(setup, read_motions(ARM, QUICK), targets)
     assert "--arm six_r" in str(caught.value)
+
+
+def test_an_arm_that_droops_before_its_own_controller_holds_it_is_at_the_start():
+    drooping = (ARM.home + np.radians([0, 2.6, 0, 0, 0, 0]))[None]  # as an SO-101 does
+    require_start(SimpleNamespace(board=stands(drooping, own=True), arm=ARM), read_motions(ARM, QUICK), ARM.home[None])
+    with pytest.raises(InputError, match="the motion starts at"):
+        require_start(SimpleNamespace(board=stands(drooping), arm=ARM), read_motions(ARM, QUICK), ARM.home[None])
 
 
 def test_a_board_that_reports_no_angles(made):
