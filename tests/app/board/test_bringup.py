@@ -19,7 +19,7 @@ from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.board_file import read_configuration
 from armsight.robot.boards.codes import Reaction, SensorKind
-from armsight.robot.boards.configuration import check_configuration
+from armsight.robot.boards.configuration import check_configuration, gains_array
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.identification import dead_spots, fit_swing
 from armsight.robot.boards.opening import open_emulator
@@ -78,6 +78,7 @@ def test_one_joint_is_identified_verified_and_stored(tmp_path):
     other.bringup.run(["verify", "store"])
     assert other.bringup.refuted
     assert not other.bringup.found.verified
+    assert not gains_array(other.board.configuration())[0, :6].any()  # those of its trial are taken back
     assert not (tmp_path / "board.toml").exists()
 
 

@@ -740,9 +740,10 @@ class Bringup:
 
     def _store(self) -> None:
         if self.refuted:
+            self._use(self._configuration(Reaction.RELEASE, gains=False))
             self._person.say(
-                f"nothing is stored: the arm did not follow with what was found. Is {self._folder / FOUND_FILE} of another"
-                " arm (-o another folder), or was the arm changed since (--again)?"
+                "nothing is stored, and the board has no gains: the arm did not follow with what was found. Is"
+                f" {self._folder / FOUND_FILE} of another arm (-o another folder), or was the arm changed since (--again)?"
             )
             return
         if not any(each.done("swing") for each in self.found.joints):

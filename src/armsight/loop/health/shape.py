@@ -382,9 +382,8 @@ class ShapeWatch:
             return self.found.begin_s, None
         # Cameras that moved cannot be excluded.
         later = sum(each.usual.begin_s >= self.found.begin_s for each in self._history)
-        return self.found.begin_s, self._mixture(self._since(tests - max(later, 1), usual=True), self._hypotheses[:1])[
-            1
-        ]
+        sums_since = self._since(tests - max(later, 1), usual=True)
+        return self.found.begin_s, self._mixture(sums_since, self._hypotheses[:1])[1]
 
     def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypotheses]) -> tuple[float, Array]:
         """Return the log-evidence that anything changed before the tests of sums, and the second moment of what did.
