@@ -167,6 +167,18 @@ def test_a_board_of_another_size_is_not_found(spec):
     assert open_board(spec).detect(picture(LONG, pattern, posed(pattern, (0.2, 0.1, 0.3), 0.2))).problem
 
 
+def test_a_larger_grid_of_smaller_dots_is_not_taken_for_the_board():
+    board = open_board("circles:4x3:90mm")
+    pattern, perforated = circle_grid(4, 3, 0.09, radius_m=0.035), circle_grid(8, 14, 0.03, radius_m=0.01)
+    large = posed(pattern, (0.3, -0.2, 0.1), 0.45, (-0.2, 0.0))
+    bodies = [PosedBody((pattern,), large), PosedBody((perforated,), posed(perforated, (0.0, 0.1, 0.05), 0.5, (0.3, 0.0)))]
+    image = render(WIDE, bodies, optics=Optics(psf_sigma_px=0.8), sensor=Sensor(), rng=np.random.default_rng(2))
+    found = board.detect(image)
+    assert found.problem is None and len(found.ids) == 12
+    off = np.abs(off_middles(board, found, WIDE, large, 0.035))
+    assert off.max() < 0.3
+
+
 @pytest.mark.parametrize("option", ["", ":radius=20mm"])
 def test_measuring_subtracts_the_bias(option):
     rig = example_rig(SIZE, focal_px=300.0, baseline_m=0.08, model="brown4")

@@ -42,7 +42,8 @@ class Lattice(Record):
     Attributes:
         cells: (N, 2) their integer positions.
         blobs: (N,) rows of the outlines.
-        weight: how much speaks for it: its discs, fewer the more unevenly they stand. Texture may be large, but not even.
+        weight: how much speaks for it: its discs, fewer the more unevenly they stand and the more they are than the board has.
+            Texture may be large, but not even.
     """
 
     cells: Ids
@@ -50,12 +51,12 @@ class Lattice(Record):
     weight: float
 
 
-def grow_lattices(blobs: Blobs, enough: int) -> list[Lattice]:
+def grow_lattices(blobs: Blobs, count: int) -> list[Lattice]:
     """Assemble lattices from outlines, the best first.
 
     Args:
         blobs: the outlines.
-        enough: no further seeds are tried once a lattice has nearly the weight of so many discs.
+        count: of the board's discs. No further seeds are tried once a lattice has nearly the weight of so many.
     """
     if len(blobs.theta) < 4:
         return []
@@ -63,18 +64,23 @@ def grow_lattices(blobs: Blobs, enough: int) -> list[Lattice]:
     regular = np.array([_regularity(blobs, i, js) for i, js in enumerate(beside)])
     found: list[Lattice] = []
     taken = np.zeros(len(beside), bool)
-    for i in np.argsort(-regular, kind="stable")[:_SEEDS]:
+    tried = 0
+    for i in np.argsort(-regular, kind="stable"):
         if taken[i] or regular[i] < 1:
             continue
+        tried += 1
+        if tried > _SEEDS:
+            break
         sides = _sides(blobs, int(i), beside[i])
         if sides is None:
             continue
         cells = _spread(blobs, int(i), sides)
-        weight = len(cells) / (1.0 + (_unevenness(blobs, cells) / _UNEVEN) ** 2)
+        even = 1.0 / (1.0 + (_unevenness(blobs, cells) / _UNEVEN) ** 2)
+        weight = even * min(len(cells), count**2 / len(cells))
         lattice = Lattice(np.array(list(cells)), np.array(list(cells.values())), weight)
-        taken[lattice.blobs if weight > 0.5 * len(cells) else i] = True
+        taken[lattice.blobs if even > 0.5 else i] = True
         found.append(lattice)
-        if weight >= _ENOUGH * enough:
+        if weight >= _ENOUGH * count:
             break
     return sorted(found, key=lambda lattice: -lattice.weight)
 
