@@ -12,6 +12,7 @@ from supersampled import board, expose, paint, picture, project, view
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
+from armsight.sim.render.optics import Optics, Sensor
 from armsight.sim.render.render import render
 from armsight.sim.render.scene import PosedBody, chessboard
 from armsight.vision.camera import Camera
@@ -198,6 +199,24 @@ def test_what_colours_leave_open_is_a_flip(spec, rotation):
     across = truth[1] - truth[0]
     if abs(rotation) < 0.7 or len(target.symmetries) == 3:  # the order that runs to the right is taken
         assert (off[0] < 0.1) == (across[0] > np.abs(across[1]) or abs(rotation) < 0.7)
+
+
+def test_a_strongly_sharpened_chessboard_is_found_without_its_covered_corner():
+    rng = np.random.default_rng(4)
+    camera = Camera((640, 480), "brown4", np.array([700.0, 700.0, 320.0, 240.0]), np.zeros(4))
+    pattern = chessboard(9, 6, 0.025)
+    T = pose(exp_so3(np.array([0.3, -0.2, 0.4])), np.array([-0.06, -0.08, 0.6]))
+    image = render(camera, [PosedBody((pattern,), T)], optics=Optics(psf_sigma_px=0.5), sensor=Sensor(), rng=rng)
+    soft = cv2.GaussianBlur(image, (0, 0), 1.5).astype(float)
+    image = np.clip(image + 2.5 * (image - soft), 0, 255).astype(np.uint8)
+    target = open_board("chessboard:9x6:25mm")
+    truth = camera.project(target.body.points @ T[:3, :3].T + T[:3, 3])
+    cv2.circle(image, tuple(int(c) for c in np.rint(truth[30] + (2.0, 1.0))), 7, 255, -1)
+    found = target.detect(image)
+    assert found.problem is None
+    off = np.linalg.norm(found.uv[:, None] - truth, axis=2)
+    assert len(found.ids) == 53 and off[:, 30].min() > 10.0
+    assert np.sqrt(np.mean(off.min(axis=1) ** 2)) < 0.2
 
 
 def test_a_covered_corner_is_left_out_and_the_others_stay():

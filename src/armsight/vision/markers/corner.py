@@ -187,8 +187,9 @@ MOVED_SHARE, MOVED_MAX_PX = 0.25, 3.0
 #: Fewest grey levels between a corner's dark and bright squares.
 CONTRAST_MIN = 8.0
 #: Largest residual as a share of the contrast (half the step). Camera noise of 10 grey levels on a contrast of 50
-#: gives 0.4; half a window of the wrong colour gives 0.9.
-MISFIT_MAX = 0.45
+#: gives 0.4; half a window of the wrong colour gives 0.9. Where those of most corners of an image are large, as the halos
+#: of sharpening make them, it is the image that is so: up to so many times their median is usual then, up to a limit.
+MISFIT_MAX, MISFIT_RATIO, MISFIT_LIMIT = 0.45, 1.5, 0.8
 
 #: Why a corner was not kept; the index is the code in :attr:`CornerFits.outcome`.
 OUTCOMES = (
@@ -340,7 +341,7 @@ def _refine(
             outcome[i] = _MOVED
         elif not abs(q[7]) >= 0.5 * CONTRAST_MIN:
             outcome[i] = _FAINT
-        elif residual[i] > MISFIT_MAX * abs(q[7]) or np.sqrt(max(q[4], q[5])) > reach:
+        elif np.sqrt(max(q[4], q[5])) > reach:
             outcome[i] = _MISFIT
         else:
             outcome[i] = _KEPT
@@ -428,6 +429,9 @@ def refine_corners(
     cov, residual, outcome = np.zeros((n, 2, 2)), np.zeros(n), np.zeros(n, np.int64)
     noise, gains = np.zeros((3, LAGS + 1, 2 * LAGS + 1)), np.zeros((n, LAGS + 1, 2 * LAGS + 1))
     _refine(_pixels(image), uv, squares, bows, arm, rough, known, models, cov, noise, gains, residual, outcome)
+    share, good = residual / np.maximum(np.abs(models[:, 7]), 1e-9), outcome == _KEPT
+    usual = float(np.median(share[good])) if good.sum() >= _MANY else 0.0
+    outcome[good & (share > max(MISFIT_MAX, min(MISFIT_RATIO * usual, MISFIT_LIMIT)))] = _MISFIT
     if not rough and n >= _MANY and residual.any():
         variances = np.maximum(_effective(noise, gains), 1.0 / 12.0)
         cov *= (variances / np.mean(residual[residual > 0] ** 2))[:, None, None]
