@@ -220,6 +220,9 @@ def test_the_ar4_drivers_offsets_are_corrected_in_their_file_and_the_old_file_is
     assert "joint_6: -178.0\n" in file.read_text()
     assert armsight(*options[:5], tmp_path / "again.yaml", "--yes", "--restore", keep).code == 0
     assert file.read_text() == AR4
+    again = (*options[:5], tmp_path / "more.yaml", "--yes", "--further")
+    assert_rejected(armsight(*again, "0,0,57.3,0,0,0"), "joint_3: 57.3 deg is more than zeros are usually off by")
+    assert not (tmp_path / "more.yaml").exists()
     assert_rejected(armsight(*options, "--further", "1,2,3"), "6 corrections are needed")
     file.write_text("joint_1: 1.0\n")
     assert_rejected(armsight(*options[:4]), "no joint_offsets of ar4_ros_driver")

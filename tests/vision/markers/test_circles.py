@@ -171,7 +171,10 @@ def test_a_larger_grid_of_smaller_dots_is_not_taken_for_the_board():
     board = open_board("circles:4x3:90mm")
     pattern, perforated = circle_grid(4, 3, 0.09, radius_m=0.035), circle_grid(8, 14, 0.03, radius_m=0.01)
     large = posed(pattern, (0.3, -0.2, 0.1), 0.45, (-0.2, 0.0))
-    bodies = [PosedBody((pattern,), large), PosedBody((perforated,), posed(perforated, (0.0, 0.1, 0.05), 0.5, (0.3, 0.0)))]
+    bodies = [
+        PosedBody((pattern,), large),
+        PosedBody((perforated,), posed(perforated, (0.0, 0.1, 0.05), 0.5, (0.3, 0.0))),
+    ]
     image = render(WIDE, bodies, optics=Optics(psf_sigma_px=0.8), sensor=Sensor(), rng=np.random.default_rng(2))
     found = board.detect(image)
     assert found.problem is None and len(found.ids) == 12

@@ -508,8 +508,11 @@ def _zeros(
     from armsight.robot.boards.board_file import configuration_text, read_configuration
 
     def asked(changes: list[changed.ZeroChange]) -> None:
+        doubtful = [] if restore is not None else changed.zero_doubts(changes)
+        if doubtful and yes:
+            raise InputError(f"{doubtful[0]}; --yes does not write this: without it you are asked")
         if not yes:
-            click.echo(changed.zeros_text(changes), err=True)
+            click.echo("\n".join([changed.zeros_text(changes), *(f"note: {each}" for each in doubtful)]), err=True)
             click.confirm("write the new zeros?", abort=True, err=True)
 
     written = angles is not None or restore is not None

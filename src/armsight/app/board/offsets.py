@@ -25,6 +25,8 @@ from armsight.robot.boards.feetech.calibration import read_calibration, write_of
 from armsight.robot.boards.feetech.offsets import OffsetChange, corrected_offsets, require_released, write_changes
 from armsight.robot.boards.feetech.registers import MOST_OFFSET, RAD_PER_COUNT
 
+#: Zeros of joints that home, or have a potentiometer, are off by a few degrees; more looks like a mistake, degrees.
+USUAL_CHANGE_DEG = 10.0
 #: A line of a joint_offsets file of ar4_ros_driver.
 _AR4_LINE = re.compile(r"(?m)^(?P<head>joint_(?P<joint>[1-6])[ \t]*:[ \t]*)(?P<value>[+-]?\d+(?:\.\d*)?)")
 
@@ -148,6 +150,16 @@ def pot_changes(config: Configuration, further_rad: Array) -> list[ZeroChange]:
         changes.append(ZeroChange(f"joint {k + 1}", old, float(np.degrees(sign * pot["angle_rad"][0]))))
     check_configuration(config)
     return changes
+
+
+def zero_doubts(changes: list[ZeroChange]) -> list[str]:
+    """Return why changes of zeros look like mistakes, a sentence each; none where they do not."""
+    return [
+        f"{c.name}: {abs(c.new_deg - c.old_deg):.1f} deg is more than zeros are usually off by, {USUAL_CHANGE_DEG:g} deg: a"
+        " wrong number, radians or another arm, or an arm that was not homed"
+        for c in changes
+        if abs(c.new_deg - c.old_deg) > USUAL_CHANGE_DEG
+    ]
 
 
 def _checked(further_rad: Array, count: int) -> Array:
