@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from armsight.app.handeye.command import Options, calibrate
-from armsight.app.handeye.images import upright
+from armsight.app.handeye.images import steady, upright
 from armsight.app.handeye.read import read_pose_table
 from armsight.app.handeye.recording import matched_rows, paired, seen_in_table
 from armsight.app.handeye.result import as_json, headline, statements
@@ -652,6 +652,14 @@ def test_a_board_that_looks_the_same_rotated_is_rotated_back(in_hand):
     back, which = upright(A, rotated, (flip,), in_hand)
     np.testing.assert_allclose(back, B, atol=1e-12)
     assert list(np.flatnonzero(which >= 0)) == [2, 5, 6]
+
+
+def test_a_board_that_looks_the_same_rotated_keeps_its_side_from_shot_to_shot():
+    flip = np.diag([-1.0, -1.0, 1.0, 1.0])
+    true = np.array([exp_se3(np.array([0.0, 0.0, 0.5, 0.3 * k, -0.2 * k, 0.25 * k])) for k in range(12)])
+    found = np.array([T @ flip if k in (3, 4, 8) else T for k, T in enumerate(true)])
+    np.testing.assert_allclose(steady(found, (flip,)), true, atol=1e-12)
+    np.testing.assert_array_equal(steady(found, ()), found)
 
 
 def test_what_measure_wrote_is_joined_by_the_names_of_its_shots(tmp_path):

@@ -177,7 +177,8 @@ def test_a_larger_grid_of_smaller_dots_is_not_taken_for_the_board():
     ]
     image = render(WIDE, bodies, optics=Optics(psf_sigma_px=0.8), sensor=Sensor(), rng=np.random.default_rng(2))
     found = board.detect(image)
-    assert found.problem is None and len(found.ids) == 12
+    assert found.problem is None
+    assert len(found.ids) == 12
     off = np.abs(off_middles(board, found, WIDE, large, 0.035))
     assert off.max() < 0.3
 

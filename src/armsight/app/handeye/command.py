@@ -28,6 +28,7 @@ class Options:
     """What the command line says; the names are its options'."""
 
     robot: Path
+    frames: str | None
     eye: str
     model: str | None
     rotation: str | None
@@ -52,7 +53,14 @@ class Options:
 
 
 @click.command("handeye")
-@click.option("--robot", required=True, metavar="POSES.csv", type=click.Path(path_type=Path), help="Poses or joints.")
+@click.option(
+    "--robot",
+    required=True,
+    metavar="POSES.csv|BAG",
+    type=click.Path(path_type=Path),
+    help="Poses or joints: a table, or a recording with /tf or joint states.",
+)
+@click.option("--frames", metavar="BASE:FLANGE", help="Frames of the recording's transforms, such as base_link:tool0.")
 @click.option(
     "--eye",
     required=True,
@@ -145,8 +153,10 @@ def _require_one_way(options: Options) -> None:
         raise InputError("--rig, --left and --right belong together, or --rig and --source")
     if options.seen is None and options.target is None:
         raise InputError("images need --target, such as chessboard:9x6:25mm (inner corners, side of a square)")
-    if options.streams and options.seen is None:
-        raise InputError("--streams needs --seen, a table of the target's poses with t_s; images have no times here")
+    if options.streams and options.seen is None and options.source is None:
+        raise InputError(
+            "--streams needs times: --seen, a table of the target's poses with t_s, or --source, a recording"
+        )
 
 
 def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswer:
@@ -157,7 +167,7 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
     """
     from armsight.app.handeye.plan import plan_poses
     from armsight.app.handeye.read import read_pose_table
-    from armsight.app.handeye.recording import links_of, paired
+    from armsight.app.handeye.recording import at_shots, links_of, paired, recording_of, robot_in_recording
     from armsight.app.handeye.result import HandEyeAnswer
     from armsight.app.handeye.suspect import require_plausible
     from armsight.loop.handeye.structured import calibrate_structured
@@ -165,17 +175,28 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
 
     progress("reading")
     arm = None if options.model is None else open_arm(options.model)
-    robot = read_pose_table(
-        options.robot,
-        rotation=options.rotation,
-        unit=options.units,
-        detect_units=options.detect_units,
-        columns=options.columns,
-        arm=arm,
-    )
+    bag = recording_of(options.robot)
+    if bag is not None:
+        for name in ("rotation", "units", "columns"):
+            if getattr(options, name) is not None:
+                raise InputError(f"{options.robot}: a recording: --{name} belongs to tables")
+        robot = robot_in_recording(bag, options.frames, arm)
+    elif options.frames is not None:
+        raise InputError(f"{options.robot}: a table: --frames belongs to recordings (bag:FILE)")
+    else:
+        robot = read_pose_table(
+            options.robot,
+            rotation=options.rotation,
+            unit=options.units,
+            detect_units=options.detect_units,
+            columns=options.columns,
+            arm=arm,
+        )
     seen = _seen(options, progress)
     if options.streams:
         return _streams(options, robot, seen, arm, progress)
+    if bag is not None:
+        robot = at_shots(robot, seen)
     recording = paired(robot, seen, options.eye == "in-hand", arm)
     progress("looking at whether both sides fit")
     recording = require_plausible(recording, arm, detect_units=options.detect_units, scale=options.scale)
@@ -218,6 +239,7 @@ def _streams(
     """Calibrate two streams with an unknown clock offset."""
     import numpy as np
 
+    from armsight.app.handeye.images import steady
     from armsight.app.handeye.plan import plan_poses
     from armsight.app.handeye.recording import links_between, of_streams
     from armsight.app.handeye.result import HandEyeAnswer
@@ -225,17 +247,24 @@ def _streams(
     from armsight.loop.handeye.handeye import MIN_POSES
     from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams, coarse_offset
 
-    for path, t_s in ((options.robot, robot.t_s), (options.seen, seen.t_s)):
+    for path, t_s in ((options.robot, robot.t_s), (options.seen or options.source, seen.t_s)):
         if t_s is None:
-            raise InputError(f"{path}: line 1: --streams needs a column t_s, seconds")
+            raise InputError(f"{path}: --streams needs times: a column t_s in line 1, seconds, or a recording")
     assert robot.t_s is not None
     assert seen.t_s is not None
     shown = np.array([not why for why in seen.missed])
     names = tuple(name for name, why in zip(seen.names, seen.missed, strict=True) if not why)
     t_s = seen.t_s[shown]
-    seen = replace(seen, Ts=seen.Ts[shown], covs=seen.covs[shown], names=names, missed=("",) * len(names), t_s=t_s)
+    seen = replace(
+        seen,
+        Ts=steady(seen.Ts[shown], seen.symmetries),
+        covs=seen.covs[shown],
+        names=names,
+        missed=("",) * len(names),
+        t_s=t_s,
+    )
     hand = PoseStream.of(robot.t_s, robot.Ts, str(options.robot))
-    eye_stream = PoseStream.of(t_s, seen.Ts, str(options.seen))
+    eye_stream = PoseStream.of(t_s, seen.Ts, str(options.seen or options.source))
     eye: Literal["in_hand", "to_hand"] = "in_hand" if options.eye == "in-hand" else "to_hand"
     notes = (*robot.notes, *seen.notes)
     progress("looking at whether both sides fit")

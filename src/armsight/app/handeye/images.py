@@ -260,12 +260,13 @@ def see_with_rig(
         InputError: no such files, or hardly a pair with the target.
     """
     rig, found = StereoRig.load_trusted(rig_file), open_target(target)
-    Ts, covs, names, missed, squares = [], [], [], [], []
+    Ts, covs, names, missed, squares, times = [], [], [], [], [], []
     by: dict[int, Array] = {}
     while (shot := source.read()) is not None:
         progress(f"reading {shot.name}")
         result = measure(rig, found, shot)
         names.append(Path(shot.name).name)
+        times.append(shot.t_s)
         if isinstance(result, Missed):
             Ts.append(np.eye(4))
             covs.append(np.eye(6))
@@ -285,7 +286,7 @@ def see_with_rig(
         np.array(covs),
         tuple(names),
         tuple(missed),
-        None,
+        None if None in times else np.array(times, float),
         found.body.points.mean(axis=0),
         _motions(found),
         float(np.sqrt(np.mean(squares))),
@@ -345,6 +346,16 @@ def upright(A: Array, B: Array, symmetries: tuple[Array, ...], in_hand: bool) ->
             break
         chosen[worst] = int(np.argmin(cost[:, worst]))
     return np.asarray(options[chosen, np.arange(len(A))]), chosen - 1
+
+
+def steady(B: Array, symmetries: tuple[Array, ...]) -> Array:
+    """Return poses B (N, 4, 4) of a stream, each rotated by the symmetry (4, 4) that is nearest to the pose before it."""
+    out = B.copy()
+    choices = np.stack([np.eye(4), *symmetries])
+    for k in range(1, len(B)):
+        options = B[k] @ choices
+        out[k] = options[int(np.argmin(_angles(out[k - 1, :3, :3].T @ options[:, :3, :3])))]
+    return out
 
 
 def _angles(R: Array) -> Array:

@@ -1,12 +1,13 @@
-"""Both sides of a hand-eye calibration brought together: row by row, or as two streams.
+"""Both sides of a hand-eye calibration brought together: row by row, by time, or as two streams.
 
-In: a table of robot poses, and what was seen. Out: :class:`PairedPoses`, rows that belong together, with their names.
+In: a table of robot poses, or a recording of them, and what was seen. Out: :class:`PairedPoses`, rows that belong together,
+with their names.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
@@ -19,7 +20,13 @@ from armsight.errors import InputError
 from armsight.geometry.pose import adjoint, inverse, log_se3, mean_pose
 from armsight.loop.handeye.handeye import MIN_POSES, Poses
 from armsight.robot.arm import Arm
+from armsight.vision.sources.bag import Bag
+from armsight.vision.sources.bag.states import PoseTrack, read_joints, read_track
 
+#: Files, and the file in a folder, that are recordings of ROS or Foxglove.
+RECORDINGS, RECORDING_INDEX = (".bag", ".mcap", ".db3"), "metadata.yaml"
+#: An arm that moves further than this in LATE_S, m, at half of the shots moves on while images are on their way.
+LATE_S, MOVING_M = 0.02, 1e-3
 #: Poses of one TCP agree within this, m and rad, with a constant transform from the model's flange.
 TCP_M, TCP_RAD = 5e-3, 0.02
 #: Step of a joint for differences, rad.
@@ -56,6 +63,109 @@ def seen_in_table(table: PoseTable) -> Seen:
     n = len(table.Ts)
     names = table.names or tuple(f"line {line}" for line in table.lines)
     return Seen(table.Ts, np.zeros((n, 6, 6)), names, table.missed, table.t_s, np.zeros(3), table=table)
+
+
+def recording_of(robot: Path) -> Path | None:
+    """Return the path of a recording given as the robot's poses, bag:FILE or the file; None where it is a table."""
+    text = str(robot)
+    if text.startswith("bag:"):
+        return Path(text[4:])
+    return robot if robot.suffix in RECORDINGS or (robot / RECORDING_INDEX).is_file() else None
+
+
+def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseTable:
+    """Read the poses of the flange that a recording holds, a row for each of its messages.
+
+    Args:
+        path: a ROS 1 or ROS 2 bag, or MCAP.
+        frames: BASE:FLANGE, of its transforms; None: the poses are those of the joints.
+        arm: the model whose joints are read, by their names.
+
+    Raises:
+        InputError: no such recording, frames that it does not have, or joints of other names.
+    """
+    bag = Bag(path)
+    notes: tuple[str, ...] = ()
+    joints = None
+    if arm is not None:
+        joints = read_joints(bag, arm.joint_names)
+        if joints is None:
+            raise InputError(f"{path}: no joint states for --model {arm.name}; it holds {bag.holds()}")
+        notes = joints.notes
+    if frames is not None:
+        base, _, flange = frames.partition(":")
+        if not base or not flange:
+            raise InputError(f"--frames {frames}: two frames are needed, such as base_link:tool0")
+        track = read_track(bag, base, flange)
+        q = None if joints is None else joints.at(track.t_s)
+    elif joints is not None and arm is not None:
+        track, q = PoseTrack(joints.t_s, np.asarray(arm.forward(joints.q))), joints.q
+    else:
+        raise InputError(
+            f"{path}: a recording needs --frames BASE:FLANGE, frames of its transforms such as base_link:tool0, or --model,"
+            " the arm whose joint states it holds"
+        )
+    if len(track.t_s) < MIN_POSES:
+        raise InputError(
+            f"{path}: {frames or 'the joints'}: {len(track.t_s)} poses over time, {MIN_POSES} and more are needed: is it a"
+            " fixed transform?"
+        )
+    there = np.ones(len(track.t_s), bool) if q is None else np.isfinite(q).all(axis=1)
+    n = int(there.sum())
+    return PoseTable(
+        path=path,
+        lines=1 + np.flatnonzero(there),
+        Ts=track.Ts[there],
+        numbers=np.zeros((n, 0)),
+        convention="",
+        q=None if q is None else q[there],
+        t_s=track.t_s[there],
+        names=None,
+        unit_m=1.0,
+        notes=(*bag.notes, *notes),
+        missed=("",) * n,
+    )
+
+
+def at_shots(robot: PoseTable, seen: Seen) -> PoseTable:
+    """Return the poses of a recording at the times of the shots, interpolated; shots beside it get no row.
+
+    Raises:
+        InputError: the shots have no times, or none is within the recording.
+    """
+    assert robot.t_s is not None
+    if seen.t_s is None:
+        raise InputError(f"{robot.path}: pairs by time, and the images have none: --source bag:FILE reads its own")
+    inside = np.flatnonzero((seen.t_s >= robot.t_s[0]) & (seen.t_s <= robot.t_s[-1]))
+    if not len(inside):
+        raise InputError(
+            f"{robot.path}: its poses are from {robot.t_s[0]:.1f} to {robot.t_s[-1]:.1f} s, the images from"
+            f" {seen.t_s[0]:.1f} to {seen.t_s[-1]:.1f} s: two recordings, or clocks that differ; --streams finds their"
+            " offset"
+        )
+    t_s, track = seen.t_s[inside], PoseTrack(robot.t_s, robot.Ts)
+    Ts = track.at(t_s)
+    moved = np.linalg.norm(track.at(t_s + LATE_S)[:, :3, 3] - Ts[:, :3, 3], axis=1)
+    late = (
+        (
+            f"{robot.path}: in half of the shots the arm moves by {1e3 * np.median(moved):.1f} mm and more in"
+            f" {1e3 * LATE_S:.0f} ms, and images come later than their stamps say: --streams finds by how much",
+        )
+        if np.median(moved) > MOVING_M
+        else ()
+    )
+    n = len(inside)
+    return replace(
+        robot,
+        lines=1 + inside,
+        Ts=Ts,
+        numbers=np.zeros((n, 0)),
+        q=None if robot.q is None else np.stack([np.interp(t_s, robot.t_s, each) for each in robot.q.T], axis=1),
+        t_s=t_s,
+        names=tuple(seen.names[k] for k in inside),
+        notes=(*robot.notes, *late),
+        missed=("",) * n,
+    )
 
 
 def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> PairedPoses:

@@ -42,8 +42,8 @@ class Lattice(Record):
     Attributes:
         cells: (N, 2) their integer positions.
         blobs: (N,) rows of the outlines.
-        weight: how much speaks for it: its discs, fewer the more unevenly they stand and the more they are than the board has.
-            Texture may be large, but not even.
+        weight: how much speaks for it: its discs, fewer the more unevenly they stand, and the more they are than the
+            board has. Texture may be large, but not even.
     """
 
     cells: Ids

@@ -6,7 +6,7 @@ time. A pose of one frame in another is composed over the tree of transforms, at
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,14 +72,15 @@ def read_joints(bag: Bag, names: tuple[str, ...] | None = None) -> JointStream |
 
     Args:
         bag: the recording.
-        names: the joints to read, in this order; by default all of the first message.
+        names: the joints to read, in this order; by default all of the first message. ``elbow`` is ``elbow_joint`` too, and
+            ``left_elbow_joint`` where only one joint is called so.
 
     Raises:
         InputError: a joint of ``names`` is never in it.
     """
     topics = [topic.name for topic in bag.of_kind(*JOINTS)]
     rows: list[tuple[float, list[float]]] = []
-    partial = 0
+    partial, known = 0, set[str]()
     for message in bag.messages(topics):
         decoded = message.decode()
         if hasattr(decoded, "joints"):
@@ -87,18 +88,32 @@ def read_joints(bag: Bag, names: tuple[str, ...] | None = None) -> JointStream |
         else:
             found = {str(name): float(q) for name, q in zip(decoded.name, decoded.position, strict=False)}
         names = tuple(found) if names is None else names
-        if not set(names) <= set(found) or not all(np.isfinite(found[name]) for name in names):
+        known |= found.keys()
+        theirs = [_called(name, found) for name in names]
+        if not all(each in found and np.isfinite(found[each]) for each in theirs):
             partial += 1
             continue
         stamp = message.stamp_ns()
-        rows.append(((stamp if stamp > 0 else message.arrival_ns) / _S_NS, [found[name] for name in names]))
+        rows.append(((stamp if stamp > 0 else message.arrival_ns) / _S_NS, [found[each] for each in theirs]))
     if not rows or names is None:
         if partial and names is not None:
-            raise InputError(f"{bag.path}: no message of {', '.join(topics)} holds the joints {', '.join(names)}")
+            raise InputError(
+                f"{bag.path}: no message of {', '.join(topics)} holds the joints {', '.join(names)}; there are"
+                f" {', '.join(sorted(known))}"
+            )
         return None
     t_s, first = np.unique([t for t, _ in rows], return_index=True)
     notes = (f"{partial} joint states do not hold all of {', '.join(names)}: left out",) if partial else ()
     return JointStream(names, t_s, np.array([rows[k][1] for k in first]), notes)
+
+
+def _called(name: str, among: Mapping[str, float]) -> str:
+    """Return what a joint is called among others: its name, or the only one that has it between a prefix and ``_joint``."""
+    if name in among:
+        return name
+    bare = {each: each.removesuffix("_joint") for each in among}
+    alike = [each for each, text in bare.items() if text == name or text.endswith(f"_{name}")]
+    return alike[0] if len(alike) == 1 else name
 
 
 def read_transforms(bag: Bag) -> dict[str, tuple[str, PoseTrack]]:

@@ -1,0 +1,154 @@
+"""Hand-eye calibration from one recording: images, /tf and /joint_states; at rest at each shot, and in motion."""
+
+import json
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
+from armsight.geometry.rotation import exp_so3
+from armsight.robot.arm_file import open_arm
+from armsight.sim.example_rig import board_poses, example_rig
+from armsight.sim.render.optics import Optics, Sensor
+from armsight.sim.render.render import render_pair
+from armsight.sim.render.scene import PosedBody, chessboard
+from bag_files import EPOCH_NS, Joints, Pixels, Sent, Transforms, write_bag
+from cli_runs import assert_rejected
+
+SIZE, SPEC = (480, 360), "chessboard:8x5:30mm"
+T_BASE_RIG = pose(exp_so3(np.array([1.2, -0.9, 0.4])), np.array([0.5, -0.2, 0.6]))
+T_FLANGE_BODY = pose(exp_so3(np.array([0.3, 0.2, -0.5])), np.array([0.04, -0.02, 0.08]))
+T_TOOL_FLANGE = pose(exp_so3(np.array([0.1, 0.2, 0.3])), np.array([0.0, 0.0, 0.1]))
+SECOND_NS = 1_000_000_000
+
+
+@lru_cache
+def cameras():
+    """The rig, and the board's pattern."""
+    return example_rig(SIZE, focal_px=420.0), chessboard(8, 5, 0.03)
+
+
+def sent_at(t_s, T_rig_body, seed, left_s=0.0):
+    """The pair of images of a pose, and T_base_flange of it; stamped at t_s + left_s."""
+    rig, pattern = cameras()
+    images = render_pair(
+        rig.cameras, rig.T_left_right, [PosedBody((pattern,), T_rig_body)],
+        optics=Optics(psf_sigma_px=0.7), sensor=Sensor(), rng=np.random.default_rng(seed),
+    )  # fmt: skip
+    stamp = EPOCH_NS + int((t_s + left_s) * SECOND_NS)
+    pair = [
+        Sent(f"/{side}/image_raw", stamp, Pixels(image)) for side, image in zip(("left", "right"), images, strict=True)
+    ]
+    return pair, T_BASE_RIG @ T_rig_body @ inverse(T_FLANGE_BODY)
+
+
+def moved(t_s, T_base_flange):
+    """The message of the transform, by way of the tool's frame."""
+    T = T_base_flange @ inverse(T_TOOL_FLANGE)
+    return Sent("/tf", EPOCH_NS + int(t_s * SECOND_NS), Transforms([("base_link", "tool0", T)]))
+
+
+STATIC = Sent("/tf_static", EPOCH_NS, Transforms([("tool0", "flange", T_TOOL_FLANGE)]))
+
+
+@pytest.fixture(scope="module")
+def at_rest(tmp_path_factory):
+    """A recording of an arm that rests at each of 14 shots, a second apart, and its rig."""
+    folder = tmp_path_factory.mktemp("rest")
+    rig, pattern = cameras()
+    sent, joints = [STATIC], np.random.default_rng(5).uniform(-0.5, 0.5, (14, 6))
+    for k, T in enumerate(board_poses(np.random.default_rng(3), rig, pattern, 14)):
+        pair, T_base_flange = sent_at(1.0 + k, T, k)
+        sent += [*pair, *(moved(1.0 + k + dt, T_base_flange) for dt in (-0.2, 0.0, 0.2))]
+        names = [
+            "wrist_3_joint",
+            "shoulder_pan_joint",
+            "shoulder_lift_joint",
+            "elbow_joint",
+            "wrist_1_joint",
+            "wrist_2_joint",
+        ]
+        sent.append(Sent("/joint_states", pair[0].stamp_ns, Joints(names, joints[k][[5, 0, 1, 2, 3, 4]])))
+    pair, _ = sent_at(30.0, T, 30)  # after the last transform
+    sent = sorted([*sent, *pair], key=lambda each: each.stamp_ns)
+    rig.save(folder / "rig.json")
+    return write_bag(folder / "run", "mcap", sent), folder / "rig.json", joints
+
+
+def options(bag, rig, *more):
+    """The command line."""
+    source = ("--eye", "to-hand", "--rig", rig, "--source", f"bag:{bag}", "--target", SPEC)
+    return ("handeye", "--robot", f"bag:{bag}", *source, "--json", *more)
+
+
+def test_poses_at_the_times_of_the_shots(armsight, at_rest):
+    bag, rig, _ = at_rest
+    said = armsight(*options(bag, rig, "--frames", "base_link:flange"))
+    assert said.code == 0, said.err
+    document = json.loads(said.out)
+    off = log_se3(inverse(T_BASE_RIG) @ np.array(document["T_base_rig"]))
+    assert np.linalg.norm(off[:3]) < 5e-4
+    assert np.linalg.norm(off[3:]) < 2e-3
+    off = log_se3(inverse(T_FLANGE_BODY) @ np.array(document["T_flange_body"]))
+    assert np.linalg.norm(off[:3]) < 5e-4
+    assert np.linalg.norm(off[3:]) < 2e-3
+    assert len(document["poses"]) == 14
+    assert "1 images without a row" in said.err  # the one after the last transform
+    assert "the arm moves" not in said.err
+
+
+def test_joints_are_read_by_their_names(at_rest):
+    from armsight.app.handeye.recording import robot_in_recording
+
+    bag, _, joints = at_rest
+    arm = open_arm("ur3e")
+    table = robot_in_recording(bag, None, arm)
+    np.testing.assert_allclose(table.q, joints, atol=1e-12)
+    np.testing.assert_allclose(table.Ts, arm.forward(joints), atol=1e-12)
+
+
+def test_what_a_recording_lacks_is_said(armsight, at_rest, tmp_path):
+    bag, rig, _ = at_rest
+    assert_rejected(armsight(*options(bag, rig)), "needs --frames BASE:FLANGE")
+    assert_rejected(armsight(*options(bag, rig, "--frames", "base_link")), "two frames are needed, such as")
+    assert_rejected(
+        armsight(*options(bag, rig, "--frames", "base_link:ee")), "no frame 'ee'", "base_link, flange, tool0"
+    )
+    assert_rejected(armsight(*options(bag, rig, "--frames", "tool0:flange")), "fixed transform")
+    assert_rejected(armsight(*options(bag, rig, "--model", "iiwa")), "holds the joints")
+    assert_rejected(armsight(*options(bag, rig, "--frames", "base_link:flange", "--units", "mm")), "belongs to tables")
+    (tmp_path / "poses.csv").write_text("x_m\n")
+    table = options(bag, rig, "--frames", "base_link:flange")
+    assert_rejected(armsight(*table[:2], tmp_path / "poses.csv", *table[3:]), "--frames belongs to recordings")
+    assert_rejected(armsight(*table[:2], tmp_path / "none.bag", *table[3:]), "no such recording")
+
+
+def test_an_arm_in_motion_and_images_that_come_late(armsight, tmp_path):
+    rig, pattern = cameras()
+    middle = board_poses(np.random.default_rng(8), rig, pattern, 1, fill=(0.5, 0.6), tilt_deg=5.0)[0]
+
+    def T_rig_body(t):
+        swing = np.array([0.05 * np.sin(1.1 * t), 0.04 * np.sin(1.7 * t + 1.0), 0.05 * np.sin(0.9 * t)])
+        return middle @ exp_se3(
+            np.array([*swing, *(0.4 * np.sin(np.array([1.3, 0.8, 1.9]) * t + np.array([0.0, 2.0, 1.0])))])
+        )
+
+    sent = [STATIC]
+    for k in range(90):
+        pair, _ = sent_at(0.5 + k / 10, T_rig_body(0.5 + k / 10), k, left_s=0.06)
+        sent += pair
+    for k in range(500):
+        sent.append(moved(k / 50, T_BASE_RIG @ T_rig_body(k / 50) @ inverse(T_FLANGE_BODY)))
+    bag = write_bag(tmp_path / "run", "ros1", sorted(sent, key=lambda each: each.stamp_ns))
+    rig.save(tmp_path / "rig.json")
+    frames = ("--frames", "base_link:flange")
+    said = armsight(*options(bag, tmp_path / "rig.json", *frames))
+    assert "images come later than their stamps say: --streams" in said.err
+    said = armsight(*options(bag, tmp_path / "rig.json", *frames, "--streams"))
+    assert said.code == 0, said.err
+    document = json.loads(said.out)
+    assert document["clock_offset_s"] == pytest.approx(-0.06, abs=1e-3)
+    off = log_se3(inverse(T_BASE_RIG) @ np.array(document["T_base_rig"]))
+    assert np.linalg.norm(off[:3]) < 1e-3
+    assert np.linalg.norm(off[3:]) < 3e-3
