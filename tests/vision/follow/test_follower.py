@@ -6,6 +6,7 @@ from disc_painter import grey, light_of, pair_of
 
 from armsight.data import Missed, PoseEstimate, Record, Shot
 from armsight.geometry.pose import exp_se3, inverse, log_se3
+from armsight.sim.example_rig import example_rig
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.targets import Composite
 from armsight.vision.measure import measure
@@ -16,13 +17,13 @@ BODY = Composite(PLATE.body.name, (), PLATE)
 TWIST = np.array([0.4, -0.2, 0.1, 0.5, -0.4, 0.8])
 
 
-def shots(target, count, seed, hidden=None, start=None):
+def shots(target, count, seed, hidden=None, start=None, rig=RIG):
     """A body that moves at constant twist, 60 shots a second."""
     rng = np.random.default_rng(seed)
     T = someplace(rng, z=(0.75, 0.85), tilt=0.4) if start is None else start
     for k in range(count):
         truth = T @ exp_se3(TWIST * k / 60)
-        left, right = pair_of(RIG, target, truth, rng, hidden=(hidden or {}).get(k, ()))
+        left, right = pair_of(rig, target, truth, rng, hidden=(hidden or {}).get(k, ()))
         yield truth, Shot(str(k), left, right, k / 60)
 
 
@@ -49,6 +50,21 @@ def test_following_gives_what_searching_gives():
     # A centre whose gradient is assumed in one way and not in the other has another covariance; most have the same.
     assert np.abs(np.median(ratios, axis=0) - 1).max() < 0.1
     assert np.abs(np.log(ratios)).max() < np.log(3.0)
+
+
+def test_large_discs_are_found_and_followed():
+    rig, ways = example_rig(focal_px=1750.0, baseline_m=0.06), []
+    five = discs_of([[-0.05, 0, 0], [0.05, 0.01, 0], [0, 0.07, 0], [-0.035, 0.04, 0.01], [0.04, 0.045, 0]])
+    follower = Follower(rig, Composite(five.body.name, (), five))
+    near = exp_se3(np.array([0.02, -0.025, 0.3, 0.1, -0.1, 0.0]))
+    for truth, shot in shots(five, 3, 3, start=near, rig=rig):
+        result = follower.measure(shot)
+        ways.append(follower.way)
+        assert isinstance(result, PoseEstimate), result.reason
+        assert 1750.0 * five.radii_m.min() / truth[2, 3] > 45.0
+        off = log_se3(inverse(truth) @ result.T_left_body)
+        assert off @ np.linalg.solve(result.cov, off) < 25.0
+    assert ways == ["searched", "followed", "followed"]
 
 
 def test_lost_and_regained():

@@ -29,7 +29,7 @@ from armsight.vision.camera import distort
 from armsight.vision.discs.bias import disc_image
 from armsight.vision.markers.disc.common import FIELDS, SHARED, common, correct
 from armsight.vision.markers.disc.fit import PARAMETERS, FitBuffers, factor, fit, shape_of, solve
-from armsight.vision.markers.disc.search import Room, outline
+from armsight.vision.markers.disc.search import REACH, Room, outline
 from armsight.vision.posefit import moved
 
 #: Code of a disc that was seen.
@@ -413,12 +413,13 @@ def _seek(
     height, width = image.shape
     x, y = int(np.rint(uv[0])), int(np.rint(uv[1]))
     reach_x, reach_y = margin + np.sqrt(shape[0]), margin + np.sqrt(shape[2])
+    half_chord = max(REACH, int(1.5 * np.sqrt(max(shape[0], shape[2]))))
     if x < 0 or y < 0 or x >= width or y >= height:
         return OUTSIDE
     code = NOT_THERE
     low = _surround(image, x, y, shape)
     if sign * (image[y, x] - low) >= least:
-        code = outline(image, x, y, int(low), sign, theta, room)
+        code = outline(image, x, y, int(low), sign, theta, room, half_chord)
         if code == 0 and (theta[0] - uv[0]) ** 2 + (theta[1] - uv[1]) ** 2 <= margin * margin:
             return 0
     # Not there: of the pixels in the window that differ from the surround by half the contrast, the nearest one.
@@ -434,7 +435,7 @@ def _seek(
     if x1 < 0:
         return code
     low = _surround(image, x1, y1, shape)
-    code = outline(image, x1, y1, int(low), sign, theta, room)
+    code = outline(image, x1, y1, int(low), sign, theta, room, half_chord)
     if code == 0 and (theta[0] - uv[0]) ** 2 + (theta[1] - uv[1]) ** 2 > margin * margin:
         return NOT_THERE
     return code

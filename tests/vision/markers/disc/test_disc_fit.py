@@ -232,6 +232,23 @@ def test_both_kinds_at_once():
     assert np.allclose(found.uv[order], [[40.2, 39.9], [120.2, 39.9]], atol=0.1)
 
 
+def test_discs_of_any_size_are_found_beside_each_other():
+    rng = np.random.default_rng(16)
+    true = np.array([[70.3, 69.8], [250.4, 180.1], [210.2, 420.7], [451.0, 60.0]])
+    halves = ((62.0, 50.0), (118.0, 105.0), (46.0, 45.0), (7.0, 6.0))
+    shapes = [outline(c, a, b, 0.3) for c, (a, b) in zip(true, halves, strict=True)]
+    found = discs_of(np.arange(12.0).reshape(4, 3) ** 2).find(
+        grey(40 + 120 * share(shapes, 1.2, np.zeros(2), 512), 2.0, rng)
+    )
+    assert len(found.uv) == 4
+    off = found.uv[:, None] - true
+    nearest = np.linalg.norm(off, axis=2).argmin(axis=1)
+    assert sorted(nearest) == [0, 1, 2, 3]
+    for k, at in enumerate(nearest):
+        assert off[k, at] @ np.linalg.solve(found.cov_uv[k], off[k, at]) < 14.0
+        assert np.linalg.norm(off[k, at]) < 0.05
+
+
 @pytest.mark.parametrize("size", [(720, 1280), (719, 1277), (40, 33), (7, 7), (2, 2), (1, 1)])
 @pytest.mark.parametrize("level", [0, 128, 255])
 def test_empty_images_of_any_size(size, level):

@@ -18,8 +18,8 @@ from armsight.kernels import kernel
 from armsight.vision.markers.disc.common import common, correct
 from armsight.vision.markers.disc.fit import FOUND_TWICE, PARAMETERS, UNKNOWNS, FitBuffers, factor, fit, shape_of, solve
 
-#: Longest half chord, px: half of the largest disc, blur and all.
-_REACH = 44
+#: Longest half chord, px: half of the largest disc of a search, blur and all. Larger ones are searched in smaller copies.
+REACH = 44
 _RAYS = 16
 _COS = np.cos(2 * np.pi * np.arange(_RAYS) / _RAYS)
 _SIN = np.sin(2 * np.pi * np.arange(_RAYS) / _RAYS)
@@ -34,10 +34,13 @@ Room: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
 
 
 @kernel
-def _walk(image: Grey, x: int, y: int, dx: int, dy: int, half: int, sign: int) -> int:
-    """Return how many pixels from (x, y) along (dx, dy) are on the disc's side of ``half``; -1 where there is no end."""
+def _walk(image: Grey, x: int, y: int, dx: int, dy: int, half: int, sign: int, reach: int) -> int:
+    """Return how many pixels from (x, y) along (dx, dy) are on the disc's side of ``half``; -1 where there is no end.
+
+    A chord is at most twice ``reach`` long.
+    """
     height, width = image.shape
-    for k in range(1, 2 * _REACH):
+    for k in range(1, 2 * reach):
         x += dx
         y += dy
         if x < 0 or y < 0 or x >= width or y >= height:
@@ -81,7 +84,7 @@ def _beyond(image: Grey, x: int, y: int, across: int, down: int, sign: int) -> i
 
 
 @kernel
-def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room: Room) -> int:
+def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room: Room, reach: int) -> int:
     """Estimate a disc's ellipse around one of its pixels, as the start of its fit.
 
     Args:
@@ -92,6 +95,7 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
         sign: 1 for a bright disc, -1 for a dark one.
         theta: (10,) filled: centre, M, blur, contrast, base, gradient.
         room: what :func:`workspace` returns.
+        reach: longest half chord, px.
 
     Returns:
         0, or the reason why there is no disc (``fit.REASONS``).
@@ -101,11 +105,11 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
     half = 0
     for round_ in range(_ROUNDS):
         half = (low + int(image[y, x])) // 2
-        left, right = _walk(image, x, y, -1, 0, half, sign), _walk(image, x, y, 1, 0, half, sign)
+        left, right = _walk(image, x, y, -1, 0, half, sign, reach), _walk(image, x, y, 1, 0, half, sign, reach)
         if left < 0 or right < 0:
             return 9
         x += (right - left) // 2
-        up, down = _walk(image, x, y, 0, -1, half, sign), _walk(image, x, y, 0, 1, half, sign)
+        up, down = _walk(image, x, y, 0, -1, half, sign, reach), _walk(image, x, y, 0, 1, half, sign, reach)
         if up < 0 or down < 0:
             return 9
         y += (down - up) // 2
@@ -126,7 +130,7 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
         c, s = _COS[k], _SIN[k]
         before = np.float64(image[y, x])  # pixels nearer than the first step are on the disc
         radius = -1.0
-        for step in range(start + 1, _REACH):
+        for step in range(start + 1, reach):
             u, v = x + step * c, y + step * s
             if u < 0.0 or v < 0.0 or u >= width - 1.0 or v >= height - 1.0:
                 return 1
@@ -169,8 +173,8 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
     # Levels: at the centre, and on a ring outside.
     inside, outside = np.float64(image[y, x]), 0.0
     for k in range(0, _RAYS, 2):
-        reach = 1.25 * np.sqrt(within / _RAYS) + 2.0
-        i, j = int(np.rint(theta[0] + reach * _COS[k])), int(np.rint(theta[1] + reach * _SIN[k]))
+        far = 1.25 * np.sqrt(within / _RAYS) + 2.0
+        i, j = int(np.rint(theta[0] + far * _COS[k])), int(np.rint(theta[1] + far * _SIN[k]))
         outside += image[min(max(j, 0), height - 1), min(max(i, 0), width - 1)] / (_RAYS / 2)
     theta[6], theta[7], theta[8], theta[9] = inside - outside, outside, 0.0, 0.0
     if not sign * theta[6] > 0.0:
@@ -354,7 +358,7 @@ def search(
                         continue
                     if n == len(starts):
                         return n
-                    codes[n], signs[n] = outline(image, x, y, int(image[y, x - 8]), sign, starts[n], room), sign
+                    codes[n], signs[n] = outline(image, x, y, int(image[y, x - 8]), sign, starts[n], room, REACH), sign
                     if codes[n] == 0:
                         _note(n, starts, mine)
                     else:
@@ -362,6 +366,23 @@ def search(
                         mine[y >> 3, x >> 3] = n
                     n += 1
     return n
+
+
+@kernel(
+    "const u1[:, ::1], const u8[:, ::1], b1, b1, f8[:, ::1], i8[::1], i8[::1], "
+    "(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])",
+)
+def outlines(
+    image: Grey, words: Words64, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
+    signs: NDArray[np.int64], room: Room,
+) -> int:  # fmt: skip
+    """Search an image as :func:`search` does; the outlines of discs come first. Return their number."""
+    n, good = search(image, words, noise_of(image), bright, dark, starts, codes, signs, room), 0
+    for i in range(n):
+        if codes[i] == 0:
+            starts[good], signs[good] = starts[i], signs[i]
+            good += 1
+    return good
 
 
 @kernel
@@ -383,26 +404,28 @@ def _again(n: int, starts: Array, signs: NDArray[np.int64], cells: NDArray[np.in
 
 
 @kernel(
-    "const u1[:, ::1], const u8[:, ::1], b1, b1, f8[:, ::1], i8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], "
-    "f8[::1], (f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1]), FitBuffers",
+    "const u1[:, ::1], const u8[:, ::1], b1, b1, i8, i8, i8, f8[:, ::1], i8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], "
+    "(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1]), FitBuffers",
 )
 def find(
-    image: Grey, words: Words64, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
-    signs: NDArray[np.int64], cov: Array, shape: Array, shared: Array, room: Room, work: FitBuffers,
+    image: Grey, words: Words64, bright: bool, dark: bool, good: int, first: int, n: int, starts: Array,
+    codes: NDArray[np.int64], signs: NDArray[np.int64], cov: Array, shape: Array, room: Room, work: FitBuffers,
 ) -> tuple[int, int]:  # fmt: skip
-    """Search an image and fit every candidate.
+    """Search an image and fit every candidate; or fit further candidates, which are given.
 
     Args:
         image: as in :func:`search`, and words, bright, dark, starts, codes, signs and room.
         words: see there.
         bright: see there.
         dark: see there.
+        good: how many discs, the first ones, are fitted already.
+        first: the first of the candidates that are not fitted.
+        n: how many candidates there are; 0: the image is searched for them.
         starts: see there; in the end the discs come first, fitted, then the rejected candidates.
         codes: see there; in the same order.
         signs: see there; in the same order.
         cov: (N, 2, 2) filled with the covariances of the discs' centres, px^2.
         shape: (N, 3) filled with the discs' ellipses, px^2.
-        shared: (SHARED,) filled with what they have in common, see :func:`~armsight.vision.markers.disc.common.common`.
         room: see there.
         work: buffers for fits.
 
@@ -410,10 +433,12 @@ def find(
         The number of discs, and the number of candidates in all.
     """
     noise = noise_of(image)
-    n = search(image, words, noise, bright, dark, starts, codes, signs, room)
-    good = 0
+    if n == 0:
+        n = search(image, words, noise, bright, dark, starts, codes, signs, room)
     cells = np.full((image.shape[0] // 8 + 1, image.shape[1] // 8 + 1), -1, np.int16)
-    for i in range(n):
+    for i in range(good):
+        cells[int(starts[i, 1]) >> 3, int(starts[i, 0]) >> 3] = i
+    for i in range(first, n):
         if codes[i] == 0:
             codes[i] = fit(image, noise, starts[i], cov[good], work)
         if codes[i] != 0:
@@ -428,9 +453,24 @@ def find(
             shape_of(starts[good], shape[good])
             work.discs[good, :] = work.shown
             good += 1
+    return good, n
+
+
+@kernel("const u1[:, ::1], i8, f8[:, ::1], f8[:, :, ::1], f8[::1], FitBuffers")
+def correct_all(image: Grey, good: int, starts: Array, cov: Array, shared: Array, work: FitBuffers) -> None:
+    """Find what the discs of an image have in common, and correct each one by it.
+
+    Args:
+        image: (H, W) grey.
+        good: how many discs there are.
+        starts: (N, 10) as :func:`find` leaves them; corrected.
+        cov: (N, 2, 2) covariances of their centres, px^2; corrected.
+        shared: (SHARED,) filled with what they have in common, see :func:`~armsight.vision.markers.disc.common.common`.
+        work: buffers for fits, as :func:`find` leaves them.
+    """
+    noise = noise_of(image)
     common(image, good, work, shared)
     for i in range(good):
         correct(image, noise, work.discs[i], shared, cov[i], work)
         for a in range(UNKNOWNS):
             starts[i, a] = work.discs[i, PARAMETERS + a]
-    return good, n

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +25,8 @@ from armsight.vision.markers.disc.common import FIELDS, SHARED
 MOST_REPORTED = 100
 #: Most candidates examined in an image; sort key of one that has no closed rim.
 _MOST_CANDIDATES, _NEVER = fit.MOST_DISCS, 99
+#: Most outlines in a smaller copy; one this large, as a share of the longest half chord in the image, is looked at.
+_MOST_LARGER, _LARGE = 512, 0.8
 _KEPT = threading.local()
 
 
@@ -70,14 +73,23 @@ class DiscTarget(Record):
         return bool(self.bright.any()), not bool(self.bright.all())
 
     def find(self, image: NDArray[np.uint8]) -> Discs:
-        """Find the discs in one grey image (H, W), of the kinds, bright or dark, that the body has."""
-        image = np.ascontiguousarray(image)
-        if image.shape[1] % 8:
-            image = np.pad(image, ((0, 0), (0, -image.shape[1] % 8)), mode="edge")
-        room = _room()
-        bright, dark = self._kinds
-        good, n = search.find(image, image.view(np.uint64), bright, dark, *room)
-        theta, codes, signs, cov, shape, shared = room[:6]
+        """Find the discs in one grey image (H, W), of the kinds, bright or dark, that the body has.
+
+        Where fewer than the body has are found, larger ones are looked for in smaller copies of the image.
+        """
+        image = _padded(image)
+        words, (bright, dark) = image.view(np.uint64), self._kinds
+        theta, codes, signs, cov, shape, shared, room, work = _room()
+        buffers = theta, codes, signs, cov, shape, room, work
+        good, n = search.find(image, words, bright, dark, 0, 0, 0, *buffers)
+        if good < len(self.radii_m):
+            larger, kinds = _larger(image, bright, dark)
+            more = slice(n, min(n + len(larger), _MOST_CANDIDATES))
+            if more.start < more.stop:
+                k = more.stop - n
+                theta[more], codes[more], signs[more] = larger[:k], 0, kinds[:k]
+                good, n = search.find(image, words, bright, dark, good, n, more.stop, *buffers)
+        search.correct_all(image, good, theta, cov, shared, work)
         rejected = _rejected(theta[good:n], codes[good:n]) if n > good else ()
         if n == _MOST_CANDIDATES:  # rows are searched from the top
             row = float(min(np.nanmax(theta[:n, 1]), len(image) - 1))
@@ -91,6 +103,40 @@ class DiscTarget(Record):
             rejected,
             shared[FIELDS:].reshape(2, 3).copy(),
         )
+
+
+def _padded(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an image whose rows are whole 64-bit words."""
+    if image.shape[1] % 8:
+        image = np.pad(image, ((0, 0), (0, -image.shape[1] % 8)), mode="edge")
+    return np.ascontiguousarray(image)
+
+
+def _larger(image: NDArray[np.uint8], bright: bool, dark: bool) -> tuple[Array, NDArray[np.int64]]:
+    """Look for discs that are too large for the search, in copies of half the size, a quarter, ...
+
+    Returns:
+        (K, 10) starts for the fit in the image itself, (K,) 1 for bright ones, -1 for dark ones.
+    """
+    if not hasattr(_KEPT, "outlines"):
+        n = _MOST_LARGER
+        _KEPT.outlines = np.empty((n, fit.UNKNOWNS)), np.empty(n, np.int64), np.empty(n, np.int64), search.workspace()
+    starts, codes, signs, work = _KEPT.outlines
+    thetas, kinds = [np.empty((0, fit.UNKNOWNS))], [np.empty(0, np.int64)]
+    scale, small = 1, image
+    while min(small.shape) >= 2 * search.REACH:
+        half = (small.shape[1] // 2, small.shape[0] // 2)
+        scale, small = 2 * scale, np.asarray(cv2.resize(small, half, interpolation=cv2.INTER_AREA), np.uint8)
+        copy = _padded(small)
+        n = search.outlines(copy, copy.view(np.uint64), bright, dark, starts, codes, signs, work)
+        large = (starts[:n, 2] * starts[:n, 4] - starts[:n, 3] ** 2) ** -0.25 > _LARGE * search.REACH / 2
+        theta = starts[:n][large]
+        theta[:, :2] = (theta[:, :2] + 0.5) * scale - 0.5
+        theta[:, 2:5] /= scale**2
+        theta[:, 5] *= scale
+        thetas.append(theta)
+        kinds.append(signs[:n][large])
+    return np.concatenate(thetas), np.concatenate(kinds)
 
 
 def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Array, Array, search.Room, fit.FitBuffers]:
