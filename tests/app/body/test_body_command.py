@@ -148,7 +148,7 @@ def test_dark_and_bright_discs_are_not_taken_for_each_other(armsight, body):
     ("positions", "looks", "more", "kind", "part"),
     [
         (TRIANGLE, {"radius": 1.5}, "", "size", "4.5 px across, below 5"),
-        (TRIANGLE, {"radius": 26.0}, "", "size", "78 px across, above 60"),
+        (TRIANGLE, {"radius": 52.0}, "", "size", "156 px across, above 150"),
         (((0, 0, 0), (15, 0, 0), (0, 85, 0)), {}, "", "overlap", "P1 and P2 overlap by 1.0 mm"),
         (((-55, 0, 0), (55, 0, 0), (0, 50, 0)), {}, TAG, "overlap", "the disc P3 lies on T"),
         (((-700, 0, 0), (700, 0, 0), (0, 85, 0)), {}, "", "image", "P1, P2 are not in both images"),

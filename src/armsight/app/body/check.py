@@ -33,7 +33,7 @@ from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.rig import StereoRig
 
 #: A disc's diameter in an image that can be used, px.
-DISC_PX = (5.0, 170.0)
+DISC_PX = (5.0, 150.0)
 #: The plain surround that a disc's edge needs, as a share of its radius.
 SURROUND = 0.5
 #: A face whose cosine to the direction of sight is above this is seen by both cameras wherever it is in their images.
