@@ -107,6 +107,13 @@ def open_direction(run: HandEyeAnswer) -> str:
     )
 
 
+def _with_sigma(value: float, sigma: float, decimals: int) -> str:
+    """Return a value and its sigma with so many decimals; with more, up to five, where these show nothing of the sigma."""
+    while sigma < 0.5 * 10.0**-decimals and decimals < 5:
+        decimals += 1
+    return f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
+
+
 def transforms_table(run: HandEyeAnswer) -> TextTable:
     """Return both transforms with their sigmas as a table."""
     found = run.found
@@ -115,8 +122,8 @@ def transforms_table(run: HandEyeAnswer) -> TextTable:
     for name, T, s in zip(names(run), (found.T_flange_held, found.T_base_still), (sigma[6:], sigma[:6]), strict=True):
         along = _along(T, s)
         angles = Rotation.from_matrix(np.array(T[:3, :3])).as_euler("xyz", degrees=True)
-        cells = [f"{1e3 * v:.2f} ± {1e3 * e:.2f}" for v, e in zip(T[:3, 3], along, strict=True)]
-        cells += [f"{v:.3f} ± {np.degrees(e):.3f}" for v, e in zip(angles, s[3:], strict=True)]
+        cells = [_with_sigma(1e3 * v, 1e3 * e, 2) for v, e in zip(T[:3, 3], along, strict=True)]
+        cells += [_with_sigma(v, np.degrees(e), 3) for v, e in zip(angles, s[3:], strict=True)]
         rows.append((name, *cells))
     head = ("", "x, mm", "y, mm", "z, mm", "rx, deg", "ry, deg", "rz, deg")
     return TextTable("angles: xyz about fixed axes; ± sigma", head, tuple(rows))
