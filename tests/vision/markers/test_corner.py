@@ -175,6 +175,20 @@ def test_what_is_no_corner_is_rejected(what):
     assert not refine_corners(image, truth[None], sides[None]).kept[0]
 
 
+@pytest.mark.filterwarnings("error")
+def test_squares_of_any_shape_in_any_image_give_finite_numbers():
+    rng = np.random.default_rng(12)
+    for _ in range(60):
+        image = np.clip(rng.normal(30, rng.choice([0.0, 1.0, 20.0]), (90, 120)), 0, 255).astype(np.uint8)
+        uv = rng.uniform(0, 120, (12, 2))
+        squares = rng.normal(0, rng.choice([0.0, 0.5, 8.0, 60.0], (12, 1, 1)), (12, 2, 2))
+        first = refine_corners(image, uv, squares, rough=True)
+        for like in (None, first):
+            fits = refine_corners(image, uv, squares, like=like)
+            assert np.isfinite(fits.cov_uv).all()
+            assert np.isfinite(fits.residual).all()
+
+
 def test_contrast_gives_the_colours_and_does_not_depend_on_which_way_the_sides_point():
     painted, truth, sides = scene(np.random.default_rng(7), 24, 0.2, 0.8)
     image = expose(painted, 120, 1, np.random.default_rng(7))

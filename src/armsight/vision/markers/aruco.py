@@ -93,6 +93,7 @@ def detect_markers(
     Returns:
         (1, 4, 2) corners of each marker, in OpenCV's order whatever the family; (n, 1) identities.
     """
+    image = _stretched(image)
     share = round(4.0 * SIDE_MIN_PX / max(image.shape), 4)
     found, read, unread = _detector(family, share, border).detectMarkers(image)
     corners = list(found)
@@ -105,6 +106,19 @@ def detect_markers(
         return (), np.zeros((0, 1), np.int32)
     kept = _without_repeats(np.reshape(corners, (-1, 4, 2)), np.array(identities))
     return [corners[i] for i in kept], np.array(identities, np.int32)[kept, None]
+
+
+#: An image whose levels, but for the extreme ones of this share, span less than this is stretched to all of them.
+_EXTREME_PERCENT, _SPAN = 0.5, 128.0
+
+
+def _stretched(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a dark or faint image with all grey levels: OpenCV's threshold of markers is a number of levels."""
+    low, high = np.percentile(image[::4, ::4], (_EXTREME_PERCENT, 100.0 - _EXTREME_PERCENT))
+    if not 0.0 < high - low < _SPAN:
+        return image
+    levels = np.clip((np.arange(256) - low) * 255.0 / (high - low), 0.0, 255.0).astype(np.uint8)
+    return np.asarray(cv2.LUT(image, levels), np.uint8)
 
 
 #: Families with fewer cells a side are not compared: what is no marker resembles one of their codes too often.

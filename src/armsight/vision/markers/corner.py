@@ -429,10 +429,12 @@ def refine_corners(
     cov, residual, outcome = np.zeros((n, 2, 2)), np.zeros(n), np.zeros(n, np.int64)
     noise, gains = np.zeros((3, LAGS + 1, 2 * LAGS + 1)), np.zeros((n, LAGS + 1, 2 * LAGS + 1))
     _refine(_pixels(image), uv, squares, bows, arm, rough, known, models, cov, noise, gains, residual, outcome)
+    lost = ~np.isfinite(residual)  # no pixel, or hardly one, determines these
+    outcome[lost], residual[lost], cov[lost] = _DIVERGED, 0.0, 0.0
     share, good = residual / np.maximum(np.abs(models[:, 7]), 1e-9), outcome == _KEPT
     usual = float(np.median(share[good])) if good.sum() >= _MANY else 0.0
     outcome[good & (share > max(MISFIT_MAX, min(MISFIT_RATIO * usual, MISFIT_LIMIT)))] = _MISFIT
-    if not rough and n >= _MANY and residual.any():
+    if not rough and np.count_nonzero(residual) >= _MANY and np.isfinite(noise).all():
         variances = np.maximum(_effective(noise, gains), 1.0 / 12.0)
         cov *= (variances / np.mean(residual[residual > 0] ** 2))[:, None, None]
     return CornerFits(models, cov, residual, outcome)
