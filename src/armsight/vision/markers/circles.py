@@ -37,6 +37,7 @@ from armsight.vision.markers.circle_grid import (
     grow_lattices,
     number_cells,
     positions,
+    shown_size,
     skips_line,
 )
 from armsight.vision.markers.disc.search import Grey
@@ -180,9 +181,13 @@ class CircleGrid(Record, Target):
         )
         if skips_line(cells, starts):
             return f"{len(cells)} of its discs were found, but between them a whole row or column was not"
+        own = (self.columns, self.rows)
+        shown = shown_size(cells, staggered=self.staggered, like=own)
+        if shown is not None and (shown[0] > own[0] or shown[1] > own[1]):
+            return f"its discs make a grid of {shown[0]}x{shown[1]}: count columns x rows"
         placement = number_cells(cells, starts, hollow, self._layout, size)
         if isinstance(placement, str):
-            return placement
+            return placement + self._other_grid(cells, shown)
         seen = placement.ids >= 0
         starts, hollow = starts[seen], hollow[seen]
         ids = self._upright(placement.ids[seen], starts[:, :2])
@@ -199,6 +204,14 @@ class CircleGrid(Record, Target):
             return f"{len(ids)} of its discs were found, but only {good.sum()} can be measured{fits.why_not()}"
         rows = np.flatnonzero(good)[np.argsort(ids[good])]
         return Detections(ids[rows], fits.uv[rows], fits.cov[rows], shape=fits.shape[rows], common=fits.common)
+
+    def _other_grid(self, cells: Ids, shown: tuple[int, int] | None) -> str:
+        """Return "; they make a grid of 7x6" where a lattice (N, 2) that is not the board fills another grid."""
+        own, kind = (self.columns, self.rows), "grid"
+        if shown is None:
+            shown = shown_size(cells, staggered=not self.staggered, like=own)
+            kind = "square grid (circles)" if self.staggered else "staggered grid (acircles)"
+        return "" if shown is None or (shown == own and kind == "grid") else f"; they make a {kind} of {shown[0]}x{shown[1]}"
 
     def _upright(self, ids: Ids, uv: Array) -> Ids:
         """Return the numbering, of those that look the same, whose rows run most to the right."""
