@@ -16,6 +16,7 @@ from armsight.vision.camera import Camera
 from armsight.vision.discs.bias import disc_bias
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.circle_grid import skips_line
+from armsight.vision.markers.circles import unseen_row
 from armsight.vision.measure import measure
 
 SIZE = (640, 480)
@@ -182,6 +183,14 @@ def test_a_staggered_board_of_another_size_is_not_found_and_its_size_is_said(spe
     pattern = circle_grid(4, 9, 0.008, radius_m=0.003, asymmetric=True)
     problem = open_board(spec).detect(picture(LONG, pattern, posed(pattern, (0.3, 0.1, 0.5), 0.25))).problem
     assert said in problem if said else problem is None
+
+
+def test_a_row_that_no_image_shows_is_said():
+    board, of_first = open_board("acircles:4x9:8mm"), np.arange(32)
+    (said,) = unseen_row(board, [of_first, of_first[:30], of_first])
+    assert said.startswith("row 9 of acircles:4x9:8mm is in none of 3 images: if the board has 4x8 discs")
+    assert unseen_row(board, [of_first, of_first]) == unseen_row(board, [of_first, of_first, of_first + 4]) == ()
+    assert unseen_row(open_board("chessboard:4x9:8mm"), [of_first] * 3) == ()
 
 
 @pytest.mark.parametrize("option", ["", ":radius=20mm"])

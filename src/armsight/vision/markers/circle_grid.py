@@ -378,7 +378,7 @@ def skips_line(cells: Ids, theta: Array) -> bool:
 def shown_size(cells: Ids, *, staggered: bool, like: tuple[int, int]) -> tuple[int, int] | None:
     """Return the columns and rows of the grid that a lattice fills, of the readings that nearest to a board's.
 
-    Outer lines with fewer than half the discs of the others are stray blobs and not counted.
+    Outer lines with fewer than half the discs of the others are not of the grid.
 
     Args:
         cells: (N, 2) the lattice's cells.
