@@ -551,11 +551,12 @@ def _chosen(
             continue
         progress(f"hand-eye: poses left out ({name})")
         trials[name] = _trial(whole, guess, used, name, gathered)
-    best, geometries = _best(whole, trials), [trials[name] for name in GEOMETRY if name in trials]
+    best, compared = _compared(whole, guess, used, trials, gathered)
+    geometries = [trials[name] for name in GEOMETRY if name in trials]
     if best == SMOOTH:
         geometries.append(trials[best])
     geometry = max(geometries, key=lambda trial: float(trial.density.mean()), default=None)
-    as_modelled = {name: trial for name, trial in trials.items() if name not in NOT_AS_MODELLED}
+    as_modelled = {name: trials[name] for name in compared if name not in NOT_AS_MODELLED}
     nominal = trials[best] if best not in NOT_AS_MODELLED or not as_modelled else trials[_best(whole, as_modelled)]
     given = nominal if best == SMOOTH else trials[best]
     progress(f"hand-eye: fitting ({best})")
@@ -563,7 +564,7 @@ def _chosen(
     rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
     linear = _linear(whole, guess, rows, best, gathered)
     x, cov = _student(whole, guess, used, best, variances, gathered)
-    weights = _weights(trials, best)
+    weights = _weights(compared, best)
     mixed = weights[best] * cov
     for name in weights.keys() - {best}:  # what the other structures that may be true as well would answer
         other, spread = _student(whole, guess, used, name, trials[name].variances, gathered)
@@ -594,7 +595,7 @@ def _chosen(
         sigma_step_s=rest.pop(0) if whole.free[1] else 0.0,
         structure=best,
         sigmas=sigmas,
-        likelihoods={name: float(trial.density.mean()) for name, trial in trials.items()},
+        likelihoods={name: float(trial.density.mean()) for name, trial in compared.items()},
         arm_m=arm,
         camera_m=camera,
         held_out=_held_out_errors(whole, guess, given.residual, given.rows),
@@ -687,6 +688,29 @@ def _student(
     known = freedom(estimated, variances, lambda v: solve(b, v).cov, 12)
     known = min(known, max(6 * len(rows) // 2 - 9, 3))  # of positions, whose fit also rotates the frames
     return solved.x[:own], cov * float(6 * f_distribution.ppf(0.95, 6, known) / chdtri(6, 0.05))
+
+
+def _compared(
+    whole: _Problem,
+    guess: _Guess,
+    used: NDArray[np.bool_],
+    trials: dict[str, _Trial],
+    gathered: dict[str, Array],
+) -> tuple[str, dict[str, _Trial]]:
+    """Return the best structure, and the trials that it was chosen from: all on the same poses, in the same parts.
+
+    Structures whose errors neighbours in time share are tried on fewer poses, a stretch of time left out: against them the
+    others are tried in the same way; among themselves those are compared on all poses.
+    """
+    timed = {name: trial for name, trial in trials.items() if name in SHARED}
+    plain = {name: trial for name, trial in trials.items() if name not in SHARED}
+    if timed:
+        alike = {name: _trial(whole, guess, used, name, gathered, timed=True) for name in plain if name != POSITIONS}
+        together = {**timed, **alike}
+        first = max(together, key=lambda name: float(together[name].density.mean()))
+        if first in timed:
+            return first, together
+    return _best(whole, plain), plain
 
 
 def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
@@ -812,16 +836,23 @@ def _distances(whole: _Problem, guess: _Guess, structure: str, variances: Array,
 
 
 def _trial(
-    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, gathered: dict[str, Array]
+    whole: _Problem,
+    guess: _Guess,
+    used: NDArray[np.bool_],
+    structure: str,
+    gathered: dict[str, Array],
+    *,
+    timed: bool = False,
 ) -> _Trial:
-    """Leave out poses under a structure."""
-    rows = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_FIT)
+    """Leave out poses under a structure; timed: as structures are tried whose errors neighbours in time share."""
+    timed = timed or structure in SHARED
+    rows = _spread(np.flatnonzero(used), MAX_SHARED if timed else MAX_FIT)
     linear = _linear(whole, guess, rows, structure, gathered)
     b = blocks(linear, structure)
     variances = reml(b, _start_variances(linear, structure))
     n = len(rows)
-    order = np.arange(n) if whole.t_s is not None else np.random.default_rng(0).permutation(n)
-    parts = [np.sort(part) for part in np.array_split(order, n if n <= FEW and structure not in SHARED else FOLDS)]
+    order = np.arange(n) if timed else np.random.default_rng(0).permutation(n)
+    parts = [np.sort(part) for part in np.array_split(order, n if n <= FEW and not timed else FOLDS)]
     density, residual, left = held_out(linear, structure, variances, parts)
     return _Trial(density, residual, left, rows, variances)
 
