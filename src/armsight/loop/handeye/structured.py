@@ -699,8 +699,8 @@ def _compared(
 ) -> tuple[str, dict[str, _Trial]]:
     """Return the best structure, and the trials that it was chosen from: all on the same poses, in the same parts.
 
-    Structures whose errors neighbours in time share are tried on fewer poses, an interval of time left out: against them the
-    others are tried in the same way; among themselves those are compared on all poses.
+    Structures whose errors neighbours in time share are tried on fewer poses, an interval of time left out: against them
+    the others are tried in the same way; among themselves those are compared on all poses.
     """
     timed = {name: trial for name, trial in trials.items() if name in SHARED}
     plain = {name: trial for name, trial in trials.items() if name not in SHARED}
