@@ -67,7 +67,7 @@ def estimate_delay(
     inside = LAGS_S[(stamps[0] - LAGS_S >= t[0]) & (stamps[-1] - LAGS_S <= t[-1])] if len(t) else LAGS_S[:0]
     if len(inside) < 3:
         raise InputError(
-            "the potentiometer readings do not cover the pose measurements; log them from a second before to a second after"
+            "the joint readings do not cover the pose measurements; log them from a second before to a second after"
         )
     jitter_s = float(np.hypot(_jitter(stamps), 0.5 * sync_s))  # of the middle between the two exposures
     delay = Delay(_coarse(arm, t, q, measurements, inside), FIRST_SIGMA_S, jitter_s)
@@ -127,7 +127,7 @@ def _filtered(
         used += estimator.vision(pose_measurement) is Outcome.USED
     if used < len(measurements) / 2:
         raise CalibrationError(
-            f"vision and potentiometers do not describe the same motion: {used} of {len(measurements)} measurements "
+            f"vision and the joint readings do not describe the same motion: {used} of {len(measurements)} measurements "
             "fit; is the hand-eye calibration this arm's, and are both stamped by one clock?"
         )
     return estimator.learned().delay

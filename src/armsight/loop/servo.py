@@ -68,10 +68,10 @@ class Mode(Enum):
     """What closes the loop."""
 
     VISION = "vision"
-    BRIDGED = "bridged: no measurement lately, the potentiometers carry on with what was learned"
-    POTENTIOMETERS = "potentiometers alone: vision is lost, the last correction is held"
+    BRIDGED = "bridged: no measurement lately, the joint sensors carry on with what was learned"
+    POTENTIOMETERS = "joint sensors alone: vision is lost, the last correction is held"
     HELD = "held: vision contradicts what was learned; the correction stays until the cause is known"
-    DISTRUSTED = "what vision measures is wrong: the potentiometers, with what was learned before that, if anything was"
+    DISTRUSTED = "what vision measures is wrong: the joint sensors, with what was learned before that, if anything was"
 
 
 @dataclass(frozen=True)

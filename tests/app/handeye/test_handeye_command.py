@@ -1,6 +1,7 @@
 """``armsight handeye``: forms of tables, what it says, and what it rejects."""
 
 import json
+import re
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -276,6 +277,23 @@ def test_a_plan_keeps_its_promise(armsight, tmp_path):
     assert after["worst_sigma_m"] == pytest.approx(first["plan"]["sigma_m"][-1], rel=0.6)
 
 
+def test_planned_poses_are_near_those_taken_with_the_target_in_view_and_say_why(armsight, tmp_path):
+    _, A, B = motion(12)
+    robot, seen = matrices(tmp_path / "robot.txt", A), matrices(tmp_path / "seen.txt", B)
+    plan = found(armsight, robot, seen, "--plan", 8)[0]["plan"]
+    Ts = np.array(plan["T_base_flange"])
+    for T, name, angle, why in zip(
+        Ts, plan["nearest"], plan["rotated_from_nearest_rad"], plan["lowers_most"], strict=True
+    ):
+        assert angle < np.radians(25.5)
+        way = log_se3(inverse(A[int(name.split()[1]) - 1]) @ T)
+        assert np.linalg.norm(way[3:]) == pytest.approx(angle)
+        assert re.fullmatch(r"(along|about) \[.+\] [\d.e-]+ to [\d.e-]+ (mm|deg)", why)
+    middle, was = ((T[:, :3, 3] / T[:, 2:3, 3])[:, :2] for T in (inverse(Ts @ X) @ Z, B))
+    assert (middle > was.min(axis=0) - 0.03).all()
+    assert (middle < was.max(axis=0) + 0.03).all()
+
+
 def test_rows_shuffled_by_name_change_nothing(armsight, tmp_path):
     _, A, B = motion()
     names = [f"pose{k}" for k in range(14)]
@@ -428,9 +446,33 @@ def test_many_blunders_ask_whether_the_rows_belong_together(armsight, tmp_path):
         B[k] = B[k] @ exp_se3(off * np.repeat([0.1, 0.5], 3))
     robot, seen = matrices(tmp_path / "robot.txt", A), matrices(tmp_path / "seen.txt", B)
     said = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand")
-    assert said.code == 0, said.err
+    assert said.code == 3
     assert "blunders, left out: 6" in said.out
-    assert "6 of 20 poses are more than slips: do the rows belong together?" in said.out
+    assert "do not trust this result: 6 of 20 poses are blunders, more than slips: do the rows belong" in said.out
+    said = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand", "--json", "-o", tmp_path / "out")
+    assert said.code == 3
+    assert said.lines[0]["untrusted"][0].startswith("6 of 20 poses are blunders")
+    assert "do not trust this result: 6 of 20" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_scale_that_walks_is_given_at_the_first_pose_and_at_the_last(armsight, tmp_path):
+    rng = np.random.default_rng(0)
+    A = open_arm("six_r").forward(open_arm("six_r").home + rng.uniform(-0.6, 0.6, (60, 6)))
+    eye = inverse(inverse(A @ X) @ Z @ exp_se3(rng.normal(0, 1e-4, (60, 6))))
+    walked = np.exp(np.cumsum(rng.normal(0, 4e-3, 60)))
+    eye[:, :3, 3] *= 2 * walked[:, None] / walked[0]
+    A = A @ exp_se3(rng.normal(0, 5e-5, (60, 6)))
+    head = "t_s,x_m,y_m,z_m,qw,qx,qy,qz"
+    robot, seen = (
+        named(tmp_path / name, head, np.column_stack([np.arange(60), Ts[:, :3, 3], quaternions(Ts)]))
+        for name, Ts in (("robot.csv", A), ("seen.csv", inverse(eye)))
+    )
+    document, _ = found(armsight, robot, seen, "--scale")
+    assert "target_scale" not in document
+    assert document["target_scale_at_start"] == pytest.approx(0.5, abs=4 * document["target_scale_at_start_sigma"])
+    low, high = document["target_scale_at_end"]
+    assert low < 0.5 * walked[0] / walked[-1] < high
+    assert document["target_scale_walks_sigma"] == pytest.approx(4e-3 * np.sqrt(59), rel=0.5)
 
 
 def test_rows_shifted_where_an_arm_moves_in_equal_steps_are_no_blunders(armsight, tmp_path):

@@ -16,6 +16,7 @@ from armsight.vision.camera import Camera
 from armsight.vision.discs.bias import disc_bias
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.circle_grid import skips_line
+from armsight.vision.markers.circles import unseen_row
 from armsight.vision.measure import measure
 
 SIZE = (640, 480)
@@ -161,10 +162,35 @@ def test_a_line_that_is_missing_between_others_is_noticed(columns, rows, skipped
     assert skips_line(cells, theta) is skipped
 
 
-@pytest.mark.parametrize("spec", ["circles:6x6:12mm", "circles:7x5:12mm", "circles:8x6:12mm"])
-def test_a_board_of_another_size_is_not_found(spec):
+@pytest.mark.parametrize("spec", ["circles:6x6:12mm", "circles:7x5:12mm", "circles:8x6:12mm", "circles:7x3:12mm"])
+def test_a_board_of_another_size_is_not_found_and_its_size_is_said(spec):
     pattern = circle_grid(7, 6, 0.012, radius_m=0.004)
-    assert open_board(spec).detect(picture(LONG, pattern, posed(pattern, (0.2, 0.1, 0.3), 0.2))).problem
+    problem = open_board(spec).detect(picture(LONG, pattern, posed(pattern, (0.2, 0.1, 0.3), 0.2))).problem
+    assert "a grid of 7x6" in problem or "a grid of 6x7" in problem  # it looks the same on its side
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ("acircles:4x8:8mm", "a grid of 4x9: count columns x rows"),
+        ("acircles:3x9:8mm", "a grid of 4x9: count columns x rows"),
+        ("acircles:5x9:8mm", "which ones they are is unknown"),
+        ("circles:4x9:8mm", "a staggered grid (acircles) of 4x9"),
+        ("acircles:4x9:8mm", None),
+    ],
+)
+def test_a_staggered_board_of_another_size_is_not_found_and_its_size_is_said(spec, said):
+    pattern = circle_grid(4, 9, 0.008, radius_m=0.003, asymmetric=True)
+    problem = open_board(spec).detect(picture(LONG, pattern, posed(pattern, (0.3, 0.1, 0.5), 0.25))).problem
+    assert said in problem if said else problem is None
+
+
+def test_a_row_that_no_image_shows_is_said():
+    board, of_first = open_board("acircles:4x9:8mm"), np.arange(32)
+    (said,) = unseen_row(board, [of_first, of_first[:30], of_first])
+    assert said.startswith("row 9 of acircles:4x9:8mm is in none of 3 images: if the board has 4x8 discs")
+    assert unseen_row(board, [of_first, of_first]) == unseen_row(board, [of_first, of_first, of_first + 4]) == ()
+    assert unseen_row(open_board("chessboard:4x9:8mm"), [of_first] * 3) == ()
 
 
 def test_a_larger_grid_of_smaller_dots_is_not_taken_for_the_board():

@@ -108,7 +108,7 @@ def attained_in(folder: Path, *, closed: bool) -> Attained:
     """
     segments = segments_of(folder, closed)
     if not segments:
-        which = "with the loop closed" if closed else "with potentiometers alone"
+        which = "with the loop closed" if closed else "with the joint sensors alone"
         raise InputError(f"{folder}: the run has no motions {which}; run.log says how far it came")
     noise = noise_of(segments)
     paths, run, circle, notes = path_rows(segments, noise)

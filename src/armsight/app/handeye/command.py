@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
+from armsight.app.messages import UNTRUSTED
 from armsight.errors import InputError
 
 if TYPE_CHECKING:
@@ -99,13 +100,15 @@ def command(**given: object) -> None:
     """Calibrate hand and eye from your own data: robot poses, and images or poses of a target.
 
     Prints both transforms with sigma, the error on poses left out, how much of it is the arm and how much the camera, which
-    poses are blunders, and which direction the motion leaves open. Forms of tables, and examples: docs/howto/handeye.md.
+    poses are blunders, and which direction the motion leaves open. Exit code 3: a quarter of the poses or more are
+    blunders, or half of them are off by more than 20 mm: the result must not be trusted. Forms of tables, and examples:
+    docs/howto/handeye.md.
     """
     options = Options(**given)  # type: ignore[arg-type]
     _require_one_way(options)
 
     from armsight.app.handeye.report import write_handeye_report
-    from armsight.app.handeye.result import as_json, plan_csv, text
+    from armsight.app.handeye.result import as_json, plan_csv, text, untrusted
     from armsight.app.progress import steps
     from armsight.app.report.page import put_files, writable_folder
     from armsight.app.report.plotting import require_matplotlib
@@ -129,10 +132,14 @@ def command(**given: object) -> None:
         click.echo(f"note: {note}", err=True)
     if options.as_json:
         click.echo(json.dumps(as_json(run)))
-        return
-    click.echo(text(run))
-    if folder is not None:
-        click.echo(f"\nwritten: {folder}/report.html, handeye.json" + (", plan.csv" if run.plan is not None else ""))
+    else:
+        click.echo(text(run))
+        if folder is not None:
+            click.echo(
+                f"\nwritten: {folder}/report.html, handeye.json" + (", plan.csv" if run.plan is not None else "")
+            )
+    if untrusted(run):
+        click.get_current_context().exit(UNTRUSTED)
 
 
 def _require_one_way(options: Options) -> None:

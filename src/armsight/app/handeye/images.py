@@ -28,6 +28,7 @@ from armsight.vision.camera import Camera
 from armsight.vision.camera_file import camera_of
 from armsight.vision.image import grey, read_image
 from armsight.vision.locate import by_rig
+from armsight.vision.markers.circles import unseen_row
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_target
 from armsight.vision.measure import measure
@@ -211,7 +212,7 @@ def _posed(
         points.mean(axis=0),
         _motions(target),
         float(np.sqrt(variance)),
-        notes,
+        (*notes, *unseen_row(target, [d.ids for d, why in zip(detections, missed, strict=True) if not why])),
     )
 
 
@@ -260,7 +261,7 @@ def see_with_rig(
         InputError: no such files, or hardly a pair with the target.
     """
     rig, found = StereoRig.load_trusted(rig_file), open_target(target)
-    Ts, covs, names, missed, squares, times = [], [], [], [], [], []
+    Ts, covs, names, missed, squares, times, shown = [], [], [], [], [], [], []
     by: dict[int, Array] = {}
     while (shot := source.read()) is not None:
         progress(f"reading {shot.name}")
@@ -276,6 +277,7 @@ def see_with_rig(
         covs.append(result.cov_noise)
         by[len(Ts) - 1] = by_rig(result)
         missed.append("")
+        shown.append(result.points.ids)
         squares.append(result.reprojection_rms_px**2)
     if not squares:
         raise InputError(
@@ -290,6 +292,7 @@ def see_with_rig(
         found.body.points.mean(axis=0),
         _motions(found),
         float(np.sqrt(np.mean(squares))),
+        unseen_row(found, shown),
         common=_common(rig.cov, by, len(Ts)),
     )
 

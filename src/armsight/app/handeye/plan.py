@@ -1,7 +1,8 @@
 """The poses to take next: those that lower the sigma of the mounting most.
 
-In: a calibration and its poses. Out: poses of the flange, and the sigma after each. Candidates are views like those seen
-(as far away, as far from the axis) with the body rotated further; the flange stays within its space, a fifth more.
+In: a calibration and its poses. Out: poses of the flange, the sigma after each, and what each is for. Candidates lie near
+poses that the arm has taken: each rotates one of them about the target's middle, by no more than ``NEAR_RAD``, the flange
+stays within its space, a fifth more, and the target within the part of the image and the distances in which it was seen.
 Each next pose is the one whose information, given those before, lowers the trace of the mounting's covariance most (a
 radian counting as 0.3 m).
 """
@@ -11,16 +12,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array, Record
-from armsight.geometry.pose import exp_se3, inverse, transform
+from armsight.geometry.pose import inverse, log_se3, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.handeye.handeye import LEVER_M, Poses, residuals
-from armsight.loop.handeye.noise import STRUCTURES, error_maps
+from armsight.loop.handeye.noise import SHARED_MAPS, STRUCTURES, error_maps
 from armsight.loop.handeye.structured import StructuredHandEye
 
-#: Candidates, how far a body is rotated from how it was seen, rad, and how much larger the flange's space may become.
-CANDIDATES, ROTATED_RAD, WIDER = 1500, np.radians(50), 0.2
+#: Candidates, how far the flange is rotated at most from the nearest pose it had, rad, how much larger its space may
+#: become, and by how much the target may leave the part of the image in which its middle was seen, as a tangent.
+CANDIDATES, NEAR_RAD, WIDER, BESIDE = 1500, np.radians(25), 0.2, 0.02
 #: Sigmas taken where a structure has none for the noise: m and rad.
 LEAST_M, LEAST_RAD = 1e-5, 1e-5
 
@@ -34,12 +37,20 @@ class PosePlan(Record):
         sigma_m: (K,) sigma of the mounting's translation along its worst axis after each, m.
         sigma_rad: (K,) the same of its rotation, rad.
         before: the two sigmas now.
+        nearest: (K,) the pose, of those given, from which the flange rotates least.
+        rotated_rad: (K,) by how much, rad.
+        moved_m: (K,) the distance from it, m.
+        reasons: what each pose lowers most.
     """
 
     Ts_base_flange: Array
     sigma_m: Array
     sigma_rad: Array
     before: tuple[float, float]
+    nearest: NDArray[np.int64]
+    rotated_rad: Array
+    moved_m: Array
+    reasons: tuple[str, ...]
 
 
 def plan_poses(found: StructuredHandEye, poses: Poses, count: int, seed: int = 0) -> PosePlan:
@@ -58,22 +69,50 @@ def plan_poses(found: StructuredHandEye, poses: Poses, count: int, seed: int = 0
     maps = error_maps(candidates, np.zeros((len(candidates.A), 6)), carry, None)
     C = np.mean(poses.cov, axis=0) + np.zeros((len(A), 6, 6))
     for name in STRUCTURES[found.structure]:
-        if name in maps:
-            C = C + found.sigmas[name] ** 2 * maps[name] @ np.swapaxes(maps[name], 1, 2)
+        if (of := SHARED_MAPS.get(name, name)) in maps:
+            C = C + found.sigmas[name] ** 2 * maps[of] @ np.swapaxes(maps[of], 1, 2)
     C = C + np.diag(np.repeat([LEAST_M**2, LEAST_RAD**2], 3))
     informations = np.swapaxes(J, 1, 2) @ np.linalg.solve(C, J)
     weights = np.concatenate([np.zeros(6), np.repeat([1.0, LEVER_M**2], 3)])
-    total = np.linalg.inv(found.cov)
-    chosen, sigmas = [], []
+    total, before = np.linalg.inv(found.cov), found.cov
+    chosen, sigmas, reasons = [], [], []
     for _ in range(count):
         after = np.linalg.inv(total + informations)
         k = int(np.argmin(np.einsum("i,nii->n", weights, after)))
         total = total + informations[k]
         chosen.append(k)
         sigmas.append(worst_sigmas(after[k]))
-        informations[k] = 0.0
+        reasons.append(_lowered(before[6:, 6:], after[k][6:, 6:], found.T_flange_held[:3, :3]))
+        before, informations[k] = after[k], 0.0
     sigma = np.array(sigmas)
-    return PosePlan(A[chosen], sigma[:, 0], sigma[:, 1], worst_sigmas(found.cov))
+    way = log_se3(inverse(poses.A)[None] @ A[chosen][:, None])
+    angle = np.linalg.norm(way[..., 3:], axis=2)
+    nearest = np.argmin(angle, axis=1)
+    moved = np.linalg.norm(A[chosen][:, :3, 3] - poses.A[nearest, :3, 3], axis=1)
+    rotated = angle[np.arange(count), nearest]
+    return PosePlan(
+        A[chosen], sigma[:, 0], sigma[:, 1], worst_sigmas(found.cov), nearest, rotated, moved, tuple(reasons)
+    )
+
+
+def _lowered(before: Array, after: Array, R: Array) -> str:
+    """Say which sigma of the mounting falls most, of covariances (6, 6) of its right tangent, m and rad.
+
+    Args:
+        before: without the pose.
+        after: with it.
+        R: (3, 3) from the axes of the mounting to the flange's.
+    """
+    falls = []
+    for part, unit, times, size in ((slice(0, 3), "mm", 1e3, 1.0), (slice(3, 6), "deg", np.degrees(1.0), LEVER_M)):
+        values, vectors = np.linalg.eigh(before[part, part] - after[part, part])
+        axis = vectors[:, -1]
+        named = R @ axis * np.sign((R @ axis)[np.argmax(np.abs(R @ axis))])
+        sigmas = [times * float(np.sqrt(axis @ C[part, part] @ axis)) for C in (before, after)]
+        along = "along" if unit == "mm" else "about"
+        said = f"{along} [{' '.join(f'{v:.1f}' for v in named)}] {sigmas[0]:.3g} to {sigmas[1]:.3g} {unit}"
+        falls.append((size**2 * float(values[-1]), said))
+    return max(falls)[1]
 
 
 def worst_sigmas(cov: Array) -> tuple[float, float]:
@@ -88,26 +127,23 @@ def _candidates(found: StructuredHandEye, poses: Poses, rng: np.random.Generator
     """Return poses of the flange and of the body as it would be seen there."""
     p = transform(poses.B, poses.centre)
     distance = np.linalg.norm(p, axis=1)
-    off_axis = float(np.max(np.linalg.norm(p[:, :2], axis=1) / distance))
-    k = rng.integers(0, len(p), CANDIDATES)
-    rotated = np.concatenate(
-        [np.zeros((CANDIDATES, 3)), rng.uniform(-ROTATED_RAD, ROTATED_RAD, (CANDIDATES, 3))], axis=1
-    )
-    around = np.eye(4)
-    around[:3, 3] = poses.centre
-    B = poses.B[k] @ around @ exp_se3(rotated) @ inverse(around)
-    roll = exp_so3(np.outer(rng.uniform(-np.pi, np.pi, CANDIDATES), [0.0, 0.0, 1.0]))
-    B[:, :3] = roll @ B[:, :3]  # the whole view, about the camera's axis
-    B[:, :3, 3] *= rng.uniform(distance.min(), distance.max(), CANDIDATES)[:, None] / distance[k, None]
+    k, other = rng.integers(0, len(p), (2, CANDIDATES))
+    axis = rng.standard_normal((CANDIDATES, 3))
+    angle = NEAR_RAD * rng.uniform(0, 1, CANDIDATES) ** (1 / 3)
+    R = exp_so3(axis * (angle / np.linalg.norm(axis, axis=1))[:, None]) @ poses.B[k, :3, :3]
+    middle = p[other] * (rng.uniform(distance.min(), distance.max(), CANDIDATES) / distance[other])[:, None]
+    B = np.tile(np.eye(4), (CANDIDATES, 1, 1))
+    B[:, :3, :3], B[:, :3, 3] = R, middle - R @ poses.centre
     Z, X = found.T_base_still, found.T_flange_held
     A = Z @ inverse(X @ B) if poses.in_hand else Z @ B @ inverse(X)
-    seen = transform(B, poses.centre)
+    seen, was = middle[:, :2] / middle[:, 2:], p[:, :2] / p[:, 2:]
     low, high = poses.A[:, :3, 3].min(axis=0), poses.A[:, :3, 3].max(axis=0)
     margin = WIDER * (high - low) + 0.02
-    facing = np.einsum("ni,ni->n", B[:, :3, 2], seen) / np.linalg.norm(seen, axis=1)
+    facing = np.einsum("ni,ni->n", B[:, :3, 2], middle) / np.linalg.norm(middle, axis=1)
     faced = np.einsum("ni,ni->n", poses.B[:, :3, 2], p) / distance
     good = (
-        (np.linalg.norm(seen[:, :2], axis=1) / np.linalg.norm(seen, axis=1) <= off_axis + 0.02)
+        (seen >= was.min(axis=0) - BESIDE).all(axis=1)
+        & (seen <= was.max(axis=0) + BESIDE).all(axis=1)
         & (A[:, :3, 3] >= low - margin).all(axis=1)
         & (A[:, :3, 3] <= high + margin).all(axis=1)
         & (facing * np.sign(np.median(faced)) > min(0.6, float(np.abs(faced).min())))

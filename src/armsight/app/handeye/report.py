@@ -16,6 +16,7 @@ from armsight.app.handeye.result import (
     plan_table,
     statements,
     transforms_table,
+    untrusted,
 )
 from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files, text
 from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png
@@ -132,8 +133,9 @@ def write_handeye_report(run: HandEyeAnswer, folder: Path) -> None:
     """
     with drawing():
         images = {name: png(plot(run)) for name, (plot, _, _) in FIGURES.items()}
+    doubts = "".join(f'<p class="headline">do not trust this result: {text(why)}</p>' for why in untrusted(run))
     result = (
-        f'<div class="assessment"><p class="headline">{text(headline(run))}</p></div>\n'
+        f'<div class="assessment">{doubts}<p class="headline">{text(headline(run))}</p></div>\n'
         + html_table(transforms_table(run))
         + bullets([*statements(run), *run.recording.notes])
     )
@@ -143,7 +145,7 @@ def write_handeye_report(run: HandEyeAnswer, folder: Path) -> None:
         sections[name] = (title, f"<figure>{image}<figcaption><p>{text(caption)}</p></figcaption></figure>\n")
     sections["blunders"] = ("Blunders", bullets(blunders(run) or ["none"]))
     if run.plan is not None:
-        sections["plan"] = ("Poses to take next", html_table(plan_table(run.plan)))
+        sections["plan"] = ("Poses to take next", html_table(plan_table(run.plan, run.recording.names)))
     sub = f"{run.recording.robot.path.name} · {len(run.found.used)} poses · eye {run.found.eye.replace('_', ' ')}"
     page = html_page("armsight: hand-eye calibration", "Hand-eye calibration", sub, sections)
     files = {f"report-{name}.png": data for name, data in images.items()}

@@ -16,8 +16,9 @@ from armsight.geometry.pose import log_se3, mean_pose
 from armsight.loop.handeye.noise import OF_THE_ARM, SHARED
 from armsight.loop.handeye.structured import GEOMETRY, POSITIONS, SCALE_WALKING, SMOOTH, StructuredHandEye
 
-#: More blunders than this share of the poses ask for another look at the tables.
-_MANY = 0.25
+#: As many blunders as this share of the poses, or a median error on poses left out beyond this, m, are no calibration to
+#: trust.
+_MANY, _FAR_M = 0.25, 0.02
 #: A structure whose mean log density is within this of the best is not distinguished from it.
 DISTINGUISHED = 0.2
 #: A scale that differs from 1 by this many sigmas is said.
@@ -162,9 +163,11 @@ def statements(run: HandEyeAnswer) -> list[str]:
             f"{np.abs(found.common).max():.1f} of its own sigmas; poses used and left out are corrected by it"
         )
     if found.structure in SCALE_WALKING:
+        low, high = scale_at_end(found)
         lines.append(
             f"the camera's scale walks by {100 * found.sigmas['scale_walk']:.2g} % over all poses (sigma): the "
-            f"target's lengths are {found.scale:.5f} ± {found.sigma_scale:.5f} of those given at the first pose alone"
+            f"target's lengths are {found.scale:.5f} ± {found.sigma_scale:.5f} of those given at the first pose alone, and "
+            f"{low:.4f} to {high:.4f} at the last (95 %)"
         )
     elif found.sigma_scale:
         lines.append(
@@ -173,19 +176,42 @@ def statements(run: HandEyeAnswer) -> list[str]:
     return lines
 
 
+def scale_at_end(found: StructuredHandEye) -> tuple[float, float]:
+    """Return within which the scale of the target is at the last pose, 95 %, where it walks."""
+    way = 1.96 * float(np.hypot(found.sigmas["scale_walk"], found.sigma_scale / found.scale))
+    return found.scale * float(np.exp(-way)), found.scale * float(np.exp(way))
+
+
+def untrusted(run: HandEyeAnswer) -> list[str]:
+    """Return why the result must not be trusted; empty where it may be."""
+    found, why = run.found, []
+    out, n = int((~found.used).sum()), len(found.used)
+    if out >= _MANY * n:
+        why.append(
+            f"{out} of {n} poses are blunders, more than slips: do the rows belong together, and did nothing move? A row "
+            "that is missing on one side shifts all after it"
+        )
+    median = float(np.nanmedian(found.held_out.position_m))
+    if median > _FAR_M:
+        why.append(f"half of the poses left out are off by more than {1e3 * median:.0f} mm: check one row by hand")
+    return why
+
+
 def text(run: HandEyeAnswer) -> str:
     """Return what people read."""
-    lines = [headline(run), "", plain_text(transforms_table(run)), "", *statements(run)]
+    lines = [
+        *(f"do not trust this result: {why}" for why in untrusted(run)),
+        headline(run),
+        "",
+        plain_text(transforms_table(run)),
+        "",
+        *statements(run),
+    ]
     out = blunders(run)
     lines += [f"blunders, left out: {len(out)}", *(f"  {line}" for line in out[:10])] if out else ["no blunders"]
-    if len(out) > _MANY * len(run.found.used):
-        lines.append(
-            f"{len(out)} of {len(run.found.used)} poses are more than slips: do the rows belong together? One that is "
-            "missing on one side shifts all after it"
-        )
     if run.plan is not None:
-        lines += ["", plain_text(plan_table(run.plan))]
-        if run.found.structure in SHARED:
+        lines += ["", plain_text(plan_table(run.plan, run.recording.names))]
+        if run.found.structure in (*SHARED, SMOOTH):
             lines.append(
                 f"these sigmas are lower bounds: with {run.found.structure} new poses share errors with the others"
             )
@@ -197,17 +223,36 @@ def _along(T: Array, sigma: Array) -> Array:
     return np.asarray(np.sqrt(np.square(T[:3, :3]) @ np.square(sigma[:3])))
 
 
-def plan_table(plan: PosePlan) -> TextTable:
-    """Return the next poses as a table for people."""
+def _near(plan: PosePlan, names: tuple[str, ...], k: int) -> str:
+    """Return the pose that a planned one is near, by name, and how far from it."""
+    far = f"{np.degrees(plan.rotated_rad[k]):.0f} deg, {1e3 * plan.moved_m[k]:.0f} mm"
+    return f"{far} from {names[plan.nearest[k]]}"
+
+
+def plan_table(plan: PosePlan, names: tuple[str, ...]) -> TextTable:
+    """Return the next poses as a table for people; names are those of the poses that were taken."""
     rows = []
     for k, (T, m, rad) in enumerate(zip(plan.Ts_base_flange, plan.sigma_m, plan.sigma_rad, strict=True), 1):
         p, angles = 1e3 * T[:3, 3], Rotation.from_matrix(np.array(T[:3, :3])).as_euler("xyz", degrees=True)
         values = [*(f"{v:.1f}" for v in p), *(f"{v:.1f}" for v in angles), f"{1e3 * m:.2f}", f"{np.degrees(rad):.3f}"]
-        rows.append((str(k), *values))
-    head = ("next", "x, mm", "y, mm", "z, mm", "rx, deg", "ry, deg", "rz, deg", "sigma, mm", "deg")
+        rows.append((str(k), *values, _near(plan, names, k - 1), plan.reasons[k - 1]))
+    head = (
+        "next",
+        "x, mm",
+        "y, mm",
+        "z, mm",
+        "rx, deg",
+        "ry, deg",
+        "rz, deg",
+        "sigma, mm",
+        "deg",
+        "near",
+        "lowers most",
+    )
     title = (
         f"poses of the flange to take next (sigma along the worst axis now {1e3 * plan.before[0]:.2f} mm, "
-        f"{np.degrees(plan.before[1]):.3f} deg); check that your arm reaches them freely"
+        f"{np.degrees(plan.before[1]):.3f} deg); each is near one that was taken, with the target in view; check that your "
+        "arm reaches them freely"
     )
     return TextTable(title, head, tuple(rows))
 
@@ -229,6 +274,7 @@ def as_json(run: HandEyeAnswer) -> dict[str, Any]:
     worst_m, worst_rad = worst_sigmas(found.cov)
     document: dict[str, Any] = {
         "eye": found.eye,
+        "untrusted": untrusted(run),
         held: found.T_flange_held.tolist(),
         still: found.T_base_still.tolist(),
         "cov_m_rad": found.cov.tolist(),
@@ -273,7 +319,10 @@ def as_json(run: HandEyeAnswer) -> dict[str, Any]:
         ],
         "notes": list(run.recording.notes),
     }
-    if found.sigma_scale:
+    if found.structure in SCALE_WALKING:
+        document |= {"target_scale_at_start": found.scale, "target_scale_at_start_sigma": found.sigma_scale}
+        document |= {"target_scale_walks_sigma": found.sigmas["scale_walk"], "target_scale_at_end": scale_at_end(found)}
+    elif found.sigma_scale:
         document |= {"target_scale": found.scale, "target_scale_sigma": found.sigma_scale}
     if run.offset_s is not None:
         document |= {"clock_offset_s": run.offset_s, "clock_offset_sigma_s": run.sigma_offset_s}
@@ -284,5 +333,9 @@ def as_json(run: HandEyeAnswer) -> dict[str, Any]:
             "T_base_flange": run.plan.Ts_base_flange.tolist(),
             "sigma_m": run.plan.sigma_m.tolist(),
             "sigma_rad": run.plan.sigma_rad.tolist(),
+            "nearest": [run.recording.names[k] for k in run.plan.nearest],
+            "rotated_from_nearest_rad": run.plan.rotated_rad.tolist(),
+            "moved_from_nearest_m": run.plan.moved_m.tolist(),
+            "lowers_most": list(run.plan.reasons),
         }
     return document

@@ -736,7 +736,7 @@ class ArmStep:
             lines.append(f"hand-eye: held out {1e3 * position_m:.2f} mm, {np.degrees(angle_rad):.3f} deg RMS")
         if outcome.delay_found:
             lines.append(f"delay of the images: {1e3 * outcome.delay.delay_s:.1f} ms")
-        for name, closed in (("potentiometers alone", False), ("loop closed on vision", True)):
+        for name, closed in (("joint sensors alone", False), ("loop closed on vision", True)):
             errors = [e for _, e, c in self._chart if c is closed]
             if errors:
                 rms = float(np.sqrt(np.mean(np.square(errors))))

@@ -30,6 +30,7 @@ from armsight.vision.detections import SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows, measurer
 from armsight.vision.image import one_image
 from armsight.vision.markers.calibrated_board import is_print
+from armsight.vision.markers.circles import unseen_row
 from armsight.vision.markers.disc.target import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_fixed, open_target
@@ -206,6 +207,9 @@ def measure_shots(
             if as_json and isinstance(opened, VideoSource) and (odd := opened.odd_frames):
                 click.echo(json.dumps({"odd_frames": odd}))
             _say(reversed_notes(found, records))
+            rank = {name: k for k, name in enumerate(found.body.point_names)}
+            of_shots = [[rank[name] for name in r.points_m if name in rank] for r in records if r.ok]
+            _say(unseen_row(found, [np.array(ids, np.int64) for ids in of_shots]))
     contradicted = missed.finding()
     if records and not any(record.ok for record in records):
         mistake = _mistaken(stereo, found, first) if detections is None else ""

@@ -116,7 +116,7 @@ class RunPlan:
     is_flag=True,
     help="The board's sync LED (docs/howto/board.md) is in view of both cameras: it gives delay and skew.",
 )
-@click.option("--open-loop", is_flag=True, help="Control by the potentiometers alone; do not close the loop on vision.")
+@click.option("--open-loop", is_flag=True, help="Control by the joint sensors alone; do not close the loop on vision.")
 @click.option(
     "--follow-rig",
     is_flag=True,

@@ -152,7 +152,7 @@ def drive(
     phase = "closed_loop" if closed else "open_loop"
     open_s = OPEN_REST_S + 2.0 * loop.setup.board.abilities.latency_s
     for motion in plan.motions:
-        progress(f"{'loop closed on vision' if closed else 'potentiometers alone'}: {motion.name}")
+        progress(f"{'loop closed on vision' if closed else 'joint sensors alone'}: {motion.name}")
         controller = control(Tabled(motion.trajectory), loop.t_s, motion.rest_s)
         segment = RunSegment(phase, motion.name, motion.kind, closed, trajectory=motion.trajectory)
         started(motion.name, motion.kind, motion.trajectory.duration_s)

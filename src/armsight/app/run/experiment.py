@@ -96,7 +96,7 @@ def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
         raise InputError(
             f"joint {joint + 1} reads {np.degrees(q[joint]):.1f} deg, the motion starts at "
             f"{np.degrees(plan.start[joint]):.1f}: bring the arm to the start, or give start_deg; if it is there, "
-            f"--arm {setup.arm.name} does not match the board's potentiometers (armsight board monitor)"
+            f"--arm {setup.arm.name} does not match the board's joint sensors (armsight board monitor)"
         )
     require_range(setup, np.vstack([targets, *(passed(m.trajectory) for m in plan.motions)]))
 

@@ -150,7 +150,7 @@ _BASED = {
     "bridged": "on the model while vision was missing",
     "potentiometers": "with the last correction, vision lost",
     "held": "with the correction held, as vision contradicted what was learned",
-    "distrusted": "on the potentiometers, with what was learned before, as vision was wrong",
+    "distrusted": "on the joint sensors, with what was learned before, as vision was wrong",
 }
 
 

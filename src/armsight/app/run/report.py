@@ -61,7 +61,7 @@ def path_figure(run: RunData) -> Figure:
     axes = figure.add_subplot(projection="3d")
     shown: list[tuple[ToolTrack | None, str, str, float, str]] = [
         (run.truth, "truth", INK, 2.6, "-"),
-        (run.potentiometers, "potentiometers", ORANGE, 1.0, "-"),
+        (run.potentiometers, "joint sensors", ORANGE, 1.0, "-"),
         (run.fused, "fused", GREEN, 1.0, "-"),
         (run.vision, "vision", BLUE, 0.0, "."),
     ]
@@ -97,7 +97,7 @@ def errors_figure(run: RunData) -> Figure | None:
     for plot, part, factor, name in ((plots[0], slice(0, 3), _MM, "mm"), (plots[2], slice(3, 6), _DEG, "deg")):
         plot.plot(alone.t_s, factor * np.linalg.norm(off[:, part], axis=1), color=ORANGE, lw=1.0)
         plot.set_ylabel(f"{'position' if name == 'mm' else 'orientation'}, {name}")
-        plot.set_title("potentiometers and the nominal arm's forward kinematics", fontsize=9)
+        plot.set_title("joint sensors and the nominal arm's forward kinematics", fontsize=9)
         plot.set_ylim(bottom=0)
     shown = {"vision": (run.vision, BLUE), "fused": (run.fused, GREEN)}
     thin = {name: (track[_thinned(len(track))], colour) for name, (track, colour) in shown.items() if len(track)}
@@ -135,7 +135,7 @@ def loop_figure(before: RunData, after: RunData) -> Figure | None:
     figure = new_figure(4.6)
     rests, paths = figure.subplots(1, 2)
     for shift, run, truth, name, colour in (
-        (-0.2, before, truth_before, "potentiometers alone", ORANGE),
+        (-0.2, before, truth_before, "joint sensors alone", ORANGE),
         (0.2, after, truth_after, "closed on vision", GREEN),
     ):
         found = rest_errors(run, truth)
@@ -238,7 +238,7 @@ def _over_time(plot: Axes, run: RunData) -> None:
     assert run.truth is not None
     start = run.t_s[0]
     for track, name, colour, every in (
-        (run.potentiometers, "potentiometers", ORANGE, _EVERY),
+        (run.potentiometers, "joint sensors", ORANGE, _EVERY),
         (run.fused, "fused", GREEN, _EVERY),
         (run.vision, "vision", BLUE, 1),
     ):
@@ -257,7 +257,7 @@ def _over_time(plot: Axes, run: RunData) -> None:
 def _at_rest(plot: Axes, before: RunData, after: RunData) -> None:
     """Plot the errors at rest, with potentiometers alone and with the loop closed."""
     for shift, run, name, colour in (
-        (-0.2, before, "potentiometers alone", ORANGE),
+        (-0.2, before, "joint sensors alone", ORANGE),
         (0.2, after, "loop closed on vision", GREEN),
     ):
         found = rest_errors(run, evaluated_track(run))
@@ -484,7 +484,7 @@ def _page(report: RunReport, figures: Mapping[str, str]) -> str:
         "motion": (
             "Joint angles and tool path",
             shown("joints", "The joint angles over time, by their sensors, and reference; shaded: the arm rests.")
-            + shown("path", "The tool's path: from potentiometers, from vision, from both fused, and the truth."),
+            + shown("path", "The tool's path: from the joint sensors, from vision, from both fused, and the truth."),
         ),
         "errors": (
             "Errors against the truth",
@@ -492,7 +492,7 @@ def _page(report: RunReport, figures: Mapping[str, str]) -> str:
         ),
         "loop": (
             "Open loop and closed loop",
-            shown("loop", "The same motions with potentiometers alone and with vision in the loop."),
+            shown("loop", "The same motions with the joint sensors alone and with vision in the loop."),
         ),
         "latency": (
             "Latency",

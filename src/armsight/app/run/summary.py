@@ -42,7 +42,7 @@ from armsight.vision.rig import Shutters
 VERSION = 2
 #: Track -> its name in tables.
 TRACKS = {
-    "potentiometers": "potentiometers",
+    "potentiometers": "joint sensors",
     "vision": "vision",
     "fused": "fused, smoothed",
     "live": "fused, live",
@@ -367,7 +367,7 @@ def loop_table(summary: RunSummary) -> TextTable | None:
         )
         if alone is not None and closed is not None
     ]
-    columns = ("", "potentiometers alone, mm", "loop closed, mm", "times smaller")
+    columns = ("", "joint sensors alone, mm", "loop closed, mm", "times smaller")
     return TextTable("Distance of the tool from its reference", columns, tuple(rows))
 
 

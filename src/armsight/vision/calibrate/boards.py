@@ -48,6 +48,7 @@ from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.camera import DISTORTION_MODELS, Camera
 from armsight.vision.discs.bias import apparent_radii
 from armsight.vision.markers.board import CalibrationBoard
+from armsight.vision.markers.circles import unseen_row
 from armsight.vision.match import join, renamed
 from armsight.vision.pnp import body_poses
 from armsight.vision.projection import of_middles, smooth
@@ -420,7 +421,7 @@ def calibrate_boards(
         trial.errors,
         tried,
         tuple(rejected),
-        (*notes, *screened.notes, *unfinished(trial.solution)),
+        (*notes, *screened.notes, *unfinished(trial.solution), *unseen_row(board, _shown(pairs))),
         (),
         None if trial.motion is None else trial.motion.scaled(trial.heldout.normalised_rms),
         radius_m,
@@ -706,6 +707,11 @@ def calibrate_recording(
         recorded=True,
     )
     return replace(calibration, weaknesses=weaknesses(calibration))
+
+
+def _shown(pairs: Sequence[Pair]) -> list[Ids]:
+    """Return the points that each image shows which shows the board."""
+    return [seen.ids for pair in pairs for seen in (pair.left, pair.right) if len(seen.ids)]
 
 
 def _spread(pairs: Sequence[Pair]) -> list[Pair]:

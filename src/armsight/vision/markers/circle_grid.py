@@ -260,6 +260,8 @@ _PREDICTED_CELLS = 3
 #: Largest share of the discs in view that may be missing or too many; how much worse the next best placement must be, and
 #: what a ring in the wrong position counts.
 _MOST_WRONG, _WORSE, _RING_COST = 0.25, 2, 3
+#: A grid of a size is shown where at least this share of its discs was found.
+_FILLED = 0.9
 #: A step across a missing line is twice as long as others; from this on it is one.
 _SKIPPED = 1.5
 
@@ -377,6 +379,40 @@ def skips_line(cells: Ids, theta: Array) -> bool:
     squares = [median(each) for each in steps.values()]
     sure = [median(each) for each in steps.values() if len(each) > 1]  # one step alone may be short by chance
     return bool(sure) and max(squares) > _SKIPPED**2 * min(sure)
+
+
+def shown_size(cells: Ids, *, staggered: bool, like: tuple[int, int]) -> tuple[int, int] | None:
+    """Return the columns and rows of the grid that a lattice fills, of the readings that nearest to a board's.
+
+    Outer lines with fewer than half the discs of the others are not of the grid.
+
+    Args:
+        cells: (N, 2) the lattice's cells.
+        staggered: whether the lattice lies diagonally in the grid.
+        like: columns and rows of the board.
+
+    Returns:
+        None where the lattice fills no grid.
+    """
+    x, y = cells.T
+    at = np.stack([x - y, x + y] if staggered else [x, y], axis=1)
+    while len(at):
+        low, high = at.min(axis=0), at.max(axis=0)
+        kept = np.ones(len(at), bool)
+        for axis in (0, 1):
+            counts = np.bincount(at[:, axis] - low[axis])
+            for end in (low[axis], high[axis]):
+                if counts[end - low[axis]] < 0.5 * np.median(counts[counts > 0]):
+                    kept &= at[:, axis] != end
+        if kept.all():
+            break
+        at = at[kept]
+    if not len(at):
+        return None
+    wide, tall = (np.ptp(at, axis=0) + 1).tolist()
+    sizes = [(wide // 2, tall), (tall // 2, wide)] if staggered else [(wide, tall), (tall, wide)]
+    whole = [size for size in sizes if _FILLED * size[0] * size[1] <= len(at) <= size[0] * size[1]]
+    return min(whole, key=lambda size: abs(size[0] - like[0]) + abs(size[1] - like[1]), default=None)
 
 
 def positions(cells: Ids, uv: Array) -> dict[Cell, complex]:

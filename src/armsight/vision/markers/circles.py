@@ -13,6 +13,7 @@ they need the radius, which the sizes of the ellipses give where the spec does n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -37,6 +38,7 @@ from armsight.vision.markers.circle_grid import (
     grow_lattices,
     number_cells,
     positions,
+    shown_size,
     skips_line,
 )
 from armsight.vision.markers.disc.search import Grey
@@ -55,6 +57,8 @@ _LOST_CONTRAST, _COMPLETED = 0.4, 2
 _ODD_OUTLINE, _ODD_FIT = 1.3, 1.7
 #: How far an outline may be from where its neighbours put it, in radii.
 _DISPLACED = 0.35
+#: Images from which on a row that is in none of them is said.
+_IMAGES = 3
 #: Whether discs are light -> how the spec says so.
 POLARITIES = {False: "dark", True: "light"}
 
@@ -180,9 +184,13 @@ class CircleGrid(Record, Target):
         )
         if skips_line(cells, starts):
             return f"{len(cells)} of its discs were found, but between them a whole row or column was not"
+        own = (self.columns, self.rows)
+        shown = shown_size(cells, staggered=self.staggered, like=own)
+        if shown is not None and (shown[0] > own[0] or shown[1] > own[1]):
+            return f"its discs make a grid of {shown[0]}x{shown[1]}: count columns x rows"
         placement = number_cells(cells, starts, hollow, self._layout, size)
         if isinstance(placement, str):
-            return placement
+            return placement + self._other_grid(cells, shown)
         seen = placement.ids >= 0
         starts, hollow = starts[seen], hollow[seen]
         ids = self._upright(placement.ids[seen], starts[:, :2])
@@ -199,6 +207,15 @@ class CircleGrid(Record, Target):
             return f"{len(ids)} of its discs were found, but only {good.sum()} can be measured{fits.why_not()}"
         rows = np.flatnonzero(good)[np.argsort(ids[good])]
         return Detections(ids[rows], fits.uv[rows], fits.cov[rows], shape=fits.shape[rows], common=fits.common)
+
+    def _other_grid(self, cells: Ids, shown: tuple[int, int] | None) -> str:
+        """Return "; they make a grid of 7x6" where a lattice (N, 2) that is not the board fills another grid."""
+        own, kind = (self.columns, self.rows), "grid"
+        if shown is None:
+            shown = shown_size(cells, staggered=not self.staggered, like=own)
+            kind = "square grid (circles)" if self.staggered else "staggered grid (acircles)"
+        same = shown is None or (shown == own and kind == "grid")
+        return "" if same or shown is None else f"; they make a {kind} of {shown[0]}x{shown[1]}"
 
     def _upright(self, ids: Ids, uv: Array) -> Ids:
         """Return the numbering, of those that look the same, whose rows run most to the right."""
@@ -218,6 +235,29 @@ class CircleGrid(Record, Target):
             if guess is not None:
                 out[k] = guess[0].real, guess[0].imag
         return out
+
+
+def unseen_row(target: Target, seen: Sequence[Ids]) -> tuple[str, ...]:
+    """Say which outer row of a grid of discs no image shows: the board may have a row less than its spec says.
+
+    Args:
+        target: anything; of other targets nothing is said.
+        seen: the discs that were found in each image that shows the board.
+
+    Returns:
+        One note, or none.
+    """
+    if not isinstance(target, CircleGrid) or len(seen) < _IMAGES:
+        return ()
+    rows = np.unique(np.concatenate(list(seen)) // target.columns)
+    missing = [1 + row for row in (0, target.rows - 1) if row not in rows]
+    if not missing:
+        return ()
+    which = " and ".join(map(str, missing))
+    return (
+        f"row {which} of {target.spec} is in none of {len(seen)} images: if the board has {target.columns}x"
+        f"{target.rows - len(missing)} discs, its origin is not where it seems; correct --target",
+    )
 
 
 def _completed(
