@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from armsight.data import Missed
-from armsight.geometry.pose import exp_se3, inverse, log_se3
+from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3
 from armsight.loop.estimators import Mounting
 from armsight.loop.health import HealthFinding, HealthMonitor, follow
+from armsight.loop.health.base_motion import Moved
 from armsight.loop.health.change import Change, suspects
 from armsight.loop.health.follow import RigCorrection, RigFollower, remeasured
 from armsight.loop.health.landmarks import LandmarkWatch
@@ -25,6 +26,13 @@ def change(suspect, xi, sigma_m=5e-5, score=50.0):
     xi_tool = log_se3(inverse(T_TOOL) @ exp_se3(xi) @ T_TOOL)
     cov = np.diag(np.repeat([sigma_m**2, (2 * sigma_m) ** 2], 3))
     return Change(suspect, 10.0, 14.0, xi_tool, cov, 200.0, score, effect, T_TOOL)
+
+
+def moved(xi, sigma_m=5e-5, *Ts):
+    """The same motion (6,) as the arm's filter estimates it, as uncertain at T_TOOL, where the arm is, after poses Ts."""
+    to_base = adjoint(T_TOOL)
+    cov = to_base @ np.diag(np.repeat([sigma_m**2, (2 * sigma_m) ** 2], 3)) @ to_base.T
+    return Moved(xi, cov, (*Ts, T_TOOL))
 
 
 def follower():
@@ -102,29 +110,55 @@ def test_findings_of_another_cause_stay_after_a_correction():
 
 
 def test_a_motion_of_the_rig_is_undone_by_its_mounting():
-    moved = np.array([0.002, -0.001, 0.003, 0.001, 0.002, -0.001])
+    motion = np.array([0.002, -0.001, 0.003, 0.001, 0.002, -0.001])
     old = Mounting(exp_se3(np.array([0.1, 0.9, 0.4, 1.0, 0.2, 0.3])), np.eye(4), 1e-10 * np.eye(12))
-    true = old.T_base_rig @ exp_se3(moved)
+    true = old.T_base_rig @ exp_se3(motion)
     xi = log_se3(old.T_base_rig @ inverse(true))  # measured = T_old inv(T_true) true
-    correction = follower().base_by_arm([change(BASE, xi)], old.T_base_rig, 15.0)
+    correction = follower().base_by_arm([change(BASE, xi)], old.T_base_rig, 15.0, moved(xi))
     new = correction.mounting(old)
     np.testing.assert_allclose(new.T_base_rig, true, atol=1e-5)
     assert (np.linalg.eigvalsh(new.cov[:6, :6]) > 1e-10).all()
     assert "the tool had appeared displaced by" in correction.line()
 
 
+MM_2 = np.full(6, 0.002)
+FAR = T_TOOL @ exp_se3(np.array([2.0, 0, 0, 0, 0, 0]))
+
+
 @pytest.mark.parametrize(
-    ("changes", "reason"),
+    ("changes", "motion", "reason"),
     [
-        ([change(BODY, np.full(6, 0.002))], "a change of the body explains the poses of the arm better"),
-        ([change(BASE, np.full(6, 0.002), sigma_m=3e-4)], "the tool would be uncertain by 0.30 mm"),
-        ([change(BASE, np.full(6, 0.002)), change(BODY, np.full(6, 0.001))], "body cannot be excluded"),
+        ([change(BODY, MM_2)], moved(MM_2), "a change of the body explains the poses of the arm better"),
+        ([change(BASE, MM_2)], moved(MM_2, 5e-4), "the tool would be uncertain by 0.50 mm"),
+        ([change(BASE, MM_2)], moved(MM_2, 1e-4, FAR), "the tool would be uncertain by 0.41 mm"),
+        ([change(BASE, MM_2)], None, "no pose was measured since it moved"),
+        ([change(BASE, MM_2), change(BODY, np.full(6, 0.001))], moved(MM_2), "body cannot be excluded"),
     ],
 )
-def test_what_is_not_determined_is_not_put_right(changes, reason):
+def test_what_is_not_determined_is_not_put_right(changes, motion, reason):
     one = follower()
-    assert one.base_by_arm(changes, np.eye(4), 15.0) is None
+    assert one.base_by_arm(changes, np.eye(4), 15.0, motion) is None
     assert reason in one.rejected
+
+
+def test_a_motion_that_was_put_right_is_refined_once_more_is_known_of_it():
+    off = np.array([2e-4, -1e-4, 1e-4, 1e-4, 0.0, 2e-4])  # what the first correction leaves
+    true_motion = np.array([0.002, -0.001, 0.003, 0.001, 0.002, -0.001])
+    old = Mounting(exp_se3(np.array([0.1, 0.9, 0.4, 1.0, 0.2, 0.3])), np.eye(4), 1e-10 * np.eye(12))
+    true = old.T_base_rig @ exp_se3(true_motion)
+    one, xi = follower(), log_se3(old.T_base_rig @ inverse(true))
+    first = one.base_by_arm([change(BASE, xi)], old.T_base_rig, 15.0, moved(xi + off, 2.8e-4))
+    then = first.mounting(old)
+    left = log_se3(then.T_base_rig @ inverse(true))
+    assert one.refined(first, then.T_base_rig, 16.0, moved(left, 2.6e-4)) is None
+    second = one.refined(first, then.T_base_rig, 17.0, moved(left, 1e-4))
+    new = second.mounting(then)
+    np.testing.assert_allclose(new.T_base_rig, true, atol=1e-7)
+    np.testing.assert_allclose(second.motion, true_motion, atol=1e-5)
+    assert second.tool_m[0] == pytest.approx(first.tool_m[0], abs=4e-4)
+    direct = replace(second, refines=None).mounting(old)
+    np.testing.assert_allclose(new.cov, direct.cov, atol=1e-9)
+    assert np.trace(new.cov) < np.trace(then.cov)
 
 
 def test_fixed_bodies_show_by_how_much_both_cameras_moved():

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import faults
 import numpy as np
 import pytest
 from faults import BODY, RATE_HZ, SIGMA_PX, SIGMAS, SYNC_S, TRUE, measured, watched_body
@@ -136,6 +137,18 @@ def test_the_focal_length_of_one_camera_is_distinguished_from_its_rotation():
     assert (found.cause, found.alternatives, found.unit) == ("lens", ("rig",), "%")
     assert "left camera" in found.what
     assert abs(found.size - 0.1) < 4 * found.sigma
+
+
+def test_focal_lengths_that_grew_alike_widen_the_poses(monkeypatch):
+    """They compress depth, by 4 mm at 0.9 m, and nothing else: no other hypothesis explains what they leave."""
+    longer = [replace(each, intrinsics=np.array(each.intrinsics) * [1.005, 1.005, 1, 1]) for each in TRUE.cameras]
+    longer_both, squares = replace(TRUE, left=longer[0], right=longer[1]), []
+    monkeypatch.setattr(faults, "both_pixels", lambda true, p: both_pixels(TRUE if true is TRUE else longer_both, p))
+    for _, t_s, T, _, given in watched_body(7803, rotated=np.zeros(3), at_s=4.0, seconds=10.0):
+        if t_s > 6.0:
+            off = log_se3(inverse(given.T_left_body) @ T)
+            squares.append(off @ np.linalg.solve(given.cov, off))
+    assert np.mean(squares) < 20.0
 
 
 def test_points_that_do_not_fit_change_nothing_of_the_other_tests():

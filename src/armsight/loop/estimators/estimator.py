@@ -85,6 +85,8 @@ class Innovation(Record):
         clock: what is known of an error of the camera's clock; None where nothing is.
         reference: returns (6,) as z, from the pose predicted by a state that stays, and its derivative (6, K), where they
             are asked for; None where none is kept (:meth:`KalmanEstimator.keep_reference`).
+        added: (K,) variances that were added to the state since the measurement before; None where nobody needs them.
+        noise: (6, 6) covariance of z without the state's and without what all measurements share; None likewise.
     """
 
     t_s: float
@@ -97,6 +99,8 @@ class Innovation(Record):
     outcome: Outcome
     clock: ClockEffect | None = None
     reference: Callable[[], tuple[Array, Array]] | None = None
+    added: Array | None = None
+    noise: Array | None = None
 
 
 @dataclass(frozen=True)

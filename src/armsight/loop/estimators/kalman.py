@@ -122,6 +122,22 @@ class KalmanEstimator:
         self._reference = self._states[-1].x.copy()
         self._reference[self._forgets] = 0.0
 
+    @property
+    def reference(self) -> Array:
+        """The state (K,) of :meth:`keep_reference`."""
+        assert self._reference is not None
+        return self._reference
+
+    @property
+    def forgets(self) -> slice:
+        """Rows of the state that motion makes it forget."""
+        return self._forgets
+
+    @property
+    def delay_row(self) -> int:
+        """Row of the delay in the state."""
+        return self._at.delay
+
     def remembered(self) -> Remembered:
         """Return what is known now, for :meth:`restore`."""
         newest = self._states[-1]
@@ -131,16 +147,21 @@ class KalmanEstimator:
         """Return that of which :meth:`restore` makes the prior."""
         return Remembered(np.zeros(self._at.size), np.zeros((self._at.size, self._at.size)), None)
 
+    def known_again(self, state: Remembered) -> tuple[Array, Array]:
+        """Return an earlier state (K,) and its covariance (K, K) later: what motion makes it forget is unknown."""
+        x, P, rows = state.x.copy(), state.P.copy(), self._forgets
+        x[rows] = P[rows] = P[:, rows] = 0.0
+        P[np.diag_indices(self._at.size)] += np.where(np.diag(P) > 0.0, 0.0, self._model.sigmas**2)
+        return x, P
+
     def restore(self, state: Remembered) -> None:
         """Go on from an earlier state: what was measured since is dropped, and what motion makes it forget is unknown.
 
         Of a clock whose state is not known at that time what is followed now stays.
         """
-        x, P, rows, newest = state.x.copy(), state.P.copy(), self._forgets, self._states[-1]
+        (x, P), newest = self.known_again(state), self._states[-1]
         if self.clock is not None:
-            self.clock.restore(state.clock, rows)
-        x[rows] = P[rows] = P[:, rows] = 0.0
-        P[np.diag_indices(self._at.size)] += np.where(np.diag(P) > 0.0, 0.0, self._model.sigmas**2)
+            self.clock.restore(state.clock, self._forgets)
         self._states, self._outliers, self._newest, self._here = [newest._replace(x=x, P=P)], [], None, None
         self._waiting, self._backlash_set = [], False
 
@@ -321,7 +342,7 @@ class KalmanEstimator:
         if outcome is Outcome.OUTLIER:
             if report is not None:
                 none = np.zeros((self._at.size, 6))
-                report(self._said(t_s, joints, pose_measurement, at, (step.kept[0], none), outcome))
+                report(self._said(t_s, joints, pose_measurement, at, step, none, outcome))
             return None, outcome
         if outcome is Outcome.REOPENED:
             at.P[np.diag_indices(self._at.size)] += self._opened
@@ -329,7 +350,7 @@ class KalmanEstimator:
         K = self._model.updated(at, joints, pose_measurement, jitter_s, learns_delay=self._learns_delay)
         x, P = at.x, at.P
         if report is not None:
-            change = report(self._said(t_s, joints, pose_measurement, at, (step.kept[0], K), outcome))
+            change = report(self._said(t_s, joints, pose_measurement, at, step, K, outcome))
             if change is not None and self.clock is not None:
                 x = x + change
                 by_delay = P[:, self._at.delay] / P[self._at.delay, self._at.delay]
@@ -342,14 +363,16 @@ class KalmanEstimator:
         joints: Smoothed,
         pose_measurement: PoseMeasurement,
         at: Predicted,
-        how: tuple[Array, Array],
+        step: Propagation,
+        gain: Array,
         outcome: Outcome,
     ) -> Innovation:
-        """Return what became of a measurement: the state at it; what was kept, and the gain; the outcome."""
+        """Return what became of a measurement: the state at it, the propagation to it, the gain, the outcome."""
         reference = None
         if self._reference is not None and self.on_innovation is not None:
             reference = partial(self._model.innovation, self._reference, joints, pose_measurement, self._delay.jitter_s)
-        return Innovation(t_s, pose_measurement.T_base_tool, at.z, at.S, at.H, *how, outcome, None, reference)
+        seen = t_s, pose_measurement.T_base_tool, at.z, at.S, at.H
+        return Innovation(*seen, step.kept[0], gain, outcome, None, reference, step.added[0], at.R)
 
     def _gate(self, at: Predicted, chi: float) -> Outcome:
         """Return whether an innovation, with its chi-square, is used, an outlier, or one too many to ignore."""

@@ -4,7 +4,7 @@ In: a :class:`~armsight.loop.health.HealthMonitor`, and the poses measured so fa
 evidence suffices, else the reason why it does not. Cameras: the estimate of :mod:`armsight.loop.health.update`, from shots
 taken after the change; it is accepted when it leaves poses nearly as certain as the calibration did. Base: the motion
 that fixed bodies in view show; without these the one that the arm's poses show, if nothing else explains them and the
-tool's position is known well enough with it.
+tool's position is known well enough with it, wherever the arm went. That is refined as the arm shows more of it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from armsight.data import Array, Body, Missed, PoseEstimate, Record
-from armsight.geometry.pose import adjoint, exp_se3, inverse
+from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3
 from armsight.geometry.rotation import skew
 from armsight.loop.estimators import Mounting
+from armsight.loop.health.base_motion import BaseMotion, KeptMeasurement, Moved
 from armsight.loop.health.change import Change
 from armsight.loop.health.record import Cause
 from armsight.loop.health.rig import TEST_S, RigWatch, differ
@@ -40,6 +41,12 @@ _MOST_SHOTS, _NEW = 60, 0.25
 #: Largest standard deviation of the tool's position by what is put right of the rig, m; and by how much what else may have
 #: moved may displace the tool further, m.
 MOST_SIGMA_M, MOST_APART_M = 2e-4, 2e-4
+#: The same where the arm's poses show it, which is refined: without vision the tool is uncertain by 0.5 mm and more.
+_MOST_BY_ARM_M = 4e-4
+#: It is refined where its sigma fell to such a share, until it is so small, m.
+_REFINED, _KNOWN_M = 0.85, 1e-4
+#: A motion that began so much earlier or later than was thought is estimated anew, s.
+_SAME_S = 0.3
 
 Poses = Callable[[], Sequence[tuple[float, PoseEstimate]]]
 
@@ -57,6 +64,7 @@ class RigCorrection(Record):
         motion: (6,) right tangent from the old pose of the rig in the base to the new one, [m; rad]; zero of the cameras.
         cov: (6, 6) its covariance.
         tool_m: by how much that displaced the measured tool, where this is what the arm's poses show, and its sigma, m.
+        refines: the correction of the same motion that this one replaces.
     """
 
     what: Literal["cameras", "base"]
@@ -67,6 +75,7 @@ class RigCorrection(Record):
     motion: Array
     cov: Array
     tool_m: tuple[float, float] | None = None
+    refines: RigCorrection | None = None
 
     @property
     def cause(self) -> Cause:
@@ -77,11 +86,15 @@ class RigCorrection(Record):
         """Return where the rig is, from where it was thought to be."""
         if self.what == "cameras":
             return old
-        cov, back = old.cov.copy(), adjoint(exp_se3(-self.motion))
+        motion, cov = exp_se3(self.motion), old.cov.copy()
+        if self.refines is not None:
+            motion = inverse(exp_se3(self.refines.motion)) @ motion
+            cov[:6, :6] -= self.refines.cov
+        back = adjoint(inverse(motion))
         cov[:6] = back @ cov[:6]
         cov[:, :6] = cov[:, :6] @ back.T
         cov[:6, :6] += self.cov
-        return Mounting(old.T_base_rig @ exp_se3(self.motion), old.T_tool_body, cov)
+        return Mounting(old.T_base_rig @ motion, old.T_tool_body, cov)
 
     def to_json(self) -> dict[str, Any]:
         """Return the object that summary.json holds."""
@@ -136,6 +149,9 @@ class RigFollower:
     def __init__(self, rig: StereoRig, body: Body) -> None:
         self._rig, self._body = rig, body
         self._tried, self._tried_s = 0, -math.inf  # differing shots of the last update that was rejected; the newest, s
+        # What estimates a motion of the rig by the arm, and how it was put right with it.
+        self._motion: BaseMotion | None = None
+        self._put_right: RigCorrection | None = None
         self.rejected: str | None = None
 
     def look(
@@ -149,6 +165,8 @@ class RigFollower:
             T_base_rig: (4, 4) the rig in the base as it is taken to be, m.
             at_s: the time, s.
         """
+        if self._put_right is not None and (monitor.changes or monitor.rig_moved() is not None):
+            self._motion = self._put_right = None
         if (watch := monitor.cameras_moved()) is not None:
             newest = poses()
             return lambda: self._of_watch(watch, newest, at_s)
@@ -159,7 +177,21 @@ class RigFollower:
             found = self.base_by_bodies(moved[0], moved[1:], at_s, p_left)
             if found is not None or not by_arm:
                 return lambda: found
-        return (lambda: self.base_by_arm(changes, T_base_rig, at_s)) if by_arm else None
+        if by_arm:
+            motion, measurements = self._motion_of(changes[0], monitor), monitor.measurements
+            return lambda: self.base_by_arm(changes, T_base_rig, at_s, _moved(motion, measurements))
+        if self._motion is None or self._put_right is None:
+            return None
+        motion, right, measurements = self._motion, self._put_right, monitor.measurements
+        return lambda: self.refined(right, T_base_rig, at_s, _moved(motion, measurements))
+
+    def _motion_of(self, best: Change, monitor: HealthMonitor) -> BaseMotion:
+        """Return what estimates the motion of the rig that a hypothesis says."""
+        slow, begin_s = best.suspect.slow, best.begin_s
+        one = self._motion
+        if one is None or one.slow is not slow or abs(one.begin_s - begin_s) > _SAME_S:
+            one = self._motion = monitor.base_motion(begin_s, slow=slow)
+        return one
 
     def _of_watch(
         self, watch: RigWatch, poses: Sequence[tuple[float, PoseEstimate]], at_s: float
@@ -240,39 +272,80 @@ class RigFollower:
         self.rejected = None
         return RigCorrection("base", since_s, at_s, "fixed bodies", None, *motion)
 
-    def base_by_arm(self, changes: Sequence[Change], T_base_rig: Array, at_s: float) -> RigCorrection | None:
+    def base_by_arm(
+        self, changes: Sequence[Change], T_base_rig: Array, at_s: float, moved: Moved | None
+    ) -> RigCorrection | None:
         """Return the rig put right by what the arm's poses show; None where they do not suffice, as ``rejected`` says.
 
         Args:
             changes: the hypotheses that explain them, the best first.
             T_base_rig: (4, 4) the rig as it was calibrated, m.
             at_s: the time, s.
+            moved: the motion of the rig, if it is one; None where nothing was measured after it.
         """
         best = changes[0]
         others = [each for each in changes[1:] if each.suspect.cause != "fixed" and not each.besides]
         if best.suspect.cause != "fixed":
             self.rejected = f"base: a change of the {best.suspect.cause} explains the poses of the arm better"
             return None
-        T, t_s = best.T_base_tool, best.end_s
-        shift, cov = best.displacement(T, t_s)
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1]))
-        if sigma_m > MOST_SIGMA_M:
+        if moved is None:
+            self.rejected = "base: no pose was measured since it moved"
+            return None
+        sigma_m = moved.sigma_m
+        if sigma_m > _MOST_BY_ARM_M:
             self.rejected = (
-                f"base: the tool would be uncertain by {1e3 * sigma_m:.2f} mm, at most {1e3 * MOST_SIGMA_M:g} mm are "
+                f"base: the tool would be uncertain by {1e3 * sigma_m:.2f} mm, at most {1e3 * _MOST_BY_ARM_M:g} mm are "
                 "accepted: move the arm more, about all its joints"
             )
             return None
+        T, t_s = best.T_base_tool, best.end_s
+        shift, _ = best.displacement(T, t_s)
         apart = [float(np.linalg.norm((each.displacement(T, t_s)[0] - shift)[:3])) for each in others]
         if max(apart, default=0.0) > MOST_APART_M:
             self.rejected = f"base: {others[int(np.argmax(apart))].suspect.cause} cannot be excluded: move the arm more"
             return None
         self.rejected = None
+        return self._by_arm(best.begin_s, T_base_rig, at_s, moved)
+
+    def refined(
+        self, right: RigCorrection, T_base_rig: Array, at_s: float, moved: Moved | None
+    ) -> RigCorrection | None:
+        """Return a correction by the arm's poses that replaces an earlier one; None where they hardly say more of it.
+
+        Args:
+            right: the earlier one.
+            T_base_rig: (4, 4) the rig as it was put right, m.
+            at_s: the time, s.
+            moved: what is left of the motion.
+        """
+        assert right.tool_m is not None
+        if moved is None or moved.sigma_m > _REFINED * right.tool_m[1]:
+            return None
+        return self._by_arm(right.since_s, T_base_rig, at_s, moved, right)
+
+    def _by_arm(
+        self, since_s: float, T_base_rig: Array, at_s: float, moved: Moved, refines: RigCorrection | None = None
+    ) -> RigCorrection:
+        """Return the correction of a motion, or of what an earlier one left of it."""
         # What was measured is exp(xi) times the true pose, with xi in the base's frame.
-        xi, cov = best.displacement(np.eye(4), t_s)
         to_rig = adjoint(inverse(T_base_rig))
-        motion, cov = -to_rig @ xi, to_rig @ cov @ to_rig.T
-        displaced_m = float(np.linalg.norm(shift[:3]))
-        return RigCorrection("base", best.begin_s, at_s, "arm", None, motion, cov, (displaced_m, sigma_m))
+        motion, cov = -to_rig @ moved.xi, to_rig @ moved.cov @ to_rig.T
+        T_rig_tool = inverse(T_base_rig) @ moved.Ts_base_tool[-1]
+        if refines is not None:
+            motion = log_se3(exp_se3(refines.motion) @ exp_se3(motion))
+        displaced_m = float(np.linalg.norm((adjoint(inverse(T_rig_tool)) @ motion)[:3]))
+        tool_m = displaced_m, moved.sigma_m
+        right = RigCorrection("base", since_s, at_s, "arm", None, motion, cov, tool_m, refines)
+        if self._motion is not None:
+            self._motion.put_right()
+        self._put_right = right if moved.sigma_m > _KNOWN_M else None
+        return right
+
+
+def _moved(motion: BaseMotion, measurements: Sequence[KeptMeasurement]) -> Moved | None:
+    """Return a motion of the rig by all that was measured."""
+    motion.take(measurements)
+    return motion.moved
 
 
 def remeasured(rig: StereoRig, body: Body, pose: PoseEstimate) -> PoseEstimate | Missed:

@@ -11,8 +11,8 @@ import numpy as np
 from armsight.data import Array, Body, PoseEstimate
 from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement, Remembered
 from armsight.loop.estimators.clock import ClockFollower
+from armsight.loop.health.base_motion import BaseMotion, KeptMeasurement, Measurements
 from armsight.loop.health.change import Change, doubtful, finding, happened_besides, suspected
-from armsight.loop.health.clock import clock_findings
 from armsight.loop.health.closure import ClosureWatch
 from armsight.loop.health.fixed import FixedWatch
 from armsight.loop.health.follow import RigCorrection
@@ -29,6 +29,8 @@ DOUBT_S = 2.0
 _KEEP_S, _KEPT = 1.0, 600
 #: A change is dated to about so much, s.
 _DATED_S = 0.7
+#: A rate of a clock is said beyond so many sigmas.
+_RATE_SIGMAS = 4.0
 
 
 class HealthMonitor:
@@ -59,6 +61,7 @@ class HealthMonitor:
         self._axis: Array | None = None  # optical axis of the left camera (3,), in the base's frame
         self._cameras_s = np.inf  # since when the cameras are found to have moved, s
         self._known: deque[tuple[float, Remembered]] = deque(maxlen=_KEPT)
+        self._measurements = Measurements()
         # What was found before a correction: what it put right, and what else.
         self._kept: tuple[HealthFinding, ...] = ()
         self._past: tuple[Change, ...] = ()
@@ -83,6 +86,7 @@ class HealthMonitor:
             for innovation in self._innovations:
                 self._fixed.take(innovation)
                 self._closure.take(innovation)
+                self._measurements.take(innovation)
             self._innovations.clear()
         if self._rig is not None and self._rig.wrong_at_rest and self._cameras_s == np.inf:
             begins = [each.since_s for each in self._rig.findings() if each.since_s is not None]
@@ -134,6 +138,8 @@ class HealthMonitor:
         """
         self._estimator, self._arm, self._axis = estimator, arm, axis
         self._known.clear()
+        self._measurements = Measurements()
+        estimator.keep_reference()
         self._begin(estimator, arm)
 
     def _begin(self, estimator: KalmanEstimator, arm: Arm) -> None:
@@ -142,7 +148,6 @@ class HealthMonitor:
         self._closure = ClosureWatch(estimator.sigmas, arm.joints)
         self._innovations, self._clock, self._names = [], estimator.clock, arm.joint_names
         estimator.on_innovation = self._note
-        estimator.keep_reference()
 
     def _note(self, innovation: Innovation) -> None:
         """Keep what became of a measurement for the tests; a contradiction counts at once."""
@@ -237,6 +242,18 @@ class HealthMonitor:
             self._landmarks = LandmarkWatch(self._fixed_names)
 
     @property
+    def measurements(self) -> tuple[KeptMeasurement, ...]:
+        """Some of the newest measurements that the estimator used."""
+        return self._measurements.newest()
+
+    def base_motion(self, begin_s: float, *, slow: bool) -> BaseMotion:
+        """Return what estimates a motion of the rig that began at a time, s, and goes on where it is slow."""
+        assert self._estimator is not None
+        nothing = -np.inf, self._estimator.nothing_known()
+        known = next((each for each in reversed(self._known) if each[0] < begin_s - _DATED_S), nothing)
+        return BaseMotion(self._estimator, known, begin_s, slow=slow)
+
+    @property
     def trust(self) -> Trust:
         """How far a loop may rely on the measured poses now."""
         cameras_moved = self._landmarks is not None and self._landmarks.cameras_moved
@@ -319,7 +336,7 @@ class HealthMonitor:
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
         self.work()
-        late = () if self._clock is None else clock_findings(self._clock, self._newest_s)
+        late = () if self._clock is None else _clock_findings(self._clock, self._newest_s)
         now = (
             *(() if self._rig is None else self._rig.findings()),
             *self._moved(),
@@ -329,6 +346,26 @@ class HealthMonitor:
         again = {_subject(each) for each in now}
         kept = (each for each in self._kept if each.corrected_s is not None or _subject(each) not in again)
         return (*kept, *now)
+
+
+def _clock_findings(clock: ClockFollower, t_s: float) -> tuple[HealthFinding, ...]:
+    """Return what is wrong with the cameras' clock at a time, s; nothing while the delay is as it was measured."""
+    if clock.since_s is None:
+        return ()
+    offset_s, (rate, sigma) = clock.offset_s(t_s), clock.rate
+    drifts = f", and drift by {1e6 * rate:.0f} +- {1e6 * sigma:.0f} ppm" if abs(rate) > _RATE_SIGMAS * sigma else ""
+    return (
+        HealthFinding(
+            "time",
+            f"the images come {abs(1e3 * offset_s):.2f} ms {'later' if offset_s > 0 else 'earlier'} than at the beginning, "
+            f"against the readings of the joints{drifts}; it was followed",
+            clock.since_s,
+            1e3 * offset_s,
+            1e3 * clock.sigma_s,
+            "ms",
+            "stamp images and readings by one clock, with the cameras' own stamps instead of times of arrival",
+        ),
+    )
 
 
 def _subject(found: HealthFinding) -> tuple[str, str]:

@@ -580,10 +580,10 @@ def _of_candidates(M: Array, freedom: float) -> _ShapeSums:
 
 
 def _hypotheses(points: int) -> tuple[_Hypotheses, ...]:
-    """Return what may have changed: the seven numbers, one focal length, a point, all points a little."""
+    """Return what may have changed: the seven numbers, one focal length, both alike, a point, all points a little."""
     every = 9 + np.arange(3 * points)
     seven = _Hypotheses(np.tile(np.arange(7), (len(_SEVEN_SCALES), 1)), np.array(_SEVEN_SCALES))
-    alone = (seven, _Hypotheses(np.array([[7]]), np.ones(1)))
+    alone = (seven, _Hypotheses(np.array([[7], [8]]), np.ones(2)))
     if not points:
         return alone
     single = _Hypotheses(every.reshape(points, 3), np.ones(points))
