@@ -150,6 +150,14 @@ def test_discs_before_level_surrounds_are_fitted_without_a_gradient():
     assert 0.75 < np.mean(normed) < 1.25  # 108 chi-squares: 0.1
 
 
+def test_a_disc_on_something_faint_is_found():
+    rng = np.random.default_rng(12)
+    spot, c = share([outline(np.array([48.0, 48.0]), 26, 26, 0)], 1.0, np.zeros(2), 96), np.array([56.3, 54.6])
+    disc = share([outline(c, 6, 6, 0)], 1.0, np.zeros(2), 96)
+    found = BRIGHT.find(grey(40 + 14 * spot + 130 * disc, 0.5, rng))
+    assert np.linalg.norm(found.uv - c, axis=1).min() < 0.05
+
+
 def test_noise_that_is_correlated_and_grows_with_contrast_is_that_of_each_discs_like():
     rng = np.random.default_rng(21)
     size, normed = 44, {30.0: [], 130.0: []}
