@@ -19,7 +19,7 @@ where they are larger, that share of the way (empirical Bayes: a normal distribu
 A disc whose gradient, or whose surround's, is significant beyond that, measured by the noise of the image, is fitted with
 other kinds of gradient, too; they are averaged by their likelihood (model averaging). In processed images noise makes
 slopes in a hundredth of the discs that white noise would not make, and a correction moves these centres away from the
-truth: so significant is what chance makes in a thousandth.
+truth: there, only what chance makes in a thousandth is significant.
 
 An edge that is steeper on one side moves its disc under blur or sharpening. A shaken exposure and a lens off its axis do so
 to all discs of an image alike, coma in proportion to the distance from the middle (Seidel): c + k x at pixel x. No fit of a
@@ -64,8 +64,10 @@ _FIRST = 0.4
 _WHITE = 4.0
 #: Vignetting as it is to be expected: standard deviation of the light that is missing in the corners.
 _VIGNETTING = 0.3
-#: Chi-square of two degrees from which a disc or its surround may have a gradient of its own, beyond that of noise, and an
-#: edge is skewed: chance exceeds it in 0.1%; one that half of them exceed.
+#: Chi-square of two degrees from which a disc or its surround may have a gradient in white noise: chance exceeds it in 1%
+#: and 10%; factor of the noise from which it is not white.
+_SLOPE_INSIDE, _SLOPE_OUTSIDE, _PROCESSED = 9.2, 4.6, 1.5
+#: The same in noise that is not white, and of a skewed edge: chance exceeds it in 0.1%; one that half of them exceed.
 _SLOPE, _SKEW, _HALF = 13.8, 13.8, 1.386
 #: The same of three degrees; mean weight of a spatial median in a plane times its variance; rounds until it has converged.
 _FIELD, _MEDIAN, _ROUNDS = 16.3, 0.8, 12
@@ -240,7 +242,9 @@ def correct(
     a, b = disc[3] - shared[1] * u, disc[4] - shared[1] * v
     own = disc[5] * a * a + 2 * disc[6] * a * b + disc[7] * b * b
     outside = disc[LEVELLED] * shared[LEVEL] > _SLOPE * factor
-    slopes = disc[12] == 0.0 and (own > _SLOPE * factor or outside)
+    white = factor < _PROCESSED
+    inside = own > (_SLOPE_INSIDE if white else _SLOPE) * factor
+    slopes = disc[12] == 0.0 and (inside or outside or (white and disc[LEVELLED] > _SLOPE_OUTSIDE * factor))
     if not (slopes and _average(image, noise_sigma, theta, shared[1] * du, shared[1] * dv, factor, cov, work)):
         level = 0.0 if outside else shared[LEVEL]
         theta[0] -= shared[1] * du + level * disc[LEVELLED + 1]
