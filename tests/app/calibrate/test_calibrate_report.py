@@ -7,6 +7,7 @@ import os
 import re
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from armsight.app.calibrate.figures import (
     round_steps,
 )
 from armsight.app.calibrate.report import FIGURES, pose_table, write_report
+from armsight.app.calibrate.run import summary
 from armsight.app.report import page
 from armsight.app.report.plotting import drawing, nice, plain, png
 from armsight.data import Body, Detections
@@ -319,6 +321,8 @@ def test_the_assessment_follows_the_held_out_metrics(calibration, changes, grade
     assert found.grade == grade
     assert found.headline.startswith({"good": "Good", "fair": "Usable", "poor": "Do not rely"}[grade])
     assert said in " ".join([found.meaning, *advice(changed)])
+    printed = summary(changed, Path("rig.json"), None, None, 0.0)
+    assert (printed["grade"], bool(printed["poor"])) == (grade, grade == "poor")
 
 
 def test_overfitting_is_reported(calibration):

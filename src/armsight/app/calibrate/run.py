@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.calibrate.assessment import graded_metrics
+from armsight.app.calibrate.assessment import assess, graded_metrics
 from armsight.app.calibrate.report import MOTION_FITTED
 from armsight.app.messages import weak
 from armsight.app.progress import bar, steps
@@ -285,6 +285,8 @@ def summary(
         "rejected": [{"pair": r.pair, "reason": r.reason} for r in c.rejected],
         "notes": list(c.notes),
         "weaknesses": list(c.weaknesses),
+        "grade": assess(c).grade,
+        "poor": _poor(c),
         "fit": {"epipolar_rms_px": _number(c.epipolar_rms_px), "reprojection_rms_px": c.reprojection_rms_px},
         "heldout": vars(c.heldout),
         "models": {name: vars(heldout) for name, heldout in c.models.items()},
@@ -300,6 +302,11 @@ def summary(
         "report": str(report / PAGE) if report is not None else None,
         "seconds": seconds,
     }
+
+
+def _poor(calibration: Calibration) -> list[str]:
+    """Return the metrics for which the calibration must not be relied on yet, with their values."""
+    return [f"{row.name} {row.heldout}" for row in graded_metrics(calibration) if row.grade == "poor"]
 
 
 def _rejected_lines(rejected: Sequence[RejectedPair]) -> list[str]:
@@ -324,7 +331,7 @@ def print_result(calibration: Calibration, output: Path, board_file: Path | None
     print_table(
         TextTable(f"Held-out errors: {h.folds} folds, each measured with the fit to the others", ("", ""), rows)
     )
-    poor = [f"{row.name} {row.heldout}" for row in graded_metrics(c) if row.grade == "poor"]
+    poor = _poor(c)
     use = "" if contradicted(c) else f"; to measure it: armsight measure {output} --target {board_file}"
     fit_px = f"{c.epipolar_rms_px:.3f} px" if math.isfinite(c.epipolar_rms_px) else "unknown"
     fitted = "" if c.motion is None else f" ({MOTION_FITTED[0].lower()}{MOTION_FITTED[1:].rstrip('.')})"

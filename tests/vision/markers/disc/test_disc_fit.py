@@ -103,6 +103,61 @@ def test_vignetting_that_no_single_disc_shows_does_not_pull_all_of_them():
     assert 0.35 < np.mean(along) < 2.0  # chi-square of 12 over 12
 
 
+def test_a_large_thing_that_slopes_is_no_vignetting():
+    rng = np.random.default_rng(9)
+    size, width, height = 48, 480, 336
+    v, _ = np.mgrid[:height, :width].astype(float)
+    light, true = np.full((height, width), 45.0), []
+    for x, y in [(x, y) for x in (250, 298, 346) for y in (150, 198, 246)]:
+        c = size / 2 + rng.uniform(-0.5, 0.5, 2)
+        light[y : y + size, x : x + size] += 130 * share([outline(c, 12, 12, 0)], 0.8, np.zeros(2), size)
+        true.append(c + np.array([x, y]))
+    size = 96
+    large = share([outline(np.array([48.2, 47.7]), 30, 28, 0.3)], 0.8, np.zeros(2), size)
+    light[2:98, 190:286] += 130 * large * (1 + 0.002 * (v - 50))[2:98, 190:286]
+    errors, normed = [], []
+    for _ in range(12):
+        found = BRIGHT.find(grey(light, 3.0, rng))
+        order = [int(np.argmin(np.linalg.norm(found.uv - c, axis=1))) for c in true]
+        e = found.uv[order] - true
+        errors.append(e.mean(axis=0))
+        normed += list(np.einsum("ni,nij,nj->n", e, np.linalg.inv(found.cov_uv[order]), e) / 2)
+    # Taken for vignetting, it moves all nine by 0.008 px; noise leaves 0.001 px of their mean.
+    assert np.linalg.norm(np.mean(errors, axis=0)) < 0.003
+    assert np.mean(normed) < 1.4
+
+
+def test_discs_before_level_surrounds_are_fitted_without_a_gradient():
+    rng = np.random.default_rng(10)
+    size, together, alone, normed = 40, [], [], []
+    for _ in range(12):
+        light, true = np.full((336, 480), 45.0), []
+        for k in range(9):
+            x, y = 180 + size * (k % 3), 108 + size * (k // 3)
+            c = size / 2 + rng.uniform(-0.5, 0.5, 2)
+            light[y : y + size, x : x + size] += 130 * share([outline(c, 5, 5, 0)], 1.4, np.zeros(2), size)
+            true.append(((x, y), c))
+        image = grey(light, 3.0, rng)
+        found = BRIGHT.find(image)
+        for (x, y), c in true:
+            k = int(np.argmin(np.linalg.norm(found.uv - c - (x, y), axis=1)))
+            e = found.uv[k] - c - (x, y)
+            together.append(e)
+            normed.append(e @ np.linalg.solve(found.cov_uv[k], e) / 2)
+            alone.append(BRIGHT.find(np.ascontiguousarray(image[y : y + size, x : x + size])).uv[0] - c)
+    # One disc alone does not show whether its surround is level: the gradient is estimated, and moves the centre.
+    assert np.mean(np.square(together)) < 0.95 * np.mean(np.square(alone))
+    assert 0.75 < np.mean(normed) < 1.25  # 108 chi-squares: 0.1
+
+
+def test_a_disc_on_something_faint_is_found():
+    rng = np.random.default_rng(12)
+    spot, c = share([outline(np.array([48.0, 48.0]), 26, 26, 0)], 1.0, np.zeros(2), 96), np.array([56.3, 54.6])
+    disc = share([outline(c, 6, 6, 0)], 1.0, np.zeros(2), 96)
+    found = BRIGHT.find(grey(40 + 14 * spot + 130 * disc, 0.5, rng))
+    assert np.linalg.norm(found.uv - c, axis=1).min() < 0.05
+
+
 def test_noise_that_is_correlated_and_grows_with_contrast_is_that_of_each_discs_like():
     rng = np.random.default_rng(21)
     size, normed = 44, {30.0: [], 130.0: []}

@@ -12,8 +12,14 @@ and all discs of a body alike, so that it does not average out. No single disc s
 the one unknown, a. Behind a tone curve a is another one, and the same for discs of one level. An error of a moves the
 centres in proportion to their distance from the middle, as coma does: it is what they share, not each one's noise.
 
+A fit estimates a gradient of the surround, which noise moves as well, and the centre with it. Where the gradients of an
+image's discs are no larger than noise makes them, surrounds are level, and centres are those of fits without a gradient;
+where they are larger, that share of the way (empirical Bayes: a normal distribution of gradients about none).
+
 A disc whose gradient, or whose surround's, is significant beyond that, measured by the noise of the image, is fitted with
-other kinds of gradient, too; they are averaged by their likelihood (model averaging).
+other kinds of gradient, too; they are averaged by their likelihood (model averaging). In processed images noise makes
+slopes in a hundredth of the discs that white noise would not make, and a correction moves these centres away from the
+truth: there, only what chance makes in a thousandth is significant.
 
 An edge that is steeper on one side moves its disc under blur or sharpening. A shaken exposure and a lens off its axis do so
 to all discs of an image alike, coma in proportion to the distance from the middle (Seidel): c + k x at pixel x. No fit of a
@@ -32,6 +38,7 @@ from armsight.kernels import kernel
 from armsight.vision.markers.disc.fit import (
     GLARE,
     HARMONICS,
+    LEVELLED,
     LIGHT,
     PARAMETERS,
     SKEWED,
@@ -57,17 +64,20 @@ _FIRST = 0.4
 _WHITE = 4.0
 #: Vignetting as it is to be expected: standard deviation of the light that is missing in the corners.
 _VIGNETTING = 0.3
-#: Chi-square of two degrees from which a disc or its surround may have a gradient: chance exceeds it in 1% and 10%.
-_SLOPE_INSIDE, _SLOPE_OUTSIDE = 9.2, 4.6
-#: Chi-square of two degrees from which an edge is skewed, beyond that of noise: chance exceeds it in 0.1%.
-_SKEW = 13.8
+#: Chi-square of two degrees from which a disc or its surround may have a gradient in white noise: chance exceeds it in 1%
+#: and 10%; factor of the noise from which it is not white.
+_SLOPE_INSIDE, _SLOPE_OUTSIDE, _PROCESSED = 9.2, 4.6, 1.5
+#: The same in noise that is not white, and of a skewed edge: chance exceeds it in 0.1%; one that half of them exceed.
+_SLOPE, _SKEW, _HALF = 13.8, 13.8, 1.386
 #: The same of three degrees; mean weight of a spatial median in a plane times its variance; rounds until it has converged.
 _FIELD, _MEDIAN, _ROUNDS = 16.3, 0.8, 12
+#: Degrees of freedom of Student's t of slopes that are not vignetting's.
+_TAIL = 4.0
 #: Coma as it is to be expected: standard deviation of the shift in the corners, px.
 _COMA = 0.2
 #: What the discs of an image have in common, and where in it the shifts are that may have moved all of them: a field
 #: c + k x of skewed edges, and one of vignetting. See :func:`common`.
-SHARED, FIELDS, VIGNETTING = 9, 3, 6
+SHARED, LEVEL, FIELDS, VIGNETTING = 10, 3, 4, 7
 #: How likely each kind of gradient is where there is one (LIGHT, SURROUND, GLARE).
 _KINDS = (0.6, 0.3, 0.1)
 
@@ -111,7 +121,8 @@ def common(image: NDArray[np.uint8], n: int, work: FitBuffers, shared: Array) ->
         n: number of discs.
         work: what they show; power and its third column become ratios, see :func:`_rim_noise`.
         shared: (SHARED,) filled: mean square of the deviations of the rims' sectors beyond white noise, px^2; the
-            vignetting a and its standard deviation, 1/px^2; from FIELDS on c (2), px, and k of the shift c + k x that
+            vignetting a and its standard deviation, 1/px^2; at LEVEL how level surrounds are, the share of their gradients
+            that is noise, as half of them show it; from FIELDS on c (2), px, and k of the shift c + k x that
             skewed edges make together at a pixel x, one standard deviation; from VIGNETTING on the same of an error of
             a, for discs of about the same size. Medians, so that a few discs that are none do not count.
     """
@@ -122,29 +133,36 @@ def common(image: NDArray[np.uint8], n: int, work: FitBuffers, shared: Array) ->
         return
     shared[0] = max(np.median(discs[:n, 1]), 0.0)
     _common_skew(image, n, discs, shared[FIELDS:VIGNETTING])
-    slope, weight, total = np.empty(n), np.empty(n), 0.0
+    square = np.empty(n)
     for i in range(n):
-        u, v, k = _from_middle(image, discs[i], 0), _from_middle(image, discs[i], 1), discs[i, 5:8] / discs[i, 2]
-        weight[i] = u * u * k[0] + 2 * u * v * k[1] + v * v * k[2]
-        along = u * (k[0] * discs[i, 3] + k[1] * discs[i, 4]) + v * (k[1] * discs[i, 3] + k[2] * discs[i, 4])
-        slope[i] = along / max(weight[i], 1e-300)
-        total += weight[i]
-    middle, below = 0.0, 0.0
-    for i in np.argsort(slope):
-        below += weight[i]
-        if below >= 0.5 * total:
-            middle = slope[i]
-            break
-    expected = 8.0 * _VIGNETTING / (image.shape[0] ** 2 + image.shape[1] ** 2)
-    information, sum_ = 1.0 / (expected * expected), 0.0
-    for i in range(n):
-        if (slope[i] - middle) ** 2 * weight[i] < _SLOPE_INSIDE:
-            information += weight[i]
-            sum_ += weight[i] * slope[i]
-    shared[1], shared[2] = sum_ / information, 1.0 / np.sqrt(information)
+        square[i] = discs[i, LEVELLED] / _factor(discs[i])
+    shared[LEVEL] = min(_HALF / max(np.median(square), _HALF), 1.0)
+    shared[1], shared[2] = _vignetting(image, n, discs)
     shared[VIGNETTING + 2] = shared[2] * 0.5 * (np.median(discs[:n, 8]) + np.median(discs[:n, 11]))
     for axis in range(2):
         shared[VIGNETTING + axis] = -shared[VIGNETTING + 2] * 0.5 * (image.shape[1 - axis] - 1)
+
+
+@kernel
+def _vignetting(image: NDArray[np.uint8], n: int, discs: Array) -> tuple[float, float]:
+    """Return the vignetting a that the first n discs show together, and its standard deviation, 1/px^2.
+
+    What in the background is taken for a disc slopes by itself, and a large one shows it well. Student's t, of which the
+    slopes beyond a (x - m) are samples, lets it count little (iterated least squares, from no vignetting on).
+    """
+    expected = 8.0 * _VIGNETTING / (image.shape[0] ** 2 + image.shape[1] ** 2)
+    a, information = 0.0, 0.0
+    for _ in range(_ROUNDS):
+        information, sum_ = 1.0 / (expected * expected), 0.0
+        for i in range(n):
+            u, v, k = _from_middle(image, discs[i], 0), _from_middle(image, discs[i], 1), discs[i, 5:8] / discs[i, 2]
+            p, q = discs[i, 3] - a * u, discs[i, 4] - a * v
+            square = k[0] * p * p + 2 * k[1] * p * q + k[2] * q * q
+            w = min((_TAIL + 2.0) / (_TAIL + square), 1.0)
+            information += w * (k[0] * u * u + 2 * k[1] * u * v + k[2] * v * v)
+            sum_ += w * (u * (k[0] * discs[i, 3] + k[1] * discs[i, 4]) + v * (k[1] * discs[i, 3] + k[2] * discs[i, 4]))
+        a = sum_ / information
+    return float(a), float(1.0 / np.sqrt(information))
 
 
 @kernel
@@ -181,6 +199,14 @@ def _common_skew(image: NDArray[np.uint8], n: int, discs: Array, field: Array) -
 
 
 @kernel
+def _factor(disc: Array) -> float:
+    """Return by how much the variances of what a disc's fit found exceed those that it says."""
+    return float(
+        disc[2] if disc[12] == 0.0 else max(disc[2] / disc[12], 1.0)
+    )  # the power contains a texture's correlation
+
+
+@kernel
 def _skew_variance(disc: Array) -> float:
     """Return the variance, along itself, of a disc's shift by a skewed edge, px^2, in white noise."""
     return float((disc[SKEWED] ** 2 + disc[SKEWED + 1] ** 2) / max(disc[SKEWED + 2], 1e-12))
@@ -210,19 +236,23 @@ def correct(
         cov: (2, 2) covariance of the centre, px^2, of the fit, replaced.
         work: buffers.
     """
-    factor, theta = disc[2], disc[PARAMETERS : PARAMETERS + UNKNOWNS]
+    theta, factor = disc[PARAMETERS : PARAMETERS + UNKNOWNS], _factor(disc)
     u, v = _from_middle(image, disc, 0), _from_middle(image, disc, 1)
     du, dv = disc[8] * u + disc[10] * v, disc[9] * u + disc[11] * v
     a, b = disc[3] - shared[1] * u, disc[4] - shared[1] * v
     own = disc[5] * a * a + 2 * disc[6] * a * b + disc[7] * b * b
-    slopes = disc[12] >= 0.0 and (own > _SLOPE_INSIDE * factor or disc[12] > _SLOPE_OUTSIDE * factor)
+    outside = disc[LEVELLED] * shared[LEVEL] > _SLOPE * factor
+    white = factor < _PROCESSED
+    inside = own > (_SLOPE_INSIDE if white else _SLOPE) * factor
+    slopes = disc[12] == 0.0 and (inside or outside or (white and disc[LEVELLED] > _SLOPE_OUTSIDE * factor))
     if not (slopes and _average(image, noise_sigma, theta, shared[1] * du, shared[1] * dv, factor, cov, work)):
-        theta[0] -= shared[1] * du
-        theta[1] -= shared[1] * dv
-        texture = max(-disc[12], 1.0)  # the power contains its correlation
+        level = 0.0 if outside else shared[LEVEL]
+        theta[0] -= shared[1] * du + level * disc[LEVELLED + 1]
+        theta[1] -= shared[1] * dv + level * disc[LEVELLED + 2]
         for i in range(2):
             for j in range(2):
-                cov[i, j] *= factor if texture == 1.0 else max(factor / texture, 1.0)
+                # Beyond white noise a gradient has no part in the factor, see _rim_noise: nothing of that is spared.
+                cov[i, j] = factor * cov[i, j] - level * disc[LEVELLED + 3 + i + j]
     own_u = shared[2] * du - shared[VIGNETTING + 2] * u  # a larger disc is moved by more than the field has
     own_v = shared[2] * dv - shared[VIGNETTING + 2] * v
     cov[0, 0] += own_u * own_u

@@ -38,8 +38,8 @@ MOST_PIXELS = 3072
 MOST_DISCS = 16384
 #: Unknowns: c (2), M (3), s, C, B, g (2).
 UNKNOWNS = 10
-#: What a fit shows of noise and light, and where its parameters are in it, and what a skewed edge does.
-SHOWN, PARAMETERS, SKEWED = 27, 14, 24
+#: What a fit shows of noise and light, and where its parameters are in it, what a skewed edge and a level surround do.
+SHOWN, PARAMETERS, SKEWED, LEVELLED = 33, 14, 24, 27
 #: Floats in a cache line.
 _LINE = 16
 
@@ -85,9 +85,9 @@ class FitBuffers(NamedTuple):
         sums: (12, 12) products of the rows of J.
         shown: (SHOWN,) what the last fit shows of noise and light: its rim (power, see :func:`rim_power`; mean
             square of the sectors' deviations beyond white noise, px^2; 1 / power of white noise), a gradient inside
-            (9, see :func:`slope_inside`), one outside (chi-square; of a textured surround minus :func:`texture_factor`),
+            (9, see :func:`slope_inside`), :func:`texture_factor` of a textured surround (0 of another),
             by how much the other unknowns enlarge the variance of the centre, its parameters (10), a skewed edge (3, see
-            :func:`skewed_edge`).
+            :func:`skewed_edge`), a level surround (6, see :func:`levelled`).
         discs: (MOST_DISCS, SHOWN) the same for each disc of an image.
     """
 
@@ -672,11 +672,39 @@ def skewed_edge(n: int, variance: float, work: FitBuffers) -> None:
 
 
 @kernel
-def slope_outside(theta: Array, work: FitBuffers) -> float:
-    """Return by how much chi-square would rise without the surround's gradient, in units of the noise's variance."""
-    L, a, b = work.L, theta[8] / work.scale[8], theta[9] / work.scale[9]
+def levelled(theta: Array, variance: float, work: FitBuffers) -> None:
+    """Find out what the fit would be with a level surround: without a gradient g, whose estimate noise has moved, too.
+
+    Centre and gradient have errors in common, V_cg: the centre of the eight other unknowns alone is c - V_cg V_gg^-1 g.
+    ``work.shown`` is filled from LEVELLED on: chi-square of g in the noise's variance; V_cg V_gg^-1 g, px (2); by how much
+    the centre's covariance falls, V_cg V_gg^-1 V_gc, px^2, as elements 00, 01, 11 (3).
+
+    Args:
+        theta: (10,) the converged parameters.
+        variance: of the noise, grey levels^2.
+        work: buffers, with the factor of the normal matrix.
+    """
+    g, L, scale, x, out = work.g, work.L, work.scale, work.x, work.shown[LEVELLED:]
     # The last corner of the factor is that of the last two unknowns' information, the others marginalised.
-    return float((a / L[8, 8] + b * L[9, 8]) ** 2 + (b / L[9, 9]) ** 2)
+    a, b = theta[8] / scale[8], theta[9] / scale[9]
+    p, q = a / L[8, 8] + b * L[9, 8], b / L[9, 9]
+    out[0] = (p * p + q * q) / variance
+    g[:] = 0.0
+    g[0] = 1.0
+    solve(L, scale, g, x)
+    u8, u9 = x[8] / scale[8], x[9] / scale[9]
+    u8, u9 = u8 / L[8, 8] + u9 * L[9, 8], u9 / L[9, 9]
+    g[:] = 0.0
+    g[1] = 1.0
+    solve(L, scale, g, x)
+    v8, v9 = x[8] / scale[8], x[9] / scale[9]
+    v8, v9 = v8 / L[8, 8] + v9 * L[9, 8], v9 / L[9, 9]
+    out[1], out[2] = u8 * p + u9 * q, v8 * p + v9 * q
+    out[3], out[4], out[5] = (
+        variance * (u8 * u8 + u9 * u9),
+        variance * (u8 * v8 + u9 * v9),
+        variance * (v8 * v8 + v9 * v9),
+    )
 
 
 _STEPS = 8
@@ -845,17 +873,18 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     slope_inside(n, theta, x0, y0, variance, work)
     power, information = rim_power(n, theta, x0, y0, variance, work)
     work.shown[0], work.shown[1], work.shown[2] = power, off / max(count, 1), information / variance
-    work.shown[12] = slope_outside(theta, work) / variance
     work.shown[PARAMETERS : PARAMETERS + UNKNOWNS] = theta
     skewed_edge(n, variance, work)
     of_centre(work, cov)
     radius = det**-0.25
     work.shown[13] = max(0.25 * (cov[0, 0] + cov[1, 1]) * information * radius, 1.0)
+    work.shown[12] = 0.0
     if texture > 0.0:
-        work.shown[12] = -texture_factor(n, theta[5], texture, work)
-        variance *= -work.shown[12]
+        work.shown[12] = texture_factor(n, theta[5], texture, work)
+        variance *= work.shown[12]
         if variance * (cov[0, 0] + cov[1, 1]) > 2.0 * _MOST_SIGMA_PX * _MOST_SIGMA_PX:
             return 10
+    levelled(theta, variance, work)
     for a in range(2):
         for b in range(2):
             cov[a, b] *= variance

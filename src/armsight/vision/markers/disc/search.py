@@ -195,8 +195,9 @@ _TOGETHER = 8 * _ROW_STEP
 #: Least contrast, grey levels, and in standard deviations of the noise of a difference.
 LEAST_CONTRAST = 10.0
 _CONTRAST_SIGMAS = 5.0
-#: A candidate this near to the rim of a known disc is that disc, px.
-_RIM_PX = 3.0
+#: A candidate this near to the rim of a known disc is that disc, px, unless its contrast is so many times as large: then a
+#: disc lies on something faint.
+_RIM_PX, _FAINTER = 3.0, 4.0
 _HIGH = np.uint64(0x8080808080808080)
 _SIX = np.uint64(0x3F3F3F3F3F3F3F3F)
 _EVERY_BYTE = np.uint64(0x0101010101010101)
@@ -277,13 +278,15 @@ def any_differs(words: Words64, y: int, t: np.uint64) -> bool:
 
 
 @kernel
-def _known(x: int, y: int, starts: Array, codes: NDArray[np.int64], cells: NDArray[np.int16]) -> bool:
-    """Whether a pixel was examined already, or lies on a disc that was found."""
+def _known(x: int, y: int, gap: int, starts: Array, codes: NDArray[np.int64], cells: NDArray[np.int16]) -> bool:
+    """Whether a pixel, ``gap`` grey levels from that to its left, was examined before or lies on a disc that was found."""
     n = cells[y >> 3, x >> 3]
     if n < 0:
         return False
     if codes[n] != 0:
         return True
+    if gap > _FAINTER * abs(starts[n, 6]):
+        return False
     u, v = x - starts[n, 0], y - starts[n, 1]
     q = starts[n, 2] * u * u + 2 * starts[n, 3] * u * v + starts[n, 4] * v * v
     return bool(np.sqrt(q) < 1.0 + _RIM_PX * np.sqrt(starts[n, 2] + starts[n, 4]))
@@ -354,7 +357,7 @@ def search(
                         if gap > best:
                             best, x = gap, 8 * i + byte + 8
                         byte += 1
-                    if _known(x, y, starts, codes, mine):
+                    if _known(x, y, best, starts, codes, mine):
                         continue
                     if n == len(starts):
                         return n
