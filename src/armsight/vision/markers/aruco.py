@@ -93,7 +93,7 @@ def detect_markers(
     Returns:
         (1, 4, 2) corners of each marker, in OpenCV's order whatever the family; (n, 1) identities.
     """
-    image = _stretched(image)
+    image = _full_range(image)
     share = round(4.0 * SIDE_MIN_PX / max(image.shape), 4)
     found, read, unread = _detector(family, share, border).detectMarkers(image)
     corners = list(found)
@@ -108,11 +108,11 @@ def detect_markers(
     return [corners[i] for i in kept], np.array(identities, np.int32)[kept, None]
 
 
-#: An image whose levels, but for the extreme ones of this share, span less than this is stretched to all of them.
+#: An image whose levels, but for the extreme ones of this share, span less than this is scaled to all of them.
 _EXTREME_PERCENT, _SPAN = 0.5, 128.0
 
 
-def _stretched(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _full_range(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return a dark or faint image with all grey levels: OpenCV's threshold of markers is a number of levels."""
     low, high = np.percentile(image[::4, ::4], (_EXTREME_PERCENT, 100.0 - _EXTREME_PERCENT))
     if not 0.0 < high - low < _SPAN:
