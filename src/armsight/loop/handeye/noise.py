@@ -15,18 +15,16 @@ those that neighbours share (a drift) one block (1, 6N, 6N): the same functions 
 - ``time_s``: the time stamp, along the motion (streams).
 - ``link_m``, ``link_rad``: a constant error of every link's frame, along and about its three axes, where the joints and a
   model are known: what an arm whose lengths and zeros are not its model's does in each of its poses.
-- ``smooth_m``, ``smooth_rad``: an error of the flange that is a smooth function of the pose (an arm whose kinematics are
-  not its model's): a Gaussian process (Rasmussen and Williams, "Gaussian Processes for Machine Learning", 2006, eq.
-  2.31), by its first eigenfunctions (:func:`smooth_functions`), whose amplitudes all poses share.
-- ``drift_m``, ``drift_rad``: an error of the flange that neighbours share: a smooth function of time (an arm that warms
-  up), a Gaussian process; or a random walk over time (an arm that slips, settles or loses steps: what it has gained
-  stays), a Wiener process.
+- ``drift_m``, ``drift_rad``: an error of the flange that neighbouring poses share: a smooth function of the pose (an arm
+  whose kinematics are not its model's) or of time (an arm that warms up), a Gaussian process (Rasmussen and Williams,
+  "Gaussian Processes for Machine Learning", 2006, eq. 2.31); or a random walk over time (an arm that slips, settles or
+  loses steps: what it has gained stays), a Wiener process.
 - ``walk_m``, ``walk_rad``: steps of a random walk of the eye's own pose, from frame to frame (visual odometry).
 - ``scale_walk``: the scale of one moving camera, which has none of its own, walks over time: the eye's way from the body's
   origin is too long by a share that is a Wiener process.
 
-Restricted likelihood: Patterson and Thompson, Biometrika 58, 1971; its gradient: Harville, JASA 72, 1977. Sigmas of links
-and of a smooth error, which residuals hardly show, are kept from zero: Chung et al., Psychometrika 78, 2013.
+Restricted likelihood: Patterson and Thompson, Biometrika 58, 1971; its gradient: Harville, JASA 72, 1977. Links' sigmas,
+which few poses hardly show, are kept from zero: Chung et al., Psychometrika 78, 2013.
 """
 
 from __future__ import annotations
@@ -69,8 +67,8 @@ STRUCTURES: dict[str, tuple[str, ...]] = {
         "lateral_m",
         "depth_m",
         "seen_rad",
-        "smooth_m",
-        "smooth_rad",
+        "drift_m",
+        "drift_rad",
     ),
     "robot drifting over time": ("flange_m", "flange_rad", "seen_m", "seen_rad", "drift_m", "drift_rad"),
     "robot walking over time": ("flange_m", "flange_rad", "seen_m", "seen_rad", "drift_m", "drift_rad"),
@@ -81,6 +79,7 @@ STRUCTURES: dict[str, tuple[str, ...]] = {
 }
 #: Structures whose errors are shared between poses, and are no unknowns.
 SHARED = (
+    "robot drifting over its poses",
     "robot drifting over time",
     "robot walking over time",
     "camera walking",
@@ -89,15 +88,10 @@ SHARED = (
 )
 #: Shared source -> the map that says what it does to a pose.
 SHARED_MAPS = {"drift_m": "flange_m", "drift_rad": "flange_rad", "scale_walk": "scale"}
-#: Sources whose errors all poses share: each of their unit errors is an unknown.
-UNKNOWNS = ("link_m", "link_rad", "smooth_m", "smooth_rad")
 #: Sources that are the arm's.
-OF_THE_ARM = ("flange_m", "flange_rad", *UNKNOWNS, "drift_m", "drift_rad")
+OF_THE_ARM = ("flange_m", "flange_rad", "link_m", "link_rad", "drift_m", "drift_rad")
 #: Where a drift over poses has forgotten itself: this rotation, rad, or this way, m; and over time, a share of the whole.
 FORGETS_RAD, FORGETS_M, FORGETS_SHARE = 1.0, 0.4, 0.15
-#: Poses that the eigenfunctions of a smooth error come from at most, how many of them are taken, and the least eigenvalue
-#: as a share of the largest.
-SMOOTH_POSES, SMOOTH_FUNCTIONS, SMOOTH_LEAST = 200, 14, 1e-6
 #: Errors of position and angle of one source are alike at LEVER_M, as far as poses do not say otherwise: the sigma of the
 #: logarithm of their variances' ratio. Few poses, or links, say little about two variances: one may vanish by chance.
 LIKE_EACH_OTHER = 1.5
@@ -151,12 +145,7 @@ class Linear(Record):
 
 
 def error_maps(
-    poses: Poses,
-    e: Array,
-    carry: Array,
-    speed: Array | None,
-    links: Array | None = None,
-    smooth: Array | None = None,
+    poses: Poses, e: Array, carry: Array, speed: Array | None, links: Array | None = None
 ) -> dict[str, Array]:
     """Return what unit errors of each independent source do to the residuals.
 
@@ -166,7 +155,6 @@ def error_maps(
         carry: (N, 6, 6) adjoints that map an error of the flange to the residuals.
         speed: (N, 6) twist of the flange, right tangent, m/s and rad/s; None: no streams.
         links: (N, L, 4, 4) T_link_flange, m; None: no model.
-        smooth: (N, M) the functions of a smooth error at the poses; None: too few.
     """
     n = len(poses.A)
     axes = np.zeros((n, 6, 3))
@@ -185,12 +173,9 @@ def error_maps(
     }
     if speed is not None:
         maps["time_s"] = carry @ speed[..., None]
-    # As the derivative by the mounting is: an error of the flange's frame and one of the mounting are the same.
-    bent = (np.eye(6) + 0.5 * small_adjoint(e)) @ carry
-    if smooth is not None:
-        at = bent[..., None] * smooth[:, None, None]  # (N, 6, 6, M)
-        maps["smooth_m"], maps["smooth_rad"] = (at[:, :, part].reshape(n, 6, -1) for part in (slice(3), slice(3, 6)))
     if links is not None:
+        # As the derivative by the mounting is: an error of the flange's frame and one of the mounting are the same.
+        bent = (np.eye(6) + 0.5 * small_adjoint(e)) @ carry
         moved = np.swapaxes(bent[:, None] @ adjoint(inverse(links)), 1, 2)  # (N, 6, L, 6)
         maps["link_m"], maps["link_rad"] = (moved[..., part].reshape(n, 6, -1) for part in (slice(3), slice(3, 6)))
     return maps
@@ -209,25 +194,12 @@ def walk_gathered(poses: Poses) -> dict[str, Array]:
     }
 
 
-def pose_kernel(A: Array, others: Array | None = None) -> Array:
-    """Return the correlation (N, K) of a smooth error between poses (N, 4, 4) and others (K, 4, 4), or themselves."""
-    B = A if others is None else others
-    way = np.sum((A[:, None, :3, 3] - B[None, :, :3, 3]) ** 2, axis=-1)
+def pose_kernel(A: Array) -> Array:
+    """Return the correlation (N, N) of a smooth error between poses (N, 4, 4)."""
+    way = np.sum((A[:, None, :3, 3] - A[None, :, :3, 3]) ** 2, axis=-1)
     # Chords, not angles: an exponential of squared angles is no covariance (Feragen et al., CVPR 2015).
-    chords = 3 - np.einsum("iab,jab->ij", A[:, :3, :3], B[:, :3, :3])
+    chords = 3 - np.einsum("iab,jab->ij", A[:, :3, :3], A[:, :3, :3])
     return np.asarray(np.exp(-0.5 * (way / FORGETS_M**2 + chords / FORGETS_RAD**2)))
-
-
-def smooth_functions(A: Array) -> Array:
-    """Return the first eigenfunctions (N, M) of a smooth error at poses (N, 4, 4), as large as it makes each.
-
-    What changes by so much from pose to pose has a constant part as large: it is in them. By Nystroem's method from some of
-    the poses (Rasmussen and Williams, section 8.1).
-    """
-    some = A[np.linspace(0, len(A) - 1, min(SMOOTH_POSES, len(A))).round().astype(int)]
-    values, vectors = np.linalg.eigh(1 + pose_kernel(some))
-    first = np.flatnonzero(values > SMOOTH_LEAST * values[-1])[-SMOOTH_FUNCTIONS:]
-    return np.asarray((1 + pose_kernel(A, some)) @ vectors[:, first] / np.sqrt(values[first]))
 
 
 def time_kernel(t_s: Array) -> Array:
@@ -254,7 +226,7 @@ class Blocks(Record):
         sources: their K names.
         known: (P,) information about each unknown beside the residuals.
         at: (P,) where each is, from where that has it.
-        links: (P,) of which source's variance an unknown is, one of ``UNKNOWNS``; -1 for the others.
+        links: (P,) of which source's variance an unknown is, an error of a link; -1 for the others.
     """
 
     e: Array
@@ -279,7 +251,7 @@ def blocks(linear: Linear, structure: str) -> Blocks:
     n = len(linear.e)
     sources = STRUCTURES[structure]
     given = np.zeros_like(linear.given) if "image" in sources else linear.given
-    links = [name for name in sources if name in UNKNOWNS]
+    links = [name for name in sources if name.startswith("link")]
     own = {name: M @ np.swapaxes(M, 1, 2) for name, M in linear.maps.items() if name in sources and name not in links}
     if "image" in sources:
         own["image"] = linear.given
@@ -363,8 +335,7 @@ def solve(b: Blocks, variances: Array) -> Solved:
     CiJ = Ci @ b.J
     is_link = b.links >= 0
     known = np.where(is_link, 1 / variances[b.links], b.known)
-    P = b.J.shape[2]
-    H = b.J.reshape(-1, P).T @ CiJ.reshape(-1, P) + np.diag(known)
+    H = np.einsum("nki,nkj->ij", b.J, CiJ) + np.diag(known)
     unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))  # m, rad and s side by side
     values, vectors = np.linalg.eigh(unit[:, None] * H * unit)
     values = np.maximum(values, 1e-14 * values[-1])
@@ -417,14 +388,14 @@ def _value_and_gradient(logs: Array, b: Blocks) -> tuple[float, Array]:
         of = b.links == k
         gradient[k] += 0.5 * float(of.sum() - ((s.root[of] ** 2).sum() + (s.x[of] ** 2).sum()) / variances[k])
     cost = s.cost
-    if b.sources[-1] in UNKNOWNS or b.sources in (("flange_m", "flange_rad"), ("seen_m", "seen_rad")):
+    if "link_m" in b.sources or b.sources in (("flange_m", "flange_rad"), ("seen_m", "seen_rad")):
         m = len(b.sources) - 2
         rad = m + 1
         off = (logs[m] - logs[rad] - 2 * np.log(LEVER_M)) / LIKE_EACH_OTHER**2
         cost += 0.5 * LIKE_EACH_OTHER**2 * off**2
         gradient[m] += off
         gradient[rad] -= off
-    # Gamma(2, 0) of the sigma of each of UNKNOWNS, so that what no residual shows is not taken for zero.
+    # Gamma(2, 0) of each link's sigma, so that what no residual shows is not taken for zero.
     for k in np.unique(b.links[b.links >= 0]):
         cost -= 0.5 * float(logs[k])
         gradient[k] -= 0.5
@@ -495,13 +466,13 @@ def jackknife(b: Blocks, s: Solved) -> Array:
     It holds for errors that are not as the structure says, too (Wu, Annals of Statistics 14, 1986).
     """
     CiJ = s.inverse @ b.J
-    H = np.swapaxes(b.J, 1, 2) @ CiJ
+    H = np.einsum("nki,nkj->nij", b.J, CiJ)
     root = s.root  # whitens: the unit matrix is all information
     left = np.eye(root.shape[1]) - root.T @ H @ root
     pulls = np.einsum("nki,nk->ni", b.J, s.weighted) @ root
     values, vectors = np.linalg.eigh(left)
     values = np.maximum(values, LEAST_LEFT)
-    moved = (vectors @ (np.swapaxes(vectors, 1, 2) @ pulls[..., None] / values[..., None]))[..., 0] @ root.T
+    moved = np.einsum("nij,nj,nkj,nk->ni", vectors, 1 / values, vectors, pulls) @ root.T
     return np.asarray(moved.T @ moved * (len(b.e) - 1) / len(b.e))
 
 

@@ -54,8 +54,8 @@ from armsight.loop.handeye.noise import (
     jackknife,
     left_out_squares,
     own_squares,
+    pose_kernel,
     reml,
-    smooth_functions,
     solve,
     time_kernel,
     walk_gathered,
@@ -190,13 +190,11 @@ class _Problem(Record):
     speed: Array | None
     free: tuple[bool, bool]
     links: Array | None = None
-    smooth: Array | None = None
 
     def rows(self, rows: NDArray[np.int64]) -> _Problem:
         """Return a part of the rows."""
-        every = (self.t_s, self.speed, self.links, self.smooth)
-        t_s, speed, links, smooth = (None if a is None else a[rows] for a in every)
-        return _Problem(self.poses.rows(rows), t_s, speed, self.free, links, smooth)
+        t_s, speed, links = (None if a is None else a[rows] for a in (self.t_s, self.speed, self.links))
+        return _Problem(self.poses.rows(rows), t_s, speed, self.free, links)
 
     def scaled(self, guess: _Guess) -> Poses:
         """Return the poses with the guess's time and vision's shared errors, the flange's lengths in the body's unit."""
@@ -224,8 +222,7 @@ class _Problem(Record):
         if shared and poses.common is not None:
             J = np.concatenate([J, poses.common if poses.in_hand else -poses.common], axis=2)
         known, at = np.repeat([0.0, 1.0], [before, shared]), np.append(np.zeros(before), guess.common)
-        maps = error_maps(poses, e, carry, self.speed, self.links, self.smooth)
-        return Linear(e, J, poses.cov, maps, {}, {}, known, at)
+        return Linear(e, J, poses.cov, error_maps(poses, e, carry, self.speed, self.links), {}, {}, known, at)
 
     def metric(self, guess: _Guess, cov: Array) -> tuple[_Guess, Array]:
         """Return Z and X in m, and the covariance (P, P) of what was fitted with them."""
@@ -241,7 +238,7 @@ class _Problem(Record):
 
     def shared(self, linear: Linear, guess: _Guess, gathered: dict[str, Array]) -> Linear:
         """Add the correlations of shared sources to residuals of the same rows."""
-        kernel: dict[str, Array] = {}
+        kernel = {SMOOTH: pose_kernel(self.poses.A)}
         if self.t_s is not None:
             kernel["robot drifting over time"] = time_kernel(self.t_s)
             walked = wiener_kernel(self.t_s)
@@ -279,8 +276,7 @@ def calibrate_structured(
     if n < MIN_POSES:
         raise InputError(f"hand-eye calibration needs {MIN_POSES} or more poses, got {n}; 15 and more are advised")
     order = _own_order(poses, t_s)
-    smooth = smooth_functions(poses.A[order])[np.argsort(order)] if n >= MIN_SHARED else None
-    whole = _Problem(poses, t_s, speed, (False, speed is not None), links, smooth).rows(order)
+    whole = _Problem(poses, t_s, speed, (False, speed is not None), links).rows(order)
     progress("hand-eye: start")
     if scale:
         whole, guess, used = _with_scale(whole)
@@ -520,13 +516,11 @@ def _allowed(structure: str, problem: _Problem, count: int, covered: bool) -> bo
         return problem.links is not None and count >= MIN_SHARED and timed
     if "time_s" in sources:
         return problem.speed is not None
-    if structure == SMOOTH:
-        return count >= MIN_SHARED
-    if structure in SHARED:
+    if structure in SHARED and structure != SMOOTH:
         walks = "walk_m" not in sources or problem.poses.in_hand
         scaled = "scale_walk" not in sources or problem.free[0]
         return problem.t_s is not None and count >= MIN_SHARED and walks and scaled
-    return True
+    return structure not in SHARED or count >= MIN_SHARED
 
 
 def _chosen(
@@ -551,12 +545,11 @@ def _chosen(
             continue
         progress(f"hand-eye: poses left out ({name})")
         trials[name] = _trial(whole, guess, used, name, gathered)
-    best, compared = _compared(whole, guess, used, trials, gathered)
-    geometries = [trials[name] for name in GEOMETRY if name in trials]
+    best, geometries = _best(whole, trials), [trials[name] for name in GEOMETRY if name in trials]
     if best == SMOOTH:
         geometries.append(trials[best])
     geometry = max(geometries, key=lambda trial: float(trial.density.mean()), default=None)
-    as_modelled = {name: trials[name] for name in compared if name not in NOT_AS_MODELLED}
+    as_modelled = {name: trial for name, trial in trials.items() if name not in NOT_AS_MODELLED}
     nominal = trials[best] if best not in NOT_AS_MODELLED or not as_modelled else trials[_best(whole, as_modelled)]
     given = nominal if best == SMOOTH else trials[best]
     progress(f"hand-eye: fitting ({best})")
@@ -564,7 +557,7 @@ def _chosen(
     rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
     linear = _linear(whole, guess, rows, best, gathered)
     x, cov = _student(whole, guess, used, best, variances, gathered)
-    weights = _weights(compared, best)
+    weights = _weights(trials, best)
     mixed = weights[best] * cov
     for name in weights.keys() - {best}:  # what the other structures that may be true as well would answer
         other, spread = _student(whole, guess, used, name, trials[name].variances, gathered)
@@ -595,7 +588,7 @@ def _chosen(
         sigma_step_s=rest.pop(0) if whole.free[1] else 0.0,
         structure=best,
         sigmas=sigmas,
-        likelihoods={name: float(trial.density.mean()) for name, trial in compared.items()},
+        likelihoods={name: float(trial.density.mean()) for name, trial in trials.items()},
         arm_m=arm,
         camera_m=camera,
         held_out=_held_out_errors(whole, guess, given.residual, given.rows),
@@ -690,29 +683,6 @@ def _student(
     return solved.x[:own], cov * float(6 * f_distribution.ppf(0.95, 6, known) / chdtri(6, 0.05))
 
 
-def _compared(
-    whole: _Problem,
-    guess: _Guess,
-    used: NDArray[np.bool_],
-    trials: dict[str, _Trial],
-    gathered: dict[str, Array],
-) -> tuple[str, dict[str, _Trial]]:
-    """Return the best structure, and the trials that it was chosen from: all on the same poses, in the same parts.
-
-    Structures whose errors neighbours in time share are tried on fewer poses, an interval of time left out: against them
-    the others are tried in the same way; among themselves those are compared on all poses.
-    """
-    timed = {name: trial for name, trial in trials.items() if name in SHARED}
-    plain = {name: trial for name, trial in trials.items() if name not in SHARED}
-    if timed:
-        alike = {name: _trial(whole, guess, used, name, gathered, timed=True) for name in plain if name != POSITIONS}
-        together = {**timed, **alike}
-        first = max(together, key=lambda name: float(together[name].density.mean()))
-        if first in timed:
-            return first, together
-    return _best(whole, plain), plain
-
-
 def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
     """Return the structure that poses left out are most probable under.
 
@@ -720,7 +690,7 @@ def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
     """
     others = {name: trial for name, trial in trials.items() if name != POSITIONS} or trials
     best = max(others, key=lambda name: others[name].density.mean())
-    if POSITIONS not in trials or best in (*SHARED, *NOT_AS_MODELLED, POSITIONS):
+    if POSITIONS not in trials or best in (*SHARED, *GEOMETRY, POSITIONS):
         return best
     of, alone = (
         np.sum((e[:, :3] - np.cross(whole.poses.centre, e[:, 3:])) ** 2, axis=1)
@@ -798,14 +768,14 @@ def _settled(
         b = blocks(linear, structure)
         solved = solve(b, variances)
         x = solved.x[: linear.J.shape[2]]
-        if structure in NOT_AS_MODELLED:
+        if structure in GEOMETRY:
             far = own_squares(blocks(whole.linear(guess), structure), variances, solved.x)
         guess = guess.moved(x, whole.free)
         if structure in SHARED:
             far = left_out_squares(b, solved)
             keep = used.copy()
             keep[rows[(far > chdtri(6, CHANCE)) & (far > 0.3 * far.max())]] = False
-        elif structure in NOT_AS_MODELLED:
+        elif structure in GEOMETRY:
             keep = far < chdtri(6, CHANCE)
         else:
             keep = 6 * _distances(whole, guess, structure, variances, gathered) < chdtri(6, CHANCE)
@@ -836,23 +806,16 @@ def _distances(whole: _Problem, guess: _Guess, structure: str, variances: Array,
 
 
 def _trial(
-    whole: _Problem,
-    guess: _Guess,
-    used: NDArray[np.bool_],
-    structure: str,
-    gathered: dict[str, Array],
-    *,
-    timed: bool = False,
+    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, gathered: dict[str, Array]
 ) -> _Trial:
-    """Leave out poses under a structure; timed: as structures are tried whose errors neighbours in time share."""
-    timed = timed or structure in SHARED
-    rows = _spread(np.flatnonzero(used), MAX_SHARED if timed else MAX_FIT)
+    """Leave out poses under a structure."""
+    rows = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_FIT)
     linear = _linear(whole, guess, rows, structure, gathered)
     b = blocks(linear, structure)
     variances = reml(b, _start_variances(linear, structure))
     n = len(rows)
-    order = np.arange(n) if timed else np.random.default_rng(0).permutation(n)
-    parts = [np.sort(part) for part in np.array_split(order, n if n <= FEW and not timed else FOLDS)]
+    order = np.arange(n) if whole.t_s is not None else np.random.default_rng(0).permutation(n)
+    parts = [np.sort(part) for part in np.array_split(order, n if n <= FEW and structure not in SHARED else FOLDS)]
     density, residual, left = held_out(linear, structure, variances, parts)
     return _Trial(density, residual, left, rows, variances)
 
