@@ -1,11 +1,17 @@
 """Hand-eye calibration from one recording: images, /tf and /joint_states; at rest at each shot, and in motion."""
 
 import json
+from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from armsight.app.handeye.images import Seen
+from armsight.app.handeye.read import PoseTable
+from armsight.app.handeye.recording import at_shots, links_of, paired
+from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.arm_file import open_arm
@@ -106,6 +112,48 @@ def test_joints_are_read_by_their_names(at_rest):
     table = robot_in_recording(bag, None, arm)
     np.testing.assert_allclose(table.q, joints, atol=1e-12)
     np.testing.assert_allclose(table.Ts, arm.forward(joints), atol=1e-12)
+
+
+def stream(t_s, Ts, **more):
+    """A recording's poses."""
+    n = len(t_s)
+    given = {"numbers": np.zeros((n, 0)), "q": None, "names": None, "notes": (), "of_joints": False} | more
+    return PoseTable(
+        path=Path("a.bag"), lines=np.arange(n), Ts=Ts, convention="", t_s=np.asarray(t_s, float), unit_m=1.0,
+        missed=("",) * n, **given,
+    )  # fmt: skip
+
+
+def shots(t_s):
+    """Shots of a target."""
+    n = len(t_s)
+    names = tuple(str(k) for k in range(n))
+    return Seen(np.tile(np.eye(4), (n, 1, 1)), np.zeros((n, 6, 6)), names, ("",) * n, np.array(t_s), np.zeros(3))
+
+
+def test_shots_in_a_gap_in_which_the_arm_moved_get_no_pose():
+    there = np.tile(np.eye(4), (6, 1, 1))
+    there[3:, 0, 3] = 0.3
+    times = [0.0, 0.1, 0.2, 30.0, 30.1, 40.0]  # it rested from 30.1 to 40 s
+    found = at_shots(stream(times, there), shots([0.15, 15.0, 30.05, 35.0]))
+    assert found.names == ("0", "2", "3")
+    assert any("1 shots are in gaps" in note for note in found.notes)
+    with pytest.raises(InputError, match="the images have none"):
+        at_shots(stream(times, there), replace(shots([0.1]), t_s=None))
+    with pytest.raises(InputError, match="two recordings, or clocks that differ"):
+        at_shots(stream(times, there), shots([99.0]))
+
+
+def test_poses_of_a_tcp_beside_the_joints_are_those_of_the_tcp():
+    arm, q = open_arm("ur3e"), np.random.default_rng(2).uniform(-1, 1, (12, 6))
+    T_flange_tcp = pose(exp_so3(np.array([0.5, 0.0, 0.0])), np.array([0.0, 0.0, 0.15]))
+    table = stream(np.arange(12.0), arm.forward(q) @ T_flange_tcp, q=q)
+    recording = paired(table, shots(np.arange(12.0)), True, arm)
+    assert any("are of a TCP at [0.0 0.0 150.0] mm" in note for note in recording.notes)
+    own = paired(replace(table, Ts=np.asarray(arm.forward(q)), of_joints=True), shots(np.arange(12.0)), True, arm)
+    assert not any("TCP" in note for note in own.notes)
+    lever = links_of(recording, arm)[0, 0, :3, 3]
+    assert np.linalg.norm(lever - links_of(own, arm)[0, 0, :3, 3]) == pytest.approx(0.15, abs=1e-6)
 
 
 def test_what_a_recording_lacks_is_said(armsight, at_rest, tmp_path):

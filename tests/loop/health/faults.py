@@ -188,6 +188,7 @@ class Moved:
             if correction is not None:
                 self.mounting = correction.mounting(self.mounting)
                 self.monitor.put_right(correction)
+                self.follower.put_right(correction)
                 self.corrections.append(correction)
         if self.found_s is None and self.monitor.findings():
             self.found_s = t_s

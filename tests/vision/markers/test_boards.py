@@ -242,6 +242,16 @@ def test_part_of_an_aprilgrid_will_do_and_a_covered_tag_is_not_made_up():
     assert np.abs(found.uv - truth[found.ids]).max() < 0.1
 
 
+@pytest.mark.parametrize("kind", ["charuco", "aprilgrid"])
+def test_markers_in_the_dark_are_found_where_they_are(kind):
+    target, image, truth = painted(kind, 0.3, 0.1, samples=4)
+    bright = target.detect(expose(image, 150, 1, np.random.default_rng(6)))
+    pixels = np.clip(12 + 0.1 * expose(image, 150, 0, np.random.default_rng(6)), 0, 255)
+    found = target.detect(np.rint(pixels + np.random.default_rng(7).normal(0, 0.7, pixels.shape)).astype(np.uint8))
+    assert len(found.ids) > 0.9 * len(bright.ids)
+    assert np.abs(found.uv - truth[found.ids]).max() < 0.5
+
+
 def test_both_layouts_of_charuco_are_read():
     target = open_board("charuco:7x6:30mm:22mm:DICT_4X4_50")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)

@@ -17,6 +17,7 @@ from armsight.vision.discs.bias import disc_bias
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.circle_grid import skips_line
 from armsight.vision.markers.circles import unseen_row
+from armsight.vision.markers.grid import grid_points
 from armsight.vision.measure import measure
 
 SIZE = (640, 480)
@@ -191,6 +192,21 @@ def test_a_row_that_no_image_shows_is_said():
     assert said.startswith("row 9 of acircles:4x9:8mm is in none of 3 images: if the board has 4x8 discs")
     assert unseen_row(board, [of_first, of_first]) == unseen_row(board, [of_first, of_first, of_first + 4]) == ()
     assert unseen_row(open_board("chessboard:4x9:8mm"), [of_first] * 3) == ()
+
+
+def test_a_few_dots_in_line_with_the_board_do_not_hide_it():
+    pattern = circle_grid(8, 6, 0.012, radius_m=0.004)
+    T = posed(pattern, (0.2, -0.1, 0.05), 0.25)
+    image = picture(LONG, pattern, T)
+    board = open_board("circles:7x6:12mm")
+    assert "8x6" in board.detect(image).problem
+    light = int(np.median(image[image > 128]))
+    at = LONG.project(transform(T, grid_points(8, 6, 0.012)))
+    u, v = at[7].astype(int)
+    image[v - 20 : v + 21, u - 20 : u + 21] = light  # a dot less in the eighth column
+    found = board.detect(image)
+    assert found.problem is None
+    assert len(found.ids) == 42
 
 
 def test_a_larger_grid_of_smaller_dots_is_not_taken_for_the_board():

@@ -175,6 +175,21 @@ def test_what_is_no_corner_is_rejected(what):
     assert not refine_corners(image, truth[None], sides[None]).kept[0]
 
 
+def test_a_corner_that_is_not_kept_does_not_change_the_sigma_of_others():
+    rng = np.random.default_rng(9)
+    size, pitch = 200, 22.0
+    H = view(pitch, 0.2, 0.3, 0.2, np.array([100.0, 100.0]), distance=40.0)
+    image = expose(paint(checks, H, (size, size), 0.8, 8), 120, 2, rng)
+    grid = np.array([[x, y] for y in range(-3, 4) for x in range(-3, 4)], float)
+    uv = project(H, grid)
+    squares = np.stack([project(H, grid + step) - uv for step in ((1, 0), (0, 1))], axis=1)
+    alone = refine_corners(image, uv, squares)
+    beside = refine_corners(image, np.vstack([uv, uv[:3] + 9.0]), np.vstack([squares, squares[:3]]))
+    assert alone.kept.all()
+    assert not beside.kept[len(uv) :].any()
+    np.testing.assert_allclose(beside.cov_uv[: len(uv)], alone.cov_uv, rtol=1e-9)
+
+
 @pytest.mark.filterwarnings("error")
 def test_squares_of_any_shape_in_any_image_give_finite_numbers():
     rng = np.random.default_rng(12)

@@ -324,6 +324,19 @@ def test_joints_and_transforms_are_streams(tmp_path):
             read_track(bag, "base", "wrist")
 
 
+def test_joints_of_two_arms_are_not_mixed(tmp_path):
+    sent = []
+    for k in range(6):
+        side = ("left", "right")[k % 2]
+        names = [f"{side}_elbow_joint", f"{side}_wrist_joint"]
+        sent.append(Sent("/joint_states", EPOCH_NS + k * STEP_NS, Joints(names, [0.1 * k, 0.2])))
+    both = Bag(write_bag(tmp_path / "two", "mcap", sent))
+    with pytest.raises(InputError, match="two arms have the joints elbow, wrist: left_elbow_joint"):
+        read_joints(both, ("elbow", "wrist"))
+    one = read_joints(Bag(write_bag(tmp_path / "one", "mcap", sent[::2])), ("elbow", "wrist"))
+    np.testing.assert_allclose(one.q[:, 0], [0.0, 0.2, 0.4], atol=1e-12)
+
+
 def test_recorded_tags_are_detections_in_our_order_of_corners(tmp_path):
     ours = np.array([[10.0, 10.0], [20.0, 11.0], [21.0, 22.0], [9.0, 20.0]])  # from the upper left, clockwise
     body = Body(

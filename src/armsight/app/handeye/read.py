@@ -100,6 +100,7 @@ class PoseTable(Record):
         unit_m: the unit that lengths were read in, m.
         notes: what was found out while reading.
         missed: (N,) why a shot that `armsight measure` wrote has no pose, and another's stands there; "" where it has one.
+        of_joints: whether the poses are those of the joints by the model.
     """
 
     path: Path
@@ -113,6 +114,7 @@ class PoseTable(Record):
     unit_m: float
     notes: tuple[str, ...]
     missed: tuple[str, ...]
+    of_joints: bool = False
 
 
 def read_pose_table(
@@ -152,7 +154,7 @@ def read_pose_table(
     if "_3" in head:
         _require_row_major(path, table, rows)
     lines = np.array([line for line, _ in rows])
-    unit_m, q = 1.0, None
+    unit_m, q, of_joints = 1.0, None, False
     numbers, convention = np.zeros((len(rows), 0)), ""
     joints = sorted((int(found[1]), name) for name in head if (found := _JOINT.fullmatch(name)))
     if joints:
@@ -162,7 +164,7 @@ def read_pose_table(
             f"{path}: line 1: no joint angles: q1_deg .. or q1_rad .. are needed; there are {', '.join(head)}"
         )
     if q is not None and arm is not None and (only_joints or not table.has_position()):
-        Ts = np.asarray(arm.forward(q))
+        Ts, of_joints = np.asarray(arm.forward(q)), True
     elif q is not None and not table.has_position():
         raise InputError(f"{path}: joint angles need the arm: give --model, a name (armsight arm list) or a .urdf file")
     else:
@@ -177,7 +179,7 @@ def read_pose_table(
         notes = (*notes, f"{path}: has no joint angles: --model {arm.name} is not used")
     if unused and not only_joints:
         notes = (*notes, f"{path}: {columns_unused(unused)}")
-    return PoseTable(path, lines, Ts, numbers, convention, q, t_s, names, unit_m, notes, missed)
+    return PoseTable(path, lines, Ts, numbers, convention, q, t_s, names, unit_m, notes, missed, of_joints)
 
 
 def _shown(

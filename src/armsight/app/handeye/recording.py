@@ -19,6 +19,7 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import adjoint, inverse, log_se3, mean_pose
 from armsight.loop.handeye.handeye import MIN_POSES, Poses
+from armsight.loop.handeye.streams import GAP_S
 from armsight.robot.arm import Arm
 from armsight.vision.sources.bag import Bag
 from armsight.vision.sources.bag.states import PoseTrack, read_joints, read_track
@@ -27,6 +28,8 @@ from armsight.vision.sources.bag.states import PoseTrack, read_joints, read_trac
 RECORDINGS, RECORDING_INDEX = (".bag", ".mcap", ".db3"), "metadata.yaml"
 #: An arm that moves further than this in LATE_S, m, at half of the shots moves on while images are on their way.
 LATE_S, MOVING_M = 0.02, 1e-3
+#: An arm is taken to rest between two poses of a recording that differ by less, m and rad.
+STILL_M, STILL_RAD = 1e-4, 1e-3
 #: Poses of one TCP agree within this, m and rad, with a constant transform from the model's flange.
 TCP_M, TCP_RAD = 5e-3, 0.02
 #: Step of a joint for differences, rad.
@@ -105,13 +108,20 @@ def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseT
             f"{path}: a recording needs --frames BASE:FLANGE, frames of its transforms such as base_link:tool0, or --model,"
             " the arm whose joint states it holds"
         )
-    if len(track.t_s) < MIN_POSES:
-        raise InputError(
-            f"{path}: {frames or 'the joints'}: {len(track.t_s)} poses over time, {MIN_POSES} and more are needed: is it a"
-            " fixed transform?"
-        )
-    there = np.ones(len(track.t_s), bool) if q is None else np.isfinite(q).all(axis=1)
+    there: NDArray[np.bool_] = np.ones(len(track.t_s), bool)
+    if q is not None:
+        there = np.asarray(np.isfinite(q).all(axis=1))
     n = int(there.sum())
+    if n < len(there):
+        notes = (
+            *notes,
+            f"{path}: {len(there) - n} of {len(there)} transforms have no joint states around them: left out",
+        )
+    if n < MIN_POSES:
+        raise InputError(
+            f"{path}: {frames or 'the joints'}: {n} poses over time, {MIN_POSES} and more are needed: is it a fixed"
+            " transform, or have the joint states other times?"
+        )
     return PoseTable(
         path=path,
         lines=1 + np.flatnonzero(there),
@@ -124,11 +134,12 @@ def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseT
         unit_m=1.0,
         notes=(*bag.notes, *notes),
         missed=("",) * n,
+        of_joints=frames is None,
     )
 
 
 def at_shots(robot: PoseTable, seen: Seen) -> PoseTable:
-    """Return the poses of a recording at the times of the shots, interpolated; shots beside it get no row.
+    """Return the poses of a recording at the times of the shots, interpolated; shots beside it, or in a gap, get no row.
 
     Raises:
         InputError: the shots have no times, or none is within the recording.
@@ -143,6 +154,16 @@ def at_shots(robot: PoseTable, seen: Seen) -> PoseTable:
             f" {seen.t_s[0]:.1f} to {seen.t_s[-1]:.1f} s: two recordings, or clocks that differ; --streams finds their"
             " offset"
         )
+    after = np.clip(np.searchsorted(robot.t_s, seen.t_s[inside]), 1, len(robot.t_s) - 1)
+    moved = log_se3(inverse(robot.Ts[after - 1]) @ robot.Ts[after])
+    apart = (np.linalg.norm(moved[:, :3], axis=1) > STILL_M) | (np.linalg.norm(moved[:, 3:], axis=1) > STILL_RAD)
+    lost = (robot.t_s[after] - robot.t_s[after - 1] > GAP_S) & apart
+    holes = (
+        (f"{robot.path}: {int(lost.sum())} shots are in gaps of over {GAP_S:g} s in which the arm moved: left out",)
+        if lost.any()
+        else ()
+    )
+    inside = inside[~lost]
     t_s, track = seen.t_s[inside], PoseTrack(robot.t_s, robot.Ts)
     Ts = track.at(t_s)
     moved = np.linalg.norm(track.at(t_s + LATE_S)[:, :3, 3] - Ts[:, :3, 3], axis=1)
@@ -151,7 +172,7 @@ def at_shots(robot: PoseTable, seen: Seen) -> PoseTable:
             f"{robot.path}: in half of the shots the arm moves by {1e3 * np.median(moved):.1f} mm and more in"
             f" {1e3 * LATE_S:.0f} ms, and images come later than their stamps say: --streams finds by how much",
         )
-        if np.median(moved) > MOVING_M
+        if len(moved) and np.median(moved) > MOVING_M
         else ()
     )
     n = len(inside)
@@ -163,7 +184,7 @@ def at_shots(robot: PoseTable, seen: Seen) -> PoseTable:
         q=None if robot.q is None else np.stack([np.interp(t_s, robot.t_s, each) for each in robot.q.T], axis=1),
         t_s=t_s,
         names=tuple(seen.names[k] for k in inside),
-        notes=(*robot.notes, *late),
+        notes=(*robot.notes, *holes, *late),
         missed=("",) * n,
     )
 
@@ -275,7 +296,7 @@ def _once(
 
 def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:
     """Return a note where the poses are those of a TCP, not of the model's flange."""
-    if arm is None or robot.q is None or robot.numbers.shape[1] == 0:
+    if arm is None or robot.q is None or robot.of_joints:
         return []
     offset = inverse(np.asarray(arm.forward(robot.q))) @ robot.Ts
     mean = mean_pose(offset)
@@ -311,7 +332,7 @@ def _joints_of(robot: PoseTable, arm: Arm, q: Array) -> tuple[Array, Array]:
 
     Poses that scatter against their joints would otherwise be explained by errors of links, as what the joints show of it.
     """
-    if robot.numbers.shape[1] == 0:
+    if robot.of_joints:
         return q, np.eye(4)
     T_flange_tcp = mean_pose(inverse(np.asarray(arm.forward(q))) @ robot.Ts)
     goal, q = robot.Ts @ inverse(T_flange_tcp), q.copy()

@@ -437,7 +437,7 @@ def _scaled(recording: PairedPoses) -> Iterator[_Reading]:
     """Yield readings of the robot's and of the target's lengths in other units."""
     p, robot, seen = recording.poses, recording.robot, recording.seen.table
     sides: list[tuple[str, str, float, str, Path | None]] = []
-    sides += [("A", "robot", robot.unit_m, "--units", robot.path)] if robot.q is None or robot.numbers.shape[1] else []
+    sides += [("A", "robot", robot.unit_m, "--units", robot.path)] if not robot.of_joints else []
     sides += [("B", "target", 1.0, "--target's size", None)] if seen is None else []
     sides += [("B", "target", seen.unit_m, "--seen-units", seen.path)] if seen is not None else []
     for side, whose, unit_m, option, path in sides:

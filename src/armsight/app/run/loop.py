@@ -605,6 +605,8 @@ class Loop:
             self._recalibrate(correction.update.rig)
         if (state := self.health.put_right(correction)) is not None:
             self.publisher.put(EventDatum(self.t_s, restored_event(state)))
+        if self.rig_follower is not None:
+            self.rig_follower.put_right(correction)
         self.log.corrections.append(correction)
         self.log.mountings.append((self.t_s, self.mounting))
 

@@ -120,7 +120,7 @@ class BaseMotion:
         n, self._delay = len(x), estimator.delay_row
         self._x, self._P = np.zeros(n + 12), np.zeros((n + 12, n + 12))
         self._x[:n], self._P[:n, :n] = x - estimator.reference, P
-        self._n, self._moves = n, False
+        self._n, self._moves, self._right_s = n, False, -np.inf
         self._effect, self._Ts = np.eye(6), deque[Array](maxlen=_KEPT)
 
     def take(self, measurements: Sequence[KeptMeasurement]) -> None:
@@ -148,7 +148,7 @@ class BaseMotion:
             if self.slow:
                 self._P[n + 6 :, n + 6 :] = np.diag(_SPEED**2)
         self._Ts.append(seen.T_base_tool)
-        if abs(since_s) < _DATED_S:
+        if abs(since_s) < _DATED_S or seen.t_s <= self._right_s:
             return
         e, H = seen.residual()
         late, (offset_s, sigma_s) = H[:, self._delay], seen.clock_s
@@ -172,12 +172,13 @@ class BaseMotion:
         visited = (*Ts[:: -(-len(Ts) // _VISITED)], Ts[-1])
         return Moved(self._effect @ self._x[d], self._effect @ self._P[d, d] @ self._effect.T, visited)
 
-    def put_right(self) -> None:
-        """Go on with measurements that are corrected by the motion as it was found.
+    def put_right(self, at_s: float) -> None:
+        """Go on with measurements after a time, s, that are corrected by the motion as it was found.
 
-        The arm's filter goes on from what it knew before: where the links are in their backlash is not known any more.
+        Those before it, which are not, are not used. The arm's filter goes on from what it knew before: where the links are
+        in their backlash is not known any more.
         """
-        n, d = self._n, slice(self._n, self._n + 6)
+        n, d, self._right_s = self._n, slice(self._n, self._n + 6), at_s
         across = self._P[:n, n:].copy()
         x, P = self._estimator.known_again(Remembered(self._x[:n], self._P[:n, :n], None))
         across[self._estimator.forgets] = 0.0

@@ -103,6 +103,8 @@ class RigCorrection(Record):
             return found | self.update.figures()
         if self.tool_m is not None:
             found |= {"tool_displaced_m": self.tool_m[0], "tool_displaced_sigma_m": self.tool_m[1]}
+        if self.refines is not None:
+            found |= {"refines_at_s": self.refines.at_s}
         sigmas = np.sqrt(np.diag(self.cov))
         return found | {
             "shift_m": self.motion[:3].tolist(),
@@ -126,7 +128,8 @@ class RigCorrection(Record):
                 )
         else:
             what = "; ".join(self.update.lines())
-        return f"rig put right at {self.at_s:.1f} s, wrong since {self.since_s:.1f} s: {what}"
+        how = "put right" if self.refines is None else f"put right again (of {self.refines.at_s:.1f} s)"
+        return f"rig {how} at {self.at_s:.1f} s, wrong since {self.since_s:.1f} s: {what}"
 
 
 def correction_lines(corrections: Sequence[RigCorrection], rejected: str | None) -> list[str]:
@@ -165,7 +168,8 @@ class RigFollower:
             T_base_rig: (4, 4) the rig in the base as it is taken to be, m.
             at_s: the time, s.
         """
-        if self._put_right is not None and (monitor.changes or monitor.rig_moved() is not None):
+        again = monitor.changes or monitor.rig_moved() is not None or monitor.cameras_moved() is not None
+        if self._put_right is not None and again:
             self._motion = self._put_right = None
         if (watch := monitor.cameras_moved()) is not None:
             newest = poses()
@@ -184,6 +188,14 @@ class RigFollower:
             return None
         motion, right, measurements = self._motion, self._put_right, monitor.measurements
         return lambda: self.refined(right, T_base_rig, at_s, _moved(motion, measurements))
+
+    def put_right(self, correction: RigCorrection) -> None:
+        """Go on after a correction that is in force from its time on; one that the arm's poses show may be refined."""
+        if self._motion is None or correction.tool_m is None:
+            self._motion = self._put_right = None
+            return
+        self._motion.put_right(correction.at_s)
+        self._put_right = correction if correction.tool_m[1] > _KNOWN_M else None
 
     def _motion_of(self, best: Change, monitor: HealthMonitor) -> BaseMotion:
         """Return what estimates the motion of the rig that a hypothesis says."""
@@ -335,11 +347,7 @@ class RigFollower:
             motion = log_se3(exp_se3(refines.motion) @ exp_se3(motion))
         displaced_m = float(np.linalg.norm((adjoint(inverse(T_rig_tool)) @ motion)[:3]))
         tool_m = displaced_m, moved.sigma_m
-        right = RigCorrection("base", since_s, at_s, "arm", None, motion, cov, tool_m, refines)
-        if self._motion is not None:
-            self._motion.put_right()
-        self._put_right = right if moved.sigma_m > _KNOWN_M else None
-        return right
+        return RigCorrection("base", since_s, at_s, "arm", None, motion, cov, tool_m, refines)
 
 
 def _moved(motion: BaseMotion, measurements: Sequence[KeptMeasurement]) -> Moved | None:

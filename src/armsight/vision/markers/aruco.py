@@ -108,17 +108,23 @@ def detect_markers(
     return [corners[i] for i in kept], np.array(identities, np.int32)[kept, None]
 
 
-#: An image whose levels, but for the extreme ones of this share, span less than this is scaled to all of them.
-_EXTREME_PERCENT, _SPAN = 0.5, 128.0
+#: An image whose levels, but for the extreme ones of this share, span less than this is scaled to all of them; but its
+#: noise to so many levels at most, for OpenCV would take it for edges, and by so much at least.
+_EXTREME_PERCENT, _SPAN, _NOISE, _GAIN = 0.5, 128.0, 4.0, 1.3
 
 
 def _full_range(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return a dark or faint image with all grey levels: OpenCV's threshold of markers is a number of levels."""
-    low, high = np.percentile(image[::4, ::4], (_EXTREME_PERCENT, 100.0 - _EXTREME_PERCENT))
+    some = image[::4]
+    low, high = np.percentile(some[:, ::4], (_EXTREME_PERCENT, 100.0 - _EXTREME_PERCENT))
     if not 0.0 < high - low < _SPAN:
         return image
-    levels = np.clip((np.arange(256) - low) * 255.0 / (high - low), 0.0, 255.0).astype(np.uint8)
-    return np.asarray(cv2.LUT(image, levels), np.uint8)
+    steps = np.abs(np.diff(some.astype(np.int16), axis=1))
+    noise = float(np.mean(steps[steps <= np.percentile(steps, 90.0)]))
+    gain = min(255.0 / (high - low), _NOISE / max(noise, 0.3))
+    if gain < _GAIN:
+        return image
+    return np.asarray(cv2.LUT(image, np.clip((np.arange(256) - low) * gain, 0.0, 255.0).astype(np.uint8)), np.uint8)
 
 
 #: Families with fewer cells a side are not compared: what is no marker resembles one of their codes too often.

@@ -260,7 +260,7 @@ _PREDICTED_CELLS = 3
 #: Largest share of the discs in view that may be missing or too many; how much worse the next best placement must be, and
 #: what a ring in the wrong position counts.
 _MOST_WRONG, _WORSE, _RING_COST = 0.25, 2, 3
-#: A grid of a size is shown where at least this share of its discs was found.
+#: A grid of a size is shown where at least this share of its discs was found, and of each outer line's.
 _FILLED = 0.9
 #: A step across a missing line is twice as long as others; from this on it is one.
 _SKIPPED = 1.5
@@ -384,7 +384,8 @@ def skips_line(cells: Ids, theta: Array) -> bool:
 def shown_size(cells: Ids, *, staggered: bool, like: tuple[int, int]) -> tuple[int, int] | None:
     """Return the columns and rows of the grid that a lattice fills, of the readings that nearest to a board's.
 
-    Outer lines with fewer than half the discs of the others are not of the grid.
+    Outer lines that lack more than a tenth of the discs of the next ones (in a staggered grid the next but one) are not of
+    the grid.
 
     Args:
         cells: (N, 2) the lattice's cells.
@@ -395,19 +396,18 @@ def shown_size(cells: Ids, *, staggered: bool, like: tuple[int, int]) -> tuple[i
         None where the lattice fills no grid.
     """
     x, y = cells.T
-    at = np.stack([x - y, x + y] if staggered else [x, y], axis=1)
+    at, step = np.stack([x - y, x + y] if staggered else [x, y], axis=1), 2 if staggered else 1
     while len(at):
-        low, high = at.min(axis=0), at.max(axis=0)
-        kept = np.ones(len(at), bool)
+        low, kept = at.min(axis=0), np.ones(len(at), bool)
         for axis in (0, 1):
             counts = np.bincount(at[:, axis] - low[axis])
-            for end in (low[axis], high[axis]):
-                if counts[end - low[axis]] < 0.5 * np.median(counts[counts > 0]):
-                    kept &= at[:, axis] != end
+            for end, inner in ((0, step), (len(counts) - 1, len(counts) - 1 - step)):
+                if 0 <= inner < len(counts) and counts[end] < _FILLED * counts[inner]:
+                    kept &= at[:, axis] - low[axis] != end
         if kept.all():
             break
         at = at[kept]
-    if not len(at):
+    if len(at) < (1.0 - _MOST_WRONG) * len(cells):
         return None
     wide, tall = (np.ptp(at, axis=0) + 1).tolist()
     sizes = [(wide // 2, tall), (tall // 2, wide)] if staggered else [(wide, tall), (tall, wide)]

@@ -305,7 +305,7 @@ def _fit_one(
 
 @kernel(
     "const u1[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8, b1, b1[::1], f8[:, ::1], f8[:, :, ::1], "
-    "f8[:, :, ::1], f8[:, :, ::1], f8[::1], i8[::1]",
+    "f8[:, :, :, ::1], f8[:, :, ::1], f8[::1], i8[::1]",
 )
 def _refine(
     image: NDArray[np.uint8],
@@ -334,7 +334,7 @@ def _refine(
         if rough:
             residual[i] = np.sqrt(rough_noise(n, w))
         else:
-            residual[i] = np.sqrt(edge_noise(n, w, L, q[:2] - origin, cov[i], noise, gains[i]))
+            residual[i] = np.sqrt(edge_noise(n, w, L, q[:2] - origin, cov[i], noise[i], gains[i]))
         reach = reach_px(squares[i])
         moved = np.hypot(q[0] - uv0[i, 0], q[1] - uv0[i, 1])
         if not moved <= min(MOVED_SHARE / WINDOW_SHARE * reach, MOVED_MAX_PX):
@@ -427,16 +427,17 @@ def refine_corners(
     else:
         known, models = like.kept, np.array(like.models)
     cov, residual, outcome = np.zeros((n, 2, 2)), np.zeros(n), np.zeros(n, np.int64)
-    noise, gains = np.zeros((3, LAGS + 1, 2 * LAGS + 1)), np.zeros((n, LAGS + 1, 2 * LAGS + 1))
+    noise, gains = np.zeros((n, 3, LAGS + 1, 2 * LAGS + 1)), np.zeros((n, LAGS + 1, 2 * LAGS + 1))
     _refine(_pixels(image), uv, squares, bows, arm, rough, known, models, cov, noise, gains, residual, outcome)
     lost = ~np.isfinite(residual)  # no pixel, or hardly one, determines these
     outcome[lost], residual[lost], cov[lost] = _DIVERGED, 0.0, 0.0
     share, good = residual / np.maximum(np.abs(models[:, 7]), 1e-9), outcome == _KEPT
     usual = float(np.median(share[good])) if good.sum() >= _MANY else 0.0
     outcome[good & (share > max(MISFIT_MAX, min(MISFIT_RATIO * usual, MISFIT_LIMIT)))] = _MISFIT
-    if not rough and np.count_nonzero(residual) >= _MANY and np.isfinite(noise).all():
-        variances = np.maximum(_effective(noise, gains), 1.0 / 12.0)
-        cov *= (variances / np.mean(residual[residual > 0] ** 2))[:, None, None]
+    good = (outcome == _KEPT) & np.isfinite(noise).all(axis=(1, 2, 3))
+    if not rough and good.sum() >= _MANY:
+        variances = np.maximum(_effective(noise[good].sum(axis=0), gains), 1.0 / 12.0)
+        cov *= (variances / np.mean(residual[good] ** 2))[:, None, None]
     return CornerFits(models, cov, residual, outcome)
 
 

@@ -80,7 +80,7 @@ def read_joints(bag: Bag, names: tuple[str, ...] | None = None) -> JointStream |
     """
     topics = [topic.name for topic in bag.of_kind(*JOINTS)]
     rows: list[tuple[float, list[float]]] = []
-    partial, known = 0, set[str]()
+    partial, known, theirs = 0, set[str](), None
     for message in bag.messages(topics):
         decoded = message.decode()
         if hasattr(decoded, "joints"):
@@ -89,10 +89,16 @@ def read_joints(bag: Bag, names: tuple[str, ...] | None = None) -> JointStream |
             found = {str(name): float(q) for name, q in zip(decoded.name, decoded.position, strict=False)}
         names = tuple(found) if names is None else names
         known |= found.keys()
-        theirs = [_called(name, found) for name in names]
-        if not all(each in found and np.isfinite(found[each]) for each in theirs):
+        here = [_called(name, found) for name in names]
+        if not all(each in found and np.isfinite(found[each]) for each in here):
             partial += 1
             continue
+        if theirs is not None and here != theirs:
+            raise InputError(
+                f"{bag.path}: two arms have the joints {', '.join(names)}: {', '.join(theirs)} and {', '.join(here)};"
+                " record one, or give --frames"
+            )
+        theirs = here
         stamp = message.stamp_ns()
         rows.append(((stamp if stamp > 0 else message.arrival_ns) / _S_NS, [found[each] for each in theirs]))
     if not rows or names is None:
