@@ -151,6 +151,8 @@ def test_a_motion_that_was_put_right_is_refined_once_more_is_known_of_it():
     then = first.mounting(old)
     left = log_se3(then.T_base_rig @ inverse(true))
     assert one.refined(first, then.T_base_rig, 16.0, moved(left, 2.6e-4)) is None
+    further = one.refined(first, then.T_base_rig, 16.0, moved(left + np.array([2e-3, 0, 0, 0, 0, 0]), 2.6e-4))
+    assert further.refines is first  # a drift goes on
     second = one.refined(first, then.T_base_rig, 17.0, moved(left, 1e-4))
     new = second.mounting(then)
     np.testing.assert_allclose(new.T_base_rig, true, atol=1e-7)

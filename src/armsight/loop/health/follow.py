@@ -45,6 +45,9 @@ MOST_SIGMA_M, MOST_APART_M = 2e-4, 2e-4
 _MOST_BY_ARM_M = 4e-4
 #: It is refined where its sigma fell to such a share, until it is so small, m.
 _REFINED, _KNOWN_M = 0.85, 1e-4
+#: It is refined, too, where what is left of it displaces the tool by more than this, squared sigmas of three numbers
+#: (chance of 1e-3): a drift goes on.
+_MORE = 16.3
 #: A motion that began so much earlier or later than was thought is estimated anew, s.
 _SAME_S = 0.3
 
@@ -331,7 +334,11 @@ class RigFollower:
             moved: what is left of the motion.
         """
         assert right.tool_m is not None
-        if moved is None or moved.sigma_m > _REFINED * right.tool_m[1]:
+        if moved is None:
+            return None
+        by, cov = moved.at(moved.Ts_base_tool[-1])
+        more = float(by[:3] @ np.linalg.solve(cov[:3, :3], by[:3])) > _MORE
+        if moved.sigma_m > _REFINED * right.tool_m[1] and not more:
             return None
         return self._by_arm(right.since_s, T_base_rig, at_s, moved, right)
 
