@@ -220,6 +220,24 @@ def test_a_strongly_sharpened_chessboard_is_found_without_its_covered_corner():
     assert np.sqrt(np.mean(off.min(axis=1) ** 2)) < 0.2
 
 
+def test_a_chessboard_out_of_focus_in_a_large_image_is_as_exact_as_it_is_said_to_be():
+    camera = Camera((1600, 1200), "brown4", np.array([1750.0, 1750.0, 800.0, 600.0]), np.zeros(4))
+    T = pose(exp_so3(np.array([0.3, -0.2, 0.4])), np.array([-0.06, -0.08, 0.6]))
+    target = open_board("chessboard:9x6:25mm")
+    truth = camera.project(target.body.points @ T[:3, :3].T + T[:3, 3])
+    squares, errors = [], []
+    for seed in range(3):
+        optics, rng = Optics(psf_sigma_px=3.5), np.random.default_rng(seed)
+        image = render(camera, [PosedBody((chessboard(9, 6, 0.025),), T)], optics=optics, sensor=Sensor(), rng=rng)
+        found = target.detect(image)
+        assert len(found.ids) == 54
+        off = found.uv - truth[np.linalg.norm(found.uv[:, None] - truth, axis=2).argmin(axis=1)]
+        errors.append(off)
+        squares.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.cov_uv), off))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.012  # 0.016 in windows of 12 px
+    assert 0.5 < np.mean(squares) / 2 < 1.6
+
+
 def test_a_covered_corner_is_left_out_and_the_others_stay():
     target, image, truth = painted("chessboard", 0.3, 0.1, samples=4)
     pixels = expose(image, 150, 1, np.random.default_rng(6))

@@ -36,6 +36,8 @@ MORE_SHARE = 0.7
 #: A residual this many times the median residual of the board's corners, both relative to the contrast, marks a
 #: disturbed corner: a glint, a finger, a staple. Never below the floor, for a clean image has a tiny median.
 MISFIT_RATIO, MISFIT_FLOOR = 4.0, 0.08
+#: Blur in a smaller copy, px, and the least side of its squares.
+COPY_BLUR_PX, SMALLEST_SIDE_PX = 0.75, 12.0
 #: The four outermost lines of a grid (rows, columns), each with the one next to it.
 _ENDS = ((np.s_[0], np.s_[1]), (np.s_[-1], np.s_[-2]), (np.s_[:, 0], np.s_[:, 1]), (np.s_[:, -1], np.s_[:, -2]))
 
@@ -194,7 +196,29 @@ def fit_grid(image: NDArray[np.uint8], rough: Array, arm: float = 1.0) -> Corner
     first = refine_corners(image, rough_uv, local_squares(rough)[0].reshape(-1, 2, 2), arm=arm, rough=True)
     uv = np.where(first.kept[:, None], first.uv, rough_uv)
     squares, bows = (array.reshape(-1, 2, 2) for array in local_squares(uv.reshape(rough.shape)))
-    return refine_corners(image, uv, squares, bows, arm=arm, like=first)
+    fits = refine_corners(image, uv, squares, bows, arm=arm, like=first)
+    return _in_smaller_copy(image, fits, squares, bows, arm)
+
+
+def _in_smaller_copy(image: NDArray[np.uint8], fits: CornerFits, squares: Array, bows: Array, arm: float) -> CornerFits:
+    """Return the fits again in a copy in which the blur is about a pixel, where it is larger.
+
+    A window ends so many pixels from a corner (:data:`~armsight.vision.markers.corner.WINDOW_MAX_PX`); of an image that is
+    out of focus, or enlarged, it shows little but blur.
+    """
+    blur_px = float(np.median(np.sqrt(fits.models[fits.kept, 4:6]))) if fits.kept.any() else 0.0
+    factor = int(min(blur_px / COPY_BLUR_PX, float(np.nanmedian(np.linalg.norm(squares, axis=2))) / SMALLEST_SIDE_PX))
+    if factor < 2:
+        return fits
+    height, width = (side // factor for side in image.shape)
+    small = cv2.resize(image[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)
+    uv = (fits.uv + 0.5) / factor - 0.5
+    again = refine_corners(np.asarray(small, np.uint8), uv, squares / factor, bows * factor, arm=arm)
+    models = again.models.copy()
+    models[:, :2] = (models[:, :2] + 0.5) * factor - 0.5
+    models[:, 4:6] *= factor**2
+    models[:, 8:] /= factor
+    return CornerFits(models, again.cov_uv * factor**2, again.residual, again.outcome)
 
 
 def extends_beyond(

@@ -432,7 +432,7 @@ def refine_corners(
     lost = ~np.isfinite(residual)  # no pixel, or hardly one, determines these
     outcome[lost], residual[lost], cov[lost] = _DIVERGED, 0.0, 0.0
     share, good = residual / np.maximum(np.abs(models[:, 7]), 1e-9), outcome == _KEPT
-    usual = float(np.median(share[good])) if good.sum() >= _MANY else 0.0
+    usual = 0.0 if rough or good.sum() < _MANY else float(np.median(share[good]))
     outcome[good & (share > max(MISFIT_MAX, min(MISFIT_RATIO * usual, MISFIT_LIMIT)))] = _MISFIT
     good = (outcome == _KEPT) & np.isfinite(noise).all(axis=(1, 2, 3))
     if not rough and good.sum() >= _MANY:
