@@ -222,7 +222,7 @@ def test_people_read_millimetres(quick):
     assert "RMS, mm" in printed
     assert "times smaller" in printed
     page = (folder / "report.html").read_text()  # the same numbers as in the terminal
-    assert all(f"<td>{cell}</td>" in page for cell in vision.split()[1:])
+    assert all(f">{cell}</td>" in page for cell in vision.split()[1:])
 
 
 def test_an_arm_model_that_cannot_be_read_leaves_nothing_behind(armsight, tmp_path):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import html
+import re
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -16,6 +17,8 @@ from armsight.app.report.plotting import plain
 from armsight.errors import InputError
 from armsight.files import replacing
 
+#: A number, with its sigma or its unit.
+_NUMBER = re.compile(r"[-+\u2212]?\d[\d.,]*(?: \u00b1 [\d.,]+)?(?: ?[%a-z\u00b0]{1,3})?")
 #: Name of the page in the folder of every report.
 PAGE = "report.html"
 STYLE = """
@@ -46,7 +49,7 @@ table.headline td { font-variant-numeric: tabular-nums; } table.headline td:last
 table.headline { font-weight: 400; font-size: .95rem; }
 table.prose th { font-weight: 400; } table.prose td { min-width: 18rem; }
 table.numbers tbody th { white-space: nowrap; } table.numbers thead th { overflow-wrap: normal; }
-table.numbers td { font-variant-numeric: tabular-nums; }
+table.numbers td { font-variant-numeric: tabular-nums; } td.number { white-space: nowrap; }
 figure { margin: 0 0 1rem; } figure img { width: 100%; height: auto; display: block; }
 figcaption { background: var(--soft); padding: .6rem 1.1rem; margin-top: .6rem; font-size: .95rem; }
 figcaption p { margin: .3rem 0; }
@@ -60,6 +63,11 @@ def text(value: object) -> str:
     return html.escape(plain(str(value), most=2000))
 
 
+def _cell(content: str) -> str:
+    """Return a cell; a number, with its sigma perhaps, stays in one line."""
+    return f'<td class="number">{content}</td>' if _NUMBER.fullmatch(content) else f"<td>{content}</td>"
+
+
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
     """Return an HTML table.
 
@@ -69,10 +77,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") ->
         kind: CSS class: headline, prose or numbers.
     """
     top = "".join(f'<th scope="col">{cell}</th>' for cell in head)
-    body = "".join(
-        f'<tr><th scope="row">{first}</th>' + "".join(f"<td>{cell}</td>" for cell in rest) + "</tr>\n"
-        for first, *rest in rows
-    )
+    body = "".join(f'<tr><th scope="row">{first}</th>' + "".join(map(_cell, rest)) + "</tr>\n" for first, *rest in rows)
     return f'<table class="{kind}"><thead><tr>{top}</tr></thead>\n<tbody>\n{body}</tbody></table>\n'
 
 
