@@ -206,8 +206,11 @@ def _in_smaller_copy(image: NDArray[np.uint8], fits: CornerFits, squares: Array,
     A window ends so many pixels from a corner (:data:`~armsight.vision.markers.corner.WINDOW_MAX_PX`); of an image that is
     out of focus, or enlarged, it shows little but blur.
     """
-    blur_px = float(np.median(np.sqrt(fits.models[fits.kept, 4:6]))) if fits.kept.any() else 0.0
-    factor = int(min(blur_px / COPY_BLUR_PX, float(np.nanmedian(np.linalg.norm(squares, axis=2))) / SMALLEST_SIDE_PX))
+    if not fits.kept.any():
+        return fits
+    blur_px = float(np.median(np.sqrt(fits.models[fits.kept, 4:6])))
+    side_px = float(np.median(np.linalg.norm(squares[fits.kept], axis=2)))
+    factor = int(min(blur_px / COPY_BLUR_PX, side_px / SMALLEST_SIDE_PX))
     if factor < 2:
         return fits
     height, width = (side // factor for side in image.shape)
