@@ -68,6 +68,11 @@ def implausible(
     if everything:
         return _wrong_size(rig, body, points, rigid)
     both = count[points.ids] == 2
+    if both.sum() < min(3, _AGREEING * len(points.ids)):
+        return (
+            f"the images of both cameras contradict each other: {both.sum()} of {len(points.ids)} points agree with one"
+            " pose in both; a frozen camera, or images of different moments?"
+        )
     if both.sum() < 3 or collinear(body.points[points.ids[both]]):
         return None
     arrays = (points.ids[both], points.p_left[both], points.cov[both], points.calibration[both])

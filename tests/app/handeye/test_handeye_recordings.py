@@ -144,6 +144,16 @@ def test_shots_in_a_gap_in_which_the_arm_moved_get_no_pose():
         at_shots(stream(times, there), shots([99.0]))
 
 
+def test_a_log_that_stopped_is_named():
+    poses = np.array([exp_se3(np.array([0.01 * k, 0.02 * k, 0.5, 0.1 * k, -0.1 * k, 0.05])) for k in range(14)])
+    moved, stopped = replace(shots(np.arange(14.0)), Ts=poses), poses.copy()
+    stopped[9:] = stopped[8]
+    assert len(paired(stream(np.arange(14.0), poses), moved, True, None).rows) == 14
+    table = stream(np.arange(14.0), stopped)
+    with pytest.raises(InputError, match="lines 8 to 13: 6 rows hold the very same pose"):
+        paired(table, moved, True, None)
+
+
 def test_poses_of_a_tcp_beside_the_joints_are_those_of_the_tcp():
     arm, q = open_arm("ur3e"), np.random.default_rng(2).uniform(-1, 1, (12, 6))
     T_flange_tcp = pose(exp_so3(np.array([0.5, 0.0, 0.0])), np.array([0.0, 0.0, 0.15]))

@@ -194,6 +194,17 @@ def test_a_row_that_no_image_shows_is_said():
     assert unseen_row(open_board("chessboard:4x9:8mm"), [of_first] * 3) == ()
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("rings", ["1x1", "0x0,3x0,0x2"])
+def test_a_board_without_the_rings_of_its_spec_is_not_found(rings):
+    pattern = circle_grid(4, 3, 0.09, radius_m=0.035)
+    image = picture(WIDE, pattern, posed(pattern, (0.5, -0.4, 0.2), 0.3, (0.2, 0.0)))
+    assert open_board(f"circles:4x3:90mm:rings={rings}").detect(image).problem is not None
+    few = image.copy()
+    few[:, image.shape[1] // 2 :] = 120
+    assert open_board(f"circles:5x5:9mm:rings={rings}").detect(few).problem is not None
+
+
 def test_a_few_dots_in_line_with_the_board_do_not_hide_it():
     pattern = circle_grid(8, 6, 0.012, radius_m=0.004)
     T = posed(pattern, (0.2, -0.1, 0.05), 0.25)

@@ -356,7 +356,14 @@ def home(name: str, baud: int | None, at_once: str, yes: bool, as_json: bool) ->
             click.confirm(
                 "the arm will move to the ends of all joints: is everything out of its reach?", abort=True, err=True
             )
-        board.home(at_once=int(at_once))
+        try:
+            board.home(at_once=int(at_once))
+        except KeyboardInterrupt:
+            click.echo(
+                "the AR4 goes on homing by itself, and answers nothing until then: its emergency stop stops it",
+                err=True,
+            )
+            raise
         q = board.receive().q[-1]
     _print_home(q, as_json)
 

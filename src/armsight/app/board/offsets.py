@@ -164,8 +164,10 @@ def zero_doubts(changes: list[ZeroChange]) -> list[str]:
 
 def _checked(further_rad: Array, count: int) -> Array:
     further = np.asarray(further_rad, float)
-    if further.shape != (count,) or not np.isfinite(further).all():
-        raise InputError(f"{count} corrections are needed, one a joint, and finite numbers all")
+    if further.shape != (count,):
+        raise InputError(f"{count} corrections are needed, one a joint; {further.size} are given")
+    if not np.isfinite(further).all():
+        raise InputError("a correction is no finite number of degrees")
     return further
 
 

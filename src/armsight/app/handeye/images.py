@@ -174,7 +174,11 @@ def fit_camera(target: Target, detections: Sequence[Detections], size: tuple[int
     """
     seen = [d for d in detections if len(d.ids) >= 6]
     if len(seen) < MIN_IMAGES:
-        raise InputError(f"the target was found in {len(seen)} images; {MIN_IMAGES} are needed to calibrate the camera")
+        why = next((f"; {each.problem}" for each in detections if each.problem is not None), "")
+        raise InputError(
+            f"the target was found in {len(seen)} of {len(detections)} images; {MIN_IMAGES} are needed to calibrate the"
+            f" camera{why}"
+        )
     points = [np.asarray(target.body.points[d.ids], np.float32) for d in seen]
     _, K, k, _, _ = cv2.calibrateCamera(points, [d.uv.astype(np.float32) for d in seen], size, None, None)
     return Camera(size, "brown5", np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), np.asarray(k, np.float64).ravel()[:5])

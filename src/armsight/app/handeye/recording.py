@@ -30,6 +30,8 @@ RECORDINGS, RECORDING_INDEX = (".bag", ".mcap", ".db3"), "metadata.yaml"
 LATE_S, MOVING_M = 0.02, 1e-3
 #: An arm is taken to rest between two poses of a recording that differ by less, m and rad.
 STILL_M, STILL_RAD = 1e-4, 1e-3
+#: So many rows of one very pose are a log that stopped, where the target was seen this far apart, m.
+STOPPED, STOPPED_M = 3, 0.01
 #: Poses of one TCP agree within this, m and rad, with a constant transform from the model's flange.
 TCP_M, TCP_RAD = 5e-3, 0.02
 #: Step of a joint for differences, rad.
@@ -220,12 +222,27 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
             notes.append(
                 f"the board looks the same rotated: {int((rotated >= 0).sum())} of {len(B)} were rotated to agree"
             )
+    _require_moving(robot, rows, B)
     both_clocks = robot.t_s is not None and seen.t_s is not None
     t_s = robot.t_s[rows] if robot.t_s is not None and (both_clocks or seen.t_s is None) else None
     names = tuple(f"line {robot.lines[r]} ({seen.names[k]})" for r, k in zip(rows, matched, strict=True))
     notes += _tcp(robot, arm)
     poses = Poses(A, B, covs, in_hand, seen.centre, common)
     return PairedPoses(poses, rows, names, t_s, robot, seen, matched, tuple(notes))
+
+
+def _require_moving(robot: PoseTable, rows: NDArray[np.int64], B: Array) -> None:
+    """Raise an InputError where rows of the table hold one pose while the target was seen in several."""
+    same = np.unique(robot.Ts[rows].reshape(-1, 16), axis=0, return_inverse=True)[1].ravel()
+    for k in np.flatnonzero(np.bincount(same) >= STOPPED):
+        stopped = np.flatnonzero(same == k)
+        apart_m = float(np.linalg.norm(B[stopped, :3, 3] - B[stopped[0], :3, 3], axis=1).max())
+        if apart_m > STOPPED_M:
+            lines = robot.lines[rows[stopped]]
+            raise InputError(
+                f"{robot.path}: lines {lines.min()} to {lines.max()}: {len(lines)} rows hold the very same pose, while the"
+                f" target was seen up to {1e3 * apart_m:.0f} mm apart: a log that stopped? Leave these rows out"
+            )
 
 
 def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

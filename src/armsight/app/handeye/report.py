@@ -32,7 +32,9 @@ def errors_figure(run: HandEyeAnswer) -> Figure:
     figure = new_figure(6.6)
     axes = figure.subplots(3, 1, sharex=True)
     found, n = run.found, len(run.found.used)
-    at = np.arange(n)
+    lines = run.recording.robot.lines[run.recording.rows]
+    by_line = run.offset_s is None and len(np.unique(lines)) == n
+    at = np.asarray(lines if by_line else np.arange(n))
     width = 0.9 if n < 100 else 1.0
     axes[0].bar(at, 1e3 * np.nan_to_num(found.held_out.position_m), color=BLUE, width=width)
     axes[0].set_title("left out: distance of the target's middle, mm")
@@ -41,7 +43,7 @@ def errors_figure(run: HandEyeAnswer) -> Figure:
     axes[2].bar(at, np.sqrt(found.distance), color=np.where(found.used, MUTED, RED), width=width)
     axes[2].set_yscale("log")
     axes[2].set_title("residual over its sigma; red: a blunder, left out of the fit")
-    axes[2].set_xlabel("row")
+    axes[2].set_xlabel("line of the robot's table" if by_line else "pose")
     axes[2].xaxis.get_major_locator().set_params(integer=True)
     return figure
 

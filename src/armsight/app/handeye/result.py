@@ -170,8 +170,14 @@ def statements(run: HandEyeAnswer) -> list[str]:
             f"{low:.4f} to {high:.4f} at the last (95 %)"
         )
     elif found.sigma_scale:
+        wrong = abs(found.scale - 1.0) > 3.0 * found.sigma_scale
         lines.append(
-            f"the target's lengths are {found.scale:.5f} ± {found.sigma_scale:.5f} of those given: correct --target's size"
+            f"the target's lengths are {found.scale:.5f} ± {found.sigma_scale:.5f} of those given: "
+            + (
+                "correct --target's size"
+                if wrong
+                else "no contradiction; without --scale the transforms are known better"
+            )
         )
     return lines
 

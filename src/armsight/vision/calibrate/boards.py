@@ -436,8 +436,8 @@ def _apart(rig: StereoRig, state: BundleState) -> None:
     distance_m = float(np.median(np.linalg.norm(state.Ts_left_body[:, :3, 3], axis=1)))
     if rig.baseline_m < max(_BASELINE_SIGMAS * sigma_m, _BASELINE_SHARE * distance_m):
         raise CalibrationError(
-            f"the cameras are {1e3 * rig.baseline_m:.3g} ± {1e3 * sigma_m:.2g} mm apart, which is no baseline: are left "
-            "and right images of one camera?"
+            f"the cameras are {1e3 * rig.baseline_m:.0f} ± {1e3 * sigma_m:.0f} mm apart, which is no baseline: are left "
+            "and right images of one camera, or of different moments?"
         )
 
 

@@ -182,6 +182,8 @@ class CircleGrid(Record, Target):
         cells, starts, hollow = _completed(
             image, grid.cells, blobs.theta[grid.blobs], sign, size, rings=bool(self.rings)
         )
+        if len(cells) < least:
+            return f"{len(cells)} of its discs were found"
         if skips_line(cells, starts):
             return f"{len(cells)} of its discs were found, but between them a whole row or column was not"
         own = (self.columns, self.rows)
@@ -281,7 +283,7 @@ def _completed(
         kept &= ~_displaced(cells, theta)
     cells, theta = cells[kept], theta[kept]
     contrast, hollow = contrasts(image, theta, sign)
-    for _ in range(_COMPLETED):
+    for _ in range(_COMPLETED if len(cells) else 0):
         more, uv = expected(cells, theta, size_px)
         like = like_neighbours(uv, theta)
         there, ring = contrasts(image, like, sign)
