@@ -263,6 +263,20 @@ def test_a_miss_says_what_was_dropped():
     assert found.reason.startswith("2 matched points, 3 are needed; dropped: P1 (its rays do not meet")
 
 
+def test_cameras_that_saw_the_body_at_two_poses_give_none():
+    rig, rng, points = rig_of(), np.random.default_rng(14), board()
+    for _ in range(12):
+        T = somewhere(rng)
+        frozen = seen(
+            rig, points, T @ exp_se3(np.array([0.0, 0.0, 0.0, *(0.12 * rng.normal(size=3))])), sigma=SIGMA_PX, rng=rng
+        )
+        shot = seen(rig, points, T, sigma=SIGMA_PX, rng=rng)
+        uv = shot.uv.copy()
+        uv[:, 1] = frozen.uv[:, 1]
+        found = located(rig, points, replace(shot, uv=uv))
+        assert isinstance(found, Missed) or len(found.points.ids) >= 3
+
+
 LINE = np.outer(np.linspace(-0.05, 0.05, 5), [1.0, 0.5, 0.2])
 
 

@@ -68,7 +68,7 @@ def implausible(
     if everything:
         return _wrong_size(rig, body, points, rigid)
     both = count[points.ids] == 2
-    if both.sum() < min(3, _AGREEING * len(points.ids)):
+    if both.sum() < 3 <= _AGREEING * len(points.ids):
         return (
             f"the images of both cameras contradict each other: {both.sum()} of {len(points.ids)} points agree with one"
             " pose in both; a frozen camera, or images of different moments?"
