@@ -45,11 +45,30 @@ def test_a_slip_of_the_body_is_the_same_at_every_pose_and_a_drift_goes_on():
     np.testing.assert_allclose(later, 2.0 * now, atol=1e-12)
 
 
+def second_order(shift):
+    metres, radians = np.linalg.norm(shift.reshape(2, 3), axis=1)
+    return np.diag(np.repeat([(metres * radians / 2) ** 2, (radians**2 / 2) ** 2], 3))
+
+
+def test_a_large_rotation_is_suspected_with_its_second_order():
+    size = np.array([0.0, 0.0, 0.0, 0.02, -0.01, 0.015])
+    rotated = replace(change("rig"), size=size, cov=1e-14 * np.eye(6))
+    extra = suspected(PoseMeasurement(12.0, T, np.eye(6), np.zeros((6, 6))), [rotated])
+    true = np.linalg.inv(T) @ small(size) @ T  # right tangent by its matrix, to second order
+    missing = true[:3, 3] - rotated.displacement(T, 12.0)[0][:3]
+    assert np.linalg.norm(missing) > 1e-5
+    assert missing @ np.linalg.solve(extra[:3, :3], missing) < 12.0
+    assert (
+        missing @ np.linalg.solve(extra[:3, :3] - second_order(rotated.displacement(T, 12.0)[0])[:3, :3], missing) > 1e3
+    )
+
+
 def test_a_pose_is_widened_by_the_mixture_of_what_cannot_be_distinguished():
     measurement = PoseMeasurement(12.0, T, np.eye(6), np.zeros((6, 6)))
     rig, body = change("rig"), change("body")
     np.testing.assert_allclose(probabilities([rig, body]), 0.5)
-    both = [shift[:, None] * shift + cov for shift, cov in (each.displacement(T, 12.0) for each in (rig, body))]
+    shifts = [each.displacement(T, 12.0) for each in (rig, body)]
+    both = [shift[:, None] * shift + cov + second_order(shift) for shift, cov in shifts]
     np.testing.assert_allclose(suspected(measurement, [rig, body]), np.mean(both, axis=0))
     assert suspected(replace(measurement, t_s=9.0), [rig, body]) is None
     assert suspected(measurement, [change("joint", 2)]) is None
@@ -60,7 +79,8 @@ def test_beside_a_drift_some_of_it_is_suspected_in_every_direction():
     drift = change("drift")
     extra, (shift, cov) = suspected(measurement, [drift]), drift.displacement(T, 18.0)
     sizes = 0.08 * np.repeat([np.linalg.norm(shift[:3]), np.linalg.norm(shift[3:])], 3)
-    np.testing.assert_allclose(extra, np.outer(shift, shift) + cov + np.diag(sizes**2), rtol=1e-12)
+    expected = np.outer(shift, shift) + cov + second_order(shift) + np.diag(sizes**2)
+    np.testing.assert_allclose(extra, expected, rtol=1e-12)
 
 
 def test_what_was_reported_is_not_undone_by_another_change_at_another_time():

@@ -200,10 +200,17 @@ def suspected(measurement: PoseMeasurement, changes: Sequence[Change]) -> Array 
         for each, share in zip(some, probabilities(some) if some else (), strict=True):
             if each.suspect.moves and t_s >= each.begin_s:
                 shift, cov = each.displacement(T, t_s)
+                cov = cov + _second_order(shift)
                 if each.suspect.kind == "drift":
                     cov = cov + _otherwise(shift)
                 extra += share * (np.outer(shift, shift) + cov)
     return extra if extra.any() else None
+
+
+def _second_order(shift: Array) -> Array:
+    """Return the covariance (6, 6) of what a shift (6,) leaves out: it was estimated as if rotations were small."""
+    metres, radians = np.linalg.norm(shift.reshape(2, 3), axis=1).tolist()
+    return np.diag(np.repeat([(0.5 * radians * metres) ** 2, (0.5 * radians**2) ** 2], 3))
 
 
 def _otherwise(shift: Array) -> Array:
