@@ -217,7 +217,7 @@ def text(run: HandEyeAnswer) -> str:
     lines += [f"blunders, left out: {len(out)}", *(f"  {line}" for line in out[:10])] if out else ["no blunders"]
     if run.plan is not None:
         lines += ["", plain_text(plan_table(run.plan, run.recording.names))]
-        if run.found.structure in (*SHARED, SMOOTH):
+        if run.found.structure in SHARED:
             lines.append(
                 f"these sigmas are lower bounds: with {run.found.structure} new poses share errors with the others"
             )

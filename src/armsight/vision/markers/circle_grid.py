@@ -382,7 +382,7 @@ def skips_line(cells: Ids, theta: Array) -> bool:
 
 
 def shown_size(cells: Ids, *, staggered: bool, like: tuple[int, int]) -> tuple[int, int] | None:
-    """Return the columns and rows of the grid that a lattice fills, of the readings that nearest to a board's.
+    """Return the columns and rows of the grid that a lattice fills; of several readings, the one nearest to a board's.
 
     Outer lines that lack more than a tenth of the discs of the next ones (in a staggered grid the next but one) are not of
     the grid.
