@@ -13,11 +13,12 @@ MAY_IMPORT = {
     "geometry": {"kernels"},
     "kernels": set(),
     "firmware": set(),
-    "vision": {"geometry", "kernels"},
-    "robot": {"geometry", "kernels", "firmware"},
-    "sim": {"geometry", "kernels", "vision", "robot"},
-    "loop": {"geometry", "kernels", "vision", "robot"},
-    "app": {"geometry", "kernels", "firmware", "vision", "robot", "sim", "loop"},
+    "tables": {"geometry"},
+    "vision": {"geometry", "kernels", "tables"},
+    "robot": {"geometry", "kernels", "firmware", "tables"},
+    "sim": {"geometry", "kernels", "tables", "vision", "robot"},
+    "loop": {"geometry", "kernels", "tables", "vision", "robot"},
+    "app": {"geometry", "kernels", "firmware", "tables", "vision", "robot", "sim", "loop"},
 }
 #: The ground: what each of these modules may import of armsight.
 GROUND = {"data": {"errors"}, "errors": set(), "files": {"errors"}, "processes": {"errors"}}

@@ -1,6 +1,5 @@
 """Foreign rig files: exact round trips, OpenCV's own projection as the oracle of every import, every damage reported."""
 
-import builtins
 import errno
 import io
 import itertools
@@ -544,25 +543,6 @@ def test_kalibr_cannot_hold_more_than_four_coefficients(tmp_path, model):
     with pytest.raises(InputError, match="radtan holds k1 k2 p1 p2 only"):
         export_rig(ordinary_rig(model), "kalibr", [tmp_path / "camchain.yaml"])
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["ros", "kalibr"])
-def test_without_pyyaml_the_error_says_what_to_install(tmp_path, monkeypatch, name):
-    export_rig(ordinary_rig("brown4"), name, paths(tmp_path, name))
-    real = builtins.__import__
-
-    def absent(module, *args, **kwargs):
-        if module == "yaml":
-            raise ImportError(module)
-        return real(module, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", absent)
-    for act in (
-        lambda: import_rig(name, paths(tmp_path, name)),
-        lambda: export_rig(ordinary_rig("brown4"), name, paths(tmp_path, name)),
-    ):
-        with pytest.raises(InputError, match=r'pip install "armsight\[formats\]"'):
-            act()
 
 
 # --- command line ----------------------------------------------------------------------------------------------------

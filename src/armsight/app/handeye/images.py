@@ -24,6 +24,7 @@ from armsight.files import read_text
 from armsight.geometry.pose import exp_se3, transform
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.handeye import LEVER_M
+from armsight.tables.yaml_file import read_yaml
 from armsight.vision.camera import Camera
 from armsight.vision.camera_file import camera_of
 from armsight.vision.image import grey, read_image
@@ -34,7 +35,7 @@ from armsight.vision.markers.targets import open_target
 from armsight.vision.measure import measure
 from armsight.vision.pnp import body_poses
 from armsight.vision.rig import StereoRig
-from armsight.vision.rigfiles.rigfile import focal_and_centre, load_yaml, need
+from armsight.vision.rigfiles.rigfile import focal_and_centre, need
 from armsight.vision.sources.source import Source
 
 #: Steps of the refinement of a pose, and the change, m and rad, below which it has settled.
@@ -144,7 +145,7 @@ def read_camera(path: Path) -> Camera:
         raise InputError(f"{path}: a camera is a .json, .yaml or .yml file, or fit (from the images themselves)")
     if read_text(path).startswith("%YAML"):
         return _opencv_camera(path)
-    document = dict(load_yaml(path))
+    document = dict(read_yaml(path))
     K = np.asarray(need(need(document, "camera_matrix"), "data"), dtype=float).reshape(3, 3)
     focal_and_centre(K, "camera_matrix")
     distortion = need(need(document, "distortion_coefficients"), "data")

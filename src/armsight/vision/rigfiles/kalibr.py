@@ -14,16 +14,14 @@ import numpy as np
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse
+from armsight.tables.yaml_file import Foreign, dump_yaml, read_yaml
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
-    Foreign,
     ImportOptions,
     count_paths,
-    dump_yaml,
     image_size,
     imported,
-    load_yaml,
     naming,
     need,
     not_held,
@@ -44,7 +42,7 @@ def read(paths: Sequence[Path], options: ImportOptions) -> StereoRig:
     """Read cam0 and cam1 of a camchain."""
     count_paths(paths, (1,), FILES)
     (path,) = paths
-    document = load_yaml(path)
+    document = read_yaml(path)
     with naming(path):
         entries = [need(document, name) for name in ("cam0", "cam1")]
         cameras = [_camera(name, entry, options) for name, entry in zip(("cam0", "cam1"), entries, strict=True)]

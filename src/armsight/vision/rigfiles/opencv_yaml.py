@@ -20,10 +20,10 @@ from armsight.errors import InputError
 from armsight.files import read_text
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse
+from armsight.tables.yaml_file import Foreign
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
-    Foreign,
     ImportOptions,
     brown,
     count_paths,

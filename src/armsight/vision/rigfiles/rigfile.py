@@ -2,7 +2,7 @@
 
 To add a format: write one module with the two functions of :class:`RigFormat`, and add one line to ``FORMATS`` in
 ``__init__.py``. The laws in tests/vision/rigfiles/test_rigfiles.py are parametrised over that registry. What the
-formats share, such as reading YAML, checking matrices and OpenCV's rectification, stands here too.
+formats share, such as checking matrices and OpenCV's rectification, stands here too.
 """
 
 from __future__ import annotations
@@ -11,22 +11,21 @@ import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Protocol
 
 import cv2
 import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import read_text, replacing
+from armsight.files import replacing
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, mean_pose, pose
+from armsight.tables.yaml_file import Foreign
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles import ASSUMED_SIGMA_PX
 
-#: A value of a foreign file: a number, a text, a list or a mapping, unknown until checked.
-Foreign: TypeAlias = Any
 #: OpenCV's alpha (of fisheyes: balance) of every rectification that is written: 0, as ROS's calibrator has it, scales the
 #: rectified images so that all of their pixels are valid; 1 would keep all pixels of the raw images, and black edges.
 ALPHA = 0.0
@@ -79,33 +78,6 @@ def count_paths(paths: Sequence[Path], allowed: Sequence[int], names: str) -> No
     """Check the number of files given."""
     if len(paths) not in allowed:
         raise InputError(f"expected {names}, got {len(paths)} file(s): {', '.join(map(str, paths)) or 'none'}")
-
-
-def load_yaml(path: Path) -> Mapping[str, Foreign]:
-    """Read a YAML file that holds a mapping; PyYAML is imported only here."""
-    try:
-        import yaml
-    except ImportError:
-        raise InputError(f'{path}: reading this format needs PyYAML: pip install "armsight[formats]"') from None
-    try:
-        document = yaml.safe_load(read_text(path))
-    except yaml.MarkedYAMLError as error:
-        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
-        raise InputError(f"{path}: {line}not YAML ({error.problem})") from None
-    except yaml.YAMLError:
-        raise InputError(f"{path}: not YAML") from None
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: expected a YAML mapping of names to values")
-    return document
-
-
-def dump_yaml(document: Mapping[str, Foreign]) -> str:
-    """Return YAML text whose numbers read back exactly."""
-    try:
-        import yaml
-    except ImportError:
-        raise InputError('writing this format needs PyYAML: pip install "armsight[formats]"') from None
-    return str(yaml.safe_dump(dict(document), sort_keys=False, default_flow_style=None, width=120))
 
 
 def write_together(paths: Sequence[Path], texts: Sequence[str]) -> None:

@@ -17,18 +17,16 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse
+from armsight.tables.yaml_file import Foreign, dump_yaml, read_yaml
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
-    Foreign,
     ImportOptions,
     brown,
     count_paths,
-    dump_yaml,
     focal_and_centre,
     image_size,
     imported,
-    load_yaml,
     naming,
     need,
     not_held,
@@ -47,7 +45,7 @@ MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidista
 def read(paths: Sequence[Path], options: ImportOptions) -> StereoRig:
     """Read the left and the right camera_info file, in this order."""
     count_paths(paths, (2,), FILES)
-    return rig_of([load_yaml(path) for path in paths], paths, options)
+    return rig_of([read_yaml(path) for path in paths], paths, options)
 
 
 def rig_of(documents: Sequence[Mapping[str, Foreign]], paths: Sequence[Path], options: ImportOptions) -> StereoRig:

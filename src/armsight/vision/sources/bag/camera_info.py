@@ -10,8 +10,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from armsight.errors import InputError
+from armsight.tables.yaml_file import Foreign
 from armsight.vision.rig import StereoRig
-from armsight.vision.rigfiles.rigfile import Foreign, ImportOptions
+from armsight.vision.rigfiles.rigfile import ImportOptions
 from armsight.vision.rigfiles.ros import rig_of
 from armsight.vision.sources.bag.images import IMAGES, parsed, two_topics
 from armsight.vision.sources.bag.reader import Bag, Decoded

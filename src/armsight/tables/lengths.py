@@ -1,0 +1,86 @@
+"""Whether a length can be one: the unit of a file is its author's, and a wrong one is a factor of 1000 in every result.
+
+In: a length, the unit it was read in, and what it is of. Out: nothing, or an error that names the unit in which it would
+be an ordinary one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from armsight.errors import InputError
+
+#: Units that people write lengths in, m; in the order in which they are tried.
+UNITS_M = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "in": 0.0254}
+
+
+class Usual(NamedTuple):
+    """What a kind of length may be.
+
+    Attributes:
+        what: its name in messages: "baseline".
+        least_m: m.
+        most_m: m.
+    """
+
+    what: str
+    least_m: float
+    most_m: float
+
+
+#: Two cameras that measure together; a stereo endoscope has 4 mm.
+BASELINE = Usual("baseline", 1e-3, 20.0)  # half, double: none of the rigs of docs/measured.md is near either end
+#: The farthest of the positions of an arm's flange, or of a target before cameras.
+REACH = Usual("farthest position", 0.02, 20.0)  # half, double: likewise
+
+
+def fitting_unit(length_m: float, unit_m: float, usual: Usual) -> str | None:
+    """Return the unit in which a length that cannot be one would be ordinary; None where it is, or none makes it so.
+
+    Args:
+        length_m: as it was read, m.
+        unit_m: the unit that it was read in, m.
+        usual: what it is of.
+    """
+    if usual.least_m <= length_m <= usual.most_m:
+        return None
+    return next(
+        (name for name, other_m in UNITS_M.items() if usual.least_m <= length_m / unit_m * other_m <= usual.most_m),
+        None,
+    )
+
+
+def check_length(length_m: float, unit_m: float, usual: Usual, advice: str = "--unit-m {unit_m:g}") -> None:
+    """Reject a length that cannot be one.
+
+    Args:
+        length_m: as it was read, m.
+        unit_m: the unit that it was read in, m.
+        usual: what it is of.
+        advice: the option that names the right unit; ``{unit_m}`` stands for it, m, ``{unit}`` for its name.
+
+    Raises:
+        InputError: what was found, what is expected, and the option that would do.
+    """
+    if usual.least_m <= length_m <= usual.most_m:
+        return
+    unit = fitting_unit(length_m, unit_m, usual)
+    found = f"{usual.what} {metric(length_m)}, with the file's lengths in {_unit_name(unit_m)}"
+    expected = f"expected {metric(usual.least_m)} to {metric(usual.most_m)}"
+    if unit is None:
+        raise InputError(f"{found}; {expected}: is the file damaged, or its unit another one?")
+    other_m = UNITS_M[unit]
+    raise InputError(
+        f"{found}; {expected}. In {unit} it is {metric(length_m / unit_m * other_m)}: "
+        f"give {advice.format(unit_m=other_m, unit=unit)}"
+    )
+
+
+def metric(length_m: float) -> str:
+    """Return a length for people: mm below a metre, else m."""
+    return f"{1e3 * length_m:.4g} mm" if length_m < 1 else f"{length_m:.4g} m"
+
+
+def _unit_name(unit_m: float) -> str:
+    """Return the name of a unit, or its length."""
+    return next((name for name, other_m in UNITS_M.items() if other_m == unit_m), f"units of {unit_m:g} m")
