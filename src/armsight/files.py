@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import csv
 import io
@@ -20,25 +21,39 @@ if TYPE_CHECKING:
 
 
 def read_text(path: str | Path) -> str:
-    """Read a text file, UTF-8, or UTF-16 with its byte-order mark.
+    """Read a text file: UTF-8, UTF-16 with its byte-order mark, or XML in the encoding that it declares.
 
     Raises:
         InputError: missing, unreadable or not text.
     """
     try:
         data = Path(path).read_bytes()
-        # Spreadsheets' "Unicode text" is UTF-16, and says so in its first two bytes.
-        return io.TextIOWrapper(
-            io.BytesIO(data), "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
-        ).read()
+        return io.TextIOWrapper(io.BytesIO(data), _encoding(path, data)).read()
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file; save text as UTF-8, a table as CSV") from None
+    except UnicodeDecodeError as error:
+        how = "save text as UTF-8, a table as CSV" if data[:5] != b"<?xml" else "its declaration says otherwise"
+        raise InputError(f"{path}: not a text file in {error.encoding}; {how}") from None
     except ValueError:  # it holds a NUL
         raise InputError(f"{str(path)!r}: not the name of a file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _encoding(path: str | Path, data: bytes) -> str:
+    """Return the encoding of a text file by its first bytes: its byte-order mark, or XML's declaration."""
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):  # spreadsheets' "Unicode text"
+        return "utf-16"
+    for wide in ("utf-16-le", "utf-16-be"):  # XML without the mark that it should have
+        if data.startswith("<?xml".encode(wide)):
+            return wide
+    declared = re.match(rb"<\?xml[^>]*?encoding\s*=\s*[\"']([\w.:-]+)", data)
+    name = "utf-8" if declared is None else declared[1].decode()
+    try:
+        codecs.lookup(name)
+    except LookupError:
+        raise InputError(f"{path}: line 1: declares encoding {name!r}, which is not known; save it as UTF-8") from None
+    return "utf-8" if name.lower().startswith("utf-16") else name  # its declaration could not be read if it were
 
 
 #: A number as half of the world writes it: 0,25 or -1,5e-3.

@@ -15,7 +15,7 @@ import sys
 import click
 
 from armsight.app.interrupts import terminate_as_interrupt
-from armsight.app.messages import colour, print_error
+from armsight.app.messages import colour, print_error, print_notes
 from armsight.errors import ArmsightError
 
 #: What a person is about -> the commands, each with the first sentence of its help; each has a folder of its name, whose
@@ -112,6 +112,7 @@ def group() -> None:
 def main() -> None:
     """Run the command line and exit: 0 done, 2 a mistake in the input (one line on stderr), 130 Ctrl-C or SIGTERM."""
     terminate_as_interrupt()
+    print_notes()
     try:
         code = group.main(prog_name="armsight", standalone_mode=False, color=colour())
         if sys.stdout is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 import os
 
 import click
@@ -21,6 +22,20 @@ def colour() -> bool | None:
 def print_error(text: str) -> None:
     """Print an error as one line on stderr."""
     click.echo(click.style(f"armsight: error: {text}", fg="red"), err=True, color=colour())
+
+
+class _Notes(logging.Handler):
+    """Prints what the library logs as notes on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one."""
+        click.echo(f"note: {record.getMessage()}", err=True)
+
+
+def print_notes() -> None:
+    """Print what reading an arm logs as notes on stderr."""
+    logger = logging.getLogger("armsight.robot")
+    logger.handlers[:], logger.propagate = [_Notes(logging.WARNING)], False
 
 
 def weak(text: str) -> str:

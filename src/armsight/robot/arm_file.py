@@ -27,6 +27,7 @@ reader passes over them: the board and :func:`~armsight.loop.identify.corrected.
 from __future__ import annotations
 
 import difflib
+import os
 import tomllib
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -67,21 +68,22 @@ _SPEED, _ACCELERATION, _JERK = 1.0, 5.0, 50.0
 _LONGEST = 20.0
 
 
-def open_arm(name_or_path: str | Path, *, tool_link: str | None = None) -> Arm:
+def open_arm(name_or_path: str | Path) -> Arm:
     """Return the arm of a built-in model's name, of a .toml file or of a .urdf file.
 
     Args:
-        name_or_path: such as "six_r", "my_arm.toml" or "my_arm.urdf".
-        tool_link: the link of a .urdf file that is the tool; None: the chain's last.
+        name_or_path: such as "six_r", "my_arm.toml", "my_arm.urdf", or "my_arm.urdf#tool0" where the link tool0 is the
+            tool; without it the chain's last link is.
 
     Raises:
         InputError: the name is unknown, the file is unreadable or holds no arm, or a tool link for what is no .urdf file.
     """
     text = str(name_or_path)
-    if text.lower().endswith((".urdf", ".xml")) or ("/" in text and not text.lower().endswith(".toml")):
-        return read_urdf(text, tool_link=tool_link)
-    if tool_link is not None:
-        raise InputError(f"--tool-link belongs to .urdf files; {text} is none")
+    path, link = split_arm(text)
+    if path.lower().endswith((".urdf", ".xml")) or ("/" in path and not path.lower().endswith(".toml")):
+        return read_urdf(path, tool_link=link)
+    if link is not None:
+        raise InputError(f"--tool-link belongs to .urdf files; {path} is none")
     if text.lower().endswith(".toml"):
         return read_arm_toml(text)
     if text not in MODELS:
@@ -89,6 +91,12 @@ def open_arm(name_or_path: str | Path, *, tool_link: str | None = None) -> Arm:
         meant = f": did you mean {' or '.join(near)}?" if near else ";"
         raise InputError(f"arm {text!r} is unknown{meant} known are {', '.join(MODELS)}, or give a .toml or .urdf file")
     return MODELS[text]
+
+
+def split_arm(name_or_path: str) -> tuple[str, str | None]:
+    """Return the file or name of an arm, and the link that is its tool, or None: "arm.urdf#tool0" has both."""
+    path, mark, link = name_or_path.rpartition("#")
+    return (path, link) if mark and link and not os.path.isfile(name_or_path) else (name_or_path, None)
 
 
 def parsed_toml(path: str | Path) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 Both are one form: ``kinematics:`` with x, y, z, m, and roll, pitch, yaw, rad, for every joint: where its frame stands in
 the frame of the joint before; it rotates about its z axis. UR's joints are called shoulder, upper_arm, forearm and wrist_1
-to wrist_3 (``ur_calibration``, beside a ``hash``), the xArm's joint1 to joint7 (``gen_kinematics_params.py``).
+to wrist_3 (``ur_calibration``, beside a ``hash``), the xArm's joint1 to joint7 (``gen_kinematics_params.py``). UR's
+controller keeps ``calibration.conf``: delta_theta, delta_a, delta_d, delta_alpha, m and rad, are added to the table.
 
 In: such a file and the nominal arm, whose limits, names and tool hold. Out: an :class:`Arm`, exactly, axes that are a
 little
@@ -12,6 +13,7 @@ the nominal table as its axes allow; and how far the two arms put their tools ap
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +29,7 @@ from armsight.geometry.rotation import log_so3
 from armsight.robot.arm import Arm
 from armsight.robot.urdf import ChainLink, arm_rows, check_same, rotation_of
 from armsight.robot.urdf_write import roll_pitch_yaw
+from armsight.tables.yaml_file import read_yaml
 
 #: What Universal Robots call their joints here.
 UR_NAMES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -67,12 +70,14 @@ def read_calibration(path: str | Path, nominal: Arm) -> Arm:
     """Return a single arm as a calibration file has it.
 
     Args:
-        path: the YAML file.
+        path: the YAML or .conf file.
         nominal: the maker's table of this kind of arm.
 
     Raises:
         InputError: unreadable, not of this form or not of this arm; the message names the joint.
     """
+    if Path(path).suffix.lower() == ".conf":
+        return _checked(path, nominal, _with_deltas(path, nominal))
     origins = _origins(path, nominal)
     links = [ChainLink(T, np.array([0.0, 0.0, 1.0])) for T in origins]
     links.append(ChainLink(nominal.T_flange_tool, np.zeros(3)))
@@ -91,6 +96,11 @@ def read_calibration(path: str | Path, nominal: Arm) -> Arm:
         source=f"calibration {Path(path).name}; nominal: {nominal.source}",
     )
     check_same(f"{path}", arm, links)
+    return _checked(path, nominal, arm)
+
+
+def _checked(path: str | Path, nominal: Arm, arm: Arm) -> Arm:
+    """Return an arm if it is about the nominal one."""
     if (far := difference(nominal, arm).mean_m) > _FAR_M:
         raise InputError(
             f"{path}: its tool is {1e3 * far:.0f} mm from that of {nominal.name} on the mean: is it the calibration of "
@@ -99,12 +109,37 @@ def read_calibration(path: str | Path, nominal: Arm) -> Arm:
     return arm
 
 
+def _with_deltas(path: str | Path, nominal: Arm) -> Arm:
+    """Return the nominal arm with what UR's calibration.conf adds to its table, m and rad."""
+    lines = dict(re.findall(r"^\s*(\w+)\s*=\s*\[([^\]]*)\]", read_text(path), re.MULTILINE))
+    if _names(nominal) != UR_NAMES:
+        raise InputError(f"{path}: a .conf is a calibration of Universal Robots; {nominal.name} is none of theirs")
+    added = {}
+    for row, key in {"offset": "theta", "a": "a", "d": "d", "alpha": "alpha"}.items():
+        try:
+            added[row] = np.array([float(cell) for cell in lines[f"delta_{key}"].split(",")])
+        except (KeyError, ValueError):
+            added[row] = np.zeros(0)
+        if added[row].shape != (nominal.joints,) or not np.isfinite(added[row]).all():
+            raise InputError(
+                f"{path}: holds {', '.join(lines) or 'no lists'}; expected delta_{key} = [{nominal.joints} numbers], as in "
+                "UR's calibration.conf"
+            )
+    return replace(
+        nominal,
+        name=f"{nominal.name}_calibrated",
+        source=f"calibration {Path(path).name}; nominal: {nominal.source}",
+        **{row: getattr(nominal, row) + delta for row, delta in added.items()},
+    )
+
+
 def _origins(path: str | Path, nominal: Arm) -> list[Array]:
     """Return where each joint's frame stands in that of the joint before (4, 4)."""
-    document = _yaml(path)
+    document = read_yaml(path)
     kinematics = document.get("kinematics")
     if not isinstance(kinematics, Mapping):
-        raise InputError(f"{path}: no kinematics; a calibration of ur_calibration or of xarm_ros has them")
+        held = ", ".join(map(str, list(document)[:6])) or "nothing"
+        raise InputError(f"{path}: holds {held}; expected kinematics:, as ur_calibration and xarm_ros write them")
     names = _names(nominal)
     missing = [name for name in names if not isinstance(kinematics.get(name), Mapping)]
     if missing:
@@ -132,20 +167,6 @@ def _names(arm: Arm) -> tuple[str, ...]:
         if arm.joint_names[0] == "shoulder_pan" and arm.joints == 6
         else tuple(f"joint{i + 1}" for i in range(arm.joints))
     )
-
-
-def _yaml(path: str | Path) -> Mapping[str, object]:
-    try:
-        import yaml
-    except ImportError:
-        raise InputError(f"{path}: YAML files need PyYAML: pip install 'armsight[formats]'") from None
-    try:
-        document = yaml.safe_load(read_text(path))
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(document, Mapping):
-        raise InputError(f"{path}: not a calibration: a mapping with kinematics is needed")
-    return document
 
 
 def calibration_text(arm: Arm, nominal: Arm) -> tuple[str, float, float]:

@@ -1,7 +1,8 @@
 """Read an arm from URDF, the XML in which ROS describes robots (wiki.ros.org/urdf/XML).
 
-In: a URDF file with four to seven revolute joints in a row, and fixed ones anywhere; an error names any other joint that
-moves.
+In: a URDF file with four to seven rotary joints (revolute or continuous) in a row, and fixed ones anywhere. Joints before
+the arm (a lift, a rail) are held at zero; a gripper's behind it and others beside it (wheels, a head) are left out; both
+are logged.
 Masses and shapes are ignored. Out: an :class:`Arm` with a standard Denavit-Hartenberg table. What is written, and where
 that goes beyond plain URDF, stands in :mod:`armsight.robot.urdf_write`.
 
@@ -13,8 +14,10 @@ axes) is chosen so that gamma and e vanish where they can, which gives a table b
 
 from __future__ import annotations
 
+import logging
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from itertools import dropwhile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,9 +40,17 @@ EXACT = 1e-9
 FAR = 1e6
 #: Random poses at which the table is compared with the chain.
 PROBES = 16
-_MOVING = ("revolute", "continuous", "prismatic", "floating", "planar")
+_ROTARY = ("revolute", "continuous")
+_MOVING = (*_ROTARY, "prismatic", "floating", "planar")
+#: A continuous joint has no limits: here it goes a revolution either way, at this speed where the file gives none, rad/s.
+_REVOLUTION, _SPEED = 2 * np.pi, 1.0
+#: Names that a message lists at most.
+_SHOWN = 6
+#: What ROS calls an arm's flange where a tool is mounted (REP 199).
+_FLANGE = "tool0"
+_LOG = logging.getLogger(__name__)
 #: A last joint of such a name is a gripper's.
-_GRIPPERS = ("grip", "jaw", "finger")
+_GRIPPERS = ("grip", "jaw", "finger", "knuckle", "thumb")
 
 
 class _Joint(NamedTuple):
@@ -51,6 +62,22 @@ class _Joint(NamedTuple):
     child: str
     T_parent_joint: Array
     element: ET.Element
+
+    @property
+    def mimics(self) -> str | None:
+        """The joint that this one follows; None where it moves by itself."""
+        mimic = self.element.find("mimic")
+        return None if mimic is None else mimic.get("joint", "")
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is no fixed one."""
+        return self.kind != "fixed"
+
+    @property
+    def rotary(self) -> bool:
+        """Whether it can be an arm's: it rotates, by itself."""
+        return self.kind in _ROTARY and self.mimics is None
 
 
 def read_urdf(path: str | Path, *, tool_link: str | None = None) -> Arm:
@@ -81,8 +108,7 @@ def parse_urdf(text: str, path: str | Path, *, tool_link: str | None = None) -> 
         raise InputError(f"{path}: holds xacro macros; expand them first: xacro {Path(path).name} > arm.urdf")
     joints = [_joint(path, element) for element in robot.findall("joint")]
     chain = _chain(path, robot, joints, tool_link)
-    revolute = [joint for joint in chain if joint.kind == "revolute"]
-    return _arm(path, robot, chain, revolute)
+    return _arm(path, robot, chain, [joint for joint in chain if joint.rotary])
 
 
 def _joint(path: str | Path, element: ET.Element) -> _Joint:
@@ -143,7 +169,7 @@ def _number(where: str, element: ET.Element, key: str) -> float | None:
 
 
 def _chain(path: str | Path, robot: ET.Element, joints: list[_Joint], tool_link: str | None) -> list[_Joint]:
-    """Return the joints from the base to the tool."""
+    """Return the joints from the base to the tool; what is left out beside them is logged."""
     links = [element.get("name") for element in robot.findall("link")]
     called: dict[str, list[str | None]] = {"links": links, "joints": [joint.name for joint in joints]}
     for kind, names in called.items():
@@ -159,70 +185,148 @@ def _chain(path: str | Path, robot: ET.Element, joints: list[_Joint], tool_link:
                 f"{path}: link {joint.child!r} hangs on two joints, {above[joint.child].name!r} and {joint.name!r}"
             )
         above[joint.child] = joint
-    parents = {joint.parent for joint in joints}
-    ends = {link: list(_up(path, link, above)) for link in above if link not in parents or link == tool_link}
-    if tool_link is not None:
-        return _chain_to(path, ends, tool_link)
-    _reject_others(path, joints)
-    revolute = [joint.name for joint in joints if joint.kind == "revolute"]
-    if not FEWEST_JOINTS <= len(revolute) <= MOST_JOINTS:
-        many = f"{len(revolute)} revolute joints ({', '.join(revolute)})"
+    chains = {link: list(_up(path, link, above))[::-1] for link in above}
+    chain = chains.get(tool_link or _tool(path, joints, chains), [])
+    held = [joint for joint in chain if joint.moves and not joint.rotary]
+    if not _is_arm(chain):
+        why = f" ({_named(held)} before it)" if held else ""
+        there = ", ".join(_tools(joints, chains)[:_SHOWN])
         raise InputError(
-            f"{path}: {many}; an arm here has {FEWEST_JOINTS} to {MOST_JOINTS}: say which link is the tool"
+            f"{path}: link {tool_link!r} is not behind {FEWEST_JOINTS} to {MOST_JOINTS} rotary joints alone{why}; these "
+            f"are: {there or 'none'}"
         )
-    whole = {link: chain for link, chain in ends.items() if _revolute(chain) == len(revolute)}
-    if not whole:
-        raise InputError(
-            f"{path}: the {len(revolute)} revolute joints do not follow one another; only serial arms are read here: say "
-            "which link is the tool"
+    if held:
+        _LOG.warning("%s: joints before the arm are held at zero: %s", path, ", ".join(joint.name for joint in held))
+    beside = [joint.name for joint in joints if joint.moves and joint not in chain]
+    if beside:
+        _LOG.warning(
+            "%s: the tool is %s; joints beside the arm are left out: %s", path, chain[-1].child, ", ".join(beside)
         )
-    if len(whole) > 1:
-        raise InputError(f"{path}: several links end the chain ({', '.join(whole)}); say which one is the tool")
-    chain = next(iter(whole.values()))
-    last = next(joint.name for joint in chain if joint.kind == "revolute")
-    if any(word in last.lower() for word in _GRIPPERS):
-        others = ", ".join(link for link, others in ends.items() if FEWEST_JOINTS <= _revolute(others) < len(revolute))
-        raise InputError(
-            f"{path}: joint {last!r} is a gripper's by its name, not the arm's; say which link is the tool "
-            f"({others or chain[0].child} is there)"
-        )
-    return chain[::-1]
+    return chain
 
 
-def _revolute(chain: list[_Joint]) -> int:
-    """Return how many joints of a chain are revolute."""
-    return sum(joint.kind == "revolute" for joint in chain)
-
-
-def _reject_others(path: str | Path, joints: list[_Joint]) -> None:
-    """Reject joints that move otherwise than an arm's here.
+def _tool(path: str | Path, joints: list[_Joint], chains: dict[str, list[_Joint]]) -> str:
+    """Return the link that is the tool where none is named: the end of the one arm of the tree.
 
     Raises:
-        InputError: there is one; the message names it.
+        InputError: there is no arm, or several, or several links end it; the message names links for --tool-link.
     """
-    unsupported = [j for j in joints if j.kind in _MOVING[1:] or j.element.find("mimic") is not None]
-    if unsupported:
-        named = ", ".join(f"{j.name!r} is {'a mimic' if j.kind == 'revolute' else j.kind}" for j in unsupported)
+    arms = _arms(joints, chains)
+    rotary = [joint.name for joint in joints if joint.rotary]
+    ends = [tip for arm in arms for tip in _tips(arm, joints)]
+    if not arms:
+        others = [joint for joint in joints if joint.moves and not joint.rotary]
+        there = _tools(joints, chains)
+        if there:
+            why = (
+                f"the {len(rotary)} rotary joints do not follow one another; only serial arms are read here: give the link "
+                f"that is the tool, --tool-link {', or '.join(there[:_SHOWN])}"
+            )
+        elif others:
+            why = (
+                f"only arms of {FEWEST_JOINTS} to {MOST_JOINTS} rotary joints are read here; {_named(others[:_SHOWN])}"
+            )
+        else:
+            names = f" ({', '.join(rotary[:_SHOWN])}{', ..' if len(rotary) > _SHOWN else ''})" if rotary else ""
+            why = f"{len(rotary)} rotary joints{names}; an arm here has {FEWEST_JOINTS} to {MOST_JOINTS} in a row"
+        raise InputError(f"{path}: {why}")
+    if len(arms) > 1:
         raise InputError(
-            f"{path}: only arms of {FEWEST_JOINTS} to {MOST_JOINTS} revolute joints are read here; {named}"
+            f"{path}: holds {len(arms)} arms: give the link that is the tool, --tool-link {', or '.join(ends[:_SHOWN])}"
         )
+    last = next(joint for joint in chains[arms[0]][::-1] if joint.rotary)
+    if _gripping(last):
+        before = ", or ".join(_tips(last.parent, joints))
+        raise InputError(
+            f"{path}: joint {last.name!r} is a gripper's by its name, not the arm's: give the link that is the tool, "
+            f"--tool-link {before}, or {', or '.join(ends[:_SHOWN])} if it is the arm's"
+        )
+    behind = {joint.name for chain in chains.values() if arms[0] in {j.child for j in chain} for joint in chain}
+    behind -= {joint.name for joint in chains[arms[0]]} | {joint.mimics for joint in joints}
+    if any(joint.name in behind and joint.rotary and not _gripping(joint) for joint in joints):
+        within = [joint for joint in joints if joint.name in behind and joint.moves and not joint.rotary]
+        raise InputError(
+            f"{path}: only arms of {FEWEST_JOINTS} to {MOST_JOINTS} rotary joints are read here; {_named(within)}: give "
+            f"the link that is the tool, --tool-link {', or '.join(ends[:_SHOWN])}"
+        )
+    if len(ends) == 1:
+        return ends[0]
+    flanges = [link for link in _rigid(arms[0], joints) if link.endswith(_FLANGE)]
+    if len(flanges) == 1:
+        others_ = ", ".join(link for link in ends if link not in flanges)
+        _LOG.warning("%s: the tool is %s; --tool-link names another: %s", path, flanges[0], others_)
+        return flanges[0]
+    raise InputError(
+        f"{path}: several links end the chain: give the one that is the tool, --tool-link {', or '.join(ends[:_SHOWN])}"
+    )
 
 
-def _chain_to(path: str | Path, ends: dict[str, list[_Joint]], tool_link: str) -> list[_Joint]:
-    """Return the joints from the base to the tool; joints beside this chain, such as a gripper's, do not count.
+def _is_arm(chain: list[_Joint]) -> bool:
+    """Return whether a chain has an arm's rotary joints, and none that moves otherwise between or behind them."""
+    moving = list(dropwhile(lambda joint: not joint.rotary and joint.mimics is None, (j for j in chain if j.moves)))
+    return all(joint.rotary for joint in moving) and FEWEST_JOINTS <= len(moving) <= MOST_JOINTS
 
-    Raises:
-        InputError: there is no such link, or too few or too many joints before it.
+
+def _tools(joints: list[_Joint], chains: dict[str, list[_Joint]]) -> list[str]:
+    """Return the links that end an arm, those behind most joints first."""
+    ends = [link for link, chain in chains.items() if _is_arm(chain) and link in _tips(link, joints)]
+    return sorted(ends, key=lambda link: -sum(joint.rotary for joint in chains[link]))
+
+
+def _gripping(joint: _Joint) -> bool:
+    """Return whether a joint is a gripper's by its name."""
+    return any(word in joint.name.lower() for word in _GRIPPERS)
+
+
+def _named(joints: list[_Joint]) -> str:
+    """Return joints and how they move, as text."""
+    return ", ".join(f"{j.name!r} is {'a mimic' if j.kind in _ROTARY else j.kind}" for j in joints)
+
+
+def _rigid(link: str, joints: list[_Joint]) -> list[str]:
+    """Return a link and those that fixed joints hang on it."""
+    body = [link]
+    for one in body:
+        body += [joint.child for joint in joints if joint.parent == one and not joint.moves]
+    return body
+
+
+def _tips(link: str, joints: list[_Joint]) -> list[str]:
+    """Return the links that end the rigid body that begins with a link."""
+    body = _rigid(link, joints)
+    return [one for one in body if not any(joint.parent == one and joint.child in body for joint in joints)]
+
+
+def _arms(joints: list[_Joint], chains: dict[str, list[_Joint]]) -> list[str]:
+    """Return the first link behind the last joint of every arm of a tree.
+
+    Behind FEWEST_JOINTS rotary joints several on one body that are called fingers are a hand's, and one that a mimic joint
+    behind that body follows drives a gripper. An arm that forks otherwise is none.
     """
-    chain = ends.get(tool_link, [])
-    if not FEWEST_JOINTS <= _revolute(chain) <= MOST_JOINTS:
-        whole = [link for link, others in ends.items() if FEWEST_JOINTS <= _revolute(others) <= MOST_JOINTS]
-        raise InputError(
-            f"{path}: link {tool_link!r} is not behind {FEWEST_JOINTS} to {MOST_JOINTS} revolute joints; these are: "
-            f"{', '.join(whole) or 'none'}"
-        )
-    _reject_others(path, chain)
-    return chain[::-1]
+    followed = {joint.mimics: joint for joint in joints if joint.mimics}
+    roots = {joint.parent for joint in joints} - {joint.child for joint in joints}
+    found: list[str] = []
+
+    def walk(link: str, count: int) -> None:
+        body = _rigid(link, joints)
+        out = [joint for joint in joints if joint.parent in body and joint.moves]
+        rotary = [joint for joint in out if joint.rotary]
+        if count >= FEWEST_JOINTS:
+            behind = {joint.name for chain in chains.values() if {*body} & {j.parent for j in chain} for joint in chain}
+            rotary = [
+                joint for joint in rotary if joint.name not in followed or followed[joint.name].name not in behind
+            ]
+            if len(rotary) > 1 and all(_gripping(joint) for joint in rotary):
+                rotary = []
+        if not rotary and FEWEST_JOINTS <= count <= MOST_JOINTS:
+            found.append(link)
+        elif not count or len(rotary) == 1:
+            for joint in rotary if count else [joint for joint in out if joint.mimics is None]:
+                walk(joint.child, count + joint.rotary)
+
+    for root in sorted(roots):
+        walk(root, 0)
+    return found
 
 
 def _up(path: str | Path, link: str, above: dict[str, _Joint]) -> Iterator[_Joint]:
@@ -240,7 +344,7 @@ def _arm(path: str | Path, robot: ET.Element, chain: list[_Joint], revolute: lis
     """Return the arm of a chain of joints from the base to the tool."""
     links = [ChainLink(np.eye(4), np.zeros(3))]
     for joint in chain:
-        if joint.kind == "revolute":
+        if joint.rotary:
             axis = _vector(f"{path}: joint {joint.name!r}", joint.element.find("axis"), "xyz", "1 0 0")
             length = float(np.linalg.norm(axis))
             if length == 0:
@@ -303,6 +407,9 @@ def _written(where: str, element: ET.Element, key: str, count: int) -> Array:
 def _limits(where: str, element: ET.Element) -> tuple[float, float, float, float, float]:
     """Read lower, upper, speed, acceleration and jerk of a joint."""
     limit = element.find("limit")
+    if element.get("type") == "continuous":
+        speed = (None if limit is None else _number(where, limit, "velocity")) or _SPEED
+        return -_REVOLUTION, _REVOLUTION, speed, speed / TO_SPEED_S, speed / TO_SPEED_S / TO_ACCELERATION_S
     if limit is None:
         raise InputError(f"{where}: no <limit>; a revolute joint needs lower, upper and velocity")
     low, high = (_number(where, limit, key) or 0.0 for key in ("lower", "upper"))

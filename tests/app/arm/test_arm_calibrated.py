@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,3 +42,24 @@ def test_mistakes_are_one_line_and_nothing_is_written(armsight, tmp_path):
     assert said.code == 2
     assert "joint1 is missing; xarm7 has joint1" in said.err
     assert not out.exists()
+
+
+def test_a_number_with_an_exponent_and_without_a_point_is_one(armsight, tmp_path):
+    data = Path(__file__).parents[2] / "robot" / "data"
+    said = armsight("arm", "calibrated", "ur5", data / "my_ur5.yaml")
+    assert "ur5_calibrated puts its tool 1.061 mm from ur5 on the mean, 2.192 mm at most" in said.out
+    (tmp_path / "plain.yaml").write_text((data / "my_ur5.yaml").read_text().replace("-1e-05", "-0.00001"))
+    assert armsight("arm", "calibrated", "ur5", tmp_path / "plain.yaml").out == said.out
+
+
+def test_the_controllers_own_file_of_a_real_ur3(armsight, tmp_path):
+    """As its owner posted it (MyRobotLab/pyrobotlab issue 145): axes a little off parallel, normals 12 to 30 m away."""
+    path = Path(__file__).parents[2] / "robot" / "data" / "ur3_calibration.conf"
+    said = armsight("arm", "calibrated", "ur3", path)
+    assert "ur3_calibrated puts its tool 0.988 mm from ur3 on the mean, 2.767 mm at most" in said.out
+    assert "is it the calibration of another kind of arm" in armsight("arm", "calibrated", "ur5", path).err
+    assert "six_r is none of theirs" in armsight("arm", "calibrated", "six_r", path).err
+    (tmp_path / "cut.conf").write_text(path.read_text().replace("delta_d", "delta_x"))
+    said = armsight("arm", "calibrated", "ur3", tmp_path / "cut.conf")
+    assert "holds delta_theta, delta_a, delta_x" in said.err
+    assert "expected delta_d = [6 numbers]" in said.err

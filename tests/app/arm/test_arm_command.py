@@ -2,12 +2,14 @@
 
 import struct
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_euler_zyx
+from armsight.robot.arm_file import split_arm
 from armsight.robot.models import MODELS
 from armsight.robot.reach import reach
 from armsight.robot.urdf_write import write_urdf
@@ -262,3 +264,15 @@ def test_readings_of_an_identified_arm_are_corrected(armsight, tmp_path):
     )
     assert "curves" in said.err
     assert armsight("arm", "show", path).code == 0
+
+
+def test_a_link_that_is_named_counts_everywhere(armsight):
+    path = Path(__file__).parents[2] / "robot" / "data" / "fingers.urdf"
+    said = armsight("identify", "plan", "--arm", path, "--tool-link", "nothing", "-n", "1")
+    assert said.code == 2
+    assert "link 'nothing' is not behind 4 to 7 rotary joints alone; these are: tool0, camera_link" in said.err
+    said = armsight("arm", "fk", path, "--tool-link", "camera_link", "0", "0", "0", "0", "0")
+    assert said.code == 0
+    assert "note: " in said.err
+    assert split_arm("a.urdf#b") == ("a.urdf", "b")
+    assert split_arm("a.urdf") == ("a.urdf", None)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
+from armsight.app.arm_option import arm_option
 from armsight.errors import InputError
 from armsight.files import check_suffix, check_writable, read_text, write_text
 
@@ -23,12 +23,14 @@ _JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON obj
 _POSE = ("x", "y", "z", "euler_z", "euler_y", "euler_x")
 
 
-def _arm_argument(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command the argument ARM and the option that belongs to URDF files."""
-    link = click.option(
-        "--tool-link", metavar="LINK", help="The tool's link in a .urdf file where several end the chain."
-    )
-    return click.argument("arm_name", metavar="ARM")(link(command))
+_ARM = arm_option("arm_name", metavar="ARM")
+
+
+def _file(arm: str) -> str:
+    """Return the file, or name, of an arm."""
+    from armsight.robot.arm_file import split_arm
+
+    return split_arm(arm)[0]
 
 
 @click.group("arm")
@@ -50,30 +52,30 @@ def list_(as_json: bool) -> None:
 
 
 @command.command()
-@_arm_argument
+@_ARM
 @click.option("-o", "--output", metavar="ARM.png", type=click.Path(path_type=Path), help="Draw the arm at home.")
 @_JSON
-def show(arm_name: str, tool_link: str | None, output: Path | None, as_json: bool) -> None:
+def show(arm_name: str, output: Path | None, as_json: bool) -> None:
     """Print an arm's table, limits and reach."""
     if output is not None:
         check_suffix(output, ".png", "a figure of the arm")
-        check_writable(output, apart_from=(arm_name,))
+        check_writable(output, apart_from=(_file(arm_name),))
 
     from armsight.app.arm import description
     from armsight.app.arm.figure import write_arm_figure
     from armsight.robot.arm_file import open_arm
 
-    arm = open_arm(arm_name, tool_link=tool_link)
+    arm = open_arm(arm_name)
     if output is not None:
         write_arm_figure(arm, output)
     click.echo(json.dumps(description.show_json(arm)) if as_json else description.show_text(arm))
 
 
 @command.command(context_settings=_NUMBERS)
-@_arm_argument
+@_ARM
 @click.argument("angles", nargs=-1, metavar="Q1 Q2 ...")
 @_JSON
-def fk(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: bool) -> None:
+def fk(arm_name: str, angles: tuple[str, ...], as_json: bool) -> None:
     """Print the pose of the tool at joint angles, in degrees.
 
     Of a corrected.toml the angles are readings: curves of the sensors and compliance are corrected, too.
@@ -82,7 +84,7 @@ def fk(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: b
     from armsight.loop.identify.corrected import is_corrected, open_corrected
     from armsight.robot.arm_file import open_arm
 
-    arm = open_arm(arm_name, tool_link=tool_link)
+    arm = open_arm(arm_name)
     q = _joints(arm, angles)
     T = arm.forward(q)
     if is_corrected(arm_name):
@@ -97,24 +99,24 @@ def fk(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: b
 
 
 @command.command(context_settings=_NUMBERS)
-@_arm_argument
+@_ARM
 @click.argument("angles", nargs=-1, metavar="Q1 Q2 ...")
 @_JSON
-def jacobian(arm_name: str, tool_link: str | None, angles: tuple[str, ...], as_json: bool) -> None:
+def jacobian(arm_name: str, angles: tuple[str, ...], as_json: bool) -> None:
     """Print the Jacobian of the tool's point in base axes at joint angles, in degrees."""
     from armsight.app.arm import description
     from armsight.robot.arm_file import open_arm
 
-    arm = open_arm(arm_name, tool_link=tool_link)
+    arm = open_arm(arm_name)
     q = _joints(arm, angles)
     click.echo(json.dumps(description.jacobian_json(arm, q)) if as_json else description.jacobian_text(arm, q))
 
 
 @command.command(context_settings=_NUMBERS)
-@_arm_argument
+@_ARM
 @click.argument("numbers", nargs=-1, metavar="X Y Z EULER_Z EULER_Y EULER_X")
 @_JSON
-def ik(arm_name: str, tool_link: str | None, numbers: tuple[str, ...], as_json: bool) -> int:
+def ik(arm_name: str, numbers: tuple[str, ...], as_json: bool) -> int:
     """Print every set of joint angles that brings the tool to a pose: x y z in mm, Euler angles in degrees.
 
     The rotation is Rz(euler_z) Ry(euler_y) Rx(euler_x); ROS calls euler_x roll. Exit code 1 where no joint angles within
@@ -127,7 +129,7 @@ def ik(arm_name: str, tool_link: str | None, numbers: tuple[str, ...], as_json: 
     from armsight.geometry.rotation import from_euler_zyx
     from armsight.robot.arm_file import open_arm
 
-    arm = open_arm(arm_name, tool_link=tool_link)
+    arm = open_arm(arm_name)
     if len(_no_options(numbers)) != len(_POSE):
         raise InputError(f"a pose is six numbers, {' '.join(_POSE)} (mm, degrees); {len(numbers)} were given")
     x, y, z, *euler = (_number(text, name) for text, name in zip(numbers, _POSE, strict=True))
@@ -139,26 +141,26 @@ def ik(arm_name: str, tool_link: str | None, numbers: tuple[str, ...], as_json: 
 
 
 @command.command()
-@_arm_argument
+@_ARM
 @click.option(
     "-o", "--output", required=True, metavar="ARM.urdf", type=click.Path(path_type=Path), help="The file to write."
 )
 @_JSON
-def urdf(arm_name: str, tool_link: str | None, output: Path, as_json: bool) -> None:
+def urdf(arm_name: str, output: Path, as_json: bool) -> None:
     """Write an arm as a URDF file."""
     check_suffix(output, ".urdf", "an arm")
-    check_writable(output, apart_from=(arm_name,))
+    check_writable(output, apart_from=(_file(arm_name),))
 
     from armsight.robot.arm_file import open_arm
     from armsight.robot.urdf_write import write_urdf
 
-    arm = open_arm(arm_name, tool_link=tool_link)
+    arm = open_arm(arm_name)
     write_urdf(arm, output)
     click.echo(json.dumps({"arm": arm.name, "output": str(output)}) if as_json else str(output))
 
 
 @command.command()
-@_arm_argument
+@_ARM
 @click.argument("file", metavar="FILE")
 @click.option(
     "-o",
@@ -169,11 +171,11 @@ def urdf(arm_name: str, tool_link: str | None, output: Path, as_json: bool) -> N
 )
 @click.option("--yes", is_flag=True, help="Do not ask before OUT is replaced.")
 @_JSON
-def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | None, yes: bool, as_json: bool) -> None:
+def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json: bool) -> None:
     """Print how far a single arm's calibrated table puts the tool from that of its kind, ARM; convert it.
 
-    FILE is the calibration of a Universal Robots arm or of an xArm (.yaml), a corrected.toml of `armsight identify`, or
-    another arm's file.
+    FILE is the calibration of a Universal Robots arm (.yaml, or its controller's calibration.conf) or of an xArm (.yaml),
+    a corrected.toml of `armsight identify`, or another arm's file.
     """
     from armsight.app.arm import description
     from armsight.robot.arm_file import open_arm
@@ -183,10 +185,10 @@ def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | N
     if output is not None:
         if output.suffix not in (".urdf", ".yaml"):
             raise InputError(f"{output}: an arm is written as .urdf or .yaml")
-        check_writable(output, apart_from=(arm_name, file))
-    nominal = open_arm(arm_name, tool_link=tool_link)
-    yaml = file.lower().endswith((".yaml", ".yml"))
-    arm = read_calibration(file, nominal) if yaml else open_arm(file)
+        check_writable(output, apart_from=(_file(arm_name), file))
+    nominal = open_arm(arm_name)
+    kept = file.lower().endswith((".yaml", ".yml", ".conf"))
+    arm = read_calibration(file, nominal) if kept else open_arm(file)
     left = (0.0, 0.0)
     if output is not None and output.exists():
         _keep(output, yes)
@@ -206,7 +208,7 @@ def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | N
 
 
 @command.command()
-@_arm_argument
+@_ARM
 @click.option(
     "--around",
     required=True,
@@ -227,7 +229,6 @@ def calibrated(arm_name: str, tool_link: str | None, file: str, output: Path | N
 @_JSON
 def plan(
     arm_name: str,
-    tool_link: str | None,
     around: Path,
     poses: int,
     cycles: int,
@@ -240,13 +241,13 @@ def plan(
     Poses all over where the body is seen, each from both sides of every joint, and five of them again and again.
     """
     check_suffix(output, ".toml", "a plan of motions")
-    check_writable(output, apart_from=(arm_name, around))
+    check_writable(output, apart_from=(_file(arm_name), around))
 
     from armsight.app.arm.evaluate import plan_report, seen_angles
     from armsight.app.check.plan import seen_by
     from armsight.robot.arm_file import open_arm
 
-    arm = open_arm(arm_name, tool_link=tool_link)
+    arm = open_arm(arm_name)
     q = seen_angles(around, arm)
     write_text(output, plan_report(arm, q, seen_by(around), poses=poses, cycles=cycles, seed=seed))
     answer = {"arm": arm.name, "poses": poses, "cycles": cycles, "output": str(output)}
@@ -255,7 +256,7 @@ def plan(
 
 @command.command()
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
-@click.option("--arm", "arm_name", metavar="ARM", help="The nominal arm; by default the one that the run names.")
+@arm_option("--arm", "arm_name", metavar="ARM", help="The nominal arm; by default the one that the run names.")
 @click.option(
     "--compare", multiple=True, metavar="FILE.json", type=click.Path(path_type=Path), help="Another arm's report.json."
 )

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
+from armsight.app.arm_option import arm_option
 from armsight.app.board.config import config_group
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
 from armsight.app.messages import UNTRUSTED
@@ -416,7 +417,7 @@ def release(name: str, baud: int | None, as_json: bool) -> None:
 @click.option(
     "--identified", metavar="ARM", help="Correct by what `armsight identify` found; with --arm, the arm it began with."
 )
-@click.option("--arm", "nominal", metavar="ARM", help="The nominal arm of --identified.")
+@arm_option("--arm", "nominal", metavar="ARM", help="The nominal arm of --identified.")
 @click.option(
     "--further", metavar="DEG,...", help="Correct by these: true angle less reported one of each joint, degrees."
 )

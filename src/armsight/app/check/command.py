@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from armsight.app.arm_option import arm_option
 from armsight.app.check import CYCLES
 from armsight.errors import InputError
 from armsight.files import check_folder, check_writable, write_text
@@ -131,7 +132,7 @@ def evaluated(
 
 
 @command.command("plan")
-@click.option(
+@arm_option(
     "--arm", "arm_name", required=True, metavar="ARM", help="The arm: a name (armsight arm list), a .toml or a .urdf."
 )
 @click.option(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from armsight.app.arm_option import arm_option
 from armsight.app.messages import UNTRUSTED, require
 
 
@@ -53,7 +54,7 @@ from armsight.app.messages import UNTRUSTED, require
     type=click.Choice(["parallel", "verging"]),
     help="Layout of the cameras.",
 )
-@click.option(
+@arm_option(
     "--nominal-arm",
     metavar="FILE",
     help="The arm model to compute with, such as corrected.toml of armsight identify; by default the nominal table.",

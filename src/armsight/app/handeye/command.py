@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
+from armsight.app.arm_option import arm_option
 from armsight.app.messages import UNTRUSTED
 from armsight.errors import InputError
 
@@ -68,7 +69,7 @@ class Options:
     type=click.Choice(["in-hand", "to-hand"]),
     help="Does the arm carry the camera, or the target?",
 )
-@click.option("--model", metavar="ARM", help="The arm whose joints the table has: a name, a .toml or a .urdf file.")
+@arm_option("--model", metavar="ARM", help="The arm whose joints the table has: a name, a .toml or a .urdf file.")
 @click.option(
     "--rotation",
     metavar="CONVENTION",

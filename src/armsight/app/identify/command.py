@@ -9,13 +9,14 @@ from pathlib import Path
 
 import click
 
+from armsight.app.arm_option import arm_option
 from armsight.errors import InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.identify import ROTATIONS
 
 
 @click.group("identify", invoke_without_command=True)
-@click.option(
+@arm_option(
     "--arm",
     "arm_name",
     metavar="ARM",
@@ -89,14 +90,14 @@ def command(
     )
     from armsight.app.progress import steps
     from armsight.app.report.plotting import require_matplotlib
-    from armsight.robot.arm_file import open_arm
+    from armsight.robot.arm_file import open_arm, split_arm
 
     arm = open_arm(arm_name)
     if output is not None:
         require_matplotlib()
     started = time.perf_counter()
     with (
-        nullcontext() if output is None else results_in(output, (data, joints, other, Path(arm_name))),
+        nullcontext() if output is None else results_in(output, (data, joints, other, Path(split_arm(arm_name)[0]))),
         steps() as progress,
     ):
         progress("reading")
@@ -132,9 +133,7 @@ def command(
 
 
 @command.command()
-@click.option(
-    "--arm", "arm_name", required=True, metavar="ARM", help="The nominal arm: a name, a .toml or a .urdf file."
-)
+@arm_option("--arm", "arm_name", required=True, metavar="ARM", help="The nominal arm: a name, a .toml or a .urdf file.")
 @click.option("--data", metavar="DONE.csv", type=click.Path(path_type=Path), help="Poses that were measured already.")
 @click.option("--rig", metavar="RIG.json", type=click.Path(path_type=Path), help="The cameras that must see the poses.")
 @click.option(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from armsight.app.arm_option import arm_option
 from armsight.errors import InputError
 
 _HERE = ("127.0.0.1", "localhost", "::1")
@@ -26,7 +27,7 @@ _HERE = ("127.0.0.1", "localhost", "::1")
 @click.option(
     "--calibration", type=click.Path(path_type=Path), help="LeRobot's calibration file of the servo bus, with feetech:."
 )
-@click.option(
+@arm_option(
     "--arm", default="six_r", show_default=True, help="The arm: a name (armsight arm list), a .toml or a .urdf file."
 )
 @click.option("--motion", type=click.Path(path_type=Path), help="The motions (TOML, docs/howto/run.md).")

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import click
 
+from armsight.app.arm_option import arm_option
+
 #: Reasons of missed shots that are printed, the most frequent ones.
 _REASONS = 3
 
@@ -18,7 +20,7 @@ _REASONS = 3
 @click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Write the tables to this folder.")
 @click.option("--rig", metavar="RIG.json", help="Another rig: needs images or tags in the recording.")
 @click.option("--target", metavar="SPEC|BODY", help="Another body: needs images or tags in the recording.")
-@click.option("--arm", metavar="ARM", help="Another arm model.")
+@arm_option("--arm", metavar="ARM", help="Another arm model.")
 @click.option("--estimator", type=click.Choice(["kalman", "latest"]), default="kalman", show_default=True)
 @click.option(
     "--rate", type=click.FloatRange(min=0), default=0.0, help="1 is real time; by default as fast as possible."

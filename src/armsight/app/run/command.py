@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from armsight.app.arm_option import arm_option
 from armsight.app.messages import UNTRUSTED, require
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
@@ -79,7 +80,7 @@ class RunPlan:
     metavar="BODY",
     help="A body in view that does not move; may be repeated. It shows cameras that move.",
 )
-@click.option(
+@arm_option(
     "--arm",
     "arm_spec",
     default="six_r",
