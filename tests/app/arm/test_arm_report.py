@@ -1,13 +1,18 @@
 """``armsight arm plan`` and ``arm report``: injected zeros, droop and drift are found, parts sum up, mistakes are named."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from armsight.app.arm import evaluate
+from armsight.app.arm import report as arm_report
 from armsight.app.arm.evaluate import evaluate_arm, least_squares, plan_report
+from armsight.app.arm.report import write_report
+from armsight.app.check.evaluate import evaluate as evaluate_check
+from armsight.app.check.run_folder import attained_in
 from armsight.app.run.folder import joint_columns
 from armsight.app.run.motion_file import read_motions
 from armsight.app.run.record import ToolTrack, write_columns, write_track
@@ -18,6 +23,7 @@ from armsight.loop.identify.model import gravity_levers
 from armsight.robot.arm_file import open_arm
 from armsight.sim.workcell.arm import Imperfections, sample_arm
 from cli_runs import assert_rejected
+from cli_runs import run as cli_run
 
 ARM = open_arm("so101")
 ZERO_DEG, DROOP_DEG_PER_M, DRIFT_MM_PER_H = np.array([0.0, 0.8, -1.1, 0.6, 0.0]), 8.0, 8.0
@@ -61,10 +67,10 @@ def report(run):
     return evaluate_arm(run, ARM)
 
 
-def test_zeros_droop_and_drift_are_found_within_three_sigma(report):
+def test_zeros_droop_and_drift_are_found_within_three_sigma(run, report):
     for k in (1, 2, 3):
         value, sigma = report.joints[k].zero_deg
-        assert abs(value - ZERO_DEG[k]) < 3 * sigma < 0.2
+        assert abs(value - ZERO_DEG[k]) < 3 * sigma < 0.3
         slope, sigma = report.joints[k].droop_deg_per_m
         assert (
             abs(slope - DROOP_DEG_PER_M) < 3 * sigma + 0.01 * DROOP_DEG_PER_M
@@ -72,6 +78,9 @@ def test_zeros_droop_and_drift_are_found_within_three_sigma(report):
     rate, sigma = report.drift_mm_per_h
     assert abs(rate - DRIFT_MM_PER_H) < 3 * sigma < DRIFT_MM_PER_H
     assert report.cycles >= 6
+    RP = [1e3 * p.repeatability.raw for p in evaluate_check(attained_in(run, closed=False)).poses.values()]
+    assert len(RP) == 5
+    assert report.one_side_mm == pytest.approx(np.mean(RP), rel=0.05)  # as armsight check has it, less vision's noise
     assert report.one_side_mm < 0.2
     assert report.both_sides_mm[1] < 0.2
     assert report.latency_s < 0.02
@@ -150,3 +159,25 @@ def test_mistakes_are_one_line(armsight, run, tmp_path):
     plan = ("arm", "plan", "so101", "--around", tmp_path, "-o", tmp_path / "plan.toml")
     assert_rejected(armsight(*plan), "handeye_poses.csv")
     assert not (tmp_path / "plan.toml").exists()
+
+
+@pytest.mark.parametrize("joints", [4, 5, 6, 7])
+def test_every_joint_of_any_arm_has_its_figure(joints, report, tmp_path):
+    several = replace(
+        report,
+        joints=(2 * report.joints)[:joints],
+        lever=np.tile(report.lever, 2)[:, :joints],
+        lag=np.tile(report.lag, 2)[:, :joints],
+    )
+    write_report(several, {}, tmp_path)
+    assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
+    assert len(arm_report._figure(several, "joints").axes) == joints
+
+
+def test_what_was_found_is_printed_and_stored_though_it_cannot_be_drawn(run, report, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(evaluate, "evaluate_arm", lambda folder, arm, *, progress: report)
+    monkeypatch.setattr(arm_report, "_figures_page", lambda report: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        cli_run("arm", "report", run, "-o", tmp_path / "out")
+    assert "What the arm does" in capsys.readouterr().out
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["kind"] == "arm report"

@@ -10,7 +10,7 @@ import pytest
 from armsight.app.check.evaluate import evaluate, read_check
 from armsight.app.check.report import paths_figure
 from armsight.app.check.rows import read_rows
-from armsight.app.check.run_folder import _reversal_times, attained_in, is_run, reversals_of, segments_of
+from armsight.app.check.run_folder import _reversal_times, attained_in, is_run, joint_track, reversals_of, segments_of
 from cli_runs import Said, assert_rejected, run
 
 NOISE_M, COMMON_M, ARM_M = 4e-5, 2e-4, 1e-4
@@ -376,7 +376,7 @@ def test_a_folder_of_version_1_is_read_as_version_1_read_it():
     attained = attained_in(VERSION_1, closed=False)
     assert [(row.pose, row.cycle, row.approach, row.t_s) for row in attained.rows] == [
         ("line", "1", "pose 1", 26.641),
-        ("line", "2", "line", 30.341),
+        ("line", "2", "sides -++-+-", 30.341),
         ("pose 1", "1", "the start", 24.641),
     ]
     expected = [  # as version 1 computed them from this folder
@@ -390,10 +390,43 @@ def test_a_folder_of_version_1_is_read_as_version_1_read_it():
 
 def test_the_joints_of_version_1_are_read_as_version_1_read_them():
     circle = [segment for segment in segments_of(VERSION_1, False) if segment.kind == "circle"]
-    reversals = reversals_of(VERSION_1, circle)
+    reversals = reversals_of(joint_track(VERSION_1), circle)
     assert [reversal.joints for reversal in reversals] == [(1, 5), (3,), (2, 4), (1, 5, 6), (3, 4), (2,)]
     np.testing.assert_allclose(reversals[0].p, [0.52770854, -0.14471832, 0.46398389], atol=5e-9)
 
 
 def test_check_says_of_a_folder_of_version_1_what_it_holds(capsys):
     assert_rejected(said(capsys, VERSION_1), "2 poses, none attained 3 times", "line, seen in 0 shots")
+
+
+@pytest.mark.parametrize("joints", [True, False])
+def test_a_visit_through_a_waypoint_without_rest_is_of_its_own_approach(joints, tmp_path, capsys):
+    made, q = Folder(tmp_path), []
+    made.rng = np.random.default_rng(2)
+    at = {"P1": 0.0, "P2": 0.5, "aside": -0.2}  # a joint's angle, whose backlash moves the tool by 2 mm
+
+    def go(name, frm, to, rest):
+        path = np.array([0.5, 0.0, 0.4]) + np.linspace(at[frm], at[to], 40)[:, None] * np.array([0.2, 0.1, 0.0])
+        off = np.repeat([[1e-3 * np.sign(at[to] - at[frm]), 0, 0]], 40, axis=0)
+        begun = len(made.reference)
+        made.motions.append(("joints", name))
+        made.segment("open_loop", name, path, off)
+        if rest:
+            made.segment("rest", name, np.repeat(path[-1:], 50, axis=0), np.repeat(off[-1:], 50, axis=0))
+        angle = np.append(np.linspace(at[frm], at[to], 40), np.full(50 * rest, at[to]))
+        q.extend([row[0], angle[k], 0.0] for k, row in enumerate(made.reference[begun:]))
+
+    for cycle in range(6):
+        go(f"P2 cycle {cycle}", "P1", "P2", rest=True)
+        if cycle == 3:
+            go("aside", "P2", "aside", rest=False)
+            go("P1 from the other side", "aside", "P1", rest=True)
+        else:
+            go(f"P1 cycle {cycle}", "P2", "P1", rest=True)
+    made.write()
+    if joints:
+        np.savetxt(tmp_path / "joints.csv", q, "%.6f", ",", header="t_s,q1_ref_rad,q2_ref_rad", comments="")
+    (found,) = said(capsys, tmp_path, "--json").lines
+    assert found["poses"]["P1"]["RP_m"]["raw"] < 1e-4  # three times the noise; 2 mm with both sides
+    came = "sides +0" if joints else "aside"
+    assert f"left out: P1 approached from {came}, too seldom (1)" in found["notes"]

@@ -4,6 +4,7 @@ import csv
 from dataclasses import replace
 
 import numpy as np
+from worn_arm import poses
 
 from armsight.robot.arm_file import open_arm
 
@@ -13,7 +14,7 @@ SECOND, THIRD = np.eye(6)[1], np.eye(6)[2]
 def arm_toml(path, arm):
     """Write an arm as a data sheet would have it."""
     lines = [f'name = "{arm.name}"', f'convention = "{arm.convention}"']
-    for i in range(6):
+    for i in range(arm.joints):
         lines += ["[[joint]]", f"a_mm = {float(1e3 * arm.a[i])!r}"]
         lines += [f"d_m = {float(arm.d[i])!r}", f"alpha_deg = {float(np.degrees(arm.alpha[i]))!r}"]
         lines += [f"offset_rad = {float(arm.offset[i])!r}"]
@@ -38,4 +39,13 @@ def poses_csv(path, n=40, seed=0, gaps=()):
             if k in gaps:
                 row[6] = "nan"
             writer.writerow(row)
+    return path
+
+
+def tracked_csv(path, worn, n, rng):
+    """Write what a worn arm's joints read at n poses, and where a tracker saw a point of its tool."""
+    q, approach = poses(worn.nominal, n, rng)
+    p = (worn.T_rig_body(q, approach) @ [0.03, 0.02, 0.05, 1.0])[:, :3] + rng.normal(0, 3e-5, (n, 3))
+    names = [*(f"q{i + 1}_rad" for i in range(q.shape[1])), *(f"p1_{axis}_m" for axis in "xyz")]
+    np.savetxt(path, np.column_stack([q, p]), "%.9f", ",", header=",".join(names), comments="")
     return path

@@ -11,8 +11,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from identify_files import arm_toml, poses_csv
+from arms import FOUR
+from identify_files import arm_toml, poses_csv, tracked_csv
 from scipy.spatial.transform import Rotation
+from worn_arm import worn
 
 from armsight.app.identify.run import headline, read_measured
 from armsight.errors import InputError
@@ -23,6 +25,7 @@ from armsight.loop.identify.model import Model
 from armsight.loop.identify.read import read_poses
 from armsight.loop.identify.validate import Errors, Validation
 from armsight.robot.arm_file import open_arm, read_arm_toml
+from armsight.robot.models import MODELS
 from cli_runs import Said, assert_rejected, run
 
 
@@ -377,3 +380,30 @@ def test_joints_by_time_are_those_of_rests(tmp_path):
     seen.write_text("\n".join(["shot,t_s,p1_x_m,p1_y_m,p1_z_m", *(f"{k},{k + 1e6},1,2,{k}" for k in range(40))]))
     with pytest.raises(InputError, match="other clocks"):
         read_joined(seen, joints)
+
+
+@pytest.mark.parametrize("joints", [4, 5, 6, 7])
+def test_an_arm_of_any_number_of_joints_is_reported(joints, tmp_path, capsys):
+    arm = {4: FOUR, 5: MODELS["so101"], 6: MODELS["six_r"], 7: MODELS["iiwa"]}[joints]
+    w, rng = worn(joints, arm, waves=1), np.random.default_rng(joints)
+    spec = arm.name if joints > 4 else arm_toml(tmp_path / "arm.toml", arm)
+    tables = [tracked_csv(tmp_path / f"{part}.csv", w, n, rng) for part, n in (("fit", 60), ("other", 20))]
+    out = tmp_path / "out"
+    answer = said(capsys, "--arm", spec, "--data", tables[0], "--validate", tables[1], "-o", out)
+    assert answer.code == 0, answer.err
+    assert answer.out.startswith("held-out error ")
+    assert (out / "report-joints.png").stat().st_size > 10_000
+    assert f">{arm.joint_names[-1]}<" in (out / "report.html").read_text()
+
+
+def test_what_was_found_is_printed_and_stored_though_the_report_cannot_be_drawn(tmp_path, monkeypatch, capsys):
+    data, out = poses_csv(tmp_path / "p.csv"), tmp_path / "out"
+
+    def broken(*_):
+        raise RuntimeError("no figure")
+
+    monkeypatch.setattr("armsight.app.identify.report.write_identify_report", broken)
+    with pytest.raises(RuntimeError, match="no figure"):
+        run("identify", "--arm", "six_r", "--data", data, "--validate", data, "-o", out)
+    assert capsys.readouterr().out.startswith("held-out error ")
+    assert {path.name for path in out.iterdir()} >= {"corrected.toml", "zeros.toml", "identify.json"}

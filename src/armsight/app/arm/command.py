@@ -286,9 +286,9 @@ def report(run: Path, arm_name: str | None, compare: tuple[Path, ...], output: P
     others = {path.parent.name or path.stem: read_report(path) for path in compare}
     with steps() as progress:
         found = evaluate_arm(run, arm, progress=progress)
-        if output is not None:
-            write_report(found, others, writable_folder(output, "no report"))
     click.echo(json.dumps(found.to_json()) if as_json else text(found, others))
+    if output is not None:  # last: what was found is printed and stored before anything is drawn
+        write_report(found, others, writable_folder(output, "no report"))
     if output is not None and not as_json:
         click.echo(f"\nwritten: {output}/report.html, report.pdf, report.json")
 

@@ -24,7 +24,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.check.run_folder import WINDOW_S, Noise, noise_of, segments_of
+from armsight.app.check.evaluate import evaluate
+from armsight.app.check.run_folder import (
+    WINDOW_S,
+    JointTrack,
+    Noise,
+    attained_in,
+    joint_track,
+    noise_of,
+    segments_of,
+)
 from armsight.app.run.record import read_track
 from armsight.data import Array, Record
 from armsight.errors import InputError
@@ -34,7 +43,7 @@ from armsight.loop.identify.backlash import joint_backlashes
 from armsight.loop.identify.identify import Identified, identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import SENSOR, gravity_levers
-from armsight.loop.iso9283.poses import MIN_POSES, repeatability
+from armsight.loop.iso9283.poses import MIN_POSES
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
 
@@ -44,8 +53,8 @@ _RANK = 1e-3
 _NAMED = 5
 #: Version of report.json.
 VERSION = 1
-#: Fewest rests, and shots of one; a joint was elsewhere from this on, rad; commands that are looked at before a rest.
-MIN_RESTS, _SHOTS, _AWAY_RAD, _BEFORE = 12, 2, np.radians(0.3), 20_000
+#: Fewest rests, and shots of one.
+MIN_RESTS, _SHOTS = 12, 2
 _SIGMAS = tuple(f"sigma_{name}" for name in ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"))
 #: Delays of the joints that are tried, s; how much a joint must move in a motion to show its delay, rad; how much of the
 #: rest after it counts, s; and so many motions at most.
@@ -67,23 +76,6 @@ _PARTS = {
 CONTROLLER, REST = "controller", "rest"
 #: Harmonics of a sensor beyond the second are left to ``armsight identify``: the recording is too short for them.
 _PRIORS = {"ripple": 0.0}
-
-
-@dataclass(frozen=True, eq=False)
-class JointTrack(Record):
-    """Readings and commands of the joints.
-
-    Attributes:
-        t_s: (N,) board's clock, s.
-        q: (N, n) readings, rad.
-        q_ref: (N, n) commands, rad.
-        moving: (N,) whether a motion was under way in open loop.
-    """
-
-    t_s: Array
-    q: Array
-    q_ref: Array
-    moving: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,33 +138,6 @@ class RestPoses(Record):
         return [np.flatnonzero(group.ravel() == k) for k in range(int(group.max()) + 1)]
 
 
-def joint_track(folder: Path, joints: int) -> JointTrack:
-    """Read joints.csv of a run.
-
-    Raises:
-        InputError: missing, or of an arm of another number of joints.
-    """
-    path = folder / "joints.csv"
-    table = read_table(path)
-    names = ["t_s", *(f"q{i + 1}_rad" for i in range(joints)), *(f"q{i + 1}_ref_rad" for i in range(joints))]
-    header = table[0] if table else []
-    if any(name not in header for name in names) or f"q{joints + 1}_rad" in header:
-        raise InputError(f"{path}: is not of an arm of {joints} joints: give the arm of the run with --arm")
-    at = [header.index(name) for name in names]
-    try:
-        values = np.array([[float(row[k]) for k in at] for row in table[1:]])
-    except (ValueError, IndexError):
-        raise InputError(f"{path}: numbers are needed in {', '.join(names)}") from None
-    if len(values) < _SHOTS:
-        raise InputError(f"{path}: no readings")
-    t_s = values[:, 0]
-    moving = np.zeros(len(t_s), bool)
-    for segment in segments_of(folder, closed=False):
-        if segment.kind != "rest":
-            moving |= (t_s > segment.reference.t_s[0]) & (t_s <= segment.reference.t_s[-1])
-    return JointTrack(t_s, values[:, 1 : joints + 1], values[:, joints + 1 :], moving)
-
-
 def rests_of(folder: Path, arm: Arm) -> RestPoses:
     """Read the rests of a run's motions in open loop.
 
@@ -195,8 +160,9 @@ def rests_of(folder: Path, arm: Arm) -> RestPoses:
         for part in (slice(0, 3), slice(3, 6)):
             cov[part, part] = R.T @ np.diag(variance[part]) @ R
         q_ref = track.q_ref[np.flatnonzero(read)[-1]]
-        side = _came(track.q_ref[track.t_s <= begin_s][-_BEFORE:], q_ref)
-        rows.append((end_s, T, arm.forward(q_ref), cov, track.q[read].mean(axis=0), q_ref, side, len(looked)))
+        rows.append(
+            (end_s, T, arm.forward(q_ref), cov, track.q[read].mean(axis=0), q_ref, track.sides(end_s), len(looked))
+        )
     if len(rows) < MIN_RESTS:
         raise InputError(
             f"{folder}: {len(rows)} rests were seen in open loop, {MIN_RESTS} at least are needed: armsight arm plan "
@@ -204,16 +170,6 @@ def rests_of(folder: Path, arm: Arm) -> RestPoses:
         )
     t_s, T_seen, T_ref, cov, q, q_ref, came, shots = (np.array(part) for part in zip(*rows, strict=True))
     return RestPoses(t_s, T_seen, T_ref, cov, q, q_ref, came, shots, noise)
-
-
-def _came(q_ref: Array, q: Array) -> Array:
-    """Return from which side each joint came to q (n,), rad, by its commands (N, n) before."""
-    sides = np.zeros(len(q))
-    for i in range(len(q)):
-        away = np.flatnonzero(np.abs(q_ref[:, i] - q[i]) > _AWAY_RAD)
-        if len(away):
-            sides[i] = np.sign(q[i] - q_ref[away[-1], i])
-    return sides
 
 
 @dataclass(frozen=True)
@@ -388,7 +344,9 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
     for i, name in enumerate(arm.joint_names):
         joints.append(_joint(arm, i, name, kept, found, lever[:, i], backlash[i]._asdict(), latencies[i]))
     known = [each for each in latencies if each is not None]
-    one, both = _one_side(rests, which), _both_sides(rests, which)
+    attained, both = evaluate(attained_in(folder, closed=False)).poses.values(), _both_sides(rests, which)
+    repeated = [each.repeatability for each in attained]
+    one = 1e3 * float(np.mean([m.raw if m.clean is None else m.clean for m in repeated])) if repeated else None
     if one is None:
         notes.append(f"no pose was approached {MIN_POSES} times from one side: no repeatability")
     if both is None:
@@ -552,17 +510,6 @@ def least_squares(A: Array, y: Array, groups: list[NDArray[np.int64]] | None) ->
     return x.tolist(), np.sqrt(np.maximum(rests, poses)).tolist()
 
 
-def _one_side(rests: RestPoses, which: NDArray[np.int64]) -> float | None:
-    """Return the mean repeatability of poses that were approached from one side three times and more, mm."""
-    found = []
-    for rows in rests.groups(which, by_side=True):
-        if len(rows) >= MIN_POSES:
-            noise = np.array([rests.noise.own / n for n in rests.shots[rows]])
-            metric = repeatability(rests.T_seen[rows, :3, 3], noise)
-            found.append(metric.raw if metric.clean is None else metric.clean)
-    return 1e3 * float(np.mean(found)) if found else None
-
-
 def _both_sides(rests: RestPoses, which: NDArray[np.int64]) -> tuple[float, float] | None:
     """Return mean and largest distance, mm, between a pose approached from one side and from the opposite one."""
     apart = []
@@ -602,7 +549,11 @@ def _latencies(folder: Path, arm: Arm) -> list[float | None]:
     Every motion counts with the beginning of its rest, and without its mean: a joint may rest off its command.
     """
     track = joint_track(folder, arm.joints)
-    ends = np.flatnonzero(np.diff(track.moving.astype(int)))
+    moving = np.zeros(len(track.t_s), bool)
+    for segment in segments_of(folder, closed=False):
+        if segment.kind != "rest":
+            moving |= (track.t_s > segment.reference.t_s[0]) & (track.t_s <= segment.reference.t_s[-1])
+    ends = np.flatnonzero(np.diff(moving.astype(int)))
     spans = [
         np.flatnonzero((track.t_s > track.t_s[a]) & (track.t_s < min(track.t_s[b] + _AFTER_S, track.t_s[c])))
         for a, b, c in zip(ends[::2], ends[1::2], np.append(ends[2::2], len(track.t_s) - 1), strict=False)
@@ -667,6 +618,7 @@ def plan_report(
         if n % every == 0 or n == len(found):
             due = round(cycles * n / len(found))
             for cycle in range(done + 1, due + 1):
+                text += _motion(f"before cycle {cycle}", found[4][0], 0.0)  # P1 always comes from P5, as the others do
                 for k, (pose, _) in enumerate(found[:5], start=1):
                     text += _motion(f"P{k} cycle {cycle}", pose, _REST_S)
             done = due

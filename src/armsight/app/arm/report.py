@@ -15,10 +15,10 @@ import numpy as np
 
 from armsight.app.arm.evaluate import VERSION, ArmReport, JointFigures
 from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files
-from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, arrows, drawing, new_figure, png
+from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, arrows, drawing, new_figure, panels, png
 from armsight.app.report.table import TextTable, html_table, plain_text
 from armsight.errors import InputError
-from armsight.files import read_text
+from armsight.files import read_text, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, FigureBase
@@ -147,11 +147,7 @@ def _parts_figure(report: ArmReport, figure: FigureBase) -> None:
 
 def _joints_figure(report: ArmReport, figure: FigureBase) -> None:
     """Plot readings less commands against the gravity load's lever of each joint."""
-    count = len(report.joints)
-    for i, axes in enumerate(figure.subplots(2, -(-count // 2)).ravel()):
-        if i >= count:
-            axes.set_axis_off()
-            continue
+    for i, axes in enumerate(panels(figure, len(report.joints))):
         axes.scatter(1e3 * report.lever[:, i], np.degrees(report.lag[:, i]), s=8, color=BLUE)
         slope = report.joints[i].droop_deg_per_m
         if slope is not None:
@@ -192,11 +188,13 @@ _PAGE = 13.0
 
 
 def write_report(report: ArmReport, others: Mapping[str, dict[str, Any]], folder: Path) -> None:
-    """Write page, PDF and JSON into a folder, all or none.
+    """Write JSON, then page and PDF into a folder.
 
     Raises:
         InputError: matplotlib is missing, or the folder cannot be written to.
     """
+    document = json.dumps(report.to_json(), indent=1, allow_nan=False) + "\n"
+    write_text(folder / "report.json", document)
     shown, said = tables(report, others), [line for line in remarks(report) if line]
     heading = f"{report.arm}: {report.accuracy_mm[0]:.2f} mm RMS, {report.placed_mm:.2f} with base and tool fitted"
     sub = f"{report.poses} poses, {report.rests} rests in {60 * report.hours:.0f} min; controller: {report.board}"
@@ -213,8 +211,7 @@ def write_report(report: ArmReport, others: Mapping[str, dict[str, Any]], folder
         "plots": ("Figures", plots),
     }
     page = html_page(f"armsight: {report.arm}", heading, sub, sections)
-    document = json.dumps(report.to_json(), indent=1, allow_nan=False) + "\n"
-    put_files(folder, {PAGE: page.encode(), "report.pdf": pdf, "report.json": document.encode()})
+    put_files(folder, {PAGE: page.encode(), "report.pdf": pdf})
 
 
 def text(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> str:

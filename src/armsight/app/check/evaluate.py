@@ -19,7 +19,7 @@ from armsight.app.check.result import (
     PoseResult,
     WorkspaceResult,
 )
-from armsight.app.check.rows import SAME_M, TESTS, Attained, Reversal, Row, natural, read_rows
+from armsight.app.check.rows import SAME_M, TESTS, Attained, Reversal, Row, first_few, natural, read_rows
 from armsight.app.check.run_folder import attained_in
 from armsight.data import Array
 from armsight.errors import InputError
@@ -79,7 +79,8 @@ def evaluate(attained: Attained) -> CheckResult:
     groups = _groups(by_test["pose"], lambda row: row.pose) if seldom is None else {}
     often = {name: groups[name] for name in sorted(groups, key=natural) if len(groups[name]) >= iso9283.MIN_POSES}
     if often:
-        notes += [f"left out: {n}, attained too seldom ({len(group)})" for n, group in groups.items() if n not in often]
+        rare = [f"left out: {n}, attained too seldom ({len(group)})" for n, group in groups.items() if n not in often]
+        notes += first_few(rare, "poses, attained too seldom")
         notes += [note for group in often.values() for note in _outliers(group)]
     poses = {name: _pose(group) for name, group in often.items()}
     distance = _distance_of_two(often)
@@ -170,7 +171,12 @@ def _outliers(rows: list[Row]) -> list[str]:
 
 def _pose(rows: list[Row]) -> PoseResult:
     """Return the metrics of a pose; None for what needs rotations that are not known."""
-    metrics = iso9283.pose_metrics(np.array([r.T for r in rows]), rows[0].T_command, _covs(rows), _common(rows))
+    ways = [row.approach for row in rows]
+    if min(Counter(ways).values()) < iso9283.MIN_POSES:  # of a table whose approaches are too many for a scatter
+        ways = [""] * len(rows)
+    _, way = np.unique(ways, return_inverse=True)
+    T = np.array([row.T for row in rows])
+    metrics = iso9283.pose_metrics(T, rows[0].T_command, _covs(rows), _common(rows), way)
     measured = all(row.measured_rotation for row in rows)
     commanded = measured and all(row.commanded_rotation for row in rows)
     return PoseResult(

@@ -25,6 +25,8 @@ _SIGMA, _COMMON = (tuple(f"{kind}_{name}" for name in _POSITION) for kind in ("s
 NEEDED = ("pose", *_POSITION, *_COMMAND[:3])
 #: Groups of columns: a row has all of a group or none of it.
 _TOGETHER = (_QUATERNION, _COMMAND[3:], _SIGMA, _COMMON)
+#: So many things that were left out are named.
+_NAMED = 5
 #: Half of the rows further off their commands than this, m, are an error: units or frames are mixed up.
 _FAR_M = 0.1
 #: Commands of one pose differ by rounding at most: by this much, m, and in their rotation matrices.
@@ -210,6 +212,12 @@ def _pose(where: str, numbers: dict[str, float], prefix: str) -> Array:
 def natural(name: str) -> list[tuple[int, str]]:
     """Return a key by which P2 comes before P10."""
     return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", name)]
+
+
+def first_few(notes: list[str], what: str) -> list[str]:
+    """Return the first notes on what was left out, and how many more there are."""
+    more = [f"left out: {len(notes) - _NAMED} more {what}"] if len(notes) > _NAMED else []
+    return notes[:_NAMED] + more
 
 
 def rows_csv(rows: list[Row]) -> str:

@@ -3,7 +3,8 @@
 In: reference.csv (where the tool was commanded to be), vision.csv, motion.toml, and joints.csv where it exists. Out: rows
 for the evaluation. The run is cut into segments: its motions, and the rest at the end of each.
 
-- A rest belongs to the pose that was commanded there, wherever else in the motion that pose comes again.
+- A rest belongs to the pose that was commanded there, wherever else in the motion that pose comes again, and to the visits
+  whose joints came from the same sides: on the other side of a joint's backlash it is another approach.
 - A line or circle belongs with those along the same commanded path; of a circle, both directions are needed.
 - The instrument's noise is half the mean square of the steps from one shot of a rest to the next: slower motion of the arm
   is not in it, faster motion is, so it is an upper estimate. What vision.csv claims beyond it is common to all shots.
@@ -23,9 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.check.rows import SAME_M, Attained, Reversal, Row, natural
+from armsight.app.check.rows import SAME_M, Attained, Reversal, Row, first_few, natural
 from armsight.app.run.record import ToolTrack, read_track
-from armsight.data import Array
+from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import read_table, read_text
 from armsight.geometry.pose import mean_pose, pose
@@ -53,6 +54,8 @@ _AHEAD_M = 1e-4
 _MOVES_RAD = float(np.radians(0.5))
 #: Joints that reverse within this share of the circle's time do so together.
 _NEAR = 0.015
+#: From here on a joint was elsewhere, rad: what it was off by less does not take up its backlash.
+_AWAY_RAD = float(np.radians(0.3))
 #: Columns of joints.csv in version 1 of a run's folder -> their present names; both are read.
 _VERSION_1 = {f"q{joint}_wanted_rad": f"q{joint}_ref_rad" for joint in range(1, MOST_JOINTS + 1)}
 _SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
@@ -96,6 +99,57 @@ class Noise:
         return self.own + np.diag(np.maximum((segment.sigma**2).mean(axis=0) - self.claimed, 0.0))
 
 
+@dataclass(frozen=True, eq=False)
+class JointTrack(Record):
+    """Readings and commands of the joints.
+
+    Attributes:
+        t_s: (N,) board's clock, s.
+        q: (N, n) readings, rad; NaN where the file has commands alone.
+        q_ref: (N, n) commands, rad.
+    """
+
+    t_s: Array
+    q: Array
+    q_ref: Array
+
+    def sides(self, t_s: float) -> Array:
+        """Return how each joint came to its command at a time, s (n,): 1 with rising angle, -1 with falling, 0 unmoved."""
+        q = self.q_ref[: max(int(np.searchsorted(self.t_s, t_s, side="right")), 1)]
+        away = np.abs(q - q[-1]) > _AWAY_RAD
+        last = len(q) - 1 - np.argmax(away[::-1], axis=0)
+        return np.where(away.any(axis=0), np.sign(q[-1] - q[last, np.arange(q.shape[1])]), 0.0)
+
+
+def joint_track(folder: Path, joints: int | None = None) -> JointTrack:
+    """Read joints.csv of a run.
+
+    Args:
+        folder: of the run.
+        joints: how many the arm has, whose readings are needed; None: as many as there are.
+
+    Raises:
+        InputError: missing, not a run's, or of an arm of another number of joints.
+    """
+    file = folder / "joints.csv"
+    table = read_table(file)
+    header = [_VERSION_1.get(name, name) for name in table[0]] if table else []
+    count = joints or sum(re.fullmatch(r"q\d+_ref_rad", name) is not None for name in header) or 6
+    names = ["t_s", *(f"q{i + 1}_ref_rad" for i in range(count)), *(f"q{i + 1}_rad" for i in range(count))]
+    if joints is not None and (set(names) - set(header) or f"q{joints + 1}_rad" in header):
+        raise InputError(f"{file}: is not of an arm of {joints} joints: give the arm of the run with --arm")
+    needed = names if set(names) <= set(header) else names[: count + 1]
+    try:
+        at = [header.index(name) for name in needed]
+        values = np.array([[float(row[k]) for k in at] for row in table[1:]]).reshape(-1, len(at))
+    except (ValueError, IndexError):
+        raise InputError(f"{file}: not a run's joints: {', '.join(needed)} are needed, numbers in every line") from None
+    if not len(values):
+        raise InputError(f"{file}: no readings")
+    q_ref = values[:, 1 : count + 1]
+    return JointTrack(values[:, 0], values[:, count + 1 :] if needed is names else np.full_like(q_ref, np.nan), q_ref)
+
+
 def attained_in(folder: Path, *, closed: bool) -> Attained:
     """Return what a run attained.
 
@@ -112,8 +166,9 @@ def attained_in(folder: Path, *, closed: bool) -> Attained:
         raise InputError(f"{folder}: the run has no motions {which}; run.log says how far it came")
     noise = noise_of(segments)
     paths, run, circle, notes = path_rows(segments, noise)
-    rows, more = _rests([s for s in segments if s.kind == "rest"], run, noise)
-    return Attained(rows + paths, more + notes, reversals_of(folder, circle))
+    track = joint_track(folder) if (folder / "joints.csv").is_file() else None
+    rows, more = _rests(segments, run, noise, track)
+    return Attained(rows + paths, more + notes, [] if track is None else reversals_of(track, circle))
 
 
 def is_run(folder: Path) -> bool:
@@ -193,43 +248,63 @@ def at_rest(segment: PathSegment) -> tuple[Array, Array]:
     return segment.seen.Ts_base_tool[rows], segment.sigma[rows]
 
 
-def _rests(segments: list[PathSegment], run: set[str], noise: Noise) -> tuple[list[Row], list[str]]:
+def _rests(
+    segments: list[PathSegment], run: set[str], noise: Noise, track: JointTrack | None
+) -> tuple[list[Row], list[str]]:
     """Return a row for every rest at a pose, but those at the ends of paths that are evaluated, and what was left out."""
-    names: list[tuple[Array, str]] = []
+    names = _pose_names(segments, run)
     visits: dict[tuple[str, str], list[Row]] = {}
     times: Counter[str] = Counter()
-    before, unseen = "the start", 0
+    before, here, unseen = "the start", "the start", 0
     for segment in segments:
-        T = segment.reference.Ts_base_tool[-1]
-        name = next((n for at, n in names if np.abs(at - T).max() < SAME_M), None)
-        if segment.name in run:
-            before = name or plain(segment.name)
+        if segment.kind != "rest":
+            before, here = here, plain(segment.name)
             continue
-        if name is None:
-            short = plain(segment.name).removeprefix("to ")
-            name = short if all(short != n for _, n in names) else segment.name
-            names.append((T, name))
-        way = (name, before)
+        T, t_s = segment.reference.Ts_base_tool[-1], float(segment.reference.t_s[-1])
+        name = next((n for at, n in names if np.abs(at - T).max() < SAME_M), None)
+        here = name or here
+        if segment.name in run or name is None:
+            continue
+        # Where commands of the joints are not known, where the last motion began says from which side they came.
+        came = before
+        if track is not None and t_s >= track.t_s[0]:
+            came = "sides " + "".join("-0+"[int(side) + 1] for side in track.sides(t_s))
         times[name] += 1
         Ts, _ = at_rest(segment)
         if len(Ts) >= _REST_SHOTS:
-            t_s = float(segment.reference.t_s[-1])
-            seen = Row("pose", name, str(times[name]), before, t_s, mean_pose(Ts), T, noise.own / len(Ts), noise.common)
-            visits.setdefault(way, []).append(seen)
+            seen = Row("pose", name, str(times[name]), came, t_s, mean_pose(Ts), T, noise.own / len(Ts), noise.common)
+            visits.setdefault((name, came), []).append(seen)
         unseen += len(Ts) < _REST_SHOTS
-        before = name
     notes = [f"{unseen} rests were not seen, and are left out"] if unseen else []
     often = any(len(came) >= MIN_POSES for came in visits.values())
     attained: Counter[str] = Counter()
-    for (name, _), came in visits.items():
-        attained[name] += len(came)
-    rows = []
-    for (name, before), came in visits.items():
-        if often and len(came) < MIN_POSES <= attained[name]:
-            notes.append(f"left out: {name} approached from {before}, too seldom ({len(came)})")
+    for (name, _), group in visits.items():
+        attained[name] += len(group)
+    rows, rare = [], []
+    for (name, came), group in visits.items():
+        if often and len(group) < MIN_POSES <= attained[name]:
+            rare.append(f"left out: {name} approached from {came}, too seldom ({len(group)})")
         else:
-            rows += came
+            rows += group
+    notes += first_few(rare, "approaches, too seldom")
     return sorted(rows, key=lambda row: (natural(row.pose), row.t_s)), notes
+
+
+def _pose_names(segments: list[PathSegment], run: set[str]) -> list[tuple[Array, str]]:
+    """Return every pose at which the arm rested, (4, 4), with a name of its own: that by which it was commanded most."""
+    found: list[tuple[Array, Counter[str]]] = []
+    for segment in segments:
+        if segment.kind == "rest" and segment.name not in run:
+            T = segment.reference.Ts_base_tool[-1]
+            called = next((each for at, each in found if np.abs(at - T).max() < SAME_M), None)
+            if called is None:
+                found.append((T, called := Counter()))
+            called[plain(segment.name).removeprefix("to ")] += 1
+    names: dict[str, Array] = {}
+    for T, called in found:
+        name = called.most_common(1)[0][0]
+        names[name if name not in names else f"{name} ({len(names) + 1})"] = T
+    return [(T, name) for name, T in names.items()]
 
 
 def path_rows(segments: list[PathSegment], noise: Noise) -> tuple[list[Row], set[str], list[PathSegment], list[str]]:
@@ -413,28 +488,14 @@ def _circle(group: list[PathSegment], noise: Noise) -> list[Row]:
     return rows
 
 
-def reversals_of(folder: Path, circle: list[PathSegment]) -> list[Reversal]:
-    """Return where joints were commanded to reverse on a circle, by a run's joints.csv; empty where it has none.
+def reversals_of(track: JointTrack, circle: list[PathSegment]) -> list[Reversal]:
+    """Return where joints were commanded to reverse on a circle.
 
     Args:
-        folder: of the run.
+        track: commands of the joints.
         circle: the circle, one cycle of each direction.
-
-    Raises:
-        InputError: joints.csv cannot be read.
     """
-    file = folder / "joints.csv"
-    if not circle or not file.is_file():
-        return []
-    table = read_table(file)
-    header = [_VERSION_1.get(name, name) for name in table[0]] if table else []
-    count = sum(name.startswith("q") and name.endswith("_ref_rad") for name in header)
-    names = ["t_s", *(f"q{i + 1}_ref_rad" for i in range(count or 6))]
-    try:
-        at = [header.index(name) for name in names]
-        values = np.array([[float(row[k]) for k in at] for row in table[1:]])
-    except (ValueError, IndexError):
-        raise InputError(f"{file}: not a run's joints: {', '.join(names)} are needed, numbers in every line") from None
+    values = np.column_stack([track.t_s, track.q_ref])
     reversals = []
     for segment in circle:
         angle = _angle_of(segment)

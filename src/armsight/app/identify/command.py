@@ -117,16 +117,17 @@ def command(
         if output is not None:
             progress("writing")
             write_results(run, output)
-            write_identify_report(run, output)
     for note in run.notes:
         click.echo(f"note: {note}", err=True)
     if as_json:
         ended = {"output": None if output is None else str(output), "wall_s": time.perf_counter() - started}
         click.echo(json.dumps({**identify_json(run), **ended}))
-        return
-    click.echo(headline(run))
-    click.echo(text(run, everything=verbose))
-    if output is not None:
+    else:
+        click.echo(headline(run))
+        click.echo(text(run, everything=verbose))
+    if output is not None:  # last: what was found is printed and stored before anything is drawn
+        write_identify_report(run, output)
+    if output is not None and not as_json:
         click.echo(
             f"\nwritten: {output}/corrected.toml, corrected.urdf, zeros.toml, parameters.csv, identify.json, report.html"
         )

@@ -15,7 +15,7 @@ import numpy as np
 from armsight.app.identify.run import Identification, headline, ranges_seen, value_text
 from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files, table
 from armsight.app.report.page import text as escaped
-from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, drawing, new_figure, png
+from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, drawing, new_figure, panels, png
 from armsight.data import Array
 from armsight.loop.identify.identify import contributions
 
@@ -73,8 +73,8 @@ def joints_figure(run: Identification) -> Figure:
     """Plot the held-out error over each joint's angle, before and after, with the mean in bins."""
     _, q, before, after = _shown(run)
     figure = new_figure(5.6)
-    axes = figure.subplots(2, 3, sharey=True)
-    for i, ax in enumerate(axes.ravel()):
+    axes = panels(figure, run.arm.joints, sharey=True)
+    for i, ax in enumerate(axes):
         degrees = np.degrees(q[:, i])
         for name, error, colour in (("nominal", before, ORANGE), ("identified", after, BLUE)):
             ax.scatter(degrees, 1e3 * error, s=4, color=colour, alpha=0.25, linewidths=0)
@@ -82,9 +82,9 @@ def joints_figure(run: Identification) -> Figure:
         ax.set_title(run.arm.joint_names[i])
         ax.set_xlabel("deg")
         ax.set_ylim(0, 1e3 * float(np.quantile(before, 0.995)) * 1.05)
-    axes[0, 0].set_ylabel("held-out error, mm")
-    axes[1, 0].set_ylabel("held-out error, mm")
-    axes[0, 2].legend(loc="upper right")
+    for ax in (axes[0], axes[(len(axes) + 1) // 2]):
+        ax.set_ylabel("held-out error, mm")
+    axes[0].legend(loc="upper right")
     return figure
 
 

@@ -57,7 +57,7 @@ class Identification(Record):
         measured: what it was identified from.
         found: the identified arm.
         held_out: nominal and identified arm on poses that were not fitted to.
-        held_out_poses: (H, 6) joint angles of those, rad.
+        held_out_poses: (H, n) joint angles of those, rad.
         how: which poses those are, as text.
         lines: (N,) lines of the file that the poses come from.
         notes: what a person should know.

@@ -81,16 +81,17 @@ class IdentifyStep:
                     open_arm(arm_spec), read.measured, read.lines, None, notes=read.notes, progress=self._progress
                 )
                 write_results(run, out)
-                write_identify_report(run, out)
+            lines = (*(f"note: {note}" for note in run.notes), *text(run).splitlines())
+            corrected = str(out / "corrected.toml")
+            self.state = replace(self.state, headline=headline(run), lines=lines, corrected=corrected)
+            write_identify_report(run, out)  # last: what was found is shown and stored before anything is drawn
         except Exception as error:  # noqa: BLE001 - nobody else watches this thread
             why = str(error) if isinstance(error, ArmsightError) else f"{type(error).__name__}: {error}"
-            self._say(Note("error", f"no arm was identified: {why}"))
+            what = "the report was not drawn" if self.state.corrected else "no arm was identified"
+            self._say(Note("error", f"{what}: {why}"))
             self.state = replace(self.state, working=None)
             return
-        lines = (*(f"note: {note}" for note in run.notes), *text(run).splitlines())
-        self.state = replace(
-            self.state, working=None, headline=headline(run), lines=lines, corrected=str(out / "corrected.toml")
-        )
+        self.state = replace(self.state, working=None)
         self._say(Note("good", f"identified: {headline(run)}; written to {out}"))
 
     def close(self) -> None:

@@ -21,7 +21,7 @@ from armsight.errors import InputError
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, FigureBase
 
 DPI = 150
 WIDTH_IN = 10.0
@@ -84,6 +84,14 @@ def new_figure(height_in: float) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def panels(figure: FigureBase, count: int, *, sharey: bool = False) -> list[Axes]:
+    """Return axes for so many plots, in two rows."""
+    grid = figure.subplots(2, -(-count // 2), sharey=sharey, squeeze=False).ravel()
+    for empty in grid[count:]:
+        empty.remove()
+    return list(grid[:count])
 
 
 def _lay_out(figure: Figure) -> None:

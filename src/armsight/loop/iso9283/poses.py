@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
@@ -52,7 +53,9 @@ class PoseMetrics(Record):
     repeatability_rotation: Array
 
 
-def pose_metrics(attained: Array, command: Array, cov: Array, common: Array | None = None) -> PoseMetrics:
+def pose_metrics(
+    attained: Array, command: Array, cov: Array, common: Array | None = None, way: NDArray[np.int64] | None = None
+) -> PoseMetrics:
     """Evaluate one commanded pose (7.2.1 and 7.2.2).
 
     Args:
@@ -60,6 +63,8 @@ def pose_metrics(attained: Array, command: Array, cov: Array, common: Array | No
         command: (4, 4) the pose commanded.
         cov: (n, 3, 3) covariance of the attained positions by the instrument, base's axes, m^2: what differs between them.
         common: (3, 3) that of the instrument's constant error; none of it where it is not given.
+        way: (n,) by which approach each was attained, from 0; None: by one. The scatter is that about each approach's own
+            barycentre: the standard's repeatability is of one direction, and vAP of several.
 
     Raises:
         InputError: fewer than three poses.
@@ -80,22 +85,32 @@ def pose_metrics(attained: Array, command: Array, cov: Array, common: Array | No
         beyond_noise(lengths, off[None], errors),
         off,
         log_so3(command[:3, :3].T @ mean[:3, :3]),
-        repeatability(p, cov),
-        3 * rotations.std(axis=0, ddof=1),
+        repeatability(p, cov, way),
+        3 * np.sqrt((_within(rotations, way)[0] ** 2).sum(axis=0) / _within(rotations, way)[1]),
     )
 
 
-def repeatability(p: Array, cov: Array) -> Metric:
+def repeatability(p: Array, cov: Array, way: NDArray[np.int64] | None = None) -> Metric:
     """Return RP of positions (7.2.2): mean distance from the barycentre plus three standard deviations of the distances.
 
     Args:
         p: (n, 3) positions attained, m.
         cov: (n, 3, 3) their covariance by the instrument, m^2.
+        way: (n,) see :func:`pose_metrics`.
     """
-    distance = np.linalg.norm(p - p.mean(axis=0), axis=1)
-    raw = float(distance.mean() + 3 * distance.std(ddof=1))
-    S = np.atleast_2d(np.cov(p.T))
-    return scatter(S, cov.mean(axis=0), len(p), distance_limit, raw / float(distance_limit(S)) if np.any(S) else 0.0)
+    off, freedom = _within(p, way)
+    distance = np.linalg.norm(off, axis=1)
+    raw = float(distance.mean() + 3 * np.sqrt(((distance - distance.mean()) ** 2).sum() / freedom))
+    S = off.T @ off / freedom
+    ratio = raw / float(distance_limit(S)) if np.any(S) else 0.0
+    return scatter(S, cov.mean(axis=0), freedom + 1, distance_limit, ratio)
+
+
+def _within(values: Array, way: NDArray[np.int64] | None) -> tuple[Array, int]:
+    """Return values (n, d) less the means of their groups, and the degrees of freedom left."""
+    groups = np.zeros(len(values), np.int64) if way is None else way
+    means = np.array([values[groups == k].mean(axis=0) for k in range(int(groups.max()) + 1)])
+    return values - means[groups], len(values) - len(means)
 
 
 def distance_limit(S: Array) -> Array:
