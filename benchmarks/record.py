@@ -1,6 +1,7 @@
-"""Figures of recordings: containers, cost of run.mcap, the real bags of tags, kill -9, batches by 1, 2 and 4 processes.
+"""Figures of recordings: containers, cost of run.mcap, the real bags of tags, kill -9, batches by 1, 2 and 4 processes,
+recordings out of order.
 
-    python benchmarks/record.py containers|cost|beside|paused|bags|killed|batch ... [--data DIR]
+    python benchmarks/record.py containers|cost|beside|paused|bags|killed|batch|disorder ... [--data DIR]
 
 Each figure prints what it measured against its target; the exit code is 1 where one is missed. The map of tags of figure
 ``bags`` is fitted on even shots and evaluated on odd ones.
@@ -339,8 +340,27 @@ def batch(count: int = 100) -> None:
         report("two processes against one", f"{faster:.2f} times (target 1.8; wants two idle cores)", faster >= 1.8)
 
 
+def disorder() -> None:
+    """7. 200 recordings out of order, in 2 to 15 files, four containers: every whole pair in order, every other named."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+    from bag_files import CONTAINERS, disordered, pairs_found
+
+    whole = measured = named = others = 0
+    wrong = []
+    for seed in range(200):
+        with tempfile.TemporaryDirectory() as folder:
+            bag = disordered(Path(folder), CONTAINERS[seed % 4], 5000 + seed)
+            found, problems = pairs_found(bag.spec)
+        whole, measured = whole + len(bag.pairs), measured + len(found)
+        others, named = others + bag.others, named + len(problems)
+        if found != bag.pairs or len(problems) != bag.others:
+            wrong.append(f"{seed} ({CONTAINERS[seed % 4]})")
+    counted = f"{measured} of {whole} pairs, {named} of {others} others named; not: {', '.join(wrong) or 'none'}"
+    report("recordings out of order", f"{200 - len(wrong)} of 200 whole and in order, {counted}", not wrong)
+
+
 FIGURES = {"containers": containers, "cost": cost, "beside": beside, "paused": paused}
-FIGURES |= {"bags": bags, "killed": killed, "batch": batch}
+FIGURES |= {"bags": bags, "killed": killed, "batch": batch, "disorder": disorder}
 
 if __name__ == "__main__":
     for figure in sys.argv[1:] or FIGURES:

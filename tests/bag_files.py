@@ -238,3 +238,76 @@ def _foxglove(path, sent):
                     message.transforms.append(one)
             writer.write_message(each.topic, message, log_time=each.logged_ns, publish_time=each.stamp_ns)
     return path
+
+
+@dataclass
+class Disordered:
+    """A recording out of order, and what is in it: frame numbers of the whole pairs in order, and how much is left."""
+
+    spec: str
+    pairs: list[int]
+    others: int
+
+
+def disordered(folder: Path, container: str, seed: int) -> Disordered:
+    """Write a recording in 2 to 15 files whose messages are shuffled, doubled, missing, late and without a stamp.
+
+    A frame's number is in its first two pixels. Messages come up to 0.3 s late, some by 3 s, one topic by a burst; files
+    overlap in time; metadata.yaml, where the container has one, names the files in their order.
+    """
+    rng = np.random.default_rng(seed)
+    count, parts = int(rng.integers(25, 90)), int(rng.integers(2, 16))
+    step_ns = int(1e9 / rng.choice([10.0, 29.97, 60.0]))
+    sent, halves, others = [], [], 0
+    unstamped = rng.random() < 0.5
+    for side, topic in enumerate(("/stereo/left/image_raw", "/stereo/right/image_raw")):
+        burst = range(*sorted(rng.integers(0, count, 2))) if rng.random() < 0.5 else ()
+        there = set()
+        for k in range(count):
+            if rng.random() < 0.08:
+                continue
+            there.add(k)
+            image = rng.integers(0, 255, (12, 16), np.uint8)
+            image[0, :2] = k, side
+            true = EPOCH_NS + k * step_ns + (side and int(1e6)) + int(rng.normal(0, 0.04 * step_ns))
+            late = int(rng.choice([1e6, 3e8 * rng.random(), 3e9], p=[0.8, 0.17, 0.03])) + (
+                2 * 10**9 if k in burst else 0
+            )
+            stamp = 0 if unstamped and late == 10**6 and rng.random() < 0.05 else true
+            one = Sent(topic, stamp, Pixels(image), true + late)
+            sent.append(one)
+            if stamp and rng.random() < 0.05:
+                sent.append(Sent(topic, stamp, Pixels(image), true + late + int(rng.integers(0, 10**9))))
+                others += 1
+        halves.append(there)
+    order = np.argsort([each.logged_ns for each in sent], kind="stable")
+    if container != "sqlite3":  # it is read in the order of arrival, whatever was written first
+        order = np.argsort(order.argsort() + rng.uniform(0, 12, len(order)))
+    pieces = [[sent[k] for k in part] for part in np.array_split(order, parts)]
+    written = [write_bag(folder / f"part_{n}", container, piece) for n, piece in enumerate(pieces)]
+    bag = folder / "bag"
+    bag.mkdir()
+    names = []
+    for n, each in enumerate(written):
+        file = next(each.glob("*.db3" if container == "sqlite3" else "*.mcap")) if each.is_dir() else each
+        names.append(f"bag_{n}{file.suffix}")
+        file.rename(bag / names[-1])
+    if container in ("sqlite3", "mcap"):
+        listed = "".join(f"  - {name}\n" for name in names)
+        (bag / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{listed}")
+    return Disordered(f"bag:{bag}", sorted(halves[0] & halves[1]), others + len(halves[0] ^ halves[1]))
+
+
+def pairs_found(spec: str):
+    """Return the frame numbers of the shots of :func:`disordered` as they come, and the problems of the others."""
+    from armsight.vision.sources import open_source
+
+    source = open_source(spec)
+    found, problems = [], []
+    while (shot := source.read()) is not None:
+        if shot.problem is not None:
+            problems.append(shot.problem)
+            continue
+        (left, is_left), (right, is_right) = shot.left[0, :2], shot.right[0, :2]
+        found.append(int(left) if left == right and (is_left, is_right) == (0, 1) else -1)
+    return found, problems

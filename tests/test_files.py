@@ -7,12 +7,24 @@ import os
 import resource
 import stat
 import sys
+from pathlib import Path
 
 import pytest
 
 from armsight import files
 from armsight.errors import InputError
-from armsight.files import check_writable, read_columns, read_table, read_text, replacing, write_text
+from armsight.files import (
+    check_readable,
+    check_writable,
+    read_columns,
+    read_json,
+    read_table,
+    read_text,
+    read_toml,
+    replacing,
+    write_text,
+)
+from armsight.vision.image import read_image
 
 SMALL, LARGE = "new\n", "new\n" * 100_000  # within one buffer, and many of them
 
@@ -178,7 +190,7 @@ def test_a_name_that_is_too_long_is_reported(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [(None, "no such file"), (b"\xff\xfe\x00\xd8", "not a text file"), (..., "cannot be read: Is a dir")],
+    [(None, "no such file"), (b"\xff\xfe\x00\xd8", "not a text file"), (..., "cannot be read: it is a folder")],
 )
 def test_reading_says_what_is_wrong(tmp_path, content, said):
     path = tmp_path / "file"
@@ -188,6 +200,57 @@ def test_reading_says_what_is_wrong(tmp_path, content, said):
         path.write_bytes(content)
     with pytest.raises(InputError, match=f"file: {said}"):
         read_text(path)
+
+
+@pytest.mark.parametrize("read", [read_text, read_table, read_json, read_toml, check_readable, read_image])
+def test_what_is_no_ordinary_file_of_bounded_size_is_rejected_at_once(tmp_path, read):
+    os.mkfifo(tmp_path / "pipe")
+    for path, kind in (("/dev/zero", "a device"), (tmp_path / "pipe", "a pipe"), (tmp_path, "a folder")):
+        with pytest.raises(InputError, match=f"cannot be read: it is {kind}; give the name of a file"):
+            read(path)
+    with (tmp_path / "huge").open("wb") as file:
+        file.truncate(6_000_000_000)  # of which the disk holds nothing
+    with pytest.raises(InputError, match=r"huge: has 6000 MB, such a file at most \d+ MB"):
+        check_readable(tmp_path / "huge", 8) if read is check_readable else read(tmp_path / "huge")
+
+
+def test_a_file_that_says_no_size_and_has_no_end_is_rejected(tmp_path, monkeypatch):
+    (tmp_path / "grows").write_bytes(b"1" * 9_000_000)
+    size_of = os.fstat
+    monkeypatch.setattr(files.os, "fstat", lambda n: os.stat_result((*size_of(n)[:6], 0, *size_of(n)[7:])))
+    with pytest.raises(InputError, match="grows: has 8 MB, such a file at most 8 MB"):
+        read_text(tmp_path / "grows")
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "said"),
+    [
+        (read_json, "[" * 100_000, "nested too deep"),
+        (read_toml, "a = " + "[" * 5_000, "nested too deep"),
+        (read_json, '{"a": 1,\n}', "line 2: not JSON"),
+        (read_toml, "a = " + "1" * 10_000, "not TOML"),
+        (read_table, "1," * 600_000, "a line of more than 1000000 characters"),
+        (read_table, "1\n" * 2_500_001, "more than 5000000 cells up to line 2500001"),
+    ],
+)
+def test_what_would_take_too_much_memory_or_stack_is_one_line(tmp_path, read, text, said):
+    (tmp_path / "file").write_text(text)
+    with pytest.raises(InputError, match=f"file: .*{said}") as caught:
+        read(tmp_path / "file")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_whole_number_of_many_digits_is_one_that_float_can_take(tmp_path):
+    (tmp_path / "file").write_text("1" * 5_000)
+    assert float(read_json(tmp_path / "file")) == float("inf")
+
+
+def test_what_was_written_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(files.os, "fsync", lambda number: done.append(os.readlink(f"/proc/self/fd/{number}")))
+    monkeypatch.setattr(files.os, "replace", lambda old, new: done.append(str(new)))
+    write_text(tmp_path / "file", SMALL)
+    assert [Path(each).name.split(".")[1:2] or Path(each).name for each in done] == [["file"], "file", tmp_path.name]
 
 
 def test_tables_are_read_as_cells(tmp_path):

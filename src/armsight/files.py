@@ -1,14 +1,20 @@
-"""Reading and writing files so that nothing half-written stays behind and every error names the file."""
+"""Reading and writing files so that nothing half-written stays behind and every error names the file.
+
+Whatever is read by name is opened by :func:`opened`, or checked by :func:`check_readable` before a library opens it: an
+ordinary file of bounded size, opened without waiting.
+"""
 
 from __future__ import annotations
 
-import codecs
 import contextlib
 import csv
 import io
+import itertools
+import json
 import math
 import os
 import re
+import stat
 import tempfile
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -20,24 +26,138 @@ if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 
-def read_text(path: str | Path) -> str:
-    """Read a text file: UTF-8, UTF-16 with its byte-order mark, or XML in the encoding that it declares.
+#: Largest documents (JSON, TOML, XML) and tables that are read: parsed they take 10 to 40 times as much memory.
+DOCUMENT_MB = 8  # half: a recording's truth of 10,000 shots is rejected; double: a hostile file takes 600 MB
+TABLE_MB = 64  # half: an hour of a run is rejected; double: twice the memory
+YAML_MB = 1  # a node takes 1 kB; half: hand-eye samples of 2,000 poses are rejected; double: 700 MB
+#: Cells and lines of a table, of up to 72 bytes each; half: 5 minutes of detections are rejected; double: 700 MB.
+_TABLE_CELLS = 5_000_000
+_LONGEST_LINE = 1_000_000  # characters of a table's line; half, double: the same, no table has such lines
+_MB = 1_000_000
+_KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"))
+
+
+def opened(path: str | Path, most_mb: float | None = None) -> IO[bytes]:
+    """Open what must be an ordinary file, for reading; whatever a name leads to, this returns at once.
+
+    Everything that is read by name comes through here: a device has no end and a pipe may never have a beginning.
+
+    Args:
+        path: the file.
+        most_mb: how large it may be; None is any size, for what is read piece by piece.
 
     Raises:
-        InputError: missing, unreadable or not text.
+        InputError: missing, unreadable, a folder, pipe or device, or larger.
     """
     try:
-        data = Path(path).read_bytes()
-        return io.TextIOWrapper(io.BytesIO(data), _encoding(path, data)).read()
+        number = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0) | _AT_ONCE)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except UnicodeDecodeError as error:
-        how = "save text as UTF-8, a table as CSV" if data[:5] != b"<?xml" else "its declaration says otherwise"
-        raise InputError(f"{path}: not a text file in {error.encoding}; {how}") from None
     except ValueError:  # it holds a NUL
         raise InputError(f"{str(path)!r}: not the name of a file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    about = os.fstat(number)
+    problem = None
+    if not stat.S_ISREG(about.st_mode):
+        kind = next((name for test, name in _KINDS if test(about.st_mode)), "a device")
+        problem = f"{path}: cannot be read: it is {kind}; give the name of a file"
+    elif most_mb is not None and about.st_size > most_mb * _MB:
+        problem = _too_large(path, about.st_size, most_mb)
+    if problem is not None:
+        os.close(number)
+        raise InputError(problem)
+    return os.fdopen(number, "rb")
+
+
+#: Not to wait for the other end of a pipe, nor become the owner of a terminal.
+_AT_ONCE = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
+
+
+def _too_large(path: str | Path, size: int, most_mb: float) -> str:
+    return f"{path}: has {size / _MB:.0f} MB, such a file at most {most_mb:.0f} MB: is it the right one?"
+
+
+def check_readable(path: str | Path, most_mb: float | None = None) -> str:
+    """Return the name of an ordinary file for a library that opens it by itself; errors as :func:`opened`."""
+    opened(path, most_mb).close()
+    return os.fspath(path)
+
+
+def read_bytes(path: str | Path, most_mb: float = DOCUMENT_MB) -> bytes:
+    """Read a whole file; errors as :func:`opened`."""
+    with opened(path, most_mb) as file:
+        try:
+            data = file.read(int(most_mb * _MB) + 1) or b""  # some files of the system have no size, and no end
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    if len(data) > most_mb * _MB:
+        raise InputError(_too_large(path, len(data), most_mb))
+    return data
+
+
+def read_text(path: str | Path, most_mb: float = DOCUMENT_MB) -> str:
+    """Read a text file: UTF-8, UTF-16 with its byte-order mark, or XML in the encoding that it declares.
+
+    Raises:
+        InputError: as :func:`opened`, or not text.
+    """
+    data = read_bytes(path, most_mb)
+    try:
+        return io.TextIOWrapper(io.BytesIO(data), _encoding(path, data)).read()
+    except UnicodeDecodeError as error:
+        raise InputError(_no_text(path, data, error)) from None
+
+
+def _no_text(path: str | Path, data: bytes, error: UnicodeDecodeError) -> str:
+    how = "save text as UTF-8, a table as CSV" if data[:5] != b"<?xml" else "its declaration says otherwise"
+    return f"{path}: not a text file in {error.encoding}; {how}"
+
+
+def read_json(path: str | Path, what: str = "") -> Any:  # noqa: ANN401 - whatever JSON holds
+    """Read a JSON file.
+
+    Args:
+        path: the file.
+        what: it is expected to be, for the message: "a rig file".
+
+    Raises:
+        InputError: as :func:`read_text`, or not JSON; the message names the line.
+    """
+    return parsed_json(read_text(path), path, what)
+
+
+def parsed_json(text: str, path: str | Path, what: str = "") -> Any:  # noqa: ANN401 - whatever JSON holds
+    """Return JSON text as what it holds; errors as :func:`read_json`."""
+    expected = f"; expected {what}" if what else ""
+    try:
+        return json.loads(text, parse_int=_integer)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg}){expected}") from None
+    except RecursionError:
+        raise InputError(f"{path}: not JSON that can be read: nested too deep{expected}") from None
+
+
+def _integer(digits: str) -> int | float:
+    """Return an integer, one that no double holds as infinity."""
+    return int(digits) if len(digits) < 300 else float(digits)
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises:
+        InputError: as :func:`read_text`, or not TOML; the message names the line.
+    """
+    import tomllib
+
+    text = read_text(path)
+    try:
+        return tomllib.loads(text)
+    except ValueError as error:  # also a number of thousands of digits
+        raise InputError(f"{path}: not TOML: {error}") from None
+    except RecursionError:
+        raise InputError(f"{path}: not TOML that can be read: nested too deep") from None
 
 
 def _encoding(path: str | Path, data: bytes) -> str:
@@ -50,7 +170,7 @@ def _encoding(path: str | Path, data: bytes) -> str:
     declared = re.match(rb"<\?xml[^>]*?encoding\s*=\s*[\"']([\w.:-]+)", data)
     name = "utf-8" if declared is None else declared[1].decode()
     try:
-        codecs.lookup(name)
+        "".encode(name)  # zlib and its like are codecs, too, and none of text
     except LookupError:
         raise InputError(f"{path}: line 1: declares encoding {name!r}, which is not known; save it as UTF-8") from None
     return "utf-8" if name.lower().startswith("utf-16") else name  # its declaration could not be read if it were
@@ -74,11 +194,17 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> li
         InputError: missing, unreadable, not text or not a table, decimal commas and points in one table, or a name of
             ``columns`` that the first line does not have.
     """
-    text = read_text(path).removeprefix("\ufeff")
-    first = text.partition("\n")[0]
+    lines = _lines(path)
+    first = next(lines, "").removeprefix("\ufeff")
     mark = next((mark for mark in (";", "\t") if mark in first and "," not in first), ",")
+    rows: list[list[str]] = []
+    cells = 0
     try:
-        rows = list(csv.reader(io.StringIO(text), delimiter=mark))
+        for row in csv.reader(itertools.chain([first] if first else [], lines), delimiter=mark):
+            rows.append(row)
+            cells += len(row) + 1
+            if cells > _TABLE_CELLS:
+                raise InputError(f"{path}: more than {_TABLE_CELLS} cells up to line {len(rows)}: split the table")
     except csv.Error as error:
         raise InputError(f"{path}: not a table: {error}") from None
     if mark != ",":
@@ -86,6 +212,19 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> li
     if columns and rows:
         rows[0] = _renamed(path, [name.strip() for name in rows[0]], columns)
     return rows
+
+
+def _lines(path: str | Path) -> Iterator[str]:
+    """Yield the lines of a table; errors as :func:`read_text`."""
+    data = read_bytes(path, TABLE_MB)
+    file = io.TextIOWrapper(io.BytesIO(data), _encoding(path, data))
+    try:
+        while line := file.readline(_LONGEST_LINE + 1):
+            if len(line) > _LONGEST_LINE:
+                raise InputError(f"{path}: a line of more than {_LONGEST_LINE} characters: not a table")
+            yield line
+    except UnicodeDecodeError as error:
+        raise InputError(_no_text(path, data, error)) from None
 
 
 def _with_points(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
@@ -162,6 +301,11 @@ class _NamedFile(io.FileIO):
         with self._named():
             return super().write(data)
 
+    def sync(self) -> None:
+        """Have the disk hold what was written: without it a crash after the renaming leaves an empty file."""
+        with self._named():
+            os.fsync(self.fileno())
+
     def close(self) -> None:
         with self._named():
             super().close()
@@ -181,6 +325,16 @@ def _target(path: str | Path) -> Path:
         kind = "a folder" if os.path.isdir(target) else "a device"
         raise InputError(f"{path}: cannot be written: it is {kind}; give the name of a file")
     return target
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have the disk hold a folder's names, where the system can."""
+    with contextlib.suppress(OSError):
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
 
 
 def _beside(target: Path) -> Path:
@@ -212,8 +366,12 @@ def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
         # A name that is not text (an undecodable file name) is written with escapes rather than not at all.
         file = buffered if "b" in mode else io.TextIOWrapper(buffered, encoding="utf-8", errors="backslashreplace")
         yield file
+        if not file.closed:
+            file.flush()
+            raw.sync()
         file.close()
         os.replace(temporary, target)
+        _sync_folder(target.parent)
     except OSError as error:
         if error.filename != os.fspath(temporary):
             raise

@@ -28,7 +28,6 @@ from __future__ import annotations
 
 import difflib
 import os
-import tomllib
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -39,7 +38,7 @@ from scipy.spatial.transform import Rotation
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import read_text
+from armsight.files import read_toml
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_quaternion_wxyz
 from armsight.robot.arm import Arm
@@ -99,25 +98,13 @@ def split_arm(name_or_path: str) -> tuple[str, str | None]:
     return (path, link) if mark and link and not os.path.isfile(name_or_path) else (name_or_path, None)
 
 
-def parsed_toml(path: str | Path) -> dict[str, Any]:
-    """Return what a TOML file holds.
-
-    Raises:
-        InputError: unreadable, or not TOML.
-    """
-    try:
-        return tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not TOML: {error}") from None
-
-
 def read_arm_toml(path: str | Path) -> Arm:
     """Read an arm from a TOML file.
 
     Raises:
         InputError: unreadable, or a key or number that is not allowed; the message names it.
     """
-    given = parsed_toml(path)
+    given = read_toml(path)
     if "identified" in given:
         return _identified(path, given)
     rows = given.pop("joint", None)

@@ -19,7 +19,7 @@ import numpy as np
 
 from armsight.data import SIDES, Array, Image, Record
 from armsight.errors import InputError
-from armsight.files import read_text, replacing, write_text
+from armsight.files import read_json, replacing, write_text
 from armsight.geometry.check import checked
 from armsight.sim.render.background import BACKGROUNDS
 from armsight.sim.render.optics import Optics, Sensor
@@ -73,7 +73,7 @@ class Truth(Record):
         """
         path = Path(folder) / TRUTH
         try:
-            document = json.loads(read_text(path))
+            document = read_json(path)
             if document["format"] != FORMAT or document["version"] > VERSION:
                 raise InputError(f"{path}: expected format {FORMAT}, version up to {VERSION}")
             entries = document["shots"]
@@ -84,7 +84,7 @@ class Truth(Record):
                 checked([entry["t_s"] for entry in entries], (None,), "t_s"),
                 checked([entry["T_left_body_m"] for entry in entries], (None, 4, 4), "T_left_body_m"),
             )
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
+        except (KeyError, TypeError) as error:
             raise InputError(f"{path}: not the truth of a recording: {error}") from None
 
 

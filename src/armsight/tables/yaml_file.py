@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import yaml
 
 from armsight.errors import InputError
-from armsight.files import read_text
+from armsight.files import YAML_MB, read_text
 
 #: A value of a file of another program: a number, a text, a list or a mapping, unknown until checked.
 Foreign: TypeAlias = Any
@@ -89,7 +89,7 @@ def read_yaml(path: str | Path) -> Mapping[str, Foreign]:
     Raises:
         InputError: missing, not YAML, another number of documents, or no mapping; the message names file and line.
     """
-    documents = parse_yaml(read_text(path), path)
+    documents = parse_yaml(read_text(path, YAML_MB), path)
     if len(documents) != 1:
         raise InputError(
             f"{path}: holds {len(documents)} YAML documents, separated by ---; expected one: keep one of them"

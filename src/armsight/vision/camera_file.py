@@ -10,7 +10,6 @@ Kannala-Brandt's. A camera may have its own ``image_size_px``.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import numpy as np
 
 from armsight.data import SIDES
 from armsight.errors import InputError
-from armsight.files import read_text
+from armsight.files import read_json
 from armsight.geometry.check import checked
 from armsight.vision.camera import Camera
 
@@ -32,12 +31,7 @@ def read_cameras(path: str | Path) -> tuple[Camera, Camera]:
     Raises:
         InputError: missing, not JSON, or not two cameras; the message names the file and the entry.
     """
-    try:
-        document = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg})") from None
-    except (ValueError, RecursionError) as error:  # a number of thousands of digits, thousands of brackets
-        raise InputError(f"{path}: not a file of cameras: {error}") from None
+    document = read_json(path)
     if not isinstance(document, dict) or not all(isinstance(document.get(side), dict) for side in SIDES):
         raise InputError(f'{path}: expected an object with "left" and "right", each with "K" and "distortion"')
     size = document.get("image_size_px")

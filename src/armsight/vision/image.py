@@ -19,7 +19,10 @@ from numpy.typing import NDArray
 
 from armsight.data import Image
 from armsight.errors import InputError
+from armsight.files import read_bytes
 
+#: Largest image file; half: 50 Mpx of 16 bits, uncompressed, are rejected; double: as much more memory.
+IMAGE_MB = 128
 _STDERR = threading.Lock()
 
 
@@ -82,12 +85,7 @@ def read_image(path: str | Path) -> Image:
     Raises:
         InputError: missing, unreadable, not an image, or truncated; the message names the file.
     """
-    try:
-        data = Path(path).read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    data = read_bytes(path, IMAGE_MB)
     if not data:
         raise InputError(f"{path}: the file is empty")
     for start, (kind, complete) in _FORMATS.items():

@@ -16,7 +16,7 @@ import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import read_text, write_text
+from armsight.files import parsed_json, read_text, write_text
 from armsight.geometry.check import checked
 from armsight.geometry.pose import exp_se3
 from armsight.vision.camera import DISTORTION_MODELS, Camera
@@ -349,12 +349,7 @@ def _check_covariance(cov: Array, names: tuple[str, ...]) -> None:
 
 def _document(text: str, path: str | Path) -> dict[str, Any]:
     """Return the JSON object of a rig file of a version this program knows."""
-    try:
-        document = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg}); expected a rig file") from None
-    except (ValueError, RecursionError) as error:  # a number of thousands of digits, thousands of brackets
-        raise InputError(f"{path}: not a rig file: {error}") from None
+    document = parsed_json(text, path, "a rig file")
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise InputError(f'{path}: not a rig file: expected "format": "{FORMAT}"; `armsight calibrate` writes one')
     version = document.get("version")

@@ -46,7 +46,7 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path):
         ),
         (("current_limit_ma = 1600", "current_limit_ma = -5"), "current_limit_ma is -5; 10 to 500000 is allowed"),
         (("supply_min_mv = 10000", "supply_min_mv = -5"), "supply_min_mv is -5; 0 to 4294967295 is allowed"),
-        (("[joint.2]", "[joint.1]"), "no board.toml: .*joint"),
+        (("[joint.2]", "[joint.1]"), "not TOML: .*joint"),
         (("joint_count = 6", "joint_count = 5"), "there is joint.6.soft_min_rad, but arm.joint_count is 5: leave"),
         (("soft_max_rad = 2.4", "soft_max_rad = 24.0"), "joint 1: soft_max_rad is 24; -13 to 13 is allowed"),
         (("soft_max_rad = 2.4", "soft_max_rad = '2.4'"), "joint.1.soft_max_rad is '2.4'; a number is needed"),

@@ -14,8 +14,6 @@ its base is.
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -37,7 +35,7 @@ from armsight.app.check.run_folder import (
 from armsight.app.run.record import read_track
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import finite_json, read_table, read_text
+from armsight.files import finite_json, read_json, read_table, read_toml
 from armsight.geometry.pose import mean_pose
 from armsight.loop.identify.backlash import joint_backlashes
 from armsight.loop.identify.identify import Identified, identify
@@ -380,10 +378,7 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
 def _summary(folder: Path) -> dict[str, Any]:
     """Return summary.json of a run, empty where there is none."""
     path = folder / "summary.json"
-    try:
-        found = json.loads(read_text(path)) if path.is_file() else {}
-    except ValueError as error:
-        raise InputError(f"{path}: not JSON: {error}") from None
+    found = read_json(path) if path.is_file() else {}
     return found if isinstance(found, dict) else {}
 
 
@@ -670,7 +665,7 @@ def seen_angles(folder: Path, arm: Arm) -> Array:
     except (ValueError, IndexError):
         raise InputError(f"{path}: numbers are needed in {', '.join(names)}") from None
     try:
-        start = tomllib.loads(read_text(folder / "motion.toml")).get("start_deg", np.degrees(arm.home).tolist())
+        start = read_toml(folder / "motion.toml").get("start_deg", np.degrees(arm.home).tolist())
         return np.vstack([np.radians(np.array(start, float)), seen])
-    except (tomllib.TOMLDecodeError, ValueError):
+    except ValueError:
         raise InputError(f"{folder / 'motion.toml'}: is not of an arm of {arm.joints} joints") from None

@@ -18,7 +18,7 @@ from armsight.app.report.page import PAGE, bullets, html_page, picture, put_file
 from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, arrows, drawing, new_figure, panels, png
 from armsight.app.report.table import TextTable, html_table, plain_text
 from armsight.errors import InputError
-from armsight.files import read_text, write_text
+from armsight.files import read_json, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, FigureBase
@@ -278,10 +278,7 @@ def read_report(path: Path) -> dict[str, Any]:
     Raises:
         InputError: it is none, or of another version.
     """
-    try:
-        found = json.loads(read_text(path))
-    except ValueError as error:
-        raise InputError(f"{path}: not JSON: {error}") from None
+    found = read_json(path)
     if not isinstance(found, dict) or found.get("kind") != "arm report":
         raise InputError(f"{path}: no report of an arm; armsight arm report RUN -o DIR writes DIR/report.json")
     if found.get("version") != VERSION:

@@ -16,7 +16,7 @@ from armsight.app.report.page import html_page, picture, table, text
 from armsight.app.report.plotting import BLUE, MUTED, ORANGE, drawing, new_figure, png
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import read_text, write_text
+from armsight.files import read_json, write_text
 from armsight.robot.boards.codes import Reaction, SensorKind
 from armsight.robot.boards.configuration import (
     CONFIG_VERSION,
@@ -237,7 +237,7 @@ class Found:
             InputError: it is no such file.
         """
         try:
-            data = json.loads(read_text(path))
+            data = read_json(path)
             names = {each.name for each in fields(JointFound)}
             joints = data["joints"]
             if data.pop("version") != CONFIG_VERSION or not isinstance(joints, list) or len(joints) != JOINTS:

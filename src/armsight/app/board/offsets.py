@@ -16,7 +16,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import check_outputs, check_writable, read_text, write_text
+from armsight.files import check_outputs, check_writable, read_json, read_text, write_text
 from armsight.robot.arm import Arm
 from armsight.robot.boards.ar4.models import SENSE
 from armsight.robot.boards.configuration import Configuration, check_configuration
@@ -69,9 +69,9 @@ def restored_changes(board: FeetechBoard, path: Path) -> list[OffsetChange]:
         InputError: it is no such file, or of another arm.
     """
     try:
-        kept = json.loads(read_text(path))["homing_offsets"]
+        kept = read_json(path)["homing_offsets"]
         wished = {int(id): int(value) for id, value in kept.items()}
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError):
+    except (KeyError, TypeError, ValueError, AttributeError):
         raise InputError(f"{path}: not a file of old offsets that `armsight board offsets` kept") from None
     for id, value in wished.items():
         if abs(value) > MOST_OFFSET:

@@ -25,7 +25,7 @@ from armsight.app.body import PAPERS
 from armsight.app.report.plotting import drawing, plain
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import replacing
+from armsight.files import read_bytes, replacing
 from armsight.geometry.pose import transform
 from armsight.sim.render.scene import CLEAR, Pattern, aprilgrid, charuco, chessboard, circle_grid, tag
 from armsight.vision.discs.predict import face_axes, look_direction
@@ -345,7 +345,7 @@ def draw_body(
     else:
         layout = read_layout(path)
         name, (planes, notes) = layout.name, pages(path, layout)
-        foot = f"{plain(Path(path).name)}   sha256 {hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]}"
+        foot = f"{plain(Path(path).name)}   sha256 {hashlib.sha256(read_bytes(path)).hexdigest()[:16]}"
     sizes = [_paper(path, page, paper, split) for page in planes]
     parts = [_sheets(size, PAPERS[paper]) if split and paper != "fit" else [] for size in sizes]
     if suffix == ".png":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import tempfile
 from collections.abc import Callable
 from functools import partial
@@ -18,7 +17,7 @@ from armsight.app.check import CYCLES, DRIFT_CYCLES, REQUIRED_CYCLES
 from armsight.app.run.motion_file import read_motions
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import read_text, write_text
+from armsight.files import read_json, write_text
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rotation import quaternion_wxyz
@@ -133,7 +132,7 @@ def seen_by(run: Path) -> Allowed:
     rig, body = StereoRig.load(run / "rig.json"), open_target(str(run / "body.toml")).body.points
     file = run / "handeye.json"
     try:
-        document = json.loads(read_text(file))
+        document = read_json(file)
         T_base_rig, T_tool_body = (checked(document[key], (4, 4), key) for key in ("T_base_rig", "T_tool_body"))
     except InputError as error:
         raise InputError(f"{file}: {error}" if str(file) not in str(error) else str(error)) from None

@@ -15,7 +15,6 @@ From top to bottom: reading and segments, noise, rests, paths, circle, joint rev
 from __future__ import annotations
 
 import re
-import tomllib
 from collections import Counter
 from dataclasses import dataclass
 from itertools import combinations, pairwise
@@ -28,7 +27,7 @@ from armsight.app.check.rows import SAME_M, Attained, Reversal, Row, first_few, 
 from armsight.app.run.record import ToolTrack, read_track
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import read_table, read_text
+from armsight.files import read_table, read_toml
 from armsight.geometry.pose import mean_pose, pose
 from armsight.loop.iso9283.paths import plane_axes
 from armsight.loop.iso9283.poses import MIN_POSES
@@ -215,9 +214,9 @@ def segments_of(folder: Path, closed: bool) -> list[PathSegment]:
 def _kinds(file: Path) -> dict[str, str]:
     """Return the kind of every motion of a motion file by its name."""
     try:
-        entries: Any = tomllib.loads(read_text(file)).get("motion", [])
+        entries: Any = read_toml(file).get("motion", [])
         return {str(e.get("name", f"{e['kind']} {n}")): str(e["kind"]) for n, e in enumerate(entries, start=1)}
-    except (tomllib.TOMLDecodeError, AttributeError, KeyError, TypeError):
+    except (AttributeError, KeyError, TypeError):
         raise InputError(f"{file}: not a motion file (docs/howto/motions.md)") from None
 
 

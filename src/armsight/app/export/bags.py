@@ -11,7 +11,7 @@ from typing import Any
 
 from armsight.app.stream.ros import TO_ROS, ros_name
 from armsight.errors import InputError
-from armsight.files import replacing
+from armsight.files import opened, replacing
 from armsight.vision.sources.bag import Bag
 
 
@@ -24,7 +24,7 @@ def write_mcap(file: Path, output: Path) -> list[Path]:
     except ImportError:
         raise InputError(f'{file}: MCAP needs mcap, which is not installed: pip install "armsight[record]"') from None
     Bag(file)  # names what is wrong with it
-    with replacing(output, "wb") as out, file.open("rb") as stream:
+    with replacing(output, "wb") as out, opened(file) as stream:
         writer = Writer(out, compression=CompressionType.ZSTD)
         writer.start(profile="", library="armsight")
         schemas: dict[int, int] = {0: 0}

@@ -7,7 +7,6 @@ covariance from the pixels' scatter over all images; the camera may be calibrate
 from __future__ import annotations
 
 import glob
-import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from armsight.app.handeye.read import PoseTable
 from armsight.data import Array, Detections, Missed, Record
 from armsight.errors import InputError
-from armsight.files import read_text
+from armsight.files import read_json, read_text
 from armsight.geometry.pose import exp_se3, transform
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.handeye import LEVER_M
@@ -132,10 +131,7 @@ def read_camera(path: Path) -> Camera:
         InputError: missing, or none of these.
     """
     if path.suffix.lower() == ".json":
-        try:
-            document = json.loads(read_text(path))
-        except json.JSONDecodeError as error:
-            raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg})") from None
+        document = read_json(path)
         if not isinstance(document, dict) or "K" not in document:
             raise InputError(
                 f'{path}: expected {{"image_size_px": [w, h], "K": [[..]], "distortion": [..]}}, one camera'

@@ -22,10 +22,11 @@ from armsight.loop.handeye.handeye import MIN_POSES, Poses
 from armsight.loop.handeye.streams import GAP_S
 from armsight.robot.arm import Arm
 from armsight.vision.sources.bag import Bag
+from armsight.vision.sources.bag.reader import SUFFIXES
 from armsight.vision.sources.bag.states import PoseTrack, read_joints, read_track
 
 #: Files, and the file in a folder, that are recordings of ROS or Foxglove.
-RECORDINGS, RECORDING_INDEX = (".bag", ".mcap", ".db3"), "metadata.yaml"
+RECORDING_INDEX = "metadata.yaml"
 #: An arm that moves further than this in LATE_S, m, at half of the shots moves on while images are on their way.
 LATE_S, MOVING_M = 0.02, 1e-3
 #: An arm is taken to rest between two poses of a recording that differ by less, m and rad.
@@ -75,7 +76,7 @@ def recording_of(robot: Path) -> Path | None:
     text = str(robot)
     if text.startswith("bag:"):
         return Path(text[4:])
-    return robot if robot.suffix in RECORDINGS or (robot / RECORDING_INDEX).is_file() else None
+    return robot if robot.suffix in SUFFIXES or (robot / RECORDING_INDEX).is_file() else None
 
 
 def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseTable:

@@ -45,6 +45,7 @@ from armsight.app.live.records import command_of, json_text
 from armsight.app.live.session import LiveSession
 from armsight.app.run.loop import SWITCH_S
 from armsight.errors import ArmsightError, DeviceError, InputError
+from armsight.files import read_bytes
 from armsight.vision.image import grey
 
 if TYPE_CHECKING:
@@ -205,8 +206,8 @@ class LiveServer:
     def _drawing(self, connection: ServerConnection, path: str) -> Response:
         """Answer with a drawing, to be printed from the computer that shows the page."""
         try:
-            data = (self.session.folder / path.removeprefix("/")).read_bytes()
-        except OSError:
+            data = read_bytes(self.session.folder / path.removeprefix("/"))
+        except InputError:
             return _text(connection, HTTPStatus.NOT_FOUND, "it is not drawn yet\n")
         response = _text(connection, HTTPStatus.OK, "")
         response.body = data

@@ -23,6 +23,7 @@ from armsight.vision.sources import Source, notes_of, open_source
 from armsight.vision.sources.bag import Bag
 from armsight.vision.sources.bag.camera_info import bag_rig
 from armsight.vision.sources.bag.images import IMAGES, image_topics, parsed, source_of
+from armsight.vision.sources.bag.reader import SUFFIXES
 from armsight.vision.sources.bag.states import read_joints
 from armsight.vision.sources.bag.tags import TAGS, read_tags
 from armsight.vision.sources.folder import INDEX
@@ -112,7 +113,9 @@ def _of_source(request: Request, recorded: RecordedRun | None, say: Callable[[st
         raise InputError(f"{request.recording}: what is to be measured in it? give --target, a board or a body file")
     path, named = parsed(request.recording.removeprefix("bag:"))
     folder = Path(path).expanduser()
-    if folder.is_dir() and ((folder / INDEX).is_file() or not [*folder.glob("*.mcap"), *folder.glob("*.db3")]):
+    if folder.is_dir() and (
+        (folder / INDEX).is_file() or not any(each.suffix in SUFFIXES for each in folder.iterdir())
+    ):
         return _of_images(request, open_source(path), None, say)
     bag = Bag(path if recorded is None else recorded.path)
     if bag.of_kind(*IMAGES):

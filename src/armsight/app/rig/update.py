@@ -6,7 +6,6 @@ with the old rig beside the new one.
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from armsight.app.report.page import PAGE, html_page, put_files, table, text, writable_folder
 from armsight.data import Missed
 from armsight.errors import InputError
+from armsight.files import read_json
 from armsight.loop.health.rig import TEST_S
 from armsight.loop.health.update import DEPTHS_M, LEAST_STAYS, RigUpdate, updated_rig
 from armsight.vision.detections import SeenShot, detection_times, read_detections
@@ -74,9 +74,9 @@ def _found_since(run: Path) -> float | None:
     """Return since when a run found that its cameras had moved against each other, s; None where it did not."""
     file = run / "summary.json"
     try:
-        health = json.loads(file.read_text(encoding="utf-8")).get("health", [])
+        health = read_json(file).get("health", [])
         since = [each["since_s"] for each in health if each["cause"] == "rig"]
-    except (OSError, ValueError, AttributeError, KeyError, TypeError):
+    except (InputError, AttributeError, KeyError, TypeError):
         return None
     return float(since[0]) if since and isinstance(since[0], int | float) else None
 

@@ -6,7 +6,6 @@ joints, home, line or circle; ``_KINDS`` lists the keys of each. Lengths are in 
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import read_text
+from armsight.files import read_toml
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3, from_euler_zyx
 from armsight.robot.arm import Arm
@@ -84,10 +83,7 @@ def read_motions(arm: Arm, path: str | Path = DEFAULT_MOTION) -> MotionPlan:
         InputError: the file cannot be read, a key or a number is not allowed, or a motion cannot be made; the message
             names the file and the motion.
     """
-    try:
-        document = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not TOML: {error}") from None
+    document = read_toml(path)
     start = _numbers(f"{path}", document.pop("start_deg", np.degrees(arm.home).tolist()), "start_deg", arm.joints)
     entries = document.pop("motion", None)
     if document:

@@ -16,7 +16,7 @@ import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import write_text
+from armsight.files import read_toml, write_text
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import nearest_rotation, quaternion_wxyz
 from armsight.loop.identify import model as chain
@@ -28,7 +28,6 @@ from armsight.robot.arm_file import (
     file_transform,
     identified_table,
     joint_numbers,
-    parsed_toml,
     tilted_urdf,
 )
 
@@ -178,7 +177,7 @@ def is_corrected(path: str | Path) -> bool:
     Raises:
         InputError: a .toml file that is unreadable, or not TOML.
     """
-    return str(path).lower().endswith(".toml") and "identified" in parsed_toml(path)
+    return str(path).lower().endswith(".toml") and "identified" in read_toml(path)
 
 
 def open_corrected(path: str | Path) -> Corrected:
@@ -189,7 +188,7 @@ def open_corrected(path: str | Path) -> Corrected:
     Raises:
         InputError: unreadable, no corrected.toml, or something in it is missing or wrong; the message names it.
     """
-    given = parsed_toml(path)
+    given = read_toml(path)
     if "identified" not in given:
         raise InputError(f"{path}: no identified arm; `armsight identify -o DIR` writes DIR/corrected.toml")
     arm, beta = identified_table(path, given)

@@ -23,7 +23,6 @@ Every value must be there, once; a name that is not known is named with the one 
 from __future__ import annotations
 
 import difflib
-import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from armsight.errors import InputError
-from armsight.files import read_text
+from armsight.files import read_toml
 from armsight.robot.boards.codes import SensorKind
 from armsight.robot.boards.configuration import (
     CONFIG,
@@ -119,10 +118,7 @@ def read_configuration(path: Path) -> tuple[Configuration, str]:
     Raises:
         InputError: it cannot be read, or names the file and the value that is missing, unknown, or out of range.
     """
-    try:
-        data = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: no board.toml: {error}") from None
+    data = read_toml(path)
     if data.get("version") != CONFIG_VERSION or not isinstance(data.get("board"), str):
         raise InputError(
             f"{path}: version is {data.get('version')!r} and board {data.get('board')!r}; version {CONFIG_VERSION} and a"

@@ -7,13 +7,12 @@ not have is left out. What each parameter does to a disc: the documentation's pa
 from __future__ import annotations
 
 import os
-import tomllib
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
 from armsight.errors import InputError
-from armsight.files import read_text
+from armsight.files import read_toml
 from armsight.sim.render.optics import Optics
 from armsight.sim.render.render import Shutter
 
@@ -367,13 +366,13 @@ class CameraPipeline:
     @classmethod
     def _from_tables(cls, path: str | Path) -> Self:
         """Return what a file says."""
-        tables = _tables(path)
+        tables = read_toml(path)
         base = tables.pop("preset", None)
         if base is not None:
             if base not in preset_names():
                 raise InputError(f"{path}: preset is {base!r}; known are {', '.join(preset_names())}")
             changed = tables
-            tables = _tables(_PRESETS / f"{base}.toml")
+            tables = read_toml(_PRESETS / f"{base}.toml")
             for stage, values in changed.items():
                 tables[stage] = tables.get(stage, {}) | values if isinstance(values, dict) else values
         stages: dict[str, Any] = {
@@ -431,14 +430,6 @@ STAGES: dict[str, type[Stage]] = {
 def preset_names() -> tuple[str, ...]:
     """Return the names of the presets, the plainest first."""
     return ("clean", *sorted(path.stem for path in _PRESETS.glob("*.toml") if path.stem != "clean"))
-
-
-def _tables(path: str | Path) -> dict[str, Any]:
-    """Return the tables of a TOML file."""
-    try:
-        return tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not TOML: {error}") from None
 
 
 def _stage(path: str | Path, name: str, values: object) -> Stage:

@@ -9,7 +9,6 @@ has the amounts.
 from __future__ import annotations
 
 import os
-import tomllib
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import read_text
+from armsight.files import read_toml
 from armsight.robot.arm import Arm
 
 #: Rows of the table whose amounts say more than where base and tool are.
@@ -117,10 +116,7 @@ def imperfections(arm: str) -> Imperfections:
         known = f"{', '.join(PRESETS)}, or a TOML file (docs/howto/workcell.md)"
         hint = f"; a file's name must end in .toml: {arm}" if os.path.isfile(arm) else ""
         raise InputError(f"arm {arm!r} is unknown; known are {known}{hint}")
-    try:
-        given = tomllib.loads(read_text(arm))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{arm}: not TOML: {error}") from None
+    given = read_toml(arm)
     preset = given.pop("preset", "nominal")
     if preset not in PRESETS:
         raise InputError(f"{arm}: preset is {preset!r}; known are {', '.join(PRESETS)}")

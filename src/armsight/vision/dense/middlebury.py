@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Image, Record
 from armsight.errors import InputError
-from armsight.files import read_text, replacing
+from armsight.files import check_readable, read_bytes, read_text, replacing
 from armsight.vision.dense.evaluate import TrueDisparity, seen_by_right
 from armsight.vision.dense.method import Search
-from armsight.vision.image import read_image
+from armsight.vision.image import IMAGE_MB, read_image
 
 
 def read_pfm(path: str | Path) -> NDArray[np.float32]:
@@ -37,12 +37,7 @@ def read_pfm(path: str | Path) -> NDArray[np.float32]:
     Raises:
         InputError: missing, unreadable, or no grey PFM.
     """
-    try:
-        data = Path(path).read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    data = read_bytes(path, IMAGE_MB)
     try:
         kind, size, scale, rest = data.split(b"\n", 3)
         width, height = (int(n) for n in size.split())
@@ -79,7 +74,7 @@ def read_tiff(path: str | Path) -> NDArray[Any] | None:
         return None
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # or it warns of tags it does not know
     try:
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image = cv2.imread(check_readable(path, IMAGE_MB), cv2.IMREAD_UNCHANGED)
     finally:
         cv2.utils.logging.setLogLevel(level)
     return None if image is None else np.asarray(image)

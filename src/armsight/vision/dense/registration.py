@@ -28,6 +28,7 @@ from scipy.spatial import cKDTree
 
 from armsight.data import Array, Missed, Record
 from armsight.errors import InputError
+from armsight.files import read_bytes
 from armsight.geometry.check import checked
 from armsight.geometry.pose import exp_se3, inverse, transform
 
@@ -127,6 +128,7 @@ def outline_pull(
     return J.T @ (weight[:, None] * J), J.T @ (weight * off)
 
 
+_STL_MB = 64  # largest mesh, 1.3 million triangles; half: some scans are rejected; double: 600 MB of memory
 #: Distance between the points a mesh is sampled at, m, and the neighbours that a normal of a cloud is fitted to.
 _SPACING_M, _NEIGHBOURS = 0.002, 24
 #: The reach begins at the largest error of the first pose and shrinks by this share each step, to so many sigmas of the
@@ -347,10 +349,7 @@ def read_stl(path: str | Path, unit_m: float = 1e-3) -> tuple[Array, NDArray[np.
     Raises:
         InputError: missing, unreadable, or no binary STL.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    data = read_bytes(path, _STL_MB)
     count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else 0
     if count == 0 or len(data) < 84 + 50 * count:
         raise InputError(f"{path}: not a binary STL mesh (80 bytes of header, a count, 50 bytes a triangle)")

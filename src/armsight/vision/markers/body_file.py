@@ -11,7 +11,6 @@ The format: docs/howto/targets.md. How well a body can be located is a separate 
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from armsight.data import Array, Body, Record
 from armsight.errors import InputError
-from armsight.files import read_table, read_text, write_text
+from armsight.files import read_table, read_toml, write_text
 from armsight.geometry.check import checked
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_euler_zyx, from_quaternion_wxyz
@@ -136,10 +135,7 @@ def read_body_file(path: str | Path, kinds: Collection[str]) -> tuple[str, tuple
     Raises:
         InputError: missing, not TOML, or not a body; the message names the file and the entry.
     """
-    try:
-        document = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not TOML: {error}") from None
+    document = read_toml(path)
     unknown = set(document) - {"version", "name", "markers"}
     if unknown:
         raise InputError(f"{path}: unknown key {sorted(unknown)[0]!r}; a body file has version, name and [[markers]]")

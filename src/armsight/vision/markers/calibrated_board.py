@@ -12,7 +12,6 @@ against the drawing, that is a residual in every shot. The format::
 from __future__ import annotations
 
 import json
-import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.errors import InputError
-from armsight.files import read_text, write_text
+from armsight.files import read_toml, write_text
 from armsight.geometry.check import checked
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import VERSION
@@ -87,7 +86,7 @@ def load_board_file(path: str | Path) -> EstimatedBoard:
     Raises:
         InputError: missing, malformed, or points that are not those of the board; the message names the file.
     """
-    document = tomllib.loads(read_text(path))
+    document = read_toml(path)
     if unknown := document.keys() - {"version", "board", "points_mm"}:
         raise InputError(f"{path}: unknown key {min(unknown)!r}; a board file has version, board and points_mm")
     version, spec = document.get("version", 1), document["board"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +13,7 @@ from scipy.spatial.distance import pdist
 
 from armsight.data import Body, Detections, Record
 from armsight.errors import InputError
-from armsight.files import read_text
+from armsight.files import read_toml
 from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.board import BOARDS, open_board
 from armsight.vision.markers.board_marker import BoardTarget, board_codes, check_codes, dictionary
@@ -168,11 +167,8 @@ def _codes(target: Target) -> set[tuple[str, int]]:
 
 
 def _is_board_file(path: str) -> bool:
-    """Say whether a TOML file describes a board as calibrated; one that is no TOML is left to the body files' reader."""
-    try:
-        return "board" in tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError:
-        return False
+    """Say whether a TOML file describes a board as calibrated."""
+    return "board" in read_toml(path)
 
 
 def open_body(spec: str) -> Body:

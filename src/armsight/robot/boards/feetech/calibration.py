@@ -18,7 +18,7 @@ import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import read_text, write_text
+from armsight.files import read_json, write_text
 from armsight.robot.boards.feetech.registers import COUNTS, MIDDLE, MOST_OFFSET, RAD_PER_COUNT
 
 #: The joints of an SO-100 or SO-101 from the base on; ids 1 to 5.
@@ -148,10 +148,7 @@ def write_offsets(path: str | Path, source: str | Path, offsets: dict[int, int])
 
 
 def _entries(path: str | Path) -> dict[str, dict[str, Any]]:
-    try:
-        entries = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: no JSON: line {error.lineno}: {error.msg}") from None
+    entries = read_json(path)
     if not isinstance(entries, dict) or not all(isinstance(each, dict) for each in entries.values()):
         raise InputError(f"{path}: no calibration of LeRobot: an object of joints is needed, each with id and range")
     if not set(entries) - {GRIPPER}:

@@ -53,20 +53,22 @@ _NAMED = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1"
 #: Of several topics of one camera the first of these is taken: raw before rectified or processed images.
 _PREFERRED = ("image_raw", "image", "image_mono", "image_color")
 _S_NS = 1e9
+#: Messages that wait until they are due, MB; half: a recording far from the order of time is read more often; double: twice
+#: the memory.
+_HELD_MB = 128
 
 
 @dataclass(frozen=True)
 class _Planned:
-    """A shot to be: the message numbers of its two images, None where one has no partner."""
+    """A shot to be: the message numbers of its two images, none where one has no partner."""
 
-    left: int | None
-    right: int | None
+    messages: tuple[int, ...]
     t_s: float
     problem: str | None
 
 
 class BagSource:
-    """The stereo images of a recording; two messages that belong together are a shot.
+    """The stereo images of a recording in the order of time; two messages that belong together are a shot.
 
     An image without a partner is a shot with a problem, which says so.
 
@@ -78,7 +80,7 @@ class BagSource:
     def __init__(self, bag: Bag, topics: tuple[str, str], pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> None:
         self.topics, self.notes = topics, (*bag.notes, *pairing.notes)
         self._bag = bag
-        self._planned = _plan(topics, pairing, stamps)
+        self._planned = _plan(pairing, stamps)
         self._shots = self._read()
 
     @property
@@ -95,40 +97,39 @@ class BagSource:
         self._shots = iter(())
 
     def _read(self) -> Iterator[Shot]:
-        waiting: tuple[dict[int, BagMessage], dict[int, BagMessage]] = ({}, {})
-        messages = self._bag.messages(self.topics)
+        due = {key: k for k, planned in enumerate(self._planned) for key in enumerate(planned.messages)}
+        held: dict[tuple[int, int], BagMessage] = {}
+        messages, passes, size = self._bag.messages(self.topics), 0, 0
         for number, planned in enumerate(self._planned):
-            name = f"{number:06d}"
+            name, needed = f"{number:06d}", tuple(enumerate(planned.messages))
+            while any(key not in held for key in needed) and passes <= number + 1:
+                message = next(messages, None)
+                if message is None:  # the recording's order is far from that of time: once more from its beginning
+                    messages, passes = self._bag.messages(self.topics), passes + 1
+                    continue
+                key = (self.topics.index(message.topic), message.index)
+                if due.get(key, -1) >= number:
+                    held[key] = message
+                    size += len(message.data)
+                if size > _HELD_MB * 1e6 and len(held) > 2:
+                    size -= len(held.pop(max(held, key=lambda each: due[each])).data)
             if planned.problem is not None:
                 yield Shot(name, None, None, planned.t_s, planned.problem)
-                continue
-            needed = (planned.left, planned.right)
-            while any(n not in held for n, held in zip(needed, waiting, strict=True)):
-                message = next(messages, None)
-                if message is None:
-                    yield Shot(name, None, None, planned.t_s, "the recording ends before both images")
-                    return
-                waiting[self.topics.index(message.topic)][message.index] = message
-            pair_ = [held.pop(n) for n, held in zip(needed, waiting, strict=True) if n is not None]
-            for n, held in zip(needed, waiting, strict=True):  # those without a partner are not waited for
-                for old in [k for k in held if n is not None and k < n]:
-                    del held[old]
-            yield _shot(name, planned.t_s, pair_)
+            elif any(key not in held for key in needed):
+                yield Shot(
+                    name, None, None, planned.t_s, "an image cannot be read a second time: has the file changed?"
+                )
+            else:
+                pair_ = [held.pop(key) for key in needed]
+                size -= sum(len(each.data) for each in pair_)
+                yield _shot(name, planned.t_s, pair_)
 
 
-def _plan(topics: tuple[str, str], pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> list[_Planned]:
-    """Return the shots in the order of the left messages; those without a partner follow the one before."""
-    left, _ = stamps
-    rows: list[tuple[float, _Planned]] = []
-    for k, n in pairing.pairs:
-        rows.append((k, _Planned(k, n, left.t_ns[k] / _S_NS, None)))
-    of_right = {n: k for k, n in pairing.pairs}
-    for side, n in pairing.alone:
-        t_s = stamps[side].t_ns[n] / _S_NS
-        other = topics[1 - side]
-        problem = f"{topics[side]} has an image at {t_s:.3f} s, {other} none within {1e3 * pairing.allowed_s:.1f} ms"
-        at = float(n) if side == 0 else max((k for m, k in of_right.items() if m < n), default=-1) + 0.5
-        rows.append((at, _Planned(None, None, t_s, problem)))
+def _plan(pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> list[_Planned]:
+    """Return the shots in the order of time."""
+    rows = [(pairing.due_ns[0, k], _Planned((k, n), stamps[0].t_ns[k] / _S_NS, None)) for k, n in pairing.pairs]
+    for (side, n), problem in pairing.alone.items():
+        rows.append((pairing.due_ns[side, n], _Planned((), stamps[side].t_ns[n] / _S_NS, problem)))
     return [planned for _, planned in sorted(rows, key=lambda row: row[0])]
 
 
@@ -198,11 +199,14 @@ def source_of(bag: Bag, topics: tuple[str, str]) -> BagSource:
 
 def stamps_of_topics(bag: Bag, topics: tuple[str, str]) -> tuple[Stamps, Stamps]:
     """Read the stamps of two topics."""
-    found: dict[str, tuple[list[int], list[int]]] = {topic: ([], []) for topic in topics}
+    found: dict[str, tuple[list[int], list[int], list[int]]] = {topic: ([], [], []) for topic in topics}
     for message in bag.messages(topics):
-        header, arrival = found[message.topic]
+        header, arrival, contents = found[message.topic]
         header.append(message.stamp_ns())
         arrival.append(message.arrival_ns)
+        contents.append(hash(message.data))
+    if any(header and max(header) <= 0 for header, _, _ in found.values()):  # both cameras by one clock
+        found = {topic: ([0] * len(arrival), arrival, contents) for topic, (_, arrival, contents) in found.items()}
     left, right = (stamps_of(topic, *found[topic]) for topic in topics)
     for each in (left, right):
         if not each.t_ns:

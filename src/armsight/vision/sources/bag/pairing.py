@@ -1,8 +1,9 @@
 """Pairs the messages of two topics by their time stamps, and says what it left out.
 
-In: the stamps of both topics in the order they were recorded. Out: pairs of message numbers, the unpaired ones, and notes
-on stamps that cannot be right. Two messages are a pair where each is the other's nearest and they are no further apart
-than half the period of the faster topic.
+In: the stamps of both topics, in any order. Out: pairs of message numbers, the unpaired ones, and notes on stamps that
+cannot be right. Two messages are a pair where each is the other's nearest and they are no further apart than half the
+period of the faster topic. Several with one stamp are paired in the order of the recording; one that was recorded twice
+counts once.
 """
 
 from __future__ import annotations
@@ -11,13 +12,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from armsight.data import Array
 from armsight.errors import InputError
 
-#: A stamp that moves by this much more or less than the recorder's clock has jumped, s.
-_JUMP_S = 1.0
-#: A pair is never further apart than this, s, however slow the topics are.
+_Times = NDArray[np.int64]
+#: A clock that moves by so much more or less than the recorder's has jumped, s, and as many periods; half: messages that
+#: come late are taken for a jump; double: a clock that steps by a second is not seen.
+_JUMP_S, _JUMP_PERIODS = 1.0, 4.0
+#: So many messages are looked at together: half of them that come late are no jump; half, double: shorter, longer bursts.
+_TOGETHER = 5
+#: Of the times that messages took this quantile is that of one without a stamp; half, double: the same if few are late.
+_LATE = 0.25
+#: A pair is never further apart than this, s, however slow the topics are; half, double: the same for all above 1 Hz.
 _APART_S = 0.5
 _NS = 1e-9
 
@@ -28,46 +37,99 @@ class Stamps:
 
     Attributes:
         topic: its name.
-        t_ns: time stamps, ns, in the order of the messages: those of the headers, or the arrival where there are none.
+        t_ns: time stamps, ns, in the order of the messages: those of the headers, or from the arrival where there are none.
         notes: what is wrong with them.
+        repeats: numbers of the messages that were recorded before, with the same stamp and content.
+        jumps_ns: after how much time of arrival the clock jumped, ns, and by how much; none for most.
+        arrival_ns: the recorder's times of arrival, ns.
     """
 
     topic: str
     t_ns: tuple[int, ...]
     notes: tuple[str, ...] = ()
+    repeats: frozenset[int] = frozenset()
+    jumps_ns: tuple[tuple[int, int], ...] = ()
+    arrival_ns: tuple[int, ...] = ()
 
     @property
     def period_s(self) -> float:
-        """Median interval, s; infinite where there are fewer than two."""
-        return float(np.median(np.abs(np.diff(self.t_ns)))) * _NS if len(self.t_ns) > 1 else np.inf
+        """Median interval, s; infinite where there are fewer than two times."""
+        return _period_ns(np.array(self.t_ns, np.int64)) * _NS
 
 
-def stamps_of(topic: str, header_ns: Sequence[int], arrival_ns: Sequence[int]) -> Stamps:
+def _period_ns(t: _Times) -> float:
+    steps = np.diff(np.unique(t))
+    return float(np.median(steps)) if len(steps) else np.inf
+
+
+def stamps_of(
+    topic: str, header_ns: Sequence[int], arrival_ns: Sequence[int], contents: Sequence[int] | None = None
+) -> Stamps:
     """Return the stamps of a topic, checked.
 
     Args:
         topic: its name.
         header_ns: stamps of the headers, ns.
         arrival_ns: the recorder's times of arrival, ns.
+        contents: a hash of each message's content, by which one that was recorded twice is found.
     """
-    stamps, arrivals, notes = list(header_ns), list(arrival_ns), []
-    bad = [k for k, t in enumerate(stamps) if t <= 0]
-    if bad:
-        said = "all" if len(bad) == len(stamps) else str(len(bad))
+    t, arrival, notes = np.array(header_ns, np.int64), np.array(arrival_ns, np.int64), []
+    seen: set[tuple[int, int]] = set()
+    repeats = set()
+    for k, key in enumerate(zip(header_ns, contents or (), strict=False)):
+        if key in seen and key[0] > 0:
+            repeats.add(k)
+        seen.add(key)
+    bad = t <= 0
+    good = np.flatnonzero(~bad & ~np.isin(np.arange(len(t)), [*repeats]))
+    jumps = _jumps(t[good], arrival[good])
+    if bad.any():
+        said = "all" if bad.all() else str(int(bad.sum()))
         notes.append(
-            f"{topic}: {said} of {len(stamps)} stamps are zero or negative, first at message {bad[0]}: the time of arrival "
-            "is used for the whole topic"
+            f"{topic}: {said} of {len(t)} stamps are zero or negative, first at message {int(np.argmax(bad))}: taken from "
+            "the time of arrival"
         )
-        return Stamps(topic, tuple(arrivals), tuple(notes))
-    steps = np.diff(np.array(stamps, dtype=np.int64)) * _NS
-    jumps = np.flatnonzero(np.abs(steps - np.diff(np.array(arrivals, dtype=np.int64)) * _NS) > _JUMP_S)
-    if len(jumps):
-        k = int(jumps[0])
-        notes.append(
-            f"{topic}: its clock jumps {len(jumps)} time{'' if len(jumps) == 1 else 's'}, first by {steps[k]:+.3f} s after "
-            f"message {k}: shots are paired on either side of it"
-        )
-    return Stamps(topic, tuple(stamps), tuple(notes))
+        t[bad] = arrival[bad]
+        if len(good):
+            late = arrival[good] - _continuous(t[good], arrival[good], jumps)
+            t[bad] -= int(np.quantile(late, _LATE))
+            t[bad] = _continuous(t[bad], arrival[bad], [(at, -by) for at, by in jumps])
+    if jumps:
+        times, by_s = f"{len(jumps)} time{'' if len(jumps) == 1 else 's'}", jumps[0][1] * _NS
+        notes.append(f"{topic}: its clock jumps {times}, first by {by_s:+.3f} s: shots are paired on either side of it")
+    if repeats:
+        notes.append(f"{topic}: {len(repeats)} of {len(t)} messages were recorded twice: each counts once")
+    return Stamps(topic, tuple(t.tolist()), tuple(notes), frozenset(repeats), jumps, tuple(arrival.tolist()))
+
+
+def _continuous(t: _Times, arrival: _Times, jumps_ns: Sequence[tuple[int, int]]) -> _Times:
+    """Return stamps (N,) as if the clock had not jumped."""
+    for at, by in jumps_ns:
+        t = np.where(arrival >= at, t - by, t)
+    return t
+
+
+def _jumps(t: _Times, arrival: _Times) -> tuple[tuple[int, int], ...]:
+    """Return when, by the time of arrival, the clock of stamps (N,) jumped, and by how much; all in ns.
+
+    A single message that comes late is none, nor a burst of them: their stamps fill the gap that they left.
+    """
+    if len(t) <= _TOGETHER:
+        return ()
+    order = np.lexsort((t, arrival))
+    early, came = t[order], arrival[order]
+    period = _period_ns(t)
+    least = max(_JUMP_S / _NS, _JUMP_PERIODS * period)
+    step, took = (np.diff(median_filter(each, _TOGETHER, mode="nearest")).astype(float) for each in (early, came))
+    at = np.flatnonzero((step < -least) | (step - took > least)) + 1
+    spacing = np.diff(np.sort(t)).astype(float)
+    filled = spacing.max() <= least and np.sum(spacing < period / 2) < _TOGETHER
+    if (
+        not len(at) or filled or np.diff([0, *at, len(t)]).min() < (_TOGETHER + 1) // 2
+    ):  # no clock jumps at each message
+        return ()
+    offsets = [int(np.median(part)) for part in np.split(early - came, at)]
+    return tuple((int(came[k]), after - before) for k, before, after in zip(at, offsets, offsets[1:], strict=False))
 
 
 @dataclass(frozen=True)
@@ -75,18 +137,20 @@ class Pairing:
     """Which messages are one shot.
 
     Attributes:
-        pairs: (left, right) message numbers in the order of the left ones.
-        alone: (side, message number) of those without a partner: 0 left, 1 right.
+        pairs: (left, right) message numbers in the order of time.
+        alone: (side, message number) of those without a partner, 0 left, 1 right -> why.
         allowed_s: how far apart a pair may be, s.
         skew_s: median of right minus left over the pairs, s; 0 without any.
         notes: what was left out.
+        due_ns: (side, message number) -> its time as if no clock had jumped, ns.
     """
 
     pairs: tuple[tuple[int, int], ...]
-    alone: tuple[tuple[int, int], ...]
+    alone: dict[tuple[int, int], str]
     allowed_s: float
     skew_s: float
     notes: tuple[str, ...]
+    due_ns: dict[tuple[int, int], int]
 
 
 def pair(left: Stamps, right: Stamps, allowed_s: float | None = None) -> Pairing:
@@ -102,40 +166,69 @@ def pair(left: Stamps, right: Stamps, allowed_s: float | None = None) -> Pairing
     """
     if allowed_s is None:
         allowed_s = min(_APART_S, left.period_s / 2, right.period_s / 2)
-    a, b = np.array(left.t_ns, dtype=np.int64), np.array(right.t_ns, dtype=np.int64)
-    if len(a) == len(b) > 1 and not (a != a[0]).any() and not (b != b[0]).any():
-        note = f"{left.topic} and {right.topic}: all stamps are the same: paired in the order of the recording"
-        pairs_ = tuple((k, k) for k in range(len(a)))
-        return Pairing(pairs_, (), allowed_s, 0.0, (*left.notes, *right.notes, note))
-    there, back = _nearest(a, b), _nearest(b, a)
-    pairs = [(k, int(n)) for k, n in enumerate(there) if back[n] == k and abs(int(b[n]) - int(a[k])) * _NS <= allowed_s]
+    notes = [*left.notes, *right.notes]
+    if len(left.t_ns) > 1 and len({*left.t_ns}) == len({*right.t_ns}) == 1:
+        notes.append(f"{left.topic} and {right.topic}: all stamps are the same: paired in the order of the recording")
+    # A clock jumped if messages find their partners so; what came late does not.
+    choices = [_mutual(left, right, jumps, allowed_s) for jumps in ((left.jumps_ns, _shared(left, right)), ((), ()))]
+    (a, b), pairs, gap_s = max(choices, key=lambda choice: len(choice[1]))
     if not pairs:
-        gap_s = float(np.min(np.abs(b[there] - a))) * _NS
         raise InputError(
             f"{left.topic} and {right.topic}: no two images within {1e3 * allowed_s:.1f} ms; the closest are "
             f"{gap_s:.3f} s apart: are their clocks the same?"
         )
     with_left, with_right = {k for k, _ in pairs}, {n for _, n in pairs}
-    alone = [(0, k) for k in range(len(a)) if k not in with_left] + [
-        (1, n) for n in range(len(b)) if n not in with_right
-    ]
-    notes = [*left.notes, *right.notes]
-    if alone:
-        counts = [sum(side == each for each, _ in alone) for side in (0, 1)]
+    alone: dict[tuple[int, int], str] = {}
+    for side, (of, other, paired) in enumerate(((left, right, with_left), (right, left, with_right))):
+        for n in set(range(len(of.t_ns))) - paired:
+            why = f"{other.topic} none within {1e3 * allowed_s:.1f} ms"
+            why = "recorded twice: it counts once" if n in of.repeats else why
+            alone[side, n] = f"{of.topic} has a message at {of.t_ns[n] * _NS:.3f} s, {why}"
+    counts = [sum(side == each for each, _ in alone) - len(of.repeats) for side, of in enumerate((left, right))]
+    if any(counts):
         notes.append(
             f"{counts[0]} of {len(a)} messages of {left.topic} and {counts[1]} of {len(b)} of {right.topic} have no "
             f"partner within {1e3 * allowed_s:.1f} ms"
         )
     skews: Array = np.array([b[n] - a[k] for k, n in pairs]) * _NS
-    return Pairing(tuple(pairs), tuple(alone), allowed_s, float(np.median(skews)), tuple(notes))
+    due = {(0, k): int(t) for k, t in enumerate(a)} | {(1, n): int(t) for n, t in enumerate(b)}
+    pairs.sort(key=lambda pair_: due[0, pair_[0]])
+    return Pairing(tuple(pairs), alone, allowed_s, float(np.median(skews)), tuple(notes), due)
 
 
-def _nearest(of: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Return for each time (N,) the row of the nearest among (M,), which need not be sorted."""
-    order = np.argsort(among, kind="stable")
-    sorted_ = among[order]
-    after = np.clip(np.searchsorted(sorted_, of), 1, max(len(sorted_) - 1, 1))
+def _mutual(
+    left: Stamps, right: Stamps, jumps: tuple[Sequence[tuple[int, int]], ...], allowed_s: float
+) -> tuple[list[_Times], list[tuple[int, int]], float]:
+    """Return the times of both as if their clocks had not jumped, ns, who is whose nearest, and the least distance, s."""
+    both, groups = [], []
+    for of, jumps_ns in zip((left, right), jumps, strict=True):
+        t = _continuous(np.array(of.t_ns, np.int64), np.array(of.arrival_ns, np.int64), jumps_ns)
+        rows: dict[int, list[int]] = {}  # those of one time, in the order of the recording
+        for k in np.argsort(t, kind="stable").tolist():
+            if k not in of.repeats:
+                rows.setdefault(int(t[k]), []).append(k)
+        both.append(t)
+        groups.append(rows)
+    (one, other), (ours, theirs) = ([list(rows.values()) for rows in groups], [np.array([*rows]) for rows in groups])
+    there, back = _nearest(ours, theirs), _nearest(theirs, ours)
+    apart_s = np.abs(theirs[there] - ours) * _NS
+    found = [(one[k], other[n]) for k, n in enumerate(there) if back[n] == k and apart_s[k] <= allowed_s]
+    return both, [pair_ for mates in found for pair_ in zip(*mates, strict=False)], float(apart_s.min())
+
+
+def _shared(left: Stamps, right: Stamps) -> Sequence[tuple[int, int]]:
+    """Return the jumps of the right clock, by as much as the left one where both are one: pairs stay as they are."""
+    if len(left.jumps_ns) != len(right.jumps_ns):
+        return right.jumps_ns
+    return [
+        (at, by if abs(by - ours) < _JUMP_S / 2 / _NS else ours)
+        for (_, by), (at, ours) in zip(left.jumps_ns, right.jumps_ns, strict=True)
+    ]
+
+
+def _nearest(of: _Times, among: _Times) -> NDArray[np.int64]:
+    """Return for each time (N,) the row of the nearest among rising ones (M,)."""
+    after = np.clip(np.searchsorted(among, of), 1, max(len(among) - 1, 1))
     before = after - 1
-    after = np.minimum(after, len(sorted_) - 1)
-    nearer = np.where(np.abs(sorted_[after] - of) < np.abs(sorted_[before] - of), after, before)
-    return np.asarray(order[nearer])
+    after = np.minimum(after, len(among) - 1)
+    return np.where(np.abs(among[after] - of) < np.abs(among[before] - of), after, before)

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import sqlite3
 import struct
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from armsight.errors import InputError
+from armsight.files import check_readable, opened, read_text
 
 #: A message as its library decodes it; what it holds is checked where it is used.
 Decoded: TypeAlias = Any
@@ -29,9 +31,13 @@ _Raw: TypeAlias = tuple[str, int, str, bytes, Callable[[], Decoded]]
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _COMPRESSIONS = ("", "lz4", "zstd")
+#: Largest record of an MCAP file, MB: a message of raw 33 Mpx in colour; half: 16 Mpx; double: as much more memory.
+_CHUNK_MB = 100
 #: Bytes before the stamp of a message that begins with a header: ROS 1 has a sequence number, CDR says its byte order.
 _BEFORE_STAMP = 4
 _SECOND_NS = 1_000_000_000
+#: Suffixes of recordings; in a folder files of the first that is there are one recording.
+SUFFIXES = (".mcap", ".db3", ".bag")
 _INSTALL = 'pip install "armsight[ros]"'
 
 
@@ -98,9 +104,9 @@ class Bag:
         self.path = path
         self.notes: list[str] = []
         self.metadata: dict[str, dict[str, str]] = {}
-        self._files = _files(path)
-        read = _McapFiles(path, self._files, self.notes, self.metadata) if _is_mcap(self._files[0]) else None
-        self._container: _McapFiles | _RosFile = read or _RosFile(path)
+        files = _files(path, self.notes)
+        read = _McapFiles(path, files, self.notes, self.metadata) if _is_mcap(files[0]) else None
+        self._container: _McapFiles | _RosFiles = read or _RosFiles(path, files, self.notes)
         self.topics = {topic.name: topic for topic in self._container.topics()}
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
@@ -127,31 +133,43 @@ class Bag:
         return "; ".join([text, *self.notes])
 
 
-def _files(path: str | Path) -> list[Path]:
-    """Return the files of a recording.
+def _files(path: str | Path, notes: list[str]) -> list[Path]:
+    """Return the files of a recording in the order of its metadata.yaml; or a folder, of one that is compressed as a whole.
 
     Raises:
         InputError: nothing is there, or a folder holds no bag.
     """
     given = Path(path).expanduser()
-    if given.is_file():
-        return [given]
     if not given.is_dir():
-        raise InputError(
-            f"{path}: no such recording; expected a .bag, .db3 or .mcap file, or the folder of a ROS 2 bag"
-        )
-    for suffix in (".mcap", ".db3"):
-        if found := sorted(given.glob(f"*{suffix}")):
-            return found
-    raise InputError(f"{path}: this folder holds no recording: expected .mcap or .db3 files and metadata.yaml")
+        if not given.exists():
+            raise InputError(
+                f"{path}: no such recording; expected a .bag, .db3 or .mcap file, or the folder of a ROS 2 bag"
+            )
+        check_readable(given)
+        return [given]
+    metadata = given / "metadata.yaml"
+    about = read_text(metadata) if metadata.exists() else ""
+    if re.search(r"^ *compression_mode: *.?(file|message)", about, re.MULTILINE | re.IGNORECASE):
+        return [given]
+    listed = re.search(r"^ *relative_file_paths:((?: *\n *- .*)+)", about, re.MULTILINE)
+    named = [Path(name.strip("- '\"")).name for name in listed[1].split("\n") if name.strip()] if listed else []
+    there = next((found for suffix in SUFFIXES if (found := [*given.glob(f"*{suffix}")])), [])
+    if not there:
+        raise InputError(f"{path}: this folder holds no recording: expected {', '.join(SUFFIXES)} files")
+    there.sort(key=lambda each: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", each.name)])
+    here = {each.name: each for each in there}
+    notes += [f"{metadata} names {name}, which is missing: the rest is read" for name in named if name not in here]
+    more = [name for name in here if name not in named]
+    if named and more:
+        notes.append(f"{metadata} does not name {', '.join(more)}: read after the others")
+    return [here[name] for name in (*(name for name in named if name in here), *more)]
 
 
 def _is_mcap(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    if path.is_dir():
+        return False
+    with opened(path) as file:
+        return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
 
 
 def _plain(kind: str) -> str:
@@ -159,32 +177,44 @@ def _plain(kind: str) -> str:
     return kind.replace("/msg/", "/")
 
 
-class _RosFile:
-    """A ROS 1 bag or a ROS 2 bag of sqlite3; it is open only while it is read."""
+class _RosFiles:
+    """A ROS 1 bag or the files of a ROS 2 bag of sqlite3, read one after the other; each is open only while it is read."""
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, files: list[Path], notes: list[str]) -> None:
         try:
             import rosbags.highlevel  # noqa: F401 - only whether it is there
         except ImportError:
             raise InputError(f"{path}: a ROS bag is read with rosbags, which is not installed: {_INSTALL}") from None
-        self._path = path
+        self._path, self._files = path, []
         counts: dict[tuple[str, str], int] = {}
-        with self._opened() as reader:
-            self._store, self._is_cdr = reader.typestore, bool(reader.is2)
-            for each in reader.connections:
-                key = (each.topic, _plain(each.msgtype))
-                counts[key] = counts.get(key, 0) + each.msgcount
+        for file in files:
+            try:
+                with self._opened(file) as reader:
+                    self._is_cdr = bool(reader.is2)
+                    for each in reader.connections:
+                        key = (each.topic, _plain(each.msgtype))
+                        counts[key] = counts.get(key, 0) + each.msgcount
+            except InputError as error:
+                if len(files) == 1:
+                    raise
+                notes.append(f"{file.name}: left out: {error}")
+                continue
+            self._files.append(file)
+        if not self._files:
+            raise InputError(f"{path}: none of its {len(files)} files can be read; {notes[-1]}")
         self._topics = [Topic(name, kind, count) for (name, kind), count in counts.items()]
 
     @contextlib.contextmanager
-    def _opened(self) -> Iterator[_RosReader]:
-        """Open the file for a block; whatever the library finds wrong with it becomes one line."""
+    def _opened(self, file: Path) -> Iterator[_RosReader]:
+        """Open a file for a block; whatever the library finds wrong with it becomes one line."""
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
 
         try:
-            path = Path(self._path).expanduser()
-            with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            if not file.is_dir():
+                check_readable(file)
+            with AnyReader([file], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+                self._store = reader.typestore
                 yield reader
         except (InputError, GeneratorExit):
             raise
@@ -196,16 +226,19 @@ class _RosFile:
 
     def messages(self, topics: Collection[str]) -> Iterator[_Raw]:
         encoding = "cdr" if self._is_cdr else "ros1"
-        with self._opened() as reader:
-            connections = [each for each in reader.connections if each.topic in topics]
-            for connection, arrival_ns, data in reader.messages(connections) if connections else ():
-                decode = self._decoder(bytes(data), connection.msgtype)
-                yield connection.topic, arrival_ns, encoding, bytes(data), decode
+        for file in self._files:
+            with self._opened(file) as reader:
+                connections = [each for each in reader.connections if each.topic in topics]
+                for connection, arrival_ns, data in reader.messages(connections) if connections else ():
+                    decode = self._decoder(bytes(data), connection.msgtype)
+                    yield connection.topic, arrival_ns, encoding, bytes(data), decode
 
     def _decoder(self, data: bytes, kind: str) -> Callable[[], Decoded]:
+        store = self._store
+
         def decode() -> Decoded:
             try:
-                return (self._store.deserialize_cdr if self._is_cdr else self._store.deserialize_ros1)(data, kind)
+                return (store.deserialize_cdr if self._is_cdr else store.deserialize_ros1)(data, kind)
             except Exception as error:  # noqa: BLE001 - as above
                 raise InputError(_undecodable(self._path, _plain(kind), error)) from None
 
@@ -277,8 +310,8 @@ class _McapFiles:
             return None
 
         try:
-            with file.open("rb") as stream:
-                for record in StreamReader(stream, emit_chunks=True).records:
+            with opened(file) as stream:
+                for record in StreamReader(stream, emit_chunks=True, record_size_limit=_CHUNK_MB * 1_000_000).records:
                     if not isinstance(record, records.Chunk):
                         if (one := found(record)) is not None:
                             yield one
@@ -288,7 +321,7 @@ class _McapFiles:
                             f"{self._path}: its chunks are compressed with {record.compression!r}; lz4 and zstd are read: "
                             f"mcap compress --compression zstd {file} -o OUT.mcap"
                         )
-                    for inner in breakup_chunk(record, validate_crc=True):
+                    for inner in breakup_chunk(_decompressed(record), validate_crc=True):
                         if (one := found(inner)) is not None:
                             yield one
         except InputError:
@@ -319,6 +352,25 @@ class _McapFiles:
                 raise InputError(_undecodable(self._path, _plain(name), error)) from None
 
         return decode
+
+
+def _decompressed(chunk: _McapRecord) -> _McapRecord:
+    """Return a chunk decompressed; one that is larger than it says, or than any is, raises a ValueError before it is."""
+    size = chunk.uncompressed_size
+    if size > _CHUNK_MB * 1_000_000:
+        raise ValueError(f"a chunk of {size / 1e6:.0f} MB, more than {_CHUNK_MB}")
+    data = chunk.data
+    if chunk.compression == "lz4":
+        import lz4.frame
+
+        data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+    elif chunk.compression == "zstd":
+        import zstandard
+
+        data = zstandard.ZstdDecompressor(max_window_size=_CHUNK_MB * 1_000_000).stream_reader(data).read(size + 1)
+    if len(data) != size:
+        raise ValueError(f"a chunk that says {size} bytes and has {len(data)}, or more")
+    return replace(chunk, compression="", data=data)
 
 
 def _mcap_decoder(schema: _McapRecord, channel: _McapRecord) -> Callable[[bytes], Decoded]:

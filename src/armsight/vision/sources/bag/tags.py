@@ -70,8 +70,7 @@ def read_tags(spec: str, target: Target | Body) -> tuple[list[SeenShot], tuple[s
     nothing = (np.zeros(0, np.int64), np.zeros((0, 2)))
     rows: list[tuple[int, tuple[int | None, int | None], str | None]] = []
     rows += [(stamps[0].t_ns[k], (k, n), None) for k, n in pairing.pairs]
-    for side, n in pairing.alone:
-        alone = f"{topics[1 - side]} has no message within {1e3 * pairing.allowed_s:.1f} ms of {topics[side]}'s"
+    for (side, n), alone in pairing.alone.items():
         rows.append((stamps[side].t_ns[n], (n, None) if side == 0 else (None, n), alone))
     rows.sort(key=lambda row: row[0])
     shots = []
