@@ -1,4 +1,4 @@
-"""A length that cannot be one is refused with the unit in which it would be."""
+"""A length that cannot be one is rejected with the unit in which it would be."""
 
 import pytest
 
@@ -19,7 +19,7 @@ def test_the_unit_of_a_baseline(number, unit_m, fits):
             check_length(number * unit_m, unit_m, BASELINE)
 
 
-def test_what_no_unit_makes_ordinary_is_refused_without_one():
+def test_what_no_unit_makes_ordinary_is_rejected_without_one():
     with pytest.raises(InputError, match=r"farthest position 1e.09 m.*is the file damaged"):
         check_length(1e9, 1.0, REACH)
 

@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 from armsight.app.handeye.read import PoseTable
 from armsight.data import Array, Detections, Missed, Record
 from armsight.errors import InputError
-from armsight.files import read_json, read_text
 from armsight.geometry.pose import exp_se3, transform
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.handeye import LEVER_M
-from armsight.tables.yaml_file import read_yaml
 from armsight.vision.camera import Camera
-from armsight.vision.camera_file import camera_of
+from armsight.vision.camera_file import read_camera
 from armsight.vision.image import grey, read_image
 from armsight.vision.locate import by_rig
 from armsight.vision.markers.circles import unseen_row
@@ -34,7 +32,6 @@ from armsight.vision.markers.targets import open_target
 from armsight.vision.measure import measure
 from armsight.vision.pnp import body_poses
 from armsight.vision.rig import StereoRig
-from armsight.vision.rigfiles.rigfile import focal_and_centre, need
 from armsight.vision.sources.source import Source
 
 #: Steps of the refinement of a pose, and the change, m and rad, below which it has settled.
@@ -122,45 +119,6 @@ def see_with_camera(
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Return a key that sorts image2 before image10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
-
-
-def read_camera(path: Path) -> Camera:
-    """Read the calibration of one camera: {"image_size_px", "K", "distortion"}, ROS's or OpenCV's YAML.
-
-    Raises:
-        InputError: missing, or none of these.
-    """
-    if path.suffix.lower() == ".json":
-        document = read_json(path)
-        if not isinstance(document, dict) or "K" not in document:
-            raise InputError(
-                f'{path}: expected {{"image_size_px": [w, h], "K": [[..]], "distortion": [..]}}, one camera'
-            )
-        return camera_of(path, document)
-    if path.suffix.lower() not in (".yaml", ".yml"):
-        raise InputError(f"{path}: a camera is a .json, .yaml or .yml file, or fit (from the images themselves)")
-    if read_text(path).startswith("%YAML"):
-        return _opencv_camera(path)
-    document = dict(read_yaml(path))
-    K = np.asarray(need(need(document, "camera_matrix"), "data"), dtype=float).reshape(3, 3)
-    focal_and_centre(K, "camera_matrix")
-    distortion = need(need(document, "distortion_coefficients"), "data")
-    size = [need(document, "image_width"), need(document, "image_height")]
-    model = "fisheye" if document.get("distortion_model") in ("equidistant", "fisheye") else ""
-    return camera_of(path, {"image_size_px": size, "K": K, "distortion": distortion, "distortion_model": model})
-
-
-def _opencv_camera(path: Path) -> Camera:
-    """Read camera_matrix and distortion_coefficients as OpenCV's calibration sample writes them."""
-    try:
-        storage = cv2.FileStorage(read_text(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        K, d = (storage.getNode(key).mat() for key in ("camera_matrix", "distortion_coefficients"))
-        size = [int(storage.getNode(key).real()) for key in ("image_width", "image_height")]
-    except (cv2.error, SystemError):
-        raise InputError(f"{path}: not an OpenCV FileStorage file, or a damaged one") from None
-    if K is None or d is None:
-        raise InputError(f"{path}: has no camera_matrix and distortion_coefficients")
-    return camera_of(path, {"image_size_px": size, "K": K, "distortion": d.ravel()})
 
 
 def fit_camera(target: Target, detections: Sequence[Detections], size: tuple[int, int]) -> Camera:

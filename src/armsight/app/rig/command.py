@@ -12,20 +12,19 @@ import click
 
 from armsight.errors import InputError
 from armsight.files import check_outputs, check_writable
-from armsight.vision.rigfiles import ASSUMED_SIGMA_PX, FORMATS, export_rig, import_rig, open_format
+from armsight.vision.rigfiles import ASSUMED_SIGMA_PX, EXPORTED, FORMATS, export_rig, import_rig, open_format
 
 if TYPE_CHECKING:
     from armsight.vision.rig import StereoRig
-
-_FORMAT = click.option("--format", "name", required=True, type=click.Choice(list(FORMATS)), help="The other program.")
 
 
 @click.group("rig")
 def command() -> None:
     """Show a rig file, import a rig of another program, export one, or update one from what a run saw.
 
-    Files of each format, in this order: opencv: intrinsics.yml extrinsics.yml (or one file with both); ros: left.yaml
-    right.yaml (camera_info); kalibr: camchain.yaml.
+    Read are OpenCV's stereo calibrations (YAML, XML, JSON, .npz, .mat, any names), ROS's camera_info (left.yaml
+    right.yaml), Kalibr's and OpenVINS's camchain.yaml, EuRoC's sensor.yaml, Basalt, ORB-SLAM, caliscope, aniposelib,
+    multical, mrcal (left.cameramodel right.cameramodel) and Stereolabs (SN*.conf).
     """
 
 
@@ -43,8 +42,13 @@ def show(path: str, as_json: bool) -> None:
 @command.command("import")
 @click.argument("files", nargs=-1, required=True)
 @click.option("-o", "--output", required=True, metavar="RIG.json", help="The rig file to write.")
-@_FORMAT
+@click.option(
+    "--format", "name", type=click.Choice(list(FORMATS)), help="The other program; by default found by content."
+)
 @click.option("--unit-m", type=float, help="Length of the file's unit of translation, m; OpenCV files need it.")
+@click.option(
+    "--pair", metavar="LEFT,RIGHT", help="Names of the two cameras in a file of more; by default the first two."
+)
 @click.option("--image-size", metavar="WxH", help="Image size, px; OpenCV files without one need it.")
 @click.option(
     "--sigma-px", type=float, default=ASSUMED_SIGMA_PX, show_default=True, help="Standard deviation of a detection, px."
@@ -53,8 +57,9 @@ def show(path: str, as_json: bool) -> None:
 def import_(
     files: tuple[str, ...],
     output: str,
-    name: str,
+    name: str | None,
     unit_m: float | None,
+    pair: str | None,
     image_size: str | None,
     sigma_px: float,
     as_json: bool,
@@ -62,7 +67,11 @@ def import_(
     """Convert another program's calibration to a rig file. Its uncertainty is unknown, which the rig file records."""
     size = None if image_size is None else _image_size(image_size)
     check_writable(output, apart_from=files)
-    rig = import_rig(name, files, unit_m=unit_m, image_size_px=size, sigma_px=sigma_px)
+    names = None if pair is None else tuple(one.strip() for one in pair.split(","))
+    if names is not None and (len(names) != 2 or names[0] == names[1]):
+        raise InputError(f"--pair {pair}: expected the names of two cameras, left first, such as cam0,cam1")
+    chosen = None if names is None else (names[0], names[1])
+    rig = import_rig(name, files, unit_m=unit_m, image_size_px=size, sigma_px=sigma_px, pair=chosen)
     rig.save(output)
     for key in ("uncertainty", "sigma_px"):
         click.echo(f"note: {key}: {rig.provenance[key]}", err=True)
@@ -75,7 +84,7 @@ def import_(
 @click.argument("path", metavar="RIG.json")
 @click.argument("more", nargs=-1, metavar="[OUT]...")
 @click.option("-o", "--output", multiple=True, required=True, metavar="OUT", help="File to write; may be repeated.")
-@_FORMAT
+@click.option("--format", "name", required=True, type=click.Choice(list(EXPORTED)), help="The other program.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def export(path: str, more: tuple[str, ...], output: tuple[str, ...], name: str, as_json: bool) -> None:
     """Write a rig for another program, and print what its format cannot hold.

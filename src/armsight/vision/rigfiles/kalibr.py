@@ -1,7 +1,8 @@
-"""A Kalibr camchain YAML: cam0 is taken as left, cam1 as right.
+"""Kalibr's camchain YAML, OpenVINS's chains to the IMU, and the sensor.yaml pairs of EuRoC recordings.
 
-``T_cn_cnm1`` of cam1 takes cam0's coordinates to cam1's, in metres, so T_left_right is its inverse. Models: pinhole
-with radtan (Brown-Conrady, four coefficients), equidistant (Kannala-Brandt) or none.
+``T_cn_cnm1`` takes the coordinates of the camera before to camera n's, in metres; where a camera has none, its pose to the
+IMU holds: ``T_cam_imu`` takes the IMU's coordinates to the camera's, ``T_imu_cam`` and EuRoC's ``T_BS`` the other way.
+Models: pinhole with radtan (Brown-Conrady, four coefficients), equidistant (Kannala-Brandt) or none.
 """
 
 from __future__ import annotations
@@ -11,56 +12,88 @@ from pathlib import Path
 
 import numpy as np
 
+from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse
-from armsight.tables.yaml_file import Foreign, dump_yaml, read_yaml
+from armsight.tables.yaml_file import Foreign, dump_yaml
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
+    Document,
     ImportOptions,
     count_paths,
-    image_size,
-    imported,
-    naming,
-    need,
     not_held,
+    posed_rig,
     rigid,
     write_together,
 )
 
-FILES = "one file, camchain.yaml"
+TITLE = "a Kalibr camchain"
 #: Its file holds no rectification.
 RECTIFIES = False
-#: Kalibr model -> ours.
-MODELS = {"radtan": "brown4", "equidistant": "fisheye", "none": "none"}
+#: Poses to a third frame: name -> whether it takes the camera's coordinates to that frame's.
+_THIRD = {"T_cam_imu": False, "T_imu_cam": True, "T_BS": True, "T_C_B": False}
 #: Keys that armsight cannot represent.
-_LEFT_BEHIND = ("T_cam_imu", "timeshift_cam_imu", "rostopic")
+_LEFT_BEHIND = ("timeshift_cam_imu", "rostopic")
 
 
-def read(paths: Sequence[Path], options: ImportOptions) -> StereoRig:
-    """Read cam0 and cam1 of a camchain."""
-    count_paths(paths, (1,), FILES)
-    (path,) = paths
-    document = read_yaml(path)
-    with naming(path):
-        entries = [need(document, name) for name in ("cam0", "cam1")]
-        cameras = [_camera(name, entry, options) for name, entry in zip(("cam0", "cam1"), entries, strict=True)]
-        if "T_cn_cnm1" not in entries[1]:
-            raise InputError("cam1 has no 'T_cn_cnm1': calibrate both cameras in one chain")
-        T = checked(entries[1]["T_cn_cnm1"], (4, 4), "cam1.T_cn_cnm1")
-        T_right_left, notes = rigid(T[:3, :3], T[:3, 3], "rotation of cam1.T_cn_cnm1")
-    T_right_left[:3, 3] *= 1.0 if options.unit_m is None else options.unit_m
-    if others := [name for name in document if name not in ("cam0", "cam1")]:
-        notes.append(f"left behind: {', '.join(map(str, others))}")
-    if keys := [key for key in _LEFT_BEHIND if any(key in entry for entry in entries)]:
-        notes.append(f"left behind: {', '.join(keys)}")
-    return imported(cameras, inverse(T_right_left), options, paths, notes)
+def _entries(documents: Sequence[Document]) -> dict[str, Mapping[str, Foreign]]:
+    """Return the cameras of a chain, or of a pair of EuRoC's files, by name."""
+    if all("T_BS" in document and "intrinsics" in document for document in documents):
+        return {f"cam{i}": document for i, document in enumerate(documents)}
+    if len(documents) > 1:
+        return {}
+    return {
+        str(name): entry
+        for name, entry in documents[0].items()
+        if str(name)[-1:].isdigit() and str(name).startswith("cam") and isinstance(entry, Mapping)
+    }
+
+
+def recognises(documents: Sequence[Document]) -> bool:
+    """Say whether a file has cameras cam0, cam1, .. as Kalibr writes them, or files have EuRoC's."""
+    keys = {"camera_model", "cam_overlaps", "T_cn_cnm1", "distortion_coeffs", *_THIRD}
+    return any(keys & set(entry) for entry in _entries(documents).values())
+
+
+def read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+    """Read two cameras of a chain, or one camera of each of two sensor.yaml."""
+    entries = _entries(documents)
+    count_paths(paths, (1, 2), "one file, camchain.yaml, or two sensor.yaml, the left camera's first")
+    chained = all("T_cn_cnm1" in entry for entry in list(entries.values())[1:])
+    third = next((key for key in _THIRD if all(key in entry for entry in entries.values())), None)
+
+    def posed(name: str) -> tuple[Array, list[str]]:
+        if not chained and third is not None:
+            T, said = _rigid(entries[name][third], f"{name}.{third}")
+            return inverse(T) if _THIRD[third] else T, said
+        T, notes = np.eye(4), list[str]()
+        for link, entry in list(entries.items())[1 : list(entries).index(name) + 1]:
+            if "T_cn_cnm1" not in entry:
+                raise InputError(
+                    f"{link} has no 'T_cn_cnm1', nor have all cameras {' or '.join(_THIRD)}; there are {', '.join(entry)}: "
+                    "calibrate both cameras in one chain"
+                )
+            step, said = _rigid(entry["T_cn_cnm1"], f"{link}.T_cn_cnm1")
+            T, notes = step @ T, notes + said
+        return T, notes
+
+    rig = posed_rig(entries, posed, options, paths)
+    if keys := [key for key in _LEFT_BEHIND if any(key in entry for entry in entries.values())]:
+        rig.provenance["notes"].append(f"left behind: {', '.join(keys)}")
+    return rig
+
+
+def _rigid(value: Foreign, name: str) -> tuple[Array, list[str]]:
+    """Return (4, 4) a transform as printed, and notes."""
+    T = checked(value, (4, 4), name)
+    return rigid(T[:3, :3], T[:3, 3], f"rotation of {name}")
 
 
 def write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
     """Write a camchain of two cameras."""
-    count_paths(paths, (1,), FILES)
+    count_paths(paths, (1,), "one file, camchain.yaml")
     T_right_left = inverse(rig.T_left_right)
     document = {
         f"cam{i}": _entry(name, camera)
@@ -69,24 +102,6 @@ def write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
     document["cam1"] = {"T_cn_cnm1": T_right_left.tolist(), **document["cam1"]}
     write_together(paths, [dump_yaml(document)])
     return not_held(rig)
-
-
-def _camera(name: str, entry: Mapping[str, Foreign], options: ImportOptions) -> Camera:
-    """Build a camera from its entry in the chain."""
-    with naming(name):
-        kind = need(entry, "camera_model")
-        if kind != "pinhole":
-            raise InputError(
-                f"camera_model {kind!r} is not supported (Kalibr's omni, ds and eucm neither); use pinhole"
-            )
-        model = str(need(entry, "distortion_model"))
-        if model not in MODELS:
-            raise InputError(f"distortion_model {model!r} is not supported; supported are {', '.join(MODELS)}")
-        width_height = checked(need(entry, "resolution"), (2,), "resolution")
-        intrinsics = checked(need(entry, "intrinsics"), (4,), "intrinsics")
-        d = checked(need(entry, "distortion_coeffs"), (None,), "distortion_coeffs") if model != "none" else np.zeros(0)
-        size = image_size(width_height[0], width_height[1], options.image_size_px)
-        return Camera(size, MODELS[model], intrinsics, d)
 
 
 def _entry(name: str, camera: Camera) -> dict[str, Foreign]:

@@ -1,6 +1,6 @@
 """The contract of a foreign rig file: another program's calibration goes in, a StereoRig comes out, and back.
 
-To add a format: write one module with the two functions of :class:`RigFormat`, and add one line to ``FORMATS`` in
+To add a format: write one module with the functions of :class:`RigFormat`, and add one line to ``FORMATS`` in
 ``__init__.py``. The laws in tests/vision/rigfiles/test_rigfiles.py are parametrised over that registry. What the
 formats share, such as checking matrices and OpenCV's rectification, stands here too.
 """
@@ -8,10 +8,10 @@ formats share, such as checking matrices and OpenCV's rectification, stands here
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import cv2
 import numpy as np
@@ -21,11 +21,17 @@ from armsight.errors import InputError
 from armsight.files import replacing
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, mean_pose, pose
+from armsight.tables.lengths import BASELINE, check_length
 from armsight.tables.yaml_file import Foreign
 from armsight.vision.camera import Camera
+from armsight.vision.camera_file import camera_of
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles import ASSUMED_SIGMA_PX
 
+#: A file's names and values.
+Document: TypeAlias = Mapping[str, Foreign]
+#: A baseline longer than this is remarked, m.
+LONG_M = 2.0  # half: rooms' rigs are remarked; double: 30 cm read as inches are not
 #: OpenCV's alpha (of fisheyes: balance) of every rectification that is written: 0, as ROS's calibrator has it, scales the
 #: rectified images so that all of their pixels are valid; 1 would keep all pixels of the raw images, and black edges.
 ALPHA = 0.0
@@ -41,23 +47,31 @@ class ImportOptions:
         unit_m: length of the file's unit of translation, m; None where the file or the format says it.
         image_size_px: (width, height); None where the file says it.
         sigma_px: standard deviation of a detection, px.
+        pair: names of the left and the right camera, of a file that has more than two; None takes the first two.
     """
 
     unit_m: float | None = None
     image_size_px: tuple[int, int] | None = None
     sigma_px: float = ASSUMED_SIGMA_PX
+    pair: tuple[str, str] | None = None
 
 
 class RigFormat(Protocol):
-    """One foreign format; a module with this constant and these two functions fulfils it.
+    """One foreign format; a module with these constants and functions fulfils it, ``write`` where it is exported to.
 
     Attributes:
-        RECTIFIES: whether its files hold a rectification, which is computed with ALPHA.
+        TITLE: what its files are, for messages: "a Kalibr camchain".
+        RECTIFIES: whether its files hold a rectification, which is computed with ALPHA; of exported ones alone.
     """
 
+    TITLE: str
     RECTIFIES: bool
 
-    def read(self, paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+    def recognises(self, documents: Sequence[Document]) -> bool:
+        """Say by their content whether files are of this format."""
+        ...
+
+    def read(self, documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
         """Read a rig; its provenance says what was assumed and what was left behind.
 
         Raises:
@@ -78,6 +92,47 @@ def count_paths(paths: Sequence[Path], allowed: Sequence[int], names: str) -> No
     """Check the number of files given."""
     if len(paths) not in allowed:
         raise InputError(f"expected {names}, got {len(paths)} file(s): {', '.join(map(str, paths)) or 'none'}")
+
+
+def posed_rig(
+    entries: Mapping[str, Mapping[str, Foreign]],
+    pose_of: Callable[[str], tuple[Array, list[str]]],
+    options: ImportOptions,
+    paths: Sequence[Path],
+) -> StereoRig:
+    """Return the rig of two of several cameras whose poses in a third frame are known.
+
+    Args:
+        entries: each camera's entry by its name, in the order of the file.
+        pose_of: returns (4, 4) T_camera_reference of a camera, in the file's unit, and notes.
+        options: what the user added; ``pair`` chooses the two.
+        paths: the files.
+
+    Raises:
+        InputError: fewer than two, an unknown name in ``pair``, or a camera that cannot be read.
+    """
+    names = list(entries)
+    if len(names) < 2:
+        raise InputError(
+            f"{paths[-1]}: holds {'one camera, ' + names[0] if names else 'no camera'}; a rig has two: give both"
+        )
+    chosen = options.pair or (names[0], names[1])
+    for name in chosen:
+        if name not in entries:
+            raise InputError(f"{paths[-1]}: has no camera {name!r}; there are {', '.join(names)}: --pair LEFT,RIGHT")
+    cameras, Ts, notes = [], [], []
+    for name in chosen:
+        with naming(paths[min(names.index(name), len(paths) - 1)]), naming(name):
+            camera, said = camera_of(entries[name], options.image_size_px)
+        with naming(paths[-1]):
+            T, noted = pose_of(name)
+        cameras.append(camera)
+        Ts.append(T)
+        notes += [f"{name}: {note}" for note in said] + noted
+    if others := [name for name in names if name not in chosen]:
+        left, right = chosen
+        notes.append(f"left behind: {', '.join(others)}; {left} is left, {right} right: --pair LEFT,RIGHT chooses")
+    return imported(cameras, Ts[0] @ inverse(Ts[1]), options, paths, notes)
 
 
 def write_together(paths: Sequence[Path], texts: Sequence[str]) -> None:
@@ -105,37 +160,6 @@ def naming(where: str | Path) -> Iterator[None]:
         raise InputError(f"{where}: {error}") from None
 
 
-def image_size(width: Foreign, height: Foreign, given: tuple[int, int] | None) -> tuple[int, int]:
-    """Return (width, height), px, from what a file holds; a size given by a person must agree."""
-    size = checked([width, height], (2,), "image size")
-    if not (size >= 1).all() or (size != size.round()).any():
-        raise InputError(f"image size must be whole pixels, got {width} x {height}")
-    if given is not None and given != (int(size[0]), int(size[1])):
-        raise InputError(f"the images are {width} x {height}, which is not the {given[0]} x {given[1]} given")
-    return int(size[0]), int(size[1])
-
-
-def brown(coefficients: Array) -> tuple[str, Array]:
-    """Name the Brown-Conrady model of OpenCV's distortion vector (n,); thin prism and tilt must be zero."""
-    d = coefficients[:8] if coefficients.size in (12, 14) and not coefficients[8:].any() else coefficients
-    models = {0: "none", 4: "brown4", 5: "brown5", 8: "brown8"}
-    if d.size in (12, 14):
-        raise InputError(
-            "thin-prism or tilted-sensor distortion is not supported; calibrate with 8 coefficients or fewer"
-        )
-    if d.size not in models:
-        raise InputError(f"{d.size} distortion coefficients; OpenCV's models have 4, 5, 8, 12 or 14")
-    return models[d.size], d
-
-
-def focal_and_centre(K: Foreign, name: str) -> Array:
-    """Return (4,) fx fy cx cy of a camera matrix (3, 3) without skew."""
-    K = checked(K, (3, 3), name)
-    if K[0, 1] != 0 or K[1, 0] != 0 or (K[2] != [0, 0, 1]).any():
-        raise InputError(f"{name} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported")
-    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
-
-
 def rigid(R: Foreign, t: Foreign, name: str) -> tuple[Array, list[str]]:
     """Return (4, 4) a transform from a printed rotation and translation, and a note where its digits were few."""
     T = pose(checked(R, (3, 3), name), checked(t, (3,), f"translation of {name}"))
@@ -153,14 +177,40 @@ def imported(
     options: ImportOptions,
     paths: Sequence[Path],
     notes: Sequence[str],
+    unit_m: float = 1.0,
 ) -> StereoRig:
-    """Assemble an imported rig, its uncertainty unknown, with a provenance that says so."""
+    """Assemble an imported rig, its uncertainty unknown, with a provenance that says so.
+
+    Args:
+        cameras: left and right.
+        T_left_right: (4, 4), its translation in the file's unit.
+        options: what the user added.
+        paths: the files.
+        notes: what was assumed and left behind.
+        unit_m: of the file, where the user gave none, m.
+
+    Raises:
+        InputError: both cameras at one position, or a baseline that cannot be.
+    """
     left, right = cameras
     notes = [*notes]
+    unit_m = unit_m if options.unit_m is None else options.unit_m
+    T_left_right = np.array(T_left_right)
+    T_left_right[:3, 3] *= unit_m
     if T_left_right[0, 3] < 0 and abs(T_left_right[0, 3]) > abs(T_left_right[1, 3]):
-        notes.append("the second camera stands left of the first; armsight calls the first one left all the same")
+        notes.append(
+            "the second camera stands left of the first; armsight calls the first one left all the same: where they were "
+            "given in the wrong order, exchange the files, or give --pair"
+        )
     if not np.linalg.norm(T_left_right[:3, 3]) > 0:
         raise InputError(f"{paths[-1]}: the two cameras are at one position (baseline 0); this is not a stereo pair")
+    baseline_m = float(np.linalg.norm(T_left_right[:3, 3]))
+    with naming(paths[-1]):
+        check_length(baseline_m, unit_m, BASELINE)
+    if baseline_m > LONG_M:
+        notes.append(
+            f"the baseline is {baseline_m:.3g} m: if the file is in cm or inches, give --unit-m 0.01 or 0.0254"
+        )
     count = left.parameters.size + right.parameters.size + 6
     provenance = {
         "origin": "imported",

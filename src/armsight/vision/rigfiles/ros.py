@@ -1,4 +1,4 @@
-"""A ROS camera_info pair: two YAML files as camera_calibration writes them, left and right.
+"""A ROS camera_info pair, left and right: files of camera_calibration, or messages as ``rostopic echo`` prints them.
 
 The files hold no relative pose. It follows from both rectification matrices and the last columns of the projection
 matrices, which position the cameras in the rectified frame: P = K' [I | t], t = (-B, 0, 0) for the right one, so
@@ -8,7 +8,7 @@ p_left = R_left^T (R_right p_right - K_right'^-1 P_right[:, 3] + K_left'^-1 P_le
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,38 +17,55 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse
-from armsight.tables.yaml_file import Foreign, dump_yaml, read_yaml
+from armsight.tables.yaml_file import Foreign, dump_yaml
 from armsight.vision.camera import Camera
+from armsight.vision.camera_file import camera_of, described, focal_and_centre, found, is_camera
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
+    Document,
     ImportOptions,
-    brown,
     count_paths,
-    focal_and_centre,
-    image_size,
     imported,
     naming,
-    need,
     not_held,
     rectification,
     rigid,
     write_together,
 )
 
-FILES = "two files, left.yaml and right.yaml"
+TITLE = "a pair of ROS camera_info files"
 #: Its files hold a rectification.
 RECTIFIES = True
+#: Names of the matrices in the files of camera_calibration, and in printed messages (D K R P, in ROS 2 d k r p).
+_NAMES = {
+    "camera_matrix": ("cameramatrix", "k"),
+    "distortion_coefficients": ("distortioncoefficients", "d"),
+    "rectification_matrix": ("rectificationmatrix", "r"),
+    "projection_matrix": ("projectionmatrix", "p"),
+}
 #: ROS model -> the numbers of coefficients it may come with.
 MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 
 
-def read(paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+def recognises(documents: Sequence[Document]) -> bool:
+    """Say whether every file has a camera's matrix and its projection, in files' or messages' names."""
+    return all(
+        is_camera(document) and found(document, _NAMES["projection_matrix"]) is not None for document in documents
+    ) or all(_rows(document) is not None for document in documents)
+
+
+def read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
     """Read the left and the right camera_info file, in this order."""
-    count_paths(paths, (2,), FILES)
-    return rig_of([read_yaml(path) for path in paths], paths, options)
+    if len(paths) == 1 and len(documents) == 1:
+        with naming(paths[0]):
+            raise InputError(
+                "camera_info of one camera, got 1 file(s); a stereo pair has two: give left.yaml and right.yaml"
+            )
+    count_paths(paths, (2,), "two files, left.yaml and right.yaml")
+    return rig_of(documents, paths, options)
 
 
-def rig_of(documents: Sequence[Mapping[str, Foreign]], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+def rig_of(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
     """Return the rig of a left and a right camera_info.
 
     Args:
@@ -69,17 +86,16 @@ def rig_of(documents: Sequence[Mapping[str, Foreign]], paths: Sequence[Path], op
     if (Ts[0][:3, 3] == Ts[1][:3, 3]).all():
         raise InputError(
             f"{paths[1]}: projection_matrix holds no baseline (P[0, 3] as in the left file): these are two single "
-            "cameras, not a stereo pair; calibrate them together"
+            "cameras, or one file twice, not a stereo pair; calibrate them together"
         )
     T_left_right = inverse(Ts[0]) @ Ts[1]
-    T_left_right[:3, 3] *= 1.0 if options.unit_m is None else options.unit_m
     notes.append("relative pose recovered from the rectification and projection matrices, which hold it indirectly")
     return imported(cameras, T_left_right, options, paths, notes)
 
 
 def write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
     """Write the left and the right camera_info file."""
-    count_paths(paths, (2,), FILES)
+    count_paths(paths, (2,), "two files, left.yaml and right.yaml")
     lost = list(not_held(rig))
     R1, R2, P1, P2, _ = rectification(rig)
     documents = []
@@ -107,41 +123,42 @@ def write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
     return tuple(lost)
 
 
-def _read_one(document: Mapping[str, Foreign], options: ImportOptions) -> tuple[Camera, Array, list[str]]:
+def _rows(document: Document) -> Document | None:
+    """Return the numbers of P by itself, where a document has a projection and no matrix of the raw camera."""
+    return document if found(document, _NAMES["projection_matrix"]) is not None and "P" in document else None
+
+
+def _read_one(document: Document, options: ImportOptions) -> tuple[Camera, Array, list[str]]:
     """Return a camera, (4, 4) its T_rect_camera in the unit of the file, and notes."""
-    model = str(document.get("distortion_model", "plumb_bob"))
-    if model not in MODELS:
-        raise InputError(f"distortion_model {model!r} is not supported; supported are {', '.join(MODELS)}")
-    size = image_size(need(document, "image_width"), need(document, "image_height"), options.image_size_px)
-    intrinsics = focal_and_centre(_data(document, "camera_matrix", (3, 3)), "camera_matrix")
-    d = _data(document, "distortion_coefficients", None)
-    if d.size not in MODELS[model]:
-        raise InputError(f"{model} has {' or '.join(map(str, MODELS[model]))} coefficients, got {d.size}")
-    name, d = ("fisheye", d) if model == "equidistant" else brown(d)
-    P = _data(document, "projection_matrix", (3, 4))
+    for key in ("camera_matrix", "distortion_coefficients", "rectification_matrix", "projection_matrix"):
+        if found(document, _NAMES[key]) is None:
+            raise InputError(f"has no {key!r} (in messages {_NAMES[key][-1].upper()}); there are {described(document)}")
+    if (word := found(document, ("distortionmodel",))) not in (None, "", *MODELS):
+        raise InputError(f"distortion_model {word!r} is not supported; supported are {', '.join(MODELS)}")
+    model = str(word or "plumb_bob")
+    count = np.size(found(document, _NAMES["distortion_coefficients"]))
+    if count not in MODELS[model]:
+        raise InputError(f"{model} has {' or '.join(map(str, MODELS[model]))} coefficients, got {count}")
+    camera, notes = camera_of({**document, "distortion_model": model}, options.image_size_px)
+    if not np.any(np.asarray(found(document, _NAMES["camera_matrix"]), float)):
+        raise InputError("camera_matrix is zero: the camera that published it was not calibrated")
+    P = _matrix_of(document, "projection_matrix", (3, 4))
     fx, fy, _, _ = focal_and_centre(P[:, :3], "projection_matrix")
     if P[2, 3] != 0 or not (fx > 0 and fy > 0):
         raise InputError("projection_matrix must be [[fx, 0, cx, Tx], [0, fy, cy, Ty], [0, 0, 1, 0]]: uncalibrated?")
-    T_rect_camera, notes = rigid(
-        _data(document, "rectification_matrix", (3, 3)), -np.linalg.solve(P[:, :3], P[:, 3]), "rectification_matrix"
-    )
-    if "distortion_model" not in document:
-        notes.append("no distortion_model; plumb_bob assumed, as ROS does")
-    return Camera(size, name, intrinsics, d), T_rect_camera, notes
+    R = _matrix_of(document, "rectification_matrix", (3, 3))
+    T_rect_camera, said = rigid(R, -np.linalg.solve(P[:, :3], P[:, 3]), "rectification_matrix")
+    if not word:
+        said.append("no distortion_model; plumb_bob assumed, as ROS does")
+    return camera, T_rect_camera, notes + said
 
 
-def _data(document: Mapping[str, Foreign], key: str, shape: tuple[int, int] | None) -> Array:
-    """Return the numbers of a matrix entry, (n,) where no shape is required."""
-    matrix = need(document, key)
-    data = checked(need(matrix, "data"), (None,), f"{key}.data")
-    rows, cols = matrix.get("rows"), matrix.get("cols")
-    if isinstance(rows, int) and isinstance(cols, int) and rows * cols != data.size:
-        raise InputError(f"{key} says {rows} rows and {cols} cols, and its data holds {data.size} numbers")
-    if shape is None:
-        return data
-    if data.size != shape[0] * shape[1]:
-        raise InputError(f"{key}.data must hold {shape[0]} x {shape[1]} numbers, got {data.size}")
-    return data.reshape(shape)
+def _matrix_of(document: Document, key: str, shape: tuple[int, int]) -> Array:
+    """Return the numbers of a matrix entry; messages hold them row by row."""
+    numbers = np.asarray(found(document, _NAMES[key]), object)
+    if numbers.size != shape[0] * shape[1]:
+        raise InputError(f"{key} must hold {shape[0]} x {shape[1]} numbers, got {numbers.size}")
+    return checked(numbers.reshape(shape), shape, key)
 
 
 def _matrix(m: Array) -> dict[str, Foreign]:

@@ -77,9 +77,9 @@ def _beside(image_topic: str, topics: list[str]) -> str:
 def _document(message: Decoded) -> dict[str, Foreign]:
     """Return a message with the keys of a camera_info file; ROS 1 and Foxglove write D K R P, ROS 2 d k r p."""
 
-    def numbers(name: str) -> dict[str, list[float]]:
+    def numbers(name: str) -> list[float]:
         values = getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
-        return {"data": [float(value) for value in values]}
+        return [float(value) for value in values]
 
     return {
         "image_width": int(message.width),

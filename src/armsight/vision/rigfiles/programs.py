@@ -1,0 +1,314 @@
+"""Formats that are read and not written, of programs that keep each camera's pose in a third frame, or the pair's.
+
+mrcal: mrcal's .cameramodel files, one a camera, the left one first.
+
+Intrinsics are fx fy cx cy and OpenCV's distortion; ``extrinsics`` (later ``rt_cam_ref``) is the rotation vector and the
+translation, m, that take the reference's coordinates to the camera's. Splined and CAHVOR lenses are not read.
+
+basalt: Basalt's calibration.json: ``value0`` with T_imu_cam (px py pz qx qy qz qw, m), intrinsics, resolution.
+
+Read are pinhole, pinhole-radtan8 and kb4 (Kannala-Brandt); its own ds, ucm and eucm are not.
+
+caliscope: Camera arrays of caliscope (``[cameras.0]``) and aniposelib (``[cam_0]``): TOML, a table for each camera.
+
+``rotation``, a rotation vector or a matrix, and ``translation`` take the world's coordinates to the camera's; caliscope's
+are in m, aniposelib's in the unit of the board.
+
+multical: multical's calibration.json: ``cameras`` with K, dist, image_size, and ``camera_poses`` with R and T, m.
+
+A pose takes the coordinates of the rig, or of the master camera, to the camera's: p_cam2 = R p_cam1 + T in the entry
+``cam2_to_cam1`` (which is what its name does not say).
+
+stereolabs: Stereolabs' SN*.conf of a ZED camera: sections LEFT_CAM_HD, RIGHT_CAM_HD, .. for each resolution, and STEREO.
+
+The right camera stands Baseline mm to the right; its rotation is the vector (RX, CV, RZ), rad, of the section's
+resolution: p_right = R p_left + (-Baseline, TY, TZ), as zed-opencv-native's example rectifies with.
+
+orbslam: ORB-SLAM's stereo settings: ORB-SLAM3's Camera1.fx .. and Stereo.T_c1_c2, ORB-SLAM2's LEFT.K LEFT.D LEFT.R LEFT.P.
+
+T_c1_c2 takes the right camera's coordinates to the left one's, m; of images that are rectified already the file has
+Stereo.b, the baseline, alone. LEFT and RIGHT are ROS's matrices, and are read as those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.geometry.check import checked
+from armsight.geometry.pose import inverse, pose
+from armsight.geometry.rotation import exp_so3, from_quaternion_wxyz
+from armsight.tables.yaml_file import Foreign
+from armsight.vision.camera_file import camera_of, found, is_camera
+from armsight.vision.rig import StereoRig
+from armsight.vision.rigfiles.rigfile import (
+    Document,
+    ImportOptions,
+    count_paths,
+    imported,
+    naming,
+    need,
+    posed_rig,
+    rigid,
+)
+from armsight.vision.rigfiles.ros import rig_of
+
+
+class ReadFormat(NamedTuple):
+    """A format that is only read, as :class:`~.rigfile.RigFormat` has it.
+
+    Attributes:
+        TITLE: what its files are.
+        recognises: says by their content whether files are of it.
+        read: reads a rig.
+    """
+
+    TITLE: str
+    recognises: Callable[[Sequence[Document]], bool]
+    read: Callable[[Sequence[Document], Sequence[Path], ImportOptions], StereoRig]
+
+
+#: Lens models whose parameters are OpenCV's.
+_LENSES = {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)} | {"LENSMODEL_PINHOLE": 0}
+
+
+def _mrcal_recognises(documents: Sequence[Document]) -> bool:
+    """Say whether a file names one of mrcal's lens models."""
+    return any("lensmodel" in document for document in documents)
+
+
+def _mrcal_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+    """Read the left and the right camera."""
+    count_paths(paths, (2,), "two files, left.cameramodel and right.cameramodel (a file has one camera)")
+    models, entries = {}, {}
+    for path, document in zip(paths, documents, strict=True):
+        with naming(path):
+            name = path.name if path.name not in models else str(path)
+            models[name], entries[name] = document, _mrcal_entry(document)
+
+    def posed(name: str) -> tuple[Array, list[str]]:
+        value = models[name].get("rt_cam_ref", models[name].get("extrinsics"))
+        rt = checked([] if value is None else value, (6,), f"{name}: extrinsics")
+        return pose(exp_so3(rt[:3]), rt[3:]), []
+
+    return posed_rig(entries, posed, options, paths)
+
+
+def _mrcal_entry(document: Document) -> Mapping[str, Foreign]:
+    """Return a camera's entry under the names of :mod:`~armsight.vision.camera_file`."""
+    lens = str(need(document, "lensmodel"))
+    if lens not in _LENSES:
+        raise InputError(
+            f"lens {lens.split('_order')[0]} is not supported; supported are {', '.join(_LENSES)}: convert it with "
+            "mrcal-convert-lensmodel LENSMODEL_OPENCV8"
+        )
+    numbers = checked(need(document, "intrinsics"), (4 + _LENSES[lens],), f"intrinsics of {lens}")
+    return {
+        "K": numbers[:4],
+        "distortion": np.array(numbers[4:]),
+        "distortion_model": "opencv",
+        "imagersize": need(document, "imagersize"),
+    }
+
+
+def _basalt_recognises(documents: Sequence[Document]) -> bool:
+    """Say whether a file has Basalt's only entry with cameras in it."""
+    return any(isinstance(value := document.get("value0"), Mapping) and "T_imu_cam" in value for document in documents)
+
+
+def _basalt_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+    """Read two cameras, called cam0, cam1, .. in their order."""
+    count_paths(paths, (1,), "one file, calibration.json")
+    with naming(paths[0]):
+        inner = need(documents[0], "value0")
+        poses, cameras, sizes = (need(inner, key) for key in ("T_imu_cam", "intrinsics", "resolution"))
+        if not len(poses) == len(cameras) == len(sizes):
+            raise InputError(f"has {len(poses)} poses, {len(cameras)} intrinsics and {len(sizes)} resolutions")
+    entries = {
+        f"cam{i}": {**camera, "distortion_model": camera.get("camera_type"), "resolution": size}
+        for i, (camera, size) in enumerate(zip(cameras, sizes, strict=True))
+    }
+    for entry in entries.values():
+        if entry["distortion_model"] == "pinhole":
+            entry["distortion"] = []
+
+    def posed(name: str) -> tuple[Array, list[str]]:
+        given = poses[list(entries).index(name)]
+        p, q = (checked([need(given, key) for key in keys], (len(keys),), f"T_imu_cam of {name}") for keys in _KEYS)
+        return inverse(pose(from_quaternion_wxyz(q / np.linalg.norm(q)), p)), []
+
+    return posed_rig(entries, posed, options, paths)
+
+
+_KEYS = (("px", "py", "pz"), ("qw", "qx", "qy", "qz"))
+
+
+_ROTATIONS = ("rotation", "rotationvector", "rvec", "r")
+_TRANSLATIONS = ("translation", "tvec", "t")
+
+
+def _caliscope_entries(document: Document) -> dict[str, Mapping[str, Foreign]]:
+    """Return the tables of the cameras, caliscope's ignored ones left out."""
+    inner = document.get("cameras", document)
+    if not isinstance(inner, Mapping):
+        return {}
+    return {str(name): one for name, one in inner.items() if is_camera(one) and one.get("ignore") is not True}
+
+
+def _caliscope_recognises(documents: Sequence[Document]) -> bool:
+    """Say whether a file has tables of cameras with their poses."""
+    return len(documents) == 1 and any(
+        found(entry, _TRANSLATIONS) is not None and found(entry, _ROTATIONS) is not None
+        for entry in _caliscope_entries(documents[0]).values()
+    )
+
+
+def _caliscope_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+    """Read two cameras of an array."""
+    count_paths(paths, (1,), "one file, camera_array.toml")
+    entries = _caliscope_entries(documents[0])
+
+    def posed(name: str) -> tuple[Array, list[str]]:
+        R, t = (found(entries[name], names) for names in (_ROTATIONS, _TRANSLATIONS))
+        if R is None or t is None:
+            raise InputError(f"{name} has no rotation and translation: its pose was not calibrated")
+        R = np.asarray(R, object)
+        if R.size == 3:
+            R = exp_so3(checked(R.ravel(), (3,), f"rotation of {name}"))
+        return rigid(R, np.ravel(np.asarray(t, object)), f"rotation of {name}")
+
+    return posed_rig(entries, posed, options, paths)
+
+
+def _multical_recognises(documents: Sequence[Document]) -> bool:
+    """Say whether a file has cameras and poses of them."""
+    return any(
+        all(isinstance(document.get(key), Mapping) for key in ("cameras", "camera_poses")) for document in documents
+    )
+
+
+def _multical_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+    """Read two cameras."""
+    count_paths(paths, (1,), "one file, calibration.json")
+    poses = {str(name).partition("_to_")[0]: value for name, value in documents[0]["camera_poses"].items()}
+    entries = {str(name): entry for name, entry in documents[0]["cameras"].items()}
+
+    def posed(name: str) -> tuple[Array, list[str]]:
+        if name not in poses:
+            raise InputError(f"camera_poses has no {name}; there are {', '.join(poses)}")
+        return rigid(need(poses[name], "R"), need(poses[name], "T"), f"R of {name}")
+
+    return posed_rig(entries, posed, options, paths)
+
+
+#: Name of a resolution in the file -> its image size, px.
+SIZES = {
+    "VGA": (672, 376),
+    "HD": (1280, 720),
+    "FHD": (1920, 1080),
+    "2K": (2208, 1242),
+    "SVGA": (960, 600),
+    "FHD1200": (1920, 1200),
+    "QHDPLUS": (3200, 1800),
+    "4K": (3840, 2160),
+}
+
+
+def _stereolabs_recognises(documents: Sequence[Document]) -> bool:
+    """Say whether a file has such sections."""
+    return any(str(key).upper().startswith(("LEFT_CAM_", "RIGHT_CAM_")) for document in documents for key in document)
+
+
+def _stereolabs_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+    """Read the cameras of one resolution: that of ``image_size_px``, or the only one."""
+    count_paths(paths, (1,), "one file, SN12345.conf")
+    with naming(paths[0]):
+        sections = {str(key).upper(): value for key, value in documents[0].items() if isinstance(value, Mapping)}
+        names = [name for name in SIZES if {f"LEFT_CAM_{name}", f"RIGHT_CAM_{name}"} <= set(sections)]
+        if options.image_size_px is not None:
+            chosen = [name for name in names if SIZES[name] == options.image_size_px]
+        else:
+            chosen = names
+        if len(chosen) != 1:
+            there = ", ".join(f"{name} {SIZES[name][0]}x{SIZES[name][1]}" for name in names) or "none of both cameras"
+            raise InputError(f"resolutions in it: {there}; give --image-size, that of the images to be measured in")
+        (name,) = chosen
+        cameras, notes = [], [f"resolution {name}, {SIZES[name][0]}x{SIZES[name][1]} px"]
+        for side in ("LEFT", "RIGHT"):
+            with naming(f"{side}_CAM_{name}"):
+                camera, said = camera_of(
+                    {**sections[f"{side}_CAM_{name}"], "image_size": SIZES[name], "distortion_model": "brown"}
+                )
+            cameras.append(camera)
+            notes += said
+        stereo = {str(key).upper(): value for key, value in sections.get("STEREO", {}).items()}
+        values = {}
+        for key in ("BASELINE", "TY", "TZ", "RX", "CV", "RZ"):
+            value = stereo.get(f"{key}_{name}", stereo.get(key))
+            if value is None and key not in ("TY", "TZ"):
+                raise InputError(f"section STEREO has no {key}_{name}; there are {', '.join(stereo) or 'no names'}")
+            values[key] = 0.0 if value is None else value
+        r = checked([values[key] for key in ("RX", "CV", "RZ")], (3,), f"RX CV RZ of {name}")
+        b, ty, tz = checked([values[key] for key in ("BASELINE", "TY", "TZ")], (3,), "Baseline TY TZ")
+    T_right_left = pose(exp_so3(r), np.array([-b, ty, tz]))
+    return imported(cameras, inverse(T_right_left), options, paths, notes, 1e-3)
+
+
+def _orbslam_recognises(documents: Sequence[Document]) -> bool:
+    """Say whether a file has both cameras' parameters under ORB-SLAM's names."""
+    return any({"Camera1.fx", "LEFT.K"} & set(document) for document in documents)
+
+
+def _orbslam_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+    """Read both cameras of a settings file."""
+    count_paths(paths, (1,), "one settings file")
+    (document,), (path,) = documents, paths
+    if "LEFT.K" in document:
+        return rig_of([_orbslam_part(document, side) for side in ("LEFT", "RIGHT")], [path, path], options)
+    with naming(path):
+        rectified = document.get("Camera.type") == "Rectified"
+        shared = {
+            "distortion_model": str(document.get("Camera.type", "pinhole")),
+            "width": document.get("Camera.width"),
+            "height": document.get("Camera.height"),
+        }
+        cameras, notes = [], []
+        for name in ("Camera1", "Camera1" if rectified else "Camera2"):
+            entry = {**shared, **_orbslam_part(document, name)}
+            if "k1" not in entry:
+                entry["distortion"] = []
+            with naming(name):
+                camera, said = camera_of(entry, options.image_size_px)
+            cameras.append(camera)
+            notes += said
+        if rectified:
+            T = np.eye(4)
+            T[0, 3] = checked(document.get("Stereo.b", np.nan), (), "Stereo.b")
+            said = ["rectified images: both cameras alike, Stereo.b apart"]
+        elif "Stereo.T_c1_c2" in document:
+            given = checked(document["Stereo.T_c1_c2"], (4, 4), "Stereo.T_c1_c2")
+            T, said = rigid(given[:3, :3], given[:3, 3], "Stereo.T_c1_c2")
+        else:
+            raise InputError("has no Stereo.T_c1_c2, the pose of the right camera: settings of one camera, or of RGB-D")
+    return imported(cameras, T, options, paths, notes + said)
+
+
+def _orbslam_part(document: Document, name: str) -> dict[str, Foreign]:
+    """Return the entries ``name.X`` as X."""
+    return {key.removeprefix(f"{name}."): value for key, value in document.items() if key.startswith(f"{name}.")}
+
+
+#: The formats of this file by their names.
+PROGRAMS = {
+    "mrcal": ReadFormat("mrcal .cameramodel files", _mrcal_recognises, _mrcal_read),
+    "basalt": ReadFormat("a Basalt calibration.json", _basalt_recognises, _basalt_read),
+    "caliscope": ReadFormat("a camera array of caliscope or aniposelib", _caliscope_recognises, _caliscope_read),
+    "multical": ReadFormat("a multical calibration.json", _multical_recognises, _multical_read),
+    "stereolabs": ReadFormat("a Stereolabs SN*.conf", _stereolabs_recognises, _stereolabs_read),
+    "orbslam": ReadFormat("ORB-SLAM's stereo settings", _orbslam_recognises, _orbslam_read),
+}
