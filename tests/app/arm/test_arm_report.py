@@ -40,7 +40,7 @@ def run(tmp_path_factory):
     """The folder of a run with the motions that were planned, with zeros that are off, joints that droop, and noise."""
     folder, rng = tmp_path_factory.mktemp("run"), np.random.default_rng(3)
     around = ARM.home + np.vstack([np.zeros(5), rng.uniform(-1.0, 1.0, (12, 5))])
-    (folder / "motion.toml").write_text(plan_report(ARM, around, everywhere, poses=9, cycles=6))
+    (folder / "motion.toml").write_text(plan_report(ARM, around, everywhere, poses=9, cycles=6)[0])
     plan = read_motions(ARM, folder / "motion.toml")
     q_ref, phase, name = [], [], []
     for motion in plan.motions:
@@ -123,13 +123,20 @@ def test_the_sigma_of_a_slope_without_groups_is_the_classical_one():
     assert alone[1] > 1.1 * sigma[1]  # what a group for each row gave
 
 
-def test_the_parts_of_the_error_sum_up_and_a_remedy_takes_its_part_away(report):
+def test_the_whole_error_is_split_and_a_remedy_takes_its_part_away(run, report):
     assert sum(part.share for part in report.parts.values()) == pytest.approx(1.0, abs=1e-9)
-    zeros, controller, rest = (report.parts[name] for name in ("zeros", "controller", "rest"))
-    assert min(zeros.share, controller.share) > 0.05
-    assert max(zeros.without_mm, controller.without_mm) < report.placed_mm
-    assert rest.rms_mm < 0.2 * report.placed_mm
-    assert report.accuracy_mm[0] >= report.placed_mm
+    rests = evaluate.rests_of(run, ARM)
+    at, ref, true = (ARM.forward(q)[:, :3, 3] for q in (rests.q, rests.q_ref, rests.q + np.radians(ZERO_DEG)))
+    for name, moved in (("controller", at - ref), ("zeros", true - at)):
+        part, size = report.parts[name], 1e3 * np.sqrt((moved**2).sum(axis=1).mean())
+        assert abs(part.rms_mm - size) < 3 * part.sigma_mm + 0.01 * size
+        assert part.determined
+        assert part.without_mm < report.accuracy_mm[0]
+    assert report.parts["rest"].rms_mm < 0.02 * report.accuracy_mm[0]
+    assert not report.parts["backlash"].determined
+    assert any(
+        line.startswith("backlash ") and "not determined" in line for line in arm_report.text(report, {}).split("\n")
+    )
 
 
 def test_page_pdf_and_json_are_written_and_another_arm_is_compared(armsight, run, report, tmp_path, monkeypatch):
@@ -141,7 +148,8 @@ def test_page_pdf_and_json_are_written_and_another_arm_is_compared(armsight, run
     assert "so101" in (out / "report.html").read_text()
     written = json.loads((out / "report.json").read_text())
     assert written["kind"] == "arm report"
-    assert {"share", "rms_mm", "without_mm", "remedy"} == set(written["parts"]["zeros"])
+    keys = {"share", "rms_mm", "sigma_mm", "without_mm", "remedy", "determined"}
+    assert keys == set(written["parts"]["zeros"])
     assert written["joints"][1]["sigma_zero_deg"] > 0
     again = armsight("arm", "report", run, "--compare", out / "report.json", "--json")
     assert json.loads(again.out) == written

@@ -407,3 +407,19 @@ def test_what_was_found_is_printed_and_stored_though_the_report_cannot_be_drawn(
         run("identify", "--arm", "six_r", "--data", data, "--validate", data, "-o", out)
     assert capsys.readouterr().out.startswith("held-out error ")
     assert {path.name for path in out.iterdir()} >= {"corrected.toml", "zeros.toml", "identify.json"}
+
+
+def test_sigmas_known_to_be_too_small_are_said_first_and_widened(tmp_path, capsys):
+    data, other, loud = (poses_csv(tmp_path / f"{k}.csv", seed=k) for k in range(3))
+    head, *rows = loud.read_text().splitlines()
+    numbers = np.array([row.split(",") for row in rows], float)
+    numbers[:, 6:] += np.random.default_rng(0).normal(0, 0.2, (len(rows), 3))  # mm: seven times the noise
+    np.savetxt(loud, numbers, "%.9f", ",", header=head, comments="")
+    plain, wide = (said(capsys, "--arm", "six_r", "--data", data, "--validate", v, "--json") for v in (other, loud))
+    assert "times as large as predicted" not in plain.err
+    note = next(line for line in wide.err.splitlines() if line.startswith("note: "))
+    over = wide.lines[0]["residual_over_predicted"]
+    assert 4 < over < 10
+    assert f"are {over:.2f} times as large as predicted" in note
+    sigmas = [{p["name"]: p["sigma"] for p in run.lines[0]["parameters"]} for run in (plain, wide)]
+    assert sigmas[1]["a2"] == pytest.approx(over * sigmas[0]["a2"])

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 #: A minus before a number is no option.
 _NUMBERS = {"ignore_unknown_options": True}
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+#: A recording of poses over less than this, m, tells an arm's zeros from its base and tool badly. Half: fewer notes.
+_NARROW_M = 0.15
 _POSE = ("x", "y", "z", "euler_z", "euler_y", "euler_x")
 
 
@@ -249,9 +251,16 @@ def plan(
 
     arm = open_arm(arm_name)
     q = seen_angles(around, arm)
-    write_text(output, plan_report(arm, q, seen_by(around), poses=poses, cycles=cycles, seed=seed))
-    answer = {"arm": arm.name, "poses": poses, "cycles": cycles, "output": str(output)}
-    click.echo(json.dumps(answer) if as_json else str(output))
+    text, extent = plan_report(arm, q, seen_by(around), poses=poses, cycles=cycles, seed=seed)
+    write_text(output, text)
+    if extent.min() < _NARROW_M:
+        click.echo(
+            f"note: the poses are between those at which {around} saw the body, and cover only {_cm(extent)}: zeros, base and "
+            "tool, and lengths will hardly be distinguished; record a run whose hand-eye poses cover more of the room first",
+            err=True,
+        )
+    answer = {"arm": arm.name, "poses": poses, "cycles": cycles, "extent_m": extent.tolist(), "output": str(output)}
+    click.echo(json.dumps(answer) if as_json else f"{output}: {poses} poses over {_cm(extent)}")
 
 
 @command.command()
@@ -291,6 +300,11 @@ def report(run: Path, arm_name: str | None, compare: tuple[Path, ...], output: P
         write_report(found, others, writable_folder(output, "no report"))
     if output is not None and not as_json:
         click.echo(f"\nwritten: {output}/report.html, report.pdf, report.json")
+
+
+def _cm(extent: Array) -> str:
+    """Return the size (3,) of a space, m, as text."""
+    return " x ".join(f"{100 * size:.0f}" for size in extent) + " cm"
 
 
 def _keep(output: Path, yes: bool) -> None:

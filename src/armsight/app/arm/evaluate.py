@@ -3,19 +3,20 @@
 :func:`plan_report` writes the motions of the recording. :func:`evaluate_arm` evaluates its rests in open loop: where vision
 saw the tool, what the joints' own sensors read, and what was commanded. The error of a rest, seen less commanded, is split
 
-    error = base and tool + controller + the arm's error sources + rest,
+    error = controller + base and tool + the arm's error sources + rest,
 
-the controller's part being what readings and commands put apart by the nominal table, the sources those that an
-identification (``loop.identify``) selects by poses left out. The parts are taken one after the other, each beyond what
-those before it explain, so that what two could explain is counted once: their shares of the mean square error sum to 1.
-What a remedy leaves is the RMS error where it alone is taken. All after base and tool were fitted, as no arm knows where
-its base is.
+all of it, in the frames of the run. The controller's part is what readings and commands put apart by the nominal table.
+The others are what a fit of everything that may be off (``loop.identify``) says that each moves the tool by; a joint's
+zero has the mean of its other sources over these poses. The fit's covariance gives their sigmas, which are large where
+these poses do not distinguish two of them (another zero looks like another base). A part's share is its component along
+the error, over the error: shares sum to 1, and one that cancels others is negative. What a remedy leaves is the error
+less that part.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import finite_json, read_json, read_table, read_toml
 from armsight.geometry.pose import mean_pose
+from armsight.geometry.rotation import log_so3
 from armsight.loop.identify.backlash import joint_backlashes
 from armsight.loop.identify.identify import Identified, identify
 from armsight.loop.identify.measured import Measured
@@ -45,8 +47,6 @@ from armsight.loop.iso9283.poses import MIN_POSES
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
 
-#: Directions of parameters that differ by less than this share are one.
-_RANK = 1e-3
 #: So many rests that were left out are named.
 _NAMED = 5
 #: Version of report.json.
@@ -59,18 +59,17 @@ _SIGMAS = tuple(f"sigma_{name}" for name in ("x_m", "y_m", "z_m", "rx_rad", "ry_
 _DELAYS_S, _MOVED_RAD, _AFTER_S, _MOTIONS = np.arange(0.0, 1.2, 0.005), np.radians(2.0), 0.5, 60
 #: Poses that are at most this far apart by their commands, rad, are one pose.
 _SAME_RAD = 1e-6
-#: Part of the error -> the kinds of parameters that make it, those that its remedy corrects as well, and the remedy.
+#: Part of the error -> the kinds of parameters that make it, and its remedy.
 _PARTS = {
-    "zeros": (("offset",), (), "set the zeros of the joints (armsight board offsets, or corrected.toml)"),
-    "lengths and angles": (("d", "a", "alpha", "beta"), ("offset",), "use the identified table (armsight identify)"),
-    "sensors' curves": (
-        ("gain", "wave", "ripple"),
-        ("offset",),
-        "correct the sensors' curves (zeros.toml of armsight identify)",
-    ),
-    "backlash": (("backlash", "gravity_backlash"), (), "approach from one side, or take the backlash out of the gears"),
-    "compliance": (("compliance",), (), "correct the compliance under gravity (corrected.toml)"),
+    "base and tool": (("base", "tool"), "calibrate hand and eye anew, over more of the room"),
+    "zeros": (("offset",), "set the zeros of the joints (armsight board offsets, or corrected.toml)"),
+    "lengths and angles": (("d", "a", "alpha", "beta"), "use the identified table (armsight identify)"),
+    "sensors' curves": (("gain", "wave", "ripple"), "correct the sensors' curves (zeros.toml of armsight identify)"),
+    "backlash": (("backlash", "gravity_backlash"), "approach from one side, or take the backlash out of the gears"),
+    "compliance": (("compliance",), "correct the compliance under gravity (corrected.toml)"),
 }
+#: A part, or a number, is determined where it is more than so many of its sigmas.
+SURE = 2.0
 CONTROLLER, REST = "controller", "rest"
 #: Harmonics of a sensor beyond the second are left to ``armsight identify``: the recording is too short for them.
 _PRIORS = {"ripple": 0.0}
@@ -203,16 +202,23 @@ class ErrorPart:
     """A part of the error.
 
     Attributes:
-        share: of the mean square error, beyond what the parts before it explain; all sum to 1.
-        rms_mm: of that.
+        share: of the mean square error; all sum to 1.
+        rms_mm: what it moves the tool by, RMS.
+        sigma_mm: sigma of that: the RMS of its own error.
         without_mm: RMS error that its remedy alone would leave.
         remedy: what would take it away; empty where nothing does.
     """
 
     share: float
     rms_mm: float
+    sigma_mm: float
     without_mm: float
     remedy: str
+
+    @property
+    def determined(self) -> bool:
+        """Whether these poses show it at all."""
+        return self.rms_mm > SURE * self.sigma_mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,7 +293,7 @@ class ArmReport(Record):
         shown["both_sides_mean_mm"], shown["both_sides_max_mm"] = self.both_sides_mm or (None, None)
         shown["drift_mm_per_h"], shown["drift_sigma_mm_per_h"] = self.drift_mm_per_h or (None, None)
         shown["joints"] = [_with_sigmas(asdict(joint)) for joint in self.joints]
-        shown["parts"] = {name: asdict(part) for name, part in self.parts.items()}
+        shown["parts"] = {n: {**asdict(part), "determined": part.determined} for n, part in self.parts.items()}
         shown["health"], shown["notes"] = list(self.health), list(self.notes)
         shown["map"] = [
             {"at_m": p, "error_mm": e} for p, e in zip(self.at.tolist(), (1e3 * self.off).tolist(), strict=True)
@@ -331,7 +337,7 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
         times = ", ".join(f"{t:.0f}" for t in rests.t_s[found.left_out][:_NAMED])
         more = ", ..." if len(found.left_out) > _NAMED else ""
         notes.append(f"{len(found.left_out)} rests were left out as mistakes: at {times}{more} s of the run")
-    off, parts = _split(arm, kept, found, measured.rows(found.solution.used))
+    off, parts = _split(arm, kept, found)
     lever = gravity_levers(arm, kept.q)
     seen_off = rests.T_seen[:, :3, 3] - rests.T_ref[:, :3, 3]
     distance = np.linalg.norm(seen_off, axis=1)
@@ -382,51 +388,54 @@ def _summary(folder: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _split(arm: Arm, rests: RestPoses, found: Identified, measured: Measured) -> tuple[Array, dict[str, ErrorPart]]:
-    """Return the errors (N, 3), m, after base and tool were fitted, and their parts."""
-    model, x = found.model, found.solution.x
-    _, J = model.linearised(x, measured, model.feature_values(measured.q, measured.approach))
-    R = rests.T_seen[:, :3, :3]
-    J = np.einsum("nij,njp->nip", R, J[:, :3]).reshape(-1, len(x))  # into the base's axes; predicted less measured
-    kinds = np.array([p.kind for p in model.parameters])
-    placed = np.linalg.qr(J[:, np.isin(kinds, ("base", "tool"))])[0]
+def _split(arm: Arm, rests: RestPoses, found: Identified) -> tuple[Array, dict[str, ErrorPart]]:
+    """Return the errors (N, 3), m, after base and tool were fitted, and the parts of the whole error."""
+    error = rests.T_seen[:, :3, 3] - rests.T_ref[:, :3, 3]
+    square = max(float((error**2).sum()), 1e-30)
 
-    def free(values: Array) -> Array:
-        """Take out what another base and tool would do."""
-        flat = values.reshape(-1)
-        return np.asarray(flat - placed @ (placed.T @ flat))
+    def part(values: Array, sigma_mm: float, remedy: str) -> ErrorPart:
+        without = _rms_mm(error - values) if remedy else _rms_mm(error)
+        return ErrorPart(float((values * error).sum()) / square, _rms_mm(values), sigma_mm, without, remedy)
 
-    error = free(rests.T_seen[:, :3, 3] - rests.T_ref[:, :3, 3])
-    square = max(float(error @ error), 1e-30)
-
-    def rms(values: Array) -> float:
-        return 1e3 * float(np.sqrt((values**2).sum() / len(rests)))
-
-    controller = free(arm.forward(rests.q)[:, :3, 3] - rests.T_ref[:, :3, 3])
-    left, basis = error - controller, np.zeros((len(error), 0))
-    share = 1.0 - float(left @ left) / square
-    shown = {CONTROLLER: ErrorPart(share, rms(controller), rms(left), "command what is missing: close the loop")}
-    for name, (of, needs, remedy) in _PARTS.items():
-        columns = J[:, np.isin(kinds, of) & found.solution.free]
-        new = _basis(columns - placed @ (placed.T @ columns), basis)
-        taken, basis = new @ (new.T @ left), np.column_stack([basis, new])
-        left = left - taken
-        columns = J[:, np.isin(kinds, (*of, *needs)) & found.solution.free]
-        alone = _basis(columns - placed @ (placed.T @ columns), np.zeros((len(error), 0)))
-        remedied = error - alone @ (alone.T @ error) if new.size else error
-        shown[name] = ErrorPart(float(taken @ taken) / square, rms(taken), rms(remedied), remedy)
-    shown[REST] = ErrorPart(float(left @ left) / square, rms(left), rms(error), "")
-    return np.asarray(error.reshape(-1, 3)), shown
+    J, constant, off = _displacements(arm, rests, found)
+    kinds = np.array([p.kind for p in found.model.parameters])
+    left = error - (controller := arm.forward(rests.q)[:, :3, 3] - rests.T_ref[:, :3, 3])
+    shown = {CONTROLLER: part(controller, 0.0, "command what is missing: close the loop")}
+    for name, (of, remedy) in _PARTS.items():
+        by = J * np.isin(kinds, of) + constant * (float("offset" in of) - np.isin(kinds, of))
+        moved = by @ off
+        sigma = 1e3 * float(np.sqrt(np.einsum("nip,pq,niq->n", by, found.cov_everything, by).mean()))
+        shown[name], left = part(moved, sigma, remedy), left - moved
+    shown[REST] = part(left, 0.0, "")
+    placed = np.linalg.qr(J[:, :, np.isin(kinds, ("base", "tool"))].reshape(error.size, -1))[0]
+    flat = error.ravel()
+    return np.asarray((flat - placed @ (placed.T @ flat)).reshape(-1, 3)), shown
 
 
-def _basis(columns: Array, beyond: Array) -> Array:
-    """Return an orthonormal basis (N, r) of columns (N, k) beyond what a basis (N, m) spans."""
-    sizes = np.linalg.norm(columns, axis=0)
-    columns = columns[:, sizes > 1e-9] / sizes[sizes > 1e-9]
-    for _ in range(2):  # twice is enough against rounding
-        columns = columns - beyond @ (beyond.T @ columns)
-    U, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(U[:, s > _RANK])
+def _displacements(arm: Arm, rests: RestPoses, found: Identified) -> tuple[Array, Array, Array]:
+    """Return the derivative of the tool's position (N, 3, P), the same by the error sources' means, and what is off (P,).
+
+    Base and tool are off the frames of the run. The derivative is that in the middle between the run's and what was found,
+    so that all of them together move the tool as far as both put it apart, to the second order.
+    """
+    model, x = found.model, found.solution.x - found.moved
+    T_tool, T_base, T_body = arm.T_flange_tool, model.T_rig_base(x), model.T_6_body(x)
+    model = replace(model, R_start=np.eye(3), R_tool=T_tool[:3, :3])
+    nominal, true, at = model.nominal(), x.copy(), model.table_at
+    nominal[model.tool_at : at - 3] = T_tool[:3, 3]
+    true[3:6], true[at - 3 : at] = log_so3(T_base[:3, :3]), log_so3(T_tool[:3, :3].T @ T_body[:3, :3])
+    measured, phi = rests.measured(), model.feature_values(rests.q, rests.approach)
+    middle, R = 0.5 * (nominal + true), rests.T_seen[:, :3, :3]
+    J, constant = (
+        R @ model.linearised(middle, measured, p)[1][:, :3] for p in (phi, np.tile(phi.mean(0), (len(phi), 1)))
+    )
+    constant[:, :, : model.sources_at] = 0.0
+    return J, constant, true - nominal
+
+
+def _rms_mm(values: Array) -> float:
+    """Return the RMS length of vectors (N, 3), m, in mm."""
+    return 1e3 * float(np.sqrt((values**2).sum(axis=1).mean()))
 
 
 def _joint(
@@ -574,8 +583,8 @@ def _left(track: JointTrack, i: int, rows: NDArray[np.int64], delay_s: float) ->
 
 def plan_report(
     arm: Arm, around: Array, visible: Callable[[Array], NDArray[np.bool_]], *, poses: int, cycles: int, seed: int = 0
-) -> str:
-    """Return the motions of the recording that a report needs, as a motion file.
+) -> tuple[str, Array]:
+    """Return the motions of the recording that a report needs, as a motion file, and the space (3,) that its poses cover, m.
 
     Poses all over where the body is seen, each from two opposite sides of all joints, and five of them again and again.
 
@@ -602,6 +611,7 @@ def plan_report(
             found.append((q, side))
     if len(found) < max(poses // 2, _LEAST_POSES):
         raise InputError(f"the body is seen at {len(found)} of {poses} poses: bring the cameras further from the arm")
+    extent = np.ptp(arm.forward(np.array([q for q, _ in found]))[:, :3, 3], axis=0)
     text = f"# armsight arm plan: {arm.name}, {len(found)} poses from both sides, {cycles} cycles of five.\n"
     text += f"start_deg = {np.degrees(around[0]).round(4).tolist()}\n"
     every = max(1, round(len(found) / max(cycles, 1)))
@@ -617,7 +627,7 @@ def plan_report(
                 for k, (pose, _) in enumerate(found[:5], start=1):
                     text += _motion(f"P{k} cycle {cycle}", pose, _REST_S)
             done = due
-    return text
+    return text, extent
 
 
 #: How far a joint goes aside before it comes to a pose, rad; rest at a pose, s; candidates for a pose; fewest poses.

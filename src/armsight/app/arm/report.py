@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from armsight.app.arm.evaluate import VERSION, ArmReport, JointFigures
+from armsight.app.arm.evaluate import SURE, VERSION, ArmReport, JointFigures
 from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files
 from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, arrows, drawing, new_figure, panels, png
 from armsight.app.report.table import TextTable, html_table, plain_text
@@ -27,7 +27,15 @@ FILES = (PAGE, "report.pdf", "report.json")
 
 
 def _pair(value: tuple[float, float] | None, digits: int = 3) -> str:
-    return "–" if value is None else f"{value[0]:.{digits}f} ± {value[1]:.{digits}f}"
+    if value is None:
+        return "–"
+    pair = f"{value[0]:.{digits}f} ± {value[1]:.{digits}f}"
+    return pair if determined(value) else f"not determined (± {value[1]:.{digits}f})"
+
+
+def determined(value: tuple[float, float] | None) -> bool:
+    """Return whether a value is more than chance, by its sigma."""
+    return value is not None and abs(value[0]) > SURE * value[1]
 
 
 def _one(value: float | None, unit: str, digits: int = 3) -> str:
@@ -54,23 +62,19 @@ def tables(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> list[Text
         )
     ]
     found = [TextTable("What the arm does", ("", report.arm, *others), tuple(rows))]
-    parts = report.parts.items()
-    found.append(
-        TextTable(
-            f"What explains the {report.placed_mm:.2f} mm, and what each remedy would leave",
-            ("", "share", "itself, mm", "left by the remedy, mm", "remedy"),
-            tuple(
-                (
-                    name,
-                    f"{100 * p.share:.0f} %",
-                    f"{p.rms_mm:.3f}",
-                    f"{p.without_mm:.3f}" if p.remedy else "–",
-                    p.remedy,
-                )
-                for name, p in parts
-            ),
+    rows = [
+        (
+            name,
+            f"{100 * p.share:.0f} %" if p.determined else "not determined",
+            f"{p.rms_mm:.3f} ± {p.sigma_mm:.3f}" if p.determined else f"± {p.sigma_mm:.3f}",
+            f"{p.without_mm:.3f}" if p.remedy and p.determined else "–",
+            p.remedy,
         )
-    )
+        for name, p in report.parts.items()
+    ]
+    title = f"What the {report.accuracy_mm[0]:.2f} mm are made of, and what each remedy alone would leave"
+    parts = TextTable(title, ("", "share", "itself, mm", "left by the remedy, mm", "remedy"), tuple(rows))
+    found.insert(0, parts)
     head = (
         "",
         "zero, deg",
@@ -92,7 +96,7 @@ def _joint_row(j: JointFigures) -> tuple[str, ...]:
         _pair(j.backlash_deg),
         _pair(j.hysteresis_deg),
         _pair(j.droop_deg_per_m, 2),
-        "–" if j.droop_deg is None else f"{j.droop_deg:.2f}",
+        "–" if j.droop_deg is None or not determined(j.droop_deg_per_m) else f"{j.droop_deg:.2f}",
         _pair(j.once_per_revolution_deg),
         "–" if j.latency_s is None else f"{j.latency_s:.3f}",
     )
@@ -108,8 +112,10 @@ def remarks(report: ArmReport) -> list[str]:
         "Zero: true angle less reading; that of the first and of the last joint looks like another base and another tool.",
         "Backlash: behind the joint's sensor. Sides: reading from above less from below, at the same command. Droop: "
         "reading less command for a metre of the gravity load's lever.",
-        "What is smaller than twice its sigma is not distinguished from zero.",
-        "Each part of the error is what it explains beyond those above it; beside it stands what its remedy alone leaves.",
+        "What is smaller than twice its sigma is not determined: these poses distinguish it too little from zero, "
+        "or from another part.",
+        "Each part is what it moves the tool by, RMS, in the frames of the run; parts may cancel each other: then a "
+        "share is negative. Controller: readings less commands, such as the droop under gravity.",
         "Drift has no temperature beside it: runs do not record any." if report.drift_mm_per_h else "",
     ]
 
@@ -133,14 +139,14 @@ def _map_figure(report: ArmReport, figure: FigureBase) -> None:
 def _parts_figure(report: ArmReport, figure: FigureBase) -> None:
     """Plot the parts of the error: shares, and what each remedy would leave."""
     left, right = figure.subplots(1, 2)
-    names = list(report.parts)[::-1]
+    names = [name for name, part in report.parts.items() if part.determined][::-1]
     rows = np.arange(len(names))
     left.barh(rows, [100 * report.parts[name].share for name in names], color=BLUE, height=0.65)
     left.set_yticks(rows, names)
     left.set_xlabel("share of the mean square error, %")
     left_over = [part.without_mm if part.remedy else 0.0 for part in (report.parts[name] for name in names)]
     right.barh(rows, left_over, color=ORANGE, height=0.65)
-    right.axvline(report.placed_mm, color=MUTED, linewidth=1)
+    right.axvline(report.accuracy_mm[0], color=MUTED, linewidth=1)
     right.set_yticks(rows, [""] * len(rows))
     right.set_xlabel("RMS error with its remedy alone, mm (line: as it is)")
 
@@ -196,7 +202,7 @@ def write_report(report: ArmReport, others: Mapping[str, dict[str, Any]], folder
     document = json.dumps(report.to_json(), indent=1, allow_nan=False) + "\n"
     write_text(folder / "report.json", document)
     shown, said = tables(report, others), [line for line in remarks(report) if line]
-    heading = f"{report.arm}: {report.accuracy_mm[0]:.2f} mm RMS, {report.placed_mm:.2f} with base and tool fitted"
+    heading = f"{report.arm}: {report.accuracy_mm[0]:.2f} mm RMS, {report.placed_mm:.2f} with another base and tool"
     sub = f"{report.poses} poses, {report.rests} rests in {60 * report.hours:.0f} min; controller: {report.board}"
     with drawing():
         pdf = _pdf([_text_page(heading, sub, shown, said), _figures_page(report)])

@@ -12,11 +12,12 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from armsight.app.handeye.read import COLUMNS as POSE_COLUMNS
 from armsight.app.handeye.read import NAMES, PoseTable, read_pose_table
@@ -27,8 +28,8 @@ from armsight.files import check_writable, read_columns, read_table, write_text
 from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
 from armsight.loop.identify.corrected import Corrected, zeros_text
 from armsight.loop.identify.diagnose import check_plausible, find_step, without_tool
-from armsight.loop.identify.identify import Identified, contributions, identify
-from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.identify import ALIKE, Identified, contributions, identify
+from armsight.loop.identify.measured import Measured, visits
 from armsight.loop.identify.model import Model, Parameter
 from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.read import COLUMNS, Read, poses_in, read_poses
@@ -39,6 +40,8 @@ from armsight.robot.arm import Arm
 FOLDS = 5
 #: With more poses than this, one part is enough.
 MANY = 500
+#: Residuals of poses left out that chance makes so large with this probability only show that the sigmas are too small.
+TOO_SMALL = 1e-3
 #: Few poses to validate with that are further from the nominal arm than this, m, are not of it: no arm is so inaccurate.
 FAR_M = 0.1
 #: Joined by time, a shot counts where no joint reads further from its angle than this, rad, so long before and after, s: an
@@ -223,9 +226,16 @@ def run_identify(
     else:
         held_out, poses, how = _left_out(arm, measured.rows(found.solution.used), priors, progress)
         how += f", {len(found.left_out)} taken for mistakes apart" if len(found.left_out) else ""
-    return Identification(
-        arm, measured, found, held_out, poses, how, lines, (*notes, *_notes(arm, found, measured, lines))
-    )
+    said = _notes(arm, found, measured, lines)
+    over, numbers = held_out.residual_over_predicted, len(poses) * measured.size
+    if over**2 > chdtri(numbers, TOO_SMALL) / numbers:
+        found = replace(found, cov=over**2 * found.cov)
+        said = (
+            f"residuals of poses left out are {over:.2f} times as large as predicted: the arm does something that the "
+            f"model does not know; all sigmas are made {over:.2f} times as large",
+            *said,
+        )
+    return Identification(arm, measured, found, held_out, poses, how, lines, (*said, *notes))
 
 
 def check_other(arm: Arm, measured: Measured, other: Measured) -> None:
@@ -260,22 +270,24 @@ def _left_out(
     arm: Arm, measured: Measured, priors: Mapping[str, float] | None, progress: Callable[[str], None]
 ) -> tuple[Validation, Array, str]:
     """Identify without a part of the poses, and validate on it; with few poses once for every part."""
-    shuffled = np.random.default_rng(0).permutation(len(measured))
-    parts = np.array_split(shuffled, min(FOLDS, len(shuffled)))
+    which = visits(measured.q)
+    shuffled = np.random.default_rng(0).permutation(int(which.max()) + 1)
+    parts = [np.flatnonzero(np.isin(which, part)) for part in np.array_split(shuffled, min(FOLDS, len(shuffled)))]
     tried = parts if len(measured) <= MANY else parts[:1]
     done, rows = [], []
     for i, part in enumerate(tried):
         progress(f"error on poses left out, part {i + 1} of {len(tried)}")
         try:
-            done.append(
-                validate(identify(arm, measured.rows(np.setdiff1d(shuffled, part)), priors=priors), measured.rows(part))
-            )
+            others = measured.rows(np.setdiff1d(np.arange(len(which)), part))
+            done.append(validate(identify(arm, others, priors=priors), measured.rows(part)))
         except (InputError, CalibrationError) as error:
             raise CalibrationError(f"too few poses to leave a fifth of them out: {error}") from None
         rows.append(part)
     over = float(np.sqrt(np.mean([v.residual_over_predicted**2 for v in done])))
     joined = Validation(_joined([v.nominal for v in done]), _joined([v.identified for v in done]), False, over)
     how = f"{sum(map(len, rows))} poses left out" + (" in five rounds" if len(tried) > 1 else " of the fit")
+    again = len(which) - len(shuffled)
+    how += f", {again} of them visits of another's pose, with which they are left out" if again else ""
     return joined, measured.q[np.concatenate(rows)], how
 
 
@@ -286,6 +298,15 @@ def _joined(errors: list[Errors]) -> Errors:
 def _notes(arm: Arm, found: Identified, measured: Measured, lines: Array) -> tuple[str, ...]:
     """Return what a person should know about the data."""
     notes = []
+    still = [str(i + 1) for i in np.flatnonzero(np.ptp(measured.q, axis=0) < ALIKE)]
+    lost = [p.name for p, k in zip(found.model.parameters, found.solution.free, strict=True) if p.joint < 0 and not k]
+    if still:
+        notes.append(
+            f"joint{'s' * (len(still) > 1)} {', '.join(still)} hardly moved: what is off there is not observable, and is "
+            "kept at its nominal value; held-out errors hold for poses with the same angles there"
+        )
+    if lost:
+        notes.append(f"not observable by these motions, and kept: {', '.join(lost)} (base and tool)")
     if len(found.left_out):
         shown = ", ".join(f"{lines[k]:.0f}" for k in found.left_out[:8]) + (", .." if len(found.left_out) > 8 else "")
         poses = f"{len(found.left_out)} pose{'s' if len(found.left_out) > 1 else ''}"

@@ -90,7 +90,8 @@ class RunPlan:
 @click.option(
     "--motion",
     type=click.Path(path_type=Path),
-    help="The motions (TOML, docs/howto/run.md); by default five poses, a line and a circle.",
+    help="The motions (TOML, docs/howto/run.md). Without: five poses, a line and a circle, made for six_r; "
+    "other arms need theirs (armsight check plan).",
 )
 @click.option(
     "--rate",

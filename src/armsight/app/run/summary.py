@@ -42,7 +42,7 @@ from armsight.vision.rig import Shutters
 VERSION = 2
 #: Track -> its name in tables.
 TRACKS = {
-    "potentiometers": "joint sensors",
+    "potentiometers": "joint readings by the nominal arm",
     "vision": "vision",
     "fused": "fused, smoothed",
     "live": "fused, live",
@@ -367,8 +367,8 @@ def loop_table(summary: RunSummary) -> TextTable | None:
         )
         if alone is not None and closed is not None
     ]
-    columns = ("", "joint sensors alone, mm", "loop closed, mm", "times smaller")
-    return TextTable("Distance of the tool from its reference", columns, tuple(rows))
+    columns = ("", "open loop, mm", "loop closed, mm", "times smaller")
+    return TextTable("Distance of the tool from its command", columns, tuple(rows))
 
 
 def print_summary(summary: RunSummary, folder: Path) -> None:

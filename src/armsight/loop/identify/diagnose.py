@@ -28,7 +28,7 @@ from armsight.loop.handeye.handeye import kronecker
 from armsight.loop.identify import ROTATIONS
 from armsight.loop.identify.fit import SIGMA
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.placement import angle_between, linear_placement
+from armsight.loop.identify.placement import angle_between, linear_placement, rigid_placement
 from armsight.loop.identify.read import AnglesMeasured, rotations_of
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics import chain
@@ -140,8 +140,11 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
     rows = np.linspace(0, len(measured) - 1, min(POSES, len(measured))).astype(int)
     q, p = measured.q[rows], measured.p_rig[rows]
     off, _, scale = misfit(arm, q, p)
+    limit, rigid = max(BAD_SHARE * _span(p), BAD_M), rigid_misfit(arm, q, p)
+    if rigid < limit and rigid < BETTER * off:  # where few joints move, the motions leave the scale open
+        off, scale = rigid, 1.0
     scaled = abs(np.log(scale)) > np.log1p(SCALE_OFF)
-    good = off < max(BAD_SHARE * _span(p), BAD_M * (scale if scaled else 1.0))
+    good = off < (max(limit, BAD_M * scale) if scaled else limit)
     if good and not scaled:
         _check_rotations(arm, measured, rows)
         step = find_step(arm, measured)
@@ -173,6 +176,12 @@ def misfit(arm: Arm, q: Array, p_rig: Array) -> Off:
         e -= e.mean(axis=(0, 1))
         offs.append(float(np.sqrt(np.mean(np.sum(e**2, axis=2)))) / scale)
     return Off(offs[0], offs[1], 1 / scale)
+
+
+def rigid_misfit(arm: Arm, q: Array, p_rig: Array) -> float:
+    """Return how far points (N, K, 3) are off an arm at q (N, n), RMS, m, with base and tool free, in their own unit."""
+    T = arm.forward(q) @ np.linalg.inv(arm.T_flange_tool)
+    return rigid_placement(T[:, :3, :3], T[:, :3, 3], p_rig)[3]
 
 
 def _unit(scale: float) -> str:
@@ -333,8 +342,8 @@ def find_step(arm: Arm, measured: Measured) -> Step | None:
         p = np.concatenate([p, p + AXES_M * measured.R_rig_body[rows].swapaxes(1, 2)], axis=1)
     n, K = p.shape[:2]
     T = arm.forward(q)
-    M, _, t = linear_placement(T[:, :3, :3], T[:, :3, 3], p)
-    here, there = p @ nearest_rotation(M).T, _points(T, t)
+    M, _, t, _ = rigid_placement(T[:, :3, :3], T[:, :3, 3], p)
+    here, there = p @ M.T, _points(T, t)
     here += (there - here).mean(axis=(0, 1))
     joints = [(_points(arm.forward(q + STEP_RAD * one), t) - there) / STEP_RAD for one in np.eye(arm.joints)]
     base = [*np.broadcast_to(np.eye(3)[:, None, None], (3, n, K, 3)), *(np.cross(axis, here) for axis in np.eye(3))]

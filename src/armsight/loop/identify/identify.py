@@ -19,7 +19,7 @@ from armsight.loop.identify.diagnose import check_plausible, without_tool
 from armsight.loop.identify.fit import Mask, Solution, covariance, fit, prior_sigma
 from armsight.loop.identify.joint_noise import JointNoise, joint_noise, no_noise, with_joint_noise
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.model import PLENTY, Model, approaches
+from armsight.loop.identify.model import PLENTY, SENSOR, Model, approaches
 from armsight.loop.identify.observable import Observed, observed
 from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.selection import PLACEMENT, TOGETHER, SelectionStep, forward_selection, scaled_prior
@@ -55,6 +55,7 @@ class Identified(Record):
         cov: (P, P) covariance of all that may be off, fitted or not: a fitted number's sigma includes what the error
             sources that were not selected, or hardly show, could still be, and how far leaving them out has moved it.
             ``solution.cov`` is that of the fitted ones, the rest taken for nominal.
+        cov_everything: (P, P) covariance of all that may be off in the fit of all of it, ``solution.x - moved``.
         moved: (P,) fitted numbers less those of the fit of everything that can be observed: what the selection has moved.
     """
 
@@ -66,6 +67,7 @@ class Identified(Record):
     singular_values: Array
     prior: Array
     cov: Array
+    cov_everything: Array
     moved: Array
     joint_sigma_rad: Array
 
@@ -117,9 +119,9 @@ def identify(
         InputError: too few poses, or data that cannot be of this arm; the message says what would make them fit.
         CalibrationError: poses so alike that not even base and tool are observable.
     """
-    model, x, prior = begun(arm, measured, priors=priors, progress=progress)
+    model, x, prior, seen = _begun(arm, measured, priors, progress)
     progress("base and tool")
-    placement = _of(model, PLACEMENT)
+    placement = _of(model, PLACEMENT) & seen.free
     start = fit(model, x, measured, placement, prior)
     return _identified(model, start, measured, prior, placement, progress)
 
@@ -145,15 +147,31 @@ def begun(
         InputError: too few poses, or data that cannot be of this arm.
         CalibrationError: poses so alike that not even base and tool are observable.
     """
+    model, x, prior, seen = _begun(arm, measured, priors, progress)
+    lost = [model.names[k] for k in np.flatnonzero(_of(model, PLACEMENT) & ~seen.free)]
+    if lost:
+        raise CalibrationError(
+            f"the poses are too alike: {', '.join(lost)} cannot be distinguished from the others; move every joint between "
+            "poses, by 20 degrees and more"
+        )
+    return model, x, prior
+
+
+def _begun(
+    arm: Arm, measured: Measured, priors: Mapping[str, float] | None, progress: Callable[[str], None]
+) -> tuple[Model, Array, Array, Observed]:
+    """Return what :func:`begun` does, and which parameters of base and tool the poses show."""
     _require_enough(measured)
     arm = without_tool(arm)
     progress("is this the arm")
     check_plausible(arm, measured)
     model, x = with_placement(Model.of(arm, measured, backlash=approaches(measured)), measured)
-    prior = prior_sigma(model, priors)
+    still = np.ptp(measured.q, axis=0) < ALIKE  # the curve of a joint that does not move is its zero
+    curves = np.array([p.kind in SENSOR and bool(still[p.joint]) for p in model.parameters])
+    prior = np.where(curves, 0.0, prior_sigma(model, priors))
     at = _first(model, x, measured, prior)
-    _require_placement(model, at.x, measured, prior, at.noise, _of(model, PLACEMENT))
-    return model, at.x, prior
+    placement = np.where(_of(model, PLACEMENT), prior, 0.0)
+    return model, at.x, prior, observed(model, at.x, measured, placement, at.noise)
 
 
 def _identified(
@@ -181,11 +199,11 @@ def _identified(
     kept_together = {model.names[k] for k in np.flatnonzero(selection.free & ~observable.free)}
     reasons = {**{n: why for n, why in observable.reasons.items() if n not in kept_together}, **selection.reasons}
     model = model.with_seen(measured.q[solution.used])
-    cov = _whole(model, solution, measured, observable.possible, prior)
+    everything = _whole(model, solution, measured, observable.possible, prior)
     moved = solution.x - whole.x
-    cov = np.where(selection.free[:, None] & selection.free, cov + np.diag(moved**2), 0.0)
+    cov = np.where(selection.free[:, None] & selection.free, everything + np.diag(moved**2), 0.0)
     found = (model, nominal.x, solution, reasons, selection.steps, observable.singular_values)
-    return Identified(*found, prior, cov, moved, scatter.sigma_rad)
+    return Identified(*found, prior, cov, everything, moved, scatter.sigma_rad)
 
 
 def _everything(
@@ -230,19 +248,6 @@ def _require_enough(measured: Measured) -> None:
         )
     if np.ptp(measured.q, axis=0).max() < ALIKE:
         raise CalibrationError("the poses are too alike: no joint moves; move every joint by 20 degrees and more")
-
-
-def _require_placement(
-    model: Model, x: Array, measured: Measured, prior: Array, noise: tuple[float, float], placement: Mask
-) -> None:
-    """Reject poses that do not even determine base and tool."""
-    found = observed(model, x, measured, np.where(placement, prior, 0.0), noise)
-    lost = [model.names[k] for k in np.flatnonzero(placement & ~found.free)]
-    if lost:
-        raise CalibrationError(
-            f"the poses are too alike: {', '.join(lost)} cannot be distinguished from the others; move every joint between "
-            "poses, by 20 degrees and more"
-        )
 
 
 def contributions(found: Identified, measured: Measured) -> dict[str, float]:

@@ -10,6 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
@@ -74,3 +77,18 @@ class Measured(Record):
         """Return a part of the poses."""
         parts = (None if a is None else a[rows] for a in (self.R_rig_body, self.cov, self.approach))
         return Measured(self.q[rows], self.p_rig[rows], *parts)
+
+
+#: Poses whose joints all read within this, rad, of each other's are one pose, visited again.
+SAME_RAD = 5e-3
+
+
+def visits(q: Array) -> NDArray[np.int64]:
+    """Return the pose (N,) that each row of joint angles (N, n) is a visit of, from 0 in the order of the rows.
+
+    What is left out to judge a fit is left out with all of its visits: one that stays in would give it away.
+    """
+    near = cKDTree(q).query_pairs(SAME_RAD, p=np.inf, output_type="ndarray")
+    graph = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(q), len(q)))
+    _, first, which = np.unique(connected_components(graph, directed=False)[1], return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[which], np.int64)

@@ -30,7 +30,7 @@ from scipy.optimize import minimize
 
 from armsight.data import Array
 from armsight.loop.identify.fit import Mask, Solution, weighted
-from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.measured import Measured, visits
 from armsight.loop.identify.model import Model
 
 #: The kinds whose priors are scaled: they differ most from arm to arm.
@@ -286,14 +286,16 @@ class _Removal:
 
 
 def folds_of(q: Array, folds: int = FOLDS) -> NDArray[np.int64]:
-    """Return the fold (N,) of every pose: poses that are near each other in joint angles are left out together."""
-    k = min(CLUSTERS, len(q) // CLUSTER)
+    """Return the fold (N,) of every pose: near poses, and visits of one, are left out together."""
+    which = visits(q)
+    _, first = np.unique(which, return_index=True)
+    k = min(CLUSTERS, len(first) // CLUSTER)
     if k < folds:
-        return np.random.default_rng(0).permutation(len(q)) % min(folds, len(q))
-    at = np.concatenate([np.cos(q), np.sin(q)], axis=1)
+        return np.asarray((np.random.default_rng(0).permutation(len(first)) % min(folds, len(first)))[which])
+    at = np.concatenate([np.cos(q[first]), np.sin(q[first])], axis=1)
     _, labels = kmeans2(at, k, iter=5, minit="++", seed=np.random.default_rng(0))
     found, labels = np.unique(labels, return_inverse=True)
-    return np.asarray((np.random.default_rng(1).permutation(len(found)) % folds)[labels])
+    return np.asarray((np.random.default_rng(1).permutation(len(found)) % folds)[labels[which]])
 
 
 def forward_selection(

@@ -113,7 +113,7 @@ def require_alike(measured: Measured, points: int, full: bool) -> None:
 def placement_refitted(found: Identified, measured: Measured) -> tuple[Model, Array, Array]:
     """Return the model, the nominal and the identified vector with base and tool fitted to other poses."""
     model, start = with_placement(found.model, measured)
-    placement = np.array([p.kind in PLACEMENT for p in model.parameters])
+    placement = np.array([p.kind in PLACEMENT for p in model.parameters]) & found.solution.free
     out = []
     for x in (found.nominal, found.solution.x):
         out.append(fit(model, np.where(placement, start, x), measured, placement, found.prior).x)
