@@ -3,8 +3,8 @@
     python benchmarks/arm_report.py --seeds 10
 
 Arms are SO-101 and AR4, with errors of base and tool, zeros, lengths and angles, backlash and droop of random size. The
-truth of a part is what it alone moves the tool by at the rests, RMS. Printed are the truth, what is found, and the distance in
-sigmas; then how many parts are further than three sigmas from the truth.
+truth of a part is what it alone moves the tool by at the rests, RMS. Printed are the truth, what is found, and the distance
+in sigmas; then how many parts are further than three sigmas from the truth.
 """
 
 import argparse

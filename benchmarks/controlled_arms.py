@@ -258,7 +258,7 @@ def report(name, seed, poses=20, cycles=4):
     """
     cell, folder = LightCell(name, seed), Path(tempfile.gettempdir()) / f"arm_report_{name}_{seed}"
     around = np.vstack([cell.model.home, workcell_poses(cell.model, default=False)])
-    text = plan_report(cell.model, around, lambda Ts: np.ones(len(Ts), bool), poses=poses, cycles=cycles)
+    text, _ = plan_report(cell.model, around, lambda Ts: np.ones(len(Ts), bool), poses=poses, cycles=cycles)
     plan = cell.plan(text)
     found = cell.run(plan, close_loop=False)
     found.kept, found.picture = [], None  # there are no images

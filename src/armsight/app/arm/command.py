@@ -255,8 +255,8 @@ def plan(
     write_text(output, text)
     if extent.min() < _NARROW_M:
         click.echo(
-            f"note: the poses are between those at which {around} saw the body, and cover only {_cm(extent)}: zeros, base and "
-            "tool, and lengths will hardly be distinguished; record a run whose hand-eye poses cover more of the room first",
+            f"note: the poses are between those at which {around} saw the body, and cover only {_cm(extent)}: zeros, base "
+            "and tool, and lengths will hardly be distinguished; first record a run whose hand-eye poses cover more",
             err=True,
         )
     answer = {"arm": arm.name, "poses": poses, "cycles": cycles, "extent_m": extent.tolist(), "output": str(output)}

@@ -584,7 +584,7 @@ def _left(track: JointTrack, i: int, rows: NDArray[np.int64], delay_s: float) ->
 def plan_report(
     arm: Arm, around: Array, visible: Callable[[Array], NDArray[np.bool_]], *, poses: int, cycles: int, seed: int = 0
 ) -> tuple[str, Array]:
-    """Return the motions of the recording that a report needs, as a motion file, and the space (3,) that its poses cover, m.
+    """Return the motions of the recording that a report needs, as a motion file, and the space (3,) it covers, m.
 
     Poses all over where the body is seen, each from two opposite sides of all joints, and five of them again and again.
 
