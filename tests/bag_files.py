@@ -253,7 +253,8 @@ def disordered(folder: Path, container: str, seed: int) -> Disordered:
     """Write a recording in 2 to 15 files whose messages are shuffled, doubled, missing, late and without a stamp.
 
     A frame's number is in its first two pixels. Messages come up to 0.3 s late, some by 3 s, one topic by a burst; files
-    overlap in time; metadata.yaml, where the container has one, names the files in their order.
+    overlap in time; where stamps are missing, messages come at once, so that their arrival says it. metadata.yaml, where the
+    container has one, names the files in their order.
     """
     rng = np.random.default_rng(seed)
     count, parts = int(rng.integers(25, 90)), int(rng.integers(2, 16))
@@ -270,10 +271,9 @@ def disordered(folder: Path, container: str, seed: int) -> Disordered:
             image = rng.integers(0, 255, (12, 16), np.uint8)
             image[0, :2] = k, side
             true = EPOCH_NS + k * step_ns + (side and int(1e6)) + int(rng.normal(0, 0.04 * step_ns))
-            late = int(rng.choice([1e6, 3e8 * rng.random(), 3e9], p=[0.8, 0.17, 0.03])) + (
-                2 * 10**9 if k in burst else 0
-            )
-            stamp = 0 if unstamped and late == 10**6 and rng.random() < 0.05 else true
+            late = int(rng.choice([1e6, 3e8 * rng.random(), 3e9], p=[0.8, 0.17, 0.03]))
+            late = int(rng.uniform(1e6, 3e6)) if unstamped else late + 2 * 10**9 * (k in burst)
+            stamp = 0 if unstamped and rng.random() < 0.05 else true
             one = Sent(topic, stamp, Pixels(image), true + late)
             sent.append(one)
             if stamp and rng.random() < 0.05:

@@ -9,6 +9,7 @@ imported when they are first used, so that the command line starts at once.
 from __future__ import annotations
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -27,6 +28,11 @@ if TYPE_CHECKING:
     from armsight.vision.measure import measure
     from armsight.vision.rig import StereoRig
     from armsight.vision.sources import open_source
+
+#: Largest image that is decoded, pixels: a small file can say any size. OpenCV takes the limit when it is first imported.
+#: Half: images of 50 Mpx are rejected; double: one hostile image takes 400 MB.
+MOST_PIXELS = 1 << 26
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_PIXELS))
 
 __all__ = [
     "Arm",

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from armsight import MOST_PIXELS
 from armsight.data import Image
 from armsight.errors import InputError
 from armsight.files import read_bytes
@@ -88,6 +89,11 @@ def read_image(path: str | Path) -> Image:
     data = read_bytes(path, IMAGE_MB)
     if not data:
         raise InputError(f"{path}: the file is empty")
+    return decoded(data, path)
+
+
+def decoded(data: bytes, path: str | Path) -> Image:
+    """Decode an image file that was read, or stood in a recording; as :func:`read_image`."""
     for start, (kind, complete) in _FORMATS.items():
         if data.startswith(start) and not complete(data):
             raise InputError(
@@ -97,7 +103,9 @@ def read_image(path: str | Path) -> Image:
     with _quiet(), contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
-        raise InputError(f"{path}: not an image that can be read (JPEG, PNG, TIFF, BMP, PGM, ...)")
+        raise InputError(
+            f"{path}: not an image that can be read (JPEG, PNG, TIFF, BMP, PGM, ... of {MOST_PIXELS >> 20} Mpx at most)"
+        )
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path}: pixels are {image.dtype}; expected 8 or 16 bits, unsigned")
     if image.ndim == 3 and image.shape[2] == 4:

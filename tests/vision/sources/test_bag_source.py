@@ -2,7 +2,9 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -18,6 +20,7 @@ from armsight.vision.rigfiles.rigfile import rectification
 from armsight.vision.sources import notes_of, open_source
 from armsight.vision.sources.bag import Bag
 from armsight.vision.sources.bag.camera_info import bag_rig, open_rig
+from armsight.vision.sources.bag.images import decoded_image
 from armsight.vision.sources.bag.pairing import pair, stamps_of
 from armsight.vision.sources.bag.states import read_joints, read_track
 from armsight.vision.sources.bag.tags import read_tags
@@ -104,6 +107,52 @@ def test_ros_encodings_become_grey_or_bgr(tmp_path):
     assert "encoding 'nv24' is not read" in found[0].problem
 
 
+def sent_as(encoding, image):
+    return [
+        Sent(t, EPOCH_NS + k, Pixels(image), options={"encoding": encoding})
+        for k in (0, STEP_NS)
+        for t in (LEFT, RIGHT)
+    ]
+
+
+@pytest.mark.parametrize("encoding", ["nv12", "nv21"])
+def test_luminance_with_half_the_colours_behind_it_is_read(tmp_path, encoding):
+    red = np.full((8, 16, 3), (40, 80, 220), np.uint8)
+    planes = cv2.cvtColor(red, cv2.COLOR_BGR2YUV_I420)
+    u, v = planes[8:10].reshape(4, 8), planes[10:12].reshape(4, 8)
+    colours = np.dstack([u, v] if encoding == "nv12" else [v, u]).reshape(4, 16)
+    sent = sent_as(encoding, np.vstack([planes[:8], colours]))
+    path = write_bag(tmp_path / "a", "mcap", sent)
+    whole = Bag(path)
+    for message in whole.messages([LEFT]):
+        decoded = message.decode()
+        decoded.height, decoded.step = 8, 16  # as drivers say it: the rows of the luminance
+        np.testing.assert_allclose(decoded_image(message.kind, decoded)[0], red, atol=4)
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_bayer_patterns_of_16_bits_are_those_of_8(tmp_path, pattern):
+    raw = np.random.default_rng(1).integers(0, 255, (12, 16), np.uint8)
+    eight, _ = shots(f"bag:{write_bag(tmp_path / '8', 'ros1', sent_as(f'bayer_{pattern}8', raw))}")
+    sixteen, _ = shots(f"bag:{write_bag(tmp_path / '16', 'ros1', sent_as(f'bayer_{pattern}16', raw * np.uint16(257)))}")
+    np.testing.assert_allclose(sixteen[0].left / 257, eight[0].left, atol=1)
+
+
+def test_distances_are_said_to_be_no_picture(tmp_path):
+    found, _ = shots(f"bag:{write_bag(tmp_path / 'a', 'sqlite3', sent_as('32FC1', np.zeros((8, 8), np.float32)))}")
+    assert found[0].problem.startswith("left image: its 32FC1 holds distances of a depth camera")
+    sent = images(3)
+    for each in [*sent]:
+        depth = Pixels(each.content.image, "png")
+        sent.append(Sent(each.topic.replace("image_raw", "depth/compressedDepth"), each.stamp_ns, depth))
+    path = write_bag(tmp_path / "b", "mcap", sent)
+    assert open_source(f"bag:{path}").topics == (LEFT, RIGHT)
+    with pytest.raises(InputError, match="16UC1; compressedDepth png holds distances of a depth camera"):
+        decoded_image(
+            "sensor_msgs/CompressedImage", SimpleNamespace(format="16UC1; compressedDepth png", data=b"\0" * 20)
+        )
+
+
 def test_an_image_without_a_partner_is_a_shot_that_says_so(tmp_path):
     sent = images(6)
     del sent[5]  # the right image of the third shot
@@ -168,6 +217,19 @@ def test_a_missing_file_of_a_split_recording_is_said_and_the_rest_read(tmp_path)
         lost.write_bytes(b"damaged")
         if container == "sqlite3":
             assert pairs_found(bag.spec)[0] == found
+
+
+def test_a_message_without_a_stamp_among_late_ones_is_named_and_never_guessed():
+    rng = np.random.default_rng(5)
+    true = EPOCH_NS + np.arange(80) * STEP_NS
+    late = np.where(rng.random(80) < 0.5, 10**6, 2 * 10**9)  # which of both is unknown
+    stamps = np.where(rng.random(80) < 0.1, 0, true)
+    right = np.delete(true, np.flatnonzero(rng.random(80) < 0.3))
+    found = pair(
+        stamps_of("/l", stamps.tolist(), (true + late).tolist()), stamps_of("/r", right.tolist(), right.tolist())
+    )
+    assert all(true[k] == right[n] for k, n in found.pairs)
+    assert {k for k, _ in found.pairs} >= set(np.flatnonzero(np.isin(stamps, right)))
 
 
 @pytest.mark.parametrize("jumping", ["both", "left"])
@@ -332,6 +394,18 @@ def info(camera, R, P):
     model = {"fisheye": "equidistant", "brown8": "rational_polynomial"}.get(camera.model, "plumb_bob")
     d = camera.distortion if camera.distortion.size != 4 or camera.model == "fisheye" else [*camera.distortion, 0.0]
     return Info(camera.image_size_px, model, np.array(d), camera.matrix, R, P)
+
+
+def test_foxgloves_name_of_the_fisheye_model_is_read_and_written(tmp_path):
+    rig = ordinary_rig("fisheye")
+    R1, R2, P1, P2, _ = rectification(rig)
+    sent = [Sent(f"/stereo/{side}/camera_info", EPOCH_NS, info(camera, R, P))
+            for side, camera, R, P in (("left", rig.left, R1, P1), ("right", rig.right, R2, P2))]  # fmt: skip
+    for each in sent:
+        each.content.model = "kannala_brandt"
+    found = open_rig(f"bag:{write_bag(tmp_path / 'a', 'foxglove', sent)}")
+    assert [camera.model for camera in found.cameras] == ["fisheye", "fisheye"]
+    np.testing.assert_allclose(found.T_left_right, rig.T_left_right, atol=1e-12)
 
 
 @pytest.mark.parametrize("container", CONTAINERS)

@@ -1,5 +1,6 @@
 """Video files: real AVI files, written by OpenCV with a frame number in the grey of each frame."""
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -103,6 +104,53 @@ def test_a_file_that_is_cut_short_says_so(film, picture):
     assert found[-1].problem == f"{path} is damaged or cut short: it ends after {len(found) - 1} of 20 frames"
 
 
+@pytest.mark.parametrize("codec", ["libsvtav1", "libx264", "mpeg4", "libvpx-vp9", "mjpeg"])
+def test_what_cameras_and_datasets_write_is_read(tmp_path, picture, codec):
+    files = []
+    for side in ("left", "right"):
+        files.append(tmp_path / f"{side}.mkv")
+        with av.open(str(files[-1]), "w") as file:
+            stream = file.add_stream(
+                codec,
+                30,
+                bit_rate=1_000_000,
+                width=64,
+                height=64,
+                pix_fmt="yuvj420p" if codec == "mjpeg" else "yuv420p",
+            )
+            for k in range(12):
+                image = picture(side, k, (64, 64))
+                file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+            file.mux(stream.encode(None))
+    found = shots(f"video:{files[0]},{files[1]}")
+    assert [shot.problem for shot in found] == [None] * 12
+    assert [shot.t_s for shot in found] == pytest.approx([k / 30 for k in range(12)], abs=1e-3)
+    for k, shot in enumerate(found):
+        assert abs(float(np.mean(shot.left)) - 10 * k) < 4
+        assert abs(float(np.mean(shot.right)) - 10 * k - 5) < 4
+
+
+def test_a_file_that_names_others_is_no_video(film, picture, tmp_path):
+    good = film("good.avi", [picture("left", 1)])
+    playlist = tmp_path / "list.mp4"
+    playlist.write_text("#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:9/a.ts\n#EXT-X-ENDLIST\n")
+    with pytest.raises(InputError, match="not a video file"):
+        open_source(f"video:{playlist},{good}")
+
+
+def test_damaged_frames_are_counted_and_the_rest_read(film):
+    rng = np.random.default_rng(7)
+    path = film("both.avi", [rng.integers(0, 256, (96, 128, 3), dtype=np.uint8) for _ in range(20)])
+    data = bytearray(path.read_bytes())
+    at = [k for k in range(len(data) - 1) if data[k : k + 2] == b"\xff\xd8"]
+    data[at[5] : at[6] - 8] = bytes(at[6] - 8 - at[5])
+    path.write_bytes(data)
+    source = open_source(f"video:{path}")
+    found = list(iter(source.read, None))
+    assert sum(shot.problem is None for shot in found) == 19
+    assert f"{path}: 1 frames are damaged: left out" in notes_of(source)
+
+
 def test_what_is_no_video_is_named(film, picture, tmp_path, capfd):
     odd = film("odd.avi", [picture("left", 1, (65, 48))])
     good = film("good.avi", [picture("left", 1)])
@@ -111,7 +159,7 @@ def test_what_is_no_video_is_named(film, picture, tmp_path, capfd):
     for spec, said in (
         (f"video:{odd}", f"{odd}: a side-by-side video must have an even width, this one is 65 px wide"),
         (f"video:{good},{tmp_path}/none.avi", f"{tmp_path}/none.avi: no such file"),
-        (f"video:{text}", f"{text}: not a video file that OpenCV can read"),
+        (f"video:{text}", f"{text}: not a video file, or one that is cut short at its beginning"),
         (f"video:{good},{good}", f"{good}: given as both left and right video"),
         (f"video:{good},{good},{good}", "expected video:LEFT.mp4,RIGHT.mp4 or video:SIDE_BY_SIDE.mp4"),
         ("video:", "expected video:LEFT.mp4,RIGHT.mp4"),

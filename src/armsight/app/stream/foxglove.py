@@ -29,7 +29,7 @@ _SIGMAS, _LEAST_M = 3.0, 2e-4
 _NS = 1_000_000_000
 _GREEN, _RED, _YELLOW = (0.1, 0.8, 0.2, 1.0), (0.9, 0.2, 0.1, 1.0), (1.0, 0.8, 0.1, 0.4)
 _LEVELS = {"info": 2, "warning": 3, "error": 4}
-_MODELS = {"fisheye": "equidistant", "brown8": "rational_polynomial"}
+_MODELS = {"fisheye": "kannala_brandt", "brown8": "rational_polynomial"}
 
 
 def require_foxglove(what: str, extra: str) -> None:

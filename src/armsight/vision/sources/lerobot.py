@@ -1,13 +1,13 @@
 """A LeRobot dataset: two of its cameras as shots, and its joints.
 
 In: the folder of a dataset of format 2 or 3 (meta/info.json, Parquet tables, one MP4 an episode or a file, usually AV1).
-Out: one shot a frame of the table, with the table's time stamp. Read are the features of dtype ``video``; which two are
-left and right their names say, or the user does: ``lerobot:DIR,left=KEY,right=KEY``; ``episode=N`` reads one episode alone.
+Out: one shot a frame of the table, with the table's time stamp. Read are the features of dtype ``video``, and ``image``,
+which stand in the table (lerobot's ``use_videos=False``); depth maps are not. Which two are left and right their names say,
+or the user does: ``lerobot:DIR,left=KEY,right=KEY``; ``episode=N`` reads one episode alone.
 """
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,12 +18,18 @@ import numpy as np
 
 from armsight.data import SIDES, Array, Image, Record, Shot
 from armsight.errors import InputError
-from armsight.files import read_text
-from armsight.vision.sources.capture import QuietCapture, open_capture
+from armsight.files import opened, read_json
+from armsight.vision.image import decoded
+from armsight.vision.sources.video import Film
 
 #: Columns of a table by name.
 _Columns: TypeAlias = dict[str, list[Any]]
+#: A file of the library pyarrow.
+_Parquet: TypeAlias = Any
 _JOINTS = "observation.state"
+#: Cells of a table that are read; a small file can hold any number of equal ones. Half: 10 hours of six joints are
+#: rejected; double: 600 MB.
+_CELLS = 10_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +49,32 @@ class LeRobotJoints(Record):
     episode: Array
 
 
+def _is_depth(feature: dict[str, Any]) -> bool:
+    """Return whether a camera gives distances: lerobot marks it in one of three ways."""
+    about = (feature.get("info") or {}, feature.get("video_info") or {})
+    return any(each.get("is_depth_map") or each.get("video.is_depth_map") for each in about)
+
+
+def _parquet_files(folder: Path, part: str) -> Iterator[tuple[Path, _Parquet]]:
+    """Yield the Parquet files of a part of a dataset, each open while it is used."""
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        raise InputError(
+            f'{folder}: its tables need pyarrow, which is not installed: pip install "armsight[ros]"'
+        ) from None
+    files = sorted((folder / part).glob("**/*.parquet"))
+    if not files:
+        raise InputError(f"{folder}: holds no table: there is no {part}/**/*.parquet")
+    for file in files:
+        with opened(file) as stream:
+            try:
+                table = parquet.ParquetFile(stream)
+            except (OSError, ValueError) as error:
+                raise InputError(f"{file}: damaged, or a column is missing: {' '.join(str(error).split())}") from None
+            yield file, table
+
+
 class LeRobotDataset:
     """A dataset's description and its table of frames.
 
@@ -56,10 +88,10 @@ class LeRobotDataset:
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder).expanduser()
         path = self.folder / "meta" / "info.json"
-        if not path.is_file():
+        if not path.exists():
             raise InputError(f"{folder}: no LeRobot dataset: there is no meta/info.json")
         try:
-            self.info: dict[str, Any] = json.loads(read_text(path))
+            self.info: dict[str, Any] = read_json(path)
             self.features: dict[str, dict[str, Any]] = dict(self.info["features"])
             version = str(self.info["codebase_version"])
         except (ValueError, KeyError, TypeError) as error:
@@ -70,28 +102,45 @@ class LeRobotDataset:
 
     def cameras(self) -> list[str]:
         """Return the keys of its cameras."""
-        return sorted(key for key, feature in self.features.items() if feature.get("dtype") == "video")
+        return sorted(
+            key
+            for key, each in self.features.items()
+            if each.get("dtype") in ("video", "image") and not _is_depth(each)
+        )
 
     def table(self, columns: list[str]) -> _Columns:
         """Return columns of the frames' table, in the order of the frames."""
-        try:
-            from pyarrow import parquet
-        except ImportError:
-            raise InputError(
-                f'{self.folder}: its tables need pyarrow, which is not installed: pip install "armsight[ros]"'
-            ) from None
-        files = sorted((self.folder / "data").glob("**/*.parquet"))
-        if not files:
-            raise InputError(f"{self.folder}: holds no table: there is no data/**/*.parquet")
         found: _Columns = {name: [] for name in columns}
-        for file in files:
+        for file, table in self._tables():
+            cells = sum(
+                group.column(k).num_values
+                for group in (table.metadata.row_group(n) for n in range(table.num_row_groups))
+                for k in range(group.num_columns)
+                if group.column(k).path_in_schema.split(".")[0] in columns
+            )
+            if cells > _CELLS:
+                raise InputError(f"{file}: {cells} cells, more than {_CELLS}: split the dataset")
             try:
-                read = parquet.read_table(file, columns=columns).to_pydict()
+                read = table.read(columns=columns).to_pydict()
+                for name in columns:
+                    found[name] += read[name]
             except (OSError, ValueError, KeyError) as error:
                 raise InputError(f"{file}: damaged, or a column is missing: {' '.join(str(error).split())}") from None
-            for name in columns:
-                found[name] += read[name]
         return found
+
+    def images(self, key: str) -> Iterator[Image | str]:
+        """Yield a camera's image of every frame of the table, or why it cannot be decoded."""
+        for file, table in self._tables():
+            for batch in table.iter_batches(batch_size=1, columns=[key]):
+                stored = batch.column(0)[0].as_py() or {}
+                try:
+                    yield decoded(stored.get("bytes") or b"", f"{file}: {key}")
+                except InputError as error:
+                    yield str(error)
+
+    def _tables(self) -> Iterator[tuple[Path, _Parquet]]:
+        """Yield the files of the frames' table, each open while it is used."""
+        yield from _parquet_files(self.folder, "data")
 
     def joints(self) -> LeRobotJoints:
         """Return the joints of all frames."""
@@ -120,17 +169,24 @@ class LeRobotDataset:
             names = {"video_key": key}
             names |= {f"{part}_index": int(row[f"{prefix}/{part}_index"]) for part in ("chunk", "file")}
             begin_s = float(row.get(f"{prefix}/from_timestamp", 0.0))
-        path = self.folder / str(self.info["video_path"]).format(**names)
+        template = str(self.info.get("video_path"))
+        if re.search(r"\{(?!\w+(:0?\d{1,2}d?)?\})", template):
+            raise InputError(f"{self.folder}: meta/info.json: video_path {template[:80]!r} is none of lerobot's")
+        try:
+            path = self.folder / template.format(**names)
+        except (KeyError, ValueError):
+            raise InputError(
+                f"{self.folder}: meta/info.json: video_path {template[:80]!r} is none of lerobot's"
+            ) from None
         if not path.is_file():
             raise InputError(f"{path}: the video of {key} is missing: download the dataset with its videos")
         return path, begin_s
 
     def _episode(self, episode: int) -> dict[str, Any]:
         """Return the row of an episode in meta/episodes, of format 3."""
-        from pyarrow import parquet
-
-        for file in sorted((self.folder / "meta" / "episodes").glob("**/*.parquet")):
-            for row in parquet.read_table(file).to_pylist():
+        for _, table in _parquet_files(self.folder, "meta/episodes"):
+            names = [name for name in table.schema_arrow.names if name.startswith(("videos/", "episode_index"))]
+            for row in table.read(columns=names).to_pylist():
                 if row["episode_index"] == episode:
                     return dict(row)
         raise InputError(f"{self.folder}: meta/episodes does not describe episode {episode}")
@@ -148,21 +204,23 @@ class LeRobotSource:
         columns = (np.array(table[key]).reshape(-1) for key in ("timestamp", "episode_index", "frame_index"))
         stamps, episodes, frames = columns
         self._dataset, self._keys = dataset, keys
-        self._rows = [
-            (float(t), int(e), int(f))
-            for t, e, f in zip(stamps, episodes, frames, strict=True)
+        self._rows = [  # row of the table, time, episode, frame
+            (row, float(t), int(e), int(f))
+            for row, (t, e, f) in enumerate(zip(stamps, episodes, frames, strict=True))
             if episode is None or e == episode
         ]
         if not self._rows:
             raise InputError(f"{dataset.folder}: holds no frame of episode {episode}")
         missing: dict[int, str] = {}
-        for number in sorted({e for _, e, _ in self._rows}):
+        videos = [key for key in keys if dataset.features[key]["dtype"] == "video"]
+        numbers = sorted({e for _, _, e, _ in self._rows})
+        for number in numbers:
             try:
-                for key in keys:
+                for key in videos:
                     dataset.video(key, number)
             except InputError as error:
                 missing[number] = str(error)
-        if len(missing) == len({e for _, e, _ in self._rows}):
+        if len(missing) == len(numbers):
             raise InputError(next(iter(missing.values())))
         self._missing = missing
         self.notes = tuple(f"episode {number}: {why}: left out" for number, why in missing.items())
@@ -184,68 +242,85 @@ class LeRobotSource:
         next(self._shots, None)
 
     def _read(self) -> Iterator[Shot]:
-        opened: tuple[int, list[_EpisodeVideo]] | None = None
+        number, views = None, tuple[_View, ...]()
         begin_s, last_s = 0.0, 0.0
         try:
-            for t_s, episode, frame in self._rows:
+            for row, t_s, episode, frame in self._rows:
                 if self._ended:
                     return
-                name = f"{episode:03d}-{frame:06d}"
-                if opened is None or opened[0] != episode:
-                    for video in opened[1] if opened else ():
-                        video.capture.release()
+                if number != episode:
                     # Episodes begin at 0 each; a shot's times must rise.
-                    begin_s = 0.0 if opened is None else last_s + 1.0
-                    files = (
-                        []
-                        if episode in self._missing
-                        else [_EpisodeVideo.open(*self._dataset.video(k, episode)) for k in self._keys]
-                    )
-                    opened = (episode, files)
+                    begin_s = 0.0 if number is None else last_s + 1.0
+                    number, old = episode, views
+                    missing = episode in self._missing
+                    views = () if missing else tuple(self._view(key, episode, old) for key in self._keys)
+                    for view in old:
+                        if view not in views:
+                            view.close()
                 last_s = begin_s + t_s
-                if not opened[1]:
-                    yield Shot(name, None, None, last_s, self._missing[episode])
-                    continue
-                images = [video.at(t_s) for video in opened[1]]
-                if images[0] is None or images[1] is None:
-                    side = SIDES[0] if images[0] is None else SIDES[1]
-                    yield Shot(
-                        name, None, None, last_s, f"the {side} video has no frame at {t_s:.3f} s of episode {episode}"
-                    )
-                    continue
-                yield Shot(name, images[0], images[1], last_s)
+                name = f"{episode:03d}-{frame:06d}"
+                images = [view.at(row, t_s) for view in views]
+                problem = self._missing.get(episode)
+                for side, image in zip(SIDES, images, strict=False):
+                    if isinstance(image, str) and problem is None:
+                        problem = f"the {side} {image} of episode {episode}"
+                left, right = (
+                    each if problem is None and not isinstance(each, str) else None for each in images or (None, None)
+                )
+                yield Shot(name, left, right, last_s, problem)
         finally:
-            for video in opened[1] if opened else ():
-                video.capture.release()
+            for view in views:
+                view.close()
+
+    def _view(self, key: str, episode: int, before: tuple[_View, ...]) -> _View:
+        """Return a camera's images of an episode: the table's go on, a video is opened."""
+        if self._dataset.features[key]["dtype"] == "image":
+            return next((each for each in before if each.key == key), None) or _TableView(
+                key, self._dataset.images(key)
+            )
+        path, begin_s = self._dataset.video(key, episode)
+        return _VideoView(key, path, begin_s)
 
 
-class _EpisodeVideo:
-    """A video file, read forwards from the beginning of an episode."""
+class _TableView:
+    """A camera's images that stand in the table of frames, read forwards."""
 
-    @staticmethod
-    def open(path: Path, begin_s: float) -> _EpisodeVideo:
-        capture = open_capture(str(path))
-        if capture is None:
-            raise InputError(f"{path}: not a video that this OpenCV can decode (AV1 needs a build of FFmpeg with it)")
-        return _EpisodeVideo(capture, begin_s)
+    def __init__(self, key: str, images: Iterator[Image | str]) -> None:
+        self.key, self._images, self._next = key, images, 0
 
-    def __init__(self, capture: QuietCapture, begin_s: float) -> None:
-        import cv2
+    def at(self, row: int, t_s: float) -> Image | str:
+        """Return the image of a row of the table, or why there is none."""
+        image: Image | str = ""
+        while self._next <= row:
+            image, self._next = next(self._images, "table ends"), self._next + 1
+        return f"image cannot be read at {t_s:.3f} s: {image}" if isinstance(image, str) else image
 
-        self.capture, self._begin_s = capture, begin_s
-        fps = capture.get(cv2.CAP_PROP_FPS)
-        self._half_s = 0.5 / fps if fps > 0 else 0.5
-        self._stamp = cv2.CAP_PROP_POS_MSEC
+    def close(self) -> None:
+        """Close the table."""
+        self._images = iter(())
 
-    def at(self, t_s: float) -> Image | None:
-        """Return the frame at a time of the episode, s; None where there is none."""
-        due_s = self._begin_s + t_s
-        while self.capture.grab():
-            at_s = self.capture.get(self._stamp) / 1000
-            if at_s >= due_s - self._half_s:
-                ok, image = self.capture.retrieve()
-                return image if ok else None
-        return None
+
+class _VideoView:
+    """A camera's video, read forwards from the beginning of an episode, s."""
+
+    def __init__(self, key: str, path: Path, begin_s: float) -> None:
+        self.key, self._film, self._begin_s = key, Film(str(path)), begin_s
+        self._half_s = min(0.5, self._film.period_s / 2)
+        self._film.seek(begin_s)
+
+    def at(self, row: int, t_s: float) -> Image | str:
+        """Return the frame at a time of the episode, or why there is none."""
+        while self._film.next():
+            if self._film.t_s >= self._begin_s + t_s - self._half_s:
+                return self._film.image()
+        return f"video has no frame at {t_s:.3f} s"
+
+    def close(self) -> None:
+        """Close the file."""
+        self._film.close()
+
+
+_View: TypeAlias = _TableView | _VideoView
 
 
 def open_lerobot(rest: str) -> LeRobotSource:

@@ -2,21 +2,33 @@
 
 In: file names. Out: one shot a frame, with the file's own time stamps. Frames are paired by time stamp, so that a frame
 one recorder dropped costs one shot and does not shift the rest.
+
+:class:`Film` decodes by PyAV, which brings FFmpeg with the decoders that cameras and LeRobot use (AV1 among them, which
+opencv-python's wheels open, count and do not decode). Images are as they are stored: a rotation that a phone noted for
+players is not applied.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from armsight import MOST_PIXELS
 from armsight.data import Array, Image, Shot
 from armsight.errors import InputError
-from armsight.vision.sources.capture import QuietCapture, open_capture
+from armsight.files import check_readable
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.video.frame import VideoFrame
+    from av.video.stream import VideoStream
 
 #: Two rates that differ by more than this share are said.
 _RATES = 0.01
@@ -36,6 +48,10 @@ _LISTED = 8
 _MIXED, _MOVED_GREY = 0.08, 12.0
 #: Share of such pixels below which nothing is said to move.
 _MOVED_LEAST = 0.002
+
+
+#: What a player would fetch: a file may name others, and addresses.
+_OPTIONS = {"protocol_whitelist": "file"}
 
 
 class VideoSource:
@@ -64,8 +80,8 @@ class VideoSource:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is odd about the files: different rates, and frames that repeat or are interpolated among those read."""
-        said = (text for file in self._files for text in (file.repeats(), file.interpolated()))
+        """What is odd: different rates, and frames among those read that are damaged, repeat or are mixtures."""
+        said = (text for file in self._files for text in (file.damaged(), file.repeats(), file.interpolated()))
         return (*self._odd, *(text for text in said if text is not None))
 
     @property
@@ -88,10 +104,10 @@ class VideoSource:
         """
         if right is not None and Path(left).resolve() == Path(right).resolve():
             raise InputError(f"{left}: given as both left and right video; a side-by-side video is video:{left}")
-        files = [_File.open(path) for path in (left, right) if path is not None]
+        files = [_File(str(path)) for path in (left, right) if path is not None]
         width, _ = files[0].size_px
         if right is None and width % 2:
-            files[0].capture.release()
+            files[0].close()
             raise InputError(f"{left}: a side-by-side video must have an even width, this one is {width} px wide")
         return VideoSource(files)
 
@@ -115,19 +131,14 @@ class VideoSource:
             )
             return Shot(name, None, None, early.t_s, problem)
         images = [file.image() for file in self._files]
-        for file, image in zip(self._files, images, strict=True):
-            if image is None:
-                return Shot(
-                    name, None, None, first.t_s, f"{file.path}: the frame at {file.t_s:.3f} s cannot be decoded"
-                )
-        left, right = images if len(images) == 2 else np.split(np.asarray(images[0]), 2, axis=1)
+        left, right = images if len(images) == 2 else np.split(images[0], 2, axis=1)
         return Shot(name, left, right, first.t_s)
 
     def close(self) -> None:
         """Close the files."""
         self._ended = True
         for file in self._files:
-            file.capture.release()
+            file.close()
 
     def _unexpected_end(self, grabbed: list[bool]) -> str | None:
         """Return what is wrong with the end of the files; None where nothing is."""
@@ -140,31 +151,108 @@ class VideoSource:
         return None
 
 
-class _File:
-    """One open video file and its current frame."""
+class Film:
+    """An open video file and its current frame.
 
-    @staticmethod
-    def open(path: str | Path) -> _File:
-        """Open a file.
+    Args:
+        path: the file.
 
-        Raises:
-            InputError: it is missing or not a video.
-        """
-        if not os.path.isfile(path):
-            raise InputError(f"{path}: no such file")
-        capture = open_capture(str(path))
-        if capture is None:
-            raise InputError(f"{path}: not a video file that OpenCV can read")
-        return _File(str(path), capture)
+    Raises:
+        InputError: it is missing, not a video, or of a codec that this PyAV does not decode.
 
-    def __init__(self, path: str, capture: QuietCapture) -> None:
-        self.path, self.capture = path, capture
-        fps = self.capture.get(cv2.CAP_PROP_FPS)
-        self.period_s = 1 / fps if fps > 0 else np.inf
-        self.promised = int(self.capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        self.size_px = tuple(int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        self.frames = 0
+    Attributes:
+        path: the file.
+        size_px: width and height of its images.
+        period_s: between two frames, s; infinite where the file does not say.
+        promised: how many frames the file says it has; an estimate in some containers.
+        frames: how many were decoded.
+        undecoded: how many could not be.
+        t_s: time of the current frame from the beginning, s.
+    """
+
+    def __init__(self, path: str) -> None:
+        import av  # not before it is needed: it takes a tenth of a second
+
+        av.logging.set_level(av.logging.PANIC)
+        self.path = check_readable(path)
+        self._error: type[Exception] = av.error.FFmpegError
+        try:
+            self._container: InputContainer = av.open(f"file:{path}", options=_OPTIONS)
+        except (self._error, ValueError):
+            raise InputError(f"{path}: not a video file, or one that is cut short at its beginning") from None
+        if not self._container.streams.video:
+            self._container.close()
+            raise InputError(f"{path}: holds no video")
+        self._stream: VideoStream = self._container.streams.video[0]
+        problem = self._problem()
+        if problem:
+            self._container.close()
+            raise InputError(f"{path}: {problem}")
+        self._stream.thread_type = "AUTO"
+        self.size_px = (self._stream.width, self._stream.height)
+        rate = self._stream.average_rate or self._stream.guessed_rate
+        self.period_s = float(1 / rate) if rate else np.inf
+        duration_s = (self._container.duration or 0) / 1e6
+        self.promised = self._stream.frames or (int(duration_s / self.period_s) if rate else 0)
+        self.frames = self.undecoded = 0
         self.t_s = 0.0
+        self._time_base: Fraction = self._stream.time_base or Fraction(1)
+        self._frame: VideoFrame | None = None
+        self._frames = self._decoded()
+
+    def _problem(self) -> str | None:
+        """Return why the stream cannot be decoded."""
+        context = self._stream.codec_context
+        if context is None:
+            return "its codec is not one that this PyAV decodes; convert it: ffmpeg -i IN -c:v libx264 -crf 10 OUT.mp4"
+        if context.width * context.height > MOST_PIXELS:
+            return f"frames of {context.width}x{context.height} px, more than {MOST_PIXELS >> 20} Mpx"
+        return None if context.width * context.height else "damaged: its frames have no size"
+
+    def _decoded(self) -> Iterator[VideoFrame]:
+        """Yield what can be decoded; a damaged packet is counted, a damaged container is the end."""
+        with contextlib.suppress(self._error, ValueError):
+            for packet in self._container.demux(self._stream):
+                try:
+                    yield from packet.decode()
+                except self._error:
+                    self.undecoded += 1
+
+    def next(self) -> bool:
+        """Go to the next frame; False at the end."""
+        self._frame = next(self._frames, None)
+        if self._frame is None:
+            return False
+        if self._frame.pts is None:
+            self.t_s = self.frames * self.period_s if self.frames else 0.0
+        else:
+            self.t_s = float((self._frame.pts - (self._stream.start_time or 0)) * self._time_base)
+        self.frames += 1
+        return True
+
+    def image(self) -> Image:
+        """Return the current frame, (H, W, 3) BGR, uint8."""
+        assert self._frame is not None
+        return np.asarray(self._frame.to_ndarray(format="bgr24"))
+
+    def seek(self, t_s: float) -> None:
+        """Go to a frame at a time or before it, from which the frames up to that time can be decoded."""
+        with contextlib.suppress(self._error):
+            self._container.seek(int(t_s / self._time_base) + (self._stream.start_time or 0), stream=self._stream)
+            self._frames = self._decoded()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._frames = iter(())
+        self._frame = None
+        self._container.close()
+
+
+class _File(Film):
+    """One open video file, and what is odd about its frames."""
+
+    def __init__(self, path: str) -> None:
+        super().__init__(path)
         self.held = False  # the current frame waits for a partner: the next grab keeps it
         self._before: Array | None = None
         self._two_before: Array | None = None
@@ -175,20 +263,14 @@ class _File:
         self._mixtures: list[tuple[float, float]] = []
 
     def grab(self) -> bool:
-        """Go to the next frame; False at the end."""
-        if not self.held:
-            if not self.capture.grab():
-                return False
-            self.frames += 1
-            self.t_s = self.capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+        """Go to the next frame, unless the current one waits; False at the end."""
+        going = self.held or self.next()
         self.held = False
-        return True
+        return going
 
-    def image(self) -> Image | None:
-        """Decode the current frame; None if that fails."""
-        ok, image = self.capture.retrieve()
-        if not ok:
-            return None
+    def image(self) -> Image:
+        """Decode the current frame, and compare it with those before."""
+        image = super().image()
         self._numbers.append(self.frames - 1)
         some = np.asarray(image[::_EVERY, ::_EVERY], np.float64)
         if self._before is not None:
@@ -196,7 +278,7 @@ class _File:
         if self._before is not None and self._two_before is not None:
             self._mixtures.append(_mixture(self._two_before, self._before, some))
         self._two_before, self._before = self._before, some
-        return np.asarray(image)
+        return image
 
     @property
     def repeated(self) -> tuple[list[int], float]:
@@ -224,6 +306,10 @@ class _File:
         share = float(odd.sum() / max(of.sum(), 1))
         numbers = np.array(self._numbers)[1 + _NEARBY :][: len(odd)]
         return (numbers[odd].tolist(), share) if share > _REPEATS_SAID else ([], 0.0)
+
+    def damaged(self) -> str | None:
+        """Return what to say where frames could not be decoded."""
+        return f"{self.path}: {self.undecoded} frames are damaged: left out" if self.undecoded else None
 
     def repeats(self) -> str | None:
         """Return what to say where frames repeat the ones before them, as a slower camera's do in a faster file."""

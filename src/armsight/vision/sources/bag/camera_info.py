@@ -21,6 +21,8 @@ from armsight.vision.sources.bag.reader import Bag, Decoded
 INFOS = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
 #: Metadata of a recording made by armsight, and its key that holds the rig file.
 METADATA, RIG = "armsight", "rig.json"
+#: Names of models -> ROS's: Foxglove calls the equidistant one by its authors.
+_MODELS = {"": "plumb_bob", "kannala_brandt": "equidistant"}
 
 
 def open_rig(spec: str | Path) -> StereoRig:
@@ -84,7 +86,7 @@ def _document(message: Decoded) -> dict[str, Foreign]:
     return {
         "image_width": int(message.width),
         "image_height": int(message.height),
-        "distortion_model": str(message.distortion_model) or "plumb_bob",
+        "distortion_model": _MODELS.get(str(message.distortion_model), str(message.distortion_model)),
         "camera_matrix": numbers("K"),
         "distortion_coefficients": numbers("D"),
         "rectification_matrix": numbers("R"),

@@ -3,8 +3,8 @@
 In: a :class:`~.reader.Bag`. Out: :class:`BagSource`. The topics are found by type; where there are more than two, their
 names say which are left and right, or the user does: ``bag:FILE,left=/a/image_raw,right=/b/image_raw``.
 
-Images of sensor_msgs/Image are taken as they are (8 or 16 bits, grey, BGR, RGB with or without alpha, Bayer), compressed
-ones are decoded by OpenCV.
+Images of sensor_msgs/Image are taken as they are (8 or 16 bits, grey, BGR, RGB with or without alpha, Bayer, YUV 4:2:2 and
+4:2:0), compressed ones are decoded by OpenCV. Distances of depth cameras are no images.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from armsight import MOST_PIXELS
 from armsight.data import SIDES, Image, Shot
 from armsight.errors import InputError
+from armsight.vision.image import decoded
 from armsight.vision.sources.bag.pairing import Pairing, Stamps, pair, stamps_of
 from armsight.vision.sources.bag.reader import Bag, BagMessage, Decoded
 
@@ -42,11 +44,25 @@ _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "bayer_bggr8": ("u1", 1, cv2.COLOR_BayerRG2BGR),
     "bayer_gbrg8": ("u1", 1, cv2.COLOR_BayerGR2BGR),
     "bayer_grbg8": ("u1", 1, cv2.COLOR_BayerGB2BGR),
+    "bayer_rggb16": ("u2", 1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr16": ("u2", 1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg16": ("u2", 1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg16": ("u2", 1, cv2.COLOR_BayerGB2BGR),
     "yuyv": ("u1", 2, cv2.COLOR_YUV2BGR_YUY2),
     "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2BGR_YUY2),
     "uyvy": ("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
     "yuv422": ("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
+    "nv12": ("u1", 1, cv2.COLOR_YUV2BGR_NV12),
+    "nv21": ("u1", 1, cv2.COLOR_YUV2BGR_NV21),
 }
+#: Of these half as many rows of colours follow those of the luminance.
+_PLANAR = ("nv12", "nv21")
+_FLOATING = re.compile(r"(32|64)FC\d|(8|16|32)SC\d")
+#: Topics that hold distances.
+_DEPTH = re.compile(r"depth|disparity", re.IGNORECASE)
+_NO_PICTURE = (
+    "holds distances of a depth camera, or numbers whose range it does not say, and no picture: record image_raw"
+)
 _COMPRESSED = re.compile(r"/(compressed|image_compressed)$")
 #: Words of a topic's name that say which camera it is of, left ones first.
 _NAMED = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"), ("fisheye1", "fisheye2"))
@@ -155,20 +171,28 @@ def decoded_image(kind: str, message: Decoded) -> tuple[Image, bytes | None]:
         InputError: an unknown encoding, or data that do not fit its size.
     """
     if "Compressed" in kind:
+        if "compresseddepth" in str(message.format).lower():
+            raise InputError(f"its {message.format} {_NO_PICTURE}")
         data = bytes(message.data)
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-        if image is None:
-            raise InputError(f"its {message.format or 'compressed'} data cannot be decoded")
-        return image, data
+        return decoded(data, f"its {message.format or 'compressed'} data"), data
+    if _FLOATING.fullmatch(message.encoding):
+        raise InputError(f"its {message.encoding} {_NO_PICTURE}")
     if message.encoding not in _ENCODINGS:
         raise InputError(f"encoding {message.encoding!r} is not read; known are {', '.join(_ENCODINGS)}")
     kind_, channels, convert = _ENCODINGS[message.encoding]
     bigendian = bool(getattr(message, "is_bigendian", False))
     dtype = np.dtype(f"{'>' if bigendian else '<'}{kind_}")
     height, width, step = int(message.height), int(message.width), int(message.step)
+    height = height * 3 // 2 if message.encoding in _PLANAR else height
     raw = np.frombuffer(bytes(message.data), np.uint8)
     row = width * channels * dtype.itemsize
-    if height < 1 or width < 1 or step < row or raw.size < step * (height - 1) + row:
+    if (
+        height < 1
+        or width < 1
+        or step < row
+        or width * height > MOST_PIXELS * 2
+        or raw.size < step * (height - 1) + row
+    ):
         raise InputError(
             f"{width}x{height} {message.encoding} with rows of {step} bytes needs {step * height} bytes, it has {raw.size}"
         )
@@ -232,7 +256,9 @@ def parsed(rest: str) -> tuple[str, dict[str, str]]:
 
 def image_topics(bag: Bag, named: dict[str, str]) -> tuple[str, str]:
     """Return the topics of the left and of the right images."""
-    return two_topics(bag, named, bag_topics=[t.name for t in bag.of_kind(*IMAGES)], what="images")
+    topics = [t.name for t in bag.of_kind(*IMAGES)]
+    pictures = [name for name in topics if not _DEPTH.search(name)] or topics
+    return two_topics(bag, named, topics if named else pictures, "images")
 
 
 def two_topics(bag: Bag, named: dict[str, str], bag_topics: list[str], what: str) -> tuple[str, str]:

@@ -24,8 +24,6 @@ _Times = NDArray[np.int64]
 _JUMP_S, _JUMP_PERIODS = 1.0, 4.0
 #: So many messages are looked at together: half of them that come late are no jump; half, double: shorter, longer bursts.
 _TOGETHER = 5
-#: Of the times that messages took this quantile is that of one without a stamp; half, double: the same if few are late.
-_LATE = 0.25
 #: A pair is never further apart than this, s, however slow the topics are; half, double: the same for all above 1 Hz.
 _APART_S = 0.5
 _NS = 1e-9
@@ -40,6 +38,7 @@ class Stamps:
         t_ns: time stamps, ns, in the order of the messages: those of the headers, or from the arrival where there are none.
         notes: what is wrong with them.
         repeats: numbers of the messages that were recorded before, with the same stamp and content.
+        unknown: numbers of the messages without a stamp whose time of arrival does not say when they were sent.
         jumps_ns: after how much time of arrival the clock jumped, ns, and by how much; none for most.
         arrival_ns: the recorder's times of arrival, ns.
     """
@@ -48,6 +47,7 @@ class Stamps:
     t_ns: tuple[int, ...]
     notes: tuple[str, ...] = ()
     repeats: frozenset[int] = frozenset()
+    unknown: frozenset[int] = frozenset()
     jumps_ns: tuple[tuple[int, int], ...] = ()
     arrival_ns: tuple[int, ...] = ()
 
@@ -75,7 +75,7 @@ def stamps_of(
     """
     t, arrival, notes = np.array(header_ns, np.int64), np.array(arrival_ns, np.int64), []
     seen: set[tuple[int, int]] = set()
-    repeats = set()
+    repeats, unknown = set(), set[int]()
     for k, key in enumerate(zip(header_ns, contents or (), strict=False)):
         if key in seen and key[0] > 0:
             repeats.add(k)
@@ -89,17 +89,24 @@ def stamps_of(
             f"{topic}: {said} of {len(t)} stamps are zero or negative, first at message {int(np.argmax(bad))}: taken from "
             "the time of arrival"
         )
+        late, period = arrival[good] - _continuous(t[good], arrival[good], jumps), _period_ns(t[good])
         t[bad] = arrival[bad]
-        if len(good):
-            late = arrival[good] - _continuous(t[good], arrival[good], jumps)
-            t[bad] -= int(np.quantile(late, _LATE))
-            t[bad] = _continuous(t[bad], arrival[bad], [(at, -by) for at, by in jumps])
+        for k in np.flatnonzero(bad).tolist() if len(good) else ():
+            near = late[np.argsort(np.abs(arrival[good] - arrival[k]), kind="stable")[:_TOGETHER]]
+            took = np.median(near)
+            jumped = sum(by for at, by in jumps if arrival[k] >= at)
+            t[k] = arrival[k] - int(took) + jumped
+            unlike = np.sum(np.abs(near - took) < period / 4) <= len(near) / 2
+            if unlike or np.abs(t[good] - t[k]).min() < period / 2:  # or it is where another was
+                unknown.add(k)
     if jumps:
         times, by_s = f"{len(jumps)} time{'' if len(jumps) == 1 else 's'}", jumps[0][1] * _NS
         notes.append(f"{topic}: its clock jumps {times}, first by {by_s:+.3f} s: shots are paired on either side of it")
     if repeats:
         notes.append(f"{topic}: {len(repeats)} of {len(t)} messages were recorded twice: each counts once")
-    return Stamps(topic, tuple(t.tolist()), tuple(notes), frozenset(repeats), jumps, tuple(arrival.tolist()))
+    return Stamps(
+        topic, tuple(t.tolist()), tuple(notes), frozenset(repeats), frozenset(unknown), jumps, tuple(arrival.tolist())
+    )
 
 
 def _continuous(t: _Times, arrival: _Times, jumps_ns: Sequence[tuple[int, int]]) -> _Times:
@@ -183,8 +190,11 @@ def pair(left: Stamps, right: Stamps, allowed_s: float | None = None) -> Pairing
         for n in set(range(len(of.t_ns))) - paired:
             why = f"{other.topic} none within {1e3 * allowed_s:.1f} ms"
             why = "recorded twice: it counts once" if n in of.repeats else why
+            why = "of arrival, no stamp, and others near it came late" if n in of.unknown else why
             alone[side, n] = f"{of.topic} has a message at {of.t_ns[n] * _NS:.3f} s, {why}"
-    counts = [sum(side == each for each, _ in alone) - len(of.repeats) for side, of in enumerate((left, right))]
+    counts = [
+        sum(side == each for each, _ in alone) - len(of.repeats | of.unknown) for side, of in enumerate((left, right))
+    ]
     if any(counts):
         notes.append(
             f"{counts[0]} of {len(a)} messages of {left.topic} and {counts[1]} of {len(b)} of {right.topic} have no "
@@ -205,7 +215,7 @@ def _mutual(
         t = _continuous(np.array(of.t_ns, np.int64), np.array(of.arrival_ns, np.int64), jumps_ns)
         rows: dict[int, list[int]] = {}  # those of one time, in the order of the recording
         for k in np.argsort(t, kind="stable").tolist():
-            if k not in of.repeats:
+            if k not in of.repeats and k not in of.unknown:
                 rows.setdefault(int(t[k]), []).append(k)
         both.append(t)
         groups.append(rows)
