@@ -253,8 +253,8 @@ def disordered(folder: Path, container: str, seed: int) -> Disordered:
     """Write a recording in 2 to 15 files whose messages are shuffled, doubled, missing, late and without a stamp.
 
     A frame's number is in its first two pixels. Messages come up to 0.3 s late, some by 3 s, one topic by a burst; files
-    overlap in time; where stamps are missing, messages come at once, so that their arrival says it. metadata.yaml, where the
-    container has one, names the files in their order.
+    overlap in time; where stamps are missing, messages come at once, so that their arrival says it. metadata.yaml,
+    where the container has one, names the files in their order.
     """
     rng = np.random.default_rng(seed)
     count, parts = int(rng.integers(25, 90)), int(rng.integers(2, 16))

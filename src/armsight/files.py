@@ -343,7 +343,7 @@ def _beside(target: Path) -> Path:
 
 
 @contextlib.contextmanager
-def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
+def replacing(path: str | Path, mode: str = "w", *, durable: bool = True) -> Iterator[IO[Any]]:
     """Open a file for writing that replaces ``path`` only when the block ends well.
 
     Blocks may be nested; an error names the file it happened to; an error of another file passes through.
@@ -351,6 +351,7 @@ def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     Args:
         path: the file to be, or a link to it; its folder must exist.
         mode: "w" for UTF-8 text, "wb" for bytes.
+        durable: it outlives a crash of the computer from then on; for many files a second the caller sees to that.
 
     Raises:
         InputError: the folder is missing or not writable, ``path`` is no ordinary file, or the disk is full; what stood
@@ -368,10 +369,12 @@ def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
         yield file
         if not file.closed:
             file.flush()
-            raw.sync()
+            if durable:
+                raw.sync()
         file.close()
         os.replace(temporary, target)
-        _sync_folder(target.parent)
+        if durable:
+            _sync_folder(target.parent)
     except OSError as error:
         if error.filename != os.fspath(temporary):
             raise

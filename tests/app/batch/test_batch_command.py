@@ -1,6 +1,7 @@
 """armsight batch: one row a shot and one a recording, the same by one and by two workers, and on again where it was."""
 
 import json
+import pickle
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ import pytest
 pytest.importorskip("distributed")
 pytest.importorskip("mcap")
 
-from armsight.app.batch.run import Batch, _keys, found_recordings, run_batch
+from armsight.app.batch.run import Batch, _keys, _load, found_recordings, run_batch
 from armsight.app.batch.work import BatchOptions, Done, work
 from armsight.errors import InputError
 from cli_runs import assert_rejected
@@ -76,7 +77,7 @@ def test_one_and_two_workers_give_the_same_tables_and_it_goes_on(archive, render
     next((tmp_path / "two" / "parts").iterdir()).unlink()
     parts = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "two" / "parts").iterdir()}
     last = run_batch(Batch([str(archive / "take*")], tmp_path / "two", options, scheduler=one), said.append)
-    assert last.before == 3
+    assert last.before == 2  # one failed before
     assert tables(tmp_path / "two") == [recordings, shots]
     assert all((tmp_path / "two" / "parts" / name).stat().st_mtime_ns == time for name, time in parts.items())
 
@@ -117,6 +118,34 @@ def test_a_recording_that_fails_is_a_row_with_its_reason(tmp_path):
     assert done.recording["status"] == "failed"
     assert "no such file or folder" in done.recording["reason"]
     assert done.shots == []
+
+
+def test_what_failed_is_tried_again_and_makes_the_exit_code_1(armsight, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.csv").write_text("hello\n")
+    arguments = ("batch", "identify", tmp_path / "*.csv", "-o", tmp_path / "out", "--arm", "six_r", "--workers", 1)
+    for _ in range(2):
+        done = armsight(*arguments)
+        assert done.code == 1, done.err
+        assert "2 recordings: 0 done, 0 of them before, 2 failed" in done.out
+        assert list((tmp_path / "out" / "parts").iterdir()) == []
+    assert (tmp_path / "out" / "recordings.parquet").is_file()
+
+
+def test_what_all_recordings_share_is_opened_first(armsight, tmp_path):
+    (tmp_path / "a.bag").write_text("hello\n")
+    bad = ("batch", "measure", tmp_path / "a.bag", "-o", tmp_path / "out")
+    assert_rejected(armsight(*bad, "--rig", tmp_path / "none.json"), "none.json: no such file")
+    assert_rejected(armsight(*bad, "--target", tmp_path / "none.toml"), "none.toml: no such file")
+    assert_rejected(armsight(*bad, "--arm", "none"), "arm 'none' is unknown")
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_that_were_stored_hold_no_programs(tmp_path):
+    stored = tmp_path / "part"
+    stored.write_bytes(pickle.dumps(({"recording": "a"}, [])))
+    with pytest.raises(InputError, match="part: not"):
+        _load(stored)
 
 
 def test_check_and_identify_take_the_data_of_their_commands(tmp_path, monkeypatch):

@@ -1,10 +1,14 @@
 """The guided hand-eye calibration: each pose it chooses lowers the error, and it says when to stop."""
 
+import os
+import shutil
+
 import numpy as np
 import pytest
 
 from armsight.app.live import handeye
 from armsight.app.live.handeye import LEAST_POSES, MOST_POSES, HandEyeGuide, likely_joint_errors
+from armsight.app.live.session import LiveSession, SessionOptions
 from armsight.app.run.calibrate import VisitedPose, handeye_poses
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, pose
@@ -60,6 +64,41 @@ def test_the_same_pose_again_is_rejected(calibrated):
     again = guide.run
     with pytest.raises(InputError, match="like this one was taken"):
         guide.add(VisitedPose(again.q[3], again.Ts_left_body[3], again.covs[3], np.zeros(6)))
+
+
+def test_a_session_that_is_started_again_has_its_rig_and_its_poses(calibrated, tmp_path):
+    guide, _ = calibrated
+    shutil.copytree(guide.folder, tmp_path / "handeye")
+    example_rig((1280, 720), 900.0).save(tmp_path / "rig.json")
+    os.utime(tmp_path / "rig.json", (1.0, 1.0))
+    session = LiveSession(SessionOptions(tmp_path, "usb:0,1"))
+    try:
+        again = session.arm.handeye
+        again.fit()
+        assert session.measuring.rig_path == tmp_path / "rig.json"
+        assert again.state.poses == guide.state.poses
+        np.testing.assert_allclose(again.run.mounting.T_base_rig, guide.run.mounting.T_base_rig, atol=1e-6)
+        assert [event.text.split(" stored in")[0] for event in session.events()] == [
+            "the rig",
+            f"the {guide.state.poses} poses of the hand-eye calibration",
+        ]
+    finally:
+        session.close()
+
+
+@pytest.mark.parametrize("newer", ["rig", "other arm"])
+def test_poses_seen_by_another_rig_or_arm_are_not_used(calibrated, tmp_path, newer):
+    guide, _ = calibrated
+    shutil.copytree(guide.folder, tmp_path / "handeye")
+    (tmp_path / "rig.json").write_text("")
+    if newer != "rig":
+        os.utime(tmp_path / "rig.json", (1.0, 1.0))
+    said = []
+    other = HandEyeGuide(tmp_path, ARM if newer == "rig" else MODELS["so101"], "", said.append)
+    other.recall(tmp_path / "rig.json")
+    assert other.state.poses == 0
+    assert len(said) == (newer != "rig")
+    other.close()
 
 
 def test_a_singular_arm_does_not_explain_a_millimetre_by_degrees():

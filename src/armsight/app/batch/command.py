@@ -38,8 +38,8 @@ def command(
     """Measure many recordings, on all cores or on a cluster; started again it goes on where it was.
 
     Quote the GLOB: ``'archive/**/*.mcap'``, ``'s3://bucket/**/*.bag'``. A recording that fails is a row with its
-    reason. identify takes tables of poses (armsight identify -h), check folders of runs (armsight check -h),
-    measure and replay recordings (armsight replay -h).
+    reason, is tried again when the batch is started again, and makes the exit code 1. identify takes tables of poses
+    (armsight identify -h), check folders of runs (armsight check -h), measure and replay recordings (armsight replay -h).
     """
     from armsight.app.batch.run import Batch, run_batch
     from armsight.app.batch.work import BatchOptions
@@ -54,11 +54,13 @@ def command(
     done = run_batch(batch, lambda line: click.echo(line, err=True))
     if as_json:
         click.echo(json.dumps(done.to_json()))
-        return
-    click.echo(
-        f"{done.recordings} recordings: {done.ok} done, {done.failed} failed (their rows have the reasons), {done.before} "
-        f"of them before; {done.shots} shots; written to {output}"
-    )
+    else:
+        click.echo(
+            f"{done.recordings} recordings: {done.ok} done, {done.before} of them before, {done.failed} failed (their rows "
+            f"have the reasons; started again they are tried again); {done.shots} shots; written to {output}"
+        )
+    if done.failed:
+        click.get_current_context().exit(1)
 
 
 def _absolute(name: str | None) -> str | None:

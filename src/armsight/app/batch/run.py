@@ -1,8 +1,9 @@
 """Hand the recordings out to Dask's workers, and collect what comes back.
 
 A few recordings a worker are handed out at a time, the next when one is done: so the scheduler holds the same however many
-there are. Each result is stored in ``parts`` as it comes; a batch that is started again skips those whose recording
-and options are the same. A worker that dies loses the recordings it had in hand: Dask hands them to another.
+there are. Each result is stored in ``parts`` as it comes, as JSON; a batch that is started again skips those whose
+recording and options are the same, and tries again what failed. A worker that dies loses the recordings it had in hand:
+Dask hands them to another.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import hashlib
 import json
 import logging
 import os
-import pickle
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,12 +22,16 @@ from armsight import __version__
 from armsight.app.batch.work import BatchOptions, Done, work
 from armsight.app.progress import bar
 from armsight.errors import InputError
-from armsight.files import check_folder, replacing, write_text
+from armsight.files import check_folder, parsed_json, read_bytes, read_text, replacing, write_text
+from armsight.robot.arm_file import open_arm
+from armsight.vision.markers.targets import open_body, open_target
+from armsight.vision.sources.bag.camera_info import open_rig
 
 #: Files of a batch.
 SHOTS, RECORDINGS, ABOUT, PARTS = "shots.parquet", "recordings.parquet", "batch.json", "parts"
 #: Recordings in hand a worker: one that it works on, and the next.
 _IN_HAND = 2
+_PART_MB = 512  # largest result of one recording; half: 12 hours of shots are too many; double: twice the memory
 _Client: TypeAlias = Any
 
 
@@ -114,7 +118,7 @@ def found_recordings(patterns: Sequence[str]) -> dict[str, str]:
 def _keys(paths: dict[str, str], options: BatchOptions) -> dict[str, str]:
     """Return for each recording a name that changes with its state, the options, the files they name and the version."""
     files = [Path(name) for name in (options.rig, options.target, options.arm) if name is not None]
-    contents = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files if file.is_file()]
+    contents = [hashlib.sha256(read_bytes(file)).hexdigest() for file in files if file.is_file()]
     common = json.dumps([options.to_json(), contents, __version__])
     return {
         path: hashlib.sha256(json.dumps([path, state, common]).encode()).hexdigest()[:32]
@@ -125,6 +129,8 @@ def _keys(paths: dict[str, str], options: BatchOptions) -> dict[str, str]:
 def run_batch(batch: Batch, say: Callable[[str], None]) -> BatchDone:
     """Run a batch.
 
+    What all recordings share, rig, target and arm, is opened first: a mistake in it is one line, not a row each.
+
     Args:
         batch: what is to be done.
         say: is given the address of the dashboard, and notes.
@@ -134,6 +140,13 @@ def run_batch(batch: Batch, say: Callable[[str], None]) -> BatchDone:
     """
     require_dask()
     paths = found_recordings(batch.recordings)
+    for name, open_one in (
+        (batch.options.rig, open_rig),
+        (batch.options.target, _opened_target),
+        (batch.options.arm, open_arm),
+    ):
+        if name is not None:
+            open_one(name)
     check_folder(batch.output, problem="no batch can be written here")
     parts = batch.output / PARTS
     try:
@@ -142,16 +155,25 @@ def run_batch(batch: Batch, say: Callable[[str], None]) -> BatchDone:
         raise InputError(f"{parts}: cannot be written: {error.strerror}") from None
     keys = _keys(paths, batch.options)
     left = [path for path in paths if not (parts / keys[path]).is_file()]
+    failed: dict[str, Done] = {}
     about = {"version": __version__, "options": batch.options.to_json(), "recordings": list(batch.recordings)}
     write_text(batch.output / ABOUT, json.dumps(about, indent=1) + "\n")
     if left:
         with _client(batch, len(left), say) as (client, workers), bar("recordings", len(left)) as advance:
             for path, done in _results(client, left, batch.options, _IN_HAND * workers):
-                _store(parts / keys[path], done)
+                if done.recording["status"] == "ok":
+                    write_text(parts / keys[path], json.dumps(asdict(done)))
+                else:
+                    failed[path] = done
                 advance()
-    recordings, shots = _write(batch.output, [parts / keys[path] for path in paths])
+    recordings, shots = _write(batch.output, [failed.get(path, parts / keys[path]) for path in paths])
     ok = sum(row["status"] == "ok" for row in recordings)
     return BatchDone(len(paths), ok, len(paths) - ok, len(paths) - len(left), shots)
+
+
+def _opened_target(spec: str) -> object:
+    """Open a target; of points in a CSV file no images are measured, but tags."""
+    return open_body(spec) if spec.lower().endswith(".csv") else open_target(spec)
 
 
 @contextlib.contextmanager
@@ -203,12 +225,7 @@ def _results(client: _Client, paths: list[str], options: BatchOptions, in_hand: 
             completed.add(submitted(following))
 
 
-def _store(path: Path, done: Done) -> None:
-    with replacing(path, "wb") as file:
-        pickle.dump((done.recording, done.shots), file)
-
-
-def _write(folder: Path, parts: list[Path]) -> tuple[list[dict[str, Any]], int]:
+def _write(folder: Path, parts: list[Path | Done]) -> tuple[list[dict[str, Any]], int]:
     """Write both tables from the parts, in the order of the recordings; return the recordings' rows, and the shots."""
     import pyarrow as pa
     from pyarrow import parquet
@@ -236,7 +253,12 @@ def _write(folder: Path, parts: list[Path]) -> tuple[list[dict[str, Any]], int]:
     return rows, count
 
 
-def _load(part: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    with part.open("rb") as file:
-        recording, shots = pickle.load(file)
-    return recording, shots
+def _load(part: Path | Done) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the rows of a recording, stored or in hand."""
+    if isinstance(part, Done):
+        return part.recording, part.shots
+    stored = parsed_json(read_text(part, _PART_MB), part, "a result of armsight batch; remove it")
+    try:
+        return dict(stored["recording"]), list(stored["shots"])
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{part}: not a result of armsight batch: remove it") from None

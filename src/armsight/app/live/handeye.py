@@ -25,9 +25,10 @@ from armsight.app.run.record import RunSegment
 from armsight.data import Array, Missed
 from armsight.errors import ArmsightError, CalibrationError, InputError
 from armsight.files import write_text
-from armsight.geometry.pose import inverse, log_se3, transform
+from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.handeye import SHARES, HandEye, Poses, information
+from armsight.loop.identify.read import read_poses
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import point_to_point
 from armsight.vision.rig import StereoRig
@@ -123,6 +124,26 @@ class HandEyeGuide:
 
     _file: Path | None
     _missing: tuple[str, ...]
+
+    def recall(self, rig: Path) -> None:
+        """Take the poses that an earlier session stored, seen by a rig that is no newer than they are, and calibrate."""
+        file = self.folder / "handeye_poses.csv"
+        if not file.exists() or file.stat().st_mtime < rig.stat().st_mtime:
+            return
+        try:
+            seen = read_poses(file).measured
+            if seen.q.shape[1] != self._arm.joints or seen.R_rig_body is None or seen.cov is None:
+                raise InputError(f"{file}: not full poses of an arm of {self._arm.joints} joints")
+        except InputError as error:
+            self._say(Note("warn", f"the stored poses of the hand-eye calibration are not used: {error}"))
+            return
+        approach = np.zeros_like(seen.q) if seen.approach is None else seen.approach
+        rows = zip(seen.q, seen.p_rig[:, 0], seen.R_rig_body, seen.cov, approach, strict=True)
+        with self._lock:
+            self._visited = [VisitedPose(q, pose(R, p), cov, way) for q, p, R, cov, way in rows]
+            self._tried = [each.q for each in self._visited]
+        self._say(Note("good", f"the {len(seen.q)} poses of the hand-eye calibration stored in {file} are used"))
+        self.fit_soon()
 
     def use_arm(self, arm: Arm, spec: str) -> None:
         """Take another model of the arm, and calibrate anew from the same poses."""

@@ -302,7 +302,7 @@ class LiveSession:
         self._notes: tuple[Note, ...] = ()
         self._looks: tuple[_Look, _Look] | None = None
         self._covering: tuple[float, float] | None = None
-        self._left_known = options.rig is not None or simulated
+        self._left_known = simulated
         self._closing = threading.Event()
         self._eye = threading.Thread(target=self._see, name="eye", daemon=True)
         self._begin()
@@ -324,12 +324,24 @@ class LiveSession:
             self.folder.mkdir(parents=True, exist_ok=True)
             write_text(self.folder / "body.toml", self._simulated.workcell.body_text)
             options = replace(options, target=str(self.folder / "body.toml"))
+        stored = self.folder / "rig.json"
         if options.rig is not None:
-            self.measuring.use_rig(StereoRig.load_trusted(options.rig), options.rig)
-            self._step = "measure"
+            self._use_rig(options.rig)
+        elif stored.exists():
+            try:
+                self._use_rig(stored)
+                self.say(Note("good", f"the rig stored in {stored} is used; calibrate again where the cameras moved"))
+                self.arm.handeye.recall(stored)
+            except InputError as error:
+                self.say(Note("warn", f"the stored rig is not used: {error}"))
         if options.target is not None:
             self.measuring.use_target(options.target)
             self.body.use(options.target, self._rig())
+
+    def _use_rig(self, path: Path) -> None:
+        """Begin with measuring by a calibrated rig."""
+        self.measuring.use_rig(StereoRig.load_trusted(path), path)
+        self._step, self._left_known = "measure", True
 
     def start(self) -> None:
         """Start reading and looking."""

@@ -158,7 +158,7 @@ class ShotFolder:
                 for side in SIDES:
                     files.append(self.folder / f"{side}{self.shots:06d}.png")
                     _, data = cv2.imencode(".png", np.asarray(shot.image(side)))
-                    with replacing(files[-1], "wb") as file:
+                    with replacing(files[-1], "wb", durable=False) as file:
                         file.write(data)
                     encoded.append(data.tobytes())
             names = [file.name for file in files] or ["", ""]
@@ -175,9 +175,10 @@ class ShotFolder:
         return shot if shot.encoded is not None or not encoded else replace(shot, encoded=(encoded[0], encoded[1]))
 
     def close(self) -> None:
-        """Close the index, and remove it if it names no shot."""
+        """Close the index, and remove it if it names no shot; what it names is on the disk then."""
         if self._index is not None:
             os.close(self._index)
+            os.sync()
             if self._whole == 0:
                 (self.folder / INDEX).unlink()
 
