@@ -31,7 +31,7 @@ from armsight.sim.render.scene import CLEAR, Pattern, aprilgrid, charuco, chessb
 from armsight.vision.discs.predict import face_axes, look_direction
 from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.aruco import cells
-from armsight.vision.markers.board import BOARDS, open_board
+from armsight.vision.markers.board import BOARDS, KALIBR, open_board
 from armsight.vision.markers.body_layout import Layout, read_layout
 from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.chessboard import Chessboard
@@ -313,7 +313,9 @@ class _Sheet:
 
 
 def is_board_spec(path: str | Path) -> bool:
-    """Say whether what is to be drawn is a board's spec and no file."""
+    """Say whether what is to be drawn is a board: a spec, or Kalibr's target file."""
+    if Path(path).suffix.lower() in KALIBR:
+        return True
     return str(path).strip().split(":")[0] in BOARDS or (":" in str(path) and not Path(path).exists())
 
 
@@ -367,6 +369,8 @@ def draw_body(
 def _board_page(spec: str) -> Page:
     """Return the page of a board by itself, its white margin left to the paper."""
     board = open_board(spec)
+    if next(iter(board.codes[1]), 0):
+        raise InputError(f"{spec}: boards are drawn with ids from 0 on only; leave out first={board.codes[1][0]}")
     pattern = BOARD_PATTERNS[type(board)](board)
     axes = np.diag([1.0, -1.0, -1.0]) if board.y_up else np.eye(3)
     mark = _pattern("", pattern, pattern.T_body_pattern)(axes)

@@ -215,10 +215,10 @@ class _Unseen:
 
     def _codes(self, image: Grey) -> str:
         """Return whose codes an image shows in place of the target, or an empty string."""
-        family, count = self._target.codes
+        family, ids = self._target.codes
         if not family or len(detect_markers(image, family)[1]) >= _LEAST_CODES:
             return ""
-        most, least = "", max(_LEAST_CODES, count // 4) - 1
+        most, least = "", max(_LEAST_CODES, len(ids) // 4) - 1
         for name in sorted(FAMILIES, key=family_size):  # of families that begin alike the smallest one is named
             if (found := len(detect_markers(image, name)[1])) > least:
                 most, least = name, found

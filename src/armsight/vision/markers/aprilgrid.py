@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.vision.markers.aruco import cells, family_size, find_squares
 from armsight.vision.markers.marker import Target
-from armsight.vision.markers.spec import Fields
+from armsight.vision.markers.spec import Fields, first_id
 from armsight.vision.markers.square import SquareFit, fit_square
 
 FAMILY = "tag36h11"
@@ -35,22 +35,23 @@ class AprilGrid(Record, Target):
         rows: tags along y.
         tag_m: side of a tag, m.
         spacing: gap between tags as a share of their side.
+        first: number of its first tag; the others follow.
     """
 
     columns: int
     rows: int
     tag_m: float
     spacing: float
+    first: int = 0
 
-    form = "aprilgrid:COLUMNSxROWS:TAG:SPACING (tags; gap as a share of the tag), such as aprilgrid:6x6:88mm:0.3"
+    form = "aprilgrid:COLUMNSxROWS:TAG:SPACING[:first=ID] (tags; gap as a share of the tag), such as aprilgrid:6x6:88mm:0.3"
 
     @staticmethod
     def from_fields(fields: Fields) -> AprilGrid:
         """Build the board a spec names."""
         columns, rows = fields.counts(0, least=1)
-        if columns * rows > family_size(FAMILY):
-            raise fields.error(f"has {columns * rows} tags, and {FAMILY} has {family_size(FAMILY)}")
-        return AprilGrid(columns, rows, fields.length_m(1), fields.ratio(2))
+        tag_m, spacing = fields.length_m(1), fields.ratio(2)
+        return AprilGrid(columns, rows, tag_m, spacing, fields.first(columns * rows, FAMILY, family_size(FAMILY)))
 
     @property
     def y_up(self) -> bool:
@@ -58,9 +59,9 @@ class AprilGrid(Record, Target):
         return True
 
     @property
-    def codes(self) -> tuple[str, int]:
-        """Family and number of its tags."""
-        return FAMILY, self.columns * self.rows
+    def codes(self) -> tuple[str, range]:
+        """Family and numbers of its tags."""
+        return FAMILY, range(self.first, self.first + self.columns * self.rows)
 
     @cached_property
     def body(self) -> Body:
@@ -71,15 +72,18 @@ class AprilGrid(Record, Target):
         ]
         y, x = np.meshgrid(steps[1], steps[0], indexing="ij")
         points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-        name = f"aprilgrid:{self.columns}x{self.rows}:{self.tag_m * 1e3:g}mm:{self.spacing:g}"
+        name = f"aprilgrid:{self.columns}x{self.rows}:{self.tag_m * 1e3:g}mm:{self.spacing:g}{first_id(self.first)}"
         return Body(name, tuple(str(i) for i in range(len(points))), points)
 
     def detect(self, image: NDArray[np.uint8]) -> Detections:
         """Find the board in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
         found: list[tuple[int, Array]] = []
+        others: set[int] = set()
         border = BORDERS[0]
         for border in BORDERS:
-            found = [tag for tag in find_squares(image, FAMILY, border) if tag[0] < self.columns * self.rows]
+            seen = find_squares(image, FAMILY, border)
+            found = [(identity - self.first, corners) for identity, corners in seen if identity in self.codes[1]]
+            others |= {identity for identity, _ in seen if identity not in self.codes[1]}
             if found:
                 break
         identities = [identity for identity, _ in found]
@@ -90,7 +94,13 @@ class AprilGrid(Record, Target):
         for identity, corners in self._missed(fitted, image.shape):
             self._fit(image, identity, corners, border, fitted)
         if not fitted:
-            return Detections.none(f"no tag of {self.body.name} found")
+            own, beside = self.codes[1], ""
+            if others:
+                beside = (
+                    f"; {len(others)} tags of {FAMILY} in view have ids {min(others)} to {max(others)}, it has "
+                    f"{own[0]} to {own[-1]}: if its ids begin elsewhere, add first=ID"
+                )
+            return Detections.none(f"no tag of {self.body.name} found{beside}")
         ids = np.concatenate([self._corner_ids(identity) for identity in fitted])
         order = np.argsort(ids)
         uv, cov = (np.concatenate([getattr(fit, key) for fit in fitted.values()])[order] for key in ("uv", "cov_uv"))
@@ -100,7 +110,7 @@ class AprilGrid(Record, Target):
         self, image: NDArray[np.uint8], identity: int, corners: Array, border: int, fitted: dict[int, SquareFit]
     ) -> None:
         """Fit one tag and add it to ``fitted`` if the fit is good."""
-        fit = fit_square(image, corners, cells(FAMILY, identity, border), diagonal=-1)
+        fit = fit_square(image, corners, cells(FAMILY, identity + self.first, border), diagonal=-1)
         if fit.problem is None:
             fitted[identity] = fit
 

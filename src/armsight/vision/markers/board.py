@@ -6,9 +6,13 @@ To add a kind of board: write one file with a class that fulfils :class:`Calibra
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Protocol
 
 from armsight.errors import InputError
+from armsight.geometry.check import checked
+from armsight.tables.document import read_document
+from armsight.vision.camera_file import described, stranger
 from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.chessboard import Chessboard
@@ -29,8 +33,8 @@ class CalibrationBoard(Target, Protocol):
         ...
 
     @property
-    def codes(self) -> tuple[str, int]:
-        """The family of its tags, which have the ids from 0 on, and how many there are; "" and 0 where it has none."""
+    def codes(self) -> tuple[str, range]:
+        """The family of its tags, and their ids; "" and none where it has no tags."""
         ...
 
 
@@ -44,15 +48,60 @@ BOARDS: dict[str, tuple[str, Callable[[Fields], CalibrationBoard]]] = {
 }
 
 
+#: Suffixes of Kalibr's target files.
+KALIBR = (".yaml", ".yml")
+#: Kalibr's target_type -> the kind here, and its keys: columns, rows, lengths, m.
+_TARGETS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "aprilgrid": ("aprilgrid", ("tagCols", "tagRows", "tagSize", "tagSpacing")),
+    "checkerboard": ("chessboard", ("targetCols", "targetRows", "rowSpacingMeters", "colSpacingMeters")),
+    "circlegrid": ("circles", ("targetCols", "targetRows", "spacingMeters")),
+}
+
+
+def kalibr_spec(path: str) -> str:
+    """Return the spec of the board that one of Kalibr's target files describes.
+
+    Raises:
+        InputError: missing, no target file, or one whose squares are no squares; the message names file and key.
+    """
+    document = read_document(path)
+    kind = document.get("target_type")
+    if kind not in _TARGETS:
+        said = stranger(document) or f"there are {described(document)}"
+        got = f"target_type is {kind!r}" if kind is not None else said
+        raise InputError(f"{path}: no target: {got}; expected Kalibr's target_type, one of {', '.join(_TARGETS)}")
+    board, keys = _TARGETS[kind]
+    if missing := [key for key in keys if key not in document]:
+        raise InputError(f"{path}: {kind} has no {missing[0]}; needed are {', '.join(keys)}")
+    numbers = checked([document[key] for key in keys], (len(keys),), f"{path}: {', '.join(keys)}")
+    if (numbers[:2] != numbers[:2].round()).any():
+        raise InputError(
+            f"{path}: {keys[0]} and {keys[1]} must be whole numbers, got {numbers[0]:g} and {numbers[1]:g}"
+        )
+    if kind == "checkerboard" and numbers[2] != numbers[3]:
+        raise InputError(
+            f"{path}: its squares are {1e3 * numbers[3]:g} x {1e3 * numbers[2]:g} mm; those of chessboards here are square"
+        )
+    if not numbers[2] <= 2.0:
+        raise InputError(f"{path}: {keys[2]} is {numbers[2]:g} m; Kalibr's lengths are in metres: is it in mm?")
+    if kind == "circlegrid" and document.get("asymmetricGrid"):
+        board = "acircles"
+    tail = f":{numbers[3]:g}" if kind == "aprilgrid" else ""
+    return f"{board}:{numbers[0]:.0f}x{numbers[1]:.0f}:{numbers[2]:.9g}m{tail}"
+
+
 def open_board(spec: str) -> CalibrationBoard:
     """Make the board that a spec names.
 
     Args:
-        spec: kind and fields, separated by colons; lengths carry a unit (mm, cm, m, in).
+        spec: kind and fields, separated by colons; lengths carry a unit (mm, cm, m, in); or the name of Kalibr's target
+            file (.yaml).
 
     Raises:
         InputError: unknown kind or malformed fields; the message shows the form and the known kinds.
     """
+    if Path(spec).suffix.lower() in KALIBR and Path(spec).suffix != spec:
+        spec = kalibr_spec(spec)
     kind, *values = spec.strip().split(":")
     if kind not in BOARDS:
         raise InputError(f"unknown board {spec!r}; known are {'; '.join(form for form, _ in BOARDS.values())}")

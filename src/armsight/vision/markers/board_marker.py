@@ -123,19 +123,19 @@ def check_codes(tags: Sequence[Marker], boards: Sequence[Marker]) -> None:
         InputError: such a tag; the message names it and the board.
     """
     for entry in boards:
-        family, count = board_codes(open_board(entry.fields["spec"]))
+        family, ids = board_codes(open_board(entry.fields["spec"]))
         for tag in tags:
-            if dictionary(family_name(tag.fields["family"])) == family and tag.fields["id"] < count:
+            if dictionary(family_name(tag.fields["family"])) == family and tag.fields["id"] in ids:
                 raise tag.error(
-                    f"{tag.fields['family']} id {tag.fields['id']} is on the board {entry.name!r} too, which has ids 0 to "
-                    f"{count - 1}: use another id or family"
+                    f"{tag.fields['family']} id {tag.fields['id']} is on the board {entry.name!r} too, which has ids "
+                    f"{ids[0]} to {ids[-1]}: use another id or family"
                 )
 
 
-def board_codes(board: CalibrationBoard) -> tuple[str, int]:
-    """Return the dictionary of a board's tags and their number; an empty name and 0 where it has no tags."""
-    family, count = board.codes
-    return dictionary(family), count
+def board_codes(board: CalibrationBoard) -> tuple[str, range]:
+    """Return the dictionary of a board's tags and their ids; an empty name and none where it has no tags."""
+    family, ids = board.codes
+    return dictionary(family), ids
 
 
 def dictionary(family: str) -> str:
@@ -144,6 +144,8 @@ def dictionary(family: str) -> str:
 
 
 def _alike(one: CalibrationBoard, other: CalibrationBoard) -> bool:
-    """Whether the finder of one board may find the other: tags of one dictionary, or two of a kind without tags."""
-    families = board_codes(one)[0], board_codes(other)[0]
-    return families[0] == families[1] if any(families) else type(one) is type(other)
+    """Whether the finder of one board may find the other: common tags of a dictionary, or two of a kind without tags."""
+    (family, ids), (family_other, ids_other) = board_codes(one), board_codes(other)
+    if not (family or family_other):
+        return type(one) is type(other)
+    return family == family_other and bool(set(ids) & set(ids_other))

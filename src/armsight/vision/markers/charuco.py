@@ -9,7 +9,7 @@ a fraction of a pixel.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -23,13 +23,15 @@ from armsight.vision.markers.aruco import charuco_detector, detect_markers, fami
 from armsight.vision.markers.chessboard import fit_grid, misfits
 from armsight.vision.markers.grid import completed, grid_points
 from armsight.vision.markers.marker import Target
-from armsight.vision.markers.spec import Fields
+from armsight.vision.markers.spec import Fields, first_id
 
 #: Markers from whose neighbours the image's scale at one follows, it included, and how far they may be from it, squares;
 #: of more, or of those further off, the perspective bends the fit. Fewest markers that have such neighbours.
 _NEIGHBOURS, _REACH, _FITS = 5, 2.1, 3
 #: Markers that are off their layout by more than this share of a square have another one.
 _OFF = 0.2
+#: First ids that are tried where the given one does not fit.
+_SHIFTS = 100  # half: only boards that are seen nearly whole are named; double: a miss takes twice as long
 #: OpenCV's outline of a marker runs through the middles of its outermost pixels: it is this much smaller, px.
 _OUTLINE_PX = 1.0
 #: A given side of the markers that differs from the image's by more than this share, and by more than so many pixels
@@ -51,6 +53,7 @@ class Charuco(Record, Target):
         square_m: side of a square, m.
         marker_m: side of a marker, m.
         family: the markers' family.
+        first: number of its first marker; the others follow.
     """
 
     columns: int
@@ -58,8 +61,9 @@ class Charuco(Record, Target):
     square_m: float
     marker_m: float
     family: str
+    first: int = 0
 
-    form = "charuco:COLUMNSxROWS:SQUARE:MARKER:FAMILY (squares), such as charuco:8x11:15mm:11mm:DICT_5X5_100"
+    form = "charuco:COLUMNSxROWS:SQUARE:MARKER:FAMILY[:first=ID] (squares), such as charuco:8x11:15mm:11mm:DICT_5X5_100"
 
     @staticmethod
     def from_fields(fields: Fields) -> Charuco:
@@ -72,9 +76,8 @@ class Charuco(Record, Target):
             family = family_name(fields.values[3])
         except InputError as error:
             raise fields.error(f"has an {error}") from None
-        if columns * rows // 2 > family_size(family):
-            raise fields.error(f"needs {columns * rows // 2} markers, and {family} has {family_size(family)}")
-        return Charuco(columns, rows, square_m, marker_m, family)
+        first = fields.first(columns * rows // 2, family, family_size(family))
+        return Charuco(columns, rows, square_m, marker_m, family, first)
 
     @property
     def y_up(self) -> bool:
@@ -82,16 +85,16 @@ class Charuco(Record, Target):
         return False
 
     @property
-    def codes(self) -> tuple[str, int]:
-        """Family and number of its tags."""
-        return self.family, self.columns * self.rows // 2
+    def codes(self) -> tuple[str, range]:
+        """Family and numbers of its tags."""
+        return self.family, range(self.first, self.first + self.columns * self.rows // 2)
 
     @cached_property
     def body(self) -> Body:
         """The inner corners, m, z = 0, named by their number."""
         points = grid_points(self.columns - 1, self.rows - 1, self.square_m)
         lengths = f"{self.square_m * 1e3:g}mm:{self.marker_m * 1e3:g}mm"
-        name = f"charuco:{self.columns}x{self.rows}:{lengths}:{self.family}"
+        name = f"charuco:{self.columns}x{self.rows}:{lengths}:{self.family}{first_id(self.first)}"
         return Body(name, tuple(str(i) for i in range(len(points))), points)
 
     @property
@@ -112,7 +115,8 @@ class Charuco(Record, Target):
 
     def _found(self, image: NDArray[np.uint8]) -> Detections:
         """Find the board with dark markers on light squares."""
-        markers = detect_markers(image, self.family)
+        seen, identities = detect_markers(image, self.family)
+        markers = seen, identities - self.first
         if (wrong := self._contradiction(image, *markers)) is not None:
             return Detections.none(wrong)
         layouts = [self._rough(image, *markers, legacy) for legacy in (False, True)]
@@ -137,6 +141,8 @@ class Charuco(Record, Target):
         size = (self.columns, self.rows)
         detector = charuco_detector(size, self.square_m, self.marker_m, self.family, legacy)
         uv, ids = None, None
+        ours = (identities.ravel() >= 0) & (identities.ravel() < len(self.codes[1]))
+        markers, identities = [m for m, own in zip(markers, ours, strict=True) if own], identities[ours]
         if len(markers):
             uv, ids, _, _ = detector.detectBoard(image, markerCorners=markers, markerIds=identities)
         if ids is not None and uv is not None:
@@ -152,6 +158,13 @@ class Charuco(Record, Target):
         sides = [self._sides(corners, outlined, identities, legacy) for legacy in (False, True)]
         off, seen_m, px = min(sides, key=lambda found: found[0])
         if off > _OFF:
+            if (first := self._other_first(corners, outlined, identities)) is not None:
+                last = first + len(self.codes[1]) - 1
+                return (
+                    f"{len(markers)} markers of {self.family} in view have the ids {first} to {last} of such a board, and "
+                    f"{self.body.name} has {self.first} to {self.codes[1][-1]}: if this is the board, give "
+                    f"{replace(self, first=first).body.name}"
+                )
             if max(sides)[0] == np.inf:
                 return None  # nothing is known of one layout
             return (
@@ -165,6 +178,18 @@ class Charuco(Record, Target):
             f"not of {self.marker_m * 1e3:g} mm: measure the squares and the markers (with their dark border) again"
         )
 
+    def _other_first(self, corners: Array, outlined: NDArray[np.bool_], identities: NDArray[Any]) -> int | None:
+        """Return the first id with which the markers in view lie as the board has them; None where there is none."""
+        ids, count = identities.ravel() + self.first, len(self.codes[1])
+        if len(ids) < _NEIGHBOURS:
+            return None
+        low, high = max(0, int(ids.max()) - count + 1), min(int(ids.min()), family_size(self.family) - count)
+        for first in range(high, max(low, high - _SHIFTS) - 1, -1):
+            shifted = (identities + self.first) - first
+            if min(self._sides(corners, outlined, shifted, legacy)[0] for legacy in (False, True)) <= _OFF:
+                return first
+        return None
+
     def _sides(
         self, corners: Array, outlined: NDArray[np.bool_], identities: NDArray[Any], legacy: bool
     ) -> tuple[float, float, float]:
@@ -175,7 +200,7 @@ class Charuco(Record, Target):
             markers that have neighbours, the side of those that are outlined. Infinite and NaN where too few are.
         """
         layout = marker_corners((self.columns, self.rows), self.square_m, self.marker_m, self.family, legacy)
-        known = [k for k, identity in enumerate(identities.ravel()) if identity < len(layout)]
+        known = [k for k, identity in enumerate(identities.ravel()) if 0 <= identity < len(layout)]
         if len(known) < _NEIGHBOURS:
             return np.inf, np.nan, np.nan
         corners, outlined = corners[known], outlined[known]

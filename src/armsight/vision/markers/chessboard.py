@@ -70,9 +70,9 @@ class Chessboard(Record, Target):
         return False
 
     @property
-    def codes(self) -> tuple[str, int]:
-        """Family and number of its tags."""
-        return "", 0
+    def codes(self) -> tuple[str, range]:
+        """Family and numbers of its tags."""
+        return "", range(0)
 
     @cached_property
     def body(self) -> Body:

@@ -87,9 +87,23 @@ class Fields:
             raise self.error(f"has the length {text}, which is not between 0.01 mm and 2 m")
         return length
 
+    def first(self, count: int, family: str, size: int) -> int:
+        """Read the option ``first=ID``, the number of the first of ``count`` tags of a family of so many; 0 without it."""
+        text = self.options("first=").get("first", "0")
+        if not re.fullmatch("[0-9]{1,5}", text):
+            raise self.error(f"has first={text} where the id of the first tag belongs")
+        if int(text) + count > size:
+            raise self.error(f"needs {count} tags from id {int(text)} on, and {family} has {size}")
+        return int(text)
+
     def ratio(self, index: int) -> float:
         """Read a plain positive number."""
         text = self.values[index]
         if not re.fullmatch(_NUMBER, text) or not 0 < float(text) < 100:
             raise self.error(f"has {text!r} where a ratio such as 0.3 belongs")
         return float(text)
+
+
+def first_id(first: int) -> str:
+    """Return the option of a spec that says where a board's ids begin; empty for 0."""
+    return f":first={first}" if first else ""

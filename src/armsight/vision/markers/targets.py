@@ -15,7 +15,7 @@ from armsight.data import Body, Detections, Record
 from armsight.errors import InputError
 from armsight.files import read_toml
 from armsight.vision.markers.aprilgrid import AprilGrid
-from armsight.vision.markers.board import BOARDS, open_board
+from armsight.vision.markers.board import BOARDS, KALIBR, open_board
 from armsight.vision.markers.board_marker import BoardTarget, board_codes, check_codes, dictionary
 from armsight.vision.markers.body_file import Marker, check_points, load_body_csv, read_body_file
 from armsight.vision.markers.calibrated_board import EstimatedBoard, load_board_file
@@ -161,8 +161,8 @@ def _codes(target: Target) -> set[tuple[str, int]]:
     if isinstance(target, EstimatedBoard):
         return _codes(target.drawing)
     if isinstance(target, AprilGrid | Charuco):
-        family, count = board_codes(target)
-        return {(family, k) for k in range(count)}
+        family, ids = board_codes(target)
+        return {(family, k) for k in ids}
     return set()
 
 
@@ -181,12 +181,13 @@ def open_body(spec: str) -> Body:
 
 
 def _kind(spec: str) -> str:
-    """Return ``board``, ``.toml`` or ``.csv``."""
+    """Return ``board``, ``.toml`` or ``.csv``; Kalibr's target files are boards."""
     suffix = Path(spec).suffix.lower()
-    if spec.strip().split(":")[0] in BOARDS or (":" in spec and not Path(spec).exists()):
+    if spec.strip().split(":")[0] in BOARDS or (":" in spec and not Path(spec).exists()) or suffix in KALIBR:
         return "board"
     if suffix in (".toml", ".csv"):
         return suffix
     raise InputError(
-        f"{spec!r} is not a target: expected a board ({', '.join(BOARDS)}), a .toml body file or a .csv of points"
+        f"{spec!r} is not a target: expected a board ({', '.join(BOARDS)}), a .toml body file, a .csv of points or "
+        "Kalibr's .yaml of a target"
     )
