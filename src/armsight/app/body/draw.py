@@ -30,6 +30,7 @@ from armsight.geometry.pose import transform
 from armsight.sim.render.scene import CLEAR, Pattern, aprilgrid, charuco, chessboard, circle_grid, tag
 from armsight.vision.discs.predict import face_axes, look_direction
 from armsight.vision.markers.aprilgrid import AprilGrid
+from armsight.vision.markers.apriltag3 import LAYOUTS, printed
 from armsight.vision.markers.aruco import cells
 from armsight.vision.markers.board import BOARDS, KALIBR, open_board
 from armsight.vision.markers.body_layout import Layout, read_layout
@@ -207,7 +208,10 @@ def _patterns(layout: Layout) -> list[_PosedMarker]:
     """Return tags and boards."""
     markers = []
     for one in () if layout.tags is None else layout.tags.tags:
-        pattern = tag(cells(one.family, one.identity) > 0, one.size_m, black=0.0, white=1.0)
+        whole = one.family in LAYOUTS
+        bits = printed(one.family, one.identity) if whole else cells(one.family, one.identity)
+        side_m = one.size_m * (len(bits) / LAYOUTS[one.family].square if whole else 1.0)
+        pattern = tag(bits > 0, side_m, black=0.0, white=1.0)
         T = one.T_body_tag
         markers.append(_PosedMarker(one.name, T[:3, 3], -T[:3, 2], _pattern(one.name, pattern, T)))
     for two in () if layout.boards is None else layout.boards.boards:

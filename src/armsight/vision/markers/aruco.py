@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.vision.markers.apriltag3 import LAYOUTS, codes, read_tag
 
 #: AprilTag's families -> OpenCV's dictionaries, in which they stand upside down.
 APRILTAGS = {f"tag{kind}": f"DICT_APRILTAG_{kind}" for kind in ("16h5", "25h9", "36h10", "36h11")}
@@ -32,13 +33,13 @@ SIDE_MIN_PX = 10.0
 
 
 def family_name(text: str) -> str:
-    """Return the family that a text names: any case, with or without OpenCV's ``DICT_``.
+    """Return the family that a text names: any case, with or without ``DICT_`` or ``tag``.
 
     Raises:
         InputError: unknown; the message lists the known ones.
     """
     for name in FAMILIES:
-        if text.lower() in (name.lower(), name.lower().removeprefix("dict_")):
+        if text.lower() in (name.lower(), name.lower().removeprefix("dict_"), name.lower().removeprefix("tag")):
             return name
     raise InputError(f"unknown marker family {text!r}; known are {', '.join(FAMILIES)}")
 
@@ -149,13 +150,13 @@ def _blurred_codes(family: str, border: int) -> tuple[NDArray[np.float32], ...]:
     name = APRILTAGS.get(family, family)
     whole = [cells(name, k, border) for k in range(family_size(family))]
     grids = np.array([np.rot90(np.pad(c, 1, constant_values=1), -r) for c in whole for r in range(4)], np.float32)
-    codes = []
+    blurred = []
     for sigma in _CODE_BLURS:
         soft = np.array([cv2.GaussianBlur(grid, (5, 5), sigma, borderType=cv2.BORDER_REPLICATE) for grid in grids])
         inner = soft[:, border + 1 : -border - 1, border + 1 : -border - 1].reshape(len(grids), -1)
         inner = inner - inner.mean(axis=1, keepdims=True)
-        codes.append(inner / np.maximum(np.linalg.norm(inner, axis=1, keepdims=True), 1e-9))
-    return tuple(codes)
+        blurred.append(inner / np.maximum(np.linalg.norm(inner, axis=1, keepdims=True), 1e-9))
+    return tuple(blurred)
 
 
 def _nearest_code(image: NDArray[np.uint8], quad: Array, family: str, border: int) -> tuple[int, Array] | None:
@@ -176,8 +177,8 @@ def _nearest_code(image: NDArray[np.uint8], quad: Array, family: str, border: in
         if inner.std() < _CODE_DEPTH * step:
             continue
         inner /= np.linalg.norm(inner)
-        for codes in _blurred_codes(family, border):
-            correlation = codes @ inner
+        for blurred in _blurred_codes(family, border):
+            correlation = blurred @ inner
             row = int(correlation.argmax())
             first = float(correlation[row])
             correlation[row - row % 4 : row - row % 4 + 4] = 0.0  # the same marker, rotated
@@ -214,19 +215,51 @@ def find_squares(image: NDArray[np.uint8], family: str, border: int = 1) -> list
 
     Args:
         image: (H, W) grey image.
-        family: a name of FAMILIES.
+        family: a name of FAMILIES or of LAYOUTS.
         border: width of the markers' dark border, cells.
 
     Returns:
         Identity and rough corners (4, 2), raw pixels, of each marker seen: upper left, upper right, lower right, lower
-        left of the upright marker.
+        left of the upright marker; of AprilTag 3's families those of the inner square.
     """
+    if family in LAYOUTS:
+        return _find_apriltag3(image, family)
     rot90 = 2 if family in APRILTAGS else 0
     corners, identities = detect_markers(image, family, border)
     return [
         (int(identity), np.roll(found.reshape(4, 2).astype(np.float64), -rot90, axis=0))
         for identity, found in zip(identities[:, 0], corners, strict=True)
     ]
+
+
+def _find_apriltag3(image: NDArray[np.uint8], family: str) -> list[tuple[int, Array]]:
+    """Find tags of AprilTag 3's families: in the negative of an image their inner squares are dark outlines."""
+    image = _full_range(image)
+    share = round(4.0 * SIDE_MIN_PX / max(image.shape), 4)
+    some, _, others = _detector("DICT_4X4_50", share, 1).detectMarkers(255 - image)
+    tags = [read_tag(image, np.reshape(quad, (4, 2)).astype(np.float64), family) for quad in (*some, *others)]
+    found = [tag for tag in tags if tag is not None]
+    if not found:
+        return []
+    kept = _without_repeats(np.array([corners for _, corners in found]), np.array([identity for identity, _ in found]))
+    return [found[i] for i in kept]
+
+
+def tag_family(text: str) -> str:
+    """Return the family of single tags that a text names: AprilTag 3's too; otherwise as :func:`family_name`."""
+    if name := next(
+        (name for name in LAYOUTS if text.lower() in (name.lower(), name.lower().removeprefix("tag"))), None
+    ):
+        return name
+    try:
+        return family_name(text)
+    except InputError:
+        raise InputError(f"unknown marker family {text!r}; known are {', '.join((*LAYOUTS, *FAMILIES))}") from None
+
+
+def tag_count(family: str) -> int:
+    """Return how many tags a family has, AprilTag 3's too."""
+    return len(codes(family)) if family in LAYOUTS else family_size(family)
 
 
 @lru_cache(maxsize=64)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Record
 from armsight.geometry.pose import transform
-from armsight.vision.markers.aruco import APRILTAGS, family_name
+from armsight.vision.markers.aruco import APRILTAGS, tag_family
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.body_file import Marker
 from armsight.vision.markers.marker import Target
@@ -125,7 +125,7 @@ def check_codes(tags: Sequence[Marker], boards: Sequence[Marker]) -> None:
     for entry in boards:
         family, ids = board_codes(open_board(entry.fields["spec"]))
         for tag in tags:
-            if dictionary(family_name(tag.fields["family"])) == family and tag.fields["id"] in ids:
+            if dictionary(tag_family(tag.fields["family"])) == family and tag.fields["id"] in ids:
                 raise tag.error(
                     f"{tag.fields['family']} id {tag.fields['id']} is on the board {entry.name!r} too, which has ids "
                     f"{ids[0]} to {ids[-1]}: use another id or family"

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Record
 from armsight.geometry.pose import transform
-from armsight.vision.markers.aruco import cells, family_name, family_size, find_squares
+from armsight.vision.markers.apriltag3 import LAYOUTS, negative_square
+from armsight.vision.markers.aruco import cells, find_squares, tag_count, tag_family
 from armsight.vision.markers.body_file import Marker
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.square import fit_square
@@ -32,9 +33,9 @@ class Tag(Record):
 
     Attributes:
         name: what its corners are named after.
-        family: a name of :data:`~armsight.vision.markers.aruco.FAMILIES`.
+        family: a name of :data:`~armsight.vision.markers.aruco.FAMILIES`, or AprilTag 3's.
         identity: its number in the family.
-        size_m: side of its dark outline, m.
+        size_m: side of its dark outline, of AprilTag 3's families that of the square where the rings meet, m.
         T_body_tag: (4, 4) its pose on the body, m.
     """
 
@@ -68,10 +69,10 @@ class TagTarget(Record, Target):
         taken: dict[tuple[str, int], str] = {}
         for marker in markers:
             marker.check_keys("tag", required=("family", "id", "size_mm"))
-            family = marker.converted("family", family_name)
+            family = marker.converted("family", tag_family)
             identity = marker.fields["id"]
-            if type(identity) is not int or not 0 <= identity < family_size(family):
-                raise marker.error(f"id {identity!r} is not in {family}; it has 0 to {family_size(family) - 1}")
+            if type(identity) is not int or not 0 <= identity < tag_count(family):
+                raise marker.error(f"id {identity!r} is not in {family}; it has 0 to {tag_count(family) - 1}")
             if (family, identity) in taken:
                 raise marker.error(f"{family} id {identity} is on marker {taken[family, identity]!r} already")
             taken[family, identity] = marker.name
@@ -98,7 +99,10 @@ class TagTarget(Record, Target):
                 if seen[tag.identity] > 1:
                     problems.append(f"{tag.name} is seen {seen[tag.identity]} times")
                     continue
-                fit = fit_square(image, corners[tag.identity], cells(family, tag.identity))
+                if family in LAYOUTS:
+                    fit = fit_square(255 - image, corners[tag.identity], negative_square(family, tag.identity))
+                else:
+                    fit = fit_square(image, corners[tag.identity], cells(family, tag.identity))
                 if fit.problem is not None:
                     problems.append(f"{tag.name}: {fit.problem}")
                     continue
