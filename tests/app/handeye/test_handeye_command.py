@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from armsight.app.handeye.command import Options, calibrate
 from armsight.app.handeye.images import steady, upright
-from armsight.app.handeye.read import read_pose_table
 from armsight.app.handeye.recording import matched_rows, paired, seen_in_table
 from armsight.app.handeye.result import as_json, headline, statements
 from armsight.app.handeye.suspect import _nearer_models
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.robot.arm_file import open_arm
+from armsight.tables.poses import read_pose_table
 from cli_runs import assert_rejected
 
 X = exp_se3(np.array([0.03, -0.02, 0.08, 0.2, -0.1, 1.2]))
@@ -189,8 +189,8 @@ def test_a_unit_or_a_rotation_that_is_given_counts(tmp_path):
     ("text", "said"),
     [
         ("DECL PDAT PPDAT1={VEL 100.0,ACC 100.0}\n", "begins no table"),
-        ("- effector_wrt_world: [1, 0, 0, 0]\n", "begins no table"),
-        ("[[[1, 0, 0, 0.1], [0, 1, 0, 0.2]]]\n", "begins no table"),
+        ("- effector_wrt_world: [1, 0, 0, 0]\n", "holds a list of 1, and no poses: expected a list of matrices"),
+        ("[[[1, 0, 0, 0.1], [0, 1, 0, 0.2]]]\n", "holds a list of 1, and no poses: expected a list of matrices"),
         ("j1,j2,j3,j4,j5,j6\n1,2,3,4,5,6\n", "joints without a unit: name them q1_deg"),
     ],
 )
@@ -221,7 +221,7 @@ def test_where_the_arms_geometry_is_off_the_error_is_of_the_transforms_that_are_
     off = q + np.array([0.0, 0.02, -0.02, 0.02, -0.02, 0.0])
     B = inverse(open_arm("six_r").forward(off) @ X) @ Z
     B = B @ exp_se3(np.random.default_rng(1).normal(0, [2e-4] * 3 + [5e-4] * 3, (16, 6)))
-    nothing = dict.fromkeys(one.name for one in fields(Options))
+    nothing = dict.fromkeys(one.name for one in fields(Options)) | {"columns": ()}
     given = {
         "robot": named(tmp_path / "q.csv", ",".join(f"q{i}_rad" for i in range(1, 7)), q),
         "seen": matrices(tmp_path / "b.txt", B),
@@ -508,7 +508,9 @@ def test_readings_of_rotations_axes_and_units(armsight, tmp_path, seen):
     other = A.copy()
     other[:, :2, 3] = A[:, [1, 0], 3]
     rejected(matrices(path, other), "the positions fit as y, x, z")
-    rejected(matrices(path, np.swapaxes(A, 1, 2)), "line 1", "column by column")
+    columnwise, notes = found(armsight, matrices(path, np.swapaxes(A, 1, 2)), seen)  # Franka's O_T_EE, Eigen, MATLAB
+    assert "its matrices are column by column" in notes
+    assert_right(columnwise)
     angles = Rotation.from_matrix(A[:, :3, :3]).as_euler("ZYX", degrees=True)
     rejected(named(path, "X,Y,Z,W,P,R", np.hstack([1e3 * A[:, :3, 3], angles])), "about x and z are exchanged")
     rejected(named(path, "x_m,y_m,z_m,rx_rad,ry_rad,rz_rad", np.hstack([A[:, :3, 3], angles])), "are these degrees?")

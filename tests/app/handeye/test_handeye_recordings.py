@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from armsight.app.handeye.images import Seen
-from armsight.app.handeye.read import PoseTable
 from armsight.app.handeye.recording import at_shots, links_of, paired
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
@@ -19,6 +18,7 @@ from armsight.sim.example_rig import board_poses, example_rig
 from armsight.sim.render.optics import Optics, Sensor
 from armsight.sim.render.render import render_pair
 from armsight.sim.render.scene import PosedBody, chessboard
+from armsight.tables.poses import PoseTable
 from bag_files import EPOCH_NS, Joints, Pixels, Sent, Transforms, write_bag
 from cli_runs import assert_rejected
 
@@ -117,7 +117,14 @@ def test_joints_are_read_by_their_names(at_rest):
 def stream(t_s, Ts, **more):
     """A recording's poses."""
     n = len(t_s)
-    given = {"numbers": np.zeros((n, 0)), "q": None, "names": None, "notes": (), "of_joints": False} | more
+    given = {
+        "numbers": np.zeros((n, 0)),
+        "written": np.zeros((n, 0)),
+        "q": None,
+        "names": None,
+        "notes": (),
+        "of_joints": False,
+    } | more
     return PoseTable(
         path=Path("a.bag"), lines=np.arange(n), Ts=Ts, convention="", t_s=np.asarray(t_s, float), unit_m=1.0,
         missed=("",) * n, **given,

@@ -209,10 +209,10 @@ def test_poses_to_validate_with_that_cannot_be_of_the_arm_are_explained(tmp_path
     [
         (lambda lines: [], "no rows"),
         (lambda lines: lines[:1], "no rows"),
-        (lambda lines: [lines[0].replace("q6_rad", "elbow"), *lines[1:]], "5 joint angles a row, six_r has 6 joints"),
+        (lambda lines: [lines[0].replace("q6_rad", "elbow"), *lines[1:]], "5 joints (q1_rad..q5_rad); six_r has 6"),
         (
             lambda lines: [lines[0] + ",q7_rad", *(line + ",0" for line in lines[1:])],
-            "7 joint angles a row, six_r has 6 joints",
+            "7 joints (q1_rad..q7_rad); six_r has 6",
         ),
         (lambda lines: [line.replace("p1_", "p2_") for line in lines], "no point 1"),
         (

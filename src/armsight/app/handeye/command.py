@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from armsight.app.handeye.images import Seen
-    from armsight.app.handeye.read import PoseTable
     from armsight.app.handeye.result import HandEyeAnswer
     from armsight.robot.arm import Arm
+    from armsight.tables.poses import PoseTable
 
 _BY_RIG = "--rig with --left and --right, or with --source"
 
@@ -35,7 +35,7 @@ class Options:
     model: str | None
     rotation: str | None
     units: str | None
-    columns: str | None
+    columns: tuple[str, ...]
     seen: Path | None
     seen_rotation: str | None
     seen_units: str | None
@@ -76,7 +76,13 @@ class Options:
     help="wxyz or xyzw; rotvec; or angles: xyz (fixed axes), XYZ (rotated axes), ...",
 )
 @click.option("--units", type=click.Choice(["m", "mm"]), help="Of lengths whose columns do not name a unit.")
-@click.option("--columns", metavar="NAME=COLUMN,...", help="Names of columns in your table, such as x_mm=X,rx_deg=A.")
+@click.option(
+    "--columns",
+    metavar="[seen:]NAME=COLUMN,...",
+    multiple=True,
+    help="Names of columns in your table, such as x_mm=X,rx_deg=A, or of all in order, such as rx,ry,rz,x,y,z; with seen: "
+    "of the target's table.",
+)
 @click.option(
     "--seen", metavar="TARGET.csv", type=click.Path(path_type=Path), help="Poses of the target in the camera."
 )
@@ -105,7 +111,7 @@ def command(**given: object) -> None:
     blunders, or half of them are off by more than 20 mm: the result must not be trusted. Forms of tables, and examples:
     docs/howto/handeye.md.
     """
-    options = Options(**given)  # type: ignore[arg-type]
+    options = _with_both(Options(**given))  # type: ignore[arg-type]
     _require_one_way(options)
 
     from armsight.app.handeye.report import write_handeye_report
@@ -143,14 +149,31 @@ def command(**given: object) -> None:
         click.get_current_context().exit(UNTRUSTED)
 
 
+def _columns(options: Options, side: str) -> str | None:
+    """Return what --columns says of one table, "robot" or "seen"."""
+    seen = [text.removeprefix("seen:") for text in options.columns if text.startswith("seen:")]
+    robot = [text.removeprefix("robot:") for text in options.columns if not text.startswith("seen:")]
+    return ",".join(robot if side == "robot" else seen) or None
+
+
+def _with_both(options: Options) -> Options:
+    """Return the options with the robot's file as that of what was seen, where it holds both and nothing else is given."""
+    from armsight.tables.documents import has_both
+
+    given = (options.seen, options.images, options.camera, options.rig, options.left, options.right, options.source)
+    return replace(options, seen=options.robot) if not any(given) and has_both(options.robot) else options
+
+
 def _require_one_way(options: Options) -> None:
     """Reject options that do not go together."""
+    from armsight.tables.documents import has_both
+
     ways = {
         "--seen": options.seen is not None,
         "--images with --camera": options.images is not None or options.camera is not None,
         _BY_RIG: any(given is not None for given in (options.rig, options.left, options.right, options.source)),
     }
-    if options.seen is not None and options.seen.resolve() == options.robot.resolve():
+    if options.seen is not None and options.seen.resolve() == options.robot.resolve() and not has_both(options.robot):
         raise InputError(f"{options.seen}: one file for both: --robot has the arm's poses, --seen what the camera saw")
     if sum(ways.values()) != 1:
         raise InputError(f"give what the camera saw in one way: {', or '.join(ways)}")
@@ -174,19 +197,19 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
         ArmsightError: the input is wrong, or the motions leave a direction open.
     """
     from armsight.app.handeye.plan import plan_poses
-    from armsight.app.handeye.read import read_pose_table
     from armsight.app.handeye.recording import at_shots, links_of, paired, recording_of, robot_in_recording
     from armsight.app.handeye.result import HandEyeAnswer
     from armsight.app.handeye.suspect import require_plausible
     from armsight.loop.handeye.structured import calibrate_structured
     from armsight.robot.arm_file import open_arm
+    from armsight.tables.poses import read_pose_table
 
     progress("reading")
     arm = None if options.model is None else open_arm(options.model)
     bag = recording_of(options.robot)
     if bag is not None:
         for name in ("rotation", "units", "columns"):
-            if getattr(options, name) is not None:
+            if getattr(options, name):
                 raise InputError(f"{options.robot}: a recording: --{name} belongs to tables")
         robot = robot_in_recording(bag, options.frames, arm)
     elif options.frames is not None:
@@ -197,7 +220,7 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
             rotation=options.rotation,
             unit=options.units,
             detect_units=options.detect_units,
-            columns=options.columns,
+            columns=_columns(options, "robot"),
             arm=arm,
         )
     seen = _seen(options, progress)
@@ -220,13 +243,18 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
 def _seen(options: Options, progress: Callable[[str], None]) -> Seen:
     """Read or measure the poses of the target."""
     from armsight.app.handeye.images import see_with_camera, see_with_rig
-    from armsight.app.handeye.read import read_pose_table
     from armsight.app.handeye.recording import seen_in_table
+    from armsight.tables.poses import read_pose_table
     from armsight.vision.sources import PairsSource, Source, open_source
 
     if options.seen is not None:
         table = read_pose_table(
-            options.seen, rotation=options.seen_rotation, unit=options.seen_units, detect_units=options.detect_units
+            options.seen,
+            rotation=options.seen_rotation,
+            unit=options.seen_units,
+            detect_units=options.detect_units,
+            columns=_columns(options, "seen"),
+            side="seen",
         )
         return seen_in_table(table)
     target = str(options.target)

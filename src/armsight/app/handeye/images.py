@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.handeye.read import PoseTable
 from armsight.data import Array, Detections, Missed, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, transform
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.handeye import LEVER_M
+from armsight.tables.poses import PoseTable
 from armsight.vision.camera import Camera
 from armsight.vision.camera_file import read_camera
 from armsight.vision.image import grey, read_image

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.handeye.images import Seen, upright
-from armsight.app.handeye.read import PoseTable
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import adjoint, inverse, log_se3, mean_pose
 from armsight.loop.handeye.handeye import MIN_POSES, Poses
 from armsight.loop.handeye.streams import GAP_S
 from armsight.robot.arm import Arm
+from armsight.tables.poses import PoseTable
 from armsight.vision.sources.bag import Bag
 from armsight.vision.sources.bag.reader import SUFFIXES
 from armsight.vision.sources.bag.states import PoseTrack, read_joints, read_track
@@ -130,6 +130,7 @@ def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseT
         lines=1 + np.flatnonzero(there),
         Ts=track.Ts[there],
         numbers=np.zeros((n, 0)),
+        written=np.zeros((n, 0)),
         convention="",
         q=None if q is None else q[there],
         t_s=track.t_s[there],
@@ -184,6 +185,7 @@ def at_shots(robot: PoseTable, seen: Seen) -> PoseTable:
         lines=1 + inside,
         Ts=Ts,
         numbers=np.zeros((n, 0)),
+        written=np.zeros((n, 0)),
         q=None if robot.q is None else np.stack([np.interp(t_s, robot.t_s, each) for each in robot.q.T], axis=1),
         t_s=t_s,
         names=tuple(seen.names[k] for k in inside),

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations, permutations, product
+from itertools import combinations, permutations
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.handeye.read import CONVENTIONS, MIXED, PoseTable, rotations_by, stacked
 from armsight.app.handeye.recording import PairedPoses
 from armsight.data import Array
 from armsight.errors import InputError
@@ -30,6 +29,8 @@ from armsight.loop.handeye.handeye import LEVER_M, Poses, residuals, starts
 from armsight.loop.handeye.structured import CONTRADICTS, rotations_of, scale_between
 from armsight.robot.arm import Arm
 from armsight.robot.models import MODELS
+from armsight.tables.misread import Misread, misreadings
+from armsight.tables.poses import MIXED
 
 #: Of the residuals that are looked at: their median, and what nine of ten are below.
 QUANTILES = (0.5, 0.9)
@@ -326,16 +327,16 @@ def _readings(recording: PairedPoses, arm: Arm | None, streams: bool) -> Iterato
     table, seen = recording.robot, recording.seen.table
     sides = [(table, recording.rows, "A", "")]
     sides += [] if seen is None else [(seen, recording.matched, "B", "seen-")]
+    kinds: dict[str, list[tuple[str, Misread]]] = {}
     for one, rows, side, option in sides:
-        poses = getattr(p, side)
-        for R, said in _rotations(one, rows, poses[:, :3, :3], option):
-            yield _Reading(_with(p, side, stacked(R, poses[:, :3, 3])), said, one.path)
-        for named, position in _axes(poses[:, :3, 3]):
-            yield _Reading(
-                _with(p, side, stacked(poses[:, :3, :3], position)),
-                f"the axes of the positions are not those of the rotations: the positions fit as {named}",
-                one.path,
-            )
+        for reading in misreadings(one, rows, getattr(p, side), option):
+            kinds.setdefault(reading.kind, []).append((side, reading))
+            yield _Reading(_with(p, side, reading.Ts), reading.said, one.path)
+    for both in kinds.values():  # what one program wrote wrongly it may have written wrongly in both tables
+        if len(both) == 2:
+            (_, robots), (_, seens) = both
+            said = robots.said if robots.said == seens.said else f"{robots.said}; and in {seens.path}: {seens.said}"
+            yield _Reading(replace(p, A=robots.Ts, B=seens.Ts), said)
     if arm is not None and table.q is not None and table.numbers.shape[1] == 0:
         yield from (_Reading(replace(p, A=A), said) for A, said in _joints(p, arm, table.q[recording.rows]))
 
@@ -392,45 +393,6 @@ def _shifted(p: Poses, shift: int) -> tuple[NDArray[np.int64], NDArray[np.int64]
     later_hands = hands[hands >= first + (max(shift, 0) if first else 0)]
     earlier = np.arange(first)
     return np.append(earlier, later_hands), np.append(earlier, later_hands - shift), first
-
-
-def _rotations(table: PoseTable, rows: NDArray[np.int64], R: Array, option: str) -> Iterator[tuple[Array, str]]:
-    """Yield other readings of a table's rotations (N, 3, 3), and what they would mean."""
-    numbers = table.numbers[rows]
-    width = numbers.shape[1]
-    for convention in CONVENTIONS if width else ():
-        if convention != table.convention and width == (4 if convention in ("wxyz", "xyzw") else 3):
-            yield (
-                rotations_by(numbers, convention, table.path),
-                f"the rotations are {convention}, not {table.convention}: --{option}rotation {convention}, or exchange the "
-                "columns' names where they have any",
-            )
-    if width == 3:
-        for unit, other, given in (
-            (np.degrees(numbers), "radians", "degrees"),
-            (np.radians(numbers), "degrees", "radians"),
-        ):
-            yield (
-                rotations_by(unit, table.convention, table.path),
-                f"the rotations are in {other}, not {given}: name the columns rx_{other[:3]} ry_{other[:3]} rz_{other[:3]}",
-            )
-        yield (
-            rotations_by(numbers[:, ::-1], table.convention, table.path),
-            "the rotations about x and z are exchanged: KUKA's A is about z, Fanuc's W about x: exchange the names of the "
-            "first and the last angle",
-        )
-    yield (
-        np.swapaxes(R, 1, 2),
-        "the rotations are inverse (matrices column by column, or quaternions conjugate), the positions are not",
-    )
-
-
-def _axes(position: Array) -> Iterator[tuple[str, Array]]:
-    """Yield positions (N, 3) with axes exchanged and mirrored, and how they are named."""
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        if order != (0, 1, 2) or min(signs) < 0:
-            named = ", ".join(f"{'-' if sign < 0 else ''}{'xyz'[k]}" for k, sign in zip(order, signs, strict=True))
-            yield named, position[:, order] * signs
 
 
 def _scaled(recording: PairedPoses) -> Iterator[_Reading]:

@@ -12,7 +12,7 @@ import click
 from armsight.app.arm_option import arm_option
 from armsight.errors import InputError
 from armsight.files import check_writable, write_text
-from armsight.loop.identify import ROTATIONS
+from armsight.tables.rotations import ROTATIONS
 
 
 @click.group("identify", invoke_without_command=True)

@@ -19,12 +19,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from armsight.app.handeye.read import COLUMNS as POSE_COLUMNS
-from armsight.app.handeye.read import NAMES, PoseTable, read_pose_table
 from armsight.app.handeye.recording import matched_rows
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
-from armsight.files import check_writable, read_columns, read_table, write_text
+from armsight.files import check_writable, write_text
 from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
 from armsight.loop.identify.corrected import Corrected, zeros_text
 from armsight.loop.identify.diagnose import check_plausible, find_step, without_tool
@@ -35,6 +33,9 @@ from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.read import COLUMNS, Read, poses_in, read_poses
 from armsight.loop.identify.validate import MIN_POSES, Errors, Validation, errors, require_alike, validate
 from armsight.robot.arm import Arm
+from armsight.tables.cells import Cells, read_cells, read_columns
+from armsight.tables.columns import NAMES
+from armsight.tables.poses import PoseTable, read_pose_table
 
 #: Parts of the poses that are left out, one after the other, where nothing is given to validate with.
 FOLDS = 5
@@ -93,58 +94,51 @@ def read_measured(
         InputError: either file, or they do not fit together.
     """
     if joints is None:
-        return read_poses(data, rotation=rotation, columns=columns)
+        return read_poses(data, rotation=rotation, columns=columns, arm=arm)
     parts = [] if columns is None else columns.split(",")
-    theirs = [
-        part for part in parts if (name := part.partition("=")[0].strip()) in POSE_COLUMNS and name not in COLUMNS
-    ]
-    theirs += [part for part in parts if re.match(r"\s*q\d+_", part)]
+    theirs = [part for part in parts if re.match(r"\s*(?:q\d+_|image|name|shot)", part)]
     table = read_pose_table(joints, columns=",".join(theirs) or None, arm=arm, only_joints=True)
     ours = ",".join(part for part in parts if part not in theirs) or None
-    rows, notes = _with_joints(data, read_table(data, read_columns(ours, COLUMNS)), table)
-    read = poses_in(data, rows, rotation=rotation)
+    cells, notes = _with_joints(data, read_cells(data, read_columns(ours, COLUMNS), "seen"), table)
+    read = poses_in(data, cells, rotation=rotation)
     return read._replace(notes=(*table.notes, *notes, *read.notes))
 
 
-def _with_joints(data: Path, rows: list[list[str]], table: PoseTable) -> tuple[list[list[str]], list[str]]:
-    """Return a table's cells with the joint angles of each row, blank where it has none or no pose, and notes."""
+def _with_joints(data: Path, read: Cells, table: PoseTable) -> tuple[Cells, list[str]]:
+    """Return a table's cells with the joint angles of each row, without those that have none or no pose, and notes."""
     assert table.q is not None
-    head = [name.strip() for name in rows[0]] if rows else []
+    head, rows = read.head, [(line, row) for line, row in read.rows if any(row)]
     if own := next((name for name in head if re.fullmatch(r"q\d+_(rad|deg)", name)), None):
         raise InputError(f"{data}: line 1: has joint angles of its own ({own}): leave them out, or --joints")
-    there = [k for k, row in enumerate(rows) if k and any(cell.strip() for cell in row)]
+    lines = [line for line, _ in rows]
 
     def cells(name: str) -> list[str]:
-        at = head.index(name)
-        return [rows[k][at].strip() if at < len(rows[k]) else "" for k in there]
+        return [row[head.index(name)] for _, row in rows]
 
     key = next((name for name in NAMES if name in head), None)
-    if table.names is None and len(table.q) != len(there) and table.t_s is not None and "t_s" in head:
-        angles, notes = _at_rest(data, cells("t_s"), there, table)
+    if table.names is None and len(table.q) != len(rows) and table.t_s is not None and "t_s" in head:
+        angles, notes = _at_rest(data, cells("t_s"), lines, table)
     elif table.names is not None and key is None:
         raise InputError(
             f"{data}: line 1: no column {', '.join(NAMES)}, by which {table.path} names its rows; there are "
             f"{', '.join(head)}"
         )
     else:
-        at, among = matched_rows(table, [f"line {k + 1}" for k in there] if key is None else cells(key))
-        angles = {there[i]: table.q[row] for row, i in zip(at, among, strict=True)}
-        alone = len(there) - len(angles)
-        notes = [f"{alone} of {len(there)} poses have no row in {table.path}, and are left out"] if alone else []
+        at, among = matched_rows(table, [f"line {line}" for line in lines] if key is None else cells(key))
+        angles = {lines[i]: table.q[row] for row, i in zip(at, among, strict=True)}
+        alone = len(rows) - len(angles)
+        notes = [f"{alone} of {len(rows)} poses have no row in {table.path}, and are left out"] if alone else []
     missed = (
-        {k for k, status in zip(there, cells("status"), strict=True) if status == "missed"}
+        {line for line, status in zip(lines, cells("status"), strict=True) if status == "missed"}
         if "status" in head
         else set()
     )
     if missed:
-        notes.append(f"{len(missed)} of {len(there)} shots were missed, and are left out")
-    out = [[*rows[0], *(f"q{k}_rad" for k in range(1, table.q.shape[1] + 1))]] if rows else []
-    out += [
-        [*row, *map(repr, angles[k].tolist())] if k in angles and k not in missed else []
-        for k, row in enumerate(rows)
-        if k
+        notes.append(f"{len(missed)} of {len(rows)} shots were missed, and are left out")
+    joined = [
+        (line, [*row, *map(repr, angles[line].tolist())]) for line, row in rows if line in angles and line not in missed
     ]
-    return out, notes
+    return read._replace(head=[*head, *(f"q{k}_rad" for k in range(1, table.q.shape[1] + 1))], rows=joined), notes
 
 
 def _at_rest(data: Path, times: list[str], lines: list[int], table: PoseTable) -> tuple[dict[int, Array], list[str]]:
@@ -159,7 +153,7 @@ def _at_rest(data: Path, times: list[str], lines: list[int], table: PoseTable) -
         try:
             at = float(cell)
         except ValueError:
-            raise InputError(f"{data}: line {line + 1}: t_s is {cell!r}, must be a number, s") from None
+            raise InputError(f"{data}: line {line}: t_s is {cell!r}, must be a number, s") from None
         if not t_s[0] <= at <= t_s[-1]:
             continue
         inside += 1

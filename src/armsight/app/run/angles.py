@@ -18,7 +18,7 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import read_table
 from armsight.robot.arm import Arm
-from armsight.robot.boards.feetech.calibration import degree_columns
+from armsight.tables.columns import degree_columns
 
 #: Angles at the time of a shot are interpolated between rows at most so far apart, s.
 MOST_GAP_S = 0.25

@@ -9,7 +9,3 @@ In: the nominal :class:`~armsight.robot.arm.Arm` and :class:`Measured` poses (``
 from pose to pose, ``validate`` evaluates the result on other poses, ``plan`` chooses the next poses to measure. Equations
 and formats: docs/howto/identify.md.
 """
-
-#: Conventions of three angles: a rotation vector; or rotations about x, y, z in the order given, about fixed axes (lower
-#: case) or about the axes of the rotated frame (capitals).
-ROTATIONS = ("rotvec", "xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")

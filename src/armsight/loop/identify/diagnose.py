@@ -25,13 +25,13 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.rotation import nearest_rotation
 from armsight.loop.handeye.handeye import kronecker
-from armsight.loop.identify import ROTATIONS
 from armsight.loop.identify.fit import SIGMA
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.placement import angle_between, linear_placement, rigid_placement
 from armsight.loop.identify.read import AnglesMeasured, rotations_of
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics import chain
+from armsight.tables.rotations import ROTATIONS
 
 #: Worse than this part of the space that the points span (RMS about their middle), and this many m, is another arm.
 BAD_SHARE, BAD_M = 0.08, 0.015

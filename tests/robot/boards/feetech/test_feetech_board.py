@@ -10,11 +10,12 @@ from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.codes import Alarm, BoardState, Command
 from armsight.robot.boards.feetech.board import FeetechBoard
 from armsight.robot.boards.feetech.bus import ServoBus
-from armsight.robot.boards.feetech.calibration import NAMES, degree_columns, read_calibration, write_offsets
+from armsight.robot.boards.feetech.calibration import NAMES, read_calibration, write_offsets
 from armsight.robot.boards.feetech.registers import RAD_PER_COUNT
 from armsight.sim.boards.device import SteppedLink
 from armsight.sim.boards.so101 import So101Bus, So101Mechanics
 from armsight.sim.boards.wire import NoisyDevice
+from armsight.tables.columns import degree_columns
 
 REST = np.zeros(5)
 

@@ -3,13 +3,12 @@
 In: the JSON that ``lerobot-calibrate`` writes: by joint name ``id``, ``drive_mode``, ``homing_offset``, ``range_min``,
 ``range_max``. Out: :class:`ServoCalibration`. A joint is at 0 in the middle of its range, as LeRobot has it in degrees
 (``motors_bus.py``, ``MotorNormMode.DEGREES``) and the SO-101's URDF; a count is 360/4096 degree, which LeRobot takes as
-360/4095. The gripper is left out: it is no joint of the arm. Also LeRobot's names of columns (:func:`degree_columns`).
+360/4095. The gripper is left out: it is no joint of the arm.
 """
 
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,13 +19,11 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import read_json, write_text
 from armsight.robot.boards.feetech.registers import COUNTS, MIDDLE, MOST_OFFSET, RAD_PER_COUNT
+from armsight.tables.columns import LEROBOT
 
 #: The joints of an SO-100 or SO-101 from the base on; ids 1 to 5.
-NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+NAMES = LEROBOT
 GRIPPER, GRIPPER_ID = "gripper", 6
-#: What LeRobot's names of positions end with; as percent they reach this; and what is a number.
-_POSITION, _MOST_PERCENT = ".pos", 100.001
-_NUMBER = re.compile(r"[+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?")
 _FIELDS = {"id": (0, 253), "drive_mode": (0, 0), "homing_offset": (-MOST_OFFSET, MOST_OFFSET)}
 _FIELDS |= {"range_min": (0, COUNTS - 1), "range_max": (0, COUNTS - 1)}
 
@@ -58,39 +55,6 @@ class ServoCalibration(Record):
     def counts(self, q: Array) -> Array:
         """Return counts (..., n), whole ones, of joint angles, rad."""
         return np.round(np.asarray(q, float) / RAD_PER_COUNT + self.middle)
-
-
-def degree_columns(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
-    """Return a table with ``q1_deg ..`` for LeRobot's names of an SO-100's or SO-101's joints, ``shoulder_pan.pos`` ...
-
-    LeRobot records degrees or, with ``use_degrees`` off, percent of each joint's range, -100 to 100; its data do not say
-    which. Beyond 100 they are degrees.
-
-    Args:
-        path: the table's file, for errors.
-        rows: its cells, names first.
-
-    Raises:
-        InputError: other joints than these, or no value beyond 100: both are possible.
-    """
-    head = [cell.strip() for cell in rows[0]] if rows else []
-    theirs = [name for name in head if name.endswith(_POSITION) and name != GRIPPER + _POSITION]
-    if not {f"{name}{_POSITION}" for name in NAMES} & set(theirs) or {"q1_deg", "q1_rad"} & set(head):
-        return rows
-    known = [name + _POSITION for name in NAMES]
-    if sorted(theirs) != sorted(known):
-        raise InputError(
-            f"{path}: line 1: LeRobot's columns {', '.join(theirs)}; read are those of one SO-100 or SO-101, "
-            f"{', '.join(known)}; name the columns q1_deg .. in the order of your arm's joints"
-        )
-    at = {head.index(name): k for k, name in enumerate(known, 1)}
-    cells = (row[column] for row in rows[1:] for column in at if column < len(row))
-    if not any(_NUMBER.fullmatch(cell.strip()) and abs(float(cell)) > _MOST_PERCENT for cell in cells):
-        raise InputError(
-            f"{path}: {known[0]} .. {known[-1]}: degrees, or percent of each joint's range? LeRobot's data do not say, and "
-            "no value is beyond 100; where use_degrees was on, name the columns q1_deg .. q5_deg, else record with it on"
-        )
-    return [[f"q{at[k]}_deg" if k in at else name for k, name in enumerate(head)], *rows[1:]]
 
 
 def uncalibrated(lowest: Array, highest: Array) -> ServoCalibration:

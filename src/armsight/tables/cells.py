@@ -1,0 +1,346 @@
+"""Text files as rows of cells: tables with any separator, lists, programs of robots, YAML and JSON.
+
+In: a file. Out: :class:`Cells`, names of columns and rows of text, whichever form the file has. What the columns mean is
+``columns.py``'s.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from armsight.errors import InputError
+from armsight.files import DECIMAL_COMMA, TABLE_MB, read_table, read_text
+from armsight.tables.documents import document_rows, is_document
+from armsight.tables.programs import program_rows
+
+Rows = list[tuple[int, list[str]]]
+#: A number, as any program writes it: Fortran's 1D-3 and the minus of a typesetter among them.
+_NUMBER = re.compile(r"[+\-\u2212]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][+\-\u2212]?\d+)?")
+_NO_FINITE = re.compile(r"[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
+#: A number with its unit.
+_WITH_UNIT = re.compile(rf"({_NUMBER.pattern}|{DECIMAL_COMMA.pattern})\s*(mm|m|deg|\N{{DEGREE SIGN}}|rad|s)")
+#: A list alone in its line.
+_LIST = re.compile(r"\[([^\[\]{}\"]*)\],?")
+#: The line that stands beneath the names in Markdown or psql, and psql's last line.
+_RULE = re.compile(r"[\s|+:-]*-[\s|+:-]*|\(\d+ rows?\)")
+_MATRIX = [name for i in "123" for name in (f"r{i}1", f"r{i}2", f"r{i}3", "xyz"[int(i) - 1])]
+_QUATERNION = ["n1", "n2", "n3", "n4"]
+#: Names for columns that have none, by how many they are.
+_FORMS = {
+    16: [*_MATRIX, "_0", "_1", "_2", "_3"],
+    12: _MATRIX,
+    8: ["t_s", *"xyz", *_QUATERNION],
+    7: [*"xyz", *_QUATERNION],
+    6: [*"xyz", "n1", "n2", "n3"],
+}
+
+
+class Cells(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+        head: the names of its columns; n1.. of a rotation and _0.. of a last row where the file has no names.
+        rows: the line, or the number of the record, and the cells of each row.
+        rotation: the convention of its rotations, where the program that wrote it has one.
+        notes: what it was read as.
+        listed: whether its rows are lists of numbers without names, which may be joints as well.
+    """
+
+    head: list[str]
+    rows: Rows
+    rotation: str | None = None
+    notes: tuple[str, ...] = ()
+    listed: bool = False
+
+
+def number(text: str) -> float | None:
+    """Return a number; NaN and infinities too; None where it is none."""
+    text = text.strip()
+    if _NUMBER.fullmatch(text):
+        return float(re.sub("[dD]", "e", text.replace("\u2212", "-")))
+    return float(text) if _NO_FINITE.fullmatch(text) else None
+
+
+def read_columns(text: str | None, known: Collection[str]) -> Mapping[str, str] | list[str]:
+    """Read the option ``--columns``: NAME=THEIRS,... or the names of all columns in order, _ for one that is not used.
+
+    Args:
+        text: its value; None where it is not given.
+        known: the names that the command looks for.
+
+    Returns:
+        Name that the command looks for -> name in the file; or the names in order.
+
+    Raises:
+        InputError: no such form, an unknown name, or one given twice.
+    """
+    columns: dict[str, str] = {}
+    parts = [] if text is None else [part.strip() for part in text.split(",")]
+    in_order = len(parts) > 1 and not any("=" in part for part in parts)
+    for part in parts:
+        name, equals, theirs = (piece.strip() for piece in part.partition("="))
+        if in_order:
+            name, theirs = part, f"{len(columns)}"
+        elif not (name and equals and theirs):
+            raise InputError(
+                f"--columns {text}: expected NAME=COLUMN,..., such as x_m=X,y_m=Y, or the names of all columns in order, "
+                f"such as rx,ry,rz,x,y,z; got {part!r}"
+            )
+        if name == "_" and in_order:
+            name = f"_{len(columns)}"
+        elif name not in known:
+            raise InputError(f"--columns {text}: unknown name {name!r}; known are {', '.join(known)}")
+        if name in columns or theirs in columns.values():
+            raise InputError(f"--columns {text}: {part} repeats a name")
+        columns[name] = theirs
+    return ["" if name.startswith("_") else name for name in columns] if in_order else columns
+
+
+def read_cells(path: Path, columns: Mapping[str, str] | Sequence[str] = (), side: str = "robot") -> Cells:
+    """Read a file.
+
+    Args:
+        path: the file, or a glob of files of one pose each.
+        columns: names for the file's own, or for its columns in their order, as :func:`read_columns` returns them.
+        side: "robot" or "seen": whose poses are read where a file holds both.
+
+    Raises:
+        InputError: no such form; the message says what was found and what would do.
+    """
+    renamed = dict(columns) if isinstance(columns, Mapping) else {}
+    whose = renamed.pop("pose", None)
+    if any(mark in path.name for mark in "*?") and not path.exists():
+        cells = _of_files(path, side, whose)
+    else:
+        cells = _of_file(path, side, whose)
+    if renamed:
+        cells = cells._replace(head=_renamed(path, cells.head, renamed))
+    elif columns and not isinstance(columns, Mapping):
+        cells = _in_order(path, cells, list(columns))
+    if all(name.startswith("_") for name in cells.head):
+        raise InputError(
+            f"{path}: line {cells.rows[0][0]}: {len(cells.head)} numbers without names; known are 16 or 12 (a matrix), 8 "
+            "(time, position, quaternion), 7 (position, quaternion), 6 (position, three numbers of a rotation); or name "
+            "columns, --columns x_mm,y_mm,.."
+        )
+    return _without_units(path, cells)
+
+
+def _of_files(path: Path, side: str, whose: str | None) -> Cells:
+    """Return the poses of files of one pose each, in the order of the numbers in their names, which name them."""
+
+    def natural(file: Path) -> list[tuple[int, str]]:
+        return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", file.name)]
+
+    files = sorted(path.parent.glob(path.name), key=natural)
+    if not files:
+        raise InputError(f"{path}: no such file; quote a glob such as 'poses/pose_*.yaml'")
+    each = [_of_file(file, side, whose) for file in files]
+    for file, cells in zip(files, each, strict=True):
+        if len(cells.rows) != 1 or cells.head != each[0].head:
+            raise InputError(
+                f"{file}: holds {len(cells.rows)} rows of {', '.join(cells.head)}; expected one pose of "
+                f"{', '.join(each[0].head)}, as {files[0].name}"
+            )
+    if "name" in each[0].head:
+        return each[0]._replace(rows=[(k, cells.rows[0][1]) for k, cells in enumerate(each, 1)])
+    rows = [(k, [file.stem, *cells.rows[0][1]]) for k, (file, cells) in enumerate(zip(files, each, strict=True), 1)]
+    return each[0]._replace(head=["name", *each[0].head], rows=rows)
+
+
+def _of_file(path: Path, side: str, whose: str | None) -> Cells:
+    """Return what one file holds, its names as they stand there."""
+    if path.suffix.lower() in (".npy", ".npz", ".mat", ".xml", ".gz"):
+        return _of_records(path, None, side, whose)
+    text = read_text(path, TABLE_MB).removeprefix("\ufeff")
+    if points := program_rows(path, text):
+        return Cells(points.head, _even(path, points.rows, len(points.head)), points.rotation, points.notes)
+    written = [(line, row.strip()) for line, row in enumerate(text.splitlines(), 1)]
+    written = [(line, row) for line, row in written if row and not row.startswith("#")]
+    if written and _LIST.fullmatch(written[0][1]):
+        cells = _without_names(path, _lists(path, written))
+        return cells._replace(listed=True)
+    if is_document(path, text):
+        return _of_records(path, text, side, whose)
+    if written and re.match(r"[{<]|.*(?::=|=|[\[{]$)", written[0][1]):
+        raise InputError(
+            f"{path}: {written[0][1][:40]!r} begins no table: write one pose a line, a matrix of 16 numbers or columns "
+            "such as x_mm,y_mm,z_mm,qw,qx,qy,qz"
+        )
+    return _delimited(path, text, written)
+
+
+def _of_records(path: Path, text: str | None, side: str, whose: str | None) -> Cells:
+    """Return what a document holds."""
+    head, records = document_rows(path, text, side, whose)
+    rows = [(k, [record.get(name, "") for name in head]) for k, record in enumerate(records, 1)]
+    return Cells(head, rows)
+
+
+def _delimited(path: Path, text: str, written: list[tuple[int, str]]) -> Cells:
+    """Return the cells of a table, whatever separates them."""
+    first = written[0][1] if written else ""
+    if "|" in first:
+        lines = ["" if _RULE.fullmatch(line.strip()) else line.strip().strip("|") for line in text.splitlines()]
+        cells = [[] if not line else line.split("|") for line in lines]
+    elif _has_decimal_commas(first.split()):
+        cells = [line.replace(",", ".").split() for line in text.splitlines()]
+    elif any(mark in first for mark in ",;\t"):
+        cells = read_table(path)
+    else:
+        cells = [line.split() for line in text.splitlines()]
+    rows = [(line, [cell.strip() for cell in row]) for line, row in enumerate(cells, 1)]
+    rows = [(line, row) for line, row in rows if any(row) and not row[0].startswith("#")]
+    count = len(rows[0][1]) - (rows[0][1][-1] == "") if rows else 0
+    rows = [(line, row[:-1] if len(row) == count + 1 and row[-1] == "" else row) for line, row in rows]
+    if not rows:
+        raise InputError(f"{path}: no rows; one line a pose is needed")
+    head = rows[0][1]
+    if number(head[0]) is None or any(re.fullmatch(r"[A-Za-z_]\w*", cell) and number(cell) is None for cell in head):
+        twice = next((name for name in head if name and head.count(name) > 1), None)
+        if twice is not None:
+            raise InputError(f"{path}: line {rows[0][0]} names a column twice: {twice}")
+        return Cells(head, _even(path, rows[1:], len(head)))
+    return _without_names(path, rows)
+
+
+def _even(path: Path, rows: Rows, count: int) -> Rows:
+    """Return the rows if all have as many fields as there are columns."""
+    for line, row in rows:
+        if len(row) != count:
+            commas = (
+                "are there decimal commas between commas? separate by semicolons, or " if len(row) == 2 * count else ""
+            )
+            raise InputError(
+                f"{path}: line {line}: {len(row)} fields where {count} are expected; {commas}correct or remove the line"
+            )
+    if not rows:
+        raise InputError(f"{path}: no rows; one line a pose is needed")
+    return rows
+
+
+def _lists(path: Path, written: list[tuple[int, str]]) -> Rows:
+    """Return the numbers of lists, one a line."""
+    rows = []
+    for line, row in written:
+        found = _LIST.fullmatch(row)
+        if found is None:
+            raise InputError(f"{path}: line {line}: expected a list [..] as before, found {row[:40]!r}")
+        rows.append((line, re.split(r"\s*[,;]\s*|\s+", found[1].strip())))
+    return rows
+
+
+def _without_names(path: Path, rows: Rows) -> Cells:
+    """Return columns that have no names, named by how many they are."""
+    if len(rows[0][1]) == 4:
+        rows = _matrices(path, _even(path, rows, 4))
+    count = len(rows[0][1])
+    head = _FORMS.get(count) or [f"_{k}" for k in range(count)]
+    rows = _even(path, rows, count)
+    if count == 16:
+        return _row_major(path, Cells(head, rows))
+    return Cells(head, rows)
+
+
+def _row_major(path: Path, cells: Cells) -> Cells:
+    """Return matrices of 16 numbers row by row; those of Franka's O_T_EE, Eigen's and MATLAB's are column by column."""
+    values = [[number(cell) for cell in row] for _, row in cells.rows]
+    lasts = [[[row[k] for k in at] for row in values] for at in ((12, 13, 14, 15), (3, 7, 11, 15))]
+    rowwise, columnwise = (
+        all(None not in last and np.allclose(np.array(last, float), [0, 0, 0, 1], atol=1e-6) for last in side)
+        for side in lasts
+    )
+    if not rowwise and columnwise:
+        order = np.arange(16).reshape(4, 4).T.ravel()
+        note = f"{path}: its matrices are column by column (0 0 0 1 is the last of every four numbers), and read so"
+        return cells._replace(rows=[(line, [row[k] for k in order]) for line, row in cells.rows], notes=(note,))
+    bad = next(
+        (
+            k
+            for k, last in enumerate(lasts[0])
+            if None not in last and not np.allclose(np.array(last, float), [0, 0, 0, 1], atol=1e-6)
+        ),
+        None,
+    )
+    if bad is not None:
+        line, row = cells.rows[bad]
+        raise InputError(
+            f"{path}: line {line}: 16 numbers are a matrix row by row, which ends with 0 0 0 1, not "
+            f"{' '.join(row[12:])[:40]}; or name the columns, --columns"
+        )
+    return cells
+
+
+def _matrices(path: Path, rows: Rows) -> Rows:
+    """Return matrices of four lines each, or of three without the last one, as a row each."""
+
+    def is_last(row: list[str]) -> bool:
+        numbers = [number(cell) for cell in row]
+        return None not in numbers and np.allclose(np.array(numbers, float), [0, 0, 0, 1], atol=1e-6)
+
+    count = 4 if any(is_last(row) for _, row in rows) else 3  # three of [R p], whose rows have length 1, never end so
+    for line, row in rows[3::4] if count == 4 else ():
+        if not is_last(row):
+            raise InputError(
+                f"{path}: line {line}: expected 0 0 0 1, the last of a matrix's four lines, found {' '.join(row)[:40]!r}"
+            )
+    if len(rows) % count:
+        raise InputError(
+            f"{path}: line {rows[-1][0]}: ends within a matrix: four numbers a line are matrices of four lines each, the "
+            "last 0 0 0 1, or of three without it"
+        )
+    return [(rows[k][0], [cell for _, row in rows[k : k + count] for cell in row]) for k in range(0, len(rows), count)]
+
+
+def _has_decimal_commas(cells: list[str]) -> bool:
+    """Return whether cells that blanks separate are numbers with decimal commas; whole ones have none, points are none."""
+    commas = [bool(DECIMAL_COMMA.fullmatch(cell)) for cell in cells]
+    whole = [number(cell) is not None and "." not in cell for cell in cells]
+    return len(cells) > 1 and any(commas) and all(a or b for a, b in zip(commas, whole, strict=True))
+
+
+def _renamed(path: Path, head: list[str], columns: Mapping[str, str]) -> list[str]:
+    """Return the names that the caller looks for in place of the file's own."""
+    for name, theirs in columns.items():
+        if theirs not in head:
+            raise InputError(f"{path}: line 1: no column {theirs!r} for {name}; there are {', '.join(head)}")
+    given = {theirs: name for name, theirs in columns.items()}
+    return [given.get(name, f"({name})" if name in columns else name) for name in head]
+
+
+def _in_order(path: Path, cells: Cells, names: list[str]) -> Cells:
+    """Return the cells under names given in order, in place of the file's own."""
+    if len(names) != len(cells.head):
+        raise InputError(
+            f"{path}: line {cells.rows[0][0]}: has {len(cells.head)} columns, --columns names {len(names)}: name "
+            "each, _ for one that is not used"
+        )
+    return cells._replace(head=names, rotation=None, notes=(), listed=False)
+
+
+def _without_units(path: Path, cells: Cells) -> Cells:
+    """Return numbers without the units that stand behind them, 12.5 mm, and the units in the columns' names."""
+    head, columns = list(cells.head), list(zip(*(row for _, row in cells.rows), strict=True))
+    for k, column in enumerate(columns):
+        found = [_WITH_UNIT.fullmatch(cell) for cell in column]
+        if not any(found):
+            continue
+        units = {one[2].replace("\N{DEGREE SIGN}", "deg") if one else "" for one in found}
+        if len(units) > 1:
+            raise InputError(
+                f"{path}: column {head[k] or k + 1} has numbers in several units ({', '.join(sorted(units)) or 'none'}): "
+                "write one"
+            )
+        unit = units.pop()
+        columns[k] = tuple(one[1].replace(",", ".") for one in found if one)
+        bare = re.sub(r"\s*[\[(]\w+[\])]$", "", head[k])
+        head[k] = (
+            head[k] if bare.endswith(f"_{unit}") else {"n1": "rx", "n2": "ry", "n3": "rz"}.get(bare, bare) + f"_{unit}"
+        )
+    rows = [(line, list(row)) for (line, _), row in zip(cells.rows, zip(*columns, strict=True), strict=True)]
+    return cells._replace(head=head, rows=rows) if columns else cells

@@ -1,0 +1,320 @@
+"""What the columns of a table are: our names for those of ROS, of robots' makers, of LeRobot and of spreadsheets.
+
+In: names of a file, and the option ``--columns``. Out: names such as x_mm, qw, rx_deg, r11, q1_rad, t_s, name; and
+:class:`Columns`, which gives numbers by these names.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.geometry.rotation import nearest_rotation
+from armsight.tables.cells import Rows, number
+from armsight.tables.rotations import QUATERNION_OFF, rotations_by
+
+#: Columns whose cells name the rows.
+NAMES = ("image", "name", "shot")
+#: Joints that an arm may have.
+MOST_JOINTS = 7
+#: Names that ``--columns`` may give the file's own for.
+COLUMNS = (
+    *(f"{axis}{unit}" for axis in "xyz" for unit in ("", "_m", "_mm")),
+    *("qw", "qx", "qy", "qz"),
+    *(f"r{axis}{unit}" for axis in "xyz" for unit in ("", "_deg", "_rad")),
+    *(f"r{i}{j}" for i in "123" for j in "123"),
+    *(f"q{i}_{unit}" for i in range(1, MOST_JOINTS + 1) for unit in ("rad", "deg")),
+    *("t_s", *NAMES),
+)
+#: No joint rotates further, rad; larger numbers of radians are degrees.
+MOST_RAD = 4 * np.pi
+#: How far a matrix may be from a rotation: what six digits leave.
+LOOSE = 2e-3
+#: LeRobot's names of an SO-100's or SO-101's joints, from the base on; its position columns end so; percent reach this.
+LEROBOT = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+_LEROBOT_POSITION, _LEROBOT_GRIPPER, _MOST_PERCENT = ".pos", "gripper", 100.001
+#: ROS's messages as columns, in metres (REP 103): pose.position.x, field.pose.orientation.w, transform.translation.x ...
+_ROS = re.compile(r"(?:.*[./_])?(?:(position|translation)|orientation|rotation)[._]([xyzw])")
+#: Names of others for ours, in small letters; roll, pitch and yaw rotate about the fixed x, y and z.
+_THEIRS = {"tx": "x", "ty": "y", "tz": "z", "roll": "rx", "pitch": "ry", "yaw": "rz"}
+#: Angles of robots' makers: the columns beside X, Y and Z, mm, whose rotations about fixed x, y and z they are, degrees.
+_MAKERS = {"KUKA": ("c", "b", "a"), "Fanuc": ("w", "p", "r")}
+#: A column of theirs, in small letters.
+_OF_A_MAKER = re.compile(r"(?:([xyz])(?:_(m|mm))?|([abcwpr])(?:_(deg|rad))?)")
+#: A joint without a unit.
+_UNITLESS = re.compile(r"(?:q|j|joint)_?([1-7])")
+_JOINT = re.compile(r"q(\d+)_(rad|deg)")
+
+
+def understood(
+    path: Path, head: list[str], joint_names: Sequence[str], unit: str | None, rotation: str | None
+) -> tuple[list[str], str | None, tuple[str, ...]]:
+    """Return our names for those of ROS, of robots' makers and of spreadsheets.
+
+    Args:
+        path: the file.
+        head: its names.
+        joint_names: of the arm whose joints it may name.
+        unit: of lengths whose columns name none; None: ROS's, m, and the makers', mm.
+        rotation: its convention where it is given.
+
+    Returns:
+        The names; the convention, the usual one where none is given, None where there is none either; and a note where
+        something was taken for granted.
+    """
+    bare = [name.strip().strip('"').strip().lower().replace("°", "deg") for name in head]
+    bare = [re.sub(r"\s*[\[(](mm|m|deg|rad|s)[\])]$", r"_\1", name) for name in bare]
+    ros = [_ROS.fullmatch(name) for name in bare]
+    parts = {found[2] for found in ros if found and not found[1]}  # without w they are no quaternion
+    links = {name.lower(): f"q{k}_rad" for k, name in enumerate(joint_names, 1)}
+    out = []
+    for given, name, found in zip(head, bare, ros, strict=True):
+        axis, mark, rest = name.partition("_")
+        ours = _THEIRS.get(axis, axis) + mark + rest
+        if found and (found[1] or parts == set("xyzw")):
+            ours = f"{found[2]}_{unit or 'm'}" if found[1] else f"q{found[2]}"
+        elif (joint := re.sub(r"_joint$", "", name)) in links:
+            ours = links[joint]
+        out.append(ours if ours in COLUMNS else given.strip().strip('"').strip())
+    theirs, said = _of_a_maker(bare, out, unit or "mm")
+    out = [theirs.get(k, name) for k, name in enumerate(out)]
+    if len(set(out)) < len(out):
+        return head, rotation, ()
+    if theirs:
+        return out, rotation or "xyz", (f"{path}: {said}; --columns says otherwise",)
+    if rotation is None and any(name.startswith("roll") for name in bare):
+        note = f"{path}: roll, pitch, yaw read as rotations about the fixed x, y and z; --rotation says otherwise"
+        return out, "xyz", (note,)
+    return out, rotation, ()
+
+
+def is_unitless(name: str) -> bool:
+    """Return whether a column is of a joint whose unit is not said."""
+    return bool(_UNITLESS.fullmatch(name.lower()))
+
+
+def _of_a_maker(bare: list[str], ours: list[str], unit: str) -> tuple[dict[int, str], str]:
+    """Return our names for the six columns of KUKA or Fanuc, by their positions, and what they are read as.
+
+    Other columns may stand beside them, but for another rotation: which one counts would be a guess.
+    """
+    found = {
+        one[1] or one[3]: (k, one[2] or one[4]) for k, name in enumerate(bare) if (one := _OF_A_MAKER.fullmatch(name))
+    }
+    makers = [maker for maker, angles in _MAKERS.items() if {*"xyz", *angles} <= set(found)]
+    if len(makers) != 1 or {"qw", "r11", "rx", "rx_deg", "rx_rad"} & set(ours):
+        return {}, ""
+    angles = _MAKERS[makers[0]]
+    lengths, angle_unit = found["x"][1] or unit, found[angles[0]][1] or "deg"
+    names = {found[axis][0]: f"{axis}_{found[axis][1] or unit}" for axis in "xyz"}
+    names |= {found[name][0]: f"r{axis}_{found[name][1] or 'deg'}" for name, axis in zip(angles, "xyz", strict=True)}
+    about = ", ".join(f"{name.upper()} about {axis}" for name, axis in zip(angles, "xyz", strict=True))
+    degrees = "degrees" if angle_unit == "deg" else "radians"
+    return names, f"read as {makers[0]}'s: {lengths}; {degrees}, {about}"
+
+
+def degree_columns(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
+    """Return a table with ``q1_deg ..`` for LeRobot's names of an SO-100's or SO-101's joints, ``shoulder_pan.pos`` ...
+
+    LeRobot records degrees or, with ``use_degrees`` off, percent of each joint's range, -100 to 100; its data do not say
+    which. Beyond 100 they are degrees.
+
+    Args:
+        path: the table's file, for errors.
+        rows: its cells, names first.
+
+    Raises:
+        InputError: other joints than these, or no value beyond 100: both are possible.
+    """
+    head = [cell.strip() for cell in rows[0]] if rows else []
+    theirs = [
+        name for name in head if name.endswith(_LEROBOT_POSITION) and name != _LEROBOT_GRIPPER + _LEROBOT_POSITION
+    ]
+    if not {f"{name}{_LEROBOT_POSITION}" for name in LEROBOT} & set(theirs) or {"q1_deg", "q1_rad"} & set(head):
+        return rows
+    known = [name + _LEROBOT_POSITION for name in LEROBOT]
+    if sorted(theirs) != sorted(known):
+        raise InputError(
+            f"{path}: line 1: LeRobot's columns {', '.join(theirs)}; read are those of one SO-100 or SO-101, "
+            f"{', '.join(known)}; name the columns q1_deg .. in the order of your arm's joints"
+        )
+    at = {head.index(name): k for k, name in enumerate(known, 1)}
+    cells = (number(row[column]) for row in rows[1:] for column in at if column < len(row))
+    if not any(cell is not None and _MOST_PERCENT < abs(cell) < np.inf for cell in cells):
+        raise InputError(
+            f"{path}: {known[0]} .. {known[-1]}: degrees, or percent of each joint's range? LeRobot's data do not say, and "
+            "no value is beyond 100; where use_degrees was on, name the columns q1_deg .. q5_deg, else record with it on"
+        )
+    return [[f"q{at[k]}_deg" if k in at else name for k, name in enumerate(head)], *rows[1:]]
+
+
+class Columns:
+    """Columns of a table by their names."""
+
+    def __init__(self, path: Path, head: list[str], rows: Rows, links: Sequence[str] = ()) -> None:
+        self.path, self.at, self.rows = path, {name: k for k, name in enumerate(head) if name}, rows
+        self.used: set[str] = set()
+        self._links = links
+
+    def has_position(self) -> bool:
+        """Return whether there are positions."""
+        return any(name in self.at for name in ("x", "x_m", "x_mm"))
+
+    def numbers(self, names: Sequence[str], *, gaps: bool = False) -> Array:
+        """Return columns (N, K); with gaps NaN where a cell is empty or not finite."""
+        for name in names:
+            if name not in self.at:
+                raise InputError(f"{self.path}: line 1: column {name} is missing; there are {', '.join(self.at)}")
+        self.used.update(names)
+        out = np.full((len(self.rows), len(names)), np.nan)
+        for i, (line, row) in enumerate(self.rows):
+            for k, name in enumerate(names):
+                cell = row[self.at[name]] if self.at[name] < len(row) else ""
+                value = number(cell) if cell or not gaps else np.nan
+                if value is None or not (gaps or np.isfinite(value)):
+                    raise InputError(
+                        f"{self.path}: line {line}: {name} is {cell[:40]!r}, not a number; correct or remove the line"
+                    )
+                out[i, k] = value if np.isfinite(value) else np.nan
+        return out
+
+    def joint_names(self, joint_count: int | None = None, arm: str = "") -> list[str]:
+        """Return the names of the columns of joint angles, from the first joint on; [] where there are none.
+
+        Args:
+            joint_count: how many joints there are to be; None: as many as there are columns.
+            arm: whose they are, for messages.
+
+        Raises:
+            InputError: another number of joints, or not numbered from 1 on in one unit.
+        """
+        there = [name for name in self.at if _JOINT.fullmatch(name)]
+        names = sorted(there, key=lambda name: (int(name[1:-4]), name))
+        if joint_count is not None and names and len(names) != joint_count:
+            raise InputError(
+                f"{self.path}: line 1: {len(names)} joints ({names[0]}..{names[-1]}); {arm} has {joint_count}"
+                + self._near(names, joint_count)
+            )
+        for k, name in enumerate(names, 1):
+            if name != f"q{k}_{names[0][-3:]}":
+                raise InputError(
+                    f"{self.path}: line 1: has {name} where q{k}_{names[0][-3:]} is expected: joints are numbered from 1 "
+                    "on, each once, all in degrees or all in radians"
+                )
+        return names
+
+    def _near(self, names: list[str], count: int) -> str:
+        """Return what may be wrong with the columns of joints."""
+        if len(names) == count + 1:
+            return "; is the last one a gripper? remove its column"
+        gone = next((f"q{k}" for k in range(1, count) if not any(name.startswith(f"q{k}_") for name in names)), None)
+        unknown = next((name for name in self.at if name and name not in COLUMNS), None)
+        if unknown is None:
+            return "" if gone is None else f"; column {gone}{names[0][2:]} is missing"
+        known = [*self._links, *(f"{name}_joint" for name in self._links), *COLUMNS]
+        near = get_close_matches(unknown, known, 1)
+        return f"; column {unknown!r} is not known" + (f": is it {near[0]}?" if near else "")
+
+    def joints(self, names: Sequence[str], *, gaps: bool = False) -> Array:
+        """Return joint angles (N, J), rad."""
+        q = self.numbers(names, gaps=gaps)
+        if names[0].endswith("_rad") and np.nanmax(np.abs(q), initial=0.0) > MOST_RAD:
+            row, joint = np.unravel_index(int(np.nanargmax(np.abs(q))), q.shape)
+            raise InputError(
+                f"{self.path}: line {self.rows[row][0]}: q{joint + 1}_rad is {q[row, joint]:g}: are these degrees? name "
+                "the columns q1_deg .."
+            )
+        return np.radians(q) if names[0].endswith("_deg") else q
+
+    def times(self) -> Array | None:
+        """Return the times (N,), s."""
+        known = "t_s" in self.at and any(row[self.at["t_s"]] for _, row in self.rows)
+        return self.numbers(["t_s"])[:, 0] if known else None
+
+    def names(self) -> tuple[str, ...] | None:
+        """Return the names of the rows, or of their images."""
+        key = next((key for key in NAMES if key in self.at), None)
+        if key is None:
+            return None
+        self.used.add(key)
+        found = tuple(row[self.at[key]] for _, row in self.rows)
+        twice = next((name for name in found if found.count(name) > 1), None)
+        if twice is not None:
+            raise InputError(f"{self.path}: {key} {twice!r} names two rows; a row belongs to one image")
+        return found
+
+    def rotations(self, rotation: str | None) -> tuple[Array, Array, str, Array]:
+        """Return the rotations (N, 3, 3), the numbers they come from, degrees, their convention, and them as written."""
+        if "r11" in self.at:
+            R = self.numbers([f"r{i}{j}" for i in "123" for j in "123"]).reshape(-1, 3, 3)
+            return self._checked(R), np.zeros((len(R), 0)), "", np.zeros((len(R), 0))
+        if "qw" in self.at:
+            written = self.numbers(["qw", "qx", "qy", "qz"])
+            found, convention = written, "wxyz"
+        elif "n4" in self.at:
+            if rotation not in ("wxyz", "xyzw"):
+                raise InputError(
+                    f"{self.path}: which of the four numbers of a quaternion is w? give --rotation wxyz or --rotation xyzw"
+                )
+            written = self.numbers(["n1", "n2", "n3", "n4"])
+            self._require_in_order(written)
+            found, convention = written, rotation
+        else:
+            found, convention, written = self._angles(rotation)
+        return self._checked(rotations_by(found, convention, self.path)), found, convention, written
+
+    def _require_in_order(self, quaternions: Array) -> None:
+        """Raise an InputError where the four numbers of a quaternion stand before the position: their length is 1 there."""
+        first = self.numbers([*"xyz", "n1"])
+        off, other = (float(np.abs(np.linalg.norm(four, axis=1) - 1).max()) for four in (quaternions, first))
+        if off > QUATERNION_OFF > other:
+            raise InputError(
+                f"{self.path}: the last four numbers are no quaternions, the first four are: the rotation comes before the "
+                "position: name the columns in their order, --columns qx,qy,qz,qw,x,y,z or qw,qx,qy,qz,x,y,z"
+            )
+
+    def _angles(self, rotation: str | None) -> tuple[Array, str, Array]:
+        """Return three numbers of a rotation (N, 3), degrees, their convention, and them as written."""
+        unit = next((u for u in ("_rad", "_deg", "") if f"rx{u}" in self.at), None)
+        names = ["n1", "n2", "n3"] if "n1" in self.at else [f"r{axis}{unit}" for axis in "xyz"]
+        if unit is None and "n1" not in self.at:
+            raise InputError(
+                f"{self.path}: line 1: no rotation: qw qx qy qz, rx_deg ry_deg rz_deg, or r11 .. r33 are needed; there are "
+                f"{', '.join(list(self.at)[:10])}"
+            )
+        found = self.numbers(names)
+        convention = rotation or ("rotvec" if unit == "_rad" else None)
+        if convention is None or convention in ("wxyz", "xyzw"):
+            raise InputError(
+                f"{self.path}: what do the three numbers of a rotation mean? give --rotation rotvec, or the order of the "
+                "angles: xyz (about fixed axes), XYZ (about the rotated axes), zyx ..."
+            )
+        if unit == "_rad" and np.abs(found).max() > MOST_RAD:
+            row, column = np.unravel_index(int(np.abs(found).argmax()), found.shape)
+            raise InputError(
+                f"{self.path}: line {self.rows[row][0]}: {names[column]} is {found[row, column]:g}: are these degrees? "
+                "name the columns rx_deg ry_deg rz_deg"
+            )
+        radians = unit == "_rad" or (unit != "_deg" and bool((np.abs(found) <= 2 * np.pi + 1e-3).all()))
+        return (np.degrees(found) if radians else found), convention, found
+
+    def _checked(self, R: Array) -> Array:
+        """Return rotations, cleaned of rounding."""
+        for (line, _), one in zip(self.rows, R, strict=True):
+            off, determinant = float(np.abs(one @ one.T - np.eye(3)).max()), float(np.linalg.det(one))
+            if off < LOOSE and determinant < 0:
+                raise InputError(
+                    f"{self.path}: line {line}: the 3x3 part is left-handed (determinant -1): an axis is mirrored; robot "
+                    "and camera poses are right-handed: exchange no axes without a sign"
+                )
+            if off >= LOOSE:
+                raise InputError(
+                    f"{self.path}: line {line}: the 3x3 part is no rotation (R R^T differs from 1 by {off:.2g})"
+                )
+        return np.asarray([nearest_rotation(one) for one in R])

@@ -1,0 +1,358 @@
+"""Poses in YAML, JSON, numpy's files and ROS's printed messages, as programs of hand-eye calibration save them.
+
+In: a file. Out: names of columns and rows. Whatever the nesting, a pose is recognised by its form: a matrix of 4x4 or 3x4,
+16, 12, 7 or 6 numbers, a position beside a rotation, or numbers that are named x, y, z. Around it: a list of poses, a
+mapping of named ones, lists in parallel (rvecs, tvecs), documents of ``rostopic echo`` with their stamps. Where a record
+holds poses of both sides (easy_handeye's robot and tracking, moveit_calibration's effector_wrt_world and
+object_wrt_sensor), the names say which is which.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from armsight.errors import InputError
+from armsight.files import YAML_MB, read_text
+from armsight.tables.document import read_document
+from armsight.tables.yaml_file import parse_yaml
+
+Record: TypeAlias = dict[str, str]
+#: Words in the names of poses that say whose they are.
+SIDES = {
+    "robot": ("robot", "hand", "gripper", "effector", "eef", "flange", "tcp", "arm", "wrist", "o_t_ee", "end"),
+    "seen": (
+        "track",
+        "target",
+        "marker",
+        "object",
+        "board",
+        "optical",
+        "sensor",
+        "camera",
+        "cam",
+        "tag",
+        "pattern",
+        "calib",
+    ),
+}
+_MATRIX = [name for i in "123" for name in (f"r{i}1", f"r{i}2", f"r{i}3", "xyz"[int(i) - 1])]
+_BY_COUNT = {
+    16: [*_MATRIX, "_0", "_1", "_2", "_3"],
+    12: _MATRIX,
+    7: [*"xyz", "n1", "n2", "n3", "n4"],
+    6: [*"xyz", "n1", "n2", "n3"],
+}
+_ROTATION = [f"r{i}{j}" for i in "123" for j in "123"]
+#: Names of a position, and of a rotation, alone or before or behind whose they are.
+_POSITION = r"translations?|positions?|tvecs?|trans|pos|t|p|xyz"
+_ORIENTATION = r"rotations?|orientations?|rvecs?|rotvecs?|rot|quaternions?|quat|q|R|r|rpy|euler|axis_angle"
+_HALF = re.compile(
+    rf"(?:(?P<before>.+?)[_.])?(?:(?P<position>{_POSITION})|(?P<rotation>{_ORIENTATION}))(?:[_.](?P<behind>.+))?"
+)
+_XYZ = {"x", "y", "z"}
+#: A list of numbers of such a name is of joints; a unit, or an order, behind a name.
+_JOINTS, _UNIT = re.compile(r"joint|servo|angles|qpos|^q$", re.IGNORECASE), re.compile(r"_(mm|m|deg|rad|xyzw|wxyz)$")
+#: Where a text begins so, it is one of these files.
+_DOCUMENT = re.compile(r"%YAML|---\s*$|[\[{]\s*$|[\[{]\s*[\[{\"'-]|- \S|-\s*$|[\w.\"' -]+:(?:\s|$)")
+#: A transform as tf_echo and tf2_echo print it.
+_ECHO = re.compile(
+    r"(?:At time\s+([\d.]+)\s+)?-?\s*Translation:\s*\[([^\]]*)\]\s+"
+    r"-?\s*Rotation:\s*in Quaternion(?:\s*\(xyzw\))?\s*\[([^\]]*)\]"
+)
+
+
+def is_document(path: Path, text: str) -> bool:
+    """Return whether a text, or a file by its suffix, is one of these."""
+    first = next((row.strip() for row in text.splitlines() if row.strip() and not row.strip().startswith("#")), "")
+    return path.suffix.lower() in (".yaml", ".yml", ".json") or bool(_ECHO.search(text) or _DOCUMENT.match(first))
+
+
+def document_rows(path: Path, text: str | None, side: str, whose: str | None) -> tuple[list[str], list[Record]]:
+    """Return the names of columns and the records of a document.
+
+    Args:
+        path: the file.
+        text: what it holds; None: it is one of those that ``document.py`` unpacks.
+        side: "robot" or "seen": which poses are requested where records have both.
+        whose: the name of the poses that are requested; None: the names say whose they are.
+
+    Raises:
+        InputError: no document, no poses in it, or poses of several and no name says whose.
+    """
+    if text is not None and (echoed := _ECHO.findall(text)):
+        records = [
+            {"t_s": at, **dict(zip("xyz", p.split(","), strict=False)), **_quaternion(q.split(","))}
+            for at, p, q in echoed
+        ]
+        records = [{key: cell.strip() for key, cell in one.items() if cell} for one in records]
+        return list(dict.fromkeys(key for one in records for key in one)), records
+    records = []
+    items = _items(_parsed(path, text))
+    for k, (item, name) in enumerate(items, 1):
+        groups = dict(_poses(item))
+        if not groups and records:
+            raise InputError(
+                f"{path}: record {k} of {len(items)} holds {_content(item)}, and no pose, as those before it do"
+            )
+        if groups:
+            poses = [key for key, one in groups.items() if not _is_joints(one)]
+            record = dict(groups[_chosen(path, poses or list(groups), side, whose)])
+            record |= next((one for one in groups.values() if poses and len(groups) > 1 and _with_unit(one)), {})
+            records.append({**record, **({} if name is None else {"name": name}), **_beside(item)})
+    if not records:
+        held = _content(_parsed(path, text))
+        raise InputError(
+            f"{path}: holds {held}, and no poses: expected a list of matrices, of 6 or 7 numbers, or of positions beside "
+            "rotations (translation, rotation), or a table such as x_mm,y_mm,z_mm,qw,qx,qy,qz"
+        )
+    return list(dict.fromkeys(key for one in records for key in one)), records
+
+
+def _quaternion(cells: list[str]) -> Record:
+    return dict(zip(("qx", "qy", "qz", "qw"), cells, strict=False))
+
+
+def _parsed(path: Path, text: str | None) -> Any:  # noqa: ANN401 - whatever a document holds
+    """Return a document, its matrices as lists."""
+    if text is None:
+        return _plain(read_document(path))
+    if text.lstrip()[:1] in ("{", "[") or path.suffix.lower() == ".json":
+        rows = [row for row in text.splitlines() if row.strip()]
+        try:
+            try:
+                return _plain(json.loads(text))
+            except json.JSONDecodeError:
+                if len(rows) < 2 or any(row.strip()[0] not in "{[" for row in rows):
+                    raise
+                return _plain([json.loads(row.strip().rstrip(",")) for row in rows])  # JSON Lines
+        except RecursionError:
+            raise InputError(f"{path}: not JSON that can be read: nested too deep") from None
+        except json.JSONDecodeError as error:
+            if path.suffix.lower() == ".json":
+                raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg})") from None
+    documents = parse_yaml(text if len(text) <= 1e6 * YAML_MB else read_text(path, YAML_MB), path)
+    return _plain(documents[0] if len(documents) == 1 else documents)
+
+
+def _plain(node: Any) -> Any:  # noqa: ANN401
+    """Return a node with OpenCV's and ViSP's matrices as nested lists without sides of 1."""
+    if isinstance(node, np.ndarray):
+        return node.tolist()
+    if isinstance(node, list):
+        return [_plain(one) for one in node]
+    if not isinstance(node, Mapping):
+        return node
+    if {"rows", "cols", "data"} <= set(node):
+        try:
+            data = np.array(node["data"], float).ravel()
+            shape = (int(node["rows"]), int(node["cols"]), -1)
+            matrix = np.squeeze(data.reshape(shape))
+        except (ValueError, TypeError):
+            return dict(node)
+        # ViSP's vector of a pose, theta u in radians; its matrices have no dt
+        return (
+            {"position": matrix[:3].tolist(), "rotvec": matrix[3:].tolist()}
+            if matrix.shape == (6,) and "dt" not in node
+            else matrix.tolist()
+        )
+    return {str(key): _plain(one) for key, one in node.items()}
+
+
+def _array(node: object) -> np.ndarray[Any, np.dtype[np.float64]] | None:
+    """Return a list of numbers, nested or not, without sides of 1; None where it is none."""
+    if not isinstance(node, list) or not node:
+        return None
+    try:
+        found = np.array(node, dtype=float)
+    except (ValueError, TypeError):
+        return None
+    return np.squeeze(found)
+
+
+def _items(node: Any) -> list[tuple[Any, str | None]]:  # noqa: ANN401
+    """Return the records of a document, each with its name where it has one."""
+    array = _array(node)
+    if array is not None:
+        if array.ndim == 1 or array.shape in ((4, 4), (3, 4)):
+            return [(array.tolist(), None)]
+        return [(one.tolist(), None) for one in array]
+    if isinstance(node, list):
+        found: list[tuple[Any, str | None]] = [(one, None) for one in node if isinstance(one, Mapping | list)]
+        return found if len(found) != 1 else _items(found[0][0])
+    if not isinstance(node, Mapping):
+        return []
+    named = [(one, str(key)) for key, one in node.items() if isinstance(one, Mapping | list) and dict(_poses(one, key))]
+    if len(named) > 2 and len(named) == sum(isinstance(one, Mapping | list) for one in node.values()):
+        return list(named)
+    if dict(_poses(node)):
+        return [(node, None)]
+    lists = {key: one for key, one in node.items() if isinstance(one, list) and len(one) > 1}
+    counts = {len(one) for one in lists.values()}
+    if len(lists) > 1 and len(counts) == 1:  # in parallel
+        rows = [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
+        if any(dict(_poses(row)) for row in rows):
+            return [(row, None) for row in rows]
+    inner = [_items(one) for one in node.values() if isinstance(one, Mapping | list)]
+    return max((one for one in inner), key=lambda one: sum(bool(dict(_poses(item))) for item, _ in one), default=[])
+
+
+def _poses(node: Any, name: str = "") -> Iterator[tuple[str, Record]]:  # noqa: ANN401
+    """Yield the poses, or joints, of a record, each by its name."""
+    array = _array(node)
+    if array is not None:
+        if (found := _of_numbers(array, name)) is not None:
+            yield name, found
+        return
+    if isinstance(node, list) and len(node) == 1:
+        yield from _poses(node[0], name)
+    if not isinstance(node, Mapping):
+        return
+    names, angles = node.get("name"), node.get("position")
+    if isinstance(names, list) and isinstance(angles, list) and len(names) == len(angles):  # sensor_msgs/JointState
+        yield name, {str(joint): repr(float(angle)) for joint, angle in zip(names, angles, strict=True)}
+        return
+    scalars = {key: one for key, one in node.items() if isinstance(one, int | float) and not isinstance(one, bool)}
+    if {key.lower().partition("_")[0] for key in scalars} >= _XYZ and len(scalars) > 3 and set(scalars) != {*"wxyz"}:
+        yield name, {key: repr(float(one)) for key, one in scalars.items()}
+        return
+    halves: dict[str, Record] = {}
+    for key, one in node.items():
+        half = _HALF.fullmatch(_UNIT.sub("", key))
+        if half is not None and (numbers := _half(key, one, half)):
+            whose = ".".join(part for part in (half["before"], half["behind"]) if part)
+            halves.setdefault(whose, {}).update(numbers)
+    whole = {whose: found for whose, found in halves.items() if len(found) > 4}
+    for whose, found in whole.items():
+        yield f"{name}.{whose}".strip("."), found
+    if whole:
+        return
+    for key, one in node.items():
+        yield from _poses(one, f"{name}.{key}".strip("."))
+
+
+def _is_joints(record: Record) -> bool:
+    return not {key.partition("_")[0] for key in record} & {*_XYZ, *"XYZ"}
+
+
+def _with_unit(record: Record) -> bool:
+    """Return whether a record is of joints whose unit is known."""
+    return _is_joints(record) and all(re.fullmatch(r"q\d_(deg|rad)", key) for key in record)
+
+
+def _of_numbers(array: np.ndarray[Any, np.dtype[np.float64]], name: str) -> Record | None:
+    """Return a pose, or joints by their name, of numbers alone; None where they are none."""
+    if array.ndim == 1 and _JOINTS.search(name.split(".")[-1]):
+        unit = next((f"_{unit}" for unit in ("deg", "rad") if unit in name.lower()), "")
+        return {f"q{k}{unit}": repr(float(one)) for k, one in enumerate(array, 1)}
+    if array.shape == (3, 4):
+        array = array.ravel()
+    if array.shape in ((4, 4), (16,)):
+        array = array.reshape(4, 4)
+        if not np.allclose(array[3], [0, 0, 0, 1], atol=1e-6) and np.allclose(array[:, 3], [0, 0, 0, 1], atol=1e-6):
+            array = array.T  # column by column, as Franka's O_T_EE
+        array = array.ravel()
+    if array.ndim != 1 or len(array) not in _BY_COUNT or "cov" in name.lower():
+        return None
+    return dict(zip(_BY_COUNT[len(array)], (repr(float(one)) for one in array), strict=True))
+
+
+def _half(key: str, node: Any, half: re.Match[str]) -> Record:  # noqa: ANN401
+    """Return the numbers of a position or a rotation by their names; {} where they are none."""
+    if isinstance(node, Mapping):
+        numbers = {
+            k: repr(float(one)) for k, one in node.items() if isinstance(one, int | float) and not isinstance(one, bool)
+        }
+        if half["position"] and set(numbers) == _XYZ:
+            return numbers
+        if half["rotation"] and set(numbers) == {*"wxyz"}:
+            return {f"q{k}": one for k, one in numbers.items()}
+        return {f"r{k}": one for k, one in numbers.items()} if half["rotation"] and set(numbers) == _XYZ else {}
+    array = _array(node)
+    if array is None:
+        return {}
+    cells = [repr(float(one)) for one in array.ravel()]
+    unit = found[0] if (found := _UNIT.search(key)) else ""
+    if half["position"]:
+        return dict(zip((f"{axis}{unit}" for axis in "xyz"), cells, strict=True)) if array.shape == (3,) else {}
+    if array.shape in ((3, 3), (9,)):
+        return dict(zip(_ROTATION, cells, strict=True))
+    if array.shape == (4,):
+        order = next((order for order in ("xyzw", "wxyz") if order in key.lower()), None)
+        return dict(zip([f"q{k}" for k in order] if order else ["n1", "n2", "n3", "n4"], cells, strict=True))
+    if array.shape != (3,):
+        return {}
+    vector = any(word in key.lower() for word in ("rvec", "rotvec", "axis"))
+    unit = unit or ("_rad" if vector else "")
+    return dict(zip((f"r{axis}{unit}" for axis in "xyz"), cells, strict=True))
+
+
+def _beside(item: Any) -> Record:  # noqa: ANN401
+    """Return the name, the image and the time of a record."""
+    if not isinstance(item, Mapping):
+        return {}
+    out = {}
+    for key, one in item.items():
+        name = {"file": "image", "filename": "image", "image_path": "image"}.get(key.lower(), key.lower())
+        if isinstance(one, str) and name in ("name", "image", "shot"):
+            out[name] = one
+        if (
+            isinstance(one, int | float)
+            and not isinstance(one, bool)
+            and name in ("t_s", "t", "time", "timestamp", "stamp")
+        ):
+            out["t_s"] = repr(float(one))
+    stamp = item.get("stamp", item.get("header", {}).get("stamp") if isinstance(item.get("header"), Mapping) else None)
+    if isinstance(stamp, Mapping):
+        whole, parts = (
+            next((stamp[key] for key in keys if key in stamp), 0) for keys in (("sec", "secs"), ("nanosec", "nsecs"))
+        )
+        out["t_s"] = f"{int(whole)}.{int(parts):09d}"
+    return out
+
+
+def _chosen(path: Path, names: list[str], side: str, whose: str | None) -> str:
+    """Return the name of the poses that are requested, of those that a record holds."""
+    if whose is not None:
+        if whose not in names:
+            raise InputError(f"{path}: has no poses {whose!r}; there are {', '.join(names)}")
+        return whose
+    if len(names) == 1:
+        return names[0]
+    exact = [name for name in names if name.split(".")[-1] == "O_T_EE"]
+    if len(exact) == 1 and side == "robot":
+        return exact[0]
+    other = next(one for one in SIDES if one != side)
+    scores = {name: _score(name, side) - _score(name, other) for name in names}
+    best = [name for name in names if scores[name] == max(scores.values())]
+    if (len(best) == 1 and scores[best[0]] > 0) or (len(names) == 2 and len(best) == 1):
+        return best[0]
+    option = "--columns pose=" if side == "robot" else "--columns seen:pose="
+    raise InputError(f"{path}: holds poses of {', '.join(names)}: say which, {option}{names[0]}")
+
+
+def _score(name: str, side: str) -> int:
+    """Return how many words of a side a name has; what stands behind ``2`` or ``wrt`` is what a pose is given in."""
+    own = re.split(r"_wrt_|2|_in_|_to_", name.lower())[0]
+    return 2 * any(word in own for word in SIDES[side]) + any(word in name.lower() for word in SIDES[side])
+
+
+def has_both(path: Path) -> bool:
+    """Return whether a document's records hold poses of both sides, the robot's and what was seen."""
+    if path.suffix.lower() not in (".yaml", ".yml", ".json") or not path.is_file():
+        return False
+    items = _items(_parsed(path, read_text(path)))
+    names = [name for name, _ in _poses(items[0][0])] if items else []
+    return len(names) == 2 and all(any(_score(name, side) for name in names) for side in SIDES)
+
+
+def _content(node: Any) -> str:  # noqa: ANN401
+    """Return what a document holds, as text."""
+    if isinstance(node, Mapping):
+        return f"a mapping of {', '.join(map(str, list(node)[:5]))}" + (", .." if len(node) > 5 else "")
+    return f"a list of {len(node)}" if isinstance(node, list) else f"{str(node)[:40]!r}"

@@ -1,0 +1,234 @@
+"""Tables of poses as robots, cameras and people write them.
+
+In: a file of any form that ``cells.py`` reads. Out: :class:`PoseTable`. The columns are those of ``columns.py``, in any
+order: ``x_m y_m z_m`` (or ``x_mm``, or ``x`` with ``unit``); ``qw qx qy qz``; or ``rx_deg ry_deg rz_deg`` (or ``rx_rad``,
+or ``rx``); or ``r11 .. r33``; or joints ``q1_deg ..`` (``q1_rad``) of an arm, also by their names. ``t_s`` is a time,
+``image`` the image that belongs to a row, ``name`` (``shot`` in what ``armsight measure`` writes) a name that both tables
+share; rows whose ``status`` is missed count as shots without a pose. Without names: 16 (or 12) numbers a row, a matrix; 7:
+x, y, z and a quaternion; 6: x, y, z and three numbers of a rotation, whose convention the option ``rotation`` names.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.files import columns_unused
+from armsight.tables.cells import Rows, read_cells, read_columns
+from armsight.tables.columns import COLUMNS, Columns, degree_columns, is_unitless, understood
+from armsight.tables.rotations import CONVENTIONS
+
+#: Lengths beyond this, m, are no robot's: they are mm; below the other, all of them, they are m taken for mm.
+FAR_M, NEAR_M = 20.0, 0.02
+#: Lengths that differ by more than this factor in one table are not in one unit.
+MIXED = 200.0
+#: Columns of the poses that `armsight measure -o` wrote.
+_MEASURED = {"shot", "status", "reason", "x_m"}
+
+
+class ArmJoints(Protocol):
+    """What a table needs of an arm: its name, its joints' names, and where the flange is at joint angles."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The names of its joints."""
+
+    def forward(self, q: Array) -> Array:
+        """Return the flange (N, 4, 4) at joint angles (N, J), rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTable(Record):
+    """The poses of a file.
+
+    Attributes:
+        path: the file.
+        lines: (N,) the line of each row.
+        Ts: (N, 4, 4) the poses, m.
+        numbers: (N, K) the numbers of the rotations as in the file; (N, 0) for matrices and joints.
+        written: (N, 6) or (N, 7) position and rotation as in the file, where its columns have this order; (N, 0) else.
+        convention: what they were taken for, one of CONVENTIONS; "" for matrices and joints.
+        q: (N, J) joint angles, rad; None where there are none.
+        t_s: (N,) times, s; None where there are none.
+        names: of the rows, or of their images; None where there are none.
+        unit_m: the unit that lengths were read in, m.
+        notes: what was found out while reading.
+        missed: (N,) why a shot that `armsight measure` wrote has no pose, and another's stands there; "" where it has one.
+        of_joints: whether the poses are those of the joints by the model.
+    """
+
+    path: Path
+    lines: NDArray[np.int64]
+    Ts: Array
+    numbers: Array
+    written: Array
+    convention: str
+    q: Array | None
+    t_s: Array | None
+    names: tuple[str, ...] | None
+    unit_m: float
+    notes: tuple[str, ...]
+    missed: tuple[str, ...]
+    of_joints: bool = False
+
+
+def read_pose_table(
+    path: Path,
+    *,
+    rotation: str | None = None,
+    unit: str | None = None,
+    detect_units: bool = False,
+    columns: str | None = None,
+    arm: ArmJoints | None = None,
+    only_joints: bool = False,
+    side: str = "robot",
+) -> PoseTable:
+    """Read a table of poses.
+
+    Args:
+        path: the file.
+        rotation: one of CONVENTIONS; None: what the columns' names say.
+        unit: "m" or "mm" for lengths whose columns do not name one; None: m.
+        detect_units: whether lengths that cannot be metres are taken for millimetres, with a note.
+        columns: NAME=THEIRS,... with names of COLUMNS, or the names of all columns in their order.
+        arm: the model whose joints the table has.
+        only_joints: whether positions are passed over: the poses are then those of the joints.
+        side: "robot" or "seen": whose poses are read where a file holds both.
+
+    Raises:
+        InputError: the file, the line and what was expected.
+    """
+    if rotation is not None and rotation not in CONVENTIONS:
+        raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
+    cells = read_cells(path, read_columns(columns, (*COLUMNS, "pose")), side)
+    head, *body = degree_columns(path, [cells.head, *(row for _, row in cells.rows)])
+    rows: Rows = [(line, row) for (line, _), row in zip(cells.rows, body, strict=True)]
+    links = () if arm is None else arm.joint_names
+    if cells.listed and len(head) == 6:
+        notes = _notes_of_lists(path, rows[0], arm, unit, rotation)
+        head = ["x", "y", "z", "rx_rad", "ry_rad", "rz_rad"]
+    else:
+        if cells.listed:
+            _notes_of_lists(path, rows[0], arm, unit, rotation)
+        head, rotation, notes = understood(path, head, links, unit, rotation or cells.rotation)
+    notes = (*cells.notes, *notes)
+    measured = set(head) >= _MEASURED
+    rows, missed = _shown(path, head, rows) if measured else (rows, ("",) * len(rows))
+    table = Columns(path, head, rows, links)
+    lines = np.array([line for line, _ in rows])
+    unit_m, q, of_joints = 1.0, None, False
+    numbers, written, convention = np.zeros((len(rows), 0)), np.zeros((len(rows), 0)), ""
+    joints = table.joint_names(*((len(links), arm.name) if arm is not None else (None, "")))
+    if joints:
+        q = table.joints(joints)
+    if only_joints and q is None:
+        raise InputError(
+            f"{path}: line 1: no joint angles: q1_deg .. or q1_rad .. are needed; there are {', '.join(head)}"
+        )
+    if q is not None and arm is not None and (only_joints or not table.has_position()):
+        Ts, of_joints = np.asarray(arm.forward(q)), True
+    elif q is not None and not table.has_position():
+        raise InputError(f"{path}: joint angles need the arm: give --model, a name (armsight arm list) or a .urdf file")
+    else:
+        p, unit_m, found_out = _positions(table, unit, detect_units)
+        notes = (*notes, *found_out)
+        R, numbers, convention, written = table.rotations(rotation)
+        written = np.hstack([p / unit_m, written]) if written.shape[1] else written
+        Ts = stacked(R, p)
+    t_s, names = table.times(), table.names()
+    unused = [name for name in head if name and name not in table.used and not re.fullmatch(r"_[0-3]", name)]
+    if arm is not None and q is None:
+        notes = (*notes, f"{path}: has no joint angles: --model {arm.name} is not used")
+    if unused and not only_joints and not measured:
+        notes = (*notes, f"{path}: {columns_unused(unused)}")
+    return PoseTable(path, lines, Ts, numbers, written, convention, q, t_s, names, unit_m, notes, missed, of_joints)
+
+
+def _shown(path: Path, head: list[str], rows: Rows) -> tuple[Rows, tuple[str, ...]]:
+    """Return the rows of `armsight measure`, some pose in those without one, and why they have none."""
+    status, reason, first = head.index("status"), head.index("reason"), head.index("x_m")
+    some = next((row for _, row in rows if row[status] == "ok"), None)
+    if some is None:
+        raise InputError(f"{path}: none of {len(rows)} shots was measured; {rows[0][1][reason]}")
+    missed = tuple("" if row[status] == "ok" else row[reason] or row[status] for _, row in rows)
+    filled = [row[:first] + some[first:] if why else row for (_, row), why in zip(rows, missed, strict=True)]
+    return [(line, row) for (line, _), row in zip(rows, filled, strict=True)], missed
+
+
+def _notes_of_lists(
+    path: Path, first: tuple[int, list[str]], arm: ArmJoints | None, unit: str | None, rotation: str | None
+) -> tuple[str, ...]:
+    """Return what lists of six numbers are read as; reject those that may be the joints of an arm as well."""
+    line, cells = first
+    if arm is not None and rotation is None and len(cells) in (6, len(arm.joint_names)):
+        raise InputError(
+            f"{path}: line {line}: is this list a pose, or joint angles of {arm.name}? write poses as p[x, y, z, rx, "
+            "ry, rz], or name columns of joints q1_rad .. or q1_deg .."
+        )
+    what = "UR's pose" if rotation is None else "poses"
+    how = f"{unit or 'm'} and {rotation or 'rotation vector'}, rad"
+    return (f"{path}: lists read as {what}: {how}",) if len(cells) == 6 else ()
+
+
+def stacked(R: Array, p: Array) -> Array:
+    """Return poses (N, 4, 4) of rotations (N, 3, 3) and positions (N, 3)."""
+    Ts = np.tile(np.eye(4), (len(R), 1, 1))
+    Ts[:, :3, :3], Ts[:, :3, 3] = R, p
+    return Ts
+
+
+def _positions(table: Columns, unit: str | None, detect: bool) -> tuple[Array, float, tuple[str, ...]]:
+    """Return positions (N, 3), m, the unit they were read in, and notes."""
+    suffix = next((s for s in ("_m", "_mm", "") if f"x{s}" in table.at), None)
+    if suffix is None:
+        if any(is_unitless(name) for name in table.at):
+            raise InputError(
+                f"{table.path}: line 1: joints without a unit: name them q1_deg .. or q1_rad .., and give --model"
+            )
+        raise InputError(
+            f"{table.path}: line 1: no positions: x_m y_m z_m or x_mm y_mm z_mm are needed, or, with "
+            f"--model, joints q1_rad .. or q1_deg ..; there are {', '.join(list(table.at)[:10])}: --columns x_m=NAME,... "
+            "gives yours"
+        )
+    p = table.numbers([f"{axis}{suffix}" for axis in "xyz"])
+    given = suffix[1:] or unit
+    unit_m = 1e-3 if given == "mm" else 1.0
+    far = float(np.abs(p).max()) * unit_m
+    if unit_m == 1.0 and far > FAR_M:
+        lengths = np.linalg.norm(p, axis=1)
+        near = np.flatnonzero((lengths < min(lengths.max() / MIXED, FAR_M)) & (lengths > NEAR_M))
+        if len(near) > 1 and (given is None or suffix == "_m"):  # one alone may be at the base's origin
+            large, small = (table.rows[k][0] for k in (int(lengths.argmax()), near[0]))
+            raise InputError(
+                f"{table.path}: line {large} is {lengths.max():.0f} m from the base, {small} {lengths[near[0]]:.2g} m: "
+                f"are some rows in millimetres? {len(near)} of {len(p)} rows are near; write all in one unit"
+            )
+        if not detect:
+            raise InputError(
+                f"{table.path}: positions of up to {far:.0f} m: are they millimetres? name the columns x_mm y_mm z_mm, or "
+                f"give {'' if suffix else '--units mm, or '}--detect-units"
+            )
+        return 1e-3 * p, 1e-3, (f"{table.path}: positions read as millimetres: as metres they would reach {far:.0f} m",)
+    if unit_m == 1e-3 and far < NEAR_M:
+        if not detect:
+            raise InputError(
+                f"{table.path}: positions of at most {1e3 * far:.2g} mm: are they metres? name the columns x_m y_m z_m, or "
+                f"give {'' if suffix else '--units m, or '}--detect-units"
+            )
+        return (
+            p,
+            1.0,
+            (f"{table.path}: positions read as metres: as millimetres they would stay within {1e3 * far:.2g} mm",),
+        )
+    return unit_m * p, unit_m, ()

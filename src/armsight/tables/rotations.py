@@ -1,0 +1,43 @@
+"""Rotations as people write them: quaternions in both orders, rotation vectors, angles about three axes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from armsight.data import Array
+from armsight.errors import InputError
+
+#: Conventions of three angles: a rotation vector; or rotations about x, y, z in the order given, about fixed axes (lower
+#: case) or about the axes of the rotated frame (capitals).
+ROTATIONS = ("rotvec", "xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
+#: How far the length of a quaternion may be from 1: what two digits leave.
+QUATERNION_OFF = 1e-2
+#: What three or four numbers of a rotation may mean.
+CONVENTIONS = ("wxyz", "xyzw", *ROTATIONS)
+
+
+def rotations_by(numbers: Array, convention: str, path: Path) -> Array:
+    """Return rotations (N, 3, 3) of quaternions (N, 4), or of angles (N, 3) in degrees, in a convention.
+
+    Raises:
+        InputError: a quaternion whose length is not 1.
+    """
+    if convention in ("wxyz", "xyzw"):
+        lengths = np.linalg.norm(numbers, axis=1)
+        if (np.abs(lengths - 1) > QUATERNION_OFF).any():
+            raise InputError(f"{path}: a quaternion has length {lengths[np.argmax(np.abs(lengths - 1))]:.4g}, not 1")
+        return np.asarray(Rotation.from_quat(numbers[:, [1, 2, 3, 0]] if convention == "wxyz" else numbers).as_matrix())
+    if convention == "rotvec":
+        return np.asarray(Rotation.from_rotvec(np.radians(numbers)).as_matrix())
+    order = ["xyz".index(axis) for axis in convention.lower()]
+    return np.asarray(Rotation.from_euler(convention, np.radians(numbers[:, order])).as_matrix())
+
+
+def stacked(R: Array, p: Array) -> Array:
+    """Return poses (N, 4, 4) of rotations (N, 3, 3) and positions (N, 3)."""
+    Ts = np.tile(np.eye(4), (len(R), 1, 1))
+    Ts[:, :3, :3], Ts[:, :3, 3] = R, p
+    return Ts

@@ -1,0 +1,486 @@
+"""Poses and joints as the programs of the field write them: one table of inputs, each with its program and its right value.
+
+Every text is built here from the same poses by SciPy's rotations, in the form that the named source documents.
+"""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from armsight.errors import InputError
+from armsight.robot.arm_file import open_arm
+from armsight.tables.cells import number
+from armsight.tables.documents import has_both
+from armsight.tables.poses import read_pose_table
+
+N = 6
+_RNG = np.random.default_rng(37)
+R = Rotation.random(N, random_state=37)
+P = np.array([0.45, 0.05, 0.35]) + _RNG.uniform(-0.2, 0.2, (N, 3))
+A = np.tile(np.eye(4), (N, 1, 1))
+A[:, :3, :3], A[:, :3, 3] = R.as_matrix(), P
+MM = 1e3 * P
+XYZW, WXYZ, VECTOR = R.as_quat(), R.as_quat()[:, [3, 0, 1, 2]], R.as_rotvec()
+FIXED, ROTATED = R.as_euler("xyz", degrees=True), R.as_euler("XYZ", degrees=True)
+KUKA, ZYZ = R.as_euler("ZYX", degrees=True), R.as_euler("ZYZ", degrees=True)
+#: What was seen, another set of poses.
+B = A[::-1] @ A[0]
+Q = _RNG.uniform(-1.5, 1.5, (N, 6))
+DEG = np.degrees(Q)
+
+
+def rows(form, *columns):
+    """One line for each pose, the columns' numbers in order."""
+    numbers = np.hstack([np.reshape(column, (N, -1)) for column in columns])
+    return "".join(form.format(*(f"{value:.9f}" for value in row), k=k) + "\n" for k, row in enumerate(numbers))
+
+
+def csv(head, *columns, mark=","):
+    width = sum(np.reshape(column, (N, -1)).shape[1] for column in columns)
+    return (head + "\n" if head else "") + rows(mark.join(["{}"] * width), *columns)
+
+
+def vector(p):
+    return dict(zip("xyz", map(float, p), strict=True))
+
+
+def quaternion(q):
+    return dict(zip("xyzw", map(float, q), strict=True))
+
+
+def ros(keys=("translation", "rotation"), T=A):
+    """A list of ROS's transforms or poses."""
+    quaternions = Rotation.from_matrix(T[:, :3, :3]).as_quat()
+    return [{keys[0]: vector(one[:3, 3]), keys[1]: quaternion(q)} for one, q in zip(T, quaternions, strict=True)]
+
+
+def messages(each):
+    return "".join(yaml.safe_dump(one, sort_keys=False) + "---\n" for one in each)
+
+
+def stamped(k, **more):
+    return {"header": {"seq": k, "stamp": {"secs": 1626900134 + k, "nsecs": 5000000}, "frame_id": "base"}, **more}
+
+
+def opencv(name, matrix):
+    matrix = np.atleast_2d(matrix)
+    data = ", ".join(repr(float(one)) for one in matrix.ravel())
+    height, width = matrix.shape
+    return f"{name}: !!opencv-matrix\n   rows: {height}\n   cols: {width}\n   dt: d\n   data: [ {data} ]\n"
+
+
+JBI = (
+    "/JOB\n//NAME POSES\n//POS\n///NPOS 6,0,0,0,0,0\n///TOOL 0\n///POSTYPE BASE\n///RECTAN\n///RCONF 0,0,0,0,0,0,0,0\n"
+)
+LS = (
+    "P[{k}:\"at {k}\"]{{\n   GP1:\n\tUF : 0, UT : 1,\t\tCONFIG : 'N U T, 0, 0, 0',\n"
+    "\tX =  {}  mm,\tY =  {}  mm,\tZ =  {}  mm,\n\tW =  {} deg,\tP =  {} deg,\tR =  {} deg\n}};"
+)
+DTX = '<Database><Datas><Data name="p" access="public" xsi:type="array" type="pointRx" size="6">\n'
+
+#: Program and its source -> file name, text, options. All give the poses A.
+FORMS = {
+    "easy_handeye 0.4 samples (TakeSample)": (
+        "samples.yaml",
+        yaml.safe_dump([{"robot": a, "tracking": b} for a, b in zip(ros(), ros(T=B), strict=True)]),
+        {},
+    ),
+    "easy_handeye2 samples with TransformStamped (handeye_sampler.py: robot, optical)": (
+        "s.yaml",
+        yaml.safe_dump(
+            {
+                "samples": [
+                    {"robot": {"transform": a}, "optical": {"t": b}} for a, b in zip(ros(), ros(T=B), strict=True)
+                ]
+            }
+        ),
+        {},
+    ),
+    "moveit_calibration saveSamples (handeye_control_widget.cpp)": (
+        "m.yaml",
+        yaml.safe_dump(
+            [
+                {"effector_wrt_world": a.ravel().tolist(), "object_wrt_sensor": b.ravel().tolist()}
+                for a, b in zip(A, B, strict=True)
+            ]
+        ),
+        {},
+    ),
+    "ethz-asl/hand_eye_calibration csv (datasets/*.csv)": (
+        "t.csv",
+        rows("{}, {}, {}, {}, {}, {}, {}, {}", 1491416639.9 + np.arange(N), P, XYZW),
+        {"rotation": "xyzw"},
+    ),
+    "MRPT CPose3D::asString [x y z yaw pitch roll]": (
+        "mrpt.txt",
+        rows("[{} {} {} {} {} {}]", P, KUKA),
+        {"columns": "x,y,z,rz_deg,ry_deg,rx_deg", "rotation": "xyz"},
+    ),
+    "OpenCV 4 FileStorage R_gripper2base, t_gripper2base as lists": (
+        "cv.json",
+        json.dumps(
+            {
+                "R_gripper2base": A[:, :3, :3].tolist(),
+                "t_gripper2base": P[:, :, None].tolist(),
+                "R_target2cam": B[:, :3, :3].tolist(),
+                "t_target2cam": B[:, :3, 3:].tolist(),
+            }
+        ),
+        {},
+    ),
+    "OpenCV 4 FileStorage of rvecs and tvecs, Nx3": (
+        "cv.yml",
+        "%YAML:1.0\n---\n" + opencv("rvecs", VECTOR) + opencv("tvecs", P),
+        {},
+    ),
+    "KUKA KRL .src LIN with $TOOL and $BASE (KSS 8.3)": (
+        "p.src",
+        "DEF P()\n$BASE={{X 0,Y 0,Z 0,A 0,B 0,C 0}}\n$TOOL={{X 0,Y 0,Z 120,A 0,B 0,C 0}}\n".replace("{{", "{").replace(
+            "}}", "}"
+        )
+        + rows("LIN {{X {},Y {},Z {},A {},B {},C {}}} C_DIS", MM, KUKA)
+        + "END\n",
+        {},
+    ),
+    "KUKA KRL .dat E6POS (KSS 8.3)": (
+        "p.dat",
+        "DEFDAT P\n"
+        + rows("DECL E6POS XP{k}={{X {},Y {},Z {},A {},B {},C {},S 6,T 27,E1 0.0,E2 0.0}}", MM, KUKA)
+        + "ENDDAT\n",
+        {},
+    ),
+    "FANUC TP .LS (HandlingTool 9.40)": ("p.LS", "/PROG  P\n/MN\n/POS\n" + rows(LS, MM, FIXED) + "/END\n", {}),
+    "Universal Robots URScript 5.11": (
+        "p.script",
+        "def p():\n  set_tcp(p[0,0,0,0,0,0])\n".replace("  set_tcp(p[0,0,0,0,0,0])\n", "  set_payload(1.2)\n")
+        + rows("  movel(p[{},{},{},{},{},{}], a=1.2, v=0.25)\n  sleep(0.5)", P, VECTOR)
+        + "end\n",
+        {},
+    ),
+    "Universal Robots RTDE actual_TCP_pose_0 .. 5 (rtde 2.4 csv)": (
+        "r.csv",
+        csv(" ".join(["timestamp", *(f"actual_TCP_pose_{k}" for k in range(6))]), np.arange(N), P, VECTOR, mark=" "),
+        {"columns": "t_s,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad"},
+    ),
+    "Yaskawa .JBI, RECTAN (DX100 manual 4.3.1)": (
+        "p.JBI",
+        JBI + rows("C{k:05d}={},{},{},{},{},{}", MM, FIXED) + "//INST\n",
+        {},
+    ),
+    "Staubli VAL3 .dtx pointRx (VAL3 7)": (
+        "p.dtx",
+        DTX
+        + rows('<Value key="{k}" x="{}" y="{}" z="{}" rx="{}" ry="{}" rz="{}" fatherId="world[0]" />', MM, ROTATED)
+        + "</Data></Datas></Database>\n",
+        {},
+    ),
+    "Mecademic MovePose (programming manual 8)": (
+        "p.mxprog",
+        "SetTRF(0,0,0,0,0,0)\n" + rows("MovePose({},{},{},{},{},{})", MM, ROTATED),
+        {},
+    ),
+    "Doosan DRL posx (2.10)": ("p.drl", rows("p{k} = posx({}, {}, {}, {}, {}, {})", MM, ZYZ), {}),
+    "DENSO PacScript P() (RC8, id 1939)": ("p.pcs", rows("P{k} = P({}, {}, {}, {}, {}, {}, 5)", MM, FIXED), {}),
+    "xArm Python SDK set_position (1.13)": (
+        "p.py",
+        rows("arm.set_position(x={}, y={}, z={}, roll={}, pitch={}, yaw={}, speed=100, wait=True)", MM, FIXED),
+        {},
+    ),
+    "xArm JSON of positions": (
+        "x.json",
+        json.dumps(
+            [
+                dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), [*p, *r], strict=True))
+                for p, r in zip(MM, FIXED, strict=True)
+            ]
+        ),
+        {"unit": "mm"},
+    ),
+    "ABB RAPID robtargets beside tooldata (RobotWare 6)": (
+        "p.mod",
+        "MODULE P\nPERS tooldata t:=[TRUE,[[0,0,100],[1,0,0,0]],[1,[0,0,1],[1,0,0,0],0,0,0]];\n"
+        + rows("CONST robtarget p{k}:=[[{},{},{}],[{},{},{},{}],[0,0,-1,0],[9E9,9E9,9E9,9E9,9E9,9E9]];", MM, WXYZ)
+        + "ENDMODULE\n",
+        {},
+    ),
+    "ABB FlexPendant position log [[..],[..],[..]] alone": (
+        "p.txt",
+        rows("[[{},{},{}],[{},{},{},{}],[0,0,0,0]]", MM, WXYZ),
+        {},
+    ),
+    "RoboDK 5 targets as csv (XYZRPW of Staubli and Mecademic)": (
+        "r.csv",
+        csv("X (mm),Y (mm),Z (mm),rx (deg),ry (deg),rz (deg)", MM, ROTATED),
+        {"rotation": "XYZ"},
+    ),
+    "libfranka 0.9 O_T_EE, column by column": ("f.csv", csv("", A.swapaxes(1, 2)), {}),
+    "franka_msgs/FrankaState (rostopic echo)": (
+        "f.yaml",
+        messages(
+            stamped(k, O_T_EE=T.T.ravel().tolist(), F_T_EE=np.eye(4).ravel().tolist(), q=[0.1] * 7)
+            for k, T in enumerate(A)
+        ),
+        {},
+    ),
+    "geometry_msgs/PoseStamped (rostopic echo)": (
+        "e.yaml",
+        messages(stamped(k, pose=one) for k, one in enumerate(ros(("position", "orientation")))),
+        {},
+    ),
+    "geometry_msgs/TransformStamped (ros2 topic echo)": (
+        "e.txt",
+        messages(
+            {
+                "header": {"stamp": {"sec": 7 + k, "nanosec": 500}, "frame_id": "base"},
+                "child_frame_id": "tool0",
+                "transform": one,
+            }
+            for k, one in enumerate(ros())
+        ),
+        {},
+    ),
+    "tf2_msgs/TFMessage of one transform (ros2 topic echo)": (
+        "tf.yaml",
+        messages({"transforms": [stamped(k, child_frame_id="tool0", transform=one)]} for k, one in enumerate(ros())),
+        {},
+    ),
+    "geometry_msgs/PoseArray": ("a.yaml", yaml.safe_dump(stamped(0, poses=ros(("position", "orientation")))), {}),
+    "nav_msgs/Odometry (rostopic echo)": (
+        "o.yaml",
+        messages(
+            stamped(k, pose={"pose": one, "covariance": [0.0] * 36}, twist={"twist": {"linear": vector([1, 2, 3])}})
+            for k, one in enumerate(ros(("position", "orientation")))
+        ),
+        {},
+    ),
+    "tf tf_echo (ROS 1 Noetic)": (
+        "tf.txt",
+        rows(
+            "At time {}\n- Translation: [{}, {}, {}]\n- Rotation: in Quaternion [{}, {}, {}, {}]\n"
+            "            in RPY (radian) [0.000, -0.001, 0.000]\n            in RPY (degree) [0.000, -0.046, 0.000]",
+            1626900134 + np.arange(N),
+            P,
+            XYZW,
+        ),
+        {},
+    ),
+    "tf2_ros tf2_echo (ROS 2 Humble)": (
+        "tf2.txt",
+        rows(
+            "At time {}\n- Translation: [{}, {}, {}]\n- Rotation: in Quaternion (xyzw) [{}, {}, {}, {}]\n"
+            "- Rotation: in RPY (radian) [0.000, -0.000, 0.000]\n- Matrix:\n  1.0  0.0  0.0  0.1",
+            42 + np.arange(N),
+            P,
+            XYZW,
+        ),
+        {},
+    ),
+    "numbers with their units": (
+        "u.csv",
+        "x;y;z;rx;ry;rz\n" + rows("{} mm;{} mm;{} mm;{}°;{}°;{}°", MM, FIXED).replace(".", ","),
+        {"rotation": "xyz"},
+    ),
+    "psql table": (
+        "p.txt",
+        " x_mm | y_mm | z_mm | qw | qx | qy | qz\n------+------+------+----+----+----+----\n"
+        + rows(" {} | {} | {} | {} | {} | {} | {}", MM, WXYZ)
+        + "(6 rows)\n",
+        {},
+    ),
+    "Markdown table": (
+        "p.md",
+        "| x_mm | y_mm | z_mm | qw | qx | qy | qz |\n|---|:-:|---|---|---|---|---|\n"
+        + rows("| {} | {} | {} | {} | {} | {} | {} |", MM, WXYZ),
+        {},
+    ),
+    "named poses in a mapping (YAML)": (
+        "n.yaml",
+        yaml.safe_dump(
+            {
+                f"pose_{k}": {"position": p.tolist(), "rvec": v.tolist()}
+                for k, (p, v) in enumerate(zip(P, VECTOR, strict=True))
+            }
+        ),
+        {},
+    ),
+    "JSON Lines of matrices with image names": (
+        "j.jsonl",
+        "".join(json.dumps({"image": f"{k}.png", "T_base_flange": T.tolist()}) + "\n" for k, T in enumerate(A)),
+        {},
+    ),
+    "lists of translation and quaternion_xyzw, mm": (
+        "q.json",
+        json.dumps(
+            {"data": [{"position_mm": p.tolist(), "quat_xyzw": q.tolist()} for p, q in zip(MM, XYZW, strict=True)]},
+            indent=1,
+        ),
+        {},
+    ),
+    "Fortran's exponents and a typesetter's minus": (
+        "d.csv",
+        csv("x_m,y_m,z_m,qw,qx,qy,qz", P, WXYZ).replace("-", "\u2212").replace("\n", "D0\n").replace("qzD0", "qz"),
+        {},
+    ),
+    "rotation before position": ("o.csv", csv("", VECTOR, P), {"columns": "rx,ry,rz,x,y,z", "rotation": "rotvec"}),
+    "rotation before position, quaternion": ("o.csv", csv("", XYZW, P), {"columns": "qx,qy,qz,qw,x,y,z"}),
+    "Kawasaki-like OAT given on as a table, with a column not used": (
+        "k.csv",
+        csv("", np.arange(N), MM, FIXED),
+        {"columns": "_,x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg", "rotation": "xyz"},
+    ),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_each_program_gives_the_same_poses(tmp_path, form):
+    name, text, options = FORMS[form]
+    (tmp_path / name).write_text(text)
+    np.testing.assert_allclose(read_pose_table(tmp_path / name, **options).Ts, A, atol=1e-8)
+
+
+@pytest.mark.parametrize("suffix", ["npy", "npz"])
+def test_numpys_files_of_matrices(tmp_path, suffix):
+    path = tmp_path / f"T.{suffix}"
+    np.save(path, A) if suffix == "npy" else np.savez(path, robot=A, target=B)
+    np.testing.assert_allclose(read_pose_table(path).Ts, A, atol=1e-12)
+    (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY")
+    with pytest.raises(InputError, match="damaged numpy file"):
+        read_pose_table(tmp_path / "bad.npy")
+
+
+def test_files_of_one_pose_each_are_one_table(tmp_path):
+    """As ViSP 3.6 keeps them: pose_fPe_1.yaml .. with x, y, z and theta u, radians."""
+    for k, row in enumerate(np.hstack([P, VECTOR]), 8):
+        cells = "".join(f"  - [{value:.9f}]\n" for value in row)
+        (tmp_path / f"pose_fPe_{k}.yaml").write_text(f"rows: 6\ncols: 1\ndata: \n{cells}")
+    table = read_pose_table(tmp_path / "pose_fPe_*.yaml")
+    np.testing.assert_allclose(table.Ts, A, atol=1e-8)
+    assert table.names[:3] == ("pose_fPe_8", "pose_fPe_9", "pose_fPe_10")
+    np.savetxt(tmp_path / "frame-000.txt", A[0])
+    np.testing.assert_allclose(read_pose_table(tmp_path / "frame-*.txt").Ts, A[:1], atol=1e-12)
+    np.savetxt(tmp_path / "frame-001.txt", A[:2].reshape(-1, 4))
+    with pytest.raises(InputError, match=r"frame-001.txt: holds 2 rows .* expected one pose"):
+        read_pose_table(tmp_path / "frame-*.txt")
+    with pytest.raises(InputError, match="no such file; quote a glob"):
+        read_pose_table(tmp_path / "none*.txt")
+
+
+SIX = open_arm("six_r")
+JOINTS = {
+    "KUKA {A1 ..}": ("a.dat", rows("PTP {{A1 {},A2 {},A3 {},A4 {},A5 {},A6 {}}}", DEG), {}),
+    "FANUC .LS joints": (
+        "j.LS",
+        rows(
+            "P[{k}]{{\n   GP1:\n\tUF : 0, UT : 1,\n\tJ1= {} deg,\tJ2= {} deg,\tJ3= {} deg,\n"
+            "\tJ4= {} deg,\tJ5= {} deg,\tJ6= {} deg\n}};",
+            DEG,
+        ),
+        {},
+    ),
+    "ABB jointtarget": (
+        "j.mod",
+        rows("CONST jointtarget j{k}:=[[{},{},{},{},{},{}],[9E9,9E9,9E9,9E9,9E9,9E9]];", DEG),
+        {},
+    ),
+    "Mecademic MoveJoints": ("j.mxprog", rows("MoveJoints({},{},{},{},{},{})", DEG), {}),
+    "Doosan posj": ("j.drl", rows("j{k} = posj({}, {}, {}, {}, {}, {})", DEG), {}),
+    "xArm set_servo_angle": ("j.py", rows("arm.set_servo_angle(angle=[{}, {}, {}, {}, {}, {}], speed=20)", DEG), {}),
+    "Staubli jointRx, zeros left out": (
+        "j.dtx",
+        '<Data name="j" type="jointRx" size="6">\n'
+        + rows('<Value key="{k}" j1="{}" j2="{}" j3="{}" j4="{}" j5="{}" j6="{}" />', DEG)
+        + "</Data>",
+        {},
+    ),
+    "sensor_msgs/JointState (rostopic echo)": (
+        "js.yaml",
+        messages(
+            stamped(k, name=[*SIX.joint_names][::-1], position=q[::-1].tolist(), velocity=[], effort=[])
+            for k, q in enumerate(Q)
+        ),
+        {},
+    ),
+    "moveit_calibration joint states": (
+        "js.yaml",
+        yaml.safe_dump({"joint_names": [*SIX.joint_names], "joint_values": Q.tolist()}),
+        {"columns": ",".join(f"q{k}_rad" for k in range(1, 7))},
+    ),
+    "xArm Studio JSON with joints in degrees": ("x.json", json.dumps([{"joints_deg": q.tolist()} for q in DEG]), {}),
+}
+
+
+@pytest.mark.parametrize("form", JOINTS)
+def test_each_program_gives_the_same_joints(tmp_path, form):
+    name, text, options = JOINTS[form]
+    (tmp_path / name).write_text(text)
+    np.testing.assert_allclose(read_pose_table(tmp_path / name, arm=SIX, **options).q, Q, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        (
+            "p.JBI",
+            JBI.replace("RECTAN", "PULSE").replace("BASE", "PULSE") + rows("C{k:05d}={},{},{},{},{},{}", MM, FIXED),
+            "pulses of the motors' encoders",
+        ),
+        ("p.LS", rows(LS, MM, FIXED).replace("UT : 1", "UT : 2", 1), "several frames or tools .UF 0, UT 2, UF 0, UT 1"),
+        (
+            "p.mod",
+            "CONST robtarget p:=[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9]];\nCONST jointtarget j:=[[1,2,3,4,5,6],[9E9]];\n",
+            "holds 1 poses .line 1. and 1 joints .line 2.: keep one kind",
+        ),
+        (
+            "p.dtx",
+            DTX + '<Value key="0" x="1" fatherId="a[0]" />\n<Value key="1" x="2" fatherId="b[0]" />\n</Data>',
+            "points are of several frames",
+        ),
+        ("a.yaml", "a: [1, 2\n", "not YAML"),
+        ("a.json", '{"a": [1, 2}', "line 1: not JSON"),
+        (
+            "a.json",
+            '{"image_width": 640, "image_height": 480}',
+            "holds a mapping of image_width, image_height, and no poses",
+        ),
+        (
+            "a.json",
+            '[{"T": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}, {"T": null}]',
+            "record 2 of 2 holds a mapping of T, and no pose",
+        ),
+        (
+            "a.json",
+            json.dumps([{"a": np.eye(4).tolist(), "b": np.eye(4).tolist()}] * 2),
+            "holds poses of a, b: say which, --columns pose=a",
+        ),
+        ("a.csv", "x,y,z,rx,ry,rz\n1 mm,2 mm,3 m,0,0,0\n4 m,5 mm,6 m,0,0,0\n", "column x has numbers in several units"),
+        (
+            "a.csv",
+            csv("", XYZW, P),
+            "the last four numbers are no quaternions, the first four are: the rotation comes before",
+        ),
+        ("a.csv", "1,2,3,4,5\n", "5 numbers without names.*--columns x_mm"),
+    ],
+)
+def test_what_cannot_be_read_is_said_with_what_would_do(tmp_path, name, text, said):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=said):
+        read_pose_table(tmp_path / name, rotation="wxyz" if name == "a.csv" and "0." in text else None)
+
+
+def test_columns_in_order_and_by_name(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(csv("", P, XYZW))
+    with pytest.raises(InputError, match="has 7 columns, --columns names 6"):
+        read_pose_table(path, columns="x,y,z,qw,qx,qy")
+    with pytest.raises(InputError, match="unknown name 'roll'"):
+        read_pose_table(path, columns="x,y,z,roll,qx,qy,qz")
+    both = tmp_path / "both.json"
+    both.write_text(json.dumps([{"a": a.tolist(), "b": b.tolist()} for a, b in zip(A, B, strict=True)]))
+    np.testing.assert_allclose(read_pose_table(both, columns="pose=b").Ts, B, atol=1e-12)
+    assert not has_both(both)
+    assert number("1e-05") == 1e-5
+    assert number("1_000") is None
+    assert np.isnan(number("nan"))
