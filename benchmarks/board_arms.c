@@ -14,7 +14,7 @@
 #define SPEED_TICKS 8u /* over which a joint's speed is taken: less shows how the converter's noise shakes it */
 
 typedef struct arm_loop {
-    double *q, *qd, *link, *qdd, *model, *hand, *current_a, *broken;
+    double *q, *qd, *link, *qdd, *model, *hand, *current_a, *broken, *stuck, *offset_a;
     int64_t *fault;
     uint64_t *noise;
     uint32_t *counts;
@@ -71,12 +71,10 @@ static void sense(arm_loop *arm)
         reading = arm->fault[i] == 1 ? 65535 : arm->fault[i] == 2 ? 0 : arm->fault[i] == 3 ? arm->counts[i] : reading;
         arm->counts[i] = (uint32_t)(reading < 0 ? 0 : reading > 65535 ? 65535 : reading);
         const double current_noise = normal(&arm->noise[i]);
-        arm->current_ma[i] = (int32_t)floor(1e3 * model[10u * JOINTS + i] * arm->current_a[i] +
-                                            model[9u * JOINTS + i] * current_noise + 0.5);
+        const double seen_a = model[10u * JOINTS + i] * arm->current_a[i] + arm->offset_a[i];
+        arm->current_ma[i] = (int32_t)floor(1e3 * seen_a + model[9u * JOINTS + i] * current_noise + 0.5);
     }
 }
-
-
 
 static void step(arm_loop *arm)
 {
@@ -87,7 +85,8 @@ static void step(arm_loop *arm)
     const double supply_v = arm->supply_mv * 1e-3;
     double before = 0.0;
     for (uint32_t i = 0u; i < JOINTS; i++) {
-        const double own = model[2u * JOINTS + i], constant = model[JOINTS + i], duty = (double)out->duty[i];
+        const double own = model[2u * JOINTS + i], constant = model[JOINTS + i];
+        const double duty = arm->stuck[i] == 0.0 ? (double)out->duty[i] : arm->stuck[i];
         const double conductance = awake ? constant / model[i] : 0.0;
         const double dry = model[4u * JOINTS + i] + (out->brakes_open == 0u ? model[11u * JOINTS + i] : 0.0);
         const double inertia = own + h * (model[3u * JOINTS + i] + conductance * constant);

@@ -60,6 +60,8 @@ PLANT_ARRAYS = {
     "hand": "hand_n_m",
     "current_a": "_current_a",
     "broken": "_broken",
+    "stuck": "stuck",
+    "offset_a": "offset_a",
     "fault": "_fault",
     "noise": "_noise",
     "counts": "_counts",
@@ -261,6 +263,11 @@ class Arm:
         here = np.tile(np.array(self.out[0]["reference_rad"], dtype=float), (ticks // PERIOD_TICKS, 1))
         passed = self.follow(here, np.zeros_like(here))
         return passed if self.out[0]["faults"] else None
+
+    def rest_on(self, ticks):
+        """Stay, whatever fault there is."""
+        here = np.tile(np.array(self.out[0]["reference_rad"], dtype=float), (ticks // PERIOD_TICKS, 1))
+        self.follow(here, np.zeros_like(here), stop_at_fault=False)
 
     @property
     def first(self):

@@ -10,7 +10,7 @@
 #include "setpoint.h"
 
 /* Begin to drive a joint from where it is, at rest, with limits that let it move in but never further out. */
-static void start_joint(joint_state *joint, const joint_config *config, uint32_t i)
+static void start_joint(joint_state *joint, const joint_config *config, uint32_t nominal_mv, uint32_t i)
 {
     const float angle_rad = joint->pot.angle_rad;
     const float speed_rad_s = joint->pid.speed_rad_s;
@@ -19,7 +19,10 @@ static void start_joint(joint_state *joint, const joint_config *config, uint32_t
     setpoint_hold(&joint->setpoint, angle_rad);
     governor_hold(&joint->reference, angle_rad);
     motor_start(&joint->motor, angle_rad, config->speed_limit_rad_s, i);
+    const float ka_mv = config->gains.ka_s2_per_rad * (float)nominal_mv; /* J R / K by 1000 */
+    joint->motor.swift_per_a = ka_mv > 0.0f ? config->motor.resistance_ohm / ka_mv : 0.0f;
     joint->released = 0u;
+    joint->zero.ticks = 0u;
     joint->suspect = FAULT_NONE;
     pot_watch(&joint->pot, angle_rad);
     joint->low_rad = angle_rad < config->soft_min_rad ? angle_rad : config->soft_min_rad;
@@ -54,7 +57,7 @@ static uint32_t enable(core_state *core, bool inward)
     }
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         if (!held || core->joint[i].released != 0u) { /* what is held stays where it is held */
-            start_joint(&core->joint[i], &core->config.joint[i], i);
+            start_joint(&core->joint[i], &core->config.joint[i], core->config.supply_nominal_mv, i);
         }
     }
     core->state = STATE_ENABLED;
@@ -86,7 +89,11 @@ static uint32_t clear_faults(core_state *core)
     if (core->state == STATE_STOPPED || core->state == STATE_STOPPING) {
         return REJECTION_WRONG_STATE;
     }
-    if (core->standing != 0u) {
+    bool stands = core->standing != 0u;
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) { /* a joint without its witness is held, and no more */
+        stands = stands || (safety_drives_on(core) && core->joint[i].motor.doubted != 0u);
+    }
+    if (stands) {
         return REJECTION_FAULT_STANDS;
     }
     safety_forget(core);

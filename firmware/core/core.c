@@ -21,7 +21,7 @@ void core_init(core_state *core, const core_config *config, uint32_t source, uin
         core->config = *config;
     } else {
         config_factory(&core->config);
-        core->permanent = 1u << FAULT_CONFIG;
+        core->permanent = FAULT_BIT(FAULT_CONFIG);
         safety_raise(core, FAULT_CONFIG, NO_JOINT);
     }
     if (reset != RESET_POWER) {
@@ -208,19 +208,21 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
         return;
     }
     core->standing = 0u;
-    const bool driven = safety_drives_on(core);
+    const bool closed = core->shorted != 0u; /* the windings, by drives on or off */
     core->supply_v = (float)inputs->supply_mv * 0.001f;
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         joint_state *joint = &core->joint[i];
         const joint_config *config = &core->config.joint[i];
         joint->limited = 0u;
         measure(core, joint, config, i, inputs->counts[i]);
-        joint->current_a = (float)(config->motor_direction * inputs->current_ma[i]) * 0.001f;
+        joint->current_a = (float)(config->motor_direction * inputs->current_ma[i]) * 0.001f - joint->zero.now_a;
         joint->over_a = number_size(joint->current_a) - (float)config->current_limit_ma * 0.001f;
-        if (joint->over_a > 0.0f) { /* a driver that limits the current does not put the duty out */
+        if (joint->over_a > 0.0f && joint->motor.duty != 0.0f) { /* a driver that limits it does not put the duty out */
             motor_pause(&joint->motor, joint->pot.angle_rad);
-        } else if (driven) {
+        } else if (closed) {
             motor_measure(&joint->motor, &config->motor, core->supply_v, joint->current_a, joint->pot.angle_rad);
+        } else {
+            motor_sleep(&joint->zero, joint->current_a);
         }
     }
     safety_watch_arm(core, inputs);
@@ -236,8 +238,14 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
     close_brakes(core);
     if (safety_drives_on(core)) {
         core->shorted = 1u;
+        core->stopped_ticks = 0u;
     } else {
         rest(core);
+        if (core->shorted != 0u) {
+            safety_watch_rest(core);
+        } else {
+            safety_watch_sleep(core);
+        }
     }
     put_out(core, inputs->supply_mv);
     report(core, outputs);

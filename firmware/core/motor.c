@@ -2,10 +2,13 @@
 
 #define FADE_S 0.4f           /* a gap fades with this time constant: what opens more slowly is not seen */
 #define PRIOR_VARIANCE 0.005625f /* of R and K over the configuration's: 0.075^2, so that three sigma of both cover 15 % */
-#define WANDER_VARIANCE 6e-9f /* by which each becomes less certain per tick: windings get warm */
+#define WANDER_VARIANCE 6e-9f /* by which K becomes less certain per tick: magnets get warm */
+#define WARMS 1e-5f           /* sigma of R per tick: three of it are 3 % a second, 40 % within 20 s; half: a winding that warms
+                                 so fast is a fault, double: a reading that stands still is noticed later */
+#define WARM_VARIANCE 0.04f   /* to which that grows where nothing is learnt: 0.2^2, so that three sigma cover -20 to +40 % */
 #define SIGMAS 3.0f
-#define SCALE_LOW 0.8f        /* further off than so is no resistance's tolerance, warm or cold */
-#define SCALE_HIGH 1.25f
+#define SCALE_LOW 0.68f       /* of R: a tolerance of 15 %, and copper from -50 to +100 K (0.39 % a kelvin) */
+#define SCALE_HIGH 1.61f
 #define CONSTANT_LOW (1.0f - CONSTANT_OFF)
 #define CONSTANT_HIGH (1.0f + CONSTANT_OFF)
 #define WINDOW_TICKS 32u      /* R and K are learnt from a window: until the reading has moved, looked at as often, */
@@ -13,7 +16,8 @@
 #define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
 #define RESTING 0.5f          /* of the backlash: two positions in it are a sigma of 0.41 apart */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
-#define SURPRISE 9.0f         /* squared sigmas beyond which a window teaches nothing */
+#define SURPRISE 3.0f         /* sigmas beyond which a window teaches nothing until motor and reading agreed once, and then */
+#define TEACHES 1.5f          /* as much as one that is off by so many: 1 a winding that warms is followed too late, 3 a drift is */
 #define SAMPLE_TICKS 8u
 #define AGREED 4.0f           /* of apart_rad: so much way together proves that wiring and scale are right, */
 #define SAME_LOW 0.75f        /* if the motor's is as much of the reading's: */
@@ -26,21 +30,35 @@
 #define REVERSAL_TICKS 64u    /* in a longer window than so a joint may have reversed and come back */
 #define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
 #define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
+#define ZERO_TICKS 64u        /* over which the zero of a current is averaged */
+#define DISOBEY_SAMPLES 2u    /* 16 ms: by then a joint that was driven goes the way it is driven, or brakes */
+#define DISOBEY_RAD 0.008f    /* in which it goes so far at least: three sigma of two readings */
+#define DISOBEY_OFF_RAD 0.02f /* and so far it is from where it is to be: no joint lags by as much on its path */
+#define STUCK_SUPPLY 0.2f     /* of the supply: less a stuck bridge hardly moves */
+#define STEP_RAD_S 0.05f      /* a motor's speed that changes by so much in a tick, beyond noise and what its torque does, is none */
+#define ROUGH_TIMES 5.0f      /* of the mean change from tick to tick: four sigma of its noise */
+#define ROUGH_SHARE 0.0625f   /* of a sample in that mean */
+#define ROUGH_RAD_S 0.08f     /* the mean at first */
 
 void motor_start(motor_state *motor, float angle_rad, float speed_limit_rad_s, uint32_t phase)
 {
     const float duty = motor->duty;
+    const bool new = motor->variance_rr == 0.0f; /* else it may still be as warm as it was */
+    const float resistance = new ? 1.0f : motor->resistance_scale;
     *motor = (motor_state){.duty = duty,
                            .fastest_rad_s = speed_limit_rad_s > SEEN_RAD_S ? speed_limit_rad_s : SEEN_RAD_S,
                            .last_rad = angle_rad,
                            .window_rad = angle_rad,
-                           .window_ticks = phase,
                            .window_side = SIDE_UNKNOWN,
-                           .resistance_scale = 1.0f,
+                           .resistance_scale = resistance,
                            .constant_scale = 1.0f,
                            .variance_rr = PRIOR_VARIANCE,
                            .variance_kk = PRIOR_VARIANCE,
                            .unsure_rad_s = UNKNOWN_RAD_S,
+                           .step_rad_s = UNKNOWN_RAD_S,
+                           .sample_ticks = SETTLE_TICKS + 1u,
+                           .part_ticks = SETTLE_TICKS,
+                           .rough_rad_s = ROUGH_RAD_S,
                            .trust = CAREFUL,
                            .phase = phase};
 }
@@ -92,7 +110,11 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
     const float ticks = (float)motor->window_ticks;
     const float per_tick = 1.0f / ticks;
     const float wander = WANDER_VARIANCE * ticks;
-    motor->variance_rr += motor->variance_rr < PRIOR_VARIANCE ? wander : 0.0f; /* also where nothing is learnt */
+    if (motor->variance_rr < WARM_VARIANCE) { /* also where nothing is learnt; a temperature that rises is no random walk */
+        const float sigma = number_root(motor->variance_rr) + WARMS * ticks;
+        motor->variance_rr = sigma * sigma;
+        motor->unsure_per_a = SIGMAS * sigma * config->resistance_ohm / config->constant_v_s;
+    }
     const float per_s = (float)TICKS_PER_S * per_tick;
     const float ir_v = motor->window_ir_v * per_tick;
     const float kw_v = config->constant_v_s * (angle_rad - motor->window_rad) * per_s;
@@ -100,20 +122,22 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
     const float gain_r = motor->variance_rr * ir_v + motor->variance_rk * kw_v;
     const float gain_k = motor->variance_rk * ir_v + motor->variance_kk * kw_v;
     const float variance = ir_v * gain_r + kw_v * gain_k + noise_v * noise_v;
-    const float off_v = motor->window_v * per_tick - motor->resistance_scale * ir_v - motor->constant_scale * kw_v;
-    if (off_v * off_v <= SURPRISE * variance) {
-        const float per_variance = 1.0f / variance;
-        const bool moved = number_size(angle_rad - motor->window_rad) > WINDOW_WAY_RAD;
-        motor->resistance_scale =
-            number_clamp(motor->resistance_scale + gain_r * off_v * per_variance, SCALE_LOW, SCALE_HIGH);
-        if (moved) { /* else the constant is only taken into account (Schmidt's form) */
-            motor->constant_scale =
-                number_clamp(motor->constant_scale + gain_k * off_v * per_variance, CONSTANT_LOW, CONSTANT_HIGH);
-            motor->variance_kk += wander - gain_k * gain_k * per_variance;
-        }
-        motor->variance_rr -= gain_r * gain_r * per_variance;
-        motor->variance_rk -= gain_r * gain_k * per_variance;
+    const float seen_v = motor->window_v * per_tick - motor->resistance_scale * ir_v - motor->constant_scale * kw_v;
+    const float sigma_v = number_root(variance);
+    if (motor->trust != 1.0f && number_size(seen_v) > SURPRISE * sigma_v) {
+        return;
     }
+    const float off_v = motor->trust != 1.0f ? seen_v : number_bound(seen_v, TEACHES * sigma_v);
+    const float per_variance = 1.0f / variance;
+    motor->resistance_scale =
+        number_clamp(motor->resistance_scale + gain_r * off_v * per_variance, SCALE_LOW, SCALE_HIGH);
+    if (number_size(angle_rad - motor->window_rad) > WINDOW_WAY_RAD) { /* else the constant is only taken into account */
+        motor->constant_scale = /* (Schmidt's form) */
+            number_clamp(motor->constant_scale + gain_k * off_v * per_variance, CONSTANT_LOW, CONSTANT_HIGH);
+        motor->variance_kk += wander - gain_k * gain_k * per_variance;
+    }
+    motor->variance_rr -= gain_r * gain_r * per_variance;
+    motor->variance_rk -= gain_r * gain_k * per_variance;
 }
 
 static void window_begin(motor_state *motor, float angle_rad)
@@ -124,12 +148,13 @@ static void window_begin(motor_state *motor, float angle_rad)
     motor->window_ticks = 0u;
 }
 
-static void window(motor_state *motor, const motor_config *config, float voltage_v, float ir_v, float angle_rad)
+/* Take a sample's sums into the window; a window that is long enough teaches. */
+static void window(motor_state *motor, const motor_config *config, float angle_rad)
 {
-    motor->window_v += voltage_v;
-    motor->window_ir_v += ir_v;
-    motor->window_ticks++;
-    if (motor->window_ticks % WINDOW_TICKS != 0u) {
+    motor->window_v += motor->part_v;
+    motor->window_ir_v += motor->part_a * config->resistance_ohm;
+    motor->window_ticks += motor->driven_ticks - motor->part_ticks;
+    if (motor->window_ticks < WINDOW_TICKS) {
         return;
     }
     const float way_rad = angle_rad - motor->window_rad;
@@ -141,10 +166,17 @@ static void window(motor_state *motor, const motor_config *config, float voltage
         earn(motor, config, way_rad);
     }
     /* A gap that R and K may explain must be learnt from: else they would stay wrong for good. */
-    if (number_size(motor->gap_rad) < 0.5f * config->apart_rad + motor->band_rad) {
+    if (motor->heard_ohm > 0.0f && number_size(motor->gap_rad) < 0.5f * config->apart_rad + motor->band_rad) {
         learn(motor, config, angle_rad, noise_rad);
     }
     window_begin(motor, angle_rad);
+}
+
+static void part_begin(motor_state *motor)
+{
+    motor->part_v = 0.0f;
+    motor->part_a = 0.0f;
+    motor->part_ticks = motor->driven_ticks;
 }
 
 /* Let the unknown duration of a pause make the motor's speed unknown. */
@@ -154,7 +186,26 @@ void motor_pause(motor_state *motor, float angle_rad)
     motor->unsure_rad_s = UNKNOWN_RAD_S;
     motor->sure_rad_s = 0.0f;
     motor->window_side = SIDE_UNKNOWN; /* backlash may be crossed meanwhile */
+    motor->sampled = 0u;
+    motor->sample_ticks = motor->driven_ticks + 1u;
+    motor->step_rad_s = UNKNOWN_RAD_S;
+    part_begin(motor);
     window_begin(motor, angle_rad);
+}
+
+void motor_sleep(zero_state *zero, float current_a)
+{
+    if (zero->ticks == 0u) {
+        zero->before_a = zero->now_a;
+    }
+    zero->ticks = zero->ticks < ZERO_TICKS ? zero->ticks + 1u : ZERO_TICKS;
+    zero->now_a += current_a / (float)zero->ticks;
+}
+
+bool motor_flows_asleep(const zero_state *zero, const motor_config *config, float supply_v)
+{
+    const float shown_v = number_size(zero->now_a - zero->before_a) * config->resistance_ohm;
+    return zero->ticks == ZERO_TICKS / 2u && shown_v > STUCK_SUPPLY * supply_v;
 }
 
 /* What changes slowly: how uncertain the speed is, and the samples. */
@@ -163,6 +214,7 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     const float variance = motor->variance_rr * ir_v * ir_v + 2.0f * motor->variance_rk * ir_v * emf_v +
                            motor->variance_kk * emf_v * emf_v;
     motor->unsure_rad_s = SIGMAS * number_root(variance > 0.0f ? variance : 0.0f) / config->constant_v_s;
+    motor->unsure_rad = motor->unsure_rad_s * TICK_S;
     if (motor->trust == 1.0f) {
         motor->doubt_rad_s = motor->unsure_rad_s;
     } else { /* nobody contradicts a constant that is too large: the joint is as fast as it may be */
@@ -171,15 +223,63 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     }
     const uint32_t at = motor->sampled % MOTOR_SAMPLES;
     motor->sample_read_rad[at] = angle_rad;
-    motor->sample_motor_rad[at] = motor->travel_rad;
+    motor->sample_v[at] = motor->part_v;
+    motor->sample_a[at] = motor->part_a;
     motor->sampled++;
+    motor->step_rad_s = STEP_RAD_S + ROUGH_TIMES * motor->rough_rad_s;
+    motor->heard_ohm = motor->doubted != 0u || motor_stepped(motor) ? 0.0f : config->resistance_ohm;
+    const uint32_t slot = motor->driven_ticks + motor->phase;
+    motor->sample_ticks = motor->driven_ticks + SAMPLE_TICKS - slot % SAMPLE_TICKS;
+    window(motor, config, angle_rad);
+    motor->per_constant = 1.0f / (motor->constant_scale * config->constant_v_s);
+    const float seen_a = number_size(motor->part_a) / (float)(motor->driven_ticks - motor->part_ticks);
+    const float kept_a = (1.0f - (float)SAMPLE_TICKS * TICK_S / FADE_S) * motor->current_a;
+    motor->current_a = seen_a > kept_a ? seen_a : kept_a;
+    part_begin(motor);
+}
+
+#define LOAD_SAMPLES 8u
+#define MOTOR_SHARE 0.35f /* of what voltage and current have parted, at the voltage: more, and the motor is not what it was; a
+                             sensor leaves it at 0, a winding of half the turns has 0.5 */
+
+/* Write the means over the last samples: what the load takes of the applied voltage, V (less the back-EMF by the reading),
+ * and the current, A. */
+static void load_of(const motor_state *motor, const motor_config *config, float *volts, float *amperes)
+{
+    *volts = *amperes = 0.0f;
+    const uint32_t last = motor->sampled - 1u;
+    for (uint32_t i = 0u; i < LOAD_SAMPLES; i++) {
+        *volts += motor->sample_v[(last - i) % MOTOR_SAMPLES];
+        *amperes += motor->sample_a[(last - i) % MOTOR_SAMPLES];
+    }
+    const float way_rad = motor->sample_read_rad[last % MOTOR_SAMPLES] -
+                          motor->sample_read_rad[(last - LOAD_SAMPLES) % MOTOR_SAMPLES];
+    const float ticks = (float)(LOAD_SAMPLES * SAMPLE_TICKS);
+    *volts = (*volts - config->constant_v_s * way_rad * (float)TICKS_PER_S) / ticks;
+    *amperes /= ticks;
+}
+
+/* Take a change of the motor's speed in a tick that is beyond noise: by its torque, its uncertain numbers, or a step. */
+static void changed(motor_state *motor, const motor_config *config, float change_rad_s, float current_a)
+{
+    const float torque_rad_s = motor->swift_per_a * motor->current_a;
+    const float unsure_rad_s = motor->unsure_per_a * number_size(current_a - motor->last_a);
+    if (change_rad_s <= motor->step_rad_s + torque_rad_s + unsure_rad_s || motor_stepped(motor)) {
+        return; /* what steps on began with the first */
+    }
+    motor->step_ticks = motor->driven_ticks;
+    motor->heard_ohm = 0.0f;
+    motor->before = motor->sampled > LOAD_SAMPLES ? 1u : 0u;
+    if (motor->before != 0u) {
+        load_of(motor, config, &motor->before_v, &motor->before_a);
+    }
 }
 
 void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad)
 {
     const float moved_rad = angle_rad - motor->last_rad;
     motor->last_rad = angle_rad;
-    motor->driven_ticks = number_count(motor->driven_ticks);
+    motor->driven_ticks++;
     if (config->resistance_ohm <= 0.0f || motor->driven_ticks <= SETTLE_TICKS) {
         motor->window_rad = angle_rad;
         motor->trust = config->resistance_ohm <= 0.0f ? 1.0f : motor->trust; /* no witness, no trust to earn */
@@ -188,39 +288,47 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     const float voltage_v = motor->duty * supply_v;
     const float ir_v = current_a * config->resistance_ohm;
     const float emf_v = voltage_v - motor->resistance_scale * ir_v;
-    const bool sampled = (motor->driven_ticks + motor->phase) % SAMPLE_TICKS == 0u || motor->unsure_rad_s == UNKNOWN_RAD_S;
-    if (sampled) {
-        motor->per_constant = 1.0f / (motor->constant_scale * config->constant_v_s);
+    const bool sampled = motor->driven_ticks == motor->sample_ticks;
+    const float speed_rad_s = emf_v * motor->per_constant;
+    const float change_rad_s = number_size(speed_rad_s - motor->speed_rad_s);
+    if (change_rad_s > motor->step_rad_s) {
+        changed(motor, config, change_rad_s, current_a);
     }
-    motor->speed_rad_s = emf_v * motor->per_constant;
+    motor->last_a = current_a;
+    motor->speed_rad_s = speed_rad_s;
+    motor->part_v += voltage_v;
+    motor->part_a += current_a;
     const float keep = 1.0f - TICK_S / FADE_S;
-    const float travelled_rad = motor->speed_rad_s * TICK_S;
-    motor->travel_rad += travelled_rad;
-    const float seen_a = number_size(current_a);
-    motor->current_a = seen_a > keep * motor->current_a ? seen_a : keep * motor->current_a;
     if (sampled) {
         sample(motor, config, ir_v, emf_v, angle_rad);
+        motor->rough_rad_s += ROUGH_SHARE * (change_rad_s - motor->rough_rad_s);
     }
-    motor->gap_rad = keep * motor->gap_rad + moved_rad - travelled_rad;
-    motor->band_rad = keep * motor->band_rad + motor->unsure_rad_s * TICK_S;
-    window(motor, config, voltage_v, ir_v, angle_rad);
-    const float size_rad_s = number_size(motor->speed_rad_s);
-    const bool known = motor->current_a * config->resistance_ohm > DEAD_SHARE * config->constant_v_s * size_rad_s;
+    motor->gap_rad = keep * motor->gap_rad + moved_rad - speed_rad_s * TICK_S;
+    motor->band_rad = keep * motor->band_rad + motor->unsure_rad;
+    const float size_rad_s = number_size(speed_rad_s);
+    const bool known = motor->current_a * motor->heard_ohm > DEAD_SHARE * config->constant_v_s * size_rad_s;
     motor->known = known ? 1u : 0u;
     motor->sure_rad_s = known ? size_rad_s - motor->doubt_rad_s : 0.0f;
 }
 
+static uint32_t fewer(uint32_t a, uint32_t b) { return a < b ? a : b; }
+
 uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v)
 {
     const float across_v = number_size(motor->duty) * supply_v;
-    if (motor->current_a * config->resistance_ohm < DEAD_SHARE * across_v) {
+    if (motor->current_a * config->resistance_ohm < DEAD_SHARE * across_v ||
+        (motor->trust == 1.0f && motor_stepped(motor))) {
         return FAULT_CURRENT_SENSOR;
     }
     /* What it looks like so far, by the last 32 ms. */
-    const uint32_t back = motor->sampled < 4u ? motor->sampled : 4u;
-    const uint32_t at = (motor->sampled - back) % MOTOR_SAMPLES;
-    const float motor_rad = motor->travel_rad - motor->sample_motor_rad[at];
-    const float read_rad = motor->last_rad - motor->sample_read_rad[at];
+    const uint32_t back = fewer(motor->sampled, 4u);
+    const float read_rad = motor->last_rad - motor->sample_read_rad[(motor->sampled - back) % MOTOR_SAMPLES];
+    float motor_v = motor->part_v - motor->resistance_scale * config->resistance_ohm * motor->part_a;
+    for (uint32_t i = 1u; i < back; i++) {
+        const uint32_t at = (motor->sampled - i) % MOTOR_SAMPLES;
+        motor_v += motor->sample_v[at] - motor->resistance_scale * config->resistance_ohm * motor->sample_a[at];
+    }
+    const float motor_rad = motor_v * motor->per_constant * TICK_S;
     const bool agreed = motor->trust == 1.0f;
     if (number_size(read_rad) < 0.25f * number_size(motor_rad) + WINDOW_NOISE_RAD) {
         return FAULT_POT_FROZEN;
@@ -238,94 +346,132 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
 #define NAME_NOISE_RAD 0.002f
 #define JUMP_SHARE 0.7f
 #define LAG_SHARE 0.5f      /* of what the others leave unexplained: a lag has one number more to fit with */
+#define GAIN_OFF 0.25f      /* so far is a current's gain off at least, or it is a winding's resistance */
+#define STUCK_SHARE 0.5f    /* likewise: of what a sound bridge leaves */
 
-/* Sums over the samples: reading y, motor m, their difference z, the sample's number k, the way between them x. */
-typedef struct name_sums {
-    float y, m, z, k, x;
-    float yy, mm, zz, kk, xx;
-    float my, zk, yk, yx, kx;
-} name_sums;
+/* What a joint did over some samples, in radians since the first of them: reading, way by the voltage alone, way that the
+ * winding's voltage takes of it, the sample's number, and the sum of the way between motor and reading. */
+enum { READ, VOLTAGE, CURRENT, TIME, BETWEEN };
+#define COLUMNS MOTOR_COLUMNS
 
-/* Return what is left of squares yy once a regressor with squares xx is fitted; *slope is its factor. */
-static float left_of(float yy, float xy, float xx, float *slope)
+typedef float combination[COLUMNS]; /* of the columns */
+
+static const combination reading = {1.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+static const combination motors = {0.0f, 1.0f, -1.0f, 0.0f, 0.0f};
+static const combination gap = {1.0f, -1.0f, 1.0f, 0.0f, 0.0f};
+static const combination winding = {0.0f, 0.0f, 1.0f, 0.0f, 0.0f};
+static const combination at_terminals = {1.0f, 0.0f, 1.0f, 0.0f, 0.0f}; /* voltage, by reading and current */
+static const combination passing = {0.0f, 0.0f, 0.0f, 1.0f, 0.0f};
+static const combination between = {0.0f, 0.0f, 0.0f, 0.0f, 1.0f};
+
+static float product(const motor_sums *s, const combination a, const combination b)
 {
-    *slope = xx > 0.0f ? xy / xx : 0.0f;
-    return yy - *slope * xy;
-}
-
-static name_sums sums_of(const motor_state *motor, uint32_t count)
-{
-    name_sums s = {0};
-    const uint32_t first = (motor->sampled - count) % MOTOR_SAMPLES;
-    float x = 0.0f;
-    for (uint32_t i = 0u; i < count; i++) {
-        const uint32_t at = (motor->sampled - count + i) % MOTOR_SAMPLES;
-        const float y = motor->sample_read_rad[at] - motor->sample_read_rad[first];
-        const float m = motor->sample_motor_rad[at] - motor->sample_motor_rad[first];
-        const float z = y - m;
-        const float k = (float)i;
-        x -= z;
-        s.y += y; s.m += m; s.z += z; s.k += k; s.x += x;
-        s.yy += y * y; s.mm += m * m; s.zz += z * z; s.kk += k * k; s.xx += x * x;
-        s.my += m * y; s.zk += z * k; s.yk += y * k; s.yx += y * x; s.kx += k * x;
+    float sum = 0.0f;
+    for (uint32_t i = 0u; i < COLUMNS; i++) {
+        for (uint32_t j = 0u; j < COLUMNS; j++) {
+            sum += a[i] * s->of[i * COLUMNS + j] * b[j];
+        }
     }
-    const float n = (float)count; /* about their means */
-    s.yy -= s.y * s.y / n; s.mm -= s.m * s.m / n; s.zz -= s.z * s.z / n; s.kk -= s.k * s.k / n; s.xx -= s.x * s.x / n;
-    s.my -= s.m * s.y / n; s.zk -= s.z * s.k / n; s.yk -= s.y * s.k / n; s.yx -= s.y * s.x / n; s.kx -= s.k * s.x / n;
-    return s;
+    return sum;
 }
 
-/* Return what is left of the reading if it follows late: y = a k + x T/lag by least squares; x alone is what lag adds. */
-static float left_by_lag(const name_sums *s, float *rate)
+static void sums_of(const motor_state *motor, const motor_config *config, uint32_t count, motor_sums *s)
 {
-    float unused;
-    const float yy = left_of(s->yy, s->yk, s->kk, &unused);
-    const float yx = s->yx - s->yk * s->kx / s->kk;
-    const float xx = s->xx - s->kx * s->kx / s->kk;
-    return left_of(yy, yx, xx, rate);
+    const uint32_t first = motor->sampled - count;
+    const float per_v = TICK_S / (motor->constant_scale * config->constant_v_s);
+    const float per_a = per_v * motor->resistance_scale * config->resistance_ohm;
+    for (uint32_t i = 0u; i < COLUMNS; i++) {
+        s->at[i] = s->sum[i] = 0.0f;
+        for (uint32_t j = 0u; j < COLUMNS; j++) {
+            s->of[i * COLUMNS + j] = 0.0f;
+        }
+    }
+    float *at = s->at, *sum = s->sum;
+    for (uint32_t k = 0u; k < count; k++) {
+        const uint32_t n = (first + k) % MOTOR_SAMPLES;
+        at[READ] = motor->sample_read_rad[n] - motor->sample_read_rad[first % MOTOR_SAMPLES];
+        at[VOLTAGE] += k != 0u ? motor->sample_v[n] * per_v : 0.0f;
+        at[CURRENT] += k != 0u ? motor->sample_a[n] * per_a : 0.0f;
+        at[TIME] = (float)k;
+        at[BETWEEN] += at[VOLTAGE] - at[CURRENT] - at[READ];
+        for (uint32_t i = 0u; i < COLUMNS; i++) {
+            sum[i] += at[i];
+            for (uint32_t j = 0u; j < COLUMNS; j++) {
+                s->of[i * COLUMNS + j] += at[i] * at[j];
+            }
+        }
+    }
+    for (uint32_t i = 0u; i < COLUMNS; i++) {
+        for (uint32_t j = 0u; j < COLUMNS; j++) {
+            s->of[i * COLUMNS + j] -= sum[i] * sum[j] / (float)count;
+        }
+    }
+}
+
+/* Return what squares are left of y once it is fitted by a; *slope is its factor. */
+static float left_by(const motor_sums *s, const combination y, const combination a, float *slope)
+{
+    const float aa = product(s, a, a);
+    const float ay = product(s, a, y);
+    *slope = aa > 0.0f ? ay / aa : 0.0f;
+    return product(s, y, y) - *slope * ay;
+}
+
+/* Return what is left of the reading if it follows late: by least squares a k + x T/lag, of which x alone is what lag adds. */
+static float left_by_lag(const motor_sums *s, float *rate)
+{
+    float slope, between_slope;
+    const float kk = product(s, passing, passing);
+    const float yy = left_by(s, reading, passing, &slope);
+    const float xx = left_by(s, between, passing, &between_slope);
+    const float yx = product(s, reading, between) - slope * between_slope * kk;
+    *rate = xx > 0.0f ? yx / xx : 0.0f;
+    return yy - *rate * yx;
 }
 
 /* Return whether most of what lies between reading and motor opened from one sample to the next. */
-static bool jumped(const motor_state *motor, uint32_t count)
+static bool jumped(const motor_state *motor, const motor_config *config, uint32_t count)
 {
-    float low = 0.0f, high = 0.0f, largest = 0.0f, last = 0.0f;
-    const uint32_t first = (motor->sampled - count) % MOTOR_SAMPLES;
-    for (uint32_t i = 1u; i < count; i++) {
-        const uint32_t at = (motor->sampled - count + i) % MOTOR_SAMPLES;
-        const float z = motor->sample_read_rad[at] - motor->sample_motor_rad[at] - motor->sample_read_rad[first] +
-                        motor->sample_motor_rad[first];
-        const float step = number_size(z - last);
+    float low = 0.0f, high = 0.0f, largest = 0.0f, z = 0.0f;
+    for (uint32_t i = count - 1u; i > 0u; i--) {
+        const uint32_t at = (motor->sampled - i) % MOTOR_SAMPLES;
+        const float emf_v = motor->sample_v[at] - motor->resistance_scale * config->resistance_ohm * motor->sample_a[at];
+        const float step = motor->sample_read_rad[at] - motor->sample_read_rad[(at + MOTOR_SAMPLES - 1u) % MOTOR_SAMPLES] -
+                           emf_v * motor->per_constant * TICK_S;
+        z += step;
         low = z < low ? z : low;
         high = z > high ? z : high;
-        largest = step > largest ? step : largest;
-        last = z;
+        largest = number_size(step) > largest ? number_size(step) : largest;
     }
     return largest > 10.0f * NAME_NOISE_RAD && largest > JUMP_SHARE * (high - low);
 }
 
-uint32_t motor_names(const motor_state *motor, uint32_t suspect)
+uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect, motor_sums *s)
 {
-    const uint32_t count = motor->sampled < NAME_SAMPLES ? motor->sampled : NAME_SAMPLES;
+    const uint32_t count = fewer(motor->sampled, NAME_SAMPLES);
     if (count < NAME_SAMPLES / 2u) {
         return suspect;
     }
-    if (jumped(motor, count)) {
+    if (jumped(motor, config, count)) {
         return FAULT_POT_JUMP;
     }
-    const name_sums s = sums_of(motor, count);
+    sums_of(motor, config, count, s);
     const float noise = (float)count * NAME_NOISE_RAD * NAME_NOISE_RAD;
-    if (s.mm < 4.0f * noise) { /* the motor rests */
-        return s.yy > 4.0f * noise ? FAULT_POT_DRIFT : suspect;
+    if (product(s, motors, motors) < 4.0f * noise) { /* the motor rests */
+        return product(s, reading, reading) > 4.0f * noise ? FAULT_POT_DRIFT : suspect;
     }
     float share, drift, rate;
-    const float by_share = left_of(s.yy, s.my, s.mm, &share) + noise;
-    const float by_drift = left_of(s.zz, s.zk, s.kk, &drift) + noise;
+    const float by_share = left_by(s, reading, motors, &share) + noise;
+    const float by_drift = left_by(s, gap, passing, &drift) + noise;
     const float least = by_share < by_drift ? by_share : by_drift;
     if (by_share < by_drift && share < -0.3f) {
         return FAULT_POT_INVERTED;
     }
-    if (left_by_lag(&s, &rate) + noise < LAG_SHARE * least && rate > 0.0f) {
+    if (left_by_lag(s, &rate) + noise < LAG_SHARE * least && rate > 0.0f) {
         return FAULT_POT_LAG;
+    }
+    if (motor->trust == 1.0f && left_by(s, gap, winding, &rate) + noise < LAG_SHARE * least && number_size(rate) > GAIN_OFF) {
+        return FAULT_CURRENT_SENSOR;
     }
     if (by_drift < by_share) {
         return number_size(drift) * (float)count > 4.0f * NAME_NOISE_RAD ? FAULT_POT_DRIFT : suspect;
@@ -334,7 +480,65 @@ uint32_t motor_names(const motor_state *motor, uint32_t suspect)
         return FAULT_POT_FROZEN;
     }
     const bool agreed = motor->trust == 1.0f;
-    return agreed && share < 1.0f ? FAULT_POT_SLIP : FAULT_POT_SCALE;
+    return !agreed ? FAULT_POT_SCALE : share < 1.0f ? FAULT_POT_SLIP : FAULT_MOTOR;
+}
+
+uint32_t motor_blames(const motor_state *motor, const motor_config *config)
+{
+    if (motor->before == 0u || motor->sampled <= LOAD_SAMPLES) {
+        return FAULT_CURRENT_SENSOR;
+    }
+    float volts, amperes;
+    load_of(motor, config, &volts, &amperes);
+    const float ohm = motor->resistance_scale * config->resistance_ohm;
+    const float more_v = volts - motor->before_v;
+    const float apart_v = more_v - ohm * (amperes - motor->before_a);
+    return more_v * apart_v > MOTOR_SHARE * apart_v * apart_v ? FAULT_MOTOR : FAULT_CURRENT_SENSOR;
+}
+
+bool motor_is_stuck(const motor_state *motor, const motor_config *config, float supply_v, motor_sums *s)
+{
+    const uint32_t since = (motor->driven_ticks - motor->step_ticks) / SAMPLE_TICKS;
+    const uint32_t count = fewer(fewer(motor->sampled, NAME_SAMPLES), since);
+    if (!motor_stepped(motor) || count < 4u) {
+        return false;
+    }
+    sums_of(motor, config, count, s);
+    const float noise = (float)count * NAME_NOISE_RAD * NAME_NOISE_RAD;
+    float by_time, unused;
+    const float stuck = left_by(s, at_terminals, passing, &by_time) + noise;
+    const float offset = left_by(s, gap, passing, &unused) + noise;
+    const float gain = left_by(s, gap, winding, &unused) + noise;
+    const float by_v = by_time * config->constant_v_s / (TICK_S * (float)SAMPLE_TICKS);
+    return stuck < STUCK_SHARE * (offset < gain ? offset : gain) && number_size(by_v) > STUCK_SUPPLY * supply_v;
+}
+
+bool motor_disobeys(const motor_state *motor, const motor_config *config, float supply_v, float wanted_rad)
+{
+    if (motor->sampled <= DISOBEY_SAMPLES) {
+        return false;
+    }
+    float applied_v = 0.0f, amperes = 0.0f;
+    bool off = true;
+    for (uint32_t i = 1u; i <= DISOBEY_SAMPLES; i++) {
+        const uint32_t at = (motor->sampled - i) % MOTOR_SAMPLES;
+        applied_v += motor->sample_v[at];
+        amperes += motor->sample_a[at];
+        off = off && motor->sample_v[at] == 0.0f;
+    }
+    const float per_tick = 1.0f / (float)(DISOBEY_SAMPLES * SAMPLE_TICKS);
+    const float way_rad = motor->sample_read_rad[(motor->sampled - 1u) % MOTOR_SAMPLES] -
+                          motor->sample_read_rad[(motor->sampled - 1u - DISOBEY_SAMPLES) % MOTOR_SAMPLES];
+    const float ir_v = motor->resistance_scale * config->resistance_ohm * amperes * per_tick;
+    const float terminal_v = ir_v + config->constant_v_s * way_rad * (float)TICKS_PER_S * per_tick;
+    if (number_size(terminal_v - applied_v * per_tick) < STUCK_SUPPLY * supply_v) {
+        return false;
+    }
+    if (off) { /* the current drives it on, or would if nothing held it: shorted windings brake */
+        return terminal_v * ir_v > 0.0f && terminal_v * way_rad > -number_size(terminal_v) * WINDOW_NOISE_RAD;
+    }
+    return applied_v * wanted_rad > 0.0f && way_rad * wanted_rad < 0.0f && number_size(way_rad) > DISOBEY_RAD &&
+           number_size(wanted_rad) > DISOBEY_OFF_RAD;
 }
 
 #define SWING_TICKS 60u   /* a swing of 8 Hz and faster changes its side as often */

@@ -8,6 +8,7 @@
 #include "number.h"
 #include "types.h"
 
+#define MOTOR_STEP_TICKS 160u /* for so long a step may be what a gap began with */
 #define MOTOR_WITNESS 0.1f /* of the speed it is held to: so much faster than the reading it must be to count */
 
 /* Begin to watch a joint that reads angle_rad and has this speed limit; phase differs from joint to joint, so that not
@@ -20,6 +21,12 @@ void motor_pause(motor_state *motor, float angle_rad);
 /* Take what a tick measured: supply (V), current (A, the joint's direction) and reading, while the windings are closed.
  * What R and K really are is learnt as long as motor and reading agree. */
 void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad);
+
+/* Take a tick in which the bridge sleeps: what current_a shows then is the sensor's zero. */
+void motor_sleep(zero_state *zero, float current_a);
+
+/* Return whether a current is shown that was not, once the bridge has slept for 32 ms: the sensor's error. */
+bool motor_flows_asleep(const zero_state *zero, const motor_config *config, float supply_v);
 
 /* Return the joint's speed: the reading's, or the motor's where that is faster beyond all its uncertainty. */
 static inline float motor_witness(const motor_state *motor, float reading_rad_s)
@@ -39,14 +46,32 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
 
 /* Return the fault by what motor and reading did in the last 192 ms; suspect where that does not show it. A motor that was
  * let go of changes its speed by itself: only then a reading that drifts can be distinguished from one that slips. */
-uint32_t motor_names(const motor_state *motor, uint32_t suspect);
+uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect, motor_sums *sums);
+
+/* Return whether the speed by the back-EMF has changed of late as no torque changes it: then current, winding or bridge are
+ * not what they were, and the reading has no part in it. */
+static inline bool motor_stepped(const motor_state *motor)
+{
+    return motor->step_ticks != 0u && motor->driven_ticks - motor->step_ticks < MOTOR_STEP_TICKS;
+}
+
+/* Return the fault of a motor that is none: what the load took has not changed, so of voltage and current that one is
+ * right which is still what it was before. */
+uint32_t motor_blames(const motor_state *motor, const motor_config *config);
+
+/* Return whether since such a step reading and current go with a voltage that stays, whatever is put out. */
+bool motor_is_stuck(const motor_state *motor, const motor_config *config, float supply_v, motor_sums *sums);
+
+/* Return whether for 16 ms a motor has not done what was put out to it, and by reading and current another voltage drives
+ * it: against the way wanted_rad that it is driven, or at all where nothing was put out and shorted windings brake. */
+bool motor_disobeys(const motor_state *motor, const motor_config *config, float supply_v, float wanted_rad);
 
 #define MOTOR_SWING 0.2f /* of the speed limit: so far from the reference's speed a swing goes at least */
 
 /* Return whether the motor swings about its reference, from whose speed it is far off by off_rad_s. */
 bool motor_swings_far(motor_state *motor, float off_rad_s);
 
-/* Return whether the motor swings about a reference that moves at reference_rad_s. To be asked each tick. */
+/* Return whether the motor swings about a reference that moves at reference_rad_s. To be asked each WATCH_TICKS. */
 static inline bool motor_swings(motor_state *motor, float reference_rad_s, float speed_limit_rad_s)
 {
     const float off_rad_s = motor->speed_rad_s - reference_rad_s;

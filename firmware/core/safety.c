@@ -11,6 +11,7 @@
 #define LOST_TICKS 100u   /* so many ticks lost of late are no accident */
 #define CRC_BYTES 2u      /* of the configuration looked at in a tick: all of it in less than a second */
 #define OVERCURRENT_TICKS 20u
+#define STOP_TICKS 300u   /* after which an emergency stop ends with sleeping drives, braked by shorted windings until then */
 #define NAME_TICKS 160u   /* after which a joint let go of has shown which fault it has */
 
 #define FAULT_NAME(name, code, reaction, text) [code] = #name,
@@ -69,7 +70,7 @@ static uint32_t reaction_to(const core_state *core, uint32_t fault)
 
 void safety_raise(core_state *core, uint32_t fault, uint32_t joint)
 {
-    const uint32_t bit = 1u << fault;
+    const uint32_t bit = FAULT_BIT(fault);
     core->standing |= bit;
     core->faults |= bit;
     if (joint < JOINTS) {
@@ -82,11 +83,12 @@ void safety_raise(core_state *core, uint32_t fault, uint32_t joint)
         core->first_fault = fault;
         core->first_joint = joint;
     }
+    const uint32_t reaction = reaction_to(core, fault);
+    core->shorted = reaction == REACTION_SLEEP ? 0u : core->shorted;
     if (core->state == STATE_STOPPED) {
         return;
     }
-    const uint32_t reaction = reaction_to(core, fault);
-    if (reaction == REACTION_RELEASE || !safety_drives_on(core)) {
+    if (reaction == REACTION_RELEASE || reaction == REACTION_SLEEP || !safety_drives_on(core)) {
         core->state = STATE_FAULTED;
         return;
     }
@@ -150,7 +152,7 @@ static void watch_memory(core_state *core)
         return;
     }
     if (core->crc_known != 0u && core->crc != core->crc_right) {
-        core->permanent |= 1u << FAULT_MEMORY;
+        core->permanent |= FAULT_BIT(FAULT_MEMORY);
     }
     core->crc_right = core->crc;
     core->crc_known = 1u;
@@ -176,7 +178,7 @@ void safety_watch_arm(core_state *core, const core_inputs *inputs)
     }
     watch_supply(core, inputs->supply_mv);
     for (uint32_t fault = 1u; core->permanent != 0u && fault < FAULT_COUNT; fault++) {
-        if ((core->permanent & (1u << fault)) != 0u) {
+        if ((core->permanent & FAULT_BIT(fault)) != 0u) {
             safety_raise(core, fault, NO_JOINT);
         }
     }
@@ -225,15 +227,58 @@ static void take_back_gains(core_state *core, joint_state *joint, uint32_t i)
     joint->motor.swings = 0u;
 }
 
+/* Give a fault of a joint another name, once there is evidence for it. */
+static void rename_fault(core_state *core, uint32_t i, uint32_t from, uint32_t to)
+{
+    core->joint_faults[i] &= ~FAULT_BIT(from);
+    core->joint_faults[i] |= FAULT_BIT(to);
+    uint32_t joints = 0u;
+    for (uint32_t other = 0u; other < JOINTS; other++) {
+        joints |= core->joint_faults[other];
+    }
+    core->faults &= joints | ~FAULT_BIT(from);
+    core->faults |= FAULT_BIT(to);
+    if (core->first_fault == from && core->first_joint == i) {
+        core->first_fault = to;
+    }
+}
+
+/* Raise a fault of a joint's drive: other faults of the joint came of it. */
+static void blame(core_state *core, joint_state *joint, uint32_t fault, uint32_t i)
+{
+    if (core->first_joint == i) {
+        rename_fault(core, i, core->first_fault, fault);
+    }
+    safety_raise(core, fault, i);
+    joint->suspect = fault == FAULT_BRIDGE ? FAULT_NONE : fault;
+}
+
+/* Hold a joint by its reading: its motor is no witness any more, until the drives were off. */
+static void doubt_motor(joint_state *joint)
+{
+    joint->motor.doubted = 1u;
+    if (joint->released != 0u) {
+        joint->released = 0u;
+        joint->motor.sampled = 0u; /* what it did meanwhile it was not driven to */
+        pid_reset(&joint->pid, joint->pot.angle_rad);
+        yield(joint);
+    }
+}
+
 /* Watch the motor: as a witness of the motion, and for itself. */
 static void watch_motor(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
     motor_state *motor = &joint->motor;
     if (motor_is_apart(motor, &config->motor)) {
         const uint32_t fault = motor_disagrees(motor, &config->motor, core->supply_v);
-        safety_raise(core, fault, i);
-        joint->suspect = fault == FAULT_CURRENT_SENSOR ? FAULT_NONE : fault;
         joint->suspect_ticks = 0u;
+        if (fault == FAULT_CURRENT_SENSOR) {
+            doubt_motor(joint);
+            blame(core, joint, fault, i);
+        } else {
+            safety_raise(core, fault, i);
+            joint->suspect = fault;
+        }
         return;
     }
     if (motor_is_fast(motor, joint->pid.speed_rad_s)) {
@@ -246,37 +291,54 @@ static void watch_motor(core_state *core, joint_state *joint, const joint_config
     }
 }
 
-/* Give a fault of a joint that was let go of its right name, once the motion since then shows it. */
-static void name_suspect(core_state *core, joint_state *joint, uint32_t i)
+/* Give a fault by which motor and reading disagreed its right name, once the motion since then shows it. Letting go of a
+ * joint asks whose fault it is: where the back-EMF goes on without a step, the motor is a good witness. */
+static void name_suspect(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
-    joint->suspect_ticks = in_a_row(joint->suspect_ticks, joint->suspect != FAULT_NONE);
-    if (joint->suspect_ticks < NAME_TICKS) {
+    motor_state *motor = &joint->motor;
+    if (motor_is_stuck(motor, &config->motor, core->supply_v, &core->sums) ||
+        (motor_stepped(motor) && motor_disobeys(motor, &config->motor, core->supply_v, joint->pid.error_rad))) {
+        blame(core, joint, FAULT_BRIDGE, i);
         return;
     }
-    const uint32_t suspect = joint->suspect;
-    const uint32_t fault = motor_names(&joint->motor, suspect);
-    joint->suspect = FAULT_NONE;
-    core->joint_faults[i] &= ~(1u << suspect);
-    core->joint_faults[i] |= 1u << fault;
-    uint32_t joints = 0u;
-    for (uint32_t other = 0u; other < JOINTS; other++) {
-        joints |= core->joint_faults[other];
+    if (joint->suspect == FAULT_NONE) {
+        return;
     }
-    core->faults &= joints | ~(1u << suspect);
-    core->faults |= 1u << fault;
-    if (core->first_fault == suspect && core->first_joint == i) {
-        core->first_fault = fault;
+    /* What a load takes shows at rest. */
+    const bool shows = motor->doubted == 0u || joint->reference.speed_rad_s == 0.0f;
+    joint->suspect_ticks = in_a_row(joint->suspect_ticks, shows);
+    if (motor->doubted == 0u && motor_stepped(motor)) {
+        doubt_motor(joint);
+        rename_fault(core, i, joint->suspect, FAULT_CURRENT_SENSOR);
+        joint->suspect = FAULT_CURRENT_SENSOR;
+    }
+    if (joint->suspect_ticks >= NAME_TICKS) {
+        const uint32_t fault = motor->doubted != 0u ? motor_blames(motor, &config->motor)
+                                                    : motor_names(motor, &config->motor, joint->suspect, &core->sums);
+        if (fault == FAULT_MOTOR || fault == FAULT_CURRENT_SENSOR) {
+            doubt_motor(joint);
+        }
+        rename_fault(core, i, joint->suspect, fault);
+        joint->suspect = FAULT_NONE;
     }
 }
 
 static void watch_joint(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
+    if (joint->released != 0u || joint->motor.doubted != 0u) {
+        name_suspect(core, joint, config, i);
+    }
     if (joint->released != 0u) {
-        name_suspect(core, joint, i);
         return;
     }
     const float off_rad = number_size(joint->pid.error_rad);
-    watch_motor(core, joint, config, i);
+    if (joint->motor.doubted == 0u) {
+        watch_motor(core, joint, config, i);
+    }
+    if (motor_swings(&joint->motor, joint->reference.speed_rad_s, config->speed_limit_rad_s)) {
+        safety_raise(core, FAULT_OSCILLATION, i);
+        take_back_gains(core, joint, i);
+    }
     watch_load(core, joint, config, i, off_rad);
     if (pot_is_inverted(&joint->pot, &config->pot, joint->pid.error_rad, joint->pid.duty)) {
         /* Where the motor is no witness, an inversion cannot be distinguished from a push: take the worse. */
@@ -301,12 +363,29 @@ void safety_watch_joints(core_state *core)
     for (uint32_t i = core->tick % WATCH_TICKS; i < core->config.joint_count; i += WATCH_TICKS) {
         watch_joint(core, &core->joint[i], &core->config.joint[i], i);
     }
-    for (uint32_t i = 0u; i < core->config.joint_count; i++) { /* what swings may do so at every tick */
+}
+
+void safety_watch_rest(core_state *core)
+{
+    if (core->state == STATE_STOPPED && ++core->stopped_ticks >= STOP_TICKS) {
+        core->shorted = 0u;
+    }
+    for (uint32_t i = core->tick % WATCH_TICKS; i < core->config.joint_count; i += WATCH_TICKS) {
         joint_state *joint = &core->joint[i];
-        const float limit_rad_s = core->config.joint[i].speed_limit_rad_s;
-        if (joint->released == 0u && motor_swings(&joint->motor, joint->reference.speed_rad_s, limit_rad_s)) {
-            safety_raise(core, FAULT_OSCILLATION, i);
-            take_back_gains(core, joint, i);
+        if (motor_disobeys(&joint->motor, &core->config.joint[i].motor, core->supply_v, 0.0f)) {
+            blame(core, joint, FAULT_BRIDGE, i);
+        }
+    }
+}
+
+void safety_watch_sleep(core_state *core)
+{
+    core->stopped_ticks = 0u;
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
+        const motor_config *motor = &core->config.joint[i].motor;
+        const bool bridge = (core->joint_faults[i] & FAULT_BIT(FAULT_BRIDGE)) != 0u;
+        if (bridge && motor_flows_asleep(&core->joint[i].zero, motor, core->supply_v)) {
+            rename_fault(core, i, FAULT_BRIDGE, FAULT_CURRENT_SENSOR);
         }
     }
 }

@@ -26,7 +26,7 @@ inline bool safety_drives_on(const core_state *core)
 /* Latch a fault of a joint (0 to 5, or NO_JOINT), whose cause stands in this tick, and react to it. */
 void safety_raise(core_state *core, uint32_t fault, uint32_t joint);
 
-/* Take the emergency stop: drives off in every state. */
+/* Take the emergency stop: drives off in every state, asleep within 0.3 s. */
 void safety_stop(core_state *core);
 
 /* Forget all latched faults; the caller has made sure that the cause of none of them stands. */
@@ -37,6 +37,12 @@ void safety_watch_arm(core_state *core, const core_inputs *inputs);
 
 /* Watch some of the driven joints, every one once in WATCH_TICKS, after their duties are known. */
 void safety_watch_joints(core_state *core);
+
+/* Watch joints whose windings are shorted with the drives off: one that is driven on puts all drivers to sleep. */
+void safety_watch_rest(core_state *core);
+
+/* Watch what sleeping bridges show: a current that flows through one is its sensor's error. */
+void safety_watch_sleep(core_state *core);
 
 /* Begin the watch over the configuration in use from its first byte; known: its CRC is still the one it had. */
 void safety_changed_config(core_state *core, bool known);

@@ -41,14 +41,16 @@
     X(PUSHED, 20, YIELD, "pushed: something moves the joint against its motor")                       \
     X(OVERSPEED, 21, HOLD, "overspeed: the joint is faster than its limit")                           \
     X(OSCILLATION, 22, HOLD, "oscillation: the joint swings about its reference; the stored gains are in use again") \
-    X(CURRENT_SENSOR, 23, JOINT, "current: no current where the voltage must drive one; its sensor or a lead is broken") \
+    X(CURRENT_SENSOR, 23, HOLD, "current: its sensor shows another one than the voltage must drive, or a lead is broken") \
     X(OVERCURRENT, 24, JOINT, "overcurrent: the motor current stays beyond twice its limit")          \
     X(ARITHMETIC, 25, RELEASE, "arithmetic: a duty was no number")                                    \
     X(MEMORY, 26, RELEASE, "memory: the configuration in use has changed by itself")                  \
     X(TICKS_LOST, 27, RELEASE, "ticks lost: the control loop loses time again and again")             \
     X(TAKEN_OVER, 28, HOLD, "taken over: another host said hello while the arm was driven")           \
     X(CRASH, 29, RELEASE, "restarted after a crash of the firmware")                                      \
-    X(ENCODER, 30, JOINT, "encoder: no sound reading: its wires, or a magnet too weak or too strong")
+    X(ENCODER, 30, JOINT, "encoder: no sound reading: its wires, or a magnet too weak or too strong")                       \
+    X(BRIDGE, 31, SLEEP, "bridge: it drives its motor by itself; all drives sleep")                        \
+    X(MOTOR, 32, HOLD, "motor: weak, or a winding shorted: it moves otherwise than its voltage and current say")
 
 /* X(name, code, text): the states. */
 #define STATE_LIST(X)                                                     \
@@ -87,8 +89,18 @@ enum { REJECTION_NONE = 0, REJECTION_LIST(REJECTION_CODE) REJECTION_COUNT };
 
 /* What a fault does to a moving arm: HOLD stops it along its path and holds it. YIELD does so too, but the joint lets
  * itself be moved to where it is. JOINT shorts the windings of the joint and stops the others along their path. RELEASE
- * shorts the windings of all. CHOSEN is the configuration's silence_reaction. */
-enum { REACTION_HOLD = 1, REACTION_RELEASE = 2, REACTION_CHOSEN = 3, REACTION_YIELD = 4, REACTION_JOINT = 5 };
+ * shorts the windings of all. SLEEP switches all drivers off, for one that does not obey. CHOSEN is the configuration's
+ * silence_reaction. */
+enum {
+    REACTION_HOLD = 1,
+    REACTION_RELEASE = 2,
+    REACTION_CHOSEN = 3,
+    REACTION_YIELD = 4,
+    REACTION_JOINT = 5,
+    REACTION_SLEEP = 6,
+};
+
+#define FAULT_BIT(code) (1u << ((code) % 32u)) /* in a set of faults; code 0 is none, so 32 has its bit */
 
 /* Why the board started. */
 enum { RESET_POWER = 0, RESET_WATCHDOG = 1, RESET_CRASH = 2 };
@@ -280,7 +292,7 @@ typedef struct core_outputs {
     uint32_t brakes_open;         /* not 0: release the brakes, where there are any */
     uint32_t feed_watchdog;       /* not 0: the tick ran to its end, the watchdog may be fed */
     uint32_t state;               /* STATE_... */
-    uint32_t faults;              /* latched faults, bit number = code */
+    uint32_t faults;              /* latched faults, FAULT_BIT of each */
     uint32_t joint_faults[JOINTS]; /* the same, those of each joint */
     uint32_t first_fault;         /* the fault that came first since the last clear, FAULT_NONE without */
     uint32_t first_joint;         /* its joint, NO_JOINT where it belongs to none */
@@ -352,12 +364,27 @@ typedef struct motor_state {
     float duty;              /* put out in the last tick, direction of the joint */
     float speed_rad_s;       /* by the back-EMF */
     float unsure_rad_s;      /* how far that may be off */
+    float unsure_rad;        /* in a tick */
     float doubt_rad_s;       /* the same, as far as it excuses a speed beyond the limit */
     float fastest_rad_s;     /* what it is held to: the speed limit, or what its noise lets show */
     float sure_rad_s;        /* the size it has at least but for the doubt; 0 where it is not known */
     uint32_t known;          /* not 0: a current is seen, without which its sensor may be broken */
-    float travel_rad;        /* since the joint was enabled */
-    float current_a;         /* the largest of late */
+    uint32_t before;         /* not 0: it is known what the load took before that, */
+    float before_v;          /* of the applied voltage less the back-EMF by the reading, */
+    float before_a;          /* and as a current */
+    float heard_ohm;         /* 0 while it is doubted, or a step was seen of late; else the configuration's R */
+    uint32_t sample_ticks;   /* driven_ticks when the next sample is taken */
+    float rough_rad_s;       /* mean change of speed_rad_s from tick to tick */
+    uint32_t doubted;        /* not 0: it is no witness until the drives were off */
+    float step_rad_s;        /* change of speed_rad_s in a tick that no torque makes */
+    float last_a;            /* the current of the last tick */
+    float unsure_per_a;      /* rad/s by which speed_rad_s may be off for each ampere */
+    float swift_per_a;       /* rad/s by which an ampere changes its speed in a tick */
+    uint32_t step_ticks;     /* driven_ticks when that was last seen, 0: never */
+    float part_v;            /* sums since the last sample: applied voltage, current */
+    float part_a;
+    uint32_t part_ticks;     /* driven_ticks then */
+    float current_a;         /* the largest mean of a sample of late */
     float gap_rad;           /* travel of the reading less that of the motor; fades */
     float band_rad;          /* how much of it the motor's uncertain numbers explain; fades */
     float last_rad;          /* the reading of the last tick */
@@ -386,8 +413,19 @@ typedef struct motor_state {
     uint32_t driven_ticks;   /* since the windings were closed */
     uint32_t phase;          /* when it is sampled */
     float sample_read_rad[MOTOR_SAMPLES];
-    float sample_motor_rad[MOTOR_SAMPLES];
+    float sample_v[MOTOR_SAMPLES]; /* sums since the sample before: applied voltage, V ticks, */
+    float sample_a[MOTOR_SAMPLES]; /* and current, A ticks */
 } motor_state;
+
+#define MOTOR_COLUMNS 5u
+#define MOTOR_PRODUCTS 25u
+
+/* Products of what a joint did over some samples, about their means (motor.c). */
+typedef struct motor_sums {
+    float of[MOTOR_PRODUCTS]; /* of columns i and j: at i MOTOR_COLUMNS + j */
+    float at[MOTOR_COLUMNS];  /* a sample, */
+    float sum[MOTOR_COLUMNS]; /* and the sum of all */
+} motor_sums;
 
 /* What is remembered of one potentiometer. */
 typedef struct pot_state {
@@ -407,6 +445,13 @@ typedef struct encoder_state {
     uint32_t zero_counts; /* those at home_rad */
     uint32_t homed;       /* not 0: it is known that they are */
 } encoder_state;
+
+/* What the sensor of a current reads while the bridges sleep and none flows. */
+typedef struct zero_state {
+    float now_a;
+    float before_a; /* when they last fell asleep */
+    uint32_t ticks; /* since then */
+} zero_state;
 
 /* What is remembered of one joint. */
 typedef struct joint_state {
@@ -432,6 +477,7 @@ typedef struct joint_state {
     uint32_t held_back;      /* LIMITED_SOFT and LIMITED_SPEED of the last motion command */
     uint32_t limited;        /* LIMITED_... of this tick */
     encoder_state encoder;
+    zero_state zero;
     motor_state motor;
 } joint_state;
 
@@ -448,6 +494,7 @@ typedef struct core_state {
     uint32_t supply_bad_ticks;
     uint32_t missed;         /* ticks lost of late; fades */
     uint32_t shorted;        /* not 0: windings stay shorted while the drives are off */
+    uint32_t stopped_ticks;  /* since an emergency stop, while they are */
     uint32_t closing;        /* not 0: the brakes close, the drives go off once they are */
     uint32_t brake_ticks;    /* until the brakes are open, or closed */
     gain_set start_gains;    /* those it started with: an oscillation goes back to them */
@@ -460,6 +507,7 @@ typedef struct core_state {
     uint32_t joint_faults[JOINTS];
     uint32_t first_fault;
     uint32_t first_joint;
+    motor_sums sums;         /* of the joint that is looked at; nothing is kept here */
     uint32_t permanent;      /* faults only a restart takes away */
     uint32_t acknowledged_sequence;
     uint32_t acknowledged_count;

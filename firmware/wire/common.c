@@ -245,8 +245,8 @@ static bool say_new_fault(wire_state *wire)
         of_joints |= faults;
         *said &= faults;
         for (uint32_t fault = 1u; fault < FAULT_COUNT; fault++) {
-            if ((faults & ~*said & (1u << fault)) != 0u) {
-                *said |= 1u << fault;
+            if ((faults & ~*said & FAULT_BIT(fault)) != 0u) {
+                *said |= FAULT_BIT(fault);
                 say_fault(wire, fault, joint);
                 return true;
             }

@@ -41,7 +41,7 @@ def _records() -> dict[str, type[ctypes.Structure]]:
 
 
 FAULTS, STATES, REJECTIONS = _listed("FAULT"), _listed("STATE"), _listed("REJECTION")
-REACTIONS = dict(re.findall(r"X\((\w+), \d+, (RELEASE|HOLD|CHOSEN|YIELD|JOINT),", HEADER))
+REACTIONS = dict(re.findall(r"X\((\w+), \d+, (RELEASE|HOLD|CHOSEN|YIELD|JOINT|SLEEP),", HEADER))
 RECORDS = _records()
 
 #: Records by name (``c.core_inputs``), numbers by name (``c.JOINTS``, ``c.COMMAND_MOVE``, ``c.FAULT_STALL``).

@@ -138,7 +138,7 @@ def drawn_model(seed: int, *, load: float = 0.6, inertia: float = 6.0, spread: f
     )
 
 
-@kernel("f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], b1, b1, f8, b1[::1]")
+@kernel("f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], b1, b1, f8, b1[::1]")
 def _move(
     q: Array,
     qd: Array,
@@ -147,6 +147,7 @@ def _move(
     model: Array,
     hand: Array,
     duty: Array,
+    stuck: Array,
     awake: bool,
     braked: bool,
     supply_v: float,
@@ -164,7 +165,8 @@ def _move(
         x = link[i] * link[i]
         cosine = 1 - x / 2 * (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))))
         load = hand[i] - model[5, i] * cosine - model[7, i] * own * before
-        push = h * (conductance * duty[i] * supply_v + load)
+        share = duty[i] if stuck[i] == 0.0 else stuck[i]
+        push = h * (conductance * share * supply_v + load)
         start = qd[i]
         for _ in range(_SUBSTEPS):
             free = (own * qd[i] + push) / inertia
@@ -192,10 +194,11 @@ def _normal(s: np.uint64) -> tuple[np.uint64, float]:
     return s, total / 37837.2
 
 
-@kernel("f8[::1], f8[::1], f8[:, ::1], u8[::1], i8[::1], f8[:, ::1], u4[::1], i4[::1]")
+@kernel("f8[::1], f8[::1], f8[::1], f8[:, ::1], u8[::1], i8[::1], f8[:, ::1], u4[::1], i4[::1]")
 def _read(
     link: Array,
     current_a: Array,
+    offset_a: Array,
     model: Array,
     noise: NDArray[np.uint64],
     fault: NDArray[np.int64],
@@ -237,7 +240,8 @@ def _read(
             reading = np.int64(counts[i])
         counts[i] = np.uint32(0 if reading < 0 else 65535 if reading > 65535 else reading)
         noise[i], normal = _normal(s)
-        current_ma[i] = np.int32(np.floor(1e3 * model[10, i] * current_a[i] + model[9, i] * normal + 0.5))
+        seen_a = model[10, i] * current_a[i] + offset_a[i]
+        current_ma[i] = np.int32(np.floor(1e3 * seen_a + model[9, i] * normal + 0.5))
 
 
 class JointPlant:
@@ -256,6 +260,9 @@ class JointPlant:
         supply_mv: motor supply, mV.
         stop_pressed: whether the emergency stop is pressed.
         blocked: (6,) joints that something holds fast.
+        stuck: (6,) share of the supply, -1 to 1, that a broken bridge puts out while it is awake, whatever its duty; 0
+            where it is sound.
+        offset_a: (6,) offset of the current's sensor, A.
     """
 
     def __init__(self, q: Array | None = None, *, seed: int = 1, model: JointModel | None = None) -> None:
@@ -269,6 +276,7 @@ class JointPlant:
         self.supply_mv = round(1e3 * SUPPLY_V)
         self.stop_pressed = False
         self.blocked = np.zeros(JOINTS, dtype=bool)
+        self.stuck, self.offset_a = np.zeros(JOINTS), np.zeros(JOINTS)
         self._qdd, self._current_a = np.zeros(JOINTS), np.zeros(JOINTS)
         self._noise = np.random.default_rng(seed).integers(1, 1 << 63, JOINTS, dtype=np.uint64)
         self._fault, self._broken = np.zeros(JOINTS, np.int64), np.zeros((3, JOINTS))
@@ -295,6 +303,7 @@ class JointPlant:
         _read(
             self.link,
             self._current_a,
+            self.offset_a,
             self._model,
             self._noise,
             self._fault,
@@ -309,8 +318,9 @@ class JointPlant:
         supply_v = self.supply_mv * 1e-3
         duty = np.asarray(duty, dtype=float)
         state = (self.q, self.qd, self.link, self._qdd)
-        _move(*state, self._model, self.hand_n_m, duty, awake, braked, supply_v, self.blocked)
+        _move(*state, self._model, self.hand_n_m, duty, self.stuck, awake, braked, supply_v, self.blocked)
         if awake:
+            duty = np.where(self.stuck != 0.0, self.stuck, duty)
             self._current_a[:] = (duty * supply_v - self._model[1] * self.qd) / self._model[0]
         else:
             self._current_a[:] = 0

@@ -141,7 +141,7 @@ AT_START = {"WATCHDOG": {"watchdog": True}, "CONFIG": {"source": c.CONFIG_FACTOR
 #: Found by the motor, which this arm has not (test_firmware_motor.py), by a restart or by the wire.
 BY_OTHERS = {
     "POT_SLIP", "POT_DRIFT", "POT_SCALE", "POT_LAG", "PUSHED", "OVERSPEED", "OSCILLATION", "CURRENT_SENSOR",
-    "OVERCURRENT", "CRASH", "ENCODER",
+    "OVERCURRENT", "CRASH", "ENCODER", "BRIDGE", "MOTOR",
 }  # fmt: skip
 
 

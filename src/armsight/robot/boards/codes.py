@@ -21,7 +21,7 @@ class BoardState(IntEnum):
 
 
 class Fault(IntEnum):
-    """What went wrong; bit ``1 << code`` in a set of faults."""
+    """What went wrong; bit ``1 << code % 32`` in a set of faults."""
 
     POT_OPEN = 1
     POT_SHORT = 2
@@ -53,6 +53,8 @@ class Fault(IntEnum):
     TAKEN_OVER = 28
     CRASH = 29
     ENCODER = 30
+    BRIDGE = 31
+    MOTOR = 32
 
 
 class Alarm(IntEnum):
@@ -161,7 +163,7 @@ FAULT_TEXTS: Mapping[Fault, str] = {
     Fault.PUSHED: "pushed: something moves the joint against its motor",
     Fault.OVERSPEED: "overspeed: the joint is faster than its limit",
     Fault.OSCILLATION: "oscillation: the joint swings about its reference; the stored gains are in use again",
-    Fault.CURRENT_SENSOR: "current: no current where the voltage must drive one; its sensor or a lead is broken",
+    Fault.CURRENT_SENSOR: "current: its sensor shows another one than the voltage must drive, or a lead is broken",
     Fault.OVERCURRENT: "overcurrent: the motor current stays beyond twice its limit",
     Fault.ARITHMETIC: "arithmetic: a duty was no number",
     Fault.MEMORY: "memory: the configuration in use has changed by itself",
@@ -169,6 +171,8 @@ FAULT_TEXTS: Mapping[Fault, str] = {
     Fault.TAKEN_OVER: "taken over: another host said hello while the arm was driven",
     Fault.CRASH: "restarted after a crash of the firmware",
     Fault.ENCODER: "encoder: no sound reading: its wires, or a magnet too weak or too strong",
+    Fault.BRIDGE: "bridge: it drives its motor by itself; all drives sleep",
+    Fault.MOTOR: "motor: weak, or a winding shorted: it moves otherwise than its voltage and current say",
 }
 ALARM_TEXTS: Mapping[Alarm, str] = {
     Alarm.VOLTAGE: "supply outside the servo's limits",
@@ -198,4 +202,4 @@ REJECTION_TEXTS: Mapping[Rejection, str] = {
 
 def faults_in(bits: int) -> tuple[Fault, ...]:
     """Return the faults of a set of bits, by code; bits that belong to no fault are ignored."""
-    return tuple(fault for fault in Fault if bits >> fault & 1) if bits else ()
+    return tuple(fault for fault in Fault if bits >> fault % 32 & 1) if bits else ()
