@@ -5,7 +5,7 @@ import pytest
 
 from armsight.data import Body
 from armsight.errors import InputError
-from armsight.vision.camera_file import read_cameras
+from armsight.vision.camera_file import read_camera, read_cameras
 from armsight.vision.detections import read_detections
 
 BODY = Body("ball", ("9", "10", "11", "12", "13"), np.arange(15.0).reshape(5, 3))
@@ -160,3 +160,43 @@ def test_what_a_camera_may_not_be(cameras, tmp_path, left, texts):
 def test_what_a_camera_file_may_not_be(cameras, document, texts):
     with pytest.raises(InputError, match=texts):
         cameras(document)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("ros.yaml", "image_width: 640\nimage_height: 480\ncamera_matrix: {rows: 3, cols: 3, data: [500, 0, 320, 0, 501, 240, 0, 0, 1]}\n"
+         "distortion_model: plumb_bob\ndistortion_coefficients: {rows: 1, cols: 4, data: [1e-2, 0, 0, 0]}\n"),
+        ("echo.txt", "width: 640\nheight: 480\ndistortion_model: plumb_bob\nD: [1e-2, 0.0, 0.0, 0.0]\n"
+         "K: [500.0, 0.0, 320.0, 0.0, 501.0, 240.0, 0.0, 0.0, 1.0]\n---\n"),
+        ("opencv.yml", "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n"
+         "   dt: d\n   data: [ 500., 0., 320., 0., 501., 240., 0., 0., 1. ]\ndistortion_coefficients: !!opencv-matrix\n"
+         "   rows: 4\n   cols: 1\n   dt: d\n   data: [ 1e-2, 0., 0., 0. ]\n"),
+        ("own.json", '{"image_size_px": [640, 480], "K": [[500, 0, 320], [0, 501, 240], [0, 0, 1]], "distortion": [0.01, 0, 0, 0]}'),
+        ("kalibr.yaml", "cam0:\n  camera_model: pinhole\n  intrinsics: [500, 501, 320, 240]\n  distortion_model: radtan\n"
+         "  distortion_coeffs: [0.01, 0, 0, 0]\n  resolution: [640, 480]\n"),
+        ("left.cameramodel", "# mrcal\n{'lensmodel': 'LENSMODEL_OPENCV4', 'intrinsics': [500, 501, 320, 240, 0.01, 0, 0, 0], 'imagersize': [640, 480]}"),
+    ],
+)  # fmt: skip
+def test_one_camera_of_any_program(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    camera = read_camera(tmp_path / name)
+    assert camera.image_size_px == (640, 480)
+    assert camera.intrinsics.tolist() == [500, 501, 320, 240]
+    assert camera.distortion.tolist() == [0.01, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a: 1\n", "holds no camera, expected one: .*there are a"),
+        ("left: {K: [[1]]}\nright: {K: [[1]]}\n", "camera|K"),
+        ("target_type: aprilgrid\n", "Kalibr's target file"),
+        ("K: [500, 0, 320, 0, 501, 240, 0, 0, 1]\nD: []\n", "c.yaml: holds no image size"),
+    ],
+)
+def test_what_is_no_camera_is_named_with_its_file(tmp_path, text, said):
+    (tmp_path / "c.yaml").write_text(text)
+    with pytest.raises(InputError, match=said) as caught:
+        read_camera(tmp_path / "c.yaml")
+    assert "c.yaml" in str(caught.value)

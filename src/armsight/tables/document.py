@@ -13,6 +13,7 @@ import configparser
 import io
 import re
 import tomllib
+import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -76,6 +77,8 @@ def _with_matrices(name: str, value: Foreign) -> Foreign:
         return [_with_matrices(name, one) for one in value] if any(isinstance(one, dict) for one in value) else value
     if not isinstance(value, Mapping):
         return value
+    if {"sizes", "data", "dt"} <= set(value):  # OpenCV 5's vectors, and matrices of three dimensions
+        value = {**value, "rows": int(np.prod(np.asarray(value["sizes"], float))), "cols": 1}
     if not {"rows", "cols", "data"} <= set(value):
         return {str(key): _with_matrices(f"{name}.{key}", one) for key, one in value.items()}
     try:
@@ -95,11 +98,14 @@ def _unpacked(data: bytes, path: str | Path) -> bytes:
     """Return what gzip packed."""
     most = int(DOCUMENT_MB * 1e6)
     try:
-        out = zlib.decompressobj(31).decompress(data, most + 1)
+        packed = zlib.decompressobj(31)
+        out = packed.decompress(data, most + 1)
     except zlib.error as error:
         raise InputError(f"{path}: compressed by gzip and damaged: {error}") from None
     if len(out) > most:
         raise InputError(f"{path}: holds more than {DOCUMENT_MB} MB: is it the right file?")
+    if not packed.eof:
+        raise InputError(f"{path}: compressed by gzip and cut short: copy it again")
     return out
 
 
@@ -128,7 +134,7 @@ def _numpy(data: bytes, path: str | Path) -> dict[str, Foreign]:
         if "allow_pickle" in str(error):
             raise InputError(f"{path}: holds a pickled Python object, which may run programs: {_SAVE}") from None
         raise InputError(f"{path}: a damaged numpy file: {error}") from None
-    except (OSError, KeyError, EOFError, NotImplementedError, zlib.error, RuntimeError) as error:
+    except (OSError, KeyError, EOFError, NotImplementedError, zlib.error, RuntimeError, zipfile.BadZipFile) as error:
         raise InputError(
             f"{path}: an archive (zip) or damaged .npz: {error}; unpack it and give the files in it"
         ) from None
@@ -192,6 +198,8 @@ def _toml_or_ini(text: str, path: str | Path) -> dict[str, Foreign]:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         problem = error
+    if Path(path).suffix.lower() == ".toml":
+        raise InputError(f"{path}: not TOML: {problem}") from None
     parser = configparser.ConfigParser(interpolation=None, strict=False)
     parser.optionxform = str  # type: ignore[assignment,method-assign] # names keep their capitals
     try:

@@ -335,8 +335,11 @@ def read_camera(path: str | Path) -> Camera:
     inner = [value for value in document.values() if is_camera(value)]
     if not is_camera(document) and len(inner) == 1:
         document = dict(inner[0])
+    if "lensmodel" in document:  # mrcal's intrinsics go on with the distortion
+        numbers = checked(document.get("intrinsics", []), (None,), f"{path}: intrinsics")
+        document |= {"intrinsics": numbers[:4], "distortion": numbers[4:]}
     if not is_camera(document):
-        kind = f"{len(inner)} cameras" if inner else "no camera"
+        kind = f"{len(inner)} cameras" if inner else stranger(document) or "no camera"
         raise InputError(
             f"{path}: holds {kind}, expected one: camera_matrix (or K), distortion and image size; there are "
             f"{described(document)}"

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from armsight.data import Array
 
 
-class Layout(NamedTuple):
+class FamilyLayout(NamedTuple):
     """Where a family has its data.
 
     Attributes:
@@ -40,11 +40,11 @@ class Layout(NamedTuple):
 
 #: Every family, by its own name.
 LAYOUTS = {
-    "tagStandard41h12": Layout(5, 9, 12, "0:0-7 3:3-4"),
-    "tagStandard52h13": Layout(6, 10, 13, "0:0-8 3:3-5 4:4-4"),
-    "tagCircle21h7": Layout(5, 9, 7, "0:3-5 3:3-4"),
-    "tagCircle49h12": Layout(5, 11, 12, "0:4-6 1:2-8 4:4-5"),
-    "tagCustom48h12": Layout(6, 10, 12, "0:0-8 3:3-5"),
+    "tagStandard41h12": FamilyLayout(5, 9, 12, "0:0-7 3:3-4"),
+    "tagStandard52h13": FamilyLayout(6, 10, 13, "0:0-8 3:3-5 4:4-4"),
+    "tagCircle21h7": FamilyLayout(5, 9, 7, "0:3-5 3:3-4"),
+    "tagCircle49h12": FamilyLayout(5, 11, 12, "0:4-6 1:2-8 4:4-5"),
+    "tagCustom48h12": FamilyLayout(6, 10, 12, "0:0-8 3:3-5"),
 }
 _PRIME = np.uint64(982451653)
 #: Most cells that are read wrong: one of every four in which two codes differ, this at most.
@@ -139,7 +139,7 @@ _POPULATION = np.array([bin(byte).count("1") for byte in range(256)], np.uint8)
 
 
 @lru_cache(maxsize=8)
-def _rings(layout: Layout) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _rings(layout: FamilyLayout) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return where a tag's cells are the bright ring, and where the dark one, without its corners."""
     rows, columns = np.mgrid[: layout.cells, : layout.cells] - (layout.cells - 1) / 2
     far = np.maximum(np.abs(rows), np.abs(columns))

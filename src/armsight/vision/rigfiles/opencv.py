@@ -27,6 +27,7 @@ from armsight.tables.yaml_file import Foreign
 from armsight.vision.camera_file import DISTORTION, MATRIX, SIZE, camera_of, described, found, plain
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
+    LOOSEST_ROTATION,
     Document,
     ImportOptions,
     count_paths,
@@ -245,22 +246,37 @@ def _columns_first(size: Foreign, entry: Mapping[str, Foreign]) -> Foreign:
 
 def _between(flat: Mapping[str, Foreign]) -> tuple[Array, list[str]]:
     """Return (4, 4) T_right_left in the file's unit, and notes."""
-    by_name = {plain(name.rpartition(".")[2]): value for name, value in flat.items()} | {
-        plain(name): value for name, value in flat.items()
-    }
+    by_name = {plain(name.rpartition(".")[2]): value for name, value in flat.items()}
+    by_name |= {plain(name): value for name, value in flat.items()}
     values = []
-    for what, known in (
-        ("R, the rotation between the cameras", _ROTATIONS),
-        ("T, the translation between them", _TRANSLATIONS),
+    for what, known, is_one in (
+        ("R, the rotation between the cameras", _ROTATIONS, _is_rotation),
+        ("T, the translation between them", _TRANSLATIONS, _is_translation),
     ):
         value = next((by_name[name] for name in known if name in by_name), None)
         if value is None:
-            raise InputError(f"has no {what}; there are {described(flat)}: are these two cameras, each by itself?")
+            alike = [value for name, value in flat.items() if is_one(name, value)]
+            if len(alike) != 1:
+                raise InputError(f"has no {what}; there are {described(flat)}: are these two cameras, each by itself?")
+            value = alike[0]
         values.append(value)
     R, t = values
     if np.size(np.asarray(R, object)) == 3:
         R = exp_so3(_numbers(R).ravel())
     return rigid(R, np.ravel(np.asarray(t, object)), "R")
+
+
+def _is_rotation(name: str, value: Foreign) -> bool:
+    """Say whether a value is a rotation by its numbers, and not one of a rectification by its name."""
+    R = _numbers(value)
+    if R.shape != (3, 3) or plain(name) in ("r1", "r2") or _DERIVED & set(_words(name)):
+        return False
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < LOOSEST_ROTATION and np.linalg.det(R) > 0)
+
+
+def _is_translation(name: str, value: Foreign) -> bool:
+    """Say whether a value is three numbers called something with t."""
+    return _numbers(value).size == 3 and _stem(name).startswith("t")
 
 
 def _unit_m(flat: Mapping[str, Foreign], length: float, options: ImportOptions) -> float:
