@@ -30,9 +30,9 @@ from scipy.stats import chi2
 
 from armsight.errors import ArmsightError
 from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.handeye.handeye import Poses
+from armsight.loop.handeye.handeye import calibrate_structured
+from armsight.loop.handeye.poses import Poses
 from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams
-from armsight.loop.handeye.structured import calibrate_structured
 
 #: A motion is degenerate where the second eigenvalue of KinHEC's scatter of rotation axes is below this: parallel axes.
 DEGENERATE = 1e-6

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.loop.handeye.handeye import calibrate_handeye
-from armsight.loop.handeye.streams import PoseStream, calibrate_streams
+from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams
 from armsight.vision.image import grey, read_image
 from armsight.vision.markers.board import open_board
 
@@ -44,9 +44,12 @@ def kuka2(folder: Path, report) -> None:
         B.append(pose(cv2.Rodrigues(r)[0], t.ravel()))
     B = np.array(B)
     h = calibrate_handeye(A[even], B[even], eye="in_hand", centre=middle)
-    off = transform(A[odd] @ h.T_flange_rig @ B[odd], middle) - transform(h.T_base_body, middle)
+    off = transform(A[odd] @ h.T_flange_held @ B[odd], middle) - transform(h.T_base_still, middle)
     report(
-        "kuka2, board's middle, even to odd", 1e3 * float(np.linalg.norm(off, axis=1).mean()), 0.55, more=f", {h.share}"
+        "kuka2, board's middle, even to odd",
+        1e3 * float(np.linalg.norm(off, axis=1).mean()),
+        0.55,
+        more=f", {h.structure}",
     )
 
 
@@ -73,7 +76,9 @@ def eth_pairs(folder: Path, report) -> None:
     for name in PAIRS:
         hand, t, B = pair(folder, name)
         late = t > np.median(t)
-        found = [calibrate_streams(hand, PoseStream.of(t[r], B[r], "eye"), eye="in_hand") for r in (~late, late)]
+        found = [
+            calibrate_structured_streams(hand, PoseStream.of(t[r], B[r], "eye"), eye="in_hand") for r in (~late, late)
+        ]
         a, b = (f.offset_s for f in found)
         sigma = float(np.hypot(*(f.sigma_offset_s for f in found)))
         more = f": {1e3 * a:.2f} and {1e3 * b:.2f} ms, sigma of the difference {1e3 * sigma:.2f}"
@@ -89,7 +94,7 @@ def simulated(folder: Path, report, seeds: int = 4) -> None:
     anew: their size and how neighbours hang together are the recording's, and the answer is known.
     """
     hand, t, B = pair(folder, "robot_arm_w_color_camera_sim")
-    found = calibrate_streams(hand, PoseStream.of(t, B, "eye"), eye="in_hand")
+    found = calibrate_structured_streams(hand, PoseStream.of(t, B, "eye"), eye="in_hand")
     more = f": {1e3 * found.offset_s:.2f} ms, sigma {1e3 * found.sigma_offset_s:.2f}; stamps are whole milliseconds"
     report(
         "simulated arm, offset from its one clock's zero",
@@ -106,12 +111,12 @@ def simulated(folder: Path, report, seeds: int = 4) -> None:
     for seed in range(seeds):
         starts = np.random.default_rng(seed).integers(0, len(t) - BLOCK, len(t) // BLOCK + 1)
         sampled = np.concatenate([left[s : s + BLOCK] for s in starts])[: len(t)]
-        again = calibrate_streams(hand, PoseStream.of(t, seen @ exp_se3(sampled), "eye"), eye="in_hand")
+        again = calibrate_structured_streams(hand, PoseStream.of(t, seen @ exp_se3(sampled), "eye"), eye="in_hand")
         h, true = again.handeye, found.handeye
         e = np.concatenate(
             [
-                log_se3(inverse(true.T_base_body) @ h.T_base_body),
-                log_se3(inverse(true.T_flange_rig) @ h.T_flange_rig),
+                log_se3(inverse(true.T_base_body) @ h.T_base_still),
+                log_se3(inverse(true.T_flange_rig) @ h.T_flange_held),
             ]
         )
         off += [*(e / np.sqrt(np.diag(h.cov))), (again.offset_s - found.offset_s) / again.sigma_offset_s]

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
-from armsight.loop.handeye.handeye import Poses
+from armsight.loop.handeye.handeye import SMOOTH, calibrate_structured
 from armsight.loop.handeye.noise import (
     STRUCTURES,
     Blocks,
@@ -23,8 +23,8 @@ from armsight.loop.handeye.noise import (
     solve,
     walk_gathered,
 )
+from armsight.loop.handeye.poses import Poses
 from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams
-from armsight.loop.handeye.structured import SMOOTH, calibrate_structured
 from armsight.robot.arm_file import open_arm
 from asserts import numeric_jacobian
 

@@ -200,7 +200,7 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
     from armsight.app.handeye.recording import at_shots, links_of, paired, recording_of, robot_in_recording
     from armsight.app.handeye.result import HandEyeAnswer
     from armsight.app.handeye.suspect import require_plausible
-    from armsight.loop.handeye.structured import calibrate_structured
+    from armsight.loop.handeye.handeye import calibrate_structured
     from armsight.robot.arm_file import open_arm
     from armsight.tables.poses import read_pose_table
 
@@ -280,7 +280,7 @@ def _streams(
     from armsight.app.handeye.recording import links_between, of_streams
     from armsight.app.handeye.result import HandEyeAnswer
     from armsight.app.handeye.suspect import require_plausible, resized
-    from armsight.loop.handeye.handeye import MIN_POSES
+    from armsight.loop.handeye.poses import MIN_POSES
     from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams, coarse_offset
 
     for path, t_s in ((options.robot, robot.t_s), (options.seen or options.source, seen.t_s)):

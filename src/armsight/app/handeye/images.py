@@ -20,7 +20,7 @@ from armsight.data import Array, Detections, Missed, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, transform
 from armsight.geometry.rotation import skew
-from armsight.loop.handeye.handeye import LEVER_M
+from armsight.loop.handeye.poses import LEVER_M
 from armsight.tables.poses import PoseTable
 from armsight.vision.camera import Camera
 from armsight.vision.camera_file import read_camera

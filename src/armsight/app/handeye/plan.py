@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from armsight.data import Array, Record
 from armsight.geometry.pose import inverse, log_se3, transform
 from armsight.geometry.rotation import exp_so3
-from armsight.loop.handeye.handeye import LEVER_M, Poses, residuals
-from armsight.loop.handeye.noise import SHARED_MAPS, STRUCTURES, error_maps
-from armsight.loop.handeye.structured import StructuredHandEye
+from armsight.loop.handeye.handeye import HandEye
+from armsight.loop.handeye.poses import LEVER_M, Poses
 
 #: Candidates, how far the flange is rotated at most from the nearest pose it had, rad, how much larger its space may
 #: become, and by how much the target may leave the part of the image in which its middle was seen, as a tangent.
@@ -53,7 +52,7 @@ class PosePlan(Record):
     reasons: tuple[str, ...]
 
 
-def plan_poses(found: StructuredHandEye, poses: Poses, count: int, seed: int = 0) -> PosePlan:
+def plan_poses(found: HandEye, poses: Poses, count: int, seed: int = 0) -> PosePlan:
     """Choose the next poses.
 
     Args:
@@ -64,15 +63,8 @@ def plan_poses(found: StructuredHandEye, poses: Poses, count: int, seed: int = 0
     """
     rng = np.random.default_rng(seed)
     A, B = _candidates(found, poses.rows(found.used), rng)
-    candidates = Poses(A, B, np.zeros((len(A), 6, 6)), poses.in_hand, poses.centre)
-    _, J, carry = residuals(candidates, found.T_base_still, found.T_flange_held)
-    maps = error_maps(candidates, np.zeros((len(candidates.A), 6)), carry, None)
-    C = np.mean(poses.cov, axis=0) + np.zeros((len(A), 6, 6))
-    for name in STRUCTURES[found.structure]:
-        if (of := SHARED_MAPS.get(name, name)) in maps:
-            C = C + found.sigmas[name] ** 2 * maps[of] @ np.swapaxes(maps[of], 1, 2)
-    C = C + np.diag(np.repeat([LEAST_M**2, LEAST_RAD**2], 3))
-    informations = np.swapaxes(J, 1, 2) @ np.linalg.solve(C, J)
+    candidates = Poses(A, B, np.tile(poses.cov.mean(axis=0), (len(A), 1, 1)), poses.in_hand, poses.centre)
+    informations = found.informations(candidates)
     weights = np.concatenate([np.zeros(6), np.repeat([1.0, LEVER_M**2], 3)])
     total, before = np.linalg.inv(found.cov), found.cov
     chosen, sigmas, reasons = [], [], []
@@ -123,7 +115,7 @@ def worst_sigmas(cov: Array) -> tuple[float, float]:
     )
 
 
-def _candidates(found: StructuredHandEye, poses: Poses, rng: np.random.Generator) -> tuple[Array, Array]:
+def _candidates(found: HandEye, poses: Poses, rng: np.random.Generator) -> tuple[Array, Array]:
     """Return poses of the flange and of the body as it would be seen there."""
     p = transform(poses.B, poses.centre)
     distance = np.linalg.norm(p, axis=1)

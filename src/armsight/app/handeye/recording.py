@@ -17,7 +17,7 @@ from armsight.app.handeye.images import Seen, upright
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import adjoint, inverse, log_se3, mean_pose
-from armsight.loop.handeye.handeye import MIN_POSES, Poses
+from armsight.loop.handeye.poses import MIN_POSES, Poses
 from armsight.loop.handeye.streams import GAP_S
 from armsight.robot.arm import Arm
 from armsight.tables.poses import PoseTable

@@ -13,8 +13,8 @@ from armsight.app.handeye.recording import PairedPoses
 from armsight.app.report.table import TextTable, plain_text
 from armsight.data import Array, Record
 from armsight.geometry.pose import log_se3, mean_pose
+from armsight.loop.handeye.handeye import GEOMETRY, POSITIONS, SCALE_WALKING, SMOOTH, HandEye
 from armsight.loop.handeye.noise import OF_THE_ARM, SHARED
-from armsight.loop.handeye.structured import GEOMETRY, POSITIONS, SCALE_WALKING, SMOOTH, StructuredHandEye
 
 #: As many blunders as this share of the poses, or a median error on poses left out beyond this, m, are no calibration to
 #: trust.
@@ -37,7 +37,7 @@ class HandEyeAnswer(Record):
     """
 
     recording: PairedPoses
-    found: StructuredHandEye
+    found: HandEye
     offset_s: float | None
     sigma_offset_s: float
     plan: PosePlan | None
@@ -182,7 +182,7 @@ def statements(run: HandEyeAnswer) -> list[str]:
     return lines
 
 
-def scale_at_end(found: StructuredHandEye) -> tuple[float, float]:
+def scale_at_end(found: HandEye) -> tuple[float, float]:
     """Return within which the scale of the target is at the last pose, 95 %, where it walks."""
     way = 1.96 * float(np.hypot(found.sigmas["scale_walk"], found.sigma_scale / found.scale))
     return found.scale * float(np.exp(-way)), found.scale * float(np.exp(way))

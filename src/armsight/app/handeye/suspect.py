@@ -5,7 +5,7 @@ shifted against the images, from the first on or from where one is missing, the 
 another unit, another order of angles, quaternions, axes or joints, another arm, or where something was displaced.
 
 How well a reading fits is given by two quantiles of the residuals of the closed forms
-(:func:`~armsight.loop.handeye.handeye.starts`): of a position, m, or of a rotation as it moves a point at 0.3 m. The
+(:func:`~armsight.loop.handeye.poses.starts`): of a position, m, or of a rotation as it moves a point at 0.3 m. The
 median alone does not do: where an arm moves in equal steps, rows that are shifted by one fit another mounting but where the
 steps change, a third of the rows.
 """
@@ -25,8 +25,8 @@ from armsight.app.handeye.recording import PairedPoses
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, log_se3, mean_pose
-from armsight.loop.handeye.handeye import LEVER_M, Poses, residuals, starts
-from armsight.loop.handeye.structured import CONTRADICTS, rotations_of, scale_between
+from armsight.loop.handeye.handeye import CONTRADICTS, rotations_of, scale_between
+from armsight.loop.handeye.poses import LEVER_M, Poses, residuals, starts
 from armsight.robot.arm import Arm
 from armsight.robot.models import MODELS
 from armsight.tables.misread import Misread, misreadings

@@ -27,13 +27,16 @@ from armsight.errors import ArmsightError, CalibrationError, InputError
 from armsight.files import write_text
 from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.geometry.rotation import skew
-from armsight.loop.handeye.handeye import SHARES, HandEye, Poses, information
+from armsight.loop.handeye.noise import STRUCTURES
+from armsight.loop.handeye.poses import Poses
 from armsight.loop.identify.read import read_poses
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import point_to_point
 from armsight.vision.rig import StereoRig
 
 #: Poses before the first fit; the fewest of a calibration that is called good; the most that are asked for.
+#: Structures of the noise that are tried while poses are few.
+QUICK = ("robot", "robot and camera")
 FIRST_FIT, LEAST_POSES, MOST_POSES = 6, 12, 30
 #: Another pose that lowers the predicted error by less than this share is not worth taking.
 LITTLE = 0.02
@@ -208,11 +211,11 @@ class HandEyeGuide:
         with self._lock:
             visited, missed, arm = list(self._visited), tuple(self._missed), self._arm
         missing: tuple[str, ...] = ()
-        for shares in (SHARES[:1], SHARES):  # the other attributions take long, and only once it is good
+        for structures in (QUICK, tuple(STRUCTURES)):  # all of them take long, and only once it is good
             run: HandEyeRun | None = None
             if len(visited) >= FIRST_FIT:
                 try:
-                    run = handeye_of(arm, visited, missed, shares)
+                    run = handeye_of(arm, visited, missed, structures)
                 except (CalibrationError, np.linalg.LinAlgError) as error:
                     missing = (f"the poses cannot be fitted yet: {error}",)
             with self._lock:
@@ -339,14 +342,10 @@ def _errors_m(run: HandEyeRun, covs: Array) -> Array:
 
 def _errors_after_m(run: HandEyeRun, Ts_base_flange: Array) -> Array:
     """Return (C,) the predicted error after one more of the poses (C, 4, 4) of the flange, m."""
-    found: HandEye = run.found
-    sigma = (found.sigma_flange_m, found.sigma_flange_rad, found.sigma_seen_m, found.sigma_seen_rad)
-    B, cov, known = found.predict(Ts_base_flange), run.covs.mean(axis=0), np.linalg.inv(found.cov)
-    after = []
-    for T, seen in zip(Ts_base_flange, B, strict=True):
-        one = Poses(T[None], seen[None], cov[None], False, np.zeros(3))
-        after.append(np.linalg.inv(known + information(one, found.T_base_still, found.T_flange_held, sigma)))
-    return _errors_m(run, np.array(after))
+    covs = np.tile(run.covs.mean(axis=0), (len(Ts_base_flange), 1, 1))
+    poses = Poses(Ts_base_flange, run.found.predict(Ts_base_flange), covs, False, np.zeros(3))
+    known = np.linalg.inv(run.found.cov) + run.found.informations(poses)
+    return _errors_m(run, np.asarray(np.linalg.inv(known), float))
 
 
 def visit_poses(loop: Loop, guide: HandEyeGuide, start: Array, progress: Callable[[str], None]) -> None:

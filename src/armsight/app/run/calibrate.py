@@ -21,7 +21,8 @@ from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.delay import MIN_MEASUREMENTS, estimate_delay
 from armsight.loop.estimators import Delay, Mounting, Prior
-from armsight.loop.handeye.handeye import SHARES, HandEye, Share, calibrate_handeye
+from armsight.loop.handeye.handeye import HandEye, calibrate_handeye
+from armsight.loop.handeye.noise import STRUCTURES
 from armsight.loop.sync_led import with_led
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import point_to_point
@@ -234,7 +235,7 @@ def visit(
 
 
 def handeye_of(
-    arm: Arm, visited: Sequence[VisitedPose], missed: tuple[str, ...], shares: tuple[Share, ...] = SHARES
+    arm: Arm, visited: Sequence[VisitedPose], missed: tuple[str, ...], structures: Sequence[str] = tuple(STRUCTURES)
 ) -> HandEyeRun:
     """Calibrate hand and eye.
 
@@ -242,14 +243,14 @@ def handeye_of(
         arm: the nominal arm.
         visited: four poses at least.
         missed: poses at which the body was not measured, and why.
-        shares: what the arm's error may be attributed to; fewer take less time.
+        structures: of the noise, names to choose from; fewer take less time.
 
     Raises:
         CalibrationError: the motions leave a direction open.
     """
     q = np.array([each.q for each in visited])
     Ts_left_body, cov = np.array([each.T_left_body for each in visited]), np.array([each.cov for each in visited])
-    found = calibrate_handeye(arm.forward(q) @ inverse(arm.T_flange_tool), Ts_left_body, cov, shares=shares)
+    found = calibrate_handeye(arm.forward(q) @ inverse(arm.T_flange_tool), Ts_left_body, cov, structures=structures)
     mounting = replace(Mounting.of(found, arm), cov=np.zeros((12, 12)))
     return HandEyeRun(mounting, found, q, Ts_left_body, cov, np.array([each.approach for each in visited]), missed)
 

@@ -76,8 +76,9 @@ def write_handeye(folder: Path, run: HandEyeRun, corrected: Sequence[tuple[float
         "cov": (found.cov + newest.cov - run.mounting.cov).tolist(),
         "held_out_position_rms_m": position,
         "held_out_angle_rms_rad": angle,
-        "sigma_flange_m": found.sigma_flange_m,
-        "sigma_flange_rad": found.sigma_flange_rad,
+        "sigma_flange_m": found.sigma_flange[0],
+        "sigma_flange_rad": found.sigma_flange[1],
+        "structure": found.structure,
         "poses": len(run.q),
         "missed": list(run.missed),
     }

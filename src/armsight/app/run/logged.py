@@ -27,7 +27,8 @@ from armsight.errors import CalibrationError, InputError
 from armsight.files import write_text
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators import Mounting
-from armsight.loop.handeye.handeye import SHARES, HandEye, Share, calibrate_handeye
+from armsight.loop.handeye.handeye import HandEye, calibrate_handeye
+from armsight.loop.handeye.noise import STRUCTURES
 from armsight.loop.identify.diagnose import check_plausible, without_tool
 from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
@@ -39,6 +40,9 @@ from armsight.vision.sources import Source
 MIN_POSES = 12
 #: Rows that belong to the neighbouring shots fit so many times better: then they are shifted.
 _SHIFTED, _STEP_SHARE = 3.0, 0.2
+#: Structures of the noise with which shifted rows are tried.
+_QUICK = ("robot",)
+SHIFTED = "the angles of the row {} fit every shot far better than its own: are rows and images shifted by one?"
 _MOVED_RAD = float(np.radians(0.5))
 
 
@@ -77,10 +81,7 @@ class LoggedRun(Record):
         """Why the result must not be trusted; empty where nothing says so."""
         if not self.shift:
             return () if self.implausible is None else (self.implausible,)
-        side = "before" if self.shift > 0 else "behind"
-        return (
-            f"the angles of the row {side} fit every shot far better than its own: are rows and images shifted by one?",
-        )
+        return (SHIFTED.format("before" if self.shift > 0 else "behind"),)
 
     def to_json(self) -> dict[str, Any]:
         """Return what summary.json has."""
@@ -94,9 +95,9 @@ class LoggedRun(Record):
             "held_out_position_rms_mm": round(1e3 * position, 4),
             "held_out_angle_rms_deg": round(float(np.degrees(angle)), 5),
             "held_out_position_max_mm": round(1e3 * found.held_out.most()[0], 4),
-            "sigma_flange_mm": round(1e3 * found.sigma_flange_m, 4),
-            "sigma_flange_deg": round(float(np.degrees(found.sigma_flange_rad)), 5),
-            "share": found.share,
+            "sigma_flange_mm": round(1e3 * found.sigma_flange[0], 4),
+            "sigma_flange_deg": round(float(np.degrees(found.sigma_flange[1])), 5),
+            "share": found.structure,
             "rows_shifted_by": self.shift,
             "weak": list(self.weak),
         }
@@ -137,13 +138,15 @@ def run_logged(
     centre = target.body.points.mean(axis=0)
     found = _calibrated(arm, q, Ts, covs, centre)
     if isinstance(found, CalibrationError):
-        raise found
+        shift = _shift(arm, q, Ts, covs, centre, np.inf)
+        why = SHIFTED.format("before" if shift > 0 else "behind") if shift else _implausible(arm, q, Ts)
+        raise found if why is None else CalibrationError(f"{why} ({found})")
     steps = np.diff(q, axis=0, prepend=q[:1])
     approach = np.sign(np.where(np.abs(steps) > _MOVED_RAD, steps, 0.0))
     mounting = replace(Mounting.of(found, arm), cov=np.zeros((12, 12)))
     run = HandEyeRun(mounting, found, q, Ts, covs, approach, missed)
     progress("hand-eye: are rows and shots shifted, are the angles this arm's?")
-    shift = _shift(arm, run, centre)
+    shift = _shift(arm, q, Ts, covs, centre, found.held_out.rms()[0])
     implausible = None if shift else _implausible(arm, q[found.used], Ts[found.used])
     return LoggedRun(run, tuple(names[k] for k in good), len(names), unpaired, shift, implausible)
 
@@ -158,26 +161,26 @@ def _implausible(arm: Arm, q: Array, Ts_left_body: Array) -> str | None:
 
 
 def _calibrated(
-    arm: Arm, q: Array, Ts: Array, covs: Array, centre: Array, shares: tuple[Share, ...] = SHARES
+    arm: Arm, q: Array, Ts: Array, covs: Array, centre: Array, structures: tuple[str, ...] = tuple(STRUCTURES)
 ) -> HandEye | CalibrationError:
     try:
-        return calibrate_handeye(arm.forward(q) @ inverse(arm.T_flange_tool), Ts, covs, centre=centre, shares=shares)
+        return calibrate_handeye(
+            arm.forward(q) @ inverse(arm.T_flange_tool), Ts, covs, centre=centre, structures=structures
+        )
     except CalibrationError as error:
         return error
 
 
-def _shift(arm: Arm, run: HandEyeRun, centre: Array) -> int:
-    """Return by how many rows the angles seem to be late: 1, -1, or 0."""
-    own = run.found.held_out.rms()[0]
-    steps_m = np.linalg.norm(np.diff(run.Ts_left_body[:, :3, 3], axis=0), axis=1)
+def _shift(arm: Arm, q_all: Array, Ts_all: Array, covs_all: Array, centre: Array, own: float) -> int:
+    """Return by how many rows the angles seem to be late: 1, -1, or 0; ``own`` is the held-out error of none, m."""
+    steps_m = np.linalg.norm(np.diff(Ts_all[:, :3, 3], axis=0), axis=1)
     if own < _STEP_SHARE * np.median(steps_m):  # a shift makes errors as large as the steps from pose to pose
         return 0
-    best, shift = own / _SHIFTED, 0
+    best, shift = (own if np.isfinite(own) else float(np.median(steps_m))) / _SHIFTED, 0
     for late in (1, -1):
-        q, Ts, covs = (run.q[:-1], run.Ts_left_body[1:], run.covs[1:])
-        if late < 0:
-            q, Ts, covs = run.q[1:], run.Ts_left_body[:-1], run.covs[:-1]
-        other = _calibrated(arm, q, Ts, covs, centre, SHARES[:1])
+        rows, shots = (slice(None, -1), slice(1, None))[::late]
+        q, Ts, covs = q_all[rows], Ts_all[shots], covs_all[shots]
+        other = _calibrated(arm, q, Ts, covs, centre, _QUICK)
         if isinstance(other, HandEye) and other.used.mean() > 0.8 and other.held_out.rms()[0] < best:
             best, shift = other.held_out.rms()[0], late
     return shift

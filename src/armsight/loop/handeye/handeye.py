@@ -1,388 +1,107 @@
-"""Hand-eye calibration: where the cameras are to the arm, from motions of the arm while they watch.
+"""Hand-eye calibration whose noise has a structure: whose error it is, and whether neighbouring poses share it.
 
-In: poses of the flange in the base (from the joints) and of the body in the rig (from vision, with covariance), pairwise.
-Out: :class:`HandEye` with both unknown transforms, their covariance, and the error on poses left out of the fit. Eye to
-hand, T_base_flange T_flange_body = T_base_rig T_rig_body; eye in hand, T_base_flange T_flange_rig T_rig_body =
-T_base_body. Both are A_i X = Z B_i. Equations: docs/howto/handeye.md. The file in order:
+In: :class:`~armsight.loop.handeye.poses.Poses`, and where there are streams their times and speeds. Out:
+:class:`HandEye`: both transforms with a covariance that allows for the structure, the sources of the error, and
+the error of poses left out. In order:
 
-1. Maximum likelihood (:func:`fit`). The residual of a pose is the tangent of the motion left over, in the axes of what the
-   camera measured. Its covariance is the one given, plus that of an unknown share (``SHARES``): of the flange, about the
-   flange, or of the measured body, about its middle, mapped by the adjoint. The sigmas of position and rotation are those
-   of the greatest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971).
-2. Closed-form starts (:func:`starts`), from all poses and from small parts of them: rotations by the leading singular
-   vectors of the Kronecker sum, translations by linear least squares (Shah, "Solving the robot-world/hand-eye calibration
-   problem using the Kronecker product", J. Mechanisms Robotics 5(3), 2013). OpenCV's solvers are tried beside it where the
-   installed OpenCV has them (5.0 has not).
-3. The calibration (:func:`calibrate_handeye`): input checks, starts, fits, held-out errors.
+1. A robust start: closed forms from all poses and from small parts (:func:`~armsight.loop.handeye.poses.starts`), then
+   least squares with the weights of Student's t; what is further than chance allows is left out as a blunder.
+2. Motions that leave a direction open are rejected (:func:`require_rotations`, :func:`require_known`).
+3. For every structure of noise the variances of the greatest restricted likelihood; poses left out decide between the
+   structures (:mod:`armsight.loop.handeye.noise`).
+
+The rows are put into an order of their own first (by time, else by content), so that theirs changes nothing.
 """
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import minimize
 from scipy.special import chdtri
+from scipy.stats import f as f_distribution
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
-from armsight.geometry.check import checked
-from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, mean_pose, pose, small_adjoint, transform
-from armsight.geometry.rotation import nearest_rotation, skew
-
-#: A pose whose residual has a smaller chance than this is taken for a mistake and left out.
-CHANCE = 1e-5
-#: Gauss-Newton steps at most, and the step (m, rad) below which it has converged.
-STEPS, CONVERGED = 30, 1e-10
-#: Poses that the sigmas are estimated from at most, spread evenly.
-MAX_SIGMA_POSES = 200
-#: The sigmas are looked for between these, m and rad: beyond, they are zero, or no arm.
-MIN_SIGMA, MAX_SIGMA = 1e-7, 0.1
-
-
-Sigmas = tuple[float, float, float, float]
-Share = Literal["flange", "seen", "positions"]
-#: What the error beyond the covariance given is attributed to: the flange (its joints); the measured body ("seen"); or the
-#: measured body's positions, with hardly any weight on its rotations: an arm's rotations and its positions may contradict
-#: each other by more than either scatters.
-SHARES: tuple[Share, ...] = ("flange", "seen", "positions")
-#: Sigma of rotations that have hardly any weight, rad: enough to determine what positions leave open.
-HARDLY = 0.005
-
-
-@dataclass(frozen=True, eq=False)
-class Poses(Record):
-    """What a hand-eye calibration is made from.
-
-    Attributes:
-        A: (N, 4, 4) T_base_flange, m.
-        B: (N, 4, 4) T_rig_body, m.
-        cov: (N, 6, 6) covariance of B, right tangent, zero where unknown.
-        in_hand: whether the rig is on the flange and the body stands still; else the body is on the flange.
-        centre: (3,) the middle of what is seen of the body, body frame, m.
-        common: (N, 6, K) what K independent errors that all poses share (the rig's calibration), of one sigma each, do to
-            B, right tangent; None where unknown.
-    """
-
-    A: Array
-    B: Array
-    cov: Array
-    in_hand: bool
-    centre: Array
-    common: Array | None = None
-
-    def rows(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Poses:
-        """Return a part of the poses."""
-        common = None if self.common is None else self.common[rows]
-        return Poses(self.A[rows], self.B[rows], self.cov[rows], self.in_hand, self.centre, common)
-
-    def corrected(self, errors: Array) -> Poses:
-        """Return the poses without shared errors (K,), in sigmas."""
-        return self if self.common is None else replace(self, B=self.B @ exp_se3(self.common @ errors))
-
-    @property
-    def right_side(self) -> Array:
-        """(N, 4, 4) the poses B of A_i X = Z B_i."""
-        return inverse(self.B) if self.in_hand else self.B
-
-
-@dataclass(frozen=True, eq=False)
-class Fit(Record):
-    """The unknown transforms of A_i X = Z B_i.
-
-    Attributes:
-        Z: (4, 4) what stands still, in the base.
-        X: (4, 4) what the flange carries, in the flange.
-        cov: (12, 12) covariance of the right tangents of Z and X, in this order.
-        sigma: sigmas along or about one axis: the flange's position, m, and rotation, rad; those of the body's middle,
-            beyond the covariance given.
-        used: (N,) whether a pose was used.
-    """
-
-    Z: Array
-    X: Array
-    cov: Array
-    sigma: Sigmas
-    used: NDArray[np.bool_]
-
-
-def residuals(poses: Poses, Z: Array, X: Array) -> tuple[Array, Array, Array]:
-    """Return residuals, their derivative, and the adjoints that map an error of the flange to them.
-
-    Returns:
-        (N, 6) residuals e in the axes of the body, (N, 6, 12) their derivative by the right tangents of Z and X, exact to
-        the square of e, and (N, 6, 6).
-    """
-    if poses.in_hand:
-        M, last = X @ poses.B, poses.B  # E = Z^-1 A X B
-        E = inverse(Z) @ poses.A @ M
-        by_x = adjoint(inverse(last))
-    else:
-        M = np.broadcast_to(X, poses.A.shape)  # E = B^-1 Z^-1 A X
-        E = inverse(Z @ poses.B) @ poses.A @ M
-        by_x = np.broadcast_to(np.eye(6), (len(poses.A), 6, 6))
-    # A change of Z acts from the left of what follows it.
-    by_z = -adjoint(inverse(E) if poses.in_hand else inverse(poses.A @ M) @ Z)
-    e = log_se3(E)
-    bend = np.eye(6) + 0.5 * small_adjoint(e)  # the right Jacobian's inverse, to first order
-    return e, np.concatenate([bend @ by_z, bend @ by_x], axis=2), adjoint(inverse(M))
-
-
-def covariances(poses: Poses, carry: Array, sigma: Sigmas) -> Array:
-    """Return the covariance (N, 6, 6) of residuals: what is given, the flange's carried over, and the body's."""
-    flange, body = np.repeat(np.square(sigma[:2]), 3), np.repeat(np.square(sigma[2:]), 3)
-    about = np.eye(6)
-    about[:3, 3:] = skew(poses.centre)  # the adjoint of the translation from the body's origin to its middle
-    return np.asarray(poses.cov + (carry * flange) @ np.swapaxes(carry, 1, 2) + (about * body) @ about.T)
-
-
-def fit(poses: Poses, start: tuple[Array, Array], share: Share) -> Fit:
-    """Fit both transforms, the unknown sigmas, and which poses are mistakes.
-
-    Args:
-        poses: at least three.
-        start: X and Z near the answer.
-        share: who has the share of the error that is not given.
-    """
-    X, Z = start
-    sigma = _robust_sigma(poses, Z, X, share)
-    used = np.ones(len(poses.A), bool)
-    for _ in range(8):
-        e, _, carry = residuals(poses, Z, X)
-        far = _squares(e, covariances(poses, carry, sigma))
-        keep = far < chdtri(6, CHANCE)
-        if keep.sum() < max(3, len(keep) // 2):  # no half can be a mistake: then the sigmas are what is wrong
-            keep = far <= np.sort(far)[max(3, len(keep) // 2) - 1]
-        part = poses.rows(keep)
-        Z, X = _newton(part, Z, X, sigma)
-        sigma_new = _variance(part, Z, X, sigma, share)
-        settled = bool((keep == used).all()) and bool(np.allclose(sigma_new, sigma, rtol=0.02, atol=1e-8))
-        used, sigma = keep, sigma_new
-        if settled:
-            break
-    part = poses.rows(used)
-    Z, X = _newton(part, Z, X, sigma)
-    return Fit(Z, X, np.asarray(np.linalg.inv(information(part, Z, X, sigma))), sigma, used)
-
-
-def information(poses: Poses, Z: Array, X: Array, sigma: Sigmas) -> Array:
-    """Return the information (12, 12) about the right tangents of Z and X."""
-    _, J, carry = residuals(poses, Z, X)
-    WJ = np.linalg.solve(covariances(poses, carry, sigma), J)
-    return np.asarray(np.einsum("nki,nkj->ij", J, WJ))
-
-
-def _squares(e: Array, cov: Array) -> Array:
-    """Return the squared Mahalanobis lengths (N,)."""
-    return np.asarray(np.einsum("ni,ni->n", e, np.linalg.solve(cov, e[..., None])[..., 0]))
-
-
-def _shared(position: float, rotation: float, share: Share) -> Sigmas:
-    """Return the four sigmas of a share."""
-    if share == "flange":
-        return position, rotation, 0.0, 0.0
-    return 0.0, 0.0, position, rotation if share == "seen" else HARDLY
-
-
-def _robust_sigma(poses: Poses, Z: Array, X: Array, share: Share) -> Sigmas:
-    """Return sigmas along one axis from the median residual, which mistakes do not reach."""
-    e, _, _ = residuals(poses, Z, X)
-    middle = np.sqrt(chdtri(3, 0.5))
-    position, rotation = (float(np.median(np.linalg.norm(part, axis=1))) / middle for part in (e[:, :3], e[:, 3:]))
-    return _shared(max(position, MIN_SIGMA), max(rotation, MIN_SIGMA), share)
-
-
-def _newton(poses: Poses, Z: Array, X: Array, sigma: Sigmas) -> tuple[Array, Array]:
-    """Minimise the weighted squares over both transforms."""
-    for _ in range(STEPS):
-        e, J, carry = residuals(poses, Z, X)
-        WJ = np.linalg.solve(covariances(poses, carry, sigma), J)
-        step = -np.linalg.lstsq(np.einsum("nki,nkj->ij", J, WJ), np.einsum("nki,nk->i", WJ, e), rcond=1e-15)[0]
-        Z, X = Z @ exp_se3(step[:6]), X @ exp_se3(step[6:])
-        if np.abs(step).max() < CONVERGED:
-            break
-    return Z, X
-
-
-def _variance(poses: Poses, Z: Array, X: Array, sigma: Sigmas, share: Share) -> Sigmas:
-    """Return the sigmas of the greatest restricted likelihood."""
-    if len(poses.A) > MAX_SIGMA_POSES:
-        poses = poses.rows(np.linspace(0, len(poses.A) - 1, MAX_SIGMA_POSES).astype(np.int64))
-    e, _, carry = residuals(poses, Z, X)
-    freedom = max(1 - 12 / e.size, 1 / e.size)  # what the fit has left of the residuals'
-    low, high = np.log(MIN_SIGMA), np.log(MAX_SIGMA)
-
-    def shared(logs: Array) -> Sigmas:
-        position, rotation = np.exp(np.clip(logs, low, high))
-        return _shared(float(position), float(rotation), share)
-
-    def cost(logs: Array) -> float:
-        C = covariances(poses, carry, shared(logs))
-        return float(freedom * np.linalg.slogdet(C)[1].sum() + _squares(e, C).sum())
-
-    start = np.log(np.maximum(sigma[:2] if share == "flange" else sigma[2:], MIN_SIGMA))
-    best = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-2, "fatol": 1e-3})
-    return shared(best.x)
-
-
-#: OpenCV as it is at run time: its type stubs are those of one version.
-_CV: Any = cv2
-#: Parts of this many poses are tried too, so that some of them are free of gross errors.
-PART = 6
-#: How many parts: with 20 % gross errors all of them would hold one with a chance of (1 - 0.8^6)^24, 0.1 %.
-PARTS = 24
-#: Share of the poses that must be good: the scale of residuals is that of the best so many. A median breaks down where half
-#: are blunders.
-MIDDLE = 0.4
-#: Share of the pairs of rows that count as agreeing: where half of the rows are good, a quarter does. With more rows than
-#: this none are looked for.
-AGREE, MOST_AGREEING = 0.15, 300
-#: Weight of a rotation in the score, m/rad: 1 mrad counts as 0.3 mm, as it does at a tool 0.3 m from the wrist.
-LEVER_M = 0.3
-#: OpenCV's solvers of A X = Z B, by the names it gives them; 5.0 has none of them.
-_OPENCV = ("CALIB_ROBOT_WORLD_HAND_EYE_SHAH", "CALIB_ROBOT_WORLD_HAND_EYE_LI")
-_OPENCV_MOTIONS = (
-    "CALIB_HAND_EYE_TSAI",
-    "CALIB_HAND_EYE_PARK",
-    "CALIB_HAND_EYE_HORAUD",
-    "CALIB_HAND_EYE_ANDREFF",
-    "CALIB_HAND_EYE_DANIILIDIS",
+from armsight.geometry.pose import exp_se3, inverse, log_se3, mean_pose, transform
+from armsight.geometry.rotation import skew
+from armsight.loop.handeye.noise import (
+    OF_THE_ARM,
+    SHARED,
+    SHARED_MAPS,
+    STRUCTURES,
+    Linear,
+    blocks,
+    error_maps,
+    freedom,
+    held_out,
+    jackknife,
+    left_out_squares,
+    own_squares,
+    pose_kernel,
+    reml,
+    solve,
+    time_kernel,
+    walk_gathered,
+    wiener_kernel,
+)
+from armsight.loop.handeye.poses import (
+    CHANCE,
+    CLEARLY,
+    MIDDLE,
+    MIN_POSES,
+    PART,
+    PARTS,
+    Eye,
+    HeldOut,
+    Poses,
+    checked_poses,
+    kronecker,
+    residuals,
+    starts,
 )
 
-
-def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
-    """Return candidates for X and Z of ``A_i X = Z B_i``, smallest median residual first.
-
-    Args:
-        A: (N, 4, 4) poses, N >= 3.
-        B: (N, 4, 4) poses.
-        seed: of the choice of parts.
-    """
-    rng = np.random.default_rng(seed)
-    found = [kronecker(A, B), *_opencv(A, B)]
-    if len(A) > PART:
-        for _ in range(PARTS):
-            rows = rng.choice(len(A), PART, replace=False)
-            found.append(kronecker(A[rows], B[rows]))
-    if len(rows := _agreeing(A, B)) >= MIN_POSES:
-        found.append(kronecker(A[rows], B[rows]))
-    found = [
-        (X, Z) for X, Z in found if np.isfinite(X).all() and np.isfinite(Z).all() and _is_rigid(X) and _is_rigid(Z)
-    ]
-    return sorted(found, key=lambda XZ: _score(A, B, *XZ))
-
-
-def _agreeing(A: Array, B: Array) -> NDArray[np.int64]:
-    """Return the rows that agree with that with which most do: between two rows both sides rotate by one angle.
-
-    Blunders hardly agree with anything, so these are good ones though half of the rows are not.
-    """
-    if len(A) > MOST_AGREEING:
-        return np.zeros(0, np.int64)
-    cosines = (np.einsum("iab,jab->ij", T[:, :3, :3], T[:, :3, :3]) for T in (A, B))
-    angles_A, angles_B = (np.arccos(np.clip((cosine - 1) / 2, -1, 1)) for cosine in cosines)
-    off = np.abs(angles_A - angles_B)
-    near = off < np.quantile(off[np.triu_indices(len(A), 1)], AGREE)
-    return np.flatnonzero(near[near.sum(axis=1).argmax()])
-
-
-def kronecker(A: Array, B: Array) -> tuple[Array, Array]:
-    """Solve ``A_i X = Z B_i`` in closed form: rotations first, then translations.
-
-    With column-stacked matrices, R_A R_X R_B^T = R_Z reads (R_B kron R_A) vec(R_X) = vec(R_Z) for every i, so both are the
-    leading singular vectors of the sum of the Kronecker products.
-
-    Returns:
-        (4, 4) X and (4, 4) Z.
-    """
-    RA, RB = A[:, :3, :3], B[:, :3, :3]
-    K = np.einsum("nij,nkl->ikjl", RB, RA).reshape(9, 9)
-    U, _, Vt = np.linalg.svd(K)
-    RX, RZ = _rotation(Vt[0].reshape(3, 3, order="F")), _rotation(U[:, 0].reshape(3, 3, order="F"))
-    # R_A t_X - t_Z = R_Z t_B - t_A
-    M = np.concatenate([RA, np.broadcast_to(-np.eye(3), RA.shape)], axis=2).reshape(-1, 6)
-    right = (B[:, :3, 3] @ RZ.T - A[:, :3, 3]).ravel()
-    t = np.linalg.lstsq(M, right, rcond=None)[0]
-    return pose(RX, t[:3]), pose(RZ, t[3:])
-
-
-def _rotation(M: Array) -> Array:
-    """Return the rotation nearest to a multiple, of either sign, of a rotation (3, 3)."""
-    return nearest_rotation(M * np.sign(np.linalg.det(M)))
-
-
-def _opencv(A: Array, B: Array) -> Iterator[tuple[Array, Array]]:
-    """Yield what OpenCV's solvers find, where it has them and they accept the poses."""
-    back = inverse(B)
-    for name in _OPENCV_MOTIONS if hasattr(cv2, "calibrateHandEye") else ():
-        with contextlib.suppress(cv2.error):
-            R, t = _CV.calibrateHandEye(*_parts(A), *_parts(back), method=getattr(cv2, name))
-            X = pose(R, t.ravel())
-            if np.isfinite(X).all():  # OpenCV 4 answers degenerate poses with NaN
-                yield X, mean_pose(A @ X @ back)
-    for name in _OPENCV if hasattr(cv2, "calibrateRobotWorldHandEye") else ():
-        with contextlib.suppress(cv2.error):
-            RX, tX, RZ, tZ = _CV.calibrateRobotWorldHandEye(*_parts(A), *_parts(B), method=getattr(cv2, name))
-            yield pose(RX, tX.ravel()), pose(RZ, tZ.ravel())
-
-
-def _parts(Ts: Array) -> tuple[list[Array], list[Array]]:
-    return [T[:3, :3] for T in Ts], [T[:3, 3] for T in Ts]
-
-
-def _is_rigid(T: Array) -> bool:
-    """Return whether a solver's answer is a rigid motion at all."""
-    return bool(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-6 and np.linalg.det(T[:3, :3]) > 0)
-
-
-def _score(A: Array, B: Array, X: Array, Z: Array) -> float:
-    """Return the size of the residual motions below which the share MIDDLE is, m."""
-    e = log_se3(inverse(Z @ B) @ A @ X)
-    sizes = np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1))
-    return float(np.quantile(sizes, MIDDLE))
-
-
-Eye = Literal["to_hand", "in_hand"]
-#: Parts into which the poses are cut for the held-out error.
-FOLDS = 10
-#: Fewest poses: three determine both transforms, and what is left out must leave three.
-MIN_POSES = 4
-#: Starts that are refined; the best of them by likelihood is kept.
-REFINED = 3
-#: Another share than the first must lower the held-out error by this factor: less is chance with tens of poses.
-CLEARLY = 1.1
-#: A direction worse determined than this (sigma, m or rad, for an arm that is off by 1 mm and 1 mrad) is not determined.
-UNDETERMINED = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class HeldOut(Record):
-    """Prediction errors of poses left out of the fit.
-
-    Attributes:
-        position_m: (N,) distance between the body's middle measured and predicted; NaN where a pose was not used.
-        angle_rad: (N,) angle between the body's rotations measured and predicted.
-    """
-
-    position_m: Array
-    angle_rad: Array
-
-    def mean(self) -> tuple[float, float]:
-        """Return the means, m and rad."""
-        return float(np.nanmean(self.position_m)), float(np.nanmean(self.angle_rad))
-
-    def rms(self) -> tuple[float, float]:
-        """Return the root mean squares, m and rad."""
-        return float(np.sqrt(np.nanmean(self.position_m**2))), float(np.sqrt(np.nanmean(self.angle_rad**2)))
-
-    def most(self) -> tuple[float, float]:
-        """Return the greatest, m and rad."""
-        return float(np.nanmax(self.position_m)), float(np.nanmax(self.angle_rad))
+#: Poses that a fit comes from at most, evenly spread. The structure is chosen from as many: what is claimed of many poses
+#: must have been looked for in as many.
+MAX_FIT = 1000
+#: With a shared error, poses that variances and held-out likelihoods come from at most, and the transforms.
+MAX_SHARED, MAX_SHARED_FIT = 40, 120
+#: Fewest poses for a structure with shared errors.
+MIN_SHARED = 12
+#: Numbers left of the residuals for each variance at least: fewer do not determine it.
+PER_VARIANCE = 8
+#: Parts that are left out, one after the other; of so few poses each one by itself.
+FOLDS, FEW = 5, 24
+#: Rotation about a second axis must exceed the noise of rotations by this factor, and this angle, rad.
+CLEARLY_ROTATED, LEAST_ROTATION = 3.0, np.radians(0.5)
+#: Rotations of half of the poses that differ by more than this, rad, are not of one motion.
+CONTRADICTS = np.radians(10.0)
+#: A sigma of the mounting beyond this (m, rad) is no calibration.
+OPEN_M, OPEN_RAD = 0.5, 0.5
+#: What a further pose is uncertain by at least, m and rad: where hardly anything scattered, one would determine all.
+LEAST_M, LEAST_RAD = 1e-5, 1e-5
+#: Degrees of freedom of Student's t in the robust start.
+FREEDOM = 4.0
+#: A scale must be off by this many sigmas to be taken, and has settled where a step is below this share of one: where the
+#: flange hardly moves it runs away.
+SURELY, SETTLED = 5.0, 0.1
+#: Neighbours' residuals hang together where Moran's statistic, in sigmas of chance, is above this.
+HANGING = 1.0
+#: The structure that weights positions alone, and by how many sigmas its squared errors must be lower.
+POSITIONS, SURELY_LOWER = "positions alone", 3.0
+#: The structures whose links are off, whose transforms go with the true arm; that of an arm whose error is a smooth
+#: function of the pose, whose transforms are the mounting that suits its model; and all of an arm that is not as its model.
+GEOMETRY = ("robot's geometry off", "robot's geometry and time stamps off")
+SMOOTH = "robot drifting over its poses"
+NOT_AS_MODELLED = (*GEOMETRY, SMOOTH)
+#: Those whose scale walks.
+SCALE_WALKING = ("camera's scale walking", "camera and its scale walking")
+#: Draws by which structures are weighted, and the weight below which one is not true.
+DRAWS, HARDLY_TRUE = 400, 0.02
+#: Rounds of least squares and of leaving out.
+ROUNDS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,27 +112,47 @@ class HandEye(Record):
         eye: "to_hand": the rig stands still and the flange carries the body; "in_hand": the other way round.
         T_base_still: (4, 4) what stands still, in the base: the rig, or in_hand the body.
         T_flange_held: (4, 4) what the flange carries: the body, or in_hand the rig.
-        cov: (12, 12) covariance of the right tangents of T_base_still and T_flange_held, in this order, m and rad.
-        sigma_flange_m: error of the flange by the joints, sigma along one axis, m.
-        sigma_flange_rad: the same of its rotation about one axis, rad.
-        sigma_seen_m: error of the measured body beyond its covariance, sigma of its middle along one axis, m.
-        sigma_seen_rad: the same of its rotation about one axis, rad.
-        share: what the error beyond the covariance given was attributed to, one of ``SHARES``.
-        held_out: the error on poses left out of the fit.
-        used: (N,) whether a pose was used, and not taken for a mistake.
+        cov: (12, 12) covariance of the right tangents of T_base_still and T_flange_held, m and rad.
+        scale: true lengths over those of the measured body; 1 where it was taken as given.
+        sigma_scale: its sigma; zero where it was not fitted.
+        step_s: what is left of the time offset, s, to be added to the eye's times; sigma_step_s its sigma; zero without.
+        structure: of the noise, one of ``STRUCTURES``.
+        sigmas: source -> sigma of one axis, m, rad, s, or a factor.
+        likelihoods: structure -> mean logarithm of the probability density of a pose left out.
+        arm_m: what the arm's error moves the body's middle by, RMS of the distance, m.
+        camera_m: what vision's error does, m.
+        held_out: the error on poses left out of the fit, of transforms found as these were, the arm as its model is. Where
+            the structure says that the arm's geometry is off (``GEOMETRY``) they go with the true arm, not with the model.
+        held_out_nominal: the same with the mounting that suits the arm's nominal model; another only with ``GEOMETRY``.
+        held_out_geometry: the same as held_out where the arm's error, as the other poses show it, is taken into account:
+            its geometry with ``links``, else, where the structure has it, its smooth error over its poses; None where
+            there is neither, or from too few poses.
+        used: (N,) whether a pose was used, and not taken for a blunder.
+        distance: (N,) Mahalanobis distance of each pose's residual, in units of its expectation.
+        common: (K,) the errors that all poses share (``Poses.common``), as found, in sigmas.
+        common_m: what they move the body's middle by, RMS of the distance, m.
     """
 
     eye: Eye
     T_base_still: Array
     T_flange_held: Array
     cov: Array
-    sigma_flange_m: float
-    sigma_flange_rad: float
-    sigma_seen_m: float
-    sigma_seen_rad: float
-    share: Share
+    scale: float
+    sigma_scale: float
+    step_s: float
+    sigma_step_s: float
+    structure: str
+    sigmas: dict[str, float]
+    likelihoods: dict[str, float]
+    arm_m: float
+    camera_m: float
     held_out: HeldOut
+    held_out_nominal: HeldOut
+    held_out_geometry: HeldOut | None
     used: NDArray[np.bool_]
+    distance: Array
+    common: Array
+    common_m: float
 
     @property
     def T_base_rig(self) -> Array:
@@ -440,11 +179,113 @@ class HandEye(Record):
             raise InputError(f"{name} is not constant with the eye {self.eye!r}; it belongs to {eye!r}")
         return T
 
+    @property
+    def sigma_flange(self) -> tuple[float, float]:
+        """Error of the flange by the joints from pose to pose: sigmas along one axis, m, and about one, rad."""
+        return self.sigmas.get("flange_m", 0.0), self.sigmas.get("flange_rad", 0.0)
+
+    def informations(self, poses: Poses) -> Array:
+        """Return the information (N, 12, 12) about the right tangents that each of further poses would give."""
+        e, J, carry = residuals(poses, self.T_base_still, self.T_flange_held)
+        maps, C = error_maps(poses, 0 * e, carry, None), poses.cov + np.diag(np.repeat([LEAST_M**2, LEAST_RAD**2], 3))
+        for name in STRUCTURES[self.structure]:
+            if (of := SHARED_MAPS.get(name, name)) in maps:
+                C = C + self.sigmas[name] ** 2 * maps[of] @ np.swapaxes(maps[of], 1, 2)
+        return np.asarray(np.swapaxes(J, 1, 2) @ np.linalg.solve(C, J))
+
     def predict(self, Ts_base_flange: Array) -> Array:
         """Return T_rig_body (..., 4, 4) at poses of the flange (..., 4, 4)."""
         if self.eye == "in_hand":
             return np.asarray(inverse(Ts_base_flange @ self.T_flange_held) @ self.T_base_still)
         return np.asarray(inverse(self.T_base_still) @ Ts_base_flange @ self.T_flange_held)
+
+
+@dataclass(frozen=True, eq=False)
+class _Guess(Record):
+    """Transforms, scale, what is left of the time offset, and errors that vision shares between poses, in sigmas.
+
+    Lengths are in the unit of the measured body, in which a scale that is fitted is not drawn to small values by the
+    body's noise: ``per_m`` of them make one metre.
+    """
+
+    Z: Array
+    X: Array
+    per_m: float = 1.0
+    step_s: float = 0.0
+    common: Array = field(default_factory=lambda: np.zeros(0))
+
+    def moved(self, x: Array, free: tuple[bool, bool]) -> _Guess:
+        """Return the guess after a step (P,) of Z, X and what is free of scale and time."""
+        rest = list(x[12:])
+        per_m = self.per_m * float(np.exp(np.clip(rest.pop(0), -1, 1))) if free[0] else self.per_m
+        step_s = self.step_s + float(np.clip(rest.pop(0), -0.05, 0.05)) if free[1] else self.step_s
+        common = self.common + rest if rest else self.common  # none are free in the robust start
+        return _Guess(self.Z @ exp_se3(x[:6]), self.X @ exp_se3(x[6:12]), per_m, step_s, common)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem(Record):
+    """What is fitted: the poses in their own order, and what their streams say."""
+
+    poses: Poses
+    t_s: Array | None
+    speed: Array | None
+    free: tuple[bool, bool]
+    links: Array | None = None
+
+    def rows(self, rows: NDArray[np.int64]) -> _Problem:
+        """Return a part of the rows."""
+        t_s, speed, links = (None if a is None else a[rows] for a in (self.t_s, self.speed, self.links))
+        return _Problem(self.poses.rows(rows), t_s, speed, self.free, links)
+
+    def scaled(self, guess: _Guess) -> Poses:
+        """Return the poses with the guess's time and vision's shared errors, the flange's lengths in the body's unit."""
+        p = self.poses.corrected(guess.common) if guess.common.size else self.poses
+        A = p.A.copy() if self.speed is None or guess.step_s == 0 else p.A @ exp_se3(guess.step_s * self.speed)
+        A[:, :3, 3] *= guess.per_m
+        return replace(p, A=A)
+
+    def linear(self, guess: _Guess) -> Linear:
+        """Return the residuals at a guess, with what noise does to them; no shared sources.
+
+        Vision's shared errors are unknowns where the guess has them.
+        """
+        poses = self.scaled(guess)
+        e, J, carry = residuals(poses, guess.Z, guess.X)
+        unit = np.repeat([guess.per_m, 1.0], 3)  # an error of the flange of 1 m, and of 1 rad
+        if self.free[0]:
+            way = np.zeros((len(e), 6, 1))
+            way[:, :3] = np.swapaxes(poses.A[:, :3, :3], 1, 2) @ poses.A[:, :3, 3:]
+            J = np.concatenate([J, carry @ way], axis=2)
+        carry = carry * unit
+        if self.free[1] and self.speed is not None:
+            J = np.concatenate([J, carry @ self.speed[..., None]], axis=2)
+        before, shared = J.shape[2], guess.common.size
+        if shared and poses.common is not None:
+            J = np.concatenate([J, poses.common if poses.in_hand else -poses.common], axis=2)
+        known, at = np.repeat([0.0, 1.0], [before, shared]), np.append(np.zeros(before), guess.common)
+        return Linear(e, J, poses.cov, error_maps(poses, e, carry, self.speed, self.links), {}, {}, known, at)
+
+    def metric(self, guess: _Guess, cov: Array) -> tuple[_Guess, Array]:
+        """Return Z and X in m, and the covariance (P, P) of what was fitted with them."""
+        change = np.eye(len(cov))
+        change[:3, :3] = change[6:9, 6:9] = np.eye(3) / guess.per_m
+        Z, X = guess.Z.copy(), guess.X.copy()
+        Z[:3, 3] /= guess.per_m
+        X[:3, 3] /= guess.per_m
+        if self.free[0]:
+            change[:3, 12] = -Z[:3, :3].T @ Z[:3, 3]
+            change[6:9, 12] = -X[:3, :3].T @ X[:3, 3]
+        return replace(guess, Z=Z, X=X), change @ cov @ change.T
+
+    def shared(self, linear: Linear, guess: _Guess, gathered: dict[str, Array]) -> Linear:
+        """Add the correlations of shared sources to residuals of the same rows."""
+        kernel = {SMOOTH: pose_kernel(self.poses.A)}
+        if self.t_s is not None:
+            kernel["robot drifting over time"] = time_kernel(self.t_s)
+            walked = wiener_kernel(self.t_s)
+            kernel |= {"robot walking over time": walked, **dict.fromkeys(SCALE_WALKING, walked)}
+        return replace(linear, kernel=kernel, walk=gathered)
 
 
 def calibrate_handeye(
@@ -454,8 +295,7 @@ def calibrate_handeye(
     *,
     eye: Eye = "to_hand",
     centre: ArrayLike | None = None,
-    folds: int = FOLDS,
-    shares: tuple[Share, ...] = SHARES,
+    structures: Sequence[str] = tuple(STRUCTURES),
     progress: Callable[[str], None] = lambda line: None,
 ) -> HandEye:
     """Calibrate the two constant transforms of rig, body and arm.
@@ -467,90 +307,619 @@ def calibrate_handeye(
         eye: "to_hand" where the rig stands still and the arm carries the body, "in_hand" where the arm carries the rig.
         centre: (3,) the middle of the body's points, body frame, m: errors of vision rotate the body about it.
             None: the body's origin.
-        folds: parts for the held-out error; each is predicted by a fit to the others.
-        shares: what the error beyond the covariance given may be attributed to; the held-out position error decides.
+        structures: of the noise, names to choose from; fewer take less time.
         progress: called with the name of each step as it begins.
 
     Raises:
         InputError: wrong shapes, NaN, no rigid motions, fewer than 4 poses.
-        CalibrationError: the motions leave a direction undetermined.
+        CalibrationError: the motions leave a direction open.
     """
-    poses = _poses(Ts_base_flange, Ts_rig_body, covs, eye, np.zeros(3) if centre is None else centre)
-    progress("hand-eye: fitting")
-    candidates = starts(poses.A, poses.right_side)[:REFINED]
-    found: list[HandEye] = []
-    for share in shares:
-        result = _best(poses, candidates, share)
-        _require_determined(poses, result)
-        progress(f"hand-eye: errors on poses left out ({share})")
-        held_out = _held_out(poses, result, folds, share)
-        found.append(HandEye(eye, result.Z, result.X, result.cov, *result.sigma, share, held_out, result.used))
-    return min(found, key=lambda h: h.held_out.rms()[0] * (1.0 if h.share == shares[0] else CLEARLY))
+    poses = checked_poses(Ts_base_flange, Ts_rig_body, covs, eye, np.zeros(3) if centre is None else centre)
+    return calibrate_structured(poses, structures=structures, progress=progress)
 
 
-def _poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, centre: ArrayLike) -> Poses:
-    """Check the input, once."""
-    if eye not in ("to_hand", "in_hand"):
-        raise InputError(f"eye is {eye!r}; known are to_hand, in_hand")
-    Ts_base_flange = checked(A, (None, 4, 4), "Ts_base_flange")
-    Ts_rig_body = checked(B, (len(Ts_base_flange), 4, 4), "Ts_rig_body")
-    for name, Ts in (("Ts_base_flange", Ts_base_flange), ("Ts_rig_body", Ts_rig_body)):
-        R = Ts[:, :3, :3]
-        off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).reshape(-1, 9).max(axis=1)
-        bad = (off > 1e-4) | (np.linalg.det(R) < 0) if len(Ts) else np.zeros(0, bool)
-        if bad.any():
-            raise InputError(f"{name}: pose {int(np.argmax(bad))} is no rigid motion: its 3x3 part is no rotation")
-    n = len(Ts_base_flange)
+def calibrate_structured(
+    poses: Poses,
+    *,
+    t_s: Array | None = None,
+    speed: Array | None = None,
+    links: Array | None = None,
+    scale: bool = False,
+    structures: Sequence[str] = tuple(STRUCTURES),
+    progress: Callable[[str], None] = lambda line: None,
+) -> HandEye:
+    """Calibrate hand and eye, with the structure of the noise that poses left out support best.
+
+    Args:
+        poses: four or more.
+        t_s: (N,) times of the poses, s, where they are known: what drifts over time, or walks, needs them.
+        speed: (N, 6) twist of the flange, right tangent, m/s and rad/s, of streams: the rest of the time offset is fitted.
+        links: (N, L, 4, 4) T_link_flange of every link, m, where the joints and a model are known.
+        scale: whether the size of the target may be wrong (one camera that moves has none): fitted, and kept where it is
+            surely not 1.
+        structures: names to choose from.
+        progress: called with the name of each step as it begins.
+
+    Raises:
+        InputError: fewer than four poses.
+        CalibrationError: the motions leave a direction open.
+    """
+    n = len(poses.A)
     if n < MIN_POSES:
         raise InputError(f"hand-eye calibration needs {MIN_POSES} or more poses, got {n}; 15 and more are advised")
-    cov = np.zeros((n, 6, 6)) if covs is None else checked(covs, (n, 6, 6), "covs")
-    return Poses(Ts_base_flange, Ts_rig_body, cov, eye == "in_hand", checked(centre, (3,), "centre"))
-
-
-def _best(poses: Poses, candidates: list[tuple[Array, Array]], share: Share) -> Fit:
-    """Return the fit that uses most poses, and of those the one with the smallest sigmas."""
-    fits = [fit(poses, candidate, share) for candidate in candidates]
-    return min(fits, key=lambda f: (-int(f.used.sum()), sum(f.sigma)))
-
-
-def _require_determined(poses: Poses, result: Fit) -> None:
-    """Reject motions that leave a direction of the twelve undetermined."""
-    H = information(poses.rows(result.used), result.Z, result.X, (1e-3, 1e-3, 0.0, 0.0))
-    values, vectors = np.linalg.eigh(H)
-    if values[0] > 1 / UNDETERMINED**2:
-        return
-    names = [
-        f"{what} {kind} {axis}"
-        for what in (_still(poses), _held(poses))
-        for kind in ("translation", "rotation")
-        for axis in "xyz"
-    ]
-    most = ", ".join(names[i] for i in np.argsort(-np.abs(vectors[:, 0]))[:2])
-    raise CalibrationError(
-        f"the motions do not determine the hand-eye calibration ({most} can be anything): the flange must rotate about "
-        "two axes that are not parallel, by 20 degrees and more; rotate the wrist between poses"
+    order = _own_order(poses, t_s)
+    whole = _Problem(poses, t_s, speed, (False, speed is not None), links).rows(order)
+    progress("hand-eye: start")
+    if scale:
+        whole, guess, used = _with_scale(whole)
+    else:
+        guess, used = _robust(whole, _first(whole))
+    require_rotations(whole.poses.rows(used), whole.linear(guess).e[used])
+    if poses.common is not None:
+        guess = replace(guess, common=np.zeros(poses.common.shape[2]))
+    found, used = _chosen(whole, guess, used, structures, progress)
+    used_rows, distance = np.zeros(n, bool), np.full(n, np.nan)
+    used_rows[order], distance[order] = used, found.distance
+    geometry = None if found.held_out_geometry is None else _unsorted(found.held_out_geometry, order)
+    return replace(
+        found,
+        used=used_rows,
+        distance=distance,
+        held_out=_unsorted(found.held_out, order),
+        held_out_nominal=_unsorted(found.held_out_nominal, order),
+        held_out_geometry=geometry,
     )
 
 
-def _still(poses: Poses) -> str:
-    return "base-body" if poses.in_hand else "base-rig"
+def _unsorted(of: HeldOut, order: NDArray[np.int64]) -> HeldOut:
+    """Return the errors of poses in their own order in that in which they were given."""
+    back = np.argsort(order)
+    return HeldOut(of.position_m[back], of.angle_rad[back])
+
+
+def _own_order(poses: Poses, t_s: Array | None) -> NDArray[np.int64]:
+    """Return an order of the rows that does not depend on theirs: by time, else by what they hold."""
+    keys = np.concatenate([poses.B[:, :3].reshape(len(poses.B), -1), poses.A[:, :3].reshape(len(poses.A), -1)], axis=1)
+    if t_s is not None:
+        keys = np.concatenate([keys, t_s[:, None]], axis=1)
+    return np.asarray(np.lexsort(keys.T))
+
+
+def _spread(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """Return at most this many of the rows, evenly spread."""
+    if len(rows) <= most:
+        return rows
+    return np.asarray(rows[np.linspace(0, len(rows) - 1, most).round().astype(int)])
+
+
+def _first(problem: _Problem) -> list[_Guess]:
+    """Return closed-form starts, most plausible first."""
+    part = problem.rows(_spread(np.arange(len(problem.poses.A)), 300)).poses
+    return [_Guess(Z, X) for X, Z in starts(part.A, part.right_side)[:3]]
+
+
+def _middle_sigmas(e: Array) -> tuple[float, float]:
+    """Return sigmas along one axis of position and rotation, from the length below which the share MIDDLE is."""
+    middle = np.sqrt(chdtri(3, 1 - MIDDLE))
+    lengths = (np.quantile(np.linalg.norm(p, axis=1), MIDDLE) for p in (e[:, :3], e[:, 3:]))
+    position, rotation = (max(float(length) / middle, 1e-9) for length in lengths)
+    return position, rotation
+
+
+def _robust(problem: _Problem, guesses: list[_Guess]) -> tuple[_Guess, NDArray[np.bool_]]:
+    """Refine starts with the weights of Student's t; return the best, and which rows are no blunders."""
+    best: tuple[float, _Guess] | None = None
+    rows = _spread(np.arange(len(problem.poses.A)), MAX_FIT)
+    part = problem.rows(rows)
+    for start in guesses:
+        guess = start
+        for _ in range(25):
+            linear = part.linear(guess)
+            position, rotation = _middle_sigmas(linear.e)
+            white = np.repeat([1 / position, 1 / rotation], 3)
+            e, J = linear.e * white, linear.J * white[:, None]
+            weight = (FREEDOM + 6) / (FREEDOM + np.sum(e**2, axis=1))
+            H = np.einsum("n,nki,nkj->ij", weight, J, J)
+            x = -np.linalg.lstsq(H, np.einsum("n,nki,nk->i", weight, J, e), rcond=1e-14)[0]
+            guess = guess.moved(x, problem.free)
+            if np.abs(x).max() < 1e-7:
+                break
+        cost = float(np.sum(np.log(_middle_sigmas(part.linear(guess).e))))
+        if best is None or cost < best[0] - 1e-6:
+            best = (cost, guess)
+    assert best is not None
+    e = problem.linear(best[1]).e
+    position, rotation = _middle_sigmas(e)
+    far = np.sum((e / np.repeat([position, rotation], 3)) ** 2, axis=1)
+    used = far < 3 * chdtri(6, CHANCE)  # generous: axes differ; the structure's own covariance decides later
+    return best[1], used
+
+
+def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]:
+    """Return the problem, with the scale free where it is surely not 1, and its robust solution."""
+    known, used_known = _robust(problem, _first(problem))
+    free = replace(problem, free=(True, problem.free[1]))
+    per_m = 1 / scale_between(problem.poses)
+    scaled = replace(problem, poses=problem.scaled(_Guess(np.eye(4), np.eye(4), per_m)))
+    guesses = [replace(guess, per_m=per_m) for guess in _first(scaled)]
+    found, used = _robust(free, guesses)
+    rows = _spread(np.flatnonzero(used), MAX_FIT)
+    at, sure = found, False
+    for _ in range(ROUNDS):
+        linear = free.rows(rows).linear(at)
+        b = blocks(linear, "robot and camera")
+        solved = solve(b, reml(b, _start_variances(linear, "robot and camera")))
+        at, sigma = at.moved(solved.x, free.free), np.sqrt(solved.cov[12, 12])
+        sure = abs(np.log(at.per_m)) > SURELY * sigma and abs(solved.x[12]) < sigma
+        if abs(solved.x[12]) < SETTLED * sigma:
+            break
+    (before_m, before_rad), (after_m, after_rad) = (
+        _middle_sigmas(p.rows(rows).linear(g).e) for p, g in ((problem, known), (free, found))
+    )
+    gained = 3 * float(np.log(before_m / after_m * before_rad / after_rad))  # log density of a pose
+    if ((sure and gained > -1) or gained > 1) and 1e-4 < found.per_m < 1e4:  # sure, but far worse: of blunders
+        return free, found, used
+    return problem, known, used_known
+
+
+def scale_between(poses: Poses) -> float:
+    """Return true lengths over those of the measured body, by closed forms from small parts of the poses.
+
+    Of the parts' answers it is that whose best residuals, of the share MIDDLE, are smallest.
+    """
+    p = poses.rows(_spread(np.arange(len(poses.A)), 300))
+    A, B = p.A, p.right_side
+    rng = np.random.default_rng(0)
+    best = (np.inf, 1.0)
+    for k in range(PARTS + 1):
+        part = np.arange(len(A)) if k == 0 or len(A) <= PART else rng.choice(len(A), PART, replace=False)
+        _, Z = kronecker(A[part], B[part])
+        M = np.concatenate(
+            [A[:, :3, :3], np.broadcast_to(-np.eye(3), (len(A), 3, 3)), -(B[:, :3, 3] @ Z[:3, :3].T)[..., None]], axis=2
+        )
+        found = np.linalg.lstsq(M[part].reshape(-1, 7), -A[part, :3, 3].ravel(), rcond=None)[0]
+        left = float(np.quantile(np.linalg.norm(M @ found + A[:, :3, 3], axis=1), MIDDLE))
+        if found[6] > 0 and left < best[0]:
+            best = (left, float(found[6]))
+    return best[1]
+
+
+def rotations_of(poses: Poses, e: Array) -> tuple[Array, Array, float, float]:
+    """Return how far the flange rotates, and how far it must for both transforms to be determined.
+
+    Args:
+        poses: the poses used.
+        e: (N, 6) their residuals, which say how large the noise of rotations is.
+
+    Returns:
+        Root mean squares (3,) of the rotations about each principal axis, rad, largest first; these axes (3, 3), columns,
+        smallest first, in the flange; the noise of rotations about one axis, rad; the least that the second must be, rad.
+    """
+    rotated = log_se3(inverse(mean_pose(poses.A)) @ poses.A)[:, 3:]
+    values, axes = np.linalg.eigh(rotated.T @ rotated / len(rotated))
+    noise = _middle_sigmas(e)[1]
+    return np.sqrt(np.maximum(values[::-1], 0.0)), axes, noise, max(CLEARLY_ROTATED * noise, LEAST_ROTATION)
+
+
+def require_rotations(poses: Poses, e: Array) -> None:
+    """Reject motions whose rotations are about one axis only, as far as the noise shows.
+
+    Args:
+        poses: the poses used.
+        e: (N, 6) their residuals, which say how large the noise of rotations is.
+
+    Raises:
+        CalibrationError: the open direction, by name.
+    """
+    spread, axes, noise, least = rotations_of(poses, e)
+    held = _held(poses)
+    if noise > CONTRADICTS and spread[0] > LEAST_ROTATION:
+        raise CalibrationError(
+            f"the rotations of both sides contradict each other by {np.degrees(noise):.0f} deg: they are not of the same "
+            "motion, or one side is read wrongly (order and sense of joints, rotations, which row belongs to which)"
+        )
+    if spread[0] < least:
+        raise CalibrationError(
+            f"the flange hardly rotates (RMS {np.degrees(spread[0]):.2f} deg, noise {np.degrees(noise):.2f} deg): the "
+            f"translation of {held} stays open in every direction; rotate the wrist about two axes, by 20 degrees and more"
+        )
+    if spread[1] < least:
+        axis = axes[:, 2] * np.sign(axes[np.argmax(np.abs(axes[:, 2])), 2])
+        named = " ".join(f"{value:.2f}" for value in axis)
+        raise CalibrationError(
+            f"the flange rotates about one axis only, [{named}] in the flange ({np.degrees(spread[0]):.1f} deg RMS; across "
+            f"it {np.degrees(spread[1]):.2f} deg, the noise {np.degrees(noise):.2f} deg): the translation of {held} "
+            "along this axis stays open; rotate about a second axis, by 20 degrees and more"
+        )
+
+
+def require_known(poses: Poses, Z: Array, X: Array, cov: Array) -> None:
+    """Reject a result one of whose directions is known so badly that it is no calibration.
+
+    Raises:
+        CalibrationError: the open direction, by name.
+    """
+    for name, R, block in ((_held(poses), X[:3, :3], cov[6:12, 6:12]), (_still(poses), Z[:3, :3], cov[:6, :6])):
+        for kind, part, most, unit, times in (
+            ("translation", block[:3, :3], OPEN_M, "mm", 1e3),
+            ("rotation", block[3:, 3:], OPEN_RAD, "deg", np.degrees(1.0)),
+        ):
+            values, vectors = np.linalg.eigh(part)
+            sigma = float(np.sqrt(max(values[-1], 0.0)))
+            if sigma < most:
+                continue
+            axis = R @ vectors[:, -1]
+            named = " ".join(f"{value:.2f}" for value in axis * np.sign(axis[np.argmax(np.abs(axis))]))
+            first = name.split("-")[0]
+            raise CalibrationError(
+                f"the motions leave the {kind} of {name} open: along or about [{named}] in the {first} its sigma is "
+                f"{times * sigma:.0f} {unit}; rotate the flange about two axes that are not parallel, by 20 degrees and "
+                "more, and take more poses"
+            )
 
 
 def _held(poses: Poses) -> str:
     return "flange-rig" if poses.in_hand else "flange-body"
 
 
-def _held_out(poses: Poses, result: Fit, folds: int, share: Share) -> HeldOut:
-    """Predict every used pose by a fit to the other parts."""
-    used = np.flatnonzero(result.used)
-    position, angle = np.full(len(poses.A), np.nan), np.full(len(poses.A), np.nan)
-    order = np.random.default_rng(0).permutation(used)
-    for part in np.array_split(order, min(max(folds, 2), len(used))):
-        others = np.setdiff1d(used, part)
-        f = fit(poses.rows(others), (result.X, result.Z), share)
-        A, B = poses.A[part], poses.B[part]
-        seen = A @ f.X @ B if poses.in_hand else A @ f.X
-        predicted = np.broadcast_to(f.Z, B.shape) if poses.in_hand else f.Z @ B
-        position[part] = np.linalg.norm(transform(seen, poses.centre) - transform(predicted, poses.centre), axis=1)
-        angle[part] = np.linalg.norm(log_se3(inverse(predicted) @ seen)[:, 3:], axis=1)
+def _still(poses: Poses) -> str:
+    return "base-body" if poses.in_hand else "base-rig"
+
+
+def _start_variances(linear: Linear, structure: str) -> Array:
+    """Return variances to begin at: what the residuals are, shared evenly between the sources."""
+    position, rotation = _middle_sigmas(linear.e)
+    sources = STRUCTURES[structure]
+    small = {"time_s": 1e-6, "image": 1.0, "scale_walk": 1e-4}
+    small |= {"walk_m": 0.01 * position**2, "walk_rad": 0.01 * rotation**2}
+    even = {name: (position if name.endswith("_m") else rotation) ** 2 / 2 for name in sources}
+    return np.asarray(np.maximum([small.get(name, even[name]) for name in sources], 1e-13))
+
+
+def _allowed(structure: str, problem: _Problem, count: int, covered: bool) -> bool:
+    """Return whether a structure can be determined from these poses."""
+    sources = STRUCTURES[structure]
+    if len(sources) > 2 and len(sources) > (6 * count - 12) / PER_VARIANCE:
+        return False
+    if "image" in sources:
+        return covered
+    if "link_m" in sources:
+        timed = "time_s" not in sources or problem.speed is not None
+        return problem.links is not None and count >= MIN_SHARED and timed
+    if "time_s" in sources:
+        return problem.speed is not None
+    if structure in SHARED and structure != SMOOTH:
+        walks = "walk_m" not in sources or problem.poses.in_hand
+        scaled = "scale_walk" not in sources or problem.free[0]
+        return problem.t_s is not None and count >= MIN_SHARED and walks and scaled
+    return structure not in SHARED or count >= MIN_SHARED
+
+
+def _chosen(
+    whole: _Problem,
+    guess: _Guess,
+    used: NDArray[np.bool_],
+    structures: Sequence[str],
+    progress: Callable[[str], None],
+) -> tuple[HandEye, NDArray[np.bool_]]:
+    """Try the structures, leave out blunders by the covariance of the best, and fit with it."""
+    covered = bool((np.abs(whole.poses.cov).reshape(len(used), -1).max(axis=1) > 0).all())
+    names = [name for name in structures if _allowed(name, whole, int(used.sum()), covered)]
+    if not names:
+        raise InputError(f"none of the structures {', '.join(structures)} can be determined from these poses")
+    gathered = walk_gathered(whole.scaled(guess)) if whole.t_s is not None and whole.poses.in_hand else {}
+    simple = "robot and camera" if "robot and camera" in names else names[0]
+    guess, used, variances = _settled(whole, guess, used, simple, gathered)
+    hanging = _hanging(whole, guess, used, simple, variances, gathered)
+    trials = {}
+    for name in names:
+        if name in SHARED and name not in hanging:
+            continue
+        progress(f"hand-eye: poses left out ({name})")
+        trials[name] = _trial(whole, guess, used, name, gathered)
+    best, geometries = _best(whole, trials), [trials[name] for name in GEOMETRY if name in trials]
+    if best == SMOOTH:
+        geometries.append(trials[best])
+    geometry = max(geometries, key=lambda trial: float(trial.density.mean()), default=None)
+    as_modelled = {name: trial for name, trial in trials.items() if name not in NOT_AS_MODELLED}
+    nominal = trials[best] if best not in NOT_AS_MODELLED or not as_modelled else trials[_best(whole, as_modelled)]
+    given = nominal if best == SMOOTH else trials[best]
+    progress(f"hand-eye: fitting ({best})")
+    guess, used, variances = _settled(whole, guess, used, best, gathered)
+    rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
+    linear = _linear(whole, guess, rows, best, gathered)
+    x, cov = _student(whole, guess, used, best, variances, gathered)
+    weights = _weights(trials, best)
+    mixed = weights[best] * cov
+    for name in weights.keys() - {best}:  # what the other structures that may be true as well would answer
+        other, spread = _student(whole, guess, used, name, trials[name].variances, gathered)
+        mixed = mixed + weights[name] * (spread + np.outer(other - x, other - x))
+    cov = mixed
+    if (
+        best == SMOOTH and as_modelled
+    ):  # the arm is used by its model: how far its mounting is from the true one is in cov
+        name = _best(whole, as_modelled)
+        suits, _ = _student(whole, guess, used, name, trials[name].variances, gathered)
+        cov, x = cov + np.outer(suits - x, suits - x), suits
+    guess = guess.moved(x, whole.free)
+    metric, cov = whole.metric(guess, cov)
+    require_known(whole.poses, metric.Z, metric.X, cov)
+    sigmas = {name: float(np.sqrt(v)) for name, v in zip(STRUCTURES[best], variances, strict=True)}
+    arm, camera = _displacements(whole, linear, best, variances, guess)
+    rest = np.sqrt(np.diag(cov)[12:]).tolist()
+    sigma_scale = rest.pop(0) if whole.free[0] else 0.0
+    distance = _distances(whole, guess, best, variances, gathered)
+    found = HandEye(
+        eye="in_hand" if whole.poses.in_hand else "to_hand",
+        T_base_still=metric.Z,
+        T_flange_held=metric.X,
+        cov=cov[:12, :12],
+        scale=1 / guess.per_m,
+        sigma_scale=sigma_scale / guess.per_m,
+        step_s=guess.step_s,
+        sigma_step_s=rest.pop(0) if whole.free[1] else 0.0,
+        structure=best,
+        sigmas=sigmas,
+        likelihoods={name: float(trial.density.mean()) for name, trial in trials.items()},
+        arm_m=arm,
+        camera_m=camera,
+        held_out=_held_out_errors(whole, guess, given.residual, given.rows),
+        held_out_nominal=_held_out_errors(whole, guess, nominal.residual, nominal.rows),
+        held_out_geometry=None if geometry is None else _held_out_errors(whole, guess, geometry.left, geometry.rows),
+        used=used,
+        distance=distance,
+        common=guess.common,
+        common_m=_common_m(whole.poses, guess),
+    )
+    return found, used
+
+
+def _common_m(poses: Poses, guess: _Guess) -> float:
+    """Return the RMS distance by which vision's shared errors move the body's middle, m."""
+    off = transform(poses.corrected(guess.common).B, poses.centre) - transform(poses.B, poses.centre)
+    return float(np.sqrt((off**2).sum(axis=-1).mean())) / guess.per_m if guess.common.size else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial(Record):
+    """A structure on poses left out.
+
+    Attributes:
+        density: (N,) logarithm of the probability density of each pose left out.
+        residual: (N, 6) their residuals under transforms fitted without them.
+        left: (N, 6) what is left of them with shared errors predicted.
+        rows: (N,) which rows they are.
+        variances: (K,) of the sources, from all of them.
+    """
+
+    density: Array
+    residual: Array
+    left: Array
+    rows: NDArray[np.int64]
+    variances: Array
+
+
+def _weights(trials: dict[str, _Trial], best: str) -> dict[str, float]:
+    """Return how probable the structures are that poses left out do not exclude, the best among them.
+
+    By the densities of poses left out, smoothed by what their sum is uncertain (pseudo-BMA+; Yao et al., Bayesian Analysis
+    13, 2018). Positions alone are chosen by another rule, and have none.
+    """
+    if best == POSITIONS:
+        return {best: 1.0}
+    names = [best, *(name for name in trials if name not in (best, POSITIONS))]
+    of = trials[best]
+    sums, sigmas = np.zeros(len(names)), np.zeros(len(names))
+    for k, name in enumerate(names[1:], 1):
+        other = trials[name]
+        n = min(len(of.rows), len(other.rows))
+        sums[k] = n * (other.density.mean() - of.density.mean())
+        if np.array_equal(of.rows, other.rows):
+            sigmas[k] = np.sqrt(n) * float((other.density - of.density).std())
+    drawn = sums + sigmas * np.random.default_rng(0).standard_normal((DRAWS, len(names)))
+    odds = np.exp(drawn - drawn.max(axis=1, keepdims=True))
+    shares = (odds / odds.sum(axis=1, keepdims=True)).mean(axis=0)
+    kept = {
+        name: float(share) for name, share in zip(names, shares, strict=True) if name == best or share > HARDLY_TRUE
+    }
+    return {name: share / sum(kept.values()) for name, share in kept.items()}
+
+
+def _student(
+    whole: _Problem,
+    guess: _Guess,
+    used: NDArray[np.bool_],
+    structure: str,
+    variances: Array,
+    gathered: dict[str, Array],
+) -> tuple[Array, Array]:
+    """Return the step (P,) from a guess to the least squares of a structure, and its covariance (P, P).
+
+    Where leaving out poses shows a larger one than the structure does, mean of a block of three, it is that. Residuals say
+    little about some variances: it is Student's ellipsoid in place of the normal one (Hotelling).
+    """
+    rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if structure in SHARED else MAX_FIT)
+    few = _spread(rows, MAX_SHARED if structure in SHARED else MAX_FIT)
+    linear = _linear(whole, guess, rows, structure, gathered)
+    b, own = blocks(linear, structure), linear.J.shape[2]
+    solved = solve(b, variances)
+    cov = solved.cov[:own, :own]
+    if structure not in SHARED:
+        shown, grow = jackknife(b, solved)[:own, :own], np.ones(own)
+        for part in (slice(k, k + 3) for k in range(0, 12, 3)):
+            grow[part] = np.sqrt(max(float(np.trace(np.linalg.solve(cov[part, part], shown[part, part]))) / 3, 1.0))
+        cov = cov * np.outer(grow, grow)
+    estimated = blocks(_linear(whole, guess, few, structure, gathered), structure)
+    known = freedom(estimated, variances, lambda v: solve(b, v).cov, 12)
+    known = min(known, max(6 * len(rows) // 2 - 9, 3))  # of positions, whose fit also rotates the frames
+    return solved.x[:own], cov * float(6 * f_distribution.ppf(0.95, 6, known) / chdtri(6, 0.05))
+
+
+def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
+    """Return the structure that poses left out are most probable under.
+
+    Positions alone never win so: they do where they predict positions left out better, clearly and surely.
+    """
+    others = {name: trial for name, trial in trials.items() if name != POSITIONS} or trials
+    best = max(others, key=lambda name: others[name].density.mean())
+    if POSITIONS not in trials or best in (*SHARED, *GEOMETRY, POSITIONS):
+        return best
+    of, alone = (
+        np.sum((e[:, :3] - np.cross(whole.poses.centre, e[:, 3:])) ** 2, axis=1)
+        for e in (trials[best].residual, trials[POSITIONS].residual)
+    )
+    lower = of - alone
+    sure = lower.mean() > SURELY_LOWER * lower.std() / np.sqrt(len(lower))
+    return POSITIONS if sure and of.mean() > CLEARLY**2 * alone.mean() else best
+
+
+def _hanging(
+    whole: _Problem,
+    guess: _Guess,
+    used: NDArray[np.bool_],
+    structure: str,
+    variances: Array,
+    gathered: dict[str, Array],
+) -> set[str]:
+    """Return the structures with shared errors that the residuals of neighbours speak for.
+
+    Moran's test of the residuals of a regression, which have lost what the unknowns fit (Cliff and Ord, "Spatial
+    Processes", 1981, chapter 8): a kernel that is wide beside the poses' spread is mostly lost so.
+    """
+    rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT)
+    if structure in SHARED or len(rows) < MIN_SHARED:
+        return set(SHARED)
+    part = whole.rows(rows)
+    linear = part.shared(part.linear(guess), guess, {})
+    n, C = len(rows), blocks(linear, structure).covariance(variances)
+    L = np.linalg.cholesky(C)
+    white = np.linalg.solve(L, linear.e[..., None]).reshape(-1)
+    fitted, _ = np.linalg.qr(np.linalg.solve(L, linear.J).reshape(6 * n, -1))
+    white = white - fitted @ (fitted.T @ white)
+    kernels, index = dict(linear.kernel), np.arange(n)
+    beside = np.asarray(np.abs(index[:, None] - index[None]) == 1, dtype=float)
+    if gathered:
+        kernels["camera walking"] = beside
+    kernels |= dict.fromkeys(kernels.keys() & {"robot walking over time", *SCALE_WALKING}, beside)
+    found = set()
+    for name, K in kernels.items():
+        W = np.kron(K - np.diag(np.diag(K)), np.eye(6))
+        W = W - fitted @ (fitted.T @ W)
+        W = W - (W @ fitted) @ fitted.T
+        moran = float(white @ W @ white - np.trace(W)) / np.sqrt(2 * float((W**2).sum()))
+        if moran > HANGING:
+            found.add(name)
+    return found
+
+
+def _linear(
+    whole: _Problem, guess: _Guess, rows: NDArray[np.int64], structure: str, gathered: dict[str, Array]
+) -> Linear:
+    """Return the residuals of rows, with what the structure needs."""
+    part = whole.rows(rows)
+    linear = part.linear(guess)
+    if structure not in SHARED:
+        return linear
+    return part.shared(linear, guess, {name: W[rows] for name, W in gathered.items()})
+
+
+def _settled(
+    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, gathered: dict[str, Array]
+) -> tuple[_Guess, NDArray[np.bool_], Array]:
+    """Alternate variances, transforms and blunders until they stay."""
+    variances: Array | None = None
+    for _ in range(ROUNDS):
+        few = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_FIT)
+        linear = _linear(whole, guess, few, structure, gathered)
+        if variances is None:
+            variances = reml(blocks(linear, structure), _start_variances(linear, structure))
+        else:
+            variances = reml(blocks(linear, structure), variances, 10)
+        rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if structure in SHARED else MAX_FIT)
+        linear = _linear(whole, guess, rows, structure, gathered)
+        b = blocks(linear, structure)
+        solved = solve(b, variances)
+        x = solved.x[: linear.J.shape[2]]
+        if structure in GEOMETRY:
+            far = own_squares(blocks(whole.linear(guess), structure), variances, solved.x)
+        guess = guess.moved(x, whole.free)
+        if structure in SHARED:
+            far = left_out_squares(b, solved)
+            keep = used.copy()
+            keep[rows[(far > chdtri(6, CHANCE)) & (far > 0.3 * far.max())]] = False
+        elif structure in GEOMETRY:
+            keep = far < chdtri(6, CHANCE)
+        else:
+            keep = 6 * _distances(whole, guess, structure, variances, gathered) < chdtri(6, CHANCE)
+        if keep.sum() < max(MIN_POSES, len(keep) // 3):
+            keep = used
+        settled = bool((keep == used).all()) and float(np.abs(x[:12]).max()) < 1e-5
+        used = keep
+        if settled:
+            break
+    assert variances is not None
+    return guess, used, variances
+
+
+def _distances(whole: _Problem, guess: _Guess, structure: str, variances: Array, gathered: dict[str, Array]) -> Array:
+    """Return the squared Mahalanobis length (N,) of each pose's own residual, over 6."""
+    linear = whole.linear(guess)
+    C = np.array(linear.given) * (0.0 if "image" in STRUCTURES[structure] else 1.0)
+    for name, variance in zip(STRUCTURES[structure], variances, strict=True):
+        if name == "image":
+            C += variance * linear.given
+        elif name in gathered:
+            C += variance * gathered[name]
+        else:
+            M = linear.maps[SHARED_MAPS.get(name, name)]
+            C += variance * M @ np.swapaxes(M, 1, 2)
+    C += 1e-16 * np.eye(6)
+    return np.asarray(np.einsum("ni,ni->n", linear.e, np.linalg.solve(C, linear.e[..., None])[..., 0]) / 6)
+
+
+def _trial(
+    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, gathered: dict[str, Array]
+) -> _Trial:
+    """Leave out poses under a structure."""
+    rows = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_FIT)
+    linear = _linear(whole, guess, rows, structure, gathered)
+    b = blocks(linear, structure)
+    variances = reml(b, _start_variances(linear, structure))
+    n = len(rows)
+    order = np.arange(n) if whole.t_s is not None else np.random.default_rng(0).permutation(n)
+    parts = [np.sort(part) for part in np.array_split(order, n if n <= FEW and structure not in SHARED else FOLDS)]
+    density, residual, left = held_out(linear, structure, variances, parts)
+    return _Trial(density, residual, left, rows, variances)
+
+
+def _held_out_errors(whole: _Problem, guess: _Guess, residual: Array, rows: NDArray[np.int64]) -> HeldOut:
+    """Return the distances of the body's middle and the angles, of the rows that were left out in turn."""
+    n = len(whole.poses.A)
+    position, angle = np.full(n, np.nan), np.full(n, np.nan)
+    moved = (residual[:, :3] - np.cross(whole.poses.centre, residual[:, 3:])) / guess.per_m
+    position[rows], angle[rows] = np.linalg.norm(moved, axis=1), np.linalg.norm(residual[:, 3:], axis=1)
     return HeldOut(position, angle)
+
+
+def _displacements(
+    whole: _Problem, linear: Linear, structure: str, variances: Array, guess: _Guess
+) -> tuple[float, float]:
+    """Return the RMS distances by which the arm's and vision's errors move the body's middle, m."""
+    middle = np.concatenate([np.eye(3), -skew(whole.poses.centre)], axis=1) / guess.per_m
+    arm = camera = 0.0
+    for name, variance in zip(STRUCTURES[structure], variances, strict=True):
+        if name == "image":
+            size = float(np.einsum("ai,nij,aj->n", middle, linear.given, middle).mean())
+        elif name in linear.walk:
+            size = float(np.einsum("ai,nij,aj->n", middle, linear.walk[name], middle).mean())
+        else:
+            M = middle @ linear.maps[SHARED_MAPS.get(name, name)]
+            walked = np.diag(linear.kernel[structure]) if name == "scale_walk" else 1.0
+            size = float((walked * np.einsum("nij,nij->n", M, M)).mean())
+        if name in OF_THE_ARM:
+            arm += variance * size
+        else:
+            camera += variance * size
+    if "image" not in STRUCTURES[structure]:
+        camera += float(np.einsum("ai,nij,aj->n", middle, linear.given, middle).mean())
+    return float(np.sqrt(arm)), float(np.sqrt(camera))

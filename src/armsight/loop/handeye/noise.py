@@ -40,7 +40,7 @@ from scipy.optimize import minimize
 from armsight.data import Array, Record
 from armsight.geometry.pose import adjoint, inverse, small_adjoint
 from armsight.geometry.rotation import skew
-from armsight.loop.handeye.handeye import HARDLY, LEVER_M, Poses
+from armsight.loop.handeye.poses import HARDLY, LEVER_M, Poses
 
 #: Name of a structure -> its sources. Those with a drift or a walk are tried where the poses allow it.
 STRUCTURES: dict[str, tuple[str, ...]] = {

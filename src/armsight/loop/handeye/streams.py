@@ -1,15 +1,15 @@
 """Hand-eye calibration of two streams of poses whose clocks differ by an unknown amount.
 
-In: times and poses of the flange, times and poses of the measured body. Out: :class:`StreamHandEye` with the offset and its
-sigma. The offset is found first from the two angular speeds, which no mounting changes (correlation over all offsets that
-leave an overlap), then fitted together with both transforms. Poses of a stream are not independent: the covariance is that
-of blocks longer than the residuals' correlation (jackknife), not of single poses.
+In: times and poses of the flange, times and poses of the measured body. Out: :class:`StructuredStreams` with the offset
+and its sigma. The offset is found first from the two angular speeds, which no mounting changes (correlation over all
+offsets that leave an overlap), then fitted together with both transforms. Poses of a stream are not independent: the
+structures of the noise allow for errors that neighbours share.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.check import checked
-from armsight.geometry.pose import exp_se3, inverse, log_se3
-from armsight.loop.handeye.handeye import Eye, HandEye, Poses, calibrate_handeye, covariances, residuals
+from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.handeye.handeye import HandEye, calibrate_structured
 from armsight.loop.handeye.noise import STRUCTURES
-from armsight.loop.handeye.structured import StructuredHandEye, calibrate_structured
+from armsight.loop.handeye.poses import Eye, Poses
 
 #: Poses used at most for the fit, spread evenly: a stream's neighbours say the same.
 MAX_POSES = 600
@@ -35,11 +35,6 @@ ROUNDS, SETTLED_S = 12, 1e-6
 SPEED_S = 0.02
 #: Steps between poses over which angular speeds are taken, and how much faster than the slower stream is a blunder.
 OVER, FASTER = (4, 12, 36), 1.3
-#: Blocks at least: fewer do not determine a variance.
-MIN_BLOCKS = 8
-#: Less than this part of a direction's information without one block counts as none: its sigma is a thousand times as
-#: large.
-MIN_LEFT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,62 +83,6 @@ class PoseStream(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class StreamHandEye(Record):
-    """A hand-eye calibration of two streams.
-
-    Attributes:
-        handeye: the calibration; its covariance allows for the correlation within the streams.
-        offset_s: to be added to the eye's times to give the hand's.
-        sigma_offset_s: its sigma.
-        poses: how many poses of the eye were used.
-    """
-
-    handeye: HandEye
-    offset_s: float
-    sigma_offset_s: float
-    poses: int
-
-
-def calibrate_streams(
-    hand: PoseStream,
-    eye_stream: PoseStream,
-    *,
-    eye: Eye = "to_hand",
-    progress: Callable[[str], None] = lambda line: None,
-) -> StreamHandEye:
-    """Find the mounting and the time offset of two streams.
-
-    Args:
-        hand: T_base_flange over time.
-        eye_stream: T_rig_body over time, on another clock.
-        eye: as in :func:`calibrate_handeye`.
-        progress: called with the name of each step as it begins.
-
-    Raises:
-        CalibrationError: the streams do not overlap, nothing rotates, or the motions leave a direction undetermined.
-    """
-    progress("time offset")
-    offset = coarse_offset(hand, eye_stream)
-    rows = np.linspace(0, len(eye_stream.t_s) - 1, min(MAX_POSES, len(eye_stream.t_s))).astype(int)
-    t_eye, B = eye_stream.t_s[rows], eye_stream.Ts[rows]
-    h = _calibrated(hand, t_eye, B, offset, eye)
-    for _ in range(ROUNDS):
-        progress(f"mounting and time offset {1e3 * offset:.2f} ms")
-        step, X, Z = _joint_step(hand, t_eye, B, offset, h)
-        offset += float(np.clip(step, -0.05, 0.05))
-        h = replace(h, T_flange_held=X, T_base_still=Z)
-        if abs(step) < SETTLED_S:
-            break
-    h = _calibrated(hand, t_eye, B, offset, eye)
-    step, _, _ = _joint_step(hand, t_eye, B, offset, h)
-    offset += step
-    h = _calibrated(hand, t_eye, B, offset, eye)
-    cov = _block_covariance(hand, t_eye, B, offset, h)
-    held = replace(h, cov=cov[:12, :12])
-    return StreamHandEye(held, offset, float(np.sqrt(cov[12, 12])), int(h.used.sum()))
-
-
-@dataclass(frozen=True, eq=False)
 class StructuredStreams(Record):
     """A hand-eye calibration of two streams whose noise has a structure.
 
@@ -155,7 +94,7 @@ class StructuredStreams(Record):
         B: (M, 4, 4) the body as seen.
     """
 
-    handeye: StructuredHandEye
+    handeye: HandEye
     offset_s: float
     sigma_offset_s: float
     t_s: Array
@@ -263,96 +202,3 @@ def _correlation(a: Array, b: Array) -> Array:
     size = 1 << (n - 1).bit_length()
     product = np.fft.irfft(np.fft.rfft(a, size) * np.fft.rfft(b[::-1], size), size)
     return np.asarray(product[:n])
-
-
-def _calibrated(hand: PoseStream, t_eye: Array, B: Array, offset: float, eye: Eye) -> HandEye:
-    A, good = hand.at(t_eye + offset)
-    if good.sum() < 20:
-        raise CalibrationError(f"the streams overlap in {int(good.sum())} poses only; 20 and more are needed")
-    return calibrate_handeye(A[good], B[good], eye=eye, folds=4, shares=("flange",))
-
-
-def _linear(hand: PoseStream, t_eye: Array, B: Array, offset: float, h: HandEye) -> tuple[Array, Array, Array, Array]:
-    """Return residuals (N, 6), derivative (N, 6, 13) by both transforms and the offset, covariances, and times."""
-    A, good = hand.at(t_eye + offset)
-    early, first = hand.at(t_eye + offset - SPEED_S / 2)
-    late, last = hand.at(t_eye + offset + SPEED_S / 2)
-    good &= first & last
-    poses = Poses(A[good], B[good], np.zeros((int(good.sum()), 6, 6)), h.eye == "in_hand", np.zeros(3))
-    e, J, carry = residuals(poses, h.T_base_still, h.T_flange_held)
-    speed = log_se3(inverse(early[good]) @ late[good]) / SPEED_S
-    by_time = (carry @ speed[..., None])[..., 0]
-    C = covariances(poses, carry, (h.sigma_flange_m, h.sigma_flange_rad, h.sigma_seen_m, h.sigma_seen_rad))
-    sane = np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e) < 60.0  # gross errors: chance 1e-10
-    return e[sane], np.concatenate([J, by_time[..., None]], axis=2)[sane], C[sane], t_eye[good][sane]
-
-
-def _joint_step(hand: PoseStream, t_eye: Array, B: Array, offset: float, h: HandEye) -> tuple[float, Array, Array]:
-    """Return the Gauss-Newton step of the offset, and the transforms after it."""
-    e, J, C, _ = _linear(hand, t_eye, B, offset, h)
-    WJ = np.linalg.solve(C, J)
-    step = -np.linalg.lstsq(np.einsum("nki,nkj->ij", J, WJ), np.einsum("nki,nk->i", WJ, e), rcond=1e-14)[0]
-    return float(step[12]), h.T_flange_held @ exp_se3(step[6:12]), h.T_base_still @ exp_se3(step[:6])
-
-
-def _block_covariance(hand: PoseStream, t_eye: Array, B: Array, offset: float, h: HandEye) -> Array:
-    """Return the covariance (13, 13) that leaving out blocks of time, one after the other, shows.
-
-    The delete-a-group jackknife: unlike the plain sandwich it allows for what each block pulls the fit its own way, which
-    counts where blocks are as few as the unknowns (Bell and McCaffrey, Survey Methodology 28, 2002).
-
-    Raises:
-        CalibrationError: without one block a direction is undetermined, and nothing says how well it is known.
-    """
-    e, J, C, t = _linear(hand, t_eye, B, offset, h)
-    WJ = np.linalg.solve(C, J)
-    H = np.einsum("nki,nkj->nij", J, WJ)
-    whole = H.sum(axis=0)
-    pulls = np.einsum("nki,nk->ni", WJ, e)
-    whitened = (np.linalg.inv(np.linalg.cholesky(C)) @ e[..., None])[..., 0]
-    length = int(np.clip(2 * _correlation_length(whitened), 1, max(len(e) // MIN_BLOCKS, 1)))
-    blocks = np.array_split(np.arange(len(e)), max(len(e) // length, 2))
-    rests = whole - np.array([H[block].sum(axis=0) for block in blocks])
-    _require_two_blocks(whole, rests, [(t[block[0]], t[block[-1]]) for block in blocks])
-    moved = np.linalg.solve(rests, np.array([pulls[block].sum(axis=0) for block in blocks])[..., None])[..., 0]
-    robust = moved.T @ moved * (len(blocks) - 1) / len(blocks)
-    # Few blocks can scatter less than single poses would by chance: never claim more than independent poses allow.
-    plain = np.linalg.inv(whole)
-    grow = np.sqrt(np.maximum(np.diag(plain) / np.diag(robust), 1.0))
-    return np.asarray(robust * np.outer(grow, grow))
-
-
-def _require_two_blocks(whole: Array, rests: Array, spans: list[tuple[float, float]]) -> None:
-    """Reject streams of which one block alone determines a direction.
-
-    Args:
-        whole: (13, 13) information of all blocks.
-        rests: (B, 13, 13) that without each.
-        spans: first and last time of each block, s.
-    """
-    advice = "rotate about two axes, at changing speed, several times over the recording"
-    unit = 1 / np.sqrt(np.maximum(np.diag(whole), 1e-300))  # m, rad and s side by side
-    values, vectors = np.linalg.eigh(unit[:, None] * whole * unit)
-    if values[0] < np.finfo(float).eps * len(values) * values[-1]:
-        raise CalibrationError(f"these motions do not distinguish the time offset from the mounting: {advice}")
-    white = unit[:, None] * vectors / np.sqrt(values)  # makes the whole the unit matrix
-    left = np.linalg.eigvalsh(white.T @ rests @ white)[:, 0]
-    if left.min() < MIN_LEFT:
-        first, last = spans[int(np.argmin(left))]
-        raise CalibrationError(
-            f"only the poses from {first:.2f} s to {last:.2f} s (eye's clock) determine one direction of the mounting, "
-            f"and nothing says how well: {advice}"
-        )
-
-
-def _correlation_length(e: Array) -> float:
-    """Return over how many poses residuals (N, M) hang together: one and twice the sum of their autocorrelation."""
-    centred = e - e.mean(axis=0)
-    power = float((centred**2).mean())
-    total = 1.0
-    for lag in range(1, len(e) // 4):
-        r = float((centred[lag:] * centred[:-lag]).mean()) / max(power, 1e-300)
-        if r < 0.05:
-            break
-        total += 2 * r
-    return total

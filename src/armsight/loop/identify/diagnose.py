@@ -24,7 +24,7 @@ from scipy.stats import f as f_distribution
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.rotation import nearest_rotation
-from armsight.loop.handeye.handeye import kronecker
+from armsight.loop.handeye.poses import kronecker
 from armsight.loop.identify.fit import SIGMA
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.placement import angle_between, linear_placement, rigid_placement

@@ -2,7 +2,7 @@
 
 Points: with M = R^T and c unknown, M p_i + c = o_i + R_i t is linear in M (nine numbers, not yet a rotation), c and the
 point t in frame 6; M contains the scale, too. The rotation that fits best is then found among all of them. Full poses:
-A_i X = Z B_i, solved by :func:`~armsight.loop.handeye.handeye.starts`.
+A_i X = Z B_i, solved by :func:`~armsight.loop.handeye.poses.starts`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from armsight.data import Array
 from armsight.geometry.pose import inverse
 from armsight.geometry.rotation import exp_so3, log_so3, skew
-from armsight.loop.handeye.handeye import starts
+from armsight.loop.handeye.poses import starts
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 

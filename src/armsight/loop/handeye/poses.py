@@ -1,0 +1,264 @@
+"""What a hand-eye calibration is made from: poses, their residuals, closed-form starts, errors of poses left out.
+
+In: poses of the flange in the base (from the joints) and of the body in the rig (from vision), pairwise. Eye to hand,
+T_base_flange T_flange_body = T_base_rig T_rig_body; eye in hand, T_base_flange T_flange_rig T_rig_body = T_base_body. Both
+are A_i X = Z B_i. Equations: docs/howto/handeye.md.
+
+The residual of a pose is the tangent of the motion left over, in the axes of what the camera measured. Starts
+(:func:`starts`) come from all poses and from small parts of them: rotations by the leading singular vectors of the
+Kronecker sum, translations by linear least squares (Shah, "Solving the robot-world/hand-eye calibration problem using the
+Kronecker product", J. Mechanisms Robotics 5(3), 2013). OpenCV's solvers are tried beside it where the installed OpenCV has
+them (5.0 has not).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.geometry.check import checked
+from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, mean_pose, pose, small_adjoint
+from armsight.geometry.rotation import nearest_rotation
+
+#: A pose whose residual has a smaller chance than this is taken for a mistake and left out.
+CHANCE = 1e-5
+#: Sigma of rotations that have hardly any weight, rad: enough to determine what positions leave open.
+HARDLY = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class Poses(Record):
+    """What a hand-eye calibration is made from.
+
+    Attributes:
+        A: (N, 4, 4) T_base_flange, m.
+        B: (N, 4, 4) T_rig_body, m.
+        cov: (N, 6, 6) covariance of B, right tangent, zero where unknown.
+        in_hand: whether the rig is on the flange and the body stands still; else the body is on the flange.
+        centre: (3,) the middle of what is seen of the body, body frame, m.
+        common: (N, 6, K) what K independent errors that all poses share (the rig's calibration), of one sigma each, do to
+            B, right tangent; None where unknown.
+    """
+
+    A: Array
+    B: Array
+    cov: Array
+    in_hand: bool
+    centre: Array
+    common: Array | None = None
+
+    def rows(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Poses:
+        """Return a part of the poses."""
+        common = None if self.common is None else self.common[rows]
+        return Poses(self.A[rows], self.B[rows], self.cov[rows], self.in_hand, self.centre, common)
+
+    def corrected(self, errors: Array) -> Poses:
+        """Return the poses without shared errors (K,), in sigmas."""
+        return self if self.common is None else replace(self, B=self.B @ exp_se3(self.common @ errors))
+
+    @property
+    def right_side(self) -> Array:
+        """(N, 4, 4) the poses B of A_i X = Z B_i."""
+        return inverse(self.B) if self.in_hand else self.B
+
+
+def residuals(poses: Poses, Z: Array, X: Array) -> tuple[Array, Array, Array]:
+    """Return residuals, their derivative, and the adjoints that map an error of the flange to them.
+
+    Returns:
+        (N, 6) residuals e in the axes of the body, (N, 6, 12) their derivative by the right tangents of Z and X, exact to
+        the square of e, and (N, 6, 6).
+    """
+    if poses.in_hand:
+        M, last = X @ poses.B, poses.B  # E = Z^-1 A X B
+        E = inverse(Z) @ poses.A @ M
+        by_x = adjoint(inverse(last))
+    else:
+        M = np.broadcast_to(X, poses.A.shape)  # E = B^-1 Z^-1 A X
+        E = inverse(Z @ poses.B) @ poses.A @ M
+        by_x = np.broadcast_to(np.eye(6), (len(poses.A), 6, 6))
+    # A change of Z acts from the left of what follows it.
+    by_z = -adjoint(inverse(E) if poses.in_hand else inverse(poses.A @ M) @ Z)
+    e = log_se3(E)
+    bend = np.eye(6) + 0.5 * small_adjoint(e)  # the right Jacobian's inverse, to first order
+    return e, np.concatenate([bend @ by_z, bend @ by_x], axis=2), adjoint(inverse(M))
+
+
+#: OpenCV as it is at run time: its type stubs are those of one version.
+_CV: Any = cv2
+#: Parts of this many poses are tried too, so that some of them are free of gross errors.
+PART = 6
+#: How many parts: with 20 % gross errors all of them would hold one with a chance of (1 - 0.8^6)^24, 0.1 %.
+PARTS = 24
+#: Share of the poses that must be good: the scale of residuals is that of the best so many. A median breaks down where half
+#: are blunders.
+MIDDLE = 0.4
+#: Share of the pairs of rows that count as agreeing: where half of the rows are good, a quarter does. With more rows than
+#: this none are looked for.
+AGREE, MOST_AGREEING = 0.15, 300
+#: Weight of a rotation in the score, m/rad: 1 mrad counts as 0.3 mm, as it does at a tool 0.3 m from the wrist.
+LEVER_M = 0.3
+#: OpenCV's solvers of A X = Z B, by the names it gives them; 5.0 has none of them.
+_OPENCV = ("CALIB_ROBOT_WORLD_HAND_EYE_SHAH", "CALIB_ROBOT_WORLD_HAND_EYE_LI")
+_OPENCV_MOTIONS = (
+    "CALIB_HAND_EYE_TSAI",
+    "CALIB_HAND_EYE_PARK",
+    "CALIB_HAND_EYE_HORAUD",
+    "CALIB_HAND_EYE_ANDREFF",
+    "CALIB_HAND_EYE_DANIILIDIS",
+)
+
+
+def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
+    """Return candidates for X and Z of ``A_i X = Z B_i``, smallest median residual first.
+
+    Args:
+        A: (N, 4, 4) poses, N >= 3.
+        B: (N, 4, 4) poses.
+        seed: of the choice of parts.
+    """
+    rng = np.random.default_rng(seed)
+    found = [kronecker(A, B), *_opencv(A, B)]
+    if len(A) > PART:
+        for _ in range(PARTS):
+            rows = rng.choice(len(A), PART, replace=False)
+            found.append(kronecker(A[rows], B[rows]))
+    if len(rows := _agreeing(A, B)) >= MIN_POSES:
+        found.append(kronecker(A[rows], B[rows]))
+    found = [
+        (X, Z) for X, Z in found if np.isfinite(X).all() and np.isfinite(Z).all() and _is_rigid(X) and _is_rigid(Z)
+    ]
+    return sorted(found, key=lambda XZ: _score(A, B, *XZ))
+
+
+def _agreeing(A: Array, B: Array) -> NDArray[np.int64]:
+    """Return the rows that agree with that with which most do: between two rows both sides rotate by one angle.
+
+    Blunders hardly agree with anything, so these are good ones though half of the rows are not.
+    """
+    if len(A) > MOST_AGREEING:
+        return np.zeros(0, np.int64)
+    cosines = (np.einsum("iab,jab->ij", T[:, :3, :3], T[:, :3, :3]) for T in (A, B))
+    angles_A, angles_B = (np.arccos(np.clip((cosine - 1) / 2, -1, 1)) for cosine in cosines)
+    off = np.abs(angles_A - angles_B)
+    near = off < np.quantile(off[np.triu_indices(len(A), 1)], AGREE)
+    return np.flatnonzero(near[near.sum(axis=1).argmax()])
+
+
+def kronecker(A: Array, B: Array) -> tuple[Array, Array]:
+    """Solve ``A_i X = Z B_i`` in closed form: rotations first, then translations.
+
+    With column-stacked matrices, R_A R_X R_B^T = R_Z reads (R_B kron R_A) vec(R_X) = vec(R_Z) for every i, so both are the
+    leading singular vectors of the sum of the Kronecker products.
+
+    Returns:
+        (4, 4) X and (4, 4) Z.
+    """
+    RA, RB = A[:, :3, :3], B[:, :3, :3]
+    K = np.einsum("nij,nkl->ikjl", RB, RA).reshape(9, 9)
+    U, _, Vt = np.linalg.svd(K)
+    RX, RZ = _rotation(Vt[0].reshape(3, 3, order="F")), _rotation(U[:, 0].reshape(3, 3, order="F"))
+    # R_A t_X - t_Z = R_Z t_B - t_A
+    M = np.concatenate([RA, np.broadcast_to(-np.eye(3), RA.shape)], axis=2).reshape(-1, 6)
+    right = (B[:, :3, 3] @ RZ.T - A[:, :3, 3]).ravel()
+    t = np.linalg.lstsq(M, right, rcond=None)[0]
+    return pose(RX, t[:3]), pose(RZ, t[3:])
+
+
+def _rotation(M: Array) -> Array:
+    """Return the rotation nearest to a multiple, of either sign, of a rotation (3, 3)."""
+    return nearest_rotation(M * np.sign(np.linalg.det(M)))
+
+
+def _opencv(A: Array, B: Array) -> Iterator[tuple[Array, Array]]:
+    """Yield what OpenCV's solvers find, where it has them and they accept the poses."""
+    back = inverse(B)
+    for name in _OPENCV_MOTIONS if hasattr(cv2, "calibrateHandEye") else ():
+        with contextlib.suppress(cv2.error):
+            R, t = _CV.calibrateHandEye(*_parts(A), *_parts(back), method=getattr(cv2, name))
+            X = pose(R, t.ravel())
+            if np.isfinite(X).all():  # OpenCV 4 answers degenerate poses with NaN
+                yield X, mean_pose(A @ X @ back)
+    for name in _OPENCV if hasattr(cv2, "calibrateRobotWorldHandEye") else ():
+        with contextlib.suppress(cv2.error):
+            RX, tX, RZ, tZ = _CV.calibrateRobotWorldHandEye(*_parts(A), *_parts(B), method=getattr(cv2, name))
+            yield pose(RX, tX.ravel()), pose(RZ, tZ.ravel())
+
+
+def _parts(Ts: Array) -> tuple[list[Array], list[Array]]:
+    return [T[:3, :3] for T in Ts], [T[:3, 3] for T in Ts]
+
+
+def _is_rigid(T: Array) -> bool:
+    """Return whether a solver's answer is a rigid motion at all."""
+    return bool(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-6 and np.linalg.det(T[:3, :3]) > 0)
+
+
+def _score(A: Array, B: Array, X: Array, Z: Array) -> float:
+    """Return the size of the residual motions below which the share MIDDLE is, m."""
+    e = log_se3(inverse(Z @ B) @ A @ X)
+    sizes = np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1))
+    return float(np.quantile(sizes, MIDDLE))
+
+
+Eye = Literal["to_hand", "in_hand"]
+#: Fewest poses: three determine both transforms, and what is left out must leave three.
+MIN_POSES = 4
+#: Another structure of the noise must lower the held-out error by this factor: less is chance with tens of poses.
+CLEARLY = 1.1
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut(Record):
+    """Prediction errors of poses left out of the fit.
+
+    Attributes:
+        position_m: (N,) distance between the body's middle measured and predicted; NaN where a pose was not used.
+        angle_rad: (N,) angle between the body's rotations measured and predicted.
+    """
+
+    position_m: Array
+    angle_rad: Array
+
+    def mean(self) -> tuple[float, float]:
+        """Return the means, m and rad."""
+        return float(np.nanmean(self.position_m)), float(np.nanmean(self.angle_rad))
+
+    def rms(self) -> tuple[float, float]:
+        """Return the root mean squares, m and rad."""
+        return float(np.sqrt(np.nanmean(self.position_m**2))), float(np.sqrt(np.nanmean(self.angle_rad**2)))
+
+    def most(self) -> tuple[float, float]:
+        """Return the greatest, m and rad."""
+        return float(np.nanmax(self.position_m)), float(np.nanmax(self.angle_rad))
+
+
+def checked_poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, centre: ArrayLike) -> Poses:
+    """Return poses as given, checked.
+
+    Raises:
+        InputError: wrong shapes, NaN, no rigid motions, fewer than 4 poses, an unknown eye.
+    """
+    if eye not in ("to_hand", "in_hand"):
+        raise InputError(f"eye is {eye!r}; known are to_hand, in_hand")
+    Ts_base_flange = checked(A, (None, 4, 4), "Ts_base_flange")
+    Ts_rig_body = checked(B, (len(Ts_base_flange), 4, 4), "Ts_rig_body")
+    for name, Ts in (("Ts_base_flange", Ts_base_flange), ("Ts_rig_body", Ts_rig_body)):
+        R = Ts[:, :3, :3]
+        off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).reshape(-1, 9).max(axis=1)
+        bad = (off > 1e-4) | (np.linalg.det(R) < 0) if len(Ts) else np.zeros(0, bool)
+        if bad.any():
+            raise InputError(f"{name}: pose {int(np.argmax(bad))} is no rigid motion: its 3x3 part is no rotation")
+    n = len(Ts_base_flange)
+    if n < MIN_POSES:
+        raise InputError(f"hand-eye calibration needs {MIN_POSES} or more poses, got {n}; 15 and more are advised")
+    cov = np.zeros((n, 6, 6)) if covs is None else checked(covs, (n, 6, 6), "covs")
+    return Poses(Ts_base_flange, Ts_rig_body, cov, eye == "in_hand", checked(centre, (3,), "centre"))
