@@ -12,6 +12,7 @@ import ast
 import configparser
 import io
 import re
+import tokenize
 import tomllib
 import zipfile
 import zlib
@@ -25,6 +26,18 @@ from armsight.errors import InputError
 from armsight.files import DOCUMENT_MB, YAML_MB, parsed_json, read_bytes
 from armsight.tables.yaml_file import Foreign, parse_yaml
 
+#: What readers of binary files raise where one is damaged.
+_DAMAGED = (
+    ValueError,
+    TypeError,
+    OSError,
+    NotImplementedError,
+    IndexError,
+    KeyError,
+    EOFError,
+    OverflowError,
+    zlib.error,
+)
 #: First bytes -> what the file is, and what to do instead.
 _OTHERS = (
     (b"\x80\x02", "a Python pickle, which may run programs"),
@@ -83,7 +96,7 @@ def _with_matrices(name: str, value: Foreign) -> Foreign:
         return {str(key): _with_matrices(f"{name}.{key}", one) for key, one in value.items()}
     try:
         rows, cols, data = int(value["rows"]), int(value["cols"]), np.asarray(value["data"], float).ravel()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name} must be numbers: rows, cols and data of a matrix") from None
     channels = re.match(r"\d*", str(value.get("dt", "")))
     depth = int(channels[0]) if channels and channels[0] else 1
@@ -130,7 +143,7 @@ def _numpy(data: bytes, path: str | Path) -> dict[str, Foreign]:
     try:
         loaded = np.load(io.BytesIO(data), allow_pickle=False)
         return dict(loaded) if data[:2] == b"PK" else {Path(path).stem: loaded}
-    except ValueError as error:
+    except (ValueError, SyntaxError, tokenize.TokenError) as error:  # the header is Python's
         if "allow_pickle" in str(error):
             raise InputError(f"{path}: holds a pickled Python object, which may run programs: {_SAVE}") from None
         raise InputError(f"{path}: a damaged numpy file: {error}") from None
@@ -143,10 +156,11 @@ def _numpy(data: bytes, path: str | Path) -> dict[str, Foreign]:
 def _matlab(data: bytes, path: str | Path) -> dict[str, Foreign]:
     """Return the variables of a .mat file; a struct is a mapping."""
     from scipy.io import loadmat  # takes a while
+    from scipy.io.matlab import MatReadError
 
     try:
         loaded = loadmat(io.BytesIO(data), simplify_cells=True)  # type: ignore[arg-type] # a file is one, too
-    except (ValueError, TypeError, OSError, NotImplementedError) as error:
+    except (*_DAMAGED, MatReadError) as error:
         raise InputError(f"{path}: a damaged MATLAB file: {error}") from None
     return {key: value for key, value in loaded.items() if not key.startswith("__")}
 

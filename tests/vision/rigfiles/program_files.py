@@ -1,7 +1,7 @@
 """Calibrations of one pair of cameras as the programs of the field write them, from their documentation and source.
 
-Every entry of PROGRAMS is (program and source, format, files, options): the files' texts or bytes by name, and what a person adds.
-All describe the same pair, K_LEFT .. T, in the program's own names, syntax and unit.
+Every entry of PROGRAMS is (program and source, format, files, options): the files' texts or bytes by name, and what a
+person adds. All describe the same pair, K_LEFT .. T, in the program's own names, syntax and unit.
 """
 
 import gzip

@@ -283,3 +283,36 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path, name):
 def test_the_wrong_inputs_are_many():
     assert len(AS_ANOTHERS + UNITS + SIZES) + len(COUNTS) + 2 * 5 + len(DAMAGED) >= 150
     assert len(PROGRAMS) >= 35
+
+
+@pytest.mark.parametrize("pair", [("cam0", "cam2"), ("/left", "/third")])
+def test_a_pair_is_chosen_by_the_names_of_the_file(tmp_path, pair):
+    document = yaml.safe_load(PROGRAMS["three cameras"][2]["c.yaml"])
+    for name, topic in zip(document, ("/left", "/right", "/third"), strict=True):
+        document[name]["rostopic"] = topic
+    paths = write(tmp_path, {"c.yaml": yaml.safe_dump(document)})
+    rig = import_rig(None, paths, pair=pair)
+    shifted = pose(np.eye(3), np.array([0.1, 0.0, 0.0])) @ T_RIGHT_LEFT
+    np.testing.assert_allclose(rig.T_left_right, inverse(shifted), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_damage_is_never_a_traceback(tmp_path, name):
+    """Files cut short, with a line less or bytes changed: one line that names a file, or a rig."""
+    _, format_, files, options = PROGRAMS[name]
+    rng = np.random.default_rng(len(name))
+    whole = {file: text if isinstance(text, bytes) else text.encode() for file, text in files.items()}
+    for k in range(9):
+        file = list(whole)[k % len(whole)]
+        data = bytearray(whole[file])
+        if k % 3 == 0:
+            data = data[: int(rng.integers(len(data)))]
+        elif k % 3 == 1:
+            lines = bytes(data).split(b"\n")
+            data = bytearray(b"\n".join(np.delete(np.array(lines, object), rng.integers(len(lines)))))
+        else:
+            for at in rng.integers(len(data), size=3):
+                data[at] = int(rng.integers(256))
+        paths = write(tmp_path, whole | {file: bytes(data)})
+        for given in (None, format_):
+            reported(given, paths, options)

@@ -269,7 +269,7 @@ def _between(flat: Mapping[str, Foreign]) -> tuple[Array, list[str]]:
 def _is_rotation(name: str, value: Foreign) -> bool:
     """Say whether a value is a rotation by its numbers, and not one of a rectification by its name."""
     R = _numbers(value)
-    if R.shape != (3, 3) or plain(name) in ("r1", "r2") or _DERIVED & set(_words(name)):
+    if R.shape != (3, 3) or not np.abs(R).max() < 2 or plain(name) in ("r1", "r2") or _DERIVED & set(_words(name)):
         return False
     return bool(np.abs(R @ R.T - np.eye(3)).max() < LOOSEST_ROTATION and np.linalg.det(R) > 0)
 

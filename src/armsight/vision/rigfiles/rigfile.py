@@ -117,6 +117,8 @@ def posed_rig(
             f"{paths[-1]}: holds {'one camera, ' + names[0] if names else 'no camera'}; a rig has two: give both"
         )
     chosen = options.pair or (names[0], names[1])
+    called = {str(entry.get(key)): name for key in ("name", "rostopic") for name, entry in entries.items()}
+    chosen = (called.get(chosen[0], chosen[0]), called.get(chosen[1], chosen[1]))
     for name in chosen:
         if name not in entries:
             raise InputError(f"{paths[-1]}: has no camera {name!r}; there are {', '.join(names)}: --pair LEFT,RIGHT")
@@ -163,7 +165,8 @@ def naming(where: str | Path) -> Iterator[None]:
 def rigid(R: Foreign, t: Foreign, name: str) -> tuple[Array, list[str]]:
     """Return (4, 4) a transform from a printed rotation and translation, and a note where its digits were few."""
     T = pose(checked(R, (3, 3), name), checked(t, (3,), f"translation of {name}"))
-    off = float(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max())
+    near = np.clip(T[:3, :3], -2.0, 2.0)  # squares of damaged numbers overflow
+    off = float(np.abs(near @ near.T - np.eye(3)).max())
     if off > LOOSEST_ROTATION or np.linalg.det(T[:3, :3]) < 0:
         raise InputError(f"{name} is not a rotation: R R^T differs from the identity by {off:.2g}")
     if off < 1e-12:
