@@ -21,7 +21,7 @@ import numpy as np
 from board_arms import NAMED_TICKS, PERIOD_TICKS, Arm, c, drawn_model, opened
 
 BRAKE_N_M = 6.0
-SPEED = 1.1  # of the limit
+SPEED, ASLEEP_MS = 1.1, 60  # what a stuck bridge may do: of the limit, or until the drives sleep
 
 
 class Table:
@@ -30,6 +30,7 @@ class Table:
     def __init__(self):
         self.rows = defaultdict(lambda: defaultdict(list))
         self.codes = defaultdict(Counter)
+        self.ran = Counter()  # beyond SPEED, and not asleep after ASLEEP_MS
 
     def add(self, kind, arm, **figures):
         fault = arm.first[0]
@@ -49,7 +50,8 @@ class Table:
                 line += (
                     f"{'':24}" if not got else "".join(f"{x:8.3g}" for x in (*np.percentile(got, (50, 95)), max(got)))
                 )
-            print(line + "  " + ", ".join(f"{name} {n}" for name, n in codes.most_common()))
+            print(line + "  " + ", ".join(f"{name} {n}" for name, n in codes.most_common()), end="")
+            print(f"; ran on {self.ran[kind]}" if self.ran[kind] else "")
 
 
 def drawn_arm(library, seed, load=0.6, *, brake=0.0, warm=1.4):
@@ -163,7 +165,9 @@ def broken(library, seed, table, kind, hurt, *, moving, load=0.6, brake=0.0, sto
     sank = None if late is None else abs(arm.plant.link[joint] - float(arm.out[0]["reference_rad"][joint]))
     if stop_ms is None and late is not None:
         arm.tick(NAMED_TICKS)
+    ran = hurt is stuck and fast > SPEED and (asleep is None or asleep > ASLEEP_MS)
     table.add(label, arm, late=late, asleep=asleep, fast=fast, sank=sank, way=way)
+    table.ran[label] += ran
 
 
 def stuck(arm, joint):

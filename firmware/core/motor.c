@@ -239,6 +239,9 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
 }
 
 #define LOAD_SAMPLES 8u
+#define CONSTANT_WEAK 0.92f /* of the learnt constant: half way between a sound motor's and one of which some turns are shorted */
+#define CONSTANT_SIGMA 0.2f /* known so well it counts */
+#define SHARE_WEIGHT 3.0f /* of the load's evidence, in sigmas of the constant's */
 #define MOTOR_SHARE 0.35f /* of what voltage and current have parted, at the voltage: more, and the motor is not what it was; a
                              sensor leaves it at 0, a winding of half the turns has 0.5 */
 
@@ -269,6 +272,7 @@ static void changed(motor_state *motor, const motor_config *config, float change
     }
     motor->step_ticks = motor->driven_ticks;
     motor->heard_ohm = 0.0f;
+    motor->way_seen = 0.0f;
     motor->before = motor->sampled > LOAD_SAMPLES ? 1u : 0u;
     if (motor->before != 0u) {
         load_of(motor, config, &motor->before_v, &motor->before_a);
@@ -493,7 +497,47 @@ uint32_t motor_blames(const motor_state *motor, const motor_config *config)
     const float ohm = motor->resistance_scale * config->resistance_ohm;
     const float more_v = volts - motor->before_v;
     const float apart_v = more_v - ohm * (amperes - motor->before_a);
-    return more_v * apart_v > MOTOR_SHARE * apart_v * apart_v ? FAULT_MOTOR : FAULT_CURRENT_SENSOR;
+    const float share = apart_v != 0.0f ? number_bound(more_v / apart_v, 1.0f) : 0.0f;
+    float evidence = SHARE_WEIGHT * (share - MOTOR_SHARE);
+    if (motor->way_seen > 0.0f && motor->constant_sigma < CONSTANT_SIGMA) { /* the joint moved enough to show it */
+        evidence += (CONSTANT_WEAK - motor->constant_seen) / motor->constant_sigma;
+    }
+    return evidence > 0.0f ? FAULT_MOTOR : FAULT_CURRENT_SENSOR;
+}
+
+/* Take a column out of the sums: what is left of the others once they are fitted by it. */
+static void take_out(motor_sums *s, uint32_t column)
+{
+    const float square = s->of[column * COLUMNS + column];
+    for (uint32_t i = 0u; i < COLUMNS; i++) {
+        s->at[i] = square > 0.0f ? s->of[i * COLUMNS + column] / square : 0.0f;
+    }
+    for (uint32_t i = 0u; i < COLUMNS; i++) {
+        for (uint32_t j = 0u; j < COLUMNS; j++) {
+            s->of[i * COLUMNS + j] -= s->at[i] * s->at[j] * square;
+        }
+    }
+}
+
+void motor_weakens(motor_state *motor, const motor_config *config, motor_sums *s)
+{
+    const uint32_t since = (motor->driven_ticks - motor->step_ticks) / SAMPLE_TICKS;
+    const uint32_t count = fewer(fewer(motor->sampled, NAME_SAMPLES), since);
+    if (motor->step_ticks == 0u || count < NAME_SAMPLES / 2u) {
+        return;
+    }
+    sums_of(motor, config, count, s);
+    take_out(s, TIME); /* whatever the offset of the current, */
+    take_out(s, CURRENT); /* and its gain, or the winding's resistance */
+    float constant;
+    const float noise = (float)count * NAME_NOISE_RAD * NAME_NOISE_RAD;
+    const float way = product(s, reading, reading);
+    const float left = left_by(s, (const combination){0.0f, 1.0f, 0.0f, 0.0f, 0.0f}, reading, &constant) + noise;
+    if (way > motor->way_seen) {
+        motor->way_seen = way;
+        motor->constant_seen = constant;
+        motor->constant_sigma = number_root(left / ((float)count * way));
+    }
 }
 
 bool motor_is_stuck(const motor_state *motor, const motor_config *config, float supply_v, motor_sums *s)

@@ -55,6 +55,9 @@ static inline bool motor_stepped(const motor_state *motor)
     return motor->step_ticks != 0u && motor->driven_ticks - motor->step_ticks < MOTOR_STEP_TICKS;
 }
 
+/* Look for what the motor's constant is since the step, whatever current's offset and gain are. */
+void motor_weakens(motor_state *motor, const motor_config *config, motor_sums *sums);
+
 /* Return the fault of a motor that is none: what the load took has not changed, so of voltage and current that one is
  * right which is still what it was before. */
 uint32_t motor_blames(const motor_state *motor, const motor_config *config);

@@ -304,6 +304,9 @@ static void name_suspect(core_state *core, joint_state *joint, const joint_confi
     if (joint->suspect == FAULT_NONE) {
         return;
     }
+    if (motor->doubted != 0u) {
+        motor_weakens(motor, &config->motor, &core->sums);
+    }
     /* What a load takes shows at rest. */
     const bool shows = motor->doubted == 0u || joint->reference.speed_rad_s == 0.0f;
     joint->suspect_ticks = in_a_row(joint->suspect_ticks, shows);

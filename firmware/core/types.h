@@ -375,6 +375,9 @@ typedef struct motor_state {
     float heard_ohm;         /* 0 while it is doubted, or a step was seen of late; else the configuration's R */
     uint32_t sample_ticks;   /* driven_ticks when the next sample is taken */
     float rough_rad_s;       /* mean change of speed_rad_s from tick to tick */
+    float way_seen;          /* squares of the way that showed what the constant is since a step, */
+    float constant_seen;     /* over the learnt one, */
+    float constant_sigma;
     uint32_t doubted;        /* not 0: it is no witness until the drives were off */
     float step_rad_s;        /* change of speed_rad_s in a tick that no torque makes */
     float last_a;            /* the current of the last tick */
