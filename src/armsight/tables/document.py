@@ -141,13 +141,28 @@ def _binary(data: bytes, path: str | Path) -> dict[str, Foreign] | None:
 def _numpy(data: bytes, path: str | Path) -> dict[str, Foreign]:
     """Return the arrays of an .npz, or the one of an .npy under the file's name."""
     try:
+        if data[:2] == b"PK":
+            sizes = [member.file_size for member in zipfile.ZipFile(io.BytesIO(data)).infolist()]
+            if sum(sizes) > DOCUMENT_MB * 1e6:
+                raise InputError(
+                    f"{path}: holds {sum(sizes) / 1e6:.0f} MB, more than {DOCUMENT_MB}: is it the right file?"
+                )
         loaded = np.load(io.BytesIO(data), allow_pickle=False)
         return dict(loaded) if data[:2] == b"PK" else {Path(path).stem: loaded}
     except (ValueError, SyntaxError, tokenize.TokenError) as error:  # the header is Python's
         if "allow_pickle" in str(error):
             raise InputError(f"{path}: holds a pickled Python object, which may run programs: {_SAVE}") from None
         raise InputError(f"{path}: a damaged numpy file: {error}") from None
-    except (OSError, KeyError, EOFError, NotImplementedError, zlib.error, RuntimeError, zipfile.BadZipFile) as error:
+    except (
+        OSError,
+        KeyError,
+        EOFError,
+        NotImplementedError,
+        zlib.error,
+        RuntimeError,
+        zipfile.BadZipFile,
+        MemoryError,
+    ) as error:
         raise InputError(
             f"{path}: an archive (zip) or damaged .npz: {error}; unpack it and give the files in it"
         ) from None

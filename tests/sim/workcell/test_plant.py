@@ -8,6 +8,7 @@ import pytest
 
 from armsight.robot.arm_file import open_arm
 from armsight.robot.models import MODELS
+from armsight.sim.workcell import plant as module
 from armsight.sim.workcell.arm import PRESETS, pot_travel, sample_arm
 from armsight.sim.workcell.board import gravity_duty
 from armsight.sim.workcell.motors import GRAVITY_M_S2, SUPPLY_V, chosen, gravity_torque, row_frames, solids
@@ -15,6 +16,22 @@ from armsight.sim.workcell.plant import TICK_S, ArmPlant, mjcf
 
 MODEL = open_arm("six_r")
 OFF = np.zeros(6)
+
+
+def test_hours_of_motion_fit(monkeypatch):
+    monkeypatch.setattr(module, "_RECENT", 64)
+    travelled = module.Travelled(np.zeros(2))
+    for tick in range(1, 10_000):
+        travelled.add(np.array([tick, -tick]))
+        if tick in (100, 128, 700, 9_999):
+            assert 64 <= len(travelled.recent) <= 128
+            np.testing.assert_array_equal(travelled.recent[:, 0], travelled.begin + np.arange(len(travelled.recent)))
+            ticks, rows = travelled.whole()
+            np.testing.assert_array_equal(rows, np.column_stack([ticks, -ticks]))
+            assert ticks[0] == 0
+            assert ticks[-1] == tick
+            assert (np.diff(ticks) > 0).all()
+    assert len(ticks) < 400
 
 
 def plant(name: str = "nominal", seed: int = 0, **changes) -> ArmPlant:

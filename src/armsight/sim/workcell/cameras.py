@@ -520,14 +520,14 @@ class WorkcellSource:
         self, times: ShotTimes, shutter: Shutter, number: int, held: PosedBody | None
     ) -> list[Future[Image]]:
         """Begin to render both images, each in a thread of its own: they share nothing that changes."""
-        path, n = self._plant.path, self._plant.arm.joints
+        path, n, begin = self._plant.path, self._plant.arm.joints, self._plant.travelled.begin
 
         def seen(side: int, t_s: float) -> _Exposed:
             first = max(int((t_s - self._seen_s()) / TICK_S) - _SPARE_TICKS, 0)
-            first = min(first, max(len(path) - 4, 0))
+            first = begin + min(max(first - begin, 0), max(len(path) - 4, 0))
             covered = any(start <= t_s < end for start, end in self._covers)
             led = None if held is not None else self._lit(side, t_s, shutter)
-            return _Exposed(number, t_s, shutter, first, path[first:, n:].copy(), covered, held, led)
+            return _Exposed(number, t_s, shutter, first, path[first - begin :, n:].copy(), covered, held, led)
 
         return [
             thread.submit(draw, seen(side, t_s))

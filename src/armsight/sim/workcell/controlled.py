@@ -26,6 +26,7 @@ from armsight.sim.boards.device import STEP_S, Device, SteppedLink
 from armsight.sim.boards.so101 import SERVOS, So101Bus, So101Mechanics
 from armsight.sim.workcell.arm import Imperfections
 from armsight.sim.workcell.motors import gravity_torque, solids
+from armsight.sim.workcell.plant import Travelled
 
 #: Zeros of an arm that is not nominal: of an SO-101's servos, and of an AR4's homing, degrees.
 ZERO_DEG = 1.0
@@ -61,18 +62,17 @@ class ControlledArm:
     def __init__(self, arm: Arm, device: ControlledDevice) -> None:
         self.arm, self.parts, self.device = arm, solids(arm), device
         self.stepped: Callable[[], None] = lambda: None
-        self._path, self._count = np.empty((4096, 2 * arm.joints)), 0
-        self._note()
+        self.travelled = Travelled(np.concatenate(device.truth))
 
     @property
     def t_s(self) -> float:
         """How much time has passed, s."""
-        return (self._count - 1) * STEP_S
+        return self.travelled.ticks * STEP_S
 
     @property
     def path(self) -> Array:
-        """(N, 2 n) true angles where the sensors sit, then of the links, rad, at each millisecond from the start."""
-        return self._path[: self._count]
+        """(N, 2 n) true angles where the sensors sit, then of the links, rad, at each millisecond of the last minutes."""
+        return self.travelled.recent
 
     def write(self, data: bytes) -> None:
         """Take bytes from the host."""
@@ -85,19 +85,13 @@ class ControlledArm:
     def step(self) -> None:
         """Let STEP_S pass."""
         self.device.step()
-        self._note()
+        self.travelled.add(np.concatenate(self.device.truth))
         self.stepped()
 
     def advance(self, dt_s: float) -> None:
         """Let time pass, to the nearest millisecond."""
         for _ in range(round(dt_s / STEP_S)):
             self.step()
-
-    def _note(self) -> None:
-        if self._count == len(self._path):
-            self._path = np.concatenate([self._path, np.empty_like(self._path)])
-        self._path[self._count] = np.concatenate(self.device.truth)
-        self._count += 1
 
 
 @dataclass(frozen=True)

@@ -125,6 +125,9 @@ def _row(numbers: Array) -> str:
 #: Shares of the supply at the ends of the travel.
 LOW_SHARE, HIGH_SHARE = 0.05, 0.95
 COUNTS = 65536  # of the supply, as the board gives them
+#: Ticks that are kept as they were, 4 to 9 minutes in 50 MB; half: the same, no shot looks back so far; double: 100 MB.
+_RECENT = 1 << 18
+_THINNED = 8  # of older ticks one in so many is kept; half: twice the memory; double: 50 um between two at 1 m/s^2
 _BLOCK = 256  # ticks whose noise is sampled at once
 
 Counts = NDArray[np.uint32]
@@ -217,6 +220,48 @@ _DAMPING = 0.08
 _SETTLE_S = 0.5
 
 
+class Travelled:
+    """What an arm's angles were, at each millisecond of the last minutes; longer ago at fewer times, so that hours fit.
+
+    Args:
+        first: (K,) the first angles, rad.
+
+    Attributes:
+        begin: the tick of the first row of ``recent``.
+        ticks: how many ticks have passed since the first.
+    """
+
+    def __init__(self, first: Array) -> None:
+        self._rows, self._old = np.empty((2 * _RECENT, len(first))), np.empty((0, len(first)))
+        self._old_ticks = np.empty(0)
+        self.begin, self.ticks = 0, 0
+        self._rows[0] = first
+
+    def add(self, angles: Array) -> None:
+        """Add the angles (K,), rad, of the next tick."""
+        self.ticks += 1
+        if self.ticks - self.begin == len(self._rows):
+            self._old = np.concatenate([self._old, self._rows[:_RECENT:_THINNED]])
+            self._old_ticks = np.append(self._old_ticks, self.begin + np.arange(0, _RECENT, _THINNED))
+            if len(self._old) > 2 * _RECENT:
+                self._old, self._old_ticks = self._old[::2].copy(), self._old_ticks[::2].copy()
+            self._rows[:_RECENT] = self._rows[_RECENT:]
+            self.begin += _RECENT
+        self._rows[self.ticks - self.begin] = angles
+
+    @property
+    def recent(self) -> Array:
+        """(N, K) angles at each tick from ``begin`` on, rad."""
+        return self._rows[: self.ticks - self.begin + 1]
+
+    def whole(self) -> tuple[Array, Array]:
+        """Return ticks (M,) from the beginning on, and the angles (M, K) then, rad."""
+        ticks = np.append(self._old_ticks, self.begin + np.arange(len(self.recent), dtype=np.float64)).astype(
+            np.float64
+        )
+        return ticks, np.concatenate([self._old, self.recent])
+
+
 class ArmPlant:
     """An arm with motors, backlash, twist and potentiometers.
 
@@ -256,19 +301,18 @@ class ArmPlant:
         self._newton_metre_per_a = self.motors.gear_ratio * self.motors.torque_constant
         self._qpos[:] = np.tile(model.home, 2)
         self._mj_step(self._model, self._data, nstep=round(_SETTLE_S / TICK_S) * SUBSTEPS)
-        self._ticks = 1  # what a board's first tick, number 1, senses
-        self._path = np.empty((4096, 12))
-        self._path[:2] = self._qpos
+        self.travelled = Travelled(self._qpos)
+        self.travelled.add(self._qpos)  # what a board's first tick, number 1, senses
 
     @property
     def t_s(self) -> float:
         """When the arm is as it is now, s: what is sensed in a board's tick k is sensed at k ms."""
-        return self._ticks * TICK_S
+        return self.travelled.ticks * TICK_S
 
     @property
     def path(self) -> Array:
-        """(N, 12) true angles of the shafts, then of the links, rad, at each millisecond from the start."""
-        return self._path[: self._ticks + 1]
+        """(N, 12) true angles of the shafts, then of the links, rad, at each millisecond of the last minutes."""
+        return self.travelled.recent
 
     def sense(self) -> Sensed:
         """Return what the converters read now."""
@@ -286,10 +330,7 @@ class ArmPlant:
             self._switch(awake, braked)
         self._ctrl[:] = duty if awake else 0.0
         self._mj_step(self._model, self._data, nstep=SUBSTEPS)
-        self._ticks += 1
-        if self._ticks == len(self._path):
-            self._path = np.concatenate([self._path, np.empty_like(self._path)])
-        self._path[self._ticks] = self._qpos
+        self.travelled.add(self._qpos)
         self.stepped()
 
     def _switch(self, awake: bool, braked: bool) -> None:

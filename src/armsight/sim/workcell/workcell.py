@@ -377,14 +377,14 @@ class Workcell:
     @property
     def truth(self) -> WorkcellTruth:
         """The true values up to now; for evaluation only."""
-        path = self.plant.path.copy()
+        ticks, path = self.plant.travelled.whole()
         taken = {name: times.left_s for name, times in self.source.taken.items()}
         return WorkcellTruth(
             self.plant.arm,
             self._rig,
             self._T_base_rig,
             self._T_tool_body,
-            np.asarray(np.arange(len(path)) * TICK_S, dtype=np.float64),
+            np.asarray(ticks * TICK_S, dtype=np.float64),
             path[:, self.plant.arm.joints :],
             path[:, : self.plant.arm.joints],
             taken,
