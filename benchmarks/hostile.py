@@ -31,7 +31,7 @@ COMMANDS = {
     "body": ("body", "check", "FILE"),
     "arm table": ("arm", "show", "FILE"),
     "table of poses": ("identify", "--arm", "six_r", "--data", "FILE"),
-    "robot's poses": ("handeye", "--robot", "FILE", "--seen", "FILE", "--eye", "to-hand"),
+    "robot's poses": ("handeye", "--robot", "FILE", "--seen", "seen.csv", "--eye", "to-hand"),
     "video": ("record", "video:FILE", "-o", "out"),
     "recording": ("record", "bag:FILE", "-o", "out"),
     "image": ("calibrate", "--left", "FILE", "--right", "FILE", "--target", BOARD, "-o", "out.json"),
@@ -173,6 +173,7 @@ def ran(command: tuple[str, ...], folder: Path) -> tuple[int, str, float, float]
 def cases(folder: Path):
     """Yield the name of each case and its command; its file is made."""
     os.mkfifo(folder / "pipe")
+    (folder / "seen.csv").write_text("x_m,y_m,z_m,qw,qx,qy,qz\n0,0,1,1,0,0,0\n")
     with (folder / "huge").open("wb") as file:
         file.truncate(6_000_000_000)
     for kind, suffixes in SUFFIXES.items():
