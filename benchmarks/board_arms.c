@@ -8,13 +8,14 @@
 #define SUBSTEPS 4
 #define TICK 0.001
 #define STOP_RAD 2.55
+#define TURN_RAD 6.283185307179586
 #define ZERO_COUNTS 32767.5
 #define COUNTS_PER_RAD ((62258 - 3277) / 5.2)
 #define STEP_COUNTS 4
 #define SPEED_TICKS 8u /* over which a joint's speed is taken: less shows how the converter's noise shakes it */
 
 typedef struct arm_loop {
-    double *q, *qd, *link, *qdd, *model, *hand, *current_a, *broken, *stuck, *offset_a;
+    double *q, *qd, *link, *linkd, *qdd, *model, *between, *hand, *current_a, *broken, *stuck, *offset_a;
     int64_t *fault;
     uint64_t *noise;
     uint32_t *counts;
@@ -76,9 +77,17 @@ static void sense(arm_loop *arm)
     }
 }
 
+static double sine(double turns)
+{
+    turns -= floor(turns + 0.5);
+    turns = turns > 0.25 ? 0.5 - turns : turns < -0.25 ? -0.5 - turns : turns;
+    const double a = TURN_RAD * turns, x = a * a;
+    return a * (1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110 * (1 - x / 156))))));
+}
+
 static void step(arm_loop *arm)
 {
-    const double *model = arm->model;
+    const double *model = arm->model, *between = arm->between;
     const core_outputs *out = arm->outputs;
     const int awake = out->drives_on != 0u || out->windings_shorted != 0u;
     const double h = TICK / SUBSTEPS;
@@ -89,26 +98,50 @@ static void step(arm_loop *arm)
         const double duty = arm->stuck[i] == 0.0 ? (double)out->duty[i] : arm->stuck[i];
         const double conductance = awake ? constant / model[i] : 0.0;
         const double dry = model[4u * JOINTS + i] + (out->brakes_open == 0u ? model[11u * JOINTS + i] : 0.0);
-        const double inertia = own + h * (model[3u * JOINTS + i] + conductance * constant);
+        const double stiffness = between[i], half = 0.5 * model[6u * JOINTS + i];
+        const double mass = stiffness == 0.0 ? own : own * (1 - between[2u * JOINTS + i]);
+        const double inertia = mass + h * (model[3u * JOINTS + i] + conductance * constant);
         const double grip = h * dry / inertia;
         const double x = arm->link[i] * arm->link[i];
         const double cosine = 1 - x / 2 * (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))));
         const double load = arm->hand[i] - model[5u * JOINTS + i] * cosine - model[7u * JOINTS + i] * own * before;
-        const double push = h * (conductance * duty * supply_v + load);
-        const double start = arm->qd[i];
+        const double push = h * (conductance * duty * supply_v + (stiffness == 0.0 ? load : 0.0));
+        const double start = arm->qd[i], drum = between[5u * JOINTS + i], per_rev = between[6u * JOINTS + i];
+        const double turns_per_rad = per_rev / TURN_RAD, phase = between[7u * JOINTS + i];
         for (int k = 0; k < SUBSTEPS; k++) {
-            const double free = (own * arm->qd[i] + push) / inertia;
+            double torque = 0.0;
+            if (stiffness > 0.0) {
+                const double turns = turns_per_rad * arm->q[i] + phase;
+                const double ratio = 1 + drum * per_rev * sine(turns + 0.25);
+                double twist = arm->q[i] + drum * sine(turns) - arm->link[i];
+                twist = twist > half ? twist - half : twist < -half ? twist + half : 0.0;
+                const double stiff = stiffness * (1 + between[3u * JOINTS + i] * arm->link[i]) *
+                                     (twist < 0.0 ? between[4u * JOINTS + i] : 1.0);
+                const double damped = twist != 0.0 || half == 0.0
+                                          ? between[JOINTS + i] * (ratio * arm->qd[i] - arm->linkd[i]) : 0.0;
+                const double pull = stiff * twist + damped;
+                torque = ratio * pull;
+                arm->linkd[i] = arm->blocked[i] ? 0.0 : arm->linkd[i] + h * (pull + load) / (own - mass);
+                arm->link[i] += h * arm->linkd[i];
+                if (fabs(arm->link[i]) >= STOP_RAD) {
+                    arm->link[i] = arm->link[i] > 0 ? STOP_RAD : -STOP_RAD;
+                    arm->linkd[i] = 0.0;
+                }
+            }
+            const double free = (mass * arm->qd[i] + push - h * torque) / inertia;
             arm->qd[i] = arm->blocked[i] || fabs(free) <= grip ? 0.0 : (free > 0 ? free - grip : free + grip);
             arm->q[i] += h * arm->qd[i];
-            if (fabs(arm->q[i]) >= STOP_RAD) {
+            if (stiffness == 0.0 && fabs(arm->q[i]) >= STOP_RAD) {
                 arm->q[i] = arm->q[i] > 0 ? STOP_RAD : -STOP_RAD;
                 arm->qd[i] = 0.0;
             }
         }
         before = arm->qdd[i];
         arm->qdd[i] = (arm->qd[i] - start) / TICK;
-        const double half = 0.5 * model[6u * JOINTS + i];
-        arm->link[i] = fmin(fmax(arm->link[i], arm->q[i] - half), arm->q[i] + half);
+        if (stiffness == 0.0) {
+            const double led = arm->q[i] + drum * sine(turns_per_rad * arm->q[i] + phase);
+            arm->link[i] = fmin(fmax(arm->link[i], led - half), led + half);
+        }
         arm->way[arm->ticks % SPEED_TICKS][i] = arm->link[i];
         arm->current_a[i] = awake ? (duty * supply_v - constant * arm->qd[i]) / model[i] : 0.0;
     }

@@ -31,8 +31,9 @@ from firmware_arm import declare  # noqa: E402
 from firmware_layout import c  # noqa: E402
 
 from armsight import firmware  # noqa: E402
+from armsight.app.board.found import Found, JointFound  # noqa: E402
 from armsight.firmware import build  # noqa: E402
-from armsight.robot.boards.codes import Fault  # noqa: E402
+from armsight.robot.boards.codes import Fault, Reaction  # noqa: E402
 from armsight.robot.boards.configuration import GAINS, lab_configuration  # noqa: E402
 from armsight.robot.boards.frames import OUTPUTS  # noqa: E402
 from armsight.robot.boards.tuning import MotorFigures, motion_limits, quiet_gains, tuned_gains  # noqa: E402
@@ -46,6 +47,8 @@ from armsight.sim.joints import (  # noqa: E402
     JointPlant,
     PotFault,
     drawn_model,
+    plain_transmission,
+    sprung,
 )
 
 STIFFNESS_N_M, PERIOD_TICKS = 32.0, 4
@@ -55,8 +58,10 @@ PLANT_ARRAYS = {
     "q": "q",
     "qd": "qd",
     "link": "link",
+    "linkd": "_linkd",
     "qdd": "_qdd",
     "model": "_model",
+    "between": "_between",
     "hand": "hand_n_m",
     "current_a": "_current_a",
     "broken": "_broken",
@@ -124,6 +129,43 @@ def brought_up_configuration(model, rng):
     return config
 
 
+def found_configuration(model, between, rng):
+    """What a bring-up stores of an elastic or uneven arm, by app/board/found.py, from figures as far off as it finds them.
+
+    R is off by up to 7 %, K 5 %, inertia 12 %, stiffness 25 %, the share of the joint's inertia 15 %; unevenness by 20 %.
+    """
+    ends = [[3277.0, -2.6], [62258.0, 2.6]]
+
+    def off(most):
+        return rng.uniform(1 - most, 1 + most, 6)
+
+    rows = {
+        "noise_counts": model.noise_counts,
+        "resistance_ohm": model.resistance_ohm / model.current_gain * off(0.07),
+        "constant_v_s": model.constant_v_s * off(0.05),
+        "inertia_kg_m2": model.inertia_kg_m2 * model.current_gain * off(0.12),
+        "viscous_n_m_s": model.viscous_n_m_s,
+        "dry_n_m": model.dry_n_m,
+        "backlash_rad": model.backlash_rad * off(0.33),
+        "gravity_n_m": np.abs(model.gravity_n_m),
+        "uneven": between.drum_rad * between.drum_per_rev * off(0.2),
+        "stiffness_n_m": between.stiffness_n_m * off(0.25),
+        "spring_damping_n_m_s": between.damping_n_m_s * off(0.5),
+        "link_share": np.clip(between.link_share * off(0.15), 0.05, 0.95),
+    }
+    spring = ("stiffness_n_m", "spring_damping_n_m_s", "link_share")
+    joints = [
+        JointFound(
+            marks=ends,
+            range_counts=[3277.0, 62258.0],
+            motor_direction=1,
+            **{n: float(v[i]) for n, v in rows.items() if n not in spring or between.stiffness_n_m[i] > 0},
+        )
+        for i in range(6)
+    ]
+    return Found("pil", joints).configuration(3.0, Reaction.HOLD, gains=True)
+
+
 class Loop(ctypes.Structure):
     """``arm_loop`` of board_arms.c."""
 
@@ -153,11 +195,13 @@ def compiled():
 class Arm:
     """An arm, the core that drives it and a host that swings it."""
 
-    def __init__(self, library, seed, *, load=0.6, model=None, config=None, supply_v=None, start=None):
+    def __init__(
+        self, library, seed, *, load=0.6, model=None, config=None, supply_v=None, start=None, transmission=None
+    ):
         self.rng = np.random.default_rng([seed, 7])
         self.library = library
         self.model = drawn_model(seed, load=load) if model is None else model
-        self.plant = JointPlant(start, seed=seed + 1, model=self.model)
+        self.plant = JointPlant(start, seed=seed + 1, model=self.model, transmission=transmission)
         need_v = np.abs(self.model.gravity_n_m) / self.model.constant_v_s * self.model.resistance_ohm
         if supply_v is None:
             supply_v = self.rng.uniform(9.6, 14.0)
@@ -348,6 +392,59 @@ def slow(library, seed, table):
     table.add("slow swing", arm, ())
 
 
+def through_transmission(library, seed, table, label, rows):
+    """Swings, rests, is relieved of 1 N m and loaded again, as a bring-up leaves an arm with such a transmission."""
+    rng = np.random.default_rng([seed, 11])
+    model = drawn_model(seed)
+    between = plain_transmission(**rows(model, rng))
+    config = found_configuration(model, between, rng)
+    arm = Arm(library, seed, model=model, config=config, supply_v=SUPPLY_V, transmission=between)
+    limits, w = config["joint"], 2 * math.pi * arm.hz
+    most = np.minimum(limits["speed_limit_rad_s"] / 1.15, limits["acceleration_rad_s2"] / w / 1.15)
+    arm.speed_rad_s = np.minimum(arm.speed_rad_s, most)
+    arm.enable()
+    arm.rest(200)
+    arm.swing(4000)
+    fastest = arm.fastest  # what is let go of swings back as fast as its spring has it
+    for hand_n_m in (0.0, 1.0, 0.0):
+        arm.plant.hand_n_m[:] = hand_n_m * np.sign(model.gravity_n_m)
+        arm.rest(600)
+    arm.loop.fastest = fastest
+    table.add(label, arm, ())
+
+
+def elastic(library, seed, table):
+    """Resonances of 8 to 40 Hz with both masses free, damping 0.02 to 0.2, 25 to 75 % of the inertia behind the spring."""
+
+    def rows(model, rng):
+        hz = np.exp(rng.uniform(np.log(8.0), np.log(40.0), 6))
+        return sprung(model, hz, rng.uniform(0.02, 0.2, 6), rng.uniform(0.25, 0.75, 6))
+
+    through_transmission(library, seed, table, "elastic 8 to 40 Hz", rows)
+
+
+def softest(library, seed, table):
+    """The same at 8 Hz."""
+
+    def rows(model, rng):
+        return sprung(model, np.full(6, 8.0), rng.uniform(0.02, 0.2, 6), rng.uniform(0.25, 0.75, 6))
+
+    through_transmission(library, seed, table, "elastic 8 Hz", rows)
+
+
+def eccentric(library, seed, table):
+    """Drums of 0.02 to 0.06 rad, once to twice a revolution of the joint."""
+
+    def rows(model, rng):
+        return {
+            "drum_rad": rng.uniform(0.02, 0.06, 6),
+            "drum_per_rev": rng.integers(1, 3, 6).astype(float),
+            "drum_turns": rng.uniform(0, 1, 6),
+        }
+
+    through_transmission(library, seed, table, "eccentric drum", rows)
+
+
 def pushed(library, seed, table):
     arm = Arm(library, seed)
     arm.enable()
@@ -450,6 +547,9 @@ def main():
         "soft": soft_limit,
         "jumping": jumping_host,
         "slow": slow,
+        "elastic": elastic,
+        "softest": softest,
+        "eccentric": eccentric,
     }
     sizes = {
         PotFault.STUCK: lambda r: 0.0,

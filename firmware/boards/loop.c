@@ -29,6 +29,8 @@ static uint32_t load(board_loop *loop, core_config *config)
 {
     loop->board->read_copy(0u, &loop->copies[0]);
     loop->board->read_copy(1u, &loop->copies[1]);
+    config_upgrade(&loop->copies[0]);
+    config_upgrade(&loop->copies[1]);
     return config_load(config, &loop->copies[0], &loop->copies[1]);
 }
 

@@ -7,6 +7,7 @@
 
 _Static_assert(sizeof(pot_config) == 2u * (POT_NODES + 3u) + 4u * (POT_NODES + 4u), "pot_config has a hole");
 _Static_assert(sizeof(encoder_config) == 24u, "encoder_config has a hole");
+_Static_assert(offsetof(joint_config, transmission) + 12u == sizeof(joint_config), "a new joint only has more at its end");
 _Static_assert(offsetof(config_copy, crc) == sizeof(config_copy) - sizeof(uint32_t), "config_copy has a hole");
 
 uint32_t config_crc_on(uint32_t crc, const void *bytes, uint32_t length)
@@ -120,6 +121,12 @@ static bool motor_is_valid(const motor_config *motor)
            number_within(motor->apart_rad, 1e-3f, 1.0f) && number_within(motor->backlash_rad, 0.0f, 1.0f);
 }
 
+static bool transmission_is_valid(const transmission_config *between)
+{
+    return number_within(between->twist_rad_per_a, 0.0f, 1.0f) && number_within(between->uneven, 0.0f, 0.5f) &&
+           number_within(between->damping_share, 0.0f, 1.0f);
+}
+
 /* Return whether a potentiometer's table reaches the soft limits, within its band. */
 static bool table_is_consistent(const joint_config *joint)
 {
@@ -171,6 +178,7 @@ static bool word_within(uint32_t word, uint32_t least, uint32_t most) { return w
 static bool joint_is_valid(const joint_config *joint)
 {
     return pid_gains_in_range(&joint->gains) && sensor_is_valid(joint) && motor_is_valid(&joint->motor) &&
+           transmission_is_valid(&joint->transmission) &&
            number_within(joint->soft_min_rad, -13.0f, 13.0f) && number_within(joint->soft_max_rad, -13.0f, 13.0f) &&
            joint->soft_min_rad < joint->soft_max_rad && number_within(joint->speed_limit_rad_s, 0.01f, 20.0f) &&
            number_within(joint->deceleration_rad_s2, 0.1f, 1000.0f) &&
@@ -218,6 +226,44 @@ static bool copy_is_good(const config_copy *copy)
 {
     return copy->magic == CONFIG_MAGIC && copy->version == CONFIG_VERSION &&
            copy->crc == config_crc(copy, (uint32_t)offsetof(config_copy, crc)) && config_is_valid(&copy->config);
+}
+
+#define VERSION_5 5u
+#define NEW_BYTES ((uint32_t)sizeof(transmission_config)) /* a joint of version 5 ended before its transmission */
+
+/* Move bytes up by so many, the last first. */
+static void move_up(uint8_t *from, uint32_t length, uint32_t by)
+{
+    while (length != 0u) {
+        length--;
+        from[length + by] = from[length];
+    }
+}
+
+void config_upgrade(config_copy *copy)
+{
+    const uint32_t old = (uint32_t)offsetof(config_copy, crc) - JOINTS * NEW_BYTES;
+    uint8_t *at = (uint8_t *)copy;
+    uint32_t crc = 0u;
+    for (uint32_t i = 4u; i != 0u; i--) {
+        crc = crc << 8 | at[old + i - 1u];
+    }
+    if (copy->magic != CONFIG_MAGIC || copy->version != VERSION_5 || crc != config_crc(copy, old)) {
+        return;
+    }
+    const uint32_t joints = (uint32_t)offsetof(config_copy, config);
+    const uint32_t joint = (uint32_t)offsetof(joint_config, transmission);
+    uint32_t end = old;
+    for (uint32_t left = JOINTS; left != 0u; left--) { /* what is new has the value 0 */
+        const uint32_t from = joints + left * joint;
+        move_up(at + from, end - from, left * NEW_BYTES);
+        for (uint32_t i = 0u; i < NEW_BYTES; i++) {
+            at[from + (left - 1u) * NEW_BYTES + i] = 0u;
+        }
+        end = from;
+    }
+    copy->version = CONFIG_VERSION;
+    copy->crc = config_crc(copy, (uint32_t)offsetof(config_copy, crc));
 }
 
 /* Return the newer of two copies; serial numbers may wrap. */

@@ -8,7 +8,7 @@
 #include "types.h"
 
 #define CONFIG_MAGIC 0x31435341u /* "ASC1" as bytes in memory */
-#define CONFIG_VERSION 5u        /* goes up whenever core_config changes its layout or meaning */
+#define CONFIG_VERSION 6u        /* goes up whenever core_config changes its layout or meaning */
 
 /* Return the CRC-32 (IEEE 802.3, as zlib's) of length bytes. */
 uint32_t config_crc(const void *bytes, uint32_t length);
@@ -24,6 +24,9 @@ bool config_is_valid(const core_config *config);
 
 /* Make a copy to store: config with its serial number, version and CRC. */
 void config_seal(config_copy *copy, const core_config *config, uint32_t serial);
+
+/* Turn a good copy of version 5 into one of this version, in its place; any other stays as it is. */
+void config_upgrade(config_copy *copy);
 
 /* Take the newer of two stored copies, the older where the newer is broken, the factory's values where both are.
  * Returns CONFIG_NEWEST, CONFIG_OLDER (one copy is broken) or CONFIG_FACTORY. */

@@ -116,6 +116,9 @@ static void drive(core_state *core)
 {
     const float per_nominal_v = 1000.0f / (float)core->config.supply_nominal_mv;
     advance_arm(core);
+    for (uint32_t i = 0u; core->elastic != 0u && i < core->config.joint_count; i++) {
+        motor_damp(&core->joint[i].motor, core->joint[i].pid.speed_rad_s);
+    }
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         joint_state *joint = &core->joint[i];
         const joint_config *config = &core->config.joint[i];
@@ -217,10 +220,14 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
         measure(core, joint, config, i, inputs->counts[i]);
         joint->current_a = (float)(config->motor_direction * inputs->current_ma[i]) * 0.001f - joint->zero.now_a;
         joint->over_a = number_size(joint->current_a) - (float)config->current_limit_ma * 0.001f;
+        float angle_rad = joint->pot.angle_rad;
+        if (core->elastic != 0u) { /* where the motor is, by the reading and what the current twists between them */
+            angle_rad += joint->motor.twist_rad_per_a * joint->current_a;
+        }
         if (joint->over_a > 0.0f && joint->motor.duty != 0.0f) { /* a driver that limits it does not put the duty out */
-            motor_pause(&joint->motor, joint->pot.angle_rad);
+            motor_pause(&joint->motor, angle_rad);
         } else if (closed) {
-            motor_measure(&joint->motor, &config->motor, core->supply_v, joint->current_a, joint->pot.angle_rad);
+            motor_measure(&joint->motor, &config->motor, core->supply_v, joint->current_a, angle_rad);
         } else {
             motor_sleep(&joint->zero, joint->current_a);
         }

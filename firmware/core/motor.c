@@ -24,7 +24,8 @@
 #define SAME_HIGH 1.3f        /* its constant is off by 15 %, the rest are resistance, backlash and noise */
 #define CAREFUL 0.5f          /* of the speed limit until then: a reading of a third of the true speed is no faster joint */
 #define CONSTANT_OFF 0.15f    /* by so much a motor's constant may be off */
-#define UNKNOWN_RAD_S 1000.0f
+#define UNKNOWN_RAD_S 1000.0f /* as uncertain as a motor's speed is whose voltage is not known */
+#define SMOOTH 0.333333f      /* of a tick's news in the speed that is damped: 2 ms; half: soft joints swing, twice: noise */
 #define SEEN_RAD_S 0.5f       /* above a motor's speed in one tick by noise: no slower joint is held to its limit by it */
 #define SIDE_UNKNOWN 0
 #define REVERSAL_TICKS 64u    /* in a longer window than so a joint may have reversed and come back */
@@ -101,7 +102,8 @@ static float window_noise(motor_state *motor, const motor_config *config, float 
     const bool goes_on = side == motor->window_side && moved && motor->window_ticks <= REVERSAL_TICKS;
     motor->window_side = side;
     const float crossed = goes_on ? 0.0f : moved ? 1.0f : RESTING;
-    return WINDOW_NOISE_RAD + crossed * config->backlash_rad;
+    const float twist_rad = 0.5f * MOTOR_TWIST * motor->twist_rad_per_a * motor->current_a;
+    return WINDOW_NOISE_RAD + crossed * config->backlash_rad + twist_rad + motor->uneven * number_size(way_rad);
 }
 
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
@@ -166,7 +168,7 @@ static void window(motor_state *motor, const motor_config *config, float angle_r
         earn(motor, config, way_rad);
     }
     /* A gap that R and K may explain must be learnt from: else they would stay wrong for good. */
-    if (motor->heard_ohm > 0.0f && number_size(motor->gap_rad) < 0.5f * config->apart_rad + motor->band_rad) {
+    if (motor->heard_ohm > 0.0f && number_size(motor->gap_rad) < 0.5f * config->apart_rad + motor_explains(motor)) {
         learn(motor, config, angle_rad, noise_rad);
     }
     window_begin(motor, angle_rad);
@@ -213,7 +215,8 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
 {
     const float variance = motor->variance_rr * ir_v * ir_v + 2.0f * motor->variance_rk * ir_v * emf_v +
                            motor->variance_kk * emf_v * emf_v;
-    motor->unsure_rad_s = SIGMAS * number_root(variance > 0.0f ? variance : 0.0f) / config->constant_v_s;
+    const float unsure_v = SIGMAS * number_root(variance > 0.0f ? variance : 0.0f) + motor->uneven * number_size(emf_v);
+    motor->unsure_rad_s = unsure_v / config->constant_v_s;
     motor->unsure_rad = motor->unsure_rad_s * TICK_S;
     if (motor->trust == 1.0f) {
         motor->doubt_rad_s = motor->unsure_rad_s;
@@ -313,6 +316,14 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     const bool known = motor->current_a * motor->heard_ohm > DEAD_SHARE * config->constant_v_s * size_rad_s;
     motor->known = known ? 1u : 0u;
     motor->sure_rad_s = known ? size_rad_s - motor->doubt_rad_s : 0.0f;
+}
+
+void motor_damp(motor_state *motor, float reading_rad_s)
+{
+    const bool known = motor->known != 0u && motor->unsure_rad_s < UNKNOWN_RAD_S;
+    const float share = known ? motor->damping_share : 0.0f;
+    motor->damped_rad_s += SMOOTH * (motor->speed_rad_s - motor->damped_rad_s);
+    motor->beyond_rad_s = share * (motor->damped_rad_s - reading_rad_s);
 }
 
 static uint32_t fewer(uint32_t a, uint32_t b) { return a < b ? a : b; }

@@ -9,11 +9,20 @@
 #include "types.h"
 
 #define MOTOR_STEP_TICKS 160u /* for so long a step may be what a gap began with */
+#define MOTOR_TWIST 0.5f /* of the largest current's twist of late: half: soft joints are dropped, twice: faults show later */
 #define MOTOR_WITNESS 0.1f /* of the speed it is held to: so much faster than the reading it must be to count */
 
 /* Begin to watch a joint that reads angle_rad and has this speed limit; phase differs from joint to joint, so that not
  * all are sampled at once. */
 void motor_start(motor_state *motor, float angle_rad, float speed_limit_rad_s, uint32_t phase);
+
+/* Let what lies between motor and reading count from the start on. */
+static inline void motor_through(motor_state *motor, const transmission_config *between)
+{
+    motor->twist_rad_per_a = between->twist_rad_per_a;
+    motor->uneven = between->uneven;
+    motor->damping_share = between->damping_share;
+}
 
 /* Let a tick pass in which the voltage at the motor is not known. */
 void motor_pause(motor_state *motor, float angle_rad);
@@ -35,10 +44,21 @@ static inline float motor_witness(const motor_state *motor, float reading_rad_s)
     return faster_rad_s > number_size(reading_rad_s) ? motor->speed_rad_s : reading_rad_s;
 }
 
-/* Return whether motor and reading are apart further than noise, backlash and the motor's uncertain numbers explain. */
+/* Let the motor's speed be damped in place of the reading's as far as damping_share says: an elastic joint that is read
+ * behind its spring is damped by the motor before it. While the motor's is not known, the reading's is. */
+void motor_damp(motor_state *motor, float reading_rad_s);
+
+/* Return how far motor and reading may be apart by the motor's uncertain numbers, and by the twist that the current does not
+ * show: friction, inertia, and a stiffness that is another than the configuration's. */
+static inline float motor_explains(const motor_state *motor)
+{
+    return motor->band_rad + MOTOR_TWIST * motor->twist_rad_per_a * motor->current_a;
+}
+
+/* Return whether motor and reading are apart further than that, noise and backlash explain. */
 static inline bool motor_is_apart(const motor_state *motor, const motor_config *config)
 {
-    return number_size(motor->gap_rad) > config->apart_rad + motor->band_rad;
+    return number_size(motor->gap_rad) > config->apart_rad + motor_explains(motor);
 }
 
 /* Return the fault by which they are apart, as it looks at first. */

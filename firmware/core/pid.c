@@ -125,7 +125,7 @@ void pid_control(joint_state *joint, const joint_config *config, float per_nomin
         }
         joint->limited |= LIMITED_SPEED;
     }
-    const float seen_rad_s = motor_witness(&joint->motor, joint->pid.speed_rad_s);
+    const float seen_rad_s = motor_witness(&joint->motor, joint->pid.speed_rad_s + joint->motor.beyond_rad_s);
     const float beyond_rad_s = number_size(seen_rad_s) - fastest_rad_s;
     const float more_rad_s = beyond_rad_s > 0.0f ? BEYOND * beyond_rad_s : 0.0f;
     const pid_demand demand = {.reference_rad = joint->reference.position_rad,

@@ -192,6 +192,13 @@ typedef struct motor_config {
     float backlash_rad;   /* 0 to 1, below apart_rad: of the gear between them, from stop to stop */
 } motor_config;
 
+/* What lies between the motor and what reads the joint, where it is not rigid and even. */
+typedef struct transmission_config {
+    float twist_rad_per_a; /* 0 to 1: how far an ampere of motor current twists it */
+    float uneven;          /* 0 to 0.5: by which share its ratio varies with the angle: an eccentric drum */
+    float damping_share;   /* 0 to 1: of the speed that kd damps, the motor's own; the rest is the reading's */
+} transmission_config;
+
 /* The encoder of one joint. The joint is at home_rad where its counts are those of the zero: an absolute one's
  * zero_counts, a quadrature one's when COMMAND_HOME came. Of pot then only jump_rad, frozen_rad and inverted_rad count. */
 typedef struct encoder_config {
@@ -224,6 +231,7 @@ typedef struct joint_config {
     uint32_t current_limit_ma; /* 10 to 500000: motor current from which the duty is cut */
     int32_t motor_direction;   /* 1 or -1, multiplies the duty on its way out */
     encoder_config encoder;    /* what reads the joint, where it is no potentiometer */
+    transmission_config transmission;
 } joint_config;
 
 /* The configuration of the arm. Times are in ticks of 1 ms. */
@@ -388,6 +396,11 @@ typedef struct motor_state {
     float part_a;
     uint32_t part_ticks;     /* driven_ticks then */
     float current_a;         /* the largest mean of a sample of late */
+    float damped_rad_s;      /* the speed, smoothed */
+    float beyond_rad_s;      /* what kd damps beyond the reading's speed */
+    float twist_rad_per_a;   /* of the configuration's transmission */
+    float uneven;
+    float damping_share;
     float gap_rad;           /* travel of the reading less that of the motor; fades */
     float band_rad;          /* how much of it the motor's uncertain numbers explain; fades */
     float last_rad;          /* the reading of the last tick */
@@ -493,6 +506,7 @@ typedef struct core_state {
     uint32_t started;        /* not 0 after the first tick */
     uint32_t tick;
     uint32_t silent_ticks;
+    uint32_t elastic;        /* not 0: a joint's transmission twists, or its motor's speed is damped */
     float supply_v;          /* this tick's */
     uint32_t supply_bad_ticks;
     uint32_t missed;         /* ticks lost of late; fades */

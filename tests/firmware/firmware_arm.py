@@ -37,6 +37,7 @@ def declare(library: Library) -> Library:
         "config_crc": (word, [pointer, word]),
         "config_factory": (None, [pointer]),
         "config_is_valid": (flag, [pointer]),
+        "config_upgrade": (None, [pointer]),
         "config_seal": (None, [pointer, pointer, word]),
         "config_load": (word, [pointer, pointer, pointer]),
         "config_next": (word, [pointer, pointer, ctypes.POINTER(word)]),

@@ -8,6 +8,8 @@ behind the gear's backlash. Each millisecond is four backward Euler steps, with 
 that a joint at rest rests. Nothing but + - * / is used, so that every computer computes the same motion.
 
 What a joint is made of is a :class:`JointModel`; :func:`drawn_model` draws one that is not as its data sheet says.
+What lies between motor and joint is a :class:`Transmission`: rigid and even, or a spring (two masses, the
+potentiometer on the joint's side) and an eccentric drum; spring and joint are then integrated by symplectic Euler.
 """
 
 from __future__ import annotations
@@ -138,13 +140,81 @@ def drawn_model(seed: int, *, load: float = 0.6, inertia: float = 6.0, spread: f
     )
 
 
-@kernel("f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], b1, b1, f8, b1[::1]")
+@dataclass(frozen=True, eq=False)
+class Transmission(Record):
+    """What lies between the motors of six joints and what they drive.
+
+    Attributes:
+        stiffness_n_m: (6,) of the spring between them, N m/rad, where the joint is at 0 rad; 0: rigid.
+        damping_n_m_s: (6,) of the spring, N m s/rad.
+        link_share: (6,) share of the joint's inertia behind the spring.
+        pose_share: (6,) by which share the stiffness is greater at 1 rad; it changes linearly with the angle.
+        back_share: (6,) stiffness while the joint is ahead of the motor, over that while it is behind.
+        drum_rad: (6,) amplitude by which an eccentric drum leads the joint before and behind the motor.
+        drum_per_rev: (6,) how often it does so in a revolution of the motor, gear included.
+        drum_turns: (6,) its phase at 0 rad, of a turn.
+    """
+
+    stiffness_n_m: Array
+    damping_n_m_s: Array
+    link_share: Array
+    pose_share: Array
+    back_share: Array
+    drum_rad: Array
+    drum_per_rev: Array
+    drum_turns: Array
+
+    def packed(self) -> Array:
+        """Return all attributes as rows (8, 6)."""
+        return np.array([getattr(self, name) for name in self.__dataclass_fields__])
+
+
+def plain_transmission(**rows: float | Array) -> Transmission:
+    """Return a rigid and even one, but for the attributes that are given, for all joints or (6,)."""
+    names = Transmission.__dataclass_fields__
+    usual = dict.fromkeys(names, 0.0) | {"link_share": 0.5, "back_share": 1.0, "drum_per_rev": 1.0}
+    return Transmission(**{name: np.full(JOINTS, 0.0) + rows.get(name, usual[name]) for name in names})
+
+
+def sprung(model: JointModel, resonance_hz: Array, damping: Array, link_share: Array) -> dict[str, Array]:
+    """Return stiffness, damping and link share of joints that resonate so while both masses are free.
+
+    Args:
+        model: what the joints are made of.
+        resonance_hz: (6,) of the joint's inertia against the motor's.
+        damping: (6,) of that resonance, of critical, by the spring alone.
+        link_share: (6,) share of the joint's inertia behind the spring.
+    """
+    w = 2 * np.pi * resonance_hz
+    reduced = model.inertia_kg_m2 * link_share * (1 - link_share)
+    return {
+        "stiffness_n_m": reduced * w * w,
+        "damping_n_m_s": 2 * damping * reduced * w,
+        "link_share": np.asarray(link_share),
+    }
+
+
+@kernel
+def _sine(turns: float) -> float:
+    """Return the sine of so many turns."""
+    turns -= np.floor(turns + 0.5)
+    turns = 0.5 - turns if turns > 0.25 else (-0.5 - turns if turns < -0.25 else turns)
+    a = 6.283185307179586 * turns
+    x = a * a
+    return a * (1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110 * (1 - x / 156))))))
+
+
+@kernel(
+    "f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], b1, b1, f8, b1[::1]"
+)
 def _move(
     q: Array,
     qd: Array,
     link: Array,
+    linkd: Array,
     qdd: Array,
     model: Array,
+    between: Array,
     hand: Array,
     duty: Array,
     stuck: Array,
@@ -153,32 +223,50 @@ def _move(
     supply_v: float,
     blocked: NDArray[np.bool_],
 ) -> None:
-    """Move the joints by one tick, in-place: motors q, qd, qdd (6,) rad, rad/s, rad/s^2, and what they drive, link (6,)."""
+    """Move the joints by one tick, in-place: motors q, qd, qdd (6,) rad, rad/s, rad/s^2; what they drive, link, linkd."""
     h = _TICK_S / _SUBSTEPS
     before = 0.0
     for i in range(JOINTS):
         own, constant = model[2, i], model[1, i]
         conductance = constant / model[0, i] if awake else 0.0
         dry = model[4, i] + (model[11, i] if braked else 0.0)
-        inertia = own + h * (model[3, i] + conductance * constant)
+        stiffness, half = between[0, i], 0.5 * model[6, i]
+        mass = own if stiffness == 0 else own * (1 - between[2, i])
+        inertia = mass + h * (model[3, i] + conductance * constant)
         grip = h * dry / inertia
         x = link[i] * link[i]
         cosine = 1 - x / 2 * (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))))
         load = hand[i] - model[5, i] * cosine - model[7, i] * own * before
         share = duty[i] if stuck[i] == 0.0 else stuck[i]
-        push = h * (conductance * share * supply_v + load)
-        start = qd[i]
+        push = h * (conductance * share * supply_v + (load if stiffness == 0 else 0.0))
+        start, drum, turns_per_rad = qd[i], between[5, i], between[6, i] / 6.283185307179586
         for _ in range(_SUBSTEPS):
-            free = (own * qd[i] + push) / inertia
+            torque = 0.0
+            if stiffness > 0:
+                turns = turns_per_rad * q[i] + between[7, i]
+                ratio = 1 + drum * between[6, i] * _sine(turns + 0.25)
+                twist = q[i] + drum * _sine(turns) - link[i]
+                twist = twist - half if twist > half else (twist + half if twist < -half else 0.0)
+                stiff = stiffness * (1 + between[3, i] * link[i]) * (between[4, i] if twist < 0 else 1.0)
+                damped = between[1, i] * (ratio * qd[i] - linkd[i]) if twist != 0 or half == 0 else 0.0
+                pull = stiff * twist + damped
+                torque = ratio * pull
+                linkd[i] = 0.0 if blocked[i] else linkd[i] + h * (pull + load) / (own - mass)
+                link[i] += h * linkd[i]
+                if abs(link[i]) >= STOP_RAD:
+                    link[i] = STOP_RAD if link[i] > 0 else -STOP_RAD
+                    linkd[i] = 0.0
+            free = (mass * qd[i] + push - h * torque) / inertia
             qd[i] = 0.0 if blocked[i] or abs(free) <= grip else (free - grip if free > 0 else free + grip)
             q[i] += h * qd[i]
-            if abs(q[i]) >= STOP_RAD:
+            if stiffness == 0 and abs(q[i]) >= STOP_RAD:
                 q[i] = STOP_RAD if q[i] > 0 else -STOP_RAD
                 qd[i] = 0.0
         before = qdd[i]
         qdd[i] = (qd[i] - start) / _TICK_S
-        half = 0.5 * model[6, i]
-        link[i] = min(max(link[i], q[i] - half), q[i] + half)
+        if stiffness == 0:
+            led = q[i] + drum * _sine(turns_per_rad * q[i] + between[7, i])
+            link[i] = min(max(link[i], led - half), led + half)
 
 
 @kernel
@@ -251,11 +339,12 @@ class JointPlant:
         q: (6,) where the joints are at first, rad.
         seed: of the converters' noise.
         model: what they are made of; the data sheet's without.
+        transmission: what lies between motors and joints; rigid and even without.
 
     Attributes:
         q: (6,) true angles of the motors, rad, at the joint.
         qd: (6,) their speeds, rad/s.
-        link: (6,) true angles of the joints, rad: the motors' but for backlash.
+        link: (6,) true angles of the joints, rad: the motors' but for backlash, twist and drum.
         hand_n_m: (6,) torque with which a hand pushes, N m.
         supply_mv: motor supply, mV.
         stop_pressed: whether the emergency stop is pressed.
@@ -265,13 +354,23 @@ class JointPlant:
         offset_a: (6,) offset of the current's sensor, A.
     """
 
-    def __init__(self, q: Array | None = None, *, seed: int = 1, model: JointModel | None = None) -> None:
+    def __init__(
+        self,
+        q: Array | None = None,
+        *,
+        seed: int = 1,
+        model: JointModel | None = None,
+        transmission: Transmission | None = None,
+    ) -> None:
         start = np.zeros(JOINTS) if q is None else np.array(q, dtype=float)
         if start.shape != (JOINTS,) or not (np.abs(start) <= STOP_RAD).all():
             raise InputError(f"q must be six angles within the stops at +-{STOP_RAD} rad; {start} was given")
         self.q, self.qd, self.link = start, np.zeros(JOINTS), start.copy()
         self.model = plain_model() if model is None else model
         self._model = self.model.packed()
+        self.transmission = plain_transmission() if transmission is None else transmission
+        self._between, self._linkd = self.transmission.packed(), np.zeros(JOINTS)
+        self.meet()
         self.hand_n_m = np.zeros(JOINTS)
         self.supply_mv = round(1e3 * SUPPLY_V)
         self.stop_pressed = False
@@ -281,6 +380,18 @@ class JointPlant:
         self._noise = np.random.default_rng(seed).integers(1, 1 << 63, JOINTS, dtype=np.uint64)
         self._fault, self._broken = np.zeros(JOINTS, np.int64), np.zeros((3, JOINTS))
         self._counts, self._current_ma = np.zeros(JOINTS, np.uint32), np.zeros(JOINTS, np.int32)
+
+    def meet(self) -> None:
+        """Put the motors where even drums have the joints (what a drum leads by is found by iteration), at rest."""
+        between = self.transmission
+        for _ in range(60):
+            turns = between.drum_per_rev * self.q / (2 * np.pi) + between.drum_turns
+            self.q[:] = self.link - between.drum_rad * np.sin(2 * np.pi * turns)
+        self.qd[:] = self._linkd[:] = 0.0
+
+    def put_link(self, joint: int, angle_rad: float) -> None:
+        """Put what an elastic joint drives to an angle, rad, at rest, as a firm hand does."""
+        self.link[joint], self._linkd[joint] = angle_rad, 0.0
 
     def break_pot(self, joint: int, fault: PotFault, size: float | None = None) -> None:
         """Break a potentiometer (0 to 5) from its next reading on; :attr:`PotFault.NONE` repairs it.
@@ -317,8 +428,9 @@ class JointPlant:
         """Let 1 ms pass with these duties (6,)."""
         supply_v = self.supply_mv * 1e-3
         duty = np.asarray(duty, dtype=float)
-        state = (self.q, self.qd, self.link, self._qdd)
-        _move(*state, self._model, self.hand_n_m, duty, self.stuck, awake, braked, supply_v, self.blocked)
+        state = (self.q, self.qd, self.link, self._linkd, self._qdd)
+        given = (self._model, self._between, self.hand_n_m, duty, self.stuck)
+        _move(*state, *given, awake, braked, supply_v, self.blocked)
         if awake:
             duty = np.where(self.stuck != 0.0, self.stuck, duty)
             self._current_a[:] = (duty * supply_v - self._model[1] * self.qd) / self._model[0]

@@ -242,7 +242,7 @@ def test_typed_at_a_terminal_from_the_swing_to_the_stored_configuration(tmp_path
     evening.joints[0].motor_direction = evening.plant.wiring.motor_signs[0]
     evening.bringup.found.write(tmp_path / "bringup.json")
     master, slave = pty.openpty()
-    answers = ["perhaps\n", "y\n", "y\n"]
+    answers = ["perhaps\n", "y\n", "y\n", "y\n"]
 
     def heard(line):
         if line.endswith("[y/n]: "):

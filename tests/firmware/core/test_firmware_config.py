@@ -100,6 +100,36 @@ def test_a_copy_of_another_version_is_broken(library):
     assert load(library, sealed(library, 111, 4), copy) == (c.CONFIG_OLDER, 111)
 
 
+def of_version_5(copy):
+    """The bytes of a copy as version 5 stored it: a joint ended before its transmission."""
+    raw, joint, start = bytes(copy), ctypes.sizeof(c.joint_config), c.config_copy.config.offset
+    kept = raw[:4] + (5).to_bytes(4, "little") + raw[8:start]
+    for i in range(6):
+        kept += raw[start + i * joint :][: c.joint_config.transmission.offset]
+    kept += raw[start + 6 * joint : -4]
+    return kept + zlib.crc32(kept).to_bytes(4, "little")
+
+
+def test_a_copy_of_version_5_is_read_with_zeros_for_what_is_new(library):
+    config = config_of(library, 222)
+    for i, joint in enumerate(config.joint):
+        joint.soft_max_rad, joint.encoder.home_rad, joint.motor.backlash_rad = 2.0 + 0.1 * i, 0.1 * i, 0.001 * i
+    whole = c.config_copy()
+    library.config_seal(ctypes.byref(whole), ctypes.byref(config), 9)
+    old = of_version_5(whole)
+    copy = c.config_copy.from_buffer_copy(old + b"\xff" * (COPY_BYTES - len(old)))
+    library.config_upgrade(ctypes.byref(copy))
+    assert bytes(copy) == bytes(whole)
+    library.config_upgrade(ctypes.byref(copy))  # one of this version stays as it is
+    assert bytes(copy) == bytes(whole)
+    for at in range(0, len(old), 7):
+        broken = bytearray(old + b"\xff" * (COPY_BYTES - len(old)))
+        broken[at] ^= 4
+        copy = c.config_copy.from_buffer_copy(broken)
+        library.config_upgrade(ctypes.byref(copy))
+        assert bytes(copy) == bytes(broken)
+
+
 def test_a_power_cut_while_writing_never_costs_the_only_good_copy(library):
     """Write a hundred configurations, each write cut off somewhere: what is loaded is the last whole one."""
     draw = random.Random(7)
@@ -141,6 +171,9 @@ WRONG = {
     "motor.constant_v_s": [0, 1001, NAN],
     "motor.apart_rad": [0, 1.1, 0.01, NAN],
     "motor.backlash_rad": [-0.001, 0.03, 1.1, NAN],
+    "transmission.twist_rad_per_a": [-0.001, 1.1, NAN],
+    "transmission.uneven": [-0.001, 0.51, NAN],
+    "transmission.damping_share": [-0.001, 1.1, NAN],
     "soft_min_rad": [2.4, -13.1, -2.7, NAN],
     "soft_max_rad": [-2.4, 13.1, 2.7, NAN],
     "speed_limit_rad_s": [0, 20.0, 20.1, NAN],
@@ -243,9 +276,11 @@ def test_a_table_may_fall_and_its_direction_be_reversed(library, angles, directi
 
 def test_every_value_has_its_range_tried(library):
     """A field added to the configuration must be added here."""
-    leaves = {name for name, _ in c.joint_config._fields_ if name not in ("gains", "pot", "motor", "encoder")}
+    parts = ("gains", "pot", "motor", "encoder", "transmission")
+    leaves = {name for name, _ in c.joint_config._fields_ if name not in parts}
     leaves |= {f"gains.{name}" for name, _ in c.joint_gains._fields_}
     leaves |= {f"motor.{name}" for name, _ in c.motor_config._fields_}
+    leaves |= {f"transmission.{name}" for name, _ in c.transmission_config._fields_}
     assert leaves <= set(WRONG)
     assert {f"encoder.{name}" for name, _ in c.encoder_config._fields_} <= {*WRONG, *WRONG_ENCODER}
     assert {name for name, _ in c.core_config._fields_} - {"joint", "supply_max_mv"} == set(WRONG_ARM)

@@ -173,8 +173,10 @@ def test_a_drift_is_distinguished_from_a_slip_once_the_joint_was_let_go_of(arms,
         assert arm.out[0]["joint_faults"][joint] == arm.out[0]["faults"] == 1 << code
 
 
-def test_the_arm_that_runs_in_c_is_the_plant_of_sim(arms, library):
-    arm, twin = (arms.Arm(library, 950) for _ in range(2))
+@pytest.mark.parametrize("rows", [{}, {"drum_rad": 0.05}, {"stiffness_n_m": 60.0, "pose_share": 0.1, "drum_rad": 0.03}])
+def test_the_arm_that_runs_in_c_is_the_plant_of_sim(arms, library, rows):
+    between = arms.plain_transmission(damping_n_m_s=0.1, back_share=0.8, drum_per_rev=3.0, **rows)
+    arm, twin = (arms.Arm(library, 950, transmission=between) for _ in range(2))
     for each in (arm, twin):
         each.plant.break_pot(1, PotFault.LAG, 0.05)
         each.plant.break_pot(2, PotFault.SLIP, 0.1)
@@ -189,7 +191,50 @@ def test_the_arm_that_runs_in_c_is_the_plant_of_sim(arms, library):
         twin.plant.step(out["duty"], bool(out["drives_on"] or out["windings_shorted"]), not out["brakes_open"])
     arm.tick(300)
     assert arm.plant.q.tobytes() == twin.plant.q.tobytes()
+    assert arm.plant.link.tobytes() == twin.plant.link.tobytes()
     assert bytes(arm.outputs) == bytes(twin.outputs)
+
+
+def test_elastic_joints_are_held_and_not_taken_for_broken_ones(arms, library):
+    table = arms.Table()
+    for seed in (81, 82, 83):
+        arms.elastic(library, seed, table)
+        arms.eccentric(library, seed, table)
+    assert not sum(table.false.values())
+    assert table.fast["elastic 8 to 40 Hz"] < 1.4
+
+
+def test_an_elastic_joint_swings_where_it_is_damped_by_the_reading(arms, library):
+    """The law's damping by the motor is what holds it: the same gains on the reading's speed are a fault."""
+    model = arms.drawn_model(91)
+    between = arms.plain_transmission(**arms.sprung(model, np.full(6, 20.0), np.full(6, 0.05), np.full(6, 0.5)))
+    faults = []
+    for share in (1.0, 0.0):
+        config = arms.found_configuration(model, between, np.random.default_rng(91))
+        config["joint"]["transmission"]["damping_share"] = share
+        arm = arms.Arm(library, 91, model=model, config=config, supply_v=12.0, transmission=between)
+        arm.speed_rad_s = np.minimum(arm.speed_rad_s, 0.5 * config["joint"]["speed_limit_rad_s"])
+        arm.enable()
+        arm.swing(2000)
+        faults.append(arm.first[0])
+    assert faults[0] is None
+    assert faults[1] is not None
+
+
+def test_a_twist_that_the_current_shows_is_no_gap(library):
+    config = c.motor_config(6.0, 2.4, 0.03, 0.01)
+    gaps = []
+    for twist in (0.0, 0.1):
+        motor = c.motor_state()
+        library.motor_start(ctypes.byref(motor), ctypes.c_float(0.0), ctypes.c_float(2.0), 0)
+        for tick in range(200):  # the motor turns by 0.1 rad against a spring of 1 A, the reading rests
+            current_a = tick / 200
+            motor.duty = (6.0 * current_a + 2.4 * 0.5) / 12.0
+            seen = (ctypes.c_float(each) for each in (12.0, current_a, twist * current_a))
+            library.motor_measure(ctypes.byref(motor), ctypes.byref(config), *seen)
+        gaps.append(abs(motor.gap_rad))
+    assert gaps[0] > 0.06
+    assert gaps[1] < 0.01
 
 
 def test_a_current_that_is_never_there_is_the_sensors_fault(arms, library):

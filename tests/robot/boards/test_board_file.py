@@ -52,7 +52,7 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path):
         (("soft_max_rad = 2.4", "soft_max_rad = '2.4'"), "joint.1.soft_max_rad is '2.4'; a number is needed"),
         (("silence_ticks = 100", "silence_ticks = 100.5"), "arm.silence_ticks is 100.5; a whole number is needed"),
         (("silence_ticks = 100", ""), "arm.silence_ticks is missing"),
-        (("version = 5", "version = 1"), "version is 1"),
+        (("version = 6", "version = 1"), "version is 1"),
         (("counts = [3277, 62258]", "counts = [3277]"), r"counts is \[3277\]; a list of 2 to 9 numbers is needed"),
         (("motor_direction = 1", "motor_direction = 0"), "joint 1: motor_direction is 0"),
         (("backlash_rad = 0.01", "backlash_rad = 0.02"), "joint 1: backlash_rad must be below apart_rad"),
@@ -63,6 +63,23 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path):
 def test_what_is_wrong_is_named_with_the_file(tmp_path, change, said):
     path = written(tmp_path, change)
     with pytest.raises(InputError, match=rf"board\.toml.*{said}"):
+        read_configuration(path)
+
+
+def test_a_file_of_version_5_is_read_with_zeros_for_what_is_new(tmp_path):
+    config = lab_configuration()
+    lines = [
+        line
+        for line in configuration_text(config, "pil").replace("version = 6", "version = 5").splitlines()
+        if line.split(" ")[0] not in ("twist_rad_per_a", "uneven", "damping_share") and ".transmission]" not in line
+    ]
+    path = tmp_path / "board.toml"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    for name in ("twist_rad_per_a", "uneven", "damping_share"):
+        config["joint"]["transmission"][name] = 0.0
+    assert read_configuration(path)[0].tobytes() == config.tobytes()
+    path.write_text("\n".join([*lines, "uneven = 0.1"]), encoding="utf-8")
+    with pytest.raises(InputError, match="uneven"):
         read_configuration(path)
 
 

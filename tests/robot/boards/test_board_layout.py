@@ -9,7 +9,7 @@ import pytest
 
 from armsight import firmware
 from armsight.robot.boards import codes, configuration, frames
-from armsight.robot.boards.configuration import CONFIG, ENCODER, GAINS, JOINT, MOTOR, POT
+from armsight.robot.boards.configuration import CONFIG, ENCODER, GAINS, JOINT, MOTOR, POT, TRANSMISSION
 
 FIRMWARE = Path(__file__).resolve().parents[3] / "firmware"
 NUMBERS = {"JOINTS": 6, "POT_NODES": 9, "FRAME_BYTES": 512}
@@ -26,6 +26,7 @@ RECORDS = {
     "pot_config": POT,
     "motor_config": MOTOR,
     "encoder_config": ENCODER,
+    "transmission_config": TRANSMISSION,
     "joint_config": JOINT,
     "core_config": CONFIG,
     "core_outputs": frames.OUTPUTS,

@@ -37,9 +37,9 @@ from armsight.robot.boards.board import Board
 from armsight.robot.boards.board_file import configuration_text
 from armsight.robot.boards.codes import Command, Reaction, SensorKind
 from armsight.robot.boards.configuration import ENCODER_REV, JOINTS, POT_NODES, Configuration, gains_array
-from armsight.robot.boards.identification import dead_spots, fit_swing
+from armsight.robot.boards.identification import DITHER_HZ, dead_spots, fit_drum, fit_spring, fit_swing
 from armsight.robot.boards.reports import SensorReadings
-from armsight.robot.boards.tuning import MotorFigures, quiet_bandwidth, tuned_gains
+from armsight.robot.boards.tuning import MotorFigures, elastic_gains, quiet_bandwidth, tuned_gains
 
 FOUND_FILE, CONFIG_FILE = "bringup.json", "board.toml"
 _EVERY_S, _PERIOD_S = 0.002, 0.01
@@ -57,11 +57,13 @@ _DEAD_DUTY, _DEAD_A = 0.25, 0.02
 _RESTS = 0.25  # of what counts as a motion
 #: A swing: amplitudes, rad, and frequencies, Hz, that add up, and how far a joint may get away from where it began.
 _SWING_RAD, _SWING_HZ, _SWING_MOST_RAD = (0.12, 0.04), (0.5, 2.0), 0.26
-#: A duty on top of it that no motion follows: it separates resistance from back-EMF where friction is all the load.
-_DITHER_DUTY, _DITHER_HZ = 0.07, 8.0
+#: Duties on top of it, at all of DITHER_HZ together, their phases such that they hardly add up (Schroeder): they separate
+#: resistance from back-EMF where friction is all the load, and show a spring between motor and sensor.
+_DITHER_DUTY = 0.15
 _FIRST_SWING_S, _SWING_S, _GROW_S = 3.0, 5.0, 0.5
 _VERIFY_RAD, _VERIFY_HZ, _VERIFY_S, _VERIFY_MOST_RAD = 0.035, 0.5, 4.0, 0.01
 _GENTLE_RAD_S, _GENTLE_NOISE = 12.0, 0.02  # bandwidth of the second swing, and the noise of its duty
+_TRAVEL_RAD, _TRAVEL_S = 1.6, 6.0  # way and time of the travel that shows an uneven transmission
 _TRACE = 400  # points of a figure's line
 
 
@@ -627,14 +629,21 @@ class Bringup:
         if not self._yes(f"joint {joint + 1} will swing by {degrees:.0f} degrees either way. Is it free to? [y/n]"):
             raise _Mistake(f"joint {joint + 1}: it was not allowed to swing.")
         found = self.found.joints[joint]
+        travel = self._travel_rad(joint)
+        even = self._yes(
+            f"joint {joint + 1} will then travel by {np.degrees(travel):+.0f} degrees and back, slowly, to show an uneven"
+            " transmission. Is it free to? [y/n]"
+        )
         self._board.enable(inward=True)
         gains = gains_array(self._board.configuration())
         first = self._identify(joint, self._swung(joint, _FIRST_SWING_S))
-        better = gains.copy()
-        gentle = min(_GENTLE_RAD_S, quiet_bandwidth(first, self.found.supply_v, found.noise_rad, _GENTLE_NOISE))
-        better[joint] = tuned_gains(first, self.found.supply_v, gentle)
-        self._board.confirm(self._board.set_gains(better))
+        if found.elastic is None:  # else those that move it already are gentle enough
+            better = gains.copy()
+            gentle = min(_GENTLE_RAD_S, quiet_bandwidth(first, self.found.supply_v, found.noise_rad, _GENTLE_NOISE))
+            better[joint] = tuned_gains(first, self.found.supply_v, gentle)
+            self._board.confirm(self._board.set_gains(better))
         readings = self._swung(joint, _SWING_S)
+        travelled = self._travelled(joint, travel) if even else None
         self._board.confirm(self._board.command(Command.DISABLE))
         self._board.confirm(self._board.set_gains(gains))
         motor = self._identify(joint, readings)
@@ -642,6 +651,57 @@ class Bringup:
             f"joint {joint + 1}: R {motor.resistance_ohm:.2f} ohm, K {motor.constant_v_s:.3f} V s/rad, inertia"
             f" {1e3 * motor.inertia_kg_m2:.1f} g m^2, friction {motor.dry_n_m:.2f} N m,"
             f" backlash {1e3 * (found.backlash_rad or 0):.1f} mrad"
+        )
+        self._check_spring(joint, motor)
+        if travelled is not None:
+            self._check_drum(joint, motor, travelled)
+
+    def _travel_rad(self, joint: int) -> float:
+        """Return how far a joint travels: to the side where it has more room."""
+        ends = self._board.configuration()["joint"][joint]
+        here = float(self._board.joints.reference_rad[joint])
+        low, high = float(ends["soft_min_rad"]) - here, float(ends["soft_max_rad"]) - here
+        return float(np.clip(high if high > -low else low, -_TRAVEL_RAD, _TRAVEL_RAD))
+
+    def _travelled(self, joint: int, travel_rad: float) -> SensorReadings:
+        """Let a joint travel so far and back."""
+        start = self._board.joints.reference_rad.copy()
+        self._motion.clear()
+        for k in range(round(_TRAVEL_S / _PERIOD_S)):
+            angle = 2 * np.pi * (k + 1) * _PERIOD_S / _TRAVEL_S
+            q_ref, qd_ref = start.copy(), np.zeros(JOINTS)
+            q_ref[joint] += 0.5 * travel_rad * (1 - np.cos(angle))
+            qd_ref[joint] = 0.5 * travel_rad * np.sin(angle) * 2 * np.pi / _TRAVEL_S
+            self._move(q_ref, qd_ref, np.zeros(JOINTS))
+        return self._collected()
+
+    def _check_drum(self, joint: int, motor: MotorFigures, readings: SensorReadings) -> None:
+        """Say how uneven a joint's transmission is."""
+        found = self.found.joints[joint]
+        sign = float(found.motor_direction or 1)
+        volts, amperes = (sign * each[:, joint] for each in (readings.duty * self.found.supply_v, readings.current_a))
+        twist = 0.0 if found.stiffness_n_m is None else motor.constant_v_s / found.stiffness_n_m
+        drum = fit_drum(readings.t_s, volts, amperes, found.angles(readings.counts[:, joint]), motor, twist)
+        found.uneven = 0.0 if drum is None else drum[0] * drum[1]
+        if drum is not None:
+            self._person.say(
+                f"joint {joint + 1}: its transmission is uneven: the joint leads and lags its motor by"
+                f" {1e3 * drum[0]:.0f} mrad, {drum[1]:g} times a revolution (an eccentric drum?)"
+            )
+
+    def _check_spring(self, joint: int, motor: MotorFigures) -> None:
+        """Say where a joint resonates, and whether it can be held."""
+        found, hz = self.found.joints[joint], self.found.joints[joint].resonance_hz
+        if found.elastic is None or hz is None:
+            return
+        if elastic_gains(motor, self.found.supply_v, found.elastic, found.noise_rad) is None:
+            found.resistance_ohm = None
+            raise _Mistake(
+                f"joint {joint + 1}: it is too soft to be held: it swings about its motor at {hz:.1f} Hz, and no gains are"
+                " stable. Tighten its belt or cable, or put the sensor on the motor's side."
+            )
+        self._person.say(
+            f"joint {joint + 1}: it is elastic: it swings about its motor at {hz:.1f} Hz; it is damped by its motor's speed"
         )
 
     def _swung(self, joint: int, seconds: float) -> SensorReadings:
@@ -653,7 +713,7 @@ class Bringup:
             q_ref[joint], qd_ref[joint] = _swing_at((k + 1) * _PERIOD_S, seconds)
             q_ref[joint] += start[joint]
             dither = np.zeros(JOINTS)
-            dither[joint] = _DITHER_DUTY * np.sin(2 * np.pi * _DITHER_HZ * k * _PERIOD_S)
+            dither[joint] = _DITHER_DUTY * _dither_at(k * _PERIOD_S)
             readings = self._move(q_ref, qd_ref, dither)
             if len(readings.t_s) and abs(self._q(readings)[-1, joint] - start[joint]) > _SWING_MOST_RAD:
                 raise _Mistake(f"joint {joint + 1}: it swings further than it is to: is its load loose?")
@@ -665,11 +725,16 @@ class Bringup:
         sign = float(found.motor_direction or 1)
         volts = sign * readings.duty[keep, joint] * self.found.supply_v
         angles = found.angles(readings.counts[keep, joint])
+        amperes = sign * readings.current_a[keep, joint]
+        sprung = fit_spring(readings.t_s[keep], volts, amperes, angles)
         try:
-            fit = fit_swing(readings.t_s[keep], volts, sign * readings.current_a[keep, joint], angles)
+            fit, elastic = (fit_swing(readings.t_s[keep], volts, amperes, angles), None) if sprung is None else sprung
         except InputError as error:
             raise _Mistake(f"joint {joint + 1}: {error}.") from None
         motor = fit.motor
+        found.stiffness_n_m = None if elastic is None else elastic.stiffness_n_m
+        found.spring_damping_n_m_s = None if elastic is None else elastic.damping_n_m_s
+        found.link_share = None if elastic is None else elastic.link_share
         found.resistance_ohm, found.constant_v_s = motor.resistance_ohm, motor.constant_v_s
         found.inertia_kg_m2, found.viscous_n_m_s = motor.inertia_kg_m2, motor.viscous_n_m_s
         found.dry_n_m, found.backlash_rad, found.gravity_n_m = motor.dry_n_m, fit.backlash_rad, fit.gravity_n_m
@@ -720,7 +785,8 @@ class Bringup:
         for j in joints:
             error = np.interp(readings.t_s[last], at[:, 0], at[:, j + 1]) - q[:, j]
             rms, noise = float(np.sqrt(np.mean(error**2))), self.found.joints[j].noise_rad
-            if rms > np.hypot(_VERIFY_MOST_RAD, noise):
+            slack = self.found.joints[j].slack_rad
+            if rms > np.hypot(_VERIFY_MOST_RAD + slack, noise):
                 raise _Mistake(
                     f"joint {j + 1}: it follows a small swing with an error of {np.degrees(rms):.2f} degrees RMS."
                 )
@@ -785,6 +851,12 @@ def _swing_at(t_s: float, seconds: float) -> tuple[float, float]:
         return float(grow * grow * (3 - 2 * grow) * swing)
 
     return angle(t_s), (angle(t_s + 1e-4) - angle(t_s - 1e-4)) / 2e-4
+
+
+def _dither_at(t_s: float) -> float:
+    """Return the sum of sines at DITHER_HZ, each of the same power, all together that of a sine of amplitude 1."""
+    phases = np.pi * np.arange(len(DITHER_HZ)) ** 2 / len(DITHER_HZ)
+    return float(np.sin(2 * np.pi * DITHER_HZ * t_s + phases).sum() / np.sqrt(len(DITHER_HZ)))
 
 
 def _traces(**lines: Array) -> dict[str, list[float]]:

@@ -28,13 +28,25 @@ from armsight.robot.boards.configuration import (
     Configuration,
     lab_configuration,
 )
-from armsight.robot.boards.tuning import GAIN_RANGES, MotorFigures, motion_limits, quiet_gains
+from armsight.robot.boards.tuning import (
+    GAIN_RANGES,
+    Elasticity,
+    MotorFigures,
+    elastic_gains,
+    motion_limits,
+    quiet_gains,
+)
 
 _MARGIN_RAD = 0.05
-_POSITIVE = ("resistance_ohm", "constant_v_s", "inertia_kg_m2")
+#: Of an elastic joint: its stiffness may be less than found by this factor (another pose, one direction); a sudden load
+#: twists it by this share of the motor's stall torque, an acceleration by so much, rad; half: slower, double: it rings.
+_SOFTER, _SUDDEN, _ACCELERATION_TWIST_RAD = 1.5, 0.2, 0.005
+_MOST_INVERTED_RAD = 1.0
+_MOST_UNEVEN = 0.5  # share of a ratio, as config.c holds it
+_POSITIVE = ("resistance_ohm", "constant_v_s", "inertia_kg_m2", "stiffness_n_m")
 _NOT_NEGATIVE = (
     *("noise_counts", "breakaway_duty", "viscous_n_m_s", "dry_n_m"),
-    *("backlash_rad", "gravity_n_m", "fit_rms_v", "following_rms_rad"),
+    *("backlash_rad", "gravity_n_m", "fit_rms_v", "following_rms_rad", "spring_damping_n_m_s", "uneven"),
 )
 
 
@@ -63,6 +75,10 @@ class JointFound:
         dry_n_m: dry friction, N m.
         backlash_rad: from stop to stop.
         gravity_n_m: greatest torque of gravity.
+        stiffness_n_m: of the spring between motor and what is read, N m/rad; None where it is rigid.
+        spring_damping_n_m_s: of that spring, N m s/rad.
+        link_share: share of the inertia behind that spring.
+        uneven: by which share the ratio of its transmission varies with the angle; None where it was not measured.
         fit_rms_v: by how much the fit misses the motor's voltage.
         following_rms_rad: error of the small swing that verified the gains, as read: the sensor's noise is in it.
         sensor: what reads it: potentiometer, quadrature or absolute.
@@ -85,6 +101,10 @@ class JointFound:
     dry_n_m: float | None = None
     backlash_rad: float | None = None
     gravity_n_m: float | None = None
+    stiffness_n_m: float | None = None
+    spring_damping_n_m_s: float | None = None
+    link_share: float | None = None
+    uneven: float | None = None
     fit_rms_v: float | None = None
     following_rms_rad: float | None = None
     sensor: str = "potentiometer"
@@ -99,6 +119,22 @@ class JointFound:
         """Its motor, where it was identified."""
         values = (self.resistance_ohm, self.constant_v_s, self.inertia_kg_m2, self.viscous_n_m_s, self.dry_n_m)
         return None if None in values else MotorFigures(*values)  # type: ignore[arg-type]
+
+    @property
+    def elastic(self) -> Elasticity | None:
+        """Its spring, where it has one."""
+        values = (self.stiffness_n_m, self.spring_damping_n_m_s, self.link_share)
+        return None if None in values else Elasticity(*values)  # type: ignore[arg-type]
+
+    @property
+    def slack_rad(self) -> float:
+        """How far dry friction twists its spring from one way to the other, rad."""
+        return 0.0 if self.stiffness_n_m is None else 2 * (self.dry_n_m or 0.0) / self.stiffness_n_m
+
+    @property
+    def resonance_hz(self) -> float | None:
+        """How fast the joint swings about its motor while that is held."""
+        return None if self.elastic is None or self.motor is None else self.elastic.held_hz(self.motor.inertia_kg_m2)
 
     def done(self, step: str) -> bool:
         """Return whether a step has found what it looks for."""
@@ -118,6 +154,7 @@ class JointFound:
             if value is not None and not (_is_number(value) and (value > 0 if name in _POSITIVE else value >= 0)):
                 return name
         can_be = {
+            "link_share": self.link_share is None or (_is_number(self.link_share) and 0 < self.link_share < 1),
             "motor_direction": self.motor_direction in (None, 1, -1),
             "sensor": self.sensor in [kind.name.lower() for kind in SensorKind],
             "encoder_input": _is_number(self.encoder_input) and self.encoder_input in range(JOINTS + 1),
@@ -240,7 +277,7 @@ class Found:
             data = read_json(path)
             names = {each.name for each in fields(JointFound)}
             joints = data["joints"]
-            if data.pop("version") != CONFIG_VERSION or not isinstance(joints, list) or len(joints) != JOINTS:
+            if data.pop("version") not in (5, CONFIG_VERSION) or not isinstance(joints, list) or len(joints) != JOINTS:
                 raise ValueError("it is of another version")
             joints = [JointFound(**{k: v for k, v in each.items() if k in names}) for each in data.pop("joints")]
             found = cls(joints=joints, **data)
@@ -323,13 +360,21 @@ def _put_motor(
 ) -> None:
     """Put gains, limits and the motor's numbers."""
     gains = quiet_gains(motor, supply_v, found.noise_rad, found.gravity_n_m or 0.0)
+    elastic = found.elastic
+    if elastic is not None:
+        soft = elastic_gains(motor, supply_v, elastic, found.noise_rad)
+        gains = np.zeros(len(GAIN_RANGES)) if soft is None else soft
     joint["gains"] = np.array(tuple(gains), GAINS)
     joint["motor"]["resistance_ohm"], joint["motor"]["constant_v_s"] = motor.resistance_ohm, motor.constant_v_s
     backlash_rad = 1.5 * (LAB_BACKLASH_RAD if found.backlash_rad is None else found.backlash_rad)
     joint["motor"]["apart_rad"] = max(0.03, 10 * found.noise_rad + backlash_rad)
     joint["motor"]["backlash_rad"] = backlash_rad
+    joint["transmission"]["uneven"] = min(found.uneven or 0.0, _MOST_UNEVEN)
     speed, acceleration = motion_limits(motor, supply_v, found.gravity_n_m or 0.0)
     speed = min(speed, 0.9e3 * float(joint["pot"]["jump_rad"]))
+    if elastic is not None and found.resonance_hz is not None:
+        acceleration = min(acceleration, _ACCELERATION_TWIST_RAD * (2 * np.pi * found.resonance_hz) ** 2)
+        _put_spring(joint, motor, elastic, supply_v)
     for name, value in {
         "speed_limit_rad_s": speed,
         "acceleration_rad_s2": acceleration,
@@ -340,6 +385,20 @@ def _put_motor(
     }.items():
         joint[name] = value
     joint["current_limit_ma"] = round(1e3 * min(most_current_a, 0.95 * supply_v / motor.resistance_ohm))
+
+
+def _put_spring(joint: Configuration, motor: MotorFigures, elastic: Elasticity, supply_v: float) -> None:
+    """Put what the spring between motor and sensor makes of the law and of the motor's testimony."""
+    twist_rad_per_a = motor.constant_v_s / elastic.stiffness_n_m
+    stall_a = supply_v / motor.resistance_ohm
+    joint["transmission"]["damping_share"] = 1.0
+    joint["transmission"]["twist_rad_per_a"] = min(twist_rad_per_a, 1.0)
+    sudden_rad = _SUDDEN * stall_a * twist_rad_per_a
+    joint["motor"]["apart_rad"] = min(joint["motor"]["apart_rad"] + sudden_rad, 1.0)
+    joint["pot"]["inverted_rad"] = min(
+        joint["pot"]["inverted_rad"] + _SOFTER * stall_a * twist_rad_per_a, _MOST_INVERTED_RAD
+    )
+    joint["following_rad"] += _SOFTER * stall_a * twist_rad_per_a
 
 
 def _put_free(joint: Configuration, found: JointFound) -> None:
@@ -376,6 +435,8 @@ _NUMBERS: tuple[tuple[str, str, float, str], ...] = (
     ("dry_n_m", "dry friction, N m", 1, ".3f"),
     ("backlash_rad", "backlash, mrad", 1e3, ".1f"),
     ("gravity_n_m", "gravity at most, N m", 1, ".2f"),
+    ("resonance_hz", "resonance, Hz", 1, ".1f"),
+    ("uneven", "ratio varies by, %", 100, ".0f"),
     ("following_rms_rad", "follows to, as read, mrad RMS", 1e3, ".2f"),
     ("noise_rad", "noise, mrad", 1e3, ".2f"),
 )
@@ -389,7 +450,11 @@ def report(found: Found, gains: Array) -> str:
     """
     rows = []
     for j, each in enumerate(found.joints):
-        known = {**vars(each), "noise_rad": None if each.range_counts is None else each.noise_rad}
+        known = {
+            **vars(each),
+            "resonance_hz": each.resonance_hz,
+            "noise_rad": None if each.range_counts is None else each.noise_rad,
+        }
         values = [(known[name], scale, form) for name, _, scale, form in _NUMBERS]
         rows.append([f"joint {j + 1}", *("" if v is None else format(v * s, f) for v, s, f in values)])
     gain_rows = [[name, *(f"{value:.4g}" for value in row)] for name, row in zip(GAIN_RANGES, gains.T, strict=True)]

@@ -2,7 +2,7 @@
 
 In: a :data:`~armsight.robot.boards.configuration.Configuration`. Out: TOML text, and back, to the last bit::
 
-    version = 5                  # layout of the configuration
+    version = 6                  # layout of the configuration
     board = "nucleo-f446re"      # the board it belongs to
 
     [arm]
@@ -16,6 +16,7 @@ In: a :data:`~armsight.robot.boards.configuration.Configuration`. Out: TOML text
     [joint.1.motor]
     [joint.1.encoder]
     sensor = "potentiometer"     # or quadrature, or absolute: then with counts_per_rev, direction, zero
+    [joint.1.transmission]       # not in files of version 5, which are read as well
 
 Every value must be there, once; a name that is not known is named with the one it was perhaps meant to be.
 """
@@ -47,8 +48,13 @@ from armsight.robot.boards.configuration import (
 )
 
 #: Parts of a joint that are tables of their own.
-_PARTS = ("gains", "pot", "motor", "encoder")
+_PARTS = ("gains", "pot", "motor", "encoder", "transmission")
 _PIN = "sync_led_pin"  # a name in the file: "PB13", or "none"
+#: Version of a file -> what it did not have yet, of every joint: all of it is 0 there.
+_NEW_SINCE: Mapping[int, tuple[str, ...]] = {
+    5: ("transmission.twist_rad_per_a", "transmission.uneven", "transmission.damping_share"),
+    CONFIG_VERSION: (),
+}
 _TABLES = ("counts", "angle_rad")  # of a potentiometer: as long as its node_count, which they replace
 
 
@@ -119,10 +125,10 @@ def read_configuration(path: Path) -> tuple[Configuration, str]:
         InputError: it cannot be read, or names the file and the value that is missing, unknown, or out of range.
     """
     data = read_toml(path)
-    if data.get("version") != CONFIG_VERSION or not isinstance(data.get("board"), str):
+    if data.get("version") not in list(_NEW_SINCE) or not isinstance(data.get("board"), str):
         raise InputError(
-            f"{path}: version is {data.get('version')!r} and board {data.get('board')!r}; version {CONFIG_VERSION} and a"
-            " board's name are needed: `armsight board config get` writes such a file"
+            f"{path}: version is {data.get('version')!r} and board {data.get('board')!r}; version {CONFIG_VERSION} (or"
+            f" {min(_NEW_SINCE)}) and a board's name are needed: `armsight board config get` writes such a file"
         )
     given = dict(_flat({name: value for name, value in data.items() if name not in ("version", "board")}))
     config = np.zeros((), CONFIG)
@@ -137,7 +143,8 @@ def read_configuration(path: Path) -> tuple[Configuration, str]:
                 put(config, path_of, given[path_of])
             except InputError as error:
                 raise InputError(f"{path}: {error}") from None
-    known = dict(entries(config))
+    absent = {f"joint.{j + 1}.{name}" for j in range(count) for name in _NEW_SINCE[data["version"]]}
+    known = {name: value for name, value in entries(config) if name not in absent}
     for name in given:
         if name not in known:
             raise InputError(f"{path}: {_unknown(name, config)}")

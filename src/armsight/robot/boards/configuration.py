@@ -27,7 +27,7 @@ JOINTS, POT_NODES = 6, 9
 #: Counts of an absolute encoder's revolution.
 ENCODER_REV = 16384
 #: Layout of the configuration this armsight knows: ``firmware/core/config.h``.
-CONFIG_VERSION = 5
+CONFIG_VERSION = 6
 
 GAINS = np.dtype(
     [
@@ -55,6 +55,7 @@ POT = np.dtype(
     ]
 )
 MOTOR = np.dtype([("resistance_ohm", "<f4"), ("constant_v_s", "<f4"), ("apart_rad", "<f4"), ("backlash_rad", "<f4")])
+TRANSMISSION = np.dtype([("twist_rad_per_a", "<f4"), ("uneven", "<f4"), ("damping_share", "<f4")])
 ENCODER = np.dtype(
     [
         ("sensor", "<u4"),
@@ -86,6 +87,7 @@ JOINT = np.dtype(
         ("current_limit_ma", "<u4"),
         ("motor_direction", "<i4"),
         ("encoder", ENCODER),
+        ("transmission", TRANSMISSION),
     ]
 )
 CONFIG = np.dtype(
@@ -121,6 +123,7 @@ _MOTOR_RANGES = {
     "apart_rad": (1e-3, 1.0),
     "backlash_rad": (0.0, 1.0),
 }
+_TRANSMISSION_RANGES = {"twist_rad_per_a": (0.0, 1.0), "uneven": (0.0, 0.5), "damping_share": (0.0, 1.0)}
 _TABLE_RANGES = {"node_count": (2, POT_NODES)}
 _ENCODER_RANGES = {
     "input": (1, JOINTS),
@@ -224,6 +227,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
     **_TABLE_RANGES,
     **_ENCODER_RANGES,
     **_MOTOR_RANGES,
+    **_TRANSMISSION_RANGES,
     **_JOINT_RANGES,
     **_ARM_RANGES,
 }
@@ -336,7 +340,8 @@ def _problems(config: Configuration) -> Iterator[str]:
 
 
 def _ranged(joint: Configuration) -> tuple[tuple[Configuration, Mapping[str, tuple[float, float]]], ...]:
-    plain = (joint, _JOINT_RANGES), (joint["pot"], _POT_RANGES), (joint["motor"], _MOTOR_RANGES)
+    motor = (joint["motor"], _MOTOR_RANGES), (joint["transmission"], _TRANSMISSION_RANGES)
+    plain = (joint, _JOINT_RANGES), (joint["pot"], _POT_RANGES), *motor
     sensor = int(joint["encoder"]["sensor"])
     if sensor == SensorKind.POTENTIOMETER:
         return *plain, (joint["pot"], _TABLE_RANGES)

@@ -7,6 +7,12 @@ differentiated for the motor, and all is smoothed alike for the load (Ljung, "Sy
     flux    integral of V  =  R integral of i + K (q + b/2 sign(w)) + drift
     torque  K i  =  J dw/dt + B w + C sign(w) + gravity
 
+A joint that is read behind a spring is recognised by duties at :data:`DITHER_HZ` on top of the swing
+(:func:`fit_spring`): with L and M the speeds of joint and motor at each of them, M from its back-EMF, and p the joint's
+inertia over the stiffness,
+
+    M = L (1 - p w^2 + j w d) / (1 + j w d),    V = R I + K M,    K I = J_motor jw M + J_joint jw L + B M
+
 Gravity is a cosine and a sine of the angle, and b the backlash between the motor and the joint with its potentiometer:
 the motor leads the joint by half of it. Readings near a reversal, where the sign of the speed w is not certain, are
 left out of the sums, but not of the integrals.
@@ -21,13 +27,24 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.robot.boards.tuning import MotorFigures
+from armsight.robot.boards.tuning import Elasticity, MotorFigures
 
 _SMOOTH_S = 0.015  # standard deviation of the Gaussian that angles are smoothed by before they are differentiated
 #: Shares of the greatest speed: faster than so, the sign of the joint's speed, and of the motor's, is certain.
 _SURE, _MOTOR_SURE = 0.2, 0.1
 _LEAST_READINGS = 100
 _LEAST_SWING_RAD = 0.02
+#: Frequencies, Hz, of the duties that show a spring; apart by more than a segment of the recording blurs them.
+DITHER_HZ = np.array([4, 5, 6, 7, 9, 11, 13, 16, 19, 23, 28, 34], dtype=float)
+_SEGMENT_S, _ROUNDS = 1.0, 10
+_SLOW_SMOOTH_S = (
+    0.04  # s; takes the dither out of a slow swing; half: the resonance stays in, double: so does the swing go
+)
+#: Beyond so many sigmas, with so much of what lies between joint and motor explained, there is a spring: backlash shows 5.
+_SPRING_SIGMAS, _SPRING_EXPLAINED = 7.0, 0.7
+_LEAST_LINK_SHARE = 0.15  # of the inertia; less behind a spring is no matter, and noise alone looks like it
+_READING_NOISE_RAD, _CURRENT_NOISE_A = 5e-4, 0.02  # relative weight of both in the lines
+_LONGEST_DAMPING_S = 0.02  # of damping over stiffness: a spring with more is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +112,144 @@ def fit_swing(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) 
     return JointFit(motor, max(2 * half, 0.0), gravity, sigma[0], sigma[1], t, smooth_v, predicted)
 
 
+def fit_spring(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) -> tuple[JointFit, Elasticity] | None:
+    """Identify a joint that is read behind a spring, from a swing with duties at :data:`DITHER_HZ`; None if it is rigid.
+
+    Args:
+        t_s: (n,) times of the readings, rising, s; 1.5 s and more.
+        voltage_v: (n,) duty times supply, V, as in :func:`fit_swing`.
+        current_a: (n,) current of the motor, A, with its sign.
+        angle_rad: (n,) angles of the joint.
+    """
+    step_s = float(np.median(np.diff(t_s)))
+    t = np.arange(0.0, float(t_s[-1] - t_s[0]) + 0.5 * step_s, step_s)
+    volts, amperes, q = (np.interp(t, t_s - t_s[0], each) for each in (voltage_v, current_a, angle_rad))
+    if t[-1] < 1.5 * _SEGMENT_S or (amperes > -0.02 * np.abs(amperes).max()).all():
+        return None
+    w = 2 * np.pi * DITHER_HZ
+    speed = np.gradient(q, step_s)
+    v, i, link_speed = _lines(volts, volts, step_s), _lines(amperes, volts, step_s), _lines(speed, volts, step_s)
+    link_speed = link_speed * w * step_s / np.sin(w * step_s)  # central differences show a little less
+    resistance, p, damping, m = float(np.real(i.conj() @ v / (i.conj() @ i))), 0.0, 0.0, link_speed
+    for _ in range(_ROUNDS):
+        constant, half = _slow_constant(t, volts - resistance * amperes, amperes, q)
+        if not constant > 0:
+            return None
+        weights = 1 / np.hypot(resistance * _CURRENT_NOISE_A, constant * _READING_NOISE_RAD * w * (1 - p * w * w))
+        columns = np.column_stack([i, -constant * w * w * link_speed, constant * 1j * w * (link_speed - m)])
+        (resistance, p, damping), sigma, _ = _complex_fit(columns, v - constant * link_speed, weights)
+        damping = float(np.clip(damping, 0.0, _LONGEST_DAMPING_S))
+        m = link_speed * (1 - p * w * w + 1j * w * damping) / (1 + 1j * w * damping)
+    m = (v - resistance * i) / constant
+    between = np.column_stack([w * w * link_speed, -1j * w * (link_speed - m)])
+    _, _, explained = _complex_fit(between, link_speed - m, weights)
+    inertias = np.column_stack([1j * w * m, 1j * w * link_speed, m])
+    (rotor, link, _), _, _ = _complex_fit(inertias, constant * i, np.ones(len(w)))
+    found = p > _SPRING_SIGMAS * sigma[1] and explained > _SPRING_EXPLAINED
+    if not (found and resistance > 0 and link > _LEAST_LINK_SHARE * max(rotor + link, 0.0)):
+        return None
+    rotor = max(rotor, 0.05 * link)
+    elastic = Elasticity(link / p, damping * link / p, link / (rotor + link))
+    motor_rad_s = (volts - resistance * amperes) / constant
+    viscous, dry, gravity = _fit_load(constant * amperes, motor_rad_s, q, step_s, rotor, link)
+    motor = MotorFigures(resistance, constant, rotor + link, max(viscous, 0.0), max(dry, 0.0))
+    predicted = resistance * _smooth(amperes, step_s) + constant * _smooth(q, step_s, derivative=True)
+    smooth_v = _smooth(volts, step_s)
+    return JointFit(motor, max(2 * half, 0.0), gravity, float(sigma[0]), np.nan, t, smooth_v, predicted), elastic
+
+
+#: Periods of an eccentric drum that are tried, a revolution of the joint; beyond so many sigmas there is one.
+_DRUMS_PER_REV, _DRUM_SIGMAS = np.arange(1.0, 12.5, 0.5), 8.0
+_LEAST_DRUM_RAD = 0.004  # what a table's bend and a protractor leave looks like such a drum
+
+
+def fit_drum(
+    t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array, motor: MotorFigures, twist_rad_per_a: float
+) -> tuple[float, float] | None:
+    """Return amplitude, rad, and periods a revolution by which a joint leads its motor, as by an eccentric drum; or None.
+
+    Args:
+        t_s: (n,) times of the readings of a travel to and fro, rising, s.
+        voltage_v: (n,) duty times supply, V.
+        current_a: (n,) current of the motor, A, with its sign.
+        angle_rad: (n,) angles of the joint.
+        motor: its motor; the constant is fitted once more.
+        twist_rad_per_a: of its transmission.
+    """
+    step_s = float(np.median(np.diff(t_s)))
+    t = np.arange(0.0, float(t_s[-1] - t_s[0]) + 0.5 * step_s, step_s)
+    volts, amperes, q = (np.interp(t, t_s - t_s[0], each) for each in (voltage_v, current_a, angle_rad))
+    flux = _smooth(_integral(t, volts - motor.resistance_ohm * amperes), step_s, sigma_s=_SLOW_SMOOTH_S)
+    angle = _smooth(q + twist_rad_per_a * amperes, step_s, sigma_s=_SLOW_SMOOTH_S)
+    load = _smooth(_integral(t, amperes), step_s, sigma_s=_SLOW_SMOOTH_S)
+    way = _smooth(np.sign(np.gradient(angle, step_s)), step_s, sigma_s=_SLOW_SMOOTH_S)
+    plain = [angle, way, load, np.ones(len(t)), t]
+    alike = _SLOW_SMOOTH_S * 4 / step_s  # so many readings are one
+    fits = []
+    for n in _DRUMS_PER_REV:
+        columns = np.column_stack([*plain, np.cos(n * angle), np.sin(n * angle)])
+        factors = np.linalg.lstsq(columns, flux, rcond=None)[0]
+        left = float(np.sum((flux - columns @ factors) ** 2))
+        covariance = np.linalg.pinv(columns.T @ columns) * left / max(len(t) - alike * columns.shape[1], 1.0) * alike
+        size = factors[5:] / factors[0]
+        chance = float(np.sqrt(size @ np.linalg.pinv(covariance[5:, 5:] / factors[0] ** 2) @ size))
+        fits.append((left, float(np.hypot(*size)), float(n), chance))
+    _, amplitude, per_rev, chance = min(fits)
+    return (amplitude, per_rev) if chance > _DRUM_SIGMAS and amplitude > _LEAST_DRUM_RAD else None
+
+
+def _lines(values: Array, reference: Array, step_s: float) -> Array:
+    """Return the complex amplitudes (12,) of values (n,) at the dither's frequencies, as they follow a reference's."""
+    length = round(_SEGMENT_S / step_s)
+    window = np.hanning(length + 1)[:length]
+    turns = np.exp(-2j * np.pi * DITHER_HZ[:, None] * np.arange(length) * step_s) * window * (2 / window.sum())
+    starts = range(0, len(values) - length + 1, length // 2)
+    ours, theirs = (np.array([turns @ each[k : k + length] for k in starts]) for each in (values, reference))
+    return np.asarray((theirs.conj() * ours).sum(0) / np.sqrt((np.abs(theirs) ** 2).sum(0) * len(starts)))
+
+
+def _complex_fit(columns: Array, right: Array, weights: Array) -> tuple[Array, Array, float]:
+    """Return real factors of complex columns by least squares, their standard deviations, and the share they explain."""
+    a, b = columns * weights[:, None], right * weights
+    a, b = np.concatenate([a.real, a.imag]), np.concatenate([b.real, b.imag])
+    factors = np.linalg.lstsq(a, b, rcond=None)[0]
+    left = float(np.sum((b - a @ factors) ** 2))
+    covariance = np.linalg.pinv(a.T @ a) * left / (len(b) - a.shape[1])
+    return (
+        np.asarray(factors, dtype=float),
+        np.asarray(np.sqrt(np.diag(covariance)), dtype=float),
+        1 - left / float(b @ b),
+    )
+
+
+def _slow_constant(t: Array, emf_v: Array, amperes: Array, q: Array) -> tuple[float, float]:
+    """Return the motor constant and half the backlash by the slow swing alone, of which the current twists the spring."""
+    step_s = float(t[1] - t[0])
+    flux, angle, twisting = (
+        _smooth(each, step_s, sigma_s=_SLOW_SMOOTH_S) for each in (_integral(t, emf_v), q, amperes)
+    )
+    way = _smooth(np.sign(np.gradient(angle, step_s)), step_s, sigma_s=_SLOW_SMOOTH_S)
+    columns = np.column_stack([angle, way, twisting, np.vander(t / t[-1] - 0.5, 4)])
+    ends = round(3 * _SLOW_SMOOTH_S / step_s)
+    solution = np.linalg.lstsq(columns[ends:-ends], flux[ends:-ends], rcond=None)[0]
+    return float(solution[0]), float(solution[1] / solution[0]) if solution[0] else 0.0
+
+
+def _fit_load(
+    torque: Array, motor_rad_s: Array, q: Array, step_s: float, rotor: float, link: float
+) -> tuple[float, float, float]:
+    """Return viscous and dry friction, and gravity's greatest torque, of two known inertias."""
+    speed = _smooth(motor_rad_s, step_s)
+    moved = rotor * _smooth(motor_rad_s, step_s, derivative=True)
+    moved += link * _smooth(np.gradient(q, step_s), step_s, derivative=True)
+    off = q - q.mean()
+    columns = np.column_stack([speed, *(_smooth(each, step_s) for each in (np.sign(speed), np.cos(off), np.sin(off)))])
+    sure = _sure(speed, step_s, _MOTOR_SURE)
+    sure = sure if sure.sum() > _LEAST_READINGS else np.ones(len(q), dtype=bool)
+    viscous, dry, cosine, sine = np.linalg.lstsq(columns[sure], (_smooth(torque, step_s) - moved)[sure], rcond=None)[0]
+    return float(viscous), float(dry), float(np.hypot(cosine, sine))
+
+
 def dead_spots(counts: Array, noise_counts: float, low: float, high: float) -> list[tuple[int, int]]:
     """Return where a potentiometer that was moved by hand lost contact: first and last reading of each spot.
 
@@ -119,11 +274,11 @@ def dead_spots(counts: Array, noise_counts: float, low: float, high: float) -> l
     return spots
 
 
-def _smooth(values: Array, step_s: float, *, derivative: bool = False) -> Array:
+def _smooth(values: Array, step_s: float, *, derivative: bool = False, sigma_s: float = _SMOOTH_S) -> Array:
     """Return values (n,) convolved with a Gaussian, or their derivative by time."""
-    reach = max(2, round(4 * _SMOOTH_S / step_s))
+    reach = max(2, round(4 * sigma_s / step_s))
     at = np.arange(-reach, reach + 1) * step_s
-    kernel = np.exp(-0.5 * (at / _SMOOTH_S) ** 2)
+    kernel = np.exp(-0.5 * (at / sigma_s) ** 2)
     kernel /= kernel.sum()
     if derivative:
         kernel = -at * kernel

@@ -66,6 +66,25 @@ class MotorFigures:
     dry_n_m: float
 
 
+@dataclass(frozen=True)
+class Elasticity:
+    """A transmission that twists between the motor and what is read.
+
+    Attributes:
+        stiffness_n_m: of the spring, N m/rad.
+        damping_n_m_s: of the spring, N m s/rad.
+        link_share: share of the joint's inertia behind the spring.
+    """
+
+    stiffness_n_m: float
+    damping_n_m_s: float
+    link_share: float
+
+    def held_hz(self, inertia_kg_m2: float) -> float:
+        """Return the resonance of the joint while its motor is held, Hz, of an inertia of motor and joint together."""
+        return float(np.sqrt(self.stiffness_n_m / (self.link_share * inertia_kg_m2)) / (2 * np.pi))
+
+
 def tuned_gains(
     motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 0.7, pairs: float = _PAIRS
 ) -> Array:
@@ -101,6 +120,82 @@ def tuned_gains(
     ka = max(per_rad_s2 - kd * (filter_s + 0.5 * _TICK_S), 0.0)
     kf = _FRICTION_SHARE * motor.dry_n_m / stall
     return np.array([kp, ki, kd, own / stall + kd, ka, kf, filter_s, max(3 * ki / kp, _LEAST_ANTI_WINDUP_PER_S)])
+
+
+#: Of an elastic joint: what its stiffness may be of that identified (a payload, another pose), how near -1 the loop
+#: gain may come, and damping and ratio of the third pole to the others' frequency. The motor's speed is smoothed for so
+#: long (motor.c), and a duty comes so late: a tick is half held, one is computed in.
+_STIFFNESSES, _LEAST_MARGIN, _ELASTIC_DAMPING = (0.5, 1.0, 1.7), 0.5, 0.7
+_THIRD_POLES, _MOTOR_SMOOTH_S, _LATE_S = (1.0, 0.6), 0.002, 0.0015
+_ELASTIC_FILTER_S = 0.005  # of the reading's speed, which is damped only while the motor's is not known
+_MARGIN_HZ = np.geomspace(0.3, 400.0, 200)
+
+
+def elastic_gains(motor: MotorFigures, supply_v: float, elastic: Elasticity, noise_rad: float) -> Array | None:
+    """Return the gains with the greatest ki of a joint that is read behind its spring and damped by its motor's speed.
+
+    Without the spring there would be three poles, ``(s^2 + 2 z w s + w^2) (s + r w)``; w is the greatest with which the
+    loop gain, at the motor's duty and with the spring, stays away from -1 and every pole decays. Damping by its speed
+    takes energy from the resonance at any frequency; by the speed read behind the spring it feeds it from there on (Spong,
+    Hutchinson and Vidyasagar, "Robot Modeling and Control", 2006, section 6.5).
+
+    Args:
+        motor: its motor; the inertia is that of motor and joint together.
+        supply_v: nominal supply, V.
+        elastic: its spring.
+        noise_rad: standard deviation of a reading.
+
+    Returns:
+        (8,) as those of :func:`tuned_gains`; None where the joint is too soft: no bandwidth from 5 rad/s on is stable.
+    """
+    best: Array | None = None
+    for third in _THIRD_POLES:
+        for bandwidth in _bandwidths(motor, _QUIET_STEP_RAD_S):
+            gains = _three_pole_gains(motor, supply_v, bandwidth, third)
+            too_many = any(gain > most for gain, (_, most) in zip(gains, GAIN_RANGES.values(), strict=True))
+            if too_many or gains[0] * noise_rad > _QUIET[0][1]:
+                continue
+            if all(_holds(motor, supply_v, elastic, gains, share) for share in _STIFFNESSES):
+                best = gains if best is None or gains[1] > best[1] else best
+                break
+    return best
+
+
+def _three_pole_gains(motor: MotorFigures, supply_v: float, bandwidth: float, third: float) -> Array:
+    stall = motor.constant_v_s * supply_v / motor.resistance_ohm
+    own = motor.constant_v_s**2 / motor.resistance_ohm + motor.viscous_n_m_s
+    per_rad_s2, double = motor.inertia_kg_m2 / stall, 2 * _ELASTIC_DAMPING
+    kp, ki = (1 + double * third) * bandwidth**2 * per_rad_s2, third * bandwidth**3 * per_rad_s2
+    kd = max((double + third) * bandwidth * per_rad_s2 - 0.5 * own / stall, 0.0)
+    ka = max(per_rad_s2 - kd * (_MOTOR_SMOOTH_S + 0.5 * _TICK_S), 0.0)
+    kf = _FRICTION_SHARE * motor.dry_n_m / stall
+    windup = max(3 * ki / kp, _LEAST_ANTI_WINDUP_PER_S)
+    return np.array([kp, ki, kd, own / stall + kd, ka, kf, _ELASTIC_FILTER_S, windup])
+
+
+def _holds(motor: MotorFigures, supply_v: float, elastic: Elasticity, gains: Array, share: float) -> bool:
+    """Return whether the loop with share of the spring's stiffness is stable, with margin."""
+    stall = motor.constant_v_s * supply_v / motor.resistance_ohm
+    own = motor.constant_v_s**2 / motor.resistance_ohm + motor.viscous_n_m_s
+    link = elastic.link_share * motor.inertia_kg_m2
+    rotor, k, c = motor.inertia_kg_m2 - link, share * elastic.stiffness_n_m, elastic.damping_n_m_s
+    kp, ki, kd = gains[:3]
+    s = 2j * np.pi * _MARGIN_HZ
+    spring = k + c * s
+    per = stall * np.exp(-_LATE_S * s) / ((rotor * s**2 + own * s + spring) * (link * s**2 + spring) - spring**2)
+    loop = per * (spring * (kp + ki / s) + (link * s**2 + spring) * kd * s / (1 + _MOTOR_SMOOTH_S * s))
+    if np.abs(1 + loop).min() < _LEAST_MARGIN:
+        return False
+    # States: motor's angle and speed, joint's angle and speed, smoothed speed, integral, lateness (Pade's first order).
+    a, asked = np.zeros((7, 7)), np.array([0, 0, -kp, 0, -kd, 1, 0])
+    duty = -asked + np.array([0, 0, 0, 0, 0, 0, 4 / _LATE_S])
+    a[0, 1] = a[2, 3] = 1
+    a[1] = (stall * duty + np.array([-k, -own - c, k, c, 0, 0, 0])) / rotor
+    a[3, :4] = np.array([k, c, -k, -c]) / link
+    a[4, [1, 4]] = np.array([1, -1]) / _MOTOR_SMOOTH_S
+    a[5, 2], a[6] = -ki, asked
+    a[6, 6] -= 2 / _LATE_S
+    return bool(np.linalg.eigvals(a).real.max() < 0)
 
 
 #: Between which bandwidths one is looked for; stiffer than ``w^2 J`` a gear with backlash chatters.

@@ -16,7 +16,7 @@ from armsight.data import Array
 from armsight.robot.boards.codes import SensorKind
 from armsight.robot.boards.link import Sensed
 from armsight.sim.encoders import EncodedPlant, Encoders
-from armsight.sim.joints import JOINTS, JointModel, JointPlant, drawn_model
+from armsight.sim.joints import JOINTS, JointModel, JointPlant, Transmission, drawn_model
 
 _IN_ORDER = tuple(range(JOINTS))
 _OPEN_COUNTS = 65535
@@ -139,15 +139,23 @@ class WorkshopPlant:
             return
         joint, goal = self.hold
         if np.isnan(self._target):
-            self._target = float(self.plant.q[joint])
+            self._target = self._felt(joint)
         self._target += float(np.clip(goal - self._target, -_HAND_RAD_S * 1e-3, _HAND_RAD_S * 1e-3))
+        if self.plant.transmission.stiffness_n_m[joint] > 0:  # the hand moves the link, the motor is dragged along
+            self.plant.put_link(joint, self._target)
+            return
         pull = 400.0 * (self._target - self.plant.q[joint]) - 8.0 * self.plant.qd[joint]
         self.plant.hand_n_m[joint] += float(np.clip(pull, -25.0, 25.0))
+
+    def _felt(self, joint: int) -> float:
+        """Return where the hand feels a joint: behind its spring, where it has one."""
+        elastic = self.plant.transmission.stiffness_n_m[joint] > 0
+        return float(self.plant.link[joint] if elastic else self.plant.q[joint])
 
     @property
     def arrived(self) -> bool:
         """Whether the hand has its joint where it brings it."""
-        return self.hold is not None and abs(self.plant.q[self.hold[0]] - self.hold[1]) < 0.02 + _PROTRACTOR_RAD
+        return self.hold is not None and abs(self._felt(self.hold[0]) - self.hold[1]) < 0.02 + _PROTRACTOR_RAD
 
 
 def replace_sensed(sensed: Sensed, counts: Array, current_ma: Array) -> Sensed:
@@ -163,7 +171,7 @@ def drawn_wiring(seed: int) -> Wiring:
 
 
 def drawn_workshop(
-    seed: int, *, load: float = 0.6, encoders: Encoders | None = None
+    seed: int, *, load: float = 0.6, encoders: Encoders | None = None, transmission: Transmission | None = None
 ) -> tuple[WorkshopPlant, JointModel]:
     """Return an arm as it hangs on its evening, and what it is made of.
 
@@ -171,10 +179,11 @@ def drawn_workshop(
         seed: of all that is drawn.
         load: greatest gravity load of the stall torque.
         encoders: what reads joints in place of potentiometers.
+        transmission: what lies between motors and joints; rigid and even without.
     """
     rng = np.random.default_rng([seed, 22])
     model = drawn_model(seed, load=load)
-    plant = JointPlant(-np.sign(model.gravity_n_m) * np.pi / 2, seed=seed, model=model)
+    plant = JointPlant(-np.sign(model.gravity_n_m) * np.pi / 2, seed=seed, model=model, transmission=transmission)
     return WorkshopPlant(plant, drawn_wiring(seed), rng.uniform(0, 100, JOINTS), encoders), model
 
 
