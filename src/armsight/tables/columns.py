@@ -213,7 +213,9 @@ class Columns:
         """Return what may be wrong with the columns of joints."""
         if len(names) == count + 1:
             return "; is the last one a gripper? remove its column"
-        gone = next((f"q{k}" for k in range(1, count) if not any(name.startswith(f"q{k}_") for name in names)), None)
+        gone = next(
+            (f"q{k}" for k in range(1, count + 1) if not any(name.startswith(f"q{k}_") for name in names)), None
+        )
         unknown = next((name for name in self.at if name and name not in COLUMNS), None)
         if unknown is None:
             return "" if gone is None else f"; column {gone}{names[0][2:]} is missing"

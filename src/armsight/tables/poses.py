@@ -27,6 +27,8 @@ from armsight.tables.rotations import CONVENTIONS
 
 #: Lengths beyond this, m, are no robot's: they are mm; below the other, all of them, they are m taken for mm.
 FAR_M, NEAR_M = 20.0, 0.02
+#: An angle in degrees is not larger.
+MOST_DEG = 360.0
 #: Lengths that differ by more than this factor in one table are not in one unit.
 MIXED = 200.0
 #: Columns of the poses that `armsight measure -o` wrote.
@@ -66,6 +68,7 @@ class PoseTable(Record):
         notes: what was found out while reading.
         missed: (N,) why a shot that `armsight measure` wrote has no pose, and another's stands there; "" where it has one.
         of_joints: whether the poses are those of the joints by the model.
+        unused: the columns that were not read.
     """
 
     path: Path
@@ -81,6 +84,7 @@ class PoseTable(Record):
     notes: tuple[str, ...]
     missed: tuple[str, ...]
     of_joints: bool = False
+    unused: tuple[str, ...] = ()
 
 
 def read_pose_table(
@@ -141,7 +145,7 @@ def read_pose_table(
     elif q is not None and not table.has_position():
         raise InputError(f"{path}: joint angles need the arm: give --model, a name (armsight arm list) or a .urdf file")
     else:
-        p, unit_m, found_out = _positions(table, unit, detect_units)
+        p, unit_m, found_out = _positions(table, unit, detect_units, side)
         notes = (*notes, *found_out)
         R, numbers, convention, written = table.rotations(rotation)
         written = np.hstack([p / unit_m, written]) if written.shape[1] else written
@@ -152,7 +156,9 @@ def read_pose_table(
         notes = (*notes, f"{path}: has no joint angles: --model {arm.name} is not used")
     if unused and not only_joints and not measured:
         notes = (*notes, f"{path}: {columns_unused(unused)}")
-    return PoseTable(path, lines, Ts, numbers, written, convention, q, t_s, names, unit_m, notes, missed, of_joints)
+    return PoseTable(
+        path, lines, Ts, numbers, written, convention, q, t_s, names, unit_m, notes, missed, of_joints, tuple(unused)
+    )
 
 
 def _shown(path: Path, head: list[str], rows: Rows) -> tuple[Rows, tuple[str, ...]]:
@@ -188,7 +194,7 @@ def stacked(R: Array, p: Array) -> Array:
     return Ts
 
 
-def _positions(table: Columns, unit: str | None, detect: bool) -> tuple[Array, float, tuple[str, ...]]:
+def _positions(table: Columns, unit: str | None, detect: bool, side: str) -> tuple[Array, float, tuple[str, ...]]:
     """Return positions (N, 3), m, the unit they were read in, and notes."""
     suffix = next((s for s in ("_m", "_mm", "") if f"x{s}" in table.at), None)
     if suffix is None:
@@ -217,7 +223,7 @@ def _positions(table: Columns, unit: str | None, detect: bool) -> tuple[Array, f
         if not detect:
             raise InputError(
                 f"{table.path}: positions of up to {far:.0f} m: are they millimetres? name the columns x_mm y_mm z_mm, or "
-                f"give {'' if suffix else '--units mm, or '}--detect-units"
+                f"give {'' if suffix else '--units mm, or '}--detect-units{_or_angles(table, far, side)}"
             )
         return 1e-3 * p, 1e-3, (f"{table.path}: positions read as millimetres: as metres they would reach {far:.0f} m",)
     if unit_m == 1e-3 and far < NEAR_M:
@@ -232,3 +238,14 @@ def _positions(table: Columns, unit: str | None, detect: bool) -> tuple[Array, f
             (f"{table.path}: positions read as metres: as millimetres they would stay within {1e3 * far:.2g} mm",),
         )
     return unit_m * p, unit_m, ()
+
+
+def _or_angles(table: Columns, far: float, side: str) -> str:
+    """Return that the first three of six numbers may be angles, where they are no more than degrees, the others lengths."""
+    if "n1" not in table.at or "n4" in table.at or far > MOST_DEG:
+        return ""
+    others = np.linalg.norm(table.numbers(["n1", "n2", "n3"]), axis=1)
+    if not NEAR_M < others.max() < FAR_M:
+        return ""
+    option = "--columns rx,ry,rz,x,y,z" if side == "robot" else "--columns seen:rx,ry,rz,x,y,z"
+    return f"; or are they degrees, and the rotation comes before the position? then {option}"

@@ -1,13 +1,13 @@
 """Joint angles that another program logged: ``--board poses:FILE``, for an arm that armsight does not move.
 
-In: a CSV file with a column a joint, ``q1_rad`` or ``q1_deg`` and so on, and a column that says where each row belongs:
-``shot`` (the name of the image) or ``t_s`` (on the clock of the images; rows between are interpolated). Without either the
-rows belong to the shots in their order, one a shot. Out: :class:`LoggedAngles`, and the angles at each shot.
+In: any file that :mod:`armsight.tables` reads, with a column a joint, ``q1_rad`` or ``q1_deg`` and so on, and a column that
+says where each row belongs: ``shot`` (or ``image``, ``name``) or ``t_s`` (on the clock of the images; rows between are
+interpolated). Without either the rows belong to the shots in their order, one a shot. Out: :class:`LoggedAngles`, and the
+angles at each shot.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +16,11 @@ import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import read_table
 from armsight.robot.arm import Arm
-from armsight.tables.columns import degree_columns
+from armsight.tables.poses import read_pose_table
 
 #: Angles at the time of a shot are interpolated between rows at most so far apart, s.
 MOST_GAP_S = 0.25
-#: No joint rotates further; larger numbers of radians are degrees.
-_MOST_RAD = 4 * math.pi
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,70 +98,12 @@ def read_angles(path: str | Path, arm: Arm) -> LoggedAngles:
     """Read the logged joint angles of an arm.
 
     Raises:
-        InputError: unreadable, a joint is missing or too many, a field is no number, or degrees came as radians.
+        InputError: unreadable, a joint is missing or too many, a field is no number, degrees came as radians, or times
+            fall.
     """
-    path = Path(path)
-    rows = degree_columns(path, read_table(path))
-    lines = [(line, row) for line, row in enumerate(rows[1:], 2) if any(cell.strip() for cell in row)]
-    if not lines:
-        raise InputError(f"{path}: no rows; a first line of column names and a line a pose are needed")
-    header = [name.strip() for name in rows[0]]
-    count = len(arm.a)
-    columns, factor = _joint_columns(path, header, arm, count)
-    q = factor * np.array([[_number(path, line, header, row, k) for k in columns] for line, row in lines])
-    if factor == 1.0 and np.abs(q).max() > _MOST_RAD:
-        row, joint = np.unravel_index(int(np.abs(q).argmax()), q.shape)
-        raise InputError(
-            f"{path}:{lines[row][0]}: q{joint + 1}_rad is {q[row, joint]:g}: are these degrees? name the columns q1_deg ..."
-        )
-    shots = t_s = None
-    where = next((name for name in ("shot", "t_s") if name in header), None)
-    unused = tuple(name for k, name in enumerate(header) if name and k not in columns and name != where)
-    if "shot" in header:
-        at = header.index("shot")
-        shots = tuple(_cell(path, line, header, row, at) for line, row in lines)
-        for k, name in enumerate(shots):
-            if name in shots[:k]:
-                raise InputError(f"{path}:{lines[k][0]}: shot {name!r} stands twice")
-    elif "t_s" in header:
-        at = header.index("t_s")
-        t_s = np.array([_number(path, line, header, row, at) for line, row in lines])
-        if len(fallen := np.flatnonzero(np.diff(t_s) <= 0)):
-            raise InputError(f"{path}:{lines[fallen[0] + 1][0]}: t_s does not rise: {t_s[fallen[0] + 1]:g} s")
-    return LoggedAngles(path, q, shots, t_s, unused)
-
-
-def _joint_columns(path: Path, header: list[str], arm: Arm, count: int) -> tuple[list[int], float]:
-    """Return the columns of the joints, and what makes radians of them."""
-    for unit, factor in (("rad", 1.0), ("deg", math.pi / 180)):
-        if f"q1_{unit}" not in header:
-            continue
-        beyond = [name for name in header if name.startswith("q") and name.endswith(f"_{unit}")]
-        if f"q{count + 1}_{unit}" in header:
-            hint = ": is the last one its gripper? leave it out" if len(beyond) == count + 1 else ""
-            raise InputError(f"{path}: has q{count + 1}_{unit}, but {arm.name} has {count} joints{hint}")
-        for k in range(1, count + 1):
-            if f"q{k}_{unit}" not in header:
-                raise InputError(f"{path}: has no column q{k}_{unit}; {arm.name} has {count} joints")
-        return [header.index(f"q{k}_{unit}") for k in range(1, count + 1)], factor
-    raise InputError(
-        f"{path}: has no joint angles: columns q1_deg .. q{count}_deg (or _rad) are needed, and shot or t_s; it has"
-        f" {', '.join(header)}"
-    )
-
-
-def _cell(path: Path, line: int, header: list[str], row: list[str], at: int) -> str:
-    if at >= len(row) or not row[at].strip():
-        raise InputError(f"{path}:{line}: {header[at]} is missing")
-    return row[at].strip()
-
-
-def _number(path: Path, line: int, header: list[str], row: list[str], at: int) -> float:
-    text = _cell(path, line, header, row, at)
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputError(f"{path}:{line}: {header[at]} is {text!r}; a number is needed")
-    return value
+    table = read_pose_table(Path(path), arm=arm, only_joints=True)
+    assert table.q is not None
+    t_s = table.t_s if table.names is None else None
+    if t_s is not None and len(fallen := np.flatnonzero(np.diff(t_s) <= 0)):
+        raise InputError(f"{path}: line {table.lines[fallen[0] + 1]}: t_s does not rise: {t_s[fallen[0] + 1]:g} s")
+    return LoggedAngles(table.path, table.q, table.names, t_s, table.unused)
