@@ -23,10 +23,13 @@ from armsight.errors import InputError
 from armsight.files import columns_unused
 from armsight.tables.cells import Rows, read_cells, read_columns
 from armsight.tables.columns import COLUMNS, Columns, degree_columns, is_unitless, understood
+from armsight.tables.lengths import UNITS_M
 from armsight.tables.rotations import CONVENTIONS
 
 #: Lengths beyond this, m, are no robot's: they are mm; below the other, all of them, they are m taken for mm.
 FAR_M, NEAR_M = 20.0, 0.02
+#: No arm here reaches further, m; half: a large KUKA in cm is taken for mm alone, double: small ones in inches are named.
+REACH_M = 3.0
 #: An angle in degrees is not larger.
 MOST_DEG = 360.0
 #: Lengths that differ by more than this factor in one table are not in one unit.
@@ -223,7 +226,7 @@ def _positions(table: Columns, unit: str | None, detect: bool, side: str) -> tup
         if not detect:
             raise InputError(
                 f"{table.path}: positions of up to {far:.0f} m: are they millimetres? name the columns x_mm y_mm z_mm, or "
-                f"give {'' if suffix else '--units mm, or '}--detect-units{_or_angles(table, far, side)}"
+                f"give {'' if suffix else '--units mm, or '}--detect-units{_or_units(far)}{_or_angles(table, far, side)}"
             )
         return 1e-3 * p, 1e-3, (f"{table.path}: positions read as millimetres: as metres they would reach {far:.0f} m",)
     if unit_m == 1e-3 and far < NEAR_M:
@@ -238,6 +241,12 @@ def _positions(table: Columns, unit: str | None, detect: bool, side: str) -> tup
             (f"{table.path}: positions read as metres: as millimetres they would stay within {1e3 * far:.2g} mm",),
         )
     return unit_m * p, unit_m, ()
+
+
+def _or_units(far: float) -> str:
+    """Return the other units in which lengths that are too large for metres are an arm's reach."""
+    others = [name for name in ("cm", "in") if far * UNITS_M[name] <= REACH_M < far]
+    return f"; or in {' or '.join(others)}? write those in m or mm" if others else ""
 
 
 def _or_angles(table: Columns, far: float, side: str) -> str:
