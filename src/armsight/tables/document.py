@@ -2,7 +2,7 @@
 
 In: a file. Out: a mapping of names to texts, numbers, lists, mappings and matrices (whatever has ``rows``, ``cols`` and
 ``data`` is an array). Read are YAML, JSON, TOML, INI, Python's literals (mrcal), OpenCV's FileStorage in YAML, XML or JSON,
-numpy's .npz and .npy, MATLAB's .mat up to version 7, each also compressed by gzip. What holds programs (pickles) or is an
+numpy's .npz and .npy, each also compressed by gzip. What holds programs (pickles) or is an
 archive is named with what to do.
 """
 
@@ -26,18 +26,6 @@ from armsight.errors import InputError
 from armsight.files import DOCUMENT_MB, YAML_MB, parsed_json, read_bytes
 from armsight.tables.yaml_file import Foreign, parse_yaml
 
-#: What readers of binary files raise where one is damaged.
-_DAMAGED = (
-    ValueError,
-    TypeError,
-    OSError,
-    NotImplementedError,
-    IndexError,
-    KeyError,
-    EOFError,
-    OverflowError,
-    zlib.error,
-)
 #: First bytes -> what the file is, and what to do instead.
 _OTHERS = (
     (b"\x80\x02", "a Python pickle, which may run programs"),
@@ -70,7 +58,7 @@ def read_document(path: str | Path) -> dict[str, Foreign]:
 
 
 #: What is read, for messages.
-KINDS = "YAML, JSON, TOML, INI, OpenCV's XML, mrcal's .cameramodel, .npz, .npy or .mat, each also as .gz"
+KINDS = "YAML, JSON, TOML, INI, OpenCV's XML, mrcal's .cameramodel, .npz or .npy, each also as .gz"
 
 
 def _checked(document: Foreign, path: str | Path) -> dict[str, Foreign]:
@@ -123,13 +111,14 @@ def _unpacked(data: bytes, path: str | Path) -> bytes:
 
 
 def _binary(data: bytes, path: str | Path) -> dict[str, Foreign] | None:
-    """Return what a file of numpy or MATLAB holds, None where it is none."""
+    """Return what a file of numpy holds, None where it is none."""
     if data[:4] == b"PK\x03\x04" or data[:6] == b"\x93NUMPY":
         return _numpy(data, path)
-    if data[:10] == b"MATLAB 5.0":
-        return _matlab(data, path)
-    if data[:4] == b"\x89HDF":
-        raise InputError(f"{path}: an HDF5 file (MATLAB's -v7.3): save it with save('calibration.mat', .., '-v7')")
+    if data[:6] == b"MATLAB" or data[:4] == b"\x89HDF":
+        raise InputError(
+            f"{path}: a MATLAB file, which is not read: in MATLAB, writelines(jsonencode(load('{Path(path).name}')), "
+            "'calibration.json') writes one that is"
+        )
     if data[257:262] == b"ustar":
         raise InputError(f"{path}: an archive (tar): unpack it and give the files in it")
     for magic, what in _OTHERS:
@@ -166,18 +155,6 @@ def _numpy(data: bytes, path: str | Path) -> dict[str, Foreign]:
         raise InputError(
             f"{path}: an archive (zip) or damaged .npz: {error}; unpack it and give the files in it"
         ) from None
-
-
-def _matlab(data: bytes, path: str | Path) -> dict[str, Foreign]:
-    """Return the variables of a .mat file; a struct is a mapping."""
-    from scipy.io import loadmat  # takes a while
-    from scipy.io.matlab import MatReadError
-
-    try:
-        loaded = loadmat(io.BytesIO(data), simplify_cells=True)  # type: ignore[arg-type] # a file is one, too
-    except (*_DAMAGED, MatReadError) as error:
-        raise InputError(f"{path}: a damaged MATLAB file: {error}") from None
-    return {key: value for key, value in loaded.items() if not key.startswith("__")}
 
 
 def _text(text: str, path: str | Path) -> Foreign:

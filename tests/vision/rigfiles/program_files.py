@@ -11,7 +11,6 @@ import json
 import cv2
 import numpy as np
 import yaml
-from scipy.io import savemat
 
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3, log_so3, quaternion_wxyz
@@ -48,12 +47,6 @@ def npz(**values):
 def npy(value):
     file = io.BytesIO()
     np.save(file, value)
-    return file.getvalue()
-
-
-def mat(**values):
-    file = io.BytesIO()
-    savemat(file, values)
     return file.getvalue()
 
 
@@ -420,12 +413,11 @@ PROGRAMS = {
         MM_SIZE,
     ),
     "bouguet": (
-        "Bouguet's toolbox for MATLAB, Calib_Results_stereo.mat",
+        "Bouguet's toolbox for MATLAB, Calib_Results_stereo.mat by jsonencode(load(..))",
         "opencv",
-        {"Calib_Results_stereo.mat": mat(**BOUGUET)},
+        {"Calib_Results_stereo.json": json.dumps({k: np.squeeze(v).tolist() for k, v in BOUGUET.items()})},
         MM,
     ),
-    "mat": ("scipy.io.savemat", "opencv", {"c.mat": mat(**_k1)}, MM_SIZE),
     "14": (
         "opencv 4, CALIB_RATIONAL_MODEL: 14 coefficients",
         "opencv",

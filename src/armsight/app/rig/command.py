@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def command() -> None:
     """Show a rig file, import a rig of another program, export one, or update one from what a run saw.
 
-    Read are OpenCV's stereo calibrations (YAML, XML, JSON, .npz, .mat, any names), ROS's camera_info (left.yaml
+    Read are OpenCV's stereo calibrations (YAML, XML, JSON, .npz, any names), ROS's camera_info (left.yaml
     right.yaml), Kalibr's and OpenVINS's camchain.yaml, EuRoC's sensor.yaml, Basalt, ORB-SLAM, caliscope, aniposelib,
     multical, mrcal (left.cameramodel right.cameramodel) and Stereolabs (SN*.conf).
     """

@@ -170,7 +170,7 @@ def _is_matrix(name: str, value: Foreign) -> bool:
 
 def _is_focal(name: str, value: Foreign) -> bool:
     """Say whether a value is Bouguet's focal lengths."""
-    return "fc" in _words(name) and np.size(value) == 2
+    return "fc" in _words(name) and _numbers(value).size == 2
 
 
 def _is_distortion(name: str, value: Foreign) -> bool:
@@ -181,7 +181,7 @@ def _is_distortion(name: str, value: Foreign) -> bool:
 
 def _is_size(name: str, value: Foreign) -> bool:
     """Say whether a value is called an image's size."""
-    return _stem(name) in SIZE and np.size(value) == 2
+    return _stem(name) in SIZE and _numbers(value).size == 2
 
 
 def _stem(name: str) -> str:
@@ -209,7 +209,10 @@ def _entries(flat: Mapping[str, Foreign]) -> Iterator[dict[str, Foreign]]:
     focal, matrices = _pair(flat, _is_focal), _pair(flat, _is_matrix)
     pairs = {"distortion": _pair(flat, _is_distortion)}
     if focal is not None:
-        pairs |= {"fc": focal, "cc": _pair(flat, lambda name, value: "cc" in _words(name) and np.size(value) == 2)}
+        pairs |= {
+            "fc": focal,
+            "cc": _pair(flat, lambda name, value: "cc" in _words(name) and _numbers(value).size == 2),
+        }
     else:
         pairs["K"] = matrices
     for what, names in (("camera matrix", pairs.get("K", focal)), ("distortion", pairs["distortion"])):
@@ -261,7 +264,7 @@ def _between(flat: Mapping[str, Foreign]) -> tuple[Array, list[str]]:
             value = alike[0]
         values.append(value)
     R, t = values
-    if np.size(np.asarray(R, object)) == 3:
+    if _numbers(R).size == 3:
         R = exp_so3(_numbers(R).ravel())
     return rigid(R, np.ravel(np.asarray(t, object)), "R")
 

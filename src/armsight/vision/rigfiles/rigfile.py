@@ -37,6 +37,8 @@ LONG_M = 2.0  # half: rooms' rigs are remarked; double: 30 cm read as inches are
 ALPHA = 0.0
 #: A printed rotation may be this far from orthonormal: three digits leave 1e-3, six leave 1e-6.
 LOOSEST_ROTATION = 2e-3
+#: Lengths beyond this are damaged numbers in any unit; half, double: the same.
+_FARTHEST = 1e9
 
 
 @dataclass(frozen=True)
@@ -165,6 +167,8 @@ def naming(where: str | Path) -> Iterator[None]:
 def rigid(R: Foreign, t: Foreign, name: str) -> tuple[Array, list[str]]:
     """Return (4, 4) a transform from a printed rotation and translation, and a note where its digits were few."""
     T = pose(checked(R, (3, 3), name), checked(t, (3,), f"translation of {name}"))
+    if np.abs(T[:3, 3]).max() > _FARTHEST:
+        raise InputError(f"translation of {name} has {np.abs(T[:3, 3]).max():.2g} units: a damaged number?")
     near = np.clip(T[:3, :3], -2.0, 2.0)  # squares of damaged numbers overflow
     off = float(np.abs(near @ near.T - np.eye(3)).max())
     if off > LOOSEST_ROTATION or np.linalg.det(T[:3, :3]) < 0:

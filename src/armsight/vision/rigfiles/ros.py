@@ -136,7 +136,7 @@ def _read_one(document: Document, options: ImportOptions) -> tuple[Camera, Array
     if (word := found(document, ("distortionmodel",))) not in (None, "", *MODELS):
         raise InputError(f"distortion_model {word!r} is not supported; supported are {', '.join(MODELS)}")
     model = str(word or "plumb_bob")
-    count = np.size(found(document, _NAMES["distortion_coefficients"]))
+    count = np.asarray(found(document, _NAMES["distortion_coefficients"]), object).size
     if count not in MODELS[model]:
         raise InputError(f"{model} has {' or '.join(map(str, MODELS[model]))} coefficients, got {count}")
     camera, notes = camera_of({**document, "distortion_model": model}, options.image_size_px)
