@@ -20,10 +20,10 @@ from armsight.loop.identify.model import gravity_levers
 from armsight.robot.models import MODELS
 
 SIGMA = np.repeat([3e-5, 2e-4], 3)  # m, rad; of a rest's mean by vision
-DROOP_RAD_PER_M, HALF_RAD = 0.1, 0.8
+DROOP_RAD_PER_M = 0.1
 
 
-def world(name: str, seed: int, poses: int = 40) -> tuple[dict[str, float], dict]:
+def world(name: str, seed: int, half_rad: float, poses: int = 40) -> tuple[dict[str, float], dict]:
     """Return the truth of each part, mm, and the parts found."""
     rng, arm = np.random.default_rng([seed, 77]), MODELS[name]
     n = arm.joints
@@ -36,7 +36,7 @@ def world(name: str, seed: int, poses: int = 40) -> tuple[dict[str, float], dict
         alpha=arm.alpha + rng.normal(0, np.radians(0.15), n) * inner,
     )
     base, tool = (exp_se3(rng.normal(0, 1, 6) * np.repeat([1e-3, 3e-3], 3)) for _ in range(2))
-    q_ref = np.repeat(arm.home + rng.uniform(-HALF_RAD, HALF_RAD, (poses, n)), 2, axis=0)
+    q_ref = np.repeat(arm.home + rng.uniform(-half_rad, half_rad, (poses, n)), 2, axis=0)
     q_ref = np.clip(q_ref, arm.q_min, arm.q_max)
     side = rng.choice([-1.0, 1.0], (poses, n)).repeat(2, axis=0) * np.tile([1.0, -1.0], poses)[:, None]
     q = q_ref + rng.uniform(0.3, 1.5) * DROOP_RAD_PER_M * gravity_levers(arm, q_ref)
@@ -66,11 +66,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--half-deg", type=float, default=46.0, help="how far the joints go from home")
     given = parser.parse_args()
     far = total = shown = 0
     for name in ("so101", "ar4"):
         for seed in range(given.first, given.first + given.seeds):
-            truth, parts = world(name, seed)
+            truth, parts = world(name, seed, np.radians(given.half_deg))
             for part, size in truth.items():
                 p = parts[part]
                 off = abs(p.rms_mm - size) / max(p.sigma_mm, 0.01 * size, 1e-9)

@@ -78,8 +78,10 @@ def test_zeros_droop_and_drift_are_found_within_three_sigma(run, report):
     rate, sigma = report.drift_mm_per_h
     assert abs(rate - DRIFT_MM_PER_H) < 3 * sigma < DRIFT_MM_PER_H
     assert report.cycles >= 6
-    RP = [1e3 * p.repeatability.raw for p in evaluate_check(attained_in(run, closed=False)).poses.values()]
+    poses = evaluate_check(attained_in(run, closed=False)).poses.values()
+    RP, AP = ([1e3 * getattr(p, name).raw for p in poses] for name in ("repeatability", "accuracy"))
     assert len(RP) == 5
+    assert report.pose_accuracy_mm == pytest.approx(np.mean(AP), rel=0.01)
     assert report.one_side_mm == pytest.approx(np.mean(RP), rel=0.05)  # as armsight check has it, less vision's noise
     assert report.one_side_mm < 0.2
     assert report.both_sides_mm[1] < 0.2

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 #: A minus before a number is no option.
 _NUMBERS = {"ignore_unknown_options": True}
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-#: A recording of poses over less than this, m, tells an arm's zeros from its base and tool badly. Half: fewer notes.
+#: Over less than this, m, poses distinguish an arm's zeros badly from its base and tool. Half: fewer notes; double: more.
 _NARROW_M = 0.15
 _POSE = ("x", "y", "z", "euler_z", "euler_y", "euler_x")
 

@@ -44,6 +44,7 @@ from armsight.loop.identify.identify import Identified, identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import SENSOR, gravity_levers
 from armsight.loop.iso9283.poses import MIN_POSES
+from armsight.loop.iso9283.statistic import Metric
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
 
@@ -233,6 +234,7 @@ class ArmReport(Record):
         hours: from the first rest to the last.
         accuracy_mm: RMS and largest distance from the command in the frames of the run.
         placed_mm: RMS distance from the command after base and tool were fitted to these poses.
+        pose_accuracy_mm: accuracy AP (ISO 9283) of the poses of ``one_side_mm``, mean; None likewise.
         one_side_mm: repeatability RP (ISO 9283) of poses approached from the same side; None where none was three times.
         both_sides_mm: mean and largest distance between a pose from one side and from the other; None likewise.
         drift_mm_per_h: drift of the pose that came most often, and its sigma; None likewise.
@@ -257,6 +259,7 @@ class ArmReport(Record):
     hours: float
     accuracy_mm: tuple[float, float]
     placed_mm: float
+    pose_accuracy_mm: float | None
     one_side_mm: float | None
     both_sides_mm: tuple[float, float] | None
     drift_mm_per_h: tuple[float, float] | None
@@ -283,6 +286,7 @@ class ArmReport(Record):
             "rests",
             "hours",
             "placed_mm",
+            "pose_accuracy_mm",
             "one_side_mm",
             "cycles",
             "latency_s",
@@ -349,8 +353,7 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
         joints.append(_joint(arm, i, name, kept, found, lever[:, i], backlash[i]._asdict(), latencies[i]))
     known = [each for each in latencies if each is not None]
     attained, both = evaluate(attained_in(folder, closed=False)).poses.values(), _both_sides(rests, which)
-    repeated = [each.repeatability for each in attained]
-    one = 1e3 * float(np.mean([m.raw if m.clean is None else m.clean for m in repeated])) if repeated else None
+    accuracy, one = (_mean_mm([getattr(p, name) for p in attained]) for name in ("accuracy", "repeatability"))
     if one is None:
         notes.append(f"no pose was approached {MIN_POSES} times from one side: no repeatability")
     if both is None:
@@ -363,6 +366,7 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
         float(np.ptp(rests.t_s)) / 3600.0,
         (1e3 * float(np.sqrt((distance**2).mean())), 1e3 * float(distance.max())),
         1e3 * float(np.sqrt((off**2).sum(axis=1).mean())),
+        accuracy,
         one,
         both,
         per_h,
@@ -512,6 +516,11 @@ def least_squares(A: Array, y: Array, groups: list[NDArray[np.int64]] | None) ->
     pulls = np.array([A[rows].T @ left[rows] for rows in groups]) @ inverse
     poses = (pulls**2).sum(axis=0) * len(groups) / max(len(groups) - A.shape[1], 1)
     return x.tolist(), np.sqrt(np.maximum(rests, poses)).tolist()
+
+
+def _mean_mm(metrics: list[Metric]) -> float | None:
+    """Return the mean of a metric over poses, without the instrument's noise where it is resolved, mm; None of none."""
+    return 1e3 * float(np.mean([m.raw if m.clean is None else m.clean for m in metrics])) if metrics else None
 
 
 def _both_sides(rests: RestPoses, which: NDArray[np.int64]) -> tuple[float, float] | None:

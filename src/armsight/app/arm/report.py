@@ -52,6 +52,7 @@ def tables(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> list[Text
             ("distance from the command, RMS", "accuracy_rms_mm", "mm"),
             ("distance from the command, largest", "accuracy_max_mm", "mm"),
             ("RMS after base and tool were fitted", "placed_mm", "mm"),
+            ("accuracy AP of poses that came again, mean", "pose_accuracy_mm", "mm"),
             ("repeatability RP, from one side", "one_side_mm", "mm"),
             ("between both sides, mean distance", "both_sides_mean_mm", "mm"),
             ("between both sides, largest", "both_sides_max_mm", "mm"),

@@ -86,7 +86,7 @@ SAME_RAD = 5e-3
 def visits(q: Array) -> NDArray[np.int64]:
     """Return the pose (N,) that each row of joint angles (N, n) is a visit of, from 0 in the order of the rows.
 
-    What is left out to judge a fit is left out with all of its visits: one that stays in would give it away.
+    What is left out to evaluate a fit is left out with all of its visits: one that stays in would give it away.
     """
     near = cKDTree(q).query_pairs(SAME_RAD, p=np.inf, output_type="ndarray")
     graph = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(q), len(q)))
