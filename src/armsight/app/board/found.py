@@ -40,7 +40,7 @@ from armsight.robot.boards.tuning import (
 _MARGIN_RAD = 0.05
 #: Of an elastic joint: its stiffness may be less than found by this factor (another pose, one direction); a sudden load
 #: twists it by this share of the motor's stall torque, an acceleration by so much, rad; half: slower, double: it rings.
-_SOFTER, _SUDDEN, _ACCELERATION_TWIST_RAD = 1.5, 0.2, 0.005
+_SOFTER, _SUDDEN, _ACCELERATION_TWIST_RAD = 1.5, 0.2, 0.0025
 _MOST_INVERTED_RAD = 1.0
 _MOST_UNEVEN = 0.5  # share of a ratio, as config.c holds it
 _POSITIVE = ("resistance_ohm", "constant_v_s", "inertia_kg_m2", "stiffness_n_m")
