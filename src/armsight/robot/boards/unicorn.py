@@ -52,7 +52,9 @@ class UnicornEmulator:
             unicorn: Any = importlib.import_module("unicorn")  # it comes without types
             arm_const: Any = importlib.import_module("unicorn.arm_const")
         except ImportError:
-            raise InputError("emulated:unicorn needs unicorn: pip install 'armsight[board]'") from None
+            raise InputError(
+                "emulated:unicorn needs unicorn (GPL-2.0): pip install 'armsight[sim]'; or use emulated:qemu, emulated:host"
+            ) from None
         self._error: type[Exception] = unicorn.UcError
         self._stack, self._callee = arm_const.UC_ARM_REG_SP, arm_const.UC_ARM_REG_R4
         self._symbols, self._sizes = elf.symbols, elf.sizes
