@@ -167,7 +167,7 @@ def _of_file(path: Path, side: str, whose: str | None) -> Cells:
         return cells._replace(listed=True)
     if is_document(path, text):
         return _of_records(path, text, side, whose)
-    if written and re.match(r"[{<]|.*(?::=|=|[\[{]$)", written[0][1]):
+    if written and re.match(r"[{<\[/]|(?:DEF|MODULE|PROC)\b|.*(?::=|=|\(\)|[\[{]$)", written[0][1]):
         raise InputError(
             f"{path}: {written[0][1][:40]!r} begins no table: write one pose a line, a matrix of 16 numbers or columns "
             "such as x_mm,y_mm,z_mm,qw,qx,qy,qz"

@@ -59,7 +59,7 @@ _XYZ = {"x", "y", "z"}
 #: A list of numbers of such a name is of joints; a unit, or an order, behind a name.
 _JOINTS, _UNIT = re.compile(r"joint|servo|angles|qpos|^q$", re.IGNORECASE), re.compile(r"_(mm|m|deg|rad|xyzw|wxyz)$")
 #: Where a text begins so, it is one of these files.
-_DOCUMENT = re.compile(r"%YAML|---\s*$|[\[{]\s*$|[\[{]\s*[\[{\"'-]|- \S|-\s*$|[\w.\"' -]+:(?:\s|$)")
+_DOCUMENT = re.compile(r"%YAML|---\s*$|[\[{]\s*$|[\[{]\s*(?:\[\s*[-\d.\[]|[{\"'-])|- \S|-\s*$|[\w.\"' -]+:(?:\s|$)")
 #: A transform as tf_echo and tf2_echo print it.
 _ECHO = re.compile(
     r"(?:At time\s+([\d.]+)\s+)?-?\s*Translation:\s*\[([^\]]*)\]\s+"
