@@ -307,7 +307,8 @@ def _readings(recording: PairedPoses, arm: Arm | None, streams: bool) -> Iterato
     yield _Reading(
         replace(p, in_hand=not p.in_hand),
         f"these poses fit --eye {other.replace('_', '-')}, not {given.replace('_', '-')}: either the mounting is the other "
-        "one, or one of the tables holds inverse transforms (base in flange, or rig in target)",
+        "one, or one of the tables holds inverse transforms (base in flange, as easy_handeye saves them for a camera that "
+        "stands still; or rig in target): invert it",
     )
     units = list(_scaled(recording))
     yield from units
