@@ -242,11 +242,11 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
 }
 
 #define LOAD_SAMPLES 8u
-#define CONSTANT_WEAK 0.92f /* of the learnt constant: half way between a sound motor's and one of which some turns are shorted */
+#define CONSTANT_WEAK 0.92f /* of the learnt constant: half way between a sound motor and a partly shorted winding */
 #define CONSTANT_SIGMA 0.2f /* known so well it counts */
 #define SHARE_WEIGHT 3.0f /* of the load's evidence, in sigmas of the constant's */
 #define MOTOR_SHARE 0.35f /* of what voltage and current have parted, at the voltage: more, and the motor is not what it was; a
-                             sensor leaves it at 0, a winding of half the turns has 0.5 */
+                             sensor leaves it at 0, half a winding shorted has about 0.5 */
 
 /* Write the means over the last samples: what the load takes of the applied voltage, V (less the back-EMF by the reading),
  * and the current, A. */
@@ -568,7 +568,7 @@ bool motor_is_stuck(const motor_state *motor, const motor_config *config, float 
     return stuck < STUCK_SHARE * (offset < gain ? offset : gain) && number_size(by_v) > STUCK_SUPPLY * supply_v;
 }
 
-bool motor_disobeys(const motor_state *motor, const motor_config *config, float supply_v, float wanted_rad)
+bool motor_disobeys(const motor_state *motor, const motor_config *config, float supply_v, float error_rad)
 {
     if (motor->sampled <= DISOBEY_SAMPLES) {
         return false;
@@ -592,8 +592,8 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
     if (off) { /* the current drives it on, or would if nothing held it: shorted windings brake */
         return terminal_v * ir_v > 0.0f && terminal_v * way_rad > -number_size(terminal_v) * WINDOW_NOISE_RAD;
     }
-    return applied_v * wanted_rad > 0.0f && way_rad * wanted_rad < 0.0f && number_size(way_rad) > DISOBEY_RAD &&
-           number_size(wanted_rad) > DISOBEY_OFF_RAD;
+    return applied_v * error_rad > 0.0f && way_rad * error_rad < 0.0f && number_size(way_rad) > DISOBEY_RAD &&
+           number_size(error_rad) > DISOBEY_OFF_RAD;
 }
 
 #define SWING_TICKS 60u   /* a swing of 8 Hz and faster changes its side as often */

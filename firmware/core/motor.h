@@ -86,8 +86,8 @@ uint32_t motor_blames(const motor_state *motor, const motor_config *config);
 bool motor_is_stuck(const motor_state *motor, const motor_config *config, float supply_v, motor_sums *sums);
 
 /* Return whether for 16 ms a motor has not done what was put out to it, and by reading and current another voltage drives
- * it: against the way wanted_rad that it is driven, or at all where nothing was put out and shorted windings brake. */
-bool motor_disobeys(const motor_state *motor, const motor_config *config, float supply_v, float wanted_rad);
+ * it: against the way error_rad that it is driven, or at all where nothing was put out and shorted windings brake. */
+bool motor_disobeys(const motor_state *motor, const motor_config *config, float supply_v, float error_rad);
 
 #define MOTOR_SWING 0.2f /* of the speed limit: so far from the reference's speed a swing goes at least */
 

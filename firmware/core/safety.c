@@ -84,7 +84,6 @@ void safety_raise(core_state *core, uint32_t fault, uint32_t joint)
         core->first_joint = joint;
     }
     const uint32_t reaction = reaction_to(core, fault);
-    core->shorted = reaction == REACTION_SLEEP ? 0u : core->shorted;
     if (core->state == STATE_STOPPED) {
         return;
     }
@@ -250,7 +249,11 @@ static void blame(core_state *core, joint_state *joint, uint32_t fault, uint32_t
         rename_fault(core, i, core->first_fault, fault);
     }
     safety_raise(core, fault, i);
-    joint->suspect = fault == FAULT_BRIDGE ? FAULT_NONE : fault;
+    joint->suspect = fault;
+    if (fault == FAULT_BRIDGE) {
+        core->shorted = 0u;
+        joint->suspect = FAULT_NONE;
+    }
 }
 
 /* Hold a joint by its reading: its motor is no witness any more, until the drives were off. */

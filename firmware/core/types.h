@@ -89,7 +89,7 @@ enum { REJECTION_NONE = 0, REJECTION_LIST(REJECTION_CODE) REJECTION_COUNT };
 
 /* What a fault does to a moving arm: HOLD stops it along its path and holds it. YIELD does so too, but the joint lets
  * itself be moved to where it is. JOINT shorts the windings of the joint and stops the others along their path. RELEASE
- * shorts the windings of all. SLEEP switches all drivers off, for one that does not obey. CHOSEN is the configuration's
+ * shorts the windings of all. SLEEP switches all drivers off, for one that drives by itself. CHOSEN is the configuration's
  * silence_reaction. */
 enum {
     REACTION_HOLD = 1,

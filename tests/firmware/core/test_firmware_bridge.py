@@ -1,4 +1,4 @@
-"""Bridges, motors and current sensors: what does not obey sleeps, what is warm is followed, what is wrong is named."""
+"""Bridges, motors and current sensors: what drives by itself sleeps, what is warm is followed, what is wrong is named."""
 
 import importlib.util
 import sys
@@ -51,7 +51,7 @@ def test_a_bridge_that_drives_by_itself_puts_all_drives_to_sleep(motors, library
 
 
 @pytest.mark.parametrize("share", [-1.0, 0.4])
-def test_a_stop_that_a_bridge_does_not_obey_is_one_by_sleep_and_brake(motors, library, share):
+def test_an_emergency_stop_of_a_stuck_bridge_is_one_by_sleep_and_brake(motors, library, share):
     for seed in SEEDS:
         arm = at_rest(motors, library, seed, brake=motors.BRAKE_N_M)
         at = arm.plant.link[3]
