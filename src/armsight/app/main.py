@@ -138,7 +138,7 @@ def main() -> None:
         sys.exit(0)
     except OSError as error:  # errors of files and devices are ArmsightErrors: only the output is left
         _silence_stdout()
-        print_error(f"the output cannot be written: {error.strerror}")
+        print_error(f"{error.filename or 'the output'}: cannot be written: {error.strerror or error}")
         sys.exit(2)
 
 

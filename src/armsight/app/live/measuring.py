@@ -430,6 +430,8 @@ class MeasureStep:
             mcap.close()
         if file is not None:
             try:
+                file.flush()
+                os.fsync(file.fileno())
                 file.close()
             except OSError:  # what is still buffered does not fit on the disk: the row that failed
                 return

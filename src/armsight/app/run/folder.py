@@ -296,8 +296,10 @@ def _as_much_as_fits() -> Iterator[Callable[..., None]]:
         yield lambda write, *arguments: asked.append(writer.submit(write, *arguments))
     failed = [error for each in asked if (error := each.exception()) is not None]
     for error in failed:
-        if not isinstance(error, InputError):
+        if not isinstance(error, InputError | OSError):
             raise error
+    if failed and isinstance(failed[0], OSError):
+        raise InputError(f"{failed[0].filename or 'the run'}: cannot be written: {failed[0].strerror}")
     if failed:
         raise failed[0]
 

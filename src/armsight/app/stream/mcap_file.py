@@ -11,6 +11,7 @@ foxglove-schemas-protobuf with mcap-protobuf-support is used, not foxglove-sdk: 
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
@@ -120,6 +121,8 @@ class McapSink(Sink):
                 if self.dropped:
                     self.write(_dropped(self))
                 self._writer.finish()
+                self._file.flush()
+                os.fsync(self._file.fileno())
         finally:
             self._file.close()
 
