@@ -91,10 +91,29 @@ def calibrated_with(lens, rng):
     return replace(given, cov=np.diag((wider * SIGMAS) ** 2), sigma_px=sigma_px), mean
 
 
-def watched_body(seed, *, rotated=None, scale=1.0, skew_s=0.0, at_s=0.0, seconds=12.0, lens=None, shift=0.0):
+def strained(matrix, bent=0.0):
+    """Displacements of the body's points, m: by a matrix (3, 3) of strains, and bent by so much, 1/m, about y."""
+    from_middle = BODY.points - BODY.points.mean(axis=0)
+    return from_middle @ np.transpose(matrix) + 0.5 * bent * np.outer(from_middle[:, 0] ** 2, [0.0, 0.0, 1.0])
+
+
+def watched_body(
+    seed,
+    *,
+    rotated=None,
+    scale=1.0,
+    skew_s=0.0,
+    at_s=0.0,
+    seconds=12.0,
+    lens=None,
+    shift=0.0,
+    nod=None,
+    sigma_px=SIGMA_PX,
+):
     """Watch a body that moves and rests; yield the monitor, the time, the true pose, and what it returned for each shot.
 
-    From ``at_s`` on cameras and points of the body are displaced.
+    From ``at_s`` on cameras and points of the body are displaced; ``nod``: of a side, its camera rotates about its own
+    axes by ``(side, amplitude (3,), rad, frequency, Hz)``.
     """
     rng = np.random.default_rng(seed)
     if lens is None:
@@ -123,6 +142,12 @@ def watched_body(seed, *, rotated=None, scale=1.0, skew_s=0.0, at_s=0.0, seconds
         there = points + shift * (t >= at_s)
         uv, uv_late = (both_pixels(true, there @ each[:3, :3].T + each[:3, 3]) for each in (T, late))
         uv[:, 1] = uv_late[:, 1]
+        if nod is not None and t >= at_s:
+            side, amplitude, hz = nod
+            by = exp_so3(amplitude * np.sin(2 * np.pi * hz * t)).T
+            frame_of = [np.eye(4), inverse(true.T_left_right)][side] @ T
+            at = (there @ frame_of[:3, :3].T + frame_of[:3, 3]) @ by.T
+            uv[:, side] = true.cameras[side].project(at)
         if lens is not None:
             uv = np.stack([lens(side, uv[:, side]) for side in range(2)], axis=1)
         estimate = measured(given, body, frame @ T, uv + SIGMA_PX * rng.normal(size=uv.shape))
@@ -135,6 +160,11 @@ def ended(seed, **fault):
     return monitor.findings()
 
 
+def sag(rad, along=(0.0, 0.0, 1.0)):
+    """A bracket, along an axis of the tool, that bends by so much under gravity: by how much it rotates the body (6,)."""
+    return lambda R: np.append(np.zeros(3), rad * np.cross(along, R.T @ [0.0, 0.0, -1.0]))
+
+
 LEARNED_S, AT_S = 5.0, 6.5
 
 
@@ -143,7 +173,7 @@ class Moved:
 
     def __init__(self, estimator, T_base_rig, motion, slip=None, late=None, follows=False):
         self.estimator, self.motion, self.T_base_rig = estimator, motion, T_base_rig
-        self.slip = slip  # of the body on the tool (6,), [m; rad]
+        self.slip = slip  # of the body on the tool (6,), [m; rad], or a function of the tool's rotation that returns it
         self.late = late  # by how much the stamps are late, s, at seconds after AT_S
         self.monitor = HealthMonitor(example_rig(), body_target().body, 0.0)
         self.found_s = None
@@ -173,13 +203,14 @@ class Moved:
             if self.late is not None:
                 measurement = replace(measurement, t_s=t_s + self.late(t_s - AT_S))
             if self.slip is not None:
-                measurement = replace(measurement, T_base_tool=measurement.T_base_tool @ small(self.slip))
+                slip = self.slip(measurement.T_base_tool[:3, :3]) if callable(self.slip) else self.slip
+                measurement = replace(measurement, T_base_tool=measurement.T_base_tool @ small(slip))
         if self.corrections:
             T = self.mounting.T_base_rig @ np.linalg.inv(T) @ measurement.T_base_tool
             by = adjoint(np.linalg.inv(T) @ self.mounting.T_base_rig)
             common = measurement.cov_common + by @ self.mounting.cov[:6, :6] @ by.T
             measurement = replace(measurement, T_base_tool=T, cov_common=common)
-        outcome = self.estimator.vision(widened(measurement, self.monitor.changes))
+        outcome = self.estimator.vision(widened(measurement, self.monitor.every_change))
         self.monitor.work()
         if self.follower is not None and t_s - self.looked_s > 0.25:
             self.looked_s = t_s

@@ -103,5 +103,5 @@ def command(
         view_dir=view_dir,
         as_json=as_json,
     )
-    if health:
+    if any(each.forbids for each in health):
         click.get_current_context().exit(UNTRUSTED)

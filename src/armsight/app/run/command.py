@@ -224,7 +224,7 @@ def command(
         click.echo(json.dumps(summary.to_json()))
     else:
         print_summary(summary, output)
-    if summary.health:
+    if any(each.forbids for each in summary.health):
         click.get_current_context().exit(UNTRUSTED)
 
 

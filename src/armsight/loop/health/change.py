@@ -35,7 +35,7 @@ _ALONG = float(chdtri(5, 0.01))
 #: What the pair alone cannot distinguish from that.
 FOCAL = "; both focal lengths that changed alike look the same to the pair"
 
-Kind = Literal["rig", "drift", "body", "joint", "backlash", "time", "rate"]
+Kind = Literal["rig", "drift", "body", "joint", "backlash", "time", "rate", "shake"]
 _CAUSES: dict[Kind, Cause] = {
     "rig": "fixed",
     "drift": "fixed",
@@ -44,6 +44,7 @@ _CAUSES: dict[Kind, Cause] = {
     "backlash": "joint",
     "time": "time",
     "rate": "time",
+    "shake": "fixed",
 }
 
 
@@ -70,7 +71,7 @@ class Suspect:
 
     Attributes:
         kind: rig: it jumped; drift: it drifts; body: it slipped on the tool; joint: its zero jumped; backlash: it grew;
-            time: the camera's clock jumped; rate: it runs at another rate.
+            time: the camera's clock jumped; rate: it runs at another rate; shake: rig and arm move to and fro.
         joint: row of the joint; -1 for what is not of one.
         columns: its parameters among those that may change.
     """
@@ -190,8 +191,8 @@ def suspected(measurement: PoseMeasurement, changes: Sequence[Change]) -> Array 
     It is that of their mixture: of each the square of what it does, and its covariance; what happened besides adds to it.
     Those that were put right before say nothing.
     """
-    if not changes:
-        return None
+    shaken = [each for each in changes if each.suspect.kind == "shake"]
+    changes = [each for each in changes if each.suspect.kind != "shake"]
     until_s = min((each.until_s for each in changes if each.until_s > measurement.t_s), default=np.inf)
     changes = [each for each in changes if each.until_s == until_s]
     extra, t_s, T = np.zeros((6, 6)), measurement.t_s, measurement.T_base_tool
@@ -204,6 +205,8 @@ def suspected(measurement: PoseMeasurement, changes: Sequence[Change]) -> Array 
                 if each.suspect.kind == "drift":
                     cov = cov + _otherwise(shift)
                 extra += share * (np.outer(shift, shift) + cov)
+    for each in shaken:
+        extra += each.displacement(T, t_s)[1]
     return extra if extra.any() else None
 
 

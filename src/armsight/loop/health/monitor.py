@@ -20,6 +20,7 @@ from armsight.loop.health.host import HostWatch
 from armsight.loop.health.landmarks import LandmarkWatch
 from armsight.loop.health.record import HealthFinding, Trust
 from armsight.loop.health.rig import TEST_S, RigWatch
+from armsight.loop.health.unrest import ShakeWatch
 from armsight.robot.arm import Arm
 from armsight.vision.rig import StereoRig
 
@@ -50,6 +51,7 @@ class HealthMonitor:
         self._landmarks: LandmarkWatch | None = None
         self._fixed: FixedWatch | None = None
         self._closure: ClosureWatch | None = None
+        self._shakes = ShakeWatch()
         self._suspected: Array | None = None  # what the newest tested shot adds to the covariance of a pose
         self._newest_s, self._doubted_s = 0.0, -np.inf
         self._poses: list[tuple[PoseEstimate, float | None]] = []
@@ -72,7 +74,7 @@ class HealthMonitor:
         What is suspected is that of the shots before.
         """
         self._poses.append((pose, t_s))
-        return pose if self._suspected is None else replace(pose, cov=pose.cov + self._suspected)
+        return self._widened(pose)
 
     def work(self) -> None:
         """Make the tests of everything that was received since the last call."""
@@ -86,6 +88,7 @@ class HealthMonitor:
             for innovation in self._innovations:
                 self._fixed.take(innovation)
                 self._closure.take(innovation)
+                self._shakes.take(innovation)
                 self._measurements.take(innovation)
             self._innovations.clear()
         if self._rig is not None and self._rig.wrong_at_rest and self._cameras_s == np.inf:
@@ -100,7 +103,13 @@ class HealthMonitor:
             t_s: time of its shot, s; None where it has none.
         """
         self._take(pose, t_s)
-        return pose if self._suspected is None else replace(pose, cov=pose.cov + self._suspected)
+        return self._widened(pose)
+
+    def _widened(self, pose: PoseEstimate) -> PoseEstimate:
+        """Return a pose with what is suspected of cameras and body in its covariance."""
+        if self._suspected is None or self._rig is None:
+            return pose
+        return replace(pose, cov=pose.cov + self._suspected, cov_noise=pose.cov_noise + self._rig.noise)
 
     def _take(self, pose: PoseEstimate, t_s: float | None) -> None:
         """Test a measured pose."""
@@ -326,12 +335,17 @@ class HealthMonitor:
 
     def suspected(self, measurement: PoseMeasurement) -> Array | None:
         """Return the covariance (6, 6) of what may have moved a pose measurement of the tool; None where nothing is."""
-        return suspected(measurement, self.changes)
+        return suspected(measurement, self._widening)
 
     @property
     def every_change(self) -> tuple[Change, ...]:
         """What explains the changes of a whole run: those that were put right, and those that were not."""
-        return (*self._past, *self.changes)
+        return (*self._past, *self._widening)
+
+    @property
+    def _widening(self) -> tuple[Change, ...]:
+        """What widens poses now."""
+        return self.changes if self._shakes.change is None else (*self.changes, self._shakes.change)
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
@@ -340,6 +354,7 @@ class HealthMonitor:
         now = (
             *(() if self._rig is None else self._rig.findings()),
             *self._moved(),
+            *self._shakes.findings(),
             *late,
             *self._host.findings(),
         )

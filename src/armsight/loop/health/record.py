@@ -16,6 +16,11 @@ from scipy.special import chdtri, fdtri
 Cause = Literal["rig", "body", "fixed", "time", "lens", "joint", "estimator", "host"]
 #: Probability of a false alarm of each test within a minute, while its noise model holds.
 FALSE_ALARMS_PER_MINUTE = 1e-4
+#: What displaces the tool by less, m, forbids no result: of cameras and lenses it is not said, as poses are widened by it.
+#: Half: what webcams leave after processing is said, double: a stand that shakes by 0.2 mm is not.
+COSTS_M = 1e-4
+#: A rotation counts by what it does at this distance from the body's origin, m.
+LEVER_M = 0.1
 
 
 class Trust(Enum):
@@ -40,6 +45,7 @@ class HealthFinding:
         advice: what to do.
         alternatives: other causes that explain it nearly as well.
         corrected_s: when it was put right, s; None where it was not.
+        cost_mm: by how much it displaces the tool, or what is measured, at most so far, mm; None where that is not known.
     """
 
     cause: Cause
@@ -51,6 +57,12 @@ class HealthFinding:
     advice: str
     alternatives: tuple[Cause, ...] = ()
     corrected_s: float | None = None
+    cost_mm: float | None = None
+
+    @property
+    def forbids(self) -> bool:
+        """Whether results must not be trusted because of it: not where it hardly displaces them."""
+        return self.cost_mm is None or self.cost_mm > 1e3 * COSTS_M
 
     def to_json(self) -> dict[str, Any]:
         """Return the object that summary.json and ``--json`` hold."""
@@ -60,13 +72,17 @@ class HealthFinding:
         """Return the finding as one line for people."""
         since = "" if self.since_s is None else f" since {self.since_s:.1f} s"
         right = "" if self.corrected_s is None else f", put right at {self.corrected_s:.1f} s"
-        return f"{self.cause}: {self.what}{since}{right}; {self.advice}"
+        costs = "" if self.cost_mm is None else f", which displaces poses by up to {self.cost_mm:.2f} mm"
+        return f"{self.cause}: {self.what}{since}{costs}{right}; {self.advice}"
 
 
 def health_lines(health: Sequence[HealthFinding]) -> list[str]:
     """Return the lines for a log, a terminal or a report: none where nothing was found."""
+    meanwhile = {True: "this result", False: "what was measured meanwhile"}
     return [
-        f"do not trust {'this result' if found.corrected_s is None else 'what was measured meanwhile'}: {found.line()}"
+        f"do not trust {meanwhile[found.corrected_s is None]}: {found.line()}"
+        if found.forbids
+        else f"note: {found.line()}"
         for found in health
     ]
 

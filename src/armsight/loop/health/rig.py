@@ -17,6 +17,10 @@ camera by the body's motion between the shots; each shot has a skew of its own b
 What the camera model lacks (a lens whose distortion it cannot express, a sensor that is tilted) displaces whatever appears
 at the same position in an image by the same: r = ... + L beta, with L polynomials of the position, of which each camera has
 its own. It is reported where beta explains more than any change of the seven numbers at any time does.
+
+A camera that nods averages out in the sums: what single shots say of its rotation is compared within each second, and what
+it varies beyond the noise is a covariance of its own, which differs from shot to shot (``unrest``). Images that were seen
+before, to the bit, say nothing new.
 """
 
 from __future__ import annotations
@@ -34,10 +38,11 @@ from scipy.special import chdtri
 
 from armsight.data import Array, Body, Ids, PoseEstimate, Record
 from armsight.geometry.matrix import product, solved
-from armsight.geometry.pose import inverse, log_se3, pose
+from armsight.geometry.pose import adjoint, inverse, log_se3, pose
 from armsight.kernels import kernel
-from armsight.loop.health.record import HealthFinding, alarm_limit
-from armsight.loop.health.shape import FURTHEST_M, ResidualSums, ShapeWatch, eliminated, total
+from armsight.loop.health.record import COSTS_M, LEVER_M, HealthFinding, alarm_limit
+from armsight.loop.health.shape import FURTHEST_M, SMOOTH, ResidualSums, ShapeWatch, eliminated, total
+from armsight.loop.health.unrest import Unrest
 from armsight.vision.camera import pair_arguments
 from armsight.vision.posefit import differentiate
 from armsight.vision.rig import StereoRig
@@ -77,6 +82,8 @@ _MATTERS = 2.0
 #: A part of the seven counts as necessary beyond this chance.
 _NECESSARY = 1e-4
 _ROTATIONS, _SCALED, _SKEWED = slice(2, 5), 5, 6
+#: Shots whose detections are remembered, to know the same images again; half: a shorter loop of images counts as new.
+_IMAGES = 4096
 #: What may be wrong, and its part of the seven numbers.
 _PARTS: dict[Part, slice] = {"rig": slice(0, 5), "body": slice(5, 6), "time": slice(6, 7)}
 #: Chi-square of an alarm: of all seven numbers, and of each part alone, which share the probability of a false one.
@@ -180,6 +187,7 @@ class RigWatch:
         alarm: whether the newest test found one that is certain.
         alarmed: whether any did.
         lens: what the camera models lack, where that is certain and matters.
+        noise: (6, 6) what of the covariance that the newest shot was given differs from shot to shot.
     """
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
@@ -195,7 +203,17 @@ class RigWatch:
         self._by_fault = _fault_directions(rig, self._size)
         names = tuple(body.point_names[k] for k in self._points)
         many = len(body.points) > MOST_POINTS
-        self._shape = ShapeWatch(self._size, _focal_changes(rig, self._size), count + 1, names, printed or many, TEST_S)
+        points = np.asarray(body.points, float)[self._points]
+        self._shape = ShapeWatch(
+            self._size,
+            _focal_changes(rig, self._size),
+            count + 1,
+            points,
+            names,
+            TEST_S,
+            rigid=printed or many,
+            strained=not printed,
+        )
         # (K, K + 7 + C) what the parameters, the seven numbers and the candidates of the shape change of the parameters, in
         # units of their priors: a test has sums of these.
         self._scaled = np.hstack([self.prior, self._by_fault * _WIDE, self._shape.by_wide])
@@ -224,6 +242,8 @@ class RigWatch:
         self.alarm = self.alarmed = False
         self._alarms = 0  # in a row
         self.suspected: RigChange | None = None
+        self.noise, self._unrest = np.zeros((6, 6)), Unrest(3)
+        self._images: dict[bytes, None] = {}  # detections of shots that were summed, the newest last
 
     def take(self, estimate: PoseEstimate, t_s: float | None) -> Array:
         """Take a measured pose.
@@ -246,12 +266,57 @@ class RigWatch:
         if found is None:
             return np.zeros((6, 6))
         self._effects.append((found.response, estimate.cov))
-        self._sum(found, estimate)
-        added = self._added(found)
+        if self._is_new(estimate):
+            self._sum(found, estimate)
+        self.noise = self._nodding(found.response, estimate.T_left_body)
+        added = self._added(found) + self.noise
         if added.any():  # of a body that is far off more than what is linear
             off = log_se3(inverse(estimate.T_left_body) @ self._linear_about(estimate)[1])
             added += np.outer(off, off)
         return added
+
+    def _is_new(self, estimate: PoseEstimate) -> bool:
+        """Return whether a shot's detections differ from those of the shots before: the same images say nothing new."""
+        seen = estimate.points.seen.uv.tobytes()
+        known = seen in self._images
+        self._images[seen] = None
+        if len(self._images) > _IMAGES:
+            del self._images[next(iter(self._images))]
+        return not known
+
+    def _nodding(self, response: Array, T: Array) -> Array:
+        """Return the covariance (6, 6) that a camera which nods adds to a pose (4, 4); either camera may be the one.
+
+        By the left one, in whose frame poses are, the body moves as well.
+        """
+        last = self._rig.parameter_count
+        by_right = response[:, last - 3 : last]
+        by_left = by_right + adjoint(inverse(T))[:, 3:] @ self._rig.T_left_right[:3, :3]
+        cov = self._unrest.cov
+        return np.asarray(0.5 * (by_right @ cov @ by_right.T + by_left @ cov @ by_left.T))
+
+    def _take_unrest(self, stays: Sequence[Sequence[_ShotResiduals]]) -> None:
+        """Compare what the shots of a test say of the right camera's rotation."""
+        shots, last = [shot for stay in stays for shot in stay], 1 + self._rig.parameter_count
+        J, r = [each.rows[:, last - 3 : last] for each in shots], [each.rows[:, 0] for each in shots]
+        H, b = np.array([each.T @ each for each in J]), np.array([j.T @ e for j, e in zip(J, r, strict=True)])
+        cov = np.linalg.inv(H)
+        d = np.einsum("nij,nj->ni", cov, b)
+        freedom = sum(map(len, r)) - 9.0 * len(shots)
+        excess = (sum(float(e @ e) for e in r) - float(np.vdot(b, d))) / max(freedom, 1.0)
+        self._unrest.take(np.array([each.t_s for each in shots]), d, cov, max(excess, 1.0))
+
+    def _unrest_weighed(self, rows: Array) -> Array:
+        """Return rows of a shot, with the rotation of a camera that nods in their noise: (I + J V J^T)^-1/2 times them."""
+        if not self._unrest.cov.any():
+            return rows
+        values, vectors = np.linalg.eigh(self._unrest.cov)
+        last = 1 + self._rig.parameter_count
+        J = rows[:, last - 3 : last] @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        squares, axes = np.linalg.eigh(J.T @ J)
+        squares = np.maximum(squares, 1e-12)
+        J = J @ axes
+        return np.asarray(rows - J @ (((1.0 - 1.0 / np.sqrt(1.0 + squares)) / squares)[:, None] * (J.T @ rows)))
 
     def _added(self, found: _ShotResiduals) -> Array:
         """Return what the suspected errors add to the covariance (6, 6) of a pose."""
@@ -280,6 +345,7 @@ class RigWatch:
             or self.lens is not None
             or self._shape.found is not None
             or self._shape.doubt is not None
+            or self._unrest.cov.any()
             or not self._timed
             or not 0.0 <= passed_s < _LIKE_S
         ):
@@ -410,7 +476,7 @@ class RigWatch:
         sums = ResidualSums(size, stays[0][0].t_s if stays else 0.0)
         for alone in (True, False):  # those of one shot are summed at once
             shots = [
-                (each.every if every else each.rows, len(stay))
+                (self._unrest_weighed(each.every if every else each.rows), len(stay))
                 for stay in stays
                 for each in stay
                 if (len(stay) == 1) is alone
@@ -426,6 +492,8 @@ class RigWatch:
         if not stays:
             return
         self._poses += len(stays)
+        if self._timed:
+            self._take_unrest(stays)
         whole = self._summed(stays)
         every = whole.of(self._size).by(self._scaled)
         test = every.of(len(self._window.b))
@@ -439,13 +507,13 @@ class RigWatch:
         self._window.scale(weight)
         self._window.add(test, 1.0)
         change = self._estimated(self._window)
-        alarm = _certain(change) and self._matters(change, slice(None))
+        alarm = self._is_alarm(change)
         doubted, self._doubted = self._doubted, None
         if alarm and moments and not self._alarms and self._poses > 1:
             worst = self._worst(moments)
             left_out = self._in_priors(worst.of(self._size))
             without = self._window.less(left_out)
-            if not _certain(estimated := self._estimated(without)):
+            if not self._is_alarm(estimated := self._estimated(without)):
                 # Images that do not belong together are no moved camera; newer shots that agree with them are.
                 if doubted is not None:
                     self._window.add(doubted, 1.0)
@@ -465,6 +533,12 @@ class RigWatch:
         due = 0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0
         if due and len(self._history) < _KEPT and self._poses >= _LENS_POSES:
             self.lens = self._lens()
+
+    def _is_alarm(self, change: RigChange) -> bool:
+        """Return whether a change is certain, beyond the sigmas of poses, and displaces them by what matters."""
+        every = slice(None)
+        costs = self._cost_m(self._of_part(change, every)) > COSTS_M
+        return _certain(change) and costs and self._matters(change, every)
 
     def _in_priors(self, sums: ResidualSums) -> ResidualSums:
         """Return sums of the parameters and the seven numbers, in units of their priors, from those of the parameters."""
@@ -539,6 +613,15 @@ class RigWatch:
         parts = [] if self.suspected is None else self._to_blame(self.suspected)
         return self._shape.found is not None or (self.alarm and not set(parts) <= {"time"})
 
+    def _cost_m(self, by: Array) -> float:
+        """Return by how much a change of the parameters (K + M,) displaces one of the newest poses at most, m."""
+        shifts = np.array([response for response, _ in self._effects]) @ by
+        return float(np.max(np.linalg.norm(shifts[:, :3], axis=1) + LEVER_M * np.linalg.norm(shifts[:, 3:], axis=1)))
+
+    def _of_part(self, change: RigChange, part: slice) -> Array:
+        """Return the change of the parameters (K + M,) that a part of the seven numbers makes."""
+        return np.append(self._by_fault[:, part] @ change.f[part], np.zeros(_LENS))
+
     def _matters(self, change: RigChange, part: slice) -> bool:
         """Return whether a part of the seven numbers moves one of the newest poses by so many of its sigmas."""
         responses, cov = map(np.array, zip(*self._effects, strict=True))
@@ -605,19 +688,39 @@ class RigWatch:
         """Return what was found so far, the shots of the running test included: nothing where no test gave an alarm."""
         ended = self._ended()
         shape, lens = ended._shape.said, ended.lens
+        by_shape = 0.0 if shape is None else ended._cost_m(np.append(ended._shape.change(shape), np.zeros(_LENS)))
+        if shape is not None and shape.chosen == (SMOOTH,) and by_shape < COSTS_M:
+            shape = None  # a print as good as any: poses have it in their sigma
         if shape is not None and (lens is None or shape.chi_square > lens.chi_square):
             found = ended._shape.finding(shape, shape.begin_s if self._timed else None)
+            found = replace(found, cost_mm=1e3 * by_shape)
             return (found, *(ended._changed() if ended.alarmed and shape.seven_needed else ()))
         if lens is not None:
-            return (_lens_finding(lens),)
-        return ended._changed() if ended.alarmed else ()
+            cost_m = ended._cost_m(np.append(np.zeros(self._size), lens.beta))
+            return (_lens_finding(lens, cost_m),) if cost_m > COSTS_M else ()
+        return (*(ended._changed() if ended.alarmed else ()), *ended._nods())
+
+    def _nods(self) -> tuple[HealthFinding, ...]:
+        """Return the finding of a camera that nods, where that displaces poses by what matters."""
+        cov, newest = self._unrest.cov, list(self._effects)[-1:]
+        if not cov.any() or not newest:
+            return ()
+        covs = self._nodding(newest[0][0], self._last[1])
+        cost_m = float(np.sqrt(np.trace(covs[:3, :3]))) + LEVER_M * float(np.sqrt(np.trace(covs[3:, 3:])))
+        return (_nod_finding(cov, cost_m),) if cost_m > COSTS_M else ()
 
     def _changed(self) -> tuple[HealthFinding, ...]:
         """Return what the newest test found of the seven numbers."""
         began_s, change = self._since()
         since_s = began_s if self._timed else None
         parts = self._to_blame(change)
-        found = (_FINDINGS[part](change, since_s, len(parts) == 1 and not self._needed(change, part)) for part in parts)
+        found = (
+            replace(
+                _FINDINGS[part](change, since_s, len(parts) == 1 and not self._needed(change, part)),
+                cost_mm=1e3 * self._cost_m(self._of_part(change, _PARTS[part])),
+            )
+            for part in parts
+        )
         several = self._poses > 1 or (self._timed and self._shots > 1)
         return tuple(found) if several else tuple(map(_of_one_pose, found))
 
@@ -850,7 +953,23 @@ def _skew_finding(change: RigChange, since_s: float | None, alone: bool) -> Heal
     )
 
 
-def _lens_finding(lens: LensError) -> HealthFinding:
+def _nod_finding(cov: Array, cost_m: float) -> HealthFinding:
+    """Return the finding of a camera that nods, of the covariance (3, 3) of its rotation, rad."""
+    size = float(np.degrees(np.sqrt(np.trace(cov))))
+    return HealthFinding(
+        "rig",
+        f"a camera nods: within a second the right one rotates by {size:.3f} deg (RMS) to and fro against the left one; "
+        "which of the two moves cannot be distinguished",
+        None,
+        size,
+        float(np.degrees(np.sqrt(np.linalg.eigvalsh(cov)[-1]))) * 0.1,
+        "deg",
+        "fasten the cameras on one stiff bar, away from what vibrates; poses have this in their sigma",
+        cost_mm=1e3 * cost_m,
+    )
+
+
+def _lens_finding(lens: LensError, cost_m: float) -> HealthFinding:
     """Return the finding of camera models that lack something."""
     size, sigma = lens.size_px
     besides = "; a change of the cameras, the body or their times cannot be excluded" if lens.needed else ""
@@ -865,6 +984,7 @@ def _lens_finding(lens: LensError) -> HealthFinding:
         "calibrate again with a richer lens model and with targets over the whole of both images; look for a lens that is "
         "loose or behind a window",
         lens.needed,
+        cost_mm=1e3 * cost_m,
     )
 
 

@@ -57,8 +57,14 @@ _MATTERS, _POSES = 2.0, 60
 #: Explanations whose chi-squares differ by less are not distinguished; one is needed besides another beyond this chance.
 _ALIKE, _NECESSARY = 12.0, 1e-4
 _BESIDES = float(chdtri(3, _NECESSARY))
-#: Probability, before a test, that it is the first one after any change.
-_RARE = 1e-4
+#: Probability, before a test, that it is the first one after any change; that a body is strained or bent as a print is.
+_RARE, _PRINTED = 1e-4, 0.1
+#: A smooth deformation is said from this log-evidence on; chance exceeds it in one of a thousand bodies at most (Markov),
+#: as a body's shape is the same in all tests. Half: one of thirty, double: a shear of 0.3 % widens poses without a word.
+_CERTAIN = float(np.log(1e3))
+#: Strain, shear and what bending adds at the body's edge, as a share of its radius: widths of their priors; half: a
+#: stretch of 0.3 % is found later, double: one of 0.1 % is.
+_STRAINS = (1e-3, 4e-3)
 #: So many newest tests, together, may be those after a change, or all; all points may be displaced by about so much, m.
 _AFTER, _BENT_M = (1, 2, 4, 8, 16), (2e-4, 1e-3)
 #: Tests that are not kept are forgotten with this time constant, in tests.
@@ -159,6 +165,7 @@ class ShapeError(Record):
         seven: by how much the seven numbers explain more than they all do.
         alike: what explains nearly as much as the first.
         begin_s: since when, s.
+        unsure: whether something else explains nearly as much as a smooth deformation.
     """
 
     chosen: tuple[int, ...]
@@ -168,6 +175,7 @@ class ShapeError(Record):
     seven: float
     alike: tuple[int, ...]
     begin_s: float
+    unsure: bool = False
 
     @property
     def seven_needed(self) -> bool:
@@ -175,8 +183,8 @@ class ShapeError(Record):
         return bool(self.seven > chdtri(7, _NECESSARY))
 
 
-#: Stands for the focal lengths among the rows of the points.
-FOCAL = -1
+#: Stand for the focal lengths and for a smooth deformation among the rows of the points.
+FOCAL, SMOOTH = -1, -2
 #: Rows of the seven numbers once the parameters are eliminated.
 _SEVEN = slice(1, 8)
 
@@ -214,10 +222,15 @@ class _Reduced(NamedTuple):
 
 
 class _Hypotheses(NamedTuple):
-    """Hypotheses of D numbers each: rows (N, D) of seven numbers and candidates, and by how much of their priors (N,)."""
+    """Hypotheses of D numbers each.
+
+    Rows (N, D) of seven numbers, candidates and smooth deformations, by how much of their priors (N,), and the probability
+    of all of them before anything is seen.
+    """
 
     rows: Ids
     scales: Array
+    chance: float = _RARE
 
 
 class _Explained(NamedTuple):
@@ -245,9 +258,11 @@ class ShapeWatch:
         focal: (K, 2) what relative changes of the focal lengths change of these: of the left one by a half and of the right
             one by minus a half, and of both.
         first: row of the first parameter of the points.
-        names: of the N points that have parameters.
-        rigid: whether the points are not tested: a print whose shape a calibration found.
+        points: (N, 3) those that have parameters, m.
+        names: of them.
         test_s: how often it is tested, s.
+        rigid: whether single points are not tested.
+        strained: whether the body may be stretched, sheared or bent: not a print whose shape a calibration found.
 
     Attributes:
         by_wide: (K, C) what the standard deviations of the candidates' priors change of the parameters.
@@ -257,7 +272,18 @@ class ShapeWatch:
         said: what was found last.
     """
 
-    def __init__(self, size: int, focal: Array, first: int, names: tuple[str, ...], rigid: bool, test_s: float) -> None:
+    def __init__(
+        self,
+        size: int,
+        focal: Array,
+        first: int,
+        points: Array,
+        names: tuple[str, ...],
+        test_s: float,
+        *,
+        rigid: bool,
+        strained: bool,
+    ) -> None:
         K, n = size, len(names)
         self._size, self._first, self._names = K, first, names
         # (K, 2 + 3 N) what a unit of each candidate changes of the parameters: of the focal lengths against each other,
@@ -268,7 +294,10 @@ class ShapeWatch:
         self._wide = np.append([_FOCAL, _FOCAL], np.full(3 * n, FURTHEST_M))
         self.by_wide = self._by_candidate * self._wide
         self._candidates = () if rigid else tuple(range(n))
-        self._hypotheses = _hypotheses(len(self._candidates))
+        # What smooth deformations add to sums of the residual, the seven numbers and the candidates; in m of the latter.
+        self._smooth = _smooth(points)
+        self._with_smooth = np.hstack([np.eye(10 + 3 * n), np.vstack([np.zeros((10, 27)), self._smooth / FURTHEST_M])])
+        self._hypotheses = _hypotheses(len(self._candidates), 3 * n, strained=strained)
         self._limit_focal, self._limit = (alarm_limit(size, 1.0 / test_s, 2 * (n + 1)) for size in (1, 3))
         self._view: Array | None = None  # the newest direction that differs from the one before
         self._views: list[Array] = []  # of the running test
@@ -390,20 +419,31 @@ class ShapeWatch:
 
         Nothing is one of the hypotheses, and its evidence is 1.
         """
-        M = eliminated(sums.M, slice(1, 1 + self._size))
-        prior = _RARE / sum(len(each.scales) for each in hypotheses)
-        moment = np.zeros((len(M) - 1, len(M) - 1))
-        gain = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(moment)), M[1:, 0]))
-        if gain < -2.0 * np.log(prior):
-            return 0.0, moment
-        excess = max((float(M[0, 0]) - gain) / max(sums.freedom, 1.0), 1.0)  # what all together do not explain is noise
+        M, excess = self._whole(sums)
+        every = self._with_smooth[1:, 1:]
+        moment = np.zeros((every.shape[1], every.shape[1]))
+        if M is None:
+            return 0.0, every @ moment @ every.T
         explained = [_explained(M, each, excess) for each in hypotheses]
-        logs = [np.log(prior) + each.evidence for each in explained]
+        shares = zip(hypotheses, explained, strict=True)
+        logs = [np.log(each.chance / len(each.scales)) + found.evidence for each, found in shares]
         evidence = float(np.logaddexp.reduce(np.concatenate([*logs, [0.0]])))
-        for (rows, _), log, each in zip(hypotheses, logs, explained, strict=True):
+        for (rows, _, _), log, each in zip(hypotheses, logs, explained, strict=True):
             moments = each.size[:, :, None] * each.size[:, None, :] + each.cov
             np.add.at(moment, (rows[:, :, None], rows[:, None, :]), np.exp(log - evidence)[:, None, None] * moments)
-        return evidence, moment
+        return evidence, every @ moment @ every.T
+
+    def _whole(self, sums: ResidualSums) -> tuple[Array | None, float]:
+        """Return sums of everything that may have changed, smooth deformations included, and the Birge ratio they leave.
+
+        None where all together explain too little to matter.
+        """
+        M = eliminated(sums.M, slice(1, 1 + self._size))
+        gain = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0]))
+        if gain < 2.0:
+            return None, 1.0
+        excess = max((float(M[0, 0]) - gain) / max(sums.freedom, 1.0), 1.0)  # what all together do not explain is noise
+        return self._with_smooth.T @ M @ self._with_smooth, excess
 
     def _shown(self, begin: int) -> ShapeError | None:
         """Return what the tests from one on show for certain; None where that is nothing."""
@@ -416,7 +456,29 @@ class ShapeWatch:
         error = self._focal_alone(found, sums.begin_s)
         if error is not None and _one_is_enough(newest):
             return error
-        return self._displaced(found, newest.whole, sums.begin_s)
+        return self._deformed(sums) or self._displaced(found, newest.whole, sums.begin_s)
+
+    def _deformed(self, sums: ResidualSums) -> ShapeError | None:
+        """Return a smooth deformation of the body that tests show for certain, and better than anything else does."""
+        M, excess = self._whole(sums)
+        smooth = [k for k, each in enumerate(self._hypotheses) if each.chance == _PRINTED]
+        if M is None or not smooth:
+            return None
+        explained = [_explained(M, each, excess) for each in self._hypotheses]
+        others = max(float(explained[k].evidence.max()) for k in range(len(explained)) if k not in smooth)
+        best = max(smooth, key=lambda k: float(explained[k].evidence.max()))
+        row = int(explained[best].evidence.argmax())
+        evidence = float(explained[best].evidence[row])
+        if evidence < _CERTAIN or evidence < others - _ALIKE / 2.0:
+            return None
+        rows, each = self._hypotheses[best].rows[row], explained[best]
+        columns = self._with_smooth[1:, 1:][:, rows] * np.concatenate([np.ones(7), self._wide])[:, None]
+        value, cov = columns[7:] @ each.size[row], columns[7:] @ each.cov[row] @ columns[7:].T
+        if not self._matters(value):
+            return None
+        return ShapeError(
+            (SMOOTH,), value, cov, 2.0 * evidence, 0.0, (), sums.begin_s, others > evidence - _ALIKE / 2.0
+        )
 
     def _displaced(self, found: _Reduced, newest: _ShapeSums, begin_s: float) -> ShapeError | None:
         """Return the points that are displaced by what all tests together say, and the newest; None where none is."""
@@ -534,6 +596,10 @@ class ShapeWatch:
         shift = effect @ found.value
         return np.asarray(np.outer(shift, shift) + effect @ found.cov @ effect.T)
 
+    def change(self, error: ShapeError) -> Array:
+        """Return the change of the parameters (K,) that was found."""
+        return np.asarray(self._by_candidate @ error.value)
+
     def copied(self) -> ShapeWatch:
         """Return a copy that says what was found so far; this one goes on."""
         other = copy(self)
@@ -543,7 +609,35 @@ class ShapeWatch:
 
     def finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
         """Return the finding of what was found."""
+        if error.chosen[0] == SMOOTH:
+            return self._smooth_finding(error, since_s)
         return _focal_finding(error, since_s) if error.chosen[0] == FOCAL else self._points_finding(error, since_s)
+
+    def _smooth_finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
+        """Return the finding of a body that is strained or bent: how far a point is displaced at most, motions apart."""
+        basis, value = self._smooth[:, :9], error.value[2:]
+        rigid = np.linalg.lstsq(basis, value, rcond=1e-9)[0].reshape(3, 3)
+        spin = (basis @ (0.5 * (rigid - rigid.T)).ravel()).reshape(-1, 3)
+        shifts = value.reshape(-1, 3) - spin
+        shifts -= shifts.mean(axis=0)
+        sizes = np.linalg.norm(shifts, axis=1)
+        k = int(sizes.argmax())
+        along = np.zeros(len(error.value))
+        along[2 + 3 * k : 5 + 3 * k] = shifts[k] / sizes[k]
+        strain = 50.0 * float(np.ptp(np.linalg.eigvalsh(rigid + rigid.T)))
+        return HealthFinding(
+            "body",
+            f"the body is stretched, sheared or bent against its file: its lengths differ by {strain:.2f} % from one "
+            f"direction to another, {self._names[k]} is displaced by {1e3 * sizes[k]:.2f} mm"
+            + ("; a change of the cameras cannot be excluded" if error.unsure else ""),
+            since_s,
+            1e3 * float(sizes[k]),
+            1e3 * float(np.sqrt(along @ error.cov @ along)),
+            "mm",
+            "measure the body along two directions and both diagonals with calipers, or take its shape from images "
+            "(armsight body); printers stretch along one axis",
+            ("rig",) if error.unsure else (),
+        )
 
     def _points_finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
         """Return the finding of points that are displaced."""
@@ -579,11 +673,33 @@ def _of_candidates(M: Array, freedom: float) -> _ShapeSums:
     return _ShapeSums(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0], float(M[0, 0]), freedom)
 
 
-def _hypotheses(points: int) -> tuple[_Hypotheses, ...]:
-    """Return what may have changed: the seven numbers, one focal length, both alike, a point, all points a little."""
-    every = 9 + np.arange(3 * points)
+def _smooth(points: Array) -> Array:
+    """Return (3 N, 27) smooth deformations of points (N, 3), m: strains (9: by coordinate, direction) and bends (18).
+
+    The former are motions of rows of a matrix that multiplies the points, the latter products of two coordinates; each is
+    a share of the body's radius at a point so far out.
+    """
+    from_middle = points - points.mean(axis=0)
+    radius = float(np.linalg.norm(from_middle, axis=1).max())
+    u = from_middle / radius
+    i, k = np.triu_indices(3)
+    bends = u[:, i] * u[:, k]
+    by = np.hstack([u, bends - bends.mean(axis=0)])
+    return np.asarray(radius * np.einsum("nk,ij->nikj", by, np.eye(3)).reshape(3 * len(points), -1))
+
+
+def _hypotheses(points: int, smooth: int, *, strained: bool) -> tuple[_Hypotheses, ...]:
+    """Return what may have changed: the seven numbers, one focal length, both alike, a point, all points a little.
+
+    And smooth deformations, whose rows stand after those of all points (``smooth`` of them).
+    """
+    every, first = 9 + np.arange(3 * points), 9 + smooth
+    strains, bends = (
+        _Hypotheses(np.tile(first + np.arange(count), (len(_STRAINS), 1)), np.array(_STRAINS), _PRINTED)
+        for count in (9, 27)
+    )
     seven = _Hypotheses(np.tile(np.arange(7), (len(_SEVEN_SCALES), 1)), np.array(_SEVEN_SCALES))
-    alone = (seven, _Hypotheses(np.array([[7], [8]]), np.ones(2)))
+    alone = (seven, _Hypotheses(np.array([[7], [8]]), np.ones(2)), *((strains, bends) if strained else ()))
     if not points:
         return alone
     single = _Hypotheses(every.reshape(points, 3), np.ones(points))
