@@ -42,7 +42,7 @@ from armsight.loop.health import HealthMonitor, Trust  # noqa: E402
 from armsight.loop.health.follow import RigFollower  # noqa: E402
 from armsight.sim.example_rig import PLATE_M, TAG_FAMILY, TAG_M, TAG_MIDDLES_M  # noqa: E402
 from armsight.sim.render.scene import PosedBody, marker_bits, plate, tag  # noqa: E402
-from armsight.sim.workcell.cameras import WorkcellSource  # noqa: E402
+from armsight.sim.workcell.cameras import WorkcellSource, _OneCamera  # noqa: E402
 from armsight.vision.markers.marker import Target  # noqa: E402
 from armsight.vision.markers.targets import open_target  # noqa: E402
 
@@ -94,6 +94,26 @@ def shape_cases() -> Iterator[Case]:
     yield Case("body bent: each second disc by 0.5 mm after 5 s", {"shift": bent, "at_s": 5.0}, "body")
 
 
+def print_cases() -> Iterator[Case]:
+    """Bodies that are stretched, sheared or bent as prints are, and cameras that nod."""
+    x, y = np.eye(3)[:2]
+    for share in (0.2, 0.3, 0.5):
+        for name, along, by in (
+            ("stretched along x", x, x), ("stretched along y", y, y), ("sheared in x y", x, y),
+            ("stretched along a diagonal", (x + y) / np.sqrt(2), (x + y) / np.sqrt(2)),
+        ):  # fmt: skip
+            shift = faults.strained(1e-2 * share * np.outer(along, by))
+            yield Case(f"body {name} by {share:g} %", {"shift": shift}, "body")
+    for radius_m in (5.0, 10.0):
+        shift = faults.strained(np.zeros((3, 3)), 1.0 / radius_m)
+        yield Case(f"body bent to a cylinder of {radius_m:g} m", {"shift": shift}, "body")
+    for hz in (1.5, 3.0, 7.0):
+        for side, word in enumerate(("left", "right")):
+            for axis, name in zip((x, y), "xy", strict=True):
+                nod = {"nod": (side, 0.03 * DEG * axis, hz)}
+                yield Case(f"{word} camera nods by 0.03 deg at {hz:g} Hz ({name})", nod, "rig")
+
+
 def lens_cases() -> Iterator[Case]:
     """Lenses and sensors that the model of the cameras cannot express, on two patches."""
     for px in (0.15, 0.3, 0.6):
@@ -140,6 +160,16 @@ def arm_cases() -> Iterator[Case]:
         yield Case(f"delay wanders by 10 ms{at}", {"late": wanders}, "time", 0.0)
 
 
+def shake_cases() -> Iterator[Case]:
+    """A rig that shakes, and a bracket of the body that bends under gravity, from the beginning."""
+    for hz, along in ((5.0, np.array([0.6, 0.48, 0.64])), (12.0, np.array([1.0, 0.0, 0.0]))):
+        shift = 2e-4 * np.append(along, np.zeros(3))
+        motion = {"motion": lambda t, shift=shift, hz=hz: shift * np.sin(2 * np.pi * hz * t)}
+        yield Case(f"rig shakes by 0.2 mm at {hz:g} Hz", motion, "fixed")
+    for deg in (0.05, 0.15):
+        yield Case(f"bracket bends by {deg:g} deg under gravity", {"slip": faults.sag(deg * DEG)}, "body")
+
+
 def bump_cases() -> Iterator[Case]:
     """Bumps of the rig of other sizes and directions, and rotations."""
     for mm in (0.5, 1.0, 2.0, 4.0, 10.0):
@@ -162,7 +192,8 @@ def body_run(case: Case, seed: int) -> dict:
     begin_s = case.options.get("at_s", 0.0)
     for monitor, t_s, T, measured, given in faults.watched_body(seed, seconds=BODY_S, **case.options):
         rig = monitor._rig
-        if np.isnan(named_s) and (rig.alarm or rig.lens is not None or rig._shape.found is not None):
+        seen = rig.alarm or rig.lens is not None or rig._shape.found is not None or rig._unrest.cov.any()
+        if np.isnan(named_s) and seen:
             named_s = t_s
         error, sigma = (inverse(T) @ measured.T_left_body)[:3, 3], np.sqrt(np.trace(measured.cov[:3, :3]))
         errors.append(np.append(error, sigma) if t_s >= begin_s else np.zeros(4))
@@ -213,7 +244,8 @@ def shifts_m(options: dict, moved: faults.Moved, rows: np.ndarray) -> np.ndarray
         later = np.round([options["late"](age) / 1e-3 for age in ages]).astype(int)
         wrong = moved.Ts_true[np.clip(rows - later, 0, len(moved.Ts_true) - 1)]
     if "slip" in options:
-        wrong = Ts @ exp_se3(options["slip"])
+        slip = options["slip"]
+        wrong = Ts @ exp_se3(np.array([slip(T[:3, :3]) for T in Ts]) if callable(slip) else slip)
     return np.linalg.norm(wrong[:, :3, 3] - Ts[:, :3, 3], axis=1)
 
 
@@ -254,9 +286,11 @@ def main(words: list[str], seeds: range, results: Path | None) -> None:
     for make, cases in (
         (body_run, body_cases()),
         (body_run, shape_cases()),
+        (body_run, print_cases()),
         (body_run, lens_cases()),
         (arm_run, arm_cases()),
         (arm_run, bump_cases()),
+        (arm_run, shake_cases()),
     ):
         for case in cases:
             if words and not any(word in case.name for word in words):
@@ -419,16 +453,19 @@ PLATES = (("post1", 10, [-0.28, -0.26, 0.95]), ("post2", 20, [0.46, -0.26, 0.95]
 def with_plates(case: str) -> tuple[Target, ...]:
     """Put fixed plates before the workcell's cameras, which move where a case says so; return them as targets."""
     plates = [fixed_plate(*each) for each in PLATES]
-    image = WorkcellSource._image
+    image, begun = _OneCamera.__call__, WorkcellSource.__init__
 
-    def seen(self, side, t_s, frames, body, shutter, number, held, led):
-        if number < 0:
-            return image(self, side, t_s, frames, body, shutter, number, held, led)
-        moved = inverse(exp_se3(BUMP)) if t_s >= KNOCK_S else np.eye(4)
-        every = tuple(p.on_body(moved @ each.T_camera_body) for _, each in plates for p in each.patterns)
-        return image(self, side, t_s, frames, body, shutter, number, PosedBody(every, np.eye(4)), led)
+    def seen(camera, exposed):
+        if exposed.number >= 0:
+            moved = inverse(exp_se3(BUMP)) if exposed.t_s >= KNOCK_S else np.eye(4)
+            every = tuple(p.on_body(moved @ each.T_camera_body) for _, each in plates for p in each.patterns)
+            exposed = exposed._replace(held=PosedBody(every, np.eye(4)))
+        return image(camera, exposed)
 
-    WorkcellSource._image = seen
+    def here(source, *given, processes=False, **options):  # a process of its own would not know the plates
+        begun(source, *given, processes=False, **options)
+
+    _OneCamera.__call__, WorkcellSource.__init__ = seen, here
     return tuple(target for target, _ in plates)
 
 
