@@ -257,6 +257,7 @@ class RigWatch:
         """
         now_s, self._timed = (float(self._shots), False) if t_s is None else (t_s, True)
         self._shots += 1
+        is_new = self._is_new(estimate)
         if self._redundant(estimate.T_left_body, now_s):
             self._last = (now_s, estimate.T_left_body)
             return np.zeros((6, 6))
@@ -266,7 +267,7 @@ class RigWatch:
         if found is None:
             return np.zeros((6, 6))
         self._effects.append((found.response, estimate.cov))
-        if self._is_new(estimate):
+        if is_new:
             self._sum(found, estimate)
         self.noise = self._nodding(found.response, estimate.T_left_body)
         added = self._added(found) + self.noise

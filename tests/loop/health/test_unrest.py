@@ -1,0 +1,77 @@
+"""What moves to and fro within a second, bodies that are strained as prints are, images that were seen before."""
+
+import faults
+import numpy as np
+import pytest
+from faults import strained, watched_body
+
+from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.health.record import HealthFinding, health_lines
+from armsight.loop.health.rig import RigWatch
+from armsight.loop.health.unrest import Unrest
+
+X, Y = np.eye(3)[:2]
+
+
+def nees_and_findings(seed, **fault):
+    """Mean NEES from 3 s on of poses given out, and what was found."""
+    run = list(watched_body(seed, seconds=9.0, **fault))
+    squares = []
+    for _, t_s, T, _, given in run:
+        off = log_se3(inverse(given.T_left_body) @ T)
+        squares += [off @ np.linalg.solve(given.cov, off)] if t_s > 3.0 else []
+    return float(np.mean(squares)), run[-1][0].findings()
+
+
+@pytest.mark.parametrize(
+    ("shift", "seed"), [(strained(3e-3 * np.outer(X, X)), 31), (strained(3e-3 * np.outer(X, Y)), 32)]
+)
+def test_a_stretched_or_sheared_body_is_named_and_poses_are_widened(shift, seed):
+    nees, found = nees_and_findings(seed, shift=shift)
+    assert [each.cause for each in found] == ["body"]
+    assert "stretched, sheared or bent" in found[0].what
+    assert nees < 12.0  # 65 to 250 without
+
+
+@pytest.mark.parametrize(("side", "axis", "hz"), [(0, X, 3.0), (1, Y, 7.0)])
+def test_a_camera_that_nods_is_named_and_poses_are_widened(side, axis, hz):
+    nees, found = nees_and_findings(41, nod=(side, np.radians(0.03) * axis, hz))
+    assert [each.cause for each in found] == ["rig"]
+    assert "nods" in found[0].what
+    assert found[0].size == pytest.approx(0.03 / np.sqrt(2.0), rel=0.15)
+    assert nees < 16.0
+
+
+def test_images_seen_before_say_nothing_new():
+    shots = [(monitor._rig._rig, t_s, estimate) for monitor, t_s, _, estimate, _ in watched_body(51, seconds=3.0)]
+    once, often = (RigWatch(shots[0][0], faults.BODY, faults.SYNC_S) for _ in range(2))
+    for k in range(5):
+        for _, t_s, estimate in shots:
+            often.take(estimate, t_s + 3.0 * k)
+            if k == 0:
+                once.take(estimate, t_s)
+    np.testing.assert_array_equal(often._ended()._whole.M, once._ended()._whole.M)
+
+
+def test_unrest_finds_a_variance_and_no_other():
+    rng, unrest, calm = np.random.default_rng(3), Unrest(2), Unrest(2)
+    noise = np.diag([1.0, 4.0])
+    for k in range(30):
+        t = k + np.arange(30) / 30.0
+        values = rng.normal(size=(30, 2)) * [1.0, 2.0] + 50.0 * np.array([t, t**2]).T / 30.0
+        calm.take(t, values, np.tile(noise, (30, 1, 1)))
+        unrest.take(t, values + np.outer(3.0 * np.sin(2 * np.pi * 5.0 * t), [1.0, 0.0]), np.tile(noise, (30, 1, 1)))
+    assert not calm.cov.any()
+    assert unrest.cov[0, 0] == pytest.approx(4.5, rel=0.15)  # 3^2 / 2; some goes into the parabola
+    assert abs(unrest.cov[1, 1]) < 0.5
+
+
+def test_what_hardly_displaces_poses_forbids_nothing():
+    small = HealthFinding("rig", "x", None, 0.002, 0.001, "deg", "y", cost_mm=0.05)
+    large = HealthFinding("rig", "x", None, 0.02, 0.001, "deg", "y", cost_mm=0.5)
+    assert not small.forbids
+    assert large.forbids
+    first, second = health_lines([small, large])
+    assert first.startswith("note: ")
+    assert second.startswith("do not trust this result: ")
+    assert "by up to 0.50 mm" in second
