@@ -165,7 +165,6 @@ class ShapeError(Record):
         seven: by how much the seven numbers explain more than they all do.
         alike: what explains nearly as much as the first.
         begin_s: since when, s.
-        unsure: whether something else explains nearly as much as a smooth deformation.
     """
 
     chosen: tuple[int, ...]
@@ -175,7 +174,6 @@ class ShapeError(Record):
     seven: float
     alike: tuple[int, ...]
     begin_s: float
-    unsure: bool = False
 
     @property
     def seven_needed(self) -> bool:
@@ -459,26 +457,30 @@ class ShapeWatch:
         return self._deformed(sums) or self._displaced(found, newest.whole, sums.begin_s)
 
     def _deformed(self, sums: ResidualSums) -> ShapeError | None:
-        """Return a smooth deformation of the body that tests show for certain, and better than anything else does."""
+        """Return a smooth deformation of the body that tests show for certain, beside any change of the seven numbers.
+
+        And better than a single point does.
+        """
         M, excess = self._whole(sums)
-        smooth = [k for k, each in enumerate(self._hypotheses) if each.chance == _PRINTED]
+        smooth = [each for each in self._hypotheses if each.chance == _PRINTED]
         if M is None or not smooth:
             return None
-        explained = [_explained(M, each, excess) for each in self._hypotheses]
-        others = max(float(explained[k].evidence.max()) for k in range(len(explained)) if k not in smooth)
-        best = max(smooth, key=lambda k: float(explained[k].evidence.max()))
-        row = int(explained[best].evidence.argmax())
-        evidence = float(explained[best].evidence[row])
-        if evidence < _CERTAIN or evidence < others - _ALIKE / 2.0:
+        besides = eliminated(M, _SEVEN)
+        points = [each for each in self._hypotheses[1:] if each.chance != _PRINTED]
+        most, other = (
+            [float(_explained(besides, each._replace(rows=each.rows - 7), excess).evidence.max()) for each in some]
+            for some in (smooth, points)
+        )
+        if max(most) < max(_CERTAIN, max(other) + _ALIKE / 2.0):
             return None
-        rows, each = self._hypotheses[best].rows[row], explained[best]
-        columns = self._with_smooth[1:, 1:][:, rows] * np.concatenate([np.ones(7), self._wide])[:, None]
-        value, cov = columns[7:] @ each.size[row], columns[7:] @ each.cov[row] @ columns[7:].T
+        hypothesis = smooth[int(np.argmax(most))]
+        found = _explained(M, hypothesis, excess)
+        row = int(found.evidence.argmax())
+        columns = self._with_smooth[8:, 1:][:, hypothesis.rows[row]] * self._wide[:, None]
+        value, cov = columns @ found.size[row], columns @ found.cov[row] @ columns.T
         if not self._matters(value):
             return None
-        return ShapeError(
-            (SMOOTH,), value, cov, 2.0 * evidence, 0.0, (), sums.begin_s, others > evidence - _ALIKE / 2.0
-        )
+        return ShapeError((SMOOTH,), value, cov, 2.0 * max(most), 0.0, (), sums.begin_s)
 
     def _displaced(self, found: _Reduced, newest: _ShapeSums, begin_s: float) -> ShapeError | None:
         """Return the points that are displaced by what all tests together say, and the newest; None where none is."""
@@ -628,15 +630,13 @@ class ShapeWatch:
         return HealthFinding(
             "body",
             f"the body is stretched, sheared or bent against its file: its lengths differ by {strain:.2f} % from one "
-            f"direction to another, {self._names[k]} is displaced by {1e3 * sizes[k]:.2f} mm"
-            + ("; a change of the cameras cannot be excluded" if error.unsure else ""),
+            f"direction to another, {self._names[k]} is displaced by {1e3 * sizes[k]:.2f} mm",
             since_s,
             1e3 * float(sizes[k]),
             1e3 * float(np.sqrt(along @ error.cov @ along)),
             "mm",
             "measure the body along two directions and both diagonals with calipers, or take its shape from images "
             "(armsight body); printers stretch along one axis",
-            ("rig",) if error.unsure else (),
         )
 
     def _points_finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:

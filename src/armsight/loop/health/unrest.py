@@ -9,6 +9,9 @@ counts where chance does not explain its variance. Moments of a component of var
 
 from __future__ import annotations
 
+from collections import deque
+from typing import Any
+
 import numpy as np
 from scipy.special import chdtrc
 
@@ -22,9 +25,9 @@ from armsight.loop.health.record import COSTS_M, FALSE_ALARMS_PER_MINUTE, LEVER_
 _TERMS = 3
 #: Shots of a window at the least; half: the polynomial takes most of what they show, double: slow cameras are not watched.
 _LEAST = 8
-#: Windows are forgotten with this time constant, in windows; half: an end of the shaking is seen sooner, double: less of it
-#: is needed.
-_FORGET = 20.0
+#: Newest windows that count, without the share of them that varies most: a jump is in one of them, what shakes in all; and
+#: how many there must be. Half: a jump counts for as long as a window does, double: shaking is found after twice the time.
+_NEWEST, _ODD, _FEWEST = 20, 0.25, 4
 
 
 #: Length of a window of innovations, s; half: shaking below 4 Hz is taken for the arm, double: the arm for shaking.
@@ -39,7 +42,7 @@ class Unrest:
     """
 
     def __init__(self, size: int) -> None:
-        self._seen, self._expected, self._shares = np.zeros((size, size)), np.zeros((size, size)), np.zeros(2)
+        self._windows: deque[tuple[Any, ...]] = deque(maxlen=_NEWEST)
         self.cov = np.zeros((size, size))
 
     def take(self, t_s: Array, values: Array, covs: Array, excess: float = 1.0) -> None:
@@ -59,13 +62,16 @@ class Unrest:
         # A shot says of a variance as much as the square of its information.
         sizes = np.trace(np.linalg.solve(covs.mean(axis=0), noise), axis1=1, axis2=2)
         shares = 1.0 / sizes**2
-        weight = float(np.exp(-1.0 / _FORGET))
-        self._seen = weight * self._seen + (left.T * shares) @ left
-        self._expected = weight * self._expected + np.einsum("n,nij->ij", shares, noise)
-        self._shares = weight * self._shares + np.array([shares.sum(), np.square(shares).sum()])
-        freedom = float(self._shares[0] ** 2 / self._shares[1]) * (1.0 - _TERMS / len(t_s))
-        L = np.linalg.cholesky(self._expected / self._shares[0])
-        inner = np.linalg.solve(L, np.linalg.solve(L, self._seen / self._shares[0]).T)
+        sums = (left.T * shares) @ left, np.einsum("n,nij->ij", shares, noise), shares.sum(), np.square(shares).sum()
+        self._windows.append((float(np.trace(np.linalg.solve(sums[1], sums[0]))), len(t_s), *sums))
+        self.cov = np.zeros_like(self.cov)
+        if len(self._windows) < _FEWEST:
+            return
+        usual = sorted(self._windows, key=lambda each: each[0])[: -max(round(_ODD * len(self._windows)), 1)]
+        _, counts, seen, expected, once, twice = (sum(part) for part in zip(*usual, strict=True))
+        freedom = float(once**2 / twice) * (1.0 - _TERMS * len(usual) / counts)
+        L = np.linalg.cholesky(expected / once)
+        inner = np.linalg.solve(L, np.linalg.solve(L, seen / once).T)
         values, vectors = np.linalg.eigh((inner + inner.T) / 2.0)
         certain = chdtrc(freedom, freedom * values) * len(values) < FALSE_ALARMS_PER_MINUTE / 60.0
         axes = L @ vectors
