@@ -95,12 +95,12 @@ def shape_cases() -> Iterator[Case]:
 
 
 def print_cases() -> Iterator[Case]:
-    """Bodies that are stretched, sheared or bent as prints are, and cameras that nod."""
+    """Bodies that are elongated, sheared or bent as prints are, and cameras that nod."""
     x, y = np.eye(3)[:2]
     for share in (0.2, 0.3, 0.5):
         for name, along, by in (
-            ("stretched along x", x, x), ("stretched along y", y, y), ("sheared in x y", x, y),
-            ("stretched along a diagonal", (x + y) / np.sqrt(2), (x + y) / np.sqrt(2)),
+            ("elongated along x", x, x), ("elongated along y", y, y), ("sheared in x y", x, y),
+            ("elongated along a diagonal", (x + y) / np.sqrt(2), (x + y) / np.sqrt(2)),
         ):  # fmt: skip
             shift = faults.strained(1e-2 * share * np.outer(along, by))
             yield Case(f"body {name} by {share:g} %", {"shift": shift}, "body")
@@ -167,7 +167,7 @@ def shake_cases() -> Iterator[Case]:
         motion = {"motion": lambda t, shift=shift, hz=hz: shift * np.sin(2 * np.pi * hz * t)}
         yield Case(f"rig shakes by 0.2 mm at {hz:g} Hz", motion, "fixed")
     for deg in (0.05, 0.15):
-        yield Case(f"bracket bends by {deg:g} deg under gravity", {"slip": faults.sag(deg * DEG)}, "body")
+        yield Case(f"bracket bends by {deg:g} deg under gravity", {"slip": faults.bending(deg * DEG)}, "body")
 
 
 def bump_cases() -> Iterator[Case]:

@@ -26,7 +26,7 @@ def checked(arm, seed):
     ("wrong", "named"),
     [
         ({"alpha": np.where(JOINT == 3, -1, 1) * ARM.alpha}, "alpha of joint4 has the other sign"),
-        ({"direction": np.where(JOINT == 1, -1.0, 1.0)}, "joint2 turns the other way"),
+        ({"direction": np.where(JOINT == 1, -1.0, 1.0)}, "joint2 rotates the other way"),
         ({"offset": ARM.offset + np.radians(90.0) * (JOINT == 4)}, "the zero of joint5 is off by -90 deg"),
         ({"a": ARM.a[[0, 2, 1, 3, 4, 5]]}, "a of joint2 and a of joint3 are exchanged"),
     ],

@@ -160,7 +160,7 @@ def ended(seed, **fault):
     return monitor.findings()
 
 
-def sag(rad, along=(0.0, 0.0, 1.0)):
+def bending(rad, along=(0.0, 0.0, 1.0)):
     """A bracket, along an axis of the tool, that bends by so much under gravity: by how much it rotates the body (6,)."""
     return lambda R: np.append(np.zeros(3), rad * np.cross(along, R.T @ [0.0, 0.0, -1.0]))
 

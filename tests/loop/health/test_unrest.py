@@ -26,10 +26,10 @@ def nees_and_findings(seed, **fault):
 @pytest.mark.parametrize(
     ("shift", "seed"), [(strained(3e-3 * np.outer(X, X)), 31), (strained(3e-3 * np.outer(X, Y)), 32)]
 )
-def test_a_stretched_or_sheared_body_is_named_and_poses_are_widened(shift, seed):
+def test_a_elongated_or_sheared_body_is_named_and_poses_are_widened(shift, seed):
     nees, found = nees_and_findings(seed, shift=shift)
     assert [each.cause for each in found] == ["body"]
-    assert "stretched, sheared or bent" in found[0].what
+    assert "elongated, sheared or bent" in found[0].what
     assert nees < 12.0  # 65 to 250 without
 
 

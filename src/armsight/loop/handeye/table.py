@@ -98,7 +98,7 @@ def _mistakes(arm: Arm) -> Iterator[tuple[str, Arm]]:
             length = getattr(arm, key)
             if abs(length[i]) > _LEAST_M:
                 yield f"{key} of {name} has the other sign", replace(arm, **{key: np.where(at, -length, length)})
-        yield f"{name} turns the other way", replace(arm, direction=np.where(at, -arm.direction, arm.direction))
+        yield f"{name} rotates the other way", replace(arm, direction=np.where(at, -arm.direction, arm.direction))
         for deg in (90, -90, 180):
             yield f"the zero of {name} is off by {deg} deg", replace(arm, offset=arm.offset + np.radians(deg) * at)
     lengths = np.concatenate([arm.a, arm.d])

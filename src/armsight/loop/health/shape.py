@@ -62,8 +62,8 @@ _RARE, _PRINTED = 1e-4, 0.1
 #: A smooth deformation is said from this log-evidence on; chance exceeds it in one of a thousand bodies at most (Markov),
 #: as a body's shape is the same in all tests. Half: one of thirty, double: a shear of 0.3 % widens poses without a word.
 _CERTAIN = float(np.log(1e3))
-#: Strain, shear and what bending adds at the body's edge, as a share of its radius: widths of their priors; half: a
-#: stretch of 0.3 % is found later, double: one of 0.1 % is.
+#: Strain, shear and what bending adds at the body's edge, as a share of its radius: widths of their priors; half: an
+#: elongation of 0.3 % is found later, double: one of 0.1 % is.
 _STRAINS = (1e-3, 4e-3)
 #: So many newest tests, together, may be those after a change, or all; all points may be displaced by about so much, m.
 _AFTER, _BENT_M = (1, 2, 4, 8, 16), (2e-4, 1e-3)
@@ -260,7 +260,7 @@ class ShapeWatch:
         names: of them.
         test_s: how often it is tested, s.
         rigid: whether single points are not tested.
-        strained: whether the body may be stretched, sheared or bent: not a print whose shape a calibration found.
+        strained: whether the body may be elongated, sheared or bent: not a print whose shape a calibration found.
 
     Attributes:
         by_wide: (K, C) what the standard deviations of the candidates' priors change of the parameters.
@@ -629,14 +629,14 @@ class ShapeWatch:
         strain = 50.0 * float(np.ptp(np.linalg.eigvalsh(rigid + rigid.T)))
         return HealthFinding(
             "body",
-            f"the body is stretched, sheared or bent against its file: its lengths differ by {strain:.2f} % from one "
+            f"the body is elongated, sheared or bent against its file: its lengths differ by {strain:.2f} % from one "
             f"direction to another, {self._names[k]} is displaced by {1e3 * sizes[k]:.2f} mm",
             since_s,
             1e3 * float(sizes[k]),
             1e3 * float(np.sqrt(along @ error.cov @ along)),
             "mm",
             "measure the body along two directions and both diagonals with calipers, or take its shape from images "
-            "(armsight body); printers stretch along one axis",
+            "(armsight body); printers are off along one axis",
         )
 
     def _points_finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:

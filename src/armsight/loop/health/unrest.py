@@ -114,14 +114,14 @@ class ShakeWatch:
         """Return what was found, where it displaces the tool by what matters."""
         if self.change is None:
             return ()
-        shift, turn = (float(np.sqrt(np.trace(self.change.cov[part, part]))) for part in (slice(0, 3), slice(3, 6)))
-        if shift + LEVER_M * turn < COSTS_M:
+        shift, angle = (float(np.sqrt(np.trace(self.change.cov[part, part]))) for part in (slice(0, 3), slice(3, 6)))
+        if shift + LEVER_M * angle < COSTS_M:
             return ()
-        by = f"{1e3 * shift:.2f} mm and {np.degrees(turn):.3f} deg (RMS)"
+        by = f"{1e3 * shift:.2f} mm and {np.degrees(angle):.3f} deg (RMS)"
         what = f"rig and arm shake against each other: the tool moves by {by} to and fro within a second"
         advice = "mount the rig and the arm on one stiff base, away from what vibrates; poses have this in their sigma"
         return (
             HealthFinding(
-                "fixed", what, None, 1e3 * shift, 0.1e3 * shift, "mm", advice, cost_mm=1e3 * (shift + LEVER_M * turn)
+                "fixed", what, None, 1e3 * shift, 0.1e3 * shift, "mm", advice, cost_mm=1e3 * (shift + LEVER_M * angle)
             ),
         )
