@@ -6,9 +6,9 @@ import pytest
 from faults import strained, watched_body
 
 from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.health.fixed import Unrest
 from armsight.loop.health.record import HealthFinding, health_lines
 from armsight.loop.health.rig import RigWatch
-from armsight.loop.health.unrest import Unrest
 
 X, Y = np.eye(3)[:2]
 

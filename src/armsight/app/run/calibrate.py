@@ -23,7 +23,7 @@ from armsight.loop.delay import MIN_MEASUREMENTS, estimate_delay
 from armsight.loop.estimators import Delay, Mounting, Prior
 from armsight.loop.handeye.handeye import HandEye, calibrate_handeye
 from armsight.loop.handeye.noise import STRUCTURES
-from armsight.loop.handeye.table import require_fitting
+from armsight.loop.handeye.poses import require_fitting
 from armsight.loop.sync_led import with_led
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import point_to_point

@@ -12,20 +12,30 @@ so that z_k = G_k d + noise; a drift adds its speed to F in every step. For each
 b = sum G^T S^-1 z give d = C^-1 b, and the chi-square b^T C^-1 b. Many beginnings are tried at once, the older the coarser.
 A motion of the base gives the alarm: with six numbers it explains most of what the others do. The likelihoods of all decide
 which of them is named.
+
+What moves to and fro within a second: a mount that nods, a stand that shakes; it averages out where a mean is tested.
+
+In: values with the covariance that their noise explains, of single shots. Out: the covariance of what they scatter beyond
+that. Of each second a parabola is removed, as calibrations and arms are off by what changes slowly with the pose. The rest
+is compared with its expectation in the axes of the noise (principal axes of one covariance relative to another); an axis
+counts where chance does not explain its variance. Moments of a component of variance: Searle, Casella, McCulloch,
+"Variance Components", 1992.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections import deque
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.special import chdtrc
 
 from armsight.data import Array, Ids
 from armsight.loop.estimators import Innovation, Outcome
 from armsight.loop.estimators.armerror import layout
 from armsight.loop.health.change import RAMPS, Change, Suspect, changing, ranked, suspects
-from armsight.loop.health.record import HealthFinding, alarm_limit
+from armsight.loop.health.record import COSTS_M, FALSE_ALARMS_PER_MINUTE, LEVER_M, HealthFinding, alarm_limit
 
 #: A beginning is tried every so often, s; older than this many seconds their distances grow with their age.
 EVERY_S, _FINE_S, _RATIO = 0.2, 1.0, 1.4
@@ -237,3 +247,110 @@ def _reopened_finding(count: int, first_s: float) -> HealthFinding:
         "measurements",
         "check the body on the tool, the joints for slip, and for obstacles that the arm met",
     )
+
+
+#: Terms of the polynomial that is removed of each window; half: the arm's own errors count as shaking, double: shaking
+#: below 4 Hz does not.
+_TERMS = 3
+#: Shots of a window at the least; half: the polynomial takes most of what they show, double: slow cameras are not watched.
+_LEAST = 8
+#: Newest windows that count, without the share of them that varies most: a jump is in one of them, what shakes in all; and
+#: how many there must be. Half: a jump counts for as long as a window does, double: shaking is found after twice the time.
+_NEWEST, _ODD, _FEWEST = 20, 0.25, 4
+
+
+#: Length of a window of innovations, s; half: shaking below 4 Hz is taken for the arm, double: the arm for shaking.
+_WINDOW_S = 1.0
+
+
+class Unrest:
+    """Estimates how much values of D numbers vary within a window beyond their noise.
+
+    Attributes:
+        cov: (D, D) covariance of what they vary beyond it; zero while chance explains it.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._windows: deque[tuple[Any, ...]] = deque(maxlen=_NEWEST)
+        self.cov = np.zeros((size, size))
+
+    def take(self, t_s: Array, values: Array, covs: Array, excess: float = 1.0) -> None:
+        """Take a window.
+
+        Args:
+            t_s: (N,) times, s.
+            values: (N, D) of its shots.
+            covs: (N, D, D) covariances of their noise.
+            excess: by how much the variance of the noise is larger than they say.
+        """
+        if len(t_s) < _LEAST:
+            return
+        Q = np.linalg.qr(np.vander((t_s - t_s.mean()) / np.ptp(t_s), _TERMS))[0]
+        kept = np.eye(len(t_s)) - Q @ Q.T
+        left, noise = kept @ values, np.einsum("nk,kij->nij", kept**2, excess * covs)
+        # A shot says of a variance as much as the square of its information.
+        sizes = np.trace(np.linalg.solve(covs.mean(axis=0), noise), axis1=1, axis2=2)
+        shares = 1.0 / sizes**2
+        sums = (left.T * shares) @ left, np.einsum("n,nij->ij", shares, noise), shares.sum(), np.square(shares).sum()
+        self._windows.append((float(np.trace(np.linalg.solve(sums[1], sums[0]))), len(t_s), *sums))
+        self.cov = np.zeros_like(self.cov)
+        if len(self._windows) < _FEWEST:
+            return
+        usual = sorted(self._windows, key=lambda each: each[0])[: -max(round(_ODD * len(self._windows)), 1)]
+        _, counts, seen, expected, once, twice = (sum(part) for part in zip(*usual, strict=True))
+        freedom = float(once**2 / twice) * (1.0 - _TERMS * len(usual) / counts)
+        L = np.linalg.cholesky(expected / once)
+        inner = np.linalg.solve(L, np.linalg.solve(L, seen / once).T)
+        values, vectors = np.linalg.eigh((inner + inner.T) / 2.0)
+        certain = chdtrc(freedom, freedom * values) * len(values) < FALSE_ALARMS_PER_MINUTE / 60.0
+        axes = L @ vectors
+        self.cov = (axes * np.where(certain, values - 1.0, 0.0)) @ axes.T
+
+
+class ShakeWatch:
+    """Watches whether rig and arm shake against each other, by what the estimator leaves of poses within a second.
+
+    Attributes:
+        change: what it adds to poses; None while nothing shakes.
+    """
+
+    def __init__(self) -> None:
+        self._unrest, self._window = Unrest(6), list[tuple[float, Array, Array]]()
+        self.change: Change | None = None
+
+    def take(self, innovation: Innovation) -> None:
+        """Take what the estimator did with a measurement, in order of time."""
+        if innovation.outcome is not Outcome.USED or innovation.noise is None or innovation.added is None:
+            return
+        if self._window and not 0.0 <= innovation.t_s - self._window[0][0] < _WINDOW_S:
+            self._decide(innovation)
+        R = np.kron(np.eye(2), innovation.T_base_tool[:3, :3])
+        noise = innovation.noise + (innovation.by_state * innovation.added) @ innovation.by_state.T
+        self._window.append((innovation.t_s, R @ innovation.z, R @ noise @ R.T))
+
+    def _decide(self, newest: Innovation) -> None:
+        """Compare a window with its noise."""
+        (t_s, z, noise), self._window = map(np.array, zip(*self._window, strict=True)), []
+        self._unrest.take(t_s, z, noise)
+        cov, R = self._unrest.cov, np.kron(np.eye(2), newest.T_base_tool[:3, :3])
+        self.change = None
+        if cov.any():
+            now, effect = R.T @ cov @ R, np.eye(6)
+            shakes = Suspect("shake", -1, slice(0, 6))
+            self.change = Change(shakes, -np.inf, newest.t_s, np.zeros(6), now, 0.0, 0.0, effect, newest.T_base_tool)
+
+    def findings(self) -> tuple[HealthFinding, ...]:
+        """Return what was found, where it displaces the tool by what matters."""
+        if self.change is None:
+            return ()
+        shift, angle = (float(np.sqrt(np.trace(self.change.cov[part, part]))) for part in (slice(0, 3), slice(3, 6)))
+        if shift + LEVER_M * angle < COSTS_M:
+            return ()
+        by = f"{1e3 * shift:.2f} mm and {np.degrees(angle):.3f} deg (RMS)"
+        what = f"rig and arm shake against each other: the tool moves by {by} to and fro within a second"
+        advice = "mount the rig and the arm on one stiff base, away from what vibrates; poses have this in their sigma"
+        return (
+            HealthFinding(
+                "fixed", what, None, 1e3 * shift, 0.1e3 * shift, "mm", advice, cost_mm=1e3 * (shift + LEVER_M * angle)
+            ),
+        )

@@ -14,13 +14,12 @@ from armsight.loop.estimators.clock import ClockFollower
 from armsight.loop.health.base_motion import BaseMotion, KeptMeasurement, Measurements
 from armsight.loop.health.change import Change, doubtful, finding, happened_besides, suspected
 from armsight.loop.health.closure import ClosureWatch
-from armsight.loop.health.fixed import FixedWatch
+from armsight.loop.health.fixed import FixedWatch, ShakeWatch
 from armsight.loop.health.follow import RigCorrection
 from armsight.loop.health.host import HostWatch
 from armsight.loop.health.landmarks import LandmarkWatch
 from armsight.loop.health.record import HealthFinding, Trust
 from armsight.loop.health.rig import TEST_S, RigWatch
-from armsight.loop.health.unrest import ShakeWatch
 from armsight.robot.arm import Arm
 from armsight.vision.rig import StereoRig
 

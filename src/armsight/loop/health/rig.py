@@ -19,7 +19,7 @@ at the same position in an image by the same: r = ... + L beta, with L polynomia
 its own. It is reported where beta explains more than any change of the seven numbers at any time does.
 
 A camera that nods averages out in the sums: what single shots say of its rotation is compared within each second, and what
-it varies beyond the noise is a covariance of its own, which differs from shot to shot (``unrest``). Images that were seen
+it varies beyond the noise is a covariance of its own, which differs from shot to shot (``fixed``). Images that were seen
 before, to the bit, say nothing new.
 """
 
@@ -40,9 +40,9 @@ from armsight.data import Array, Body, Ids, PoseEstimate, Record
 from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import adjoint, inverse, log_se3, pose
 from armsight.kernels import kernel
+from armsight.loop.health.fixed import Unrest
 from armsight.loop.health.record import COSTS_M, LEVER_M, HealthFinding, alarm_limit
 from armsight.loop.health.shape import FURTHEST_M, SMOOTH, ResidualSums, ShapeWatch, eliminated, total
-from armsight.loop.health.unrest import Unrest
 from armsight.vision.camera import pair_arguments
 from armsight.vision.posefit import differentiate
 from armsight.vision.rig import StereoRig
