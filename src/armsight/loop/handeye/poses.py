@@ -10,9 +10,8 @@ Kronecker sum, translations by linear least squares (Shah, "Solving the robot-wo
 Kronecker product", J. Mechanisms Robotics 5(3), 2013). OpenCV's solvers are tried beside it where the installed OpenCV has
 them (5.0 has not).
 
-A table that is grossly wrong is rejected before a loop is closed on it (:func:`require_fitting`): single mistakes of it (a
-twist, a length or a direction of the wrong sign, a zero off by a right angle, two lengths exchanged) are tried with the closed
-form.
+A table that is grossly wrong is rejected before a loop is closed on it (:func:`require_fitting`): single mistakes (a twist,
+a length or a direction of the wrong sign, a zero off by a right angle, two lengths exchanged) are tried by the closed form.
 """
 
 from __future__ import annotations
