@@ -91,10 +91,14 @@ def calibrated_with(lens, rng):
     return replace(given, cov=np.diag((wider * SIGMAS) ** 2), sigma_px=sigma_px), mean
 
 
-def watched_body(seed, *, rotated=None, scale=1.0, skew_s=0.0, at_s=0.0, seconds=12.0, lens=None, shift=0.0):
+def watched_body(
+    seed, *, rotated=None, scale=1.0, skew_s=0.0, row_s=0.0, focal=None, at_s=0.0, seconds=12.0, lens=None, shift=0.0
+):
     """Watch a body that moves and rests; yield the monitor, the time, the true pose, and what it returned for each shot.
 
-    From ``at_s`` on cameras and points of the body are displaced.
+    From ``at_s`` on cameras and points of the body are displaced, the right camera exposes late by ``skew_s`` (or that of
+    the number of the shot, s) and each row of it by ``row_s`` later than the one above, and focal lengths change by a share
+    of themselves, ``focal`` of the time since then, left and right.
     """
     rng = np.random.default_rng(seed)
     if lens is None:
@@ -118,11 +122,21 @@ def watched_body(seed, *, rotated=None, scale=1.0, skew_s=0.0, at_s=0.0, seconds
 
     for k in range(round(seconds * RATE_HZ)):
         t = k / RATE_HZ
-        T, late = body_at(t), body_at(t + skew_s * (t >= at_s))
-        true = moved if t >= at_s else TRUE
-        there = points + shift * (t >= at_s)
+        on, T = t >= at_s, body_at(t)
+        late_s = (skew_s(k) if callable(skew_s) else skew_s) * on
+        late = body_at(t + late_s)
+        true = moved if on else TRUE
+        there = points + shift * on
         uv, uv_late = (both_pixels(true, there @ each[:3, :3].T + each[:3, 3]) for each in (T, late))
         uv[:, 1] = uv_late[:, 1]
+        if row_s and on:
+            for n, row in enumerate(uv[:, 1, 1] - TRUE.right.image_size_px[1] / 2):
+                rolled = body_at(t + late_s + row_s * row)
+                uv[n, 1] = both_pixels(true, (there @ rolled[:3, :3].T + rolled[:3, 3])[n : n + 1])[0, 1]
+        if focal is not None and on:
+            for side, share in enumerate(focal(t - at_s)):
+                middle = TRUE.cameras[side].intrinsics[2:]
+                uv[:, side] = middle + (1.0 + share) * (uv[:, side] - middle)
         if lens is not None:
             uv = np.stack([lens(side, uv[:, side]) for side in range(2)], axis=1)
         estimate = measured(given, body, frame @ T, uv + SIGMA_PX * rng.normal(size=uv.shape))
