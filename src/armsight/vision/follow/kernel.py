@@ -37,8 +37,11 @@ SEEN = 0
 _STEPS = 8
 #: A step that changes the cost by less than this share is the last.
 _REACHED = 1e-5
-#: Where a detection is off the pose by more standard deviations than this, it is not of one body with the others.
+#: Where a detection is off the pose by more standard deviations than this, the pose is rejected.
 _OFF_SIGMAS = 6.0
+#: A disc whose rows explain so many times the mean square of the others' is left out: half of it by chance once in 1,000
+#: shots, double of it once in 10 million.
+_STRANGE = 32.0
 
 
 @kernel_types(
@@ -381,8 +384,8 @@ def plausible(scene: DiscScene, found: DiscMeasurement, twist: Array) -> bool:
 
 
 @kernel
-def strangest(found: DiscMeasurement) -> int:
-    """Return the disc without which the pose fits best: r^T (1 - J H^-1 J^T)^-1 r of its own rows is largest.
+def strangest(found: DiscMeasurement) -> tuple[int, float]:
+    """Return the disc without which the pose fits best: r^T (1 - J H^-1 J^T)^-1 r of its own rows, the largest; and that.
 
     That is by how much the sum of squares falls without it (data snooping: Baarda, "A testing procedure for use in geodetic
     networks", 1968); a residual alone is small where a disc far from the others pulls the pose.
@@ -395,7 +398,7 @@ def strangest(found: DiscMeasurement) -> int:
         explained = dot(r, solved_vector(less, r))
         if explained > most:
             strange, most = m, explained
-    return strange
+    return strange, most
 
 
 #: The outcome for one disc in one image, beside SEEN and the codes of ``disc.fit.REASONS``; ASTRAY: it was seen, but not
@@ -563,8 +566,11 @@ def follow_pair(
     if both < 3:
         return 0, np.inf, wrong
     cost, least_both = settle(scene, found), max(3, (both + 1) // 2)
-    while np.isfinite(cost) and not plausible(scene, found, twist):
-        m = strangest(found)
+    while np.isfinite(cost) and cost > limits[seen]:
+        m, explained = strangest(found)
+        alike = explained < _STRANGE * max((cost - explained) / max(2 * seen - 10, 1), 1.0)
+        if alike and plausible(scene, found, twist):
+            break
         both -= found.codes[m, 0] == SEEN and found.codes[m, 1] == SEEN
         for side in range(2):
             if found.codes[m, side] == SEEN:
