@@ -12,6 +12,7 @@ from armsight.data import Body, Correspondences, JointCommand, Points, PoseEstim
 from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.estimators import Delay, KalmanEstimator, Mounting
+from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health import HealthMonitor
 from armsight.loop.health.change import widened
 from armsight.loop.health.follow import RigFollower
@@ -160,6 +161,7 @@ class Moved:
         self.slip = slip  # of the body on the tool (6,), [m; rad]
         self.late = late  # by how much the stamps are late, s, at seconds after AT_S
         self.monitor = HealthMonitor(example_rig(), body_target().body, 0.0)
+        self.monitor.stamps = FrameClock()
         self.found_s = None
         self.follower = RigFollower(example_rig(), body_target().body) if follows else None
         self.mounting = Mounting(T_base_rig, np.eye(4), np.zeros((12, 12)))
@@ -184,10 +186,14 @@ class Moved:
         if t_s >= AT_S:
             D = T @ np.linalg.inv(small(self.motion(t_s - AT_S))) @ np.linalg.inv(T)
             measurement = replace(measurement, T_base_tool=D @ measurement.T_base_tool)
-            if self.late is not None:
-                measurement = replace(measurement, t_s=t_s + self.late(t_s - AT_S))
             if self.slip is not None:
                 measurement = replace(measurement, T_base_tool=measurement.T_base_tool @ small(self.slip))
+        if self.late is not None:
+            late_s = self.late(t_s - AT_S) if t_s >= AT_S else 0.0
+            sane_s = self.monitor.stamps.time(t_s + late_s, self.estimator.span_s[1])
+            if sane_s is None:
+                return None
+            measurement = replace(measurement, t_s=sane_s)
         if self.corrections:
             T = self.mounting.T_base_rig @ np.linalg.inv(T) @ measurement.T_base_tool
             by = adjoint(np.linalg.inv(T) @ self.mounting.T_base_rig)

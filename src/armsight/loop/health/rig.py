@@ -17,6 +17,10 @@ camera by the body's motion between the shots; each shot has a skew of its own b
 What the camera model lacks (a lens whose distortion it cannot express, a sensor that is tilted) displaces whatever appears
 at the same position in an image by the same: r = ... + L beta, with L polynomials of the position, of which each camera has
 its own. It is reported where beta explains more than any change of the seven numbers at any time does.
+
+What changes and does not stay is a hypothesis of each single test (:mod:`~armsight.loop.health.passing`): each shot's own
+times of exposure, a focal length. Where its evidence is the largest the test is counted with that eliminated, so that
+cameras are not blamed for it.
 """
 
 from __future__ import annotations
@@ -36,6 +40,7 @@ from armsight.data import Array, Body, Ids, PoseEstimate, Record
 from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.kernels import kernel
+from armsight.loop.health.passing import Apart, ExposedShot, Passing, PassingSums, apart, eliminate
 from armsight.loop.health.record import HealthFinding, alarm_limit
 from armsight.loop.health.shape import FURTHEST_M, ResidualSums, ShapeWatch, eliminated, total
 from armsight.vision.camera import pair_arguments
@@ -62,6 +67,8 @@ _ODD = 4
 _PAIRED = float(chdtri(1, 1e-4))
 #: Fewer points than this say nothing of these numbers; shots further apart in time than this give no speed, s.
 _LEAST_POINTS, _APART_S = 4, 0.5
+#: The body's motion about a shot is that over so many of the newest.
+_TRACK = 5
 #: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
 TEST_S, TEST_SHOTS, FORGET_TESTS = 1.0, 60, 30.0
 #: Residuals are not linear in the size of a body that is off by more than this share of it.
@@ -155,6 +162,7 @@ class _ShotResiduals(NamedTuple):
         response: (6, K + M) of its pose to these.
         every: as ``rows``, with points that do not fit, which may be displaced.
         response_with_all: (6, K + M) of a pose measured with these.
+        exposed: by how much the times of the exposures would move each row of ``rows``, and of ``every``.
     """
 
     t_s: float
@@ -162,6 +170,7 @@ class _ShotResiduals(NamedTuple):
     response: Array
     every: Array
     response_with_all: Array
+    exposed: tuple[ExposedShot, ExposedShot]
 
 
 class RigWatch:
@@ -180,6 +189,7 @@ class RigWatch:
         alarm: whether the newest test found one that is certain.
         alarmed: whether any did.
         lens: what the camera models lack, where that is certain and matters.
+        passing: what changed from shot to shot, or from test to test.
     """
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
@@ -203,6 +213,9 @@ class RigWatch:
         self._row_of = np.full(len(body.points), -1)
         self._row_of[self._points] = np.arange(len(self._points))
         self._last = (-np.inf, np.eye(4))
+        self._track: deque[tuple[float, Array]] = deque(maxlen=_TRACK)
+        self._used_s = np.full(len(self._points), -np.inf)  # when a pose was measured with each point
+        self.passing = Passing()
         self._taken_s = -np.inf
         self._began: Array | None = None
         # The response of the newest poses to everything, and the covariances of these poses.
@@ -237,6 +250,7 @@ class RigWatch:
         """
         now_s, self._timed = (float(self._shots), False) if t_s is None else (t_s, True)
         self._shots += 1
+        self._track.append((now_s, estimate.T_left_body))
         if self._redundant(estimate.T_left_body, now_s):
             self._last = (now_s, estimate.T_left_body)
             return np.zeros((6, 6))
@@ -257,6 +271,7 @@ class RigWatch:
         """Return what the suspected errors add to the covariance (6, 6) of a pose."""
         by_parameter, by_lens = found.response[:, : self._size], found.response[:, self._size :]
         added, shape, known = self._shape.added(by_parameter), self._shape.found, 0
+        added = added + self.passing.added(found.exposed[0], by_parameter @ self._shape.by_wide[:, 0])
         if self.suspected is not None and (shape is None or shape.seven_needed):
             known = len(_WIDE)
         if self.lens is not None:
@@ -280,6 +295,7 @@ class RigWatch:
             or self.lens is not None
             or self._shape.found is not None
             or self._shape.doubt is not None
+            or self.passing.now
             or not self._timed
             or not 0.0 <= passed_s < _LIKE_S
         ):
@@ -340,13 +356,17 @@ class RigWatch:
             whole[:, by_size] /= size
             whole[:, 0] += (size - 1.0) * whole[:, by_size]
         self._noise_px = float(np.sqrt(noise_px2))
+        self._used_s[self._row_of[ids[fits]]] = now_s
+        roll = (seen.uv[rows][:, :, 1] / self._half_px[:, 1] - 1.0).repeat(2)
+        exposed = ExposedShot(A.copy(), roll, *self._along())
         if fits.all():
             response = self._eliminated(A, whole)
-            return _ShotResiduals(now_s, whole, response, whole, response)
+            return _ShotResiduals(now_s, whole, response, whole, response, (exposed, exposed))
         kept, every = np.repeat(fits, 4), np.repeat(fits | self._displaced(A, whole[:, 0]), 4)
         found, with_all = whole[kept], whole[every]
         response, response_with_all = self._eliminated(A[kept], found), self._eliminated(A[every], with_all)
-        return _ShotResiduals(now_s, found, response, with_all, response_with_all)
+        both = exposed.of(kept), exposed.of(every)
+        return _ShotResiduals(now_s, found, response, with_all, response_with_all, both)
 
     def _linear_about(self, estimate: PoseEstimate) -> tuple[float, Array]:
         """Return the size of the body over that of its file, and the pose (4, 4), about which residuals are linear.
@@ -381,9 +401,20 @@ class RigWatch:
         left = np.einsum("ni,ni->n", r, r) - np.einsum("ni,ni->n", b, d)
         return np.asarray((left < _PAIRED) & (np.linalg.norm(d, axis=1) < FURTHEST_M))
 
-    def _velocity(self, T: Array, now_s: float) -> Array:
+    def _along(self) -> tuple[Array, Array]:
+        """Return velocity and acceleration (6,) of the body over the newest shots; zero where they are unknown.
+
+        What single shots have of their own averages out.
+        """
+        if len(self._track) < _TRACK:
+            return np.zeros(6), np.zeros(6)
+        first, middle, last = self._track[0], self._track[_TRACK // 2], self._track[-1]
+        early, late = self._velocity(middle[1], middle[0], first), self._velocity(last[1], last[0], middle)
+        return (early + late) / 2.0, (late - early) * 2.0 / (last[0] - first[0])
+
+    def _velocity(self, T: Array, now_s: float, last: tuple[float, Array] | None = None) -> Array:
         """Return the velocity (6,) of the body between the shot before and this one, 1/s; zero where it is unknown."""
-        before_s, before = self._last
+        before_s, before = last or self._last
         if not self._timed or not 0.0 < now_s - before_s < _APART_S:
             return np.zeros(6)
         R = before[:3, :3].T @ T[:3, :3]  # by a small angle
@@ -404,8 +435,16 @@ class RigWatch:
         if shot.t_s - self._stays[0][0].t_s >= (TEST_S if self._timed else TEST_SHOTS):
             self._decide()
 
-    def _summed(self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool = False) -> ResidualSums:
-        """Return the sums of stays, of each the mean of its shots; ``every``: with points that do not fit, no lens."""
+    def _summed(
+        self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool = False, own: Apart | None = None
+    ) -> ResidualSums:
+        """Return the sums of stays, of each the mean of its shots.
+
+        Args:
+            stays: they.
+            every: with points that do not fit, no lens.
+            own: times of exposure that are eliminated.
+        """
         size = self._size if every else self._full
         sums = ResidualSums(size, stays[0][0].t_s if stays else 0.0)
         for alone in (True, False):  # those of one shot are summed at once
@@ -418,6 +457,10 @@ class RigWatch:
             if shots:
                 rows = [each if alone else each / np.sqrt(count) for each, count in shots]
                 sums.take(np.concatenate(rows)[:, : 1 + size], sum((len(each) - 6.0) / count for each, count in shots))
+        if own is not None:
+            seen = [(each, 1.0 / len(stay)) for stay in stays for each in stay]
+            rows = [(each.every if every else each.rows)[:, : 1 + size] for each, _ in seen]
+            eliminate(own, [(k, each.exposed[every], w) for k, (each, w) in zip(rows, seen, strict=True)], sums)
         return sums
 
     def _decide(self, *, ends: bool = False) -> None:
@@ -431,14 +474,24 @@ class RigWatch:
         test = every.of(len(self._window.b))
         if any(each.every is not each.rows for stay in stays for each in stay):
             every = self._summed(stays, every=True).by(self._scaled)
-        odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
-        usual = every.less(self._summed(odd, every=True).by(self._scaled)) if odd else every
-        self._shape.decide(every, usual, ends=ends)
         moments = [stay[0] for stay in stays if len(stay) == 1]
         weight = float(np.exp(-1.0 / FORGET_TESTS))
         self._window.scale(weight)
         self._window.add(test, 1.0)
-        change = self._estimated(self._window)
+        change, own = self._estimated(self._window), None
+        if self.passing.now or change.chi_square > _SUSPECTED:
+            passes = self._passes(stays, every)
+            if passes is not None:
+                self._window.add(test, -1.0)
+                own, test = passes.apart, passes.sums.of(len(test.b))
+                self._window.add(test, 1.0)
+                change = self._estimated(self._window)
+        if own is not None:
+            moments, whole = [], self._summed(stays, own=own)
+            every = self._summed(stays, every=True, own=own).by(self._scaled)
+        odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
+        usual = every.less(self._summed(odd, every=True, own=own).by(self._scaled)) if odd else every
+        self._shape.decide(every, usual, ends=ends)
         alarm = _certain(change) and self._matters(change, slice(None))
         doubted, self._doubted = self._doubted, None
         if alarm and moments and not self._alarms and self._poses > 1:
@@ -465,6 +518,13 @@ class RigWatch:
         due = 0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0
         if due and len(self._history) < _KEPT and self._poses >= _LENS_POSES:
             self.lens = self._lens()
+
+    def _passes(self, stays: Sequence[Sequence[_ShotResiduals]], every: ResidualSums) -> PassingSums | None:
+        """Return the sums of a test with what changed within it eliminated, where that explains it best."""
+        shots = [(each.rows[:, 0], each.exposed[0], 1.0 / len(stay)) for stay in stays for each in stay]
+        found: Apart | None = apart(shots) if self._timed else None
+        sums = None if found is None else self._summed(stays, own=found).of(self._size).by(self._scaled)
+        return self.passing.decide(every, self._shape.evidence, self._size, found, sums)
 
     def _in_priors(self, sums: ResidualSums) -> ResidualSums:
         """Return sums of the parameters and the seven numbers, in units of their priors, from those of the parameters."""
@@ -537,7 +597,12 @@ class RigWatch:
     def wrong_at_rest(self) -> bool:
         """Whether what is suspected makes poses wrong also where nothing moves."""
         parts = [] if self.suspected is None else self._to_blame(self.suspected)
-        return self._shape.found is not None or (self.alarm and not set(parts) <= {"time"})
+        shape = self._shape.found
+        if shape is not None and (points := [each for each in shape.chosen if each >= 0]):
+            moved = bool((self._used_s[points] > self._last[0] - TEST_S).any())  # else poses are of the other points
+        else:
+            moved = shape is not None
+        return moved or (self.alarm and not set(parts) <= {"time"})
 
     def _matters(self, change: RigChange, part: slice) -> bool:
         """Return whether a part of the seven numbers moves one of the newest poses by so many of its sigmas."""
@@ -603,6 +668,10 @@ class RigWatch:
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far, the shots of the running test included: nothing where no test gave an alarm."""
+        return self.passing.among(self._stays_changed(), timed=self._timed)
+
+    def _stays_changed(self) -> tuple[HealthFinding, ...]:
+        """Return what changed and stays."""
         ended = self._ended()
         shape, lens = ended._shape.said, ended.lens
         if shape is not None and (lens is None or shape.chi_square > lens.chi_square):
@@ -630,7 +699,7 @@ class RigWatch:
         """Return a copy that says what was found so far; this one goes on."""
         copied = copy(self)
         copied._history, copied._shape = self._history.copy(), self._shape.copied()
-        copied._stays = [stay.copy() for stay in self._stays]
+        copied._stays, copied.passing = [stay.copy() for stay in self._stays], copy(self.passing)
         return copied
 
     def _ended(self) -> RigWatch:
