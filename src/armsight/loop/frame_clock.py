@@ -57,6 +57,7 @@ class FrameClock:
         self.stepped: tuple[float, float] | None = None
         self.rate = 0.0
         self._shift_s = self._origin_s = 0.0
+        self._broken = False
         self._late: deque[float] = deque(maxlen=_OTHERS)
         self._odd: deque[float] = deque(maxlen=_AGREE)
         self._soonest: deque[tuple[float, float]] = deque(maxlen=_KEPT_S)  # of each second: its time, how late
@@ -92,16 +93,17 @@ class FrameClock:
             return None
         sane_s = self._shifted(stamp_s)
         late_s, soonest_s = arrived_s - sane_s, min(self._late, default=math.nan)
-        latest_s = soonest_s + (
-            _EARLY_S if self._odd else _LATE_S
-        )  # after a contradiction it is to come as soon as usual
+        # After a contradiction, or where the rhythm broke, it is to come as soon as usual.
+        latest_s = soonest_s + (_EARLY_S if self._odd or self._broken else _LATE_S)
         if len(self._late) >= _AGREE and not (sane_s > self._newest_s and soonest_s - _EARLY_S < late_s < latest_s):
             self._odd.append(late_s)
-            if len(self._odd) < _AGREE or max(self._odd) - min(self._odd) > _LATE_S:
+            if len(self._odd) < _AGREE or max(self._odd) - min(self._odd) > 2 * _EARLY_S:
                 return None
-            self._shift(min(self._odd) - soonest_s, arrived_s)
-            return self._shifted(stamp_s)
+            if abs(min(self._odd) - soonest_s) >= _EARLY_S:  # else the loop was busy
+                self._shift(min(self._odd) - soonest_s, arrived_s)
+                return self._shifted(stamp_s)
         self._odd.clear()
+        self._broken = False
         self._late.append(late_s)
         if not self._soonest or arrived_s - self._soonest[-1][0] >= 1.0:
             self._soonest.append((arrived_s, late_s))
@@ -111,12 +113,12 @@ class FrameClock:
         return self._shifted(stamp_s)
 
     def _shift(self, by_s: float, arrived_s: float) -> None:
-        """Shift stamps by a time, s; by a whole number of periods from the newest frame, as nearly as arrivals tell."""
+        """Shift stamps by a time, s; to a whole number of periods from the newest frame, if arrivals agree."""
         if self.period_s > 0.0:
             since = arrived_s - min(self._odd) + by_s - self._t_s
             gap = since - round(since / self.period_s) * self.period_s
             by_s -= gap if abs(gap) < _EARLY_S else 0.0
-        self._shift_s += by_s
+        self._shift_s, self._broken = self._shift_s + by_s, False
         since_s, before_s = (arrived_s, 0.0) if self.stepped is None else self.stepped
         self.stepped = since_s, before_s + by_s
         self._odd.clear()
@@ -142,8 +144,8 @@ class FrameClock:
         self._soonest.clear()
         self._newest_s = -math.inf
 
-    def _smoothed(self, stamp_s: float) -> float:
-        """Return a stamp that rises, s, without most of its jitter."""
+    def _smoothed(self, stamp_s: float) -> float | None:
+        """Return a stamp that rises, s, without most of its jitter; None where arrivals are to say whether it jumped."""
         if not stamp_s > self._newest_s:
             self._begin()
         self._newest_s = stamp_s
@@ -161,7 +163,10 @@ class FrameClock:
         self._strange.append(odd)
         if sum(self._strange) >= _STRANGE or self.jitter_s > _COUNTABLE * self.period_s:
             self._begin()
+            self._broken = True
             return self._begun(stamp_s)
+        if odd and self._late and abs(gap) > _EARLY_S:
+            return None
         if odd:
             return stamp_s - gap if len(self._strange) == _LEAST else stamp_s
         self._t_s = stamp_s - gap * (1.0 - tt / variance)

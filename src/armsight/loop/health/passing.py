@@ -31,8 +31,8 @@ from armsight.loop.health.shape import ResidualSums, eliminated
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
 _APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
 #: The velocity of measured poses is off by this share of the speed in any direction; half: rig and body are blamed for what
-#: is left of late images, double: less is left to tell them by.
-_SLACK = 0.2
+#: is left of late images, double: less of them is seen.
+_UNKNOWN_SHARE = 0.2
 #: Log-evidence by which a hypothesis must be ahead of all others to be taken; half: chance takes one of 100 tests for it.
 _AHEAD = math.log(1e4)
 #: Hypotheses whose log-evidence is nearer than this are not distinguished: 12 of chi-square.
@@ -80,7 +80,7 @@ class ExposedShot(NamedTuple):
         speeds = np.repeat(np.linalg.norm(self.velocity.reshape(2, 3), axis=1) / math.sqrt(3.0), 3)
         rolled = self.roll * (self.A @ self.velocity)
         skew, bent = by_right @ self.velocity, _BENT_S * (by_right @ self.acceleration)
-        return np.column_stack([skew, _SLACK * speeds * by_right, rolled * right, rolled * ~right, bent])
+        return np.column_stack([skew, _UNKNOWN_SHARE * speeds * by_right, rolled * right, rolled * ~right, bent])
 
     def without_pose(self) -> Array:
         """Return the same (n, 10) with the pose eliminated."""
@@ -280,7 +280,11 @@ class Passing:
         sigmas_s = np.sqrt(np.diag(np.linalg.inv(information)))
         own_s = math.sqrt(float(np.mean([each.apart_s**2 for each in tests])))
         k = int(np.argmax(np.abs(mean_s[:3])))
-        size, sigma = 1e3 * float(mean_s[k]), 1e3 * float(sigmas_s[k])
+        # What the velocity lacks is lacking in all shots alike.
+        size, sigma = (
+            1e3 * float(mean_s[k]),
+            1e3 * math.hypot(float(sigmas_s[k]), 0.5 * _UNKNOWN_SHARE * float(mean_s[k])),
+        )
         if own_s > _CONSTANT * abs(mean_s[k]):
             size = 1e3 * math.sqrt(float(np.mean([each.rms_s**2 for each in tests])))
             sigma = size / math.sqrt(2.0 * len(tests))

@@ -402,15 +402,15 @@ class RigWatch:
         return np.asarray((left < _PAIRED) & (np.linalg.norm(d, axis=1) < FURTHEST_M))
 
     def _along(self) -> tuple[Array, Array]:
-        """Return velocity and acceleration (6,) of the body over the newest shots; zero where they are unknown.
+        """Return velocity and acceleration (6,) of the body at the newest shot; zero where they are unknown.
 
-        What single shots have of their own averages out.
+        They are those of each second shot: what a shot has of its own and the next one not leaves them right.
         """
         if len(self._track) < _TRACK:
             return np.zeros(6), np.zeros(6)
         first, middle, last = self._track[0], self._track[_TRACK // 2], self._track[-1]
         early, late = self._velocity(middle[1], middle[0], first), self._velocity(last[1], last[0], middle)
-        return (early + late) / 2.0, (late - early) * 2.0 / (last[0] - first[0])
+        return 1.5 * late - 0.5 * early, (late - early) * 2.0 / (last[0] - first[0])
 
     def _velocity(self, T: Array, now_s: float, last: tuple[float, Array] | None = None) -> Array:
         """Return the velocity (6,) of the body between the shot before and this one, 1/s; zero where it is unknown."""
