@@ -33,6 +33,8 @@ _APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
 #: The velocity of measured poses is off by this share of the speed in any direction; half: rig and body are blamed for what
 #: is left of late images, double: less of them is seen.
 _UNKNOWN_SHARE = 0.2
+#: The body's motion at a shot is that of so many newest ones, if these are of so short a time, s.
+TRACK, _LONGEST_S = 5, 1.0
 #: Log-evidence by which a hypothesis must be ahead of all others to be taken; half: chance takes one of 100 tests for it.
 _AHEAD = math.log(1e4)
 #: Hypotheses whose log-evidence is nearer than this are not distinguished: 12 of chi-square.
@@ -49,6 +51,14 @@ _BENT_S = 0.1
 _FOCAL = 0.05
 
 
+def velocity(before: Array, after: Array, seconds: float) -> Array:
+    """Return the velocity (6,) in the body's axes, 1/s, that takes a pose (4, 4) to another, by a small angle."""
+    R = before[:3, :3].T @ after[:3, :3]
+    rotation = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    shift = after[:3, :3].T @ (after[:3, 3] - before[:3, 3])
+    return np.asarray(np.concatenate([shift, rotation]) / seconds)
+
+
 class ExposedShot(NamedTuple):
     """By how much the times of exposure move the residuals of a shot.
 
@@ -56,18 +66,29 @@ class ExposedShot(NamedTuple):
         A: (n, 6) derivative of the residuals by the pose, in standard deviations; rows u, v of the left image and of the
             right one, point by point.
         roll: (n,) the row of the image, from -1 at its top to 1.
-        velocity: (6,) of the body in its axes, 1/s.
-        acceleration: (6,) 1/s^2.
+        track: times, s, and poses T_left_body (4, 4) of the newest shots up to this one.
     """
 
     A: Array
     roll: Array
-    velocity: Array
-    acceleration: Array
+    track: tuple[tuple[float, Array], ...]
 
     def of(self, rows: NDArray[np.bool_]) -> ExposedShot:
         """Return that of some rows."""
         return self._replace(A=self.A[rows], roll=self.roll[rows])
+
+    def motion(self) -> tuple[Array, Array]:
+        """Return velocity and acceleration (6,) of the body in its axes, 1/s and 1/s^2; zero where they are unknown.
+
+        They are those of each second shot: what a shot has of its own and the next one not leaves them right.
+        """
+        if len(self.track) < TRACK:
+            return np.zeros(6), np.zeros(6)
+        (first_s, first), (middle_s, middle), (last_s, last) = self.track[0], self.track[TRACK // 2], self.track[-1]
+        if not first_s < middle_s < last_s < first_s + _LONGEST_S:
+            return np.zeros(6), np.zeros(6)
+        early, late = velocity(first, middle, middle_s - first_s), velocity(middle, last, last_s - middle_s)
+        return 1.5 * late - 0.5 * early, (late - early) * 2.0 / (last_s - first_s)
 
     def moved(self) -> Array:
         """Return what (n, 10) moves the residuals.
@@ -76,10 +97,10 @@ class ExposedShot(NamedTuple):
         the first lacks of a body that accelerates.
         """
         right = np.arange(len(self.A)) % 4 >= 2
-        by_right = self.A * right[:, None]
-        speeds = np.repeat(np.linalg.norm(self.velocity.reshape(2, 3), axis=1) / math.sqrt(3.0), 3)
-        rolled = self.roll * (self.A @ self.velocity)
-        skew, bent = by_right @ self.velocity, _BENT_S * (by_right @ self.acceleration)
+        by_right, (along, acceleration) = self.A * right[:, None], self.motion()
+        speeds = np.repeat(np.linalg.norm(along.reshape(2, 3), axis=1) / math.sqrt(3.0), 3)
+        rolled = self.roll * (self.A @ along)
+        skew, bent = by_right @ along, _BENT_S * (by_right @ acceleration)
         return np.column_stack([skew, _UNKNOWN_SHARE * speeds * by_right, rolled * right, rolled * ~right, bent])
 
     def without_pose(self) -> Array:

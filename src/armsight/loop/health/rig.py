@@ -40,7 +40,7 @@ from armsight.data import Array, Body, Ids, PoseEstimate, Record
 from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.kernels import kernel
-from armsight.loop.health.passing import Apart, ExposedShot, Passing, PassingSums, apart, eliminate
+from armsight.loop.health.passing import TRACK, Apart, ExposedShot, Passing, PassingSums, apart, eliminate, velocity
 from armsight.loop.health.record import HealthFinding, alarm_limit
 from armsight.loop.health.shape import FURTHEST_M, ResidualSums, ShapeWatch, eliminated, total
 from armsight.vision.camera import pair_arguments
@@ -67,8 +67,6 @@ _ODD = 4
 _PAIRED = float(chdtri(1, 1e-4))
 #: Fewer points than this say nothing of these numbers; shots further apart in time than this give no speed, s.
 _LEAST_POINTS, _APART_S = 4, 0.5
-#: The body's motion about a shot is that over so many of the newest.
-_TRACK = 5
 #: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
 TEST_S, TEST_SHOTS, FORGET_TESTS = 1.0, 60, 30.0
 #: Residuals are not linear in the size of a body that is off by more than this share of it.
@@ -213,7 +211,7 @@ class RigWatch:
         self._row_of = np.full(len(body.points), -1)
         self._row_of[self._points] = np.arange(len(self._points))
         self._last = (-np.inf, np.eye(4))
-        self._track: deque[tuple[float, Array]] = deque(maxlen=_TRACK)
+        self._track: deque[tuple[float, Array]] = deque(maxlen=TRACK)
         self._used_s = np.full(len(self._points), -np.inf)  # when a pose was measured with each point
         self.passing = Passing()
         self._taken_s = -np.inf
@@ -358,7 +356,7 @@ class RigWatch:
         self._noise_px = float(np.sqrt(noise_px2))
         self._used_s[self._row_of[ids[fits]]] = now_s
         roll = (seen.uv[rows][:, :, 1] / self._half_px[:, 1] - 1.0).repeat(2)
-        exposed = ExposedShot(A.copy(), roll, *self._along())
+        exposed = ExposedShot(A, roll, tuple(self._track))
         if fits.all():
             response = self._eliminated(A, whole)
             return _ShotResiduals(now_s, whole, response, whole, response, (exposed, exposed))
@@ -401,26 +399,12 @@ class RigWatch:
         left = np.einsum("ni,ni->n", r, r) - np.einsum("ni,ni->n", b, d)
         return np.asarray((left < _PAIRED) & (np.linalg.norm(d, axis=1) < FURTHEST_M))
 
-    def _along(self) -> tuple[Array, Array]:
-        """Return velocity and acceleration (6,) of the body at the newest shot; zero where they are unknown.
-
-        They are those of each second shot: what a shot has of its own and the next one not leaves them right.
-        """
-        if len(self._track) < _TRACK:
-            return np.zeros(6), np.zeros(6)
-        first, middle, last = self._track[0], self._track[_TRACK // 2], self._track[-1]
-        early, late = self._velocity(middle[1], middle[0], first), self._velocity(last[1], last[0], middle)
-        return 1.5 * late - 0.5 * early, (late - early) * 2.0 / (last[0] - first[0])
-
-    def _velocity(self, T: Array, now_s: float, last: tuple[float, Array] | None = None) -> Array:
+    def _velocity(self, T: Array, now_s: float) -> Array:
         """Return the velocity (6,) of the body between the shot before and this one, 1/s; zero where it is unknown."""
-        before_s, before = last or self._last
+        before_s, before = self._last
         if not self._timed or not 0.0 < now_s - before_s < _APART_S:
             return np.zeros(6)
-        R = before[:3, :3].T @ T[:3, :3]  # by a small angle
-        rotation = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-        shift = T[:3, :3].T @ (T[:3, 3] - before[:3, 3])
-        return np.asarray(np.concatenate([shift, rotation]) / (now_s - before_s))
+        return velocity(before, T, now_s - before_s)
 
     def _sum(self, shot: _ShotResiduals, estimate: PoseEstimate) -> None:
         """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
