@@ -269,7 +269,8 @@ class RigWatch:
         """Return what the suspected errors add to the covariance (6, 6) of a pose."""
         by_parameter, by_lens = found.response[:, : self._size], found.response[:, self._size :]
         added, shape, known = self._shape.added(by_parameter), self._shape.found, 0
-        added = added + self.passing.added(found.exposed[0], by_parameter @ self._shape.by_wide[:, 0])
+        if self.passing.now:
+            added = added + self.passing.added(found.exposed[0], by_parameter @ self._shape.by_wide[:, 0])
         if self.suspected is not None and (shape is None or shape.seven_needed):
             known = len(_WIDE)
         if self.lens is not None:
@@ -341,9 +342,10 @@ class RigWatch:
             return None
         A, whole = np.empty((4 * len(ids), 6)), np.zeros((4 * len(ids), 1 + self._full))
         size, T = self._linear_about(estimate)
+        uv = np.ascontiguousarray(seen.uv[rows])
         noise_px2 = _differentiate(
             *self._pair, self._half_px, size * self._p_body, self._row_of, np.asarray(ids, np.int64),
-            np.ascontiguousarray(seen.uv[rows]), np.ascontiguousarray(seen.cov_uv[rows]),
+            uv, np.ascontiguousarray(seen.cov_uv[rows]),
             max(self._rig.sigma_px, 1e-6), np.array(T, order="C"),
             self._velocity(estimate.T_left_body, now_s), A, whole,
         )  # fmt: skip
@@ -355,7 +357,7 @@ class RigWatch:
             whole[:, 0] += (size - 1.0) * whole[:, by_size]
         self._noise_px = float(np.sqrt(noise_px2))
         self._used_s[self._row_of[ids[fits]]] = now_s
-        roll = (seen.uv[rows][:, :, 1] / self._half_px[:, 1] - 1.0).repeat(2)
+        roll = (uv[:, :, 1] / self._half_px[:, 1] - 1.0).repeat(2)
         exposed = ExposedShot(A, roll, tuple(self._track))
         if fits.all():
             response = self._eliminated(A, whole)
