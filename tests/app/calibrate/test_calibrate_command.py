@@ -274,13 +274,13 @@ def test_images_that_contradict_each_other_are_not_to_be_trusted(rendered, armsi
     )
 
 
-def test_left_and_right_exchanged_is_reported(few, armsight, tmp_path):
+def test_left_and_right_exchanged_is_an_error(few, armsight, tmp_path):
     said = armsight(
         "calibrate", "--left", few / "right*.png", "--right", few / "left*.png", *CHESS, *QUICK,
         "-o", tmp_path / "rig.json", "--json",
     )  # fmt: skip
-    assert said.code == 0, said.err
-    assert any("are left and right exchanged" in weak for weak in said.lines[0]["weaknesses"])
+    assert_rejected(said, "left and right are exchanged")
+    assert not (tmp_path / "rig.json").exists()
 
 
 def test_a_video_is_named_with_what_to_do(armsight, tmp_path):

@@ -101,7 +101,7 @@ def command(
         with_radius,
     )
     from armsight.app.report.plotting import require_matplotlib
-    from armsight.vision.calibrate.weak import contradicted
+    from armsight.vision.calibrate.weak import contradicted, require_order
     from armsight.vision.markers.body_file import save_body_csv
     from armsight.vision.markers.calibrated_board import save_board_file
     from armsight.vision.sources import PairsSource
@@ -140,6 +140,7 @@ def command(
     elif detections is not None and cameras is not None and body is not None:
         calibration = calibrate_detections(detections, cameras, body, refine_body=refine_body is not None, folds=folds)
         given = {"detections": str(detections), "cameras": str(cameras), "body": str(body)}
+    require_order(calibration)
     calibration = replace(calibration, rig=replace(calibration.rig, provenance=provenance(given, calibration)))
     if refine_body is not None:
         save_body_csv(calibration.body, refine_body)

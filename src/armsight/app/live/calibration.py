@@ -31,6 +31,7 @@ from armsight.geometry.pose import inverse, transform
 from armsight.vision.calibrate import MODELS
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.result import Calibration
+from armsight.vision.calibrate.weak import require_order
 from armsight.vision.image import grey
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.chessboard import Chessboard
@@ -432,6 +433,7 @@ class CalibrationStep:
         assert sizes is not None
         try:
             result = calibrate_boards(self.board, pairs, sizes, models=_QUICK_MODELS, folds=min(_FOLDS, len(pairs)))
+            require_order(result)
             with self._lock:
                 self._learned(result)
                 self._add_newer({pair.name for pair in pairs})
@@ -492,6 +494,7 @@ class CalibrationStep:
         path = self.folder / "rig.json"
         try:
             result = calibrate_boards(self.board, pairs, sizes, models=MODELS)
+            require_order(result)
             record = provenance({"target": self.spec, "command": self._command()}, result)
             rig = StereoRig(
                 result.rig.left, result.rig.right, result.rig.T_left_right, result.rig.cov, result.rig.sigma_px, record

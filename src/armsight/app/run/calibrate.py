@@ -23,6 +23,7 @@ from armsight.loop.delay import MIN_MEASUREMENTS, estimate_delay
 from armsight.loop.estimators import Delay, Mounting, Prior
 from armsight.loop.handeye.handeye import HandEye, calibrate_handeye
 from armsight.loop.handeye.noise import STRUCTURES
+from armsight.loop.handeye.table import require_fitting
 from armsight.loop.sync_led import with_led
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import point_to_point
@@ -246,10 +247,11 @@ def handeye_of(
         structures: of the noise, names to choose from; fewer take less time.
 
     Raises:
-        CalibrationError: the motions leave a direction open.
+        CalibrationError: the motions leave a direction open, or the arm's table is grossly wrong.
     """
     q = np.array([each.q for each in visited])
     Ts_left_body, cov = np.array([each.T_left_body for each in visited]), np.array([each.cov for each in visited])
+    require_fitting(arm, q, Ts_left_body)
     found = calibrate_handeye(arm.forward(q) @ inverse(arm.T_flange_tool), Ts_left_body, cov, structures=structures)
     mounting = replace(Mounting.of(found, arm), cov=np.zeros((12, 12)))
     return HandEyeRun(mounting, found, q, Ts_left_body, cov, np.array([each.approach for each in visited]), missed)

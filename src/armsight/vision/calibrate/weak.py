@@ -7,6 +7,7 @@ from numpy.polynomial.chebyshev import chebvander2d
 from scipy.special import chdtri
 
 from armsight.data import Array
+from armsight.errors import CalibrationError
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.calibrate.result import Calibration
 
@@ -209,14 +210,22 @@ def _sides(calibration: Calibration) -> str | None:
             f"the left and the right images are rotated against each other by {abs(roll_deg):.0f} degrees: is a camera "
             "mounted so, or does a driver rotate its images? (the result is valid for images as they were given)"
         )
+    return None
+
+
+def require_order(calibration: Calibration) -> None:
+    """Reject a rig whose right camera stands to the left of the other.
+
+    Raises:
+        CalibrationError: it does.
+    """
     x, y, _ = calibration.rig.T_left_right[:3, 3]
     if x < 0 and abs(x) > abs(y):
-        return (
-            "the camera given as right stands to the left of the other: are left and right exchanged? (the result is "
-            "valid for the cameras as they were given) Or are all images upside down, or mirrored by the driver? Mirrored "
-            "images give a mirrored world: switch it off"
+        raise CalibrationError(
+            "left and right are exchanged: the camera given as right stands to the left of the other; exchange --left and "
+            "--right (of a recording or a video: its two sides). If they are right, all images are upside down (mount or "
+            "rotate both cameras alike), or mirrored by the driver, which gives a mirrored world: switch it off"
         )
-    return None
 
 
 def _focal(calibration: Calibration) -> str | None:
