@@ -124,6 +124,38 @@ def lens_cases() -> Iterator[Case]:
         yield Case(f"sensors tilted by {deg:g} deg", {"lens": faults.tilt(deg)}, "lens")
 
 
+def passing_cases() -> Iterator[Case]:
+    """Exposures that are not when they are said to be, and focal lengths that oscillate."""
+    frame_s, jitter = 1.0 / faults.RATE_HZ, np.random.default_rng(0).normal(size=10_000)
+
+    def breathes(t: float) -> float:
+        return 1.5e-3 * np.sin(2 * np.pi * t / 6.0)
+
+    for name, skew_s in (
+        ("at half rate", lambda k: -frame_s * (k % 2)),
+        ("that drops each third image", lambda k: -frame_s * (k % 3 == 0)),
+        ("late by a frame", frame_s),
+        ("early by a frame", -frame_s),
+        ("whose stamps scatter by 4 ms", lambda k: 4e-3 * jitter[k]),
+    ):
+        yield Case(f"right camera {name} after 5 s", {"skew_s": skew_s, "at_s": 5.0}, "time")
+    yield Case("right camera with a rolling shutter after 5 s", {"row_s": 2e-5, "at_s": 5.0}, "time")
+    yield Case("right lens breathes after 5 s", {"focal": lambda t: (0.0, breathes(t)), "at_s": 5.0}, "lens")
+    yield Case("left lens breathes after 5 s", {"focal": lambda t: (breathes(t), 0.0), "at_s": 5.0}, "lens")
+
+
+def stamp_cases() -> Iterator[Case]:
+    """Clocks of the images that jump, restart and run fast."""
+    for name, late in (
+        ("back by 1 s", lambda t: -1.0),
+        ("ahead by 1 s", lambda t: 1.0),
+        ("back by 50 ms", lambda t: -0.05),
+        ("to zero", lambda t: -faults.AT_S),
+    ):
+        yield Case(f"stamps jump {name}", {"late": late}, "time")
+    yield Case("stamps run fast by 1 %", {"late": lambda t: 0.01 * t}, "time")
+
+
 def arm_cases() -> Iterator[Case]:
     """Cases of an arm: as in the table, half and twice."""
     yield Case("nothing wrong (arm)")
@@ -192,8 +224,9 @@ def body_run(case: Case, seed: int) -> dict:
     begin_s = case.options.get("at_s", 0.0)
     for monitor, t_s, T, measured, given in faults.watched_body(seed, seconds=BODY_S, **case.options):
         rig = monitor._rig
-        seen = rig.alarm or rig.lens is not None or rig._shape.found is not None or rig._unrest.cov.any()
-        if np.isnan(named_s) and seen:
+        found = rig.alarm or rig.lens is not None or rig._shape.found is not None or rig.passing.now
+        found = found or rig._unrest.cov.any()
+        if np.isnan(named_s) and found:
             named_s = t_s
         error, sigma = (inverse(T) @ measured.T_left_body)[:3, 3], np.sqrt(np.trace(measured.cov[:3, :3]))
         errors.append(np.append(error, sigma) if t_s >= begin_s else np.zeros(4))
@@ -288,9 +321,11 @@ def main(words: list[str], seeds: range, results: Path | None) -> None:
         (body_run, shape_cases()),
         (body_run, print_cases()),
         (body_run, lens_cases()),
+        (body_run, passing_cases()),
         (arm_run, arm_cases()),
         (arm_run, bump_cases()),
         (arm_run, shake_cases()),
+        (arm_run, stamp_cases()),
     ):
         for case in cases:
             if words and not any(word in case.name for word in words):

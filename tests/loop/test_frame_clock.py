@@ -87,3 +87,66 @@ def test_stamps_that_do_not_rise_begin_anew():
     given(clock, np.arange(20) * 0.03)
     assert clock.time(0.1) == 0.1
     assert clock.period_s == 0.0
+
+
+def arriving(rng, t_s, busy=0.0):
+    """When a loop of 4 ms takes images that arrive 30 ms after their exposure, busy for 60 ms now and then."""
+    late = np.where(rng.random(len(t_s)) < busy, 0.06, 0.0)
+    return np.maximum.accumulate(np.ceil((t_s + 0.03 + late) / 0.004) * 0.004)
+
+
+@pytest.mark.parametrize(
+    ("jump", "says_s"),
+    [
+        (lambda t: t - 1.0, 1.0),
+        (lambda t: t + 1.0, -1.0),
+        (lambda t: t - 0.13, 0.13),
+        (lambda t: t - 15.0, 15.0),
+        (lambda t: 1e6 + t, -1e6),
+    ],
+    ids=["back", "ahead", "back by less than it may be late", "restarted", "another epoch"],
+)
+@pytest.mark.parametrize("rate_hz", [10.0, 60.0])
+def test_a_clock_that_jumps_is_put_right_before_a_time_is_given(jump, says_s, rate_hz):
+    rng, clock = np.random.default_rng(7), FrameClock()
+    t_s, stamps = stamped(rng, round(30 * rate_hz), period_s=1 / rate_hz, start_s=0.0, jitter_s=1e-4)
+    lied = np.where(t_s > 15.0, jump(stamps), stamps)
+    times = [clock.time(*pair) for pair in zip(lied, arriving(rng, t_s, busy=0.05), strict=True)]
+    off = np.array([np.nan if each is None else each - t for each, t in zip(times, t_s, strict=True)]) - 0.04
+    assert 3 <= np.isnan(off).sum() <= 15  # until four agree, with a loop that is busy
+    assert np.nanmax(np.abs(off)) < 1e-3
+    assert clock.stepped is not None
+    assert clock.stepped[0] == pytest.approx(15.0, abs=5 / rate_hz + 0.1)
+    assert clock.stepped[1] == pytest.approx(says_s, abs=1e-3)
+
+
+def test_single_stamps_that_lie_and_a_loop_that_is_busy_are_no_jump():
+    rng, clock = np.random.default_rng(8), FrameClock()
+    t_s, stamps = stamped(rng, 1200, period_s=1 / 60, start_s=0.0, jitter_s=1e-4)
+    odd = rng.random(len(t_s)) < 0.02
+    arrived = arriving(rng, t_s, busy=0.1)
+    times = [clock.time(s + 0.7 * o, a) for s, o, a in zip(stamps, odd, arrived, strict=True)]
+    assert clock.stepped is None
+    assert sum(each is None for each in times[10:]) >= odd[10:].sum()
+    assert max(abs(each - t - 0.04) for each, t in zip(times[10:], t_s[10:], strict=True) if each is not None) < 2e-3
+    assert clock.time(np.nan, arrived[-1] + 0.02) is None
+
+
+@pytest.mark.parametrize("rate", [0.01, -0.01, 0.002])
+def test_a_clock_of_another_rate_is_put_right(rate):
+    rng, clock = np.random.default_rng(9), FrameClock()
+    t_s, stamps = stamped(rng, 2400, period_s=1 / 60, start_s=0.0, jitter_s=1e-4)
+    times = [clock.time(*pair) for pair in zip((1 + rate) * stamps, arriving(rng, t_s), strict=True)]
+    off = np.array([np.nan if each is None else each - t for each, t in zip(times, t_s, strict=True)])
+    assert clock.rate == pytest.approx(rate, rel=0.1)
+    late = off[1200:][np.isfinite(off[1200:])]
+    assert len(late) > 1100
+    assert np.ptp(late) < 10e-3  # 200 ms as stamped
+
+
+def test_stamps_of_single_precision_are_smoothed():
+    rng, clock = np.random.default_rng(10), FrameClock()
+    t_s, stamps = stamped(rng, 1200, period_s=1 / 60, start_s=0.0, jitter_s=1e-4)
+    single = (1e8 + 1e3 * stamps).astype(np.float32).astype(float) / 1e3 - 1e5  # steps of 8 ms
+    off = given(clock, single)[400:] - t_s[400:]
+    assert np.std(off) < 0.3 * np.std(single[400:] - t_s[400:])

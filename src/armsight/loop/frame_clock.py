@@ -5,6 +5,11 @@ stamp without most of the jitter. A camera that runs freely exposes periodically
 that of buses, drivers and schedulers. So time and period are the states of a Kalman filter whose memory fades over
 ``MEMORY`` frames, so that it follows a period that drifts with temperature.
 
+Clocks jump, restart at zero, or run fast. When an image arrived is known by another clock, that of the joints: an image
+comes no sooner after its exposure than the soonest before it, and one after the other. Stamps that contradict this are not
+used; once several agree, they are shifted so that images come as soon after their stamps as before. So are those of a clock
+whose rate is beyond what two crystals differ by.
+
 Frames that were lost, or not asked for, are counted by the period; after a gap in which they cannot be, the time begins at
 the next stamp, and the period is kept. A single stamp far from the prediction gets the predicted time; several mean that
 the camera's rate has changed (auto exposure does that), and the filter begins again.
@@ -28,6 +33,14 @@ _NEXT = 1.6
 _GATE, _GATE_S = 5.0, 5e-4
 #: With a sigma above this share of the period frames cannot be counted.
 _COUNTABLE = 0.15
+#: An image that comes so much sooner after its stamp than any other, s, or so much later than the soonest, contradicts its
+#: stamp; half: a loop that was busy for as long loses its images, double: jumps of as much go to the estimator.
+_EARLY_S, _LATE_S = 0.005, 0.25
+#: So many newest images are the others; so many that contradict in a row, and agree, are a clock that jumped.
+_OTHERS, _AGREE = 120, 4
+#: A clock whose rate is off by this is corrected, seen over double of so many seconds at least, or at once where it is off
+#: by so many times that; crystals differ by 1e-4. So many seconds are compared.
+_RATE, _SEEN_S, _SURE, _KEPT_S = 1e-3, 3, 3.0, 20
 
 
 class FrameClock:
@@ -36,9 +49,18 @@ class FrameClock:
     Attributes:
         period_s: time between two frames, s; 0 before it is known.
         jitter_s: standard deviation of the stamps about their prediction, s; 0 before it is known.
+        stepped: when stamps were first shifted, s, and by how much in all, s; None while they are right.
+        rate: by which share the clock runs fast.
     """
 
     def __init__(self) -> None:
+        self.stepped: tuple[float, float] | None = None
+        self.rate = 0.0
+        self._shift_s = self._origin_s = 0.0
+        self._broken = False
+        self._late: deque[float] = deque(maxlen=_OTHERS)
+        self._odd: deque[float] = deque(maxlen=_AGREE)
+        self._soonest: deque[tuple[float, float]] = deque(maxlen=_KEPT_S)  # of each second: its time, how late
         self.period_s = self.jitter_s = 0.0
         self._first: list[float] = []  # stamps in a row, until there are enough
         self._newest_s = -math.inf
@@ -47,12 +69,83 @@ class FrameClock:
         self._tt = self._tp = self._pp = 0.0
         self._strange: deque[bool] = deque(maxlen=_LEAST)
 
-    def time(self, stamp_s: float) -> float:
-        """Return the time of a frame, s.
+    def time(self, stamp_s: float, arrived_s: float | None = None) -> float | None:
+        """Return the time of a frame, s; None where its stamp contradicts when it arrived.
 
         Args:
             stamp_s: its stamp, s. Stamps come in their order; one that does not rise begins anew.
+            arrived_s: when it arrived, s, by a clock that does not jump; None where that is not known.
         """
+        if arrived_s is not None:
+            sane_s = self._sane(stamp_s, arrived_s)
+            if sane_s is None:
+                return None
+            stamp_s = sane_s
+        return self._smoothed(stamp_s)
+
+    def _shifted(self, stamp_s: float) -> float:
+        """Return a stamp, s, with what is known of its clock removed."""
+        return stamp_s + self._shift_s - self.rate / (1.0 + self.rate) * (stamp_s - self._origin_s)
+
+    def _sane(self, stamp_s: float, arrived_s: float) -> float | None:
+        """Return a stamp that agrees with the time of arrival, s; None where it does not."""
+        if not math.isfinite(stamp_s):
+            return None
+        sane_s = self._shifted(stamp_s)
+        late_s, soonest_s = arrived_s - sane_s, min(self._late, default=math.nan)
+        # After a contradiction, or where the rhythm broke, it is to come as soon as usual.
+        latest_s = soonest_s + (_EARLY_S if self._odd or self._broken else _LATE_S)
+        if len(self._late) >= _AGREE and not (sane_s > self._newest_s and soonest_s - _EARLY_S < late_s < latest_s):
+            self._odd.append(late_s)
+            if len(self._odd) < _AGREE or max(self._odd) - min(self._odd) > 2 * _EARLY_S:
+                return None
+            if abs(min(self._odd) - soonest_s) >= _EARLY_S:  # else the loop was busy
+                self._shift(min(self._odd) - soonest_s, arrived_s)
+                return self._shifted(stamp_s)
+        self._odd.clear()
+        self._broken = False
+        self._late.append(late_s)
+        if not self._soonest or arrived_s - self._soonest[-1][0] >= 1.0:
+            self._soonest.append((arrived_s, late_s))
+            self._follow_rate(stamp_s)
+        elif late_s < self._soonest[-1][1]:
+            self._soonest[-1] = self._soonest[-1][0], late_s
+        return self._shifted(stamp_s)
+
+    def _shift(self, by_s: float, arrived_s: float) -> None:
+        """Shift stamps by a time, s; to a whole number of periods from the newest frame, if arrivals agree."""
+        if self.period_s > 0.0:
+            since = arrived_s - min(self._odd) + by_s - self._t_s
+            gap = since - round(since / self.period_s) * self.period_s
+            by_s -= gap if abs(gap) < _EARLY_S else 0.0
+        self._shift_s, self._broken = self._shift_s + by_s, False
+        since_s, before_s = (arrived_s, 0.0) if self.stepped is None else self.stepped
+        self.stepped = since_s, before_s + by_s
+        self._odd.clear()
+        self._soonest.clear()
+
+    def _follow_rate(self, stamp_s: float) -> None:
+        """Correct the rate of the clock where the soonest images of seconds come ever sooner or later."""
+        if len(self._soonest) <= _SEEN_S:
+            return
+        t_s, late_s = np.array(self._soonest)[:-1].T
+        drifts = np.diff(late_s) / np.diff(t_s)  # of a second by the joints' clock: less the rate
+        newest = drifts[-2:]
+        sure = abs(newest.sum()) == np.abs(newest).sum() and np.abs(newest).min() > _SURE * _RATE
+        drift = float(newest.mean() if sure else np.median(drifts))
+        if not sure and (len(drifts) < 2 * _SEEN_S or abs(drift) < (_RATE if self.rate == 0.0 else _RATE / 10.0)):
+            return
+        ahead_s = float(late_s[0] - late_s[-1]) - drift * float(self._soonest[-1][0] - t_s[-1])
+        now_s = self._shifted(stamp_s) - ahead_s
+        self.rate = (1.0 + self.rate) * (1.0 - drift) - 1.0
+        self._shift_s, self._origin_s = now_s - stamp_s, stamp_s
+        self.stepped = self.stepped or (self._soonest[0][0], 0.0)
+        self._late.clear()
+        self._soonest.clear()
+        self._newest_s = -math.inf
+
+    def _smoothed(self, stamp_s: float) -> float | None:
+        """Return a stamp that rises, s, without most of its jitter; None where arrivals are to say whether it jumped."""
         if not stamp_s > self._newest_s:
             self._begin()
         self._newest_s = stamp_s
@@ -70,7 +163,10 @@ class FrameClock:
         self._strange.append(odd)
         if sum(self._strange) >= _STRANGE or self.jitter_s > _COUNTABLE * self.period_s:
             self._begin()
+            self._broken = True
             return self._begun(stamp_s)
+        if odd and self._late and abs(gap) > _EARLY_S:
+            return None
         if odd:
             return stamp_s - gap if len(self._strange) == _LEAST else stamp_s
         self._t_s = stamp_s - gap * (1.0 - tt / variance)

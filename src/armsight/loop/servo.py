@@ -31,8 +31,6 @@ from armsight.robot.trajectories.resolved_rate import position_first
 
 #: A tool less well known than this is not corrected: sigma of its worst direction, m.
 MAX_SIGMA_M = 1e-3
-#: How long the correction is carried on without vision, s; then it is held.
-BRIDGE_S = 0.75
 #: The correction moves no faster than this share of each joint's speed limit, so that nothing jumps.
 RATE_SHARE = 0.1
 #: At rest a joint is taken through its backlash, with this time constant, s, for an error of the tool that lasts and of
@@ -109,8 +107,16 @@ class LoopTiming:
         z^(d+1) - z^d + g meet on the real axis; it is stable up to 2 sin(pi / (4d + 2)) (Levin and May, 1976): 2 times as
         much at d = 0, 4 at 1, pi e / 2 = 4.27 in the limit. The age of what is held between measurements counts as delay.
         """
-        d = (self.latency_s + self.vision_period_s + self.response_s) / self.period_s
-        return float(d**d / (d + 1) ** (d + 1))
+        return self.gain_at(0.0)
+
+    def gain_at(self, age_s: float) -> float:
+        """Return the same where the newest measurement is so old, s: images may come later than expected."""
+        d = self.arrived_s(age_s) / self.period_s
+        return float((d / (d + 1)) ** d / (d + 1))
+
+    def arrived_s(self, age_s: float) -> float:
+        """Return how long after a command its effect is in the estimate, s, the newest measurement being so old, s."""
+        return max(self.latency_s + self.vision_period_s, age_s) + self.response_s
 
 
 @dataclass(frozen=True)
@@ -247,17 +253,17 @@ class PoseServo:
         distrusted = mode is Mode.DISTRUSTED
         change = -self._correction if distrusted else np.zeros(self._arm.joints)
         source = before if distrusted else estimator
-        if source is not None and mode in (Mode.VISION, Mode.BRIDGED, Mode.DISTRUSTED):
+        closed = mode in (Mode.VISION, Mode.BRIDGED)
+        gain = self.timing.gain_at(estimate.vision_age_s)
+        if source is not None and (closed or distrusted):
             last, following = self._missing(source, aim)
-            push = following - last
-            if mode is not Mode.BRIDGED:
-                push += self.timing.gain * error if resting and not distrusted else self._follow * last
+            push = following - last + (gain * error if resting and closed else self._follow * last)
             change = self._joints(aim, push)
-        if mode is Mode.VISION and resting:
+        if closed and resting:
             if self._joint_loops is None:
-                change += self._crossing(estimator, aim, error)
+                change += self._crossing(estimator, aim, error, gain)
             else:
-                change = self._stepped(estimator, aim, error)
+                change = self._stepped(estimator, aim, error, self.timing.arrived_s(estimate.vision_age_s))
                 self._droops(estimate, aim)
         else:
             self._look_s, self._looks = 0.0, 0
@@ -272,9 +278,9 @@ class PoseServo:
         sigma_m = math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2])
         if sigma_m > MAX_SIGMA_M:
             sigma_m = math.sqrt(np.linalg.eigvalsh(cov)[-1])
-        usual_s = self.timing.latency_s + 2 * self.timing.vision_period_s  # one measurement may be missed
-        if estimate.vision_age_s > usual_s + BRIDGE_S or sigma_m > MAX_SIGMA_M:
+        if sigma_m > MAX_SIGMA_M:
             return Mode.POTENTIOMETERS
+        usual_s = self.timing.latency_s + 2 * self.timing.vision_period_s  # one measurement may be missed
         return Mode.VISION if estimate.vision_age_s <= usual_s else Mode.BRIDGED
 
     def _missing(self, estimator: Estimator, aim: Aim) -> Array:
@@ -293,9 +299,9 @@ class PoseServo:
         _by_tool(aim.U, aim.s, aim.Vt, self._scale, error, joints)
         return joints
 
-    def _crossing(self, estimator: Estimator, aim: Aim, error: Array) -> Array:
+    def _crossing(self, estimator: Estimator, aim: Aim, error: Array, gain: float) -> Array:
         """Return a step (n,) through the backlash of joints that rest on its wrong side for what is to be corrected."""
-        self._lasting += self.timing.gain * (error - self._lasting)
+        self._lasting += gain * (error - self._lasting)
         requested = self._joints(aim, self._lasting)
         worth = np.abs(requested) * np.linalg.norm(aim.jacobian[:3], axis=0) > CROSS_M
         return self._crossed(estimator, aim, requested, worth) * min(self.timing.period_s / CROSS_S, 1.0)
@@ -317,7 +323,7 @@ class PoseServo:
         by_joint = (missing * columns).sum(axis=2) / np.maximum((columns**2).sum(axis=1), UNCORRECTED_BELOW**2)
         return np.asarray(np.maximum(np.array([[1.0], [-1.0]]) * by_joint, 0.0))
 
-    def _stepped(self, estimator: Estimator, aim: Aim, error: Array) -> Array:
+    def _stepped(self, estimator: Estimator, aim: Aim, error: Array, arrived_s: float) -> Array:
         """Return the change (n,) over joints that move by steps: look, move by whole steps, let the joints arrive.
 
         An integral would ask for parts of steps, which their controllers do not make, or make at once when they add up.
@@ -325,7 +331,6 @@ class PoseServo:
         time left to look.
         """
         assert self._joint_loops is not None
-        arrived_s = self.timing.latency_s + self.timing.vision_period_s + self.timing.response_s
         if self._look_s == 0.0:
             self._stepped_to = self._correction
         self._look_s += aim.passed_s

@@ -67,6 +67,9 @@ _ECHO = re.compile(
 )
 
 
+_MOST_RECORDS = 200_000  # poses of a document, of 40 bytes each; half: the same; double: a hostile list takes 500 MB
+
+
 def is_document(path: Path, text: str) -> bool:
     """Return whether a text, or a file by its suffix, is one of these."""
     first = next((row.strip() for row in text.splitlines() if row.strip() and not row.strip().startswith("#")), "")
@@ -93,7 +96,10 @@ def document_rows(path: Path, text: str | None, side: str, whose: str | None) ->
         records = [{key: cell.strip() for key, cell in one.items() if cell} for one in records]
         return list(dict.fromkeys(key for one in records for key in one)), records
     records = []
-    items = _items(_parsed(path, text))
+    document = _parsed(path, text)
+    if isinstance(document, list) and len(document) > _MOST_RECORDS:
+        raise InputError(f"{path}: holds {_content(document)}, more than {_MOST_RECORDS} poses: split it")
+    items = _items(document)
     for k, (item, name) in enumerate(items, 1):
         groups = dict(_poses(item))
         if not groups and records:
@@ -106,7 +112,7 @@ def document_rows(path: Path, text: str | None, side: str, whose: str | None) ->
             record |= next((one for one in groups.values() if poses and len(groups) > 1 and _with_unit(one)), {})
             records.append({**record, **({} if name is None else {"name": name}), **_beside(item)})
     if not records:
-        held = _content(_parsed(path, text))
+        held = _content(document)
         raise InputError(
             f"{path}: holds {held}, and no poses: expected a list of matrices, of 6 or 7 numbers, or of positions beside "
             "rotations (translation, rotation), or a table such as x_mm,y_mm,z_mm,qw,qx,qy,qz"

@@ -23,11 +23,11 @@ from armsight.errors import InputError
 from armsight.files import columns_unused
 from armsight.tables.cells import Rows, read_cells, read_columns
 from armsight.tables.columns import COLUMNS, Columns, degree_columns, is_unitless, understood
-from armsight.tables.lengths import UNITS_M
+from armsight.tables.lengths import REACH, UNITS_M
 from armsight.tables.rotations import CONVENTIONS
 
 #: Lengths beyond this, m, are no robot's: they are mm; below the other, all of them, they are m taken for mm.
-FAR_M, NEAR_M = 20.0, 0.02
+_, NEAR_M, FAR_M = REACH
 #: No arm here reaches further, m; half: a large KUKA in cm is taken for mm alone, double: small ones in inches are named.
 REACH_M = 3.0
 #: An angle in degrees is not larger.

@@ -12,6 +12,7 @@ from armsight.data import Body, Correspondences, JointCommand, Points, PoseEstim
 from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.estimators import Delay, KalmanEstimator, Mounting
+from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health import HealthMonitor
 from armsight.loop.health.change import widened
 from armsight.loop.health.follow import RigFollower
@@ -103,17 +104,20 @@ def watched_body(
     rotated=None,
     scale=1.0,
     skew_s=0.0,
+    row_s=0.0,
+    focal=None,
     at_s=0.0,
     seconds=12.0,
     lens=None,
     shift=0.0,
     nod=None,
-    sigma_px=SIGMA_PX,
 ):
     """Watch a body that moves and rests; yield the monitor, the time, the true pose, and what it returned for each shot.
 
-    From ``at_s`` on cameras and points of the body are displaced; ``nod``: of a side, its camera rotates about its own
-    axes by ``(side, amplitude (3,), rad, frequency, Hz)``.
+    From ``at_s`` on cameras and points of the body are displaced, the right camera exposes late by ``skew_s`` (or that of
+    the number of the shot, s) and each row of it by ``row_s`` later than the one above, and focal lengths change by a share
+    of themselves, ``focal`` of the time since then, left and right. ``nod``: of a side, its camera rotates about its own
+    axes by (side, amplitude (3,), rad, frequency, Hz).
     """
     rng = np.random.default_rng(seed)
     if lens is None:
@@ -137,9 +141,11 @@ def watched_body(
 
     for k in range(round(seconds * RATE_HZ)):
         t = k / RATE_HZ
-        T, late = body_at(t), body_at(t + skew_s * (t >= at_s))
-        true = moved if t >= at_s else TRUE
-        there = points + shift * (t >= at_s)
+        on, T = t >= at_s, body_at(t)
+        late_s = (skew_s(k) if callable(skew_s) else skew_s) * on
+        late = body_at(t + late_s)
+        true = moved if on else TRUE
+        there = points + shift * on
         uv, uv_late = (both_pixels(true, there @ each[:3, :3].T + each[:3, 3]) for each in (T, late))
         uv[:, 1] = uv_late[:, 1]
         if nod is not None and t >= at_s:
@@ -148,6 +154,14 @@ def watched_body(
             frame_of = [np.eye(4), inverse(true.T_left_right)][side] @ T
             at = (there @ frame_of[:3, :3].T + frame_of[:3, 3]) @ by.T
             uv[:, side] = true.cameras[side].project(at)
+        if row_s and on:
+            for n, row in enumerate(uv[:, 1, 1] - TRUE.right.image_size_px[1] / 2):
+                rolled = body_at(t + late_s + row_s * row)
+                uv[n, 1] = both_pixels(true, (there @ rolled[:3, :3].T + rolled[:3, 3])[n : n + 1])[0, 1]
+        if focal is not None and on:
+            for side, share in enumerate(focal(t - at_s)):
+                middle = TRUE.cameras[side].intrinsics[2:]
+                uv[:, side] = middle + (1.0 + share) * (uv[:, side] - middle)
         if lens is not None:
             uv = np.stack([lens(side, uv[:, side]) for side in range(2)], axis=1)
         estimate = measured(given, body, frame @ T, uv + SIGMA_PX * rng.normal(size=uv.shape))
@@ -176,6 +190,7 @@ class Moved:
         self.slip = slip  # of the body on the tool (6,), [m; rad], or a function of the tool's rotation that returns it
         self.late = late  # by how much the stamps are late, s, at seconds after AT_S
         self.monitor = HealthMonitor(example_rig(), body_target().body, 0.0)
+        self.monitor.stamps = FrameClock()
         self.found_s = None
         self.follower = RigFollower(example_rig(), body_target().body) if follows else None
         self.mounting = Mounting(T_base_rig, np.eye(4), np.zeros((12, 12)))
@@ -200,11 +215,16 @@ class Moved:
         if t_s >= AT_S:
             D = T @ np.linalg.inv(small(self.motion(t_s - AT_S))) @ np.linalg.inv(T)
             measurement = replace(measurement, T_base_tool=D @ measurement.T_base_tool)
-            if self.late is not None:
-                measurement = replace(measurement, t_s=t_s + self.late(t_s - AT_S))
             if self.slip is not None:
                 slip = self.slip(measurement.T_base_tool[:3, :3]) if callable(self.slip) else self.slip
                 measurement = replace(measurement, T_base_tool=measurement.T_base_tool @ small(slip))
+                measurement = replace(measurement, T_base_tool=measurement.T_base_tool @ small(self.slip))
+        if self.late is not None:
+            late_s = self.late(t_s - AT_S) if t_s >= AT_S else 0.0
+            sane_s = self.monitor.stamps.time(t_s + late_s, self.estimator.span_s[1])
+            if sane_s is None:
+                return None
+            measurement = replace(measurement, t_s=sane_s)
         if self.corrections:
             T = self.mounting.T_base_rig @ np.linalg.inv(T) @ measurement.T_base_tool
             by = adjoint(np.linalg.inv(T) @ self.mounting.T_base_rig)

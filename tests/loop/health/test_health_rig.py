@@ -40,7 +40,7 @@ def test_a_camera_that_exposes_late_is_named_as_time_and_poses_at_rest_stay_trus
     (found,) = monitor.findings()
     assert (found.cause, found.unit) == ("time", "ms")
     assert abs(found.size - 2.0) < 4 * found.sigma
-    assert found.sigma < 0.1
+    assert found.sigma < 0.2  # the velocity is that of measured poses, to 10 %
     assert monitor.trust is Trust.FULL
 
 

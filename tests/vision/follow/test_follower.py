@@ -1,5 +1,7 @@
 """Following: the same answers as searching, regained after a loss, jumps reported, and honest covariances."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from disc_painter import grey, light_of, pair_of
@@ -7,13 +9,14 @@ from disc_painter import grey, light_of, pair_of
 from armsight.data import Missed, PoseEstimate, Record, Shot
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.sim.example_rig import example_rig
+from armsight.sim.workcell.body import body_target
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.targets import Composite
 from armsight.vision.measure import measure
 from disc_views import PLATE, discs_of, hd_rig, someplace
 
 RIG = hd_rig()
-BODY = Composite(PLATE.body.name, (), PLATE)
+BODY, NINE = Composite(PLATE.body.name, (), PLATE), body_target()
 TWIST = np.array([0.4, -0.2, 0.1, 0.5, -0.4, 0.8])
 
 
@@ -89,6 +92,37 @@ def test_one_of_four_discs_may_be_missing():
         if k == 3:
             assert [d.point for d in result.dropped] == ["B"]
             assert result.dropped[0].reason.startswith("left: ")
+
+
+@pytest.mark.parametrize(("rows", "mm"), [([1], 1.0), ([1], 3.0), ([0], 2.0), ([1, 4], 2.0)])
+def test_a_body_of_which_discs_moved_is_followed_by_the_others(rows, mm):
+    along = np.outer(np.isin(np.arange(len(NINE.discs.body.points)), rows), [0.6e-3 * mm, -0.8e-3 * mm, 0.0])
+    moved = replace(NINE.discs, body=replace(NINE.discs.body, points=NINE.discs.body.points + along))
+    follower, names = Follower(RIG, NINE), {NINE.discs.body.point_names[row] for row in rows}
+    for k, (truth, shot) in enumerate(shots(moved, 6, 5)):
+        result = follower.measure(shot)
+        assert isinstance(result, PoseEstimate)
+        assert follower.way == ("followed" if k else "searched")
+        off = log_se3(inverse(truth) @ result.T_left_body)
+        assert off @ np.linalg.solve(result.cov, off) < 25.0
+        assert not set(rows) & set(result.points.ids)
+        if k:  # a search may not even take them for discs of the body
+            assert {each.point for each in result.dropped} == names
+            assert all(each.contradicts for each in result.dropped)
+            assert set(rows) <= set(result.points.seen.ids)  # for who looks at the body's shape
+
+
+def test_a_body_of_which_more_than_half_moved_is_not_followed():
+    rng = np.random.default_rng(6)
+    points = NINE.discs.body.points
+    bent = replace(NINE.discs, body=replace(NINE.discs.body, points=points + 3e-3 * rng.normal(size=points.shape)))
+    follower = Follower(RIG, NINE)
+    for _, shot in shots(NINE.discs, 3, 6):
+        follower.measure(shot)
+    for k, (_, shot) in enumerate(shots(bent, 6, 6)):
+        if k > 3:
+            follower.measure(shot)
+            assert follower.way != "followed"
 
 
 def test_a_jump_is_reported():

@@ -235,9 +235,9 @@ class Loop:
         self._datum: ShotDatum | None = None
         self._known: Mounting | None = None  # the mounting that was published
         self._shot_s = -np.inf
-        self._frames = FrameClock()
         self._stamp_s: float | None = None  # of the shot that is measured, as it was stamped
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s, printed=is_print(setup.target))
+        self._frames = self.health.stamps = FrameClock()
         self.rig_follower: RigFollower | None = None
         self._rig_work: Future[RigCorrection | None] | None = None
         self._rig_s = -np.inf
@@ -472,8 +472,11 @@ class Loop:
         self._expected = self._twist = None
         shot = shot if shot is None or clock is None else clock.on_board(shot)
         if shot is not None and shot.t_s is not None:
-            self._stamp_s = shot.t_s
-            shot = replace(shot, t_s=self._frames.time(shot.t_s))
+            self._stamp_s, self._shot_s = shot.t_s, self.t_s
+            sane_s = self._frames.time(shot.t_s, self.t_s)
+            if sane_s is None:
+                return None
+            shot = replace(shot, t_s=sane_s)
         if shot is not None and self.mounting is not None and self.follower.way == "lost":
             self._expected = self.mounting.body(self.estimator.estimate().T_base_tool)
             motion = None if shot.t_s is None else self._motion(shot.t_s)

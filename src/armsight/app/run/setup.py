@@ -62,6 +62,7 @@ class HostClock:
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         self._now = now
         self._least_s: float | None = None
+        self._live = False
         self._heard_s, self._rise = 0.0, DRIFT
         self._minima = deque[tuple[float, float]](maxlen=_WINDOW_S)  # of each second: board's time, difference
 
@@ -98,13 +99,15 @@ class HostClock:
         assert self._least_s is not None
         if shot.t_s is None and shot.problem is not None:
             return shot
-        if shot.t_s is None or abs(self._now() - shot.t_s) > _LIVE_S:
+        # The clock of cameras that were live may jump.
+        if shot.t_s is None or (abs(self._now() - shot.t_s) > _LIVE_S and not self._live):
             problem = (
                 "has no time" if shot.t_s is None else f"was taken {self._now() - shot.t_s:.0f} s ago by its own time"
             )
             raise DeviceError(
                 f"shot {shot.name} {problem}: is it of a recording? A run needs live cameras (usb:..., url:...)"
             )
+        self._live = True
         return replace(shot, t_s=shot.t_s - self._least_s)
 
 

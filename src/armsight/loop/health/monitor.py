@@ -11,6 +11,7 @@ import numpy as np
 from armsight.data import Array, Body, PoseEstimate
 from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement, Remembered
 from armsight.loop.estimators.clock import ClockFollower
+from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health.base_motion import BaseMotion, KeptMeasurement, Measurements
 from armsight.loop.health.change import Change, doubtful, finding, happened_besides, suspected
 from armsight.loop.health.closure import ClosureWatch
@@ -41,12 +42,16 @@ class HealthMonitor:
         body: the body that is measured.
         sync_s: standard deviation of the time between the two exposures of a shot, s.
         printed: whether the body is a print whose shape a calibration found: its points are not tested.
+
+    Attributes:
+        stamps: what makes the times of the shots from their stamps; None where nothing does.
     """
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
         self._body, self._sync_s, self._printed = body, sync_s, printed
         self._rig = RigWatch(rig, body, sync_s, printed=printed) if rig.cov.any() else None
         self._host = HostWatch()
+        self.stamps: FrameClock | None = None
         self._landmarks: LandmarkWatch | None = None
         self._fixed: FixedWatch | None = None
         self._closure: ClosureWatch | None = None
@@ -350,6 +355,8 @@ class HealthMonitor:
         """Return what was found so far; nothing while all is well."""
         self.work()
         late = () if self._clock is None else _clock_findings(self._clock, self._newest_s)
+        if self.stamps is not None and self.stamps.stepped is not None:
+            late = (_stamps_finding(*self.stamps.stepped, self.stamps.rate),)
         now = (
             *(() if self._rig is None else self._rig.findings()),
             *self._moved(),
@@ -379,6 +386,23 @@ def _clock_findings(clock: ClockFollower, t_s: float) -> tuple[HealthFinding, ..
             "ms",
             "stamp images and readings by one clock, with the cameras' own stamps instead of times of arrival",
         ),
+    )
+
+
+def _stamps_finding(since_s: float, shifted_s: float, rate: float) -> HealthFinding:
+    """Return the finding of stamps of images that were shifted, s, of a clock that runs fast by a share."""
+    runs = f"runs {abs(100.0 * rate):.2f} % {'fast' if rate > 0 else 'slow'}"
+    jumped = f"jumped {'back' if shifted_s > 0 else 'ahead'} by {abs(shifted_s):.3f} s"
+    what = " and ".join([*([jumped] if shifted_s else []), *([runs] if rate else [])])
+    size, unit = (1e3 * shifted_s, "ms") if shifted_s else (100.0 * rate, "%")
+    return HealthFinding(
+        "time",
+        f"the clock that stamps the images {what}, against their arrival; stamps were put right, to some milliseconds",
+        since_s,
+        size,
+        0.0,
+        unit,
+        "stamp images by a clock that nothing sets (monotonic), and open the cameras once",
     )
 
 

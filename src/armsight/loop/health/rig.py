@@ -21,6 +21,10 @@ its own. It is reported where beta explains more than any change of the seven nu
 A camera that nods averages out in the sums: what single shots say of its rotation is compared within each second, and what
 it varies beyond the noise is a covariance of its own, which differs from shot to shot (``fixed``). Images that were seen
 before, to the bit, say nothing new.
+
+What changes and does not stay is a hypothesis of each single test (:mod:`~armsight.loop.health.passing`): each shot's own
+times of exposure, a focal length. Where its evidence is the largest the test is counted with that eliminated, so that
+cameras are not blamed for it.
 """
 
 from __future__ import annotations
@@ -41,6 +45,7 @@ from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import adjoint, inverse, log_se3, pose
 from armsight.kernels import kernel
 from armsight.loop.health.fixed import Unrest
+from armsight.loop.health.passing import TRACK, Apart, ExposedShot, Passing, PassingSums, apart, eliminate, velocity
 from armsight.loop.health.record import COSTS_M, LEVER_M, HealthFinding, alarm_limit
 from armsight.loop.health.shape import FURTHEST_M, SMOOTH, ResidualSums, ShapeWatch, eliminated, total
 from armsight.vision.camera import pair_arguments
@@ -162,6 +167,7 @@ class _ShotResiduals(NamedTuple):
         response: (6, K + M) of its pose to these.
         every: as ``rows``, with points that do not fit, which may be displaced.
         response_with_all: (6, K + M) of a pose measured with these.
+        exposed: by how much the times of the exposures would move each row of ``rows``, and of ``every``.
     """
 
     t_s: float
@@ -169,6 +175,7 @@ class _ShotResiduals(NamedTuple):
     response: Array
     every: Array
     response_with_all: Array
+    exposed: tuple[ExposedShot, ExposedShot]
 
 
 class RigWatch:
@@ -188,6 +195,7 @@ class RigWatch:
         alarmed: whether any did.
         lens: what the camera models lack, where that is certain and matters.
         noise: (6, 6) what of the covariance that the newest shot was given differs from shot to shot.
+        passing: what changed from shot to shot, or from test to test.
     """
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
@@ -221,6 +229,9 @@ class RigWatch:
         self._row_of = np.full(len(body.points), -1)
         self._row_of[self._points] = np.arange(len(self._points))
         self._last = (-np.inf, np.eye(4))
+        self._track: deque[tuple[float, Array]] = deque(maxlen=TRACK)
+        self._used_s = np.full(len(self._points), -np.inf)  # when a pose was measured with each point
+        self.passing = Passing()
         self._taken_s = -np.inf
         self._began: Array | None = None
         # The response of the newest poses to everything, and the covariances of these poses.
@@ -258,6 +269,7 @@ class RigWatch:
         now_s, self._timed = (float(self._shots), False) if t_s is None else (t_s, True)
         self._shots += 1
         is_new = self._is_new(estimate)
+        self._track.append((now_s, estimate.T_left_body))
         if self._redundant(estimate.T_left_body, now_s):
             self._last = (now_s, estimate.T_left_body)
             return np.zeros((6, 6))
@@ -323,6 +335,8 @@ class RigWatch:
         """Return what the suspected errors add to the covariance (6, 6) of a pose."""
         by_parameter, by_lens = found.response[:, : self._size], found.response[:, self._size :]
         added, shape, known = self._shape.added(by_parameter), self._shape.found, 0
+        if self.passing.now:
+            added = added + self.passing.added(found.exposed[0], by_parameter @ self._shape.by_wide[:, 0])
         if self.suspected is not None and (shape is None or shape.seven_needed):
             known = len(_WIDE)
         if self.lens is not None:
@@ -347,6 +361,7 @@ class RigWatch:
             or self._shape.found is not None
             or self._shape.doubt is not None
             or self._unrest.cov.any()
+            or self.passing.now
             or not self._timed
             or not 0.0 <= passed_s < _LIKE_S
         ):
@@ -394,9 +409,10 @@ class RigWatch:
             return None
         A, whole = np.empty((4 * len(ids), 6)), np.zeros((4 * len(ids), 1 + self._full))
         size, T = self._linear_about(estimate)
+        uv = np.ascontiguousarray(seen.uv[rows])
         noise_px2 = _differentiate(
             *self._pair, self._half_px, size * self._p_body, self._row_of, np.asarray(ids, np.int64),
-            np.ascontiguousarray(seen.uv[rows]), np.ascontiguousarray(seen.cov_uv[rows]),
+            uv, np.ascontiguousarray(seen.cov_uv[rows]),
             max(self._rig.sigma_px, 1e-6), np.array(T, order="C"),
             self._velocity(estimate.T_left_body, now_s), A, whole,
         )  # fmt: skip
@@ -407,13 +423,17 @@ class RigWatch:
             whole[:, by_size] /= size
             whole[:, 0] += (size - 1.0) * whole[:, by_size]
         self._noise_px = float(np.sqrt(noise_px2))
+        self._used_s[self._row_of[ids[fits]]] = now_s
+        roll = (uv[:, :, 1] / self._half_px[:, 1] - 1.0).repeat(2)
+        exposed = ExposedShot(A, roll, tuple(self._track))
         if fits.all():
             response = self._eliminated(A, whole)
-            return _ShotResiduals(now_s, whole, response, whole, response)
+            return _ShotResiduals(now_s, whole, response, whole, response, (exposed, exposed))
         kept, every = np.repeat(fits, 4), np.repeat(fits | self._displaced(A, whole[:, 0]), 4)
         found, with_all = whole[kept], whole[every]
         response, response_with_all = self._eliminated(A[kept], found), self._eliminated(A[every], with_all)
-        return _ShotResiduals(now_s, found, response, with_all, response_with_all)
+        both = exposed.of(kept), exposed.of(every)
+        return _ShotResiduals(now_s, found, response, with_all, response_with_all, both)
 
     def _linear_about(self, estimate: PoseEstimate) -> tuple[float, Array]:
         """Return the size of the body over that of its file, and the pose (4, 4), about which residuals are linear.
@@ -453,10 +473,7 @@ class RigWatch:
         before_s, before = self._last
         if not self._timed or not 0.0 < now_s - before_s < _APART_S:
             return np.zeros(6)
-        R = before[:3, :3].T @ T[:3, :3]  # by a small angle
-        rotation = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-        shift = T[:3, :3].T @ (T[:3, 3] - before[:3, 3])
-        return np.asarray(np.concatenate([shift, rotation]) / (now_s - before_s))
+        return velocity(before, T, now_s - before_s)
 
     def _sum(self, shot: _ShotResiduals, estimate: PoseEstimate) -> None:
         """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
@@ -471,8 +488,16 @@ class RigWatch:
         if shot.t_s - self._stays[0][0].t_s >= (TEST_S if self._timed else TEST_SHOTS):
             self._decide()
 
-    def _summed(self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool = False) -> ResidualSums:
-        """Return the sums of stays, of each the mean of its shots; ``every``: with points that do not fit, no lens."""
+    def _summed(
+        self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool = False, own: Apart | None = None
+    ) -> ResidualSums:
+        """Return the sums of stays, of each the mean of its shots.
+
+        Args:
+            stays: they.
+            every: with points that do not fit, no lens.
+            own: times of exposure that are eliminated.
+        """
         size = self._size if every else self._full
         sums = ResidualSums(size, stays[0][0].t_s if stays else 0.0)
         for alone in (True, False):  # those of one shot are summed at once
@@ -485,6 +510,10 @@ class RigWatch:
             if shots:
                 rows = [each if alone else each / np.sqrt(count) for each, count in shots]
                 sums.take(np.concatenate(rows)[:, : 1 + size], sum((len(each) - 6.0) / count for each, count in shots))
+        if own is not None:
+            seen = [(each, 1.0 / len(stay)) for stay in stays for each in stay]
+            rows = [(each.every if every else each.rows)[:, : 1 + size] for each, _ in seen]
+            eliminate(own, [(k, each.exposed[every], w) for k, (each, w) in zip(rows, seen, strict=True)], sums)
         return sums
 
     def _decide(self, *, ends: bool = False) -> None:
@@ -500,14 +529,24 @@ class RigWatch:
         test = every.of(len(self._window.b))
         if any(each.every is not each.rows for stay in stays for each in stay):
             every = self._summed(stays, every=True).by(self._scaled)
-        odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
-        usual = every.less(self._summed(odd, every=True).by(self._scaled)) if odd else every
-        self._shape.decide(every, usual, ends=ends)
         moments = [stay[0] for stay in stays if len(stay) == 1]
         weight = float(np.exp(-1.0 / FORGET_TESTS))
         self._window.scale(weight)
         self._window.add(test, 1.0)
-        change = self._estimated(self._window)
+        change, own = self._estimated(self._window), None
+        if not self._unrest.cov.any() and (self.passing.now or change.chi_square > _SUSPECTED):
+            passes = self._passes(stays, every)
+            if passes is not None:
+                self._window.add(test, -1.0)
+                own, test = passes.apart, passes.sums.of(len(test.b))
+                self._window.add(test, 1.0)
+                change = self._estimated(self._window)
+        if own is not None:
+            moments, whole = [], self._summed(stays, own=own)
+            every = self._summed(stays, every=True, own=own).by(self._scaled)
+        odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
+        usual = every.less(self._summed(odd, every=True, own=own).by(self._scaled)) if odd else every
+        self._shape.decide(every, usual, ends=ends)
         alarm = self._is_alarm(change)
         doubted, self._doubted = self._doubted, None
         if alarm and moments and not self._alarms and self._poses > 1:
@@ -540,6 +579,13 @@ class RigWatch:
         every = slice(None)
         costs = self._cost_m(self._of_part(change, every)) > COSTS_M
         return _certain(change) and costs and self._matters(change, every)
+
+    def _passes(self, stays: Sequence[Sequence[_ShotResiduals]], every: ResidualSums) -> PassingSums | None:
+        """Return the sums of a test with what changed within it eliminated, where that explains it best."""
+        shots = [(each.rows[:, 0], each.exposed[0], 1.0 / len(stay)) for stay in stays for each in stay]
+        found: Apart | None = apart(shots) if self._timed else None
+        sums = None if found is None else self._summed(stays, own=found).of(self._size).by(self._scaled)
+        return self.passing.decide(every, self._shape.evidence, self._size, found, sums)
 
     def _in_priors(self, sums: ResidualSums) -> ResidualSums:
         """Return sums of the parameters and the seven numbers, in units of their priors, from those of the parameters."""
@@ -612,7 +658,12 @@ class RigWatch:
     def wrong_at_rest(self) -> bool:
         """Whether what is suspected makes poses wrong also where nothing moves."""
         parts = [] if self.suspected is None else self._to_blame(self.suspected)
-        return self._shape.found is not None or (self.alarm and not set(parts) <= {"time"})
+        shape = self._shape.found
+        if shape is not None and (points := [each for each in shape.chosen if each >= 0]):
+            moved = bool((self._used_s[points] > self._last[0] - TEST_S).any())  # else poses are of the other points
+        else:
+            moved = shape is not None
+        return moved or (self.alarm and not set(parts) <= {"time"})
 
     def _cost_m(self, by: Array) -> float:
         """Return by how much a change of the parameters (K + M,) displaces one of the newest poses at most, m."""
@@ -687,6 +738,10 @@ class RigWatch:
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far, the shots of the running test included: nothing where no test gave an alarm."""
+        return self.passing.among(self._stays_changed(), timed=self._timed)
+
+    def _stays_changed(self) -> tuple[HealthFinding, ...]:
+        """Return what changed and stays."""
         ended = self._ended()
         shape, lens = ended._shape.said, ended.lens
         by_shape = 0.0 if shape is None else ended._cost_m(np.append(ended._shape.change(shape), np.zeros(_LENS)))
@@ -734,7 +789,7 @@ class RigWatch:
         """Return a copy that says what was found so far; this one goes on."""
         copied = copy(self)
         copied._history, copied._shape = self._history.copy(), self._shape.copied()
-        copied._stays = [stay.copy() for stay in self._stays]
+        copied._stays, copied.passing = [stay.copy() for stay in self._stays], copy(self.passing)
         return copied
 
     def _ended(self) -> RigWatch:

@@ -231,6 +231,10 @@ class _Hypotheses(NamedTuple):
     chance: float = _RARE
 
 
+#: One focal length that changed against the other, by little or much.
+_FOCAL_ALONE = _Hypotheses(np.array([[7], [7], [7]]), np.array([1.0, 0.1, 0.01]))
+
+
 class _Explained(NamedTuple):
     """Log-evidence (N,) of hypotheses against none, the sizes (N, D) of what changed, and their covariances (N, D, D)."""
 
@@ -411,6 +415,15 @@ class ShapeWatch:
         later = sum(each.usual.begin_s >= self.found.begin_s for each in self._history)
         sums_since = self._since(tests - max(later, 1), usual=True)
         return self.found.begin_s, self._mixture(sums_since, self._hypotheses[:1])[1]
+
+    def evidence(self, sums: ResidualSums, excess: float) -> tuple[float, float]:
+        """Return the log-evidence of the best hypothesis of what changed and stays in sums of one test, against none.
+
+        And that of one focal length that changed, with a noise whose variance is so many times larger.
+        """
+        M = self._with_smooth.T @ eliminated(sums.M, slice(1, 1 + self._size)) @ self._with_smooth
+        every = [_explained(M, each, excess).evidence for each in (*self._hypotheses, _FOCAL_ALONE)]
+        return max(float(each.max()) for each in every[:-1]), float(every[-1].max())
 
     def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypotheses]) -> tuple[float, Array]:
         """Return the log-evidence that anything changed before the tests of sums, and the second moment of what did.

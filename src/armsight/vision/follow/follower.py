@@ -31,6 +31,7 @@ from armsight.data import (
 from armsight.geometry.pose import inverse, log_se3
 from armsight.vision.discs.bias import bias_normals
 from armsight.vision.follow.kernel import (
+    ASTRAY,
     FACING_AWAY,
     NOT_THERE,
     OTHER_SIZE,
@@ -115,6 +116,7 @@ _TEXTS = {
     OUTSIDE: "outside the image",
     NOT_THERE: "not where it is predicted",
     OTHER_SIZE: "not of the predicted size",
+    ASTRAY: "not where the body's other discs say",
 }
 
 
@@ -314,9 +316,10 @@ class Follower:
         seen = both = self._rows
         p_left, cov_p, by_rig = found.p_left.copy(), found.cov_p.copy(), found.by_rig.copy()
         if count < 2 * len(seen):
-            good = found.codes == SEEN
-            seen, both = np.flatnonzero(good.any(axis=1)), np.flatnonzero(good.all(axis=1))
-            uv[~good], cov_uv[~good], dropped = np.nan, 0.0, self._dropped(good)
+            fits = found.codes == SEEN
+            good = fits | (found.codes == ASTRAY)
+            seen, both = np.flatnonzero(good.any(axis=1)), np.flatnonzero(fits.all(axis=1))
+            uv[~good], cov_uv[~good], dropped = np.nan, 0.0, self._dropped(fits)
             uv, cov_uv = uv[seen], cov_uv[seen]
             p_left, cov_p, by_rig = p_left[both], cov_p[both], by_rig[both]
         noise = self._cov_noise * misfit
@@ -337,7 +340,7 @@ class Follower:
         """Return which discs which camera did not see, and why."""
         names = self.target.body.point_names
         return tuple(
-            Dropped(names[m], f"{side}: {_TEXTS[int(self._found.codes[m, c])]}")
+            Dropped(names[m], f"{side}: {_TEXTS[int(self._found.codes[m, c])]}", self._found.codes[m, c] == ASTRAY)
             for c, side in enumerate(SIDES)
             for m in np.flatnonzero(~good[:, c])
         )

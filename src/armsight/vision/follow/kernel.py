@@ -39,6 +39,9 @@ _STEPS = 8
 _REACHED = 1e-5
 #: Where a detection is off the pose by more standard deviations than this, the pose is rejected.
 _OFF_SIGMAS = 6.0
+#: A disc whose rows explain so many times the mean square of the others' is left out: half of it by chance once in 1,000
+#: shots, double of it once in 10 million.
+_STRANGE = 32.0
 
 
 @kernel_types(
@@ -380,8 +383,27 @@ def plausible(scene: DiscScene, found: DiscMeasurement, twist: Array) -> bool:
     return True
 
 
-#: The outcome for one disc in one image, beside SEEN and the codes of ``disc.fit.REASONS``.
-FACING_AWAY, OUTSIDE, NOT_THERE, OTHER_SIZE = 20, 21, 22, 23
+@kernel
+def strangest(found: DiscMeasurement) -> tuple[int, float]:
+    """Return the disc without which the pose fits best: r^T (1 - J H^-1 J^T)^-1 r of its own rows, the largest; and that.
+
+    That is by how much the sum of squares falls without it (data snooping: Baarda, "A testing procedure for use in geodetic
+    networks", 1968); a residual alone is small where a disc far from the others pulls the pose.
+    """
+    inverse = solved(product(found.J.T, found.J), np.eye(6))
+    strange, most = -1, 0.0
+    for m in range(len(found.codes)):
+        J, r = found.J[4 * m : 4 * m + 4], found.whitened[4 * m : 4 * m + 4]
+        less = np.eye(4) - product(product(J, inverse), J.T)
+        explained = dot(r, solved_vector(less, r))
+        if explained > most:
+            strange, most = m, explained
+    return strange, most
+
+
+#: The outcome for one disc in one image, beside SEEN and the codes of ``disc.fit.REASONS``; ASTRAY: it was seen, but not
+#: where the body's other discs say.
+FACING_AWAY, OUTSIDE, NOT_THERE, OTHER_SIZE, ASTRAY = 20, 21, 22, 23, 24
 #: Cosine between a disc's normal and its direction to the camera below which it is not searched: 78 degrees.
 _FACING = 0.2
 #: How much larger or smaller than predicted a disc may look.
@@ -507,7 +529,7 @@ def follow_pair(
     margin: float, noise: float, least: float, limits: Array, found: DiscMeasurement, cov_noise: Array,
     work: FitBuffers, room: Room,
 ) -> tuple[int, float, float]:  # fmt: skip
-    """Measure one pair around a predicted pose.
+    """Measure one pair around a predicted pose; discs that do not fit it with the others are left out, half at most.
 
     Args:
         left: (H, W) grey.
@@ -543,8 +565,19 @@ def follow_pair(
                 wrong = max(wrong, np.sqrt(gap[0] * gap[0] + gap[1] * gap[1]))
     if both < 3:
         return 0, np.inf, wrong
-    cost = settle(scene, found)
-    if not np.isfinite(cost) or not plausible(scene, found, twist):
+    cost, least_both = settle(scene, found), max(3, (both + 1) // 2)
+    while np.isfinite(cost) and cost > limits[seen]:
+        m, explained = strangest(found)
+        alike = explained < _STRANGE * max((cost - explained) / max(2 * seen - 10, 1), 1.0)
+        if alike and plausible(scene, found, twist):
+            break
+        both -= found.codes[m, 0] == SEEN and found.codes[m, 1] == SEEN
+        for side in range(2):
+            if found.codes[m, side] == SEEN:
+                found.codes[m, side] = ASTRAY
+                seen -= 1
+        cost = settle(scene, found) if both >= least_both else np.inf
+    if not np.isfinite(cost):
         return 0, np.inf, wrong
     chi_square = uncertainty(scene, found, cov_noise, cost, limits[seen])
     triangulated(scene, found)

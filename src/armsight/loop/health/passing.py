@@ -1,0 +1,356 @@
+"""What changes and does not stay: exposures that are not when they are said to be, focal lengths that oscillate.
+
+In: the residuals of the shots of one test, and by how much the times of their exposures move each. Out: the sums of the
+test with that eliminated, where it explains them better than anything that changed once and stays (a camera, the body), and
+the findings of time and lens. Model of a shot, its pose eliminated:
+
+    r = B d + C c + n,    d ~ N(0, s^2)
+
+B d is what displacing the body in the right image does, and a displacement that grows with the row in either image (the
+rows of a rolling shutter are exposed one after the other): the body's velocity times a time that each shot has of its own,
+and a share of the speed in any direction, since the velocity is that of measured poses. C are those of its columns that are
+times alone, c their values that all shots of the test share. Late exposures, another rate, dropped images and rolling
+shutters are all of this form. A focal length has one value in each test. Hypotheses are compared by their evidence (MacKay,
+1992), which takes off what chance explains: of numbers that each shot has anew it is much.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array
+from armsight.loop.health.record import HealthFinding
+from armsight.loop.health.shape import ResidualSums, eliminated
+
+#: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
+_APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
+#: The velocity of measured poses is off by this share of the speed in any direction; half: rig and body are blamed for what
+#: is left of late images, double: less of them is seen.
+_UNKNOWN_SHARE = 0.2
+#: The body's motion at a shot is that of so many newest ones, if these are of so short a time, s.
+TRACK, _LONGEST_S = 5, 1.0
+#: Log-evidence by which a hypothesis must be ahead of all others to be taken; half: chance takes one of 100 tests for it.
+_AHEAD = math.log(1e4)
+#: Hypotheses whose log-evidence is nearer than this are not distinguished: 12 of chi-square.
+_ALIKE = 6.0
+#: Times are another in each shot where their own part is this share of what all have in common at the least.
+_CONSTANT = 0.4
+#: Tests that must show something before it is said: one in which a camera moved is of both times, and looks alike.
+_LEAST = 2
+#: Of the columns of a shot those of times: of the right camera, of the rows of the right and of the left one; acceleration.
+_TIMES = [0, 7, 8, 9]
+#: An acceleration moves the body like so many seconds of it, where times are of a second.
+_BENT_S = 0.1
+#: Standard deviation of the focal length of a test, as a share: so wide that it decides nothing beside the column's own.
+_FOCAL = 0.05
+
+
+def velocity(before: Array, after: Array, seconds: float) -> Array:
+    """Return the velocity (6,) in the body's axes, 1/s, that takes a pose (4, 4) to another, by a small angle."""
+    R = before[:3, :3].T @ after[:3, :3]
+    rotation = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    shift = after[:3, :3].T @ (after[:3, 3] - before[:3, 3])
+    return np.asarray(np.concatenate([shift, rotation]) / seconds)
+
+
+class ExposedShot(NamedTuple):
+    """By how much the times of exposure move the residuals of a shot.
+
+    Attributes:
+        A: (n, 6) derivative of the residuals by the pose, in standard deviations; rows u, v of the left image and of the
+            right one, point by point.
+        roll: (n,) the row of the image, from -1 at its top to 1.
+        track: times, s, and poses T_left_body (4, 4) of the newest shots up to this one.
+    """
+
+    A: Array
+    roll: Array
+    track: tuple[tuple[float, Array], ...]
+
+    def of(self, rows: NDArray[np.bool_]) -> ExposedShot:
+        """Return that of some rows."""
+        return self._replace(A=self.A[rows], roll=self.roll[rows])
+
+    def motion(self) -> tuple[Array, Array]:
+        """Return velocity and acceleration (6,) of the body in its axes, 1/s and 1/s^2; zero where they are unknown.
+
+        They are those of each second shot: what a shot has of its own and the next one not leaves them right.
+        """
+        if len(self.track) < TRACK:
+            return np.zeros(6), np.zeros(6)
+        (first_s, first), (middle_s, middle), (last_s, last) = self.track[0], self.track[TRACK // 2], self.track[-1]
+        if not first_s < middle_s < last_s < first_s + _LONGEST_S:
+            return np.zeros(6), np.zeros(6)
+        early, late = velocity(first, middle, middle_s - first_s), velocity(middle, last, last_s - middle_s)
+        return 1.5 * late - 0.5 * early, (late - early) * 2.0 / (last_s - first_s)
+
+    def moved(self) -> Array:
+        """Return what (n, 10) moves the residuals.
+
+        1 s later in the right image, other motions there (6), 1 s at the edge of the right and of the left one; and what
+        the first lacks of a body that accelerates.
+        """
+        right = np.arange(len(self.A)) % 4 >= 2
+        by_right, (along, acceleration) = self.A * right[:, None], self.motion()
+        speeds = np.repeat(np.linalg.norm(along.reshape(2, 3), axis=1) / math.sqrt(3.0), 3)
+        rolled = self.roll * (self.A @ along)
+        skew, bent = by_right @ along, _BENT_S * (by_right @ acceleration)
+        return np.column_stack([skew, _UNKNOWN_SHARE * speeds * by_right, rolled * right, rolled * ~right, bent])
+
+    def without_pose(self) -> Array:
+        """Return the same (n, 10) with the pose eliminated."""
+        Q, moved = np.linalg.qr(self.A)[0], self.moved()
+        return np.asarray(moved - Q @ (Q.T @ moved))
+
+    def response(self) -> Array:
+        """Return what (6, 10) these do to the pose."""
+        return np.asarray(np.linalg.lstsq(self.A, self.moved(), rcond=None)[0])
+
+
+@dataclass(frozen=True)
+class Apart:
+    """How the exposures of the shots of a test are apart.
+
+    Attributes:
+        apart_s: standard deviation of the times that each shot has of its own, s.
+        rms_s: RMS of the times by which the right camera is late, s.
+        gained: sum of squares that all explain.
+        occam: twice the logarithm of what chance explains with them.
+        shared_s: (4,) what all shots share: by how much the right camera is late, the last row of the right and of the left
+            one against the middle, s; and what the first lacks of an acceleration.
+        information: (4, 4) inverse of its covariance.
+    """
+
+    apart_s: float
+    rms_s: float
+    gained: float
+    occam: float
+    shared_s: Array
+    information: Array
+
+
+def apart(shots: Sequence[tuple[Array, ExposedShot, float]]) -> Apart | None:
+    """Return the times of exposure that explain residuals (n,) of shots, with their weights, best; None where none do."""
+    parts = list[tuple[Array, Array, float]]()
+    for r, exposed, weight in shots:
+        B = exposed.without_pose()
+        parts.append((B.T @ B, B.T @ r, weight))
+    W, b, weights = (np.array(part) for part in zip(*parts, strict=True))
+    found = [_apart(each, W, b, weights) for each in _APART_S]
+    best = max(found, key=lambda each: each.gained - each.occam)
+    return best if best.gained > best.occam else None
+
+
+def _apart(apart_s: float, W: Array, b: Array, weights: Array) -> Apart:
+    """Return the times of N shots, of information W (N, 10, 10) and right sides b (N, 10), with a prior of their own, s."""
+    K = np.eye(W.shape[1]) + apart_s**2 * W
+    left, g = np.linalg.solve(K, W), np.linalg.solve(K, b[..., None])[..., 0]
+    N, h = (np.tensordot(weights, part, 1) for part in (left[:, _TIMES][:, :, _TIMES], g[:, _TIMES]))
+    information = np.asarray(N + np.eye(len(h)) / _SHARED_S**2)
+    shared_s = np.asarray(np.linalg.solve(information, h))
+    own_s = apart_s**2 * (g[:, 0] - left[:, 0, _TIMES] @ shared_s)
+    rms_s = math.sqrt(float(weights @ (shared_s[0] + own_s) ** 2 / weights.sum()))
+    gained = apart_s**2 * float(weights @ np.einsum("ni,ni->n", b, g)) + float(h @ shared_s)
+    occam = float(weights @ np.linalg.slogdet(K)[1] + np.linalg.slogdet(_SHARED_S**2 * information)[1])
+    return Apart(apart_s, rms_s, gained, occam, shared_s, information)
+
+
+def eliminate(found: Apart, shots: Sequence[tuple[Array, ExposedShot, float]], sums: ResidualSums) -> None:
+    """Take what times of exposure explain out of sums, of whitened rows (n, 1 + K) of shots, with their weights."""
+    shared = np.zeros((len(_TIMES), len(sums.M)))
+    for rows, exposed, weight in shots:
+        B = exposed.without_pose()
+        G, K = B.T @ rows, np.eye(B.shape[1]) + found.apart_s**2 * (B.T @ B)
+        left = np.linalg.solve(K, G)
+        shared += weight * left[_TIMES]
+        sums.M -= weight * found.apart_s**2 * (G.T @ left)
+        sums.freedom -= weight * (len(K) - float(np.trace(np.linalg.inv(K))))
+    sums.M -= shared.T @ np.linalg.solve(found.information, shared)
+
+
+@dataclass(frozen=True, eq=False)
+class PassingSums:
+    """The sums of a test in which something passing was eliminated, and the times of its exposures; None for a lens."""
+
+    sums: ResidualSums
+    apart: Apart | None
+
+
+@dataclass
+class Passing:
+    """What was found that changes and does not stay; one of a watch.
+
+    Attributes:
+        apart: of the tests in which the exposures were apart, since when, s.
+        focal: the changes of one focal length against the other of the tests in which that explained most, since when, s.
+        apart_s: standard deviation of the times in the newest test, those that its shots share included, s.
+        focal_share: the focal length's change in it.
+        unsure: causes that explained the newest doubtful test nearly as well as what was taken.
+    """
+
+    apart: tuple[float, tuple[Apart, ...]] = (math.inf, ())
+    focal: tuple[float, tuple[float, ...]] = (math.inf, ())
+    apart_s: float = 0.0
+    focal_share: float = 0.0
+    unsure: tuple[str, ...] = field(default=())
+
+    @property
+    def now(self) -> bool:
+        """Whether the newest test showed something."""
+        return self.apart_s > 0.0 or self.focal_share != 0.0
+
+    def decide(
+        self,
+        every: ResidualSums,
+        evidence: Callable[[ResidualSums, float], tuple[float, float]],
+        size: int,
+        found: Apart | None,
+        sums: ResidualSums | None,
+    ) -> PassingSums | None:
+        """Decide what explains a test best; return its sums with that eliminated, None where it is something that stays.
+
+        Args:
+            every: the sums of the test: parameters, seven numbers, candidates, the first of which is a focal length.
+            evidence: returns the log-evidence of what stays, and of the focal length, of sums and a variance of the noise.
+            size: K, how many parameters there are.
+            found: times of exposure that explain it.
+            sums: those with these eliminated.
+        """
+        # What the test before showed goes on, more likely than that it ended and something else began.
+        by_lens, by_apart = (-_AHEAD if shown else 0.0 for shown in (self.focal_share, self.apart_s))
+        self.apart_s = self.focal_share = 0.0
+        focal = 1 + size + 7
+        cost = float(eliminated(every.M[: 1 + size, : 1 + size], slice(1, 1 + size))[0, 0])
+        M = eliminated(every.M, slice(1, 1 + size))
+        all_explain = (
+            cost - float(M[0, 0]) + float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0]))
+        )
+        by_time, left = 0.0, cost - all_explain
+        if found is not None and sums is not None:
+            by_time = cost - float(eliminated(sums.M[: 1 + size, : 1 + size], slice(1, 1 + size))[0, 0])
+            left = min(left, cost - by_time)
+        excess = max(left / max(every.freedom, 1.0), 1.0)
+        stays, lens = evidence(every, excess)
+        time = alone = -math.inf
+        if found is not None and sums is not None:  # what stays may have happened besides
+            alone = 0.5 * (by_time / excess - found.occam)
+            time = alone + max(evidence(sums, excess)[0], 0.0)
+        first = max(time, lens)
+        self.unsure = tuple(
+            cause
+            for cause, each in (("time", alone), ("lens", lens))
+            if each > max(stays - _ALIKE, _AHEAD) and each <= stays
+        )
+        # A focal length is one of what stays, too: it need not be ahead of itself.
+        if first < _AHEAD or (time < stays + (by_apart or _AHEAD) if time >= lens else lens < stays + by_lens - 1e-9):
+            return None
+        if time >= lens:
+            assert found is not None
+            assert sums is not None
+            self.apart_s = math.hypot(found.apart_s, float(np.linalg.norm(found.shared_s[:3])))
+            self.apart = min(self.apart[0], every.begin_s), (*self.apart[1], found)
+            return PassingSums(sums, found)
+        M = eliminated(every.M, slice(1, 1 + size))
+        self.focal_share = _FOCAL * float(M[0, 8] / (M[8, 8] + 1.0))
+        self.focal = min(self.focal[0], every.begin_s), (*self.focal[1], self.focal_share)
+        rest, column = every.of(len(every.b)), every.M[focal]
+        rest.M -= np.outer(column, column) / (1.0 + every.M[focal, focal])
+        return PassingSums(rest, None)
+
+    def added(self, exposed: ExposedShot, by_focal: Array) -> Array:
+        """Return the covariance (6, 6) of a pose by what is passing now.
+
+        Args:
+            exposed: its shot.
+            by_focal: (6,) its response to a focal length, in units of ``_FOCAL``.
+        """
+        added = np.zeros((6, 6))
+        if self.apart_s:
+            by = self.apart_s * exposed.response()
+            added += by @ by.T
+        if self.focal_share:
+            spread = math.sqrt(float(np.mean(np.square(self.focal[1]))))
+            added += (spread / _FOCAL) ** 2 * np.outer(by_focal, by_focal)
+        return added
+
+    def among(self, stays: tuple[HealthFinding, ...], *, timed: bool) -> tuple[HealthFinding, ...]:
+        """Return what was found, with findings of what stays: of one cause once; what explains it as well is named."""
+        times, focals = len(self.apart[1]), len(self.focal[1])
+        if max(times, focals) < _LEAST:
+            unsure = [each for each in ("time", "lens") if each in self.unsure]
+            return tuple(_besides(each, unsure) if each.cause in ("rig", "body") else each for each in stays)
+        found = self._time_finding(timed=timed) if times >= focals else self._lens_finding(timed=timed)
+        if focals > times:  # one that stays is sized better
+            found = next((each for each in stays if each.cause == "lens"), found)
+        # What is left of it looks like what stays: that cannot be excluded.
+        before = [each for each in stays if found.since_s and each.since_s and each.since_s < found.since_s - 1.0]
+        others = [each.cause for each in stays if each not in before]
+        return (*before, _besides(found, [*others, *(("lens",) if 0 < focals <= times else ())]))
+
+    def _time_finding(self, *, timed: bool) -> HealthFinding:
+        """Return the finding of exposures that are apart."""
+        since_s, tests = self.apart
+        information = np.sum([each.information for each in tests], axis=0)
+        mean_s = np.linalg.solve(information, np.sum([each.information @ each.shared_s for each in tests], axis=0))
+        sigmas_s = np.sqrt(np.diag(np.linalg.inv(information)))
+        own_s = math.sqrt(float(np.mean([each.apart_s**2 for each in tests])))
+        k = int(np.argmax(np.abs(mean_s[:3])))
+        # What the velocity lacks is lacking in all shots alike.
+        size, sigma = (
+            1e3 * float(mean_s[k]),
+            1e3 * math.hypot(float(sigmas_s[k]), 0.5 * _UNKNOWN_SHARE * float(mean_s[k])),
+        )
+        if own_s > _CONSTANT * abs(mean_s[k]):
+            size = 1e3 * math.sqrt(float(np.mean([each.rms_s**2 for each in tests])))
+            sigma = size / math.sqrt(2.0 * len(tests))
+            what = (
+                f"the two exposures of a shot are about {size:.1f} ms apart, and by another time in each shot: one camera "
+                "has another rate or drops images, or images of different moments are paired"
+            )
+        elif k:
+            size, sigma = 2.0 * size, 2.0 * sigma
+            what = (
+                f"the rows of the {('right', 'left')[k - 1]} camera are exposed one after the other, over {abs(size):.1f} "
+                "ms more than is known: a rolling shutter"
+            )
+        else:
+            later = "later" if size > 0 else "earlier"
+            what = f"the right camera exposes {abs(size):.2f} ms {later} than is known, against the left one"
+        return HealthFinding(
+            "time",
+            what,
+            since_s if timed else None,
+            size,
+            sigma,
+            "ms",
+            "trigger both cameras together, with one rate and the same exposure; in a recording --skew find moves the "
+            "detections to one time, and finds rolling shutters",
+        )
+
+    def _lens_finding(self, *, timed: bool) -> HealthFinding:
+        """Return the finding of a focal length that changes."""
+        since_s, shares = self.focal
+        size = 100.0 * math.sqrt(float(np.mean(np.square(shares))))
+        what = f"the focal length of one camera changes against that of the other by {size:.3f} % (RMS), within seconds"
+        return HealthFinding(
+            "lens",
+            what,
+            since_s if timed else None,
+            size,
+            size / math.sqrt(2.0 * len(shares)),
+            "%",
+            "switch autofocus and image stabilisation off, fasten focus and zoom of both lenses, calibrate the rig again",
+            ("rig",),
+        )
+
+
+def _besides(found: HealthFinding, causes: Sequence[str]) -> HealthFinding:
+    """Return a finding with other causes that cannot be excluded."""
+    more = [each for each in causes if each != found.cause]
+    return replace(found, alternatives=tuple(dict.fromkeys((*found.alternatives, *more))))  # type: ignore[arg-type]
