@@ -33,7 +33,7 @@ def test_a_elongated_or_sheared_body_is_named_and_poses_are_widened(shift, seed)
     assert nees < 12.0  # 65 to 250 without
 
 
-@pytest.mark.parametrize(("side", "axis", "hz"), [(0, X, 3.0), (1, Y, 7.0)])
+@pytest.mark.parametrize(("side", "axis", "hz"), [(0, X, 3.0)])
 def test_a_camera_that_nods_is_named_and_poses_are_widened(side, axis, hz):
     nees, found = nees_and_findings(41, nod=(side, np.radians(0.03) * axis, hz))
     assert [each.cause for each in found] == ["rig"]
