@@ -241,7 +241,7 @@ CASES["joints in two units"] = wrong(
 )
 CASES["joints without a unit"] = wrong(csv("j1,j2,j3,j4,j5,j6", DEG), "joints without a unit", arm="six_r")
 CASES["another arm"] = wrong(csv(JOINTS, DEG), "fit --model|not of the same motion|joint", arm="ur5")
-CASES["another arm of seven joints"] = wrong(csv(JOINTS, DEG), "6 joints.*has 7", arm="panda")
+CASES["another arm of seven joints"] = wrong(csv(JOINTS, DEG), "6 joints.*has 7", arm="franka")
 CASES["a joint's name misspelt"] = wrong(csv(",".join([*SIX.joint_names[:5], "jont6"]), Q), "is it joint6", arm="six_r")
 CASES["a list that may be joints"] = wrong(
     "".join(f"{row.tolist()}\n" for row in Q), "a pose, or joint angles", arm="six_r"
