@@ -8,7 +8,7 @@
 #define SUBSTEPS 4
 #define TICK 0.001
 #define STOP_RAD 2.55
-#define TURN_RAD 6.283185307179586
+#define CYCLE_RAD 6.283185307179586
 #define ZERO_COUNTS 32767.5
 #define COUNTS_PER_RAD ((62258 - 3277) / 5.2)
 #define STEP_COUNTS 4
@@ -77,11 +77,11 @@ static void sense(arm_loop *arm)
     }
 }
 
-static double sine(double turns)
+static double sine(double cycles)
 {
-    turns -= floor(turns + 0.5);
-    turns = turns > 0.25 ? 0.5 - turns : turns < -0.25 ? -0.5 - turns : turns;
-    const double a = TURN_RAD * turns, x = a * a;
+    cycles -= floor(cycles + 0.5);
+    cycles = cycles > 0.25 ? 0.5 - cycles : cycles < -0.25 ? -0.5 - cycles : cycles;
+    const double a = CYCLE_RAD * cycles, x = a * a;
     return a * (1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110 * (1 - x / 156))))));
 }
 
@@ -107,13 +107,13 @@ static void step(arm_loop *arm)
         const double load = arm->hand[i] - model[5u * JOINTS + i] * cosine - model[7u * JOINTS + i] * own * before;
         const double push = h * (conductance * duty * supply_v + (stiffness == 0.0 ? load : 0.0));
         const double start = arm->qd[i], drum = between[5u * JOINTS + i], per_rev = between[6u * JOINTS + i];
-        const double turns_per_rad = per_rev / TURN_RAD, phase = between[7u * JOINTS + i];
+        const double cycles_per_rad = per_rev / CYCLE_RAD, phase = between[7u * JOINTS + i];
         for (int k = 0; k < SUBSTEPS; k++) {
             double torque = 0.0;
             if (stiffness > 0.0) {
-                const double turns = turns_per_rad * arm->q[i] + phase;
-                const double ratio = 1 + drum * per_rev * sine(turns + 0.25);
-                double twist = arm->q[i] + drum * sine(turns) - arm->link[i];
+                const double cycles = cycles_per_rad * arm->q[i] + phase;
+                const double ratio = 1 + drum * per_rev * sine(cycles + 0.25);
+                double twist = arm->q[i] + drum * sine(cycles) - arm->link[i];
                 twist = twist > half ? twist - half : twist < -half ? twist + half : 0.0;
                 const double stiff = stiffness * (1 + between[3u * JOINTS + i] * arm->link[i]) *
                                      (twist < 0.0 ? between[4u * JOINTS + i] : 1.0);
@@ -139,7 +139,7 @@ static void step(arm_loop *arm)
         before = arm->qdd[i];
         arm->qdd[i] = (arm->qd[i] - start) / TICK;
         if (stiffness == 0.0) {
-            const double led = arm->q[i] + drum * sine(turns_per_rad * arm->q[i] + phase);
+            const double led = arm->q[i] + drum * sine(cycles_per_rad * arm->q[i] + phase);
             arm->link[i] = fmin(fmax(arm->link[i], led - half), led + half);
         }
         arm->way[arm->ticks % SPEED_TICKS][i] = arm->link[i];

@@ -439,7 +439,7 @@ def eccentric(library, seed, table):
         return {
             "drum_rad": rng.uniform(0.02, 0.06, 6),
             "drum_per_rev": rng.integers(1, 3, 6).astype(float),
-            "drum_turns": rng.uniform(0, 1, 6),
+            "drum_phase": rng.uniform(0, 1, 6),
         }
 
     through_transmission(library, seed, table, "eccentric drum", rows)

@@ -25,7 +25,7 @@ bool config_is_valid(const core_config *config);
 /* Make a copy to store: config with its serial number, version and CRC. */
 void config_seal(config_copy *copy, const core_config *config, uint32_t serial);
 
-/* Turn a good copy of version 5 into one of this version, in its place; any other stays as it is. */
+/* Convert a good copy of version 5 into one of this version; any other stays as it is. */
 void config_upgrade(config_copy *copy);
 
 /* Take the newer of two stored copies, the older where the newer is broken, the factory's values where both are.

@@ -216,6 +216,11 @@ FORMS = {
         csv("X (mm),Y (mm),Z (mm),rx (deg),ry (deg),rz (deg)", MM, ROTATED),
         {"rotation": "XYZ"},
     ),
+    "MATLAB's matrices printed transposed, four lines each": (
+        "m.txt",
+        "\n".join(" ".join(map(repr, map(float, row))) for row in A.swapaxes(1, 2).reshape(-1, 4)),
+        {},
+    ),
     "libfranka 0.9 O_T_EE, column by column": ("f.csv", csv("", A.swapaxes(1, 2)), {}),
     "franka_msgs/FrankaState (rostopic echo)": (
         "f.yaml",

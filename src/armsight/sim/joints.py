@@ -152,7 +152,7 @@ class Transmission(Record):
         back_share: (6,) stiffness while the joint is ahead of the motor, over that while it is behind.
         drum_rad: (6,) amplitude by which an eccentric drum leads the joint before and behind the motor.
         drum_per_rev: (6,) how often it does so in a revolution of the motor, gear included.
-        drum_turns: (6,) its phase at 0 rad, of a turn.
+        drum_phase: (6,) its phase at 0 rad, of a cycle.
     """
 
     stiffness_n_m: Array
@@ -162,7 +162,7 @@ class Transmission(Record):
     back_share: Array
     drum_rad: Array
     drum_per_rev: Array
-    drum_turns: Array
+    drum_phase: Array
 
     def packed(self) -> Array:
         """Return all attributes as rows (8, 6)."""
@@ -195,11 +195,11 @@ def sprung(model: JointModel, resonance_hz: Array, damping: Array, link_share: A
 
 
 @kernel
-def _sine(turns: float) -> float:
-    """Return the sine of so many turns."""
-    turns -= np.floor(turns + 0.5)
-    turns = 0.5 - turns if turns > 0.25 else (-0.5 - turns if turns < -0.25 else turns)
-    a = 6.283185307179586 * turns
+def _sine(cycles: float) -> float:
+    """Return the sine of so many cycles."""
+    cycles -= np.floor(cycles + 0.5)
+    cycles = 0.5 - cycles if cycles > 0.25 else (-0.5 - cycles if cycles < -0.25 else cycles)
+    a = 6.283185307179586 * cycles
     x = a * a
     return a * (1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110 * (1 - x / 156))))))
 
@@ -239,13 +239,13 @@ def _move(
         load = hand[i] - model[5, i] * cosine - model[7, i] * own * before
         share = duty[i] if stuck[i] == 0.0 else stuck[i]
         push = h * (conductance * share * supply_v + (load if stiffness == 0 else 0.0))
-        start, drum, turns_per_rad = qd[i], between[5, i], between[6, i] / 6.283185307179586
+        start, drum, cycles_per_rad = qd[i], between[5, i], between[6, i] / 6.283185307179586
         for _ in range(_SUBSTEPS):
             torque = 0.0
             if stiffness > 0:
-                turns = turns_per_rad * q[i] + between[7, i]
-                ratio = 1 + drum * between[6, i] * _sine(turns + 0.25)
-                twist = q[i] + drum * _sine(turns) - link[i]
+                cycles = cycles_per_rad * q[i] + between[7, i]
+                ratio = 1 + drum * between[6, i] * _sine(cycles + 0.25)
+                twist = q[i] + drum * _sine(cycles) - link[i]
                 twist = twist - half if twist > half else (twist + half if twist < -half else 0.0)
                 stiff = stiffness * (1 + between[3, i] * link[i]) * (between[4, i] if twist < 0 else 1.0)
                 damped = between[1, i] * (ratio * qd[i] - linkd[i]) if twist != 0 or half == 0 else 0.0
@@ -265,7 +265,7 @@ def _move(
         before = qdd[i]
         qdd[i] = (qd[i] - start) / _TICK_S
         if stiffness == 0:
-            led = q[i] + drum * _sine(turns_per_rad * q[i] + between[7, i])
+            led = q[i] + drum * _sine(cycles_per_rad * q[i] + between[7, i])
             link[i] = min(max(link[i], led - half), led + half)
 
 
@@ -385,8 +385,8 @@ class JointPlant:
         """Put the motors where even drums have the joints (what a drum leads by is found by iteration), at rest."""
         between = self.transmission
         for _ in range(60):
-            turns = between.drum_per_rev * self.q / (2 * np.pi) + between.drum_turns
-            self.q[:] = self.link - between.drum_rad * np.sin(2 * np.pi * turns)
+            cycles = between.drum_per_rev * self.q / (2 * np.pi) + between.drum_phase
+            self.q[:] = self.link - between.drum_rad * np.sin(2 * np.pi * cycles)
         self.qd[:] = self._linkd[:] = 0.0
 
     def put_link(self, joint: int, angle_rad: float) -> None:

@@ -283,8 +283,11 @@ def _matrices(path: Path, rows: Rows) -> Rows:
         numbers = [number(cell) for cell in row]
         return None not in numbers and np.allclose(np.array(numbers, float), [0, 0, 0, 1], atol=1e-6)
 
-    count = 4 if any(is_last(row) for _, row in rows) else 3  # three of [R p], whose rows have length 1, never end so
-    for line, row in rows[3::4] if count == 4 else ():
+    columnwise = len(rows) % 4 == 0 and all(
+        is_last([row[3] for _, row in rows[k : k + 4]]) for k in range(0, len(rows), 4)
+    )
+    count = 4 if columnwise or any(is_last(row) for _, row in rows) else 3  # three of [R p] never end so
+    for line, row in rows[3::4] if count == 4 and not columnwise else ():
         if not is_last(row):
             raise InputError(
                 f"{path}: line {line}: expected 0 0 0 1, the last of a matrix's four lines, found {' '.join(row)[:40]!r}"

@@ -227,7 +227,7 @@ def test_a_twist_that_the_current_shows_is_no_gap(library):
     for twist in (0.0, 0.1):
         motor = c.motor_state()
         library.motor_start(ctypes.byref(motor), ctypes.c_float(0.0), ctypes.c_float(2.0), 0)
-        for tick in range(200):  # the motor turns by 0.1 rad against a spring of 1 A, the reading rests
+        for tick in range(200):  # the motor moves by 0.1 rad against a spring of 1 A, the reading rests
             current_a = tick / 200
             motor.duty = (6.0 * current_a + 2.4 * 0.5) / 12.0
             seen = (ctypes.c_float(each) for each in (12.0, current_a, twist * current_a))

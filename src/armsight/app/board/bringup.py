@@ -785,8 +785,8 @@ class Bringup:
         for j in joints:
             error = np.interp(readings.t_s[last], at[:, 0], at[:, j + 1]) - q[:, j]
             rms, noise = float(np.sqrt(np.mean(error**2))), self.found.joints[j].noise_rad
-            slack = self.found.joints[j].slack_rad
-            if rms > np.hypot(_VERIFY_MOST_RAD + slack, noise):
+            twist = self.found.joints[j].friction_twist_rad
+            if rms > np.hypot(_VERIFY_MOST_RAD + twist, noise):
                 raise _Mistake(
                     f"joint {j + 1}: it follows a small swing with an error of {np.degrees(rms):.2f} degrees RMS."
                 )

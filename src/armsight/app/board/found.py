@@ -127,7 +127,7 @@ class JointFound:
         return None if None in values else Elasticity(*values)  # type: ignore[arg-type]
 
     @property
-    def slack_rad(self) -> float:
+    def friction_twist_rad(self) -> float:
         """How far dry friction twists its spring from one way to the other, rad."""
         return 0.0 if self.stiffness_n_m is None else 2 * (self.dry_n_m or 0.0) / self.stiffness_n_m
 

@@ -202,9 +202,9 @@ def _lines(values: Array, reference: Array, step_s: float) -> Array:
     """Return the complex amplitudes (12,) of values (n,) at the dither's frequencies, as they follow a reference's."""
     length = round(_SEGMENT_S / step_s)
     window = np.hanning(length + 1)[:length]
-    turns = np.exp(-2j * np.pi * DITHER_HZ[:, None] * np.arange(length) * step_s) * window * (2 / window.sum())
+    waves = np.exp(-2j * np.pi * DITHER_HZ[:, None] * np.arange(length) * step_s) * window * (2 / window.sum())
     starts = range(0, len(values) - length + 1, length // 2)
-    ours, theirs = (np.array([turns @ each[k : k + length] for k in starts]) for each in (values, reference))
+    ours, theirs = (np.array([waves @ each[k : k + length] for k in starts]) for each in (values, reference))
     return np.asarray((theirs.conj() * ours).sum(0) / np.sqrt((np.abs(theirs) ** 2).sum(0) * len(starts)))
 
 
