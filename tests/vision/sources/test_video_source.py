@@ -7,6 +7,7 @@ import pytest
 
 from armsight.errors import InputError
 from armsight.vision.sources import notes_of, open_source
+from armsight.vision.sources.video import Film
 
 pytestmark = pytest.mark.opencv
 
@@ -229,3 +230,28 @@ def test_interpolated_frames_are_said(film, rates, share):
     assert path == str(left)
     assert {k * rates[0] % rates[1] != 0 for k in odd["interpolated"]} == {True}
     assert f"frames {odd['interpolated'][0]}, {odd['interpolated'][1]}, " in note
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+def test_a_rotation_that_a_phone_noted_is_applied_as_opencv_does(tmp_path, degrees):
+    stored = np.kron(np.random.default_rng(1).integers(0, 255, (6, 8, 3), np.uint8), np.ones((12, 12, 1), np.uint8))
+    path = tmp_path / "phone.mp4"
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("mpeg4", rate=30)
+        stream.height, stream.width = stored.shape[:2]
+        for _ in range(3):
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(stored, format="bgr24")))
+        file.mux(stream.encode())
+    cos, sin = (round(65536 * f(np.radians(degrees))) for f in (np.cos, np.sin))
+    data = bytearray(path.read_bytes())
+    matrix = data.index(b"tkhd") + 44  # ISO 14496-12, 8.3.2, version 0
+    data[matrix : matrix + 36] = np.array([cos, sin, 0, -sin, cos, 0, 0, 0, 1 << 30], ">i4").tobytes()
+    path.write_bytes(data)
+    expected = cv2.VideoCapture(str(path)).read()[1]
+    film = Film(str(path))
+    assert film.size_px == expected.shape[1::-1] == ((96, 72) if degrees % 180 == 0 else (72, 96))
+    assert film.next()
+    assert film.frames == 1
+    np.testing.assert_allclose(film.image().astype(int), expected, atol=3)
+    assert [film.next() for _ in range(3)] == [True, True, False]
+    film.close()

@@ -4,13 +4,14 @@ In: file names. Out: one shot a frame, with the file's own time stamps. Frames a
 one recorder dropped costs one shot and does not shift the rest.
 
 :class:`Film` decodes by PyAV, which brings FFmpeg with the decoders that cameras and LeRobot use (AV1 among them, which
-opencv-python's wheels open, count and do not decode). Images are as they are stored: a rotation that a phone noted for
-players is not applied.
+opencv-python's wheels open, count and do not decode). A rotation by quarter turns that a phone noted for players is applied,
+as OpenCV's reader does.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -189,7 +190,6 @@ class Film:
             self._container.close()
             raise InputError(f"{path}: {problem}")
         self._stream.thread_type = "AUTO"
-        self.size_px = (self._stream.width, self._stream.height)
         rate = self._stream.average_rate or self._stream.guessed_rate
         self.period_s = float(1 / rate) if rate else np.inf
         duration_s = (self._container.duration or 0) / 1e6
@@ -198,7 +198,12 @@ class Film:
         self.t_s = 0.0
         self._time_base: Fraction = self._stream.time_base or Fraction(1)
         self._frame: VideoFrame | None = None
-        self._frames = self._decoded()
+        self._frames: Iterator[VideoFrame] = self._decoded()
+        first = list(itertools.islice(self._frames, 1))  # the rotation stands in the frames alone
+        self._frames = itertools.chain(first, self._frames)
+        self._quarter_turns = round(first[0].rotation / 90) if first else 0  # counterclockwise
+        size = (self._stream.width, self._stream.height)
+        self.size_px = size[::-1] if self._quarter_turns % 2 else size
 
     def _problem(self) -> str | None:
         """Return why the stream cannot be decoded."""
@@ -233,7 +238,8 @@ class Film:
     def image(self) -> Image:
         """Return the current frame, (H, W, 3) BGR, uint8."""
         assert self._frame is not None
-        return np.asarray(self._frame.to_ndarray(format="bgr24"))
+        image = self._frame.to_ndarray(format="bgr24")
+        return np.ascontiguousarray(np.rot90(image, self._quarter_turns))
 
     def seek(self, t_s: float) -> None:
         """Go to a frame at a time or before it, from which the frames up to that time can be decoded."""
