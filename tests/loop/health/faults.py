@@ -218,7 +218,6 @@ class Moved:
             if self.slip is not None:
                 slip = self.slip(measurement.T_base_tool[:3, :3]) if callable(self.slip) else self.slip
                 measurement = replace(measurement, T_base_tool=measurement.T_base_tool @ small(slip))
-                measurement = replace(measurement, T_base_tool=measurement.T_base_tool @ small(self.slip))
         if self.late is not None:
             late_s = self.late(t_s - AT_S) if t_s >= AT_S else 0.0
             sane_s = self.monitor.stamps.time(t_s + late_s, self.estimator.span_s[1])

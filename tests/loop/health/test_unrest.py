@@ -33,13 +33,27 @@ def test_a_elongated_or_sheared_body_is_named_and_poses_are_widened(shift, seed)
     assert nees < 12.0  # 65 to 250 without
 
 
-@pytest.mark.parametrize(("side", "axis", "hz"), [(0, X, 3.0)])
+@pytest.mark.parametrize(("side", "axis", "hz"), [(0, X, 3.0), (1, Y, 7.0), (1, X, 5.0)])
 def test_a_camera_that_nods_is_named_and_poses_are_widened(side, axis, hz):
     nees, found = nees_and_findings(41, nod=(side, np.radians(0.03) * axis, hz))
     assert [each.cause for each in found] == ["rig"]
     assert "nods" in found[0].what
     assert found[0].size == pytest.approx(0.03 / np.sqrt(2.0), rel=0.15)
     assert nees < 16.0
+
+
+def test_asking_for_findings_is_no_evidence():
+    asked, other = (watched_body(41, seconds=6.0, nod=(1, np.radians(0.03) * Y, 7.0)) for _ in range(2))
+    for (monitor, *_, given), (*_, same) in zip(asked, other, strict=True):
+        monitor.findings()
+        np.testing.assert_array_equal(given.cov, same.cov)
+
+
+def test_shots_of_one_time_say_nothing_of_unrest():
+    unrest = Unrest(2)
+    for _ in range(9):
+        unrest.take(np.full(9, 1.0), np.eye(9, 2), np.tile(np.eye(2), (9, 1, 1)))
+    assert not unrest.cov.any()
 
 
 def test_images_seen_before_say_nothing_new():

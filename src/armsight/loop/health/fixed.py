@@ -25,6 +25,7 @@ counts where chance does not explain its variance. Moments of a component of var
 from __future__ import annotations
 
 from collections import deque
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -283,7 +284,7 @@ class Unrest:
             covs: (N, D, D) covariances of their noise.
             excess: by how much the variance of the noise is larger than they say.
         """
-        if len(t_s) < _LEAST:
+        if len(t_s) < _LEAST or not np.ptp(t_s) > 0.0:
             return
         Q = np.linalg.qr(np.vander((t_s - t_s.mean()) / np.ptp(t_s), _TERMS))[0]
         kept = np.eye(len(t_s)) - Q @ Q.T
@@ -305,6 +306,12 @@ class Unrest:
         certain = chdtrc(freedom, freedom * values) * len(values) < FALSE_ALARMS_PER_MINUTE / 60.0
         axes = L @ vectors
         self.cov = (axes * np.where(certain, values - 1.0, 0.0)) @ axes.T
+
+    def copied(self) -> Unrest:
+        """Return a copy that windows can be tried on; this one goes on without them."""
+        other = copy(self)
+        other._windows = self._windows.copy()
+        return other
 
 
 class ShakeWatch:

@@ -12,6 +12,9 @@ and a share of the speed in any direction, since the velocity is that of measure
 times alone, c their values that all shots of the test share. Late exposures, another rate, dropped images and rolling
 shutters are all of this form. A focal length has one value in each test. Hypotheses are compared by their evidence (MacKay,
 1992), which takes off what chance explains: of numbers that each shot has anew it is much.
+
+A camera that nods has another rotation in each shot, and looks much the same: times explain a test only where their
+evidence is larger than that of three angles of each shot (``nodding``).
 """
 
 from __future__ import annotations
@@ -30,6 +33,9 @@ from armsight.loop.health.shape import ResidualSums, eliminated
 
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
 _APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
+#: Standard deviations that are tried of the rotation about an axis that a camera which nods has anew in each shot, rad.
+#: Half: a nod of 0.1 deg counts for less against times, double: one of 0.3 deg counts, too, in which poses are not linear.
+_NOD_RAD = tuple(1e-5 * 2.0**k for k in range(9))
 #: The velocity of measured poses is off by this share of the speed in any direction; half: rig and body are blamed for what
 #: is left of late images, double: less of them is seen.
 _UNKNOWN_SHARE = 0.2
@@ -135,16 +141,39 @@ class Apart:
     information: Array
 
 
-def apart(shots: Sequence[tuple[Array, ExposedShot, float]]) -> Apart | None:
-    """Return the times of exposure that explain residuals (n,) of shots, with their weights, best; None where none do."""
-    parts = list[tuple[Array, Array, float]]()
-    for r, exposed, weight in shots:
-        B = exposed.without_pose()
-        parts.append((B.T @ B, B.T @ r, weight))
+def _normal(shots: Sequence[tuple[Array, Array, float]]) -> tuple[Array, Array, Array]:
+    """Return information (N, K, K), right sides (N, K) and weights (N,) of residuals (n,) and their derivatives (n, K)."""
+    parts = [(B.T @ B, B.T @ r, weight) for r, B, weight in shots]
     W, b, weights = (np.array(part) for part in zip(*parts, strict=True))
+    return W, b, weights
+
+
+def apart(shots: Sequence[tuple[Array, Array, float]]) -> Apart | None:
+    """Return the times of exposure that explain residuals (n,) of shots best; None where none do.
+
+    Args:
+        shots: residuals, what times of exposure do to them (n, 10), and weights.
+    """
+    W, b, weights = _normal(shots)
     found = [_apart(each, W, b, weights) for each in _APART_S]
     best = max(found, key=lambda each: each.gained - each.occam)
     return best if best.gained > best.occam else None
+
+
+def nodding(shots: Sequence[tuple[Array, Array, float]]) -> float:
+    """Return twice the log-evidence of a camera that has another rotation in each shot, against none.
+
+    Args:
+        shots: residuals (n,), their derivatives by the rotation (n, 3), and weights.
+    """
+    W, b, weights = _normal(shots)
+
+    def evidence(sigma_rad: float) -> float:
+        K = np.eye(W.shape[1]) + sigma_rad**2 * W
+        gained = sigma_rad**2 * np.einsum("ni,ni->n", b, np.linalg.solve(K, b[..., None])[..., 0])
+        return float(weights @ (gained - np.linalg.slogdet(K)[1]))
+
+    return max(map(evidence, _NOD_RAD))
 
 
 def _apart(apart_s: float, W: Array, b: Array, weights: Array) -> Apart:
@@ -161,11 +190,16 @@ def _apart(apart_s: float, W: Array, b: Array, weights: Array) -> Apart:
     return Apart(apart_s, rms_s, gained, occam, shared_s, information)
 
 
-def eliminate(found: Apart, shots: Sequence[tuple[Array, ExposedShot, float]], sums: ResidualSums) -> None:
-    """Take what times of exposure explain out of sums, of whitened rows (n, 1 + K) of shots, with their weights."""
+def eliminate(found: Apart, shots: Sequence[tuple[Array, Array, float]], sums: ResidualSums) -> None:
+    """Take what times of exposure explain out of sums.
+
+    Args:
+        found: they.
+        shots: whitened rows (n, 1 + K), what times of exposure do to them (n, 10), and weights.
+        sums: those of the rows.
+    """
     shared = np.zeros((len(_TIMES), len(sums.M)))
-    for rows, exposed, weight in shots:
-        B = exposed.without_pose()
+    for rows, B, weight in shots:
         G, K = B.T @ rows, np.eye(B.shape[1]) + found.apart_s**2 * (B.T @ B)
         left = np.linalg.solve(K, G)
         shared += weight * left[_TIMES]

@@ -45,7 +45,17 @@ from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import adjoint, inverse, log_se3, pose
 from armsight.kernels import kernel
 from armsight.loop.health.fixed import Unrest
-from armsight.loop.health.passing import TRACK, Apart, ExposedShot, Passing, PassingSums, apart, eliminate, velocity
+from armsight.loop.health.passing import (
+    TRACK,
+    Apart,
+    ExposedShot,
+    Passing,
+    PassingSums,
+    apart,
+    eliminate,
+    nodding,
+    velocity,
+)
 from armsight.loop.health.record import COSTS_M, LEVER_M, HealthFinding, alarm_limit
 from armsight.loop.health.shape import FURTHEST_M, SMOOTH, ResidualSums, ShapeWatch, eliminated, total
 from armsight.vision.camera import pair_arguments
@@ -319,17 +329,32 @@ class RigWatch:
         excess = (sum(float(e @ e) for e in r) - float(np.vdot(b, d))) / max(freedom, 1.0)
         self._unrest.take(np.array([each.t_s for each in shots]), d, cov, max(excess, 1.0))
 
-    def _unrest_weighed(self, rows: Array) -> Array:
-        """Return rows of a shot, with the rotation of a camera that nods in their noise: (I + J V J^T)^-1/2 times them."""
+    def _unrest_weighed(self, rows: Array, other: Array | None = None) -> Array:
+        """Return rows of a shot, or others (n, K) of it, with the rotation of a camera that nods in their noise.
+
+        That is (I + J V J^T)^-1/2 times them.
+        """
+        given = rows if other is None else other
         if not self._unrest.cov.any():
-            return rows
+            return given
         values, vectors = np.linalg.eigh(self._unrest.cov)
         last = 1 + self._rig.parameter_count
         J = rows[:, last - 3 : last] @ (vectors * np.sqrt(np.maximum(values, 0.0)))
         squares, axes = np.linalg.eigh(J.T @ J)
         squares = np.maximum(squares, 1e-12)
         J = J @ axes
-        return np.asarray(rows - J @ (((1.0 - 1.0 / np.sqrt(1.0 + squares)) / squares)[:, None] * (J.T @ rows)))
+        return np.asarray(given - J @ (((1.0 - 1.0 / np.sqrt(1.0 + squares)) / squares)[:, None] * (J.T @ given)))
+
+    def _weighed_parts(
+        self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool
+    ) -> list[tuple[Array, Array, float]]:
+        """Return of each shot its rows, what the times of its exposures do to them (n, 10), and its weight."""
+        parts = list[tuple[Array, Array, float]]()
+        for stay in stays:
+            for shot in stay:
+                rows, moved = shot.every if every else shot.rows, shot.exposed[every].without_pose()
+                parts.append((self._unrest_weighed(rows), self._unrest_weighed(rows, moved), 1.0 / len(stay)))
+        return parts
 
     def _added(self, found: _ShotResiduals) -> Array:
         """Return what the suspected errors add to the covariance (6, 6) of a pose."""
@@ -511,9 +536,8 @@ class RigWatch:
                 rows = [each if alone else each / np.sqrt(count) for each, count in shots]
                 sums.take(np.concatenate(rows)[:, : 1 + size], sum((len(each) - 6.0) / count for each, count in shots))
         if own is not None:
-            seen = [(each, 1.0 / len(stay)) for stay in stays for each in stay]
-            rows = [(each.every if every else each.rows)[:, : 1 + size] for each, _ in seen]
-            eliminate(own, [(k, each.exposed[every], w) for k, (each, w) in zip(rows, seen, strict=True)], sums)
+            parts = self._weighed_parts(stays, every=every)
+            eliminate(own, [(each[:, : 1 + size], moved, weight) for each, moved, weight in parts], sums)
         return sums
 
     def _decide(self, *, ends: bool = False) -> None:
@@ -522,8 +546,6 @@ class RigWatch:
         if not stays:
             return
         self._poses += len(stays)
-        if self._timed:
-            self._take_unrest(stays)
         whole = self._summed(stays)
         every = whole.of(self._size).by(self._scaled)
         test = every.of(len(self._window.b))
@@ -534,7 +556,7 @@ class RigWatch:
         self._window.scale(weight)
         self._window.add(test, 1.0)
         change, own = self._estimated(self._window), None
-        if not self._unrest.cov.any() and (self.passing.now or change.chi_square > _SUSPECTED):
+        if self.passing.now or change.chi_square > _SUSPECTED:
             passes = self._passes(stays, every)
             if passes is not None:
                 self._window.add(test, -1.0)
@@ -544,6 +566,7 @@ class RigWatch:
         if own is not None:
             moments, whole = [], self._summed(stays, own=own)
             every = self._summed(stays, every=True, own=own).by(self._scaled)
+        nodded = stays if self._timed and own is None else []
         odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
         usual = every.less(self._summed(odd, every=True, own=own).by(self._scaled)) if odd else every
         self._shape.decide(every, usual, ends=ends)
@@ -570,6 +593,8 @@ class RigWatch:
             change if alarm or (change.chi_square > _SUSPECTED and self._matters(change, slice(None))) else None
         )
         self.alarm, self.alarmed = alarm, self.alarmed or alarm
+        if nodded:
+            self._take_unrest(nodded)
         due = 0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0
         if due and len(self._history) < _KEPT and self._poses >= _LENS_POSES:
             self.lens = self._lens()
@@ -582,8 +607,13 @@ class RigWatch:
 
     def _passes(self, stays: Sequence[Sequence[_ShotResiduals]], every: ResidualSums) -> PassingSums | None:
         """Return the sums of a test with what changed within it eliminated, where that explains it best."""
-        shots = [(each.rows[:, 0], each.exposed[0], 1.0 / len(stay)) for stay in stays for each in stay]
-        found: Apart | None = apart(shots) if self._timed else None
+        found: Apart | None = None
+        if self._timed:
+            parts, last = self._weighed_parts(stays, every=False), 1 + self._rig.parameter_count
+            found = apart([(rows[:, 0], moved, weight) for rows, moved, weight in parts])
+            nods = nodding([(rows[:, 0], rows[:, last - 3 : last], weight) for rows, _, weight in parts])
+            if found is not None and nods > found.gained - found.occam:
+                found = None
         sums = None if found is None else self._summed(stays, own=found).of(self._size).by(self._scaled)
         return self.passing.decide(every, self._shape.evidence, self._size, found, sums)
 
@@ -790,6 +820,7 @@ class RigWatch:
         copied = copy(self)
         copied._history, copied._shape = self._history.copy(), self._shape.copied()
         copied._stays, copied.passing = [stay.copy() for stay in self._stays], copy(self.passing)
+        copied._unrest = self._unrest.copied()
         return copied
 
     def _ended(self) -> RigWatch:
