@@ -335,3 +335,9 @@ def test_no_change_of_whole_steps_is_begun_that_would_not_be_over_when_the_arm_m
         if aim.left_s < rest_s - 0.2:
             at_rest.append(correction)
     assert (np.ptp(at_rest, axis=0).max() > 0) == moves
+
+
+def test_before_the_first_image_nothing_is_asked_of_the_loop():
+    timing = LoopTiming(PERIOD_S, 1 / 60, 0.045)
+    assert timing.gain_at(np.inf) == 0.0  # the age of no measurement: never NaN, which commands would take
+    assert 0.0 < timing.gain_at(10.0) < timing.gain_at(0.0) == timing.gain

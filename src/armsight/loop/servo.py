@@ -110,9 +110,10 @@ class LoopTiming:
         return self.gain_at(0.0)
 
     def gain_at(self, age_s: float) -> float:
-        """Return the same where the newest measurement is so old, s: images may come later than expected."""
+        """Return the same where the newest measurement is so old, s; 0 before the first, whose age is infinite."""
         d = self.arrived_s(age_s) / self.period_s
-        return float((d / (d + 1)) ** d / (d + 1))
+        share = 1.0 / (d + 1.0)
+        return float(share * (1.0 - share) ** d)
 
     def arrived_s(self, age_s: float) -> float:
         """Return how long after a command its effect is in the estimate, s, the newest measurement being so old, s."""
