@@ -460,6 +460,10 @@ def test_each_program_gives_the_same_joints(tmp_path, form):
             json.dumps([{"a": np.eye(4).tolist(), "b": np.eye(4).tolist()}] * 2),
             "holds poses of a, b: say which, --columns pose=a",
         ),
+        ("a.json", '{"x": {"rows": 10, "cols": 1, "data": "x"}}', "and no poses"),
+        ("a.json", "[[[1, 2], [3]]]", "and no poses|holds"),
+        ("a.json", "[[5]]", "and no poses"),
+        ("a.json", '[{"name": ["j1"], "position": ["x"]}, {"name": ["j1"], "position": [[1, 2]]}]', "and no poses"),
         ("a.csv", "x,y,z,rx,ry,rz\n1 mm,2 mm,3 m,0,0,0\n4 m,5 mm,6 m,0,0,0\n", "column x has numbers in several units"),
         (
             "a.csv",
@@ -489,3 +493,9 @@ def test_columns_in_order_and_by_name(tmp_path):
     assert number("1e-05") == 1e-5
     assert number("1_000") is None
     assert np.isnan(number("nan"))
+
+
+def test_a_stamp_that_is_none_is_passed_over(tmp_path):
+    record = {"stamp": {"sec": "a", "nanosec": None}, "position": [0.1, 0.2, 0.3], "orientation_xyzw": [0, 0, 0, 1]}
+    (tmp_path / "a.json").write_text(json.dumps([record] * 3))
+    assert read_pose_table(tmp_path / "a.json").t_s is None

@@ -78,17 +78,18 @@ def _with_matrices(name: str, value: Foreign) -> Foreign:
         return [_with_matrices(name, one) for one in value] if any(isinstance(one, dict) for one in value) else value
     if not isinstance(value, Mapping):
         return value
-    if {"sizes", "data", "dt"} <= set(value):  # OpenCV 5's vectors, and matrices of three dimensions
-        value = {**value, "rows": int(np.prod(np.asarray(value["sizes"], float))), "cols": 1}
-    if not {"rows", "cols", "data"} <= set(value):
+    sized = {"sizes", "data", "dt"} <= set(value)  # OpenCV 5's vectors, and matrices of three dimensions
+    if not sized and not {"rows", "cols", "data"} <= set(value):
         return {str(key): _with_matrices(f"{name}.{key}", one) for key, one in value.items()}
     try:
+        if sized:
+            value = {**value, "rows": int(np.prod(np.asarray(value["sizes"], float))), "cols": 1}
         rows, cols, data = int(value["rows"]), int(value["cols"]), np.asarray(value["data"], float).ravel()
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name} must be numbers: rows, cols and data of a matrix") from None
     channels = re.match(r"\d*", str(value.get("dt", "")))
     depth = int(channels[0]) if channels and channels[0] else 1
-    if rows * cols * depth != data.size:
+    if min(rows, cols) < 0 or rows * cols * depth != data.size:
         raise InputError(
             f"{name} is damaged: it says {rows} rows and {cols} cols, and its data holds {data.size} numbers"
         )

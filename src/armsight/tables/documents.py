@@ -185,7 +185,7 @@ def _items(node: Any) -> list[tuple[Any, str | None]]:  # noqa: ANN401
     """Return the records of a document, each with its name where it has one."""
     array = _array(node)
     if array is not None:
-        if array.ndim == 1 or array.shape in ((4, 4), (3, 4)):
+        if array.ndim < 2 or array.shape in ((4, 4), (3, 4)):
             return [(array.tolist(), None)]
         return [(one.tolist(), None) for one in array]
     if isinstance(node, list):
@@ -220,8 +220,9 @@ def _poses(node: Any, name: str = "") -> Iterator[tuple[str, Record]]:  # noqa: 
     if not isinstance(node, Mapping):
         return
     names, angles = node.get("name"), node.get("position")
-    if isinstance(names, list) and isinstance(angles, list) and len(names) == len(angles):  # sensor_msgs/JointState
-        yield name, {str(joint): repr(float(angle)) for joint, angle in zip(names, angles, strict=True)}
+    values = _array(angles)
+    if isinstance(names, list) and values is not None and values.size == len(names):  # sensor_msgs/JointState
+        yield name, {str(joint): repr(float(angle)) for joint, angle in zip(names, values.ravel(), strict=True)}
         return
     scalars = {key: one for key, one in node.items() if isinstance(one, int | float) and not isinstance(one, bool)}
     if {key.lower().partition("_")[0] for key in scalars} >= _XYZ and len(scalars) > 3 and set(scalars) != {*"wxyz"}:
@@ -318,7 +319,8 @@ def _beside(item: Any) -> Record:  # noqa: ANN401
         whole, parts = (
             next((stamp[key] for key in keys if key in stamp), 0) for keys in (("sec", "secs"), ("nanosec", "nsecs"))
         )
-        out["t_s"] = f"{int(whole)}.{int(parts):09d}"
+        if isinstance(whole, int) and isinstance(parts, int):
+            out["t_s"] = f"{whole}.{parts:09d}"
     return out
 
 

@@ -82,6 +82,8 @@ BROWNS = (
         "brown8",
     ),
 )
+#: Lenses that are none of these, by the names that stand beside a camera's own ("model: Logitech C920").
+_OTHER_LENSES = ("omni", "mei", "ds", "doublesphere", "ucm", "eucm", "fov", "cahvor", "scaramuzza", "ocam", "ftheta")
 #: Projections that are the pinhole's, or a fisheye's named by its distortion.
 _PINHOLES = ("pinhole", "perspective", "opencv", "brown", "brownconrady", *FISHEYES)
 #: The principal point is within the image, and nearer to its middle than this share of its sides.
@@ -216,7 +218,8 @@ def focal_and_centre(K: Any, name: str) -> Array:  # noqa: ANN401 - whatever the
     K = checked(K, (3, 3), name)
     if K[0, 2] == K[1, 2] == 0 and min(K[2, :2]) > 1:
         raise InputError(
-            f"{name} is transposed, as MATLAB's IntrinsicMatrix is: write its transpose, [[fx, 0, cx], ..]"
+            f"{name} is transposed, as MATLAB's IntrinsicMatrix is, whose pixels count from 1: save what MATLAB's "
+            "stereoParametersToOpenCV or cameraIntrinsicsToOpenCV returns, [[fx, 0, cx], ..]"
         )
     if K[0, 1] != 0 or K[1, 0] != 0 or (K[2] != [0, 0, 1]).any():
         raise InputError(f"{name} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported")
@@ -232,8 +235,13 @@ def _distortion(entry: Mapping[str, Any]) -> tuple[str, Array, list[str]]:
     if not isinstance(word, str):
         word = "fisheye" if word else ""
     kind = plain(word)
-    if kind not in FISHEYES + BROWNS and name in ("model", "type"):  # the camera's, not its distortion's
+    if kind not in FISHEYES + BROWNS + _OTHER_LENSES and name in (
+        "model",
+        "type",
+    ):  # the camera's, not its distortion's
         kind = ""
+    if kind in ("", "pinhole", "perspective") and plain(found(entry, ("fisheye", "isfisheye"))) in ("true", "1"):
+        kind = "fisheye"
     if kind not in FISHEYES + BROWNS:
         raise InputError(
             f"{name.replace('distortionmodel', 'distortion_model').replace('cameratype', 'camera_type')} {word!r} is not "

@@ -720,3 +720,15 @@ def test_what_measure_wrote_is_joined_by_the_names_of_its_shots(tmp_path):
     of_robot, of_seen = matched_rows(images, table.names)
     assert [table.names[k] for k in of_seen] == [Path(images.names[k]).stem for k in of_robot]
     assert of_seen[0] == 13
+
+
+def test_a_mounting_that_is_hardly_known_is_answered_and_not_to_be_trusted(armsight, tmp_path):
+    rng = np.random.default_rng(1)
+    w = rng.uniform(-1, 1, (8, 6)) * [0.15, 0.15, 0.15, 0.5, 0.04, 0]
+    A = exp_se3(w)
+    B = inverse(A @ X) @ Z @ exp_se3(rng.normal(0, [1.5e-3] * 3 + [6e-3] * 3, (8, 6)))
+    robot, seen = matrices(tmp_path / "robot.txt", A), matrices(tmp_path / "seen.txt", B)
+    said = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand", "--json")
+    assert said.code == 3
+    assert 0.02 < said.lines[0]["worst_sigma_m"] < 0.5
+    assert re.match(r"T_flange_rig is known to \d+ mm and \d\.\d deg only", said.lines[0]["untrusted"][0])

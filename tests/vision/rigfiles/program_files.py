@@ -260,7 +260,7 @@ def mrcal(side, key="extrinsics", lens="LENSMODEL_OPENCV5"):
 
 
 def zed(*names):
-    """SN*.conf: p_right = R p_left + (-Baseline, TY, TZ), R of (RX, CV, RZ); mm."""
+    """SN*.conf: p_right = R p_left - (Baseline, TY, TZ), R of (RX, CV, RZ); mm."""
     text = ""
     for name in names:
         for side, K, d in (("LEFT", K_LEFT, D_LEFT), ("RIGHT", K_RIGHT, D_RIGHT)):
@@ -269,7 +269,7 @@ def zed(*names):
                 "".join(f"{key}={value}\n" for key, value in zip(("k1", "k2", "p1", "p2"), d, strict=True)) + "k3=0\n\n"
             )
     r, t = log_so3(R), T * 1e3
-    text += f"[STEREO]\nBaseline={-t[0]}\nTY={t[1]}\nTZ={t[2]}\n"
+    text += f"[STEREO]\nBaseline={-t[0]}\nTY={-t[1]}\nTZ={-t[2]}\n"
     for name in names:
         text += f"CV_{name}={r[1]}\nRX_{name}={r[0]}\nRZ_{name}={r[2]}\n"
     return text + "\n[MISC]\nSensor_ID=0\n"

@@ -1,10 +1,12 @@
 """One pair of cameras in the files of many programs is one rig; what a person gets wrong with them is named."""
 
 import gzip
+import json
 import pickle
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -88,7 +90,7 @@ def from_p_right(R, t):
             700.1,
             -0.17,
             (1280, 720),
-            from_p_right(exp_so3(np.array([0.0007, 0.0015, 0.0001])), [-0.1199, 1e-5, 2e-5]),
+            from_p_right(exp_so3(np.array([0.0007, 0.0015, 0.0001])), [-0.1199, -1e-5, -2e-5]),
         ),
     ],
 )  # fmt: skip
@@ -270,6 +272,12 @@ DAMAGED = {
     "orbslam mono": ({"TUM1.yaml": re.sub(r"Stereo.T_c1_c2[^Z]*", "", orbslam3())}, {}, "has no Stereo.T_c1_c2"),
     "principal point": ({"c.npz": npz(**(named("K1", "D1", "K2", "D2")))}, MM | {"image_size_px": (720, 1280)}, "principal point .* 16 % of a side|principal point"),
     "far from the middle": ({"c.npz": npz(**(named("K1", "D1", "K2", "D2")))}, MM | {"image_size_px": (1920, 1080)}, r"is 17 % of a side from the middle of 1920x1080 px: was it calibrated with images of this size"),
+    "MATLAB's own": ({"c.json": json.dumps({"s": {"CameraParameters1": {"K": K_LEFT.tolist()}, "CameraParameters2": {"K": K_RIGHT.tolist()}, "RotationOfCamera2": R.T.tolist()}})}, MM_SIZE, "pixels count from 1 .*stereoParametersToOpenCV"),
+    "basalt of numbers": ({"c.json": '{"value0": {"T_imu_cam": [1, 2], "intrinsics": [1, 2], "resolution": [[1, 2], [3, 4]]}}'}, {}, "T_imu_cam, intrinsics and resolution must be lists with an entry for each camera"),
+    "basalt of one number": ({"c.json": '{"value0": {"T_imu_cam": 5, "intrinsics": [], "resolution": []}}'}, {}, "must be lists with an entry for each camera"),
+    "multical of numbers": ({"c.json": '{"cameras": {"a": 1, "b": 2}, "camera_poses": {"a": 1}}'}, {}, "a holds '1', expected a camera's names and values"),
+    "sides of words": ({"c.json": '{"x": {"sizes": "ab", "data": [1], "dt": "d"}}'}, {}, "x must be numbers: rows, cols and data"),
+    "sides below zero": ({"c.json": '{"x": {"rows": -3, "cols": -3, "data": [1, 1, 1, 1, 1, 1, 1, 1, 1]}}'}, {}, "x is damaged: it says -3 rows"),
     "size of a body": (PROGRAMS["k1"][2], MM | {"image_size_px": (320, 240)}, "lies outside of images of 320x240 px"),
 }  # fmt: skip
 
@@ -317,3 +325,27 @@ def test_damage_is_never_a_traceback(tmp_path, name):
         paths = write(tmp_path, whole | {file: bytes(data)})
         for given in (None, format_):
             reported(given, paths, options)
+
+
+def test_stereolabs_is_rectified_as_by_the_vendors_code(tmp_path):
+    baseline, ty, tz, r = 119.9, 0.31, -0.42, np.array([0.004, 0.002, -0.003])
+    file = re.sub(r"Baseline=.*\nTY=.*\nTZ=.*\n", f"Baseline={baseline}\nTY={ty}\nTZ={tz}\n", zed("HD"))
+    for key, value in zip(("RX", "CV", "RZ"), r, strict=True):
+        file = re.sub(rf"{key}_HD=.*", f"{key}_HD={value}", file)
+    rig = import_rig(None, write(tmp_path, {"SN1.conf": file}))
+    d = (np.zeros(5), np.zeros(5))
+    theirs = cv2.stereoRectify(  # calibration.hpp of zed-open-capture
+        rig.left.matrix,
+        d[0],
+        rig.right.matrix,
+        d[1],
+        (1280, 720),
+        cv2.Rodrigues(r)[0],
+        np.array([[baseline], [ty], [tz]]),
+    )
+    ours = inverse(rig.T_left_right)
+    own = cv2.stereoRectify(
+        rig.left.matrix, d[0], rig.right.matrix, d[1], (1280, 720), ours[:3, :3], 1e3 * ours[:3, 3:]
+    )
+    np.testing.assert_allclose(own[0], theirs[0], atol=1e-9)
+    np.testing.assert_allclose(own[1], theirs[1], atol=1e-9)

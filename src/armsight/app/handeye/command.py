@@ -108,8 +108,8 @@ def command(**given: object) -> None:
 
     Prints both transforms with sigma, the error on poses left out, how much of it is the arm and how much the camera, which
     poses are blunders, and which direction the motion leaves open. Exit code 3: a quarter of the poses or more are
-    blunders, or half of them are off by more than 20 mm: the result must not be trusted. Forms of tables, and examples:
-    docs/howto/handeye.md.
+    blunders, half of them are off by more than 20 mm, or a transform is known no better: the result must not be trusted.
+    Forms of tables, and examples: docs/howto/handeye.md.
     """
     options = _with_both(Options(**given))  # type: ignore[arg-type]
     _require_one_way(options)

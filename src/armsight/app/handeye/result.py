@@ -19,6 +19,8 @@ from armsight.loop.handeye.noise import OF_THE_ARM, SHARED
 #: As many blunders as this share of the poses, or a median error on poses left out beyond this, m, are no calibration to
 #: trust.
 _MANY, _FAR_M = 0.25, 0.02
+#: Nor is one of whose transforms a sigma is beyond ``_FAR_M``, or this: as much at a reach of half a metre, rad.
+_FAR_RAD = 0.04
 #: A structure whose mean log density is within this of the best is not distinguished from it.
 DISTINGUISHED = 0.2
 #: A scale that differs from 1 by this many sigmas is said.
@@ -200,6 +202,13 @@ def untrusted(run: HandEyeAnswer) -> list[str]:
     median = float(np.nanmedian(found.held_out.position_m))
     if median > _FAR_M:
         why.append(f"half of the poses left out are off by more than {1e3 * median:.0f} mm: check one row by hand")
+    for name, cov in zip(names(run), (found.cov[6:, 6:], found.cov[:6, :6]), strict=True):
+        far_m, far_rad = (float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in (cov[:3, :3], cov[3:, 3:]))
+        if far_m > _FAR_M or far_rad > _FAR_RAD:
+            why.append(
+                f"{name} is known to {1e3 * far_m:.0f} mm and {np.degrees(far_rad):.1f} deg only along its worst axes "
+                "(sigma): rotate the flange further, about axes that are not parallel, and take more poses"
+            )
     return why
 
 

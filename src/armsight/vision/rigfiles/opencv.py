@@ -120,6 +120,11 @@ def read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOp
     """Read any number of files that hold the two cameras together, in any order."""
     flat, where = dict(_flat(documents)), " and ".join(map(str, paths))
     with naming(where):
+        if any("CameraParameters1" in name for name in flat):
+            raise InputError(
+                "MATLAB's stereoParameters, whose pixels count from 1 and whose RotationOfCamera2 is transposed: save what "
+                "MATLAB's stereoParametersToOpenCV returns"
+            )
         cameras, notes = [], []
         for entry in _entries(flat):
             with naming(str(entry.pop("name"))):

@@ -22,7 +22,8 @@ A pose takes the coordinates of the rig, or of the master camera, to the camera'
 stereolabs: Stereolabs' SN*.conf of a ZED camera: sections LEFT_CAM_HD, RIGHT_CAM_HD, .. for each resolution, and STEREO.
 
 The right camera stands Baseline mm to the right; its rotation is the vector (RX, CV, RZ), rad, of the section's
-resolution: p_right = R p_left + (-Baseline, TY, TZ), as zed-opencv-native's example rectifies with.
+resolution: p_right = R p_left - (Baseline, TY, TZ). zed-open-capture's calibration.hpp gives (Baseline, TY, TZ) to
+stereoRectify, which rectifies alike for both signs of the whole vector, and the right camera is the right one.
 
 orbslam: ORB-SLAM's stereo settings: ORB-SLAM3's Camera1.fx .. and Stereo.T_c1_c2, ORB-SLAM2's LEFT.K LEFT.D LEFT.R LEFT.P.
 
@@ -53,6 +54,7 @@ from armsight.vision.rigfiles.rigfile import (
     imported,
     naming,
     need,
+    need_named,
     posed_rig,
     rigid,
 )
@@ -125,8 +127,12 @@ def _basalt_read(documents: Sequence[Document], paths: Sequence[Path], options: 
     """Read two cameras, called cam0, cam1, .. in their order."""
     count_paths(paths, (1,), "one file, calibration.json")
     with naming(paths[0]):
-        inner = need(documents[0], "value0")
+        inner = need_named(documents[0], "value0")
         poses, cameras, sizes = (need(inner, key) for key in ("T_imu_cam", "intrinsics", "resolution"))
+        if not all(isinstance(part, list) for part in (poses, cameras, sizes)) or not all(
+            isinstance(camera, Mapping) for camera in cameras
+        ):
+            raise InputError("T_imu_cam, intrinsics and resolution must be lists with an entry for each camera")
         if not len(poses) == len(cameras) == len(sizes):
             raise InputError(f"has {len(poses)} poses, {len(cameras)} intrinsics and {len(sizes)} resolutions")
     entries = {
@@ -195,8 +201,9 @@ def _multical_recognises(documents: Sequence[Document]) -> bool:
 def _multical_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
     """Read two cameras."""
     count_paths(paths, (1,), "one file, calibration.json")
-    poses = {str(name).partition("_to_")[0]: value for name, value in documents[0]["camera_poses"].items()}
-    entries = {str(name): entry for name, entry in documents[0]["cameras"].items()}
+    with naming(paths[0]):
+        poses = {str(k).partition("_to_")[0]: value for k, value in need_named(documents[0], "camera_poses").items()}
+        entries = {str(k): entry for k, entry in need_named(documents[0], "cameras").items()}
 
     def posed(name: str) -> tuple[Array, list[str]]:
         if name not in poses:
@@ -246,7 +253,7 @@ def _stereolabs_read(documents: Sequence[Document], paths: Sequence[Path], optio
                 )
             cameras.append(camera)
             notes += said
-        stereo = {str(key).upper(): value for key, value in sections.get("STEREO", {}).items()}
+        stereo = {str(key).upper(): value for key, value in need_named({"STEREO": {}} | sections, "STEREO").items()}
         values = {}
         for key in ("BASELINE", "TY", "TZ", "RX", "CV", "RZ"):
             value = stereo.get(f"{key}_{name}", stereo.get(key))
@@ -255,7 +262,7 @@ def _stereolabs_read(documents: Sequence[Document], paths: Sequence[Path], optio
             values[key] = 0.0 if value is None else value
         r = checked([values[key] for key in ("RX", "CV", "RZ")], (3,), f"RX CV RZ of {name}")
         b, ty, tz = checked([values[key] for key in ("BASELINE", "TY", "TZ")], (3,), "Baseline TY TZ")
-    T_right_left = pose(exp_so3(r), np.array([-b, ty, tz]))
+    T_right_left = pose(exp_so3(r), -np.array([b, ty, tz]))
     return imported(cameras, inverse(T_right_left), options, paths, notes, 1e-3)
 
 

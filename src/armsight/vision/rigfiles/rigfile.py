@@ -118,6 +118,9 @@ def posed_rig(
         raise InputError(
             f"{paths[-1]}: holds {'one camera, ' + names[0] if names else 'no camera'}; a rig has two: give both"
         )
+    for name, entry in entries.items():
+        if not isinstance(entry, Mapping):
+            raise InputError(f"{paths[-1]}: {name} holds {str(entry)[:40]!r}, expected a camera's names and values")
     chosen = options.pair or (names[0], names[1])
     called = {str(entry.get(key)): name for key in ("name", "rostopic") for name, entry in entries.items()}
     chosen = (called.get(chosen[0], chosen[0]), called.get(chosen[1], chosen[1]))
@@ -153,6 +156,14 @@ def need(document: Foreign, key: str) -> Foreign:
     if not isinstance(document, Mapping) or key not in document:
         raise InputError(f"has no {key!r}")
     return document[key]
+
+
+def need_named(document: Foreign, key: str) -> Mapping[str, Foreign]:
+    """Return ``document[key]``, which must be names and values."""
+    value = need(document, key)
+    if not isinstance(value, Mapping):
+        raise InputError(f"{key} holds {str(value)[:40]!r}, expected names and values")
+    return value
 
 
 @contextlib.contextmanager

@@ -4,8 +4,8 @@ In: file names. Out: one shot a frame, with the file's own time stamps. Frames a
 one recorder dropped costs one shot and does not shift the rest.
 
 :class:`Film` decodes by PyAV, which brings FFmpeg with the decoders that cameras and LeRobot use (AV1 among them, which
-opencv-python's wheels open, count and do not decode). A rotation by quarter turns that a phone noted for players is applied,
-as OpenCV's reader does.
+opencv-python's wheels open, count and do not decode). A rotation by right angles that a phone noted for players is
+applied, as OpenCV's reader does.
 """
 
 from __future__ import annotations
@@ -201,9 +201,9 @@ class Film:
         self._frames: Iterator[VideoFrame] = self._decoded()
         first = list(itertools.islice(self._frames, 1))  # the rotation stands in the frames alone
         self._frames = itertools.chain(first, self._frames)
-        self._quarter_turns = round(first[0].rotation / 90) if first else 0  # counterclockwise
+        self._right_angles = round(first[0].rotation / 90) if first else 0  # counterclockwise
         size = (self._stream.width, self._stream.height)
-        self.size_px = size[::-1] if self._quarter_turns % 2 else size
+        self.size_px = size[::-1] if self._right_angles % 2 else size
 
     def _problem(self) -> str | None:
         """Return why the stream cannot be decoded."""
@@ -239,7 +239,7 @@ class Film:
         """Return the current frame, (H, W, 3) BGR, uint8."""
         assert self._frame is not None
         image = self._frame.to_ndarray(format="bgr24")
-        return np.ascontiguousarray(np.rot90(image, self._quarter_turns))
+        return np.ascontiguousarray(np.rot90(image, self._right_angles))
 
     def seek(self, t_s: float) -> None:
         """Go to a frame at a time or before it, from which the frames up to that time can be decoded."""
