@@ -78,3 +78,12 @@ def test_elastic_gains_are_slower_for_softer_joints_and_none_for_the_softest():
     assert found == sorted(found)
     assert found[0] < 0.3 * found[-1]
     assert ki(2.0) is None
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 50, 3000])
+def test_readings_that_show_nothing_show_no_spring_and_no_drum(count):
+    t_s, nothing = 0.002 * np.arange(count), np.zeros(count)
+    motor = MotorFigures(6.0, 0.6, 0.03, 0.01, 0.05)
+    for angle_rad in (nothing, 0.1 * np.sin(t_s)):
+        assert fit_spring(t_s, nothing, nothing, angle_rad) is None
+        assert fit_drum(t_s, nothing, nothing, nothing, motor, 0.0) is None

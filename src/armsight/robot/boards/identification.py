@@ -121,6 +121,12 @@ def fit_spring(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array)
         current_a: (n,) current of the motor, A, with its sign.
         angle_rad: (n,) angles of the joint.
     """
+    if (
+        len(t_s) < _LEAST_READINGS
+        or min(map(np.ptp, (voltage_v, current_a))) <= 0.0
+        or np.ptp(angle_rad) < _LEAST_SWING_RAD
+    ):
+        return None  # fit_swing says what is missing
     step_s = float(np.median(np.diff(t_s)))
     t = np.arange(0.0, float(t_s[-1] - t_s[0]) + 0.5 * step_s, step_s)
     volts, amperes, q = (np.interp(t, t_s - t_s[0], each) for each in (voltage_v, current_a, angle_rad))
@@ -176,6 +182,8 @@ def fit_drum(
         motor: its motor; the constant is fitted once more.
         twist_rad_per_a: of its transmission.
     """
+    if len(t_s) < _LEAST_READINGS or np.ptp(angle_rad) < _LEAST_SWING_RAD:
+        return None
     step_s = float(np.median(np.diff(t_s)))
     t = np.arange(0.0, float(t_s[-1] - t_s[0]) + 0.5 * step_s, step_s)
     volts, amperes, q = (np.interp(t, t_s - t_s[0], each) for each in (voltage_v, current_a, angle_rad))
