@@ -9,11 +9,11 @@ from worn_arm import poses, worn
 
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse
-from armsight.loop.identify import ROTATIONS
 from armsight.loop.identify.diagnose import check_plausible, find_step, misfit, without_tool
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.read import read_poses
 from armsight.robot.arm_file import open_arm
+from armsight.tables.rotations import ROTATIONS
 
 #: One whose axes lie in a plane but for its shoulder, one with a round wrist, and two with none.
 ARMS = ("six_r", "ur5", "ur10", "puma560")
