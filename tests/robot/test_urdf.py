@@ -410,3 +410,18 @@ def test_every_link_that_moves_has_a_shape_and_the_file_says_that_they_are_stand
     assert shaped >= {f"link{i}" for i in range(1, 7)}
     sizes = [float(c.get(key)) for c in ET.fromstring(text).iter("cylinder") for key in ("radius", "length")]
     assert min(sizes) > 0
+
+
+@pytest.mark.parametrize(
+    ("key", "factor", "says"),
+    [("xyz", 1e3, "look like mm; write metres"), ("rpy", 180 / np.pi, "expected are radians")],
+)
+def test_units_that_urdf_does_not_have_are_rejected(tmp_path, key, factor, says):
+    path = tmp_path / "arm.urdf"
+    write_urdf(MODELS["ur5e"], path)
+    tree = ET.parse(path)
+    for origin in tree.iter("origin"):
+        origin.set(key, " ".join(str(factor * float(word)) for word in origin.get(key, "0 0 0").split()))
+    tree.write(path)
+    with pytest.raises(InputError, match=says):
+        read_urdf(path)

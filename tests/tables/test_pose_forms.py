@@ -499,3 +499,12 @@ def test_a_stamp_that_is_none_is_passed_over(tmp_path):
     record = {"stamp": {"sec": "a", "nanosec": None}, "position": [0.1, 0.2, 0.3], "orientation_xyzw": [0, 0, 0, 1]}
     (tmp_path / "a.json").write_text(json.dumps([record] * 3))
     assert read_pose_table(tmp_path / "a.json").t_s is None
+
+
+def test_arrays_of_both_sides_are_enough_alone(tmp_path):
+    both, one = tmp_path / "both.npz", tmp_path / "one.npz"
+    sides = {"R_gripper2base": A[:, :3, :3], "t_gripper2base": A[:, :3, 3]}
+    np.savez(both, **sides, R_target2cam=B[:, :3, :3], t_target2cam=B[:, :3, 3])
+    np.savez(one, **sides)
+    assert has_both(both)
+    assert not has_both(one)

@@ -30,6 +30,7 @@ from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS, exact_cos_sin
+from armsight.tables.lengths import REACH, fitting_unit, metric
 
 #: What an arm is given where its URDF has no accelerations and jerks: full speed in 0.25 s, full acceleration in 0.1 s.
 TO_SPEED_S, TO_ACCELERATION_S = 0.25, 0.1
@@ -44,6 +45,8 @@ _ROTARY = ("revolute", "continuous")
 _MOVING = (*_ROTARY, "prismatic", "floating", "planar")
 #: A continuous joint has no limits: here it goes a revolution either way, at this speed where the file gives none, rad/s.
 _REVOLUTION, _SPEED = 2 * np.pi, 1.0
+#: The largest angle of an origin, rad: none writes two revolutions; half: some write one; double: 20 deg passes.
+_MOST_RPY = 4 * np.pi
 #: Names that a message lists at most.
 _SHOWN = 6
 #: What ROS calls an arm's flange where a tool is mounted (REP 199).
@@ -108,7 +111,23 @@ def parse_urdf(text: str, path: str | Path, *, tool_link: str | None = None) -> 
         raise InputError(f"{path}: holds xacro macros; expand them first: xacro {Path(path).name} > arm.urdf")
     joints = [_joint(path, element) for element in robot.findall("joint")]
     chain = _chain(path, robot, joints, tool_link)
+    _check_units(path, list(dropwhile(lambda joint: not joint.rotary, chain)))
     return _arm(path, robot, chain, [joint for joint in chain if joint.rotary])
+
+
+def _check_units(path: str | Path, chain: list[_Joint]) -> None:
+    """Reject an arm whose lengths cannot be metres, or whose angles cannot be radians, which URDF's are."""
+    for joint in chain:
+        where, origin = f"{path}: joint {joint.name!r}", joint.element.find("origin")
+        xyz, rpy = (_vector(where, origin, key, "0 0 0") for key in ("xyz", "rpy"))
+        if (length := float(np.linalg.norm(xyz))) > REACH.most_m:
+            unit = fitting_unit(length, 1.0, REACH)
+            raise InputError(
+                f"{where}: its <origin> is {metric(length)} from its parent; expected are metres, at most {REACH.most_m:g}"
+                + (f": these look like {unit}; write metres" if unit else "")
+            )
+        if (angle := float(np.abs(rpy).max())) > _MOST_RPY:
+            raise InputError(f"{where}: its <origin> has the angle {angle:g} in rpy; expected are radians: write these")
 
 
 def _joint(path: str | Path, element: ET.Element) -> _Joint:

@@ -15,7 +15,7 @@ import numpy as np
 
 from armsight.errors import InputError
 from armsight.files import DECIMAL_COMMA, TABLE_MB, read_table, read_text
-from armsight.tables.documents import document_rows, is_document
+from armsight.tables.documents import PACKED, document_rows, is_document
 from armsight.tables.programs import program_rows
 
 Rows = list[tuple[int, list[str]]]
@@ -155,7 +155,7 @@ def _of_files(path: Path, side: str, whose: str | None) -> Cells:
 
 def _of_file(path: Path, side: str, whose: str | None) -> Cells:
     """Return what one file holds, its names as they stand there."""
-    if path.suffix.lower() in (".npy", ".npz", ".mat", ".xml", ".gz"):
+    if path.suffix.lower() in PACKED:
         return _of_records(path, None, side, whose)
     text = read_text(path, TABLE_MB).removeprefix("\ufeff")
     if points := program_rows(path, text):

@@ -67,13 +67,15 @@ _ECHO = re.compile(
 )
 
 
+#: Suffixes of documents that are text, and of those that ``document.py`` unpacks.
+_TEXTS, PACKED = (".yaml", ".yml", ".json"), (".npy", ".npz", ".mat", ".xml", ".gz")
 _MOST_RECORDS = 200_000  # poses of a document, of 40 bytes each; half: the same; double: a hostile list takes 500 MB
 
 
 def is_document(path: Path, text: str) -> bool:
     """Return whether a text, or a file by its suffix, is one of these."""
     first = next((row.strip() for row in text.splitlines() if row.strip() and not row.strip().startswith("#")), "")
-    return path.suffix.lower() in (".yaml", ".yml", ".json") or bool(_ECHO.search(text) or _DOCUMENT.match(first))
+    return path.suffix.lower() in _TEXTS or bool(_ECHO.search(text) or _DOCUMENT.match(first))
 
 
 def document_rows(path: Path, text: str | None, side: str, whose: str | None) -> tuple[list[str], list[Record]]:
@@ -352,9 +354,9 @@ def _score(name: str, side: str) -> int:
 
 def has_both(path: Path) -> bool:
     """Return whether a document's records hold poses of both sides, the robot's and what was seen."""
-    if path.suffix.lower() not in (".yaml", ".yml", ".json") or not path.is_file():
+    if path.suffix.lower() not in (*_TEXTS, *PACKED) or not path.is_file():
         return False
-    items = _items(_parsed(path, read_text(path)))
+    items = _items(_parsed(path, None if path.suffix.lower() in PACKED else read_text(path)))
     names = [name for name, _ in _poses(items[0][0])] if items else []
     return len(names) == 2 and all(any(_score(name, side) for name in names) for side in SIDES)
 

@@ -27,8 +27,9 @@ def rotations_by(numbers: Array, convention: str, path: Path) -> Array:
     """
     if convention in ("wxyz", "xyzw"):
         lengths = np.linalg.norm(numbers, axis=1)
+        worst = int(np.argmax(np.abs(lengths - 1))) if len(lengths) else 0
         if (np.abs(lengths - 1) > QUATERNION_OFF).any():
-            raise InputError(f"{path}: a quaternion has length {lengths[np.argmax(np.abs(lengths - 1))]:.4g}, not 1")
+            raise InputError(f"{path}: pose {worst + 1}: a quaternion has length {lengths[worst]:.4g}, not 1")
         return np.asarray(Rotation.from_quat(numbers[:, [1, 2, 3, 0]] if convention == "wxyz" else numbers).as_matrix())
     if convention == "rotvec":
         return np.asarray(Rotation.from_rotvec(np.radians(numbers)).as_matrix())

@@ -643,3 +643,25 @@ def test_one_alpha_in_all_rectifications_and_it_is_said(tmp_path):
         assert v.max() < height + 1
     out = run("export", tmp_path / "rig.json", "--format", "ros", "--help")
     assert "alpha 0" in " ".join(out.output.split())
+
+
+def test_a_number_k1_is_no_camera_matrix(tmp_path):
+    """VINS and camodocal write one camera a file, its distortion as numbers k1, k2: that is no K1 and K2."""
+    paths = [tmp_path / "left.yaml", tmp_path / "right.yaml"]
+    for path in paths:
+        path.write_text(
+            "%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 752\nimage_height: 480\n"
+            "distortion_parameters:\n   k1: -0.29\n   k2: 0.08\n   p1: 0.0\n   p2: 0.0\n"
+            "projection_parameters:\n   fx: 461.6\n   fy: 460.2\n   cx: 362.6\n   cy: 248.1\n"
+        )
+    with pytest.raises(InputError, match=r"no camera matrix of both|no calibration of two cameras"):
+        import_rig(None, paths)
+
+
+def test_a_mirrored_rotation_is_called_so(tmp_path):
+    path = tmp_path / "rig.json"
+    K = [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]
+    cameras = {"K1": K, "K2": K, "D1": [0.0] * 5, "D2": [0.0] * 5, "image_size": [640, 480]}
+    path.write_text(json.dumps({**cameras, "R": np.diag([1.0, 1, -1]).tolist(), "T": [-0.06, 0, 0]}))
+    with pytest.raises(InputError, match="left-handed"):
+        import_rig(None, [path])

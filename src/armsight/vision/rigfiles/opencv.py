@@ -170,7 +170,7 @@ def _is_matrix(name: str, value: Foreign) -> bool:
         return False
     if K.shape == (3, 3) and K[2].tolist() == [0, 0, 1] and min(K[0, 0], K[1, 1], K[0, 2], K[1, 2]) > 1:
         return True
-    return _stem(name) in MATRIX and name[:1] not in "rR"
+    return K.ndim > 0 and _stem(name) in MATRIX and name[:1] not in "rR"  # a number k1 is of a distortion
 
 
 def _is_focal(name: str, value: Foreign) -> bool:

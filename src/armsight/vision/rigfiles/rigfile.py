@@ -182,7 +182,9 @@ def rigid(R: Foreign, t: Foreign, name: str) -> tuple[Array, list[str]]:
         raise InputError(f"translation of {name} has {np.abs(T[:3, 3]).max():.2g} units: a damaged number?")
     near = np.clip(T[:3, :3], -2.0, 2.0)  # squares of damaged numbers overflow
     off = float(np.abs(near @ near.T - np.eye(3)).max())
-    if off > LOOSEST_ROTATION or np.linalg.det(T[:3, :3]) < 0:
+    if off <= LOOSEST_ROTATION and np.linalg.det(T[:3, :3]) < 0:
+        raise InputError(f"{name} is not a rotation: it is left-handed (determinant -1), an axis is mirrored")
+    if off > LOOSEST_ROTATION:
         raise InputError(f"{name} is not a rotation: R R^T differs from the identity by {off:.2g}")
     if off < 1e-12:
         return T, []
