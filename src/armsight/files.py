@@ -171,7 +171,7 @@ def _encoding(path: str | Path, data: bytes) -> str:
     name = "utf-8" if declared is None else declared[1].decode()
     try:
         "".encode(name)  # zlib and its like are codecs, too, and none of text
-    except LookupError:
+    except (LookupError, UnicodeError):
         raise InputError(f"{path}: line 1: declares encoding {name!r}, which is not known; save it as UTF-8") from None
     return "utf-8" if name.lower().startswith("utf-16") else name  # its declaration could not be read if it were
 

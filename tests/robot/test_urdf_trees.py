@@ -202,6 +202,7 @@ def test_xml_is_read_in_the_encoding_that_it_declares(tmp_path, encoding):
         '<?xml version="1.0" encoding="utf-16"?>' + (DATA / "continuous.urdf").read_text().partition("?>")[2]
     )
     np.testing.assert_array_equal(read_urdf(path).table, read_urdf(DATA / "continuous.urdf").table)  # it is UTF-8
-    path.write_text('<?xml version="1.0" encoding="klingon"?><robot/>')
-    with pytest.raises(InputError, match="declares encoding 'klingon', which is not known"):
-        read_urdf(path)
+    for name in ("klingon", "zlib", "undefined"):
+        path.write_text(f'<?xml version="1.0" encoding="{name}"?><robot/>')
+        with pytest.raises(InputError, match=f"declares encoding '{name}', which is not known"):
+            read_urdf(path)

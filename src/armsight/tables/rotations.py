@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
-from armsight.data import Array
 from armsight.errors import InputError
+
+if TYPE_CHECKING:
+    from armsight.data import Array
 
 #: Conventions of three angles: a rotation vector; or rotations about x, y, z in the order given, about fixed axes (lower
 #: case) or about the axes of the rotated frame (capitals).
@@ -25,6 +25,9 @@ def rotations_by(numbers: Array, convention: str, path: Path) -> Array:
     Raises:
         InputError: a quaternion whose length is not 1.
     """
+    import numpy as np  # the names above stand in options, whose help is quick
+    from scipy.spatial.transform import Rotation
+
     if convention in ("wxyz", "xyzw"):
         lengths = np.linalg.norm(numbers, axis=1)
         worst = int(np.argmax(np.abs(lengths - 1))) if len(lengths) else 0
@@ -35,10 +38,3 @@ def rotations_by(numbers: Array, convention: str, path: Path) -> Array:
         return np.asarray(Rotation.from_rotvec(np.radians(numbers)).as_matrix())
     order = ["xyz".index(axis) for axis in convention.lower()]
     return np.asarray(Rotation.from_euler(convention, np.radians(numbers[:, order])).as_matrix())
-
-
-def stacked(R: Array, p: Array) -> Array:
-    """Return poses (N, 4, 4) of rotations (N, 3, 3) and positions (N, 3)."""
-    Ts = np.tile(np.eye(4), (len(R), 1, 1))
-    Ts[:, :3, :3], Ts[:, :3, 3] = R, p
-    return Ts
