@@ -568,6 +568,8 @@ def follow_pair(
     cost, least_both = settle(scene, found), max(3, (both + 1) // 2)
     while np.isfinite(cost) and cost > limits[seen]:
         m, explained = strangest(found)
+        if m < 0:  # nothing is left to leave out
+            return 0, np.inf, wrong
         alike = explained < _STRANGE * max((cost - explained) / max(2 * seen - 10, 1), 1.0)
         if alike and plausible(scene, found, twist):
             break
