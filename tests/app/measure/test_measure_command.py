@@ -464,7 +464,9 @@ def test_a_rig_whose_camera_moved_is_named_and_the_exit_code_says_so(rendered, t
         "advice",
         "alternatives",
         "corrected_s",
+        "cost_mm",
     }
+    assert found["cost_mm"] > 1.0
     assert abs(found["size"] - 0.3) < 4 * found["sigma"]
     assert "do not trust this result: rig: " in said.err
 

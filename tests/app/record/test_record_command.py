@@ -130,10 +130,10 @@ def test_a_disk_that_fills_within_a_shot_leaves_none_of_it(tmp_path, monkeypatch
     shots, full = some(4), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     replacing, write, lines = recording.replacing, os.write, []
 
-    def failing_replacing(path, mode="w"):
+    def failing_replacing(path, mode="w", **how):
         if path.name.startswith(MOMENTS[moment]):
             raise InputError(f"{path}: cannot be written: {full.strerror}")
-        return replacing(path, mode)
+        return replacing(path, mode, **how)
 
     def failing_write(handle, data):
         lines.append(data)
@@ -155,10 +155,10 @@ def test_a_disk_that_fills_within_a_shot_leaves_none_of_it(tmp_path, monkeypatch
 def test_an_interrupt_within_a_shot_waits_until_it_is_stored(tmp_path, monkeypatch, moment):
     shots, replacing, write, lines = some(5), recording.replacing, os.write, []
 
-    def interrupted_replacing(path, mode="w"):
+    def interrupted_replacing(path, mode="w", **how):
         if path.name.startswith(MOMENTS[moment]):
             signal.raise_signal(signal.SIGINT)
-        return replacing(path, mode)
+        return replacing(path, mode, **how)
 
     def interrupted_write(handle, data):
         lines.append(data)
