@@ -95,10 +95,8 @@ def test_errors_are_red_on_a_terminal_without_no_color():
         ("matplotlib.figure", ("arm", "show", "six_r", "-o", "a.png"), "report"),
         ("pyarrow", ("demo",), "sim"),
         ("serial", ("board", "monitor", "--board", "serial:/dev/none"), "board"),
-        ("unicorn", ("board", "monitor", "--board", "emulated:unicorn"), "board"),
+        ("unicorn", ("board", "monitor", "--board", "emulated:unicorn"), "sim"),
         ("distributed", ("batch", "measure", "*.bag", "-o", "out"), "batch"),
-        ("yaml", ("rig", "export", "rig.json", "--format", "ros", "-o", "a.yaml", "b.yaml"), "formats"),
-        ("yaml", ("rig", "import", "rig.json", "--format", "kalibr", "-o", "a.json"), "formats"),
     ],
 )
 def test_an_optional_package_that_is_missing_is_named(armsight, monkeypatch, tmp_path, module, arguments, extra):
