@@ -190,6 +190,8 @@ def test_a_full_disk_ends_the_recording_with_a_line(session):
         def close(self):
             raise OSError(28, "No space left on device")
 
+        flush = close
+
     session.execute(records.RecordPoses())
     measuring, before = session.measuring, len(session.events())
     with measuring._lock:

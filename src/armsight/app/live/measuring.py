@@ -429,12 +429,11 @@ class MeasureStep:
         if mcap is not None:
             mcap.close()
         if file is not None:
-            try:
+            with contextlib.suppress(OSError):  # what is still buffered may not fit on the disk: the row that failed
                 file.flush()
                 os.fsync(file.fileno())
+            with contextlib.suppress(OSError):
                 file.close()
-            except OSError:  # what is still buffered does not fit on the disk: the row that failed
-                return
 
     def close(self) -> None:
         """Close the recording and the streams."""
