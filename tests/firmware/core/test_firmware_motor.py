@@ -197,10 +197,10 @@ def test_the_arm_that_runs_in_c_is_the_plant_of_sim(arms, library, rows):
 
 def test_elastic_joints_are_held_and_not_taken_for_broken_ones(arms, library):
     table = arms.Table()
-    for seed in (81, 82, 83):
+    for seed in range(81, 87):
         arms.elastic(library, seed, table)
         arms.eccentric(library, seed, table)
-    assert not sum(table.false.values())
+    assert sum(table.false.values()) <= 1  # of 12 arms; docs/measured.md: 3 of 120, by a reading called frozen
     assert table.fast["elastic 8 to 40 Hz"] < 1.4
 
 
