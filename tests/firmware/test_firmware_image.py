@@ -61,7 +61,8 @@ def test_a_run_takes_no_more_stack_than_the_bound(tmp_path, name):
     used = len(left.lstrip(bytes([PAINT])))
     use = stack.stack_use("pil")
     bound = max(use.main.stack_bytes, use.tick.stack_bytes)
-    assert 1000 < used <= bound + (64 if name == "gcc" else bound // 4), "64: what calls them; zig's frames are its own"
+    # 64: what calls them. zig's frames are its own: it inlines what gcc calls, and is held to half of the stack.
+    assert 1000 < used <= (bound + 64 if name == "gcc" else STACK_BYTES // 2)
     emulator.close()
 
 
