@@ -94,8 +94,11 @@ class FrameClock:
         sane_s = self._shifted(stamp_s)
         late_s, soonest_s = arrived_s - sane_s, min(self._late, default=math.nan)
         # After a contradiction, or where the rhythm broke, it is to come as soon as usual.
-        latest_s = soonest_s + (_EARLY_S if self._odd or self._broken else _LATE_S)
-        if len(self._late) >= _AGREE and not (sane_s > self._newest_s and soonest_s - _EARLY_S < late_s < latest_s):
+        usual_s = sorted(self._late)[9 * len(self._late) // 10] if self._late else math.nan  # of ten, nine come as soon
+        latest_s = usual_s + _EARLY_S if self._odd or self._broken else soonest_s + _LATE_S
+        # A clock may have run fast, by less than its rate is corrected for, since the others came.
+        early_s = _EARLY_S + (_RATE * (arrived_s - self._soonest[0][0]) if self._soonest else 0.0)
+        if len(self._late) >= _AGREE and not (sane_s > self._newest_s and soonest_s - early_s < late_s < latest_s):
             self._odd.append(late_s)
             if len(self._odd) < _AGREE or max(self._odd) - min(self._odd) > 2 * _EARLY_S:
                 return None
