@@ -266,7 +266,7 @@ def test_a_broken_calibration_is_named(tmp_path, name, fields, said):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"), [("{", "no JSON"), ("[1]", "no calibration of LeRobot"), ("{}", "has no joint")]
+    ("text", "said"), [("{", "not JSON"), ("[1]", "no calibration of LeRobot"), ("{}", "has no joint")]
 )
 def test_what_is_no_calibration_is_named(tmp_path, text, said):
     path = tmp_path / "a.json"
