@@ -75,7 +75,7 @@ def test_the_nominal_file_is_the_nominal_arm(tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda d: d.pop("kinematics"), "no kinematics"),
+        (lambda d: d.pop("kinematics"), "expected kinematics"),
         (lambda d: d["kinematics"].pop("forearm"), "forearm is missing; ur5e has shoulder"),
         (lambda d: d["kinematics"]["wrist_2"].update(yaw="a"), "wrist_2: yaw is 'a', must be a number"),
         (lambda d: d["kinematics"]["forearm"].update(x=-425.0), "mm from that of ur5e on the mean: .* or in mm"),
