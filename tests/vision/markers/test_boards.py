@@ -105,7 +105,7 @@ def test_boards_say_which_way_up_they_are_and_which_tags_they_have():
     boards = {kind: open_board(spec) for kind, spec in SPECS.items()}
     assert {kind for kind, board in boards.items() if board.y_up} == {"aprilgrid"}
     found = {kind: board.codes for kind, board in boards.items() if board.codes[1]}
-    assert found == {"charuco": ("DICT_5X5_100", 24), "aprilgrid": ("tag36h11", 12)}
+    assert found == {"charuco": ("DICT_5X5_100", range(24)), "aprilgrid": ("tag36h11", range(12))}
 
 
 @pytest.mark.parametrize("kind", BOARDS)
