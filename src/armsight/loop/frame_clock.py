@@ -174,7 +174,8 @@ class FrameClock:
             return stamp_s - gap if len(self._strange) == _LEAST else stamp_s
         self._t_s = stamp_s - gap * (1.0 - tt / variance)
         self.period_s += tp / variance * gap
-        more = 1.0 + (gap * gap / variance - 1.0) / MEMORY  # of the jitter's variance: all that follows from it grows alike
+        # What is not known of time and period grows as the variance of the jitter that it follows from.
+        more = 1.0 + (gap * gap / variance - 1.0) / MEMORY
         fade = (1.0 + 2.0 / MEMORY) * more
         self._pp = fade * (self._pp - tp * tp / variance)
         self._tp, self._tt = fade * tp * self.jitter_s**2 / variance, fade * tt * self.jitter_s**2 / variance
