@@ -13,14 +13,19 @@ from armsight.app.handeye.recording import PairedPoses
 from armsight.app.report.table import TextTable, plain_text
 from armsight.data import Array, Record
 from armsight.geometry.pose import log_se3, mean_pose
-from armsight.loop.handeye.handeye import GEOMETRY, POSITIONS, SCALE_WALKING, SMOOTH, HandEye
+from armsight.loop.handeye.handeye import (
+    GEOMETRY,
+    POSITIONS,
+    SCALE_WALKING,
+    SMOOTH,
+    TRUSTED_M,
+    TRUSTED_RAD,
+    HandEye,
+)
 from armsight.loop.handeye.noise import OF_THE_ARM, SHARED
 
-#: As many blunders as this share of the poses, or a median error on poses left out beyond this, m, are no calibration to
-#: trust.
-_MANY, _FAR_M = 0.25, 0.02
-#: Nor is one of whose transforms a sigma is beyond ``_FAR_M``, or this: as much at a reach of half a metre, rad.
-_FAR_RAD = 0.04
+#: As many blunders as this share of the poses are no calibration to trust.
+_MANY = 0.25
 #: A structure whose mean log density is within this of the best is not distinguished from it.
 DISTINGUISHED = 0.2
 #: A scale that differs from 1 by this many sigmas is said.
@@ -200,11 +205,11 @@ def untrusted(run: HandEyeAnswer) -> list[str]:
             "that is missing on one side shifts all after it"
         )
     median = float(np.nanmedian(found.held_out.position_m))
-    if median > _FAR_M:
+    if median > TRUSTED_M:
         why.append(f"half of the poses left out are off by more than {1e3 * median:.0f} mm: check one row by hand")
     for name, cov in zip(names(run), (found.cov[6:, 6:], found.cov[:6, :6]), strict=True):
         far_m, far_rad = (float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in (cov[:3, :3], cov[3:, 3:]))
-        if far_m > _FAR_M or far_rad > _FAR_RAD:
+        if far_m > TRUSTED_M or far_rad > TRUSTED_RAD:
             why.append(
                 f"{name} is known to {1e3 * far_m:.0f} mm and {np.degrees(far_rad):.1f} deg only along its worst axes "
                 "(sigma): rotate the flange further, about axes that are not parallel, and take more poses"

@@ -21,7 +21,7 @@ from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.delay import MIN_MEASUREMENTS, estimate_delay
 from armsight.loop.estimators import Delay, Mounting, Prior
-from armsight.loop.handeye.handeye import HandEye, calibrate_handeye
+from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, calibrate_handeye, require_known
 from armsight.loop.handeye.noise import STRUCTURES
 from armsight.loop.handeye.poses import require_fitting
 from armsight.loop.sync_led import with_led
@@ -253,6 +253,7 @@ def handeye_of(
     Ts_left_body, cov = np.array([each.T_left_body for each in visited]), np.array([each.cov for each in visited])
     require_fitting(arm, q, Ts_left_body)
     found = calibrate_handeye(arm.forward(q) @ inverse(arm.T_flange_tool), Ts_left_body, cov, structures=structures)
+    require_known(found, TRUSTED_M, TRUSTED_RAD)
     mounting = replace(Mounting.of(found, arm), cov=np.zeros((12, 12)))
     return HandEyeRun(mounting, found, q, Ts_left_body, cov, np.array([each.approach for each in visited]), missed)
 

@@ -27,7 +27,7 @@ from armsight.errors import CalibrationError, InputError
 from armsight.files import write_text
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators import Mounting
-from armsight.loop.handeye.handeye import HandEye, calibrate_handeye
+from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, calibrate_handeye, require_known
 from armsight.loop.handeye.noise import STRUCTURES
 from armsight.loop.identify.diagnose import check_plausible, without_tool
 from armsight.loop.identify.measured import Measured
@@ -148,6 +148,8 @@ def run_logged(
     progress("hand-eye: are rows and shots shifted, are the angles this arm's?")
     shift = _shift(arm, q, Ts, covs, centre, found.held_out.rms()[0])
     implausible = None if shift else _implausible(arm, q[found.used], Ts[found.used])
+    if not shift and implausible is None:
+        require_known(found, TRUSTED_M, TRUSTED_RAD)
     return LoggedRun(run, tuple(names[k] for k in good), len(names), unpaired, shift, implausible)
 
 

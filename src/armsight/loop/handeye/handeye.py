@@ -78,8 +78,10 @@ FOLDS, FEW = 5, 24
 CLEARLY_ROTATED, LEAST_ROTATION = 3.0, np.radians(0.5)
 #: Rotations of half of the poses that differ by more than this, rad, are not of one motion.
 CONTRADICTS = np.radians(10.0)
-#: A sigma of the mounting beyond this (m, rad) is no calibration.
+#: A sigma of a transform beyond this (m, rad) is no answer; beyond that, it is none to close a loop with: as much at a
+#: reach of half a metre. half: mountings from few small rotations are rejected, double: a tool 40 mm off may be driven.
 OPEN_M, OPEN_RAD = 0.5, 0.5
+TRUSTED_M, TRUSTED_RAD = 0.02, 0.04
 #: What a further pose is uncertain by at least, m and rad: where hardly anything scattered, one would determine all.
 LEAST_M, LEAST_RAD = 1e-5, 1e-5
 #: Degrees of freedom of Student's t in the robust start.
@@ -533,37 +535,41 @@ def require_rotations(poses: Poses, e: Array) -> None:
         )
 
 
-def require_known(poses: Poses, Z: Array, X: Array, cov: Array) -> None:
+def require_known(found: HandEye, most_m: float, most_rad: float) -> None:
     """Reject a result one of whose directions is known so badly that it is no calibration.
+
+    Args:
+        found: the result.
+        most_m: largest sigma of a translation, m.
+        most_rad: largest sigma of a rotation, rad.
 
     Raises:
         CalibrationError: the open direction, by name.
     """
-    for name, R, block in ((_held(poses), X[:3, :3], cov[6:12, 6:12]), (_still(poses), Z[:3, :3], cov[:6, :6])):
+    held, still = ("flange-rig", "base-body") if found.eye == "in_hand" else ("flange-body", "base-rig")
+    for name, T, block in (
+        (held, found.T_flange_held, found.cov[6:, 6:]),
+        (still, found.T_base_still, found.cov[:6, :6]),
+    ):
         for kind, part, most, unit, times in (
-            ("translation", block[:3, :3], OPEN_M, "mm", 1e3),
-            ("rotation", block[3:, 3:], OPEN_RAD, "deg", np.degrees(1.0)),
+            ("translation", block[:3, :3], most_m, "mm", 1e3),
+            ("rotation", block[3:, 3:], most_rad, "deg", np.degrees(1.0)),
         ):
             values, vectors = np.linalg.eigh(part)
             sigma = float(np.sqrt(max(values[-1], 0.0)))
             if sigma < most:
                 continue
-            axis = R @ vectors[:, -1]
+            axis = T[:3, :3] @ vectors[:, -1]
             named = " ".join(f"{value:.2f}" for value in axis * np.sign(axis[np.argmax(np.abs(axis))]))
-            first = name.split("-")[0]
             raise CalibrationError(
-                f"the motions leave the {kind} of {name} open: along or about [{named}] in the {first} its sigma is "
-                f"{times * sigma:.0f} {unit}; rotate the flange about two axes that are not parallel, by 20 degrees and "
-                "more, and take more poses"
+                f"the motions leave the {kind} of {name} open: along or about [{named}] in the {name.split('-')[0]} its "
+                f"sigma is {times * sigma:.0f} {unit}; rotate the flange about two axes that are not parallel, by 20 "
+                "degrees and more, and take more poses"
             )
 
 
 def _held(poses: Poses) -> str:
     return "flange-rig" if poses.in_hand else "flange-body"
-
-
-def _still(poses: Poses) -> str:
-    return "base-body" if poses.in_hand else "base-rig"
 
 
 def _start_variances(linear: Linear, structure: str) -> Array:
@@ -643,7 +649,6 @@ def _chosen(
         cov, x = cov + np.outer(suits - x, suits - x), suits
     guess = guess.moved(x, whole.free)
     metric, cov = whole.metric(guess, cov)
-    require_known(whole.poses, metric.Z, metric.X, cov)
     sigmas = {name: float(np.sqrt(v)) for name, v in zip(STRUCTURES[best], variances, strict=True)}
     arm, camera = _displacements(whole, linear, best, variances, guess)
     rest = np.sqrt(np.diag(cov)[12:]).tolist()
@@ -671,6 +676,7 @@ def _chosen(
         common=guess.common,
         common_m=_common_m(whole.poses, guess),
     )
+    require_known(found, OPEN_M, OPEN_RAD)
     return found, used
 
 
