@@ -7,6 +7,7 @@ import dataclasses
 import os
 import shutil
 import sys
+import traceback
 from pathlib import Path
 
 from setuptools import Distribution, setup
@@ -35,6 +36,16 @@ class BuildNative(build_py):
     """Puts compiled kernels and ``armsight/firmware/built`` beside the modules, and the firmware's sources into a wheel."""
 
     def run(self) -> None:
+        """Build; what fails ends the installation.
+
+        setuptools makes a warning of any other error in an editable one (``editable_wheel._safely_run``).
+        """
+        try:
+            self.build_all()
+        except Exception:  # noqa: BLE001 - whatever it is, with all that is known of it
+            sys.exit(traceback.format_exc())
+
+    def build_all(self) -> None:
         """Copy the modules, then build."""
         if not self.editable_mode:  # what was built before may be for another target
             shutil.rmtree(self.build_lib, ignore_errors=True)

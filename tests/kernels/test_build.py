@@ -127,6 +127,28 @@ def test_a_module_that_was_edited_since_is_rejected_with_the_command_to_run():
 
 
 @compiled
+def test_kernels_are_built_where_none_of_the_requirements_is_installed():
+    program = """
+import importlib.abc, sys
+import llvmlite, numba, numpy
+from armsight.kernels import build
+
+class Bare(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] not in ("armsight", "llvmlite", "numba", "numpy", *sys.stdlib_module_names):
+            stand_in = sys.meta_path[-1]
+            if not isinstance(stand_in, build._Absent):
+                raise ModuleNotFoundError(name)
+            return stand_in.find_spec(name)
+
+sys.meta_path.insert(0, Bare())
+for path in build.kernel_modules():
+    build.import_alone(build.module_name(path))
+"""
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert not ran.returncode, ran.stderr
+
+
 def test_a_function_that_was_not_compiled_is_rejected_with_the_command_to_run():
     with pytest.raises(
         ArmsightError, match=r"test_build\.locked is not compiled; .* python -m armsight\.kernels\.build"

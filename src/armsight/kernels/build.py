@@ -339,22 +339,31 @@ def _gather() -> dict[str, list[_Called]]:
     return called
 
 
-#: What modules with kernels import for their other functions.
-_NOT_FOR_KERNELS = ("click", "cv2", "mujoco", "rich", "ruckig", "scipy")
-
-
 class _Absent(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Stands in for packages that are not installed where the package is built: kernels need none but numpy."""
+    """Stands in for packages that are not installed where the package is built: kernels need none but numpy.
+
+    Last in ``sys.meta_path``: what is installed was found before.
+    """
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:  # noqa: ANN401
-        known = name.split(".")[0] in _NOT_FOR_KERNELS
-        return importlib.machinery.ModuleSpec(name, self, is_package=True) if known else None
+        ours = name.split(".")[0] in ("armsight", *sys.stdlib_module_names)
+        return None if ours else importlib.machinery.ModuleSpec(name, self, is_package=True)
 
     def create_module(self, spec: Any) -> Any:  # noqa: ANN401
         return mock.MagicMock(name=spec.name, __path__=[], __spec__=spec)
 
     def exec_module(self, module: Any) -> None:  # noqa: ANN401
         pass
+
+
+def import_alone(name: str) -> None:
+    """Import a module of the package whose requirements, but for numpy, need not be installed."""
+    absent = _Absent()
+    sys.meta_path.append(absent)
+    try:
+        importlib.import_module(name)
+    finally:
+        sys.meta_path.remove(absent)
 
 
 _worker: list[Any] = []
@@ -371,12 +380,7 @@ def _intermediate(path: Path) -> Path:
     called, context = _worker
     from numba.core.compiler_lock import global_compiler_lock
 
-    absent = _Absent()
-    sys.meta_path.append(absent)
-    try:
-        importlib.import_module(name)
-    finally:
-        sys.meta_path.remove(absent)
+    import_alone(name)
     library, lines = context.codegen().create_library(name), []
     with global_compiler_lock:
         for each in called.get(name, ()):
