@@ -6,6 +6,7 @@ import faults
 import numpy as np
 import pytest
 from arm_rig import ARM
+from scipy.special import chdtri
 
 from armsight.loop.estimators import Innovation, Outcome, Prior
 from armsight.loop.estimators.armerror import layout
@@ -90,6 +91,20 @@ def test_a_change_is_named_sized_and_dated(kind, size, joint, cause):
     off = change.size - factor * np.atleast_1d(size)
     if abs(found.since_s - AT_S) < 0.8 or kind != "drift":
         assert off @ np.linalg.solve(change.cov, off) < 25.0
+
+
+def test_what_is_kept_is_bounded_and_old_changes_stay_found(monkeypatch):
+    monkeypatch.setattr("armsight.loop.health.closure._MOST_KEPT", 80)
+    watch = watched(11, "rig", SHIFT, seconds=180.0)
+    assert sum(watch._merged) > 200
+    assert len(watch._t) < 80
+    assert [len(each) for each in (watch._e, watch._H, watch._merged, watch._sums.rows)] == 4 * [len(watch._t)]
+    found, change = finding(watch.changes, ARM.joint_names), watch.changes[0]
+    assert (found.cause, change.suspect.kind) == ("fixed", "rig")
+    assert found.since_s == pytest.approx(AT_S, abs=4.0)
+    off = change.size - SHIFT
+    assert off @ np.linalg.solve(change.cov, off) < chdtri(6, 1e-3)
+    assert watched(3, seconds=180.0).changes == ()
 
 
 def test_the_first_joint_looks_like_a_rotation_of_the_rig_about_its_axis():

@@ -41,6 +41,9 @@ _POSE_TRAVEL_RAD = 1.0
 _LEAST_BLOCKS, _AGAIN, _MOST_BLOCKS = 12, 4, 64
 #: Beginnings that are tried; the newer, the closer.
 _BEGINS = 12
+#: Blocks that are kept: then the older half is merged in pairs, and so on. half: an old beginning is known half as closely,
+#: double: 6 MB more.
+_MOST_KEPT = 600
 #: Errors of a block before any is seen (m, rad), and how many blocks that counts.
 _BLOCK_SIGMA, _BLOCKS = np.repeat([1.2e-4, np.radians(0.012)], 3), 8.0
 #: Priors so wide that they decide nothing: of a motion (m, rad), of a time, s, and of an angle, rad.
@@ -159,6 +162,7 @@ class ClosureWatch:
         self._e: list[Array] = []
         self._H: list[Array] = []
         self._clock_s: list[float] = []
+        self._merged: list[int] = []  # how many blocks each one is of
         self._newest: Innovation | None = None
         self._wide = np.full(RAMPS + 6 + 2 * joints - 1, _WIDE_RAD)
         self._wide[:6] = self._wide[RAMPS : RAMPS + 6] = _WIDE
@@ -212,19 +216,36 @@ class ClosureWatch:
         self._e.append(block.e / block.count)
         self._H.append(block.H / block.count)
         self._clock_s.append(block.clock_s / block.count)
+        self._merged.append(1)
         count = len(self._t)
         self._sum(slice(count - 1, count))
         if _LEAST_BLOCKS <= count <= _MOST_BLOCKS and count % _AGAIN == 0:
             self._estimate_noise()
         if count >= _LEAST_BLOCKS:
             self._decide()
+        if count >= _MOST_KEPT:
+            self._merge()
+
+    def _merge(self) -> None:
+        """Merge the older half of the blocks in pairs, but for those about a change; what is summed stays as it is."""
+        t = np.array(self._t)
+        near = np.any([np.abs(t - each.begin_s) < MOST_S for each in self.changes] or [np.zeros(len(t), bool)], axis=0)
+        for k in reversed(range(0, len(t) // 2, 2)):
+            if near[k] or near[k + 1]:
+                continue
+            n, m = self._merged[k : k + 2]
+            for values in (self._t, self._e, self._H, self._clock_s):
+                values[k : k + 2] = [(n * values[k] + m * values[k + 1]) / (n + m)]
+            self._merged[k : k + 2] = [n + m]
+            self._sums.rows[k : k + 2] = [self._sums.rows[k + 1]]
 
     def _whitened(self, blocks: slice) -> tuple[Array, Array, Array]:
         """Return of B blocks the derivatives (B, 6, K) by the model, by what may change (B, 6, D), and residuals (B, 6)."""
         # What is not known of a clock that is followed is an error along the velocity that a whole block has in common.
         H, e = np.array(self._H[blocks]), np.array(self._e[blocks])
         late = np.array(self._clock_s[blocks])[:, None] * H[:, :, self._parts.delay]
-        white = np.linalg.inv(np.linalg.cholesky(self._cov + late[:, :, None] * late[:, None, :]))
+        own = self._cov / np.array(self._merged[blocks])[:, None, None]
+        white = np.linalg.inv(np.linalg.cholesky(own + late[:, :, None] * late[:, None, :]))
         model, changes = H[:, :, : self._parts.rest] * self._sigmas, changing(self._parts, H)
         return white @ model, white @ changes, (white @ e[..., None])[..., 0]
 
@@ -383,7 +404,8 @@ class ClosureWatch:
         b, white = solved[:, -1], np.moveaxis(solved[:, :-1].reshape(self._parts.rest, len(begins), -1), 1, 0)
         # What the model leaves beyond the blocks' errors widens them.
         left = square - float(b @ b)
-        excess = max(left / max(6.0 * len(t), 1.0), 1.0)
+        numbers = 6.0 * sum(self._merged)
+        excess = max(left / numbers, 1.0)
         gained = 0.0 if without is None else (gained - left) / excess
         limits, found = _limits(self._parts.joints), list[_Tested]()
         wide = np.append(self._wide, self._wide[:RAMPS])
@@ -408,7 +430,7 @@ class ClosureWatch:
             size = cov @ (right[n, part] / by)
             chi_square = float(right[n, part] @ (size / by))
             above = chi_square + gained - limits[len(by)] - (_RARER if each.slow else 0.0)
-            rest = (left / excess - chi_square) / max(6.0 * len(t), 1.0)
+            rest = (left / excess - chi_square) / numbers
             share = max(rest, 1.0 / excess)  # the errors are no smaller than the blocks'
             found.append(_Tested(each, int(begins[n]), size, cov, chi_square, above, share))
         return found
