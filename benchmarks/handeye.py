@@ -243,14 +243,17 @@ def open3dv(data: Path, work: Path) -> list[str]:
 
 
 def ur3a(data: Path, work: Path) -> list[str]:
-    """Calibrate two webcams by the recording's own images; return the arguments for a board on a UR3e's flange."""
+    """Calibrate two webcams by the recording's own images; return the arguments for a board on a UR3e's flange.
+
+    Its camera 2 stands to the left.
+    """
     folder = data / "real" / "ur3a"
-    pairs = ["--left", folder / "cam1_*.png", "--right", folder / "cam2_*.png", "--target", "chessboard:9x7:20mm"]
-    alone = ["--left-intrinsics", folder / "intrinsics_cam1" / "*.jpg"]
-    alone += ["--right-intrinsics", folder / "intrinsics_cam2" / "*.jpg"]
+    pairs = ["--left", folder / "cam2_*.png", "--right", folder / "cam1_*.png", "--target", "chessboard:9x7:20mm"]
+    alone = ["--left-intrinsics", folder / "intrinsics_cam2" / "*.jpg"]
+    alone += ["--right-intrinsics", folder / "intrinsics_cam1" / "*.jpg"]
     command("calibrate", *pairs, *alone, "-o", work / "rig.json")
     names, *rows = (folder / "joints.csv").read_text().split()
-    rows = [f"cam1_{int(row.split(',')[0]):02d}.png{row[row.index(',') :]}" for row in rows]
+    rows = [f"cam2_{int(row.split(',')[0]):02d}.png{row[row.index(',') :]}" for row in rows]
     (work / "joints.csv").write_text("\n".join([names.replace("pose", "image"), *rows]))
     robot = ["--robot", work / "joints.csv", "--model", "ur3e", "--eye", "to-hand", "--rig", work / "rig.json"]
     return [*robot, *pairs[:4], "--target", work / "rig.board.toml"]
