@@ -20,7 +20,7 @@ from armsight.geometry.pose import exp_se3, inverse
 from armsight.robot.arm_file import open_arm
 from armsight.robot.calibration_file import read_calibration
 from armsight.robot.models import MODELS
-from armsight.robot.urdf_write import urdf_text
+from armsight.robot.urdf.write import urdf_text
 from armsight.tables.poses import read_pose_table
 
 N = 16

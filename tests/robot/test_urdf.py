@@ -17,8 +17,8 @@ from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.robot.arm import Arm
 from armsight.robot.models import MODELS
-from armsight.robot.urdf import decompose, read_urdf
-from armsight.robot.urdf_write import urdf_text, write_urdf
+from armsight.robot.urdf.read import decompose, read_urdf
+from armsight.robot.urdf.write import urdf_text, write_urdf
 
 SIX_R = MODELS["six_r"]
 TABLE = ("a", "d", "alpha", "offset", "direction", "T_base_0", "T_flange_tool")

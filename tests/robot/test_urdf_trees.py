@@ -7,7 +7,7 @@ import pytest
 
 from armsight.errors import InputError
 from armsight.robot.arm_file import open_arm
-from armsight.robot.urdf import read_urdf
+from armsight.robot.urdf.read import read_urdf
 
 pin = pytest.importorskip("pinocchio")
 DATA = Path(__file__).parent / "data"

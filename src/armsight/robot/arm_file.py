@@ -44,8 +44,8 @@ from armsight.geometry.rotation import from_quaternion_wxyz
 from armsight.robot.arm import Arm
 from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS
 from armsight.robot.models import MODELS
-from armsight.robot.urdf import parse_urdf, read_urdf
-from armsight.robot.urdf_write import urdf_text
+from armsight.robot.urdf.read import parse_urdf, read_urdf
+from armsight.robot.urdf.write import urdf_text
 
 #: Column of an identified table -> its unit; beta is Hayati's angle.
 _COLUMNS = {"offset": "rad", "d": "m", "a": "m", "alpha": "rad", "beta": "rad"}

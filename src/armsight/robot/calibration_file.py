@@ -27,8 +27,8 @@ from armsight.files import read_text, write_text
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import log_so3
 from armsight.robot.arm import Arm
-from armsight.robot.urdf import ChainLink, arm_rows, check_same, rotation_of
-from armsight.robot.urdf_write import roll_pitch_yaw
+from armsight.robot.urdf.read import ChainLink, arm_rows, check_same, rotation_of
+from armsight.robot.urdf.write import roll_pitch_yaw
 from armsight.tables.yaml_file import read_yaml
 
 #: What Universal Robots call their joints here.

@@ -9,7 +9,7 @@ import pytest
 
 from armsight.robot.calibration_file import calibration_text, read_calibration
 from armsight.robot.models import MODELS
-from armsight.robot.urdf import read_urdf
+from armsight.robot.urdf.read import read_urdf
 
 pytest.importorskip("yaml")
 UR5E = MODELS["ur5e"]

@@ -12,7 +12,7 @@ from armsight.geometry.rotation import from_euler_zyx
 from armsight.robot.arm_file import split_arm
 from armsight.robot.models import MODELS
 from armsight.robot.reach import reach
-from armsight.robot.urdf_write import write_urdf
+from armsight.robot.urdf.write import write_urdf
 from cli_runs import assert_rejected
 
 SIX_R = MODELS["six_r"]

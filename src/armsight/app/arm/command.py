@@ -154,7 +154,7 @@ def urdf(arm_name: str, output: Path, as_json: bool) -> None:
     check_writable(output, apart_from=(_file(arm_name),))
 
     from armsight.robot.arm_file import open_arm
-    from armsight.robot.urdf_write import write_urdf
+    from armsight.robot.urdf.write import write_urdf
 
     arm = open_arm(arm_name)
     write_urdf(arm, output)
@@ -182,7 +182,7 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
     from armsight.app.arm import description
     from armsight.robot.arm_file import open_arm
     from armsight.robot.calibration_file import difference, read_calibration, write_calibration
-    from armsight.robot.urdf_write import write_urdf
+    from armsight.robot.urdf.write import write_urdf
 
     if output is not None:
         if output.suffix not in (".urdf", ".yaml"):

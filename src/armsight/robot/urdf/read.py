@@ -1,10 +1,9 @@
 """Read an arm from URDF, the XML in which ROS describes robots (wiki.ros.org/urdf/XML).
 
-In: a URDF file with four to seven rotary joints (revolute or continuous) in a row, and fixed ones anywhere. Joints before
-the arm (a lift, a rail) are held at zero; a gripper's behind it and others beside it (wheels, a head) are left out; both
-are logged.
+In: a URDF file with four to seven rotary joints (revolute or continuous) in a row, and fixed ones anywhere; which joints of
+its tree are the arm's: :mod:`armsight.robot.urdf.tree`.
 Masses and shapes are ignored. Out: an :class:`Arm` with a standard Denavit-Hartenberg table. What is written, and where
-that goes beyond plain URDF, stands in :mod:`armsight.robot.urdf_write`.
+that goes beyond plain URDF, stands in :mod:`armsight.robot.urdf.write`.
 
 From a chain of axes to the table: between two axes in space there is always Rz(beta) Tz(d) Tx(a) Rx(alpha) Tz(e) Rz(gamma):
 along the first to the foot of their common normal, over it, and along the second. Rz(gamma) Tz(e) stands at the next
@@ -14,9 +13,7 @@ axes) is chosen so that gamma and e vanish where they can, which gives a table b
 
 from __future__ import annotations
 
-import logging
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
 from itertools import dropwhile
 from pathlib import Path
 from typing import NamedTuple
@@ -29,7 +26,8 @@ from armsight.files import read_text
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.arm import Arm
-from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS, exact_cos_sin
+from armsight.robot.kinematics.table import exact_cos_sin
+from armsight.robot.urdf.tree import MOVING, Joint, Tree
 from armsight.tables.lengths import REACH, fitting_unit, metric
 
 #: What an arm is given where its URDF has no accelerations and jerks: full speed in 0.25 s, full acceleration in 0.1 s.
@@ -41,46 +39,10 @@ EXACT = 1e-9
 FAR = 1e6
 #: Random poses at which the table is compared with the chain.
 PROBES = 16
-_ROTARY = ("revolute", "continuous")
-_MOVING = (*_ROTARY, "prismatic", "floating", "planar")
 #: A continuous joint has no limits: here it goes a revolution either way, at this speed where the file gives none, rad/s.
 _REVOLUTION, _SPEED = 2 * np.pi, 1.0
 #: The largest angle of an origin, rad: none writes two revolutions; half: some write one; double: 20 deg passes.
 _MOST_RPY = 4 * np.pi
-#: Names that a message lists at most.
-_SHOWN = 6
-#: What ROS calls an arm's flange where a tool is mounted (REP 199).
-_FLANGE = "tool0"
-_LOG = logging.getLogger(__name__)
-#: A last joint of such a name is a gripper's.
-_GRIPPERS = ("grip", "jaw", "finger", "knuckle", "thumb")
-
-
-class _Joint(NamedTuple):
-    """A joint element: its name, type and links, its pose (4, 4) in the parent link, m, and the element itself."""
-
-    name: str
-    kind: str
-    parent: str
-    child: str
-    T_parent_joint: Array
-    element: ET.Element
-
-    @property
-    def mimics(self) -> str | None:
-        """The joint that this one follows; None where it moves by itself."""
-        mimic = self.element.find("mimic")
-        return None if mimic is None else mimic.get("joint", "")
-
-    @property
-    def moves(self) -> bool:
-        """Whether it is no fixed one."""
-        return self.kind != "fixed"
-
-    @property
-    def rotary(self) -> bool:
-        """Whether it can be an arm's: it rotates, by itself."""
-        return self.kind in _ROTARY and self.mimics is None
 
 
 def read_urdf(path: str | Path, *, tool_link: str | None = None) -> Arm:
@@ -110,12 +72,12 @@ def parse_urdf(text: str, path: str | Path, *, tool_link: str | None = None) -> 
     if any("xacro" in element.tag for element in robot.iter() if isinstance(element.tag, str)):
         raise InputError(f"{path}: holds xacro macros; expand them first: xacro {Path(path).name} > arm.urdf")
     joints = [_joint(path, element) for element in robot.findall("joint")]
-    chain = _chain(path, robot, joints, tool_link)
+    chain = Tree(path, [element.get("name") for element in robot.findall("link")], joints).chain(tool_link)
     _check_units(path, list(dropwhile(lambda joint: not joint.rotary, chain)))
     return _arm(path, robot, chain, [joint for joint in chain if joint.rotary])
 
 
-def _check_units(path: str | Path, chain: list[_Joint]) -> None:
+def _check_units(path: str | Path, chain: list[Joint]) -> None:
     """Reject an arm whose lengths cannot be metres, or whose angles cannot be radians, which URDF's are."""
     for joint in chain:
         where, origin = f"{path}: joint {joint.name!r}", joint.element.find("origin")
@@ -130,14 +92,14 @@ def _check_units(path: str | Path, chain: list[_Joint]) -> None:
             raise InputError(f"{where}: its <origin> has the angle {angle:g} in rpy; expected are radians: write these")
 
 
-def _joint(path: str | Path, element: ET.Element) -> _Joint:
+def _joint(path: str | Path, element: ET.Element) -> Joint:
     """Read what every joint has."""
     name = element.get("name")
     if name is None:
         raise InputError(f"{path}: a <joint> has no name")
     kind, where = element.get("type", ""), f"{path}: joint {name!r}"
-    if kind not in (*_MOVING, "fixed"):
-        raise InputError(f"{where}: type {kind!r} is unknown; known are {', '.join((*_MOVING, 'fixed'))}")
+    if kind not in (*MOVING, "fixed"):
+        raise InputError(f"{where}: type {kind!r} is unknown; known are {', '.join((*MOVING, 'fixed'))}")
     links = []
     for tag in ("parent", "child"):
         found = element.find(tag)
@@ -148,7 +110,7 @@ def _joint(path: str | Path, element: ET.Element) -> _Joint:
     origin = element.find("origin")
     xyz, rpy = (_vector(where, origin, key, "0 0 0") for key in ("xyz", "rpy"))
     T = pose(rotation_of(rpy), xyz)
-    return _Joint(name, kind, links[0], links[1], T, element)
+    return Joint(name, kind, links[0], links[1], T, element)
 
 
 def rotation_of(rpy: Array) -> Array:
@@ -187,179 +149,7 @@ def _number(where: str, element: ET.Element, key: str) -> float | None:
     return value
 
 
-def _chain(path: str | Path, robot: ET.Element, joints: list[_Joint], tool_link: str | None) -> list[_Joint]:
-    """Return the joints from the base to the tool; what is left out beside them is logged."""
-    links = [element.get("name") for element in robot.findall("link")]
-    called: dict[str, list[str | None]] = {"links": links, "joints": [joint.name for joint in joints]}
-    for kind, names in called.items():
-        if twice := [name for name in names if names.count(name) > 1]:
-            raise InputError(f"{path}: two {kind} are called {twice[0]!r}")
-    above: dict[str, _Joint] = {}
-    for joint in joints:
-        for link in (joint.parent, joint.child):
-            if link not in links:
-                raise InputError(f"{path}: joint {joint.name!r}: there is no link {link!r}")
-        if joint.child in above:
-            raise InputError(
-                f"{path}: link {joint.child!r} hangs on two joints, {above[joint.child].name!r} and {joint.name!r}"
-            )
-        above[joint.child] = joint
-    chains = {link: list(_up(path, link, above))[::-1] for link in above}
-    chain = chains.get(tool_link or _tool(path, joints, chains), [])
-    held = [joint for joint in chain if joint.moves and not joint.rotary]
-    if not _is_arm(chain):
-        why = f" ({_named(held)} before it)" if held else ""
-        there = ", ".join(_tools(joints, chains)[:_SHOWN])
-        raise InputError(
-            f"{path}: link {tool_link!r} is not behind {FEWEST_JOINTS} to {MOST_JOINTS} rotary joints alone{why}; these "
-            f"are: {there or 'none'}"
-        )
-    if held:
-        _LOG.warning("%s: joints before the arm are held at zero: %s", path, ", ".join(joint.name for joint in held))
-    beside = [joint.name for joint in joints if joint.moves and joint not in chain]
-    if beside:
-        _LOG.warning(
-            "%s: the tool is %s; joints beside the arm are left out: %s", path, chain[-1].child, ", ".join(beside)
-        )
-    return chain
-
-
-def _tool(path: str | Path, joints: list[_Joint], chains: dict[str, list[_Joint]]) -> str:
-    """Return the link that is the tool where none is named: the end of the one arm of the tree.
-
-    Raises:
-        InputError: there is no arm, or several, or several links end it; the message names links for --tool-link.
-    """
-    arms = _arms(joints, chains)
-    rotary = [joint.name for joint in joints if joint.rotary]
-    ends = [tip for arm in arms for tip in _tips(arm, joints)]
-    if not arms:
-        others = [joint for joint in joints if joint.moves and not joint.rotary]
-        there = _tools(joints, chains)
-        if there:
-            why = (
-                f"the {len(rotary)} rotary joints do not follow one another; only serial arms are read here: give the link "
-                f"that is the tool, --tool-link {', or '.join(there[:_SHOWN])}"
-            )
-        elif others:
-            why = (
-                f"only arms of {FEWEST_JOINTS} to {MOST_JOINTS} rotary joints are read here; {_named(others[:_SHOWN])}"
-            )
-        else:
-            names = f" ({', '.join(rotary[:_SHOWN])}{', ..' if len(rotary) > _SHOWN else ''})" if rotary else ""
-            why = f"{len(rotary)} rotary joints{names}; an arm here has {FEWEST_JOINTS} to {MOST_JOINTS} in a row"
-        raise InputError(f"{path}: {why}")
-    if len(arms) > 1:
-        raise InputError(
-            f"{path}: holds {len(arms)} arms: give the link that is the tool, --tool-link {', or '.join(ends[:_SHOWN])}"
-        )
-    last = next(joint for joint in chains[arms[0]][::-1] if joint.rotary)
-    if _gripping(last):
-        before = ", or ".join(_tips(last.parent, joints))
-        raise InputError(
-            f"{path}: joint {last.name!r} is a gripper's by its name, not the arm's: give the link that is the tool, "
-            f"--tool-link {before}, or {', or '.join(ends[:_SHOWN])} if it is the arm's"
-        )
-    behind = {joint.name for chain in chains.values() if arms[0] in {j.child for j in chain} for joint in chain}
-    behind -= {joint.name for joint in chains[arms[0]]} | {joint.mimics for joint in joints}
-    if any(joint.name in behind and joint.rotary and not _gripping(joint) for joint in joints):
-        within = [joint for joint in joints if joint.name in behind and joint.moves and not joint.rotary]
-        raise InputError(
-            f"{path}: only arms of {FEWEST_JOINTS} to {MOST_JOINTS} rotary joints are read here; {_named(within)}: give "
-            f"the link that is the tool, --tool-link {', or '.join(ends[:_SHOWN])}"
-        )
-    if len(ends) == 1:
-        return ends[0]
-    flanges = [link for link in _rigid(arms[0], joints) if link.endswith(_FLANGE)]
-    if len(flanges) == 1:
-        others_ = ", ".join(link for link in ends if link not in flanges)
-        _LOG.warning("%s: the tool is %s; --tool-link names another: %s", path, flanges[0], others_)
-        return flanges[0]
-    raise InputError(
-        f"{path}: several links end the chain: give the one that is the tool, --tool-link {', or '.join(ends[:_SHOWN])}"
-    )
-
-
-def _is_arm(chain: list[_Joint]) -> bool:
-    """Return whether a chain has an arm's rotary joints, and none that moves otherwise between or behind them."""
-    moving = list(dropwhile(lambda joint: not joint.rotary and joint.mimics is None, (j for j in chain if j.moves)))
-    return all(joint.rotary for joint in moving) and FEWEST_JOINTS <= len(moving) <= MOST_JOINTS
-
-
-def _tools(joints: list[_Joint], chains: dict[str, list[_Joint]]) -> list[str]:
-    """Return the links that end an arm, those behind most joints first."""
-    ends = [link for link, chain in chains.items() if _is_arm(chain) and link in _tips(link, joints)]
-    return sorted(ends, key=lambda link: -sum(joint.rotary for joint in chains[link]))
-
-
-def _gripping(joint: _Joint) -> bool:
-    """Return whether a joint is a gripper's by its name."""
-    return any(word in joint.name.lower() for word in _GRIPPERS)
-
-
-def _named(joints: list[_Joint]) -> str:
-    """Return joints and how they move, as text."""
-    return ", ".join(f"{j.name!r} is {'a mimic' if j.kind in _ROTARY else j.kind}" for j in joints)
-
-
-def _rigid(link: str, joints: list[_Joint]) -> list[str]:
-    """Return a link and those that fixed joints hang on it."""
-    body = [link]
-    for one in body:
-        body += [joint.child for joint in joints if joint.parent == one and not joint.moves]
-    return body
-
-
-def _tips(link: str, joints: list[_Joint]) -> list[str]:
-    """Return the links that end the rigid body that begins with a link."""
-    body = _rigid(link, joints)
-    return [one for one in body if not any(joint.parent == one and joint.child in body for joint in joints)]
-
-
-def _arms(joints: list[_Joint], chains: dict[str, list[_Joint]]) -> list[str]:
-    """Return the first link behind the last joint of every arm of a tree.
-
-    Behind FEWEST_JOINTS rotary joints several on one body that are called fingers are a hand's, and one that a mimic joint
-    behind that body follows drives a gripper. An arm that forks otherwise is none.
-    """
-    followed = {joint.mimics: joint for joint in joints if joint.mimics}
-    roots = {joint.parent for joint in joints} - {joint.child for joint in joints}
-    found: list[str] = []
-
-    def walk(link: str, count: int) -> None:
-        body = _rigid(link, joints)
-        out = [joint for joint in joints if joint.parent in body and joint.moves]
-        rotary = [joint for joint in out if joint.rotary]
-        if count >= FEWEST_JOINTS:
-            behind = {joint.name for chain in chains.values() if {*body} & {j.parent for j in chain} for joint in chain}
-            rotary = [
-                joint for joint in rotary if joint.name not in followed or followed[joint.name].name not in behind
-            ]
-            if len(rotary) > 1 and all(_gripping(joint) for joint in rotary):
-                rotary = []
-        if not rotary and FEWEST_JOINTS <= count <= MOST_JOINTS:
-            found.append(link)
-        elif not count or len(rotary) == 1:
-            for joint in rotary if count else [joint for joint in out if joint.mimics is None]:
-                walk(joint.child, count + joint.rotary)
-
-    for root in sorted(roots):
-        walk(root, 0)
-    return found
-
-
-def _up(path: str | Path, link: str, above: dict[str, _Joint]) -> Iterator[_Joint]:
-    """Yield the joints from a link up to the base."""
-    seen = set()
-    while link in above:
-        if link in seen:
-            raise InputError(f"{path}: link {link!r} hangs on itself")
-        seen.add(link)
-        yield above[link]
-        link = above[link].parent
-
-
-def _arm(path: str | Path, robot: ET.Element, chain: list[_Joint], revolute: list[_Joint]) -> Arm:
+def _arm(path: str | Path, robot: ET.Element, chain: list[Joint], revolute: list[Joint]) -> Arm:
     """Return the arm of a chain of joints from the base to the tool."""
     links = [ChainLink(np.eye(4), np.zeros(3))]
     for joint in chain:
@@ -412,7 +202,7 @@ def _arm(path: str | Path, robot: ET.Element, chain: list[_Joint], revolute: lis
 
 
 def _written(where: str, element: ET.Element, key: str, count: int) -> Array:
-    """Read so many numbers of an attribute that :mod:`armsight.robot.urdf_write` writes."""
+    """Read so many numbers of an attribute that :mod:`armsight.robot.urdf.write` writes."""
     text = element.get(key, "")
     try:
         values = np.array([float(word) for word in text.split()])
