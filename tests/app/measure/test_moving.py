@@ -3,6 +3,7 @@
 import csv
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -111,6 +112,7 @@ def test_images_without_times_are_rejected(late, armsight):
 
 
 def test_a_rig_file_that_the_shots_have_nothing_for_is_said(tmp_path, capsys):
-    assert not measure_run._keep_noise(example_rig((640, 360)), None, False, None, tmp_path / "rig.json")
+    shots = SimpleNamespace(noise=None, skewed=[])
+    assert not measure_run._keep_noise(example_rig((640, 360)), shots, [], tmp_path / "rig.json")
     assert "rig.json was not written: too few shots" in capsys.readouterr().err
     assert not (tmp_path / "rig.json").exists()

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from armsight.app.measure import run as measure_module
+from armsight.app.measure import shots as measure_module
 from armsight.app.measure import view as view_module
 from armsight.app.measure.chart import SHOT, TIME, _intervals, chart, chart_data
 from armsight.app.measure.picture import (

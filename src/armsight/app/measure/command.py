@@ -86,22 +86,25 @@ def command(
         raise InputError("give the shots one way: --left and --right, or --source, or --detections")
 
     from armsight.app.measure.run import measure_shots
+    from armsight.app.measure.shots import Options
 
     health = measure_shots(
-        rig,
-        target,
-        left=left,
-        right=right,
-        source=source,
-        detections=detections,
-        fixed=fixed,
-        skew=skew,
-        readout=readout,
-        save_rig=save_rig,
-        output=output,
-        streams=stream,
-        view_dir=view_dir,
-        as_json=as_json,
+        Options(
+            rig,
+            target,
+            left,
+            right,
+            source,
+            detections,
+            fixed,
+            skew,
+            readout,
+            save_rig,
+            output,
+            stream,
+            view_dir,
+            as_json,
+        )
     )
     if any(each.forbids for each in health):
         click.get_current_context().exit(UNTRUSTED)
