@@ -22,9 +22,9 @@ from armsight.app.measure.picture import (
     marks_of,
     wrapped,
 )
-from armsight.app.measure.poses import ShotPose, shot_pose
 from armsight.app.measure.view import CHART, EACH_UP_TO, PictureFolder, view_folder
 from armsight.app.report import page
+from armsight.app.shot_pose import ShotPose, shot_pose
 from armsight.data import SIDES, Detections, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, transform

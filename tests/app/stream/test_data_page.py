@@ -11,9 +11,9 @@ pytest.importorskip("mcap_protobuf")
 from test_run_mcap import BODY, measured, write
 
 from armsight.app.export.tables import tables_of
-from armsight.app.measure.poses import CSV_COLUMNS, SHUTTER_COLUMNS
 from armsight.app.replay.recorded import read_run
 from armsight.app.replay.tables import LIVE_COLUMNS
+from armsight.app.shot_pose import CSV_COLUMNS, SHUTTER_COLUMNS
 from armsight.app.stream.datum import JointsDatum, ShotDatum
 from armsight.app.stream.mcap_file import METADATA
 from armsight.app.stream.ros import TO_ROS

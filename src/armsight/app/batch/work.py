@@ -89,8 +89,8 @@ def _local(path: str) -> Iterator[str]:
 
 def _replay(path: str, options: BatchOptions) -> tuple[Row, list[Row]]:
     """Replay a recording."""
-    from armsight.app.measure.poses import csv_text
     from armsight.app.replay.open import Request, replay
+    from armsight.app.shot_pose import csv_text
     from armsight.files import read_table
 
     notes: list[str] = []

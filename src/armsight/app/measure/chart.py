@@ -1,6 +1,6 @@
 """The strip chart of many shots: how each was found, the pose, its sigmas and the residuals, one above the other.
 
-In: the shots' :class:`~armsight.app.measure.poses.ShotPose`. Out: a PNG.
+In: the shots' :class:`~armsight.app.shot_pose.ShotPose`. Out: a PNG.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.measure.picture import angle_sigmas_deg
-from armsight.app.measure.poses import ANGLES, ShotPose
 from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png
+from armsight.app.shot_pose import ANGLES, ShotPose
 from armsight.data import Array, Record
 
 if TYPE_CHECKING:

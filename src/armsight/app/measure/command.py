@@ -86,10 +86,10 @@ def command(
         raise InputError("give the shots one way: --left and --right, or --source, or --detections")
 
     from armsight.app.measure.run import measure_shots
-    from armsight.app.measure.shots import Options
+    from armsight.app.measure.shots import MeasureOptions
 
     health = measure_shots(
-        Options(
+        MeasureOptions(
             rig,
             target,
             left,

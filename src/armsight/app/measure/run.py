@@ -14,11 +14,11 @@ import numpy as np
 
 from armsight.app.measure.moving import Requested, requested_shutters
 from armsight.app.measure.picture import SINGULAR
-from armsight.app.measure.poses import ANGLES, ShotPose, csv_text, shot_pose
-from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, Options, Result, open_shots
+from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, MeasureOptions, Result, open_shots
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.messages import colour, weak
 from armsight.app.progress import bar
+from armsight.app.shot_pose import ANGLES, ShotPose, csv_text, shot_pose
 from armsight.app.stream.datum import Published, ShotDatum
 from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Body, Dropped, Missed, PoseEstimate, Shot
@@ -43,7 +43,7 @@ _RECORDED = "they are no new measurements: leave them out, and record at the rat
 _LIVE_S = 10.0
 
 
-def measure_shots(options: Options) -> tuple[HealthFinding, ...]:
+def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
     """Measure the pose of a target in every shot, and print a line for each.
 
     Returns:
@@ -99,7 +99,7 @@ def measure_shots(options: Options) -> tuple[HealthFinding, ...]:
     return health
 
 
-def _check_detections(options: Options, requested: Requested | None) -> None:
+def _check_detections(options: MeasureOptions, requested: Requested | None) -> None:
     """Reject options that need images where only detections are given."""
     if options.detections is None:
         return

@@ -16,7 +16,7 @@ import click
 import numpy as np
 
 from armsight.app.measure.moving import NOTED_SHOTS, Requested, moved_results, skew_finding
-from armsight.app.measure.poses import ShotPose
+from armsight.app.shot_pose import ShotPose
 from armsight.data import SIDES, Body, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.files import check_writable
@@ -46,7 +46,7 @@ _ROTATED_SPARE_DEG = 35.0
 
 
 @dataclass(frozen=True)
-class Options:
+class MeasureOptions:
     """What ``armsight measure`` is given.
 
     Attributes:
@@ -107,7 +107,7 @@ class DetectedShots:
     discs = noise = None
     recorded = True
 
-    def __init__(self, options: Options, rig: StereoRig) -> None:
+    def __init__(self, options: MeasureOptions, rig: StereoRig) -> None:
         """Read them."""
         self.body, shots, self.printed = _detected(Path(str(options.detections)), options.target)
         self._by_name = {shot.name: shot for shot in shots}
@@ -144,7 +144,9 @@ class ImageShots:
         skewed: filled at the end: that the cameras do not expose at one time.
     """
 
-    def __init__(self, options: Options, rig: StereoRig, requested: Requested | Shutters | None, draws: bool) -> None:
+    def __init__(
+        self, options: MeasureOptions, rig: StereoRig, requested: Requested | Shutters | None, draws: bool
+    ) -> None:
         """Open target and source, say what is known of them; ``draws``: whether the images are drawn afterwards."""
         self._options, self._rig = options, rig
         self._target = target = open_target(options.target)
@@ -215,7 +217,7 @@ class ImageShots:
 
 
 def open_shots(
-    options: Options, rig: StereoRig, requested: Requested | Shutters | None, draws: bool
+    options: MeasureOptions, rig: StereoRig, requested: Requested | Shutters | None, draws: bool
 ) -> DetectedShots | ImageShots:
     """Open the shots that options name; ``draws``: whether their images are drawn afterwards.
 

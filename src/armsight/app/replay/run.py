@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.measure.poses import ShotPose, left_axes, shot_pose
 from armsight.app.replay.recorded import EventDatum, JointsDatum, RecordedDatum, RecordedRun, ShotDatum
+from armsight.app.shot_pose import ShotPose, left_axes, shot_pose
 from armsight.app.stream.datum import quaternion
 from armsight.app.stream.sink import Publisher
 from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Shot

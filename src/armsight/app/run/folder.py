@@ -26,7 +26,6 @@ import cv2
 import numpy as np
 
 from armsight.app.interrupts import uninterrupted
-from armsight.app.measure.poses import UPPER, ShotPose, csv_text, left_axes, shot_pose
 from armsight.app.record.recording import record
 from armsight.app.report.page import PAGE, writable_folder
 from armsight.app.run.calibrate import HandEyeRun
@@ -36,6 +35,7 @@ from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import Log, RunData, ToolTrack, assembled, cut, joints_of, write_columns, write_track
 from armsight.app.run.report import NAMES, Beside, RunReport, drawn_beside, write_run_report
 from armsight.app.run.summary import RunSummary, summary_of
+from armsight.app.shot_pose import UPPER, ShotPose, csv_text, left_axes, shot_pose
 from armsight.app.stream.mcap_file import RUN_MCAP
 from armsight.data import Array, Correspondences, Image, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError

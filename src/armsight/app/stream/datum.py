@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.measure.poses import left_axes, shot_pose
+from armsight.app.shot_pose import left_axes, shot_pose
 from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Record, Shot
 from armsight.files import finite_json
 from armsight.loop.estimators import KalmanEstimator, Mounting, Remembered

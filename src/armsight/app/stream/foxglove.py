@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import cv2
 import numpy as np
 
-from armsight.app.measure.poses import left_axes
+from armsight.app.shot_pose import left_axes
 from armsight.app.stream.datum import EventDatum, JointsDatum, NoteDatum, Published, ShotDatum, quaternion
 from armsight.data import SIDES, Array, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
