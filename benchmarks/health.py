@@ -444,7 +444,7 @@ def followed_cameras(seed: int, rotated: np.ndarray) -> str:
     """Rotate the right camera in mid-run; return what putting it right leaves."""
     poses, follower, rig, squares, at_s = [], None, None, [], np.nan
     for monitor, t_s, T, estimate, _ in faults.watched_body(seed, rotated=rotated, at_s=5.0, seconds=BODY_S):
-        given = monitor._rig._rig
+        given = monitor._rig.rig
         follower = follower or RigFollower(given, faults.BODY)
         poses.append((t_s, estimate))
         if rig is not None:

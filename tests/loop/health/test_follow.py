@@ -43,7 +43,7 @@ def test_cameras_that_moved_in_the_newest_test_are_put_right_after_the_next_one(
     """A large rotation is found by the few shots after it that the running test has: it may have begun at any of them."""
     one, poses, found, rotated = None, [], None, np.radians([0.0, 0.0, 0.2])
     for monitor, t_s, _, estimate, _ in faults.watched_body(5100, rotated=rotated, at_s=5.0, seconds=20.0):
-        one = one or RigFollower(monitor._rig._rig, faults.BODY)
+        one = one or RigFollower(monitor._rig.rig, faults.BODY)
         poses.append((t_s, estimate))
         if (watch := monitor.cameras_moved()) is not None and (since_s := watch.moved_since_s()) is not None:
             found = one.cameras(since_s, poses, t_s)
@@ -180,5 +180,5 @@ def test_fixed_bodies_show_by_how_much_both_cameras_moved():
 
 def test_a_pose_is_measured_again_with_another_rig():
     *_, (monitor, _, _, estimate, _) = faults.watched_body(7004, seconds=0.1)
-    again = remeasured(monitor._rig._rig, faults.BODY, estimate)
+    again = remeasured(monitor._rig.rig, faults.BODY, estimate)
     assert np.linalg.norm(log_se3(inverse(again.T_left_body) @ estimate.T_left_body)[:3]) < 1e-4

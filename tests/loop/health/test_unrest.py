@@ -3,7 +3,7 @@
 import faults
 import numpy as np
 import pytest
-from faults import strained, watched_body
+from faults import ended, strained, watched_body
 
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.health.fixed import Unrest
@@ -57,7 +57,7 @@ def test_shots_of_one_time_say_nothing_of_unrest():
 
 
 def test_images_seen_before_say_nothing_new():
-    shots = [(monitor._rig._rig, t_s, estimate) for monitor, t_s, _, estimate, _ in watched_body(51, seconds=3.0)]
+    shots = [(monitor._rig.rig, t_s, estimate) for monitor, t_s, _, estimate, _ in watched_body(51, seconds=3.0)]
     once, often = (RigWatch(shots[0][0], faults.BODY, faults.SYNC_S) for _ in range(2))
     for k in range(5):
         for _, t_s, estimate in shots:
@@ -89,3 +89,10 @@ def test_what_hardly_displaces_poses_forbids_nothing():
     assert first.startswith("note: ")
     assert second.startswith("do not trust this result: ")
     assert "by up to 0.50 mm" in second
+
+
+def test_a_lens_that_breathes_within_a_second_is_a_lens():
+    breathes = {"focal": lambda t: (0.0, 1e-3 * np.sin(4 * np.pi * t))}
+    (found,) = ended(3402, at_s=1.0, seconds=12.0, **breathes)
+    assert (found.cause, found.unit, found.alternatives) == ("lens", "%", ("rig",))
+    assert 0.04 < found.size < 0.1  # 0.07 RMS, of which a parabola takes some

@@ -305,6 +305,8 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
         delay, shutters = with_led(by_sweep, shutters, blinked, loop.led.row_shares, loop.led.reading)
         sigma_s = float(np.hypot(by_sweep.sigma_s, delay.sigma_s))
         loop.led.apart = (by_sweep.delay_s - delay.delay_s, sigma_s, loop.t_s)
+    if loop.shutters is None and shutters is not None:
+        loop.health.times_found()
     loop.shutters, loop.delay_s = shutters, delay.delay_s
     if shutters is not None:
         loop.follower.expose_apart(float(np.hypot(shutters.skew_s, shutters.jitter_s)))

@@ -30,7 +30,7 @@ from armsight.data import Array
 from armsight.loop.estimators import Innovation, Outcome
 from armsight.loop.estimators.armerror import layout
 from armsight.loop.health.change import MARGIN, RAMPS, Change, Suspect, changing, happened_besides, ranked, suspects
-from armsight.loop.health.record import alarm_limit
+from armsight.loop.health.record import LEVER_M, alarm_limit
 
 #: A block lasts so long, s, and until all joints together have travelled so far, rad, but at most so long, s: an arm that
 #: stands says the same thing again and again.
@@ -64,7 +64,7 @@ def _limits(joints: int) -> dict[int, float]:
     All suspects and the beginnings that are tried share the probability of a false alarm.
     """
     hypotheses = len(suspects(joints)) * _BEGINS
-    return {freedom: MARGIN * alarm_limit(freedom, 1.0 / BLOCK_S, hypotheses) for freedom in (1, 6, 7, 12)}
+    return {freedom: MARGIN * alarm_limit(freedom, 1.0 / BLOCK_S, hypotheses) for freedom in (1, 4, 6, 7, 10, 12)}
 
 
 @lru_cache
@@ -77,7 +77,7 @@ def _unsure(joints: int, blocks: int) -> dict[int, float]:
     """
     hypotheses = len(suspects(joints)) * _BEGINS
     single = MARGIN * alarm_limit(1, 1.0 / BLOCK_S, hypotheses, blocks)
-    return {1: single - _limits(joints)[1], 6: 0.0}
+    return {1: single - _limits(joints)[1], 4: 0.0, 6: 0.0}
 
 
 class _Tested(NamedTuple):
@@ -164,7 +164,8 @@ class ClosureWatch:
         self._clock_s: list[float] = []
         self._merged: list[int] = []  # how many blocks each one is of
         self._newest: Innovation | None = None
-        self._wide = np.full(RAMPS + 6 + 2 * joints - 1, _WIDE_RAD)
+        self._wide = np.full(RAMPS + 9 + 2 * joints, _WIDE_RAD)
+        self._wide[-1] = _WIDE[0]
         self._wide[:6] = self._wide[RAMPS : RAMPS + 6] = _WIDE
         self._wide[6] = _WIDE_S
         self._rejected: list[Innovation] = []
@@ -423,7 +424,7 @@ class ClosureWatch:
                 cov = (by**2 / own[n, part])[:, None]
             else:
                 G, inner = white[:, :, part], (ramp_C if each.slow else step_C)[:, each.columns, each.columns]
-                inner = (inner - np.swapaxes(G, 1, 2) @ G) * (by[:, None] * (by / excess)) + np.eye(6)
+                inner = (inner - np.swapaxes(G, 1, 2) @ G) * (by[:, None] * (by / excess)) + np.eye(len(by))
                 solved = np.linalg.solve(inner, right[:, part, None])[..., 0]
                 n = int(np.argmax(np.einsum("sc,sc->s", right[:, part], solved)))
                 cov = np.linalg.inv(inner[n]) * (by[:, None] * by)
@@ -441,7 +442,9 @@ def _matters(change: Change) -> bool:
     if change.suspect.cause == "time":
         return True
     if change.suspect.moves:
-        return float(np.linalg.norm(change.newest[0][:3])) > _LEAST_M
+        shift = change.newest[0]
+        turned = float(np.linalg.norm(change.size[:3])) if change.suspect.kind == "sag" else 0.0
+        return float(np.linalg.norm(shift[:3])) > _LEAST_M or turned * LEVER_M > _LEAST_M / 2.0
     return float(np.linalg.norm(change.size)) > _LEAST_RAD
 
 

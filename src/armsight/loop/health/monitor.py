@@ -198,6 +198,12 @@ class HealthMonitor:
         self._kept += self._left(correction)
         self._renew(correction)
 
+    def times_found(self) -> None:
+        """Begin the tests of the cameras anew: when they expose was not known before, which looks like what moved."""
+        self.work()
+        if self._rig is not None:
+            self._watch_cameras(self._rig.rig)
+
     def put_right(self, correction: RigCorrection) -> Remembered | None:
         """Begin anew after a correction; what was found stays found.
 
@@ -249,10 +255,14 @@ class HealthMonitor:
     def _renew(self, correction: RigCorrection) -> None:
         """Begin the tests of cameras and bodies anew."""
         if correction.update is not None:
-            self._rig = RigWatch(correction.update.rig, self._body, self._sync_s, printed=self._printed)
-            self._suspected, self._cameras_s = None, np.inf
+            self._watch_cameras(correction.update.rig)
         if self._landmarks is not None:
             self._landmarks = LandmarkWatch(self._fixed_names)
+
+    def _watch_cameras(self, rig: StereoRig) -> None:
+        """Begin the tests of cameras, as they are now, anew."""
+        self._rig = RigWatch(rig, self._body, self._sync_s, printed=self._printed)
+        self._suspected, self._cameras_s = None, np.inf
 
     @property
     def measurements(self) -> tuple[KeptMeasurement, ...]:

@@ -13,8 +13,8 @@ times alone, c their values that all shots of the test share. Late exposures, an
 shutters are all of this form. A focal length has one value in each test. Hypotheses are compared by their evidence (MacKay,
 1992), which takes off what chance explains: of numbers that each shot has anew it is much.
 
-A camera that nods has another rotation in each shot, and looks much the same: times explain a test only where their
-evidence is larger than that of three angles of each shot (``nodding``).
+A camera that nods, or a lens that breathes, has another rotation or focal length in each shot, and looks much the same:
+times explain a test only where their evidence is larger than that of these four of each shot (``nodding``).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ from armsight.loop.health.shape import ResidualSums, eliminated
 
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
 _APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
-#: Standard deviations that are tried of the rotation about an axis that a camera which nods has anew in each shot, rad.
+#: Standard deviations that are tried of what is anew in each shot: rotations about an axis, rad, a focal length's share.
 #: Half: a nod of 0.1 deg counts for less against times, double: one of 0.3 deg counts, too, in which poses are not linear.
 _NOD_RAD = tuple(1e-5 * 2.0**k for k in range(9))
 #: The velocity of measured poses is off by this share of the speed in any direction; half: rig and body are blamed for what
@@ -161,10 +161,10 @@ def apart(shots: Sequence[tuple[Array, Array, float]]) -> Apart | None:
 
 
 def nodding(shots: Sequence[tuple[Array, Array, float]]) -> float:
-    """Return twice the log-evidence of a camera that has another rotation in each shot, against none.
+    """Return twice the log-evidence of a camera that has another rotation or focal length in each shot, against none.
 
     Args:
-        shots: residuals (n,), their derivatives by the rotation (n, 3), and weights.
+        shots: residuals (n,), their derivatives by these (n, 4), and weights.
     """
     W, b, weights = _normal(shots)
 
@@ -208,14 +208,6 @@ def eliminate(found: Apart, shots: Sequence[tuple[Array, Array, float]], sums: R
     sums.M -= shared.T @ np.linalg.solve(found.information, shared)
 
 
-@dataclass(frozen=True, eq=False)
-class PassingSums:
-    """The sums of a test in which something passing was eliminated, and the times of its exposures; None for a lens."""
-
-    sums: ResidualSums
-    apart: Apart | None
-
-
 @dataclass
 class Passing:
     """What was found that changes and does not stay; one of a watch.
@@ -246,8 +238,8 @@ class Passing:
         size: int,
         found: Apart | None,
         sums: ResidualSums | None,
-    ) -> PassingSums | None:
-        """Decide what explains a test best; return its sums with that eliminated, None where it is something that stays.
+    ) -> Literal["time", "lens"] | None:
+        """Decide what explains a test best, and return it: None where it is something that stays.
 
         Args:
             every: the sums of the test: parameters, seven numbers, candidates, the first of which is a focal length.
@@ -259,7 +251,6 @@ class Passing:
         # What the test before showed goes on, more likely than that it ended and something else began.
         by_lens, by_apart = (-_AHEAD if shown else 0.0 for shown in (self.focal_share, self.apart_s))
         self.apart_s = self.focal_share = 0.0
-        focal = 1 + size + 7
         cost = float(eliminated(every.M[: 1 + size, : 1 + size], slice(1, 1 + size))[0, 0])
         M = eliminated(every.M, slice(1, 1 + size))
         all_explain = (
@@ -286,16 +277,13 @@ class Passing:
             return None
         if time >= lens:
             assert found is not None
-            assert sums is not None
             self.apart_s = math.hypot(found.apart_s, float(np.linalg.norm(found.shared_s[:3])))
             self.apart = min(self.apart[0], every.begin_s), (*self.apart[1], found)
-            return PassingSums(sums, found)
+            return "time"
         M = eliminated(every.M, slice(1, 1 + size))
         self.focal_share = _FOCAL * float(M[0, 8] / (M[8, 8] + 1.0))
         self.focal = min(self.focal[0], every.begin_s), (*self.focal[1], self.focal_share)
-        rest, column = every.of(len(every.b)), every.M[focal]
-        rest.M -= np.outer(column, column) / (1.0 + every.M[focal, focal])
-        return PassingSums(rest, None)
+        return "lens"
 
     def added(self, exposed: ExposedShot, by_focal: Array) -> Array:
         """Return the covariance (6, 6) of a pose by what is passing now.

@@ -18,9 +18,10 @@ What the camera model lacks (a lens whose distortion it cannot express, a sensor
 at the same position in an image by the same: r = ... + L beta, with L polynomials of the position, of which each camera has
 its own. It is reported where beta explains more than any change of the seven numbers at any time does.
 
-A camera that nods averages out in the sums: what single shots say of its rotation is compared within each second, and what
-it varies beyond the noise is a covariance of its own, which differs from shot to shot (``fixed``). Images that were seen
-before, to the bit, say nothing new.
+A camera that nods or a lens that breathes averages out in the sums: what single shots say of its rotation and of a focal
+length is compared within each second, and what it varies beyond the noise is a covariance of its own (``fixed``). Images
+that were seen before, to the bit, say nothing new. What images leave in all that is near each other, for a second, is in
+the noise of each test, as large as the rig itself shows it (:mod:`~armsight.loop.health.leftover`).
 
 What changes and does not stay is a hypothesis of each single test (:mod:`~armsight.loop.health.passing`): each shot's own
 times of exposure, a focal length. Where its evidence is the largest the test is counted with that eliminated, so that
@@ -37,7 +38,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.special import chdtri
 
 from armsight.data import Array, Body, Ids, PoseEstimate, Record
@@ -45,12 +46,12 @@ from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import adjoint, inverse, log_se3, pose
 from armsight.kernels import kernel
 from armsight.loop.health.fixed import Unrest
+from armsight.loop.health.leftover import Leftover
 from armsight.loop.health.passing import (
     TRACK,
     Apart,
     ExposedShot,
     Passing,
-    PassingSums,
     apart,
     eliminate,
     nodding,
@@ -113,8 +114,8 @@ _SUSPECTED = float(chdtri(len(_WIDE), 0.02))
 #: The polynomials of the position in an image are all products of x and y up to this degree; their count.
 _DEGREE = 4
 _POLYNOMIALS = (_DEGREE + 1) * (_DEGREE + 2) // 2
-#: Numbers of what the camera models lack: of two cameras, along u and v; and how wide their prior is, px.
-_LENS, _LENS_PX = 4 * _POLYNOMIALS, 1.0
+#: Numbers of what the camera models lack: of two cameras, along u and v; their prior is 1 px wide.
+_LENS = 4 * _POLYNOMIALS
 #: Standard deviations of its prior that are tried: the one of the largest evidence is taken (MacKay, 1992).
 _LENS_SCALES_PX = tuple(2.0**k for k in range(-6, 2))
 #: It is tested in every so many tests, from so many poses that differ; its chi-square of an alarm.
@@ -198,6 +199,7 @@ class RigWatch:
         printed: whether the body is a print whose shape a calibration found: its points are not tested.
 
     Attributes:
+        rig: the pair.
         prior: (K, K) square root of the covariance of all parameters: the rig's, scale and points of the body, skew. The
             skew's is zero: what is not known of it is one of the seven numbers.
         suspected: the change that the newest test found, where it matters and is more likely than not; it widens poses.
@@ -209,7 +211,7 @@ class RigWatch:
     """
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
-        self._rig, self._body, self._sync_s = rig, body, sync_s
+        self.rig, self._body, self._sync_s = rig, body, sync_s
         self._points = np.unique(np.linspace(0, len(body.points) - 1, MOST_POINTS).astype(int))
         count, shape = rig.parameter_count, 3 * len(self._points)
         self._size = count + 1 + shape + 1
@@ -222,9 +224,10 @@ class RigWatch:
         names = tuple(body.point_names[k] for k in self._points)
         many = len(body.points) > MOST_POINTS
         points = np.asarray(body.points, float)[self._points]
+        self._focal = _focal_changes(rig, self._size)
         self._shape = ShapeWatch(
             self._size,
-            _focal_changes(rig, self._size),
+            self._focal,
             count + 1,
             points,
             names,
@@ -235,6 +238,13 @@ class RigWatch:
         # (K, K + 7 + C) what the parameters, the seven numbers and the candidates of the shape change of the parameters, in
         # units of their priors: a test has sums of these.
         self._scaled = np.hstack([self.prior, self._by_fault * _WIDE, self._shape.by_wide])
+        # The same with the coefficients of what the camera models lack, px.
+        self._with_lens = block_diag(self._scaled, np.eye(_LENS))
+        # What moves to and fro of the parameters: the right camera's rotation (3), rad, a focal length against the other;
+        # and what a focal length does of the right camera alone, and of the left one.
+        last, (apart_f, both_f) = rig.parameter_count, self._focal.T
+        self._to_and_fro = np.column_stack([np.eye(self._size)[:, last - 3 : last], apart_f])
+        self._alone = np.column_stack([apart_f - 0.5 * both_f, apart_f + 0.5 * both_f])
         self._shots = 0
         self._row_of = np.full(len(body.points), -1)
         self._row_of[self._points] = np.arange(len(self._points))
@@ -252,18 +262,21 @@ class RigWatch:
         self._pair = (*pair_arguments(rig.cameras), counts, inverse(rig.T_left_right))
         self._p_body = np.array(body.points, float, order="C")
         self._half_px = np.array([camera.image_size_px for camera in rig.cameras]) / 2.0
+        self._focal_px = np.array([camera.intrinsics[:2] for camera in rig.cameras])
         # Shots of the running test, in stays; sums since the beginning are for what the camera models lack.
         self._stays: list[list[_ShotResiduals]] = []
-        self._window, self._whole = ResidualSums(self._size + len(_WIDE), 0.0), ResidualSums(self._full, 0.0)
+        self._window = ResidualSums(self._size + len(_WIDE), 0.0)
+        self._whole, self._leftover = ResidualSums(self._with_lens.shape[1], 0.0), Leftover()
         self.lens: LensError | None = None
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
+        self._plain: deque[ResidualSums] = deque(maxlen=_KEPT)  # the same with what images leave beyond noise
         self._timed = False
         self._doubted: ResidualSums | None = None  # what the alarm of the test before would have rested on
         self._poses = 0  # that differ
         self.alarm = self.alarmed = False
         self._alarms = 0  # in a row
         self.suspected: RigChange | None = None
-        self.noise, self._unrest = np.zeros((6, 6)), Unrest(3)
+        self.noise, self._unrest = np.zeros((6, 6)), Unrest(4)
         self._images: dict[bytes, None] = {}  # detections of shots that were summed, the newest last
 
     def take(self, estimate: PoseEstimate, t_s: float | None) -> Array:
@@ -308,29 +321,34 @@ class RigWatch:
         return not known
 
     def _nodding(self, response: Array, T: Array) -> Array:
-        """Return the covariance (6, 6) that a camera which nods adds to a pose (4, 4); either camera may be the one.
+        """Return the covariance (6, 6) that a camera which nods or a lens that breathes adds to a pose (4, 4).
 
-        By the left one, in whose frame poses are, the body moves as well.
+        Either camera may be the one; by a rotation of the left one, in whose frame poses are, the body moves as well.
         """
-        last = self._rig.parameter_count
-        by_right = response[:, last - 3 : last]
-        by_left = by_right + adjoint(inverse(T))[:, 3:] @ self._rig.T_left_right[:3, :3]
-        cov = self._unrest.cov
+        by_rotation = response[:, : self._size] @ self._to_and_fro[:, :3]
+        by_focal = response[:, : self._size] @ self._alone
+        by_right = np.column_stack([by_rotation, by_focal[:, 0]])
+        by_rotation = by_rotation + adjoint(inverse(T))[:, 3:] @ self.rig.T_left_right[:3, :3]
+        by_left, cov = np.column_stack([by_rotation, by_focal[:, 1]]), self._unrest.cov
         return np.asarray(0.5 * (by_right @ cov @ by_right.T + by_left @ cov @ by_left.T))
 
+    def _moving(self, rows: Array) -> Array:
+        """Return the derivatives (n, 4) of a shot's rows by what moves to and fro."""
+        return np.asarray(rows[:, 1 : 1 + self._size] @ self._to_and_fro)
+
     def _take_unrest(self, stays: Sequence[Sequence[_ShotResiduals]]) -> None:
-        """Compare what the shots of a test say of the right camera's rotation."""
-        shots, last = [shot for stay in stays for shot in stay], 1 + self._rig.parameter_count
-        J, r = [each.rows[:, last - 3 : last] for each in shots], [each.rows[:, 0] for each in shots]
+        """Compare what the shots of a test say of the right camera's rotation and a focal length."""
+        shots = [shot for stay in stays for shot in stay]
+        J, r = [self._moving(each.rows) for each in shots], [each.rows[:, 0] for each in shots]
         H, b = np.array([each.T @ each for each in J]), np.array([j.T @ e for j, e in zip(J, r, strict=True)])
         cov = np.linalg.inv(H)
         d = np.einsum("nij,nj->ni", cov, b)
-        freedom = sum(map(len, r)) - 9.0 * len(shots)
+        freedom = sum(map(len, r)) - 10.0 * len(shots)
         excess = (sum(float(e @ e) for e in r) - float(np.vdot(b, d))) / max(freedom, 1.0)
         self._unrest.take(np.array([each.t_s for each in shots]), d, cov, max(excess, 1.0))
 
     def _unrest_weighed(self, rows: Array, other: Array | None = None) -> Array:
-        """Return rows of a shot, or others (n, K) of it, with the rotation of a camera that nods in their noise.
+        """Return rows of a shot, or others (n, K) of it, with what moves to and fro in their noise.
 
         That is (I + J V J^T)^-1/2 times them.
         """
@@ -338,8 +356,7 @@ class RigWatch:
         if not self._unrest.cov.any():
             return given
         values, vectors = np.linalg.eigh(self._unrest.cov)
-        last = 1 + self._rig.parameter_count
-        J = rows[:, last - 3 : last] @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        J = self._moving(rows) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
         squares, axes = np.linalg.eigh(J.T @ J)
         squares = np.maximum(squares, 1e-12)
         J = J @ axes
@@ -418,7 +435,7 @@ class RigWatch:
         part: Part = max(("rig", "body"), key=lambda each: (more[each], change.alone[each]))
         sure = more[part] > chdtri(_PARTS[part].stop - _PARTS[part].start, _NECESSARY)
         found = _FINDINGS[part](change, None, not sure)
-        rig = self._rig.perturbed(free_directions(self._rig) @ change.f[_PARTS["rig"]])
+        rig = self.rig.perturbed(free_directions(self.rig) @ change.f[_PARTS["rig"]])
         body = replace(self._body, points=(1.0 + change.f[_SCALED]) * self._body.points)
         return rig, body, found if self._poses > 1 else _of_one_pose(found)
 
@@ -438,13 +455,13 @@ class RigWatch:
         noise_px2 = _differentiate(
             *self._pair, self._half_px, size * self._p_body, self._row_of, np.asarray(ids, np.int64),
             uv, np.ascontiguousarray(seen.cov_uv[rows]),
-            max(self._rig.sigma_px, 1e-6), np.array(T, order="C"),
+            max(self.rig.sigma_px, 1e-6), np.array(T, order="C"),
             self._velocity(estimate.T_left_body, now_s), A, whole,
         )  # fmt: skip
         if not np.isfinite(noise_px2):
             return None
         if size != 1.0:  # the residuals of a body as its file says, were they linear
-            by_size = 1 + self._rig.parameter_count
+            by_size = 1 + self.rig.parameter_count
             whole[:, by_size] /= size
             whole[:, 0] += (size - 1.0) * whole[:, by_size]
         self._noise_px = float(np.sqrt(noise_px2))
@@ -520,11 +537,10 @@ class RigWatch:
 
         Args:
             stays: they.
-            every: with points that do not fit, no lens.
+            every: with points that do not fit.
             own: times of exposure that are eliminated.
         """
-        size = self._size if every else self._full
-        sums = ResidualSums(size, stays[0][0].t_s if stays else 0.0)
+        sums = ResidualSums(self._full, stays[0][0].t_s if stays else 0.0)
         for alone in (True, False):  # those of one shot are summed at once
             shots = [
                 (self._unrest_weighed(each.every if every else each.rows), len(stay))
@@ -534,11 +550,16 @@ class RigWatch:
             ]
             if shots:
                 rows = [each if alone else each / np.sqrt(count) for each, count in shots]
-                sums.take(np.concatenate(rows)[:, : 1 + size], sum((len(each) - 6.0) / count for each, count in shots))
+                sums.take(np.concatenate(rows), sum((len(each) - 6.0) / count for each, count in shots))
         if own is not None:
-            parts = self._weighed_parts(stays, every=every)
-            eliminate(own, [(each[:, : 1 + size], moved, weight) for each, moved, weight in parts], sums)
+            eliminate(own, self._weighed_parts(stays, every=every), sums)
         return sums
+
+    def _in_units(
+        self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool = False, own: Apart | None = None
+    ) -> ResidualSums:
+        """Return the same sums of all that may have changed, in units of its priors, and of the lenses' coefficients."""
+        return self._summed(stays, every=every, own=own).by(self._with_lens)
 
     def _decide(self, *, ends: bool = False) -> None:
         """Test for a change with the newest sums; weigh the older ones down."""
@@ -546,45 +567,51 @@ class RigWatch:
         if not stays:
             return
         self._poses += len(stays)
-        whole = self._summed(stays)
-        every = whole.of(self._size).by(self._scaled)
-        test = every.of(len(self._window.b))
-        if any(each.every is not each.rows for stay in stays for each in stay):
-            every = self._summed(stays, every=True).by(self._scaled)
+        whole, left = self._in_units(stays), self._leftover
+        all_fit = all(each.every is each.rows for stay in stays for each in stay)
+        every = whole if all_fit else self._in_units(stays, every=True)
         moments = [stay[0] for stay in stays if len(stay) == 1]
+        share = len(stays) / sum(map(len, stays))
+        noise, evidence = left.seen(whole, _LENS, share)
+        test = left.without(whole, _LENS, noise).of(len(self._window.b))
         weight = float(np.exp(-1.0 / FORGET_TESTS))
         self._window.scale(weight)
         self._window.add(test, 1.0)
         change, own = self._estimated(self._window), None
         if self.passing.now or change.chi_square > _SUSPECTED:
-            passes = self._passes(stays, every)
+            passes, found = self._passes(stays, every.of(len(every.b) - _LENS))
+            if passes == "time":
+                own, moments = found, []
+                whole = self._in_units(stays, own=own)
+                every = whole if all_fit else self._in_units(stays, every=True, own=own)
             if passes is not None:
                 self._window.add(test, -1.0)
-                own, test = passes.apart, passes.sums.of(len(test.b))
+                rest = whole.without(self._size + len(_WIDE)) if passes == "lens" else whole
+                noise, evidence = left.seen(rest, _LENS, share)
+                test = left.without(rest, _LENS, noise).of(len(self._window.b))
                 self._window.add(test, 1.0)
                 change = self._estimated(self._window)
-        if own is not None:
-            moments, whole = [], self._summed(stays, own=own)
-            every = self._summed(stays, every=True, own=own).by(self._scaled)
+        left.take(evidence)
         nodded = stays if self._timed and own is None else []
         odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
-        usual = every.less(self._summed(odd, every=True, own=own).by(self._scaled)) if odd else every
-        self._shape.decide(every, usual, ends=ends)
+        usual = every.less(self._in_units(odd, every=True, own=own)) if odd else every
+        self._shape.decide(*(left.without(each, _LENS, noise) for each in (every, usual)), ends=ends)
         alarm = self._is_alarm(change)
         doubted, self._doubted = self._doubted, None
         if alarm and moments and not self._alarms and self._poses > 1:
-            worst = self._worst(moments)
-            left_out = self._in_priors(worst.of(self._size))
+            rest = whole.less(self._worst(moments))
+            left_out = test.less(left.without(rest, _LENS, noise).of(len(test.b)))
             without = self._window.less(left_out)
             if not self._is_alarm(estimated := self._estimated(without)):
                 # Images that do not belong together are no moved camera; newer shots that agree with them are.
                 if doubted is not None:
                     self._window.add(doubted, 1.0)
                 else:
-                    whole, test = whole.less(worst), test.less(left_out)
+                    whole, test = rest, test.less(left_out)
                     self._window, self._doubted, change, alarm = without, left_out, estimated, False
         if len(self._history) < _KEPT:
-            self._whole.add(whole, 1.0)
+            self._whole.add(whole.over(noise), 1.0)
+        self._plain.append(whole.of(len(test.b)).over(noise))
         self._history.append(test)
         self._alarms = self._alarms + 1 if alarm else 0
         if 0 < self._alarms <= _FRESH:
@@ -595,7 +622,7 @@ class RigWatch:
         self.alarm, self.alarmed = alarm, self.alarmed or alarm
         if nodded:
             self._take_unrest(nodded)
-        due = 0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0
+        due = ends or 0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0
         if due and len(self._history) < _KEPT and self._poses >= _LENS_POSES:
             self.lens = self._lens()
 
@@ -605,17 +632,19 @@ class RigWatch:
         costs = self._cost_m(self._of_part(change, every)) > COSTS_M
         return _certain(change) and costs and self._matters(change, every)
 
-    def _passes(self, stays: Sequence[Sequence[_ShotResiduals]], every: ResidualSums) -> PassingSums | None:
-        """Return the sums of a test with what changed within it eliminated, where that explains it best."""
+    def _passes(
+        self, stays: Sequence[Sequence[_ShotResiduals]], every: ResidualSums
+    ) -> tuple[Literal["time", "lens"] | None, Apart | None]:
+        """Return what passing cause explains a test of some sums best, and its times of exposure."""
         found: Apart | None = None
         if self._timed:
-            parts, last = self._weighed_parts(stays, every=False), 1 + self._rig.parameter_count
+            parts = self._weighed_parts(stays, every=False)
             found = apart([(rows[:, 0], moved, weight) for rows, moved, weight in parts])
-            nods = nodding([(rows[:, 0], rows[:, last - 3 : last], weight) for rows, _, weight in parts])
+            nods = nodding([(rows[:, 0], self._moving(rows), weight) for rows, _, weight in parts])
             if found is not None and nods > found.gained - found.occam:
                 found = None
-        sums = None if found is None else self._summed(stays, own=found).of(self._size).by(self._scaled)
-        return self.passing.decide(every, self._shape.evidence, self._size, found, sums)
+        sums = None if found is None else self._in_units(stays, own=found).of(len(every.b))
+        return self.passing.decide(every, self._shape.evidence, self._size, found, sums), found
 
     def _in_priors(self, sums: ResidualSums) -> ResidualSums:
         """Return sums of the parameters and the seven numbers, in units of their priors, from those of the parameters."""
@@ -625,17 +654,15 @@ class RigWatch:
         """Return the sums of the moments that fit worst: of one, or where shots have no times of a tenth of them."""
         count = 1 if self._timed else max(1, len(moments) // 10)
         worst = sorted(moments, key=lambda each: float(each.rows[:, 0] @ each.rows[:, 0]) - len(each.rows))[-count:]
-        return self._summed([[each] for each in worst])
+        return self._in_units([[each] for each in worst])
 
     def _lens(self) -> LensError | None:
         """Return what the camera models lack; None where a change of the seven explains as much, or it hardly matters."""
         K, sums, faults = self._size, self._whole, len(_WIDE)
         every = np.arange(K + faults + _LENS)
         changed, lens = every[K : K + faults], every[K + faults :]
-        M = np.zeros((self._full, len(every)))
-        M[:K, :K], M[:K, changed] = self.prior, self._by_fault * _WIDE
-        M[K:, lens] = _LENS_PX * np.eye(_LENS)
-        H, b = M.T @ sums.H @ M + np.eye(len(every)), M.T @ sums.b
+        rows = np.append(every[: K + faults], len(sums.b) - _LENS + np.arange(_LENS))
+        H, b = sums.H[np.ix_(rows, rows)] + np.eye(len(rows)), sums.b[rows]
 
         def gained(*without: Ids) -> float:
             rows = np.setdiff1d(every, np.concatenate([*without, np.zeros(0, int)]))
@@ -645,7 +672,7 @@ class RigWatch:
         excess = max((sums.square - most) / max(sums.freedom, 1.0), 1.0)
         if by_lens - gained(lens) < _LENS_ALARM * excess:
             return None
-        more = (self._split(list(self._history))[2] - (sums.square - by_lens)) / excess  # than a change at any time
+        more = (self._split(list(self._plain))[2] - (sums.square - by_lens)) / excess  # than a change at any time
         # A lens that lacks a little is not to blame where the cameras moved: then they explain most.
         moved = gained(lens) - gained(changed, lens)
         if more < max(_LENS_ALARM, _LENS_SHARE * moved / excess):
@@ -667,14 +694,14 @@ class RigWatch:
 
     def _of_lens(self, sums: ResidualSums, scale_px: float, excess: float) -> tuple[Array, Array, float]:
         """Return the coefficients (M,), px, with a prior of some size, their covariance (M, M), and its log-evidence."""
-        L = np.zeros((self._full, self._full))
-        L[: self._size, : self._size], L[self._size :, self._size :] = self.prior, scale_px * np.eye(_LENS)
-        inner = cho_factor(L.T @ sums.H @ L / excess + np.eye(len(L)))
-        b = L.T @ sums.b / excess
+        rows = np.append(np.arange(self._size), len(sums.b) - _LENS + np.arange(_LENS))
+        scales = np.append(np.ones(self._size), np.full(_LENS, scale_px))
+        inner = cho_factor(sums.H[np.ix_(rows, rows)] * np.outer(scales, scales) / excess + np.eye(len(rows)))
+        b = scales * sums.b[rows] / excess
         found = cho_solve(inner, b)
         evidence = 0.5 * float(b @ found) - float(np.log(np.diag(inner[0])).sum())
-        rows = L[self._size :]
-        return rows @ found, rows @ cho_solve(inner, rows.T), evidence
+        cov = scale_px**2 * cho_solve(inner, np.eye(len(rows)))[-_LENS:, -_LENS:]
+        return scale_px * found[-_LENS:], cov, evidence
 
     def _begun(self, change: RigChange) -> RigChange:
         """Return the change estimated from its beginning on; drop what was before."""
@@ -787,13 +814,17 @@ class RigWatch:
         return (*(ended._changed() if ended.alarmed else ()), *ended._nods())
 
     def _nods(self) -> tuple[HealthFinding, ...]:
-        """Return the finding of a camera that nods, where that displaces poses by what matters."""
+        """Return the finding of a camera that nods or a lens that breathes, where that displaces poses by what matters."""
         cov, newest = self._unrest.cov, list(self._effects)[-1:]
         if not cov.any() or not newest:
             return ()
         covs = self._nodding(newest[0][0], self._last[1])
         cost_m = float(np.sqrt(np.trace(covs[:3, :3]))) + LEVER_M * float(np.sqrt(np.trace(covs[3:, 3:])))
-        return (_nod_finding(cov, cost_m),) if cost_m > COSTS_M else ()
+        if cost_m < COSTS_M:
+            return ()
+        # The one that displaces points in the images by more.
+        seen = np.diag(cov) * np.array([1.0, 1.0, 0.0, np.square(self._half_px / self._focal_px).sum(axis=1).mean()])
+        return (_breathing_finding(cov, cost_m) if seen[3] > seen[:3].sum() else _nod_finding(cov[:3, :3], cost_m),)
 
     def _changed(self) -> tuple[HealthFinding, ...]:
         """Return what the newest test found of the seven numbers."""
@@ -818,7 +849,7 @@ class RigWatch:
     def copied(self) -> RigWatch:
         """Return a copy that says what was found so far; this one goes on."""
         copied = copy(self)
-        copied._history, copied._shape = self._history.copy(), self._shape.copied()
+        copied._history, copied._plain, copied._shape = self._history.copy(), self._plain.copy(), self._shape.copied()
         copied._stays, copied.passing = [stay.copy() for stay in self._stays], copy(self.passing)
         copied._unrest = self._unrest.copied()
         return copied
@@ -826,7 +857,8 @@ class RigWatch:
     def _ended(self) -> RigWatch:
         """Return a copy whose running test was made; this one goes on with it."""
         ended = self.copied()
-        ended._window, ended._whole = self._window.of(len(self._window.b)), self._whole.of(self._full)
+        ended._window, ended._whole = self._window.of(len(self._window.b)), self._whole.of(len(self._whole.b))
+        ended._leftover = copy(self._leftover)
         ended._decide(ends=True)
         return ended
 
@@ -1052,6 +1084,23 @@ def _nod_finding(cov: Array, cost_m: float) -> HealthFinding:
         float(np.degrees(np.sqrt(np.linalg.eigvalsh(cov)[-1]))) * 0.1,
         "deg",
         "fasten the cameras on one stiff bar, away from what vibrates; poses have this in their sigma",
+        cost_mm=1e3 * cost_m,
+    )
+
+
+def _breathing_finding(cov: Array, cost_m: float) -> HealthFinding:
+    """Return the finding of a lens that breathes, of the covariance (4, 4) of rotation and focal length."""
+    size = 100.0 * float(np.sqrt(cov[3, 3]))
+    return HealthFinding(
+        "lens",
+        f"a lens breathes: within a second the focal length of one camera changes by {size:.3f} % (RMS) to and fro against "
+        "that of the other; which of the two cannot be distinguished",
+        None,
+        size,
+        0.1 * size,
+        "%",
+        "switch autofocus and image stabilisation off, fasten focus and zoom; poses have this in their sigma",
+        ("rig",),
         cost_mm=1e3 * cost_m,
     )
 

@@ -137,6 +137,18 @@ class ResidualSums:
         found.M[1:, 0], found.M[1:, 1:] = found.M[0, 1:], T.T @ self.H @ T
         return found
 
+    def over(self, variance: float) -> ResidualSums:
+        """Return these of residuals whose noise has a variance."""
+        found = self.of(len(self.b))
+        found.M /= variance
+        return found
+
+    def without(self, row: int) -> ResidualSums:
+        """Return these with a parameter eliminated, which has a prior of variance 1; its row is of no use."""
+        rest, column = self.of(len(self.b)), self.M[1 + row]
+        rest.M -= np.outer(column, column) / (1.0 + column[1 + row])
+        return rest
+
     def less(self, other: ResidualSums) -> ResidualSums:
         """Return these sums without another's."""
         rest = ResidualSums(len(self.b), self.begin_s)
