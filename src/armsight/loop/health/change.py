@@ -35,12 +35,12 @@ _ALONG = float(chdtri(5, 0.01))
 #: What the pair alone cannot distinguish from that.
 FOCAL = "; both focal lengths that changed alike look the same to the pair"
 
-Kind = Literal["rig", "drift", "body", "sag", "joint", "backlash", "time", "rate", "shake"]
+Kind = Literal["rig", "drift", "body", "bend", "joint", "backlash", "time", "rate", "shake"]
 _CAUSES: dict[Kind, Cause] = {
     "rig": "fixed",
     "drift": "fixed",
     "body": "body",
-    "sag": "body",
+    "bend": "body",
     "joint": "joint",
     "backlash": "joint",
     "time": "time",
@@ -60,12 +60,12 @@ def changing(parts: ErrorLayout, H: Array) -> Array:
     widths = 0.5 * (H[..., parts.backlash : parts.backlash + n] + H[..., parts.floats : parts.floats + n])
     delay = H[..., parts.delay : parts.delay + 1]
     # The base's translations are carried to the tool's axes: the last one is upwards.
-    columns = [H[..., :6], delay, H[..., tool : tool + 6], H[..., parts.zeros[1:]], widths, sagging(-H[..., :3, 2])]
+    columns = [H[..., :6], delay, H[..., tool : tool + 6], H[..., parts.zeros[1:]], widths, bending(-H[..., :3, 2])]
     return np.concatenate(columns, axis=-1)
 
 
-def sagging(down: Array) -> Array:
-    """Return what (..., 6, 4) a body does that bends under gravity: its tangent by a beam's (3), rad, and by its sag, m.
+def bending(down: Array) -> Array:
+    """Return what (..., 6, 4) a body does that bends under gravity: its tangent by a beam's (3), rad, and a shift, m.
 
     A beam along an axis a of the tool, which bends by an angle where it is level, rotates its end by that times a x down.
 
@@ -86,7 +86,7 @@ class Suspect:
     """Something that may change.
 
     Attributes:
-        kind: rig: it jumped; drift: it drifts; body: it slipped on the tool; sag: it bends under gravity; joint: its zero
+        kind: rig: it jumped; drift: it drifts; body: it slipped on the tool; bend: it bends under gravity; joint: its zero
             jumped; backlash: it grew; time: the camera's clock jumped; rate: it runs at another rate; shake: rig and arm
             move to and fro.
         joint: row of the joint; -1 for what is not of one.
@@ -110,17 +110,17 @@ class Suspect:
     @property
     def moves(self) -> bool:
         """Whether it makes measured poses wrong, beyond what a clock that is followed does."""
-        return self.kind in ("rig", "drift", "body", "sag")
+        return self.kind in ("rig", "drift", "body", "bend")
 
 
 def suspects(joints: int) -> tuple[Suspect, ...]:
     """Return all of an arm of n joints."""
-    tool, sag = slice(RAMPS, RAMPS + 6), RAMPS + 5 + 2 * joints
+    tool, bend = slice(RAMPS, RAMPS + 6), RAMPS + 5 + 2 * joints
     return (
         Suspect("rig", -1, slice(0, 6)),
         Suspect("drift", -1, slice(0, 6)),
         Suspect("body", -1, tool),
-        Suspect("sag", -1, slice(sag, sag + 4)),
+        Suspect("bend", -1, slice(bend, bend + 4)),
         Suspect("time", -1, slice(6, 7)),
         Suspect("rate", -1, slice(6, 7)),
         Suspect("joint", 0, slice(5, 6)),
@@ -162,8 +162,8 @@ class Change(Record):
     def displacement(self, T_base_tool: Array, t_s: float) -> tuple[Array, Array]:
         """Return what it does to a measured pose of the tool (4, 4) at a time, s: right tangent (6,), covariance."""
         by = self.effect
-        if self.suspect.kind == "sag":
-            by = sagging(-T_base_tool[2, :3])
+        if self.suspect.kind == "bend":
+            by = bending(-T_base_tool[2, :3])
         elif self.suspect.kind != "body":  # the base moves the tool by the lever to it
             by = adjoint(inverse(T_base_tool) @ self.T_base_tool) @ by
         if self.suspect.slow:
@@ -253,7 +253,7 @@ _OTHER: dict[Kind, str] = {
     "rig": "a rig that moved",
     "drift": "a rig that drifts",
     "body": "a body that slipped on the tool",
-    "sag": "a bracket that bends under gravity",
+    "bend": "a bracket that bends under gravity",
     "joint": "a sensor of {name} that slipped",
     "backlash": "more backlash of {name}",
     "time": "a clock that jumped",
@@ -346,8 +346,8 @@ def _moved_finding(change: Change, unsure: str) -> HealthFinding:
     sigma = float(np.sqrt(along @ cov[:3, :3] @ along))
     so_far = " so far" if change.suspect.slow else ""
     by = f"displaced by {1e3 * size:.2f} mm and {np.degrees(np.linalg.norm(shift[3:])):.3f} deg{so_far}{unsure}"
-    if change.suspect.kind == "sag":
-        return _sag_finding(change, unsure)
+    if change.suspect.kind == "bend":
+        return _bend_finding(change, unsure)
     if change.suspect.kind == "body":
         what, advice = "the body slipped on the tool: it is ", "fasten the body on the tool, and run again"
     else:
@@ -357,19 +357,19 @@ def _moved_finding(change: Change, unsure: str) -> HealthFinding:
     return HealthFinding(change.suspect.cause, what + by, change.begin_s, 1e3 * size, 1e3 * sigma, "mm", advice)
 
 
-def _sag_finding(change: Change, unsure: str) -> HealthFinding:
+def _bend_finding(change: Change, unsure: str) -> HealthFinding:
     """Return the finding of a body that bends under gravity, by the angle of a beam that is level."""
-    size, sag_m = float(np.linalg.norm(change.size[:3])), abs(float(change.size[3]))
+    size, shift_m = float(np.linalg.norm(change.size[:3])), abs(float(change.size[3]))
     along = change.size[:3] / max(size, 1e-12)
     sigma = float(np.sqrt(along @ change.cov[:3, :3] @ along))
     return HealthFinding(
         "body",
-        f"what holds the body bends under gravity, as the tool turns: by up to {np.degrees(size):.3f} deg and "
-        f"{1e3 * sag_m:.2f} mm{unsure}",
+        f"what holds the body bends under gravity: by up to {np.degrees(size):.3f} deg and "
+        f"{1e3 * shift_m:.2f} mm{unsure}",
         change.begin_s,
         float(np.degrees(size)),
         float(np.degrees(sigma)),
         "deg",
         "stiffen the bracket of the body, fasten its screws, and run again",
-        cost_mm=1e3 * (sag_m + LEVER_M * size),
+        cost_mm=1e3 * (shift_m + LEVER_M * size),
     )

@@ -442,9 +442,8 @@ def _matters(change: Change) -> bool:
     if change.suspect.cause == "time":
         return True
     if change.suspect.moves:
-        shift = change.newest[0]
-        turned = float(np.linalg.norm(change.size[:3])) if change.suspect.kind == "sag" else 0.0
-        return float(np.linalg.norm(shift[:3])) > _LEAST_M or turned * LEVER_M > _LEAST_M / 2.0
+        lever_m = LEVER_M * float(np.linalg.norm(change.size[:3])) if change.suspect.kind == "bend" else 0.0
+        return float(np.linalg.norm(change.newest[0][:3])) > _LEAST_M or lever_m > _LEAST_M / 2.0
     return float(np.linalg.norm(change.size)) > _LEAST_RAD
 
 

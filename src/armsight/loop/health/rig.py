@@ -21,7 +21,7 @@ its own. It is reported where beta explains more than any change of the seven nu
 A camera that nods or a lens that breathes averages out in the sums: what single shots say of its rotation and of a focal
 length is compared within each second, and what it varies beyond the noise is a covariance of its own (``fixed``). Images
 that were seen before, to the bit, say nothing new. What images leave in all that is near each other, for a second, is in
-the noise of each test, as large as the rig itself shows it (:mod:`~armsight.loop.health.leftover`).
+the noise of each test, as large as the rig itself shows it (:class:`~armsight.loop.health.passing.Leftover`).
 
 What changes and does not stay is a hypothesis of each single test (:mod:`~armsight.loop.health.passing`): each shot's own
 times of exposure, a focal length. Where its evidence is the largest the test is counted with that eliminated, so that
@@ -46,11 +46,11 @@ from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import adjoint, inverse, log_se3, pose
 from armsight.kernels import kernel
 from armsight.loop.health.fixed import Unrest
-from armsight.loop.health.leftover import Leftover
 from armsight.loop.health.passing import (
     TRACK,
     Apart,
     ExposedShot,
+    Leftover,
     Passing,
     apart,
     eliminate,
