@@ -16,7 +16,6 @@ from armsight.errors import InputError
 from armsight.files import (
     check_readable,
     check_writable,
-    read_columns,
     read_json,
     read_table,
     read_text,
@@ -320,22 +319,3 @@ def test_tables_of_spreadsheets_are_read(tmp_path, mark):
         read_table(path)
     path.write_text(f"x,a{mark}b\n1,2\n")
     assert read_table(path) == [["x", f"a{mark}b"], ["1", "2"]]
-
-
-def test_columns_are_read_under_other_names(tmp_path):
-    path = tmp_path / "table.csv"
-    path.write_text("J1, J2 ,x_m,X\n1,2,3,4\n")
-    columns = read_columns("q1_rad=J1, x_m = X", ("q1_rad", "q2_rad", "x_m"))
-    assert columns == {"q1_rad": "J1", "x_m": "X"}
-    assert read_table(path, columns)[0] == ["q1_rad", "J2", "(x_m)", "x_m"]
-    assert read_columns(None, ("a",)) == {}
-    with pytest.raises(InputError, match=r"table\.csv: line 1: no column 'J3' for q2_rad; there are J1, J2, x_m, X"):
-        read_table(path, {"q2_rad": "J3"})
-    for text, said in (
-        ("q1_rad", "expected NAME=COLUMN"),
-        ("q9=J9", "unknown name 'q9'; known are q1_rad"),
-        ("q1_rad=J1,q1_rad=J2", "repeats a name"),
-        ("", "expected NAME=COLUMN"),
-    ):
-        with pytest.raises(InputError, match=f"--columns {text}: .*{said}"):
-            read_columns(text, ("q1_rad", "x_m"))

@@ -16,7 +16,7 @@ import os
 import re
 import stat
 import tempfile
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 #: Largest documents (JSON, TOML, XML) and tables that are read: parsed they take 10 to 40 times as much memory.
 DOCUMENT_MB = 8  # half: a recording's truth of 10,000 shots is rejected; double: a hostile file takes 600 MB
+_JSON_PARTS = 1_000_000  # lists and mappings of a JSON text; half: long tracks of points are rejected; double: 400 MB
 TABLE_MB = 64  # half: an hour of a run is rejected; double: twice the memory
-YAML_MB = 1  # a node takes 1 kB; half: hand-eye samples of 2,000 poses are rejected; double: 700 MB
 #: Cells and lines of a table, of up to 72 bytes each; half: 5 minutes of detections are rejected; double: 700 MB.
 _TABLE_CELLS = 5_000_000
 _LONGEST_LINE = 1_000_000  # characters of a table's line; half, double: the same, no table has such lines
@@ -130,6 +130,8 @@ def read_json(path: str | Path, what: str = "") -> Any:  # noqa: ANN401 - whatev
 def parsed_json(text: str, path: str | Path, what: str = "") -> Any:  # noqa: ANN401 - whatever JSON holds
     """Return JSON text as what it holds; errors as :func:`read_json`."""
     expected = f"; expected {what}" if what else ""
+    if text.count("[") + text.count("{") > _JSON_PARTS:
+        raise InputError(f"{path}: holds over {_JSON_PARTS} lists and mappings{expected}: is it the right file?")
     try:
         return json.loads(text, parse_int=_integer)
     except json.JSONDecodeError as error:
@@ -180,7 +182,7 @@ def _encoding(path: str | Path, data: bytes) -> str:
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 
 
-def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> list[list[str]]:
+def read_table(path: str | Path) -> list[list[str]]:
     """Read a CSV file into rows of cells; a byte-order mark before the first is left out.
 
     Cells may also be separated by semicolons or tabs, as spreadsheets write them where the comma is the decimal mark;
@@ -188,11 +190,9 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> li
 
     Args:
         path: the file.
-        columns: name that the caller looks for -> name in the file's first line, as :func:`read_columns` returns them.
 
     Raises:
-        InputError: missing, unreadable, not text or not a table, decimal commas and points in one table, or a name of
-            ``columns`` that the first line does not have.
+        InputError: missing, unreadable, not text or not a table, or decimal commas and points in one table.
     """
     lines = _lines(path)
     first = next(lines, "").removeprefix("\ufeff")
@@ -209,8 +209,6 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> li
         raise InputError(f"{path}: not a table: {error}") from None
     if mark != ",":
         rows = _with_points(path, rows)
-    if columns and rows:
-        rows[0] = _renamed(path, [name.strip() for name in rows[0]], columns)
     return rows
 
 
@@ -240,41 +238,6 @@ def _with_points(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
                     "the decimal mark, or the point? save it with one of them"
                 )
     return [[cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell.strip()) else cell for cell in row] for row in rows]
-
-
-def _renamed(path: str | Path, header: list[str], columns: Mapping[str, str]) -> list[str]:
-    """Return the names of a first line as the caller knows them; a column that is renamed replaces one of that name."""
-    for name, theirs in columns.items():
-        if theirs not in header:
-            raise InputError(f"{path}: line 1: no column {theirs!r} for {name}; there are {', '.join(header)}")
-    given = {theirs: name for name, theirs in columns.items()}
-    return [given.get(name, f"({name})" if name in columns else name) for name in header]
-
-
-def read_columns(text: str | None, known: Collection[str]) -> dict[str, str]:
-    """Read the option ``--columns NAME=THEIRS,...``.
-
-    Args:
-        text: its value; None where it is not given.
-        known: the names that the command looks for.
-
-    Returns:
-        Name that the command looks for -> name in the file.
-
-    Raises:
-        InputError: no such form, an unknown name, or one given twice.
-    """
-    columns: dict[str, str] = {}
-    for part in [] if text is None else text.split(","):
-        name, equals, theirs = (piece.strip() for piece in part.partition("="))
-        if not (name and equals and theirs):
-            raise InputError(f"--columns {text}: expected NAME=COLUMN,..., such as x_m=X,y_m=Y; got {part.strip()!r}")
-        if name not in known:
-            raise InputError(f"--columns {text}: unknown name {name!r}; known are {', '.join(known)}")
-        if name in columns or theirs in columns.values():
-            raise InputError(f"--columns {text}: {part.strip()} repeats a name")
-        columns[name] = theirs
-    return columns
 
 
 def columns_unused(names: Sequence[str], most: int = 8) -> str:

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from armsight.errors import InputError
 from armsight.robot.arm_file import open_arm
-from armsight.tables.cells import number
-from armsight.tables.documents import has_both
+from armsight.tables.nested import has_both
+from armsight.tables.number import number
 from armsight.tables.poses import read_pose_table
 
 N = 6
@@ -198,6 +198,45 @@ FORMS = {
             ]
         ),
         {"unit": "mm"},
+    ),
+    "Kawasaki AS .TRANS (AS Language Reference, E controller, 3.4; O A T are Euler's z, y, z)": (
+        "p.as",
+        ".PROGRAM p()\n  LMOVE p1\n.END\n.TRANS\n" + rows("p[{k}] {} {} {} {} {} {}", MM, ZYZ) + ".END\n",
+        {},
+    ),
+    "Kawasaki AS TRANS() (AS Language Reference, TRANS function)": (
+        "q.pg",
+        rows("  POINT p{k} = TRANS({}, {}, {}, {}, {}, {})", MM, ZYZ),
+        {},
+    ),
+    "Mitsubishi MELFA-BASIC V .prg (RT ToolBox3; CR750 detailed explanations, position constants)": (
+        "p.prg",
+        "1 Mov P0\n2 End\n" + rows("P{k}=({},{},{},{},{},{},+0.00,+0.00)(7,0)", MM, FIXED),
+        {},
+    ),
+    "Epson SPEL+ XY() (EPSON RC+ 7.0 language reference, XY; U about z, V about y, W about x)": (
+        "p.prg",
+        "Function main\n" + rows("  P{k} = XY({}, {}, {}, {}, {}, {}) /R /A", MM, FIXED[:, ::-1]) + "Fend\n",
+        {},
+    ),
+    "Epson RC+ 7.0 .pts": (
+        "p.pts",
+        rows(
+            '[Point{k}]\nnNumber={k}\nsLabel="p{k}"\nrX={}\nrY={}\nrZ={}\nrU={}\nrV={}\nrW={}\nrR=0\nnHand=1\n',
+            MM,
+            FIXED[:, ::-1],
+        ),
+        {},
+    ),
+    "Techman TMscript PTP and Line (TMflow 1.80 expression editor; robodk 6.0.2 Techman_2_Pose)": (
+        "p.script",
+        rows('Line("CAP",{},{},{},{},{},{},125,200,0,false)', MM, FIXED),
+        {},
+    ),
+    "Techman TMscript with an array": (
+        "q.script",
+        rows('PTP("CPP",{{{},{},{},{},{},{}}},10,200,0,false)', MM, FIXED),
+        {},
     ),
     "ABB RAPID robtargets beside tooldata (RobotWare 6)": (
         "p.mod",
@@ -400,6 +439,10 @@ JOINTS = {
         + "</Data>",
         {},
     ),
+    "Kawasaki AS .JOINTS": ("j.as", ".JOINTS\n" + rows("#j{k} {} {} {} {} {} {}", DEG) + ".END\n", {}),
+    "Mitsubishi MELFA-BASIC V joints": ("j.prg", rows("J{k}=({},{},{},{},{},{},+0.00,+0.00)", DEG), {}),
+    "Epson SPEL+ JA()": ("j.prg", rows("  Go JA({}, {}, {}, {}, {}, {})", DEG), {}),
+    "Techman TMscript JPP": ("j.script", rows('PTP("JPP",{},{},{},{},{},{},35,200,0,false)', DEG), {}),
     "sensor_msgs/JointState (rostopic echo)": (
         "js.yaml",
         messages(

@@ -29,7 +29,7 @@ from armsight.geometry.rotation import log_so3
 from armsight.robot.arm import Arm
 from armsight.robot.urdf.read import ChainLink, arm_rows, check_same, rotation_of
 from armsight.robot.urdf.write import roll_pitch_yaw
-from armsight.tables.yaml_file import read_yaml
+from armsight.tables.document import read_yaml
 
 #: What Universal Robots call their joints here.
 UR_NAMES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")

@@ -15,15 +15,13 @@ import numpy as np
 
 from armsight.errors import InputError
 from armsight.files import DECIMAL_COMMA, TABLE_MB, read_table, read_text
-from armsight.tables.documents import PACKED, document_rows, is_document
+from armsight.tables.nested import PACKED, document_rows, is_document, is_packed
+from armsight.tables.number import NUMBER, number
 from armsight.tables.programs import program_rows
 
 Rows = list[tuple[int, list[str]]]
-#: A number, as any program writes it: Fortran's 1D-3 and the minus of a typesetter among them.
-_NUMBER = re.compile(r"[+\-\u2212]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][+\-\u2212]?\d+)?")
-_NO_FINITE = re.compile(r"[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
 #: A number with its unit.
-_WITH_UNIT = re.compile(rf"({_NUMBER.pattern}|{DECIMAL_COMMA.pattern})\s*(mm|m|deg|\N{{DEGREE SIGN}}|rad|s)")
+_WITH_UNIT = re.compile(rf"({NUMBER}|{DECIMAL_COMMA.pattern})\s*(mm|m|deg|\N{{DEGREE SIGN}}|rad|s)")
 #: A list alone in its line.
 _LIST = re.compile(r"\[([^\[\]{}\"]*)\],?")
 #: The line that stands beneath the names in Markdown or psql, and psql's last line.
@@ -56,14 +54,6 @@ class Cells(NamedTuple):
     rotation: str | None = None
     notes: tuple[str, ...] = ()
     listed: bool = False
-
-
-def number(text: str) -> float | None:
-    """Return a number; NaN and infinities too; None where it is none."""
-    text = text.strip()
-    if _NUMBER.fullmatch(text):
-        return float(re.sub("[dD]", "e", text.replace("\u2212", "-")))
-    return float(text) if _NO_FINITE.fullmatch(text) else None
 
 
 def read_columns(text: str | None, known: Collection[str]) -> Mapping[str, str] | list[str]:
@@ -112,16 +102,17 @@ def read_cells(path: Path, columns: Mapping[str, str] | Sequence[str] = (), side
     Raises:
         InputError: no such form; the message says what was found and what would do.
     """
-    renamed = dict(columns) if isinstance(columns, Mapping) else {}
-    whose = renamed.pop("pose", None)
+    whose = columns.get("pose") if isinstance(columns, Mapping) else None
+    names = {k: v for k, v in columns.items() if k != "pose"} if isinstance(columns, Mapping) else columns
     if any(mark in path.name for mark in "*?") and not path.exists():
         cells = _of_files(path, side, whose)
     else:
         cells = _of_file(path, side, whose)
-    if renamed:
-        cells = cells._replace(head=_renamed(path, cells.head, renamed))
-    elif columns and not isinstance(columns, Mapping):
-        cells = _in_order(path, cells, list(columns))
+    if names:
+        head = renamed(path, cells.head, names, 1 if isinstance(names, Mapping) else cells.rows[0][0])
+        cells = cells._replace(head=head)
+        if not isinstance(names, Mapping):
+            cells = cells._replace(rotation=None, notes=(), listed=False)
     if all(name.startswith("_") for name in cells.head):
         raise InputError(
             f"{path}: line {cells.rows[0][0]}: {len(cells.head)} numbers without names; known are 16 or 12 (a matrix), 8 "
@@ -155,8 +146,8 @@ def _of_files(path: Path, side: str, whose: str | None) -> Cells:
 
 def _of_file(path: Path, side: str, whose: str | None) -> Cells:
     """Return what one file holds, its names as they stand there."""
-    if path.suffix.lower() in PACKED:
-        return _of_records(path, None, side, whose)
+    if path.suffix.lower() in PACKED or is_packed(path):
+        return _of_records(path, "", side, whose)
     text = read_text(path, TABLE_MB).removeprefix("\ufeff")
     if points := program_rows(path, text):
         return Cells(points.head, _even(path, points.rows, len(points.head)), points.rotation, points.notes)
@@ -175,7 +166,7 @@ def _of_file(path: Path, side: str, whose: str | None) -> Cells:
     return _delimited(path, text, written)
 
 
-def _of_records(path: Path, text: str | None, side: str, whose: str | None) -> Cells:
+def _of_records(path: Path, text: str, side: str, whose: str | None) -> Cells:
     """Return what a document holds."""
     head, records = document_rows(path, text, side, whose)
     rows = [(k, [record.get(name, "") for name in head]) for k, record in enumerate(records, 1)]
@@ -307,23 +298,24 @@ def _has_decimal_commas(cells: list[str]) -> bool:
     return len(cells) > 1 and any(commas) and all(a or b for a, b in zip(commas, whole, strict=True))
 
 
-def _renamed(path: Path, head: list[str], columns: Mapping[str, str]) -> list[str]:
-    """Return the names that the caller looks for in place of the file's own."""
+def renamed(path: Path, head: list[str], columns: Mapping[str, str] | Sequence[str], line: int = 1) -> list[str]:
+    """Return the names that the caller looks for in place of the file's own, as :func:`read_columns` returns them.
+
+    Raises:
+        InputError: a name of a column that is not there, or not as many as there are.
+    """
+    if not isinstance(columns, Mapping):
+        if columns and len(columns) != len(head):
+            raise InputError(
+                f"{path}: line {line}: has {len(head)} columns, --columns names {len(columns)}: name each, _ for one that "
+                "is not used"
+            )
+        return list(columns or head)
     for name, theirs in columns.items():
         if theirs not in head:
-            raise InputError(f"{path}: line 1: no column {theirs!r} for {name}; there are {', '.join(head)}")
+            raise InputError(f"{path}: line {line}: no column {theirs!r} for {name}; there are {', '.join(head)}")
     given = {theirs: name for name, theirs in columns.items()}
     return [given.get(name, f"({name})" if name in columns else name) for name in head]
-
-
-def _in_order(path: Path, cells: Cells, names: list[str]) -> Cells:
-    """Return the cells under names given in order, in place of the file's own."""
-    if len(names) != len(cells.head):
-        raise InputError(
-            f"{path}: line {cells.rows[0][0]}: has {len(cells.head)} columns, --columns names {len(names)}: name "
-            "each, _ for one that is not used"
-        )
-    return cells._replace(head=names, rotation=None, notes=(), listed=False)
 
 
 def _without_units(path: Path, cells: Cells) -> Cells:

@@ -7,7 +7,7 @@ In: names of a file, and the option ``--columns``. Out: names such as x_mm, qw, 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -15,8 +15,10 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.files import read_table
 from armsight.geometry.rotation import nearest_rotation
-from armsight.tables.cells import Rows, number
+from armsight.tables.cells import Rows, renamed
+from armsight.tables.number import number
 from armsight.tables.rotations import QUATERNION_OFF, rotations_by
 
 #: Columns whose cells name the rows.
@@ -162,24 +164,53 @@ class Columns:
         self.used: set[str] = set()
         self._links = links
 
+    @classmethod
+    def of_csv(cls, path: Path, columns: Mapping[str, str] | Sequence[str] = ()) -> Columns:
+        """Return the columns of a CSV as they are named there, blank lines left out; a line may end early.
+
+        Args:
+            path: the file.
+            columns: names for the file's own, as :func:`read_columns` returns them.
+
+        Raises:
+            InputError: no table, a column named twice, or one that is not there.
+        """
+        head, *rows = [[cell.strip() for cell in row] for row in read_table(path)] or [[]]
+        if twice := next((name for name in head if name and head.count(name) > 1), None):
+            raise InputError(f"{path}: line 1 names a column twice: {twice}")
+        padded = ((line, row + [""] * (len(head) - len(row))) for line, row in enumerate(rows, 2) if any(row))
+        return cls(path, renamed(path, head, columns), list(padded))
+
     def has_position(self) -> bool:
         """Return whether there are positions."""
         return any(name in self.at for name in ("x", "x_m", "x_mm"))
 
-    def numbers(self, names: Sequence[str], *, gaps: bool = False) -> Array:
-        """Return columns (N, K); with gaps NaN where a cell is empty or not finite."""
+    def require(self, *names: str) -> None:
+        """Raise an InputError where a column is missing; those that are there count as used."""
         for name in names:
             if name not in self.at:
                 raise InputError(f"{self.path}: line 1: column {name} is missing; there are {', '.join(self.at)}")
         self.used.update(names)
+
+    def texts(self, name: str) -> list[str]:
+        """Return the cells of a column (N,), "" where there is no such column."""
+        at = self.at.get(name)
+        return ["" if at is None else row[at] for _, row in self.rows]
+
+    def numbers(self, names: Sequence[str], *, gaps: bool = False, empty: bool = False) -> Array:
+        """Return columns (N, K); with ``empty`` NaN where a cell is empty, with ``gaps`` also where it is not finite."""
+        self.require(*names)
         out = np.full((len(self.rows), len(names)), np.nan)
         for i, (line, row) in enumerate(self.rows):
             for k, name in enumerate(names):
                 cell = row[self.at[name]] if self.at[name] < len(row) else ""
-                value = number(cell) if cell or not gaps else np.nan
+                if not cell and (gaps or empty):
+                    continue
+                value = number(cell)
                 if value is None or not (gaps or np.isfinite(value)):
                     raise InputError(
-                        f"{self.path}: line {line}: {name} is {cell[:40]!r}, not a number; correct or remove the line"
+                        f"{self.path}: line {line}: {name} is {cell[:40]!r}, not a number; finite numbers are needed: "
+                        "correct or remove the line"
                     )
                 out[i, k] = value if np.isfinite(value) else np.nan
         return out

@@ -1,9 +1,10 @@
 """Files of names and values, in whatever syntax: found by the content, not the suffix.
 
-In: a file. Out: a mapping of names to texts, numbers, lists, mappings and matrices (whatever has ``rows``, ``cols`` and
-``data`` is an array). Read are YAML, JSON, TOML, INI, Python's literals (mrcal), OpenCV's FileStorage in YAML, XML or JSON,
-numpy's .npz and .npy, each also compressed by gzip. What holds programs (pickles) or is an
-archive is named with what to do.
+In: a file. Out: its documents as mappings, lists, texts, numbers and matrices (whatever has ``rows``, ``cols`` and ``data``
+is an array). Read are YAML, JSON, JSON Lines, TOML, INI, Python's literals (mrcal), OpenCV's FileStorage in YAML, XML or
+JSON, numpy's .npz and .npy, each also compressed by gzip. What holds programs (pickles) or is an archive is named with what
+to do. YAML has the plain values of YAML 1.2's core schema, as yaml-cpp and ROS read them (1e-05 is a number, 010 is ten,
+``on`` and ``2026-01-01`` are texts), and OpenCV's ``%YAML:1.0``; a name that stands twice in one mapping is an error.
 """
 
 from __future__ import annotations
@@ -11,29 +12,54 @@ from __future__ import annotations
 import ast
 import configparser
 import io
+import json
 import re
 import tokenize
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
+from typing import Any, NoReturn, TypeAlias
 from xml.etree import ElementTree
 
 import numpy as np
+import yaml
 
 from armsight.errors import InputError
-from armsight.files import DOCUMENT_MB, YAML_MB, parsed_json, read_bytes
-from armsight.tables.yaml_file import Foreign, parse_yaml
+from armsight.files import DOCUMENT_MB, parsed_json, read_bytes, read_text
+from armsight.tables.number import number
 
-#: First bytes -> what the file is, and what to do instead.
-_OTHERS = (
-    (b"\x80\x02", "a Python pickle, which may run programs"),
-    (b"\x80\x03", "a Python pickle, which may run programs"),
-    (b"\x80\x04", "a Python pickle, which may run programs"),
-    (b"\x80\x05", "a Python pickle, which may run programs"),
-)
+#: A value of a file of another program: a number, a text, a list or a mapping, unknown until checked.
+Foreign: TypeAlias = Any
+#: An event of PyYAML's parser; its kinds have no common type with a tag and an anchor.
+_Event: TypeAlias = Any
+
+#: What is read, for messages.
+KINDS = "YAML, JSON, TOML, INI, OpenCV's XML, mrcal's .cameramodel, .npz or .npy, each also as .gz"
 _SAVE = "save the arrays with numpy.savez('calibration.npz', K1=K1, D1=D1, ..)"
+_MOST_VALUES = 1_000_000  # of YAML, aliases counted in full; half: 30,000 poses; double: 400 MB where all are lists
+_MOST_DEPTH = 100  # of YAML; half: still three times what programs nest; double: hostile files overflow the stack
+#: Plain values of YAML 1.2's core schema; OpenCV writes .Nan and .Inf.
+_PLAIN = re.compile(
+    r"(?P<null>~|null|Null|NULL|)|(?P<true>true|True|TRUE)|(?P<false>false|False|FALSE)|(?P<int>[-+]?[0-9]+)|"
+    r"(?P<based>0o[0-7]+|0x[0-9a-fA-F]+)|(?P<float>[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?)|"
+    r"(?P<special>[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN|Nan))"
+)
+_VALUES: dict[str, Callable[[str], Foreign]] = {
+    "null": lambda text: None,
+    "true": lambda text: True,
+    "false": lambda text: False,
+    "int": int,
+    "based": lambda text: int(text, 0),
+    "float": float,
+    "special": lambda text: float(text.replace(".", "")),
+}
+#: Tags that change nothing of what is plain to see.
+_CORE = "tag:yaml.org,2002:"
+_HARMLESS = {None, "!", *(_CORE + name for name in (
+    "seq", "map", "int", "float", "bool", "null", "opencv-matrix", "opencv-nd-matrix", "python/tuple"))}  # fmt: skip
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def read_document(path: str | Path) -> dict[str, Foreign]:
@@ -42,49 +68,50 @@ def read_document(path: str | Path) -> dict[str, Foreign]:
     Raises:
         InputError: missing, damaged, or of a kind that is not read; the message names it and the way out.
     """
-    data = read_bytes(path)
-    if data[:2] == b"\x1f\x8b":
-        data = _unpacked(data, path)
-    document = _binary(data, path)
-    if document is None:
-        try:
-            text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
-        except UnicodeDecodeError:
-            if data[:200].lstrip().startswith(b"<?xml"):
-                return _checked(_xml(data, path), path)
-            raise InputError(f"{path}: not a text file, and no other that is read here: {KINDS}") from None
-        document = _text(text, path)
-    return _checked(document, path)
-
-
-#: What is read, for messages.
-KINDS = "YAML, JSON, TOML, INI, OpenCV's XML, mrcal's .cameramodel, .npz or .npy, each also as .gz"
-
-
-def _checked(document: Foreign, path: str | Path) -> dict[str, Foreign]:
-    """Return a document that is a mapping, its matrices as arrays."""
-    if not isinstance(document, Mapping):
-        kind = "nothing" if document is None else f"a {'list' if isinstance(document, list) else 'single value'}"
+    documents = documents_in(read_bytes(path), path)
+    if len(documents) > 1:
+        raise InputError(
+            f"{path}: holds {len(documents)} YAML documents, separated by ---; expected one: keep one of them"
+        )
+    if not isinstance(documents[0], Mapping):
+        kind = (
+            "nothing" if documents[0] is None else f"a {'list' if isinstance(documents[0], list) else 'single value'}"
+        )
         raise InputError(f"{path}: holds {kind}; expected names and values, as YAML, JSON, TOML or INI")
     try:
-        return {str(key): _with_matrices(str(key), value) for key, value in document.items()}
+        return {str(key): _with_matrices(str(key), value) for key, value in documents[0].items()}
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def _with_matrices(name: str, value: Foreign) -> Foreign:
-    """Return a value in which whatever has rows, cols and data is an array."""
-    if isinstance(value, list):
-        return [_with_matrices(name, one) for one in value] if any(isinstance(one, dict) for one in value) else value
-    if not isinstance(value, Mapping):
-        return value
+def documents_in(data: bytes, path: str | Path) -> list[Foreign]:
+    """Return the documents that a file's bytes hold, one at least; errors as :func:`read_document`."""
+    if data[:2] == b"\x1f\x8b":
+        data = _unpacked(data, path)
+    found = _binary(data, path)
+    if found is not None:
+        return [found]
+    try:
+        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+    except UnicodeDecodeError:
+        if data[:200].lstrip().startswith(b"<?xml"):
+            return [_xml(data, path)]
+        raise InputError(f"{path}: not a text file, and no other that is read here: {KINDS}") from None
+    return _of_text(text, path)
+
+
+def matrix_of(name: str, value: Mapping[str, Foreign]) -> np.ndarray[Any, np.dtype[np.float64]] | None:
+    """Return a mapping of rows, cols and data (OpenCV, ViSP, ROS) as an array; None where it is none.
+
+    Raises:
+        InputError: no numbers, or not as many as it says.
+    """
     sized = {"sizes", "data", "dt"} <= set(value)  # OpenCV 5's vectors, and matrices of three dimensions
     if not sized and not {"rows", "cols", "data"} <= set(value):
-        return {str(key): _with_matrices(f"{name}.{key}", one) for key, one in value.items()}
+        return None
     try:
-        if sized:
-            value = {**value, "rows": int(np.prod(np.asarray(value["sizes"], float))), "cols": 1}
-        rows, cols, data = int(value["rows"]), int(value["cols"]), np.asarray(value["data"], float).ravel()
+        rows, cols = (int(np.prod(np.asarray(value["sizes"], float))), 1) if sized else (value["rows"], value["cols"])
+        rows, cols, data = int(rows), int(cols), np.asarray(value["data"], float).ravel()
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name} must be numbers: rows, cols and data of a matrix") from None
     channels = re.match(r"\d*", str(value.get("dt", "")))
@@ -94,6 +121,16 @@ def _with_matrices(name: str, value: Foreign) -> Foreign:
             f"{name} is damaged: it says {rows} rows and {cols} cols, and its data holds {data.size} numbers"
         )
     return data.reshape((rows, cols) if depth == 1 else (rows * cols, depth))
+
+
+def _with_matrices(name: str, value: Foreign) -> Foreign:
+    """Return a value in which whatever has rows, cols and data is an array."""
+    if isinstance(value, list):
+        return [_with_matrices(name, one) for one in value] if any(isinstance(one, dict) for one in value) else value
+    if not isinstance(value, Mapping):
+        return value
+    array = matrix_of(name, value)
+    return {str(key): _with_matrices(f"{name}.{key}", one) for key, one in value.items()} if array is None else array
 
 
 def _unpacked(data: bytes, path: str | Path) -> bytes:
@@ -122,9 +159,8 @@ def _binary(data: bytes, path: str | Path) -> dict[str, Foreign] | None:
         )
     if data[257:262] == b"ustar":
         raise InputError(f"{path}: an archive (tar): unpack it and give the files in it")
-    for magic, what in _OTHERS:
-        if data.startswith(magic):
-            raise InputError(f"{path}: {what} and is not read: {_SAVE}")
+    if re.match(rb"\x80[\x02-\x05]", data):
+        raise InputError(f"{path}: a Python pickle, which may run programs and is not read: {_SAVE}")
     return None
 
 
@@ -158,7 +194,7 @@ def _numpy(data: bytes, path: str | Path) -> dict[str, Foreign]:
         ) from None
 
 
-def _text(text: str, path: str | Path) -> Foreign:
+def _of_text(text: str, path: str | Path) -> list[Foreign]:
     """Return what a text holds, by its first line that is no comment."""
     if text.lstrip().startswith("# oST"):
         raise InputError(
@@ -167,27 +203,160 @@ def _text(text: str, path: str | Path) -> Foreign:
     lines = (line.strip() for line in text.splitlines())
     first = next((line for line in lines if line and not line.startswith(("#", ";", "//"))), "")
     if first.startswith("<"):
-        return _xml(text.lstrip().encode(), path)
+        return [_xml(text.lstrip().encode(), path)]
+    suffix = Path(path).suffix.lower()
     if first.startswith(("{", "[")) and not re.fullmatch(r"\[\[?[\w.\" /-]+\]?\]\s*([#;].*)?", first):
-        if (
-            Path(path).suffix.lower() != ".json"
-            and first.startswith("{")
-            and re.search(r"^\s*(#|')", text, re.MULTILINE)
-        ):
-            return _literal(text, path)
-        return parsed_json(text, path)
+        if suffix != ".json" and first.startswith("{") and re.search(r"^\s*(#|')", text, re.MULTILINE):
+            return [_literal(text, path)]
+        return _json(text, path)
     if first.startswith("[") or re.match(r"[\w.\"-]+\s*=", first):
-        return _toml_or_ini(text, path)
-    if len(text) > YAML_MB * 1e6:
-        raise InputError(
-            f"{path}: has {len(text) / 1e6:.0f} MB of YAML, such a file at most {YAML_MB} MB: is it the right one?"
-        )
-    documents = parse_yaml(text, path)
-    if len(documents) > 1:
+        return [_toml_or_ini(text, path)]
+    return [parsed_json(text, path)] if suffix == ".json" and first else parse_yaml(text, path)
+
+
+def _json(text: str, path: str | Path) -> list[Foreign]:
+    """Return JSON, JSON Lines as a list, or YAML in the form of JSON."""
+    try:
+        return [parsed_json(text, path)]
+    except InputError:
+        rows = [row.strip() for row in text.splitlines() if row.strip()]
+        if len(rows) > 1 and all(row[0] in "{[" for row in rows):
+            try:
+                return [[json.loads(row.rstrip(",")) for row in rows]]
+            except ValueError:
+                pass
+        if Path(path).suffix.lower() == ".json" or re.match(r"\s*\{\s*\"", text):
+            raise
+        return parse_yaml(text, path)
+
+
+def read_yaml(path: str | Path) -> Mapping[str, Foreign]:
+    """Read a YAML file of one document that is a mapping.
+
+    Raises:
+        InputError: missing, not YAML, another number of documents, or no mapping; the message names file and line.
+    """
+    documents = parse_yaml(read_text(path), path)
+    if len(documents) != 1:
         raise InputError(
             f"{path}: holds {len(documents)} YAML documents, separated by ---; expected one: keep one of them"
         )
+    if not isinstance(documents[0], dict):
+        raise InputError(f"{path}: expected a YAML mapping of names to values, such as width: 640")
     return documents[0]
+
+
+def parse_yaml(text: str, path: str | Path) -> list[Foreign]:
+    """Return the documents of a YAML text, one at least; an empty one at its end (a trailing ---) is left out.
+
+    Args:
+        text: the text.
+        path: where it comes from, for messages.
+
+    Raises:
+        InputError: not YAML; the message names the line.
+    """
+    text = text.removeprefix("\ufeff")
+    if text.startswith("%YAML"):  # OpenCV's header is no directive of YAML; the line stays, for messages
+        text = text[text.index("\n") :] if "\n" in text else ""
+    try:
+        documents = _Yaml(text).documents()
+    except yaml.MarkedYAMLError as error:
+        last = text.count("\n") + 1
+        line = f"line {min(error.problem_mark.line + 1, last)}: " if error.problem_mark else ""
+        raise InputError(f"{path}: {line}not YAML ({error.problem})") from None
+    except (yaml.YAMLError, ValueError):  # control characters, thousands of digits
+        raise InputError(f"{path}: not YAML") from None
+    while len(documents) > 1 and documents[-1] is None:
+        documents.pop()
+    return documents or [None]
+
+
+class _Yaml:
+    """The values of a YAML text, made from the parser's events: PyYAML's tree of nodes takes 1 kB for each value."""
+
+    def __init__(self, text: str) -> None:
+        self._events = iter(yaml.parse(text, _LOADER))
+        self._count = 0
+        #: Anchor -> its value, and how many values that holds.
+        self._anchors: dict[str, tuple[Foreign, int]] = {}
+
+    def documents(self) -> list[Foreign]:
+        """Return all documents."""
+        return [
+            self._value(next(self._events), 0) for event in self._events if isinstance(event, yaml.DocumentStartEvent)
+        ]
+
+    def _value(self, event: _Event, depth: int) -> Foreign:
+        """Return the value that begins with an event."""
+        before, self._count = self._count, self._count + 1
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in self._anchors:
+                _reject(event, f"no anchor &{event.anchor} before it")
+            value, held = self._anchors[event.anchor]
+            self._count += held
+        elif isinstance(event, yaml.ScalarEvent):
+            value = self._scalar(event)
+        else:
+            self._check_tag(event)
+            value = self._sequence(depth) if isinstance(event, yaml.SequenceStartEvent) else self._mapping(depth)
+        if self._count > _MOST_VALUES or depth > _MOST_DEPTH:
+            _reject(
+                event, f"more than {_MOST_VALUES} values, or nested more than {_MOST_DEPTH} deep: is it the right file?"
+            )
+        if event.anchor and not isinstance(event, yaml.AliasEvent):
+            self._anchors[event.anchor] = value, self._count - before
+        return value
+
+    def _sequence(self, depth: int) -> list[Foreign]:
+        values = []
+        while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
+            values.append(self._value(event, depth + 1))
+        return values
+
+    def _mapping(self, depth: int) -> dict[Hashable, Foreign]:
+        """Return a mapping; a name that stands in it twice is an error, ``<<`` gives what its own names do not."""
+        values: dict[Hashable, Foreign] = {}
+        merged: dict[Hashable, Foreign] = {}
+        while not isinstance(event := next(self._events), yaml.MappingEndEvent):
+            key = self._value(event, depth + 1)
+            value = self._value(next(self._events), depth + 1)
+            if not isinstance(key, Hashable):
+                _reject(event, "a list or mapping as a name")
+            if key == "<<":
+                for one in reversed(value if isinstance(value, list) else [value]):
+                    if not isinstance(one, dict):
+                        _reject(event, "<< needs mappings")
+                    merged |= one
+            elif key in values:
+                _reject(event, f"{key!r} stands twice in one mapping")
+            else:
+                values[key] = value
+        return merged | values if merged else values
+
+    def _scalar(self, event: yaml.ScalarEvent) -> Foreign:
+        """Return a text, or the plain value that it is; a leading zero does not make a number octal."""
+        if event.tag == _CORE + "str" or (event.tag in (None, "!") and not event.implicit[0]):
+            return event.value
+        self._check_tag(event)
+        found = _PLAIN.fullmatch(event.value)
+        return event.value if found is None else _VALUES[str(found.lastgroup)](event.value)
+
+    def _check_tag(self, event: _Event) -> None:
+        """Reject a value of a kind that is not known: what it means would be a guess."""
+        if event.tag not in _HARMLESS:
+            python = "; that is a Python object, not plain numbers: write arrays with .tolist()"
+            tag = event.tag.replace(_CORE, "!!")
+            _reject(event, f"the tag {tag} is not known{python if 'python/' in tag else ''}")
+
+
+def _reject(event: _Event, problem: str) -> NoReturn:
+    raise yaml.MarkedYAMLError(None, None, problem, event.start_mark)
+
+
+def dump_yaml(document: Mapping[str, Foreign]) -> str:
+    """Return YAML text whose numbers read back exactly."""
+    return str(yaml.safe_dump(dict(document), sort_keys=False, default_flow_style=None, width=120))
 
 
 def _literal(text: str, path: str | Path) -> Foreign:
@@ -213,7 +382,9 @@ def _toml_or_ini(text: str, path: str | Path) -> dict[str, Foreign]:
         parser.read_string(text)
     except configparser.Error:
         raise InputError(f"{path}: neither TOML nor INI: {problem}") from None
-    return {section: {key: _number(value) for key, value in parser[section].items()} for section in parser.sections()}
+    return {
+        section: {key: _or_number(value) for key, value in parser[section].items()} for section in parser.sections()
+    }
 
 
 def _xml(data: bytes, path: str | Path) -> Foreign:
@@ -237,15 +408,13 @@ def _node(element: ElementTree.Element) -> Foreign:
     words = (element.text or "").split()
     if element.tag == "dt" or not words:
         return " ".join(words)
-    values = [_number(word) for word in words]
+    values = [_or_number(word) for word in words]
     if any(isinstance(value, str) for value in values):
         return " ".join(words).strip('"')
     return values[0] if len(values) == 1 and element.tag != "data" else values
 
 
-def _number(text: str) -> Foreign:
+def _or_number(text: str) -> Foreign:
     """Return a number where a text is one."""
-    try:
-        return float(text)
-    except ValueError:
-        return text.strip()
+    found = number(text)
+    return text.strip() if found is None else found

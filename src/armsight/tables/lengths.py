@@ -32,6 +32,8 @@ class Usual(NamedTuple):
 BASELINE = Usual("baseline", 1e-3, 20.0)  # half, double: none of the rigs of docs/measured.md is near either end
 #: The farthest of the positions of an arm's flange, or of a target before cameras.
 REACH = Usual("farthest position", 0.02, 20.0)  # half, double: likewise
+#: A body of markers, or a field of them, along its longest side.
+BODY = Usual("size of the body", 2e-3, 20.0)  # half, double: likewise
 
 
 def fitting_unit(length_m: float, unit_m: float, usual: Usual) -> str | None:

@@ -9,7 +9,10 @@ of patterns, one a maker; each says in which unit and convention its numbers are
 - FANUC ``P[1]{.. X = 1 mm, .. R = 6 deg}`` (.LS), Yaskawa ``C00000=x,..`` (.JBI, ///RECTAN), DENSO ``P(x, .., rz, fig)``,
   xArm ``set_position(x=.., yaw=..)``: mm, deg, about the fixed x, y and z.
 - Staubli ``<Value x= .. rz= />`` (.dtx), Mecademic ``MovePose(..)``: mm, deg, about x, y' and z''.
-- Doosan ``posx(x, y, z, a, b, c)``: mm, deg, about z, y' and z''; given on as a quaternion.
+- Epson ``XY(x, y, z, u, v, w)`` and .pts: mm, deg, U, V, W about the fixed z, y and x; Mitsubishi ``P1=(x,..,c)(7,0)``,
+  Techman ``PTP("CPP",x,..,rz,..)``: mm, deg, about the fixed x, y and z.
+- Doosan ``posx(x, y, z, a, b, c)``, Kawasaki ``.TRANS`` and ``TRANS(x,y,z,o,a,t)``: mm, deg, about z, y' and z''; given on
+  as a quaternion.
 """
 
 from __future__ import annotations
@@ -22,13 +25,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armsight.errors import InputError
+from armsight.tables.number import NUMBER
 
-_N = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_N = NUMBER
 _SIX = rf"\s*({_N})" + rf"\s*,\s*({_N})" * 5
+_SIX_JOINTS = rf"\s*({_N}(?:\s*,\s*{_N}){{5}})"
 _JOINTS = rf"\s*({_N}(?:\s*,\s*{_N}){{3,6}})"
 _MM = ("x_mm", "y_mm", "z_mm")
 _ANGLES = ("rx_deg", "ry_deg", "rz_deg")
 _ROTATED, _FIXED = "XYZ", "xyz"
+#: Kawasaki: between two numbers; Epson: the names before the second number and on.
+_OR_BLANK = r"(?:[ \t]*,[ \t]*|[ \t]+)"
+_SPEL = "".join(rf"(?:\s*,\s*|\s*r{name}\s*=\s*)({_N})" for name in "YZUVW")
 
 
 class Program(NamedTuple):
@@ -74,20 +82,8 @@ PROGRAMS = (
         + r"\s*deg\s*,\s*".join(rf"\bJ{k}\s*=\s*(?P<J{k}>{_N})" for k in range(1, 7))
         + r"\s*deg",
     ),
-    Program(
-        "Yaskawa",
-        r"^///(?:POSTYPE|RECTAN|PULSE)\b",
-        rf"^[BC]?[CP]X?\d+\s*={_SIX}\s*$",
-        (*_MM, *_ANGLES),
-        _FIXED,
-    ),
-    Program(
-        "Staubli",
-        r"<Data\b[^>]*\btype=\"(?:pointRx|point|jointRx|joint|trsf)\"",
-        "",
-        (*_MM, *_ANGLES),
-        _ROTATED,
-    ),
+    Program("Yaskawa", r"^///(?:POSTYPE|RECTAN|PULSE)\b", rf"^[BC]?[CP]X?\d+\s*={_SIX}\s*$", (*_MM, *_ANGLES), _FIXED),
+    Program("Staubli", r"<Data\b[^>]*\btype=\"(?:pointRx|point|jointRx|joint|trsf)\"", "", (*_MM, *_ANGLES), _ROTATED),
     Program(
         "Doosan",
         r"\bpos[xj]\s*\(",
@@ -114,6 +110,38 @@ PROGRAMS = (
         rf"(?:^|[^\w])J\s*\({_JOINTS}\s*\)",
     ),
     Program(
+        "Kawasaki",
+        r"^\s*\.(?:TRANS|JOINTS)\b|\bTRANS\s*\(",
+        rf"(?:^[ \t]*[A-Za-z]\w*(?:\[\d+\])?[ \t]+|\bTRANS\s*\(\s*)({_N})" + rf"{_OR_BLANK}({_N})" * 5,
+        (*_MM, *_ANGLES),
+        "ZYZ",
+        rf"^[ \t]*#[A-Za-z]\w*(?:\[\d+\])?[ \t]+({_N}(?:{_OR_BLANK}{_N}){{5,6}})",
+    ),
+    Program(
+        "Mitsubishi",
+        r"^\s*(?:\d+\s+)?[PJ]\w*\s*=\s*\(",
+        rf"^\s*(?:\d+\s+)?P\w*\s*=\s*\({_SIX}(?:\s*,\s*{_N}){{0,2}}\s*\)\s*\(\s*\d+\s*,\s*-?\d+\s*\)",
+        (*_MM, *_ANGLES),
+        _FIXED,
+        rf"^\s*(?:\d+\s+)?J\w*\s*=\s*\({_SIX_JOINTS}(?:\s*,\s*{_N}){{0,2}}\s*\)",
+    ),
+    Program(
+        "Epson",
+        r"\bXY\s*\(|^\s*rX\s*=|\b(?:JA|AglToPls)\s*\(",
+        rf"(?:\bXY\s*\(\s*|\brX\s*=\s*)({_N}){_SPEL}",
+        (*_MM, *_ANGLES[::-1]),
+        _FIXED,
+        rf"\b(?:JA|AglToPls)\s*\({_SIX_JOINTS}\s*\)",
+    ),
+    Program(
+        "Techman",
+        r"\b(?:PTP|Line)\s*\(\s*\"(?:CPP|CAP|CAR|JPP)\"",
+        rf"\b(?:PTP|Line)\s*\(\s*\"C(?:PP|AP|AR)\"\s*,\s*\{{?{_SIX}",
+        (*_MM, *_ANGLES),
+        _FIXED,
+        rf"\bPTP\s*\(\s*\"JPP\"\s*,\s*\{{?{_SIX_JOINTS}",
+    ),
+    Program(
         "xArm",
         r"\bset_(?:position|servo_angle)\s*\(",
         r"\bset_position\s*\((?:\s*\*?\[\s*)?(?:x\s*=)?\s*({n})\s*,\s*(?:y\s*=)?\s*({n})\s*,\s*(?:z\s*=)?\s*({n})\s*,\s*"
@@ -123,7 +151,7 @@ PROGRAMS = (
         rf"\bset_servo_angle\s*\([^\[]*\[{_JOINTS}\s*\]",
     ),
 )
-_UR = re.compile(r"\bp\[([^\[\]]*)\]")
+_UR = re.compile(r"\bp\[([^\[\]]*,[^\[\]]*)\]")
 #: What a line of a program of Universal Robots may be beside one with a pose.
 _UR_BESIDE = re.compile(r"[#=()]|^\s*(?:def|end|while|if|else|elif|loop|halt)\b")
 #: A point or the axes in KUKA's language: {X 1.5,Y 2, ..}, with or without the name of its type.
@@ -184,7 +212,7 @@ def _points(path: Path, text: str, program: Program) -> ProgramPoints | None:
     if program.maker == "FANUC":
         _require_one_frame(path, kept)
     if joints:
-        cells = [one[1].split(",") if one.re.groups == 1 else list(one.groups()) for one in joints]
+        cells = [re.split(r"[\s,]+", one[1].strip()) if one.re.groups == 1 else list(one.groups()) for one in joints]
         head = [f"q{k}_deg" for k in range(1, len(cells[0]) + 1)]
         rows = [(_line(text, one), [cell.strip() for cell in row]) for one, row in zip(joints, cells, strict=True)]
         return ProgramPoints(head, rows, None, notes)

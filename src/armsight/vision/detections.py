@@ -18,6 +18,7 @@ import numpy as np
 from armsight.data import SIDES, Array, Body, Correspondences, Ids, Record
 from armsight.errors import InputError
 from armsight.files import read_table
+from armsight.tables.number import number
 
 COLUMNS = ("shot", "camera", "marker", "u_px", "v_px")
 #: How many lines with the same mistake are named before the rest is counted.
@@ -67,19 +68,19 @@ def read_detections(path: str | Path, body: Body) -> list[SeenShot]:
     at = [header.index(name) for name in COLUMNS]
     index = {name: i for i, name in enumerate(body.point_names)}
     shots: dict[str, tuple[tuple[list[int], list[int]], tuple[list[Array], list[Array]]]] = {}
-    for number, row in enumerate(rows[1:], start=2):
+    for line, row in enumerate(rows[1:], start=2):
         if not any(field.strip() for field in row):
             continue
         if len(row) != len(header):
-            raise InputError(f"{path}: line {number}: {len(row)} fields, the header has {len(header)}")
+            raise InputError(f"{path}: line {line}: {len(row)} fields, the header has {len(header)}")
         shot, camera, marker, u, v = (row[i].strip() for i in at)
         if camera not in SIDES:
-            raise InputError(f"{path}: line {number}: camera {camera!r}; it must be left or right")
+            raise InputError(f"{path}: line {line}: camera {camera!r}; it must be left or right")
         if marker not in index:
             raise InputError(
-                f"{path}: line {number}: unknown marker {marker!r}; body {body.name} has {_some(body.point_names)}"
+                f"{path}: line {line}: unknown marker {marker!r}; body {body.name} has {_some(body.point_names)}"
             )
-        uv = np.array([_number(text, path, number, name) for text, name in ((u, "u_px"), (v, "v_px"))])
+        uv = np.array([_number(text, path, line, name) for text, name in ((u, "u_px"), (v, "v_px"))])
         ids, pixels = shots.setdefault(shot, (([], []), ([], [])))
         side = SIDES.index(camera)
         ids[side].append(index[marker])
@@ -125,18 +126,17 @@ def detection_times(path: str | Path) -> dict[str, float]:
         return {}
     shot, at = header.index("shot"), header.index("t_s")
     return {
-        row[shot].strip(): _number(row[at].strip(), path, number, "t_s")
-        for number, row in enumerate(rows[1:], start=2)
+        row[shot].strip(): _number(row[at].strip(), path, line, "t_s")
+        for line, row in enumerate(rows[1:], start=2)
         if len(row) == len(header) and row[at].strip()
     }
 
 
 def _number(text: str, path: str | Path, line: int, column: str) -> float:
     """Read one finite number."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise InputError(f"{path}: line {line}: {column} is {text!r}, it must be a number") from None
+    value = number(text)
+    if value is None:
+        raise InputError(f"{path}: line {line}: {column} is {text!r}, it must be a number")
     if not np.isfinite(value):
         raise InputError(f"{path}: line {line}: {column} is {text}, it must be a finite number of pixels")
     return value

@@ -20,10 +20,12 @@ from numpy.typing import NDArray
 from armsight import MOST_PIXELS
 from armsight.data import Image
 from armsight.errors import InputError
-from armsight.files import read_bytes
+from armsight.files import opened, read_bytes
 
-#: Largest image file; half: 50 Mpx of 16 bits, uncompressed, are rejected; double: as much more memory.
+#: Largest image file that is read whole; half: PNG of 30 Mpx of 16 bits are rejected; double: as much more memory.
 IMAGE_MB = 128
+#: Largest file of any format: MOST_PIXELS of three channels of 16 bits, uncompressed; OpenCV reads those in pieces.
+_RAW_MB = 1.01 * MOST_PIXELS * 6 / 1e6
 _STDERR = threading.Lock()
 
 
@@ -86,6 +88,13 @@ def read_image(path: str | Path) -> Image:
     Raises:
         InputError: missing, unreadable, not an image, or truncated; the message names the file.
     """
+    with opened(path, _RAW_MB) as file:
+        piecewise = os.fstat(file.fileno()).st_size > IMAGE_MB * 1e6 and not file.read(8).startswith(tuple(_FORMATS))
+    if piecewise:
+        image = None
+        with _quiet(), contextlib.suppress(cv2.error):
+            image = cv2.imread(os.fspath(path), cv2.IMREAD_UNCHANGED)
+        return _checked(image, path)
     data = read_bytes(path, IMAGE_MB)
     if not data:
         raise InputError(f"{path}: the file is empty")
@@ -102,6 +111,11 @@ def decoded(data: bytes, path: str | Path) -> Image:
     image = None
     with _quiet(), contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    return _checked(image, path)
+
+
+def _checked(image: Image | None, path: str | Path) -> Image:
+    """Return an image as OpenCV decoded it without its alpha; reject None, and what has not 8 or 16 bits."""
     if image is None:
         raise InputError(
             f"{path}: not an image that can be read (JPEG, PNG, TIFF, BMP, PGM, ... of {MOST_PIXELS >> 20} Mpx at most)"

@@ -50,6 +50,23 @@ def npy(value):
     return file.getvalue()
 
 
+POSE_CAMERA_2 = {"Dimensionality": 3, "Translation": (1e3 * T).tolist(), "R": R.tolist()}
+
+
+def stereo_parameters(matrix, **pose_of_2):
+    """MATLAB's stereoParameters: pixels from 1, mm, (height, width)."""
+    one = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
+    cameras = {}
+    for k, (K, d) in enumerate(((K_LEFT, D_LEFT), (K_RIGHT, D_RIGHT)), 1):
+        cameras[f"CameraParameters{k}"] = {
+            "RadialDistortion": d[:2].tolist(),
+            "TangentialDistortion": d[2:].tolist(),
+            "ImageSize": list(SIZE[::-1]),
+            matrix: (K + one if matrix == "K" else (K + one).T).tolist(),
+        }
+    return {**cameras, "TranslationOfCamera2": (1e3 * T).tolist(), "WorldUnits": "millimeters", **pose_of_2}
+
+
 def named(K1, D1, K2, D2, R_="R", T_="T", scale=1e3, row=False, **more):
     """The six matrices under somebody's names, translation in mm."""
     d = [five(D_LEFT).reshape(1, -1), five(D_RIGHT).reshape(1, -1)]
@@ -417,6 +434,18 @@ PROGRAMS = {
         "opencv",
         {"Calib_Results_stereo.json": json.dumps({k: np.squeeze(v).tolist() for k, v in BOUGUET.items()})},
         MM,
+    ),
+    "stereoParams": (
+        "MATLAB R2019b, Computer Vision Toolbox, jsonencode(toStruct(stereoParams))",
+        "stereoparams",
+        {"stereoParams.json": json.dumps(stereo_parameters("IntrinsicMatrix", RotationOfCamera2=R.T.tolist()))},
+        {},
+    ),
+    "stereoParams, K": (
+        "MATLAB R2023a, jsonencode(load('stereo.mat')), PoseCamera2",
+        "stereoparams",
+        {"stereo.json": json.dumps({"stereoParams": stereo_parameters("K", PoseCamera2=POSE_CAMERA_2)})},
+        {},
     ),
     "14": (
         "opencv 4, CALIB_RATIONAL_MODEL: 14 coefficients",

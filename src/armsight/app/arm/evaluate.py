@@ -36,7 +36,7 @@ from armsight.app.check.run_folder import (
 from armsight.app.run.record import read_track
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import finite_json, read_json, read_table, read_toml
+from armsight.files import finite_json, read_json, read_toml
 from armsight.geometry.pose import mean_pose
 from armsight.geometry.rotation import log_so3
 from armsight.loop.identify.backlash import joint_backlashes
@@ -47,6 +47,7 @@ from armsight.loop.iso9283.poses import MIN_POSES
 from armsight.loop.iso9283.statistic import Metric
 from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
+from armsight.tables.columns import Columns
 
 #: So many rests that were left out are named.
 _NAMED = 5
@@ -673,16 +674,11 @@ def seen_angles(folder: Path, arm: Arm) -> Array:
         InputError: no run with a hand-eye calibration, or another arm's.
     """
     path = folder / "handeye_poses.csv"
-    table = read_table(path)
+    table = Columns.of_csv(path)
     names = [f"q{i + 1}_rad" for i in range(arm.joints)]
-    header = table[0] if table else []
-    if any(name not in header for name in names) or f"q{arm.joints + 1}_rad" in header:
+    if not set(names) <= set(table.at) or f"q{arm.joints + 1}_rad" in table.at:
         raise InputError(f"{path}: is not of an arm of {arm.joints} joints")
-    at = [header.index(name) for name in names]
-    try:
-        seen = np.array([[float(row[k]) for k in at] for row in table[1:]])
-    except (ValueError, IndexError):
-        raise InputError(f"{path}: numbers are needed in {', '.join(names)}") from None
+    seen = table.numbers(names)
     try:
         start = read_toml(folder / "motion.toml").get("start_deg", np.degrees(arm.home).tolist())
         return np.vstack([np.radians(np.array(start, float)), seen])

@@ -13,9 +13,10 @@ import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import read_columns, read_table
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_quaternion_wxyz, quaternion_wxyz
+from armsight.tables.cells import read_columns
+from armsight.tables.columns import Columns
 
 TESTS = ("pose", "path", "circle")
 _TEXTS = ("test", "pose", "cycle", "approach")
@@ -31,15 +32,8 @@ _NAMED = 5
 _FAR_M = 0.1
 #: Commands of one pose differ by rounding at most: by this much, m, and in their rotation matrices.
 SAME_M = 1e-5
-_COLUMNS = (
-    *_TEXTS,
-    "t_s",
-    *_POSITION,
-    *_QUATERNION,
-    *_COMMAND,
-    *_SIGMA,
-    *_COMMON,
-)
+_NUMBERS = ("t_s", *_POSITION, *_QUATERNION, *_COMMAND, *_SIGMA, *_COMMON)
+_COLUMNS = (*_TEXTS, *_NUMBERS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,20 +105,24 @@ def read_rows(file: Path, columns: str | None = None) -> list[Row]:
     Raises:
         InputError: unreadable, a column missing, or a value that is no number; the message names the line.
     """
-    table = read_table(file, read_columns(columns, _COLUMNS))
-    if not table:
+    table = Columns.of_csv(file, read_columns(columns, _COLUMNS))
+    if not table.at:
         raise InputError(f"{file}: empty; a first line of column names is needed")
-    header = [name.strip() for name in table[0]]
-    missing = [name for name in NEEDED if name not in header]
+    missing = [name for name in NEEDED if name not in table.at]
     if missing:
-        hint = "; of a run give the folder" if "phase" in header else ""
+        hint = "; of a run give the folder" if "phase" in table.at else ""
         hint = "; a motion file is for armsight run --motion" if file.suffix == ".toml" else hint
         raise InputError(f"{file}: line 1: column {missing[0]} is missing; needed are {', '.join(NEEDED)}{hint}")
-    rows = []
-    for line, entries in enumerate(table[1:], start=2):
-        if any(entry.strip() for entry in entries):
-            named = dict(zip(header, (entry.strip() for entry in entries), strict=False))
-            rows.append(_row(f"{file}: line {line}", named))
+    known = [name for name in _NUMBERS if name in table.at]
+    numbers, texts = table.numbers(known, empty=True), zip(*map(table.texts, _TEXTS), strict=True)
+    rows = [
+        _row(
+            f"{file}: line {line}",
+            dict(zip(_TEXTS, cells, strict=True)),
+            {name: float(value) for name, value in zip(known, values, strict=True) if not np.isnan(value)},
+        )
+        for (line, _), values, cells in zip(table.rows, numbers, texts, strict=True)
+    ]
     if not rows:
         raise InputError(f"{file}: no rows; one line an attained pose is needed")
     _require_sense(file, rows)
@@ -153,28 +151,17 @@ def _require_sense(file: Path, rows: list[Row]) -> None:
         )
 
 
-def _row(where: str, entries: dict[str, str]) -> Row:
-    test = entries.get("test", "") or "pose"
+def _row(where: str, entries: dict[str, str], numbers: dict[str, float]) -> Row:
+    test = entries["test"] or "pose"
     if test not in TESTS:
         raise InputError(f"{where}: test is {test!r}; known are {', '.join(TESTS)}")
-    numbers = {}
-    for name in _COLUMNS[len(_TEXTS) :]:
-        entry = entries.get(name, "")
-        if not entry:
-            continue
-        try:
-            numbers[name] = float(entry)
-        except ValueError:
-            raise InputError(f"{where}: {name} is {entry!r}, must be a number") from None
-        if not np.isfinite(numbers[name]):
-            raise InputError(f"{where}: {name} is {entry}, must be a finite number")
     _require_whole(where, entries, numbers)
     covs = [np.diag([numbers.get(name, 0.0) ** 2 for name in names]) for names in (_SIGMA, _COMMON)]
     return Row(
         test,
         entries["pose"],
-        entries.get("cycle", ""),
-        entries.get("approach", ""),
+        entries["cycle"],
+        entries["approach"],
         numbers.get("t_s"),
         _pose(where, numbers, ""),
         _pose(where, numbers, "command_"),
@@ -187,7 +174,7 @@ def _row(where: str, entries: dict[str, str]) -> Row:
 
 def _require_whole(where: str, entries: dict[str, str], numbers: dict[str, float]) -> None:
     """Raise InputError where a row lacks a value, or a standard deviation is none."""
-    if not entries.get("pose"):
+    if not entries["pose"]:
         raise InputError(f"{where}: pose is empty; it needs a name")
     for name in NEEDED[1:]:
         if name not in numbers:

@@ -27,11 +27,12 @@ from armsight.app.check.rows import SAME_M, Attained, Reversal, Row, first_few, 
 from armsight.app.run.record import ToolTrack, read_track
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import read_table, read_toml
+from armsight.files import read_toml
 from armsight.geometry.pose import mean_pose, pose
 from armsight.loop.iso9283.paths import plane_axes
 from armsight.loop.iso9283.poses import MIN_POSES
 from armsight.robot.kinematics.table import MOST_JOINTS
+from armsight.tables.columns import Columns
 
 #: A rest is evaluated over its last part, this long, s: longer averages more shots, and more of the settling.
 WINDOW_S = 0.3
@@ -131,18 +132,14 @@ def joint_track(folder: Path, joints: int | None = None) -> JointTrack:
         InputError: missing, not a run's, or of an arm of another number of joints.
     """
     file = folder / "joints.csv"
-    table = read_table(file)
-    header = [_VERSION_1.get(name, name) for name in table[0]] if table else []
-    count = joints or sum(re.fullmatch(r"q\d+_ref_rad", name) is not None for name in header) or 6
+    table = Columns.of_csv(file)
+    table.at = {_VERSION_1.get(name, name): k for name, k in table.at.items()}
+    count = joints or sum(re.fullmatch(r"q\d+_ref_rad", name) is not None for name in table.at) or 6
     names = ["t_s", *(f"q{i + 1}_ref_rad" for i in range(count)), *(f"q{i + 1}_rad" for i in range(count))]
-    if joints is not None and (set(names) - set(header) or f"q{joints + 1}_rad" in header):
+    if joints is not None and (set(names) - set(table.at) or f"q{joints + 1}_rad" in table.at):
         raise InputError(f"{file}: is not of an arm of {joints} joints: give the arm of the run with --arm")
-    needed = names if set(names) <= set(header) else names[: count + 1]
-    try:
-        at = [header.index(name) for name in needed]
-        values = np.array([[float(row[k]) for k in at] for row in table[1:]]).reshape(-1, len(at))
-    except (ValueError, IndexError):
-        raise InputError(f"{file}: not a run's joints: {', '.join(needed)} are needed, numbers in every line") from None
+    needed = names if set(names) <= set(table.at) else names[: count + 1]
+    values = table.numbers(needed)
     if not len(values):
         raise InputError(f"{file}: no readings")
     q_ref = values[:, 1 : count + 1]

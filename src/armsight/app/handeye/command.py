@@ -158,7 +158,7 @@ def _columns(options: Options, side: str) -> str | None:
 
 def _with_both(options: Options) -> Options:
     """Return the options with the robot's file as that of what was seen, where it holds both and nothing else is given."""
-    from armsight.tables.documents import has_both
+    from armsight.tables.nested import has_both
 
     given = (options.seen, options.images, options.camera, options.rig, options.left, options.right, options.source)
     return replace(options, seen=options.robot) if not any(given) and has_both(options.robot) else options
@@ -166,7 +166,7 @@ def _with_both(options: Options) -> Options:
 
 def _require_one_way(options: Options) -> None:
     """Reject options that do not go together."""
-    from armsight.tables.documents import has_both
+    from armsight.tables.nested import has_both
 
     ways = {
         "--seen": options.seen is not None,

@@ -35,6 +35,7 @@ from armsight.loop.identify.validate import MIN_POSES, Errors, Validation, error
 from armsight.robot.arm import Arm
 from armsight.tables.cells import Cells, read_cells, read_columns
 from armsight.tables.columns import NAMES
+from armsight.tables.number import number
 from armsight.tables.poses import PoseTable, read_pose_table
 
 #: Parts of the poses that are left out, one after the other, where nothing is given to validate with.
@@ -150,10 +151,9 @@ def _at_rest(data: Path, times: list[str], lines: list[int], table: PoseTable) -
     rests: list[list[tuple[int, Array]]] = []
     inside = 0
     for line, cell in zip(lines, times, strict=True):
-        try:
-            at = float(cell)
-        except ValueError:
-            raise InputError(f"{data}: line {line}: t_s is {cell!r}, must be a number, s") from None
+        at = number(cell)
+        if at is None:
+            raise InputError(f"{data}: line {line}: t_s is {cell!r}, must be a number, s")
         if not t_s[0] <= at <= t_s[-1]:
             continue
         inside += 1

@@ -10,7 +10,8 @@ import numpy as np
 
 from armsight.app.replay.tables import LIVE, POSES
 from armsight.errors import InputError
-from armsight.files import read_table
+from armsight.tables.columns import Columns
+from armsight.tables.number import number
 
 
 @dataclass(frozen=True)
@@ -68,33 +69,24 @@ def compare(first: Path, second: Path) -> list[TableDifference]:
 
 
 def _compared(first: Path, second: Path) -> TableDifference:
-    tables = []
-    for path in (first, second):
-        rows = read_table(path)
-        if not rows or rows[0][0] not in ("shot", "t_s"):
-            raise InputError(f"{path}: line 1: expected a table of poses whose first column is shot or t_s")
-        tables.append((rows[0], {row[0]: row for row in rows[1:]}))
-    (header, a), (other, b) = tables
-    common = [key for key in a if key in b]
-    columns = [name for name in header[1:] if name in other]
+    tables = [Columns.of_csv(path) for path in (first, second)]
+    for table in tables:
+        if next(iter(table.at), None) not in ("shot", "t_s"):
+            raise InputError(f"{table.path}: line 1: expected a table of poses whose first column is shot or t_s")
+    a, b = ({row[0]: row for _, row in table.rows} for table in tables)
+    columns = [name for name in list(tables[0].at)[1:] if name in tables[1].at]
     largest = dict.fromkeys(columns, 0.0)
     same, status_changed, squares = True, 0, []
-    for key in common:
-        one = dict(zip(header, a[key], strict=False))
-        two = dict(zip(other, b[key], strict=False))
-        status_changed += one.get("status") != two.get("status")
-        deltas: dict[str, float] = {}
-        for name in columns:
-            if one.get(name) != two.get(name):
-                same = False
-            try:
-                deltas[name] = abs(float(one[name]) - float(two[name]))
-            except (KeyError, ValueError):
-                continue
-            largest[name] = max(largest[name], deltas[name])
+    for key in (key for key in a if key in b):
+        cells = {name: tuple(row[table.at[name]] for row, table in zip((a[key], b[key]), tables, strict=True))
+                 for name in columns}  # fmt: skip
+        same &= all(one == two for one, two in cells.values())
+        status_changed += len(set(cells.get("status", ()))) > 1
+        numbers = {name: tuple(map(number, pair)) for name, pair in cells.items()}
+        deltas = {name: abs(x - y) for name, (x, y) in numbers.items() if x is not None and y is not None}
+        largest |= {name: max(largest[name], delta) for name, delta in deltas.items()}
         if all(f"{axis}_m" in deltas for axis in "xyz"):
             squares.append(sum(deltas[f"{axis}_m"] ** 2 for axis in "xyz"))
+    common = len(set(a) & set(b))
     rms = float(np.sqrt(np.mean(squares))) if squares else None
-    return TableDifference(
-        first.name, len(common), len(a) - len(common), len(b) - len(common), same, status_changed, largest, rms
-    )
+    return TableDifference(first.name, common, len(a) - common, len(b) - common, same, status_changed, largest, rms)

@@ -109,15 +109,16 @@ def _body_of(recorded: RecordedRun) -> Body:
 
 def _of_source(request: Request, recorded: RecordedRun | None, say: Callable[[str], None]) -> Replayed:
     """Measure the images or the tags of a recording again."""
-    if request.target is None:
-        raise InputError(f"{request.recording}: what is to be measured in it? give --target, a board or a body file")
     path, named = parsed(request.recording.removeprefix("bag:"))
     folder = Path(path).expanduser()
-    if folder.is_dir() and (
+    of_images = folder.is_dir() and (
         (folder / INDEX).is_file() or not any(each.suffix in SUFFIXES for each in folder.iterdir())
-    ):
+    )
+    bag = None if of_images else Bag(path if recorded is None else recorded.path)
+    if request.target is None:
+        raise InputError(f"{request.recording}: what is to be measured in it? give --target, a board or a body file")
+    if bag is None:
         return _of_images(request, open_source(path), None, say)
-    bag = Bag(path if recorded is None else recorded.path)
     if bag.of_kind(*IMAGES):
         return _of_images(request, source_of(bag, image_topics(bag, named)), bag, say)
     if not bag.of_kind(*TAGS):

@@ -22,13 +22,14 @@ from scipy.spatial.transform import Rotation
 
 from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Record
 from armsight.errors import InputError
-from armsight.files import read_table, replacing
+from armsight.files import replacing
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import ArmEstimate, Delay, Mounting, Outcome, PoseMeasurement
 from armsight.loop.health.change import Change, widened
 from armsight.loop.health.follow import RigCorrection
 from armsight.robot.arm import Arm
 from armsight.robot.trajectories import Trajectory
+from armsight.tables.columns import Columns
 from armsight.vision.rig import StereoRig
 
 _COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
@@ -146,41 +147,21 @@ def read_track(file: Path, more: tuple[str, ...] = ()) -> tuple[ToolTrack, Array
         InputError: unreadable, a column missing, no rows, a cell that is no finite number, or times that fall; the message
             names the line.
     """
-    table = read_table(file)
-    header = table[0] if table else []
-    columns = (*_COLUMNS, "phase", "motion", *more)
-    for name in columns:
-        if name not in header:
-            raise InputError(f"{file}: line 1: column {name} is missing; needed are {', '.join(columns)}")
-    at = [header.index(name) for name in columns]
-    body = table[1:]
-    try:
-        numbers = np.array([[float(row[k]) for k in (*at[:8], *at[10:])] for row in body]).reshape(-1, 8 + len(more))
-        texts = np.array([[row[k] for k in at[8:10]] for row in body], dtype=str).reshape(-1, 2)
-    except (ValueError, IndexError):
-        line = next(n for n, row in enumerate(body, start=2) if not _whole(row, at))
-        raise InputError(f"{file}: line {line}: numbers are needed in {', '.join(_COLUMNS)}") from None
-    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
-    if len(bad):
-        raise InputError(f"{file}: line {bad[0] + 2}: finite numbers are needed in {', '.join((*_COLUMNS, *more))}")
-    falls = np.flatnonzero(np.diff(numbers[:, 0]) < 0)
-    if len(falls):
-        raise InputError(f"{file}: line {falls[0] + 3}: t_s is less than in the line before; times must rise")
+    table = Columns.of_csv(file)
+    for name in ("phase", "motion"):
+        table.require(name)
+    numbers = table.numbers((*_COLUMNS, *more))
     if not len(numbers):
         raise InputError(f"{file}: no rows")
+    falls = np.flatnonzero(np.diff(numbers[:, 0]) < 0)
+    if len(falls):
+        line, _ = table.rows[falls[0] + 1]
+        raise InputError(f"{file}: line {line}: t_s is less than in the line before; times must rise")
     if not np.linalg.norm(numbers[:, 4:8], axis=1).all():
         raise InputError(f"{file}: a quaternion qw .. qz is zero")
     Ts = np.tile(np.eye(4), (len(numbers), 1, 1))
     Ts[:, :3, 3], Ts[:, :3, :3] = numbers[:, 1:4], Rotation.from_quat(numbers[:, [5, 6, 7, 4]]).as_matrix()
-    return ToolTrack(numbers[:, 0], Ts, texts[:, 0], texts[:, 1]), numbers[:, 8:]
-
-
-def _whole(row: list[str], at: list[int]) -> bool:
-    """Return whether a line has all its cells, and numbers where they are needed."""
-    try:
-        return bool([float(row[k]) for k in (*at[:8], *at[10:])]) and len(row) > max(at)
-    except (ValueError, IndexError):
-        return False
+    return ToolTrack(numbers[:, 0], Ts, *(np.array(table.texts(n), str) for n in ("phase", "motion"))), numbers[:, 8:]
 
 
 #: Two poses further apart than this, s, give no speed.

@@ -25,6 +25,8 @@ from armsight.files import read_table, read_toml, write_text
 from armsight.geometry.check import checked
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_euler_zyx, from_quaternion_wxyz
+from armsight.tables.lengths import BODY, check_length
+from armsight.tables.number import number
 
 #: The version of the format that is documented; a file without the key ``version`` has version 1.
 VERSION = 2
@@ -275,8 +277,6 @@ HEADERS = (
     ("id", "x", "y", "z"),
     ("marker", "x", "y", "z"),
 )
-#: A body larger than this was not written in metres.
-SIZE_MAX_M = 100.0
 
 
 def load_body_csv(path: str | Path) -> Body:
@@ -310,18 +310,18 @@ def load_body_csv(path: str | Path) -> Body:
     if len(points) < 3:
         raise InputError(f"{path}: a body needs 3 or more points, got {len(points)}")
     array = np.array(points)
-    size = float(np.ptp(array, axis=0).max())
-    if size > SIZE_MAX_M:
-        raise InputError(f"{path}: the body is {size:g} m across; coordinates must be in metres")
+    try:
+        check_length(float(np.ptp(array, axis=0).max()), 1.0, BODY, "the coordinates in metres")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     return Body(Path(path).stem, tuple(names), array)
 
 
 def _coordinate(where: str, text: str) -> float:
     """Read one coordinate."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise InputError(f"{where}: {text.strip()!r} is not a number") from None
+    value = number(text)
+    if value is None:
+        raise InputError(f"{where}: {text.strip()!r} is not a number")
     if not math.isfinite(value):
         raise InputError(f"{where}: {text.strip()} where a finite number of metres belongs")
     return value

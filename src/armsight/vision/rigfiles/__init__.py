@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from armsight.vision.rigfiles.rigfile import RigFormat
 
 #: Format name -> the module here that reads it, imported when it is opened; those of ``programs.py`` are asked first.
-FORMATS = dict.fromkeys(("stereolabs", "mrcal", "basalt", "orbslam", "multical", "caliscope"), "programs") | {
+FORMATS = dict.fromkeys(
+    ("stereolabs", "mrcal", "basalt", "orbslam", "multical", "caliscope", "stereoparams"), "programs"
+) | {
     "kalibr": "kalibr",
     "ros": "ros",
     "opencv": "opencv",

@@ -16,7 +16,7 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse
-from armsight.tables.yaml_file import Foreign, dump_yaml
+from armsight.tables.document import Foreign, dump_yaml
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (

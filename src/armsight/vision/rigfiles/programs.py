@@ -29,6 +29,11 @@ orbslam: ORB-SLAM's stereo settings: ORB-SLAM3's Camera1.fx .. and Stereo.T_c1_c
 
 T_c1_c2 takes the right camera's coordinates to the left one's, m; of images that are rectified already the file has
 Stereo.b, the baseline, alone. LEFT and RIGHT are ROS's matrices, and are read as those.
+
+stereoparams: MATLAB's stereoParameters as JSON, by jsonencode of the object or of toStruct(stereoParams).
+
+Pixels count from 1 there; K, or IntrinsicMatrix, its transpose; ImageSize is (height, width). RotationOfCamera2 is
+transposed, p2 = p1 R + t for rows; PoseCamera2, of later versions, is for columns. WorldUnits name the unit.
 """
 
 from __future__ import annotations
@@ -44,7 +49,7 @@ from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3, from_quaternion_wxyz
-from armsight.tables.yaml_file import Foreign
+from armsight.tables.document import Foreign
 from armsight.vision.camera_file import camera_of, found, is_camera
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
@@ -310,6 +315,71 @@ def _orbslam_part(document: Document, name: str) -> dict[str, Foreign]:
     return {key.removeprefix(f"{name}."): value for key, value in document.items() if key.startswith(f"{name}.")}
 
 
+#: Names of units in MATLAB, m.
+_WORLD_UNITS = {
+    "millimeters": 1e-3,
+    "mm": 1e-3,
+    "meters": 1.0,
+    "m": 1.0,
+    "centimeters": 1e-2,
+    "cm": 1e-2,
+    "inches": 0.0254,
+}
+
+
+def _matlab_inner(document: Document) -> Mapping[str, Foreign] | None:
+    """Return the mapping of a stereoParameters object, which may stand under the variable's name."""
+    for one in (document, *(value for value in document.values() if isinstance(value, Mapping))):
+        if "CameraParameters1" in one and {"PoseCamera2", "TranslationOfCamera2"} & set(one):
+            return one
+    return None
+
+
+def _matlab_recognises(documents: Sequence[Document]) -> bool:
+    """Say whether a file is a whole stereoParameters object."""
+    return any(_matlab_inner(document) is not None for document in documents)
+
+
+def _matlab_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+    """Read both cameras."""
+    count_paths(paths, (1,), "one file, of jsonencode(stereoParams)")
+    with naming(paths[0]):
+        inner = _matlab_inner(documents[0]) or need_named({}, "CameraParameters1")
+        cameras, notes = [], ["pixels counted from 1, as MATLAB's do: 1 px taken from the principal points"]
+        for name in ("CameraParameters1", "CameraParameters2"):
+            with naming(name):
+                given = need_named(inner, name)
+                given = {**given, **(inside if isinstance(inside := given.get("Intrinsics"), Mapping) else {})}
+                K = (
+                    checked(given["K"], (3, 3), "K")
+                    if "K" in given
+                    else checked(need(given, "IntrinsicMatrix"), (3, 3), "IntrinsicMatrix").T
+                )
+                K = K - [[0, 0, 1], [0, 0, 1], [0, 0, 0]]
+                size = given.get("ImageSize") or None
+                radial, tangential = (
+                    list(np.ravel(given.get(f"{kind}Distortion", (0, 0)))) for kind in ("Radial", "Tangential")
+                )
+                entry = {"K": K, "D": [*radial[:2], *tangential, *radial[2:]], "distortion_model": "brown"}
+                camera, said = camera_of(entry | ({"image_size": size[::-1]} if size else {}), options.image_size_px)
+            cameras.append(camera)
+            notes += said
+        if (later := inner.get("PoseCamera2")) is not None:
+            later = need_named(inner, "PoseCamera2")
+            R = need(later, "R") if "R" in later else checked(need(later, "A"), (4, 4), "A")[:3, :3]
+            t = later.get("Translation", None if "A" not in later else np.asarray(later["A"], float)[:3, 3])
+        else:
+            R, t = (
+                checked(need(inner, "RotationOfCamera2"), (3, 3), "RotationOfCamera2").T,
+                inner["TranslationOfCamera2"],
+            )
+        T, said = rigid(R, np.ravel(np.asarray(t, object)), "rotation of camera 2")
+        unit = str(inner.get("WorldUnits", "millimeters"))
+        if unit not in _WORLD_UNITS and options.unit_m is None:
+            raise InputError(f"WorldUnits is {unit!r}; known are {', '.join(_WORLD_UNITS)}: give --unit-m")
+    return imported(cameras, inverse(T), options, paths, notes + said, _WORLD_UNITS.get(unit, 1.0))
+
+
 #: The formats of this file by their names.
 PROGRAMS = {
     "mrcal": ReadFormat("mrcal .cameramodel files", _mrcal_recognises, _mrcal_read),
@@ -318,4 +388,5 @@ PROGRAMS = {
     "multical": ReadFormat("a multical calibration.json", _multical_recognises, _multical_read),
     "stereolabs": ReadFormat("a Stereolabs SN*.conf", _stereolabs_recognises, _stereolabs_read),
     "orbslam": ReadFormat("ORB-SLAM's stereo settings", _orbslam_recognises, _orbslam_read),
+    "stereoparams": ReadFormat("MATLAB's stereoParameters as JSON", _matlab_recognises, _matlab_read),
 }

@@ -21,8 +21,8 @@ from armsight.errors import InputError
 from armsight.files import replacing
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, mean_pose, pose
+from armsight.tables.document import Foreign
 from armsight.tables.lengths import BASELINE, check_length
-from armsight.tables.yaml_file import Foreign
 from armsight.vision.camera import Camera
 from armsight.vision.camera_file import camera_of
 from armsight.vision.rig import StereoRig

@@ -16,6 +16,7 @@ from collections.abc import Callable
 
 from armsight.errors import InputError
 from armsight.vision.sources.bag import open_bag_source
+from armsight.vision.sources.bag.reader import SUFFIXES
 from armsight.vision.sources.folder import FolderSource
 from armsight.vision.sources.lerobot import open_lerobot
 from armsight.vision.sources.pairs import PairsSource
@@ -50,7 +51,7 @@ def check_source(spec: str) -> None:
         if "://" in spec or spec.startswith("/dev/video"):
             hint = f" ({'url' if '://' in spec else 'usb'}:LEFT,RIGHT?)"
         elif os.path.isfile(os.path.expanduser(spec)):
-            hint = f" (video:{spec}?)"
+            hint = f" ({'bag' if spec.endswith(SUFFIXES) else 'video'}:{spec}?)"
         raise InputError(f"{spec}: not a source{hint}: known are {known}, or the path of a folder")
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from armsight.errors import InputError
-from armsight.tables.yaml_file import Foreign
+from armsight.tables.document import Foreign
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import ImportOptions
 from armsight.vision.rigfiles.ros import rig_of

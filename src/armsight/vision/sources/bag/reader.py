@@ -212,7 +212,7 @@ class _RosFiles:
 
         try:
             if not file.is_dir():
-                check_readable(file)
+                _check_magic(self._path, file)
             with AnyReader([file], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
                 self._store = reader.typestore
                 yield reader
@@ -243,6 +243,18 @@ class _RosFiles:
                 raise InputError(_undecodable(self._path, _plain(kind), error)) from None
 
         return decode
+
+
+def _check_magic(path: str | Path, file: Path) -> None:
+    """Reject a file that does not begin as its kind does: the library looks for an end of line in all of it."""
+    magic = {".bag": b"#ROSBAG V", ".mcap": _MCAP_MAGIC}.get(file.suffix, b"SQLite format 3\0")
+    with opened(file) as stream:
+        found = stream.read(len(magic))
+    if found != magic:
+        raise InputError(
+            f"{path}: damaged, cut short, or not a ROS bag (File magic is invalid: it begins with {found!r}, expected is "
+            f"{magic!r})"
+        )
 
 
 def _undecodable(path: str | Path, kind: str, error: Exception) -> str:

@@ -9,7 +9,6 @@ object_wrt_sensor), the names say which is which.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -18,28 +17,14 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from armsight.errors import InputError
-from armsight.files import YAML_MB, read_text
-from armsight.tables.document import read_document
-from armsight.tables.yaml_file import parse_yaml
+from armsight.files import opened, read_bytes
+from armsight.tables.document import documents_in, matrix_of
 
 Record: TypeAlias = dict[str, str]
 #: Words in the names of poses that say whose they are.
 SIDES = {
-    "robot": ("robot", "hand", "gripper", "effector", "eef", "flange", "tcp", "arm", "wrist", "o_t_ee", "end"),
-    "seen": (
-        "track",
-        "target",
-        "marker",
-        "object",
-        "board",
-        "optical",
-        "sensor",
-        "camera",
-        "cam",
-        "tag",
-        "pattern",
-        "calib",
-    ),
+    "robot": re.compile("robot|hand|gripper|effector|eef|flange|tcp|arm|wrist|o_t_ee|end"),
+    "seen": re.compile("track|target|marker|object|board|optical|sensor|camera|cam|tag|pattern|calib"),
 }
 _MATRIX = [name for i in "123" for name in (f"r{i}1", f"r{i}2", f"r{i}3", "xyz"[int(i) - 1])]
 _BY_COUNT = {
@@ -67,7 +52,7 @@ _ECHO = re.compile(
 )
 
 
-#: Suffixes of documents that are text, and of those that ``document.py`` unpacks.
+#: Suffixes of documents that are text, and of those that are not.
 _TEXTS, PACKED = (".yaml", ".yml", ".json"), (".npy", ".npz", ".mat", ".xml", ".gz")
 _MOST_RECORDS = 200_000  # poses of a document, of 40 bytes each; half: the same; double: a hostile list takes 500 MB
 
@@ -78,27 +63,31 @@ def is_document(path: Path, text: str) -> bool:
     return path.suffix.lower() in _TEXTS or bool(_ECHO.search(text) or _DOCUMENT.match(first))
 
 
-def document_rows(path: Path, text: str | None, side: str, whose: str | None) -> tuple[list[str], list[Record]]:
+def is_packed(path: Path) -> bool:
+    """Return whether a file begins as gzip or numpy's files do, whatever its suffix."""
+    with opened(path) as file:
+        return file.read(6).startswith((b"\x1f\x8b", b"\x93NUMPY"))
+
+
+def document_rows(path: Path, text: str, side: str, whose: str | None) -> tuple[list[str], list[Record]]:
     """Return the names of columns and the records of a document.
 
     Args:
         path: the file.
-        text: what it holds; None: it is one of those that ``document.py`` unpacks.
+        text: what it holds, "" where that is no text.
         side: "robot" or "seen": which poses are requested where records have both.
         whose: the name of the poses that are requested; None: the names say whose they are.
 
     Raises:
         InputError: no document, no poses in it, or poses of several and no name says whose.
     """
-    if text is not None and (echoed := _ECHO.findall(text)):
-        records = [
-            {"t_s": at, **dict(zip("xyz", p.split(","), strict=False)), **_quaternion(q.split(","))}
-            for at, p, q in echoed
-        ]
-        records = [{key: cell.strip() for key, cell in one.items() if cell} for one in records]
+    if echoed := _ECHO.findall(text):
+        names = ("t_s", "x", "y", "z", "qx", "qy", "qz", "qw")
+        rows = [dict(zip(names, (at, *p.split(","), *q.split(",")), strict=False)) for at, p, q in echoed]
+        records = [{key: cell.strip() for key, cell in one.items() if cell} for one in rows]
         return list(dict.fromkeys(key for one in records for key in one)), records
     records = []
-    document = _parsed(path, text)
+    document = _parsed(path)
     if isinstance(document, list) and len(document) > _MOST_RECORDS:
         raise InputError(f"{path}: holds {_content(document)}, more than {_MOST_RECORDS} poses: split it")
     items = _items(document)
@@ -122,54 +111,30 @@ def document_rows(path: Path, text: str | None, side: str, whose: str | None) ->
     return list(dict.fromkeys(key for one in records for key in one)), records
 
 
-def _quaternion(cells: list[str]) -> Record:
-    return dict(zip(("qx", "qy", "qz", "qw"), cells, strict=False))
-
-
-def _parsed(path: Path, text: str | None) -> Any:  # noqa: ANN401 - whatever a document holds
-    """Return a document, its matrices as lists."""
-    if text is None:
-        return _plain(read_document(path))
-    if text.lstrip()[:1] in ("{", "[") or path.suffix.lower() == ".json":
-        rows = [row for row in text.splitlines() if row.strip()]
-        try:
-            try:
-                return _plain(json.loads(text))
-            except json.JSONDecodeError:
-                if len(rows) < 2 or any(row.strip()[0] not in "{[" for row in rows):
-                    raise
-                return _plain([json.loads(row.strip().rstrip(",")) for row in rows])  # JSON Lines
-        except RecursionError:
-            raise InputError(f"{path}: not JSON that can be read: nested too deep") from None
-        except json.JSONDecodeError as error:
-            if path.suffix.lower() == ".json":
-                raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg})") from None
-    documents = parse_yaml(text if len(text) <= 1e6 * YAML_MB else read_text(path, YAML_MB), path)
+def _parsed(path: Path) -> Any:  # noqa: ANN401 - whatever a document holds
+    """Return a document, or a list of several, its matrices as lists."""
+    documents = documents_in(read_bytes(path), path)
     return _plain(documents[0] if len(documents) == 1 else documents)
 
 
 def _plain(node: Any) -> Any:  # noqa: ANN401
-    """Return a node with OpenCV's and ViSP's matrices as nested lists without sides of 1."""
+    """Return a node with arrays, and OpenCV's and ViSP's matrices, as nested lists without sides of 1."""
     if isinstance(node, np.ndarray):
         return node.tolist()
     if isinstance(node, list):
         return [_plain(one) for one in node]
     if not isinstance(node, Mapping):
         return node
-    if {"rows", "cols", "data"} <= set(node):
-        try:
-            data = np.array(node["data"], float).ravel()
-            shape = (int(node["rows"]), int(node["cols"]), -1)
-            matrix = np.squeeze(data.reshape(shape))
-        except (ValueError, TypeError):
-            return dict(node)
-        # ViSP's vector of a pose, theta u in radians; its matrices have no dt
-        return (
-            {"position": matrix[:3].tolist(), "rotvec": matrix[3:].tolist()}
-            if matrix.shape == (6,) and "dt" not in node
-            else matrix.tolist()
-        )
-    return {str(key): _plain(one) for key, one in node.items()}
+    try:
+        found = matrix_of("", node)
+    except InputError:
+        return dict(node)
+    if found is None:
+        return {str(key): _plain(one) for key, one in node.items()}
+    matrix = np.squeeze(found)
+    if matrix.shape == (6,) and "dt" not in node:  # ViSP's vector of a pose, theta u in radians
+        return {"position": matrix[:3].tolist(), "rotvec": matrix[3:].tolist()}
+    return matrix.tolist()
 
 
 def _array(node: object) -> np.ndarray[Any, np.dtype[np.float64]] | None:
@@ -349,14 +314,14 @@ def _chosen(path: Path, names: list[str], side: str, whose: str | None) -> str:
 def _score(name: str, side: str) -> int:
     """Return how many words of a side a name has; what stands behind ``2`` or ``wrt`` is what a pose is given in."""
     own = re.split(r"_wrt_|2|_in_|_to_", name.lower())[0]
-    return 2 * any(word in own for word in SIDES[side]) + any(word in name.lower() for word in SIDES[side])
+    return 2 * bool(SIDES[side].search(own)) + bool(SIDES[side].search(name.lower()))
 
 
 def has_both(path: Path) -> bool:
     """Return whether a document's records hold poses of both sides, the robot's and what was seen."""
     if path.suffix.lower() not in (*_TEXTS, *PACKED) or not path.is_file():
         return False
-    items = _items(_parsed(path, None if path.suffix.lower() in PACKED else read_text(path)))
+    items = _items(_parsed(path))
     names = [name for name, _ in _poses(items[0][0])] if items else []
     return len(names) == 2 and all(any(_score(name, side) for name in names) for side in SIDES)
 

@@ -1,0 +1,53 @@
+"""Columns of a CSV by their names, and the names that ``--columns`` gives them."""
+
+import numpy as np
+import pytest
+
+from armsight.errors import InputError
+from armsight.tables.cells import read_columns
+from armsight.tables.columns import Columns
+from armsight.tables.number import number
+
+
+def test_columns_are_read_under_other_names(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("J1, J2 ,x_m,X\n1,2,3,4\n")
+    columns = read_columns("q1_rad=J1, x_m = X", ("q1_rad", "q2_rad", "x_m"))
+    assert columns == {"q1_rad": "J1", "x_m": "X"}
+    assert list(Columns.of_csv(path, columns).at) == ["q1_rad", "J2", "(x_m)", "x_m"]
+    assert read_columns(None, ("a",)) == {}
+    with pytest.raises(InputError, match=r"table\.csv: line 1: no column 'J3' for q2_rad; there are J1, J2, x_m, X"):
+        Columns.of_csv(path, {"q2_rad": "J3"})
+    for text, said in (
+        ("q1_rad", "expected NAME=COLUMN"),
+        ("q9=J9", "unknown name 'q9'; known are q1_rad"),
+        ("q1_rad=J1,q1_rad=J2", "repeats a name"),
+        ("", "expected NAME=COLUMN"),
+    ):
+        with pytest.raises(InputError, match=f"--columns {text}: .*{said}"):
+            read_columns(text, ("q1_rad", "x_m"))
+
+
+def test_cells_that_are_empty_and_lines_that_end_early(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("name,x_m,y_m\na,1,\n\nb,2\n")
+    table = Columns.of_csv(path)
+    np.testing.assert_array_equal(table.numbers(["x_m", "y_m"], empty=True), [[1, np.nan], [2, np.nan]])
+    assert table.texts("name") == ["a", "b"]
+    assert table.texts("none") == ["", ""]
+    with pytest.raises(InputError, match="line 2: y_m is '', not a number; finite numbers are needed"):
+        table.numbers(["y_m"])
+    path.write_text("x_m\nnan\n")
+    with pytest.raises(InputError, match="line 2: x_m is 'nan', not a number"):
+        Columns.of_csv(path).numbers(["x_m"], empty=True)
+    path.write_text("x_m,x_m\n1,2\n")
+    with pytest.raises(InputError, match="names a column twice: x_m"):
+        Columns.of_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1D-3", 1e-3), ("\u22122.5", -2.5), (" 7 ", 7.0), ("1_000", None), ("", None), ("0x10", None), ("-inf", -np.inf)],
+)
+def test_one_number_parser(text, value):
+    assert number(text) == value
