@@ -111,15 +111,13 @@ def watched_body(
     lens=None,
     shift=0.0,
     nod=None,
-    left_px=0.0,
 ):
     """Watch a body that moves and rests; yield the monitor, the time, the true pose, and what it returned for each shot.
 
     From ``at_s`` on cameras and points of the body are displaced, the right camera exposes late by ``skew_s`` (or that of
     the number of the shot, s) and each row of it by ``row_s`` later than the one above, and focal lengths change by a share
     of themselves, ``focal`` of the time since then, left and right. ``nod``: of a side, its camera rotates about its own
-    axes by (side, amplitude (3,), rad, frequency, Hz). ``left_px``: what processed images leave, px: waves across each
-    image that drift, whose phases are others after some seconds, and noise of an amount that changes as often.
+    axes by (side, amplitude (3,), rad, frequency, Hz).
     """
     rng = np.random.default_rng(seed)
     if lens is None:
@@ -136,11 +134,6 @@ def watched_body(
     points = BODY.points + 2e-5 * rng.normal(size=BODY.points.shape)
     monitor = HealthMonitor(given, body, SYNC_S)
     rates, phases = rng.uniform(0.05, 0.2, 6), rng.uniform(0, 2 * np.pi, 6)
-
-    if left_px:
-        other = np.random.default_rng([seed, 1])
-        phase = other.uniform(0.0, 2 * np.pi, (2, 2, 3)), other.uniform(-1.5, 1.5, (2, 2, 3))
-        processed = other.normal(0.0, 4.0, (2, 2, 2, 3)), phase, lambda t: 1.0 + np.sin(t + seed)
 
     def body_at(t):
         u = np.sin(2 * np.pi * rates * min(t, 0.6 * seconds) + phases)  # it rests at the end
@@ -171,11 +164,6 @@ def watched_body(
                 uv[:, side] = middle + (1.0 + share) * (uv[:, side] - middle)
         if lens is not None:
             uv = np.stack([lens(side, uv[:, side]) for side in range(2)], axis=1)
-        if left_px:
-            waves, phase, own = processed
-            angle = np.einsum("nsi,saiw->nsaw", uv / TRUE.left.image_size_px, waves) + phase[0] + t * phase[1]
-            uv = uv + left_px * np.sin(angle).mean(axis=-1)
-            uv = uv + SIGMA_PX * own(t) * np.random.default_rng([seed, k]).normal(size=uv.shape)
         estimate = measured(given, body, frame @ T, uv + SIGMA_PX * rng.normal(size=uv.shape))
         yield monitor, t, frame @ T, estimate, monitor.measured(estimate, t)
 

@@ -22,8 +22,9 @@ displace all that is near each other in an image, for a while, by nearly the sam
     r = J p + L beta + n,    beta ~ N(0, tau^2),    n ~ N(0, kappa)
 
 with p all that may have changed and L polynomials of the position in each image, whose coefficients are others in each
-test. The variance kappa of the noise is that of the test, tau that of all tests: the one of the largest evidence, p being
-free. So a camera that rotated makes neither of them larger, and is found where it does more than they do.
+test. The variance kappa of the noise is that of the test, p being free; tau is that of all tests: the one of the largest
+evidence of each test after the one before it, in which p was the same. So a camera that rotated makes kappa no larger, and
+tau in two tests at the most, which are too few.
 """
 
 from __future__ import annotations
@@ -66,8 +67,11 @@ _BENT_S = 0.1
 _FOCAL = 0.05
 #: Standard deviations of coefficients that are tried, px; 0 is none.
 _TAU_PX = np.array([0.0, *(1e-3 * 2.0**k for k in range(7))])
-#: Before anything is seen none is so much more probable than any other; half, double: no test or figure differs.
-_NONE = 1e3
+#: Before anything is seen none is so much more probable than any other; half: fine noise counts as it, double: what some
+#: webcams leave is known later.
+_NONE = 30.0
+#: This share of tests says nothing of it: what changed within them looks alike. half: one counts by 0.7 more, double: less.
+_ODD = 0.02
 #: So many residuals of unit variance are assumed before those of a test; half: tests of few poses scatter more.
 _USUAL = 30.0
 
@@ -402,32 +406,44 @@ class Leftover:
 
     def __init__(self) -> None:
         self._evidence = np.log([_NONE, *np.ones(len(_TAU_PX) - 1)])
-        self.tau_px = 0.0
+        self.tau_px, self._before = 0.0, (np.zeros(7), np.eye(7))
 
-    def seen(self, sums: ResidualSums, lens: int, share: float) -> tuple[float, Array]:
+    def seen(self, sums: ResidualSums, lens: int, points: int, seven: slice, share: float) -> tuple[float, Array]:
         """Return of a test the variance of its noise, kappa, and the log-evidence of each tau that is tried.
 
         Args:
             sums: of all that may have changed, in units of its priors, and of the coefficients, px, which stand last.
             lens: how many coefficients there are.
+            points: how many numbers before them are of single points: these are as before for the evidence.
+            seven: which of the sums are the seven numbers: for the evidence they are those of the test before.
             share: of the shots those that differ from each other.
         """
         first = len(sums.M) - lens
-        H, M = sums.H[: first - 1, : first - 1], eliminated(sums.M, slice(1, first))
-        G, V = np.linalg.eigh(M[1:, 1:])
-        G, squares, most = np.maximum(G, 0.0), np.square(V.T @ M[1:, 0]), float(_TAU_PX[-1]) ** 2
-        explained = float(np.trace(np.linalg.solve(H + np.eye(len(H)), H))) + float((most * G / (1.0 + most * G)).sum())
-        left = float(M[0, 0]) - float((squares * most / (1.0 + most * G)).sum())
+        H, most = sums.H[: first - 1, : first - 1], float(_TAU_PX[-1])
+        M = eliminated(sums.M, slice(1, first))
+        G, b = most**2 * M[1:, 1:] + np.eye(lens), most * M[1:, 0]
+        explained = float(np.trace(np.linalg.solve(H + np.eye(len(H)), H))) + lens - float(np.trace(np.linalg.inv(G)))
+        left = float(M[0, 0]) - float(b @ np.linalg.solve(G, b))
         noise = max((_USUAL + left) / (_USUAL + max(sums.freedom - share * explained, 0.0)), 1.0)
+        rows = np.delete(np.arange(len(sums.M)), slice(first - points, first))
+        as_before = np.eye(len(rows))
+        as_before[seven, 0], as_before[seven, seven] = self._before
+        M = eliminated(as_before.T @ sums.M[np.ix_(rows, rows)] @ as_before / noise, slice(1, first - points))
+        values, V = np.linalg.eigh(M[1:, 1:])
         variances = np.square(_TAU_PX)[:, None]
-        ratio = 1.0 + variances * G / noise
-        return noise, 0.5 * (variances * squares / noise**2 / ratio - np.log(ratio)).sum(axis=1)
+        ratio = 1.0 + variances * np.maximum(values, 0.0)
+        return noise, 0.5 * (variances * np.square(V.T @ M[1:, 0]) / ratio - np.log(ratio)).sum(axis=1)
+
+    def passed(self, test: ResidualSums) -> None:
+        """Take the sums of the newest test, of the parameters and the seven numbers: what it says of these."""
+        M = eliminated(test.M, slice(1, len(test.M) - 7))
+        cov = np.linalg.inv(M[1:, 1:] + np.eye(7))
+        self._before = -cov @ M[1:, 0], np.linalg.cholesky(cov)
 
     def take(self, evidence: Array) -> None:
         """Count a test's log-evidence."""
-        self._evidence = self._evidence + evidence
-        likely = np.exp(self._evidence - self._evidence.max())
-        self.tau_px = float(np.sqrt(likely @ np.square(_TAU_PX) / likely.sum()))
+        self._evidence = self._evidence + np.logaddexp(evidence - evidence.max(), math.log(_ODD))
+        self.tau_px = float(_TAU_PX[int(np.argmax(self._evidence))])
 
     def without(self, sums: ResidualSums, lens: int, noise: float) -> ResidualSums:
         """Return sums without the coefficients, which are eliminated, and over the variance of the noise."""

@@ -267,6 +267,7 @@ class RigWatch:
         self._stays: list[list[_ShotResiduals]] = []
         self._window = ResidualSums(self._size + len(_WIDE), 0.0)
         self._whole, self._leftover = ResidualSums(self._with_lens.shape[1], 0.0), Leftover()
+        self._counted: list[Array] = []  # log-evidences of the newest tests, which the former is given later
         self.lens: LensError | None = None
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
         self._plain: deque[ResidualSums] = deque(maxlen=_KEPT)  # the same with what images leave beyond noise
@@ -571,8 +572,8 @@ class RigWatch:
         all_fit = all(each.every is each.rows for stay in stays for each in stay)
         every = whole if all_fit else self._in_units(stays, every=True)
         moments = [stay[0] for stay in stays if len(stay) == 1]
-        share = len(stays) / sum(map(len, stays))
-        noise, evidence = left.seen(whole, _LENS, share)
+        share, seven = len(stays) / sum(map(len, stays)), slice(1 + self._size, 1 + self._size + len(_WIDE))
+        noise, evidence = left.seen(whole, _LENS, 3 * len(self._points), seven, share)
         test = left.without(whole, _LENS, noise).of(len(self._window.b))
         weight = float(np.exp(-1.0 / FORGET_TESTS))
         self._window.scale(weight)
@@ -587,11 +588,15 @@ class RigWatch:
             if passes is not None:
                 self._window.add(test, -1.0)
                 rest = whole.without(self._size + len(_WIDE)) if passes == "lens" else whole
-                noise, evidence = left.seen(rest, _LENS, share)
+                noise, evidence = left.seen(rest, _LENS, 3 * len(self._points), seven, share)
                 test = left.without(rest, _LENS, noise).of(len(self._window.b))
                 self._window.add(test, 1.0)
                 change = self._estimated(self._window)
-        left.take(evidence)
+        left.passed(test)
+        # A point that is displaced looks like it, for some tests before it is found.
+        self._counted = [*self._counted, evidence] if self._shape.found is None else []
+        if len(self._counted) > _BEFORE:
+            left.take(self._counted.pop(0))
         nodded = stays if self._timed and own is None else []
         odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
         usual = every.less(self._in_units(odd, every=True, own=own)) if odd else every
