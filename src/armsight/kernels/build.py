@@ -339,15 +339,28 @@ def _gather() -> dict[str, list[_Called]]:
     return called
 
 
+@functools.cache
+def _third_party() -> set[str]:
+    """Return what the package's modules import from elsewhere, by its first name."""
+    names = set[str]()
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                names.add(node.module.split(".")[0])
+    return names - {"armsight", *sys.stdlib_module_names}
+
+
 class _Absent(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     """Stands in for packages that are not installed where the package is built: kernels need none but numpy.
 
-    Last in ``sys.meta_path``: what is installed was found before.
+    Last in ``sys.meta_path``: what is installed was found before. What installed packages try to import stays absent.
     """
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:  # noqa: ANN401
-        ours = name.split(".")[0] in ("armsight", *sys.stdlib_module_names)
-        return None if ours else importlib.machinery.ModuleSpec(name, self, is_package=True)
+        known = name.split(".")[0] in _third_party()
+        return importlib.machinery.ModuleSpec(name, self, is_package=True) if known else None
 
     def create_module(self, spec: Any) -> Any:  # noqa: ANN401
         return mock.MagicMock(name=spec.name, __path__=[], __spec__=spec)
