@@ -172,7 +172,7 @@ def test_the_sync_led_gives_the_delay_in_the_loop_and_a_sweep_that_differs_is_sa
     board = Obedient(late_s=0.004)  # joints that lag
     loop, _ = opened(board, lambda t_s: (np.zeros(3), np.zeros(6)), image=blinking, bit_s=BIT_S)
     loop.board.send(SimpleNamespace(q_ref=MIDDLE))
-    loop.log.commands.append((0.0, SimpleNamespace(q_ref=MIDDLE, gravity_duty=np.zeros(6))))
+    loop.log.command = SimpleNamespace(q_ref=MIDDLE, gravity_duty=np.zeros(6))
     loop.find_led()
     loop.mounting = MOUNTING
     delay = find_delay(loop, ARM, MIDDLE, MIDDLE, lambda q: np.zeros(6))

@@ -96,6 +96,14 @@ def beside(work: Callable[[], _Result], meanwhile: Callable[[Callable[[], bool]]
         pool.shutdown(wait=False)
 
 
+def _lean(result: PoseEstimate | Missed) -> PoseEstimate | Missed:
+    """Return a result without what a wrong calibration does to its points: a run of an hour keeps 200,000 of them."""
+    if isinstance(result, Missed):
+        return result
+    points = replace(result.points, calibration=np.zeros((len(result.points.ids), 3, 0)))
+    return replace(result, points=points)
+
+
 class Watch:
     """Measures shots in a thread: a search of the whole image takes longer than the loop may pause.
 
@@ -396,7 +404,7 @@ class Loop:
                 T_base_rig, T_base_tool = self.mounting.T_base_rig, measurement.T_base_tool
                 self.log.outcomes.append(outcome)
         stamped_s = np.nan if shot.t_s is None else shot.t_s - self.estimator.clock_offset_s(shot.t_s)
-        self.log.poses.append((shot.name, stamped_s, result))
+        self.log.poses.append((shot.name, stamped_s, _lean(result)))
         self._datum = ShotDatum(
             shot,
             result,
@@ -529,7 +537,8 @@ class Loop:
                 command, mode = controller.command(self.estimator)
                 self.board.send(command)
                 sent_s = time.perf_counter()
-                self.log.commands.append((self.t_s, command))
+                self.log.commanded_s.append(self.t_s)
+                self.log.command = command
                 self.log.modes.append(mode)
                 self._publish()
                 self.publisher.resume()
@@ -689,7 +698,7 @@ class Loop:
 
     def stop(self) -> None:
         """Bring the arm to rest at its present position, where the board holds it."""
-        if self.board.status.state is not BoardState.ENABLED or not self.log.commands:
+        if self.board.status.state is not BoardState.ENABLED or self.log.command is None:
             return
         still = replace(self._at_rest(_STOP_S), q_ref=self.board.joints.reference_rad)
         periods = 1 if self.setup.clock is None else round(_STOP_S / PERIOD_S)
@@ -699,7 +708,8 @@ class Loop:
 
     def _at_rest(self, duration_s: float) -> JointCommand:
         """Return the command to be at rest at the reference of the newest command."""
-        newest = self.log.commands[-1][1]
+        newest = self.log.command
+        assert newest is not None
         return JointCommand(newest.q_ref, np.zeros_like(newest.q_ref), newest.gravity_duty, duration_s)
 
     def _check_board(self) -> None:

@@ -236,9 +236,10 @@ class Log:
         fused: the estimated tool track, smoothed with measurements up to RECORD_LAG_S later, batch by batch.
         live: the estimate at the newest reading, iteration by iteration: what the loop uses.
         poses: name, time stamp (what a clock that was followed was off removed) and pose of each shot (the cameras' skew in
-            its covariance), or why there is none.
+            its covariance; without what a wrong calibration does to its points, which is most of it), or why there is none.
         outcomes: what the estimator did with each pose measurement: used, or rejected for which reason.
-        commands: time and content of each command.
+        commanded_s: time of each command, s.
+        command: the newest one; None before the first.
         modes: the basis of each command: planned, vision, bridged.
         latency_s: computing time from an image in which the body was followed to the command that depends on it, s.
         search_s: the same of images in which the body was searched; commands continued meanwhile.
@@ -252,7 +253,8 @@ class Log:
     live: list[ArmEstimate] = field(default_factory=list)
     poses: list[tuple[str, float, PoseEstimate | Missed]] = field(default_factory=list)
     outcomes: list[Outcome] = field(default_factory=list)
-    commands: list[tuple[float, JointCommand]] = field(default_factory=list)
+    commanded_s: list[float] = field(default_factory=list)
+    command: JointCommand | None = None
     modes: list[str] = field(default_factory=list)
     latency_s: list[float] = field(default_factory=list)
     search_s: list[float] = field(default_factory=list)
