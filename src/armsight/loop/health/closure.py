@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -235,7 +235,8 @@ class ClosureWatch:
             if near[k] or near[k + 1]:
                 continue
             n, m = self._merged[k : k + 2]
-            for values in (self._t, self._e, self._H, self._clock_s):
+            every: tuple[list[Any], ...] = (self._t, self._e, self._H, self._clock_s)
+            for values in every:
                 values[k : k + 2] = [(n * values[k] + m * values[k + 1]) / (n + m)]
             self._merged[k : k + 2] = [n + m]
             self._sums.rows[k : k + 2] = [self._sums.rows[k + 1]]
