@@ -96,3 +96,9 @@ def test_a_lens_that_breathes_within_a_second_is_a_lens():
     (found,) = ended(3402, at_s=1.0, seconds=12.0, **breathes)
     assert (found.cause, found.unit, found.alternatives) == ("lens", "%", ("rig",))
     assert 0.04 < found.size < 0.1  # 0.07 RMS, of which a parabola takes some
+
+
+def test_a_camera_that_nods_is_not_said_to_have_rotated_besides():
+    """What was summed before it was known to nod had too little noise."""
+    (found,) = ended(54102, nod=(0, np.radians(0.03) * X, 3.0), seconds=9.0)
+    assert "nods" in found.what

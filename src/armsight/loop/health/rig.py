@@ -346,7 +346,13 @@ class RigWatch:
         d = np.einsum("nij,nj->ni", cov, b)
         freedom = sum(map(len, r)) - 10.0 * len(shots)
         excess = (sum(float(e @ e) for e in r) - float(np.vdot(b, d))) / max(freedom, 1.0)
+        rested = not self._unrest.cov.any()
         self._unrest.take(np.array([each.t_s for each in shots]), d, cov, max(excess, 1.0))
+        if rested and self._unrest.cov.any():  # sums so far do not have it in their noise
+            self._window.scale(0.0)
+            self._history.clear()
+            self._plain.clear()
+            self._alarms, self.alarm, self.alarmed, self.suspected = 0, False, False, None
 
     def _unrest_weighed(self, rows: Array, other: Array | None = None) -> Array:
         """Return rows of a shot, or others (n, K) of it, with what moves to and fro in their noise.
@@ -628,7 +634,7 @@ class RigWatch:
         if nodded:
             self._take_unrest(nodded)
         due = ends or 0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0
-        if due and len(self._history) < _KEPT and self._poses >= _LENS_POSES:
+        if due and 0 < len(self._history) < _KEPT and self._poses >= _LENS_POSES:
             self.lens = self._lens()
 
     def _is_alarm(self, change: RigChange) -> bool:
