@@ -3,17 +3,23 @@
 python live.py stop 100      stops by the page's button in a headless browser, while the workcell's views run at 15 Hz
 python live.py moving 40     the same while the simulated loop moves the arm, searches images, and fits calibrations
 python live.py loop 4        image to command in one run, alternately without and with a page that looks on; the ratio
+python live.py attacked 200  image to command while a page names devices, pipes, huge files, odd JSON, and many sockets come
 python live.py first 3       from the first page to a written calibration by a person who follows the page: shots and error
 python live.py cost          processor's share of two 1280x720 views, first picture, memory over ten thousand frames
 python live.py guided 10     guided against random shots, ten seeds: projected points, hands that miss the outline
 """
 
+import contextlib
+import json
+import os
 import resource
 import shutil
+import socket
 import subprocess
 import sys
 import tempfile
 import time
+import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -155,6 +161,103 @@ def loop(blocks: int) -> None:
         print(f"image to command {label}: p50 {p50:.2f} ms, p99 {p99:.2f} ms, {len(times[with_page])} shots")
     ratio = [np.percentile(times[True], q) / np.percentile(times[False], q) for q in (50, 99)]
     print(f"with over without: p50 {ratio[0]:.2f}, p99 {ratio[1]:.2f}")
+    server.close()
+    session.close()
+
+
+def attacks(count, folder, rng):
+    """Return attacks, each a text that is sent to /live, bytes to the port, or a number of sockets to be opened."""
+    os.mkfifo(folder / "pipe")
+    (folder / "loop").symlink_to(folder / "loop")
+    with (folder / "huge").open("wb") as file:
+        file.truncate(6_000_000_000)
+    names = ("/dev/zero", "/dev/random", "/dev/stdin", "/proc/self/mem", "/proc/kmsg", folder / "pipe", folder / "huge",
+             folder, folder / "loop", "../../../../etc/shadow", "a\0b", "x" * 3000, "", "~root")  # fmt: skip
+    fields = (("UseBoard", "spec"), ("UseBody", "target"), ("UseSecondBody", "target"), ("UseArm", "arm"),
+              ("UseMotion", "path"), ("DrawBoard", "paper"), ("DropShot", "name"), ("GoTo", "step"))  # fmt: skip
+    kinds = ("", "bag:", "video:", "folder:", "chessboard:", "charuco:")
+    odd = ('{"command": "GoTo", "step": NaN}', "[" * 4000, '{"command": {"command": 1}}', "{}", "null", "\ud83d", '"',
+           "1e999",
+           '{"command": "SetAim", "error_mm": 1e308, "distance_m": -1e308}', '{"command": "__class__"}', "9" * 4000,
+           '{"command": "UseBoard", "spec": "chessboard:99999x99999:1mm"}', "x" * 5_000_000)  # fmt: skip
+    raw = (b"GET /" + b"../" * 40 + b"etc/passwd HTTP/1.1\r\nHost: HOST\r\n\r\n", b"\0" * 100_000,
+           b"GET / HTTP/1.1\r\n",
+           b"GET /board.pdf HTTP/1.1\r\nHost: elsewhere\r\n\r\n", b"A: " + b"b" * 200_000,
+           b"GET /live HTTP/1.1\r\nHost: HOST\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: x\r\n"
+           b"Sec-WebSocket-Version: 13\r\n\r\n")  # fmt: skip
+    for _ in range(count):
+        kind = rng.random()
+        if kind < 0.6:
+            command, field = fields[rng.integers(len(fields))]
+            yield json.dumps({"command": command, field: f"{rng.choice(kinds)}{names[rng.integers(len(names))]}"})
+        elif kind < 0.8:
+            yield odd[rng.integers(len(odd))]
+        else:
+            yield raw[rng.integers(len(raw))] if kind < 0.95 else 50
+
+
+def attack(port, seed, count):
+    """Attack a page, two a second; print how many attacks were made and what was answered to the last."""
+    from websockets.sync.client import connect
+
+    rng, host, held, made = np.random.default_rng(seed), f"127.0.0.1:{port}", [], 0
+    for one in attacks(count, Path(tempfile.mkdtemp()), rng):
+        with contextlib.suppress(Exception):  # a rejected or closed connection is an answer
+            if isinstance(one, str):
+                with connect(f"ws://{host}/live", origin=f"http://{host}", max_size=2**24, open_timeout=5) as page:
+                    page.send(one)
+                    time.sleep(0.3)
+            elif isinstance(one, bytes):
+                with socket.create_connection(("127.0.0.1", port), 5) as given:
+                    given.sendall(one.replace(b"HOST", host.encode()))
+            else:
+                held = [socket.create_connection(("127.0.0.1", port), 5) for _ in range(one)]
+        made += 1
+        time.sleep(0.2)
+    for one in held:
+        one.close()
+    print(f"{made} attacks made", flush=True)
+
+
+def attacked(count: int) -> None:
+    """Compare the control loop's times unattacked and attacked, in turn by 40 shots, until the attacks are over."""
+    folder = Path(tempfile.mkdtemp())
+    with Workcell.open(arm="worn", cameras="640x480@15", seed=0) as workcell:
+        workcell.truth.rig.save(folder / "rig.json")
+    session = LiveSession(SessionOptions(folder / "live", "sim:640x480@15", rig=folder / "rig.json", seed=0))
+    session.start()
+    server = LiveServer(session, port=0)
+    server.start()
+    session.execute(records.OpenArm())
+    until(lambda: session.arm.state.q_deg)
+    session.execute(records.GuideHandEye())
+    until(lambda: session.arm.state.handeye.good and not session.sections()["overview"].moving, 1500.0)
+    times = {False: [], True: []}
+    before_mb, most_mb, made, block = resident_mb(), 0.0, 0, max(count // 5, 1)
+    while made < count:
+        for under in (False, True):
+            script = f"import live; live.attack({server.port}, {made}, {block})"
+            here = Path(__file__).parent
+            attacker = subprocess.Popen([sys.executable, "-c", script], cwd=here) if under else None
+            while attacker is None or attacker.poll() is None:
+                while (running := session.arm._loop) is None or not running.log.latency_s:
+                    if not session.arm.busy:
+                        session.execute(records.GoToStart() if session.arm.state.away else records.RunMotions())
+                    time.sleep(0.2)
+                log, seen = running.log, len(running.log.latency_s)
+                until(lambda log=log, seen=seen: len(log.latency_s) >= seen + 40 or session.arm._loop is None, 300.0)
+                times[under] += list(log.latency_s[seen:])
+                most_mb = max(most_mb, resident_mb())
+                if attacker is None and len(times[False]) >= len(times[True]):
+                    break
+            made += block if under else 0
+    for under, label in ((False, "unattacked"), (True, "attacked")):
+        p50, p99 = 1e3 * np.percentile(times[under], (50, 99))
+        print(f"image to command {label}: p50 {p50:.2f} ms, p99 {p99:.2f} ms, {len(times[under])} shots")
+    with urllib.request.urlopen(server.address, timeout=10) as answer:
+        print(
+            f"{made} attacks; the page answers {answer.status}; memory {before_mb:.0f} MB before, at most {most_mb:.0f} MB"
+        )
     server.close()
     session.close()
 
@@ -349,6 +452,7 @@ if __name__ == "__main__":
         "stop": lambda: stop(int(number), moving=False),
         "moving": lambda: stop(int(number), moving=True),
         "loop": lambda: loop(int(number)),
+        "attacked": lambda: attacked(int(number)),
         "first": lambda: first(int(number)),
         "cost": cost,
         "guided": lambda: guided(int(number)),

@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 
 #: Largest documents (JSON, TOML, XML) and tables that are read: parsed they take 10 to 40 times as much memory.
 DOCUMENT_MB = 8  # half: a recording's truth of 10,000 shots is rejected; double: a hostile file takes 600 MB
-_JSON_PARTS = 1_000_000  # lists and mappings of a JSON text; half: long tracks of points are rejected; double: 400 MB
+_JSON_PARTS = (
+    1_000_000  # lists, mappings and pairs of values of a JSON text; half: long tracks are rejected; double: 400 MB
+)
 TABLE_MB = 64  # half: an hour of a run is rejected; double: twice the memory
 #: Cells and lines of a table, of up to 72 bytes each; half: 5 minutes of detections are rejected; double: 700 MB.
 _TABLE_CELLS = 5_000_000
@@ -130,8 +132,10 @@ def read_json(path: str | Path, what: str = "") -> Any:  # noqa: ANN401 - whatev
 def parsed_json(text: str, path: str | Path, what: str = "") -> Any:  # noqa: ANN401 - whatever JSON holds
     """Return JSON text as what it holds; errors as :func:`read_json`."""
     expected = f"; expected {what}" if what else ""
-    if text.count("[") + text.count("{") > _JSON_PARTS:
-        raise InputError(f"{path}: holds over {_JSON_PARTS} lists and mappings{expected}: is it the right file?")
+    if text.count("[") + text.count("{") + text.count(",") // 2 > _JSON_PARTS:
+        raise InputError(
+            f"{path}: holds over {_JSON_PARTS} lists, or twice as many values{expected}: is it the right file?"
+        )
     try:
         return json.loads(text, parse_int=_integer)
     except json.JSONDecodeError as error:

@@ -85,6 +85,8 @@ def test_several_documents_are_kept_apart(tmp_path):
         ("%YAML:1.0\n---\na: b: c\n", "line 3: not YAML"),
         ("a: \x00", "f.yaml: not YAML"),
         ("[" * 5000, "f.yaml: .*not YAML .*nesting"),
+        ("- " * 5000, "f.yaml: line 1: not YAML .*nested over 100 deep"),
+        ("a: &a [0]\nb: [" + "*a, " * 500_001 + "]", "f.yaml: line 2: not YAML .*over 1000000 values"),
         ("a: " + "1" * 5000, "f.yaml: not YAML"),
     ],
 )

@@ -26,6 +26,8 @@ _WITH_UNIT = re.compile(rf"({NUMBER}|{DECIMAL_COMMA.pattern})\s*(mm|m|deg|\N{{DE
 _LIST = re.compile(r"\[([^\[\]{}\"]*)\],?")
 #: The line that stands beneath the names in Markdown or psql, and psql's last line.
 _RULE = re.compile(r"[\s|+:-]*-[\s|+:-]*|\(\d+ rows?\)")
+#: The first line of a text that is no table: of a document, of a program, a call.
+_NO_TABLE = re.compile(r"[{<\[/]|\.[A-Z]|(?:DEF|MODULE|PROC)\b|.*(?::=|=|\(\)|[\[{]$)|.*\w\s*\(\s*[\"\[{\d.+-]")
 _MATRIX = [name for i in "123" for name in (f"r{i}1", f"r{i}2", f"r{i}3", "xyz"[int(i) - 1])]
 _QUATERNION = ["n1", "n2", "n3", "n4"]
 #: Names for columns that have none, by how many they are.
@@ -158,7 +160,7 @@ def _of_file(path: Path, side: str, whose: str | None) -> Cells:
         return cells._replace(listed=True)
     if is_document(path, text):
         return _of_records(path, text, side, whose)
-    if written and re.match(r"[{<\[/]|(?:DEF|MODULE|PROC)\b|.*(?::=|=|\(\)|[\[{]$)", written[0][1]):
+    if written and _NO_TABLE.match(written[0][1]):
         raise InputError(
             f"{path}: {written[0][1][:40]!r} begins no table: write one pose a line, a matrix of 16 numbers or columns "
             "such as x_mm,y_mm,z_mm,qw,qx,qy,qz"

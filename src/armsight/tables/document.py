@@ -205,8 +205,10 @@ def _of_text(text: str, path: str | Path) -> list[Foreign]:
     if first.startswith("<"):
         return [_xml(text.lstrip().encode(), path)]
     suffix = Path(path).suffix.lower()
+    if suffix == ".toml":
+        return [_toml_or_ini(text, path)]
     if first.startswith(("{", "[")) and not re.fullmatch(r"\[\[?[\w.\" /-]+\]?\]\s*([#;].*)?", first):
-        if suffix != ".json" and first.startswith("{") and re.search(r"^\s*(#|')", text, re.MULTILINE):
+        if suffix != ".json" and first.startswith("{") and re.search(r"^\s*(#|')|^\{\s*'", text, re.MULTILINE):
             return [_literal(text, path)]
         return _json(text, path)
     if first.startswith("[") or re.match(r"[\w.\"-]+\s*=", first):
@@ -290,23 +292,25 @@ class _Yaml:
     def _value(self, event: _Event, depth: int) -> Foreign:
         """Return the value that begins with an event."""
         before, self._count = self._count, self._count + 1
+        self._check_bounds(event, depth)
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in self._anchors:
                 _reject(event, f"no anchor &{event.anchor} before it")
             value, held = self._anchors[event.anchor]
             self._count += held
+            self._check_bounds(event, depth)
         elif isinstance(event, yaml.ScalarEvent):
             value = self._scalar(event)
         else:
             self._check_tag(event)
             value = self._sequence(depth) if isinstance(event, yaml.SequenceStartEvent) else self._mapping(depth)
-        if self._count > _MOST_VALUES or depth > _MOST_DEPTH:
-            _reject(
-                event, f"more than {_MOST_VALUES} values, or nested more than {_MOST_DEPTH} deep: is it the right file?"
-            )
         if event.anchor and not isinstance(event, yaml.AliasEvent):
             self._anchors[event.anchor] = value, self._count - before
         return value
+
+    def _check_bounds(self, event: _Event, depth: int) -> None:
+        if self._count > _MOST_VALUES or depth > _MOST_DEPTH:
+            _reject(event, f"over {_MOST_VALUES} values, or nested over {_MOST_DEPTH} deep: is it the right file?")
 
     def _sequence(self, depth: int) -> list[Foreign]:
         values = []

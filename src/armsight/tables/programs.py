@@ -274,7 +274,7 @@ def _points_of_staubli(path: Path, text: str) -> ProgramPoints | None:
     rows: dict[str, list[tuple[int, list[str]]]] = {"point": [], "joint": []}
     fathers: dict[str, None] = {}
     for data in re.finditer(
-        r"<Data\b[^>]*\btype=\"(pointRx|point|jointRx|joint)\"[^>]*[^/]>(.*?)</Data>", text, re.DOTALL
+        r"<Data\b[^>]*\btype=\"(pointRx|point|jointRx|joint)\"[^>]*(?<!/)>(.*?)</Data>", text, re.DOTALL
     ):
         kind = "point" if "point" in data[1] else "joint"
         keys = ("x", "y", "z", "rx", "ry", "rz") if kind == "point" else tuple(f"j{k}" for k in range(1, 7))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.errors import InputError
@@ -109,8 +110,8 @@ def poses_in(path: str | Path, cells: Cells, *, rotation: str | None = None, arm
     approach = [f"approach{i + 1}" for i in range(len(joints))] if "approach1" in table.at else []
     requested = [*joints, *(name for point in points for name in point), *(rotated or []), *covariance, *approach]
     numbers = table.numbers(requested, gaps=True)
-    good = np.asarray(np.isfinite(numbers).all(axis=1))
-    notes = (*cells.notes, *notes, *notes_of, *_gaps(table, requested, numbers))
+    good = np.array(np.isfinite(numbers).all(axis=1))
+    notes = (*cells.notes, *notes, *notes_of, *_gaps(table, requested, numbers), *_repeated(table, numbers, good))
     table = Columns(table.path, head, [row for row, kept in zip(table.rows, good, strict=True) if kept], joint_names)
     p = np.stack([unit * table.numbers(point) for point in points], axis=1)
     sides = table.numbers(approach) if approach else None
@@ -184,6 +185,15 @@ def _gaps(table: Columns, requested: list[str], numbers: Array) -> tuple[str, ..
         raise InputError(f"{table.path}: no rows; one line a pose is needed")
     where = ", ".join(f"line {line} ({name})" for line, name in named[:5]) + (", .." if len(gaps) > 5 else "")
     return (f"{len(gaps)} rows left out, empty or no finite number: {where}",) if named else ()
+
+
+def _repeated(table: Columns, numbers: Array, good: NDArray[np.bool_]) -> tuple[str, ...]:
+    """Leave rows that repeat another to the last digit out of the good ones: they are no further evidence; note them."""
+    rows = np.flatnonzero(good)
+    again = np.delete(rows, np.unique(numbers[rows], axis=0, return_index=True)[1])
+    good[again] = False
+    where = ", ".join(f"line {table.rows[k][0]}" for k in again[:5]) + (", .." if len(again) > 5 else "")
+    return (f"{len(again)} rows repeat another to the last digit, and are left out: {where}",) if len(again) else ()
 
 
 def _measured(
