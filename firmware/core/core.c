@@ -219,14 +219,18 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
         joint->limited = 0u;
         measure(core, joint, config, i, inputs->counts[i]);
         joint->current_a = (float)(config->motor_direction * inputs->current_ma[i]) * 0.001f - joint->zero.now_a;
-        joint->over_a = number_size(joint->current_a) - (float)config->current_limit_ma * 0.001f;
+        const bool seen = joint->motor.doubted == 0u || (core->joint_faults[i] & FAULT_BIT(FAULT_CURRENT_SENSOR)) == 0u;
+        const float drawn_a = seen ? joint->current_a
+                                   : motor_draws(&joint->motor, &config->motor, core->supply_v, joint->pid.speed_rad_s);
+        joint->over_a = number_size(drawn_a) - (float)config->current_limit_ma * 0.001f;
         float angle_rad = joint->pot.angle_rad;
         if (core->elastic != 0u) { /* where the motor is, by the reading and what the current twists between them */
             angle_rad += joint->motor.twist_rad_per_a * joint->current_a;
         }
-        if (joint->over_a > 0.0f && joint->motor.duty != 0.0f) { /* a driver that limits it does not put the duty out */
-            motor_pause(&joint->motor, angle_rad);
-        } else if (closed) {
+        if (closed) {
+            if (joint->over_a > 0.0f && joint->motor.duty != 0.0f) {
+                motor_limit(&joint->motor);
+            }
             motor_measure(&joint->motor, &config->motor, core->supply_v, joint->current_a, angle_rad);
         } else {
             motor_sleep(&joint->zero, joint->current_a);

@@ -22,6 +22,7 @@
 #define AGREED 4.0f           /* of apart_rad: so much way together proves that wiring and scale are right, */
 #define SAME_LOW 0.75f        /* if the motor's is as much of the reading's: */
 #define SAME_HIGH 1.3f        /* its constant is off by 15 %, the rest are resistance, backlash and noise */
+#define SAME_UNSURE 0.3f      /* of the way: what its uncertain resistance may make of the motor's; half: slow joints stay careful */
 #define CAREFUL 0.5f          /* of the speed limit until then: a reading of a third of the true speed is no faster joint */
 #define CONSTANT_OFF 0.15f    /* by so much a motor's constant may be off */
 #define UNKNOWN_RAD_S 1000.0f /* as uncertain as a motor's speed is whose voltage is not known */
@@ -35,9 +36,11 @@
 #define DISOBEY_SAMPLES 2u    /* 16 ms: by then a joint that was driven goes the way it is driven, or brakes */
 #define DISOBEY_RAD 0.008f    /* in which it goes so far at least: three sigma of two readings */
 #define DISOBEY_OFF_RAD 0.02f /* and so far it is from where it is to be: no joint lags by as much on its path */
+#define OBEYS 0.7f            /* of the answer of the configured resistance; half: weak motors look like bridges, double: a bridge shows late */
 #define STUCK_SUPPLY 0.2f     /* of the supply: less a stuck bridge hardly moves */
 #define STEP_RAD_S 0.05f      /* a motor's speed that changes by so much in a tick, beyond noise and what its torque does, is none */
 #define ROUGH_TIMES 5.0f      /* of the mean change from tick to tick: four sigma of its noise */
+#define DITHER_KEPT 0.875f    /* per sample of the sums over changes of voltage and current: 64 ms */
 #define ROUGH_SHARE 0.0625f   /* of a sample in that mean */
 #define ROUGH_RAD_S 0.08f     /* the mean at first */
 
@@ -49,6 +52,7 @@ void motor_start(motor_state *motor, float angle_rad, float speed_limit_rad_s, u
     *motor = (motor_state){.duty = duty,
                            .fastest_rad_s = speed_limit_rad_s > SEEN_RAD_S ? speed_limit_rad_s : SEEN_RAD_S,
                            .last_rad = angle_rad,
+                           .part_rad = angle_rad,
                            .window_rad = angle_rad,
                            .window_side = SIDE_UNKNOWN,
                            .resistance_scale = resistance,
@@ -67,6 +71,7 @@ void motor_start(motor_state *motor, float angle_rad, float speed_limit_rad_s, u
 static void way_begin(motor_state *motor)
 {
     motor->way_motor_rad = 0.0f;
+    motor->way_unsure_rad = 0.0f;
     motor->way_read_rad = 0.0f;
     motor->way_mark_rad = 0.0f;
     motor->way_ticks = 0u;
@@ -77,6 +82,7 @@ static void earn(motor_state *motor, const motor_config *config, float way_rad)
 {
     const float emf_v = motor->window_v - motor->resistance_scale * motor->window_ir_v;
     motor->way_motor_rad += emf_v * TICK_S / config->constant_v_s;
+    motor->way_unsure_rad += motor->unsure_per_a * number_size(motor->window_ir_v) * TICK_S / config->resistance_ohm;
     motor->way_read_rad += way_rad;
     motor->way_ticks += motor->window_ticks;
     if (number_size(motor->way_read_rad - motor->way_mark_rad) > WINDOW_WAY_RAD) { /* it goes on, be it slowly */
@@ -85,8 +91,9 @@ static void earn(motor_state *motor, const motor_config *config, float way_rad)
     } else if (motor->way_ticks >= REST_TICKS) {
         way_begin(motor);
     }
-    if (number_size(motor->way_read_rad) < AGREED * config->apart_rad) {
-        return;
+    const float size_rad = number_size(motor->way_read_rad);
+    if (size_rad < AGREED * config->apart_rad || motor->way_unsure_rad > SAME_UNSURE * size_rad) {
+        return; /* a slow joint under load moves no further than its resistance is uncertain */
     }
     const float same = motor->way_motor_rad / motor->way_read_rad;
     motor->trust = same > SAME_LOW && same < SAME_HIGH ? 1.0f : motor->trust;
@@ -174,25 +181,36 @@ static void window(motor_state *motor, const motor_config *config, float angle_r
     window_begin(motor, angle_rad);
 }
 
-static void part_begin(motor_state *motor)
+static void part_begin(motor_state *motor, float angle_rad)
 {
     motor->part_v = 0.0f;
     motor->part_a = 0.0f;
+    motor->part_rad = angle_rad;
+    motor->part_gap_rad = motor->gap_rad;
     motor->part_ticks = motor->driven_ticks;
 }
 
-/* Let the unknown duration of a pause make the motor's speed unknown. */
-void motor_pause(motor_state *motor, float angle_rad)
+void motor_limit(motor_state *motor)
 {
-    motor->last_rad = angle_rad;
-    motor->unsure_rad_s = UNKNOWN_RAD_S;
-    motor->sure_rad_s = 0.0f;
-    motor->window_side = SIDE_UNKNOWN; /* backlash may be crossed meanwhile */
-    motor->sampled = 0u;
-    motor->sample_ticks = motor->driven_ticks + 1u;
+    motor->limited = 1u;
+    motor->limit_ticks = motor->driven_ticks + 1u;
+    motor->heard_ohm = 0.0f;
     motor->step_rad_s = UNKNOWN_RAD_S;
-    part_begin(motor);
-    window_begin(motor, angle_rad);
+}
+
+/* Take a sample in which a driver may have limited the current: what it put out lies anywhere between nothing and the duty's
+ * voltage. What reading and current ask for within that is taken for it, and nothing is learnt. */
+static void sample_limited(motor_state *motor, const motor_config *config, float angle_rad)
+{
+    const float ir_v = motor->resistance_scale * config->resistance_ohm * motor->part_a;
+    const float way_rad = angle_rad - motor->part_rad;
+    const float asked_v = ir_v + motor->constant_scale * config->constant_v_s * way_rad * (float)TICKS_PER_S;
+    const float low_v = motor->part_v < 0.0f ? motor->part_v : 0.0f;
+    const float high_v = motor->part_v > 0.0f ? motor->part_v : 0.0f;
+    motor->part_v = number_clamp(asked_v, low_v, high_v);
+    motor->gap_rad = motor->part_gap_rad + way_rad - (motor->part_v - ir_v) * motor->per_constant * TICK_S;
+    motor->window_side = SIDE_UNKNOWN; /* backlash may be crossed meanwhile */
+    motor->limited = 0u;
 }
 
 void motor_sleep(zero_state *zero, float current_a)
@@ -224,6 +242,10 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
         const float by_resistance_v = SIGMAS * number_root(motor->variance_rr) * number_size(ir_v);
         motor->doubt_rad_s = (by_resistance_v - CONSTANT_OFF * number_size(emf_v)) / config->constant_v_s;
     }
+    const bool limited = motor->limited != 0u;
+    if (limited) {
+        sample_limited(motor, config, angle_rad);
+    }
     const uint32_t at = motor->sampled % MOTOR_SAMPLES;
     motor->sample_read_rad[at] = angle_rad;
     motor->sample_v[at] = motor->part_v;
@@ -233,27 +255,43 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     motor->heard_ohm = motor->doubted != 0u || motor_stepped(motor) ? 0.0f : config->resistance_ohm;
     const uint32_t slot = motor->driven_ticks + motor->phase;
     motor->sample_ticks = motor->driven_ticks + SAMPLE_TICKS - slot % SAMPLE_TICKS;
-    window(motor, config, angle_rad);
+    if (limited) {
+        window_begin(motor, angle_rad);
+    } else {
+        window(motor, config, angle_rad);
+    }
     motor->per_constant = 1.0f / (motor->constant_scale * config->constant_v_s);
     const float seen_a = number_size(motor->part_a) / (float)(motor->driven_ticks - motor->part_ticks);
     const float kept_a = (1.0f - (float)SAMPLE_TICKS * TICK_S / FADE_S) * motor->current_a;
     motor->current_a = seen_a > kept_a ? seen_a : kept_a;
-    part_begin(motor);
+    motor->dither_vv *= DITHER_KEPT;
+    motor->dither_va *= DITHER_KEPT;
+    motor->dither_aa *= DITHER_KEPT;
+    part_begin(motor, angle_rad);
 }
 
 #define LOAD_SAMPLES 8u
-#define CONSTANT_WEAK 0.92f /* of the learnt constant: half way between a sound motor and a partly shorted winding */
-#define CONSTANT_SIGMA 0.2f /* known so well it counts */
-#define SHARE_WEIGHT 3.0f /* of the load's evidence, in sigmas of the constant's */
-#define MOTOR_SHARE 0.35f /* of what voltage and current have parted, at the voltage: more, and the motor is not what it was; a
-                             sensor leaves it at 0, half a winding shorted has about 0.5 */
+#define BEFORE_SAMPLES 23u  /* so far back a fault had most likely not begun that only showed now */
+#define WORN_CONSTANT 0.83f /* of the learnt constant: what a partly shorted winding has, 0.7 to 0.95 */
+#define WORN_SIGMA 0.04f    /* of a constant that is seen: no better is it known */
+#define WAY_SHOWS 7e-4f     /* squares of a way, rad^2, over the 24 samples: seven times those of noise show a constant */
+#define LOAD_TIMES 1.5f     /* of dry friction: how well it is known what the same load takes, */
+#define LOAD_SHARE 0.1f     /* and of that itself */
+#define WEIGHS 4.0f         /* no witness says more (logarithm of the odds) */
+#define DECIDES 1.5f        /* with less two parts cannot be told apart; half: more are named wrongly, double: more are both named */
+#define ANSWER_NONE 0.25f   /* a current that answers less does not follow its voltage at all */
+#define ANSWER_TICKS 64.0f  /* that count in the sums */
+#define ANSWER_VV 0.1f      /* squares of changes of voltage, V^2, in them that show little yet */
+#define ANSWER_OFF 0.2f /* by so much an answer differs at least from that of the learnt resistance: soft joints, 15 % */
+#define ANSWER_LOW 0.5f /* of that of the configured resistance: no temperature makes it less, */
+#define ANSWER_HIGH 1.7f /* or more */
 
-/* Write the means over the last samples: what the load takes of the applied voltage, V (less the back-EMF by the reading),
+/* Write the means over some samples, which ended back samples ago: what the load takes of the applied voltage, V (less the back-EMF by the reading),
  * and the current, A. */
-static void load_of(const motor_state *motor, const motor_config *config, float *volts, float *amperes)
+static void load_of(const motor_state *motor, const motor_config *config, uint32_t back, float *volts, float *amperes)
 {
     *volts = *amperes = 0.0f;
-    const uint32_t last = motor->sampled - 1u;
+    const uint32_t last = motor->sampled - 1u - back;
     for (uint32_t i = 0u; i < LOAD_SAMPLES; i++) {
         *volts += motor->sample_v[(last - i) % MOTOR_SAMPLES];
         *amperes += motor->sample_a[(last - i) % MOTOR_SAMPLES];
@@ -263,6 +301,25 @@ static void load_of(const motor_state *motor, const motor_config *config, float 
     const float ticks = (float)(LOAD_SAMPLES * SAMPLE_TICKS);
     *volts = (*volts - config->constant_v_s * way_rad * (float)TICKS_PER_S) / ticks;
     *amperes /= ticks;
+}
+
+/* Remember what the load took before a fault. */
+static void remember_load(motor_state *motor, const motor_config *config)
+{
+    motor->way_seen = 0.0f;
+    motor->before = motor->sampled > LOAD_SAMPLES + BEFORE_SAMPLES ? 1u : 0u;
+    if (motor->before != 0u) {
+        load_of(motor, config, BEFORE_SAMPLES, &motor->before_v, &motor->before_a);
+    }
+}
+
+void motor_doubt(motor_state *motor, const motor_config *config)
+{
+    motor->doubted = 1u;
+    if (!motor_stepped(motor)) {
+        motor->step_ticks = motor->driven_ticks;
+        remember_load(motor, config);
+    }
 }
 
 /* Take a change of the motor's speed in a tick that is beyond noise: by its torque, its uncertain numbers, or a step. */
@@ -275,11 +332,34 @@ static void changed(motor_state *motor, const motor_config *config, float change
     }
     motor->step_ticks = motor->driven_ticks;
     motor->heard_ohm = 0.0f;
-    motor->way_seen = 0.0f;
-    motor->before = motor->sampled > LOAD_SAMPLES ? 1u : 0u;
-    if (motor->before != 0u) {
-        load_of(motor, config, &motor->before_v, &motor->before_a);
-    }
+    remember_load(motor, config);
+}
+
+/* Return how the current answers to the voltage from tick to tick, over the answer of the learnt resistance: no load, no
+ * speed and no reading is in it. */
+static float answer_of(const motor_state *motor, const motor_config *config)
+{
+    return motor->resistance_scale * config->resistance_ohm * motor->dither_va / motor->dither_vv;
+}
+
+bool motor_answers_otherwise(const motor_state *motor, const motor_config *config)
+{
+    const float ohm = motor->resistance_scale * config->resistance_ohm;
+    const float vv = motor->dither_vv;
+    const float va = motor->dither_va;
+    const float per_vv = 1.0f / (vv + ANSWER_VV); /* hardly driven it shows nothing */
+    const float left = number_size(motor->dither_aa * vv - va * va);
+    const float variance = ohm * ohm * left * per_vv * per_vv * (1.0f / ANSWER_TICKS) + motor->variance_rr;
+    const float off = number_size(ohm * va - vv) * per_vv;
+    return off > ANSWER_OFF + SIGMAS * number_root(variance) && /* a reading that is wrong may have taught a wrong resistance */
+           number_size(config->resistance_ohm * va - vv) * per_vv > ANSWER_OFF;
+}
+
+bool motor_answers_as_none(const motor_state *motor, const motor_config *config)
+{
+    const float seen_v = config->resistance_ohm * motor->dither_va;
+    return (seen_v < ANSWER_LOW * motor->dither_vv || seen_v > ANSWER_HIGH * motor->dither_vv) &&
+           motor_answers_otherwise(motor, config);
 }
 
 void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad)
@@ -288,7 +368,7 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     motor->last_rad = angle_rad;
     motor->driven_ticks++;
     if (config->resistance_ohm <= 0.0f || motor->driven_ticks <= SETTLE_TICKS) {
-        motor->window_rad = angle_rad;
+        motor->window_rad = motor->part_rad = angle_rad;
         motor->trust = config->resistance_ohm <= 0.0f ? 1.0f : motor->trust; /* no witness, no trust to earn */
         return;
     }
@@ -301,16 +381,24 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     if (change_rad_s > motor->step_rad_s) {
         changed(motor, config, change_rad_s, current_a);
     }
+    if (motor->driven_ticks - motor->limit_ticks > 1u) { /* the voltages of both ticks are known */
+        const float change_v = voltage_v - motor->last_v;
+        const float change_a = current_a - motor->last_a;
+        motor->dither_vv += change_v * change_v;
+        motor->dither_va += change_v * change_a;
+        motor->dither_aa += change_a * change_a;
+    }
+    motor->last_v = voltage_v;
     motor->last_a = current_a;
     motor->speed_rad_s = speed_rad_s;
     motor->part_v += voltage_v;
     motor->part_a += current_a;
     const float keep = 1.0f - TICK_S / FADE_S;
+    motor->gap_rad = keep * motor->gap_rad + moved_rad - speed_rad_s * TICK_S;
     if (sampled) {
         sample(motor, config, ir_v, emf_v, angle_rad);
         motor->rough_rad_s += ROUGH_SHARE * (change_rad_s - motor->rough_rad_s);
     }
-    motor->gap_rad = keep * motor->gap_rad + moved_rad - speed_rad_s * TICK_S;
     motor->band_rad = keep * motor->band_rad + motor->unsure_rad;
     const float size_rad_s = number_size(speed_rad_s);
     const bool known = motor->current_a * motor->heard_ohm > DEAD_SHARE * config->constant_v_s * size_rad_s;
@@ -332,7 +420,7 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
 {
     const float across_v = number_size(motor->duty) * supply_v;
     if (motor->current_a * config->resistance_ohm < DEAD_SHARE * across_v ||
-        (motor->trust == 1.0f && motor_stepped(motor))) {
+        (motor->trust == 1.0f && motor_stepped(motor)) || motor_answers_otherwise(motor, config)) {
         return FAULT_CURRENT_SENSOR;
     }
     /* What it looks like so far, by the last 32 ms. */
@@ -361,7 +449,7 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
 #define NAME_NOISE_RAD 0.002f
 #define JUMP_SHARE 0.7f
 #define LAG_SHARE 0.5f      /* of what the others leave unexplained: a lag has one number more to fit with */
-#define GAIN_OFF 0.25f      /* so far is a current's gain off at least, or it is a winding's resistance */
+#define SAME_SHARE 0.7f     /* of what a drift leaves: another ratio, or the other way round; between them both are named */
 #define STUCK_SHARE 0.5f    /* likewise: of what a sound bridge leaves */
 
 /* What a joint did over some samples, in radians since the first of them: reading, way by the voltage alone, way that the
@@ -465,55 +553,73 @@ uint32_t motor_names(const motor_state *motor, const motor_config *config, uint3
 {
     const uint32_t count = fewer(motor->sampled, NAME_SAMPLES);
     if (count < NAME_SAMPLES / 2u) {
-        return suspect;
+        return FAULT_BIT(suspect);
     }
     if (jumped(motor, config, count)) {
-        return FAULT_POT_JUMP;
+        return FAULT_BIT(FAULT_POT_JUMP);
     }
     sums_of(motor, config, count, s);
     const float noise = (float)count * NAME_NOISE_RAD * NAME_NOISE_RAD;
     if (product(s, motors, motors) < 4.0f * noise) { /* the motor rests */
-        return product(s, reading, reading) > 4.0f * noise ? FAULT_POT_DRIFT : suspect;
+        return FAULT_BIT(product(s, reading, reading) > 4.0f * noise ? FAULT_POT_DRIFT : suspect);
     }
     float share, drift, rate;
     const float by_share = left_by(s, reading, motors, &share) + noise;
     const float by_drift = left_by(s, gap, passing, &drift) + noise;
     const float least = by_share < by_drift ? by_share : by_drift;
     if (by_share < by_drift && share < -0.3f) {
-        return FAULT_POT_INVERTED;
+        return FAULT_BIT(FAULT_POT_INVERTED);
     }
     if (left_by_lag(s, &rate) + noise < LAG_SHARE * least && rate > 0.0f) {
-        return FAULT_POT_LAG;
-    }
-    if (motor->trust == 1.0f && left_by(s, gap, winding, &rate) + noise < LAG_SHARE * least && number_size(rate) > GAIN_OFF) {
-        return FAULT_CURRENT_SENSOR;
-    }
-    if (by_drift < by_share) {
-        return number_size(drift) * (float)count > 4.0f * NAME_NOISE_RAD ? FAULT_POT_DRIFT : suspect;
-    }
-    if (share < 0.15f) {
-        return FAULT_POT_FROZEN;
+        return FAULT_BIT(FAULT_POT_LAG);
     }
     const bool agreed = motor->trust == 1.0f;
-    return !agreed ? FAULT_POT_SCALE : share < 1.0f ? FAULT_POT_SLIP : FAULT_MOTOR;
+    const bool drifts = number_size(drift) * (float)count > 4.0f * NAME_NOISE_RAD;
+    const uint32_t drifting = FAULT_BIT(drifts ? FAULT_POT_DRIFT : suspect);
+    const uint32_t sharing = FAULT_BIT(share < 0.15f  ? FAULT_POT_FROZEN
+                                       : !agreed      ? FAULT_POT_SCALE
+                                       : share < 1.0f ? FAULT_POT_SLIP
+                                                      : FAULT_MOTOR);
+    return (by_drift < SAME_SHARE * by_share ? 0u : sharing) |
+           (by_share < (agreed ? SAME_SHARE : 1.0f / SAME_SHARE) * by_drift ? 0u : drifting);
 }
 
-uint32_t motor_blames(const motor_state *motor, const motor_config *config)
+#define BIT_SENSOR FAULT_BIT(FAULT_CURRENT_SENSOR)
+#define BIT_MOTOR FAULT_BIT(FAULT_MOTOR)
+#define BIT_BRIDGE FAULT_BIT(FAULT_BRIDGE)
+
+uint32_t motor_blames(const motor_state *motor, const motor_config *config, float dry_v)
 {
-    if (motor->before == 0u || motor->sampled <= LOAD_SAMPLES) {
-        return FAULT_CURRENT_SENSOR;
+    if (motor->sampled <= LOAD_SAMPLES) {
+        return BIT_SENSOR;
     }
-    float volts, amperes;
-    load_of(motor, config, &volts, &amperes);
+    const float answer = answer_of(motor, config);
     const float ohm = motor->resistance_scale * config->resistance_ohm;
-    const float more_v = volts - motor->before_v;
-    const float apart_v = more_v - ohm * (amperes - motor->before_a);
-    const float share = apart_v != 0.0f ? number_bound(more_v / apart_v, 1.0f) : 0.0f;
-    float evidence = SHARE_WEIGHT * (share - MOTOR_SHARE);
-    if (motor->way_seen > 0.0f && motor->constant_sigma < CONSTANT_SIGMA) { /* the joint moved enough to show it */
-        evidence += (CONSTANT_WEAK - motor->constant_seen) / motor->constant_sigma;
+    float volts, amperes;
+    load_of(motor, config, 0u, &volts, &amperes);
+    const float opens_v = 2.0f * config->constant_v_s * config->apart_rad / FADE_S; /* what opens the gap */
+    if (!motor_answers_otherwise(motor, config)) { /* at rest an offset stays, and a weak motor takes what its load does */
+        const float unsure_v = SIGMAS * number_root(motor->variance_rr) * number_size(ohm * amperes);
+        return number_size(volts - ohm * amperes) > opens_v + unsure_v ? BIT_SENSOR : BIT_MOTOR;
     }
-    return evidence > 0.0f ? FAULT_MOTOR : FAULT_CURRENT_SENSOR;
+    if (answer < 1.0f) { /* or a bridge that drives what its load takes, where a current flows that does not follow */
+        const bool flows = number_size(answer) < ANSWER_NONE && number_size(ohm * amperes) > opens_v;
+        return flows ? BIT_SENSOR | BIT_BRIDGE : BIT_SENSOR;
+    }
+    float odds = 0.0f; /* their logarithm, for a worn winding: what the load takes, and the constant, if the joint moved */
+    if (motor->before != 0u) {
+        const float load_v = motor->before_v;
+        const float worn_v = (1.0f / (WORN_CONSTANT * answer) - 1.0f) * load_v;
+        const float dry_vv = LOAD_TIMES * LOAD_TIMES * dry_v * dry_v;
+        const float variance = dry_vv + LOAD_SHARE * LOAD_SHARE * load_v * load_v + 0.25f * opens_v * opens_v;
+        odds = number_bound((volts - load_v - 0.5f * worn_v) * worn_v / variance, WEIGHS);
+    }
+    if (motor->way_seen > WAY_SHOWS) {
+        const float variance = motor->constant_sigma * motor->constant_sigma + motor->variance_kk + WORN_SIGMA * WORN_SIGMA;
+        const float less = 1.0f - WORN_CONSTANT;
+        odds += number_bound((1.0f - 0.5f * less - motor->constant_seen) * less / variance, WEIGHS);
+    }
+    return (odds < DECIDES ? BIT_SENSOR : 0u) | (odds > -DECIDES ? BIT_MOTOR : 0u);
 }
 
 /* Take a column out of the sums: what is left of the others once they are fitted by it. */
@@ -585,8 +691,13 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
     const float way_rad = motor->sample_read_rad[(motor->sampled - 1u) % MOTOR_SAMPLES] -
                           motor->sample_read_rad[(motor->sampled - 1u - DISOBEY_SAMPLES) % MOTOR_SAMPLES];
     const float ir_v = motor->resistance_scale * config->resistance_ohm * amperes * per_tick;
-    const float terminal_v = ir_v + config->constant_v_s * way_rad * (float)TICKS_PER_S * per_tick;
-    if (number_size(terminal_v - applied_v * per_tick) < STUCK_SUPPLY * supply_v) {
+    const float emf_v = config->constant_v_s * way_rad * (float)TICKS_PER_S * per_tick;
+    const float terminal_v = ir_v + emf_v;
+    const float follows_v = config->resistance_ohm * motor->dither_va; /* a bridge that obeys lets the current follow the duty: */
+    const bool obeys = !off && follows_v > OBEYS * motor->dither_vv; /* then resistance or constant may be half of the learnt */
+    const float unsure_v = obeys ? 0.5f * (number_size(ir_v) + number_size(emf_v)) : 0.0f;
+    if (number_size(terminal_v - applied_v * per_tick) < STUCK_SUPPLY * supply_v + unsure_v ||
+        follows_v < -ANSWER_NONE * motor->dither_vv) {
         return false;
     }
     if (off) { /* the current drives it on, or would if nothing held it: shorted windings brake */
@@ -618,10 +729,13 @@ bool motor_swings_far(motor_state *motor, float off_rad_s)
 #define FAST_TICKS 30u
 #define FAST 1.08f /* of what it is held to: by both witnesses */
 
-bool motor_is_fast(motor_state *motor, float reading_rad_s)
+bool motor_is_fast(motor_state *motor, const motor_config *config, float reading_rad_s)
 {
     const float fast_rad_s = FAST * motor->fastest_rad_s;
-    const bool fast = number_size(motor->speed_rad_s) > fast_rad_s && number_size(reading_rad_s) > motor->fastest_rad_s;
+    const float size_rad_s = number_size(reading_rad_s);
+    const bool alone = motor->doubted != 0u || config->resistance_ohm <= 0.0f;
+    const bool fast = alone ? size_rad_s > fast_rad_s
+                            : number_size(motor->speed_rad_s) > fast_rad_s && size_rad_s > motor->fastest_rad_s;
     motor->fast_ticks = fast ? number_add(motor->fast_ticks, WATCH_TICKS) : 0u;
     return motor->fast_ticks >= FAST_TICKS;
 }

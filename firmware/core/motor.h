@@ -24,8 +24,8 @@ static inline void motor_through(motor_state *motor, const transmission_config *
     motor->damping_share = between->damping_share;
 }
 
-/* Let a tick pass in which the voltage at the motor is not known. */
-void motor_pause(motor_state *motor, float angle_rad);
+/* Say that in the tick that is measured next a driver that limits the current may not put the whole duty out. */
+void motor_limit(motor_state *motor);
 
 /* Take what a tick measured: supply (V), current (A, the joint's direction) and reading, while the windings are closed.
  * What R and K really are is learnt as long as motor and reading agree. */
@@ -58,13 +58,14 @@ static inline float motor_explains(const motor_state *motor)
 /* Return whether motor and reading are apart further than that, noise and backlash explain. */
 static inline bool motor_is_apart(const motor_state *motor, const motor_config *config)
 {
-    return number_size(motor->gap_rad) > config->apart_rad + motor_explains(motor);
+    return motor->limited == 0u && number_size(motor->gap_rad) > config->apart_rad + motor_explains(motor);
 }
 
 /* Return the fault by which they are apart, as it looks at first. */
 uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v);
 
-/* Return the fault by what motor and reading did in the last 192 ms; suspect where that does not show it. A motor that was
+/* Return the fault (FAULT_BIT) by what motor and reading did in the last 192 ms, or those that cannot be told apart; suspect where
+ * that does not show it. A motor that was
  * let go of changes its speed by itself: only then a reading that drifts can be distinguished from one that slips. */
 uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect, motor_sums *sums);
 
@@ -78,9 +79,26 @@ static inline bool motor_stepped(const motor_state *motor)
 /* Look for what the motor's constant is since the step, whatever current's offset and gain are. */
 void motor_weakens(motor_state *motor, const motor_config *config, motor_sums *sums);
 
-/* Return the fault of a motor that is none: what the load took has not changed, so of voltage and current that one is
- * right which is still what it was before. */
-uint32_t motor_blames(const motor_state *motor, const motor_config *config);
+/* Let a motor be no witness any more, until the drives were off. */
+void motor_doubt(motor_state *motor, const motor_config *config);
+
+/* Return whether the current answers to the voltage otherwise than the learnt winding lets it: the reading has no part in it. */
+bool motor_answers_otherwise(const motor_state *motor, const motor_config *config);
+
+/* Return whether it does so as no temperature explains. */
+bool motor_answers_as_none(const motor_state *motor, const motor_config *config);
+
+/* Return which part has failed (FAULT_BIT), or which cannot be told apart. Over what was before, by offset a, gain g,
+ * constant k and resistance r:
+ *
+ *     what shows                        offset   sign, lead   gain   weak   shorted
+ *     answer of current to voltage      1        0, -1        g      1      1/r
+ *     current at rest without voltage   a        0            0      0      0
+ *     voltage that the load takes       1        1            1      1/k    r/k     of what it took
+ *     constant by reading               1        1            1      k      k       of the learnt one
+ *
+ * dry_v: what friction takes of the voltage, either way. */
+uint32_t motor_blames(const motor_state *motor, const motor_config *config, float dry_v);
 
 /* Return whether since such a step reading and current go with a voltage that stays, whatever is put out. */
 bool motor_is_stuck(const motor_state *motor, const motor_config *config, float supply_v, motor_sums *sums);
@@ -102,7 +120,14 @@ static inline bool motor_swings(motor_state *motor, float reference_rad_s, float
 }
 
 /* Return whether the joint has been faster than it may be long enough to be sure; reading_rad_s is what the reading says
- * of it. To be asked each WATCH_TICKS. */
-bool motor_is_fast(motor_state *motor, float reading_rad_s);
+ * of it, alone where the motor is no witness. To be asked each WATCH_TICKS. */
+bool motor_is_fast(motor_state *motor, const motor_config *config, float reading_rad_s);
+
+/* Return the current that the duty must drive by the reading's speed. */
+static inline float motor_draws(const motor_state *motor, const motor_config *config, float supply_v, float reading_rad_s)
+{
+    const float left_v = motor->duty * supply_v - config->constant_v_s * reading_rad_s;
+    return left_v / (motor->resistance_scale * config->resistance_ohm);
+}
 
 #endif

@@ -12,6 +12,11 @@
 #define CRC_BYTES 2u      /* of the configuration looked at in a tick: all of it in less than a second */
 #define OVERCURRENT_TICKS 20u
 #define STOP_TICKS 300u   /* after which an emergency stop ends with sleeping drives, braked by shorted windings until then */
+#define NONE_TICKS 33u    /* for so long a current answers as no winding lets it: half of what its sums remember */
+#define FREE_TICKS 33u    /* in which shorted windings brake any joint; half: heavy joints sleep, double: a bridge drives on longer */
+#define FREE_BRAKED 0.9f  /* of its speed then, at most */
+#define FREE_SLOW 0.25f   /* of the speed limit: what was slower when it was let go of may sink up to its limit */
+#define NAME_EARLY_TICKS 64u /* after which a weak motor may show: its joint is taken back */
 #define NAME_TICKS 160u   /* after which a joint let go of has shown which fault it has */
 
 #define FAULT_NAME(name, code, reaction, text) [code] = #name,
@@ -257,9 +262,9 @@ static void blame(core_state *core, joint_state *joint, uint32_t fault, uint32_t
 }
 
 /* Hold a joint by its reading: its motor is no witness any more, until the drives were off. */
-static void doubt_motor(joint_state *joint)
+static void doubt_motor(joint_state *joint, const joint_config *config)
 {
-    joint->motor.doubted = 1u;
+    motor_doubt(&joint->motor, &config->motor);
     if (joint->released != 0u) {
         joint->released = 0u;
         joint->motor.sampled = 0u; /* what it did meanwhile it was not driven to */
@@ -272,26 +277,62 @@ static void doubt_motor(joint_state *joint)
 static void watch_motor(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
     motor_state *motor = &joint->motor;
-    if (motor_is_apart(motor, &config->motor)) {
+    motor->none_ticks = in_a_row(motor->none_ticks, motor_answers_as_none(motor, &config->motor));
+    if (motor_is_apart(motor, &config->motor) || motor->none_ticks >= NONE_TICKS) {
         const uint32_t fault = motor_disagrees(motor, &config->motor, core->supply_v);
         joint->suspect_ticks = 0u;
         if (fault == FAULT_CURRENT_SENSOR) {
-            doubt_motor(joint);
+            doubt_motor(joint, config);
             blame(core, joint, fault, i);
         } else {
             safety_raise(core, fault, i);
             joint->suspect = fault;
         }
-        return;
     }
-    if (motor_is_fast(motor, joint->pid.speed_rad_s)) {
+}
+
+/* Watch a joint's speed and current, by the reading where the motor is no witness. */
+static void watch_limits(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
+{
+    motor_state *motor = &joint->motor;
+    if (motor_is_fast(motor, &config->motor, joint->pid.speed_rad_s)) {
         safety_raise(core, FAULT_OVERSPEED, i);
     }
-    const bool hot = 2.0f * joint->over_a > number_size(joint->current_a); /* more than twice the limit */
+    const bool hot = joint->over_a > (float)config->current_limit_ma * 0.001f; /* more than twice the limit */
     motor->current_ticks = in_a_row(motor->current_ticks, hot);
     if (motor->current_ticks >= OVERCURRENT_TICKS) {
         safety_raise(core, FAULT_OVERCURRENT, i);
     }
+}
+
+/* Return whether a joint without a motor that is watched goes on although shorted windings brake it: as fast as when it was
+ * let go of, or, where it was slow, faster than its limit. */
+static bool runs_on(joint_state *joint, const joint_config *config)
+{
+    const float speed_rad_s = number_size(joint->pid.speed_rad_s);
+    if (joint->free_ticks == 0u) {
+        joint->free_rad_s = speed_rad_s;
+    }
+    const bool moved = joint->free_rad_s > FREE_SLOW * config->speed_limit_rad_s;
+    const float most_rad_s = moved ? FREE_BRAKED * joint->free_rad_s : config->speed_limit_rad_s;
+    joint->free_ticks = speed_rad_s > most_rad_s ? number_add(joint->free_ticks, WATCH_TICKS) : 1u;
+    return config->motor.resistance_ohm <= 0.0f && joint->free_ticks >= FREE_TICKS;
+}
+
+/* Give a suspected fault its name; where parts cannot be told apart, those of all. */
+static void name(core_state *core, joint_state *joint, const joint_config *config, uint32_t parts, uint32_t i)
+{
+    uint32_t fault = 1u;
+    while ((parts & FAULT_BIT(fault)) == 0u) {
+        fault++;
+    }
+    if (fault == FAULT_MOTOR) {
+        doubt_motor(joint, config);
+    }
+    rename_fault(core, i, joint->suspect, fault);
+    core->joint_faults[i] |= parts;
+    core->faults |= parts;
+    joint->suspect = FAULT_NONE;
 }
 
 /* Give a fault by which motor and reading disagreed its right name, once the motion since then shows it. Letting go of a
@@ -313,19 +354,23 @@ static void name_suspect(core_state *core, joint_state *joint, const joint_confi
     /* What a load takes shows at rest. */
     const bool shows = motor->doubted == 0u || joint->reference.speed_rad_s == 0.0f;
     joint->suspect_ticks = in_a_row(joint->suspect_ticks, shows);
-    if (motor->doubted == 0u && motor_stepped(motor)) {
-        doubt_motor(joint);
+    if (motor->doubted == 0u && (motor_stepped(motor) || motor_answers_otherwise(motor, &config->motor))) {
+        doubt_motor(joint, config);
         rename_fault(core, i, joint->suspect, FAULT_CURRENT_SENSOR);
         joint->suspect = FAULT_CURRENT_SENSOR;
     }
-    if (joint->suspect_ticks >= NAME_TICKS) {
-        const uint32_t fault = motor->doubted != 0u ? motor_blames(motor, &config->motor)
-                                                    : motor_names(motor, &config->motor, joint->suspect, &core->sums);
-        if (fault == FAULT_MOTOR || fault == FAULT_CURRENT_SENSOR) {
-            doubt_motor(joint);
+    if (joint->suspect_ticks < NAME_EARLY_TICKS) {
+        return;
+    }
+    const bool due = joint->suspect_ticks >= NAME_TICKS;
+    if (motor->doubted == 0u) {
+        const uint32_t parts = motor_names(motor, &config->motor, joint->suspect, &core->sums);
+        if (due || parts == FAULT_BIT(FAULT_MOTOR)) { /* a joint with a weak motor falls meanwhile */
+            name(core, joint, config, parts, i);
         }
-        rename_fault(core, i, joint->suspect, fault);
-        joint->suspect = FAULT_NONE;
+    } else if (due) {
+        const float dry_v = config->gains.kf_duty * (float)core->config.supply_nominal_mv * 0.001f;
+        name(core, joint, config, motor_blames(motor, &config->motor, dry_v), i);
     }
 }
 
@@ -335,12 +380,17 @@ static void watch_joint(core_state *core, joint_state *joint, const joint_config
         name_suspect(core, joint, config, i);
     }
     if (joint->released != 0u) {
+        if (runs_on(joint, config)) {
+            blame(core, joint, FAULT_BRIDGE, i);
+        }
         return;
     }
+    joint->free_ticks = 0u;
     const float off_rad = number_size(joint->pid.error_rad);
     if (joint->motor.doubted == 0u) {
         watch_motor(core, joint, config, i);
     }
+    watch_limits(core, joint, config, i);
     if (motor_swings(&joint->motor, joint->reference.speed_rad_s, config->speed_limit_rad_s)) {
         safety_raise(core, FAULT_OSCILLATION, i);
         take_back_gains(core, joint, i);
@@ -373,12 +423,14 @@ void safety_watch_joints(core_state *core)
 
 void safety_watch_rest(core_state *core)
 {
-    if (core->state == STATE_STOPPED && ++core->stopped_ticks >= STOP_TICKS) {
+    core->stopped_ticks = core->state == STATE_STOPPED ? core->stopped_ticks + 1u : 0u;
+    if (core->stopped_ticks >= STOP_TICKS) {
         core->shorted = 0u;
     }
     for (uint32_t i = core->tick % WATCH_TICKS; i < core->config.joint_count; i += WATCH_TICKS) {
         joint_state *joint = &core->joint[i];
-        if (motor_disobeys(&joint->motor, &core->config.joint[i].motor, core->supply_v, 0.0f)) {
+        const joint_config *config = &core->config.joint[i];
+        if (motor_disobeys(&joint->motor, &config->motor, core->supply_v, 0.0f) || runs_on(joint, config)) {
             blame(core, joint, FAULT_BRIDGE, i);
         }
     }
@@ -388,9 +440,16 @@ void safety_watch_sleep(core_state *core)
 {
     core->stopped_ticks = 0u;
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {
+        joint_state *joint = &core->joint[i];
         const motor_config *motor = &core->config.joint[i].motor;
         const bool bridge = (core->joint_faults[i] & FAULT_BIT(FAULT_BRIDGE)) != 0u;
-        if (bridge && motor_flows_asleep(&core->joint[i].zero, motor, core->supply_v)) {
+        if (!bridge || !motor_flows_asleep(&joint->zero, motor, core->supply_v)) {
+            continue;
+        }
+        core->joint_faults[i] |= FAULT_BIT(FAULT_CURRENT_SENSOR); /* or the bridge conducts asleep: only a free joint that */
+        core->faults |= FAULT_BIT(FAULT_CURRENT_SENSOR);         /* rests all the same shows that it does not */
+        const bool rests = number_size(joint->pot.angle_rad - joint->motor.last_rad) < motor->apart_rad;
+        if (rests && core->config.brake_engage_ticks == 0u) {
             rename_fault(core, i, FAULT_BRIDGE, FAULT_CURRENT_SENSOR);
         }
     }

@@ -388,12 +388,20 @@ typedef struct motor_state {
     float constant_sigma;
     uint32_t doubted;        /* not 0: it is no witness until the drives were off */
     float step_rad_s;        /* change of speed_rad_s in a tick that no torque makes */
-    float last_a;            /* the current of the last tick */
+    float last_a;            /* the current of the last tick, */
+    float last_v;            /* and its applied voltage */
+    float dither_vv;         /* sums of the changes of both from tick to tick: squares of the voltage's, */
+    float dither_va;         /* products, */
+    float dither_aa;         /* squares of the current's; fade */
     float unsure_per_a;      /* rad/s by which speed_rad_s may be off for each ampere */
     float swift_per_a;       /* rad/s by which an ampere changes its speed in a tick */
     uint32_t step_ticks;     /* driven_ticks when that was last seen, 0: never */
-    float part_v;            /* sums since the last sample: applied voltage, current */
+    float part_v;            /* sums since the last sample: applied voltage, current; */
     float part_a;
+    float part_rad;          /* reading */
+    float part_gap_rad;      /* and gap then; */
+    uint32_t limited;        /* not 0: a driver may have limited the current since, */
+    uint32_t limit_ticks;    /* last at these driven_ticks */
     uint32_t part_ticks;     /* driven_ticks then */
     float current_a;         /* the largest mean of a sample of late */
     float damped_rad_s;      /* the speed, smoothed */
@@ -419,12 +427,14 @@ typedef struct motor_state {
     float trust;             /* of the speed limit: what the joint may use; 1 once motor and reading went the same way */
     float way_read_rad;      /* the way since the joint last rested, by the reading */
     float way_motor_rad;     /* and by the motor with the configured constant */
+    float way_unsure_rad;    /* how far that may be off by its resistance */
     float way_mark_rad;      /* the reading's when it last got on */
     uint32_t way_ticks;      /* since then */
     int32_t swing_side;      /* which side of the reference's speed the motor's was on last */
     uint32_t swing_since;    /* driven_ticks when it changed */
     uint32_t swings;         /* changes in quick succession */
     uint32_t fast_ticks;     /* faster than the limit, in a row */
+    uint32_t none_ticks;     /* no winding answers as it does, in a row */
     uint32_t current_ticks;  /* beyond twice the current limit, in a row */
     uint32_t driven_ticks;   /* since the windings were closed */
     uint32_t phase;          /* when it is sampled */
@@ -478,6 +488,8 @@ typedef struct joint_state {
     uint32_t released;       /* not 0: a fault took it out of the drive, its windings are shorted */
     uint32_t suspect;        /* the fault by which motor and reading disagreed, until it has its name */
     uint32_t suspect_ticks;  /* since then */
+    float free_rad_s;        /* its speed when it was left to shorted windings, */
+    uint32_t free_ticks;     /* and since when it goes on, 0 while it is driven */
     float gravity_duty;      /* in use; it follows gravity_asked */
     float gravity_asked;
     float stop_rad_s2;       /* deceleration on the way to a stop along the path */
