@@ -351,7 +351,7 @@ bool motor_answers_otherwise(const motor_state *motor, const motor_config *confi
     const float left = number_size(motor->dither_aa * vv - va * va);
     const float variance = ohm * ohm * left * per_vv * per_vv * (1.0f / ANSWER_TICKS) + motor->variance_rr;
     const float off = number_size(ohm * va - vv) * per_vv;
-    return off > ANSWER_OFF + SIGMAS * number_root(variance) && /* a reading that is wrong may have taught a wrong resistance */
+    return off > ANSWER_OFF + SIGMAS * number_root(variance) && /* a wrong reading may have taught a wrong resistance */
            number_size(config->resistance_ohm * va - vv) * per_vv > ANSWER_OFF;
 }
 
@@ -381,7 +381,8 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     if (change_rad_s > motor->step_rad_s) {
         changed(motor, config, change_rad_s, current_a);
     }
-    if (motor->driven_ticks - motor->limit_ticks > 1u) { /* the voltages of both ticks are known */
+    /* The voltages of both ticks are known, and the noise of the current is not in them. */
+    if (motor->driven_ticks - motor->limit_ticks > 1u && motor->damping_share == 0.0f) {
         const float change_v = voltage_v - motor->last_v;
         const float change_a = current_a - motor->last_a;
         motor->dither_vv += change_v * change_v;
@@ -709,6 +710,7 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
 
 #define SWING_TICKS 60u   /* a swing of 8 Hz and faster changes its side as often */
 #define SWINGS 8u         /* so many changes are no answer to anything */
+#define SWING_STAYS 0.75f /* of the first of them: a last one that is smaller decays; half: ringing stops joints, 1: noise hides a swing */
 #define SWING_RAD_S 0.4f  /* as far from the reference's speed at least */
 
 bool motor_swings_far(motor_state *motor, float off_rad_s)
@@ -720,9 +722,16 @@ bool motor_swings_far(motor_state *motor, float off_rad_s)
     }
     if (side != motor->swing_side) {
         motor->swings = motor->driven_ticks - motor->swing_since <= SWING_TICKS ? motor->swings + 1u : 0u;
+        motor->swing_first_rad_s = motor->swings <= 1u ? motor->swing_rad_s : motor->swing_first_rad_s;
+        if (motor->swings >= SWINGS && motor->swing_rad_s < SWING_STAYS * motor->swing_first_rad_s) {
+            motor->swings = 0u; /* it decays by itself */
+        }
+        motor->swing_rad_s = 0.0f;
         motor->swing_side = side;
         motor->swing_since = motor->driven_ticks;
     }
+    const float size_rad_s = number_size(off_rad_s);
+    motor->swing_rad_s = size_rad_s > motor->swing_rad_s ? size_rad_s : motor->swing_rad_s;
     return motor->swings >= SWINGS;
 }
 
@@ -737,5 +746,5 @@ bool motor_is_fast(motor_state *motor, const motor_config *config, float reading
     const bool fast = alone ? size_rad_s > fast_rad_s
                             : number_size(motor->speed_rad_s) > fast_rad_s && size_rad_s > motor->fastest_rad_s;
     motor->fast_ticks = fast ? number_add(motor->fast_ticks, WATCH_TICKS) : 0u;
-    return motor->fast_ticks >= FAST_TICKS;
+    return motor->fast_ticks >= FAST_TICKS + motor->swing_ticks;
 }

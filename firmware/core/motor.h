@@ -22,6 +22,10 @@ static inline void motor_through(motor_state *motor, const transmission_config *
     motor->twist_rad_per_a = between->twist_rad_per_a;
     motor->uneven = between->uneven;
     motor->damping_share = between->damping_share;
+    if (motor->swift_per_a > 0.0f) { /* twist over torque is 1/stiffness, speed over torque and time 1/inertia */
+        const float radians = number_root(between->twist_rad_per_a * (float)TICKS_PER_S / motor->swift_per_a);
+        motor->swing_ticks = (uint32_t)(3.14159f * radians);
+    }
 }
 
 /* Say that in the tick that is measured next a driver that limits the current may not put the whole duty out. */

@@ -39,7 +39,7 @@ INLINE float limited_duty(const pid_state *pid, const pid_demand *demand, float 
 static float direction_of(float speed_rad_s) { return speed_rad_s / (number_size(speed_rad_s) + CREEP_RAD_S); }
 
 /* Return the error that the integral gathers while the spring is bounded: what a joint that a load holds back or drives
- * away lacks of a share of its speed limit, by whichever is faster, reading or motor, and never more than its error. A joint
+ * away lacks of a share of its speed limit, or of its reference's speed, by whichever is faster, reading or motor, and never more than its error. A joint
  * that moves on gathers none. */
 static float bounded_error(const joint_gains *gains, const pid_demand *demand, float spring, float error_rad)
 {
@@ -49,7 +49,11 @@ static float bounded_error(const joint_gains *gains, const pid_demand *demand, f
     const float damped_rad_s = demand->damped_rad_s;
     const float motor_rad_s = demand->motor_rad_s;
     const float fast_rad_s = number_size(motor_rad_s) > number_size(damped_rad_s) ? motor_rad_s : damped_rad_s;
-    const float lacking = LOADED * spring - (gains->kd_s_per_rad + demand->own_s_per_rad) * fast_rad_s;
+    const float per_rad_s = gains->kd_s_per_rad + demand->own_s_per_rad;
+    const float along = demand->reference_rad_s * spring > 0.0f ? per_rad_s * number_size(demand->reference_rad_s) : 0.0f;
+    const float least = LOADED * number_size(spring);
+    const float needed = along > least ? along : least;
+    const float lacking = (spring > 0.0f ? needed : -needed) - per_rad_s * fast_rad_s;
     return lacking * spring > 0.0f ? number_bound(lacking / gains->kp_per_rad, number_size(error_rad)) : 0.0f;
 }
 

@@ -433,6 +433,9 @@ typedef struct motor_state {
     int32_t swing_side;      /* which side of the reference's speed the motor's was on last */
     uint32_t swing_since;    /* driven_ticks when it changed */
     uint32_t swings;         /* changes in quick succession */
+    float swing_rad_s;       /* how far from it it went since the last, */
+    float swing_first_rad_s; /* and before the first of them */
+    uint32_t swing_ticks;    /* half a period of the joint on its spring: so long that gives back what it took */
     uint32_t fast_ticks;     /* faster than the limit, in a row */
     uint32_t none_ticks;     /* no winding answers as it does, in a row */
     uint32_t current_ticks;  /* beyond twice the current limit, in a row */
