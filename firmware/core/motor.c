@@ -22,7 +22,7 @@
 #define AGREED 4.0f           /* of apart_rad: so much way together proves that wiring and scale are right, */
 #define SAME_LOW 0.75f        /* if the motor's is as much of the reading's: */
 #define SAME_HIGH 1.3f        /* its constant is off by 15 %, the rest are resistance, backlash and noise */
-#define SAME_UNSURE 0.3f      /* of the way: what its uncertain resistance may make of the motor's; half: slow joints stay careful */
+#define SAME_UNSURE 0.5f      /* of the way: what its uncertain resistance may make of the motor's; half: slow joints stay careful */
 #define CAREFUL 0.5f          /* of the speed limit until then: a reading of a third of the true speed is no faster joint */
 #define CONSTANT_OFF 0.15f    /* by so much a motor's constant may be off */
 #define UNKNOWN_RAD_S 1000.0f /* as uncertain as a motor's speed is whose voltage is not known */
@@ -186,7 +186,6 @@ static void part_begin(motor_state *motor, float angle_rad)
     motor->part_v = 0.0f;
     motor->part_a = 0.0f;
     motor->part_rad = angle_rad;
-    motor->part_gap_rad = motor->gap_rad;
     motor->part_ticks = motor->driven_ticks;
 }
 
@@ -198,17 +197,17 @@ void motor_limit(motor_state *motor)
     motor->step_rad_s = UNKNOWN_RAD_S;
 }
 
-/* Take a sample in which a driver may have limited the current: what it put out lies anywhere between nothing and the duty's
- * voltage. What reading and current ask for within that is taken for it, and nothing is learnt. */
+/* Take a sample in which a driver may have limited the current: it put out anything between nothing and the duty's voltage.
+ * What reading and current ask for within that is taken for it, and nothing is learnt. */
 static void sample_limited(motor_state *motor, const motor_config *config, float angle_rad)
 {
-    const float ir_v = motor->resistance_scale * config->resistance_ohm * motor->part_a;
     const float way_rad = angle_rad - motor->part_rad;
+    const float ir_v = motor->resistance_scale * config->resistance_ohm * motor->part_a;
     const float asked_v = ir_v + motor->constant_scale * config->constant_v_s * way_rad * (float)TICKS_PER_S;
     const float low_v = motor->part_v < 0.0f ? motor->part_v : 0.0f;
     const float high_v = motor->part_v > 0.0f ? motor->part_v : 0.0f;
+    motor->withheld_rad += motor->part_v * motor->per_constant * TICK_S;
     motor->part_v = number_clamp(asked_v, low_v, high_v);
-    motor->gap_rad = motor->part_gap_rad + way_rad - (motor->part_v - ir_v) * motor->per_constant * TICK_S;
     motor->window_side = SIDE_UNKNOWN; /* backlash may be crossed meanwhile */
     motor->limited = 0u;
 }
@@ -267,6 +266,7 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     motor->dither_vv *= DITHER_KEPT;
     motor->dither_va *= DITHER_KEPT;
     motor->dither_aa *= DITHER_KEPT;
+    motor->withheld_rad *= 1.0f - (float)SAMPLE_TICKS * TICK_S / FADE_S;
     part_begin(motor, angle_rad);
 }
 
@@ -359,7 +359,7 @@ bool motor_answers_as_none(const motor_state *motor, const motor_config *config)
 {
     const float seen_v = config->resistance_ohm * motor->dither_va;
     return (seen_v < ANSWER_LOW * motor->dither_vv || seen_v > ANSWER_HIGH * motor->dither_vv) &&
-           motor_answers_otherwise(motor, config);
+           config->resistance_ohm > 0.0f && motor_answers_otherwise(motor, config);
 }
 
 void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad)
@@ -395,11 +395,11 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     motor->part_v += voltage_v;
     motor->part_a += current_a;
     const float keep = 1.0f - TICK_S / FADE_S;
-    motor->gap_rad = keep * motor->gap_rad + moved_rad - speed_rad_s * TICK_S;
     if (sampled) {
         sample(motor, config, ir_v, emf_v, angle_rad);
         motor->rough_rad_s += ROUGH_SHARE * (change_rad_s - motor->rough_rad_s);
     }
+    motor->gap_rad = keep * motor->gap_rad + moved_rad - speed_rad_s * TICK_S;
     motor->band_rad = keep * motor->band_rad + motor->unsure_rad;
     const float size_rad_s = number_size(speed_rad_s);
     const bool known = motor->current_a * motor->heard_ohm > DEAD_SHARE * config->constant_v_s * size_rad_s;

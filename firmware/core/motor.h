@@ -62,7 +62,10 @@ static inline float motor_explains(const motor_state *motor)
 /* Return whether motor and reading are apart further than that, noise and backlash explain. */
 static inline bool motor_is_apart(const motor_state *motor, const motor_config *config)
 {
-    return motor->limited == 0u && number_size(motor->gap_rad) > config->apart_rad + motor_explains(motor);
+    const float less_rad = motor->withheld_rad;
+    const float gap_rad = motor->gap_rad;
+    const float left_rad = gap_rad * less_rad >= 0.0f ? gap_rad : gap_rad + number_bound(less_rad, number_size(gap_rad));
+    return motor->limited == 0u && number_size(left_rad) > config->apart_rad + motor_explains(motor);
 }
 
 /* Return the fault by which they are apart, as it looks at first. */

@@ -398,8 +398,7 @@ typedef struct motor_state {
     uint32_t step_ticks;     /* driven_ticks when that was last seen, 0: never */
     float part_v;            /* sums since the last sample: applied voltage, current; */
     float part_a;
-    float part_rad;          /* reading */
-    float part_gap_rad;      /* and gap then; */
+    float part_rad;          /* reading then */
     uint32_t limited;        /* not 0: a driver may have limited the current since, */
     uint32_t limit_ticks;    /* last at these driven_ticks */
     uint32_t part_ticks;     /* driven_ticks then */
@@ -410,6 +409,7 @@ typedef struct motor_state {
     float uneven;
     float damping_share;
     float gap_rad;           /* travel of the reading less that of the motor; fades */
+    float withheld_rad;      /* how far the motor may have gone less, as its driver limited the current; fades */
     float band_rad;          /* how much of it the motor's uncertain numbers explain; fades */
     float last_rad;          /* the reading of the last tick */
     float resistance_scale;  /* learnt: over the configuration's */
