@@ -219,9 +219,10 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
         joint->limited = 0u;
         measure(core, joint, config, i, inputs->counts[i]);
         joint->current_a = (float)(config->motor_direction * inputs->current_ma[i]) * 0.001f - joint->zero.now_a;
-        const bool seen = joint->motor.doubted == 0u || (core->joint_faults[i] & FAULT_BIT(FAULT_CURRENT_SENSOR)) == 0u;
-        const float drawn_a = seen ? joint->current_a
-                                   : motor_draws(&joint->motor, &config->motor, core->supply_v, joint->pid.speed_rad_s);
+        float drawn_a = joint->current_a;
+        if (joint->motor.doubted != 0u && (core->joint_faults[i] & FAULT_BIT(FAULT_CURRENT_SENSOR)) != 0u) {
+            drawn_a = motor_draws(&joint->motor, &config->motor, core->supply_v, joint->pid.speed_rad_s);
+        }
         joint->over_a = number_size(drawn_a) - (float)config->current_limit_ma * 0.001f;
         float angle_rad = joint->pot.angle_rad;
         if (core->elastic != 0u) { /* where the motor is, by the reading and what the current twists between them */

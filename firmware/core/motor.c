@@ -192,7 +192,6 @@ static void part_begin(motor_state *motor, float angle_rad)
 void motor_limit(motor_state *motor)
 {
     motor->limited = 1u;
-    motor->limit_ticks = motor->driven_ticks + 1u;
     motor->heard_ohm = 0.0f;
     motor->step_rad_s = UNKNOWN_RAD_S;
 }
@@ -208,6 +207,7 @@ static void sample_limited(motor_state *motor, const motor_config *config, float
     const float high_v = motor->part_v > 0.0f ? motor->part_v : 0.0f;
     motor->withheld_rad += motor->part_v * motor->per_constant * TICK_S;
     motor->part_v = number_clamp(asked_v, low_v, high_v);
+    motor->dither_vv = motor->dither_va = motor->dither_aa = 0.0f; /* what changed is not known */
     motor->window_side = SIDE_UNKNOWN; /* backlash may be crossed meanwhile */
     motor->limited = 0u;
 }
@@ -225,6 +225,44 @@ bool motor_flows_asleep(const zero_state *zero, const motor_config *config, floa
 {
     const float shown_v = number_size(zero->now_a - zero->before_a) * config->resistance_ohm;
     return zero->ticks == ZERO_TICKS / 2u && shown_v > STUCK_SUPPLY * supply_v;
+}
+
+#define ANSWER_NONE 0.25f   /* a current that answers less does not follow its voltage at all */
+#define ANSWER_TICKS 64.0f  /* that count in the sums */
+#define ANSWER_VV 0.1f      /* squares of changes of voltage, V^2, in them that show little yet */
+#define ANSWER_OFF 0.2f /* by so much an answer differs at least from that of the learnt resistance: soft joints, 15 % */
+#define ANSWER_LOW 0.5f /* of that of the configured resistance: no temperature makes it less, */
+#define ANSWER_HIGH 1.7f /* or more */
+
+/* Return how the current answers to the voltage from tick to tick, over the answer of the learnt resistance: no load, no
+ * speed and no reading is in it. */
+static float answer_of(const motor_state *motor, const motor_config *config)
+{
+    return motor->resistance_scale * config->resistance_ohm * motor->dither_va / motor->dither_vv;
+}
+
+bool motor_answers_otherwise(const motor_state *motor, const motor_config *config)
+{
+    if (motor->damping_share > 0.0f) { /* its noise is in the voltage */
+        return false;
+    }
+    const float ohm = motor->resistance_scale * config->resistance_ohm;
+    const float vv = motor->dither_vv;
+    const float va = motor->dither_va;
+    const float per_vv = 1.0f / (vv + ANSWER_VV); /* hardly driven it shows nothing */
+    const float left = number_size(motor->dither_aa * vv - va * va);
+    const float variance = ohm * ohm * left * per_vv * per_vv * (1.0f / ANSWER_TICKS) + motor->variance_rr;
+    const float off = number_size(ohm * va - vv) * per_vv;
+    return off > ANSWER_OFF + SIGMAS * number_root(variance) && /* a wrong reading may have taught a wrong resistance */
+           number_size(config->resistance_ohm * va - vv) * per_vv > ANSWER_OFF;
+}
+
+/* Return whether it does so as no temperature explains. */
+static bool answers_as_none(const motor_state *motor, const motor_config *config)
+{
+    const float seen_v = config->resistance_ohm * motor->dither_va;
+    return (seen_v < ANSWER_LOW * motor->dither_vv || seen_v > ANSWER_HIGH * motor->dither_vv) &&
+           motor_answers_otherwise(motor, config);
 }
 
 /* What changes slowly: how uncertain the speed is, and the samples. */
@@ -266,6 +304,7 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     motor->dither_vv *= DITHER_KEPT;
     motor->dither_va *= DITHER_KEPT;
     motor->dither_aa *= DITHER_KEPT;
+    motor->none_samples = answers_as_none(motor, config) ? motor->none_samples + 1u : 0u;
     motor->withheld_rad *= 1.0f - (float)SAMPLE_TICKS * TICK_S / FADE_S;
     part_begin(motor, angle_rad);
 }
@@ -279,12 +318,6 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
 #define LOAD_SHARE 0.1f     /* and of that itself */
 #define WEIGHS 4.0f         /* no witness says more (logarithm of the odds) */
 #define DECIDES 1.5f        /* with less two parts cannot be told apart; half: more are named wrongly, double: more are both named */
-#define ANSWER_NONE 0.25f   /* a current that answers less does not follow its voltage at all */
-#define ANSWER_TICKS 64.0f  /* that count in the sums */
-#define ANSWER_VV 0.1f      /* squares of changes of voltage, V^2, in them that show little yet */
-#define ANSWER_OFF 0.2f /* by so much an answer differs at least from that of the learnt resistance: soft joints, 15 % */
-#define ANSWER_LOW 0.5f /* of that of the configured resistance: no temperature makes it less, */
-#define ANSWER_HIGH 1.7f /* or more */
 
 /* Write the means over some samples, which ended back samples ago: what the load takes of the applied voltage, V (less the back-EMF by the reading),
  * and the current, A. */
@@ -335,33 +368,6 @@ static void changed(motor_state *motor, const motor_config *config, float change
     remember_load(motor, config);
 }
 
-/* Return how the current answers to the voltage from tick to tick, over the answer of the learnt resistance: no load, no
- * speed and no reading is in it. */
-static float answer_of(const motor_state *motor, const motor_config *config)
-{
-    return motor->resistance_scale * config->resistance_ohm * motor->dither_va / motor->dither_vv;
-}
-
-bool motor_answers_otherwise(const motor_state *motor, const motor_config *config)
-{
-    const float ohm = motor->resistance_scale * config->resistance_ohm;
-    const float vv = motor->dither_vv;
-    const float va = motor->dither_va;
-    const float per_vv = 1.0f / (vv + ANSWER_VV); /* hardly driven it shows nothing */
-    const float left = number_size(motor->dither_aa * vv - va * va);
-    const float variance = ohm * ohm * left * per_vv * per_vv * (1.0f / ANSWER_TICKS) + motor->variance_rr;
-    const float off = number_size(ohm * va - vv) * per_vv;
-    return off > ANSWER_OFF + SIGMAS * number_root(variance) && /* a wrong reading may have taught a wrong resistance */
-           number_size(config->resistance_ohm * va - vv) * per_vv > ANSWER_OFF;
-}
-
-bool motor_answers_as_none(const motor_state *motor, const motor_config *config)
-{
-    const float seen_v = config->resistance_ohm * motor->dither_va;
-    return (seen_v < ANSWER_LOW * motor->dither_vv || seen_v > ANSWER_HIGH * motor->dither_vv) &&
-           config->resistance_ohm > 0.0f && motor_answers_otherwise(motor, config);
-}
-
 void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad)
 {
     const float moved_rad = angle_rad - motor->last_rad;
@@ -381,14 +387,11 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     if (change_rad_s > motor->step_rad_s) {
         changed(motor, config, change_rad_s, current_a);
     }
-    /* The voltages of both ticks are known, and the noise of the current is not in them. */
-    if (motor->driven_ticks - motor->limit_ticks > 1u && motor->damping_share == 0.0f) {
-        const float change_v = voltage_v - motor->last_v;
-        const float change_a = current_a - motor->last_a;
-        motor->dither_vv += change_v * change_v;
-        motor->dither_va += change_v * change_a;
-        motor->dither_aa += change_a * change_a;
-    }
+    const float change_v = voltage_v - motor->last_v;
+    const float change_a = current_a - motor->last_a;
+    motor->dither_vv += change_v * change_v;
+    motor->dither_va += change_v * change_a;
+    motor->dither_aa += change_a * change_a;
     motor->last_v = voltage_v;
     motor->last_a = current_a;
     motor->speed_rad_s = speed_rad_s;
@@ -695,10 +698,10 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
     const float emf_v = config->constant_v_s * way_rad * (float)TICKS_PER_S * per_tick;
     const float terminal_v = ir_v + emf_v;
     const float follows_v = config->resistance_ohm * motor->dither_va; /* a bridge that obeys lets the current follow the duty: */
-    const bool obeys = !off && follows_v > OBEYS * motor->dither_vv; /* then resistance or constant may be half of the learnt */
+    const bool obeys = !off && motor->damping_share == 0.0f && follows_v > OBEYS * motor->dither_vv; /* then resistance or constant may be half of the learnt */
     const float unsure_v = obeys ? 0.5f * (number_size(ir_v) + number_size(emf_v)) : 0.0f;
     if (number_size(terminal_v - applied_v * per_tick) < STUCK_SUPPLY * supply_v + unsure_v ||
-        follows_v < -ANSWER_NONE * motor->dither_vv) {
+        (motor->damping_share == 0.0f && follows_v < -ANSWER_NONE * motor->dither_vv)) {
         return false;
     }
     if (off) { /* the current drives it on, or would if nothing held it: shorted windings brake */
@@ -747,4 +750,10 @@ bool motor_is_fast(motor_state *motor, const motor_config *config, float reading
                             : number_size(motor->speed_rad_s) > fast_rad_s && size_rad_s > motor->fastest_rad_s;
     motor->fast_ticks = fast ? number_add(motor->fast_ticks, WATCH_TICKS) : 0u;
     return motor->fast_ticks >= FAST_TICKS + motor->swing_ticks;
+}
+
+float motor_draws(const motor_state *motor, const motor_config *config, float supply_v, float reading_rad_s)
+{
+    const float left_v = motor->duty * supply_v - config->constant_v_s * reading_rad_s;
+    return left_v / (motor->resistance_scale * config->resistance_ohm);
 }

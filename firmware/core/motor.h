@@ -62,10 +62,10 @@ static inline float motor_explains(const motor_state *motor)
 /* Return whether motor and reading are apart further than that, noise and backlash explain. */
 static inline bool motor_is_apart(const motor_state *motor, const motor_config *config)
 {
-    const float less_rad = motor->withheld_rad;
-    const float gap_rad = motor->gap_rad;
-    const float left_rad = gap_rad * less_rad >= 0.0f ? gap_rad : gap_rad + number_bound(less_rad, number_size(gap_rad));
-    return motor->limited == 0u && number_size(left_rad) > config->apart_rad + motor_explains(motor);
+    const float left_rad = number_size(motor->gap_rad) - config->apart_rad - motor_explains(motor);
+    /* A motor that went less far than its duty's voltage leads it: the reading lags by as much. */
+    return left_rad > 0.0f && motor->limited == 0u &&
+           (motor->gap_rad * motor->withheld_rad >= 0.0f || left_rad > number_size(motor->withheld_rad));
 }
 
 /* Return the fault by which they are apart, as it looks at first. */
@@ -92,8 +92,7 @@ void motor_doubt(motor_state *motor, const motor_config *config);
 /* Return whether the current answers to the voltage otherwise than the learnt winding lets it: the reading has no part in it. */
 bool motor_answers_otherwise(const motor_state *motor, const motor_config *config);
 
-/* Return whether it does so as no temperature explains. */
-bool motor_answers_as_none(const motor_state *motor, const motor_config *config);
+#define MOTOR_NONE_SAMPLES 5u /* 40 ms, half of what its sums remember */
 
 /* Return which part has failed (FAULT_BIT), or which cannot be told apart. Over what was before, by offset a, gain g,
  * constant k and resistance r:
@@ -131,10 +130,6 @@ static inline bool motor_swings(motor_state *motor, float reference_rad_s, float
 bool motor_is_fast(motor_state *motor, const motor_config *config, float reading_rad_s);
 
 /* Return the current that the duty must drive by the reading's speed. */
-static inline float motor_draws(const motor_state *motor, const motor_config *config, float supply_v, float reading_rad_s)
-{
-    const float left_v = motor->duty * supply_v - config->constant_v_s * reading_rad_s;
-    return left_v / (motor->resistance_scale * config->resistance_ohm);
-}
+float motor_draws(const motor_state *motor, const motor_config *config, float supply_v, float reading_rad_s);
 
 #endif

@@ -12,7 +12,6 @@
 #define CRC_BYTES 2u      /* of the configuration looked at in a tick: all of it in less than a second */
 #define OVERCURRENT_TICKS 20u
 #define STOP_TICKS 300u   /* after which an emergency stop ends with sleeping drives, braked by shorted windings until then */
-#define NONE_TICKS 33u    /* for so long a current answers as no winding lets it: half of what its sums remember */
 #define FREE_TICKS 33u    /* in which shorted windings brake any joint; half: heavy joints sleep, double: a bridge drives on longer */
 #define FREE_BRAKED 0.9f  /* of its speed then, at most */
 #define FREE_SLOW 0.25f   /* of the speed limit: what was slower when it was let go of may sink up to its limit */
@@ -277,8 +276,7 @@ static void doubt_motor(joint_state *joint, const joint_config *config)
 static void watch_motor(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
     motor_state *motor = &joint->motor;
-    motor->none_ticks = in_a_row(motor->none_ticks, motor_answers_as_none(motor, &config->motor));
-    if (motor_is_apart(motor, &config->motor) || motor->none_ticks >= NONE_TICKS) {
+    if (motor_is_apart(motor, &config->motor) || motor->none_samples >= MOTOR_NONE_SAMPLES) {
         const uint32_t fault = motor_disagrees(motor, &config->motor, core->supply_v);
         joint->suspect_ticks = 0u;
         if (fault == FAULT_CURRENT_SENSOR) {

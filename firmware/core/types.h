@@ -399,8 +399,7 @@ typedef struct motor_state {
     float part_v;            /* sums since the last sample: applied voltage, current; */
     float part_a;
     float part_rad;          /* reading then */
-    uint32_t limited;        /* not 0: a driver may have limited the current since, */
-    uint32_t limit_ticks;    /* last at these driven_ticks */
+    uint32_t limited;        /* not 0: a driver may have limited the current since */
     uint32_t part_ticks;     /* driven_ticks then */
     float current_a;         /* the largest mean of a sample of late */
     float damped_rad_s;      /* the speed, smoothed */
@@ -437,7 +436,7 @@ typedef struct motor_state {
     float swing_first_rad_s; /* and before the first of them */
     uint32_t swing_ticks;    /* half a period of the joint on its spring: so long that gives back what it took */
     uint32_t fast_ticks;     /* faster than the limit, in a row */
-    uint32_t none_ticks;     /* no winding answers as it does, in a row */
+    uint32_t none_samples;   /* in a row: no winding answers as it does */
     uint32_t current_ticks;  /* beyond twice the current limit, in a row */
     uint32_t driven_ticks;   /* since the windings were closed */
     uint32_t phase;          /* when it is sampled */
