@@ -219,11 +219,7 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
         joint->limited = 0u;
         measure(core, joint, config, i, inputs->counts[i]);
         joint->current_a = (float)(config->motor_direction * inputs->current_ma[i]) * 0.001f - joint->zero.now_a;
-        float drawn_a = joint->current_a;
-        if (joint->motor.doubted != 0u && (core->joint_faults[i] & FAULT_BIT(FAULT_CURRENT_SENSOR)) != 0u) {
-            drawn_a = motor_draws(&joint->motor, &config->motor, core->supply_v, joint->pid.speed_rad_s);
-        }
-        joint->over_a = number_size(drawn_a) - (float)config->current_limit_ma * 0.001f;
+        joint->over_a = number_size(joint->current_a) - (float)config->current_limit_ma * 0.001f;
         float angle_rad = joint->pot.angle_rad;
         if (core->elastic != 0u) { /* where the motor is, by the reading and what the current twists between them */
             angle_rad += joint->motor.twist_rad_per_a * joint->current_a;
@@ -236,6 +232,9 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
         } else {
             motor_sleep(&joint->zero, joint->current_a);
         }
+    }
+    if ((core->faults & FAULT_BIT(FAULT_CURRENT_SENSOR)) != 0u) {
+        safety_limit_blindly(core);
     }
     safety_watch_arm(core, inputs);
     core->tick = inputs->tick;

@@ -1,5 +1,6 @@
 #include "motor.h"
 
+#define SAMPLE_KEEPS (1.0f - (float)SAMPLE_TICKS * TICK_S / FADE_S) /* of what fades, from sample to sample */
 #define FADE_S 0.4f           /* a gap fades with this time constant: what opens more slowly is not seen */
 #define PRIOR_VARIANCE 0.005625f /* of R and K over the configuration's: 0.075^2, so that three sigma of both cover 15 % */
 #define WANDER_VARIANCE 6e-9f /* by which K becomes less certain per tick: magnets get warm */
@@ -40,6 +41,7 @@
 #define STUCK_SUPPLY 0.2f     /* of the supply: less a stuck bridge hardly moves */
 #define STEP_RAD_S 0.05f      /* a motor's speed that changes by so much in a tick, beyond noise and what its torque does, is none */
 #define ROUGH_TIMES 5.0f      /* of the mean change from tick to tick: four sigma of its noise */
+#define DITHER_SUPPLY 0.02f   /* of the supply: changes that are smaller are taken once a sample; half: more ticks cost more, double: less shows */
 #define DITHER_KEPT 0.875f    /* per sample of the sums over changes of voltage and current: 64 ms */
 #define ROUGH_SHARE 0.0625f   /* of a sample in that mean */
 #define ROUGH_RAD_S 0.08f     /* the mean at first */
@@ -272,7 +274,7 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
                            motor->variance_kk * emf_v * emf_v;
     const float unsure_v = SIGMAS * number_root(variance > 0.0f ? variance : 0.0f) + motor->uneven * number_size(emf_v);
     motor->unsure_rad_s = unsure_v / config->constant_v_s;
-    motor->unsure_rad = motor->unsure_rad_s * TICK_S;
+    motor->band_rad = SAMPLE_KEEPS * motor->band_rad + motor->unsure_rad_s * (float)SAMPLE_TICKS * TICK_S;
     if (motor->trust == 1.0f) {
         motor->doubt_rad_s = motor->unsure_rad_s;
     } else { /* nobody contradicts a constant that is too large: the joint is as fast as it may be */
@@ -299,13 +301,14 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     }
     motor->per_constant = 1.0f / (motor->constant_scale * config->constant_v_s);
     const float seen_a = number_size(motor->part_a) / (float)(motor->driven_ticks - motor->part_ticks);
-    const float kept_a = (1.0f - (float)SAMPLE_TICKS * TICK_S / FADE_S) * motor->current_a;
+    const float kept_a = SAMPLE_KEEPS * motor->current_a;
     motor->current_a = seen_a > kept_a ? seen_a : kept_a;
     motor->dither_vv *= DITHER_KEPT;
     motor->dither_va *= DITHER_KEPT;
     motor->dither_aa *= DITHER_KEPT;
     motor->none_samples = answers_as_none(motor, config) ? motor->none_samples + 1u : 0u;
-    motor->withheld_rad *= 1.0f - (float)SAMPLE_TICKS * TICK_S / FADE_S;
+    motor->withheld_rad *= SAMPLE_KEEPS;
+    motor->gap_rad *= SAMPLE_KEEPS;
     part_begin(motor, angle_rad);
 }
 
@@ -368,6 +371,14 @@ static void changed(motor_state *motor, const motor_config *config, float change
     remember_load(motor, config);
 }
 
+/* Take how voltage and current changed from one tick to the next. */
+static void dither(motor_state *motor, float change_v, float change_a)
+{
+    motor->dither_vv += change_v * change_v;
+    motor->dither_va += change_v * change_a;
+    motor->dither_aa += change_a * change_a;
+}
+
 void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad)
 {
     const float moved_rad = angle_rad - motor->last_rad;
@@ -388,22 +399,19 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
         changed(motor, config, change_rad_s, current_a);
     }
     const float change_v = voltage_v - motor->last_v;
-    const float change_a = current_a - motor->last_a;
-    motor->dither_vv += change_v * change_v;
-    motor->dither_va += change_v * change_a;
-    motor->dither_aa += change_a * change_a;
+    if (sampled || number_size(change_v) > DITHER_SUPPLY * supply_v) {
+        dither(motor, change_v, current_a - motor->last_a);
+    }
     motor->last_v = voltage_v;
     motor->last_a = current_a;
     motor->speed_rad_s = speed_rad_s;
     motor->part_v += voltage_v;
     motor->part_a += current_a;
-    const float keep = 1.0f - TICK_S / FADE_S;
     if (sampled) {
         sample(motor, config, ir_v, emf_v, angle_rad);
         motor->rough_rad_s += ROUGH_SHARE * (change_rad_s - motor->rough_rad_s);
     }
-    motor->gap_rad = keep * motor->gap_rad + moved_rad - speed_rad_s * TICK_S;
-    motor->band_rad = keep * motor->band_rad + motor->unsure_rad;
+    motor->gap_rad += moved_rad - speed_rad_s * TICK_S;
     const float size_rad_s = number_size(speed_rad_s);
     const bool known = motor->current_a * motor->heard_ohm > DEAD_SHARE * config->constant_v_s * size_rad_s;
     motor->known = known ? 1u : 0u;

@@ -303,6 +303,18 @@ static void watch_limits(core_state *core, joint_state *joint, const joint_confi
     }
 }
 
+void safety_limit_blindly(core_state *core)
+{
+    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
+        joint_state *joint = &core->joint[i];
+        const joint_config *config = &core->config.joint[i];
+        if (joint->motor.doubted != 0u && (core->joint_faults[i] & FAULT_BIT(FAULT_CURRENT_SENSOR)) != 0u) {
+            const float drawn_a = motor_draws(&joint->motor, &config->motor, core->supply_v, joint->pid.speed_rad_s);
+            joint->over_a = number_size(drawn_a) - (float)config->current_limit_ma * 0.001f;
+        }
+    }
+}
+
 /* Return whether a joint without a motor that is watched goes on although shorted windings brake it: as fast as when it was
  * let go of, or, where it was slow, faster than its limit. */
 static bool runs_on(joint_state *joint, const joint_config *config)

@@ -35,6 +35,9 @@ void safety_forget(core_state *core);
 /* Watch the tick timer, the memory, the supply and, while the arm follows the host, the host's silence. */
 void safety_watch_arm(core_state *core, const core_inputs *inputs);
 
+/* Take the current that the duty must drive for that of a sensor that is not believed, where currents are limited. */
+void safety_limit_blindly(core_state *core);
+
 /* Watch some of the driven joints, every one once in WATCH_TICKS, after their duties are known. */
 void safety_watch_joints(core_state *core);
 

@@ -372,7 +372,6 @@ typedef struct motor_state {
     float duty;              /* put out in the last tick, direction of the joint */
     float speed_rad_s;       /* by the back-EMF */
     float unsure_rad_s;      /* how far that may be off */
-    float unsure_rad;        /* in a tick */
     float doubt_rad_s;       /* the same, as far as it excuses a speed beyond the limit */
     float fastest_rad_s;     /* what it is held to: the speed limit, or what its noise lets show */
     float sure_rad_s;        /* the size it has at least but for the doubt; 0 where it is not known */
