@@ -8,8 +8,8 @@
                                  so fast is a fault, double: a reading that stands still is noticed later */
 #define WARM_VARIANCE 0.04f   /* to which that grows where nothing is learnt: 0.2^2, so that three sigma cover -20 to +40 % */
 #define SIGMAS 3.0f
-#define SCALE_LOW 0.68f       /* of R: a tolerance of 15 %, and copper from -50 to +100 K (0.39 % a kelvin) */
-#define SCALE_HIGH 1.61f
+#define SCALE_LOW 0.65f       /* of R: a tolerance of 15 %, one of 3 % of the current's gain, and copper from -50 to +100 K */
+#define SCALE_HIGH 1.7f
 #define CONSTANT_LOW (1.0f - CONSTANT_OFF)
 #define CONSTANT_HIGH (1.0f + CONSTANT_OFF)
 #define WINDOW_TICKS 32u      /* R and K are learnt from a window: until the reading has moved, looked at as often, */
@@ -41,7 +41,7 @@
 #define STUCK_SUPPLY 0.2f     /* of the supply: less a stuck bridge hardly moves */
 #define STEP_RAD_S 0.05f      /* a motor's speed that changes by so much in a tick, beyond noise and what its torque does, is none */
 #define ROUGH_TIMES 5.0f      /* of the mean change from tick to tick: four sigma of its noise */
-#define DITHER_SUPPLY 0.02f   /* of the supply: changes that are smaller are taken once a sample; half: more ticks cost more, double: less shows */
+#define DITHER_SUPPLY 0.04f   /* of the supply: changes that are smaller are taken once a sample; half: more ticks cost more, double: less shows */
 #define DITHER_KEPT 0.875f    /* per sample of the sums over changes of voltage and current: 64 ms */
 #define ROUGH_SHARE 0.0625f   /* of a sample in that mean */
 #define ROUGH_RAD_S 0.08f     /* the mean at first */
@@ -177,7 +177,7 @@ static void window(motor_state *motor, const motor_config *config, float angle_r
         earn(motor, config, way_rad);
     }
     /* A gap that R and K may explain must be learnt from: else they would stay wrong for good. */
-    if (motor->heard_ohm > 0.0f && number_size(motor->gap_rad) < 0.5f * config->apart_rad + motor_explains(motor)) {
+    if (motor->heard_rad_s > 0.0f && number_size(motor->gap_rad) < 0.5f * config->apart_rad + motor_explains(motor)) {
         learn(motor, config, angle_rad, noise_rad);
     }
     window_begin(motor, angle_rad);
@@ -194,7 +194,7 @@ static void part_begin(motor_state *motor, float angle_rad)
 void motor_limit(motor_state *motor)
 {
     motor->limited = 1u;
-    motor->heard_ohm = 0.0f;
+    motor->heard_rad_s = 0.0f;
     motor->step_rad_s = UNKNOWN_RAD_S;
 }
 
@@ -233,7 +233,7 @@ bool motor_flows_asleep(const zero_state *zero, const motor_config *config, floa
 #define ANSWER_TICKS 64.0f  /* that count in the sums */
 #define ANSWER_VV 0.1f      /* squares of changes of voltage, V^2, in them that show little yet */
 #define ANSWER_OFF 0.2f /* by so much an answer differs at least from that of the learnt resistance: soft joints, 15 % */
-#define ANSWER_LOW 0.5f /* of that of the configured resistance: no temperature makes it less, */
+#define ANSWER_LOW 0.35f/* of that of the configured resistance: no temperature makes it less, */
 #define ANSWER_HIGH 1.7f /* or more */
 
 /* Return how the current answers to the voltage from tick to tick, over the answer of the learnt resistance: no load, no
@@ -291,7 +291,8 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     motor->sample_a[at] = motor->part_a;
     motor->sampled++;
     motor->step_rad_s = STEP_RAD_S + ROUGH_TIMES * motor->rough_rad_s;
-    motor->heard_ohm = motor->doubted != 0u || motor_stepped(motor) ? 0.0f : config->resistance_ohm;
+    const float ohm = motor->doubted != 0u || motor_stepped(motor) ? 0.0f : config->resistance_ohm;
+    motor->heard_rad_s = motor->current_a * ohm / (DEAD_SHARE * config->constant_v_s);
     const uint32_t slot = motor->driven_ticks + motor->phase;
     motor->sample_ticks = motor->driven_ticks + SAMPLE_TICKS - slot % SAMPLE_TICKS;
     if (limited) {
@@ -299,6 +300,7 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     } else {
         window(motor, config, angle_rad);
     }
+    motor->ohm = motor->resistance_scale * config->resistance_ohm;
     motor->per_constant = 1.0f / (motor->constant_scale * config->constant_v_s);
     const float seen_a = number_size(motor->part_a) / (float)(motor->driven_ticks - motor->part_ticks);
     const float kept_a = SAMPLE_KEEPS * motor->current_a;
@@ -367,7 +369,7 @@ static void changed(motor_state *motor, const motor_config *config, float change
         return; /* what steps on began with the first */
     }
     motor->step_ticks = motor->driven_ticks;
-    motor->heard_ohm = 0.0f;
+    motor->heard_rad_s = 0.0f;
     remember_load(motor, config);
 }
 
@@ -386,12 +388,12 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     motor->driven_ticks++;
     if (config->resistance_ohm <= 0.0f || motor->driven_ticks <= SETTLE_TICKS) {
         motor->window_rad = motor->part_rad = angle_rad;
+        motor->ohm = motor->resistance_scale * config->resistance_ohm;
         motor->trust = config->resistance_ohm <= 0.0f ? 1.0f : motor->trust; /* no witness, no trust to earn */
         return;
     }
     const float voltage_v = motor->duty * supply_v;
-    const float ir_v = current_a * config->resistance_ohm;
-    const float emf_v = voltage_v - motor->resistance_scale * ir_v;
+    const float emf_v = voltage_v - motor->ohm * current_a;
     const bool sampled = motor->driven_ticks == motor->sample_ticks;
     const float speed_rad_s = emf_v * motor->per_constant;
     const float change_rad_s = number_size(speed_rad_s - motor->speed_rad_s);
@@ -408,19 +410,20 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     motor->part_v += voltage_v;
     motor->part_a += current_a;
     if (sampled) {
-        sample(motor, config, ir_v, emf_v, angle_rad);
+        sample(motor, config, current_a * config->resistance_ohm, emf_v, angle_rad);
         motor->rough_rad_s += ROUGH_SHARE * (change_rad_s - motor->rough_rad_s);
     }
     motor->gap_rad += moved_rad - speed_rad_s * TICK_S;
     const float size_rad_s = number_size(speed_rad_s);
-    const bool known = motor->current_a * motor->heard_ohm > DEAD_SHARE * config->constant_v_s * size_rad_s;
-    motor->known = known ? 1u : 0u;
-    motor->sure_rad_s = known ? size_rad_s - motor->doubt_rad_s : 0.0f;
+    motor->sure_rad_s = size_rad_s < motor->heard_rad_s ? size_rad_s - motor->doubt_rad_s : -UNKNOWN_RAD_S;
 }
+
+/* Return whether a current is seen, without which its sensor may be broken. */
+static bool is_known(const motor_state *motor) { return motor->sure_rad_s > -0.5f * UNKNOWN_RAD_S; }
 
 void motor_damp(motor_state *motor, float reading_rad_s)
 {
-    const bool known = motor->known != 0u && motor->unsure_rad_s < UNKNOWN_RAD_S;
+    const bool known = is_known(motor) && motor->unsure_rad_s < UNKNOWN_RAD_S;
     const float share = known ? motor->damping_share : 0.0f;
     motor->damped_rad_s += SMOOTH * (motor->speed_rad_s - motor->damped_rad_s);
     motor->beyond_rad_s = share * (motor->damped_rad_s - reading_rad_s);
@@ -721,20 +724,21 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
 
 #define SWING_TICKS 60u   /* a swing of 8 Hz and faster changes its side as often */
 #define SWINGS 8u         /* so many changes are no answer to anything */
-#define SWING_STAYS 0.75f /* of the first of them: a last one that is smaller decays; half: ringing stops joints, 1: noise hides a swing */
+#define SWING_STAYS 0.6f  /* of the first half of them: a second half that is smaller decays; half: ringing stops joints, double: noise hides a swing */
 #define SWING_RAD_S 0.4f  /* as far from the reference's speed at least */
 
 bool motor_swings_far(motor_state *motor, float off_rad_s)
 {
     const int32_t side = off_rad_s > 0.0f ? 1 : -1;
-    if (motor->known == 0u || number_size(off_rad_s) <= SWING_RAD_S) {
-        motor->swings = motor->known == 0u ? 0u : motor->swings;
+    if (!is_known(motor) || number_size(off_rad_s) <= SWING_RAD_S) {
+        motor->swings = is_known(motor) ? motor->swings : 0u;
         return false;
     }
     if (side != motor->swing_side) {
         motor->swings = motor->driven_ticks - motor->swing_since <= SWING_TICKS ? motor->swings + 1u : 0u;
-        motor->swing_first_rad_s = motor->swings <= 1u ? motor->swing_rad_s : motor->swing_first_rad_s;
-        if (motor->swings >= SWINGS && motor->swing_rad_s < SWING_STAYS * motor->swing_first_rad_s) {
+        const float stays = motor->swings > SWINGS / 2u ? motor->swing_rad_s : -SWING_STAYS * motor->swing_rad_s;
+        motor->swing_stays_rad_s = motor->swings != 0u ? motor->swing_stays_rad_s + stays : 0.0f;
+        if (motor->swings >= SWINGS && motor->swing_stays_rad_s < 0.0f) {
             motor->swings = 0u; /* it decays by itself */
         }
         motor->swing_rad_s = 0.0f;
@@ -749,13 +753,10 @@ bool motor_swings_far(motor_state *motor, float off_rad_s)
 #define FAST_TICKS 30u
 #define FAST 1.08f /* of what it is held to: by both witnesses */
 
-bool motor_is_fast(motor_state *motor, const motor_config *config, float reading_rad_s)
+bool motor_stays_fast(motor_state *motor, const motor_config *config, float reading_rad_s)
 {
-    const float fast_rad_s = FAST * motor->fastest_rad_s;
-    const float size_rad_s = number_size(reading_rad_s);
     const bool alone = motor->doubted != 0u || config->resistance_ohm <= 0.0f;
-    const bool fast = alone ? size_rad_s > fast_rad_s
-                            : number_size(motor->speed_rad_s) > fast_rad_s && size_rad_s > motor->fastest_rad_s;
+    const bool fast = number_size(alone ? reading_rad_s : motor->speed_rad_s) > FAST * motor->fastest_rad_s;
     motor->fast_ticks = fast ? number_add(motor->fast_ticks, WATCH_TICKS) : 0u;
     return motor->fast_ticks >= FAST_TICKS + motor->swing_ticks;
 }

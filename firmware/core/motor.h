@@ -125,9 +125,19 @@ static inline bool motor_swings(motor_state *motor, float reference_rad_s, float
     return number_size(off_rad_s) > MOTOR_SWING * speed_limit_rad_s && motor_swings_far(motor, off_rad_s);
 }
 
+/* Return whether a joint whose reading is faster than its limit has been so long enough to be sure. */
+bool motor_stays_fast(motor_state *motor, const motor_config *config, float reading_rad_s);
+
 /* Return whether the joint has been faster than it may be long enough to be sure; reading_rad_s is what the reading says
  * of it, alone where the motor is no witness. To be asked each WATCH_TICKS. */
-bool motor_is_fast(motor_state *motor, const motor_config *config, float reading_rad_s);
+static inline bool motor_is_fast(motor_state *motor, const motor_config *config, float reading_rad_s)
+{
+    if (number_size(reading_rad_s) <= motor->fastest_rad_s) {
+        motor->fast_ticks = 0u;
+        return false;
+    }
+    return motor_stays_fast(motor, config, reading_rad_s);
+}
 
 /* Return the current that the duty must drive by the reading's speed. */
 float motor_draws(const motor_state *motor, const motor_config *config, float supply_v, float reading_rad_s);

@@ -374,12 +374,12 @@ typedef struct motor_state {
     float unsure_rad_s;      /* how far that may be off */
     float doubt_rad_s;       /* the same, as far as it excuses a speed beyond the limit */
     float fastest_rad_s;     /* what it is held to: the speed limit, or what its noise lets show */
-    float sure_rad_s;        /* the size it has at least but for the doubt; 0 where it is not known */
-    uint32_t known;          /* not 0: a current is seen, without which its sensor may be broken */
+    float sure_rad_s;        /* the size it has at least but for the doubt; less than nothing where it is not known */
     uint32_t before;         /* not 0: it is known what the load took before that, */
     float before_v;          /* of the applied voltage less the back-EMF by the reading, */
     float before_a;          /* and as a current */
-    float heard_ohm;         /* 0 while it is doubted, or a step was seen of late; else the configuration's R */
+    float heard_rad_s;       /* up to this speed a current is heard of late; 0 while it is doubted, or a step was seen */
+    float ohm;               /* learnt, as of the last sample */
     uint32_t sample_ticks;   /* driven_ticks when the next sample is taken */
     float rough_rad_s;       /* mean change of speed_rad_s from tick to tick */
     float way_seen;          /* squares of the way that showed what the constant is since a step, */
@@ -432,7 +432,7 @@ typedef struct motor_state {
     uint32_t swing_since;    /* driven_ticks when it changed */
     uint32_t swings;         /* changes in quick succession */
     float swing_rad_s;       /* how far from it it went since the last, */
-    float swing_first_rad_s; /* and before the first of them */
+    float swing_stays_rad_s; /* sum of that over the second half of the changes that count, less a share of the first half's */
     uint32_t swing_ticks;    /* half a period of the joint on its spring: so long that gives back what it took */
     uint32_t fast_ticks;     /* faster than the limit, in a row */
     uint32_t none_samples;   /* in a row: no winding answers as it does */

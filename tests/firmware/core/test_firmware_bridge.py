@@ -131,3 +131,66 @@ def test_a_current_that_flows_asleep_is_its_sensors_error(motors, library):
     arm.tick(200)
     assert asleep(arm)
     assert arm.first == (Fault.CURRENT_SENSOR, 4)
+
+
+@pytest.mark.parametrize("share", [-0.6, 0.6])
+def test_a_bridge_of_a_joint_without_motor_figures_is_put_to_sleep(motors, library, share):
+    """No current is compared with its voltage there: what shorted windings do not brake is driven on."""
+    arm = motors.drawn_arm(library, 812, load=0.2)
+    for joint in arm.core.config.joint:
+        joint.motor.resistance_ohm = 0.0
+    arm.core.crc, arm.core.crc_at, arm.core.crc_known = 0xFFFFFFFF, 0, 0
+    arm.enable()
+    motors.until_moving(arm, 2)
+    arm.plant.stuck[2] = share
+    arm.swing(600, stop_at_fault=False)
+    assert arm.first == (Fault.BRIDGE, 2)
+    assert asleep(arm)
+
+
+def test_a_gain_and_a_worn_winding_that_cannot_be_told_apart_are_both_named_and_the_joint_held(motors, library):
+    both = (1 << int(Fault.CURRENT_SENSOR)) | 1  # MOTOR, 32, has bit 0
+    arm = motors.drawn_arm(library, 813, load=0.02)
+    arm.enable()
+    arm.rest(1200)
+    arm.plant._model[10, 1] *= 2.2
+    arm.rest_on(1200)
+    assert arm.out[0]["joint_faults"][1] == both
+    assert arm.out[0]["drives_on"]
+
+
+def test_a_current_whose_sign_changes_is_its_sensors_fault_in_any_case(motors, library):
+    for seed in SEEDS:
+        arm = at_rest(motors, library, seed)
+        arm.plant._model[10, 3] *= -1
+        arm.rest_on(600)
+        arm.tick(200)
+        assert arm.first == (Fault.CURRENT_SENSOR, 3)
+        assert int(arm.out[0]["joint_faults"][3]) == 1 << int(Fault.CURRENT_SENSOR)
+
+
+def test_healthy_joints_at_their_current_limit_are_not_dropped(motors, library):
+    """A driver that limits may withhold a part of the duty: that explains a gap, and nothing is learnt meanwhile."""
+    for seed in SEEDS:
+        arm = motors.drawn_arm(library, seed, load=0.4)
+        for joint in arm.core.config.joint:
+            joint.current_limit_ma = 1200
+        arm.core.crc, arm.core.crc_at, arm.core.crc_known = 0xFFFFFFFF, 0, 0
+        arm.enable()
+        arm.swing(3000)
+        assert arm.first == (None, None)
+        arm.plant.stuck[3] = 0.7
+        arm.rest_on(120)
+        assert arm.first == (Fault.BRIDGE, 3)
+
+
+def test_a_stop_that_was_cleared_gives_the_next_one_its_whole_time(motors, library):
+    arm = at_rest(motors, library, 800)
+    for _ in range(2):
+        arm.inputs.stop_pressed = 1
+        out = arm.tick(250)
+        assert out["windings_shorted"]
+        arm.inputs.stop_pressed = 0
+        arm.command(c.COMMAND_CLEAR_STOP)
+    arm.inputs.stop_pressed = 1
+    assert arm.tick(100)["windings_shorted"]

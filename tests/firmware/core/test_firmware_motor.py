@@ -207,7 +207,7 @@ def test_elastic_joints_are_held_and_not_taken_for_broken_ones(arms, library):
 def test_an_elastic_joint_swings_where_it_is_damped_by_the_reading(arms, library):
     """The law's damping by the motor is what holds it: the same gains on the reading's speed are a fault."""
     model = arms.drawn_model(91)
-    between = arms.plain_transmission(**arms.sprung(model, np.full(6, 20.0), np.full(6, 0.05), np.full(6, 0.5)))
+    between = arms.plain_transmission(**arms.sprung(model, np.full(6, 20.0), np.full(6, 0.02), np.full(6, 0.5)))
     faults = []
     for share in (1.0, 0.0):
         config = arms.found_configuration(model, between, np.random.default_rng(91))
