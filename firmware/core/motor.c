@@ -1,50 +1,77 @@
 #include "motor.h"
 
 #define SAMPLE_KEEPS (1.0f - (float)SAMPLE_TICKS * TICK_S / FADE_S) /* of what fades, from sample to sample */
-#define FADE_S 0.4f           /* a gap fades with this time constant: what opens more slowly is not seen */
-#define PRIOR_VARIANCE 0.005625f /* of R and K over the configuration's: 0.075^2, so that three sigma of both cover 15 % */
-#define WANDER_VARIANCE 6e-9f /* by which K becomes less certain per tick: magnets get warm */
+#define FADE_S 0.4f /* s; a gap fades with this time constant; half: slow drifts stay unseen, double: old errors add up */
+#define PRIOR_VARIANCE 0.005625f /* of R and K over the configuration's: 0.075^2, three sigma of both cover 15 %; half:
+                                    other motors are doubted, double: faults show later at first */
+#define WANDER_VARIANCE 6e-9f /* per tick, of K: magnets get warm; half: K follows later, double: a reading's scale is
+                                 learnt as K */
 #define WARMS 1e-5f           /* sigma of R per tick: three of it are 3 % a second, 40 % within 20 s; half: a winding that warms
                                  so fast is a fault, double: a reading that stands still is noticed later */
 #define WARM_VARIANCE 0.04f   /* to which that grows where nothing is learnt: 0.2^2, so that three sigma cover -20 to +40 % */
-#define SIGMAS 3.0f
-#define SCALE_LOW 0.65f       /* of R: a tolerance of 15 %, one of 3 % of the current's gain, and copper from -50 to +100 K */
-#define SCALE_HIGH 1.7f
+#define SIGMAS 3.0f /* of a number that count as its uncertainty; half: sound joints are doubted, double: faults show
+                       late */
+#define SCALE_LOW 0.65f /* of R: a tolerance of 15 %, 3 % of the current's gain, copper from -50 to +100 K; half:
+                           shorted windings are learnt, double: cold ones doubted */
+#define SCALE_HIGH 1.7f /* likewise; half: warm windings are doubted, double: bad contacts are learnt */
 #define CONSTANT_LOW (1.0f - CONSTANT_OFF)
 #define CONSTANT_HIGH (1.0f + CONSTANT_OFF)
-#define WINDOW_TICKS 32u      /* R and K are learnt from a window: until the reading has moved, looked at as often, */
-#define REST_TICKS 256u       /* or has rested for so long */
-#define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer */
-#define RESTING 0.5f          /* of the backlash: two positions in it are a sigma of 0.41 apart */
+#define WINDOW_TICKS 32u /* R and K are learnt from a window, which ends once the reading has moved, looked at as
+                            often; half: noise teaches, double: later */
+#define REST_TICKS 256u /* or has rested for so long; half: noise teaches, double: a warm winding is followed later */
+#define WINDOW_NOISE_RAD 0.0025f /* two readings' noise, at most 20 counts of a usual potentiometer; half: noise
+                                    teaches, double: less is learnt */
+#define RESTING 0.5f /* of the backlash: two positions in it are a sigma of 0.41 apart; half: backlash teaches, double:
+                        rest teaches less */
 #define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
-#define SURPRISE 3.0f         /* sigmas beyond which a window teaches nothing until motor and reading agreed once, and then */
-#define TEACHES 1.5f          /* as much as one that is off by so many: 1 a winding that warms is followed too late, 3 a drift is */
-#define SAMPLE_TICKS 8u
-#define AGREED 4.0f           /* of apart_rad: so much way together proves that wiring and scale are right, */
-#define SAME_LOW 0.75f        /* if the motor's is as much of the reading's: */
-#define SAME_HIGH 1.3f        /* its constant is off by 15 %, the rest are resistance, backlash and noise */
-#define SAME_UNSURE 0.5f      /* of the way: what its uncertain resistance may make of the motor's; half: slow joints stay careful */
-#define CAREFUL 0.5f          /* of the speed limit until then: a reading of a third of the true speed is no faster joint */
-#define CONSTANT_OFF 0.15f    /* by so much a motor's constant may be off */
+#define SURPRISE 3.0f /* sigmas beyond which a window teaches nothing until motor and reading agreed once, and then;
+                         half: other motors are never learnt, double: wrong scales are */
+#define TEACHES 1.5f /* as much as one that is off by so many; half: a winding that warms is followed too late, double:
+                        a drift is followed */
+#define SAMPLE_TICKS 8u /* between samples; half: ticks cost more, double: faults are named later */
+#define AGREED 4.0f /* of apart_rad: so much way together proves that wiring and scale are right; half: noise proves
+                       it, double: joints are careful for longer */
+#define SAME_LOW 0.75f /* if the motor's is as much of the reading's; half: a scale of 2 passes, double: none passes */
+#define SAME_HIGH 1.3f /* at most: its constant is off by 15 %, the rest are resistance, backlash and noise; half: none
+                          passes, double: a scale of 0.4 passes */
+#define SAME_UNSURE 0.5f /* of the way: what its uncertain resistance may make of the motor's; half: slow joints stay
+                            careful, double: wrong scales pass */
+#define CAREFUL 0.5f /* of the speed limit until then; half: first motions take twice as long, double: a wrong scale is
+                        twice as fast */
+#define CONSTANT_OFF 0.15f /* by so much a motor's constant may be off; half: other motors are doubted, double: weak
+                              motors are learnt */
 #define UNKNOWN_RAD_S 1000.0f /* as uncertain as a motor's speed is whose voltage is not known */
 #define SMOOTH 0.333333f      /* of a tick's news in the speed that is damped: 2 ms; half: soft joints swing, twice: noise */
-#define SEEN_RAD_S 0.5f       /* above a motor's speed in one tick by noise: no slower joint is held to its limit by it */
+#define SEEN_RAD_S 0.5f /* rad/s, above a motor's speed in one tick by noise: no slower limit is held by it; half:
+                           noise brakes, double: slow joints go beyond theirs */
 #define SIDE_UNKNOWN 0
-#define REVERSAL_TICKS 64u    /* in a longer window than so a joint may have reversed and come back */
-#define DEAD_SHARE 0.05f      /* of what the voltage could drive: a current that small of late is none */
-#define SETTLE_TICKS 3u       /* after the windings were closed, currents are not yet known */
-#define ZERO_TICKS 64u        /* over which the zero of a current is averaged */
-#define DISOBEY_SAMPLES 2u    /* 16 ms: by then a joint that was driven goes the way it is driven, or brakes */
-#define DISOBEY_RAD 0.008f    /* in which it goes so far at least: three sigma of two readings */
-#define DISOBEY_OFF_RAD 0.02f /* and so far it is from where it is to be: no joint lags by as much on its path */
+#define REVERSAL_TICKS 64u /* in a longer window a joint may have reversed and come back; half: less is learnt, double:
+                              backlash teaches */
+#define DEAD_SHARE 0.05f /* of what the voltage could drive: a smaller current of late is none; half: dead sensors show
+                            later, double: unloaded joints look dead */
+#define SETTLE_TICKS 3u /* after the windings were closed, currents are not yet known; half: the first current is
+                           wrong, double: nothing notable */
+#define ZERO_TICKS 64u /* over which the zero of a current is averaged; half: noise stays in it, double: the bridges
+                          must sleep for longer */
+#define DISOBEY_SAMPLES 2u /* 16 ms: by then a joint that was driven goes the way it is driven, or brakes; half: noise
+                              convicts, double: a bridge drives on longer */
+#define DISOBEY_RAD 0.008f /* in which it goes so far at least: three sigma of two readings; half: noise convicts,
+                              double: a bridge shows later */
+#define DISOBEY_OFF_RAD 0.02f /* and so far it is from where it is to be; half: lagging joints are suspected, double: a
+                                 bridge shows later */
 #define OBEYS 0.7f            /* of the answer of the configured resistance; half: weak motors look like bridges, double: a bridge shows late */
-#define STUCK_SUPPLY 0.2f     /* of the supply: less a stuck bridge hardly moves */
-#define STEP_RAD_S 0.05f      /* a motor's speed that changes by so much in a tick, beyond noise and what its torque does, is none */
-#define ROUGH_TIMES 5.0f      /* of the mean change from tick to tick: four sigma of its noise */
+#define STUCK_SUPPLY 0.2f /* of the supply: less a stuck bridge hardly moves; half: uncertain windings look like
+                             bridges, double: bridges at 0.3 are not seen */
+#define STEP_RAD_S 0.05f /* a change of the motor's speed in a tick, beyond noise and torque, that is none; half: noise
+                            steps, double: small offsets do not */
+#define ROUGH_TIMES 5.0f /* of the mean change from tick to tick: four sigma of its noise; half: noise steps, double:
+                            faults do not */
 #define DITHER_SUPPLY 0.04f   /* of the supply: changes that are smaller are taken once a sample; half: more ticks cost more, double: less shows */
-#define DITHER_KEPT 0.875f    /* per sample of the sums over changes of voltage and current: 64 ms */
-#define ROUGH_SHARE 0.0625f   /* of a sample in that mean */
-#define ROUGH_RAD_S 0.08f     /* the mean at first */
+#define DITHER_KEPT 0.875f /* per sample, of the sums over changes of voltage and current: 64 ms; half: noise names
+                              parts, nearer 1: a fault shows later in them */
+#define ROUGH_SHARE 0.0625f /* of a sample in that mean; half: a noisier load is followed later, double: the mean is
+                               noisy itself */
+#define ROUGH_RAD_S 0.08f /* rad/s, the mean at first; half: first motions step, double: early steps are missed */
 
 void motor_start(motor_state *motor, float angle_rad, float speed_limit_rad_s, uint32_t phase)
 {
@@ -229,12 +256,15 @@ bool motor_flows_asleep(const zero_state *zero, const motor_config *config, floa
     return zero->ticks == ZERO_TICKS / 2u && shown_v > STUCK_SUPPLY * supply_v;
 }
 
-#define ANSWER_NONE 0.25f   /* a current that answers less does not follow its voltage at all */
-#define ANSWER_TICKS 64.0f  /* that count in the sums */
-#define ANSWER_VV 0.1f      /* squares of changes of voltage, V^2, in them that show little yet */
-#define ANSWER_OFF 0.2f /* by so much an answer differs at least from that of the learnt resistance: soft joints, 15 % */
-#define ANSWER_LOW 0.35f/* of that of the configured resistance: no temperature makes it less, */
-#define ANSWER_HIGH 1.7f /* or more */
+#define ANSWER_NONE 0.25f /* a current that answers less does not follow its voltage; half: bridges look like sensors,
+                             double: gains of 0.4 like bridges */
+#define ANSWER_TICKS 64.0f /* that count in the sums; half: less is certain, double: noise names parts */
+#define ANSWER_VV 0.1f /* V^2; smaller squares in them show little yet; half, double: nothing notable */
+#define ANSWER_OFF 0.2f /* by so much an answer differs at least; half: light joints are suspected, double: shorted
+                           windings are not seen */
+#define ANSWER_LOW 0.35f /* of that of the configured resistance: no temperature makes it less; half: gains show only
+                            in motion, double: warm light joints alarm */
+#define ANSWER_HIGH 1.7f /* or more; half: sound joints alarm, double: shorted windings show only under load */
 
 /* Return how the current answers to the voltage from tick to tick, over the answer of the learnt resistance: no load, no
  * speed and no reading is in it. */
@@ -314,14 +344,19 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     part_begin(motor, angle_rad);
 }
 
-#define LOAD_SAMPLES 8u
-#define BEFORE_SAMPLES 23u  /* so far back a fault had most likely not begun that only showed now */
-#define WORN_CONSTANT 0.83f /* of the learnt constant: what a partly shorted winding has, 0.7 to 0.95 */
-#define WORN_SIGMA 0.04f    /* of a constant that is seen: no better is it known */
-#define WAY_SHOWS 7e-4f     /* squares of a way, rad^2, over the 24 samples: seven times those of noise show a constant */
-#define LOAD_TIMES 1.5f     /* of dry friction: how well it is known what the same load takes, */
-#define LOAD_SHARE 0.1f     /* and of that itself */
-#define WEIGHS 4.0f         /* no witness says more (logarithm of the odds) */
+#define LOAD_SAMPLES 8u /* in a mean of the load; half: noisier, double: the joint moves meanwhile */
+#define BEFORE_SAMPLES 23u /* so far back a fault had not begun that shows now; half: it had, double: is not remembered */
+#define WORN_CONSTANT 0.83f /* of the learnt constant: what a partly shorted winding has, 0.7 to 0.95; half: sensors
+                               are named, double: motors */
+#define WORN_SIGMA 0.04f /* of a constant that is seen; half: a motion says more than it knows, double: more are both
+                            named */
+#define WAY_SHOWS 7e-4f /* rad^2, squares of a way over 24 samples: seven times those of noise; half: noise shows a
+                           constant, double: fewer motions do */
+#define LOAD_TIMES 1.5f /* of dry friction: how well it is known what the same load takes; half: friction names parts,
+                           double: more are both named */
+#define LOAD_SHARE 0.1f /* and of that itself; likewise */
+#define WEIGHS 4.0f /* no witness says more (logarithm of the odds); half: none convicts against the other, double: one
+                       outweighs the other */
 #define DECIDES 1.5f        /* with less two parts cannot be told apart; half: more are named wrongly, double: more are both named */
 
 /* Write the means over some samples, which ended back samples ago: what the load takes of the applied voltage, V (less the back-EMF by the reading),
@@ -461,11 +496,13 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
 }
 
 #define NAME_SAMPLES 24u    /* of the last 192 ms: most of them after the joint was let go of */
-#define NAME_NOISE_RAD 0.002f
-#define JUMP_SHARE 0.7f
-#define LAG_SHARE 0.5f      /* of what the others leave unexplained: a lag has one number more to fit with */
-#define SAME_SHARE 0.7f     /* of what a drift leaves: another ratio, or the other way round; between them both are named */
-#define STUCK_SHARE 0.5f    /* likewise: of what a sound bridge leaves */
+#define NAME_NOISE_RAD 0.002f /* of a reading; half: noise names faults, double: small ones keep their first name */
+#define JUMP_SHARE 0.7f /* of the way between both, in one sample; half: slips look like jumps, double: no jump is
+                           named */
+#define LAG_SHARE 0.5f /* of what the others leave: a lag has one number more to fit with; half: lags are named
+                          otherwise, double: slips are named lags */
+#define SAME_SHARE 0.7f /* of what the other leaves; half: more are both named, double: the smaller is always named */
+#define STUCK_SHARE 0.5f /* of what a sound bridge leaves; half: bridges show later, double: offsets look like bridges */
 
 /* What a joint did over some samples, in radians since the first of them: reading, way by the voltage alone, way that the
  * winding's voltage takes of it, the sample's number, and the sum of the way between motor and reading. */
@@ -722,10 +759,13 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
            number_size(error_rad) > DISOBEY_OFF_RAD;
 }
 
-#define SWING_TICKS 60u   /* a swing of 8 Hz and faster changes its side as often */
-#define SWINGS 8u         /* so many changes are no answer to anything */
+#define SWING_TICKS 60u /* in which a swing of 8 Hz and faster changes its side; half: only from 16 Hz on, double:
+                           motions look like swings */
+#define SWINGS 8u /* so many changes are no answer to anything; half: pushes look like swings, double: a joint swings
+                     for longer */
 #define SWING_STAYS 0.6f  /* of the first half of them: a second half that is smaller decays; half: ringing stops joints, double: noise hides a swing */
-#define SWING_RAD_S 0.4f  /* as far from the reference's speed at least */
+#define SWING_RAD_S 0.4f /* rad/s from the reference's speed at least; half: noise swings, double: slow joints swing
+                            unseen */
 
 bool motor_swings_far(motor_state *motor, float off_rad_s)
 {
@@ -750,8 +790,8 @@ bool motor_swings_far(motor_state *motor, float off_rad_s)
     return motor->swings >= SWINGS;
 }
 
-#define FAST_TICKS 30u
-#define FAST 1.08f /* of what it is held to: by both witnesses */
+#define FAST_TICKS 30u /* for so long; half: pushed joints alarm, double: a fast joint goes twice as far */
+#define FAST 1.08f /* of what it is held to, by both witnesses; half: all alarm, double: none does */
 
 bool motor_stays_fast(motor_state *motor, const motor_config *config, float reading_rad_s)
 {

@@ -40,8 +40,10 @@ _SEGMENT_S, _ROUNDS = 1.0, 10
 _SLOW_SMOOTH_S = (
     0.04  # s; takes the dither out of a slow swing; half: the resonance stays in, double: so does the swing go
 )
-#: Beyond so many sigmas, with so much of what lies between joint and motor explained, there is a spring: backlash shows 5.
-_SPRING_SIGMAS, _SPRING_EXPLAINED = 7.0, 0.7
+_SPRING_SIGMAS = (
+    7.0  # of a compliance that is a spring: backlash shows 5; half: backlash is one, double: stiff ones are none
+)
+_SPRING_EXPLAINED = 0.7  # share of what lies between joint and motor; half: noise is a spring, double: none is
 _LEAST_LINK_SHARE = 0.15  # of the inertia; less behind a spring is no matter, and noise alone looks like it
 _READING_NOISE_RAD, _CURRENT_NOISE_A = 5e-4, 0.02  # relative weight of both in the lines
 _LONGEST_DAMPING_S = 0.02  # of damping over stiffness: a spring with more is none
@@ -164,9 +166,10 @@ def fit_spring(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array)
     return JointFit(motor, max(2 * half, 0.0), gravity, float(sigma[0]), np.nan, t, smooth_v, predicted), elastic
 
 
-#: Periods of an eccentric drum that are tried, a revolution of the joint; beyond so many sigmas there is one.
-_DRUMS_PER_REV, _DRUM_SIGMAS = np.arange(1.0, 12.5, 0.5), 8.0
-_LEAST_DRUM_RAD = 0.004  # what a table's bend and a protractor leave looks like such a drum
+#: Periods a revolution of the joint of an eccentric drum that are tried; double: noise finds one, half: slow ones.
+_DRUMS_PER_REV = np.arange(1.0, 12.5, 0.5)
+_DRUM_SIGMAS = 8.0  # of an amplitude that is a drum's; half: friction is one, double: only large ones are found
+_LEAST_DRUM_RAD = 0.004  # rad; a table's bend looks like less; half: bends are drums, double: small ones are missed
 
 
 def fit_drum(
