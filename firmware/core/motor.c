@@ -59,7 +59,7 @@
                               double: a bridge shows later */
 #define DISOBEY_OFF_RAD 0.02f /* and so far it is from where it is to be; half: lagging joints are suspected, double: a
                                  bridge shows later */
-#define OBEYS 0.7f            /* of the answer of the configured resistance; half: weak motors look like bridges, double: a bridge shows late */
+#define FOLLOWS 0.7f            /* of the answer of the configured resistance; half: weak motors look like bridges, double: a bridge shows late */
 #define STUCK_SUPPLY 0.2f /* of the supply: less a stuck bridge hardly moves; half: uncertain windings look like
                              bridges, double: bridges at 0.3 are not seen */
 #define STEP_RAD_S 0.05f /* a change of the motor's speed in a tick, beyond noise and torque, that is none; half: noise
@@ -357,7 +357,7 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
 #define LOAD_SHARE 0.1f /* and of that itself; likewise */
 #define WEIGHS 4.0f /* no witness says more (logarithm of the odds); half: none convicts against the other, double: one
                        outweighs the other */
-#define DECIDES 1.5f        /* with less two parts cannot be told apart; half: more are named wrongly, double: more are both named */
+#define DECIDES 1.5f        /* with less two parts cannot be distinguished; half: more are named wrongly, double: more are both named */
 
 /* Write the means over some samples, which ended back samples ago: what the load takes of the applied voltage, V (less the back-EMF by the reading),
  * and the current, A. */
@@ -745,9 +745,9 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
     const float ir_v = motor->resistance_scale * config->resistance_ohm * amperes * per_tick;
     const float emf_v = config->constant_v_s * way_rad * (float)TICKS_PER_S * per_tick;
     const float terminal_v = ir_v + emf_v;
-    const float follows_v = config->resistance_ohm * motor->dither_va; /* a bridge that obeys lets the current follow the duty: */
-    const bool obeys = !off && motor->damping_share == 0.0f && follows_v > OBEYS * motor->dither_vv; /* then resistance or constant may be half of the learnt */
-    const float unsure_v = obeys ? 0.5f * (number_size(ir_v) + number_size(emf_v)) : 0.0f;
+    const float follows_v = config->resistance_ohm * motor->dither_va; /* a bridge that follows lets the current follow the duty: */
+    const bool follows = !off && motor->damping_share == 0.0f && follows_v > FOLLOWS * motor->dither_vv; /* then resistance or constant may be half of the learnt */
+    const float unsure_v = follows ? 0.5f * (number_size(ir_v) + number_size(emf_v)) : 0.0f;
     if (number_size(terminal_v - applied_v * per_tick) < STUCK_SUPPLY * supply_v + unsure_v ||
         (motor->damping_share == 0.0f && follows_v < -ANSWER_NONE * motor->dither_vv)) {
         return false;

@@ -71,7 +71,7 @@ static inline bool motor_is_apart(const motor_state *motor, const motor_config *
 /* Return the fault by which they are apart, as it looks at first. */
 uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v);
 
-/* Return the fault (FAULT_BIT) by what motor and reading did in the last 192 ms, or those that cannot be told apart; suspect where
+/* Return the fault (FAULT_BIT) by what motor and reading did in the last 192 ms, or those that cannot be distinguished; suspect where
  * that does not show it. A motor that was
  * let go of changes its speed by itself: only then a reading that drifts can be distinguished from one that slips. */
 uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect, motor_sums *sums);
@@ -94,7 +94,7 @@ bool motor_answers_otherwise(const motor_state *motor, const motor_config *confi
 
 #define MOTOR_NONE_SAMPLES 5u /* 40 ms, half of what its sums remember */
 
-/* Return which part has failed (FAULT_BIT), or which cannot be told apart. Over what was before, by offset a, gain g,
+/* Return which part has failed (FAULT_BIT), or which cannot be distinguished. Over what was before, by offset a, gain g,
  * constant k and resistance r:
  *
  *     what shows                        offset   sign, lead   gain   weak   shorted

@@ -329,7 +329,7 @@ static bool runs_on(joint_state *joint, const joint_config *config)
     return config->motor.resistance_ohm <= 0.0f && joint->free_ticks >= FREE_TICKS;
 }
 
-/* Give a suspected fault its name; where parts cannot be told apart, those of all. */
+/* Give a suspected fault its name; where parts cannot be distinguished, those of all. */
 static void name(core_state *core, joint_state *joint, const joint_config *config, uint32_t parts, uint32_t i)
 {
     uint32_t fault = 1u;

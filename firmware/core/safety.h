@@ -35,7 +35,7 @@ void safety_forget(core_state *core);
 /* Watch the tick timer, the memory, the supply and, while the arm follows the host, the host's silence. */
 void safety_watch_arm(core_state *core, const core_inputs *inputs);
 
-/* Take the current that the duty must drive for that of a sensor that is not believed, where currents are limited. */
+/* Take the current that the duty must drive for that of a sensor that is doubted, where currents are limited. */
 void safety_limit_blindly(core_state *core);
 
 /* Watch some of the driven joints, every one once in WATCH_TICKS, after their duties are known. */

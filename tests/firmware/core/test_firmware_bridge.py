@@ -148,7 +148,7 @@ def test_a_bridge_of_a_joint_without_motor_figures_is_put_to_sleep(motors, libra
     assert asleep(arm)
 
 
-def test_a_gain_and_a_worn_winding_that_cannot_be_told_apart_are_both_named_and_the_joint_held(motors, library):
+def test_a_gain_and_a_worn_winding_that_cannot_be_distinguished_are_both_named_and_the_joint_held(motors, library):
     both = (1 << int(Fault.CURRENT_SENSOR)) | 1  # MOTOR, 32, has bit 0
     arm = motors.drawn_arm(library, 813, load=0.02)
     arm.enable()

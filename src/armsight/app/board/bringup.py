@@ -65,7 +65,7 @@ _VERIFY_RAD, _VERIFY_HZ, _VERIFY_S, _VERIFY_MOST_RAD = 0.035, 0.5, 4.0, 0.01
 _GENTLE_RAD_S, _GENTLE_NOISE = 12.0, 0.02  # bandwidth of the second swing, and the noise of its duty
 _TRAVEL_RAD, _TRAVEL_S = 1.6, 6.0  # way and time of the travel that shows an uneven transmission
 _SOFT_TWIST_RAD = (
-    0.2  # of a spring by its load: more sags and swings; half: joints that hold are warned of, double: none is
+    0.2  # of a spring by its load: more gives way and swings; half: joints that hold are warned of, double: none is
 )
 _TRACE = 400  # points of a figure's line
 
@@ -705,8 +705,8 @@ class Bringup:
             )
         twist_rad = (found.gravity_n_m or 0.0) / found.elastic.stiffness_n_m
         soft = (
-            f". Its load twists it by {twist_rad:.2f} rad: it is too soft to be held well, it sags and swings when a hand"
-            " lets go of it. Take load off, or tighten its belt or cable"
+            f". Its load twists it by {twist_rad:.2f} rad: it is too soft to be held well, and swings when a hand lets go"
+            " of it. Take load off, or tighten its belt or cable"
         )
         self._person.say(
             f"joint {joint + 1}: it is elastic: it swings about its motor at {hz:.1f} Hz; it is damped by its motor's speed"
