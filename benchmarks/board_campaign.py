@@ -3,7 +3,7 @@
     python benchmarks/board_campaign.py 100 --seed 9902      rounds of 40 cases each
 
 ``right``: the first code is the broken part's, and its alone; ``both``: it is latched beside another one that cannot be
-be distinguished from it; ``silent``: no fault. Healthy classes begin with H: there no fault is right.
+distinguished from it; ``silent``: no fault. Healthy classes begin with H: there no fault is right.
 """
 
 from __future__ import annotations
