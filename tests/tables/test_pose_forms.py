@@ -199,22 +199,22 @@ FORMS = {
         ),
         {"unit": "mm"},
     ),
-    "Kawasaki AS .TRANS (AS Language Reference, E controller, 3.4; O A T are Euler's z, y, z)": (
+    "Kawasaki AS .TRANS (O A T are Euler's z, y, z; no manual was at hand)": (
         "p.as",
         ".PROGRAM p()\n  LMOVE p1\n.END\n.TRANS\n" + rows("p[{k}] {} {} {} {} {} {}", MM, ZYZ) + ".END\n",
         {},
     ),
-    "Kawasaki AS TRANS() (AS Language Reference, TRANS function)": (
+    "Kawasaki AS TRANS() (no manual was at hand)": (
         "q.pg",
         rows("  POINT p{k} = TRANS({}, {}, {}, {}, {}, {})", MM, ZYZ),
         {},
     ),
-    "Mitsubishi MELFA-BASIC V .prg (RT ToolBox3; CR750 detailed explanations, position constants)": (
+    "Mitsubishi MELFA-BASIC V .prg (no manual was at hand)": (
         "p.prg",
         "1 Mov P0\n2 End\n" + rows("P{k}=({},{},{},{},{},{},+0.00,+0.00)(7,0)", MM, FIXED),
         {},
     ),
-    "Epson SPEL+ XY() (EPSON RC+ 7.0 language reference, XY; U about z, V about y, W about x)": (
+    "Epson SPEL+ XY() (U about z, V about y, W about x; no manual was at hand)": (
         "p.prg",
         "Function main\n" + rows("  P{k} = XY({}, {}, {}, {}, {}, {}) /R /A", MM, FIXED[:, ::-1]) + "Fend\n",
         {},

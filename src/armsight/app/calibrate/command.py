@@ -17,9 +17,7 @@ from armsight.files import check_folder, check_outputs
 from armsight.vision.calibrate import FOLDS, MODELS
 
 if TYPE_CHECKING:
-    from armsight.vision.sources import Source
-
-_VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
+    from armsight.app.calibrate.run import GivenDetections, GivenImages
 
 
 @click.command("calibrate")
@@ -90,68 +88,46 @@ def command(
         raise InputError("--left-intrinsics and --right-intrinsics go with images of a --target")
 
     from armsight.app.calibrate.report import REPORT_FILES, write_report
-    from armsight.app.calibrate.run import (
-        calibrate_detections,
-        calibrate_images,
-        files_of,
-        open_stored,
-        print_result,
-        provenance,
-        summary,
-        with_radius,
-    )
+    from armsight.app.calibrate.run import GivenDetections, GivenImages, print_result, provenance, summary
     from armsight.app.report.plotting import require_matplotlib
     from armsight.vision.calibrate.weak import contradicted, require_order
-    from armsight.vision.markers.body_file import save_body_csv
-    from armsight.vision.markers.calibrated_board import save_board_file
-    from armsight.vision.sources import PairsSource
-    from armsight.vision.sources.pairs import StoredSource
 
-    opened: Source | None = None
-    if left is not None and right is not None:
-        opened = PairsSource.open(left, right)
-        video = next((file for file in opened.files if file.suffix.lower() in _VIDEOS), None)
-        if video is not None:
-            raise InputError(f"{video}: is a video: give both as --source video:LEFT,RIGHT")
-    elif source is not None:
-        opened = open_stored(source)
-    alone = (files_of(left_intrinsics), files_of(right_intrinsics))
-    files = opened.files if isinstance(opened, StoredSource) else ()
-    inputs = points if opened is None else (*files, *alone[0], *alone[1])
-    board_file = None if opened is None else output.parent / f"{output.stem}.board.toml"
-    check_outputs((output, refine_body, board_file), inputs)
-    if report is not None:
-        require_matplotlib()
-        check_folder(
-            report,
-            holding=REPORT_FILES,
-            apart_from=(output, refine_body, board_file, *inputs),
-            problem="no report can be written here",
-        )
-    started = time.perf_counter()
-    if opened is not None and target is not None and board_file is not None:
+    given: GivenDetections | GivenImages
+    if detections is not None and cameras is not None and body is not None:
+        given = GivenDetections(detections, cameras, body, refine_body)
+    elif target is not None:
         models = MODELS if lens_model is None else (lens_model,)
-        with contextlib.closing(opened):
-            calibration = calibrate_images(opened, alone, target, models, flat=flat_target, folds=folds)
-        given = {"source": source} if source is not None else {"left": str(left), "right": str(right)}
-        given |= {"target": target, "board": board_file.name}
-        more = {"left_intrinsics": left_intrinsics, "right_intrinsics": right_intrinsics}
-        given |= {name: pattern for name, pattern in more.items() if pattern is not None}
-    elif detections is not None and cameras is not None and body is not None:
-        calibration = calibrate_detections(detections, cameras, body, refine_body=refine_body is not None, folds=folds)
-        given = {"detections": str(detections), "cameras": str(cameras), "body": str(body)}
+        board_file = output.parent / f"{output.stem}.board.toml"
+        given = GivenImages(
+            source or (str(left), str(right)),
+            (left_intrinsics, right_intrinsics),
+            target,
+            models,
+            flat_target,
+            board_file,
+        )
+    with contextlib.closing(given):
+        check_outputs((output, refine_body, given.board_file), given.files)
+        if report is not None:
+            require_matplotlib()
+            check_folder(
+                report,
+                holding=REPORT_FILES,
+                apart_from=(output, refine_body, given.board_file, *given.files),
+                problem="no report can be written here",
+            )
+        started = time.perf_counter()
+        calibration = given.calibrated(folds)
     require_order(calibration)
-    calibration = replace(calibration, rig=replace(calibration.rig, provenance=provenance(given, calibration)))
-    if refine_body is not None:
-        save_body_csv(calibration.body, refine_body)
+    calibration = replace(calibration, rig=replace(calibration.rig, provenance=provenance(given.named, calibration)))
     calibration.rig.save(output)
-    if board_file is not None and target is not None:
-        save_board_file(board_file, with_radius(target, calibration.disc_radius_m), calibration.body.points)
+    given.save(calibration)
     if report is not None:
         write_report(calibration, report)
     if as_json:
-        click.echo(json.dumps(summary(calibration, output, board_file, report, time.perf_counter() - started)))
+        seconds = time.perf_counter() - started
+        click.echo(json.dumps(summary(calibration, output, given.board_file, report, seconds)))
     else:
-        print_result(calibration, output, board_file, report)
+        print_result(calibration, output, given.board_file, report)
     if contradicted(calibration):
         click.get_current_context().exit(UNTRUSTED)

@@ -34,11 +34,13 @@ from armsight.vision.detections import read_detections
 from armsight.vision.image import darkness, grey, one_image, read_image
 from armsight.vision.markers.aruco import FAMILIES, detect_markers, family_size
 from armsight.vision.markers.board import CalibrationBoard, open_board
-from armsight.vision.markers.body_file import load_body_csv
+from armsight.vision.markers.body_file import load_body_csv, save_body_csv
+from armsight.vision.markers.calibrated_board import save_board_file
 from armsight.vision.rig import CONTRADICTED
-from armsight.vision.sources import Source, notes_of, open_source
+from armsight.vision.sources import PairsSource, Source, notes_of, open_source
 from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files
 
+_VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 #: Fewest markers of a family by which it is named as the one in view; in families of few cells less are chance.
 _LEAST_CODES = 4
 
@@ -46,12 +48,7 @@ Grey = NDArray[np.uint8]
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 
-def with_radius(spec: str, disc_radius_m: float | None) -> str:
-    """Return a board's spec with the radius of its discs that the images showed, where it has discs and no radius."""
-    return spec if disc_radius_m is None or "radius=" in spec else f"{spec}:radius={1e3 * disc_radius_m:.6g}mm"
-
-
-def files_of(pattern: str | None) -> list[Path]:
+def _files_of(pattern: str | None) -> list[Path]:
     """Return the images that a glob matches, sorted; none without one."""
     if pattern is None:
         return []
@@ -87,7 +84,7 @@ def _single(path: Path, target: CalibrationBoard, side: int, size: tuple[int, in
     return Pair(str(path), *((found, nothing) if side == 0 else (nothing, found)))
 
 
-def open_stored(spec: str) -> Source:
+def _open_stored(spec: str) -> Source:
     """Open a folder or a recording.
 
     Raises:
@@ -100,7 +97,86 @@ def open_stored(spec: str) -> Source:
     return open_source(spec)
 
 
-def calibrate_images(
+class GivenDetections:
+    """Detections of a known body, to calibrate from; the body's points are estimated into a file that is named."""
+
+    board_file: Path | None = None
+
+    def __init__(self, detections: Path, cameras: Path, body: Path, refined: Path | None) -> None:
+        """Hold the files, which are read later."""
+        self.files, self._refined = (detections, cameras, body), refined
+        self.named = {"detections": str(detections), "cameras": str(cameras), "body": str(body)}
+
+    def calibrated(self, folds: int) -> Calibration:
+        """Read the files, and calibrate."""
+        detections, cameras, body = self.files
+        known, pair, refine = load_body_csv(body), read_cameras(cameras), self._refined is not None
+        with steps() as progress:
+            shots = read_detections(detections, known)
+            return calibrate_bodies(known, shots, pair, refine_body=refine, folds=folds, progress=progress)
+
+    def save(self, calibration: Calibration) -> None:
+        """Write what was found besides the rig."""
+        if self._refined is not None:
+            save_body_csv(calibration.body, self._refined)
+
+    def close(self) -> None:
+        """Close nothing."""
+
+
+class GivenImages:
+    """Images of a board, to calibrate from; the board's shape as it is found goes into ``board_file``."""
+
+    def __init__(
+        self,
+        images: str | tuple[str, str],
+        alone: tuple[str | None, str | None],
+        spec: str,
+        models: tuple[str, ...],
+        flat: bool,
+        board_file: Path,
+    ) -> None:
+        """Open a source, or the images that two globs match, and find those of one camera alone.
+
+        Raises:
+            InputError: there is no such source, or nothing matches.
+        """
+        if isinstance(images, str):
+            self._source, self.named = _open_stored(images), {"source": images}
+        else:
+            opened = PairsSource.open(*images)
+            video = next((file for file in opened.files if file.suffix.lower() in _VIDEOS), None)
+            if video is not None:
+                raise InputError(f"{video}: is a video: give both as --source video:LEFT,RIGHT")
+            self._source, self.named = opened, dict(zip(SIDES, images, strict=True))
+        self.named |= {"target": spec, "board": board_file.name}
+        self.named |= {f"{side}_intrinsics": each for side, each in zip(SIDES, alone, strict=True) if each is not None}
+        self._alone = (_files_of(alone[0]), _files_of(alone[1]))
+        self._spec, self._models, self._flat, self.board_file = spec, models, flat, board_file
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All images that are files."""
+        stored = self._source.files if isinstance(self._source, StoredSource) else ()
+        return (*stored, *self._alone[0], *self._alone[1])
+
+    def calibrated(self, folds: int) -> Calibration:
+        """Detect the board in all images, and calibrate."""
+        return _calibrate_images(self._source, self._alone, self._spec, self._models, flat=self._flat, folds=folds)
+
+    def save(self, calibration: Calibration) -> None:
+        """Write the board as it was found."""
+        radius_m = calibration.disc_radius_m
+        known = radius_m is None or "radius=" in self._spec
+        spec = self._spec if known else f"{self._spec}:radius={1e3 * float(radius_m or 0.0):.6g}mm"
+        save_board_file(self.board_file, spec, calibration.body.points)
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()
+
+
+def _calibrate_images(
     source: Source,
     alone: tuple[list[Path], list[Path]],
     spec: str,
@@ -234,14 +310,6 @@ def _shots(source: Source) -> Iterator[tuple[Shot, tuple[Path | str, Path | str]
         return
     while (next_one := source.read()) is not None:
         yield next_one, (f"shot {next_one.name}", f"shot {next_one.name}")
-
-
-def calibrate_detections(detections: Path, cameras: Path, body: Path, *, refine_body: bool, folds: int) -> Calibration:
-    """Calibrate from detections of a known body, all read from their files."""
-    known, pair = load_body_csv(body), read_cameras(cameras)
-    with steps() as progress:
-        shots = read_detections(detections, known)
-        return calibrate_bodies(known, shots, pair, refine_body=refine_body, folds=folds, progress=progress)
 
 
 def _same(sizes: Sizes | None, now: Sizes, left: Path | str, right: Path | str) -> Sizes:
