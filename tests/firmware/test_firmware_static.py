@@ -17,7 +17,19 @@ BOARD = [*CORE, *WIRE, "boards/loop.c", "boards/pil/pil.c"]
 SHAKES = {"core": [HERE / "shake.c", *CORE], "wire": [HERE / "fuzz_wire.c", *BOARD]}
 FUZZ_RUNS = 12000
 #: Python tests of the core; what they reach is counted.
-CORE_TESTS = ("pid", "setpoint", "pot", "states", "faults", "commands", "config", "encoder", "random", "motor", "bridge")
+CORE_TESTS = (
+    "pid",
+    "setpoint",
+    "pot",
+    "states",
+    "faults",
+    "commands",
+    "config",
+    "encoder",
+    "random",
+    "motor",
+    "bridge",
+)
 BRANCHES_PERCENT = 95.0
 
 
