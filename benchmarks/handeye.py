@@ -30,9 +30,9 @@ from scipy.stats import chi2
 
 from armsight.errors import ArmsightError
 from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.handeye.handeye import calibrate_structured
+from armsight.loop.handeye.handeye import calibrate_poses
 from armsight.loop.handeye.poses import Poses
-from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams
+from armsight.loop.handeye.streams import PoseStream, calibrate_streams
 
 #: A motion is degenerate where the second eigenvalue of KinHEC's scatter of rotation axes is below this: parallel axes.
 DEGENERATE = 1e-6
@@ -105,11 +105,11 @@ def ours(sequence, row: Row, joints: bool) -> None:
             A = sequence.robot.T_base_ee_meas[seen]
             poses = Poses(A, B, np.zeros((len(A), 6, 6)), eye == "in_hand", np.zeros(3))
             links = None if links_at is None else links_at(t)
-            found = calibrate_structured(poses, t_s=t if ordered else None, links=links, scale=True)
+            found = calibrate_poses(poses, t_s=t if ordered else None, links=links, scale=True)
         else:
             hand = PoseStream.of(sequence.robot.t, sequence.robot.T_base_ee_meas, "hand")
             eyes = PoseStream.of(t, B, "eye")
-            streams = calibrate_structured_streams(hand, eyes, eye=eye, scale=True, links_at=links_at)
+            streams = calibrate_streams(hand, eyes, eye=eye, scale=True, links_at=links_at)
             found = streams.handeye
             row.offset_ms = 1e3 * abs(-streams.offset_s - sequence.time_offset)
     except ArmsightError as error:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.loop.handeye.handeye import calibrate_handeye
-from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams
+from armsight.loop.handeye.streams import PoseStream, calibrate_streams
 from armsight.vision.image import grey, read_image
 from armsight.vision.markers.board import open_board
 
@@ -77,7 +77,7 @@ def eth_pairs(folder: Path, report) -> None:
         hand, t, B = pair(folder, name)
         late = t > np.median(t)
         found = [
-            calibrate_structured_streams(hand, PoseStream.of(t[r], B[r], "eye"), eye="in_hand") for r in (~late, late)
+            calibrate_streams(hand, PoseStream.of(t[r], B[r], "eye"), eye="in_hand") for r in (~late, late)
         ]
         a, b = (f.offset_s for f in found)
         sigma = float(np.hypot(*(f.sigma_offset_s for f in found)))
@@ -94,7 +94,7 @@ def simulated(folder: Path, report, seeds: int = 4) -> None:
     anew: their size and how neighbours hang together are the recording's, and the answer is known.
     """
     hand, t, B = pair(folder, "robot_arm_w_color_camera_sim")
-    found = calibrate_structured_streams(hand, PoseStream.of(t, B, "eye"), eye="in_hand")
+    found = calibrate_streams(hand, PoseStream.of(t, B, "eye"), eye="in_hand")
     more = f": {1e3 * found.offset_s:.2f} ms, sigma {1e3 * found.sigma_offset_s:.2f}; stamps are whole milliseconds"
     report(
         "simulated arm, offset from its one clock's zero",
@@ -111,7 +111,7 @@ def simulated(folder: Path, report, seeds: int = 4) -> None:
     for seed in range(seeds):
         starts = np.random.default_rng(seed).integers(0, len(t) - BLOCK, len(t) // BLOCK + 1)
         sampled = np.concatenate([left[s : s + BLOCK] for s in starts])[: len(t)]
-        again = calibrate_structured_streams(hand, PoseStream.of(t, seen @ exp_se3(sampled), "eye"), eye="in_hand")
+        again = calibrate_streams(hand, PoseStream.of(t, seen @ exp_se3(sampled), "eye"), eye="in_hand")
         h, true = again.handeye, found.handeye
         e = np.concatenate(
             [

@@ -17,7 +17,8 @@ MAY_IMPORT = {
     "vision": {"geometry", "kernels", "tables"},
     "robot": {"geometry", "kernels", "firmware", "tables"},
     "sim": {"geometry", "kernels", "tables", "vision", "robot"},
-    "loop": {"geometry", "kernels", "tables", "vision", "robot"},
+    "estimate": {"geometry"},
+    "loop": {"geometry", "kernels", "tables", "vision", "robot", "estimate"},
     "app": {"geometry", "kernels", "firmware", "tables", "vision", "robot", "sim", "loop"},
 }
 #: The ground: what each of these modules may import of armsight.

@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from handeye_motions import SIGMA_FLANGE_M, SIGMA_FLANGE_RAD, error, recording
+from handeye_motions import error, recording
 from scipy.stats import chi2
 
 from armsight.errors import CalibrationError, InputError
@@ -15,20 +15,16 @@ pytestmark = pytest.mark.opencv
 
 
 @pytest.mark.parametrize("eye", ["to_hand", "in_hand"])
-def test_the_covariance_holds_the_error_and_the_arms_share_is_found(eye):
-    squares, position, rotation = [], [], []
+def test_the_covariance_holds_the_error_and_blunders_are_left_out(eye):
+    squares = []
     for seed in range(16):
         A, B, cov, Z, X = recording(seed, eye, gross=seed % 4)
-        h = calibrate_handeye(A, B, cov, eye=eye, structures=("robot",))
+        h = calibrate_handeye(A, B, cov, eye=eye, quick=True)
         assert (h.used == (np.arange(len(A)) >= seed % 4)).all()
         e = error(h, Z, X)
         squares.append(e @ np.linalg.solve(h.cov, e))
-        position.append(h.sigma_flange[0])
-        rotation.append(h.sigma_flange[1])
     # Chance 1e-3 at either end; the sigmas themselves are estimated from 180 numbers, which widens the upper end by 10 %.
     assert chi2.ppf(1e-3, 12 * 16) < sum(squares) < 1.1 * chi2.isf(1e-3, 12 * 16)
-    assert np.mean(position) == pytest.approx(SIGMA_FLANGE_M, rel=0.1)
-    assert np.mean(rotation) == pytest.approx(SIGMA_FLANGE_RAD, rel=0.1)
 
 
 @pytest.mark.parametrize("eye", ["to_hand", "in_hand"])
@@ -110,4 +106,4 @@ def test_an_unknown_mounting_and_a_transform_of_the_other_one_are_rejected():
     with pytest.raises(InputError, match="to_hand, in_hand"):
         calibrate_handeye(A, B, cov, eye="on_foot")
     with pytest.raises(InputError, match="belongs to 'in_hand'"):
-        _ = calibrate_handeye(A, B, cov, structures=("robot",)).T_flange_rig
+        _ = calibrate_handeye(A, B, cov).T_flange_rig

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import exp_se3, inverse
 from armsight.loop.handeye.pivot import calibrate_pivot
-from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams, coarse_offset
+from armsight.loop.handeye.streams import PoseStream, calibrate_streams, coarse_offset
 
 OFFSET_S = 0.3217
 
@@ -41,7 +41,7 @@ def test_the_offset_and_the_mounting_are_found_within_their_sigmas(eye):
     squares, offsets = 0.0, []
     for seed in range(2):
         hand, seen, Z, X = streams(seed, eye)
-        found = calibrate_structured_streams(hand, seen, eye=eye)
+        found = calibrate_streams(hand, seen, eye=eye)
         offsets.append((found.offset_s - OFFSET_S) / found.sigma_offset_s)
         assert found.sigma_offset_s < 1e-3
         e = error(found.handeye, Z, X)
@@ -68,7 +68,7 @@ def test_streams_that_stand_still_or_do_not_overlap_are_rejected():
     hand, seen, _, _ = streams(3)
     still = PoseStream(hand.t_s, np.repeat(hand.Ts[:1], len(hand.t_s), axis=0))
     with pytest.raises(CalibrationError, match="nothing rotates"):
-        calibrate_structured_streams(still, PoseStream(seen.t_s, np.repeat(seen.Ts[:1], len(seen.t_s), axis=0)))
+        calibrate_streams(still, PoseStream(seen.t_s, np.repeat(seen.Ts[:1], len(seen.t_s), axis=0)))
     with pytest.raises(InputError, match="20 and more"):
         PoseStream.of(seen.t_s[:10], seen.Ts[:10], "eye")
 
@@ -115,12 +115,12 @@ def recorded(data_dir, archive, end):
 def test_a_simulated_arms_one_clock_has_no_offset_and_its_own_motion_gives_back_a_known_mounting(data_dir):
     hand = PoseStream.of(*recorded(data_dir, "robot_arm_w_color_camera_sim", "sim_hand.csv"), "hand")
     t, T = recorded(data_dir, "robot_arm_w_color_camera_sim", "sim_camera.csv")
-    found = calibrate_structured_streams(hand, PoseStream.of(t, inverse(T), "eye"), eye="in_hand")
+    found = calibrate_streams(hand, PoseStream.of(t, inverse(T), "eye"), eye="in_hand")
     assert abs(found.offset_s) < 3 * found.sigma_offset_s
     A, good = hand.at(t - OFFSET_S)  # what an eye of a known mounting, whose clock is behind, would have seen
     rng = np.random.default_rng(0)
     X, Z = exp_se3(rng.normal(0, [0.05] * 3 + [1] * 3)), exp_se3(rng.normal(0, [0.5] * 3 + [1] * 3))
     B = inverse(A[good] @ X) @ Z @ exp_se3(rng.normal(0, [1e-3] * 3 + [2e-3] * 3, (int(good.sum()), 6)))
-    known = calibrate_structured_streams(hand, PoseStream.of(t[good], B, "eye"), eye="in_hand")
+    known = calibrate_streams(hand, PoseStream.of(t[good], B, "eye"), eye="in_hand")
     assert abs(known.offset_s + OFFSET_S) < 3.5 * known.sigma_offset_s
     assert np.abs(error(known.handeye, Z, X) / np.sqrt(np.diag(known.handeye.cov))).max() < 3.5

@@ -200,7 +200,7 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
     from armsight.app.handeye.recording import at_shots, links_of, paired, recording_of, robot_in_recording
     from armsight.app.handeye.result import HandEyeAnswer
     from armsight.app.handeye.suspect import require_plausible
-    from armsight.loop.handeye.handeye import calibrate_structured
+    from armsight.loop.handeye.handeye import calibrate_poses
     from armsight.robot.arm_file import open_arm
     from armsight.tables.poses import read_pose_table
 
@@ -232,9 +232,7 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
     progress("looking at whether both sides fit")
     recording = require_plausible(recording, arm, detect_units=options.detect_units, scale=options.scale)
     links = None if arm is None else links_of(recording, arm)
-    found = calibrate_structured(
-        recording.poses, t_s=recording.t_s, links=links, scale=options.scale, progress=progress
-    )
+    found = calibrate_poses(recording.poses, t_s=recording.t_s, links=links, scale=options.scale, progress=progress)
     progress("choosing poses")
     plan = plan_poses(found, recording.poses, options.plan) if options.plan else None
     return HandEyeAnswer(recording, found, None, 0.0, plan)
@@ -281,7 +279,7 @@ def _streams(
     from armsight.app.handeye.result import HandEyeAnswer
     from armsight.app.handeye.suspect import require_plausible, resized
     from armsight.loop.handeye.poses import MIN_POSES
-    from armsight.loop.handeye.streams import PoseStream, calibrate_structured_streams, coarse_offset
+    from armsight.loop.handeye.streams import PoseStream, calibrate_streams, coarse_offset
 
     for path, t_s in ((options.robot, robot.t_s), (options.seen or options.source, seen.t_s)):
         if t_s is None:
@@ -319,7 +317,7 @@ def _streams(
                 (eye_stream, pairs.poses.B, checked.poses.B),
             )
         )
-    found = calibrate_structured_streams(
+    found = calibrate_streams(
         hand,
         eye_stream,
         eye=eye,

@@ -66,7 +66,7 @@ def sigma_figure(run: HandEyeAnswer) -> Figure:
 
 
 def structure_figure(run: HandEyeAnswer) -> Figure:
-    """Plot how probable the poses left out are under each structure of the noise."""
+    """Plot how probable the poses left out are under each choice of sources."""
     ranked = sorted(run.found.likelihoods.items(), key=lambda one: one[1])
     figure = new_figure(0.34 * len(ranked) + 1.2)
     ax = figure.subplots()
@@ -116,7 +116,7 @@ FIGURES: dict[str, tuple[Callable[[HandEyeAnswer], Figure], str, str]] = {
     "structure": (
         structure_figure,
         "Whose error it is",
-        "The longer the bar, the less this structure of the noise explains the poses left out. A difference below 0.2 is "
+        "The longer the bar, the less these sources of error explain the poses left out. A difference below 0.2 is "
         "chance.",
     ),
     "coverage": (

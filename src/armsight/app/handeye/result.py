@@ -13,20 +13,12 @@ from armsight.app.handeye.recording import PairedPoses
 from armsight.app.report.table import TextTable, plain_text
 from armsight.data import Array, Record
 from armsight.geometry.pose import log_se3, mean_pose
-from armsight.loop.handeye.handeye import (
-    GEOMETRY,
-    POSITIONS,
-    SCALE_WALKING,
-    SMOOTH,
-    TRUSTED_M,
-    TRUSTED_RAD,
-    HandEye,
-)
-from armsight.loop.handeye.noise import OF_THE_ARM, SHARED
+from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye
+from armsight.loop.handeye.sources import OF_THE_ARM
 
 #: As many blunders as this share of the poses are no calibration to trust.
 _MANY = 0.25
-#: A structure whose mean log density is within this of the best is not distinguished from it.
+#: Sources whose mean log density of a pose left out is within this of the best are not distinguished from them.
 DISTINGUISHED = 0.2
 #: A scale that differs from 1 by this many sigmas is said.
 SCALE_SIGMAS = 5.0
@@ -67,23 +59,10 @@ def blunders(run: HandEyeAnswer) -> list[str]:
 def whose(run: HandEyeAnswer) -> str:
     """Return how much of the error is the arm's and how much the camera's, as a sentence."""
     found = run.found
-    best = found.likelihoods[found.structure]
-    near = [
-        name for name, value in found.likelihoods.items() if name != found.structure and best - value < DISTINGUISHED
-    ]
     arm, camera = 1e3 * found.arm_m, 1e3 * found.camera_m
-    if found.structure == POSITIONS:
-        said = (
-            "rotations and positions contradict each other by more than either scatters; positions alone were weighted, "
-            f"which scatter by {camera:.2f} mm RMS at the target"
-        )
-    elif arm == 0:
-        said = f"the camera's error, {camera:.2f} mm RMS at the target, explains the residuals best"
-    elif camera == 0:
-        said = f"the arm's error, {arm:.2f} mm RMS at the target, explains the residuals best"
-    else:
-        said = f"at the target the arm is off by {arm:.2f} mm RMS, the camera by {camera:.2f} mm"
-    if {"robot", "camera", "camera, depth apart"} & set(near) and not (arm and camera):
+    said = f"at the target the arm is off by {arm:.2f} mm RMS, the camera by {camera:.2f} mm"
+    best = max(found.likelihoods.values())
+    if all(best - found.likelihoods.get(name, -np.inf) < DISTINGUISHED for name in ("robot", "camera")):
         said += "; these poses hardly distinguish arm from camera"
     return f"{said} (structure of the noise: {found.structure})"
 
@@ -148,28 +127,28 @@ def statements(run: HandEyeAnswer) -> list[str]:
         errors = (found.held_out, found.held_out_nominal, found.held_out_geometry)
         plain, nominal, geometry = (1e3 * of.rms()[0] for of in errors)
         what, found_by = "geometry of the arm", "armsight identify finds it"
-        if found.structure == SMOOTH:
+        if "drift_m" in found.sigmas:
             joints = "" if run.recording.robot.q is not None else "with joints and --model "
             what, found_by = "smooth error of the arm", f"{joints}armsight identify finds its geometry"
         lines.append(
             f"with the {what} that the other poses show, poses left out come to {geometry:.2f} mm in place of "
             f"{nominal:.2f}; {found_by}"
         )
-        if found.structure in GEOMETRY:
+        if "link_m" in found.sigmas:
             lines.append(
                 f"the transforms go with the true arm: with the arm's nominal model they leave {plain:.2f} mm; with the "
                 f"mounting that suits the arm's nominal model: {nominal:.2f} mm"
             )
-    elif run.recording.robot.q is None:
-        lines.append(
-            "without joints and --model the sigmas leave out what the arm's own geometry is off by in all poses alike"
-        )
+    lines.append(
+        f"the arm is not as its model with a probability of {100 * found.arm_off:.0f} %; the sigmas allow with that weight "
+        "for what it is then off by in all poses alike"
+    )
     if found.common.size:
         lines.append(
             f"the rig's calibration was fitted too: {1e3 * found.common_m:.2f} mm RMS at the target, at most "
             f"{np.abs(found.common).max():.1f} of its own sigmas; poses used and left out are corrected by it"
         )
-    if found.structure in SCALE_WALKING:
+    if "scale_walk" in found.sigmas:
         low, high = scale_at_end(found)
         lines.append(
             f"the camera's scale walks by {100 * found.sigmas['scale_walk']:.2g} % over all poses (sigma): the "
@@ -231,7 +210,7 @@ def text(run: HandEyeAnswer) -> str:
     lines += [f"blunders, left out: {len(out)}", *(f"  {line}" for line in out[:10])] if out else ["no blunders"]
     if run.plan is not None:
         lines += ["", plain_text(plan_table(run.plan, run.recording.names))]
-        if run.found.structure in SHARED:
+        if run.found.structure != "robot and camera":
             lines.append(
                 f"these sigmas are lower bounds: with {run.found.structure} new poses share errors with the others"
             )
@@ -311,6 +290,7 @@ def as_json(run: HandEyeAnswer) -> dict[str, Any]:
         "camera_rms_m": found.camera_m,
         "noise": {
             "structure": found.structure,
+            "arm_off_probability": found.arm_off,
             "sigmas": found.sigmas,
             "of_the_arm": [name for name in found.sigmas if name in OF_THE_ARM],
             "log_likelihood_left_out": found.likelihoods,
@@ -339,7 +319,7 @@ def as_json(run: HandEyeAnswer) -> dict[str, Any]:
         ],
         "notes": list(run.recording.notes),
     }
-    if found.structure in SCALE_WALKING:
+    if "scale_walk" in found.sigmas:
         document |= {"target_scale_at_start": found.scale, "target_scale_at_start_sigma": found.sigma_scale}
         document |= {"target_scale_walks_sigma": found.sigmas["scale_walk"], "target_scale_at_end": scale_at_end(found)}
     elif found.sigma_scale:

@@ -27,7 +27,6 @@ from armsight.errors import ArmsightError, CalibrationError, InputError
 from armsight.files import write_text
 from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.geometry.rotation import skew
-from armsight.loop.handeye.noise import STRUCTURES
 from armsight.loop.handeye.poses import Poses
 from armsight.loop.identify.read import read_poses
 from armsight.robot.arm import Arm
@@ -35,8 +34,6 @@ from armsight.robot.trajectories import point_to_point
 from armsight.vision.rig import StereoRig
 
 #: Poses before the first fit; the fewest of a calibration that is called good; the most that are asked for.
-#: Structures of the noise that are tried while poses are few.
-QUICK = ("robot", "robot and camera")
 FIRST_FIT, LEAST_POSES, MOST_POSES = 6, 12, 30
 #: Another pose that lowers the predicted error by less than this share is not worth taking.
 LITTLE = 0.02
@@ -211,11 +208,11 @@ class HandEyeGuide:
         with self._lock:
             visited, missed, arm = list(self._visited), tuple(self._missed), self._arm
         missing: tuple[str, ...] = ()
-        for structures in (QUICK, tuple(STRUCTURES)):  # all of them take long, and only once it is good
+        for quick in (True, False):  # what variances leave open takes long, and only once it is good
             run: HandEyeRun | None = None
             if len(visited) >= FIRST_FIT:
                 try:
-                    run = handeye_of(arm, visited, missed, structures)
+                    run = handeye_of(arm, visited, missed, quick)
                 except (CalibrationError, np.linalg.LinAlgError) as error:
                     missing = (f"the poses cannot be fitted yet: {error}",)
             with self._lock:

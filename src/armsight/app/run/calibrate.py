@@ -22,7 +22,6 @@ from armsight.geometry.rotation import exp_so3
 from armsight.loop.delay import MIN_MEASUREMENTS, estimate_delay
 from armsight.loop.estimators import Delay, Mounting, Prior
 from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, calibrate_handeye, require_known
-from armsight.loop.handeye.noise import STRUCTURES
 from armsight.loop.handeye.poses import require_fitting
 from armsight.loop.sync_led import with_led
 from armsight.robot.arm import Arm
@@ -235,16 +234,14 @@ def visit(
     return VisitedPose.of(q, good, q_to - q_from)
 
 
-def handeye_of(
-    arm: Arm, visited: Sequence[VisitedPose], missed: tuple[str, ...], structures: Sequence[str] = tuple(STRUCTURES)
-) -> HandEyeRun:
+def handeye_of(arm: Arm, visited: Sequence[VisitedPose], missed: tuple[str, ...], quick: bool = False) -> HandEyeRun:
     """Calibrate hand and eye.
 
     Args:
         arm: the nominal arm.
         visited: four poses at least.
         missed: poses at which the body was not measured, and why.
-        structures: of the noise, names to choose from; fewer take less time.
+        quick: as in :func:`~armsight.loop.handeye.handeye.calibrate_handeye`.
 
     Raises:
         CalibrationError: the motions leave a direction open, or the arm's table is grossly wrong.
@@ -252,7 +249,7 @@ def handeye_of(
     q = np.array([each.q for each in visited])
     Ts_left_body, cov = np.array([each.T_left_body for each in visited]), np.array([each.cov for each in visited])
     require_fitting(arm, q, Ts_left_body)
-    found = calibrate_handeye(arm.forward(q) @ inverse(arm.T_flange_tool), Ts_left_body, cov, structures=structures)
+    found = calibrate_handeye(arm.forward(q) @ inverse(arm.T_flange_tool), Ts_left_body, cov, quick=quick)
     require_known(found, TRUSTED_M, TRUSTED_RAD)
     mounting = replace(Mounting.of(found, arm), cov=np.zeros((12, 12)))
     return HandEyeRun(mounting, found, q, Ts_left_body, cov, np.array([each.approach for each in visited]), missed)

@@ -28,7 +28,6 @@ from armsight.files import write_text
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators import Mounting
 from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, calibrate_handeye, require_known
-from armsight.loop.handeye.noise import STRUCTURES
 from armsight.loop.identify.diagnose import check_plausible, without_tool
 from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
@@ -40,8 +39,6 @@ from armsight.vision.sources import Source
 MIN_POSES = 12
 #: Rows that belong to the neighbouring shots fit so many times better: then they are shifted.
 _SHIFTED, _STEP_SHARE = 3.0, 0.2
-#: Structures of the noise with which shifted rows are tried.
-_QUICK = ("robot",)
 SHIFTED = "the angles of the row {} fit every shot far better than its own: are rows and images shifted by one?"
 _MOVED_RAD = float(np.radians(0.5))
 
@@ -163,12 +160,10 @@ def _implausible(arm: Arm, q: Array, Ts_left_body: Array) -> str | None:
 
 
 def _calibrated(
-    arm: Arm, q: Array, Ts: Array, covs: Array, centre: Array, structures: tuple[str, ...] = tuple(STRUCTURES)
+    arm: Arm, q: Array, Ts: Array, covs: Array, centre: Array, quick: bool = False
 ) -> HandEye | CalibrationError:
     try:
-        return calibrate_handeye(
-            arm.forward(q) @ inverse(arm.T_flange_tool), Ts, covs, centre=centre, structures=structures
-        )
+        return calibrate_handeye(arm.forward(q) @ inverse(arm.T_flange_tool), Ts, covs, centre=centre, quick=quick)
     except CalibrationError as error:
         return error
 
@@ -182,7 +177,7 @@ def _shift(arm: Arm, q_all: Array, Ts_all: Array, covs_all: Array, centre: Array
     for late in (1, -1):
         rows, shots = (slice(None, -1), slice(1, None))[::late]
         q, Ts, covs = q_all[rows], Ts_all[shots], covs_all[shots]
-        other = _calibrated(arm, q, Ts, covs, centre, _QUICK)
+        other = _calibrated(arm, q, Ts, covs, centre, True)
         if isinstance(other, HandEye) and other.used.mean() > 0.8 and other.held_out.rms()[0] < best:
             best, shift = other.held_out.rms()[0], late
     return shift

@@ -4,7 +4,7 @@ In: poses of the flange in the base (from the joints) and of a marker body in th
 transforms with covariance and held-out error.
 
 - ``handeye``: from pairs of poses, A X = Z B; :class:`~armsight.loop.handeye.handeye.HandEye`.
-- ``structured``: the same with the structure of the noise chosen by poses left out (``noise``); ``armsight handeye``.
+- ``sources``: whose errors they are, and which poses share them.
 - ``streams``: from two streams of poses whose clocks differ by an unknown offset.
 - ``pivot``: the tip of a tool, from rotating it about its tip.
 """

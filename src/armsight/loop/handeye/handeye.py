@@ -1,55 +1,40 @@
-"""Hand-eye calibration whose noise has a structure: whose error it is, and whether neighbouring poses share it.
+"""Hand-eye calibration, with the sources of its error weighed by the residuals themselves.
 
 In: :class:`~armsight.loop.handeye.poses.Poses`, and where there are streams their times and speeds. Out:
-:class:`HandEye`: both transforms with a covariance that allows for the structure, the sources of the error, and
-the error of poses left out. In order:
+:class:`HandEye`: both transforms with a covariance, the sources of the error, and the error of poses left out. In order:
 
 1. A robust start: closed forms from all poses and from small parts (:func:`~armsight.loop.handeye.poses.starts`), then
    least squares with the weights of Student's t; what is further than chance allows is left out as a blunder.
 2. Motions that leave a direction open are rejected (:func:`require_rotations`, :func:`require_known`).
-3. For every structure of noise the variances of the greatest restricted likelihood; poses left out decide between the
-   structures (:mod:`armsight.loop.handeye.noise`).
+3. Variances of the sources (:mod:`armsight.loop.handeye.sources`) and transforms in turn, blunders left out. What changes
+   over time is taken up by the score of its variance at zero.
+4. Two models, an arm that is as its model says and one that is not (its links where the joints are known, else a smooth
+   error over its poses), each integrated over what the residuals leave open about the variances, and weighted by their
+   evidence (:mod:`armsight.estimate.variance`). An error that is the same in all poses is in no residual: what an arm's
+   lengths may be off by (``LINK``, ``DRIFT``) is in the covariance by this weight alone.
 
 The rows are put into an order of their own first (by time, else by content), so that theirs changes nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import chdtri
+from scipy.special import chdtri, expit
 from scipy.stats import f as f_distribution
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
+from armsight.estimate.linear import Linear
+from armsight.estimate.solve import Solved, covariances, left_out, log_density, solve
+from armsight.estimate.variance import SPEAKS, integrate, most_probable, posterior, scores
 from armsight.geometry.pose import exp_se3, inverse, log_se3, mean_pose, transform
 from armsight.geometry.rotation import skew
-from armsight.loop.handeye.noise import (
-    OF_THE_ARM,
-    SHARED,
-    SHARED_MAPS,
-    STRUCTURES,
-    Linear,
-    blocks,
-    error_maps,
-    freedom,
-    held_out,
-    jackknife,
-    left_out_squares,
-    own_squares,
-    pose_kernel,
-    reml,
-    solve,
-    time_kernel,
-    walk_gathered,
-    wiener_kernel,
-)
 from armsight.loop.handeye.poses import (
     CHANCE,
-    CLEARLY,
     MIDDLE,
     MIN_POSES,
     PART,
@@ -62,18 +47,25 @@ from armsight.loop.handeye.poses import (
     residuals,
     starts,
 )
+from armsight.loop.handeye.sources import (
+    DRIFT,
+    LINKS,
+    MAP_OF,
+    OF_THE_ARM,
+    OVER_TIME,
+    SAID,
+    error_maps,
+    over_poses,
+    over_time,
+)
 
-#: Poses that a fit comes from at most, evenly spread. The structure is chosen from as many: what is claimed of many poses
-#: must have been looked for in as many.
-MAX_FIT = 1000
-#: With a shared error, poses that variances and held-out likelihoods come from at most, and the transforms.
-MAX_SHARED, MAX_SHARED_FIT = 40, 120
-#: Fewest poses for a structure with shared errors.
+#: Poses that the fit comes from at most, and the variances, evenly spread; half: less is known, double: twice the time.
+MAX_FIT, MAX_VARIANCE = 1000, 120
+#: Poses that sources over time are chosen from at most, and everything where something walks: each step of it is an
+#: unknown; half: walks are seen badly, double: eight times the time.
+MAX_WALK = 60
+#: Fewest poses for errors that poses share.
 MIN_SHARED = 12
-#: Numbers left of the residuals for each variance at least: fewer do not determine it.
-PER_VARIANCE = 8
-#: Parts that are left out, one after the other; of so few poses each one by itself.
-FOLDS, FEW = 5, 24
 #: Rotation about a second axis must exceed the noise of rotations by this factor, and this angle, rad.
 CLEARLY_ROTATED, LEAST_ROTATION = 3.0, np.radians(0.5)
 #: Rotations of half of the poses that differ by more than this, rad, are not of one motion.
@@ -84,24 +76,18 @@ OPEN_M, OPEN_RAD = 0.5, 0.5
 TRUSTED_M, TRUSTED_RAD = 0.02, 0.04
 #: What a further pose is uncertain by at least, m and rad: where hardly anything scattered, one would determine all.
 LEAST_M, LEAST_RAD = 1e-5, 1e-5
+#: What an arm may be off by, beside its joints' scatter: mean sigma of each of its links, and of the smooth error that all
+#: make together, m and rad; and how probable that is before any residual. half: an arm a few mm longer than its model is
+#: not allowed for, double: few poses claim too little.
+LINK, DRIFT_SIZE, ARM_OFF = (1e-3, 1e-3), (1e-3, 1e-3), 0.5
+#: Sigma of rotations that have hardly any weight, rad; by how many sigmas, and by which factor, errors of positions left
+#: out must be lower without them. half: chance weights positions alone, double: contradictions spoil the nominal arm's use.
+HARDLY, SURELY_LOWER, CLEARLY = 0.005, 3.0, 1.1
 #: Degrees of freedom of Student's t in the robust start.
 FREEDOM = 4.0
 #: A scale must be off by this many sigmas to be taken, and has settled where a step is below this share of one: where the
 #: flange hardly moves it runs away.
 SURELY, SETTLED = 5.0, 0.1
-#: Neighbours' residuals hang together where Moran's statistic, in sigmas of chance, is above this.
-HANGING = 1.0
-#: The structure that weights positions alone, and by how many sigmas its squared errors must be lower.
-POSITIONS, SURELY_LOWER = "positions alone", 3.0
-#: The structures whose links are off, whose transforms go with the true arm; that of an arm whose error is a smooth
-#: function of the pose, whose transforms are the mounting that suits its model; and all of an arm that is not as its model.
-GEOMETRY = ("robot's geometry off", "robot's geometry and time stamps off")
-SMOOTH = "robot drifting over its poses"
-NOT_AS_MODELLED = (*GEOMETRY, SMOOTH)
-#: Those whose scale walks.
-SCALE_WALKING = ("camera's scale walking", "camera and its scale walking")
-#: Draws by which structures are weighted, and the weight below which one is not true.
-DRAWS, HARDLY_TRUE = 400, 0.02
 #: Rounds of least squares and of leaving out.
 ROUNDS = 6
 
@@ -118,17 +104,17 @@ class HandEye(Record):
         scale: true lengths over those of the measured body; 1 where it was taken as given.
         sigma_scale: its sigma; zero where it was not fitted.
         step_s: what is left of the time offset, s, to be added to the eye's times; sigma_step_s its sigma; zero without.
-        structure: of the noise, one of ``STRUCTURES``.
-        sigmas: source -> sigma of one axis, m, rad, s, or a factor.
-        likelihoods: structure -> mean logarithm of the probability density of a pose left out.
+        structure: what is found beside independent errors, as people read it; "robot and camera" if nothing is.
+        sigmas: source -> most probable sigma of one axis, m, rad, s, or a factor.
+        likelihoods: sources -> mean logarithm of the probability density of a pose left out.
+        arm_off: the probability that the arm is not as its model says, by the residuals; 0 where it was not asked.
         arm_m: what the arm's error moves the body's middle by, RMS of the distance, m.
         camera_m: what vision's error does, m.
         held_out: the error on poses left out of the fit, of transforms found as these were, the arm as its model is. Where
-            the structure says that the arm's geometry is off (``GEOMETRY``) they go with the true arm, not with the model.
-        held_out_nominal: the same with the mounting that suits the arm's nominal model; another only with ``GEOMETRY``.
+            the links are found to be off (``sigmas`` has them) they go with the true arm, not with the model.
+        held_out_nominal: the same with the mounting that suits the arm's nominal model; another only with links.
         held_out_geometry: the same as held_out where the arm's error, as the other poses show it, is taken into account:
-            its geometry with ``links``, else, where the structure has it, its smooth error over its poses; None where
-            there is neither, or from too few poses.
+            its geometry with ``links``, else its smooth error over its poses; None where it is rather as its model.
         used: (N,) whether a pose was used, and not taken for a blunder.
         distance: (N,) Mahalanobis distance of each pose's residual, in units of its expectation.
         common: (K,) the errors that all poses share (``Poses.common``), as found, in sigmas.
@@ -146,6 +132,7 @@ class HandEye(Record):
     structure: str
     sigmas: dict[str, float]
     likelihoods: dict[str, float]
+    arm_off: float
     arm_m: float
     camera_m: float
     held_out: HeldOut
@@ -190,9 +177,9 @@ class HandEye(Record):
         """Return the information (N, 12, 12) about the right tangents that each of further poses would give."""
         e, J, carry = residuals(poses, self.T_base_still, self.T_flange_held)
         maps, C = error_maps(poses, 0 * e, carry, None), poses.cov + np.diag(np.repeat([LEAST_M**2, LEAST_RAD**2], 3))
-        for name in STRUCTURES[self.structure]:
-            if (of := SHARED_MAPS.get(name, name)) in maps:
-                C = C + self.sigmas[name] ** 2 * maps[of] @ np.swapaxes(maps[of], 1, 2)
+        for name, sigma in self.sigmas.items():
+            if (M := maps.get(MAP_OF.get(name, name))) is not None:
+                C = C + sigma**2 * M @ np.swapaxes(M, 1, 2)
         return np.asarray(np.swapaxes(J, 1, 2) @ np.linalg.solve(C, J))
 
     def predict(self, Ts_base_flange: Array) -> Array:
@@ -247,10 +234,15 @@ class _Problem(Record):
         A[:, :3, 3] *= guess.per_m
         return replace(p, A=A)
 
-    def linear(self, guess: _Guess) -> Linear:
-        """Return the residuals at a guess, with what noise does to them; no shared sources.
+    def linear(self, guess: _Guess, arm: bool = False, times: bool = False) -> Linear:
+        """Return the residuals at a guess, with the sources of their error.
 
         Vision's shared errors are unknowns where the guess has them.
+
+        Args:
+            guess: the transforms.
+            arm: whether with what is the arm's own in all poses.
+            times: whether with what changes over time.
         """
         poses = self.scaled(guess)
         e, J, carry = residuals(poses, guess.Z, guess.X)
@@ -262,11 +254,38 @@ class _Problem(Record):
         carry = carry * unit
         if self.free[1] and self.speed is not None:
             J = np.concatenate([J, carry @ self.speed[..., None]], axis=2)
-        before, shared = J.shape[2], guess.common.size
-        if shared and poses.common is not None:
+        before, common = J.shape[2], guess.common.size
+        if common and poses.common is not None:
             J = np.concatenate([J, poses.common if poses.in_hand else -poses.common], axis=2)
-        known, at = np.repeat([0.0, 1.0], [before, shared]), np.append(np.zeros(before), guess.common)
-        return Linear(e, J, poses.cov, error_maps(poses, e, carry, self.speed, self.links), {}, {}, known, at)
+        known, at = np.repeat([0.0, 1.0], [before, common]), np.append(np.zeros(before), guess.common)
+        maps, given = error_maps(poses, e, carry, self.speed, self.links), poses.cov
+        own = {name: M for name, M in maps.items() if name not in (*LINKS, "scale")}
+        if self.covered:
+            own["image"] = np.asarray(np.linalg.cholesky(given + 1e-18 * np.eye(6)))
+            given = np.zeros_like(given)
+        shared: dict[str, Array] = {}
+        if arm:
+            shared = {name: maps[name] for name in LINKS} if "link_m" in maps else over_poses(self.poses.A, maps)
+        if times and self.t_s is not None:
+            shared |= over_time(self.t_s, poses, maps, self.free[0])
+        return Linear(e, J, given, own, shared, known, at)
+
+    @property
+    def covered(self) -> bool:
+        """Whether every pose has a covariance from vision."""
+        return bool(self.poses.cov.any(axis=(1, 2)).all())
+
+    def means(self, linear: Linear, guess: _Guess) -> dict[str, float]:
+        """Return the mean of each source's sigma before it is looked for: what the residuals are, or what arms do."""
+        position, rotation = _middle_sigmas(linear.e)
+        lengths = {
+            "flange_m": position / guess.per_m,
+            "time_drift_m": position / guess.per_m,
+            "time_walk_m": position / guess.per_m,
+        }
+        of = {name: position if name.endswith("_m") else rotation for name in linear.sources} | lengths
+        of |= {"scale_walk": 1e-2, "image": 1.0, "time_s": 1e-3}
+        return of | dict(zip((*LINKS, *DRIFT), (*LINK, *DRIFT_SIZE), strict=True))
 
     def metric(self, guess: _Guess, cov: Array) -> tuple[_Guess, Array]:
         """Return Z and X in m, and the covariance (P, P) of what was fitted with them."""
@@ -280,15 +299,6 @@ class _Problem(Record):
             change[6:9, 12] = -X[:3, :3].T @ X[:3, 3]
         return replace(guess, Z=Z, X=X), change @ cov @ change.T
 
-    def shared(self, linear: Linear, guess: _Guess, gathered: dict[str, Array]) -> Linear:
-        """Add the correlations of shared sources to residuals of the same rows."""
-        kernel = {SMOOTH: pose_kernel(self.poses.A)}
-        if self.t_s is not None:
-            kernel["robot drifting over time"] = time_kernel(self.t_s)
-            walked = wiener_kernel(self.t_s)
-            kernel |= {"robot walking over time": walked, **dict.fromkeys(SCALE_WALKING, walked)}
-        return replace(linear, kernel=kernel, walk=gathered)
-
 
 def calibrate_handeye(
     Ts_base_flange: ArrayLike,
@@ -297,7 +307,7 @@ def calibrate_handeye(
     *,
     eye: Eye = "to_hand",
     centre: ArrayLike | None = None,
-    structures: Sequence[str] = tuple(STRUCTURES),
+    quick: bool = False,
     progress: Callable[[str], None] = lambda line: None,
 ) -> HandEye:
     """Calibrate the two constant transforms of rig, body and arm.
@@ -309,7 +319,7 @@ def calibrate_handeye(
         eye: "to_hand" where the rig stands still and the arm carries the body, "in_hand" where the arm carries the rig.
         centre: (3,) the middle of the body's points, body frame, m: errors of vision rotate the body about it.
             None: the body's origin.
-        structures: of the noise, names to choose from; fewer take less time.
+        quick: whether independent errors alone are weighed, at their most probable sizes: while poses are being taken.
         progress: called with the name of each step as it begins.
 
     Raises:
@@ -317,20 +327,20 @@ def calibrate_handeye(
         CalibrationError: the motions leave a direction open.
     """
     poses = checked_poses(Ts_base_flange, Ts_rig_body, covs, eye, np.zeros(3) if centre is None else centre)
-    return calibrate_structured(poses, structures=structures, progress=progress)
+    return calibrate_poses(poses, quick=quick, progress=progress)
 
 
-def calibrate_structured(
+def calibrate_poses(
     poses: Poses,
     *,
     t_s: Array | None = None,
     speed: Array | None = None,
     links: Array | None = None,
     scale: bool = False,
-    structures: Sequence[str] = tuple(STRUCTURES),
+    quick: bool = False,
     progress: Callable[[str], None] = lambda line: None,
 ) -> HandEye:
-    """Calibrate hand and eye, with the structure of the noise that poses left out support best.
+    """Calibrate hand and eye.
 
     Args:
         poses: four or more.
@@ -339,7 +349,7 @@ def calibrate_structured(
         links: (N, L, 4, 4) T_link_flange of every link, m, where the joints and a model are known.
         scale: whether the size of the target may be wrong (one camera that moves has none): fitted, and kept where it is
             surely not 1.
-        structures: names to choose from.
+        quick: as in :func:`calibrate_handeye`.
         progress: called with the name of each step as it begins.
 
     Raises:
@@ -359,7 +369,7 @@ def calibrate_structured(
     require_rotations(whole.poses.rows(used), whole.linear(guess).e[used])
     if poses.common is not None:
         guess = replace(guess, common=np.zeros(poses.common.shape[2]))
-    found, used = _chosen(whole, guess, used, structures, progress)
+    found, used = _weighed(whole, guess, used, quick, progress)
     used_rows, distance = np.zeros(n, bool), np.full(n, np.nan)
     used_rows[order], distance[order] = used, found.distance
     geometry = None if found.held_out_geometry is None else _unsorted(found.held_out_geometry, order)
@@ -445,13 +455,12 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
     scaled = replace(problem, poses=problem.scaled(_Guess(np.eye(4), np.eye(4), per_m)))
     guesses = [replace(guess, per_m=per_m) for guess in _first(scaled)]
     found, used = _robust(free, guesses)
-    rows = _spread(np.flatnonzero(used), MAX_FIT)
+    rows = _spread(np.flatnonzero(used), MAX_VARIANCE)
     at, sure = found, False
     for _ in range(ROUNDS):
         linear = free.rows(rows).linear(at)
-        b = blocks(linear, "robot and camera")
-        solved = solve(b, reml(b, _start_variances(linear, "robot and camera")))
-        at, sigma = at.moved(solved.x, free.free), np.sqrt(solved.cov[12, 12])
+        solved = solve(linear, most_probable(linear, free.means(linear, at), steps=30))
+        at, sigma = at.moved(solved.x, free.free), float(np.linalg.norm(solved.root[12]))
         sure = abs(np.log(at.per_m)) > SURELY * sigma and abs(solved.x[12]) < sigma
         if abs(solved.x[12]) < SETTLED * sigma:
             break
@@ -572,112 +581,207 @@ def _held(poses: Poses) -> str:
     return "flange-rig" if poses.in_hand else "flange-body"
 
 
-def _start_variances(linear: Linear, structure: str) -> Array:
-    """Return variances to begin at: what the residuals are, shared evenly between the sources."""
-    position, rotation = _middle_sigmas(linear.e)
-    sources = STRUCTURES[structure]
-    small = {"time_s": 1e-6, "image": 1.0, "scale_walk": 1e-4}
-    small |= {"walk_m": 0.01 * position**2, "walk_rad": 0.01 * rotation**2}
-    even = {name: (position if name.endswith("_m") else rotation) ** 2 / 2 for name in sources}
-    return np.asarray(np.maximum([small.get(name, even[name]) for name in sources], 1e-13))
+def _taken_up(problem: _Problem, guess: _Guess, quick: bool) -> dict[str, float]:
+    """Return the sources of an arm that is as its model says, with their most probable variances.
+
+    Of those that change over time and whose scores speak, it is each time the one that makes the residuals most probable.
+    """
+    times = not quick and problem.t_s is not None and len(problem.poses.A) >= MIN_SHARED
+    linear = problem.linear(guess, times=times)
+    means, pairs = problem.means(linear, guess), [pair for pair in OVER_TIME if pair[0] in linear.shared]
+
+    start: dict[str, float] = {}
+
+    def fitted(names: tuple[str, ...]) -> tuple[dict[str, float], float]:
+        part = linear.of(names)
+        variances = most_probable(part, means, start, 25)
+        return dict(zip(part.sources, variances.tolist(), strict=True)), posterior(part, variances, means)
+
+    best, cost = fitted(tuple(linear.own))
+    while pairs:
+        start |= best
+        part = linear.of(best)
+        z = scores(linear, solve(part, np.array(list(best.values()))), [name for pair in pairs for name in pair])
+        pairs = [pair for pair in pairs if max(z[name] for name in pair) > SPEAKS]
+        tried = [(*fitted((*best, *pair)), pair) for pair in pairs]
+        found = min(tried, key=lambda one: one[1], default=None)
+        if found is None or found[1] > cost:
+            break
+        best, cost, pair = found
+        pairs.remove(pair)
+    return best
 
 
-def _allowed(structure: str, problem: _Problem, count: int, covered: bool) -> bool:
-    """Return whether a structure can be determined from these poses."""
-    sources = STRUCTURES[structure]
-    if len(sources) > 2 and len(sources) > (6 * count - 12) / PER_VARIANCE:
-        return False
-    if "image" in sources:
-        return covered
-    if "link_m" in sources:
-        timed = "time_s" not in sources or problem.speed is not None
-        return problem.links is not None and count >= MIN_SHARED and timed
-    if "time_s" in sources:
-        return problem.speed is not None
-    if structure in SHARED and structure != SMOOTH:
-        walks = "walk_m" not in sources or problem.poses.in_hand
-        scaled = "scale_walk" not in sources or problem.free[0]
-        return problem.t_s is not None and count >= MIN_SHARED and walks and scaled
-    return structure not in SHARED or count >= MIN_SHARED
+def _settled(
+    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], quick: bool
+) -> tuple[_Guess, NDArray[np.bool_], dict[str, float], int]:
+    """Alternate variances, transforms and blunders until they stay.
+
+    Returns:
+        Guess, used rows, variances of the sources taken up, and of how many poses what is shared comes at most.
+    """
+    few = whole.rows(_spread(np.flatnonzero(used), MAX_VARIANCE if whole.t_s is None else MAX_WALK))
+    variances = _taken_up(few, guess, quick)
+    most = MAX_WALK if any("walk" in name for name in variances) else MAX_FIT
+    for _ in range(ROUNDS):
+        rows = _spread(np.flatnonzero(used), most)
+        few, part = whole.rows(_spread(rows, min(most, MAX_VARIANCE))), whole.rows(rows)
+        estimated, linear = (p.linear(guess, times=_timed(variances)).of(variances) for p in (few, part))
+        found = most_probable(estimated, few.means(estimated, guess), variances)
+        variances = dict(zip(linear.sources, found.tolist(), strict=True))
+        solved = solve(linear, found)
+        far = _far(whole, guess, variances, rows, linear, solved)
+        # Variances come from these residuals, too: Fisher's distribution in place of chi-square.
+        limit = 6 * f_distribution.isf(CHANCE, 6, max(6 * int(used.sum()) - 12, 6))
+        keep = (far < limit) | (used & (far < 0.3 * far[used].max()))
+        if keep.sum() < max(MIN_POSES, len(keep) // 3):
+            keep = used
+        x = solved.x[: linear.J.shape[2]]
+        settled = bool((keep == used).all()) and float(np.abs(x[:12]).max()) < 1e-5
+        guess, used = guess.moved(x, whole.free), keep
+        if settled:
+            break
+    return guess, used, variances, most
 
 
-def _chosen(
-    whole: _Problem,
-    guess: _Guess,
-    used: NDArray[np.bool_],
-    structures: Sequence[str],
-    progress: Callable[[str], None],
+def _timed(names: Collection[str]) -> bool:
+    return any(name in names for pair in OVER_TIME for name in pair)
+
+
+def _weighed(
+    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], quick: bool, progress: Callable[[str], None]
 ) -> tuple[HandEye, NDArray[np.bool_]]:
-    """Try the structures, leave out blunders by the covariance of the best, and fit with it."""
-    covered = bool((np.abs(whole.poses.cov).reshape(len(used), -1).max(axis=1) > 0).all())
-    names = [name for name in structures if _allowed(name, whole, int(used.sum()), covered)]
-    if not names:
-        raise InputError(f"none of the structures {', '.join(structures)} can be determined from these poses")
-    gathered = walk_gathered(whole.scaled(guess)) if whole.t_s is not None and whole.poses.in_hand else {}
-    simple = "robot and camera" if "robot and camera" in names else names[0]
-    guess, used, variances = _settled(whole, guess, used, simple, gathered)
-    hanging = _hanging(whole, guess, used, simple, variances, gathered)
-    trials = {}
-    for name in names:
-        if name in SHARED and name not in hanging:
-            continue
-        progress(f"hand-eye: poses left out ({name})")
-        trials[name] = _trial(whole, guess, used, name, gathered)
-    best, geometries = _best(whole, trials), [trials[name] for name in GEOMETRY if name in trials]
-    if best == SMOOTH:
-        geometries.append(trials[best])
-    geometry = max(geometries, key=lambda trial: float(trial.density.mean()), default=None)
-    as_modelled = {name: trial for name, trial in trials.items() if name not in NOT_AS_MODELLED}
-    nominal = trials[best] if best not in NOT_AS_MODELLED or not as_modelled else trials[_best(whole, as_modelled)]
-    given = nominal if best == SMOOTH else trials[best]
-    progress(f"hand-eye: fitting ({best})")
-    guess, used, variances = _settled(whole, guess, used, best, gathered)
-    rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if best in SHARED else MAX_FIT)
-    linear = _linear(whole, guess, rows, best, gathered)
-    x, cov = _student(whole, guess, used, best, variances, gathered)
-    weights = _weights(trials, best)
-    mixed = weights[best] * cov
-    for name in weights.keys() - {best}:  # what the other structures that may be true as well would answer
-        other, spread = _student(whole, guess, used, name, trials[name].variances, gathered)
-        mixed = mixed + weights[name] * (spread + np.outer(other - x, other - x))
-    cov = mixed
-    if (
-        best == SMOOTH and as_modelled
-    ):  # the arm is used by its model: how far its mounting is from the true one is in cov
-        name = _best(whole, as_modelled)
-        suits, _ = _student(whole, guess, used, name, trials[name].variances, gathered)
-        cov, x = cov + np.outer(suits - x, suits - x), suits
-    guess = guess.moved(x, whole.free)
-    metric, cov = whole.metric(guess, cov)
-    sigmas = {name: float(np.sqrt(v)) for name, v in zip(STRUCTURES[best], variances, strict=True)}
-    arm, camera = _displacements(whole, linear, best, variances, guess)
+    """Settle, then weigh an arm that is as its model says against one that is not."""
+    progress("hand-eye: sources of the error")
+    guess, used, variances, most = _settled(whole, guess, used, quick)
+    rows = _spread(np.flatnonzero(used), most)
+    progress("hand-eye: an arm as its model")
+    best = nominal = _Model.of(whole, guess, rows, variances, False, quick)
+    arm_off, x, cov, likelihoods = 0.0, nominal.x, nominal.cov, {_said(nominal.linear.sources): nominal.density}
+    if not quick:
+        progress("hand-eye: an arm that is not")
+        other = _Model.of(whole, guess, rows, variances, True, quick)
+        arm_off = float(expit(other.evidence - nominal.evidence + np.log(ARM_OFF / (1 - ARM_OFF))))
+        best = other if arm_off > 0.5 and len(rows) >= MIN_SHARED else nominal
+        likelihoods[_said(other.linear.sources)] = other.density
+        for said, alone in (("robot", ("flange_m", "flange_rad")), ("camera", ("lateral_m", "depth_m", "seen_rad"))):
+            likelihoods[said] = _Model.of(whole, guess, rows, dict.fromkeys(alone, 0.0), False, True).density
+        # The arm is used by its model: where its links are not known, the mounting is the one that suits the model.
+        suits, suits_left = _suiting(whole, guess, nominal)
+        x = arm_off * other.x + (1 - arm_off) * nominal.x if whole.links is not None else suits
+        cov = arm_off * other.about(x) + (1 - arm_off) * nominal.about(x)
+    moved = guess.moved(x, whole.free)
+    metric, cov = whole.metric(moved, cov)
     rest = np.sqrt(np.diag(cov)[12:]).tolist()
     sigma_scale = rest.pop(0) if whole.free[0] else 0.0
-    distance = _distances(whole, guess, best, variances, gathered)
+    sigmas = {name: float(np.sqrt(v)) for name, v in best.variances.items()}
+    sigmas |= {
+        name: sigmas[name] / np.sqrt(len(used) - 1) for name in ("walk_m", "walk_rad") if name in sigmas
+    }  # a frame
+    arm_m, camera_m = _displacements(whole, best, guess)
+    left = [_alone(one.solved, one.linear) for one in (nominal, best)]
+    left[0] = left[0] if quick else suits_left
+    errors = [_held_out_errors(whole, moved, e, rows) for e in (*left, left_out(best.solved)[0])]
     found = HandEye(
         eye="in_hand" if whole.poses.in_hand else "to_hand",
         T_base_still=metric.Z,
         T_flange_held=metric.X,
         cov=cov[:12, :12],
-        scale=1 / guess.per_m,
-        sigma_scale=sigma_scale / guess.per_m,
-        step_s=guess.step_s,
+        scale=1 / moved.per_m,
+        sigma_scale=sigma_scale / moved.per_m,
+        step_s=moved.step_s,
         sigma_step_s=rest.pop(0) if whole.free[1] else 0.0,
-        structure=best,
+        structure=_said(best.linear.sources),
         sigmas=sigmas,
-        likelihoods={name: float(trial.density.mean()) for name, trial in trials.items()},
-        arm_m=arm,
-        camera_m=camera,
-        held_out=_held_out_errors(whole, guess, given.residual, given.rows),
-        held_out_nominal=_held_out_errors(whole, guess, nominal.residual, nominal.rows),
-        held_out_geometry=None if geometry is None else _held_out_errors(whole, guess, geometry.left, geometry.rows),
+        likelihoods=likelihoods,
+        arm_off=arm_off,
+        arm_m=arm_m,
+        camera_m=camera_m,
+        held_out=errors[0 if whole.links is None else 1],
+        held_out_nominal=errors[0],
+        held_out_geometry=None if best is nominal else errors[2],
         used=used,
-        distance=distance,
-        common=guess.common,
-        common_m=_common_m(whole.poses, guess),
+        distance=_far(whole, guess, nominal.variances, rows, nominal.linear, nominal.solved) / 6,
+        common=moved.common,
+        common_m=_common_m(whole.poses, moved),
     )
     require_known(found, OPEN_M, OPEN_RAD)
     return found, used
+
+
+@dataclass(frozen=True, eq=False)
+class _Model(Record):
+    """One choice of sources: its residuals, most probable variances and the solution at these, and what integrating gives.
+
+    That is the step (P,), its covariance, and the log evidence.
+    """
+
+    linear: Linear
+    variances: dict[str, float]
+    solved: Solved
+    x: Array
+    cov: Array
+    evidence: float
+
+    @staticmethod
+    def of(
+        whole: _Problem, guess: _Guess, rows: NDArray[np.int64], start: dict[str, float], arm: bool, quick: bool
+    ) -> _Model:
+        """Weigh the sources of ``start``, and with ``arm`` the arm's own; ``quick``: without integrating."""
+        few, part = whole.rows(_spread(rows, MAX_VARIANCE)), whole.rows(rows)
+        names = (*start, *((LINKS if whole.links is not None else DRIFT) if arm else ()))
+        estimated, linear = (p.linear(guess, arm, _timed(names)).of(names) for p in (few, part))
+        means = few.means(estimated, guess)
+        probable = most_probable(estimated, means, {name: v for name, v in start.items() if v > 0})
+        solved, P = solve(linear, probable), linear.J.shape[2]
+        variances = dict(zip(linear.sources, probable.tolist(), strict=True))
+        if quick:
+            return _Model(linear, variances, solved, solved.x[:P], solved.root[:P] @ solved.root[:P].T, 0.0)
+        more = linear if len(rows) > MAX_VARIANCE else None
+        return _Model(linear, variances, solved, *integrate(estimated, probable, means, more))
+
+    @property
+    def density(self) -> float:
+        """Mean logarithm of the probability density of a pose left out."""
+        return float(log_density(*left_out(self.solved)).mean())
+
+    def about(self, x: Array) -> Array:
+        """Return the mean square (P, P) of the error of another step (P,)."""
+        return np.asarray(self.cov + np.outer(self.x - x, self.x - x))
+
+
+def _alone(s: Solved, linear: Linear) -> Array:
+    """Return residuals (N, 6) of poses left out, without the shared errors that the others show."""
+    P = linear.J.shape[2]
+    AR = s.A @ s.root
+    kept = np.linalg.inv(s.W) - AR @ np.swapaxes(AR, 1, 2) + 1e-18 * np.eye(6)
+    away = (np.swapaxes(AR, 1, 2) @ np.linalg.solve(kept, s.left[..., None]))[..., 0]
+    x = s.x[:P] + away @ s.root[:P].T
+    return np.asarray(linear.e + np.einsum("nip,np->ni", linear.J, x))
+
+
+def _suiting(whole: _Problem, guess: _Guess, nominal: _Model) -> tuple[Array, Array]:
+    """Return the step (P,) to the mounting that suits the arm's model best, and its residuals (N, 6) of poses left out.
+
+    Where rotations and positions contradict each other by more than either scatters, that is the one of positions alone:
+    where it predicts positions left out clearly and surely better.
+    """
+    linear, own = nominal.linear, nominal.linear.own
+    middle = {"seen_m": np.concatenate([own["lateral_m"], own["depth_m"]], axis=2)}
+    hardly = HARDLY**2 * own["seen_rad"] @ np.swapaxes(own["seen_rad"], 1, 2)
+    positions = replace(linear, given=hardly, own=middle, shared={})
+    s = solve(positions, most_probable(positions, {"seen_m": _middle_sigmas(linear.e)[0]}))
+    found = [_alone(nominal.solved, linear), _alone(s, positions)]
+    of, alone = (np.sum((e[:, :3] - np.cross(whole.poses.centre, e[:, 3:])) ** 2, axis=1) for e in found)
+    lower = of - alone
+    sure = lower.mean() > SURELY_LOWER * lower.std() / np.sqrt(len(lower)) and of.mean() > CLEARLY**2 * alone.mean()
+    return (s.x, found[1]) if sure else (nominal.x, found[0])
+
+
+def _said(names: tuple[str, ...]) -> str:
+    """Return sources as people read them."""
+    found = [SAID.get(name.rpartition("_")[0] if name != "scale_walk" else name) for name in names]
+    return ", ".join(dict.fromkeys(name for name in found if name)) or "robot and camera"
 
 
 def _common_m(poses: Poses, guess: _Guess) -> float:
@@ -686,216 +790,21 @@ def _common_m(poses: Poses, guess: _Guess) -> float:
     return float(np.sqrt((off**2).sum(axis=-1).mean())) / guess.per_m if guess.common.size else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Trial(Record):
-    """A structure on poses left out.
-
-    Attributes:
-        density: (N,) logarithm of the probability density of each pose left out.
-        residual: (N, 6) their residuals under transforms fitted without them.
-        left: (N, 6) what is left of them with shared errors predicted.
-        rows: (N,) which rows they are.
-        variances: (K,) of the sources, from all of them.
-    """
-
-    density: Array
-    residual: Array
-    left: Array
-    rows: NDArray[np.int64]
-    variances: Array
-
-
-def _weights(trials: dict[str, _Trial], best: str) -> dict[str, float]:
-    """Return how probable the structures are that poses left out do not exclude, the best among them.
-
-    By the densities of poses left out, smoothed by what their sum is uncertain (pseudo-BMA+; Yao et al., Bayesian Analysis
-    13, 2018). Positions alone are chosen by another rule, and have none.
-    """
-    if best == POSITIONS:
-        return {best: 1.0}
-    names = [best, *(name for name in trials if name not in (best, POSITIONS))]
-    of = trials[best]
-    sums, sigmas = np.zeros(len(names)), np.zeros(len(names))
-    for k, name in enumerate(names[1:], 1):
-        other = trials[name]
-        n = min(len(of.rows), len(other.rows))
-        sums[k] = n * (other.density.mean() - of.density.mean())
-        if np.array_equal(of.rows, other.rows):
-            sigmas[k] = np.sqrt(n) * float((other.density - of.density).std())
-    drawn = sums + sigmas * np.random.default_rng(0).standard_normal((DRAWS, len(names)))
-    odds = np.exp(drawn - drawn.max(axis=1, keepdims=True))
-    shares = (odds / odds.sum(axis=1, keepdims=True)).mean(axis=0)
-    kept = {
-        name: float(share) for name, share in zip(names, shares, strict=True) if name == best or share > HARDLY_TRUE
-    }
-    return {name: share / sum(kept.values()) for name, share in kept.items()}
-
-
-def _student(
-    whole: _Problem,
-    guess: _Guess,
-    used: NDArray[np.bool_],
-    structure: str,
-    variances: Array,
-    gathered: dict[str, Array],
-) -> tuple[Array, Array]:
-    """Return the step (P,) from a guess to the least squares of a structure, and its covariance (P, P).
-
-    Where leaving out poses shows a larger one than the structure does, mean of a block of three, it is that. Residuals say
-    little about some variances: it is Student's ellipsoid in place of the normal one (Hotelling).
-    """
-    rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if structure in SHARED else MAX_FIT)
-    few = _spread(rows, MAX_SHARED if structure in SHARED else MAX_FIT)
-    linear = _linear(whole, guess, rows, structure, gathered)
-    b, own = blocks(linear, structure), linear.J.shape[2]
-    solved = solve(b, variances)
-    cov = solved.cov[:own, :own]
-    if structure not in SHARED:
-        shown, grow = jackknife(b, solved)[:own, :own], np.ones(own)
-        for part in (slice(k, k + 3) for k in range(0, 12, 3)):
-            grow[part] = np.sqrt(max(float(np.trace(np.linalg.solve(cov[part, part], shown[part, part]))) / 3, 1.0))
-        cov = cov * np.outer(grow, grow)
-    estimated = blocks(_linear(whole, guess, few, structure, gathered), structure)
-    known = freedom(estimated, variances, lambda v: solve(b, v).cov, 12)
-    known = min(known, max(6 * len(rows) // 2 - 9, 3))  # of positions, whose fit also rotates the frames
-    return solved.x[:own], cov * float(6 * f_distribution.ppf(0.95, 6, known) / chdtri(6, 0.05))
-
-
-def _best(whole: _Problem, trials: dict[str, _Trial]) -> str:
-    """Return the structure that poses left out are most probable under.
-
-    Positions alone never win so: they do where they predict positions left out better, clearly and surely.
-    """
-    others = {name: trial for name, trial in trials.items() if name != POSITIONS} or trials
-    best = max(others, key=lambda name: others[name].density.mean())
-    if POSITIONS not in trials or best in (*SHARED, *GEOMETRY, POSITIONS):
-        return best
-    of, alone = (
-        np.sum((e[:, :3] - np.cross(whole.poses.centre, e[:, 3:])) ** 2, axis=1)
-        for e in (trials[best].residual, trials[POSITIONS].residual)
-    )
-    lower = of - alone
-    sure = lower.mean() > SURELY_LOWER * lower.std() / np.sqrt(len(lower))
-    return POSITIONS if sure and of.mean() > CLEARLY**2 * alone.mean() else best
-
-
-def _hanging(
-    whole: _Problem,
-    guess: _Guess,
-    used: NDArray[np.bool_],
-    structure: str,
-    variances: Array,
-    gathered: dict[str, Array],
-) -> set[str]:
-    """Return the structures with shared errors that the residuals of neighbours speak for.
-
-    Moran's test of the residuals of a regression, which have lost what the unknowns fit (Cliff and Ord, "Spatial
-    Processes", 1981, chapter 8): a kernel that is wide beside the poses' spread is mostly lost so.
-    """
-    rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT)
-    if structure in SHARED or len(rows) < MIN_SHARED:
-        return set(SHARED)
-    part = whole.rows(rows)
-    linear = part.shared(part.linear(guess), guess, {})
-    n, C = len(rows), blocks(linear, structure).covariance(variances)
-    L = np.linalg.cholesky(C)
-    white = np.linalg.solve(L, linear.e[..., None]).reshape(-1)
-    fitted, _ = np.linalg.qr(np.linalg.solve(L, linear.J).reshape(6 * n, -1))
-    white = white - fitted @ (fitted.T @ white)
-    kernels, index = dict(linear.kernel), np.arange(n)
-    beside = np.asarray(np.abs(index[:, None] - index[None]) == 1, dtype=float)
-    if gathered:
-        kernels["camera walking"] = beside
-    kernels |= dict.fromkeys(kernels.keys() & {"robot walking over time", *SCALE_WALKING}, beside)
-    found = set()
-    for name, K in kernels.items():
-        W = np.kron(K - np.diag(np.diag(K)), np.eye(6))
-        W = W - fitted @ (fitted.T @ W)
-        W = W - (W @ fitted) @ fitted.T
-        moran = float(white @ W @ white - np.trace(W)) / np.sqrt(2 * float((W**2).sum()))
-        if moran > HANGING:
-            found.add(name)
-    return found
-
-
-def _linear(
-    whole: _Problem, guess: _Guess, rows: NDArray[np.int64], structure: str, gathered: dict[str, Array]
-) -> Linear:
-    """Return the residuals of rows, with what the structure needs."""
-    part = whole.rows(rows)
-    linear = part.linear(guess)
-    if structure not in SHARED:
-        return linear
-    return part.shared(linear, guess, {name: W[rows] for name, W in gathered.items()})
-
-
-def _settled(
-    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, gathered: dict[str, Array]
-) -> tuple[_Guess, NDArray[np.bool_], Array]:
-    """Alternate variances, transforms and blunders until they stay."""
-    variances: Array | None = None
-    for _ in range(ROUNDS):
-        few = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_FIT)
-        linear = _linear(whole, guess, few, structure, gathered)
-        if variances is None:
-            variances = reml(blocks(linear, structure), _start_variances(linear, structure))
-        else:
-            variances = reml(blocks(linear, structure), variances, 10)
-        rows = _spread(np.flatnonzero(used), MAX_SHARED_FIT if structure in SHARED else MAX_FIT)
-        linear = _linear(whole, guess, rows, structure, gathered)
-        b = blocks(linear, structure)
-        solved = solve(b, variances)
-        x = solved.x[: linear.J.shape[2]]
-        if structure in GEOMETRY:
-            far = own_squares(blocks(whole.linear(guess), structure), variances, solved.x)
-        guess = guess.moved(x, whole.free)
-        if structure in SHARED:
-            far = left_out_squares(b, solved)
-            keep = used.copy()
-            keep[rows[(far > chdtri(6, CHANCE)) & (far > 0.3 * far.max())]] = False
-        elif structure in GEOMETRY:
-            keep = far < chdtri(6, CHANCE)
-        else:
-            keep = 6 * _distances(whole, guess, structure, variances, gathered) < chdtri(6, CHANCE)
-        if keep.sum() < max(MIN_POSES, len(keep) // 3):
-            keep = used
-        settled = bool((keep == used).all()) and float(np.abs(x[:12]).max()) < 1e-5
-        used = keep
-        if settled:
-            break
-    assert variances is not None
-    return guess, used, variances
-
-
-def _distances(whole: _Problem, guess: _Guess, structure: str, variances: Array, gathered: dict[str, Array]) -> Array:
-    """Return the squared Mahalanobis length (N,) of each pose's own residual, over 6."""
-    linear = whole.linear(guess)
-    C = np.array(linear.given) * (0.0 if "image" in STRUCTURES[structure] else 1.0)
-    for name, variance in zip(STRUCTURES[structure], variances, strict=True):
-        if name == "image":
-            C += variance * linear.given
-        elif name in gathered:
-            C += variance * gathered[name]
-        else:
-            M = linear.maps[SHARED_MAPS.get(name, name)]
-            C += variance * M @ np.swapaxes(M, 1, 2)
-    C += 1e-16 * np.eye(6)
-    return np.asarray(np.einsum("ni,ni->n", linear.e, np.linalg.solve(C, linear.e[..., None])[..., 0]) / 6)
-
-
-def _trial(
-    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], structure: str, gathered: dict[str, Array]
-) -> _Trial:
-    """Leave out poses under a structure."""
-    rows = _spread(np.flatnonzero(used), MAX_SHARED if structure in SHARED else MAX_FIT)
-    linear = _linear(whole, guess, rows, structure, gathered)
-    b = blocks(linear, structure)
-    variances = reml(b, _start_variances(linear, structure))
-    n = len(rows)
-    order = np.arange(n) if whole.t_s is not None else np.random.default_rng(0).permutation(n)
-    parts = [np.sort(part) for part in np.array_split(order, n if n <= FEW and structure not in SHARED else FOLDS)]
-    density, residual, left = held_out(linear, structure, variances, parts)
-    return _Trial(density, residual, left, rows, variances)
+def _far(
+    whole: _Problem, guess: _Guess, variances: dict[str, float], rows: NDArray[np.int64], linear: Linear, solved: Solved
+) -> Array:
+    """Return the squared Mahalanobis length (N,) of each pose's residual: of those fitted, as predicted by all others."""
+    everything = whole.linear(guess)
+    C = covariances(everything, np.array([variances[name] for name in everything.sources]))
+    for name, M in (linear.shared or {}).items():  # as far as the worst pose is moved by what all share
+        C = C + variances[name] * np.einsum("nik,njk->nij", M, M).max(axis=0)
+    P = everything.J.shape[2]
+    C = C + (known := everything.J @ solved.root[:P]) @ np.swapaxes(known, 1, 2)
+    moved = everything.e + everything.J @ solved.x[:P]
+    far = np.einsum("ni,ni->n", moved, np.linalg.solve(C, moved[..., None])[..., 0])
+    left, C = left_out(solved)
+    far[rows] = np.einsum("ni,ni->n", left, np.linalg.solve(C, left[..., None])[..., 0])
+    return np.asarray(far)
 
 
 def _held_out_errors(whole: _Problem, guess: _Guess, residual: Array, rows: NDArray[np.int64]) -> HeldOut:
@@ -907,25 +816,14 @@ def _held_out_errors(whole: _Problem, guess: _Guess, residual: Array, rows: NDAr
     return HeldOut(position, angle)
 
 
-def _displacements(
-    whole: _Problem, linear: Linear, structure: str, variances: Array, guess: _Guess
-) -> tuple[float, float]:
+def _displacements(whole: _Problem, model: _Model, guess: _Guess) -> tuple[float, float]:
     """Return the RMS distances by which the arm's and vision's errors move the body's middle, m."""
     middle = np.concatenate([np.eye(3), -skew(whole.poses.centre)], axis=1) / guess.per_m
-    arm = camera = 0.0
-    for name, variance in zip(STRUCTURES[structure], variances, strict=True):
-        if name == "image":
-            size = float(np.einsum("ai,nij,aj->n", middle, linear.given, middle).mean())
-        elif name in linear.walk:
-            size = float(np.einsum("ai,nij,aj->n", middle, linear.walk[name], middle).mean())
-        else:
-            M = middle @ linear.maps[SHARED_MAPS.get(name, name)]
-            walked = np.diag(linear.kernel[structure]) if name == "scale_walk" else 1.0
-            size = float((walked * np.einsum("nij,nij->n", M, M)).mean())
-        if name in OF_THE_ARM:
-            arm += variance * size
-        else:
-            camera += variance * size
-    if "image" not in STRUCTURES[structure]:
-        camera += float(np.einsum("ai,nij,aj->n", middle, linear.given, middle).mean())
+    linear = model.linear
+    arm, camera = 0.0, float(np.einsum("ai,nij,aj->n", middle, linear.given, middle).mean())
+    for name, variance in model.variances.items():
+        M = middle @ (linear.own | linear.shared)[name]
+        M = M - M.mean(axis=0) if name in linear.shared else M  # what is the same in all poses is in the mounting
+        size = float(variance * np.einsum("nij,nij->n", M, M).mean())
+        arm, camera = (arm + size, camera) if name in OF_THE_ARM else (arm, camera + size)
     return float(np.sqrt(arm)), float(np.sqrt(camera))

@@ -35,8 +35,6 @@ from armsight.robot.arm import Arm
 
 #: A pose whose residual has a smaller chance than this is taken for a mistake and left out.
 CHANCE = 1e-5
-#: Sigma of rotations that have hardly any weight, rad: enough to determine what positions leave open.
-HARDLY = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,8 +215,6 @@ def _score(A: Array, B: Array, X: Array, Z: Array) -> float:
 Eye = Literal["to_hand", "in_hand"]
 #: Fewest poses: three determine both transforms, and what is left out must leave three.
 MIN_POSES = 4
-#: Another structure of the noise must lower the held-out error by this factor: less is chance with tens of poses.
-CLEARLY = 1.1
 
 
 @dataclass(frozen=True, eq=False)

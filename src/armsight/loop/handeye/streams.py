@@ -1,9 +1,9 @@
 """Hand-eye calibration of two streams of poses whose clocks differ by an unknown amount.
 
-In: times and poses of the flange, times and poses of the measured body. Out: :class:`StructuredStreams` with the offset
+In: times and poses of the flange, times and poses of the measured body. Out: :class:`Streams` with the offset
 and its sigma. The offset is found first from the two angular speeds, which no mounting changes (correlation over all
-offsets that leave an overlap), then fitted together with both transforms. Poses of a stream are not independent: the
-structures of the noise allow for errors that neighbours share.
+offsets that leave an overlap), then fitted together with both transforms. Poses of a stream are not independent: errors
+that neighbours share are weighed, too.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.handeye.handeye import HandEye, calibrate_structured
-from armsight.loop.handeye.noise import STRUCTURES
+from armsight.loop.handeye.handeye import HandEye, calibrate_poses
 from armsight.loop.handeye.poses import Eye, Poses
 
 #: Poses used at most for the fit, spread evenly: a stream's neighbours say the same.
@@ -83,8 +82,8 @@ class PoseStream(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class StructuredStreams(Record):
-    """A hand-eye calibration of two streams whose noise has a structure.
+class Streams(Record):
+    """A hand-eye calibration of two streams.
 
     Attributes:
         handeye: the calibration; its rows are those of the eye's poses that were used, in the order of time.
@@ -102,7 +101,7 @@ class StructuredStreams(Record):
     B: Array
 
 
-def calibrate_structured_streams(
+def calibrate_streams(
     hand: PoseStream,
     eye_stream: PoseStream,
     *,
@@ -111,8 +110,8 @@ def calibrate_structured_streams(
     scale: bool = False,
     links_at: Callable[[Array], Array] | None = None,
     progress: Callable[[str], None] = lambda line: None,
-) -> StructuredStreams:
-    """Find the mounting, the time offset and the structure of the noise of two streams.
+) -> Streams:
+    """Find the mounting and the time offset of two streams.
 
     Args:
         hand: T_base_flange over time.
@@ -130,7 +129,7 @@ def calibrate_structured_streams(
     progress("time offset")
     offset = coarse_offset(hand, eye_stream)
     rows = np.linspace(0, len(eye_stream.t_s) - 1, min(MAX_POSES, len(eye_stream.t_s))).astype(int)
-    for structures in (("robot and camera",), ("robot and camera",), tuple(STRUCTURES)):
+    for quick in (True, True, False):
         t_eye, B = eye_stream.t_s[rows], eye_stream.Ts[rows]
         A, good = hand.at(t_eye + offset)
         early, first = hand.at(t_eye + offset - SPEED_S / 2)
@@ -142,17 +141,17 @@ def calibrate_structured_streams(
             A[good], B[good], np.zeros((int(good.sum()), 6, 6)), eye == "in_hand", np.asarray(centre, dtype=float)
         )
         speed = log_se3(inverse(early[good]) @ late[good]) / SPEED_S
-        found = calibrate_structured(
+        found = calibrate_poses(
             poses,
             t_s=t_eye[good],
             speed=speed,
             links=None if links_at is None else links_at(t_eye[good] + offset),
             scale=scale,
-            structures=structures,
+            quick=quick,
             progress=progress,
         )
         offset += found.step_s
-    return StructuredStreams(found, offset, found.sigma_step_s, t_eye[good], poses.A, poses.B)
+    return Streams(found, offset, found.sigma_step_s, t_eye[good], poses.A, poses.B)
 
 
 def coarse_offset(hand: PoseStream, eye: PoseStream) -> float:

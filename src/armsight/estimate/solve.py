@@ -1,0 +1,108 @@
+"""Weighted least squares whose shared errors are unknowns too (Henderson, Biometrics 31, 1975).
+
+In: :class:`~armsight.estimate.linear.Linear` and a variance for each source. Out: the step, the covariance, the restricted
+likelihood (Patterson and Thompson, Biometrika 58, 1971) with its gradient, and the prediction of measurements left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dtrtri
+
+from armsight.data import Array, Record
+from armsight.estimate.linear import Linear
+
+#: Information about a direction, as a share of each unknown's own, below which it is open.
+OPEN = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class Solved(Record):
+    """Weighted least squares at given variances.
+
+    Attributes:
+        x: (Q,) step of the P unknowns, then the shared errors.
+        root: (Q, Q) root @ root.T is its covariance.
+        W: (N, m, m) inverse covariance of the measurements' own errors.
+        left: (N, m) what is left of the residuals.
+        A: (N, m, Q) derivative by all.
+        of: (Q,) of which source a column is, -1 for the unknowns.
+        cost: minus the restricted log-likelihood.
+    """
+
+    x: Array
+    root: Array
+    W: Array
+    left: Array
+    A: Array
+    of: NDArray[np.int64]
+    cost: float
+
+
+def covariances(linear: Linear, variances: Array) -> Array:
+    """Return the covariance (N, m, m) of each measurement's own errors."""
+    C = np.array(linear.given)
+    for v, M in zip(variances, linear.own.values(), strict=False):
+        C += v * (M @ np.swapaxes(M, 1, 2))
+    i = np.arange(C.shape[-1])
+    C[:, i, i] = C[:, i, i] * (1 + 1e-8) + 1e-16  # positive definite in spite of rounding
+    return C
+
+
+def solve(linear: Linear, variances: Array) -> Solved:
+    """Solve at the variances (K,) of ``linear.sources``."""
+    first, P = len(linear.own), linear.J.shape[2]
+    A = np.concatenate([linear.J, *linear.shared.values()], axis=2)
+    of = np.repeat(np.arange(-1, len(linear.shared)), [P, *(F.shape[2] for F in linear.shared.values())])
+    of = np.where(of >= 0, of + first, of)
+    known = np.concatenate([linear.known, 1 / variances[of[P:]]])
+    at = np.concatenate([linear.at, np.zeros(len(of) - P)])
+    C = covariances(linear, variances)
+    L = np.linalg.cholesky(C)
+    half = np.linalg.inv(L)
+    n, m = linear.e.shape
+    white, e = (half @ A).reshape(n * m, -1), (half @ linear.e[..., None]).ravel()
+    H = white.T @ white + np.diag(known)
+    unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+    R = np.linalg.cholesky(unit[:, None] * H * unit + OPEN * np.eye(len(unit)))
+    root = unit[:, None] * dtrtri(R, lower=1)[0].T
+    x = -root @ (root.T @ (white.T @ e + known * at))
+    squares = float(((e + white @ x) ** 2).sum() + (known * (at + x) ** 2).sum())
+    logdet = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
+    logdet += float(2 * np.log(np.diag(R)).sum() - 2 * np.log(unit).sum() - np.log(known[P:]).sum())
+    W = np.swapaxes(half, 1, 2) @ half
+    return Solved(x, root, W, linear.e + A @ x, A, of, 0.5 * (logdet + squares))
+
+
+def gradient(linear: Linear, variances: Array, s: Solved) -> Array:
+    """Return the derivative (K,) of the cost by the logarithms of the variances (Harville, JASA 72, 1977)."""
+    out = np.zeros(len(variances))
+    weighted = (s.W @ s.left[..., None])[..., 0]
+    WR = s.W @ (s.A @ s.root)
+    G = s.W - WR @ np.swapaxes(WR, 1, 2) - weighted[:, :, None] * weighted[:, None, :]
+    for k, M in enumerate(linear.own.values()):
+        out[k] = 0.5 * variances[k] * float(np.einsum("nij,nik,njk->", G, M, M, optimize=True))
+    for k in range(len(linear.own), len(variances)):
+        of = s.of == k
+        out[k] = 0.5 * float(of.sum() - ((s.root[of] ** 2).sum() + (s.x[of] ** 2).sum()) / variances[k])
+    return out
+
+
+def left_out(s: Solved) -> tuple[Array, Array]:
+    """Return what is left (N, m) of each measurement under the fit to all others, and its covariance (N, m, m)."""
+    AR = s.A @ s.root
+    own = np.linalg.inv(s.W)
+    kept = own - AR @ np.swapaxes(AR, 1, 2)  # covariance of what is left in the fit to all
+    i = np.arange(kept.shape[-1])
+    kept[:, i, i] += 1e-9 * own[:, i, i]
+    gain = own @ np.linalg.inv(kept)
+    return (gain @ s.left[..., None])[..., 0], np.asarray(gain @ own)
+
+
+def log_density(left: Array, cov: Array) -> Array:
+    """Return the logarithm of the normal density (N,) of residuals (N, m) with covariances (N, m, m)."""
+    squares = np.einsum("ni,ni->n", left, np.linalg.solve(cov, left[..., None])[..., 0])
+    return np.asarray(-0.5 * (squares + np.linalg.slogdet(cov)[1] + left.shape[1] * np.log(2 * np.pi)))
