@@ -1,4 +1,4 @@
-"""Estimation: how anything is fitted, weighed and judged.
+"""Estimation: how anything is fitted and its errors weighed.
 
 In: residuals near a state with the covariance that each source of error causes (:class:`~armsight.estimate.linear.Linear`).
 Out: the unknowns with a covariance that allows for what is not known about the sources' variances.

@@ -1,6 +1,6 @@
 """Hand-eye calibration of two streams of poses whose clocks differ by an unknown amount.
 
-In: times and poses of the flange, times and poses of the measured body. Out: :class:`Streams` with the offset
+In: times and poses of the flange, times and poses of the measured body. Out: :class:`HandEyeStreams` with the offset
 and its sigma. The offset is found first from the two angular speeds, which no mounting changes (correlation over all
 offsets that leave an overlap), then fitted together with both transforms. Poses of a stream are not independent: errors
 that neighbours share are weighed, too.
@@ -82,7 +82,7 @@ class PoseStream(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class Streams(Record):
+class HandEyeStreams(Record):
     """A hand-eye calibration of two streams.
 
     Attributes:
@@ -110,7 +110,7 @@ def calibrate_streams(
     scale: bool = False,
     links_at: Callable[[Array], Array] | None = None,
     progress: Callable[[str], None] = lambda line: None,
-) -> Streams:
+) -> HandEyeStreams:
     """Find the mounting and the time offset of two streams.
 
     Args:
@@ -151,7 +151,7 @@ def calibrate_streams(
             progress=progress,
         )
         offset += found.step_s
-    return Streams(found, offset, found.sigma_step_s, t_eye[good], poses.A, poses.B)
+    return HandEyeStreams(found, offset, found.sigma_step_s, t_eye[good], poses.A, poses.B)
 
 
 def coarse_offset(hand: PoseStream, eye: PoseStream) -> float:
