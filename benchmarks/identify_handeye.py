@@ -76,9 +76,7 @@ def eth_pairs(folder: Path, report) -> None:
     for name in PAIRS:
         hand, t, B = pair(folder, name)
         late = t > np.median(t)
-        found = [
-            calibrate_streams(hand, PoseStream.of(t[r], B[r], "eye"), eye="in_hand") for r in (~late, late)
-        ]
+        found = [calibrate_streams(hand, PoseStream.of(t[r], B[r], "eye"), eye="in_hand") for r in (~late, late)]
         a, b = (f.offset_s for f in found)
         sigma = float(np.hypot(*(f.sigma_offset_s for f in found)))
         more = f": {1e3 * a:.2f} and {1e3 * b:.2f} ms, sigma of the difference {1e3 * sigma:.2f}"
