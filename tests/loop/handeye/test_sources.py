@@ -181,6 +181,18 @@ def test_a_scale_that_walks_is_recognised_and_the_covariance_allows_for_it(steps
     assert sum(found for found, _ in off) < 0.5 * sum(before for _, before in off)
 
 
+def test_a_scale_is_rejected_where_the_flange_only_rotates():
+    rng = np.random.default_rng(8)
+    A = exp_se3(np.concatenate([np.zeros((60, 3)), rng.uniform(-0.5, 0.5, (60, 3))], axis=1))
+    A[:, :3, 3] = [0.4, 0.1, 0.3]
+    X, Z = exp_se3(np.array([0.02, -0.05, 0.06, 0.1, 0.2, -0.3])), exp_se3(np.array([0.6, 0.1, 0.0, 0.5, -1.0, 0.2]))
+    B = inverse(A @ X) @ Z @ exp_se3(rng.normal(size=(60, 6)) * 2e-4)
+    B[:, :3, 3] *= 0.2
+    measured = A @ exp_se3(rng.normal(size=(60, 6)) * 5e-4)
+    with pytest.raises(CalibrationError, match=r"hardly moves: its positions spread by 0\.\d mm"):
+        calibrate_poses(Poses(measured, B, np.zeros((60, 6, 6)), True, np.zeros(3)), scale=True)
+
+
 def test_a_scale_that_runs_away_is_not_taken():
     # The wrist alone rotates: the flange hardly moves, and lengths of zero explain that, too.
     rng = np.random.default_rng(2)

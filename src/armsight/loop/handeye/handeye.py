@@ -88,6 +88,9 @@ FREEDOM = 4.0
 #: A scale must be off by this many sigmas to be taken, and has settled where a step is below this share of one: where the
 #: flange hardly moves it runs away.
 SURELY, SETTLED = 5.0, 0.1
+#: Times the error of a position that the flange's must spread for a scale. half: noise is taken for a motion; double:
+#: recordings of a few cm are rejected.
+STILL = 3.0
 #: Rounds of least squares and of leaving out.
 ROUNDS = 6
 
@@ -467,6 +470,13 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
     (before_m, before_rad), (after_m, after_rad) = (
         _middle_sigmas(p.rows(rows).linear(g).e) for p, g in ((problem, known), (free, found))
     )
+    spread_m = float(problem.poses.A[used_known][:, :3, 3].std(axis=0).max())
+    if spread_m < STILL * min(before_m, after_m / found.per_m):
+        raise CalibrationError(
+            f"the flange rotates, but hardly moves: its positions spread by {1e3 * spread_m:.1f} mm, no more than errors "
+            "do; the mounting and the size of what is seen cannot be found together: move the flange by 100 mm and more, "
+            "or, where the size is known, leave out --scale"
+        )
     gained = 3 * float(np.log(before_m / after_m * before_rad / after_rad))  # log density of a pose
     if ((sure and gained > -1) or gained > 1) and 1e-4 < found.per_m < 1e4:  # sure, but far worse: of blunders
         return free, found, used
