@@ -213,6 +213,7 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
     core->standing = 0u;
     const bool closed = core->shorted != 0u; /* the windings, by drives on or off */
     core->supply_v = (float)inputs->supply_mv * 0.001f;
+    const bool weak = inputs->supply_mv < core->config.supply_min_mv || core->supply_bad_ticks != 0u;
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         joint_state *joint = &core->joint[i];
         const joint_config *config = &core->config.joint[i];
@@ -225,7 +226,7 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
             angle_rad += joint->motor.twist_rad_per_a * joint->current_a;
         }
         if (closed) {
-            if (joint->over_a > 0.0f && joint->motor.duty != 0.0f) {
+            if ((weak || joint->over_a > 0.0f) && joint->motor.duty != 0.0f) { /* what it does not put out is not known */
                 motor_limit(&joint->motor);
             }
             motor_measure(&joint->motor, &config->motor, core->supply_v, joint->current_a, angle_rad);

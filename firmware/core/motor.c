@@ -40,7 +40,6 @@
                         twice as fast */
 #define CONSTANT_OFF 0.15f /* by so much a motor's constant may be off; half: other motors are doubted, double: weak
                               motors are learnt */
-#define UNKNOWN_RAD_S 1000.0f /* as uncertain as a motor's speed is whose voltage is not known */
 #define SMOOTH 0.333333f      /* of a tick's news in the speed that is damped: 2 ms; half: soft joints swing, twice: noise */
 #define SEEN_RAD_S 0.5f /* rad/s, above a motor's speed in one tick by noise: no slower limit is held by it; half:
                            noise brakes, double: slow joints go beyond theirs */
@@ -454,11 +453,9 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
 }
 
 /* Return whether a current is seen, without which its sensor may be broken. */
-static bool is_known(const motor_state *motor) { return motor->sure_rad_s > -0.5f * UNKNOWN_RAD_S; }
-
 void motor_damp(motor_state *motor, float reading_rad_s)
 {
-    const bool known = is_known(motor) && motor->unsure_rad_s < UNKNOWN_RAD_S;
+    const bool known = motor_is_known(motor) && motor->unsure_rad_s < UNKNOWN_RAD_S;
     const float share = known ? motor->damping_share : 0.0f;
     motor->damped_rad_s += SMOOTH * (motor->speed_rad_s - motor->damped_rad_s);
     motor->beyond_rad_s = share * (motor->damped_rad_s - reading_rad_s);
@@ -770,8 +767,7 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
 bool motor_swings_far(motor_state *motor, float off_rad_s)
 {
     const int32_t side = off_rad_s > 0.0f ? 1 : -1;
-    if (!is_known(motor) || number_size(off_rad_s) <= SWING_RAD_S) {
-        motor->swings = is_known(motor) ? motor->swings : 0u;
+    if (number_size(off_rad_s) <= SWING_RAD_S) {
         return false;
     }
     if (side != motor->swing_side) {
@@ -780,6 +776,7 @@ bool motor_swings_far(motor_state *motor, float off_rad_s)
         motor->swing_stays_rad_s = motor->swings != 0u ? motor->swing_stays_rad_s + stays : 0.0f;
         if (motor->swings >= SWINGS && motor->swing_stays_rad_s < 0.0f) {
             motor->swings = 0u; /* it decays by itself */
+            motor->swing_stays_rad_s = 0.0f;
         }
         motor->swing_rad_s = 0.0f;
         motor->swing_side = side;
@@ -795,7 +792,7 @@ bool motor_swings_far(motor_state *motor, float off_rad_s)
 
 bool motor_stays_fast(motor_state *motor, const motor_config *config, float reading_rad_s)
 {
-    const bool alone = motor->doubted != 0u || config->resistance_ohm <= 0.0f;
+    const bool alone = motor->doubted != 0u || config->resistance_ohm <= 0.0f || !motor_is_known(motor);
     const bool fast = number_size(alone ? reading_rad_s : motor->speed_rad_s) > FAST * motor->fastest_rad_s;
     motor->fast_ticks = fast ? number_add(motor->fast_ticks, WATCH_TICKS) : 0u;
     return motor->fast_ticks >= FAST_TICKS + motor->swing_ticks;

@@ -118,10 +118,16 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
 /* Return whether the motor swings about its reference, from whose speed it is far off by off_rad_s. */
 bool motor_swings_far(motor_state *motor, float off_rad_s);
 
-/* Return whether the motor swings about a reference that moves at reference_rad_s. To be asked each WATCH_TICKS. */
-static inline bool motor_swings(motor_state *motor, float reference_rad_s, float speed_limit_rad_s)
+#define UNKNOWN_RAD_S 1000.0f /* as uncertain as a motor's speed is whose voltage is not known */
+
+/* Return whether the voltage across a motor, and so its speed, is known: not where a driver may have withheld some. */
+static inline bool motor_is_known(const motor_state *motor) { return motor->sure_rad_s > -0.5f * UNKNOWN_RAD_S; }
+
+/* Return whether the motor, or where its speed is not known the reading, swings about a reference that moves at
+ * reference_rad_s. To be asked each WATCH_TICKS. */
+static inline bool motor_swings(motor_state *motor, float reading_rad_s, float reference_rad_s, float speed_limit_rad_s)
 {
-    const float off_rad_s = motor->speed_rad_s - reference_rad_s;
+    const float off_rad_s = (motor_is_known(motor) ? motor->speed_rad_s : reading_rad_s) - reference_rad_s;
     return number_size(off_rad_s) > MOTOR_SWING * speed_limit_rad_s && motor_swings_far(motor, off_rad_s);
 }
 

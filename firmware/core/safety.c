@@ -401,7 +401,7 @@ static void watch_joint(core_state *core, joint_state *joint, const joint_config
         watch_motor(core, joint, config, i);
     }
     watch_limits(core, joint, config, i);
-    if (motor_swings(&joint->motor, joint->reference.speed_rad_s, config->speed_limit_rad_s)) {
+    if (motor_swings(&joint->motor, joint->pid.speed_rad_s, joint->reference.speed_rad_s, config->speed_limit_rad_s)) {
         safety_raise(core, FAULT_OSCILLATION, i);
         take_back_gains(core, joint, i);
     }

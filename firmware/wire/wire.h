@@ -14,7 +14,7 @@
 #include "mavlink_setup.h"
 #include "types.h"
 
-#define FIRMWARE_VERSION "0.1.0" /* the package's; at most 16 characters */
+#define FIRMWARE_VERSION "0.2.0" /* the package's; at most 16 characters */
 #define WIRE_OUT_BYTES 1024u     /* room for what waits to go out; a power of two */
 #define WIRE_QUEUE 8u            /* commands that may wait for their tick */
 #define WIRE_PART_BYTES 200u     /* of the configuration in one CONFIG_PART */

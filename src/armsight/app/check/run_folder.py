@@ -139,7 +139,7 @@ def joint_track(folder: Path, joints: int | None = None) -> JointTrack:
     if joints is not None and (set(names) - set(table.at) or f"q{joints + 1}_rad" in table.at):
         raise InputError(f"{file}: is not of an arm of {joints} joints: give the arm of the run with --arm")
     needed = names if set(names) <= set(table.at) else names[: count + 1]
-    values = table.numbers(needed)
+    values = table.numbers(needed, gaps=True)  # nothing is commanded before the first motion
     if not len(values):
         raise InputError(f"{file}: no readings")
     q_ref = values[:, 1 : count + 1]
