@@ -533,6 +533,19 @@ def broken(library, seed, table, kind, size, *, moving=True):
     table.add(label, arm, True, joint, arm.ticks - begun if arm.first[0] else None)
 
 
+#: Fault of a potentiometer -> how large it is, drawn from a generator.
+SIZES = {
+    PotFault.STUCK: lambda r: 0.0,
+    PotFault.FROZEN: lambda r: 0.0,
+    PotFault.JUMP: lambda r: r.choice([-1, 1]) * r.uniform(0.08, 0.5),
+    PotFault.SLIP: lambda r: r.uniform(0.1, 0.4),
+    PotFault.DRIFT: lambda r: r.choice([-1, 1]) * r.uniform(0.3, 0.8),
+    PotFault.SCALED: lambda r: r.choice([r.uniform(0.3, 0.6), r.uniform(1.6, 2.5)]),
+    PotFault.LAG: lambda r: r.uniform(0.1, 0.3),
+    PotFault.INVERTED: lambda r: 0.0,
+}
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("cases", type=int, nargs="?", default=100)
@@ -551,21 +564,11 @@ def main():
         "softest": softest,
         "eccentric": eccentric,
     }
-    sizes = {
-        PotFault.STUCK: lambda r: 0.0,
-        PotFault.FROZEN: lambda r: 0.0,
-        PotFault.JUMP: lambda r: r.choice([-1, 1]) * r.uniform(0.08, 0.5),
-        PotFault.SLIP: lambda r: r.uniform(0.1, 0.4),
-        PotFault.DRIFT: lambda r: r.choice([-1, 1]) * r.uniform(0.3, 0.8),
-        PotFault.SCALED: lambda r: r.choice([r.uniform(0.3, 0.6), r.uniform(1.6, 2.5)]),
-        PotFault.LAG: lambda r: r.uniform(0.1, 0.3),
-        PotFault.INVERTED: lambda r: 0.0,
-    }
     for index in range(given.cases):
         for number, (name, run) in enumerate(classes.items()):
             if given.only in name:
                 run(library, given.seed * 1000003 + 97 * index + number, table)
-        for number, (kind, size) in enumerate(sizes.items()):
+        for number, (kind, size) in enumerate(SIZES.items()):
             if given.only in kind.name.lower():
                 rng = np.random.default_rng([given.seed, index, number])
                 seed = given.seed * 1000003 + 97 * index + 20 + number

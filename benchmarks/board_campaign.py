@@ -15,7 +15,7 @@ import numpy as np
 
 import board_arms
 import board_motors
-from board_arms import NAMED_TICKS, POT_NAMES, Fault, PotFault
+from board_arms import NAMED_TICKS, POT_NAMES, SIZES, Fault
 
 PARTS = {
     board_motors.offset: Fault.CURRENT_SENSOR,
@@ -24,16 +24,6 @@ PARTS = {
     board_motors.weak: Fault.MOTOR,
     board_motors.shorted: Fault.MOTOR,
     board_motors.stuck: Fault.BRIDGE,
-}
-SIZES = {
-    PotFault.STUCK: lambda r: 0.0,
-    PotFault.FROZEN: lambda r: 0.0,
-    PotFault.JUMP: lambda r: r.choice([-1, 1]) * r.uniform(0.08, 0.5),
-    PotFault.SLIP: lambda r: r.uniform(0.1, 0.4),
-    PotFault.DRIFT: lambda r: r.choice([-1, 1]) * r.uniform(0.3, 0.8),
-    PotFault.SCALED: lambda r: r.choice([r.uniform(0.3, 0.6), r.uniform(1.6, 2.5)]),
-    PotFault.LAG: lambda r: r.uniform(0.1, 0.3),
-    PotFault.INVERTED: lambda r: 0.0,
 }
 HEALTHY = (
     "healthy",

@@ -71,9 +71,8 @@ static inline bool motor_is_apart(const motor_state *motor, const motor_config *
 /* Return the fault by which they are apart, as it looks at first. */
 uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v);
 
-/* Return the fault (FAULT_BIT) by what motor and reading did in the last 192 ms, or those that cannot be distinguished; suspect where
- * that does not show it. A motor that was
- * let go of changes its speed by itself: only then a reading that drifts can be distinguished from one that slips. */
+/* Return the fault (FAULT_BIT) by what motor and reading did in the last 192 ms, or those that cannot be distinguished;
+ * suspect where that does not show it. A motor that was let go of changes its speed by itself: only then a reading that drifts can be distinguished from one that slips. */
 uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect, motor_sums *sums);
 
 /* Return whether the speed by the back-EMF has changed of late as no torque changes it: then current, winding or bridge are

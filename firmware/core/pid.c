@@ -39,8 +39,8 @@ INLINE float limited_duty(const pid_state *pid, const pid_demand *demand, float 
 static float direction_of(float speed_rad_s) { return speed_rad_s / (number_size(speed_rad_s) + CREEP_RAD_S); }
 
 /* Return the error that the integral gathers while the spring is bounded: what a joint that a load holds back or drives
- * away lacks of a share of its speed limit, or of its reference's speed, by whichever is faster, reading or motor, and never more than its error. A joint
- * that moves on gathers none. */
+ * away lacks of a share of its speed limit, or of its reference's speed, by whichever is faster, reading or motor, and never
+ * more than its error. A joint that moves on gathers none. */
 static float bounded_error(const joint_gains *gains, const pid_demand *demand, float spring, float error_rad)
 {
     if (gains->kp_per_rad <= 0.0f || spring * error_rad <= 0.0f) {

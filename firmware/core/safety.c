@@ -13,9 +13,11 @@
 #define OVERCURRENT_TICKS 20u
 #define STOP_TICKS 300u   /* after which an emergency stop ends with sleeping drives, braked by shorted windings until then */
 #define FREE_TICKS 33u    /* in which shorted windings brake any joint; half: heavy joints sleep, double: a bridge drives on longer */
-#define FREE_BRAKED 0.9f  /* of its speed then, at most */
-#define FREE_SLOW 0.25f   /* of the speed limit: what was slower when it was let go of may sink up to its limit */
-#define NAME_EARLY_TICKS 64u /* after which a weak motor may show: its joint is taken back */
+#define FREE_BRAKED 0.9f  /* of its speed then, at most; half: heavy joints sleep, nearer 1: a bridge drives on longer */
+#define FREE_SLOW 0.25f   /* of the speed limit: what was slower when it was let go of may sink up to its limit; half: slow
+                             joints that sink sleep, double: a bridge drives up to the limit */
+#define NAME_EARLY_TICKS 64u /* after which a weak motor may show: its joint is taken back; half: noise names,
+                                double: it sinks for longer */
 #define NAME_TICKS 160u   /* after which a joint let go of has shown which fault it has */
 
 #define FAULT_NAME(name, code, reaction, text) [code] = #name,
