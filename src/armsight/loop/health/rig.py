@@ -633,7 +633,7 @@ class RigWatch:
         self.alarm, self.alarmed = alarm, self.alarmed or alarm
         if nodded:
             self._take_unrest(nodded)
-        due = ends or 0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0
+        due = 0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0
         if due and 0 < len(self._history) < _KEPT and self._poses >= _LENS_POSES:
             self.lens = self._lens()
 
