@@ -2,8 +2,10 @@
 
 #include "number.h"
 
-#define TRACK_S 0.02f  /* time constant of the way back to the path, once near it */
-#define ANSWER_PER_S 200.0f /* 1/time constant of the speed that leads there: a quarter, so that nothing overshoots */
+#define TRACK_S 0.02f /* s; time constant of the way back to the path, once near it; half: it overshoots, double: it is off
+                         the path for longer */
+#define ANSWER_PER_S 200.0f /* 1/s; of the speed that leads there: four times as fast, so that nothing overshoots; half: it
+                               does, double: the acceleration limit acts instead */
 
 void governor_hold(governor_state *reference, float position_rad)
 {

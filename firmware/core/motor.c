@@ -492,7 +492,8 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
     return agreed ? FAULT_POT_SLIP : FAULT_POT_SCALE;
 }
 
-#define NAME_SAMPLES 24u    /* of the last 192 ms: most of them after the joint was let go of */
+#define NAME_SAMPLES 24u /* of the last 192 ms: most of them after the joint was let go of; half: noise names parts, double:
+                            what was before the fault does */
 #define NAME_NOISE_RAD 0.002f /* of a reading; half: noise names faults, double: small ones keep their first name */
 #define JUMP_SHARE 0.7f /* of the way between both, in one sample; half: slips look like jumps, double: no jump is
                            named */

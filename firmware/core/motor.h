@@ -8,9 +8,11 @@
 #include "number.h"
 #include "types.h"
 
-#define MOTOR_STEP_TICKS 160u /* for so long a step may be what a gap began with */
+#define MOTOR_STEP_TICKS 160u /* for so long a step may be what a gap began with; half: slow gaps have no beginning, double:
+                                 old steps are blamed */
 #define MOTOR_TWIST 0.5f /* of the largest current's twist of late: half: soft joints are dropped, twice: faults show later */
-#define MOTOR_WITNESS 0.1f /* of the speed it is held to: so much faster than the reading it must be to count */
+#define MOTOR_WITNESS 0.1f /* of the speed it is held to: so much faster than the reading it must be to count; half: noise
+                              brakes, double: a wrong reading lets it be faster */
 
 /* Begin to watch a joint that reads angle_rad and has this speed limit; phase differs from joint to joint, so that not
  * all are sampled at once. */
@@ -112,7 +114,8 @@ bool motor_is_stuck(const motor_state *motor, const motor_config *config, float 
  * it: against the way error_rad that it is driven, or at all where nothing was put out and shorted windings brake. */
 bool motor_disobeys(const motor_state *motor, const motor_config *config, float supply_v, float error_rad);
 
-#define MOTOR_SWING 0.2f /* of the speed limit: so far from the reference's speed a swing goes at least */
+#define MOTOR_SWING 0.2f /* of the speed limit: so far from the reference's speed a swing goes at least; half: elastic joints
+                            alarm, double: slow swings are not seen */
 
 /* Return whether the motor swings about its reference, from whose speed it is far off by off_rad_s. */
 bool motor_swings_far(motor_state *motor, float off_rad_s);

@@ -4,10 +4,13 @@
 #include "number.h"
 
 #define INLINE static inline __attribute__((always_inline))
-#define BEYOND 2.0f       /* so much more is a speed damped beyond its limit */
-#define BRAKE_S 0.003f    /* a few ticks: less, and a motor's speed measured a tick late swings */
-#define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up */
-#define LOADED 0.25f      /* of the speed limit: a joint far from its reference that is slower is held back by a load */
+#define BEYOND 2.0f /* so many times a speed is damped beyond its limit; half: limits are exceeded by loads, double: it chatters
+                       there */
+#define BRAKE_S 0.003f /* s; a few ticks; half: a motor's speed measured a tick late swings, double: limits hold later */
+#define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up; 1: it cannot, 1.06: it is faster
+                             than its limit by that */
+#define LOADED 0.25f /* of the speed limit: a joint far from its reference that is slower is held back by a load; half: loads
+                        are lifted later, double: free joints overshoot */
 #define CREEP_RAD_S 0.005f /* from here on dry friction is compensated by half and more */
 
 void pid_reset(pid_state *pid, float measured_rad)

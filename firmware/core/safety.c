@@ -8,17 +8,21 @@
 #include "pot.h"
 #include "setpoint.h"
 
-#define LOST_TICKS 100u   /* so many ticks lost of late are no accident */
-#define CRC_BYTES 2u      /* of the configuration looked at in a tick: all of it in less than a second */
-#define OVERCURRENT_TICKS 20u
-#define STOP_TICKS 300u   /* after which an emergency stop ends with sleeping drives, braked by shorted windings until then */
+#define LOST_TICKS 100u /* so many ticks lost of late are no accident; half: a burst of interrupts stops the arm, double: an
+                           overloaded board moves on for longer */
+#define CRC_BYTES 2u /* of the configuration looked at in a tick: all of it in less than a second; half: a flipped bit shows
+                        after twice the time, double: ticks cost more */
+#define OVERCURRENT_TICKS 20u /* in a row above the limit; half: a reversal trips it, double: windings heat for longer */
+#define STOP_TICKS 300u /* after which an emergency stop ends with sleeping drives, braked by shorted windings until then; half:
+                           a fast joint coasts, double: a bridge that conducts by itself drives on for longer */
 #define FREE_TICKS 33u    /* in which shorted windings brake any joint; half: heavy joints sleep, double: a bridge drives on longer */
 #define FREE_BRAKED 0.9f  /* of its speed then, at most; half: heavy joints sleep, nearer 1: a bridge drives on longer */
 #define FREE_SLOW 0.25f   /* of the speed limit: what was slower when it was let go of may sink up to its limit; half: slow
                              joints that sink sleep, double: a bridge drives up to the limit */
 #define NAME_EARLY_TICKS 64u /* after which a weak motor may show: its joint is taken back; half: noise names,
                                 double: it sinks for longer */
-#define NAME_TICKS 160u   /* after which a joint let go of has shown which fault it has */
+#define NAME_TICKS 160u /* after which a joint let go of has shown which fault it has; half: more are named wrongly, double: the
+                           arm hears of it later */
 
 #define FAULT_NAME(name, code, reaction, text) [code] = #name,
 #define FAULT_TEXT(name, code, reaction, text) [code] = text,
