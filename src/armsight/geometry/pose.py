@@ -12,9 +12,9 @@ from armsight.geometry.rotation import Array, log_so3, nearest_rotation, skew
 
 
 def pose(R: Array, t: Array) -> Array:
-    """Assemble a transform (4, 4) from a rotation (3, 3) and a translation (3,)."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
+    """Assemble transforms (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
+    T = np.zeros((*np.shape(R)[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
     return T
 
 

@@ -45,15 +45,15 @@ def log_so3(R: Array) -> Array:
 
 
 def nearest_rotation(M: Array, *, mirrored: bool = False) -> Array:
-    """Project a matrix (3, 3) onto SO(3): the rotation nearest to it in the Frobenius norm.
+    """Project matrices (..., 3, 3) onto SO(3): the rotations nearest to them in the Frobenius norm.
 
     Args:
-        M: (3, 3) any matrix of rank two or more.
-        mirrored: return the nearest orthogonal matrix of determinant -1 instead, a reflection.
+        M: (..., 3, 3) any matrices of rank two or more.
+        mirrored: return the nearest orthogonal matrices of determinant -1 instead, reflections.
     """
     U, _, Vt = np.linalg.svd(M)
-    sign = -1.0 if mirrored else 1.0
-    return np.asarray(U @ np.diag([1.0, 1.0, sign * np.linalg.det(U @ Vt)]) @ Vt)
+    U[..., 2] *= (-1.0 if mirrored else 1.0) * np.linalg.det(U @ Vt)[..., None]
+    return np.asarray(U @ Vt)
 
 
 def quaternion_wxyz(R: Array) -> Array:

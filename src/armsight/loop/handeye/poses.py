@@ -131,15 +131,16 @@ def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
     rng = np.random.default_rng(seed)
     found = [kronecker(A, B), *_opencv(A, B)]
     if len(A) > PART:
-        for _ in range(PARTS):
-            rows = rng.choice(len(A), PART, replace=False)
-            found.append(kronecker(A[rows], B[rows]))
+        parts = np.array([rng.choice(len(A), PART, replace=False) for _ in range(PARTS)])
+        found += zip(*kronecker(A[parts], B[parts]), strict=True)
     if len(rows := _agreeing(A, B)) >= MIN_POSES:
         found.append(kronecker(A[rows], B[rows]))
-    found = [
-        (X, Z) for X, Z in found if np.isfinite(X).all() and np.isfinite(Z).all() and _is_rigid(X) and _is_rigid(Z)
-    ]
-    return sorted(found, key=lambda XZ: _score(A, B, *XZ))
+    Xs, Zs = map(np.array, zip(*found, strict=True))
+    rigid = np.flatnonzero(_is_rigid(Xs) & _is_rigid(Zs))
+    if not len(rigid):
+        return []
+    order = rigid[np.argsort(_scores(A, B, Xs[rigid], Zs[rigid]), kind="stable")]
+    return [(Xs[k], Zs[k]) for k in order]
 
 
 def _agreeing(A: Array, B: Array) -> NDArray[np.int64]:
@@ -162,23 +163,28 @@ def kronecker(A: Array, B: Array) -> tuple[Array, Array]:
     With column-stacked matrices, R_A R_X R_B^T = R_Z reads (R_B kron R_A) vec(R_X) = vec(R_Z) for every i, so both are the
     leading singular vectors of the sum of the Kronecker products.
 
+    Args:
+        A: (..., N, 4, 4) poses.
+        B: (..., N, 4, 4) poses.
+
     Returns:
-        (4, 4) X and (4, 4) Z.
+        (..., 4, 4) X and (..., 4, 4) Z.
     """
-    RA, RB = A[:, :3, :3], B[:, :3, :3]
-    K = np.einsum("nij,nkl->ikjl", RB, RA).reshape(9, 9)
+    RA, RB = A[..., :3, :3], B[..., :3, :3]
+    K = np.einsum("...nij,...nkl->...ikjl", RB, RA, optimize=True).reshape(*A.shape[:-3], 9, 9)
     U, _, Vt = np.linalg.svd(K)
-    RX, RZ = _rotation(Vt[0].reshape(3, 3, order="F")), _rotation(U[:, 0].reshape(3, 3, order="F"))
+    RX, RZ = _rotation(Vt[..., 0, :]), _rotation(U[..., 0])
     # R_A t_X - t_Z = R_Z t_B - t_A
-    M = np.concatenate([RA, np.broadcast_to(-np.eye(3), RA.shape)], axis=2).reshape(-1, 6)
-    right = (B[:, :3, 3] @ RZ.T - A[:, :3, 3]).ravel()
-    t = np.linalg.lstsq(M, right, rcond=None)[0]
-    return pose(RX, t[:3]), pose(RZ, t[3:])
+    M = np.concatenate([RA, np.broadcast_to(-np.eye(3), RA.shape)], axis=-1).reshape(*A.shape[:-3], -1, 6)
+    right = (B[..., :3, 3] @ np.swapaxes(RZ, -1, -2) - A[..., :3, 3]).reshape(*A.shape[:-3], -1, 1)
+    t = (np.linalg.pinv(M) @ right)[..., 0]
+    return pose(RX, t[..., :3]), pose(RZ, t[..., 3:])
 
 
-def _rotation(M: Array) -> Array:
-    """Return the rotation nearest to a multiple, of either sign, of a rotation (3, 3)."""
-    return nearest_rotation(M * np.sign(np.linalg.det(M)))
+def _rotation(columns: Array) -> Array:
+    """Return the rotations nearest to multiples, of either sign, of rotations given by their columns (..., 9)."""
+    M = np.swapaxes(columns.reshape(*columns.shape[:-1], 3, 3), -1, -2)
+    return nearest_rotation(M * np.sign(np.linalg.det(M))[..., None, None])
 
 
 def _opencv(A: Array, B: Array) -> Iterator[tuple[Array, Array]]:
@@ -200,16 +206,18 @@ def _parts(Ts: Array) -> tuple[list[Array], list[Array]]:
     return [T[:3, :3] for T in Ts], [T[:3, 3] for T in Ts]
 
 
-def _is_rigid(T: Array) -> bool:
-    """Return whether a solver's answer is a rigid motion at all."""
-    return bool(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-6 and np.linalg.det(T[:3, :3]) > 0)
+def _is_rigid(Ts: Array) -> NDArray[np.bool_]:
+    """Return which of a solver's answers (C, 4, 4) are finite and rigid motions at all."""
+    R, finite = Ts[:, :3, :3], np.isfinite(Ts).all(axis=(1, 2))
+    off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    return np.asarray(finite & (off < 1e-6) & (np.linalg.det(R) > 0))
 
 
-def _score(A: Array, B: Array, X: Array, Z: Array) -> float:
-    """Return the size of the residual motions below which the share MIDDLE is, m."""
-    e = log_se3(inverse(Z @ B) @ A @ X)
-    sizes = np.hypot(np.linalg.norm(e[:, :3], axis=1), LEVER_M * np.linalg.norm(e[:, 3:], axis=1))
-    return float(np.quantile(sizes, MIDDLE))
+def _scores(A: Array, B: Array, Xs: Array, Zs: Array) -> Array:
+    """Return of candidates (C, 4, 4) the size of the residual motions below which the share MIDDLE is, (C,), m."""
+    e = log_se3(inverse(Zs[:, None] @ B) @ A @ Xs[:, None])
+    sizes = np.hypot(np.linalg.norm(e[..., :3], axis=-1), LEVER_M * np.linalg.norm(e[..., 3:], axis=-1))
+    return np.asarray(np.quantile(sizes, MIDDLE, axis=1))
 
 
 Eye = Literal["to_hand", "in_hand"]
