@@ -5,8 +5,8 @@
     python benchmarks/dense.py --json found.json
 
 Metrics: 1 errors on tsukuba, teddy and cones (whole image, all pixels with a truth, filled), 2 times at 1280x720 with 128
-disparities, 3 memory, 4 how often 1.96 sigma hold the error, 5 a tool without markers. Scenes are looked for in
-``middlebury`` at ARMSIGHT_DATA, or ../shared/data beside the project; another folder of scenes: --scenes DIR.
+disparities, 3 memory, 4 how often 1.96 sigma hold the error. Scenes are looked for in ``middlebury`` at
+ARMSIGHT_DATA, or ../shared/data beside the project; another folder of scenes: --scenes DIR.
 
 OpenCV's disparities are filled in rows from behind, as ours, and its images are widened to the left, or its first columns
 stay empty; StereoBM and SGBM have OpenCV's own post-processing only.
@@ -36,7 +36,6 @@ METRICS = {
     "2": ("Times, 1280x720, 128 disparities, one thread, CPU ms", dense_speed.times),
     "3": ("Memory of the whole command, everything loaded, 1280x720, 128 disparities", dense_speed.memory),
     "4": ("Errors inside 1.96 sigma, measured pixels that both cameras see", dense_accuracy.coverage),
-    "5": ("A tool without markers at 0.8 m, rendered", dense_accuracy.tool),
 }
 
 

@@ -1,4 +1,4 @@
-"""Metrics of dense.py that have a truth: errors, honesty of sigma, and the pose of a tool without markers."""
+"""Metrics of dense.py that have a truth: errors and honesty of sigma."""
 
 from __future__ import annotations
 
@@ -8,20 +8,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from armsight.data import Missed
-from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
+from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.example_rig import example_rig
-from armsight.sim.render.mesh import Solid, box, joined, moved, see, with_noise
+from armsight.sim.render.mesh import box, see, with_noise
 from armsight.vision.camera import Camera
 from armsight.vision.dense.block import Block
-from armsight.vision.dense.depth import depth_of
 from armsight.vision.dense.evaluate import TrueDisparity, evaluate_disparity
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.middlebury import find_scenes, load_scene
 from armsight.vision.dense.postprocess import filled
 from armsight.vision.dense.rectified import plain_grey
-from armsight.vision.dense.registration import CloudPose, Surface, locate_cloud
 from armsight.vision.dense.scanline import Scanline
 from armsight.vision.dense.semiglobal import Semiglobal
 
@@ -34,7 +30,6 @@ OURS = {
 #: Bad-1 of Birchfield and Tomasi on tsukuba, both-seen pixels, in %: Scharstein and Szeliski, IJCV 47, 2002, table 5.
 BIRCHFIELD_TOMASI = 5.12
 SEEDS = range(100, 110)
-TOOL_SEED, TOOL_POSES = 50, 20
 
 
 def opencv_methods(count: int) -> dict[str, cv2.StereoMatcher]:
@@ -149,56 +144,3 @@ def coverage(folder: Path) -> dict[str, Any]:
         print(f"  {name:<14}{cones}rendered {np.mean(rendered):.1f}% {spread}; required 90 to 97", flush=True)
         found[name] = inside
     return found
-
-
-def a_tool() -> Solid:
-    grain = {"grain_m": 0.012, "contrast": 30.0, "seed": 3}
-    arm = pose(exp_so3(np.array([0, 0, 0.4])), np.array([-0.07, -0.03, -0.03]))
-    return joined(
-        box(np.array([0.10, 0.08, 0.06]), **grain),
-        moved(box(np.array([0.03, 0.12, 0.03]), **grain), pose(np.eye(3), np.array([0.03, 0.06, -0.02]))),
-        moved(box(np.array([0.12, 0.025, 0.025]), **grain), arm),
-    )
-
-
-def tool(folder: Path) -> dict[str, Any]:
-    rng, rig, mesh = np.random.default_rng(TOOL_SEED), example_rig((1280, 720)), a_tool()
-    form, surface = rig.rectify(), Surface.of_mesh(mesh.vertices, mesh.triangles)
-    wall = box(np.array([3.0, 3.0, 0.02]), grain_m=0.05, contrast=25.0, seed=9)
-    behind = pose(exp_so3(np.array([0.1, 0.1, 0.0])), np.array([0.1, 0.0, 1.3]))
-    found = []
-    for _ in range(TOOL_POSES):
-        T = pose(exp_so3(rng.uniform(-0.5, 0.5, 3)), np.array([*rng.uniform((0, -0.06), (0.1, 0.06)), 0.8]))
-        images = []
-        for camera, T_c in ((rig.left, np.eye(4)), (rig.right, inverse(rig.T_left_right))):
-            images.append(with_noise(see(camera, [(wall, T_c @ behind), (mesh, T_c @ T)])[0], 1.5, rng))
-        result = Semiglobal().match(*form.images(*images), Search(0, int(form.disparity_of(0.6))))
-        depth = depth_of(form, result)
-        chosen = result.measured & np.isfinite(depth.depth_m)
-        v, u = np.nonzero(chosen)
-        points = form.points(np.column_stack([u, v]).astype(float), result.disparity[chosen].astype(float))
-        start = T @ exp_se3(np.concatenate([rng.uniform(-0.008, 0.008, 3), np.radians(rng.uniform(-3, 3, 3))]))
-        found.append(errors_of(locate_cloud(surface, points, depth.sigma_m[chosen], start), T))
-    return summed_up(np.array(found))
-
-
-def errors_of(at: CloudPose | Missed, T: np.ndarray) -> tuple[float, float, float]:
-    """mm, degrees, and the error's squared length in claimed sigmas; NaN where the body was not found."""
-    if isinstance(at, Missed):
-        print(f"  missed: {at.reason}")
-        return np.nan, np.nan, np.nan
-    off = log_se3(inverse(at.T_left_body) @ T)
-    mm, degrees = 1e3 * float(np.linalg.norm(off[:3])), float(np.degrees(np.linalg.norm(off[3:])))
-    print(f"  {mm:.2f} mm, {degrees:.3f} deg (required 1, 0.5)", flush=True)
-    return mm, degrees, float(off @ np.linalg.solve(at.cov, off))
-
-
-def summed_up(found: np.ndarray) -> dict[str, Any]:
-    held = (found[:, 0] <= 1) & (found[:, 1] <= 0.5)
-    for name, column in (("mm", 0), ("degrees", 1)):
-        median, most = np.nanpercentile(found[:, column], (50, 100))
-        print(f"  {name}: median {median:.2f}, most {most:.2f}")
-    claimed = np.nanpercentile(found[:, 2], (50, 90))
-    print(f"  squared error in claimed sigmas, median and 90%: {claimed[0]:.1f}, {claimed[1]:.1f} (honest: 5.3, 10.6)")
-    print(f"  {held.sum()} of {len(held)} poses within 1 mm and 0.5 deg: {'held' if held.all() else 'MISSED'}")
-    return {"mm_deg_squared": found.tolist()}

@@ -1,8 +1,8 @@
 """
-Dense stereo and a body without markers
-=======================================
+Dense stereo
+============
 
-Render a box in front of a wall, match the pair of images, and locate the box, which carries no marker.
+Render a box in front of a wall, match the pair of images, and compute the depth of every pixel.
 
 .. code-block:: console
 
@@ -11,8 +11,7 @@ Render a box in front of a wall, match the pair of images, and locate the box, w
 
 import numpy as np
 
-from armsight import Missed
-from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
+from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import example_rig
 from armsight.sim.render.mesh import box, see, with_noise
@@ -20,7 +19,6 @@ from armsight.vision.dense.depth import depth_of
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.methods import open_method
 from armsight.vision.dense.rectified import match_pair
-from armsight.vision.dense.registration import Surface, locate_cloud
 
 BOX_M = np.array([0.20, 0.15, 0.12])
 T_TRUE = pose(exp_so3(np.array([0.5, 0.6, 0.2])), np.array([0.05, 0.0, 0.8]))
@@ -28,7 +26,7 @@ WALL = pose(exp_so3(np.array([0.1, 0.1, 0.0])), np.array([0.1, 0.0, 1.4]))
 
 
 def main() -> np.ndarray:
-    """Render, match, locate; return the depth (H, W) in m, NaN where it was not measured."""
+    """Render and match; return the depth (H, W) in m, NaN where it was not measured."""
     rng, rig = np.random.default_rng(1), example_rig((480, 360), focal_px=480.0, baseline_m=0.12, convergence_deg=6.0)
     thing = box(BOX_M, grain_m=0.02, seed=1)
     wall = box(np.array([3.0, 3.0, 0.02]), grain_m=0.05, seed=2)
@@ -43,15 +41,6 @@ def main() -> np.ndarray:
     chosen = result.measured & np.isfinite(depth.depth_m)
     print(f"measured {100 * result.measured.mean():.0f}% of the image, median sigma "
           f"{1e3 * np.median(depth.sigma_m[chosen]):.1f} mm at {np.median(depth.depth_m[chosen]):.2f} m")  # fmt: skip
-    v, u = np.nonzero(chosen)
-    p_left = form.points(np.column_stack([u, v]).astype(float), result.disparity[chosen].astype(float))
-    about = T_TRUE @ exp_se3(np.array([0.006, -0.005, 0.008, 0.04, -0.03, 0.03]))  # what an arm's joints would report
-    found = locate_cloud(Surface.of_mesh(thing.vertices, thing.triangles), p_left, depth.sigma_m[chosen], about)
-    if isinstance(found, Missed):
-        print("missed:", found.reason)
-        return np.where(chosen, depth.depth_m, np.nan)
-    off = log_se3(inverse(found.T_left_body) @ T_TRUE)
-    print(f"the box: error {1e3 * np.linalg.norm(off[:3]):.2f} mm, {np.degrees(np.linalg.norm(off[3:])):.2f} deg")
     return np.where(chosen, depth.depth_m, np.nan)
 
 

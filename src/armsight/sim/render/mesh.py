@@ -52,20 +52,6 @@ def box(size_m: Array, **grain: float) -> Solid:
     return Solid(v, triangles, **grain)  # type: ignore[arg-type]
 
 
-def joined(*parts: Solid) -> Solid:
-    """Return several meshes as one, with the grain of the first."""
-    shifts = np.cumsum([0, *(len(p.vertices) for p in parts[:-1])])
-    triangles = np.concatenate([p.triangles + s for p, s in zip(parts, shifts, strict=True)])
-    first = parts[0]
-    vertices = np.concatenate([p.vertices for p in parts])
-    return Solid(vertices, triangles, first.grain_m, first.contrast, first.seed)
-
-
-def moved(solid: Solid, T: Array) -> Solid:
-    """Return a mesh with its vertices moved within its frame."""
-    return Solid(transform(T, solid.vertices), solid.triangles, solid.grain_m, solid.contrast, solid.seed)
-
-
 @kernel("f8[:, :, ::1], f8[:, ::1], (i8, i8, i8, i8), f8[:, ::1], i4[:, ::1], i8")
 def _cast(
     rays: Array, corners: Array, box: tuple[int, int, int, int], depth: Array, owner: NDArray[np.int32], k: int

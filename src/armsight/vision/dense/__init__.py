@@ -5,7 +5,6 @@ The contract is :class:`~armsight.vision.dense.method.Method` in ``method.py``; 
 - The methods: ``block.py`` (windows), ``scanline.py`` (dynamic programming),
   ``semiglobal.py``, ``opencv.py``. What they share: ``cost.py`` (matching costs), ``winner.py`` (the least total),
   ``postprocess.py`` (rejection, smoothing, filling, sigma).
-- Before and after: ``rectified.py`` (checks of a pair), ``depth.py`` (depth with its standard deviation),
-  ``registration.py`` (the pose of a body from a point cloud).
+- Before and after: ``rectified.py`` (checks of a pair), ``depth.py`` (depth with its standard deviation).
 - ``evaluate.py`` and ``middlebury.py``: errors against a true disparity map, and the benchmark's files.
 """
