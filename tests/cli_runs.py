@@ -1,13 +1,18 @@
 """Runs of the command line in this process, and the manners a mistake must have."""
 
 import json
+import os
 import signal
 import sys
 from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path
 
 import pytest
 
 from armsight.app.main import main
+
+KEYS = Path(__file__).with_name("json_keys.json")
 
 
 @dataclass(frozen=True)
@@ -28,6 +33,31 @@ def _not_json(text):
     raise AssertionError(f"{text} is not JSON")
 
 
+def keys_of(value, at=""):
+    """Return the keys of a JSON value with those within, ``poses[].name``; names out of the input are ``*``."""
+    if isinstance(value, list):
+        return {key for each in value for key in keys_of(each, f"{at}[]")}
+    if not isinstance(value, dict):
+        return set()
+    names = {k: f"{at}.{k if k.isidentifier() and (k.islower() or '_' in k) else '*'}".lstrip(".") for k in value}
+    return set(names.values()).union(*(keys_of(value[k], name) for k, name in names.items()))
+
+
+def hold_keys(arguments, out):
+    """Hold JSON to the keys that stood in each output of a command: somebody's program reads them.
+
+    After new ones: remove the file, and run the tests of tests/app with ``ARMSIGHT_KEYS=1`` and ``-n 0``.
+    """
+    command = " ".join(takewhile(str.isalpha, map(str, arguments)))
+    known = json.loads(KEYS.read_text()) if KEYS.exists() else {}
+    for keys in (keys_of(json.loads(line)) for line in out.splitlines()):
+        if "ARMSIGHT_KEYS" in os.environ:
+            known[command] = sorted(keys.intersection(known.get(command, keys)))
+            KEYS.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
+        missing = set(known.get(command, [])) - keys
+        assert not missing, f"armsight {command} --json: keys are missing: {sorted(missing)}"
+
+
 def run(*arguments):
     """Run ``armsight`` with arguments in this process and return its exit code."""
     with pytest.MonkeyPatch.context() as patch:
@@ -35,6 +65,15 @@ def run(*arguments):
         with pytest.raises(SystemExit) as end:
             main()
     return end.value.code
+
+
+def said_of(capsys, *arguments):
+    """Run ``armsight`` and return what it printed; its JSON must have the keys that are known."""
+    capsys.readouterr()
+    said = Said(run(*arguments), *capsys.readouterr())
+    if "--json" in arguments and said.code in (0, 3):
+        hold_keys(arguments, said.out)
+    return said
 
 
 def assert_rejected(said, *words):

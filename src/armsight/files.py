@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import dataclasses
 import io
 import itertools
 import json
@@ -480,10 +481,16 @@ def _same_file(one: str | Path, other: str | Path) -> bool:
         return False
 
 
-def finite_json(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return a value as JSON can hold it: None (null) replaces every NaN and infinity in it."""
+def json_of(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
+    """Return records, arrays, paths and what holds them as JSON has it; null replaces every NaN and infinity."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {each.name: json_of(getattr(value, each.name)) for each in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {key: finite_json(one) for key, one in value.items()}
-    if isinstance(value, list):
-        return [finite_json(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return {str(key): json_of(each) for key, each in value.items()}
+    if hasattr(value, "tolist"):  # an array or a number of numpy, which is not imported here
+        return json_of(value.tolist())
+    if isinstance(value, list | tuple):
+        return [json_of(each) for each in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value

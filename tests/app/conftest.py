@@ -2,28 +2,22 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from armsight.sim.example_rig import demo_recording
 from armsight.sim.recording import Truth
-from cli_runs import Said, run
+from cli_runs import run, said_of
 from made_once import made_once
 
 
 @pytest.fixture
 def armsight(capsys, monkeypatch):
-    """Run the command line, which does not say how far it is; returns a :class:`Said`."""
+    """Run the command line, which does not say how far it is; returns what it printed."""
     monkeypatch.setattr("armsight.app.progress._EVERY_S", math.inf)
-
-    def said(*arguments):
-        capsys.readouterr()
-        code = run(*arguments)
-        got = capsys.readouterr()
-        return Said(code, got.out, got.err)
-
-    return said
+    return partial(said_of, capsys)
 
 
 @dataclass(frozen=True)

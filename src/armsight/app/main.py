@@ -15,7 +15,7 @@ import sys
 import click
 
 from armsight.app.interrupts import terminate_as_interrupt
-from armsight.app.messages import colour, print_error, print_notes
+from armsight.app.show.messages import colour, print_error, print_notes
 from armsight.errors import ArmsightError
 
 #: What a person is about -> the commands, each with the first sentence of its help; each has a folder of its name, whose

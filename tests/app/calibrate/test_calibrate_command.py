@@ -111,16 +111,16 @@ def test_people_read_the_held_out_table_first(few, armsight, tmp_path):
 def test_a_report_is_written_where_it_is_asked_for(few, armsight, tmp_path, monkeypatch):
     written = []  # its pages have their own tests
     monkeypatch.setattr(
-        "armsight.app.calibrate.report.write_report", lambda calibration, folder: written.append((calibration, folder))
+        "armsight.app.show.report.Report.write", lambda report, folder: written.append((report, folder))
     )
     said = armsight(
         "calibrate", *images(few), *CHESS, *QUICK, "-o", tmp_path / "rig.json", "--report", tmp_path / "r", "--json"
     )
     assert said.code == 0, said.err
     assert Path(said.lines[0]["report"]) == tmp_path / "r" / "report.html"
-    ((calibration, folder),) = written
+    ((report, folder),) = written
     assert folder == tmp_path / "r"
-    assert len(calibration.pairs) == 5
+    assert report.sub.startswith("chessboard:9x6:25mm · 5 of 5 pairs of images used")
 
 
 # Bad input, one by one.

@@ -2,10 +2,10 @@
 
 import base64
 import errno
-import html.parser
 import os
 import re
 import sys
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 
-from armsight.app.calibrate import report
 from armsight.app.calibrate.assessment import advice, assess, predicted_sigmas, volume_slice
 from armsight.app.calibrate.figures import (
     MOST_BARS,
@@ -24,10 +23,9 @@ from armsight.app.calibrate.figures import (
     pairs_figure,
     round_steps,
 )
-from armsight.app.calibrate.report import FIGURES, pose_table, write_report
-from armsight.app.calibrate.run import summary
-from armsight.app.report import page
-from armsight.app.report.plotting import drawing, nice, plain, png
+from armsight.app.calibrate.report import FIGURES, calibration_report, pose_table
+from armsight.app.show import page
+from armsight.app.show.plotting import drawing, nice, plain, png
 from armsight.data import Body, Detections
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose, transform
@@ -82,10 +80,15 @@ def calibration():
     return replace(calibration, rig=replace(calibration.rig, provenance=provenance), notes=("pair <3>: mended",))
 
 
+def report_of(calibration):
+    """Return its Report."""
+    return calibration_report(calibration, Path("rig.json"), None, None, 0.0)
+
+
 @pytest.fixture(scope="module")
 def written(calibration, tmp_path_factory):
     folder = tmp_path_factory.mktemp("report") / "new" / "folder"
-    page = write_report(calibration, folder)
+    page = report_of(calibration).write(folder)
     assert page == folder / "report.html"
     return folder
 
@@ -93,35 +96,20 @@ def written(calibration, tmp_path_factory):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Spare the rendering where a test is not about the pictures."""
-    monkeypatch.setattr(report, "png", lambda figure: b"png")
+    monkeypatch.setattr("armsight.app.show.report.png", lambda figure: b"png")
 
 
-class Page(html.parser.HTMLParser):
-    """What a browser makes of a page: its text by section, its tags, and that every tag is closed."""
+class Page:
+    """What a browser makes of a page: its text by section, its tags and attributes; every tag is closed."""
 
     def __init__(self, text):
-        super().__init__()
-        self.section, self.open, self.tags, self.text, self.attributes = "", [], [], {"": ""}, []
-        self.feed(text)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        self.attributes += [(tag, key, value) for key, value in attrs]
-        if tag == "section":
-            self.section = dict(attrs)["id"]
-            self.text[self.section] = ""
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-        if tag == "section":
-            self.section = ""
-
-    def handle_data(self, data):
-        self.text[self.section] += data
+        root = ET.fromstring(
+            re.sub(r"<((?:meta|img)[^>]*)>", r"<\1/>", f"<all>{text.replace('<!DOCTYPE html>', '')}</all>")
+        )
+        self.tags = [each.tag for each in root.iter()]
+        self.attributes = [(each.tag, *pair) for each in root.iter() for pair in each.items()]
+        self.text = {"": "".join(root.itertext())}
+        self.text |= {each.get("id"): "".join(each.itertext()) for each in root.iter("section")}
 
 
 def page_of(folder):
@@ -212,13 +200,13 @@ def test_the_pose_tables_sigmas_are_along_the_left_cameras_axes():
 
 
 def test_without_an_estimated_target_its_picture_is_left_out_and_an_old_one_goes(calibration, tmp_path, undrawn):
-    write_report(calibration, tmp_path)
+    report_of(calibration).write(tmp_path)
     assert (tmp_path / "report-target.png").exists()
     (tmp_path / "mine.png").write_bytes(b"kept")
     flat = replace(calibration, deviation_m=0.0)
     hand = replace(calibration, body=Body("hand", calibration.body.point_names, calibration.body.points + 0.01))
     for other in (flat, hand):
-        write_report(other, tmp_path)
+        report_of(other).write(tmp_path)
         assert not (tmp_path / "report-target.png").exists()
         assert "target" not in page_of(tmp_path).text
     assert "points of the body" in page_of(tmp_path).text["coverage"]
@@ -227,7 +215,7 @@ def test_without_an_estimated_target_its_picture_is_left_out_and_an_old_one_goes
 
 def test_a_given_camera_and_an_unknown_uncertainty_are_said(calibration, tmp_path, undrawn):
     given = replace(calibration, rig=replace(calibration.rig, cov=np.zeros_like(calibration.rig.cov)), models={})
-    write_report(given, tmp_path)
+    report_of(given).write(tmp_path)
     text = page_of(tmp_path).text
     assert "± " not in text["parameters"].replace("± one sigma", "").replace("± is", "")
     assert text["parameters"].count("given") == given.rig.parameter_count + 1  # and the baseline
@@ -240,7 +228,7 @@ def test_a_hundred_pairs_and_a_hundred_rejected_ones_still_make_a_page(calibrati
     errors = replace(e, **{name: np.tile(getattr(e, name), times) for name in ("pair", *FIELDS)})
     rejected = tuple(RejectedPair(f"bad{k:03d}", f"reason {k % 2}") for k in range(100))
     many = replace(calibration, errors=errors, rejected=rejected)
-    write_report(many, tmp_path)
+    report_of(many).write(tmp_path)
     page = page_of(tmp_path)
     assert all(f"bad{k:03d}" in page.text["result"] for k in range(100))
     assert page.text["result"].count("reason 1") == 1
@@ -264,7 +252,7 @@ def test_without_matplotlib_there_is_one_clear_error_and_no_folder(calibration, 
     for name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(InputError) as caught:
-        write_report(calibration, tmp_path / "a")
+        report_of(calibration).write(tmp_path / "a")
     assert 'pip install "armsight[report]"' in str(caught.value)
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
@@ -274,7 +262,7 @@ def test_a_folder_that_cannot_be_written_is_one_clear_error(calibration, tmp_pat
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below", "/proc/none"):
         with pytest.raises(InputError, match=f"{folder}: no report can be written here: ") as caught:
-            write_report(calibration, folder)
+            report_of(calibration).write(folder)
         assert "\n" not in str(caught.value)
 
 
@@ -294,7 +282,7 @@ def test_a_disk_that_fills_leaves_nothing_half_written(calibration, tmp_path, mo
     with monkeypatch.context() as patch:
         patch.setattr(page, "replacing", failing)
         with pytest.raises(InputError, match=r"report.html: cannot be written: No space left on device"):
-            write_report(calibration, tmp_path / "a")
+            report_of(calibration).write(tmp_path / "a")
     assert list((tmp_path / "a").iterdir()) == []
 
 
@@ -321,7 +309,7 @@ def test_the_assessment_follows_the_held_out_metrics(calibration, changes, grade
     assert found.grade == grade
     assert found.headline.startswith({"good": "Good", "fair": "Usable", "poor": "Do not rely"}[grade])
     assert said in " ".join([found.meaning, *advice(changed)])
-    printed = summary(changed, Path("rig.json"), None, None, 0.0)
+    printed = report_of(changed).json()
     assert (printed["grade"], bool(printed["poor"])) == (grade, grade == "poor")
 
 

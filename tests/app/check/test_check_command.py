@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from armsight.app.check.limits import check_limits
-from armsight.app.check.report import MetricLine
+from armsight.app.check.result import MetricLine
 from armsight.app.run.motion_file import read_motions
 from armsight.geometry.pose import pose
 from armsight.loop.iso9283.statistic import Metric
 from armsight.robot.arm_file import open_arm
 from armsight.sim.workcell.workcell import Workcell
-from cli_runs import Said, assert_rejected, run
+from cli_runs import assert_rejected, said_of
 
 COLUMNS = ["test", "pose", "cycle", "approach", "t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
 COMMAND = ["command_x_m", "command_y_m", "command_z_m", "command_qw", "command_qx", "command_qy", "command_qz"]
@@ -22,10 +22,7 @@ SIGMA = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 
 
 def said(capsys, *arguments):
-    capsys.readouterr()
-    code = run("check", *arguments)
-    out = capsys.readouterr()
-    return Said(code, out.out, out.err)
+    return said_of(capsys, "check", *arguments)
 
 
 def rows_of(sigma_arm=1e-4, noise=5e-5):
@@ -310,11 +307,8 @@ def test_a_row_far_from_its_pose_is_named_and_the_sequence_of_rows_has_no_effect
     assert (after["distance"]["to"], after["drift"]["pose"]) == ("P4", "P1")
     n = next(n for n, row in enumerate(rows) if row[1] == "P3" and row[2] == 7)
     rows[n][7] += 5e-3
-    (outlier,) = [
-        note
-        for note in json.loads(said(capsys, file_of(tmp_path / "c.csv", rows), "--json").out)["notes"]
-        if "counts" in note
-    ]
+    notes = said(capsys, file_of(tmp_path / "c.csv", rows), "--json").lines[0]["notes"]
+    (outlier,) = [note for note in notes if "counts" in note]
     assert "P3, cycle 7: 4.93 mm" in outlier
     rows = [row for row in rows_of(2e-6, 2e-6) if row[0] == "pose"]
     for row in rows:  # a table rounded so far that most agree, and an odd name

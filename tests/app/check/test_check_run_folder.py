@@ -11,7 +11,7 @@ from armsight.app.check.evaluate import evaluate, read_check
 from armsight.app.check.report import paths_figure
 from armsight.app.check.rows import read_rows
 from armsight.app.check.run_folder import _reversal_times, attained_in, is_run, joint_track, reversals_of, segments_of
-from cli_runs import Said, assert_rejected, run
+from cli_runs import assert_rejected, said_of
 
 NOISE_M, COMMON_M, ARM_M = 4e-5, 2e-4, 1e-4
 OFF_M = np.array([1.5e-3, -8e-4, 4e-4])
@@ -74,10 +74,7 @@ class Folder:
 
 
 def said(capsys, *arguments):
-    capsys.readouterr()
-    code = run("check", *arguments)
-    out = capsys.readouterr()
-    return Said(code, out.out, out.err)
+    return said_of(capsys, "check", *arguments)
 
 
 def test_rests_belong_to_their_poses_and_cycles(tmp_path, capsys):

@@ -1,6 +1,7 @@
 """``armsight dense`` as a user types it: files, numbers, and what is said about mistakes."""
 
 import shutil
+from functools import partial
 
 import cv2
 import numpy as np
@@ -13,19 +14,14 @@ from armsight.sim.render.mesh import box, see, with_noise
 from armsight.vision.dense.methods import METHODS
 from armsight.vision.dense.middlebury import read_pfm
 from armsight.vision.rig import StereoRig
-from cli_runs import Said, assert_rejected, run
+from cli_runs import assert_rejected, said_of
 
 pytestmark = pytest.mark.opencv
 
 
 @pytest.fixture
 def dense(capsys):
-    def call(*arguments):
-        capsys.readouterr()
-        code = run("dense", *arguments)
-        return Said(code, *capsys.readouterr())
-
-    return call
+    return partial(said_of, capsys, "dense")
 
 
 def noise_texture(rng, shape):

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from armsight.app.handeye.command import Options, calibrate
 from armsight.app.handeye.images import steady, upright
 from armsight.app.handeye.recording import matched_rows, paired, seen_in_table
-from armsight.app.handeye.result import as_json, headline, statements
+from armsight.app.handeye.report import handeye_report
 from armsight.app.handeye.suspect import _nearer_models
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
@@ -229,13 +229,13 @@ def test_where_the_arms_geometry_is_off_the_error_is_of_the_transforms_that_are_
         "model": "six_r",
     }
     run = calibrate(Options(**(nothing | given)), lambda line: None)
-    document, said = as_json(run), "\n".join(statements(run))
+    document, said = handeye_report(run).json(), handeye_report(run).text()
     assert document["noise"]["structure"] == "robot's geometry off"
     poses = np.array([pose["held_out_m"] for pose in document["poses"] if pose["used"]])
     assert document["held_out_rms_m"] == pytest.approx(np.sqrt((poses**2).mean()))
     held_out, nominal = (f"{1e3 * document[f'held_out_{of}rms_m']:.2f} mm" for of in ("", "nominal_"))
     assert nominal != held_out
-    assert f"poses left out: {held_out}" in headline(run)
+    assert f"poses left out: {held_out}" in said
     assert f"with the arm's nominal model they leave {held_out}" in said
     assert f"suits the arm's nominal model: {nominal}" in said
 

@@ -8,6 +8,7 @@ import tomllib
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,7 +17,8 @@ from identify_files import arm_toml, poses_csv, tracked_csv
 from scipy.spatial.transform import Rotation
 from worn_arm import worn
 
-from armsight.app.identify.run import headline, read_measured
+from armsight.app.identify.report import headline
+from armsight.app.identify.run import read_measured
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.loop.identify.corrected import Corrected
@@ -26,14 +28,11 @@ from armsight.loop.identify.read import read_poses
 from armsight.loop.identify.validate import Errors, Validation
 from armsight.robot.arm_file import open_arm, read_arm_toml
 from armsight.robot.models import MODELS
-from cli_runs import Said, assert_rejected, run
+from cli_runs import assert_rejected, run, said_of
 
 
 def said(capsys, *arguments):
-    capsys.readouterr()
-    code = run("identify", *arguments)
-    out = capsys.readouterr()
-    return Said(code, out.out, out.err)
+    return said_of(capsys, "identify", *arguments)
 
 
 def test_from_files_to_files(tmp_path, capsys):
@@ -398,11 +397,7 @@ def test_an_arm_of_any_number_of_joints_is_reported(joints, tmp_path, capsys):
 
 def test_what_was_found_is_printed_and_stored_though_the_report_cannot_be_drawn(tmp_path, monkeypatch, capsys):
     data, out = poses_csv(tmp_path / "p.csv"), tmp_path / "out"
-
-    def broken(*_):
-        raise RuntimeError("no figure")
-
-    monkeypatch.setattr("armsight.app.identify.report.write_identify_report", broken)
+    monkeypatch.setattr("armsight.app.show.report.Report.write", Mock(side_effect=RuntimeError("no figure")))
     with pytest.raises(RuntimeError, match="no figure"):
         run("identify", "--arm", "six_r", "--data", data, "--validate", data, "-o", out)
     assert capsys.readouterr().out.startswith("held-out error ")

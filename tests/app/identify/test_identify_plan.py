@@ -13,7 +13,7 @@ from armsight.loop.identify.measured import Measured
 from armsight.robot.arm_file import open_arm
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
-from cli_runs import Said, assert_rejected, run
+from cli_runs import assert_rejected, said_of
 
 T_FLANGE_BODY = exp_se3(np.array([0.02, -0.01, 0.05, 0.1, 0.2, -0.3]))
 
@@ -90,10 +90,7 @@ def test_a_rig_that_sees_no_pose_of_the_arm_is_reported():
 
 
 def said(capsys, *arguments):
-    capsys.readouterr()
-    code = run("identify", "plan", "--arm", "six_r", *arguments)
-    out = capsys.readouterr()
-    return Said(code, out.out, out.err)
+    return said_of(capsys, "identify", "plan", "--arm", "six_r", *arguments)
 
 
 def test_poses_that_cannot_locate_the_arm_are_rejected_as_identify_rejects_them(tmp_path, capsys):

@@ -23,8 +23,8 @@ from armsight.app.measure.picture import (
     wrapped,
 )
 from armsight.app.measure.view import CHART, EACH_UP_TO, PictureFolder, view_folder
-from armsight.app.report import page
 from armsight.app.shot_pose import ShotPose, shot_pose
+from armsight.app.show import page
 from armsight.data import SIDES, Detections, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, transform

@@ -33,16 +33,16 @@ def by_the_book(p):
 def test_without_noise_the_metrics_are_the_standards():
     Ts, command, cov = attained(1, 30, off=(1e-3, 0, 0))
     metrics = iso9283.pose_metrics(Ts, command, cov)
-    assert metrics.repeatability.raw == pytest.approx(by_the_book(Ts[:, :3, 3]), rel=1e-12)
-    assert metrics.repeatability.clean == pytest.approx(metrics.repeatability.raw, rel=1e-9)
-    assert metrics.accuracy.raw == pytest.approx(np.linalg.norm(Ts[:, :3, 3].mean(axis=0) - command[:3, 3]), rel=1e-12)
-    assert np.linalg.norm(metrics.accuracy_xyz - [1e-3, 0, 0]) < 4 * np.linalg.norm(ARM_M) / np.sqrt(30)
-    np.testing.assert_allclose(metrics.repeatability_rotation, 3e-3, rtol=0.5)  # 30 numbers: 13 % sigma
+    assert metrics.RP_m.raw == pytest.approx(by_the_book(Ts[:, :3, 3]), rel=1e-12)
+    assert metrics.RP_m.clean == pytest.approx(metrics.RP_m.raw, rel=1e-9)
+    assert metrics.AP_m.raw == pytest.approx(np.linalg.norm(Ts[:, :3, 3].mean(axis=0) - command[:3, 3]), rel=1e-12)
+    assert np.linalg.norm(metrics.AP_xyz_m - [1e-3, 0, 0]) < 4 * np.linalg.norm(ARM_M) / np.sqrt(30)
+    np.testing.assert_allclose(metrics.RP_rotation_rad, 3e-3, rtol=0.5)  # 30 numbers: 13 % sigma
 
 
 @pytest.mark.parametrize("n", [3, 5, 30])
 def test_the_best_value_lies_within_its_interval(n):
-    metrics = [iso9283.pose_metrics(*attained(seed, n, noise=1e-4)).repeatability for seed in range(40)]
+    metrics = [iso9283.pose_metrics(*attained(seed, n, noise=1e-4)).RP_m for seed in range(40)]
     resolved = [metric for metric in metrics if metric.clean is not None]
     assert len(resolved) > 5
     for metric in resolved:
@@ -142,7 +142,7 @@ def test_accuracy_and_distance_hold_their_intervals(n, off, common):
         p = rng.normal(0, ARM_M, (n, 3)) + off * np.array([0.8, 0.6, 0]) + rng.normal(0, common, 3)
         Ts = np.array([pose(np.eye(3), at) for at in p])
         cov = np.zeros((n, 3, 3))
-        metrics.append(iso9283.pose_metrics(Ts, command, cov, np.eye(3) * common**2).accuracy)
+        metrics.append(iso9283.pose_metrics(Ts, command, cov, np.eye(3) * common**2).AP_m)
         to = rng.normal([0.5, 0, 0], ARM_M[0], (n, 3))
         AD, RD = iso9283.distance_metrics(rng.normal(0, ARM_M[0], (n, 3)), to, 0.5 - off, cov)
         errors.append(AD)
@@ -171,7 +171,7 @@ def test_accuracy_over_the_workspace():
 
 def test_accuracy_below_its_own_scatter_is_not_resolvable():
     Ts, command, cov = attained(3, 30)
-    assert iso9283.pose_metrics(Ts - Ts.mean(axis=0) + command, command, cov).accuracy.clean is None
+    assert iso9283.pose_metrics(Ts - Ts.mean(axis=0) + command, command, cov).AP_m.clean is None
 
 
 def test_two_directions_and_distance():
@@ -209,9 +209,9 @@ def test_a_path():
     ahead = np.array([2e-3, 0, 0])  # along the path: is no error of the path
     paths = command + bow + ahead + rng.normal(0, 1e-5, (10, 40, 3))
     metrics = path_metrics(paths, command, np.zeros((10, 40, 3, 3)))
-    assert metrics.accuracy.clean == pytest.approx(1e-3, abs=4 * 1e-5 / np.sqrt(10))
+    assert metrics.AT_m.clean == pytest.approx(1e-3, abs=4 * 1e-5 / np.sqrt(10))
     # Square to the path two directions of 10 um scatter: RP 3.2 times that, the largest of 40 at most twice as much.
-    assert 2e-5 < metrics.repeatability.raw < 7e-5
+    assert 2e-5 < metrics.RT_m.raw < 7e-5
     with pytest.raises(InputError, match="followed 2 times"):
         path_metrics(paths[:2], command, np.zeros((2, 40, 3, 3)))
 
@@ -226,9 +226,9 @@ def test_a_path_holds_its_interval():
         common = rng.normal(0, 1e-4, 3)
         paths = command + bow + common + rng.normal(0, 5e-5, (10, 1, 3)) + rng.normal(0, 1e-5, (10, 40, 3))
         metrics.append(path_metrics(paths, command, np.zeros((10, 40, 3, 3)), np.eye(3) * 1e-8))
-    covers([f.accuracy for f in metrics], 1e-3, 1.5 * np.hypot(mean_width(np.hypot(5e-5, 1e-5), 10), 4e-4))
+    covers([f.AT_m for f in metrics], 1e-3, 1.5 * np.hypot(mean_width(np.hypot(5e-5, 1e-5), 10), 4e-4))
     true = population(np.diag([0, 1, 1]) * (5e-5**2 + 1e-5**2))
-    covers([f.repeatability for f in metrics], true, 1.5 * chi_width(10) * true)
+    covers([f.RT_m for f in metrics], true, 1.5 * chi_width(10) * true)
 
 
 def test_a_path_goes_on():
@@ -263,15 +263,15 @@ def test_backlash_shows_at_the_quadrants(backlash):
             p - 0.5 * np.array([*backlash, 0]) * np.sign(speed) + rng.normal(0, 1e-5, p.shape) + [0.4, 0.1, 0.3]
         )
     metrics = circle_metrics(*ways, np.eye(3)[:2])
-    for found, true in zip(metrics.backlash, backlash, strict=True):
+    for found, true in zip(metrics.backlash_m, backlash, strict=True):
         sigma = (found.high - found.low) / (2 * 1.96)
         assert abs(found.raw - true) < 5 * sigma
         assert sigma < 1e-5
         assert found.sigma == (pytest.approx(sigma, rel=1e-4) if true else None)
         assert (found.clean is not None) == (true > 0)
     # At the jumps both ways differ by the backlash, elsewhere by its share along the radius.
-    assert metrics.hysteresis.raw == pytest.approx(np.hypot(*backlash), abs=6e-5 if any(backlash) else 3e-5)
-    np.testing.assert_allclose(metrics.centre, [0.4, 0.1, 0.3], atol=5e-6)
+    assert metrics.hysteresis_m.raw == pytest.approx(np.hypot(*backlash), abs=6e-5 if any(backlash) else 3e-5)
+    np.testing.assert_allclose(metrics.centre_m, [0.4, 0.1, 0.3], atol=5e-6)
     with pytest.raises(InputError, match=r"300 positions, up to 210\.5 degrees apart"):
         circle_metrics(ways[0][:300], ways[1], np.eye(3)[:2])
 
@@ -302,7 +302,7 @@ def test_circularity_holds_its_interval_without_a_sigma(times):
     true = ring(angle) * (1 + 2e-3 * np.cos(2 * np.radians(angle)))[:, None]  # an oval, 0.4 mm of circularity
     for _ in range(60):
         ways = [true + rng.normal(0, 1e-4, true.shape) for _ in range(2)]
-        metrics.append(circle_metrics(*ways, np.eye(3)[:2]).circularity)
+        metrics.append(circle_metrics(*ways, np.eye(3)[:2]).circularity_m)
     # 8 positions a bin. Below the error's own largest, of two ways of 90, 2 * 3.3 sigmas; above the interval of two means.
     covers(metrics, 4e-4, (2 * 3.3 + 2 * np.sqrt(2)) * 1e-4 / np.sqrt(8 * times))
 
@@ -314,7 +314,7 @@ def test_jumps_that_do_not_agree_are_no_backlash():
         r = 0.1 + 5e-4 * kink * (angle < np.pi) * np.cos(angle / 2)
         r = r + np.random.default_rng(1).normal(0, 1e-5, r.shape)
         ways.append(np.stack([r * np.cos(angle), r * np.sin(angle), 0 * angle], axis=1))
-    backlash = circle_metrics(*ways, np.eye(3)[:2]).backlash[0]
+    backlash = circle_metrics(*ways, np.eye(3)[:2]).backlash_m[0]
     assert backlash.clean is None
     assert backlash.resolvable > 3e-4
 
@@ -326,7 +326,7 @@ def test_noise_alone_makes_no_circularity(cov):
         ways = [np.stack([0.1 * np.cos(angle), 0.1 * np.sin(angle), 0 * angle], axis=1) for _ in range(2)]
         ways = [p + rng.normal(0, 3e-5, p.shape) for p in ways]
         metrics = circle_metrics(*ways, np.eye(3)[:2], cov)
-        resolved += (metrics.circularity.clean is not None) + (metrics.hysteresis.clean is not None)
+        resolved += (metrics.circularity_m.clean is not None) + (metrics.hysteresis_m.clean is not None)
     assert resolved <= 8  # of 80; 2.5 % by chance
 
 

@@ -279,10 +279,9 @@ def report(run: Path, arm_name: str | None, compare: tuple[Path, ...], output: P
     RUN is a folder of `armsight run` or `demo`, best with the motions of `armsight arm plan`; its rests in open loop count.
     """
     from armsight.app.arm.evaluate import evaluate_arm, nominal_arm
-    from armsight.app.arm.report import FILES, read_report, text, write_report
+    from armsight.app.arm.report import FILES, arm_report, read_report, write_report
     from armsight.app.progress import steps
-    from armsight.app.report.page import writable_folder
-    from armsight.app.report.plotting import require_matplotlib
+    from armsight.app.show.plotting import require_matplotlib
     from armsight.files import check_folder
 
     if output is not None:
@@ -295,9 +294,10 @@ def report(run: Path, arm_name: str | None, compare: tuple[Path, ...], output: P
     others = {path.parent.name or path.stem: read_report(path) for path in compare}
     with steps() as progress:
         found = evaluate_arm(run, arm, progress=progress)
-    click.echo(json.dumps(found.to_json()) if as_json else text(found, others))
-    if output is not None:  # last: what was found is printed and stored before anything is drawn
-        write_report(found, others, writable_folder(output, "no report"))
+    shown = arm_report(found, others)
+    shown.echo(as_json=as_json)
+    if output is not None:  # last: what was found is printed before anything is drawn
+        write_report(shown, found, output)
     if output is not None and not as_json:
         click.echo(f"\nwritten: {output}/report.html, report.pdf, report.json")
 

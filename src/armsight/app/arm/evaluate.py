@@ -36,7 +36,7 @@ from armsight.app.check.run_folder import (
 from armsight.app.run.record import read_track
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import finite_json, read_json, read_toml
+from armsight.files import json_of, read_json, read_toml
 from armsight.geometry.pose import mean_pose
 from armsight.geometry.rotation import log_so3
 from armsight.loop.identify.backlash import joint_backlashes
@@ -303,7 +303,7 @@ class ArmReport(Record):
         shown["map"] = [
             {"at_m": p, "error_mm": e} for p, e in zip(self.at.tolist(), (1e3 * self.off).tolist(), strict=True)
         ]
-        known: dict[str, Any] = finite_json(shown)
+        known: dict[str, Any] = json_of(shown)
         return known
 
 
@@ -354,7 +354,7 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
         joints.append(_joint(arm, i, name, kept, found, lever[:, i], backlash[i]._asdict(), latencies[i]))
     known = [each for each in latencies if each is not None]
     attained, both = evaluate(attained_in(folder, closed=False)).poses.values(), _both_sides(rests, which)
-    accuracy, one = (_mean_mm([getattr(p, name) for p in attained]) for name in ("accuracy", "repeatability"))
+    accuracy, one = (_mean_mm([getattr(p, name) for p in attained]) for name in ("AP_m", "RP_m"))
     if one is None:
         notes.append(f"no pose was approached {MIN_POSES} times from one side: no repeatability")
     if both is None:

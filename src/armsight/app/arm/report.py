@@ -6,17 +6,19 @@ In: an :class:`~armsight.app.arm.evaluate.ArmReport`, and reports of other arms.
 from __future__ import annotations
 
 import io
-import json
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from armsight.app.arm.evaluate import SURE, VERSION, ArmReport, JointFigures
-from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files
-from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, arrows, drawing, new_figure, panels, png
-from armsight.app.report.table import TextTable, html_table, plain_text
+from armsight.app.show.page import PAGE, writable_folder
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, arrows, drawing, new_figure, panels
+from armsight.app.show.report import Lines, Plot, Report, Section
+from armsight.app.show.table import TextTable
 from armsight.errors import InputError
 from armsight.files import read_json, write_text
 
@@ -108,8 +110,7 @@ def remarks(report: ArmReport) -> list[str]:
     lines = [f"do not trust this recording: {line}" for line in report.health]
     lines += [*report.notes]
     lines += [f"backlash of {j.name}: {j.backlash_how}" for j in report.joints if j.backlash_deg is None]
-    return [
-        *lines,
+    lines += [
         "Zero: true angle less reading; that of the first and of the last joint looks like another base and another tool.",
         "Backlash: behind the joint's sensor. Sides: reading from above less from below, at the same command. Droop: "
         "reading less command for a metre of the gravity load's lever.",
@@ -117,8 +118,8 @@ def remarks(report: ArmReport) -> list[str]:
         "or from another part.",
         "Each part is what it moves the tool by, RMS, in the frames of the run; parts may cancel each other: then a "
         "share is negative. Controller: readings less commands, such as the droop under gravity.",
-        "Drift has no temperature beside it: runs do not record any." if report.drift_mm_per_h else "",
     ]
+    return [*lines, "Drift has no temperature beside it: runs do not record any."] if report.drift_mm_per_h else lines
 
 
 def _map_figure(report: ArmReport, figure: FigureBase) -> None:
@@ -194,46 +195,38 @@ _FIGURES: dict[str, tuple[str, float, Callable[[ArmReport, FigureBase], None]]] 
 _PAGE = 13.0
 
 
-def write_report(report: ArmReport, others: Mapping[str, dict[str, Any]], folder: Path) -> None:
-    """Write JSON, then page and PDF into a folder.
+def arm_report(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> Report:
+    """Return what a run shows of an arm; ``others`` are the JSON objects of other arms by their names."""
+    heading = f"{report.arm}: {report.accuracy_mm[0]:.2f} mm RMS, {report.placed_mm:.2f} with another base and tool"
+    sub = f"{report.poses} poses, {report.rests} rests in {60 * report.hours:.0f} min; controller: {report.board}"
+    plots = [Plot(name, partial(_figure, report, name), caption, caption) for name, (caption, *_) in _FIGURES.items()]
+    sections: dict[str, Section] = {
+        "figures": ("In numbers", tables(report, others)),
+        "notes": ("Notes", [Lines(remarks(report))]),
+        "plots": ("Figures", plots),
+    }
+    return Report(report.arm, heading, sub, "", sections, values=report.to_json())
+
+
+def write_report(report: Report, found: ArmReport, folder: Path) -> None:
+    """Write JSON, then page, figures and PDF into a folder.
 
     Raises:
         InputError: matplotlib is missing, or the folder cannot be written to.
     """
-    document = json.dumps(report.to_json(), indent=1, allow_nan=False) + "\n"
-    write_text(folder / "report.json", document)
-    shown, said = tables(report, others), [line for line in remarks(report) if line]
-    heading = f"{report.arm}: {report.accuracy_mm[0]:.2f} mm RMS, {report.placed_mm:.2f} with another base and tool"
-    sub = f"{report.poses} poses, {report.rests} rests in {60 * report.hours:.0f} min; controller: {report.board}"
+    write_text(writable_folder(folder, "no report") / "report.json", report.json_text())
     with drawing():
-        pdf = _pdf([_text_page(heading, sub, shown, said), _figures_page(report)])
-        images = {name: png(_figure(report, name)) for name in _FIGURES}
-    plots = "".join(
-        f"<figure>{picture(images[name], caption)}<figcaption>{caption}</figcaption></figure>\n"
-        for name, (caption, *_) in _FIGURES.items()
-    )
-    sections = {
-        "figures": ("In numbers", "".join(map(html_table, shown))),
-        "notes": ("Notes", bullets(said)),
-        "plots": ("Figures", plots),
-    }
-    page = html_page(f"armsight: {report.arm}", heading, sub, sections)
-    put_files(folder, {PAGE: page.encode(), "report.pdf": pdf})
+        pdf = _pdf([_text_page(report), _figures_page(found)])
+    report.write(folder, {"report.pdf": pdf})
 
 
-def text(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> str:
-    """Return a report for the terminal."""
-    lines = [plain_text(table) for table in tables(report, others)]
-    return "\n\n".join([*lines, "\n".join(line for line in remarks(report) if line)])
-
-
-def _text_page(heading: str, sub: str, shown: Sequence[TextTable], said: Sequence[str]) -> Figure:
+def _text_page(report: Report) -> Figure:
     """Return a page of text for the PDF."""
     figure = new_figure(_PAGE)
     figure.set_layout_engine(None)
-    lines = "\n\n".join([*(plain_text(table) for table in shown), "\n".join(_folded(line) for line in said)])
-    figure.text(0.04, 0.97, heading, fontsize=16, va="top", weight="bold")
-    figure.text(0.04, 0.945, sub, fontsize=9, va="top", color=MUTED)
+    lines = "\n".join(textwrap.fill(line, 150, subsequent_indent="  ") for line in report.text().split("\n"))
+    figure.text(0.04, 0.97, report.heading, fontsize=16, va="top", weight="bold")
+    figure.text(0.04, 0.945, report.sub, fontsize=9, va="top", color=MUTED)
     figure.text(0.04, 0.915, lines, fontsize=7, va="top", family="monospace", linespacing=1.35)
     return figure
 
@@ -255,16 +248,6 @@ def _figures_page(report: ArmReport) -> Figure:
         draw(report, part)
         part.suptitle(caption, fontsize=9, color=MUTED)
     return figure
-
-
-def _folded(line: str, width: int = 150) -> str:
-    """Return a line broken between words."""
-    rows = [""]
-    for word in line.split():
-        if len(rows[-1]) + len(word) >= width:
-            rows.append("")
-        rows[-1] += ("" if not rows[-1] else " ") + word
-    return "\n  ".join(rows)
 
 
 def _pdf(figures: Sequence[Figure]) -> bytes:

@@ -29,7 +29,7 @@ import numpy as np
 
 from armsight.app.board.command import STEPS
 from armsight.app.board.found import Found, JointFound, put_gentle, report
-from armsight.app.report.page import PAGE, put_files
+from armsight.app.show.page import PAGE, put_files
 from armsight.data import Array, JointCommand
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import write_text

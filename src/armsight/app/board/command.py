@@ -15,7 +15,7 @@ from click.core import ParameterSource
 from armsight.app.arm_option import arm_option
 from armsight.app.board.config import config_group
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
-from armsight.app.messages import UNTRUSTED
+from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import DeviceError, InputError
 
 if TYPE_CHECKING:
@@ -266,8 +266,8 @@ def bringup(
     """
     from armsight.app.board.bringup import Bringup, TerminalOperator
     from armsight.app.board.found import found_json
-    from armsight.app.report.page import writable_folder
-    from armsight.app.report.plotting import require_matplotlib
+    from armsight.app.show.page import writable_folder
+    from armsight.app.show.plotting import require_matplotlib
     from armsight.files import check_folder
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.emulated import EmulatedLink

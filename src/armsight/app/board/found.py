@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.report.page import html_page, picture, table, text
-from armsight.app.report.plotting import BLUE, MUTED, ORANGE, drawing, new_figure, png
+from armsight.app.show.page import html_page, picture, table, text
+from armsight.app.show.plotting import BLUE, MUTED, ORANGE, drawing, new_figure, png
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import read_json, write_text

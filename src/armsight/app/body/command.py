@@ -36,8 +36,7 @@ def command() -> None:
     help="Distance from the cameras, m; may be repeated. 0.6, 0.8 and 1.2 by default.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-@click.pass_context
-def check(context: click.Context, path: str, rig_path: str | None, distances: tuple[float, ...], as_json: bool) -> None:
+def check(path: str, rig_path: str | None, distances: tuple[float, ...], as_json: bool) -> int:
     """Assess whether a body is identified by its discs, how well its pose is known, and what to change.
 
     Exit code 0: usable at every distance; 1: ambiguous or unusable at one of them; 2: no body file.
@@ -47,7 +46,7 @@ def check(context: click.Context, path: str, rig_path: str | None, distances: tu
             raise InputError(f"--distance {distance:g}: expected metres, between 0.01 and 100")
 
     from armsight.app.body.check import assess
-    from armsight.app.body.text import assessment_json, assessment_lines, cameras_text
+    from armsight.app.body.text import body_report
     from armsight.vision.discs.predict import plain_rig
     from armsight.vision.markers.body_layout import read_layout
     from armsight.vision.rig import StereoRig
@@ -55,12 +54,8 @@ def check(context: click.Context, path: str, rig_path: str | None, distances: tu
     layout = read_layout(path)
     rig = plain_rig() if rig_path is None else StereoRig.load(rig_path)
     assessment = assess(layout, rig, tuple(sorted(set(distances))) or (0.6, 0.8, 1.2))
-    cameras = cameras_text(rig, rig_path)
-    if as_json:
-        click.echo(json.dumps(assessment_json(path, layout, rig, cameras, assessment), allow_nan=False))
-    else:
-        click.echo("\n".join(assessment_lines(path, layout, cameras, assessment)))
-    context.exit(0 if assessment.grade == "usable" else 1)
+    body_report(path, layout, rig, rig_path, assessment).echo(as_json=as_json)
+    return 0 if assessment.grade == "usable" else 1
 
 
 @command.command()

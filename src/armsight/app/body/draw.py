@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.body import PAPERS
-from armsight.app.report.plotting import drawing, plain
+from armsight.app.show.plotting import drawing, plain
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import read_bytes, replacing

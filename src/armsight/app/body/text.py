@@ -1,4 +1,4 @@
-"""What ``armsight body check`` prints: an assessment in, text and JSON out. Lengths in mm, angles in degrees."""
+"""What ``armsight body check`` says: an assessment in, a Report out. Lengths in mm, angles in degrees."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from armsight.app.body.check import SEPARATED_SIGMAS, sigma_px
 from armsight.app.body.finding import Assessment, Prediction, ambiguity_text
+from armsight.app.show.report import Block, Fact, Lines, Report, Text
 from armsight.vision.markers.body_layout import Layout
 from armsight.vision.rig import StereoRig
 
@@ -16,7 +17,7 @@ from armsight.vision.rig import StereoRig
 _DISTANCES = 15
 
 
-def cameras_text(rig: StereoRig, path: str | None) -> str:
+def _cameras(rig: StereoRig, path: str | None) -> str:
     """Say which cameras the numbers are for."""
     (width, height), f = rig.left.image_size_px, rig.left.intrinsics[0]
     name = "two perfect cameras" if path is None else path
@@ -46,8 +47,8 @@ def _closest(distances: list[tuple[str, str, float]]) -> list[str]:
     ]
 
 
-def assessment_lines(path: str, layout: Layout, cameras: str, assessment: Assessment) -> list[str]:
-    """Return the assessment as lines of text: mm, degrees, px."""
+def body_report(path: str, layout: Layout, rig: StereoRig, rig_path: str | None, assessment: Assessment) -> Report:
+    """Return what an assessment says: mm, degrees, px; ``rig_path`` None: two perfect cameras."""
     count = {
         "disc": layout.disc_count,
         "tag": 0 if layout.tags is None else len(layout.tags.tags),
@@ -55,24 +56,39 @@ def assessment_lines(path: str, layout: Layout, cameras: str, assessment: Assess
     }
     kinds = ", ".join(f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in count.items() if n)
     size = np.ptp(layout.body.points, axis=0) * 1e3
-    lines = [
-        f"{path}: {layout.name}: {kinds}; {' x '.join(f'{s:.1f}' for s in size)} mm",
-        f"assessment: {assessment.grade}",
+    distances, cameras = _distances(layout), _cameras(rig, rig_path)
+    listed = "distances, mm: " + ", ".join(f"{a}-{b} {1e3 * d:.2f}" for a, b, d in distances)
+    values = {
+        "body": path,
+        "name": layout.name,
+        "sigma_px": sigma_px(rig),
+        "points": len(layout.body.points),
+        "discs": layout.disc_count,
+        "coded": layout.coded,
+        "ambiguities": _ambiguities(layout, assessment),
+        "findings": [{**vars(f), "text": f.text or None, "change": f.change or None} for f in assessment.findings],
+    }
+    blocks: list[Block] = [
+        Fact(f"assessment: {assessment.grade}", {"assessment": assessment.grade}),
+        Fact(f"unique: {_unique(layout, assessment)}"),
+        Fact(
+            listed if 0 < len(distances) <= _DISTANCES else "",
+            {"distances_mm": [{"from": a, "to": b, "mm": 1e3 * d} for a, b, d in distances]},
+        ),
+        Fact("closest: " + "; ".join(_closest(distances)) if len(distances) > 1 else ""),
+        Text(""),
+        Fact(
+            f"expected sigma: {cameras}; the body faces them",
+            {"cameras": cameras, "expected": [_expected(one) for one in assessment.predictions]},
+        ),
+        Lines([*_table(assessment), ""]),
     ]
-    lines += [f"unique: {_unique(layout, assessment)}"]
-    if distances := _distances(layout):
-        if len(distances) <= _DISTANCES:
-            lines.append("distances, mm: " + ", ".join(f"{a}-{b} {1e3 * d:.2f}" for a, b, d in distances))
-        if len(distances) > 1:
-            lines.append("closest: " + "; ".join(_closest(distances)))
-    lines += ["", f"expected sigma: {cameras}; the body faces them", *_table(assessment), ""]
     grades = {"bad": "bad ", "weak": "weak", "note": "note"}
     for finding in sorted(assessment.findings, key=lambda f: list(grades).index(f.grade)):
-        if finding.text:
-            lines.append(f"{grades[finding.grade]}  {finding.text}")
-        if finding.change:
-            lines.append(f"      change: {finding.change}")
-    return lines
+        blocks.append(Fact(f"{grades[finding.grade]}  {finding.text}" if finding.text else ""))
+        blocks.append(Fact(f"      change: {finding.change}" if finding.change else ""))
+    headline = f"{path}: {layout.name}: {kinds}; {' x '.join(f'{s:.1f}' for s in size)} mm"
+    return Report("body", "Assessment of a body", path, headline, {"result": ("Result", blocks)}, values=values)
 
 
 def _unique(layout: Layout, assessment: Assessment) -> str:
@@ -121,9 +137,9 @@ def _pixels(one: Prediction) -> str:
     return f"{low:.1f} px" if high - low < 0.05 else f"{low:.1f} to {high:.1f} px"
 
 
-def assessment_json(path: str, layout: Layout, rig: StereoRig, cameras: str, assessment: Assessment) -> dict[str, Any]:
-    """Return the assessment as JSON has it."""
-    ambiguities = [
+def _ambiguities(layout: Layout, assessment: Assessment) -> list[dict[str, Any]]:
+    """Return what may be taken for what, for programs."""
+    return [
         {
             "seen": [layout.body.point_names[i] for i in one.symmetry.seen],
             "taken_for": [layout.body.point_names[i] for i in one.symmetry.taken_for],
@@ -131,43 +147,21 @@ def assessment_json(path: str, layout: Layout, rig: StereoRig, cameras: str, ass
             "off_mm": 1e3 * one.symmetry.off_m,
             "from_behind": one.behind,
             "settled_by_normals": one.by_side,
-            "separation_sigmas": [_number(sigmas) for sigmas in one.separation_sigmas],
+            "separation_sigmas": one.separation_sigmas,
             "distinguishable": not bool((one.separation_sigmas < SEPARATED_SIGMAS).any()),
         }
         for one in assessment.ambiguities
     ]
-    return {
-        "body": path,
-        "name": layout.name,
-        "assessment": assessment.grade,
-        "cameras": cameras,
-        "sigma_px": sigma_px(rig),
-        "points": len(layout.body.points),
-        "discs": layout.disc_count,
-        "coded": layout.coded,
-        "distances_mm": [{"from": a, "to": b, "mm": 1e3 * d} for a, b, d in _distances(layout)],
-        "ambiguities": ambiguities,
-        "expected": [_expected(one) for one in assessment.predictions],
-        "findings": [
-            {"grade": f.grade, "kind": f.kind, "text": f.text or None, "change": f.change or None}
-            for f in assessment.findings
-        ],
-    }
 
 
 def _expected(one: Prediction) -> dict[str, Any]:
-    """Return the expected sigma at a distance as JSON."""
+    """Return the expected sigma at a distance, for programs."""
     (across, depth), (tilt, roll) = one.position_mm, one.rotation_deg
     return {
         "distance_m": one.distance_m,
-        "sigma_across_mm": _number(across),
-        "sigma_depth_mm": _number(depth),
-        "sigma_tilt_deg": _number(tilt),
-        "sigma_about_sight_deg": _number(roll),
-        "disc_px": None if np.isnan(one.disc_px).any() else one.disc_px.tolist(),
+        "sigma_across_mm": across,
+        "sigma_depth_mm": depth,
+        "sigma_tilt_deg": tilt,
+        "sigma_about_sight_deg": roll,
+        "disc_px": None if np.isnan(one.disc_px).any() else one.disc_px,
     }
-
-
-def _number(value: float) -> float | None:
-    """Return a number, or None where it is none or infinite: JSON knows neither."""
-    return float(value) if np.isfinite(value) else None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.messages import UNTRUSTED
+from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import InputError
 from armsight.files import check_folder, check_outputs
 from armsight.vision.calibrate import FOLDS, MODELS
@@ -69,7 +68,7 @@ def command(
     output: Path,
     report: Path | None,
     as_json: bool,
-) -> None:
+) -> int:
     """Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.
 
     From images: --left, --right and --target. From a recording of a board that moves before cameras that may not expose
@@ -87,9 +86,9 @@ def command(
     if (left_intrinsics or right_intrinsics) and target is None:
         raise InputError("--left-intrinsics and --right-intrinsics go with images of a --target")
 
-    from armsight.app.calibrate.report import REPORT_FILES, write_report
-    from armsight.app.calibrate.run import GivenDetections, GivenImages, print_result, provenance, summary
-    from armsight.app.report.plotting import require_matplotlib
+    from armsight.app.calibrate.report import REPORT_FILES, calibration_report
+    from armsight.app.calibrate.run import GivenDetections, GivenImages, provenance
+    from armsight.app.show.plotting import require_matplotlib
     from armsight.vision.calibrate.weak import contradicted, require_order
 
     given: GivenDetections | GivenImages
@@ -122,12 +121,8 @@ def command(
     calibration = replace(calibration, rig=replace(calibration.rig, provenance=provenance(given.named, calibration)))
     calibration.rig.save(output)
     given.save(calibration)
+    found = calibration_report(calibration, output, given.board_file, report, time.perf_counter() - started)
     if report is not None:
-        write_report(calibration, report)
-    if as_json:
-        seconds = time.perf_counter() - started
-        click.echo(json.dumps(summary(calibration, output, given.board_file, report, seconds)))
-    else:
-        print_result(calibration, output, given.board_file, report)
-    if contradicted(calibration):
-        click.get_current_context().exit(UNTRUSTED)
+        found.write(report)
+    found.echo(as_json=as_json)
+    return UNTRUSTED if contradicted(calibration) else 0

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.interpolate import griddata
 
 from armsight.app.calibrate.assessment import HELD_M, SHARES, Slice, target_drawing, target_points, volume_slice
-from armsight.app.report.plotting import BLUE, EMPTY, INK, MUTED, ORANGE, RED, WIDTH_IN, arrows, new_figure, nice, plain
+from armsight.app.show.plotting import BLUE, EMPTY, INK, MUTED, ORANGE, RED, WIDTH_IN, arrows, new_figure, nice, plain
 from armsight.data import SIDES, Array
 from armsight.vision.calibrate.result import Calibration
 from armsight.vision.calibrate.weak import COVERAGE_GRID, coverage

@@ -1,16 +1,15 @@
-"""The report of a calibration: one HTML page with its assessment, and its figures as PNG files beside it.
+"""The result of a calibration as a Report: its table, its JSON, and a page with its assessment and its figures.
 
-In: a Calibration. Out: a folder. The page holds its figures itself, needs no network and runs no script. Everything is
-rendered in memory first; then each file is written completely, the page last.
-
-In order: the tables; the sections of the page, from the assessment to the parameters; the page. A section is a function of
-the calibration and of its figures (name -> HTML image). Its caption explains what one should see, and what would be bad.
+In order: the tables; the sections of the page, from the assessment to the parameters; the report. A figure's caption
+explains what one should see, and what would be bad.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,13 +36,16 @@ from armsight.app.calibrate.figures import (
     target_figure,
     volume_figure,
 )
-from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files, table, text, writable_folder
-from armsight.app.report.plotting import drawing, png, require_matplotlib
+from armsight.app.show.messages import weak
+from armsight.app.show.page import PAGE, bullets, table, text
+from armsight.app.show.report import Block, Html, Plot, Report, Section, Text, assessment
+from armsight.app.show.table import TextTable, plain_text
 from armsight.data import Array
 from armsight.geometry.pose import exp_se3
 from armsight.geometry.rotation import log_so3
 from armsight.vision.calibrate.result import Calibration, HeldOutErrors
-from armsight.vision.calibrate.weak import COVERAGE_GRID
+from armsight.vision.calibrate.screen import merged_notes
+from armsight.vision.calibrate.weak import COVERAGE_GRID, contradicted
 from armsight.vision.rig import StereoRig
 
 if TYPE_CHECKING:
@@ -159,23 +161,27 @@ def provenance_table(provenance: Mapping[str, Any]) -> str:
     return table(("", ""), rows, "provenance") if rows else "<p>Nothing is recorded.</p>"
 
 
-Figures = Mapping[str, str]
-Section = Callable[[Calibration, Figures], str]
+#: Name -> the function that plots it (None where there is nothing to plot), and its description for who cannot see it.
+FIGURES: dict[str, tuple[Callable[[Calibration], Figure | None], str]] = {
+    "coverage": (coverage_figure, "Maps of both images: how many points were seen in which part"),
+    "residuals": (residuals_figure, "Residual vectors over both images, every point and averaged by region"),
+    "pairs": (pairs_figure, "Bars: held-out epipolar and rigid error of every pair"),
+    "volume": (volume_figure, "Maps of the predicted depth and lateral sigma over a slice of the volume"),
+    "target": (target_figure, "Map of the target's deviation from its drawing"),
+}
 
 
-def _figure(figures: Figures, name: str, see: str, bad: str, opening: str = "You should see") -> str:
+def _figure(calibration: Calibration, name: str, see: str, bad: str, opening: str = "You should see") -> Plot:
     """Return a figure with its caption: what one should see, and what would be bad."""
+    draw, description = FIGURES[name]
     caption = f"<p><b>{opening}</b> {see}</p><p><b>Bad would be</b> {bad}</p>"
-    return f"<figure>{figures[name]}<figcaption>{caption}</figcaption></figure>\n"
+    return Plot(name, partial(draw, calibration), caption, description)
 
 
-def result(calibration: Calibration, figures: Figures) -> str:
+def result(calibration: Calibration) -> list[Block]:
     """Return the assessment, the held-out metrics, what is weak, and which pairs were rejected or used in part."""
     found = assess(calibration)
-    parts = [
-        f'<div class="assessment {found.grade}"><p class="headline">{text(found.headline)}</p>'
-        f"<p>{text(found.meaning)}</p></div>\n"
-    ]
+    parts = [assessment([found.headline], found.meaning, found.grade)]
     parts.append(headline_table(calibration))
     parts.append(
         "<p>Rely on the held-out column: a fit adapts to the pairs it is made from, the more so the fewer they are. The "
@@ -196,10 +202,10 @@ def result(calibration: Calibration, figures: Figures) -> str:
         parts.append(f"<p>None: all {used} pairs were used.</p>\n")
     if calibration.notes:
         parts.append("<h3>Corrected, or used in part</h3>\n" + bullets(calibration.notes))
-    return "".join(parts)
+    return [Html("".join(parts))]
 
 
-def coverage(calibration: Calibration, figures: Figures) -> str:
+def coverage(calibration: Calibration) -> list[Block]:
     """Return the coverage maps."""
     what = target(calibration)
     see = (
@@ -210,10 +216,10 @@ def coverage(calibration: Calibration, figures: Figures) -> str:
         "hatched cells where you want to measure: no point was seen there, so the lens model is extrapolated. Take more "
         f"pairs with the {what} there. (The dark rim around the image of a fisheye lens stays empty.)"
     )
-    return _figure(figures, "coverage", see, bad)
+    return [_figure(calibration, "coverage", see, bad)]
 
 
-def residuals(calibration: Calibration, figures: Figures) -> str:
+def residuals(calibration: Calibration) -> list[Block]:
     """Return the residual vectors."""
     sigma = np.sqrt(corner_variance_px2(calibration))
     see = (
@@ -226,10 +232,10 @@ def residuals(calibration: Calibration, figures: Figures) -> str:
         f"{target(calibration)} from its drawing. Red arrows are more than {STANDS_OUT:g} times their own uncertainty. "
         "Longer arrows in one image than in the other: that camera is out of focus, moves, or has too little light."
     )
-    return _figure(figures, "residuals", see, bad)
+    return [_figure(calibration, "residuals", see, bad)]
 
 
-def pairs(calibration: Calibration, figures: Figures) -> str:
+def pairs(calibration: Calibration) -> list[Block]:
     """Return the held-out errors by pair."""
     see = "bars of similar length, all blue."
     shown = len(calibration.errors.pair)
@@ -241,10 +247,10 @@ def pairs(calibration: Calibration, figures: Figures) -> str:
         "between the two images or was taken at two moments; one that stands out in the rigid error only was blurred, "
         "far away or bent. Look at its images and take it again. Each pair was measured with a rig fitted without it."
     )
-    return _figure(figures, "pairs", see, bad)
+    return [_figure(calibration, "pairs", see, bad)]
 
 
-def volume(calibration: Calibration, figures: Figures) -> str:
+def volume(calibration: Calibration) -> list[Block]:
     """Return the predicted sigma over the volume, and where the board was."""
     what = target(calibration)
     see = (
@@ -266,13 +272,11 @@ def volume(calibration: Calibration, figures: Figures) -> str:
     )
     if not calibration.rig.cov.any():
         known += "<p><b>The uncertainty of this calibration is unknown; its share is missing here.</b></p>\n"
-    return _figure(figures, "volume", see, bad, "It shows") + sigma_table(calibration) + known
+    return [_figure(calibration, "volume", see, bad, "It shows"), Html(sigma_table(calibration) + known)]
 
 
-def target_shape(calibration: Calibration, figures: Figures) -> str:
+def target_shape(calibration: Calibration) -> list[Block]:
     """Return the deviation of the target from its drawing, where it was estimated."""
-    if "target" not in figures:
-        return ""
     see = (
         f"the deviation of the target from its drawing, {1e3 * calibration.deviation_m:.2g} mm RMS: a few hundredths of a "
         "millimetre for a target on glass or aluminium, tenths for paper on card. It was estimated together with the "
@@ -282,10 +286,10 @@ def target_shape(calibration: Calibration, figures: Figures) -> str:
         "a millimetre or more: a loose or bowed sheet, which also bends from pair to pair. Glue it to something stiff. "
         "(The cameras cannot measure the size of the whole target; it is the one you gave.)"
     )
-    return _figure(figures, "target", see, bad, "It shows")
+    return [_figure(calibration, "target", see, bad, "It shows")]
 
 
-def numbers(calibration: Calibration, figures: Figures) -> str:
+def numbers(calibration: Calibration) -> list[Block]:
     """Return the parameters with their sigmas and the distortion models tried."""
     rig = calibration.rig
     parts = [
@@ -300,16 +304,16 @@ def numbers(calibration: Calibration, figures: Figures) -> str:
         parts.append(
             "<p>Evaluated on held-out pairs alone; of models that are about as good, the simplest is chosen.</p>\n"
         )
-    return "".join(parts)
+    return [Html("".join(parts))]
 
 
-def provenance(calibration: Calibration, figures: Figures) -> str:
+def provenance(calibration: Calibration) -> list[Block]:
     """Return how the rig was made."""
-    return provenance_table(calibration.rig.provenance)
+    return [Html(provenance_table(calibration.rig.provenance))]
 
 
-#: Anchor -> title and text, in the page's order; a section without text is left out.
-SECTIONS: dict[str, tuple[str, Section]] = {
+#: Anchor -> title, and what stands there, in the page's order.
+SECTIONS: dict[str, tuple[str, Callable[[Calibration], list[Block]]]] = {
     "result": ("Assessment", result),
     "coverage": ("Coverage of the images", coverage),
     "residuals": ("Residuals of the fit", residuals),
@@ -321,56 +325,103 @@ SECTIONS: dict[str, tuple[str, Section]] = {
 }
 
 
-#: Name -> the function that plots it (None where there is nothing to plot), and its description for who cannot see it.
-FIGURES: dict[str, tuple[Callable[[Calibration], Figure | None], str]] = {
-    "coverage": (coverage_figure, "Maps of both images: how many points were seen in which part"),
-    "residuals": (residuals_figure, "Residual vectors over both images, every point and averaged by region"),
-    "pairs": (pairs_figure, "Bars: held-out epipolar and rigid error of every pair"),
-    "volume": (volume_figure, "Maps of the predicted depth and lateral sigma over a slice of the volume"),
-    "target": (target_figure, "Map of the target's deviation from its drawing"),
-}
+def _values(
+    calibration: Calibration, output: Path, board_file: Path | None, report: Path | None, seconds: float
+) -> dict[str, Any]:
+    """Return the object that ``--json`` prints."""
+    c = calibration
+    return {
+        "pairs_found": c.pairs_found,
+        "pairs_used": len(c.pairs),
+        "rejected": c.rejected,
+        "notes": c.notes,
+        "weaknesses": c.weaknesses,
+        "grade": assess(c).grade,
+        "poor": _poor(c),
+        "fit": {"epipolar_rms_px": c.epipolar_rms_px, "reprojection_rms_px": c.reprojection_rms_px},
+        "heldout": c.heldout,
+        "models": c.models,
+        "baseline_m": c.rig.baseline_m,
+        "convergence_deg": c.rig.convergence_deg,
+        "distortion_model": c.rig.left.model,
+        "sigma_px": c.rig.sigma_px,
+        "body_deviation_rms_m": c.deviation_m,
+        "disc_radius_m": c.disc_radius_m,
+        "shutters": None if c.rig.shutters is None else c.rig.shutters.to_json(),
+        "rig": output,
+        "board": board_file,
+        "report": None if report is None else report / PAGE,
+        "seconds": seconds,
+    }
+
+
+def _poor(calibration: Calibration) -> list[str]:
+    """Return the metrics for which the calibration must not be relied on yet, with their values."""
+    return [f"{row.name} {row.heldout}" for row in graded_metrics(calibration) if row.grade == "poor"]
+
+
+def _rejected_lines(calibration: Calibration) -> list[str]:
+    """Return a line for each pair that was rejected; neighbours rejected for one reason share a line."""
+    lines = []
+    for reason, group in itertools.groupby(calibration.rejected, key=lambda r: r.reason):
+        first, *more = (r.pair for r in group)
+        pairs = f"{1 + len(more)} pairs {first} to {more[-1]}" if more else f"pair {first}"
+        lines.append(f"rejected {pairs}: {reason}")
+    return lines
+
+
+def _printed(calibration: Calibration, output: Path, board_file: Path | None, report: Path | None) -> Text:
+    """Return what is printed: the held-out errors first, then those of the fit, then what is weak."""
+    c, h = calibration, calibration.heldout
+    rows = (
+        ("epipolar RMS", f"{h.epipolar_rms_px:.3f} px"),
+        ("rigid RMS (shape of the target)", f"{1e3 * h.rigid_rms_m:.3f} mm"),
+        ("scale error", f"{100 * h.scale_error:+.3f} %"),
+        ("residual over predicted sigma", f"{h.normalised_rms:.2f}"),
+    )
+    title = f"Held-out errors: {h.folds} folds, each measured with the fit to the others"
+    poor = _poor(c)
+    use = "" if contradicted(c) else f"; to measure it: armsight measure {output} --target {board_file}"
+    fit_px = f"{c.epipolar_rms_px:.3f} px" if np.isfinite(c.epipolar_rms_px) else "unknown"
+    fitted = "" if c.motion is None else f" ({MOTION_FITTED[0].lower()}{MOTION_FITTED[1:].rstrip('.')})"
+    lines = [
+        plain_text(TextTable(title, ("", ""), rows)),
+        f"fit: epipolar {fit_px}, reprojection {c.reprojection_rms_px:.3f} px RMS{fitted}; "
+        f"{len(c.pairs)} of {c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px",
+        f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg; the body differs from its "
+        f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
+        *([] if c.disc_radius_m is None else [f"radius of the board's discs: {1e3 * c.disc_radius_m:.3f} mm"]),
+        *_rejected_lines(c),
+        *(f"note: {note}" for note in merged_notes(c.notes)),
+        *(weak(weakness) for weakness in c.weaknesses),
+        *([weak(f"do not rely on this calibration yet: {', '.join(poor)}")] if poor else []),
+        f"rig written to {output}" + (f", report to {report / PAGE}" if report is not None else ""),
+        *([] if board_file is None else [f"board as found written to {board_file}{use}"]),
+    ]
+    return Text("\n".join(lines))
 
 
 #: Names of all files that a report may have.
 REPORT_FILES = (PAGE, *(f"report-{name}.png" for name in FIGURES))
 
 
-def write_report(calibration: Calibration, directory: str | Path) -> Path:
-    """Write the report of a calibration.
+def calibration_report(
+    calibration: Calibration, output: Path, board_file: Path | None, report: Path | None, seconds: float
+) -> Report:
+    """Return what a calibration says.
 
     Args:
         calibration: what is reported on.
-        directory: the folder; files of an earlier report in it are replaced, others stay.
-
-    Returns:
-        The page, report.html in the folder; every figure is beside it as report-NAME.png.
-
-    Raises:
-        InputError: matplotlib is missing, or the folder cannot be written to; then none of the report's files is new.
+        output: the rig's file.
+        board_file: the board's; None where there is none.
+        report: the report's folder; None where none is asked for.
+        seconds: how long it took.
     """
-    require_matplotlib()
-    folder = writable_folder(directory, "no report")
-    images: dict[str, bytes] = {}
-    with drawing():
-        for name, (draw, _) in FIGURES.items():
-            figure = draw(calibration)
-            if figure is not None:
-                images[name] = png(figure)
-    files = {f"report-{name}.png": data for name, data in images.items()}
-    put_files(folder, {**files, PAGE: page(calibration, images).encode()})
-    for name in FIGURES.keys() - images.keys():
-        (folder / f"report-{name}.png").unlink(missing_ok=True)
-    return folder / PAGE
-
-
-def page(calibration: Calibration, images: dict[str, bytes]) -> str:
-    """Return the page; ``images`` maps the names of figures to PNG data."""
-    figures = {name: picture(data, FIGURES[name][1]) for name, data in images.items()}
-    bodies = {anchor: make(calibration, figures) for anchor, (_, make) in SECTIONS.items()}
-    shown = {anchor: SECTIONS[anchor][0] for anchor, body in bodies.items() if body}
     left, right = ("{} x {}".format(*camera.image_size_px) for camera in calibration.rig.cameras)
     size = f"{left} px" if left == right else f"{left} px left, {right} px right"
     used = f"{len(calibration.pairs)} of {calibration.pairs_found} pairs of images used"
     what = f"{calibration.body.name} · {used} · {size} · baseline {1e3 * calibration.rig.baseline_m:.1f} mm"
-    sections = {anchor: (title, bodies[anchor]) for anchor, title in shown.items()}
-    return html_page("armsight: calibration report", "Calibration of two cameras", what, sections)
+    sections: dict[str, Section] = {name: (title, make(calibration)) for name, (title, make) in SECTIONS.items()}
+    sections["printed"] = ("", [_printed(calibration, output, board_file, report)])
+    values = _values(calibration, output, board_file, report, seconds)
+    return Report("calibration report", "Calibration of two cameras", what, "", sections, values=values)

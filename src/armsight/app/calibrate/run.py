@@ -1,33 +1,24 @@
-"""One calibration: images or detections in, a calibration out; what ``armsight calibrate`` prints and records of it."""
+"""One calibration: images or detections in, a calibration out, and how it was made."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib.metadata
-import itertools
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import click
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.calibrate.assessment import assess, graded_metrics
-from armsight.app.calibrate.report import MOTION_FITTED
-from armsight.app.messages import weak
 from armsight.app.progress import bar, steps
-from armsight.app.report.page import PAGE
-from armsight.app.report.table import TextTable, print_table
 from armsight.data import SIDES, Detections, Shot
 from armsight.errors import CalibrationError, InputError
 from armsight.vision.calibrate.boards import Pair, calibrate_boards, calibrate_recording
 from armsight.vision.calibrate.bodies import calibrate_bodies
-from armsight.vision.calibrate.result import Calibration, RejectedPair
-from armsight.vision.calibrate.screen import merged_notes
+from armsight.vision.calibrate.result import Calibration
 from armsight.vision.calibrate.weak import contradicted
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
@@ -335,85 +326,3 @@ def provenance(given: dict[str, str], calibration: Calibration) -> dict[str, Any
         "heldout_scale_error": h.scale_error,
         **({CONTRADICTED: round(h.epipolar_rms_px, 2)} if contradicted(calibration) else {}),
     }
-
-
-def _number(value: float) -> float | None:
-    """Return a number as JSON has it, which knows no NaN."""
-    return value if math.isfinite(value) else None
-
-
-def summary(
-    calibration: Calibration, output: Path, board_file: Path | None, report: Path | None, seconds: float
-) -> dict[str, Any]:
-    """Return the object that ``--json`` prints."""
-    c = calibration
-    return {
-        "pairs_found": c.pairs_found,
-        "pairs_used": len(c.pairs),
-        "rejected": [{"pair": r.pair, "reason": r.reason} for r in c.rejected],
-        "notes": list(c.notes),
-        "weaknesses": list(c.weaknesses),
-        "grade": assess(c).grade,
-        "poor": _poor(c),
-        "fit": {"epipolar_rms_px": _number(c.epipolar_rms_px), "reprojection_rms_px": c.reprojection_rms_px},
-        "heldout": vars(c.heldout),
-        "models": {name: vars(heldout) for name, heldout in c.models.items()},
-        "baseline_m": c.rig.baseline_m,
-        "convergence_deg": c.rig.convergence_deg,
-        "distortion_model": c.rig.left.model,
-        "sigma_px": c.rig.sigma_px,
-        "body_deviation_rms_m": c.deviation_m,
-        "disc_radius_m": c.disc_radius_m,
-        "shutters": None if c.rig.shutters is None else c.rig.shutters.to_json(),
-        "rig": str(output),
-        "board": None if board_file is None else str(board_file),
-        "report": str(report / PAGE) if report is not None else None,
-        "seconds": seconds,
-    }
-
-
-def _poor(calibration: Calibration) -> list[str]:
-    """Return the metrics for which the calibration must not be relied on yet, with their values."""
-    return [f"{row.name} {row.heldout}" for row in graded_metrics(calibration) if row.grade == "poor"]
-
-
-def _rejected_lines(rejected: Sequence[RejectedPair]) -> list[str]:
-    """Return a line for each pair that was rejected; neighbours rejected for one reason share a line."""
-    lines = []
-    for reason, group in itertools.groupby(rejected, key=lambda r: r.reason):
-        first, *more = (r.pair for r in group)
-        pairs = f"{1 + len(more)} pairs {first} to {more[-1]}" if more else f"pair {first}"
-        lines.append(f"rejected {pairs}: {reason}")
-    return lines
-
-
-def print_result(calibration: Calibration, output: Path, board_file: Path | None, report: Path | None) -> None:
-    """Print the held-out metrics first, then those of the fit, then what is weak."""
-    c, h = calibration, calibration.heldout
-    rows = (
-        ("epipolar RMS", f"{h.epipolar_rms_px:.3f} px"),
-        ("rigid RMS (shape of the target)", f"{1e3 * h.rigid_rms_m:.3f} mm"),
-        ("scale error", f"{100 * h.scale_error:+.3f} %"),
-        ("residual over predicted sigma", f"{h.normalised_rms:.2f}"),
-    )
-    print_table(
-        TextTable(f"Held-out errors: {h.folds} folds, each measured with the fit to the others", ("", ""), rows)
-    )
-    poor = _poor(c)
-    use = "" if contradicted(c) else f"; to measure it: armsight measure {output} --target {board_file}"
-    fit_px = f"{c.epipolar_rms_px:.3f} px" if math.isfinite(c.epipolar_rms_px) else "unknown"
-    fitted = "" if c.motion is None else f" ({MOTION_FITTED[0].lower()}{MOTION_FITTED[1:].rstrip('.')})"
-    lines = [
-        f"fit: epipolar {fit_px}, reprojection {c.reprojection_rms_px:.3f} px RMS{fitted}; "
-        f"{len(c.pairs)} of {c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px",
-        f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg; the body differs from its "
-        f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
-        *([] if c.disc_radius_m is None else [f"radius of the board's discs: {1e3 * c.disc_radius_m:.3f} mm"]),
-        *_rejected_lines(c.rejected),
-        *(f"note: {note}" for note in merged_notes(c.notes)),
-        *(weak(weakness) for weakness in c.weaknesses),
-        *([weak(f"do not rely on this calibration yet: {', '.join(poor)}")] if poor else []),
-        f"rig written to {output}" + (f", report to {report / PAGE}" if report is not None else ""),
-        *([] if board_file is None else [f"board as found written to {board_file}{use}"]),
-    ]
-    click.echo("\n".join(lines))

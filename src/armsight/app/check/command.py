@@ -89,12 +89,13 @@ def evaluated(
     armsight check plan --help.
     """
     from armsight.app.check.evaluate import evaluate, read_check
-    from armsight.app.check.limits import check_limits, limits_json, read_limits
-    from armsight.app.check.report import REPORT_FILES, metric_lines, text, write_check
-    from armsight.app.check.result import check_json
+    from armsight.app.check.limits import check_limits, read_limits
+    from armsight.app.check.report import REPORT_FILES, check_report
+    from armsight.app.check.result import metric_lines
+    from armsight.app.check.rows import rows_csv
     from armsight.app.check.run_folder import is_run
-    from armsight.app.report.page import PAGE, writable_folder
-    from armsight.app.report.plotting import require_matplotlib
+    from armsight.app.show.page import PAGE
+    from armsight.app.show.plotting import require_matplotlib
 
     if output is not None:
         require_matplotlib()
@@ -111,24 +112,13 @@ def evaluated(
     limits = read_limits(limit_texts)
     attained = read_check(data, closed=closed, columns=columns)
     result = evaluate(attained)
-    outcomes = check_limits(list(metric_lines(result)), limits)
-    remarks = ["" if each is None else each.text() for each in outcomes] if limits else []
+    outcomes = check_limits(list(metric_lines(result)), limits) if limits else []
+    report = check_report(result, attained.rows, data, outcomes)
     if output is not None:
-        folder = writable_folder(output, "no report")
-        write_check(result, attained.rows, data, folder, remarks, limits_json(outcomes))
-    failed = [each for each in outcomes if each is not None and not each.passed]
-    for note in result.notes:
-        click.echo(f"note: {note}", err=True)
-    if as_json:
-        click.echo(json.dumps(check_json(result) | limits_json(outcomes)))
-        return 1 if failed else 0
-    click.echo(text(result, remarks))
-    if limits:
-        compared = sum(each is not None for each in outcomes)
-        click.echo(f"\n{'FAIL' if failed else 'PASS'}: {len(failed)} of {compared} metrics with a limit are above it")
-    if output is not None:
-        click.echo(f"\nwritten: {output}/report.html with its figures as PNG, check.json, check.csv")
-    return 1 if failed else 0
+        report.write(output, {"check.json": report.json_text(), "check.csv": rows_csv(list(attained.rows))})
+    files = "report.html with its figures as PNG, check.json, check.csv"
+    report.echo(as_json=as_json, written=None if output is None else f"{output}/{files}")
+    return 1 if any(each is not None and not each.passed for each in outcomes) else 0
 
 
 @command.command("plan")

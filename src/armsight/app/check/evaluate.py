@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,6 @@ from armsight.app.check.result import (
     DistanceResult,
     DriftResult,
     JumpResult,
-    PathResult,
-    PoseResult,
     WorkspaceResult,
 )
 from armsight.app.check.rows import SAME_M, TESTS, Attained, Reversal, Row, first_few, natural, read_rows
@@ -24,8 +23,7 @@ from armsight.app.check.run_folder import attained_in
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop.iso9283 import poses as iso9283
-from armsight.loop.iso9283.paths import circle_metrics, path_metrics, plane_axes
-from armsight.loop.iso9283.statistic import Metric
+from armsight.loop.iso9283.paths import PathMetrics, circle_metrics, path_metrics, plane_axes
 
 #: Where no pose was attained often enough for a repeatability: this many poses and more give errors over the workspace.
 _WIDE = 10
@@ -83,6 +81,8 @@ def evaluate(attained: Attained) -> CheckResult:
         notes += first_few(rare, "poses, attained too seldom")
         notes += [note for group in often.values() for note in _outliers(group)]
     poses = {name: _pose(group) for name, group in often.items()}
+    ways = {name: [way for way in _groups(group, _approach).values() if len(way) > 1] for name, group in often.items()}
+    several = {n: iso9283.multi_directional([_positions(w) for w in each]) for n, each in ways.items() if len(each) > 1}
     distance = _distance_of_two(often)
     drift = _drift_of_first(often)
     workspace = _workspace(by_test["pose"]) if groups and not often else None
@@ -92,7 +92,7 @@ def evaluate(attained: Attained) -> CheckResult:
     if not (poses or workspace or followed or circle):
         raise InputError("; ".join(["nothing can be evaluated", *([seldom] if seldom else []), *notes]))
     notes += [f"left out: all poses, as none was attained {iso9283.MIN_POSES} times"] if seldom else []
-    return CheckResult(poses, workspace, distance, drift, followed, circle, notes)
+    return CheckResult(poses, several, workspace, distance, drift, followed, circle, notes)
 
 
 def _too_seldom(rows: list[Row]) -> str | None:
@@ -111,6 +111,10 @@ def _groups(rows: list[Row], key: Callable[[Row], str]) -> dict[str, list[Row]]:
     for row in rows:
         out.setdefault(key(row), []).append(row)
     return out
+
+
+def _approach(row: Row) -> str:
+    return row.approach
 
 
 def _positions(rows: list[Row]) -> Array:
@@ -169,7 +173,7 @@ def _outliers(rows: list[Row]) -> list[str]:
     ]
 
 
-def _pose(rows: list[Row]) -> PoseResult:
+def _pose(rows: list[Row]) -> iso9283.PoseMetrics:
     """Return the metrics of a pose; None for what needs rotations that are not known."""
     ways = [row.approach for row in rows]
     if min(Counter(ways).values()) < iso9283.MIN_POSES:  # of a table whose approaches are too many for a scatter
@@ -179,21 +183,11 @@ def _pose(rows: list[Row]) -> PoseResult:
     metrics = iso9283.pose_metrics(T, rows[0].T_command, _covs(rows), _common(rows), way)
     measured = all(row.measured_rotation for row in rows)
     commanded = measured and all(row.commanded_rotation for row in rows)
-    return PoseResult(
-        metrics.count,
-        metrics.accuracy,
-        metrics.accuracy_xyz,
-        metrics.accuracy_rotation if commanded else None,
-        metrics.repeatability,
-        metrics.repeatability_rotation if measured else None,
-        _multi_directional(rows),
+    return replace(
+        metrics,
+        AP_rotation_rad=metrics.AP_rotation_rad if commanded else None,
+        RP_rotation_rad=metrics.RP_rotation_rad if measured else None,
     )
-
-
-def _multi_directional(rows: list[Row]) -> Metric | None:
-    """Return vAP of a pose; None where it was approached repeatedly from one direction only."""
-    ways = [way for way in _groups(rows, lambda row: row.approach).values() if len(way) > 1]
-    return iso9283.multi_directional([_positions(way) for way in ways]) if len(ways) > 1 else None
 
 
 def _distance(first: str, first_rows: list[Row], last: str, last_rows: list[Row]) -> DistanceResult | None:
@@ -208,7 +202,7 @@ def _distance(first: str, first_rows: list[Row], last: str, last_rows: list[Row]
     return DistanceResult(first, last, commanded, AD, RD)
 
 
-def _path(name: str, rows: list[Row]) -> PathResult:
+def _path(name: str, rows: list[Row]) -> PathMetrics:
     """Return AT and RT of a path; every cycle along it has the path points of the first."""
     cycles = _groups(rows, lambda row: row.cycle)
     (first_cycle, first), *others = cycles.items()
@@ -222,14 +216,13 @@ def _path(name: str, rows: list[Row]) -> PathResult:
     attained = np.array([_positions(group) for group in cycles.values()])
     cov = np.array([_covs(group) for group in cycles.values()])
     try:
-        metrics = path_metrics(attained, _commands(first), cov, _common(rows))
+        return path_metrics(attained, _commands(first), cov, _common(rows))
     except InputError as error:
         raise InputError(f"path {name}: {error}") from None
-    return PathResult(len(attained), metrics)
 
 
 def _circle(rows: list[Row], reversals: list[Reversal]) -> CircleResult:
-    ways = _groups(rows, lambda row: row.approach)
+    ways = _groups(rows, _approach)
     if set(ways) != {"1", "-1"}:
         raise InputError(
             "circle: approach must be 1 for counter-clockwise and -1 for clockwise, and both must be there"
@@ -243,6 +236,6 @@ def _circle(rows: list[Row], reversals: list[Reversal]) -> CircleResult:
     metrics = circle_metrics(_positions(ways["1"]), _positions(ways["-1"]), axes, _covs(rows).mean(axis=0), asked)
     jumps = [
         JumpResult(reversal.joints, reversal.way, angle, jump)
-        for reversal, angle, jump in zip(reversals, at, metrics.jumps, strict=True)
+        for reversal, angle, jump in zip(reversals, at, metrics.jumps_m, strict=True)
     ]
     return CircleResult(axes, metrics, jumps)

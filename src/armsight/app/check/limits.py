@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
-from armsight.app.check.report import MEANINGS, MetricLine
+from armsight.app.check.result import MEANINGS, MetricLine
+from armsight.app.show.report import Fact
 from armsight.errors import InputError
 
 #: Unit -> how many of it are a metre.
@@ -99,7 +99,11 @@ def _compared(line: MetricLine, limit_m: float) -> LimitResult:
     return LimitResult(line.name, line.what, limit_m, value, value <= limit_m, certain)
 
 
-def limits_json(outcomes: Iterable[LimitResult | None]) -> dict[str, Any]:
-    """Return outcomes as JSON has them; nothing where there are no limits."""
-    compared = [asdict(outcome) for outcome in outcomes if outcome is not None]
-    return {"limits": compared, "passed": all(each["passed"] for each in compared)} if compared else {}
+def all_compared(outcomes: Iterable[LimitResult | None]) -> Fact:
+    """Return how many passed; nothing where there are no limits."""
+    compared = [outcome for outcome in outcomes if outcome is not None]
+    if not compared:
+        return Fact()
+    failed = sum(not each.passed for each in compared)
+    said = f"\n{'FAIL' if failed else 'PASS'}: {failed} of {len(compared)} metrics with a limit are above it"
+    return Fact(said, {"limits": compared, "passed": not failed})

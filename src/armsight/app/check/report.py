@@ -6,19 +6,20 @@ its figures as PNG, check.json and check.csv.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from armsight.app.check.result import CheckResult, JumpResult, check_json
-from armsight.app.check.rows import Row, rows_csv
-from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files, table
-from armsight.app.report.page import text as escaped
-from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, nice, png
+from armsight.app.check.limits import LimitResult, all_compared
+from armsight.app.check.result import MEANINGS, CheckResult, direction, metric_lines
+from armsight.app.check.rows import Row
+from armsight.app.show.messages import Note
+from armsight.app.show.page import PAGE, bullets
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, new_figure, nice
+from armsight.app.show.report import Block, Html, Report, Text, figures
+from armsight.app.show.table import TextTable, html_table
 from armsight.data import Array
 from armsight.loop.iso9283.paths import square_to
 from armsight.loop.iso9283.statistic import Metric
@@ -27,82 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.projections.polar import PolarAxes
-
-#: Short name of every metric -> its name and what it is.
-MEANINGS = {
-    "AP": "pose accuracy: from the command to the mean of the attained positions",
-    "RP": "pose repeatability: mean distance from that mean, plus three standard deviations",
-    "vAP": "multi-directional pose accuracy variation: largest distance between the means of several approaches",
-    "AD": "distance accuracy: error of the mean distance between two poses",
-    "RD": "distance repeatability: three standard deviations of it",
-    "dAP": "drift: how far the mean wanders over five parts of the time",
-    "mean error": "mean distance from the command over all poses",
-    "largest error": "the largest of them",
-    "AT": "path accuracy: largest distance of the mean path from the commanded one",
-    "RT": "path repeatability: the largest along it",
-    "circularity": "largest less smallest radius",
-    "hysteresis": "largest difference of the radii of both ways",
-    "backlash": "how much the radius jumps where the motion along that direction reverses",
-    "jump": "the same where a joint reverses: what its backlash does to the radius there",
-}
-
-
-class MetricLine(NamedTuple):
-    """One metric as it is listed.
-
-    Attributes:
-        name: short, a key of MEANINGS.
-        what: what it is of.
-        metric: its value, interval and resolution, m.
-    """
-
-    name: str
-    what: str
-    metric: Metric
-
-
-def metric_lines(result: CheckResult) -> Iterator[MetricLine]:
-    """Give all metrics of a test in the sequence of the standard."""
-    for name, p in result.poses.items():
-        yield MetricLine("AP", f"{name}, {p.count} times", p.accuracy)
-        yield MetricLine("RP", f"{name}, {p.count} times", p.repeatability)
-        if p.multi_directional is not None:
-            yield MetricLine("vAP", name, p.multi_directional)
-    if result.workspace is not None:
-        yield MetricLine("mean error", f"{result.workspace.count} poses", result.workspace.mean)
-        yield MetricLine("largest error", f"{result.workspace.count} poses", result.workspace.largest)
-    if result.distance is not None:
-        d = result.distance
-        what = f"{d.first} to {d.last}, {1e3 * d.commanded_m:.1f} mm"
-        yield MetricLine("AD", what, d.accuracy)
-        yield MetricLine("RD", what, d.repeatability)
-    if result.drift is not None:
-        yield MetricLine("dAP", f"{result.drift.pose}, {np.ptp(result.drift.t_s):.0f} s", result.drift.largest)
-    for name, path in result.paths.items():
-        yield MetricLine("AT", f"{name}, {path.count} times", path.metrics.accuracy)
-        yield MetricLine("RT", f"{name}, {path.count} times", path.metrics.repeatability)
-    if result.circle is not None:
-        c = result.circle.metrics
-        what = f"radius {1e3 * c.radius_m:.1f} mm"
-        yield MetricLine("circularity", what, c.circularity)
-        yield MetricLine("hysteresis", what, c.hysteresis)
-        for axis, backlash in zip(result.circle.axes, c.backlash, strict=True):
-            yield MetricLine("backlash", f"along {direction(axis)}", backlash)
-        for reversal in result.circle.reversals:
-            yield MetricLine("jump", _reversal_text(reversal), reversal.jump)
-
-
-def _reversal_text(reversal: JumpResult) -> str:
-    """Return which joints reverse where, as text."""
-    way = "counter-clockwise" if reversal.way > 0 else "clockwise"
-    joints = ", ".join(map(str, reversal.joints))
-    return f"{'joints' if len(reversal.joints) > 1 else 'joint'} {joints} at {reversal.angle_deg:.0f} deg, {way}"
-
-
-def direction(axis: Array) -> str:
-    """Return a direction (3,) as text: x, or the numbers where it is along no axis of the base."""
-    near = int(np.argmax(np.abs(axis)))
-    return "xyz"[near] if axis[near] > 1 - 1e-6 else "({:.2f}, {:.2f}, {:.2f})".format(*(np.round(axis, 2) + 0.0))
 
 
 def metric_text(metric: Metric) -> str:
@@ -115,17 +40,6 @@ def metric_text(metric: Metric) -> str:
         below = f"below {high:.3f} mm" if low >= 0 else f"{low:.3f} to {high:.3f} mm"
         return f"not resolvable: {below}; {least:.3f} mm could have been resolved ({raw:.3f} as measured)"
     return f"{clean:.3f} mm, {low:.3f} to {high:.3f} ({raw:.3f} as measured)"
-
-
-def text(result: CheckResult, remarks: Sequence[str] = ()) -> str:
-    """Return all metrics as text; ``remarks`` stand behind their lines, one each."""
-    rows = list(metric_lines(result))
-    wide = max(len(row.what) for row in rows)
-    lines = [f"{row.name:14s} {row.what:{wide}s}  {metric_text(row.metric)}" for row in rows]
-    lines = [f"{line}  {remark}".rstrip() for line, remark in zip(lines, remarks or [""] * len(lines), strict=True)]
-    return "\n".join(
-        ["metric without the instrument's noise, the interval that holds it to 95 %, as measured:", *lines]
-    )
 
 
 #: This many poses are shown with their scatter.
@@ -146,7 +60,7 @@ def scatter_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
     for column, name in enumerate(names):
         p = _positions(rows, name)
         off, middle = p - p.mean(axis=0), result.poses[name]
-        RP = middle.repeatability.clean
+        RP = middle.RP_m.clean
         reach = max(reach, 1.15 * float(np.abs(off).max()), 1.1 * (RP or 0.0))
         for row, (i, j, view) in enumerate(_VIEWS):
             ax = panels[row, column]
@@ -155,10 +69,10 @@ def scatter_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
             )
             ax.axhline(0, color="#e4e7eb", lw=0.8, zorder=0)
             ax.axvline(0, color="#e4e7eb", lw=0.8, zorder=0)
-            _ring(ax, 1e3 * (RP if RP is not None else (middle.repeatability.high or 0.0)), dotted=RP is None)
+            _ring(ax, 1e3 * (RP if RP is not None else (middle.RP_m.high or 0.0)), dotted=RP is None)
             ax.set_aspect("equal")
             if row == 0:
-                ax.set_title(f"{name}: command is\n{1e3 * middle.accuracy.raw:.2f} mm off")
+                ax.set_title(f"{name}: command is\n{1e3 * middle.AP_m.raw:.2f} mm off")
             if row == 1:
                 ax.set_xlabel("x, mm")
             if column == 0:
@@ -182,7 +96,7 @@ def _positions(rows: Sequence[Row], name: str) -> Array:
 
 def anywhere_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
     """Plot the error over the workspace."""
-    if result.workspace is None:
+    if result.anywhere is None:
         return None
     chosen = [row for row in rows if row.test == "pose"]
     at = np.array([row.T_command[:3, 3] for row in chosen])
@@ -230,7 +144,7 @@ def paths_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
     figure = new_figure(3.2)
     ax = figure.subplots()
     for (name, p), colour in zip(result.paths.items(), (BLUE, ORANGE, MUTED, RED) * len(result.paths), strict=False):
-        off_m = p.metrics.off
+        off_m = p.off_m
         share = 100 * (np.arange(len(off_m)) + 1) / (len(off_m) + 1)
         ax.plot(share, 1e3 * off_m, color=colour, label=name)
         cycles = {row.cycle for row in rows if row.test == "path" and (row.approach or "path") == name}
@@ -285,28 +199,28 @@ def circle_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
     return figure
 
 
-#: Anchor -> title, the function that plots it (None where there is nothing to plot), and the caption.
-FIGURES: dict[str, tuple[str, Callable[[CheckResult, Sequence[Row]], Figure | None], str]] = {
+#: Anchor -> the function that plots it (None where there is nothing to plot), title, and caption.
+FIGURES: dict[str, tuple[Callable[[CheckResult, Sequence[Row]], Figure | None], str, str]] = {
     "scatter": (
-        "The poses",
         scatter_figure,
+        "The poses",
         "Attained positions of each pose about their mean, and RP as a circle: dotted where it cannot be resolved, then it "
         "is the bound. The instrument's noise is still in the dots.",
     ),
-    "anywhere": ("The workspace", anywhere_figure, "How far from the command each pose was attained."),
+    "anywhere": (anywhere_figure, "The workspace", "How far from the command each pose was attained."),
     "drift": (
-        "Drift",
         drift_figure,
+        "Drift",
         "Attained positions of the first pose over time, and how far their mean has wandered.",
     ),
     "paths": (
-        "The paths",
         paths_figure,
+        "The paths",
         "Distance from the commanded path along it: mean path thick, every cycle thin.",
     ),
     "circle": (
-        "The circle",
         circle_figure,
+        "The circle",
         "Deviations from the fitted circle, enlarged. Where the motion along an axis reverses, the radius jumps by the "
         "backlash: at each such position stands the jump counter-clockwise / clockwise, mm. J: these joints reverse there; "
         "the backlash of an arm of revolute joints shows there, and not where x or y reverses.",
@@ -318,88 +232,60 @@ FIGURES: dict[str, tuple[str, Callable[[CheckResult, Sequence[Row]], Figure | No
 REPORT_FILES = (PAGE, "check.json", "check.csv", *(f"check-{name}.png" for name in FIGURES))
 
 
-def write_check(
-    result: CheckResult,
-    rows: Sequence[Row],
-    source: Path,
-    folder: Path,
-    remarks: Sequence[str] = (),
-    more: Mapping[str, Any] = MappingProxyType({}),
-) -> Path:
-    """Write the report of a test.
+def check_report(
+    result: CheckResult, rows: Sequence[Row], source: Path, outcomes: Sequence[LimitResult | None] = ()
+) -> Report:
+    """Return what a test shows.
 
     Args:
         result: its metrics.
         rows: what they are made of.
         source: where those came from.
-        folder: an existing folder; files of an earlier report in it are replaced.
-        remarks: what stands behind the metrics' lines, one each: PASS or FAIL.
-        more: further entries of check.json.
-
-    Returns:
-        The page; check.json, check.csv and the figures are beside it.
-
-    Raises:
-        InputError: matplotlib is missing, or a file cannot be written; then none of the new ones is left.
+        outcomes: of the metrics against their limits, one each; none without limits.
     """
-    images: dict[str, bytes] = {}
-    with drawing():
-        for name, (_, plot, _) in FIGURES.items():
-            plotted = plot(result, rows)
-            if plotted is not None:
-                images[name] = png(plotted)
-    files = {f"check-{name}.png": data for name, data in images.items()}
-    files["check.json"] = (json.dumps(check_json(result) | dict(more), indent=1) + "\n").encode()
-    files["check.csv"] = rows_csv(list(rows)).encode()
-    put_files(folder, {**files, PAGE: _page(result, images, source, remarks).encode()})
-    for name in FIGURES.keys() - images.keys():
-        (folder / f"check-{name}.png").unlink(missing_ok=True)
-    return folder / PAGE
-
-
-def _page(result: CheckResult, images: dict[str, bytes], source: Path, remarks: Sequence[str]) -> str:
-    """Return the page."""
-    sections = {"result": ("Result", _result_section(result, remarks))}
-    for name, data in images.items():
-        title, _, caption = FIGURES[name]
-        image = picture(data, title)
-        sections[name] = (title, f"<figure>{image}<figcaption><p>{escaped(caption)}</p></figcaption></figure>")
-    return html_page("armsight: check", "ISO 9283 test", f"ISO 9283 · {source}", sections)
+    listed = list(metric_lines(result))
+    remarks = ["" if each is None else each.text() for each in outcomes or [None] * len(listed)]
+    wide = max(len(row.what) for row in listed)
+    printed = [f"{name:14s} {what:{wide}s}  {metric_text(metric)}" for name, what, metric in listed]
+    cells = [
+        (
+            name,
+            what,
+            "not resolvable" if m.clean is None else _mm(m.clean),
+            _mm(m.sigma),
+            "" if m.low is None else f"{_mm(m.low)} to {_mm(m.high)}",
+            *(_mm(m.raw), _mm(m.resolvable)),
+            remark,
+        )
+        for (name, what, m), remark in zip(listed, remarks, strict=True)
+    ]
+    title = (
+        "Each metric without the noise, the interval that holds the true one 95 times in a hundred, and the metric as the "
+        "standard computes it. What the noise could make as well is called not resolvable; the last column of lengths is "
+        "the smallest value that could have been resolved. Without the instrument's sigma a metric may have no interval."
+    )
+    head = ("", "of", "mm", "sigma", "95 %, from to", "as measured", "resolvable from", "limit" if outcomes else "")
+    first = "metric without the instrument's noise, the interval that holds it to 95 %, as measured:"
+    meant = [f"{name}: {meaning}." for name, meaning in MEANINGS.items() if name in {row.name for row in listed}]
+    blocks: list[Block] = [
+        Text(
+            "\n".join([first, *(f"{line}  {remark}".rstrip() for line, remark in zip(printed, remarks, strict=True))])
+        ),
+        Html(html_table(TextTable(title, head, tuple(cells))) + bullets(meant)),
+        all_compared(outcomes),
+    ]
+    return Report(
+        "check",
+        "ISO 9283 test",
+        f"ISO 9283 · {source}",
+        "",
+        {"result": ("Result", blocks), **figures(FIGURES, result, rows)},
+        [Note("note", each) for each in result.notes],
+        result.values(),
+        prefix="check",
+    )
 
 
 def _mm(value: float | None) -> str:
     """Return a length, m, in mm; nothing where there is none."""
     return "" if value is None else f"{1e3 * value:.3f}"
-
-
-def _result_section(result: CheckResult, remarks: Sequence[str]) -> str:
-    """Return the table of all metrics, HTML."""
-    listed = list(metric_lines(result))
-    rows = []
-    for (name, what, m), remark in zip(listed, remarks or [""] * len(listed), strict=True):
-        raw, sigma, low, high, least = (_mm(value) for value in (m.raw, m.sigma, m.low, m.high, m.resolvable))
-        value = "not resolvable" if m.clean is None else _mm(m.clean)
-        ends = f"{low} to {high}" if low else ""
-        rows.append(
-            (
-                escaped(name),
-                escaped(what),
-                f"<b>{value}</b>",
-                sigma,
-                ends,
-                raw,
-                least,
-                *([escaped(remark)] if remarks else []),
-            )
-        )
-    head = ("", "of", "mm", "sigma", "95 %, from to", "as measured", "resolvable from", *(["limit"] if remarks else []))
-    used = {row.name for row in listed}
-    meant = [f"{name}: {meaning}." for name, meaning in MEANINGS.items() if name in used]
-    introduction = (
-        "<p>Each metric without the noise, the interval that holds the true one 95 times in a hundred, and the metric as "
-        "the standard computes it. What the noise could make as well is called not resolvable; the last column is the "
-        "smallest value that could have been resolved. Without the instrument's sigma a metric may have no interval.</p>\n"
-    )
-    return (
-        introduction + table(head, rows, "numbers") + bullets(meant) + (bullets(result.notes) if result.notes else "")
-    )

@@ -1,37 +1,17 @@
-"""The metrics of a test, as records, and the JSON document made of them (docs/howto/iso9283.md has its keys)."""
+"""What a test shows: records whose fields are the keys of check.json (docs/howto/iso9283.md), SI units, and their list."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from armsight.data import Array
 from armsight.loop.iso9283.paths import CircleMetrics, PathMetrics
+from armsight.loop.iso9283.poses import PoseMetrics
 from armsight.loop.iso9283.statistic import Metric
-
-
-@dataclass(frozen=True)
-class PoseResult:
-    """Metrics of one commanded pose.
-
-    Attributes:
-        count: how many times the pose was attained.
-        accuracy: AP, m.
-        accuracy_xyz: (3,) attained mean less command, base, m.
-        accuracy_rotation: (3,) rotation of the attained mean against the command, rad; None where a rotation is unknown.
-        repeatability: RP, m.
-        repeatability_rotation: (3,) rad; None where the attained rotations are unknown.
-        multi_directional: vAP, m; None where the pose was approached repeatedly from one direction only.
-    """
-
-    count: int
-    accuracy: Metric
-    accuracy_xyz: Array
-    accuracy_rotation: Array | None
-    repeatability: Metric
-    repeatability_rotation: Array | None
-    multi_directional: Metric | None
 
 
 @dataclass(frozen=True)
@@ -40,32 +20,24 @@ class WorkspaceResult:
 
     Attributes:
         count: attained poses.
-        mean: mean distance from the command, m.
-        largest: largest distance, m.
+        mean_m: mean distance from the command.
+        max_m: largest distance.
     """
 
     count: int
-    mean: Metric
-    largest: Metric
+    mean_m: Metric
+    max_m: Metric
 
 
 @dataclass(frozen=True)
 class DistanceResult:
-    """Metrics of the distance between two poses.
-
-    Attributes:
-        first: name of the first pose.
-        last: name of the second pose.
-        commanded_m: commanded distance, m.
-        accuracy: AD, m.
-        repeatability: RD, m.
-    """
+    """Metrics of the distance between two poses, by their names: what was commanded, AD and RD."""
 
     first: str
     last: str
     commanded_m: float
-    accuracy: Metric
-    repeatability: Metric
+    AD_m: Metric
+    RD_m: Metric
 
 
 @dataclass(frozen=True)
@@ -74,28 +46,15 @@ class DriftResult:
 
     Attributes:
         pose: its name.
-        t_s: (K,) middle of each part of the time, s.
-        dAP_m: (K,) distance of that part's mean position from the first part's, m.
-        largest: the largest of them, m.
+        t_s: (K,) middle of each part of the time.
+        dAP_m: (K,) distance of that part's mean position from the first part's.
+        max_m: the largest of them.
     """
 
     pose: str
     t_s: Array
     dAP_m: Array
-    largest: Metric
-
-
-@dataclass(frozen=True)
-class PathResult:
-    """Metrics of one path.
-
-    Attributes:
-        count: how many times the path was followed.
-        metrics: AT, RT and the mean path's distance from the command at every path point.
-    """
-
-    count: int
-    metrics: PathMetrics
+    max_m: Metric
 
 
 @dataclass(frozen=True)
@@ -106,13 +65,13 @@ class JumpResult:
         joints: numbers of the joints, 1 to 6.
         way: 1 counter-clockwise, -1 clockwise.
         angle_deg: where on the circle.
-        jump: of the radius, outwards positive, m.
+        jump_m: of the radius, outwards positive.
     """
 
     joints: tuple[int, ...]
     way: float
     angle_deg: float
-    jump: Metric
+    jump_m: Metric
 
 
 @dataclass(frozen=True)
@@ -136,7 +95,8 @@ class CheckResult:
 
     Attributes:
         poses: by name of the pose.
-        workspace: where no pose was attained often.
+        vAP_m: by name of the pose, of those that were approached repeatedly from several directions.
+        anywhere: where no pose was attained often.
         distance: between two poses.
         drift: of the first pose.
         paths: by name of the path.
@@ -144,83 +104,97 @@ class CheckResult:
         notes: what was left out or is remarkable, as text.
     """
 
-    poses: dict[str, PoseResult] = field(default_factory=dict)
-    workspace: WorkspaceResult | None = None
+    poses: dict[str, PoseMetrics] = field(default_factory=dict)
+    vAP_m: dict[str, Metric] = field(default_factory=dict)
+    anywhere: WorkspaceResult | None = None
     distance: DistanceResult | None = None
     drift: DriftResult | None = None
-    paths: dict[str, PathResult] = field(default_factory=dict)
+    paths: dict[str, PathMetrics] = field(default_factory=dict)
     circle: CircleResult | None = None
     notes: Sequence[str] = ()
 
+    def values(self) -> dict[str, Any]:
+        """Return what check.json has; what is not known is absent."""
+        found = {name: value for name, value in vars(self).items() if value}
+        if (d := self.distance) is not None:
+            ends = {"from": d.first, "to": d.last}
+            found["distance"] = {**ends, "commanded_m": d.commanded_m, "AD_m": d.AD_m, "RD_m": d.RD_m}
+        if (c := self.circle) is not None:
+            found["circle"] = {**vars(c.metrics), "axes": c.axes, "reversals": c.reversals}
+        return found
 
-def check_json(result: CheckResult) -> dict[str, Any]:
-    """Return metrics as check.json has them, SI units; what is not known is absent or null."""
-    document: dict[str, Any] = {}
-    if result.workspace is not None:
-        w = result.workspace
-        document["anywhere"] = {"count": w.count, "mean_m": _metric_json(w.mean), "max_m": _metric_json(w.largest)}
-    if result.poses:
-        document["poses"] = {name: _pose_json(p) for name, p in result.poses.items()}
-        several = {n: p.multi_directional for n, p in result.poses.items() if p.multi_directional is not None}
-        document |= {"vAP_m": {name: _metric_json(metric) for name, metric in several.items()}} if several else {}
-    if result.distance is not None:
-        d = result.distance
-        document["distance"] = {
-            "from": d.first,
-            "to": d.last,
-            "commanded_m": d.commanded_m,
-            "AD_m": _metric_json(d.accuracy),
-            "RD_m": _metric_json(d.repeatability),
-        }
-    if result.drift is not None:
-        f = result.drift
-        times, dAP_m = f.t_s.tolist(), f.dAP_m.tolist()
-        document["drift"] = {"pose": f.pose, "t_s": times, "dAP_m": dAP_m, "max_m": _metric_json(f.largest)}
-    if result.paths:
-        document["paths"] = {name: _path_json(path) for name, path in result.paths.items()}
+
+#: Short name of every metric -> its name and what it is.
+MEANINGS = {
+    "AP": "pose accuracy: from the command to the mean of the attained positions",
+    "RP": "pose repeatability: mean distance from that mean, plus three standard deviations",
+    "vAP": "multi-directional pose accuracy variation: largest distance between the means of several approaches",
+    "AD": "distance accuracy: error of the mean distance between two poses",
+    "RD": "distance repeatability: three standard deviations of it",
+    "dAP": "drift: how far the mean wanders over five parts of the time",
+    "mean error": "mean distance from the command over all poses",
+    "largest error": "the largest of them",
+    "AT": "path accuracy: largest distance of the mean path from the commanded one",
+    "RT": "path repeatability: the largest along it",
+    "circularity": "largest less smallest radius",
+    "hysteresis": "largest difference of the radii of both ways",
+    "backlash": "how much the radius jumps where the motion along that direction reverses",
+    "jump": "the same where a joint reverses: what its backlash does to the radius there",
+}
+
+
+class MetricLine(NamedTuple):
+    """One metric as it is listed.
+
+    Attributes:
+        name: short, a key of MEANINGS.
+        what: what it is of.
+        metric: its value, interval and resolution, m.
+    """
+
+    name: str
+    what: str
+    metric: Metric
+
+
+def metric_lines(result: CheckResult) -> Iterator[MetricLine]:
+    """Give all metrics of a test in the sequence of the standard."""
+    for name, p in result.poses.items():
+        yield MetricLine("AP", f"{name}, {p.count} times", p.AP_m)
+        yield MetricLine("RP", f"{name}, {p.count} times", p.RP_m)
+        if name in result.vAP_m:
+            yield MetricLine("vAP", name, result.vAP_m[name])
+    if (w := result.anywhere) is not None:
+        yield MetricLine("mean error", f"{w.count} poses", w.mean_m)
+        yield MetricLine("largest error", f"{w.count} poses", w.max_m)
+    if (d := result.distance) is not None:
+        what = f"{d.first} to {d.last}, {1e3 * d.commanded_m:.1f} mm"
+        yield MetricLine("AD", what, d.AD_m)
+        yield MetricLine("RD", what, d.RD_m)
+    if (f := result.drift) is not None:
+        yield MetricLine("dAP", f"{f.pose}, {np.ptp(f.t_s):.0f} s", f.max_m)
+    for name, path in result.paths.items():
+        yield MetricLine("AT", f"{name}, {path.count} times", path.AT_m)
+        yield MetricLine("RT", f"{name}, {path.count} times", path.RT_m)
     if result.circle is not None:
-        document["circle"] = _circle_json(result.circle)
-    return document | {"notes": list(result.notes)}
+        c = result.circle.metrics
+        what = f"radius {1e3 * c.radius_m:.1f} mm"
+        yield MetricLine("circularity", what, c.circularity_m)
+        yield MetricLine("hysteresis", what, c.hysteresis_m)
+        for axis, backlash in zip(result.circle.axes, c.backlash_m, strict=True):
+            yield MetricLine("backlash", f"along {direction(axis)}", backlash)
+        for reversal in result.circle.reversals:
+            yield MetricLine("jump", _reversal_text(reversal), reversal.jump_m)
 
 
-def _metric_json(metric: Metric) -> dict[str, float | None]:
-    return {**asdict(metric), "sigma": metric.sigma}
+def _reversal_text(reversal: JumpResult) -> str:
+    """Return which joints reverse where, as text."""
+    way = "counter-clockwise" if reversal.way > 0 else "clockwise"
+    joints = ", ".join(map(str, reversal.joints))
+    return f"{'joints' if len(reversal.joints) > 1 else 'joint'} {joints} at {reversal.angle_deg:.0f} deg, {way}"
 
 
-def _pose_json(p: PoseResult) -> dict[str, Any]:
-    return {
-        "count": p.count,
-        "AP_m": _metric_json(p.accuracy),
-        "AP_xyz_m": p.accuracy_xyz.tolist(),
-        "AP_rotation_rad": None if p.accuracy_rotation is None else p.accuracy_rotation.tolist(),
-        "RP_m": _metric_json(p.repeatability),
-        "RP_rotation_rad": None if p.repeatability_rotation is None else p.repeatability_rotation.tolist(),
-    }
-
-
-def _path_json(path: PathResult) -> dict[str, Any]:
-    return {
-        "count": path.count,
-        "AT_m": _metric_json(path.metrics.accuracy),
-        "RT_m": _metric_json(path.metrics.repeatability),
-        "off_m": path.metrics.off.tolist(),
-    }
-
-
-def _circle_json(circle: CircleResult) -> dict[str, Any]:
-    metrics = circle.metrics
-    return {
-        "centre_m": metrics.centre.tolist(),
-        "radius_m": metrics.radius_m,
-        "axes": circle.axes.tolist(),
-        "circularity_m": _metric_json(metrics.circularity),
-        "hysteresis_m": _metric_json(metrics.hysteresis),
-        "steps_m": metrics.steps_m.tolist(),
-        "backlash_m": [_metric_json(metric) for metric in metrics.backlash],
-        "reversals": [
-            {"joints": list(r.joints), "way": r.way, "angle_deg": r.angle_deg, "jump_m": _metric_json(r.jump)}
-            for r in circle.reversals
-        ],
-        "angle_deg": metrics.angle_deg.tolist(),
-        "radii_m": metrics.radii_m.tolist(),
-    }
+def direction(axis: Array) -> str:
+    """Return a direction (3,) as text: x, or the numbers where it is along no axis of the base."""
+    near = int(np.argmax(np.abs(axis)))
+    return "xyz"[near] if axis[near] > 1 - 1e-6 else "({:.2f}, {:.2f}, {:.2f})".format(*(np.round(axis, 2) + 0.0))

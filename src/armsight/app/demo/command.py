@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from armsight.app.arm_option import arm_option
-from armsight.app.messages import UNTRUSTED, require
+from armsight.app.show.messages import UNTRUSTED, require
 
 
 @click.command("demo")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from armsight.app.dense.files import make_folder, paint_disparity, paint_errors, write_png
-from armsight.files import finite_json, write_text
+from armsight.files import json_of, write_text
 from armsight.vision.dense.evaluate import DisparityErrors, evaluate_disparity
 from armsight.vision.dense.methods import open_method
 from armsight.vision.dense.middlebury import MiddleburyScene
@@ -115,7 +115,7 @@ def averages(lines: list[SceneResult]) -> dict[str, dict[str, float]]:
 def evaluation_json(lines: list[SceneResult]) -> dict[str, Any]:
     """Return an evaluation as one object; numbers that are not there are null."""
     whole = {"scenes": [line.to_json() for line in lines], "weighted_average": averages(lines)}
-    document: dict[str, Any] = finite_json(whole)
+    document: dict[str, Any] = json_of(whole)
     return document
 
 

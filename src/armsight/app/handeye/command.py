@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -11,14 +10,13 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 from armsight.app.arm_option import arm_option
-from armsight.app.messages import UNTRUSTED
 from armsight.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from armsight.app.handeye.images import Seen
-    from armsight.app.handeye.result import HandEyeAnswer
+    from armsight.app.handeye.report import HandEyeAnswer
     from armsight.robot.arm import Arm
     from armsight.tables.poses import PoseTable
 
@@ -103,7 +101,7 @@ class Options:
     "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Folder for the page and the files."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
-def command(**given: object) -> None:
+def command(**given: object) -> int:
     """Calibrate hand and eye from your own data: robot poses, and images or poses of a target.
 
     Prints both transforms with sigma, the error on poses left out, how much of it is the arm and how much the camera, which
@@ -114,11 +112,9 @@ def command(**given: object) -> None:
     options = _with_both(Options(**given))  # type: ignore[arg-type]
     _require_one_way(options)
 
-    from armsight.app.handeye.report import write_handeye_report
-    from armsight.app.handeye.result import as_json, plan_csv, text, untrusted
+    from armsight.app.handeye.report import handeye_report, plan_csv
     from armsight.app.progress import steps
-    from armsight.app.report.page import put_files, writable_folder
-    from armsight.app.report.plotting import require_matplotlib
+    from armsight.app.show.plotting import require_matplotlib
     from armsight.files import check_folder
 
     folder = None
@@ -127,26 +123,13 @@ def command(**given: object) -> None:
         folder = check_folder(options.output, problem="no report can be written here")
     with steps() as progress:
         run = calibrate(options, progress)
+        report = handeye_report(run)
+        files = {} if run.plan is None else {"plan.csv": plan_csv(run.plan)}
         if folder is not None:
             progress("writing")
-            writable_folder(folder, "no report")
-            write_handeye_report(run, folder)
-            files = {"handeye.json": json.dumps(as_json(run), indent=1).encode() + b"\n"}
-            if run.plan is not None:
-                files["plan.csv"] = plan_csv(run.plan).encode()
-            put_files(folder, files)
-    for note in run.recording.notes:
-        click.echo(f"note: {note}", err=True)
-    if options.as_json:
-        click.echo(json.dumps(as_json(run)))
-    else:
-        click.echo(text(run))
-        if folder is not None:
-            click.echo(
-                f"\nwritten: {folder}/report.html, handeye.json" + (", plan.csv" if run.plan is not None else "")
-            )
-    if untrusted(run):
-        click.get_current_context().exit(UNTRUSTED)
+            report.write(folder, {"handeye.json": report.json_text(), **files})
+    written = None if folder is None else f"{folder}/{', '.join(['report.html', 'handeye.json', *files])}"
+    return report.echo(as_json=options.as_json, written=written)
 
 
 def _columns(options: Options, side: str) -> str | None:
@@ -198,7 +181,7 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
     """
     from armsight.app.handeye.plan import plan_poses
     from armsight.app.handeye.recording import at_shots, links_of, paired, recording_of, robot_in_recording
-    from armsight.app.handeye.result import HandEyeAnswer
+    from armsight.app.handeye.report import HandEyeAnswer
     from armsight.app.handeye.suspect import require_plausible
     from armsight.loop.handeye.handeye import calibrate_poses
     from armsight.robot.arm_file import open_arm
@@ -276,7 +259,7 @@ def _streams(
     from armsight.app.handeye.images import steady
     from armsight.app.handeye.plan import plan_poses
     from armsight.app.handeye.recording import links_between, of_streams
-    from armsight.app.handeye.result import HandEyeAnswer
+    from armsight.app.handeye.report import HandEyeAnswer
     from armsight.app.handeye.suspect import require_plausible, resized
     from armsight.loop.handeye.poses import MIN_POSES
     from armsight.loop.handeye.streams import PoseStream, calibrate_streams, coarse_offset

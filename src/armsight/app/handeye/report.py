@@ -1,30 +1,312 @@
-"""The page of a hand-eye calibration: one HTML file that holds its figures, and the figures as PNG files beside it."""
+"""The result of a hand-eye calibration as a Report: what is said of it, its JSON, its figures, the poses to take next."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from armsight.app.handeye.result import (
-    HandEyeAnswer,
-    blunders,
-    headline,
-    names,
-    plan_table,
-    statements,
-    transforms_table,
-    untrusted,
-)
-from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files, text
-from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png
-from armsight.app.report.table import html_table
+from armsight.app.handeye.plan import PosePlan, worst_sigmas
+from armsight.app.handeye.recording import PairedPoses
+from armsight.app.show.messages import Note
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, new_figure
+from armsight.app.show.report import Block, Fact, Lines, Report, Section, figures
+from armsight.app.show.table import TextTable
+from armsight.data import Record
 from armsight.geometry.pose import inverse, log_se3, mean_pose, transform
+from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye
+from armsight.loop.handeye.sources import OF_THE_ARM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+#: As many blunders as this share of the poses are no calibration to trust.
+_MANY = 0.25
+#: Sources whose mean log density of a pose left out is within this of the best are not distinguished from them.
+DISTINGUISHED = 0.2
+_POSE = ("x, mm", "y, mm", "z, mm", "rx, deg", "ry, deg", "rz, deg")
+
+
+@dataclass(frozen=True, eq=False)
+class HandEyeAnswer(Record):
+    """A calibration with what it was made from.
+
+    Attributes:
+        recording: both sides.
+        found: the calibration.
+        offset_s: to be added to the eye's times; None where there are no streams; sigma_offset_s its sigma.
+        plan: the poses to take next; None where not asked for.
+    """
+
+    recording: PairedPoses
+    found: HandEye
+    offset_s: float | None
+    sigma_offset_s: float
+    plan: PosePlan | None
+
+
+def names(run: HandEyeAnswer) -> tuple[str, str]:
+    """Return what the flange carries and what stands still: names of the transforms."""
+    if run.found.eye == "in_hand":
+        return "T_flange_rig", "T_base_body"
+    return "T_flange_body", "T_base_rig"
+
+
+def handeye_report(run: HandEyeAnswer) -> Report:
+    """Return what a calibration says."""
+    found, names_ = run.found, run.recording.names
+    held, still = names(run)
+    position, angle = found.held_out.rms()
+    headline = (
+        f"poses left out: {1e3 * position:.2f} mm, {np.degrees(angle):.3f} deg RMS; {int(found.used.sum())} of "
+        f"{len(found.used)} poses used"
+    )
+    out = np.flatnonzero(~found.used)
+    worst = out[np.argsort(-found.distance[out])]
+    blunders = [f"{names_[k]}: {np.sqrt(found.distance[k]):.0f} sigma from the others" for k in worst]
+    why = _untrusted(run)
+    values = {
+        "eye": found.eye,
+        "untrusted": why,
+        held: found.T_flange_held,
+        still: found.T_base_still,
+        "cov_m_rad": found.cov,
+        "cov_order": [f"{still}: right tangent, translation then rotation", f"{held}: the same"],
+        "held_out_rms_m": position,
+        "held_out_rms_rad": angle,
+        "held_out_mean_m": found.held_out.mean()[0],
+        "held_out_nominal_rms_m": found.held_out_nominal.rms()[0],
+        "held_out_nominal_mean_m": found.held_out_nominal.mean()[0],
+        "held_out_geometry_rms_m": None if found.held_out_geometry is None else found.held_out_geometry.rms()[0],
+        "held_out_geometry_mean_m": None if found.held_out_geometry is None else found.held_out_geometry.mean()[0],
+        "noise": {
+            "structure": found.structure,
+            "arm_off_probability": found.arm_off,
+            "sigmas": found.sigmas,
+            "of_the_arm": [name for name in found.sigmas if name in OF_THE_ARM],
+            "log_likelihood_left_out": found.likelihoods,
+        },
+        "poses": [
+            {
+                "name": names_[k],
+                "line": run.recording.robot.lines[row],
+                "used": found.used[k],
+                "sigmas_from_the_others": np.sqrt(found.distance[k]),
+                "held_out_m": found.held_out.position_m[k],
+                "held_out_rad": found.held_out.angle_rad[k],
+            }
+            for k, row in enumerate(run.recording.rows)
+        ],
+    }
+    if run.recording.seen.scatter_px:
+        values["reprojection_rms_px"] = run.recording.seen.scatter_px
+    sections: dict[str, Section] = {
+        "result": ("Result", [_transforms_table(run), *_facts(run)]),
+        **figures(FIGURES, run),
+    }
+    listed = Lines(blunders, f"blunders, left out: {len(blunders)}", most=10, none="no blunders")
+    sections["blunders"] = ("Blunders", [listed])
+    if run.plan is not None:
+        sections["plan"] = ("Poses to take next", _plan(run.plan, names_, found.structure))
+    return Report(
+        "hand-eye calibration",
+        "Hand-eye calibration",
+        f"{run.recording.robot.path.name} · {len(found.used)} poses · eye {found.eye.replace('_', ' ')}",
+        headline,
+        sections,
+        [*(Note("untrusted", each) for each in why), *(Note("note", each) for each in run.recording.notes)],
+        values,
+    )
+
+
+def _with_sigma(value: float, sigma: float, decimals: int) -> str:
+    """Return a value and its sigma with so many decimals; with more, up to five, where these show nothing of the sigma."""
+    while sigma < 0.5 * 10.0**-decimals and decimals < 5:
+        decimals += 1
+    return f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
+
+
+def _transforms_table(run: HandEyeAnswer) -> TextTable:
+    """Return both transforms with their sigmas as a table."""
+    found = run.found
+    sigma = np.sqrt(np.diag(found.cov))
+    rows = []
+    for name, T, s in zip(names(run), (found.T_flange_held, found.T_base_still), (sigma[6:], sigma[:6]), strict=True):
+        along = np.sqrt(np.square(T[:3, :3]) @ np.square(s[:3]))  # the tangent's sigmas are along its own axes
+        angles = Rotation.from_matrix(np.array(T[:3, :3])).as_euler("xyz", degrees=True)
+        cells = [_with_sigma(1e3 * v, 1e3 * e, 2) for v, e in zip(T[:3, 3], along, strict=True)]
+        cells += [_with_sigma(v, np.degrees(e), 3) for v, e in zip(angles, s[3:], strict=True)]
+        rows.append((name, *cells))
+    return TextTable("angles: xyz about fixed axes; ± sigma", ("", *_POSE), tuple(rows))
+
+
+def _facts(run: HandEyeAnswer) -> list[Block]:
+    """Return what is said beside the transforms, a line each, with what programs read of it."""
+    found = run.found
+    facts: list[Block] = [_whose(found), _open_direction(run)]
+    if run.offset_s is not None:
+        offset = f"clock offset {1e3 * run.offset_s:.2f} ± {1e3 * run.sigma_offset_s:.2f} ms"
+        sentence = f"{offset}, to be added to the camera's times"
+        facts.append(Fact(sentence, {"clock_offset_s": run.offset_s, "clock_offset_sigma_s": run.sigma_offset_s}))
+    facts += [Fact(line) for line in _of_the_geometry(run)]
+    facts.append(
+        Fact(
+            f"the arm is not as its model with a probability of {100 * found.arm_off:.0f} %; the sigmas allow with that "
+            "weight for what it is then off by in all poses alike"
+        )
+    )
+    common = (
+        f"the rig's calibration was fitted too: {1e3 * found.common_m:.2f} mm RMS at the target, at most "
+        f"{np.abs(found.common).max():.1f} of its own sigmas; poses used and left out are corrected by it"
+        if found.common.size
+        else ""
+    )
+    facts.append(Fact(common, {"rig_calibration_rms_m": found.common_m}))
+    return [*facts, *_scale(found)]
+
+
+def _whose(found: HandEye) -> Fact:
+    """Say how much of the error is the arm's and how much the camera's."""
+    arm, camera = 1e3 * found.arm_m, 1e3 * found.camera_m
+    said = f"at the target the arm is off by {arm:.2f} mm RMS, the camera by {camera:.2f} mm"
+    best = max(found.likelihoods.values())
+    if all(best - found.likelihoods.get(name, -np.inf) < DISTINGUISHED for name in ("robot", "camera")):
+        said += "; these poses hardly distinguish arm from camera"
+    said += f" (structure of the noise: {found.structure})"
+    return Fact(said, {"arm_rms_m": found.arm_m, "camera_rms_m": found.camera_m})
+
+
+def _open_direction(run: HandEyeAnswer) -> Fact:
+    """Say in which direction the mounting is known worst."""
+    found = run.found
+    values, vectors = np.linalg.eigh(found.cov[6:9, 6:9])
+    axis = found.T_flange_held[:3, :3] @ vectors[:, -1]
+    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+    named = " ".join(f"{value:.2f}" for value in axis)
+    ratio = float(np.sqrt(values[-1] / max(values[0], 1e-300)))
+    rotated = log_se3(np.linalg.inv(mean_pose(run.recording.poses.A)) @ run.recording.poses.A)[:, 3:]
+    spread, axes = np.linalg.eigh(rotated.T @ rotated / len(rotated))
+    least = axes[:, 0] * np.sign(axes[np.argmax(np.abs(axes[:, 0])), 0])
+    about = " ".join(f"{value:.2f}" for value in least)
+    said = (
+        f"worst known along [{named}] of the flange: sigma {1e3 * np.sqrt(values[-1]):.2f} mm, {ratio:.1f} times the best; "
+        f"the poses rotate least about [{about}] ({np.degrees(np.sqrt(max(spread[0], 0.0))):.1f} deg RMS)"
+    )
+    worst_m, worst_rad = worst_sigmas(found.cov)
+    return Fact(said, {"open_direction": said, "worst_sigma_m": worst_m, "worst_sigma_rad": worst_rad})
+
+
+def _of_the_geometry(run: HandEyeAnswer) -> list[str]:
+    """Say what the arm's geometry, as the other poses show it, is worth."""
+    found = run.found
+    if found.held_out_geometry is None:
+        return []
+    errors = (found.held_out, found.held_out_nominal, found.held_out_geometry)
+    plain, nominal, geometry = (1e3 * of.rms()[0] for of in errors)
+    what, found_by = "geometry of the arm", "armsight identify finds it"
+    if "drift_m" in found.sigmas:
+        joints = "" if run.recording.robot.q is not None else "with joints and --model "
+        what, found_by = "smooth error of the arm", f"{joints}armsight identify finds its geometry"
+    lines = [
+        f"with the {what} that the other poses show, poses left out come to {geometry:.2f} mm in place of "
+        f"{nominal:.2f}; {found_by}"
+    ]
+    if "link_m" in found.sigmas:
+        lines.append(
+            f"the transforms go with the true arm: with the arm's nominal model they leave {plain:.2f} mm; with the "
+            f"mounting that suits the arm's nominal model: {nominal:.2f} mm"
+        )
+    return lines
+
+
+def _scale(found: HandEye) -> list[Fact]:
+    """Say how long the target is."""
+    scale, sigma = found.scale, found.sigma_scale
+    of_given = f"{scale:.5f} ± {sigma:.5f} of those given"
+    if "scale_walk" in found.sigmas:
+        walk = found.sigmas["scale_walk"]
+        way = 1.96 * float(np.hypot(walk, sigma / scale))
+        low, high = ends = scale * float(np.exp(-way)), scale * float(np.exp(way))
+        said = (
+            f"the camera's scale walks by {100 * walk:.2g} % over all poses (sigma): the target's lengths are {of_given} "
+            f"at the first pose alone, and {low:.4f} to {high:.4f} at the last (95 %)"
+        )
+        values = {"target_scale_at_start": scale, "target_scale_at_start_sigma": sigma}
+        return [Fact(said, values | {"target_scale_walks_sigma": walk, "target_scale_at_end": ends})]
+    if not sigma:
+        return []
+    advice = "no contradiction; without --scale the transforms are known better"
+    if abs(scale - 1.0) > 3.0 * sigma:
+        advice = "correct --target's size"
+    return [
+        Fact(f"the target's lengths are {of_given}: {advice}", {"target_scale": scale, "target_scale_sigma": sigma})
+    ]
+
+
+def _untrusted(run: HandEyeAnswer) -> list[str]:
+    """Return why the result must not be trusted; empty where it may be."""
+    found, why = run.found, []
+    out, n = int((~found.used).sum()), len(found.used)
+    if out >= _MANY * n:
+        why.append(
+            f"{out} of {n} poses are blunders, more than slips: do the rows belong together, and did nothing move? A row "
+            "that is missing on one side shifts all after it"
+        )
+    median = float(np.nanmedian(found.held_out.position_m))
+    if median > TRUSTED_M:
+        why.append(f"half of the poses left out are off by more than {1e3 * median:.0f} mm: check one row by hand")
+    for name, cov in zip(names(run), (found.cov[6:, 6:], found.cov[:6, :6]), strict=True):
+        far_m, far_rad = (float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in (cov[:3, :3], cov[3:, 3:]))
+        if far_m > TRUSTED_M or far_rad > TRUSTED_RAD:
+            why.append(
+                f"{name} is known to {1e3 * far_m:.0f} mm and {np.degrees(far_rad):.1f} deg only along its worst axes "
+                "(sigma): rotate the flange further, about axes that are not parallel, and take more poses"
+            )
+    return why
+
+
+def _plan(plan: PosePlan, names: tuple[str, ...], structure: str) -> list[Block]:
+    """Return the next poses; names are those of the poses that were taken."""
+    values = {
+        "T_base_flange": plan.Ts_base_flange,
+        "sigma_m": plan.sigma_m,
+        "sigma_rad": plan.sigma_rad,
+        "nearest": [names[k] for k in plan.nearest],
+        "rotated_from_nearest_rad": plan.rotated_rad,
+        "moved_from_nearest_m": plan.moved_m,
+        "lowers_most": plan.reasons,
+    }
+    bounds = f"these sigmas are lower bounds: with {structure} new poses share errors with the others"
+    return [_plan_table(plan, names), Fact("" if structure == "robot and camera" else bounds, {"plan": values})]
+
+
+def _plan_table(plan: PosePlan, names: tuple[str, ...]) -> TextTable:
+    """Return the next poses as a table for people; names are those of the poses that were taken."""
+    rows = []
+    for k, (T, m, rad) in enumerate(zip(plan.Ts_base_flange, plan.sigma_m, plan.sigma_rad, strict=True), 1):
+        p, angles = 1e3 * T[:3, 3], Rotation.from_matrix(np.array(T[:3, :3])).as_euler("xyz", degrees=True)
+        values = [*(f"{v:.1f}" for v in p), *(f"{v:.1f}" for v in angles), f"{1e3 * m:.2f}", f"{np.degrees(rad):.3f}"]
+        far = f"{np.degrees(plan.rotated_rad[k - 1]):.0f} deg, {1e3 * plan.moved_m[k - 1]:.0f} mm"
+        rows.append((str(k), *values, f"{far} from {names[plan.nearest[k - 1]]}", plan.reasons[k - 1]))
+    head = ("next", *_POSE, "sigma, mm", "deg", "near", "lowers most")
+    title = (
+        f"poses of the flange to take next (sigma along the worst axis now {1e3 * plan.before[0]:.2f} mm, "
+        f"{np.degrees(plan.before[1]):.3f} deg); each is near one that was taken, with the target in view; check that your "
+        "arm reaches them freely"
+    )
+    return TextTable(title, head, tuple(rows))
+
+
+def plan_csv(plan: PosePlan) -> str:
+    """Return the next poses as a table that the command reads."""
+    lines = ["x_m,y_m,z_m,qw,qx,qy,qz"]
+    for T in plan.Ts_base_flange:
+        x, y, z, w = Rotation.from_matrix(np.array(T[:3, :3])).as_quat()
+        lines.append(",".join(f"{v:.9g}" for v in (*T[:3, 3], w, x, y, z)))
+    return "\n".join(lines) + "\n"
 
 
 def errors_figure(run: HandEyeAnswer) -> Figure:
@@ -125,30 +407,3 @@ FIGURES: dict[str, tuple[Callable[[HandEyeAnswer], Figure], str, str]] = {
         "Good: rotations spread in both colours, by 20 degrees and more; points on a line are rotations about one axis.",
     ),
 }
-
-
-def write_handeye_report(run: HandEyeAnswer, folder: Path) -> None:
-    """Write report.html and its figures into an existing folder.
-
-    Raises:
-        InputError: matplotlib is missing, or the folder cannot be written to.
-    """
-    with drawing():
-        images = {name: png(plot(run)) for name, (plot, _, _) in FIGURES.items()}
-    doubts = "".join(f'<p class="headline">do not trust this result: {text(why)}</p>' for why in untrusted(run))
-    result = (
-        f'<div class="assessment">{doubts}<p class="headline">{text(headline(run))}</p></div>\n'
-        + html_table(transforms_table(run))
-        + bullets([*statements(run), *run.recording.notes])
-    )
-    sections = {"result": ("Result", result)}
-    for name, (_, title, caption) in FIGURES.items():
-        image = picture(images[name], title)
-        sections[name] = (title, f"<figure>{image}<figcaption><p>{text(caption)}</p></figcaption></figure>\n")
-    sections["blunders"] = ("Blunders", bullets(blunders(run) or ["none"]))
-    if run.plan is not None:
-        sections["plan"] = ("Poses to take next", html_table(plan_table(run.plan, run.recording.names)))
-    sub = f"{run.recording.robot.path.name} · {len(run.found.used)} poses · eye {run.found.eye.replace('_', ' ')}"
-    page = html_page("armsight: hand-eye calibration", "Hand-eye calibration", sub, sections)
-    files = {f"report-{name}.png": data for name, data in images.items()}
-    put_files(folder, {**files, PAGE: page.encode()})

@@ -78,18 +78,10 @@ def command(
     if arm_name is None or data is None:
         raise InputError("give --arm and --data: armsight identify --arm ur10 --data poses.csv -o corrected/")
 
-    from armsight.app.identify.report import write_identify_report
-    from armsight.app.identify.run import (
-        headline,
-        identify_json,
-        read_measured,
-        results_in,
-        run_identify,
-        text,
-        write_results,
-    )
+    from armsight.app.identify.report import identify_report, write_results
+    from armsight.app.identify.run import FILES, read_measured, results_in, run_identify
     from armsight.app.progress import steps
-    from armsight.app.report.plotting import require_matplotlib
+    from armsight.app.show.plotting import require_matplotlib
     from armsight.robot.arm_file import open_arm, split_arm
 
     arm = open_arm(arm_name)
@@ -117,20 +109,12 @@ def command(
         if output is not None:
             progress("writing")
             write_results(run, output)
-    for note in run.notes:
-        click.echo(f"note: {note}", err=True)
-    if as_json:
-        ended = {"output": None if output is None else str(output), "wall_s": time.perf_counter() - started}
-        click.echo(json.dumps({**identify_json(run), **ended}))
-    else:
-        click.echo(headline(run))
-        click.echo(text(run, everything=verbose))
+    report = identify_report(run, everything=verbose)
+    report.echo(as_json=as_json, output=output, wall_s=time.perf_counter() - started)
     if output is not None:  # last: what was found is printed and stored before anything is drawn
-        write_identify_report(run, output)
+        report.write(output)
     if output is not None and not as_json:
-        click.echo(
-            f"\nwritten: {output}/corrected.toml, corrected.urdf, zeros.toml, parameters.csv, identify.json, report.html"
-        )
+        click.echo(f"\nwritten: {output}/{', '.join([*FILES, 'report.html'])}")
 
 
 @command.command()

@@ -1,23 +1,32 @@
-"""The report of an identification: one HTML page that holds its figures, and the figures as PNG files beside it.
+"""The result of an identification as a Report, and the files beside it: the corrected arm, zeros, parameters.
 
 Figures: errors over the workspace and over joint angles, error sources, forward selection, correlations.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Callable
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from armsight.app.identify.run import Identification, headline, ranges_seen, value_text
-from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files, table
-from armsight.app.report.page import text as escaped
-from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, drawing, new_figure, panels, png
+from armsight.app.identify.run import Identification
+from armsight.app.show.messages import Note
+from armsight.app.show.page import table
+from armsight.app.show.page import text as escaped
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, new_figure, panels
+from armsight.app.show.report import Block, Fact, Html, Lines, Report, Text, figures
+from armsight.app.show.table import TextTable, plain_text
 from armsight.data import Array
-from armsight.loop.identify.identify import contributions
+from armsight.files import write_text
+from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
+from armsight.loop.identify.corrected import Corrected, zeros_text
+from armsight.loop.identify.identify import Identified, contributions
+from armsight.loop.identify.model import Parameter
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -203,62 +212,188 @@ FIGURES: dict[str, tuple[Callable[[Identification], Figure], str, str]] = {
 }
 
 
-def write_identify_report(run: Identification, folder: Path) -> Path:
-    """Write the report of an identification.
-
-    Args:
-        run: the identification.
-        folder: an existing folder.
-
-    Returns:
-        The page, report.html.
-
-    Raises:
-        InputError: matplotlib is missing, or the folder cannot be written to.
-    """
-    with drawing():
-        images = {name: png(plot(run)) for name, (plot, _, _) in FIGURES.items()}
-    files = {f"report-{name}.png": data for name, data in images.items()}
-    put_files(folder, {**files, PAGE: page(run, images).encode()})
-    return folder / PAGE
-
-
-def page(run: Identification, images: dict[str, bytes]) -> str:
-    """Return the page; ``images`` maps the names of figures to PNG data."""
-    sections = {"result": ("Result", _result_section(run))}
-    for name, (_, title, caption) in FIGURES.items():
-        image = picture(images[name], title)
-        sections[name] = (title, f"<figure>{image}<figcaption><p>{escaped(caption)}</p></figcaption></figure>\n")
-    sections["ranges"] = ("Ranges of the joints", _ranges(run))
-    sections["parameters"] = ("Parameters", _parameters(run))
-    fitted = int(run.found.solution.free.sum())
-    sub = f"{run.arm.name} · {len(run.measured)} poses · {fitted} parameters fitted"
-    return html_page("armsight: identification of an arm", "Kinematic identification", sub, sections)
-
-
-def _result_section(run: Identification) -> str:
-    """Return the held-out errors and the notes, HTML."""
-    return (
-        f'<div class="assessment"><p class="headline">{escaped(headline(run))}</p></div>\n'
-        f"<p>Held-out residual over its predicted sigma: {run.held_out.residual_over_predicted:.2f} (1: the sigmas are "
-        "right).</p>\n"
-    ) + (bullets(run.notes) if run.notes else "")
-
-
-def _ranges(run: Identification) -> str:
-    """Return the readings that the poses have shown of each joint, HTML."""
-    rows = [
-        [escaped(name), f"{np.degrees(low):.1f}", f"{np.degrees(high):.1f}"]
-        for name, (low, high) in zip(run.arm.joint_names, ranges_seen(run.found), strict=True)
+def identify_report(run: Identification, *, everything: bool = False) -> Report:
+    """Return what an identification says; ``everything`` has also why the rest was not fitted printed."""
+    found = run.found
+    noise = f"noise {1e3 * found.solution.noise[0]:.3f} mm"
+    if found.model.full:
+        noise += f", {np.degrees(found.solution.noise[1]):.4f} deg"
+    fitted = int(found.solution.free.sum())
+    fact = (
+        f"{len(run.measured)} poses, {fitted} parameters fitted, {noise}; held-out residual over its predicted sigma "
+        f"{run.held_out.residual_over_predicted:.2f} (1: the sigmas are right)"
+    )
+    parts = contributions(found, run.measured).items()
+    backlash = [f"joint {p.joint + 1}  {_backlash_text(p)}" for p in joint_backlashes(found, run.measured)]
+    moved = "displacement of the tool by each error source, RMS, beyond what the sources before it explain:"
+    pairs = [f"{a} and {b}: {c:+.3f}" for a, b, c in found.correlated()]
+    result: list[Block] = [
+        Fact(fact, _values(run)),
+        Lines([f"{source:<28} {1e3 * size:8.3f} mm" for source, size in parts], moved),
+        Lines(backlash, "backlash of each joint, stop to stop:"),
+        Lines(pairs, "correlations over 0.9 (more varied poses distinguish them):"),
     ]
-    fade = np.degrees(run.found.model.fade_rad)
-    return (
+    return Report(
+        "identification of an arm",
+        "Kinematic identification",
+        f"{run.arm.name} · {len(run.measured)} poses · {fitted} parameters fitted",
+        headline(run),
+        {
+            "result": ("Result", result),
+            **figures(FIGURES, run),
+            "ranges": ("Ranges of the joints", _ranges(run)),
+            "parameters": ("Parameters", [*_printed(run, everything=everything), _parameters(run)]),
+        },
+        [Note("note", each) for each in run.notes],
+    )
+
+
+class ParameterRow(NamedTuple):
+    """One parameter of the model, as parameters.csv and the JSON object have it: the fields are their columns and keys.
+
+    Attributes:
+        name: of the parameter.
+        unit: m, rad, rad/m or 1.
+        nominal: value of the nominal arm; None of base and tool.
+        value: identified; the nominal one where it was not fitted.
+        sigma: standard deviation; None where it was not fitted.
+        frozen: why it was not fitted, or not alone; None where it was.
+    """
+
+    name: str
+    unit: str
+    nominal: float | None
+    value: float
+    sigma: float | None
+    frozen: str | None
+
+
+def parameter_rows(run: Identification) -> list[ParameterRow]:
+    """Return all parameters of the model, SI units."""
+    found, sigma = run.found, np.sqrt(np.diag(run.found.cov))
+    nominal = found.model.nominal()
+    return [
+        ParameterRow(
+            p.name,
+            p.unit,
+            None if p.kind in ("base", "tool") else float(nominal[k]),
+            float(found.solution.x[k]),
+            float(sigma[k]) if found.solution.free[k] else None,
+            found.reasons.get(p.name),
+        )
+        for k, p in enumerate(found.model.parameters)
+    ]
+
+
+def _values(run: Identification) -> dict[str, Any]:
+    """Return what programs read, SI units."""
+    found = run.found
+    return {
+        "version": 2,
+        "arm": run.arm.name,
+        "poses": len(run.measured),
+        "left_out_lines": [int(run.lines[k]) for k in found.left_out],
+        "validation": run.how,
+        "validation_placement_refitted": run.held_out.placement_refitted,
+        "nominal": run.held_out.nominal.summary(),
+        "identified": run.held_out.identified.summary(),
+        "residual_over_predicted": run.held_out.residual_over_predicted,
+        "noise_m": found.solution.noise[0],
+        "noise_rad": found.solution.noise[1] if found.model.full else None,
+        "parameters": [row._asdict() for row in parameter_rows(run)],
+        "joint_ranges_seen": [
+            {"joint": i + 1, "min_rad": low, "max_rad": high} for i, (low, high) in enumerate(ranges_seen(found))
+        ],
+        "curve_fade_rad": found.model.fade_rad,
+        "correlated": [{"a": a, "b": b, "correlation": c} for a, b, c in found.correlated()],
+        "forward_selection": [{"source": s.source, "parameters": s.names, "held_out_rms": s.rms} for s in found.steps],
+    }
+
+
+def write_results(run: Identification, out: Path) -> None:
+    """Write the corrected arm, the board's zeros, the parameters and the summary into a folder."""
+    corrected = Corrected.of(run.found)
+    corrected.save(out / "corrected.toml")
+    write_text(out / "corrected.urdf", corrected.urdf())
+    write_text(out / "zeros.toml", zeros_text(run.found))
+    write_text(out / "parameters.csv", _parameters_csv(run))
+    write_text(out / "identify.json", identify_report(run).json_text())
+
+
+def _parameters_csv(run: Identification) -> str:
+    """Return the parameters as CSV, SI units."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(ParameterRow._fields)
+    writer.writerows(["" if value is None else value for value in row] for row in parameter_rows(run))
+    return out.getvalue()
+
+
+def headline(run: Identification) -> str:
+    """Return the held-out errors, of the nominal and of the identified arm, in one line."""
+    before, after = run.held_out.nominal.summary(), run.held_out.identified.summary()
+    line = f"held-out error {1e3 * before['mean_m']:.3f} -> {1e3 * after['mean_m']:.3f} mm mean"
+    line += f", {1e3 * before['max_m']:.2f} -> {1e3 * after['max_m']:.2f} mm largest"
+    if "mean_rad" in after:
+        line += f", {np.degrees(before['mean_rad']):.3f} -> {np.degrees(after['mean_rad']):.3f} deg mean"
+    no_better = "; no better than the nominal arm: keep that one, or take more poses"
+    return f"{line} ({run.how}){no_better if after['mean_m'] >= before['mean_m'] else ''}"
+
+
+def value_text(p: Parameter, value: float) -> str:
+    """Return a value in mm, deg, deg/m or %."""
+    if p.unit == "m":
+        return f"{1e3 * value:.3f} mm"
+    if p.unit == "rad":
+        return f"{np.degrees(value):.4f} deg"
+    if p.unit == "rad/m":
+        return f"{np.degrees(value):.4f} deg/m"
+    return f"{100 * value:.4f} %"
+
+
+def _printed(run: Identification, *, everything: bool) -> list[Block]:
+    """Return the parameters that were fitted, for the terminal, and why others were not."""
+    found, nominal = run.found, run.found.model.nominal()
+    rows = []
+    for k, p in enumerate(found.model.parameters):
+        if found.solution.free[k] and p.kind not in ("base", "tool", *([] if everything else ["ripple"])):
+            cells = [value_text(p, value) for value in (nominal[k], *found.value(p.name))]
+            tied = "with others (-v)" if p.name in found.reasons and not everything else ""
+            rows.append((p.name, *cells, tied))
+    left = sum(
+        not free and p.kind not in ("base", "tool")
+        for p, free in zip(found.model.parameters, found.solution.free, strict=True)
+    )
+    shown = Text(plain_text(TextTable("", ("parameter", "nominal", "identified", "sigma", ""), tuple(rows))))
+    if everything:
+        return [shown, Text("\n".join(["\nnot fitted, or not alone:", *(f"  {line}" for line in _not_fitted(run))]))]
+    return [shown, *map(Text, _ripples(run)), Text(f"\n{left} more parameters were not fitted; -v says why")]
+
+
+def ranges_seen(found: Identified) -> list[tuple[float, float]]:
+    """Return the least and greatest reading of each joint in the poses fitted, rad."""
+    assert found.model.q_seen is not None  # for the type checker: an identified arm has them
+    return [(float(low), float(high)) for low, high in found.model.q_seen]
+
+
+def _ranges(run: Identification) -> list[Block]:
+    """Return the readings that the poses have shown of each joint."""
+    fade, seen = np.degrees(run.found.model.fade_rad), [np.degrees(each) for each in ranges_seen(run.found)]
+    rows = [[escaped(n), f"{a:.1f}", f"{b:.1f}"] for n, (a, b) in zip(run.arm.joint_names, seen, strict=True)]
+    curves = (
         f"<p>The curve of a joint's sensor holds over the readings seen. Beyond them it fades within {fade:.0f} degrees to "
         "its mean over them: a pose measured there would say what it is.</p>\n"
-    ) + table(("joint", "least reading, deg", "greatest reading, deg"), rows, "numbers")
+    )
+    title = (
+        f"\nreadings seen (beyond them a sensor's curve fades within {fade:.0f} deg to its mean; zeros and lengths hold "
+        "everywhere):"
+    )
+    lines = [f"  joint {i + 1}  {a:.1f} to {b:.1f} deg" for i, (a, b) in enumerate(seen)]
+    shown = table(("joint", "least reading, deg", "greatest reading, deg"), rows, "numbers")
+    return [Text("\n".join([title, *lines])), Html(curves + shown)]
 
 
-def _parameters(run: Identification) -> str:
+def _parameters(run: Identification) -> Html:
     """Return the table of all parameters, fitted ones first, HTML."""
     found, sigma, nominal = run.found, np.sqrt(np.diag(run.found.cov)), run.found.model.nominal()
     rows = []
@@ -268,4 +403,36 @@ def _parameters(run: Identification) -> str:
         now = value_text(p, found.solution.x[k]) if free else ""
         row = (p.name, was, now, value_text(p, sigma[k]) if free else "", found.reasons.get(p.name, ""))
         rows.append([escaped(entry) for entry in row])
-    return table(("parameter", "nominal", "identified", "sigma", "why not, or with what"), rows, "numbers")
+    return Html(table(("parameter", "nominal", "identified", "sigma", "why not, or with what"), rows, "numbers"))
+
+
+def _ripples(run: Identification) -> list[str]:
+    """Return how large the fast part of each sensor's curve is: its many numbers say nothing one by one."""
+    found, lines = run.found, []
+    for i in range(found.model.arm.joints):
+        rows = [k for k, p in enumerate(found.model.parameters) if p.kind == "ripple" and p.joint == i]
+        rows = [k for k in rows if found.solution.free[k]]
+        if rows:
+            size = np.degrees(np.sqrt(np.sum(found.solution.x[rows] ** 2) / 2))
+            lines.append(
+                f"  ripple{i + 1}_.. {len(rows)} numbers, together {size:.4f} deg RMS over a revolution (-v lists them)"
+            )
+    return lines
+
+
+def _backlash_text(backlash: JointBacklash) -> str:
+    """Return a joint's backlash, and what showed it."""
+    if not np.isfinite(backlash.value_rad):
+        return backlash.how
+    return f"{np.degrees(backlash.value_rad):.3f} +- {np.degrees(backlash.sigma_rad):.3f} deg, by {backlash.how}"
+
+
+def _not_fitted(run: Identification) -> list[str]:
+    """Return the reasons of what was not fitted, equal ones together."""
+    by_reason: dict[str, list[str]] = {}
+    for p in run.found.model.parameters:
+        reason = run.found.reasons.get(p.name)
+        if reason is not None and p.kind not in ("base", "tool"):
+            short = reason.split(":")[0] if reason.startswith("not selected") else reason
+            by_reason.setdefault(short, []).append(p.name)
+    return [f"{', '.join(names)}: {reason}" for reason, names in by_reason.items()]

@@ -6,15 +6,11 @@ parameters and JSON; text in mm and degrees, the held-out errors first.
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -22,13 +18,11 @@ from scipy.special import chdtri
 from armsight.app.handeye.recording import matched_rows
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
-from armsight.files import check_writable, write_text
-from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
-from armsight.loop.identify.corrected import Corrected, zeros_text
+from armsight.files import check_writable
 from armsight.loop.identify.diagnose import check_plausible, find_step, without_tool
-from armsight.loop.identify.identify import ALIKE, Identified, contributions, identify
+from armsight.loop.identify.identify import ALIKE, Identified, identify
 from armsight.loop.identify.measured import Measured, visits
-from armsight.loop.identify.model import Model, Parameter
+from armsight.loop.identify.model import Model
 from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.read import COLUMNS, Read, poses_in, read_poses
 from armsight.loop.identify.validate import MIN_POSES, Errors, Validation, errors, require_alike, validate
@@ -321,71 +315,6 @@ def _notes(arm: Arm, found: Identified, measured: Measured, lines: Array) -> tup
     return tuple(notes)
 
 
-class ParameterRow(NamedTuple):
-    """One parameter of the model, as parameters.csv and the JSON object have it: the fields are their columns and keys.
-
-    Attributes:
-        name: of the parameter.
-        unit: m, rad, rad/m or 1.
-        nominal: value of the nominal arm; None of base and tool.
-        value: identified; the nominal one where it was not fitted.
-        sigma: standard deviation; None where it was not fitted.
-        frozen: why it was not fitted, or not alone; None where it was.
-    """
-
-    name: str
-    unit: str
-    nominal: float | None
-    value: float
-    sigma: float | None
-    frozen: str | None
-
-
-def parameter_rows(run: Identification) -> list[ParameterRow]:
-    """Return all parameters of the model, SI units."""
-    found, sigma = run.found, np.sqrt(np.diag(run.found.cov))
-    nominal = found.model.nominal()
-    return [
-        ParameterRow(
-            p.name,
-            p.unit,
-            None if p.kind in ("base", "tool") else float(nominal[k]),
-            float(found.solution.x[k]),
-            float(sigma[k]) if found.solution.free[k] else None,
-            found.reasons.get(p.name),
-        )
-        for k, p in enumerate(found.model.parameters)
-    ]
-
-
-def identify_json(run: Identification) -> dict[str, Any]:
-    """Return an identification as JSON has it, SI units."""
-    found = run.found
-    return {
-        "version": 2,
-        "arm": run.arm.name,
-        "poses": len(run.measured),
-        "left_out_lines": [int(run.lines[k]) for k in found.left_out],
-        "validation": run.how,
-        "validation_placement_refitted": run.held_out.placement_refitted,
-        "nominal": run.held_out.nominal.summary(),
-        "identified": run.held_out.identified.summary(),
-        "residual_over_predicted": run.held_out.residual_over_predicted,
-        "noise_m": found.solution.noise[0],
-        "noise_rad": found.solution.noise[1] if found.model.full else None,
-        "parameters": [row._asdict() for row in parameter_rows(run)],
-        "joint_ranges_seen": [
-            {"joint": i + 1, "min_rad": low, "max_rad": high} for i, (low, high) in enumerate(ranges_seen(found))
-        ],
-        "curve_fade_rad": float(found.model.fade_rad),
-        "correlated": [{"a": a, "b": b, "correlation": c} for a, b, c in found.correlated()],
-        "forward_selection": [
-            {"source": s.source, "parameters": list(s.names), "held_out_rms": s.rms} for s in found.steps
-        ],
-        "notes": list(run.notes),
-    }
-
-
 @contextmanager
 def results_in(out: Path, apart_from: tuple[Path | None, ...]) -> Iterator[None]:
     """Make the folder of the results before long work; where that fails, no folder made for it stays behind.
@@ -415,133 +344,3 @@ def _make(out: Path, made: list[Path]) -> None:
                 made.append(folder)
     except OSError as error:
         raise InputError(f"{out}: cannot be made: {error.strerror}") from None
-
-
-def write_results(run: Identification, out: Path) -> None:
-    """Write the corrected arm, the board's zeros, the parameters and the summary into a folder."""
-    corrected = Corrected.of(run.found)
-    corrected.save(out / "corrected.toml")
-    write_text(out / "corrected.urdf", corrected.urdf())
-    write_text(out / "zeros.toml", zeros_text(run.found))
-    write_text(out / "parameters.csv", _parameters(run))
-    write_text(out / "identify.json", json.dumps(identify_json(run), indent=1) + "\n")
-
-
-def _parameters(run: Identification) -> str:
-    """Return the parameters as CSV, SI units."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(ParameterRow._fields)
-    writer.writerows(["" if value is None else value for value in row] for row in parameter_rows(run))
-    return out.getvalue()
-
-
-def headline(run: Identification) -> str:
-    """Return the held-out errors, of the nominal and of the identified arm, in one line."""
-    before, after = run.held_out.nominal.summary(), run.held_out.identified.summary()
-    line = f"held-out error {1e3 * before['mean_m']:.3f} -> {1e3 * after['mean_m']:.3f} mm mean"
-    line += f", {1e3 * before['max_m']:.2f} -> {1e3 * after['max_m']:.2f} mm largest"
-    if "mean_rad" in after:
-        line += f", {np.degrees(before['mean_rad']):.3f} -> {np.degrees(after['mean_rad']):.3f} deg mean"
-    no_better = "; no better than the nominal arm: keep that one, or take more poses"
-    return f"{line} ({run.how}){no_better if after['mean_m'] >= before['mean_m'] else ''}"
-
-
-def value_text(p: Parameter, value: float) -> str:
-    """Return a value in mm, deg, deg/m or %."""
-    if p.unit == "m":
-        return f"{1e3 * value:.3f} mm"
-    if p.unit == "rad":
-        return f"{np.degrees(value):.4f} deg"
-    if p.unit == "rad/m":
-        return f"{np.degrees(value):.4f} deg/m"
-    return f"{100 * value:.4f} %"
-
-
-def text(run: Identification, *, everything: bool = False) -> str:
-    """Return what is printed after the headline; with ``everything`` also why the rest was not fitted."""
-    found = run.found
-    noise = f"noise {1e3 * found.solution.noise[0]:.3f} mm"
-    if found.model.full:
-        noise += f", {np.degrees(found.solution.noise[1]):.4f} deg"
-    lines = [
-        f"{len(run.measured)} poses, {int(found.solution.free.sum())} parameters fitted, {noise}; held-out residual over "
-        f"its predicted sigma {run.held_out.residual_over_predicted:.2f}",
-        "",
-        "displacement of the tool by each error source, RMS, beyond what the sources before it explain:",
-    ]
-    parts = contributions(found, run.measured).items()
-    lines += [f"  {source:<28} {1e3 * size:8.3f} mm" for source, size in parts]
-    lines += ["", f"  {'parameter':<12} {'nominal':>16} {'identified':>16} {'sigma':>14}"]
-    nominal = found.model.nominal()
-    for k, p in enumerate(found.model.parameters):
-        if found.solution.free[k] and p.kind not in ("base", "tool", *([] if everything else ["ripple"])):
-            value, sigma = found.value(p.name)
-            row = (value_text(p, nominal[k]), value_text(p, value), value_text(p, sigma))
-            tied = "  with others (-v)" if p.name in found.reasons and not everything else ""
-            lines.append(f"  {p.name:<12} {row[0]:>16} {row[1]:>16} {row[2]:>14}{tied}")
-    lines += [] if everything else _ripples(run)
-    lines += ["", "backlash of each joint, stop to stop:"]
-    lines += [f"  joint {p.joint + 1}  {_backlash_text(p)}" for p in joint_backlashes(found, run.measured)]
-    left = sum(
-        not free and p.kind not in ("base", "tool")
-        for p, free in zip(found.model.parameters, found.solution.free, strict=True)
-    )
-    lines += _not_fitted(run) if everything else ["", f"{left} more parameters were not fitted; -v says why"]
-    lines += ["", _ranges_title(found)]
-    lines += [
-        f"  joint {i + 1}  {np.degrees(a):.1f} to {np.degrees(b):.1f} deg"
-        for i, (a, b) in enumerate(ranges_seen(found))
-    ]
-    pairs = found.correlated()
-    if pairs:
-        lines += ["", "correlations over 0.9 (more varied poses distinguish them):"]
-        lines += [f"  {a} and {b}: {c:+.3f}" for a, b, c in pairs]
-    return "\n".join(lines)
-
-
-def ranges_seen(found: Identified) -> list[tuple[float, float]]:
-    """Return the least and greatest reading of each joint in the poses fitted, rad."""
-    assert found.model.q_seen is not None  # for the type checker: an identified arm has them
-    return [(float(low), float(high)) for low, high in found.model.q_seen]
-
-
-def _ranges_title(found: Identified) -> str:
-    fade = f"within {np.degrees(found.model.fade_rad):.0f} deg"
-    return f"readings seen (beyond them a sensor's curve fades {fade} to its mean; zeros and lengths hold everywhere):"
-
-
-def _ripples(run: Identification) -> list[str]:
-    """Return how large the fast part of each sensor's curve is: its many numbers say nothing one by one."""
-    found, lines = run.found, []
-    for i in range(found.model.arm.joints):
-        rows = [k for k, p in enumerate(found.model.parameters) if p.kind == "ripple" and p.joint == i]
-        rows = [k for k in rows if found.solution.free[k]]
-        if rows:
-            size = np.degrees(np.sqrt(np.sum(found.solution.x[rows] ** 2) / 2))
-            lines.append(
-                f"  ripple{i + 1}_.. {len(rows)} numbers, together {size:.4f} deg RMS over a revolution (-v lists them)"
-            )
-    return lines
-
-
-def _backlash_text(backlash: JointBacklash) -> str:
-    """Return a joint's backlash, and what showed it."""
-    if not np.isfinite(backlash.value_rad):
-        return backlash.how
-    return f"{np.degrees(backlash.value_rad):.3f} +- {np.degrees(backlash.sigma_rad):.3f} deg, by {backlash.how}"
-
-
-def _not_fitted(run: Identification) -> list[str]:
-    """Return the reasons of what was not fitted, equal ones together."""
-    by_reason: dict[str, list[str]] = {}
-    for p in run.found.model.parameters:
-        reason = run.found.reasons.get(p.name)
-        if reason is not None and p.kind not in ("base", "tool"):
-            short = reason.split(":")[0] if reason.startswith("not selected") else reason
-            by_reason.setdefault(short, []).append(p.name)
-    if not by_reason:
-        return []
-    return ["", "not fitted, or not alone:"] + [
-        f"  {', '.join(names)}: {reason}" for reason, names in by_reason.items()
-    ]

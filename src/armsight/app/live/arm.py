@@ -24,9 +24,7 @@ from armsight.app.live.capture import CameraCapture
 from armsight.app.live.handeye import HandEyeGuide, HandEyeState, likely_joint_errors, visit_poses
 from armsight.app.live.identification import IdentifyState, IdentifyStep
 from armsight.app.live.measuring import MeasureStep
-from armsight.app.live.quality import Note
 from armsight.app.live.simulated import SimulatedCameras
-from armsight.app.report.plotting import require_matplotlib
 from armsight.app.run.angles import LoggedAngles, read_angles
 from armsight.app.run.calibrate import VisitedPose, handeye_poses
 from armsight.app.run.controllers import Planned
@@ -45,6 +43,8 @@ from armsight.app.run.loop import Loop
 from armsight.app.run.motion_file import MotionPlan, read_motions
 from armsight.app.run.record import RunSegment, require_pyarrow
 from armsight.app.run.setup import HostClock, Setup, require_joints, setup_of
+from armsight.app.show.messages import Note
+from armsight.app.show.plotting import require_matplotlib
 from armsight.app.stream.datum import Published
 from armsight.app.stream.mcap_file import LazyMcap, properties
 from armsight.data import Array, Missed, PoseEstimate, Shot

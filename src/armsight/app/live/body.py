@@ -13,8 +13,8 @@ from pathlib import Path
 
 from armsight.app.body.check import assess
 from armsight.app.body.draw import draw_body, is_board_spec
-from armsight.app.body.text import assessment_lines, cameras_text
-from armsight.app.live.quality import Note
+from armsight.app.body.text import body_report
+from armsight.app.show.messages import Note
 from armsight.errors import ArmsightError
 from armsight.vision.discs.predict import plain_rig
 from armsight.vision.markers.body_layout import read_layout
@@ -94,8 +94,8 @@ class BodyStep:
             layout = read_layout(target)
             cameras = plain_rig() if rig is None else rig[0]
             found = assess(layout, cameras, _DISTANCES_M)
-            text = cameras_text(cameras, None if rig is None else str(rig[1]))
-            lines, grade = tuple(assessment_lines(target, layout, text, found)), str(found.grade)
+            report = body_report(target, layout, cameras, None if rig is None else str(rig[1]), found)
+            lines, grade = tuple(report.text().splitlines()), str(found.grade)
         except ArmsightError as error:
             lines, grade = (str(error),), "bad"
         if self._state is begun:

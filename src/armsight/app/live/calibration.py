@@ -22,9 +22,10 @@ from armsight.app.calibrate.assessment import advice, assess, graded_metrics
 from armsight.app.calibrate.run import provenance
 from armsight.app.live.capture import LiveShot
 from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, NextPose, guessed_camera, guessed_rig
-from armsight.app.live.quality import SHARP_PX, Note, edge_spread_px
+from armsight.app.live.quality import SHARP_PX, edge_spread_px
 from armsight.app.live.records import Drawn, polyline
 from armsight.app.record.recording import ShotFolder
+from armsight.app.show.messages import Note
 from armsight.data import Array, Detections, Record, Shot
 from armsight.errors import ArmsightError, CalibrationError, InputError
 from armsight.geometry.pose import inverse, transform

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from armsight.app.live.quality import Note
 from armsight.app.run.calibrate import HandEyeRun, VisitedPose, handeye_of, handeye_poses, visit
 from armsight.app.run.controllers import Planned
 from armsight.app.run.folder import write_handeye
 from armsight.app.run.loop import Loop
 from armsight.app.run.record import RunSegment
+from armsight.app.show.messages import Note
 from armsight.data import Array, Missed
 from armsight.errors import ArmsightError, CalibrationError, InputError
 from armsight.files import write_text

@@ -11,10 +11,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from armsight.app.identify.report import write_identify_report
-from armsight.app.identify.run import headline, results_in, run_identify, text, write_results
-from armsight.app.live.quality import Note
-from armsight.app.report.plotting import require_matplotlib
+from armsight.app.identify.report import identify_report, write_results
+from armsight.app.identify.run import results_in, run_identify
+from armsight.app.show.messages import Note
+from armsight.app.show.plotting import require_matplotlib
 from armsight.errors import ArmsightError, InputError
 from armsight.loop.identify.read import read_poses
 from armsight.robot.arm_file import open_arm
@@ -81,10 +81,11 @@ class IdentifyStep:
                     open_arm(arm_spec), read.measured, read.lines, None, notes=read.notes, progress=self._progress
                 )
                 write_results(run, out)
-            lines = (*(f"note: {note}" for note in run.notes), *text(run).splitlines())
+            report = identify_report(run)
+            lines = (*(f"note: {note}" for note in run.notes), *report.text().splitlines()[1:])
             corrected = str(out / "corrected.toml")
-            self.state = replace(self.state, headline=headline(run), lines=lines, corrected=corrected)
-            write_identify_report(run, out)  # last: what was found is shown and stored before anything is drawn
+            self.state = replace(self.state, headline=report.headline, lines=lines, corrected=corrected)
+            report.write(out)  # last: what was found is shown and stored before anything is drawn
         except Exception as error:  # noqa: BLE001 - nobody else watches this thread
             why = str(error) if isinstance(error, ArmsightError) else f"{type(error).__name__}: {error}"
             what = "the report was not drawn" if self.state.corrected else "no arm was identified"
@@ -92,7 +93,7 @@ class IdentifyStep:
             self.state = replace(self.state, working=None)
             return
         self.state = replace(self.state, working=None)
-        self._say(Note("good", f"identified: {headline(run)}; written to {out}"))
+        self._say(Note("good", f"identified: {report.headline}; written to {out}"))
 
     def close(self) -> None:
         """End the thread."""

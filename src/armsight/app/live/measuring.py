@@ -19,9 +19,9 @@ from typing import TextIO
 import numpy as np
 
 from armsight.app.live.capture import LiveShot
-from armsight.app.live.quality import Note
 from armsight.app.live.records import Drawn, polyline
 from armsight.app.shot_pose import csv_text, shot_pose
+from armsight.app.show.messages import Note
 from armsight.app.stream.datum import Published, ShotDatum
 from armsight.app.stream.mcap_file import LazyMcap, properties
 from armsight.app.stream.streams import open_streams

@@ -11,15 +11,14 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from armsight.app.show.messages import Note
 from armsight.data import Array
 
-Level = Literal["good", "hint", "warn", "error"]
 Grey = NDArray[np.uint8]
 
 #: An edge spread up to this is sharp, px; beyond the second it costs accuracy.
@@ -32,19 +31,6 @@ _DARK_MEAN = 35.0
 _BANDS = 40  # rows into which an image is averaged for the flicker
 _FLICKER_IMAGES, _FLICKER_SHARE, _LINE_SHARE = 12, 0.008, 0.4
 _SAME_DIFFERENCE = 4.0  # mean grey levels by which two views of one camera differ at most
-
-
-@dataclass(frozen=True)
-class Note:
-    """A line for a person.
-
-    Attributes:
-        level: how it is meant: good, hint, warn, error.
-        text: the line.
-    """
-
-    level: Level
-    text: str
 
 
 @dataclass(frozen=True)

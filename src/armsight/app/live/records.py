@@ -10,16 +10,15 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from armsight.app.live.quality import Level
+from armsight.app.show.messages import Level
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.files import json_of
 
 #: The steps in their order, by the names that commands and states use.
 STEPS = ("cameras", "board", "calibrate", "body", "measure", "arm", "health")
@@ -349,20 +348,3 @@ def _plain(value: object) -> object:
     if isinstance(value, np.ndarray):
         return value.tolist()
     return value.item() if isinstance(value, np.generic) else json_of(value)
-
-
-def json_of(value: object) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return records, arrays and paths as what JSON holds; numbers that are not finite as None."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {each.name: json_of(getattr(value, each.name)) for each in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): json_of(each) for key, each in value.items()}
-    if isinstance(value, np.ndarray):
-        return json_of(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [json_of(each) for each in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, np.generic):
-        return value.item()
-    return str(value) if isinstance(value, Path) else value

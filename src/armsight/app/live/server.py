@@ -40,10 +40,10 @@ from urllib.parse import parse_qs, urlsplit
 import cv2
 
 from armsight.app.live.capture import LiveShot
-from armsight.app.live.quality import Note
 from armsight.app.live.records import command_of, json_text
 from armsight.app.live.session import LiveSession
 from armsight.app.run.loop import SWITCH_S
+from armsight.app.show.messages import Note
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import read_bytes
 from armsight.vision.image import grey

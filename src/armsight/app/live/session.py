@@ -23,10 +23,11 @@ from armsight.app.live.calibration import CalibrationState, CalibrationStep
 from armsight.app.live.capture import CameraCapture, LiveShot
 from armsight.app.live.guide import CalibrationAim
 from armsight.app.live.measuring import MeasureState, MeasureStep
-from armsight.app.live.quality import FlickerWatch, ImageQuality, Note, image_quality, quality_notes, same_camera
+from armsight.app.live.quality import FlickerWatch, ImageQuality, image_quality, quality_notes, same_camera
 from armsight.app.live.records import Command, Event
 from armsight.app.live.simulated import ACTIONS, SimulatedCameras
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK
+from armsight.app.show.messages import Note
 from armsight.data import Record, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import check_folder, write_text

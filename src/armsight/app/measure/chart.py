@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.measure.picture import angle_sigmas_deg
-from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png
 from armsight.app.shot_pose import ANGLES, ShotPose
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png
 from armsight.data import Array, Record
 
 if TYPE_CHECKING:

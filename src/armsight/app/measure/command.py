@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from armsight.app.messages import UNTRUSTED
+from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import InputError
 
 

@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.report.plotting import nice, plain
 from armsight.app.shot_pose import ANGLES, ShotPose
+from armsight.app.show.plotting import nice, plain
 from armsight.data import SIDES, Array, Body, Dropped, Image, PoseEstimate, Record
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import exp_so3

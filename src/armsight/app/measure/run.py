@@ -16,9 +16,9 @@ from armsight.app.measure.moving import Requested, requested_shutters
 from armsight.app.measure.picture import SINGULAR
 from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, MeasureOptions, Result, open_shots
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
-from armsight.app.messages import colour, weak
 from armsight.app.progress import bar
 from armsight.app.shot_pose import ANGLES, ShotPose, csv_text, shot_pose
+from armsight.app.show.messages import colour, weak
 from armsight.app.stream.datum import Published, ShotDatum
 from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Body, Dropped, Missed, PoseEstimate, Shot

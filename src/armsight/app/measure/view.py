@@ -14,9 +14,9 @@ import cv2
 
 from armsight.app.measure.chart import chart
 from armsight.app.measure.picture import draw_shot, header, marks_of
-from armsight.app.report.page import writable_folder
-from armsight.app.report.plotting import require_matplotlib
 from armsight.app.shot_pose import ShotPose
+from armsight.app.show.page import writable_folder
+from armsight.app.show.plotting import require_matplotlib
 from armsight.data import Body, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.files import check_folder, replacing

@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.report.page import PAGE, html_page, put_files, table, text, writable_folder
+from armsight.app.show.page import writable_folder
+from armsight.app.show.report import Report
+from armsight.app.show.table import TextTable
 from armsight.data import Missed
 from armsight.errors import InputError
 from armsight.files import read_json
@@ -65,8 +67,7 @@ def update(run: Path, output: Path, since_s: float | None, report: Path | None) 
     new.save(output)
     answer = {"rig": str(output), "run": str(run), "since_s": since_s, **found.figures()}
     if folder is not None:
-        put_files(folder, {PAGE: page(rig, new, found, run, since_s).encode()})
-        answer["report"] = str(folder / PAGE)
+        answer["report"] = str(_page(rig, new, found, run, since_s).write(folder))
     return answer, [*found.lines(), f"written to {output}"]
 
 
@@ -81,12 +82,12 @@ def _found_since(run: Path) -> float | None:
     return float(since[0]) if since and isinstance(since[0], int | float) else None
 
 
-def page(old: StereoRig, new: StereoRig, found: RigUpdate, run: Path, since_s: float | None) -> str:
+def _page(old: StereoRig, new: StereoRig, found: RigUpdate, run: Path, since_s: float | None) -> Report:
     """Return the page of an update: its figures, and the old rig beside the new one."""
     head = (
         (
             "right camera rotated by",
-            f"{np.degrees(found.rotation_rad):.3f} &plusmn; {np.degrees(found.sigma_rad):.3f} deg",
+            f"{np.degrees(found.rotation_rad):.3f} ± {np.degrees(found.sigma_rad):.3f} deg",
         ),
         ("shifted across the baseline by", f"{1e3 * found.shift_m:.3f} mm"),
         *(
@@ -106,13 +107,11 @@ def page(old: StereoRig, new: StereoRig, found: RigUpdate, run: Path, since_s: f
     sigmas = (np.sqrt(np.maximum(np.diag(rig.cov), 0.0)) for rig in (old, new))
     values = (np.concatenate([*(c.parameters for c in rig.cameras), rig.T_left_right[:3, 3]]) for rig in (old, new))
     rows = [
-        (text(name), f"{a:.6g}", f"{sa:.2g}", f"{b:.6g}", f"{sb:.2g}")
+        (name, f"{a:.6g}", f"{sa:.2g}", f"{b:.6g}", f"{sb:.2g}")
         for name, a, sa, b, sb in zip(
             new.parameter_names, *(column for pair in zip(values, sigmas, strict=True) for column in pair), strict=False
         )
     ]
-    sections = {
-        "figures": ("What changed", table(("", ""), head, "numbers")),
-        "rigs": ("Old and new rig", table(("", "old", "sigma", "new", "sigma"), rows, "numbers")),
-    }
-    return html_page("armsight rig update", "Rig updated", text(run), sections)
+    tables = TextTable("", ("", ""), head), TextTable("", ("", "old", "sigma", "new", "sigma"), tuple(rows))
+    sections = {"figures": ("What changed", tables[:1]), "rigs": ("Old and new rig", tables[1:])}
+    return Report("rig update", "Rig updated", str(run), "", sections)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from armsight.app.arm_option import arm_option
-from armsight.app.messages import UNTRUSTED, require
+from armsight.app.show.messages import UNTRUSTED, require
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
 
@@ -234,12 +234,12 @@ def _run_logged(
     """Calibrate hand and eye from a recording and the joint angles that were logged beside it."""
     import contextlib
 
-    from armsight.app.messages import colour, weak
     from armsight.app.progress import steps
-    from armsight.app.report.page import writable_folder
-    from armsight.app.report.plotting import require_matplotlib
     from armsight.app.run.angles import read_angles
     from armsight.app.run.logged import run_logged, summary_lines, write_logged
+    from armsight.app.show.messages import colour, weak
+    from armsight.app.show.page import writable_folder
+    from armsight.app.show.plotting import require_matplotlib
     from armsight.files import columns_unused
     from armsight.robot.arm_file import open_arm
     from armsight.vision.markers.targets import open_target

@@ -27,7 +27,6 @@ import numpy as np
 
 from armsight.app.interrupts import uninterrupted
 from armsight.app.record.recording import record
-from armsight.app.report.page import PAGE, writable_folder
 from armsight.app.run.calibrate import HandEyeRun
 from armsight.app.run.experiment import RunResult
 from armsight.app.run.metrics import Study
@@ -36,6 +35,7 @@ from armsight.app.run.record import Log, RunData, ToolTrack, assembled, cut, joi
 from armsight.app.run.report import NAMES, Beside, RunReport, drawn_beside, write_run_report
 from armsight.app.run.summary import RunSummary, summary_of
 from armsight.app.shot_pose import UPPER, ShotPose, csv_text, left_axes, shot_pose
+from armsight.app.show.page import PAGE, writable_folder
 from armsight.app.stream.mcap_file import RUN_MCAP
 from armsight.data import Array, Correspondences, Image, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError

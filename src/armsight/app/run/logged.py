@@ -13,18 +13,18 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from armsight.app.report.page import PAGE, bullets, html_page, picture, text
-from armsight.app.report.plotting import BLUE, drawing, new_figure, png
 from armsight.app.run.angles import LoggedAngles
 from armsight.app.run.calibrate import HandEyeRun
 from armsight.app.run.folder import write_handeye
+from armsight.app.show.page import PAGE
+from armsight.app.show.plotting import BLUE, new_figure
+from armsight.app.show.report import Lines, Report, figures
 from armsight.data import Array, Missed, PoseEstimate, Record
 from armsight.errors import CalibrationError, InputError
-from armsight.files import write_text
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators import Mounting
 from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, calibrate_handeye, require_known
@@ -35,6 +35,9 @@ from armsight.vision.markers.marker import Target
 from armsight.vision.measure import measure
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import Source
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MIN_POSES = 12
 #: Rows that belong to the neighbouring shots fit so many times better: then they are shifted.
@@ -195,9 +198,8 @@ def write_logged(folder: Path, result: LoggedRun, properties: dict[str, str]) ->
     )
     for name, q, mm, deg, used in rows:
         writer.writerow([name, *np.round(q, 4), _rounded(mm), _rounded(deg), int(used)])
-    write_text(folder / "errors.csv", output.getvalue())
-    write_text(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
-    write_text(folder / PAGE, _page(result, summary))
+    files = {"errors.csv": output.getvalue(), "summary.json": json.dumps(summary, indent=1) + "\n"}
+    _report(result, summary).write(folder, files)
     return summary
 
 
@@ -219,8 +221,10 @@ def _rounded(value: float) -> str:
     return "" if np.isnan(value) else f"{value:.4f}"
 
 
-def _page(result: LoggedRun, summary: dict[str, Any]) -> str:
-    with drawing():
+def _report(result: LoggedRun, summary: dict[str, Any]) -> Report:
+    """Return the page of a run without motion."""
+
+    def errors() -> Figure:
         figure = new_figure(3.6)
         top, bottom = figure.subplots(2, 1, sharex=True)
         at = np.arange(len(result.names))
@@ -230,24 +234,21 @@ def _page(result: LoggedRun, summary: dict[str, Any]) -> str:
         bottom.set_title("angle, deg")
         bottom.set_xlabel("pose")
         bottom.xaxis.get_major_locator().set_params(integer=True)
-        data = png(figure)
-    *lines, _, following = summary_lines(summary, Path())
-    said = f'<div class="assessment"><p class="headline">{text(lines[1])}</p></div>\n'
-    said += bullets([*result.weak, lines[0], *lines[2:], f"board {summary['board']}", following])
+        return figure
+
+    measured, headline, *lines, _, following = summary_lines(summary, Path())
     outliers = [f"{name}: an outlier" for name in summary["outliers"]]
     missed = [*result.run.missed, *(f"{name}: no joint angles" for name in result.unpaired), *outliers]
-    shown = picture(data, "error of each pose, mm and degrees")
-    return html_page(
-        "armsight run",
+    caption = "Good: no pose stands out, and nothing drifts from the first to the last."
+    said = Lines([*result.weak, measured, *lines, f"board {summary['board']}", following])
+    return Report(
+        "run",
         f"{summary['arm']}: logged poses",
         "The arm was moved by another program; each pose is predicted by a fit to the others.",
+        headline,
         {
-            "result": ("Result", said),
-            "errors": (
-                "Error of each pose left out of the fit",
-                f"<figure>{shown}<figcaption><p>Good: no pose stands out, and nothing drifts from the first to the last."
-                "</p></figcaption></figure>\n",
-            ),
-            "missed": ("Shots that were not used", bullets(missed or ["none"])),
+            "result": ("Result", [said]),
+            **figures({"errors": (errors, "Error of each pose left out of the fit", caption)}),
+            "missed": ("Shots that were not used", [Lines(missed, none="none")]),
         },
     )

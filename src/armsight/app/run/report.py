@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 from scipy.special import ndtri
 
-from armsight.app.report.page import PAGE, bullets, html_page, picture, put_files
-from armsight.app.report.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, plain_log, png, svg
-from armsight.app.report.table import html_table
 from armsight.app.run.metrics import Study, evaluated_track, path_errors, rest_errors
 from armsight.app.run.record import RunData, ToolTrack, errors
 from armsight.app.run.summary import RunSummary, loop_table, track_table
+from armsight.app.show.page import PAGE, bullets, html_page, picture, put_files
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, plain_log, png, svg
+from armsight.app.show.table import html_table
 from armsight.data import Array, Image
 
 if TYPE_CHECKING:

@@ -15,8 +15,6 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.messages import colour, weak
-from armsight.app.report.table import TextTable, print_table
 from armsight.app.run.experiment import RunResult
 from armsight.app.run.metrics import (
     Spread,
@@ -32,7 +30,9 @@ from armsight.app.run.metrics import (
 )
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import RunData, ToolTrack
-from armsight.files import finite_json
+from armsight.app.show.messages import colour, weak
+from armsight.app.show.table import TextTable, print_table
+from armsight.files import json_of
 from armsight.loop.health import HealthFinding, health_lines, unseen_lines
 from armsight.loop.health.follow import RigCorrection, correction_lines
 from armsight.robot.arm import Arm
@@ -179,7 +179,7 @@ class RunSummary:
         found["rig_corrections"] = [each.to_json() for each in self.corrections]
         found["rig_not_corrected"] = self.not_corrected
         found |= {**self.properties, "wall_s": self.wall_s, "ended_by": self.ended_by}
-        known: dict[str, Any] = finite_json(found)
+        known: dict[str, Any] = json_of(found)
         return known
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from armsight.app.shot_pose import left_axes, shot_pose
 from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Record, Shot
-from armsight.files import finite_json
+from armsight.files import json_of
 from armsight.loop.estimators import KalmanEstimator, Mounting, Remembered
 from armsight.robot.arm import Arm
 from armsight.vision.rig import StereoRig
@@ -182,7 +182,7 @@ def json_text(content: Mapping[str, Any]) -> bytes:
     try:
         return json.dumps(content, allow_nan=False).encode()
     except ValueError:
-        return json.dumps(finite_json(content), allow_nan=False).encode()
+        return json.dumps(json_of(content), allow_nan=False).encode()
 
 
 def mounting_event(mounting: Mounting) -> dict[str, Any]:

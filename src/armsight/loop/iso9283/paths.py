@@ -7,13 +7,12 @@ Out: :class:`PathMetrics`, :class:`CircleMetrics`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
-from armsight.data import Array
+from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.loop.iso9283.poses import repeatability
 from armsight.loop.iso9283.statistic import (
@@ -38,18 +37,21 @@ _BIN_DEG = 4.0
 _TRIALS = 200
 
 
-class PathMetrics(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class PathMetrics(Record):
     """A path followed several times.
 
     Attributes:
-        accuracy: AT: the largest distance of the mean path from the commanded one.
-        repeatability: RT: that of the path point with the largest as measured.
-        off: (S,) distance of the mean path from the commanded one at every path point, m.
+        count: how many times.
+        AT_m: the largest distance of the mean path from the commanded one.
+        RT_m: that of the path point with the largest as measured.
+        off_m: (S,) distance of the mean path from the commanded one at every path point.
     """
 
-    accuracy: Metric
-    repeatability: Metric
-    off: Array
+    count: int
+    AT_m: Metric
+    RT_m: Metric
+    off_m: Array
 
 
 def path_metrics(attained: Array, command: Array, cov: Array, common: Array | None = None) -> PathMetrics:
@@ -77,6 +79,7 @@ def path_metrics(attained: Array, command: Array, cov: Array, common: Array | No
     worst = int(np.argmax(limits))
     RT = repeatability(seen[:, worst], across[worst] @ cov[:, worst] @ across[worst])
     return PathMetrics(
+        n,
         beyond_noise(lengths, middle, errors),
         _picked(RT, _chosen(seen - middle, rng)),
         np.linalg.norm(middle, axis=1),
@@ -122,28 +125,29 @@ def _picked(metric: Metric, factor: float) -> Metric:
     return replace(metric, clean=clean, low=low)
 
 
-class CircleMetrics(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class CircleMetrics(Record):
     """A circle run both ways.
 
     Attributes:
-        centre: (3,) of the fitted circle, m.
+        centre_m: (3,) of the fitted circle.
         radius_m: of the fitted circle.
-        circularity: G, the largest less the smallest radius of either way, the larger of the two.
-        hysteresis: H, the largest difference of the radii of the two ways at one angle.
+        circularity_m: G, the largest less the smallest radius of either way, the larger of the two.
+        hysteresis_m: H, the largest difference of the radii of the two ways at one angle.
         steps_m: (2, 4) jump of the radius at 0, 90, 180, 270 degrees, counter-clockwise and clockwise, outwards positive.
-        backlash: along the circle's first and second axis: the mean of the four jumps where that axis reverses.
-        jumps: of the radius at each of the reversals asked for.
+        backlash_m: along the circle's first and second axis: the mean of the four jumps where that axis reverses.
+        jumps_m: of the radius at each of the reversals asked for.
         angle_deg: (B,) angles of the curves.
         radii_m: (2, B) mean radii about each, less ``radius_m``, counter-clockwise and clockwise.
     """
 
-    centre: Array
+    centre_m: Array
     radius_m: float
-    circularity: Metric
-    hysteresis: Metric
+    circularity_m: Metric
+    hysteresis_m: Metric
     steps_m: Array
-    backlash: tuple[Metric, Metric]
-    jumps: tuple[Metric, ...]
+    backlash_m: tuple[Metric, Metric]
+    jumps_m: tuple[Metric, ...]
     angle_deg: Array
     radii_m: Array
 

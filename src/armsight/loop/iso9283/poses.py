@@ -38,19 +38,20 @@ class PoseMetrics(Record):
 
     Attributes:
         count: how many attained poses.
-        accuracy: AP of the position, m: distance of the attained poses' barycentre from the command.
-        accuracy_xyz: (3,) its parts, m.
-        accuracy_rotation: (3,) the rotation from the command to the mean, rad, about the command's axes.
-        repeatability: RP of the position, m: mean distance from the barycentre plus three of its standard deviations.
-        repeatability_rotation: (3,) RP of the rotation about the command's axes, rad: three standard deviations.
+        AP_m: AP of the position: distance of the attained poses' barycentre from the command.
+        AP_xyz_m: (3,) its parts.
+        AP_rotation_rad: (3,) the rotation from the command to the mean about the command's axes; None where a rotation is
+            not known.
+        RP_m: RP of the position: mean distance from the barycentre plus three of its standard deviations.
+        RP_rotation_rad: (3,) RP of the rotation about the command's axes: three standard deviations; None likewise.
     """
 
     count: int
-    accuracy: Metric
-    accuracy_xyz: Array
-    accuracy_rotation: Array
-    repeatability: Metric
-    repeatability_rotation: Array
+    AP_m: Metric
+    AP_xyz_m: Array
+    AP_rotation_rad: Array | None
+    RP_m: Metric
+    RP_rotation_rad: Array | None
 
 
 def pose_metrics(

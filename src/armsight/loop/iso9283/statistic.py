@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import chdtri, ndtri, stdtrit
@@ -29,6 +29,7 @@ class Metric:
             still the end of its interval. None where the noise is not known.
         high: the other end; where the metric cannot be resolved, its upper bound. None where the noise is not known.
         resolvable: the smallest metric that this test can distinguish from noise. None where the noise is not known.
+        sigma: standard deviation that belongs to the interval; None where the metric cannot be resolved or has none.
     """
 
     raw: float
@@ -36,13 +37,12 @@ class Metric:
     low: float | None
     high: float | None
     resolvable: float | None
+    sigma: float | None = field(init=False)
 
-    @property
-    def sigma(self) -> float | None:
-        """Standard deviation that belongs to the interval; None where the metric cannot be resolved or has none."""
-        if self.clean is None or self.low is None or self.high is None:
-            return None
-        return (self.high - self.low) / (2 * WIDE)
+    def __post_init__(self) -> None:
+        """Compute the sigma."""
+        known = self.clean is not None and self.low is not None and self.high is not None
+        object.__setattr__(self, "sigma", ((self.high or 0.0) - (self.low or 0.0)) / (2 * WIDE) if known else None)
 
 
 def beyond_noise(statistic: Callable[[Array], Array], value: Array, errors: Array) -> Metric:

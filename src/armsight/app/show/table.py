@@ -11,7 +11,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from armsight.app.report import page
+from armsight.app.show import page
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,8 @@ def html_table(table: TextTable) -> str:
     """Return a table of numbers as HTML, its title above it."""
     head = [page.text(cell) for cell in table.columns]
     rows = [[page.text(cell) for cell in row] for row in table.rows]
-    return f"<p>{page.text(table.title)}</p>\n" + page.table(head, rows, "numbers")
+    title = f"<p>{page.text(table.title)}</p>\n" if table.title else ""
+    return title + page.table(head, rows, "numbers")
 
 
 def print_table(table: TextTable) -> None:

@@ -5,7 +5,7 @@ import io
 import cv2
 import numpy as np
 
-from armsight.app.report.plotting import DPI, drawing, new_figure, png, svg
+from armsight.app.show.plotting import DPI, drawing, new_figure, png, svg
 
 
 def figure():

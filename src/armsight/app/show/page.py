@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from armsight.app.report.plotting import plain
+from armsight.app.show.plotting import plain
 from armsight.errors import InputError
 from armsight.files import replacing
 
@@ -82,8 +82,9 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") ->
 
 
 def bullets(lines: Iterable[str]) -> str:
-    """Return a list of plain lines, escaped."""
-    return "<ul>" + "".join(f"<li>{text(line)}</li>\n" for line in lines) + "</ul>\n"
+    """Return a list of plain lines, escaped; nothing where there are none."""
+    items = "".join(f"<li>{text(line)}</li>\n" for line in lines)
+    return f"<ul>{items}</ul>\n" if items else ""
 
 
 def picture(data: bytes, description: str, *, kind: str = "png", attributes: str = "") -> str:

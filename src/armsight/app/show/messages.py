@@ -1,17 +1,29 @@
-"""How messages look on a terminal: errors are red, weaknesses yellow; elsewhere, and with NO_COLOR, plain text."""
+"""Messages, and how they look: errors are red, weaknesses yellow; in a pipe, and with NO_COLOR, plain text."""
 
 from __future__ import annotations
 
 import importlib.util
 import logging
 import os
+from dataclasses import dataclass
+from typing import Literal
 
 import click
 
 from armsight.errors import InputError
 
+#: Of a result: worth knowing; worse than it could be; must not be used. Of what happens on a live page: the others.
+Level = Literal["note", "weak", "untrusted", "good", "hint", "warn", "error"]
 #: Exit code of a command that is done, but whose result must not be trusted (docs/concepts/health.md).
 UNTRUSTED = 3
+
+
+@dataclass(frozen=True)
+class Note:
+    """A line for a person, and how it is meant."""
+
+    level: Level
+    text: str
 
 
 def colour() -> bool | None:

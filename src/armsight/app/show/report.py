@@ -1,0 +1,263 @@
+"""One result: a Report is made once by the command that found something, and shown as text, JSON, page and exit code.
+
+In: facts, tables, figures and notes, in sections. Out, of the same Report: :meth:`Report.text` for the terminal,
+:meth:`Report.json` for programs, :meth:`Report.write` for the folder of ``-o``, :meth:`Report.echo` to end a command.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from armsight.app.show import page
+from armsight.app.show.messages import UNTRUSTED, Level, Note, weak
+from armsight.app.show.plotting import drawing, png, require_matplotlib
+from armsight.app.show.table import TextTable, html_table, plain_text
+from armsight.files import json_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Fact:
+    """Something that was found.
+
+    Attributes:
+        sentence: for people; empty where the values are for programs alone.
+        values: by their JSON keys, SI units, sigmas among them: whatever :func:`~armsight.files.json_of` takes.
+    """
+
+    sentence: str = ""
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Lines that belong together.
+
+    Attributes:
+        lines: plain text.
+        title: stands above them on the terminal, where they are indented; empty: they are not.
+        most: so many are printed; the page has them all.
+        none: what is said instead where there are none.
+    """
+
+    lines: Sequence[str]
+    title: str = ""
+    most: int | None = None
+    none: str = ""
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure on the page, and as PNG beside it.
+
+    Attributes:
+        name: of its file, without the prefix.
+        draw: plots it; None where there is nothing to plot.
+        caption: HTML.
+        description: for who cannot see it.
+    """
+
+    name: str
+    draw: Callable[[], Figure | None]
+    caption: str
+    description: str
+
+
+@dataclass(frozen=True)
+class Html:
+    """HTML that stands on the page alone."""
+
+    html: str
+
+
+@dataclass(frozen=True)
+class Text:
+    """Text that stands on the terminal alone."""
+
+    text: str
+
+
+Block = Fact | Lines | TextTable | Plot | Html | Text
+#: Title on the page, and what stands there.
+Section = tuple[str, Sequence[Block]]
+
+
+@dataclass(frozen=True)
+class Report:
+    """A result.
+
+    Attributes:
+        name: of the command.
+        heading: first line of the page.
+        sub: the line below it.
+        headline: the result in one line; empty: the first section says it.
+        sections: by their anchors, in order.
+        notes: remarks.
+        values: what programs read besides the facts.
+        prefix: of the figures' files.
+    """
+
+    name: str
+    heading: str
+    sub: str
+    headline: str
+    sections: Mapping[str, Section]
+    notes: Sequence[Note] = ()
+    values: Mapping[str, Any] = field(default_factory=dict)
+    prefix: str = "report"
+
+    @property
+    def blocks(self) -> list[Block]:
+        """What stands in all sections."""
+        return [block for _, blocks in self.sections.values() for block in blocks]
+
+    def noted(self, level: Level) -> list[str]:
+        """Return the notes of one level."""
+        return [note.text for note in self.notes if note.level == level]
+
+    def json(self) -> dict[str, Any]:
+        """Return what programs read: the values of all facts, and the notes."""
+        found: dict[str, Any] = {"notes": self.noted("note"), **self.values}
+        for block in self.blocks:
+            if isinstance(block, Fact):
+                found |= block.values
+        shown: dict[str, Any] = json_of(found)
+        return shown
+
+    def json_text(self) -> str:
+        """Return a file of it."""
+        return json.dumps(self.json(), indent=1) + "\n"
+
+    def text(self) -> str:
+        """Return what people read on a terminal."""
+        lines = [*(f"do not trust this result: {why}" for why in self.noted("untrusted")), self.headline]
+        for block in self.blocks:
+            match block:
+                case Fact(sentence) if sentence:
+                    lines.append(sentence)
+                case Lines():
+                    lines += _printed(block)
+                case Text(text):
+                    lines.append(text)
+                case TextTable():
+                    lines += ["", plain_text(block), ""]
+        lines += map(weak, self.noted("weak"))
+        return "\n".join(lines).strip("\n")
+
+    def page(self, images: Mapping[str, bytes]) -> str:
+        """Return the page; ``images`` maps the names of figures to PNG data."""
+        said = [*(f"do not trust this result: {why}" for why in self.noted("untrusted")), self.headline]
+        bodies = {
+            anchor: "".join(_html(block, images) for block in blocks) for anchor, (_, blocks) in self.sections.items()
+        }
+        first = next(iter(bodies))
+        bodies[first] = assessment(said) + page.bullets([*self.noted("weak"), *self.noted("note")]) + bodies[first]
+        shown = {
+            anchor: (self.sections[anchor][0], body.replace("</ul>\n<ul>", ""))
+            for anchor, body in bodies.items()
+            if body
+        }
+        return page.html_page(f"armsight: {self.name}", self.heading, self.sub, shown)
+
+    def write(self, folder: Path, files: Mapping[str, str | bytes] = MappingProxyType({})) -> Path:
+        """Draw the figures, and write page, figures and further files into a folder.
+
+        Args:
+            folder: made where it does not exist; figures of an earlier report are replaced, or removed where there is
+                nothing to plot.
+            files: name -> text or bytes of what stands beside.
+
+        Returns:
+            The page, report.html.
+
+        Raises:
+            InputError: matplotlib is missing, or a file cannot be written; then none of the new ones is left.
+        """
+        plots, images = [block for block in self.blocks if isinstance(block, Plot)], dict[str, bytes]()
+        if plots:
+            require_matplotlib()
+        folder = page.writable_folder(folder, "no report")
+        with drawing() if plots else contextlib.nullcontext():
+            for plot in plots:
+                if (figure := plot.draw()) is not None:
+                    images[plot.name] = png(figure)
+        pictures = {self.file(name): data for name, data in images.items()}
+        beside = {name: data.encode() if isinstance(data, str) else data for name, data in files.items()}
+        page.put_files(folder, {**pictures, **beside, page.PAGE: self.page(images).encode()})
+        for plot in plots:
+            if plot.name not in images:
+                (folder / self.file(plot.name)).unlink(missing_ok=True)
+        return folder / page.PAGE
+
+    def file(self, plot: str) -> str:
+        """Return the name of a figure's file."""
+        return f"{self.prefix}-{plot}.png"
+
+    def echo(self, *, as_json: bool, written: str | None = None, **more: object) -> int:
+        """Print the result, notes on stderr, and return the exit code.
+
+        Args:
+            as_json: whether programs read it.
+            written: the files that were written, for people.
+            more: further entries of the JSON object.
+        """
+        for note in self.noted("note"):
+            click.echo(f"note: {note}", err=True)
+        click.echo(json.dumps({**self.json(), **json_of(more)}) if as_json else self.text())
+        if written is not None and not as_json:
+            click.echo(f"\nwritten: {written}")
+        return UNTRUSTED if self.noted("untrusted") else 0
+
+
+def figures(plots: Mapping[str, tuple[Callable[..., Figure | None], str, str]], *of: object) -> dict[str, Section]:
+    """Return a section for each figure: name -> (what plots it from ``of``, title, caption as HTML)."""
+    return {
+        name: (title, [Plot(name, partial(draw, *of), caption, title)])
+        for name, (draw, title, caption) in plots.items()
+    }
+
+
+def _printed(block: Lines) -> list[str]:
+    """Return lines as a terminal shows them."""
+    if not block.lines:
+        return [block.none] if block.none else []
+    if not block.title:
+        return list(block.lines)
+    return ["", block.title, *(f"  {line}" for line in block.lines[: block.most])]
+
+
+def assessment(headlines: Sequence[str], meaning: str = "", grade: str = "") -> str:
+    """Return the box at the top of a page, HTML; ``grade`` is its colour: good, fair or poor."""
+    said = "".join(f'<p class="headline">{page.text(line)}</p>' for line in headlines if line)
+    more = f"<p>{page.text(meaning)}</p>" if meaning else ""
+    return f'<div class="assessment {grade}">{said}{more}</div>\n' if said else ""
+
+
+def _html(block: Block, images: Mapping[str, bytes]) -> str:
+    """Return a block as HTML."""
+    match block:
+        case Html(html):
+            return html
+        case TextTable():
+            return html_table(block)
+        case Plot(name, _, caption, description) if name in images:
+            said = caption if caption.startswith("<p") else f"<p>{caption}</p>"
+            shown = page.picture(images[name], description)
+            return f"<figure>{shown}<figcaption>{said}</figcaption></figure>\n"
+        case Fact(sentence) if sentence:
+            return page.bullets([sentence])
+        case Lines() if block.lines or block.none:
+            title = f"<p>{page.text(block.title)}</p>\n" if block.title and block.lines else ""
+            return title + page.bullets(block.lines or [block.none])
+    return ""
