@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import dataclasses
 import io
 import itertools
 import json
-import math
 import os
 import re
 import stat
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -479,18 +477,3 @@ def _same_file(one: str | Path, other: str | Path) -> bool:
         return os.path.samefile(one, other)
     except (OSError, ValueError):
         return False
-
-
-def json_of(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return records, arrays, paths and what holds them as JSON has it; null replaces every NaN and infinity."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {each.name: json_of(getattr(value, each.name)) for each in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): json_of(each) for key, each in value.items()}
-    if hasattr(value, "tolist"):  # an array or a number of numpy, which is not imported here
-        return json_of(value.tolist())
-    if isinstance(value, list | tuple):
-        return [json_of(each) for each in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value) if isinstance(value, Path) else value

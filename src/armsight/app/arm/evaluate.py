@@ -34,9 +34,10 @@ from armsight.app.check.run_folder import (
     segments_of,
 )
 from armsight.app.run.record import read_track
+from armsight.app.show.encode import json_of
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import json_of, read_json, read_toml
+from armsight.files import read_json, read_toml
 from armsight.geometry.pose import mean_pose
 from armsight.geometry.rotation import log_so3
 from armsight.loop.identify.backlash import joint_backlashes

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from armsight.app.dense.files import make_folder, paint_disparity, paint_errors, write_png
-from armsight.files import json_of, write_text
+from armsight.app.show.encode import json_of
+from armsight.files import write_text
 from armsight.vision.dense.evaluate import DisparityErrors, evaluate_disparity
 from armsight.vision.dense.methods import open_method
 from armsight.vision.dense.middlebury import MiddleburyScene
@@ -114,9 +115,8 @@ def averages(lines: list[SceneResult]) -> dict[str, dict[str, float]]:
 
 def evaluation_json(lines: list[SceneResult]) -> dict[str, Any]:
     """Return an evaluation as one object; numbers that are not there are null."""
-    whole = {"scenes": [line.to_json() for line in lines], "weighted_average": averages(lines)}
-    document: dict[str, Any] = json_of(whole)
-    return document
+    found: dict[str, Any] = {"scenes": [line.to_json() for line in lines], "weighted_average": averages(lines)}
+    return {key: json_of(value) for key, value in found.items()}
 
 
 def table_text(lines: list[SceneResult]) -> str:

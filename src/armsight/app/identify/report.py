@@ -300,7 +300,7 @@ def _values(run: Identification) -> dict[str, Any]:
         "residual_over_predicted": run.held_out.residual_over_predicted,
         "noise_m": found.solution.noise[0],
         "noise_rad": found.solution.noise[1] if found.model.full else None,
-        "parameters": [row._asdict() for row in parameter_rows(run)],
+        "parameters": parameter_rows(run),
         "joint_ranges_seen": [
             {"joint": i + 1, "min_rad": low, "max_rad": high} for i, (low, high) in enumerate(ranges_seen(found))
         ],

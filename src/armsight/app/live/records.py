@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from armsight.app.show.encode import json_of
 from armsight.app.show.messages import Level
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import json_of
 
 #: The steps in their order, by the names that commands and states use.
 STEPS = ("cameras", "board", "calibrate", "body", "measure", "arm", "health")

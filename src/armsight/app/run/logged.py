@@ -205,7 +205,7 @@ def write_logged(folder: Path, result: LoggedRun, properties: dict[str, str]) ->
 
 def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
     """Return a summary for people: mm and degrees."""
-    lines = [
+    return [
         f"{summary['poses']} of {summary['shots']} shots measured with joint angles"
         + (f", {len(summary['outliers'])} outliers" if summary["outliers"] else ""),
         f"left out of the fit: {summary['held_out_position_rms_mm']:.3f} mm RMS"
@@ -214,7 +214,6 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
         f"{folder / PAGE}",
         f"next, what explains it: armsight identify --arm {summary['arm']} --data {folder / 'handeye_poses.csv'} -o DIR",
     ]
-    return lines
 
 
 def _rounded(value: float) -> str:

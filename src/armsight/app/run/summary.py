@@ -30,9 +30,9 @@ from armsight.app.run.metrics import (
 )
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import RunData, ToolTrack
+from armsight.app.show.encode import json_of
 from armsight.app.show.messages import colour, weak
 from armsight.app.show.table import TextTable, print_table
-from armsight.files import json_of
 from armsight.loop.health import HealthFinding, health_lines, unseen_lines
 from armsight.loop.health.follow import RigCorrection, correction_lines
 from armsight.robot.arm import Arm

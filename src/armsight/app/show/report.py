@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from armsight.app.show import page
+from armsight.app.show.encode import json_of
 from armsight.app.show.messages import UNTRUSTED, Level, Note, weak
 from armsight.app.show.plotting import drawing, png, require_matplotlib
 from armsight.app.show.table import TextTable, html_table, plain_text
-from armsight.files import json_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,7 +33,7 @@ class Fact:
 
     Attributes:
         sentence: for people; empty where the values are for programs alone.
-        values: by their JSON keys, SI units, sigmas among them: whatever :func:`~armsight.files.json_of` takes.
+        values: by their JSON keys, SI units, sigmas among them: whatever :func:`~armsight.app.show.encode.json_of` takes.
     """
 
     sentence: str = ""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri, stdtrit
@@ -45,7 +46,7 @@ class PathMetrics(Record):
         count: how many times.
         AT_m: the largest distance of the mean path from the commanded one.
         RT_m: that of the path point with the largest as measured.
-        off_m: (S,) distance of the mean path from the commanded one at every path point.
+        off_m: (S,) distance of the mean path from it at every path point.
     """
 
     count: int
@@ -78,12 +79,8 @@ def path_metrics(attained: Array, command: Array, cov: Array, common: Array | No
     limits = _limits(seen - middle)
     worst = int(np.argmax(limits))
     RT = repeatability(seen[:, worst], across[worst] @ cov[:, worst] @ across[worst])
-    return PathMetrics(
-        n,
-        beyond_noise(lengths, middle, errors),
-        _picked(RT, _chosen(seen - middle, rng)),
-        np.linalg.norm(middle, axis=1),
-    )
+    AT, RT = beyond_noise(lengths, middle, errors), _picked(RT, _chosen(seen - middle, rng))
+    return PathMetrics(n, AT, RT, np.linalg.norm(middle, axis=1))
 
 
 def square_to(command: Array) -> Array:
@@ -120,13 +117,11 @@ def _chosen(off: Array, rng: np.random.Generator) -> float:
 
 def _picked(metric: Metric, factor: float) -> Metric:
     """Return a metric that was picked as the largest, divided by its bias; the upper end stays."""
-    clean = None if metric.clean is None else metric.clean / factor
-    low = None if metric.low is None else metric.low / factor
+    clean, low = (None if each is None else each / factor for each in (metric.clean, metric.low))
     return replace(metric, clean=clean, low=low)
 
 
-@dataclass(frozen=True, eq=False)
-class CircleMetrics(Record):
+class CircleMetrics(NamedTuple):
     """A circle run both ways.
 
     Attributes:

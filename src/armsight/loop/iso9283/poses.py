@@ -40,8 +40,7 @@ class PoseMetrics(Record):
         count: how many attained poses.
         AP_m: AP of the position: distance of the attained poses' barycentre from the command.
         AP_xyz_m: (3,) its parts.
-        AP_rotation_rad: (3,) the rotation from the command to the mean about the command's axes; None where a rotation is
-            not known.
+        AP_rotation_rad: (3,) the rotation from the command to the mean about the command's axes; None if unknown.
         RP_m: RP of the position: mean distance from the barycentre plus three of its standard deviations.
         RP_rotation_rad: (3,) RP of the rotation about the command's axes: three standard deviations; None likewise.
     """

@@ -40,8 +40,7 @@ class Metric:
     sigma: float | None = field(init=False)
 
     def __post_init__(self) -> None:
-        """Compute the sigma."""
-        known = self.clean is not None and self.low is not None and self.high is not None
+        known = None not in (self.clean, self.low, self.high)
         object.__setattr__(self, "sigma", ((self.high or 0.0) - (self.low or 0.0)) / (2 * WIDE) if known else None)
 
 
