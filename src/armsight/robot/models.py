@@ -22,7 +22,7 @@ def _m(*lengths: float) -> Array:
     return np.array(lengths)
 
 
-#: The 6R arm of docs/concepts/method.md; its source gives no limits: those of a table-top arm with geared motors are chosen.
+#: The 6R arm of docs/concepts/method.md; its source gives no limits: those of a table-top arm are chosen.
 _SIX_R = Arm(
     name="six_r",
     a=_m(0.0365, 0.2515, 0.125, 0.092, 0.0, 0.0),

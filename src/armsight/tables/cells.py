@@ -177,16 +177,7 @@ def _of_records(path: Path, text: str, side: str, whose: str | None) -> Cells:
 
 def _delimited(path: Path, text: str, written: list[tuple[int, str]]) -> Cells:
     """Return the cells of a table, whatever separates them."""
-    first = written[0][1] if written else ""
-    if "|" in first:
-        lines = ["" if _RULE.fullmatch(line.strip()) else line.strip().strip("|") for line in text.splitlines()]
-        cells = [[] if not line else line.split("|") for line in lines]
-    elif _has_decimal_commas(first.split()):
-        cells = [line.replace(",", ".").split() for line in text.splitlines()]
-    elif any(mark in first for mark in ",;\t"):
-        cells = read_table(path)
-    else:
-        cells = [line.split() for line in text.splitlines()]
+    cells = _separated(path, text.splitlines(), written[0][1] if written else "")
     rows = [(line, [cell.strip() for cell in row]) for line, row in enumerate(cells, 1)]
     rows = [(line, row) for line, row in rows if any(row) and not row[0].startswith("#")]
     count = len(rows[0][1]) - (rows[0][1][-1] == "") if rows else 0
@@ -200,6 +191,16 @@ def _delimited(path: Path, text: str, written: list[tuple[int, str]]) -> Cells:
             raise InputError(f"{path}: line {rows[0][0]} names a column twice: {twice}")
         return Cells(head, _even(path, rows[1:], len(head)))
     return _without_names(path, rows)
+
+
+def _separated(path: Path, lines: list[str], first: str) -> list[list[str]]:
+    """Return the cells of lines, separated as those of the first one with content are."""
+    if "|" in first:
+        bare = ["" if _RULE.fullmatch(line.strip()) else line.strip().strip("|") for line in lines]
+        return [[] if not line else line.split("|") for line in bare]
+    if _has_decimal_commas(first.split()):
+        return [line.replace(",", ".").split() for line in lines]
+    return read_table(path) if any(mark in first for mark in ",;\t") else [line.split() for line in lines]
 
 
 def _even(path: Path, rows: Rows, count: int) -> Rows:

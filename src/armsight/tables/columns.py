@@ -72,18 +72,8 @@ def understood(
     """
     bare = [name.strip().strip('"').strip().lower().replace("°", "deg") for name in head]
     bare = [re.sub(r"\s*[\[(](mm|m|deg|rad|s)[\])]$", r"_\1", name) for name in bare]
-    ros = [_ROS.fullmatch(name) for name in bare]
-    parts = {found[2] for found in ros if found and not found[1]}  # without w they are no quaternion
-    links = {name.lower(): f"q{k}_rad" for k, name in enumerate(joint_names, 1)}
-    out = []
-    for given, name, found in zip(head, bare, ros, strict=True):
-        axis, mark, rest = name.partition("_")
-        ours = _THEIRS.get(axis, axis) + mark + rest
-        if found and (found[1] or parts == set("xyzw")):
-            ours = f"{found[2]}_{unit or 'm'}" if found[1] else f"q{found[2]}"
-        elif (joint := re.sub(r"_joint$", "", name)) in links:
-            ours = links[joint]
-        out.append(ours if ours in COLUMNS else given.strip().strip('"').strip())
+    ours = _of_ros(bare, joint_names, unit or "m")
+    out = [one if one in COLUMNS else name.strip().strip('"').strip() for one, name in zip(ours, head, strict=True)]
     theirs, said = _of_a_maker(bare, out, unit or "mm")
     out = [theirs.get(k, name) for k, name in enumerate(out)]
     if len(set(out)) < len(out):
@@ -94,6 +84,21 @@ def understood(
         note = f"{path}: roll, pitch, yaw read as rotations about the fixed x, y and z; --rotation says otherwise"
         return out, "xyz", (note,)
     return out, rotation, ()
+
+
+def _of_ros(bare: Sequence[str], joint_names: Sequence[str], unit: str) -> list[str]:
+    """Return our names for those of ROS, of an arm's joints and of spreadsheets; others as they are."""
+    ros = [_ROS.fullmatch(name) for name in bare]
+    parts = {found[2] for found in ros if found and not found[1]}  # without w they are no quaternion
+    links = {name.lower(): f"q{k}_rad" for k, name in enumerate(joint_names, 1)}
+    out = []
+    for name, found in zip(bare, ros, strict=True):
+        axis, mark, rest = name.partition("_")
+        if found and (found[1] or parts == set("xyzw")):
+            out.append(f"{found[2]}_{unit}" if found[1] else f"q{found[2]}")
+        else:
+            out.append(links.get(re.sub(r"_joint$", "", name), _THEIRS.get(axis, axis) + mark + rest))
+    return out
 
 
 def is_unitless(name: str) -> bool:

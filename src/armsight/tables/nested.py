@@ -85,12 +85,16 @@ def document_rows(path: Path, text: str, side: str, whose: str | None) -> tuple[
         names = ("t_s", "x", "y", "z", "qx", "qy", "qz", "qw")
         rows = [dict(zip(names, (at, *p.split(","), *q.split(",")), strict=False)) for at, p, q in echoed]
         records = [{key: cell.strip() for key, cell in one.items() if cell} for one in rows]
-        return list(dict.fromkeys(key for one in records for key in one)), records
-    records = []
-    document = _parsed(path)
+    else:
+        records = _records(path, _parsed(path), side, whose)
+    return list(dict.fromkeys(key for one in records for key in one)), records
+
+
+def _records(path: Path, document: Any, side: str, whose: str | None) -> list[Record]:  # noqa: ANN401
+    """Return the records of a document, each with one pose."""
     if isinstance(document, list) and len(document) > _MOST_RECORDS:
         raise InputError(f"{path}: holds {_content(document)}, more than {_MOST_RECORDS} poses: split it")
-    items = _items(document)
+    records, items = list[Record](), _items(document)
     for k, (item, name) in enumerate(items, 1):
         groups = dict(_poses(item))
         if not groups and records:
@@ -103,12 +107,11 @@ def document_rows(path: Path, text: str, side: str, whose: str | None) -> tuple[
             record |= next((one for one in groups.values() if poses and len(groups) > 1 and _with_unit(one)), {})
             records.append({**record, **({} if name is None else {"name": name}), **_beside(item)})
     if not records:
-        held = _content(document)
         raise InputError(
-            f"{path}: holds {held}, and no poses: expected a list of matrices, of 6 or 7 numbers, or of positions beside "
-            "rotations (translation, rotation), or a table such as x_mm,y_mm,z_mm,qw,qx,qy,qz"
+            f"{path}: holds {_content(document)}, and no poses: expected a list of matrices, of 6 or 7 numbers, or of "
+            "positions beside rotations (translation, rotation), or a table such as x_mm,y_mm,z_mm,qw,qx,qy,qz"
         )
-    return list(dict.fromkeys(key for one in records for key in one)), records
+    return records
 
 
 def _parsed(path: Path) -> Any:  # noqa: ANN401 - whatever a document holds
@@ -158,21 +161,32 @@ def _items(node: Any) -> list[tuple[Any, str | None]]:  # noqa: ANN401
     if isinstance(node, list):
         found: list[tuple[Any, str | None]] = [(one, None) for one in node if isinstance(one, Mapping | list)]
         return found if len(found) != 1 else _items(found[0][0])
-    if not isinstance(node, Mapping):
-        return []
-    named = [(one, str(key)) for key, one in node.items() if isinstance(one, Mapping | list) and dict(_poses(one, key))]
-    if len(named) > 2 and len(named) == sum(isinstance(one, Mapping | list) for one in node.values()):
+    return _items_of_mapping(node) if isinstance(node, Mapping) else []
+
+
+def _items_of_mapping(node: Mapping[str, Any]) -> list[tuple[Any, str | None]]:
+    """Return the same of a mapping: of named poses, of one pose, of lists in parallel, or of its largest part."""
+    inner = {key: one for key, one in node.items() if isinstance(one, Mapping | list)}
+    named = [(one, str(key)) for key, one in inner.items() if dict(_poses(one, key))]
+    if 2 < len(named) == len(inner):
         return list(named)
     if dict(_poses(node)):
         return [(node, None)]
-    lists = {key: one for key, one in node.items() if isinstance(one, list) and len(one) > 1}
-    counts = {len(one) for one in lists.values()}
-    if len(lists) > 1 and len(counts) == 1:  # in parallel
+    lists = {key: one for key, one in inner.items() if isinstance(one, list) and len(one) > 1}
+    if len(lists) > 1 and len({len(one) for one in lists.values()}) == 1:
         rows = [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
         if any(dict(_poses(row)) for row in rows):
             return [(row, None) for row in rows]
-    inner = [_items(one) for one in node.values() if isinstance(one, Mapping | list)]
-    return max((one for one in inner), key=lambda one: sum(bool(dict(_poses(item))) for item, _ in one), default=[])
+    return max(
+        map(_items, inner.values()), key=lambda one: sum(bool(dict(_poses(item))) for item, _ in one), default=[]
+    )
+
+
+def _numbers(node: Mapping[str, Any]) -> Record:
+    """Return the numbers of a mapping, as text."""
+    return {
+        key: repr(float(one)) for key, one in node.items() if isinstance(one, int | float) and not isinstance(one, bool)
+    }
 
 
 def _poses(node: Any, name: str = "") -> Iterator[tuple[str, Record]]:  # noqa: ANN401
@@ -191,23 +205,26 @@ def _poses(node: Any, name: str = "") -> Iterator[tuple[str, Record]]:  # noqa: 
     if isinstance(names, list) and values is not None and values.size == len(names):  # sensor_msgs/JointState
         yield name, {str(joint): repr(float(angle)) for joint, angle in zip(names, values.ravel(), strict=True)}
         return
-    scalars = {key: one for key, one in node.items() if isinstance(one, int | float) and not isinstance(one, bool)}
+    scalars = _numbers(node)
     if {key.lower().partition("_")[0] for key in scalars} >= _XYZ and len(scalars) > 3 and set(scalars) != {*"wxyz"}:
-        yield name, {key: repr(float(one)) for key, one in scalars.items()}
+        yield name, scalars
         return
+    whole = _positions_beside_rotations(node)
+    for whose, found in whole.items():
+        yield f"{name}.{whose}".strip("."), found
+    for key, one in () if whole else node.items():
+        yield from _poses(one, f"{name}.{key}".strip("."))
+
+
+def _positions_beside_rotations(node: Mapping[str, Any]) -> dict[str, Record]:
+    """Return the poses whose position and rotation a mapping holds beside each other, by whose they are."""
     halves: dict[str, Record] = {}
     for key, one in node.items():
         half = _HALF.fullmatch(_UNIT.sub("", key))
         if half is not None and (numbers := _half(key, one, half)):
             whose = ".".join(part for part in (half["before"], half["behind"]) if part)
             halves.setdefault(whose, {}).update(numbers)
-    whole = {whose: found for whose, found in halves.items() if len(found) > 4}
-    for whose, found in whole.items():
-        yield f"{name}.{whose}".strip("."), found
-    if whole:
-        return
-    for key, one in node.items():
-        yield from _poses(one, f"{name}.{key}".strip("."))
+    return {whose: found for whose, found in halves.items() if len(found) > 4}
 
 
 def _is_joints(record: Record) -> bool:
@@ -239,14 +256,13 @@ def _of_numbers(array: np.ndarray[Any, np.dtype[np.float64]], name: str) -> Reco
 def _half(key: str, node: Any, half: re.Match[str]) -> Record:  # noqa: ANN401
     """Return the numbers of a position or a rotation by their names; {} where they are none."""
     if isinstance(node, Mapping):
-        numbers = {
-            k: repr(float(one)) for k, one in node.items() if isinstance(one, int | float) and not isinstance(one, bool)
+        numbers = _numbers(node)
+        before = {
+            frozenset(_XYZ): "" if half["position"] else "r",
+            frozenset("wxyz"): None if half["position"] else "q",
         }
-        if half["position"] and set(numbers) == _XYZ:
-            return numbers
-        if half["rotation"] and set(numbers) == {*"wxyz"}:
-            return {f"q{k}": one for k, one in numbers.items()}
-        return {f"r{k}": one for k, one in numbers.items()} if half["rotation"] and set(numbers) == _XYZ else {}
+        prefix = before.get(frozenset(numbers))
+        return {} if prefix is None else {f"{prefix}{k}": one for k, one in numbers.items()}
     array = _array(node)
     if array is None:
         return {}
@@ -254,12 +270,17 @@ def _half(key: str, node: Any, half: re.Match[str]) -> Record:  # noqa: ANN401
     unit = found[0] if (found := _UNIT.search(key)) else ""
     if half["position"]:
         return dict(zip((f"{axis}{unit}" for axis in "xyz"), cells, strict=True)) if array.shape == (3,) else {}
-    if array.shape in ((3, 3), (9,)):
+    return _rotation_cells(key, array.shape, cells, unit)
+
+
+def _rotation_cells(key: str, shape: tuple[int, ...], cells: list[str], unit: str) -> Record:
+    """Return the numbers of a rotation, of an array of some shape, by their names; {} where they are none."""
+    if shape in ((3, 3), (9,)):
         return dict(zip(_ROTATION, cells, strict=True))
-    if array.shape == (4,):
+    if shape == (4,):
         order = next((order for order in ("xyzw", "wxyz") if order in key.lower()), None)
         return dict(zip([f"q{k}" for k in order] if order else ["n1", "n2", "n3", "n4"], cells, strict=True))
-    if array.shape != (3,):
+    if shape != (3,):
         return {}
     vector = any(word in key.lower() for word in ("rvec", "rotvec", "axis"))
     unit = unit or ("_rad" if vector else "")
@@ -275,12 +296,8 @@ def _beside(item: Any) -> Record:  # noqa: ANN401
         name = {"file": "image", "filename": "image", "image_path": "image"}.get(key.lower(), key.lower())
         if isinstance(one, str) and name in ("name", "image", "shot"):
             out[name] = one
-        if (
-            isinstance(one, int | float)
-            and not isinstance(one, bool)
-            and name in ("t_s", "t", "time", "timestamp", "stamp")
-        ):
-            out["t_s"] = repr(float(one))
+        if name in ("t_s", "t", "time", "timestamp", "stamp") and (number := _numbers({key: one})):
+            out["t_s"] = number[key]
     stamp = item.get("stamp", item.get("header", {}).get("stamp") if isinstance(item.get("header"), Mapping) else None)
     if isinstance(stamp, Mapping):
         whole, parts = (

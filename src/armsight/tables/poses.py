@@ -10,7 +10,6 @@ x, y, z and a quaternion; 6: x, y, z and three numbers of a rotation, whose conv
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -118,50 +117,64 @@ def read_pose_table(
     """
     if rotation is not None and rotation not in CONVENTIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
-    cells = read_cells(path, read_columns(columns, (*COLUMNS, "pose")), side)
-    head, *body = degree_columns(path, [cells.head, *(row for _, row in cells.rows)])
-    rows: Rows = [(line, row) for (line, _), row in zip(cells.rows, body, strict=True)]
-    links = () if arm is None else arm.joint_names
-    if cells.listed and len(head) == 6:
-        notes = _notes_of_lists(path, rows[0], arm, unit, rotation)
-        head = ["x", "y", "z", "rx_rad", "ry_rad", "rz_rad"]
-    else:
-        if cells.listed:
-            _notes_of_lists(path, rows[0], arm, unit, rotation)
-        head, rotation, notes = understood(path, head, links, unit, rotation or cells.rotation)
-    notes = (*cells.notes, *notes)
-    measured = set(head) >= _MEASURED
-    rows, missed = _shown(path, head, rows) if measured else (rows, ("",) * len(rows))
-    table = Columns(path, head, rows, links)
-    lines = np.array([line for line, _ in rows])
-    unit_m, q, of_joints = 1.0, None, False
-    numbers, written, convention = np.zeros((len(rows), 0)), np.zeros((len(rows), 0)), ""
-    joints = table.joint_names(*((len(links), arm.name) if arm is not None else (None, "")))
-    if joints:
-        q = table.joints(joints)
+    table, rotation, notes, missed = _table(path, rotation, unit, columns, arm, side)
+    names = table.joint_names(*((len(arm.joint_names), arm.name) if arm is not None else (None, "")))
+    q = table.joints(names) if names else None
     if only_joints and q is None:
         raise InputError(
-            f"{path}: line 1: no joint angles: q1_deg .. or q1_rad .. are needed; there are {', '.join(head)}"
+            f"{path}: line 1: no joint angles: q1_deg .. or q1_rad .. are needed; there are {', '.join(table.at)}"
         )
-    if q is not None and arm is not None and (only_joints or not table.has_position()):
-        Ts, of_joints = np.asarray(arm.forward(q)), True
-    elif q is not None and not table.has_position():
-        raise InputError(f"{path}: joint angles need the arm: give --model, a name (armsight arm list) or a .urdf file")
-    else:
+    nothing = np.zeros((len(table.rows), 0))
+    numbers, written, convention, unit_m, of_joints = nothing, nothing, "", 1.0, False
+    if q is None or (table.has_position() and not (only_joints and arm is not None)):
         p, unit_m, found_out = _positions(table, unit, detect_units, side)
         notes = (*notes, *found_out)
         R, numbers, convention, written = table.rotations(rotation)
         written = np.hstack([p / unit_m, written]) if written.shape[1] else written
         Ts = stacked(R, p)
-    t_s, names = table.times(), table.names()
-    unused = [name for name in head if name and name not in table.used and not re.fullmatch(r"_[0-3]", name)]
+    elif arm is None:
+        raise InputError(f"{path}: joint angles need the arm: give --model, a name (armsight arm list) or a .urdf file")
+    else:
+        Ts, of_joints = np.asarray(arm.forward(q)), True
+    t_s, row_names, lines = table.times(), table.names(), np.array([line for line, _ in table.rows])
+    unused = tuple(name for name in table.at if name not in table.used | {"_0", "_1", "_2", "_3"})
     if arm is not None and q is None:
         notes = (*notes, f"{path}: has no joint angles: --model {arm.name} is not used")
-    if unused and not only_joints and not measured:
+    if unused and not only_joints and not set(table.at) >= _MEASURED:
         notes = (*notes, f"{path}: {columns_unused(unused)}")
     return PoseTable(
-        path, lines, Ts, numbers, written, convention, q, t_s, names, unit_m, notes, missed, of_joints, tuple(unused)
+        path,
+        lines,
+        Ts,
+        numbers,
+        written,
+        convention,
+        q,
+        t_s,
+        row_names,
+        unit_m,
+        notes,
+        missed,
+        of_joints,
+        unused,
     )
+
+
+def _table(
+    path: Path, rotation: str | None, unit: str | None, columns: str | None, arm: ArmJoints | None, side: str
+) -> tuple[Columns, str | None, tuple[str, ...], tuple[str, ...]]:
+    """Return the columns of a file, the convention of its rotations, notes, and why rows of it have no pose."""
+    cells = read_cells(path, read_columns(columns, (*COLUMNS, "pose")), side)
+    head, *body = degree_columns(path, [cells.head, *(row for _, row in cells.rows)])
+    rows: Rows = [(line, row) for (line, _), row in zip(cells.rows, body, strict=True)]
+    links = () if arm is None else arm.joint_names
+    notes = _notes_of_lists(path, rows[0], arm, unit, rotation) if cells.listed else ()
+    if cells.listed and len(head) == 6:
+        head = ["x", "y", "z", "rx_rad", "ry_rad", "rz_rad"]
+    else:
+        head, rotation, notes = understood(path, head, links, unit, rotation or cells.rotation)
+    rows, missed = _shown(path, head, rows) if set(head) >= _MEASURED else (rows, ("",) * len(rows))
+    return Columns(path, head, rows, links), rotation, (*cells.notes, *notes), missed
 
 
 def _shown(path: Path, head: list[str], rows: Rows) -> tuple[Rows, tuple[str, ...]]:
@@ -199,17 +212,7 @@ def stacked(R: Array, p: Array) -> Array:
 
 def _positions(table: Columns, unit: str | None, detect: bool, side: str) -> tuple[Array, float, tuple[str, ...]]:
     """Return positions (N, 3), m, the unit they were read in, and notes."""
-    suffix = next((s for s in ("_m", "_mm", "") if f"x{s}" in table.at), None)
-    if suffix is None:
-        if any(is_unitless(name) for name in table.at):
-            raise InputError(
-                f"{table.path}: line 1: joints without a unit: name them q1_deg .. or q1_rad .., and give --model"
-            )
-        raise InputError(
-            f"{table.path}: line 1: no positions: x_m y_m z_m or x_mm y_mm z_mm are needed, or, with "
-            f"--model, joints q1_rad .. or q1_deg ..; there are {', '.join(list(table.at)[:10])}: --columns x_m=NAME,... "
-            "gives yours"
-        )
+    suffix = _suffix(table)
     p = table.numbers([f"{axis}{suffix}" for axis in "xyz"])
     given = suffix[1:] or unit
     unit_m = 1e-3 if given == "mm" else 1.0
@@ -241,6 +244,21 @@ def _positions(table: Columns, unit: str | None, detect: bool, side: str) -> tup
             (f"{table.path}: positions read as metres: as millimetres they would stay within {1e3 * far:.2g} mm",),
         )
     return unit_m * p, unit_m, ()
+
+
+def _suffix(table: Columns) -> str:
+    """Return how the names of positions end."""
+    suffix = next((s for s in ("_m", "_mm", "") if f"x{s}" in table.at), None)
+    if suffix is not None:
+        return suffix
+    if any(is_unitless(name) for name in table.at):
+        raise InputError(
+            f"{table.path}: line 1: joints without a unit: name them q1_deg .. or q1_rad .., and give --model"
+        )
+    raise InputError(
+        f"{table.path}: line 1: no positions: x_m y_m z_m or x_mm y_mm z_mm are needed, or, with --model, joints q1_rad .. "
+        f"or q1_deg ..; there are {', '.join(list(table.at)[:10])}: --columns x_m=NAME,... gives yours"
+    )
 
 
 def _or_units(far: float) -> str:

@@ -216,9 +216,15 @@ def _points(path: Path, text: str, program: Program) -> ProgramPoints | None:
         head = [f"q{k}_deg" for k in range(1, len(cells[0]) + 1)]
         rows = [(_line(text, one), [cell.strip() for cell in row]) for one, row in zip(joints, cells, strict=True)]
         return ProgramPoints(head, rows, None, notes)
-    if not poses:
+    return _poses_of(path, program, [(_line(text, one), list(one.groups())) for one in poses], notes)
+
+
+def _poses_of(
+    path: Path, program: Program, rows: list[tuple[int, list[str]]], notes: tuple[str, ...]
+) -> ProgramPoints | None:
+    """Return the poses of a program, by their lines; None where there are none."""
+    if not rows:
         return None
-    rows = [(_line(text, one), list(one.groups())) for one in poses]
     how = f"degrees, {program.rotation}" if program.rotation else "quaternions"
     said = f"{path}: {len(rows)} points read as {program.maker}'s: mm, {how}"
     if program.rotation == "ZYZ":  # not among the conventions of three axes

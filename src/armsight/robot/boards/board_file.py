@@ -24,7 +24,7 @@ Every value must be there, once; a name that is not known is named with the one 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -136,31 +136,32 @@ def read_configuration(path: Path) -> tuple[Configuration, str]:
     if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= JOINTS:
         raise InputError(f"{path}: arm.joint_count is {count!r}; 1 to {JOINTS} is needed: the joints the arm has")
     config["joint_count"], config["joint"]["pot"]["node_count"][:count] = count, 2
-    for j in range(count):  # first of all: what else there is to say depends on it
-        path_of = f"joint.{j + 1}.encoder.sensor"
-        if path_of in given:
-            try:
-                put(config, path_of, given[path_of])
-            except InputError as error:
-                raise InputError(f"{path}: {error}") from None
     absent = {f"joint.{j + 1}.{name}" for j in range(count) for name in _NEW_SINCE[data["version"]]}
-    known = {name: value for name, value in entries(config) if name not in absent}
-    for name in given:
-        if name not in known:
-            raise InputError(f"{path}: {_unknown(name, config)}")
-    for name in known:
-        if name not in given:
-            raise InputError(f"{path}: {name} is missing")
-        try:
-            put(config, name, given[name])
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
     try:
+        _fill(config, given, absent)
         check_configuration(config)
         check_pin(config, data["board"])
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return config, data["board"]
+
+
+def _fill(config: Configuration, given: Mapping[str, object], absent: Collection[str]) -> None:
+    """Put all values of a file into a configuration, but those that a file of its version does not have.
+
+    Raises:
+        InputError: one is missing, unknown, or of another kind.
+    """
+    for j in range(int(config["joint_count"])):  # first of all: what else there is to say depends on it
+        if (sensor := f"joint.{j + 1}.encoder.sensor") in given:
+            put(config, sensor, given[sensor])
+    known = [name for name, _ in entries(config) if name not in absent]
+    if unknown := next((name for name in given if name not in known), None):
+        raise InputError(_unknown(unknown, config))
+    if missing := next((name for name in known if name not in given), None):
+        raise InputError(f"{missing} is missing")
+    for name in known:
+        put(config, name, given[name])
 
 
 def _flat(data: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
@@ -187,22 +188,7 @@ def put(config: Configuration, path: str, value: object) -> None:
     Raises:
         InputError: there is no such path, or the value is of another kind.
     """
-    record, names = config, path.split(".")
-    if names[0] == "arm":
-        names = names[1:]
-    elif names[0] == "joint" and len(names) > 2 and names[1] in map(str, range(1, JOINTS + 1)):
-        record, names = config["joint"][int(names[1]) - 1], names[2:]
-    else:
-        raise InputError(
-            f"nothing is called {path}; such names are arm.silence_ticks and joint.3.pot.jump_rad, joints 1 to {JOINTS}"
-        )
-    for name in names[:-1]:
-        if name not in _PARTS or name not in (record.dtype.names or ()):
-            raise InputError(_unknown(path, config))
-        record = record[name]
-    name = names[-1]
-    if name not in (record.dtype.names or ()) or name in ("node_count", "joint", *_PARTS):
-        raise InputError(_unknown(path, config))
+    record, name = _record_of(config, path)
     if name == _PIN:
         record[name] = pin_number(value)
         return
@@ -226,6 +212,26 @@ def put(config: Configuration, path: str, value: object) -> None:
             if not limits.min <= number <= limits.max:
                 raise InputError(f"{path} is {number}; {low:.0f} to {high:.0f} is allowed")
         record[name] = number
+
+
+def _record_of(config: Configuration, path: str) -> tuple[Configuration, str]:
+    """Return the part of a configuration that a path leads to, and the name of its value there."""
+    record, names = config, path.split(".")
+    if names[0] == "arm":
+        names = names[1:]
+    elif names[0] == "joint" and len(names) > 2 and names[1] in map(str, range(1, JOINTS + 1)):
+        record, names = config["joint"][int(names[1]) - 1], names[2:]
+    else:
+        raise InputError(
+            f"nothing is called {path}; such names are arm.silence_ticks and joint.3.pot.jump_rad, joints 1 to {JOINTS}"
+        )
+    for name in names[:-1]:
+        if name not in _PARTS or name not in (record.dtype.names or ()):
+            raise InputError(_unknown(path, config))
+        record = record[name]
+    if names[-1] not in (record.dtype.names or ()) or names[-1] in ("node_count", "joint", *_PARTS):
+        raise InputError(_unknown(path, config))
+    return record, names[-1]
 
 
 def _checked(path: str, value: object, whole: bool) -> float | int:

@@ -279,14 +279,22 @@ class So101Bus:
                 self._store(k, parameters[0], parameters[1:])
             self._answer([(k, b"") for k in servos if to != _BROADCAST])
         elif instruction == 0x82 and len(parameters) > 2:
-            for each in parameters[2:]:  # one answers after the other, with what it measures then
-                self._refresh(max(self.t_s, self._free_s) - self.t_s)
-                self._answer([(k, self._bytes(k, *parameters[:2])) for k, own in enumerate(self.ids) if own == each])
+            self._read_each(parameters)
         elif instruction == 0x83 and len(parameters) > 2:
-            address, count = parameters[:2]
-            for at in range(2, len(parameters) - count, count + 1):
-                for k in (k for k, own in enumerate(self.ids) if own == parameters[at]):
-                    self._store(k, address, parameters[at + 1 : at + 1 + count])
+            self._write_each(parameters)
+
+    def _read_each(self, parameters: bytes) -> None:
+        """Answer SYNC READ: one servo after the other, with what it measures then."""
+        for each in parameters[2:]:
+            self._refresh(max(self.t_s, self._free_s) - self.t_s)
+            self._answer([(k, self._bytes(k, *parameters[:2])) for k, own in enumerate(self.ids) if own == each])
+
+    def _write_each(self, parameters: bytes) -> None:
+        """Store what SYNC WRITE has for each servo."""
+        address, count = parameters[:2]
+        for at in range(2, len(parameters) - count, count + 1):
+            for k in (k for k, own in enumerate(self.ids) if own == parameters[at]):
+                self._store(k, address, parameters[at + 1 : at + 1 + count])
 
     def _bytes(self, servo: int, address: int, count: int) -> bytes:
         return bytes(self.tables[servo][address : address + count])
