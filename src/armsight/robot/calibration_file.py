@@ -36,8 +36,6 @@ UR_NAMES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 _KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 #: Seeded poses within the limits over which two arms are compared, and a tool further off than this is not of this arm, m.
 _POSES, _FAR_M = 1000, 0.1
-#: What a file cannot hold of a flange is said from here on, m and rad.
-_HELD = 1e-9
 
 
 class Difference(NamedTuple):

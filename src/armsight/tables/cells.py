@@ -15,7 +15,7 @@ import numpy as np
 
 from armsight.errors import InputError
 from armsight.files import DECIMAL_COMMA, TABLE_MB, read_table, read_text
-from armsight.tables.nested import PACKED, document_rows, is_document, is_packed
+from armsight.tables.nested import BY_COUNT, PACKED, document_rows, is_document, is_packed
 from armsight.tables.number import NUMBER, number
 from armsight.tables.programs import program_rows
 
@@ -28,16 +28,8 @@ _LIST = re.compile(r"\[([^\[\]{}\"]*)\],?")
 _RULE = re.compile(r"[\s|+:-]*-[\s|+:-]*|\(\d+ rows?\)")
 #: The first line of a text that is no table: of a document, of a program, a call.
 _NO_TABLE = re.compile(r"[{<\[/]|\.[A-Z]|(?:DEF|MODULE|PROC)\b|.*(?::=|=|\(\)|[\[{]$)|.*\w\s*\(\s*[\"\[{\d.+-]")
-_MATRIX = [name for i in "123" for name in (f"r{i}1", f"r{i}2", f"r{i}3", "xyz"[int(i) - 1])]
-_QUATERNION = ["n1", "n2", "n3", "n4"]
 #: Names for columns that have none, by how many they are.
-_FORMS = {
-    16: [*_MATRIX, "_0", "_1", "_2", "_3"],
-    12: _MATRIX,
-    8: ["t_s", *"xyz", *_QUATERNION],
-    7: [*"xyz", *_QUATERNION],
-    6: [*"xyz", "n1", "n2", "n3"],
-}
+_FORMS = {8: ["t_s", *BY_COUNT[7]], **BY_COUNT}
 
 
 class Cells(NamedTuple):
@@ -241,28 +233,21 @@ def _without_names(path: Path, rows: Rows) -> Cells:
     return Cells(head, rows)
 
 
+def _is_last(cells: list[str]) -> bool | None:
+    """Return whether cells are the last row of a matrix, 0 0 0 1; None where one is no number."""
+    numbers = [number(cell) for cell in cells]
+    return None if None in numbers else bool(np.allclose(np.array(numbers, float), [0, 0, 0, 1], atol=1e-6))
+
+
 def _row_major(path: Path, cells: Cells) -> Cells:
     """Return matrices of 16 numbers row by row; those of Franka's O_T_EE, Eigen's and MATLAB's are column by column."""
-    values = [[number(cell) for cell in row] for _, row in cells.rows]
-    lasts = [[[row[k] for k in at] for row in values] for at in ((12, 13, 14, 15), (3, 7, 11, 15))]
-    rowwise, columnwise = (
-        all(None not in last and np.allclose(np.array(last, float), [0, 0, 0, 1], atol=1e-6) for last in side)
-        for side in lasts
-    )
-    if not rowwise and columnwise:
+    rowwise = [_is_last(row[12:]) for _, row in cells.rows]
+    if not all(rowwise) and all(_is_last(row[3::4]) for _, row in cells.rows):
         order = np.arange(16).reshape(4, 4).T.ravel()
         note = f"{path}: its matrices are column by column (0 0 0 1 is the last of every four numbers), and read so"
         return cells._replace(rows=[(line, [row[k] for k in order]) for line, row in cells.rows], notes=(note,))
-    bad = next(
-        (
-            k
-            for k, last in enumerate(lasts[0])
-            if None not in last and not np.allclose(np.array(last, float), [0, 0, 0, 1], atol=1e-6)
-        ),
-        None,
-    )
-    if bad is not None:
-        line, row = cells.rows[bad]
+    if False in rowwise:
+        line, row = cells.rows[rowwise.index(False)]
         raise InputError(
             f"{path}: line {line}: 16 numbers are a matrix row by row, which ends with 0 0 0 1, not "
             f"{' '.join(row[12:])[:40]}; or name the columns, --columns"
@@ -272,17 +257,12 @@ def _row_major(path: Path, cells: Cells) -> Cells:
 
 def _matrices(path: Path, rows: Rows) -> Rows:
     """Return matrices of four lines each, or of three without the last one, as a row each."""
-
-    def is_last(row: list[str]) -> bool:
-        numbers = [number(cell) for cell in row]
-        return None not in numbers and np.allclose(np.array(numbers, float), [0, 0, 0, 1], atol=1e-6)
-
     columnwise = len(rows) % 4 == 0 and all(
-        is_last([row[3] for _, row in rows[k : k + 4]]) for k in range(0, len(rows), 4)
+        _is_last([row[3] for _, row in rows[k : k + 4]]) for k in range(0, len(rows), 4)
     )
-    count = 4 if columnwise or any(is_last(row) for _, row in rows) else 3  # three of [R p] never end so
+    count = 4 if columnwise or any(_is_last(row) for _, row in rows) else 3  # three of [R p] never end so
     for line, row in rows[3::4] if count == 4 and not columnwise else ():
-        if not is_last(row):
+        if not _is_last(row):
             raise InputError(
                 f"{path}: line {line}: expected 0 0 0 1, the last of a matrix's four lines, found {' '.join(row)[:40]!r}"
             )

@@ -26,8 +26,9 @@ SIDES = {
     "robot": re.compile("robot|hand|gripper|effector|eef|flange|tcp|arm|wrist|o_t_ee|end"),
     "seen": re.compile("track|target|marker|object|board|optical|sensor|camera|cam|tag|pattern|calib"),
 }
+#: Names for numbers that have none, by how many they are.
 _MATRIX = [name for i in "123" for name in (f"r{i}1", f"r{i}2", f"r{i}3", "xyz"[int(i) - 1])]
-_BY_COUNT = {
+BY_COUNT = {
     16: [*_MATRIX, "_0", "_1", "_2", "_3"],
     12: _MATRIX,
     7: [*"xyz", "n1", "n2", "n3", "n4"],
@@ -248,9 +249,9 @@ def _of_numbers(array: np.ndarray[Any, np.dtype[np.float64]], name: str) -> Reco
         if not np.allclose(array[3], [0, 0, 0, 1], atol=1e-6) and np.allclose(array[:, 3], [0, 0, 0, 1], atol=1e-6):
             array = array.T  # column by column, as Franka's O_T_EE
         array = array.ravel()
-    if array.ndim != 1 or len(array) not in _BY_COUNT or "cov" in name.lower():
+    if array.ndim != 1 or len(array) not in BY_COUNT or "cov" in name.lower():
         return None
-    return dict(zip(_BY_COUNT[len(array)], (repr(float(one)) for one in array), strict=True))
+    return dict(zip(BY_COUNT[len(array)], (repr(float(one)) for one in array), strict=True))
 
 
 def _half(key: str, node: Any, half: re.Match[str]) -> Record:  # noqa: ANN401

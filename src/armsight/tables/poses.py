@@ -115,8 +115,6 @@ def read_pose_table(
     Raises:
         InputError: the file, the line and what was expected.
     """
-    if rotation is not None and rotation not in CONVENTIONS:
-        raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
     table, rotation, notes, missed = _table(path, rotation, unit, columns, arm, side)
     names = table.joint_names(*((len(arm.joint_names), arm.name) if arm is not None else (None, "")))
     q = table.joints(names) if names else None
@@ -143,20 +141,7 @@ def read_pose_table(
     if unused and not only_joints and not set(table.at) >= _MEASURED:
         notes = (*notes, f"{path}: {columns_unused(unused)}")
     return PoseTable(
-        path,
-        lines,
-        Ts,
-        numbers,
-        written,
-        convention,
-        q,
-        t_s,
-        row_names,
-        unit_m,
-        notes,
-        missed,
-        of_joints,
-        unused,
+        path, lines, Ts, numbers, written, convention, q, t_s, row_names, unit_m, notes, missed, of_joints, unused
     )
 
 
@@ -164,6 +149,8 @@ def _table(
     path: Path, rotation: str | None, unit: str | None, columns: str | None, arm: ArmJoints | None, side: str
 ) -> tuple[Columns, str | None, tuple[str, ...], tuple[str, ...]]:
     """Return the columns of a file, the convention of its rotations, notes, and why rows of it have no pose."""
+    if rotation is not None and rotation not in CONVENTIONS:
+        raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
     cells = read_cells(path, read_columns(columns, (*COLUMNS, "pose")), side)
     head, *body = degree_columns(path, [cells.head, *(row for _, row in cells.rows)])
     rows: Rows = [(line, row) for (line, _), row in zip(cells.rows, body, strict=True)]

@@ -52,7 +52,7 @@ _HAND_COUNTS, _HAND_ENCODER_COUNTS = 1500.0, 40.0  # a hand that moves a joint c
 _UNEVEN_RAD = 0.1
 _MOST_ANGLE_RAD = 13.0  # of a joint, as config.c holds it
 _UNSOUND, _MAGNET = 0x4000, 0x8000  # beside an absolute encoder's angle (ENCODER_... of types.h)
-_JOG_RAD, _JOG_DUTY, _JOG_DUTY_PER_S, _JOG_MOST_RAD = 0.010, 0.6, 0.15, 0.05
+_JOG_RAD, _JOG_DUTY, _JOG_DUTY_PER_S = 0.010, 0.6, 0.15
 _DEAD_DUTY, _DEAD_A = 0.25, 0.02
 _RESTS = 0.25  # of what counts as a motion
 #: A swing: amplitudes, rad, and frequencies, Hz, that add up, and how far a joint may get away from where it began.

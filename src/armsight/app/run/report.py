@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-GREEN, SOFT_BLUE, SOFT_GREEN = "#2f7d4f", "#cfe3f5", "#cfe8d8"
+GREEN, SOFT_GREEN = "#2f7d4f", "#cfe8d8"
 _MM, _DEG = 1e3, float(np.degrees(1.0))
 _BAND = float(ndtri(0.975))
 _POINTS = 4000  # of a line in a figure: more cannot be seen

@@ -161,14 +161,7 @@ def kronecker(A: Array, B: Array) -> tuple[Array, Array]:
     """Solve ``A_i X = Z B_i`` in closed form: rotations first, then translations.
 
     With column-stacked matrices, R_A R_X R_B^T = R_Z reads (R_B kron R_A) vec(R_X) = vec(R_Z) for every i, so both are the
-    leading singular vectors of the sum of the Kronecker products.
-
-    Args:
-        A: (..., N, 4, 4) poses.
-        B: (..., N, 4, 4) poses.
-
-    Returns:
-        (..., 4, 4) X and (..., 4, 4) Z.
+    leading singular vectors of the sum of the Kronecker products. A and B are (..., N, 4, 4), X and Z (..., 4, 4).
     """
     RA, RB = A[..., :3, :3], B[..., :3, :3]
     K = np.einsum("...nij,...nkl->...ikjl", RB, RA, optimize=True).reshape(*A.shape[:-3], 9, 9)

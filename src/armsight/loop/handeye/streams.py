@@ -28,8 +28,6 @@ MAX_POSES = 600
 GAP_S = 0.25
 #: Rotation slower than this, rad/s, does not determine the time offset.
 MIN_SPEED_RAD_S = 0.02
-#: Rounds of offset and transforms, and the change of the offset, s, below which it has settled.
-ROUNDS, SETTLED_S = 12, 1e-6
 #: Over this time the speed of the flange is measured, s.
 SPEED_S = 0.02
 #: Steps between poses over which angular speeds are taken, and how much faster than the slower stream is a blunder.

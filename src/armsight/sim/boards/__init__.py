@@ -2,5 +2,4 @@
 
 - ``device``: what an emulated controller is, and how it is reached: in step, or at a pseudo-terminal in real time;
 - ``so101``: the servo bus of an SO-101; ``ar4``: the Teensy of an AR4;
-- ``wire``: noise on the line.
 """

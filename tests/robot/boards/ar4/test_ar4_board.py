@@ -9,7 +9,7 @@ from armsight.robot.boards.ar4.board import Ar4Board
 from armsight.robot.boards.codes import Alarm, BoardState, Command
 from armsight.sim.boards.ar4 import Ar4Mechanics, Ar4Teensy
 from armsight.sim.boards.device import SteppedLink
-from armsight.sim.boards.wire import NoisyDevice
+from noisy_device import NoisyDevice
 
 REST = np.zeros(6)
 

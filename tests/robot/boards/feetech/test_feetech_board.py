@@ -14,8 +14,8 @@ from armsight.robot.boards.feetech.calibration import NAMES, read_calibration, w
 from armsight.robot.boards.feetech.registers import RAD_PER_COUNT
 from armsight.sim.boards.device import SteppedLink
 from armsight.sim.boards.so101 import So101Bus, So101Mechanics
-from armsight.sim.boards.wire import NoisyDevice
 from armsight.tables.columns import degree_columns
+from noisy_device import NoisyDevice
 
 REST = np.zeros(5)
 

@@ -23,7 +23,7 @@ from armsight.tables.columns import LEROBOT
 
 #: The joints of an SO-100 or SO-101 from the base on; ids 1 to 5.
 NAMES = LEROBOT
-GRIPPER, GRIPPER_ID = "gripper", 6
+GRIPPER = "gripper"
 _FIELDS = {"id": (0, 253), "drive_mode": (0, 0), "homing_offset": (-MOST_OFFSET, MOST_OFFSET)}
 _FIELDS |= {"range_min": (0, COUNTS - 1), "range_max": (0, COUNTS - 1)}
 

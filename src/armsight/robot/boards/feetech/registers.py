@@ -57,7 +57,6 @@ class Register(NamedTuple):
 
 
 MODEL = Register(3, 2)
-RETURN_DELAY = Register(7, 1)
 MIN_POSITION, MAX_POSITION = Register(9, 2), Register(11, 2)
 HOMING_OFFSET = Register(31, 2, 11)
 MODE = Register(33, 1)

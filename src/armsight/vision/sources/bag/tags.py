@@ -34,11 +34,6 @@ _WITHOUT_CORNERS = ("apriltag_ros/AprilTagDetectionArray", "apriltag_ros_msgs/Ap
 _S_NS = 1e9
 
 
-def holds_tags(spec: str) -> bool:
-    """Return whether ``bag:FILE`` names a recording of tags without images."""
-    return bool(Bag(parsed(spec.removeprefix("bag:"))[0]).of_kind(*TAGS))
-
-
 def read_tags(spec: str, target: Target | Body) -> tuple[list[SeenShot], tuple[str, ...]]:
     """Read the detected tags of a recording.
 
