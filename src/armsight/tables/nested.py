@@ -51,8 +51,6 @@ _ECHO = re.compile(
     r"(?:At time\s+([\d.]+)\s+)?-?\s*Translation:\s*\[([^\]]*)\]\s+"
     r"-?\s*Rotation:\s*in Quaternion(?:\s*\(xyzw\))?\s*\[([^\]]*)\]"
 )
-
-
 #: Suffixes of documents that are text, and of those that are not.
 _TEXTS, PACKED = (".yaml", ".yml", ".json"), (".npy", ".npz", ".mat", ".xml", ".gz")
 _MOST_RECORDS = 200_000  # poses of a document, of 40 bytes each; half: the same; double: a hostile list takes 500 MB
@@ -185,9 +183,7 @@ def _items_of_mapping(node: Mapping[str, Any]) -> list[tuple[Any, str | None]]:
 
 def _numbers(node: Mapping[str, Any]) -> Record:
     """Return the numbers of a mapping, as text."""
-    return {
-        key: repr(float(one)) for key, one in node.items() if isinstance(one, int | float) and not isinstance(one, bool)
-    }
+    return {key: repr(float(one)) for key, one in node.items() if type(one) in (int, float)}
 
 
 def _poses(node: Any, name: str = "") -> Iterator[tuple[str, Record]]:  # noqa: ANN401

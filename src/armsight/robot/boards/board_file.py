@@ -147,11 +147,7 @@ def read_configuration(path: Path) -> tuple[Configuration, str]:
 
 
 def _fill(config: Configuration, given: Mapping[str, object], absent: Collection[str]) -> None:
-    """Put all values of a file into a configuration, but those that a file of its version does not have.
-
-    Raises:
-        InputError: one is missing, unknown, or of another kind.
-    """
+    """Put all values of a file into a configuration, but those that a file of its version does not have."""
     for j in range(int(config["joint_count"])):  # first of all: what else there is to say depends on it
         if (sensor := f"joint.{j + 1}.encoder.sensor") in given:
             put(config, sensor, given[sensor])
