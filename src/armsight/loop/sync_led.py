@@ -388,7 +388,6 @@ _POOLED_S = 30.0
 #: so many seconds: what the sweep's model of the arm lacks of friction and backlash is up to 1 ms.
 _CHANGED, _CHANGED_S, _APART_S = 5.0, 3e-4, 1.5e-3
 
-
 _SIDES = ("left", "right")
 #: A smaller skew is none, s.
 _SIMULTANEOUS_S = 5e-5

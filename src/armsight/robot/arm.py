@@ -40,7 +40,6 @@ Convention = Literal["standard", "modified"]
 Axes = Literal["base", "tool"]
 _AXES = {"base": False, "tool": True}
 
-
 #: Attribute -> what every joint has where it is not given.
 _DEFAULTS = {"offset": 0.0, "direction": 1.0, "home": 0.0}
 

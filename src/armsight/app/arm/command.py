@@ -24,7 +24,6 @@ _JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON obj
 _NARROW_M = 0.15
 _POSE = ("x", "y", "z", "euler_z", "euler_y", "euler_x")
 
-
 _ARM = arm_option("arm_name", metavar="ARM")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -485,17 +485,20 @@ def offsets(
             changes = changed.planned_changes(board, none if angles is None else angles)
         if given:
             doubtful = [] if restore is not None else doubts(changes, board.calibration)
-            if doubtful and yes:
-                raise InputError(f"{doubtful[0]}; --yes does not write this: without it you are asked")
-            if not yes:
-                click.echo(
-                    "\n".join([changed.changes_text(changes), *(f"note: {each}" for each in doubtful)]), err=True
-                )
-                click.confirm("write the new offsets to the servos?", abort=True, err=True)
+            _confirm(changed.changes_text(changes), doubtful, "write the new offsets to the servos?", yes)
             changed.apply(board, changes, keep, calibration)
     click.echo(json.dumps(changed.changes_json(changes, bool(given))) if as_json else changed.changes_text(changes))
     if given:
         click.echo(f"written; the old offsets are in {keep}", err=True)
+
+
+def _confirm(text: str, doubts: Sequence[str], question: str, yes: bool) -> None:
+    """Ask before something is written; what is doubtful is not written without being asked."""
+    if doubts and yes:
+        raise InputError(f"{doubts[0]}; --yes does not write this: without it you are asked")
+    if not yes:
+        click.echo("\n".join([text, *(f"note: {each}" for each in doubts)]), err=True)
+        click.confirm(question, abort=True, err=True)
 
 
 def _zeros(
@@ -517,11 +520,7 @@ def _zeros(
 
     def asked(changes: list[changed.ZeroChange]) -> None:
         doubtful = [] if restore is not None else changed.zero_doubts(changes)
-        if doubtful and yes:
-            raise InputError(f"{doubtful[0]}; --yes does not write this: without it you are asked")
-        if not yes:
-            click.echo("\n".join([changed.zeros_text(changes), *(f"note: {each}" for each in doubtful)]), err=True)
-            click.confirm("write the new zeros?", abort=True, err=True)
+        _confirm(changed.zeros_text(changes), doubtful, "write the new zeros?", yes)
 
     written = angles is not None or restore is not None
     none = np.zeros(6) if angles is None else angles

@@ -227,7 +227,6 @@ FIGURES: dict[str, tuple[Callable[[CheckResult, Sequence[Row]], Figure | None], 
     ),
 }
 
-
 #: Names of all files that a report may have.
 REPORT_FILES = (PAGE, "check.json", "check.csv", *(f"check-{name}.png" for name in FIGURES))
 

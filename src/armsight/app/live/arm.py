@@ -761,23 +761,13 @@ class ArmStep:
     def state(self) -> ArmState:
         """What to show now."""
         options, board, loop = self.options, self._board, self._loop
-        command = (
-            f"armsight run --source {options.source} --board {options.board or 'serial:PORT'} --rig "
-            f"{self._measuring.rig_path or 'rig.json'} --target {self._measuring.target_spec or 'body.toml'} "
-            f"--arm {options.arm_spec}"
-            + (
-                " -o run"
-                if self._logged is not None
-                else f" --motion {options.motion}{' --follow-rig' * options.follow_rig} -o run"
-            )
-        )
         plain = ArmState(
             options.arm.name,
             missing=self._lacking(),
             handeye=self.handeye.state,
             identify=self.identify.state,
             motion_file=str(options.motion),
-            command=command,
+            command=self._command(),
         )
         q = self._q if self._logged is None else self._logged_q()
         vision, scene = self._vision(q)
@@ -812,6 +802,16 @@ class ArmStep:
             error_mm=tuple((round(t, 3), round(e, 4), c) for t, e, c in list(self._chart)),
             results=self._results,
             folder=None if self._run_folder is None else str(self._run_folder),
+        )
+
+    def _command(self) -> str:
+        """The command that runs the same."""
+        options, measuring = self.options, self._measuring
+        motion = f" --motion {options.motion}{' --follow-rig' * options.follow_rig}" if self._logged is None else ""
+        return (
+            f"armsight run --source {options.source} --board {options.board or 'serial:PORT'} --rig "
+            f"{measuring.rig_path or 'rig.json'} --target {measuring.target_spec or 'body.toml'} "
+            f"--arm {options.arm_spec}{motion} -o run"
         )
 
     def _logged_q(self) -> Array | None:

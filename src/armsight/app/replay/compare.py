@@ -68,6 +68,12 @@ def compare(first: Path, second: Path) -> list[TableDifference]:
     return [_compared(first / name, second / name) for name in names]
 
 
+def _difference(one: str, other: str) -> float:
+    """Return the difference of two cells; NaN where one is no number."""
+    x, y = number(one), number(other)
+    return np.nan if x is None or y is None else x - y
+
+
 def _compared(first: Path, second: Path) -> TableDifference:
     tables = [Columns.of_csv(path) for path in (first, second)]
     for table in tables:
@@ -75,18 +81,15 @@ def _compared(first: Path, second: Path) -> TableDifference:
             raise InputError(f"{table.path}: line 1: expected a table of poses whose first column is shot or t_s")
     a, b = ({row[0]: row for _, row in table.rows} for table in tables)
     columns = [name for name in list(tables[0].at)[1:] if name in tables[1].at]
-    largest = dict.fromkeys(columns, 0.0)
-    same, status_changed, squares = True, 0, []
-    for key in (key for key in a if key in b):
-        cells = {name: tuple(row[table.at[name]] for row, table in zip((a[key], b[key]), tables, strict=True))
-                 for name in columns}  # fmt: skip
-        same &= all(one == two for one, two in cells.values())
-        status_changed += len(set(cells.get("status", ()))) > 1
-        numbers = {name: tuple(map(number, pair)) for name, pair in cells.items()}
-        deltas = {name: abs(x - y) for name, (x, y) in numbers.items() if x is not None and y is not None}
-        largest |= {name: max(largest[name], delta) for name, delta in deltas.items()}
-        if all(f"{axis}_m" in deltas for axis in "xyz"):
-            squares.append(sum(deltas[f"{axis}_m"] ** 2 for axis in "xyz"))
-    common = len(set(a) & set(b))
-    rms = float(np.sqrt(np.mean(squares))) if squares else None
-    return TableDifference(first.name, common, len(a) - common, len(b) - common, same, status_changed, largest, rms)
+    both = [(a[key], b[key]) for key in a if key in b]
+    cells = {name: [(x[tables[0].at[name]], y[tables[1].at[name]]) for x, y in both] for name in columns}
+    same = all(x == y for pairs in cells.values() for x, y in pairs)
+    status_changed = sum(x != y for x, y in cells.get("status", ()))
+    deltas = {name: np.array([_difference(*pair) for pair in pairs]) for name, pairs in cells.items()}
+    largest = {name: float(np.nanmax(np.abs(each), initial=0.0)) for name, each in deltas.items()}
+    axes = [deltas[f"{axis}_m"] for axis in "xyz" if f"{axis}_m" in deltas]
+    squares = np.sum(np.square(axes), axis=0) if len(axes) == 3 else np.zeros(0)
+    squares = squares[np.isfinite(squares)]
+    rms = float(np.sqrt(squares.mean())) if len(squares) else None
+    alone = len(a) - len(both), len(b) - len(both)
+    return TableDifference(first.name, len(both), *alone, same, status_changed, largest, rms)

@@ -112,28 +112,18 @@ def run_logged(
         InputError: rows and shots do not belong together.
         CalibrationError: too few shots show the body, or the motions leave a direction open.
     """
-    names: list[str] = []
-    times: list[float | None] = []
-    seen: list[PoseEstimate | Missed] = []
-    while (shot := source.read()) is not None:
-        progress(f"measuring shot {len(names) + 1}")
-        names.append(shot.name)
-        times.append(shot.t_s)
-        seen.append(measure(rig, target, shot))
-    if not names:
-        raise CalibrationError("the source has no shot")
-    q_all = angles.at(names, times)
-    unpaired = tuple(name for name, q in zip(names, q_all, strict=True) if q is None)
-    missed = tuple(f"{name}: {r.reason}" for name, r in zip(names, seen, strict=True) if isinstance(r, Missed))
-    good = [k for k, result in enumerate(seen) if isinstance(result, PoseEstimate) and q_all[k] is not None]
+    names, seen, q_all = _measured(source, rig, target, angles, progress)
+    rows = list(zip(names, seen, q_all, strict=True))
+    unpaired = tuple(name for name, _, q in rows if q is None)
+    missed = tuple(f"{name}: {r.reason}" for name, r, _ in rows if isinstance(r, Missed))
+    good = [(name, r, q) for name, r, q in rows if isinstance(r, PoseEstimate) and q is not None]
     if len(good) < MIN_POSES:
         first = f": {missed[0]}" if missed else ""
         raise CalibrationError(
             f"{len(good)} of {len(names)} shots show the body and have joint angles; {MIN_POSES} at least are needed{first}"
         )
-    poses = [result for k in good if isinstance(result := seen[k], PoseEstimate)]
-    q = np.array([q_all[k] for k in good])
-    Ts, covs = np.array([each.T_left_body for each in poses]), np.array([each.cov for each in poses])
+    q = np.array([angles_of for _, _, angles_of in good])
+    Ts, covs = np.array([pose.T_left_body for _, pose, _ in good]), np.array([pose.cov for _, pose, _ in good])
     progress("hand-eye: calibrating")
     centre = target.body.points.mean(axis=0)
     found = _calibrated(arm, q, Ts, covs, centre)
@@ -150,7 +140,22 @@ def run_logged(
     implausible = None if shift else _implausible(arm, q[found.used], Ts[found.used])
     if not shift and implausible is None:
         require_known(found, TRUSTED_M, TRUSTED_RAD)
-    return LoggedRun(run, tuple(names[k] for k in good), len(names), unpaired, shift, implausible)
+    return LoggedRun(run, tuple(name for name, _, _ in good), len(names), unpaired, shift, implausible)
+
+
+def _measured(
+    source: Source, rig: StereoRig, target: Target, angles: LoggedAngles, progress: Callable[[str], None]
+) -> tuple[list[str], list[PoseEstimate | Missed], list[Array | None]]:
+    """Return the name of every shot, what it shows, and the joint angles that belong to it."""
+    names, times, seen = list[str](), list[float | None](), list[PoseEstimate | Missed]()
+    while (shot := source.read()) is not None:
+        progress(f"measuring shot {len(names) + 1}")
+        names.append(shot.name)
+        times.append(shot.t_s)
+        seen.append(measure(rig, target, shot))
+    if not names:
+        raise CalibrationError("the source has no shot")
+    return names, seen, angles.at(names, times)
 
 
 def _implausible(arm: Arm, q: Array, Ts_left_body: Array) -> str | None:

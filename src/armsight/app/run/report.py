@@ -337,7 +337,6 @@ for (const box of document.querySelectorAll(".zoom")) {
 _BOX = '<div class="zoom" style="overflow:hidden;cursor:grab;touch-action:none">{}</div>'
 _ZOOMED = 'style="transform-origin:0 0" draggable="false"'
 
-
 #: Figures by name, as PNG and as SVG; and what waits for some of them.
 _Files = dict[str, tuple[bytes, bytes | None]]
 Beside = Callable[[], _Files]

@@ -259,7 +259,6 @@ _LEAST = 8
 #: how many there must be. Half: a jump counts for as long as a window does, double: shaking is found after twice the time.
 _NEWEST, _ODD, _FEWEST = 20, 0.25, 4
 
-
 #: Length of a window of innovations, s; half: shaking below 4 Hz is taken for the arm, double: the arm for shaking.
 _WINDOW_S = 1.0
 

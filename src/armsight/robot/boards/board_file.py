@@ -57,7 +57,6 @@ _NEW_SINCE: Mapping[int, tuple[str, ...]] = {
 }
 _TABLES = ("counts", "angle_rad")  # of a potentiometer: as long as its node_count, which they replace
 
-
 #: What of a potentiometer's configuration an encoder has no use for.
 _POT_ONLY = (*_TABLES, "short_counts", "open_counts", "direction")
 _SENSORS = {each.name.lower(): each for each in SensorKind}

@@ -167,7 +167,6 @@ _ARM_RANGES = {
     "sync_led_ticks": (1, 100),
 }
 
-
 #: Pins as ``sync_led_pin`` has them, 0 for none: 16 (port + 1) + pin.
 PIN_NUMBERS = (16, 143)
 NO_PIN, _PIN_FORM = "none", "none or a pin such as PB13 is allowed"

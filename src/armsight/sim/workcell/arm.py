@@ -96,7 +96,6 @@ _KEYS: dict[str, tuple[str, float, float, float]] = {
     "friction": ("friction", 1.0, 0.0, 3.0),
 }
 
-
 #: Keys of files of earlier versions -> today's.
 _OLD_KEYS = {"sag_deg": "compliance_deg"}
 

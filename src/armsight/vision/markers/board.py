@@ -47,7 +47,6 @@ BOARDS: dict[str, tuple[str, Callable[[Fields], CalibrationBoard]]] = {
     "aprilgrid": (AprilGrid.form, AprilGrid.from_fields),
 }
 
-
 #: Suffixes of Kalibr's target files.
 KALIBR = (".yaml", ".yml")
 #: Kalibr's target_type -> the kind here, and its keys: columns, rows, lengths, m.

@@ -31,7 +31,6 @@ MARKERS: dict[str, Callable[[str, Sequence[Marker]], Target]] = {
     "board": BoardTarget.from_markers,
 }
 
-
 #: The kind of a plain disc in a body file.
 DISC = "disc"
 #: Bodies without codes whose distances differ by less than this, m, cannot be distinguished safely.

@@ -158,7 +158,6 @@ def _basalt_read(documents: Sequence[Document], paths: Sequence[Path], options: 
 
 _KEYS = (("px", "py", "pz"), ("qw", "qx", "qy", "qz"))
 
-
 _ROTATIONS = ("rotation", "rotationvector", "rvec", "r")
 _TRANSLATIONS = ("translation", "tvec", "t")
 

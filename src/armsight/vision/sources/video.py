@@ -50,7 +50,6 @@ _MIXED, _MOVED_GREY = 0.08, 12.0
 #: Share of such pixels below which nothing is said to move.
 _MOVED_LEAST = 0.002
 
-
 #: What a player would fetch: a file may name others, and addresses.
 _OPTIONS = {"protocol_whitelist": "file"}
 
