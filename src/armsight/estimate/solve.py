@@ -6,7 +6,7 @@ likelihood (Patterson and Thompson, Biometrika 58, 1971) with its gradient, and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,22 @@ def covariances(linear: Linear, variances: Array) -> Array:
     i = np.arange(C.shape[-1])
     C[:, i, i] = C[:, i, i] * (1 + 1e-8) + 1e-16  # positive definite in spite of rounding
     return C
+
+
+def whitened(linear: Linear, variances: Array) -> tuple[Array, Array]:
+    """Return residuals (N, m) and their derivative (N, m, Q) by all over the root of each measurement's own covariance."""
+    half = np.linalg.inv(np.linalg.cholesky(covariances(linear, variances)))
+    return (half @ linear.e[..., None])[..., 0], half @ np.concatenate([linear.J, *linear.shared.values()], axis=2)
+
+
+def condensed(linear: Linear, variances: Array) -> Linear:
+    """Return as few numbers as there are unknowns that say the same of them, the variances of what is own being known."""
+    e, A = whitened(linear, variances)
+    T = np.linalg.qr(np.column_stack([A.reshape(e.size, -1), e.ravel()]), mode="r")[:, None]
+    ends = np.cumsum([linear.J.shape[2], *(F.shape[2] for F in linear.shared.values())])
+    J, *columns, left = np.split(T, ends, axis=2)
+    shared = dict(zip(linear.shared, columns, strict=True))
+    return replace(linear, e=left[..., 0], J=J, given=np.ones((len(T), 1, 1)), own={}, shared=shared)
 
 
 def solve(linear: Linear, variances: Array) -> Solved:

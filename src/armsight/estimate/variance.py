@@ -69,6 +69,37 @@ def most_probable(
     return np.asarray(np.exp(found.x))
 
 
+def restricted(linear: Linear, start: Array, low: float, high: float, steps: int = 40) -> Array:
+    """Return the variances (K,) of the greatest restricted likelihood, without a prior.
+
+    Args:
+        linear: residuals.
+        start: (K,) variances to begin at.
+        low: the least sigma.
+        high: the greatest sigma.
+        steps: iterations at most.
+    """
+    numbers = [linear.e.size] * len(linear.own) + [F.shape[2] for F in linear.shared.values()]
+    unit = np.sqrt(2 / np.array(numbers, float))  # about the sigma of a logarithm
+
+    def cost(z: Array) -> tuple[float, Array]:
+        variances = np.exp(unit * z)
+        s = solve(linear, variances)
+        return s.cost, unit * gradient(linear, variances, s)
+
+    bounds = np.outer(1 / unit, 2 * np.log([low, high]))
+    begin = np.clip(np.log(np.maximum(start, low**2)) / unit, *bounds.T)
+    found = minimize(
+        cost,
+        begin,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": steps, "ftol": 1e-9, "gtol": 0.02},
+    )
+    return np.asarray(np.exp(unit * found.x))
+
+
 def posterior(linear: Linear, variances: Array, means: Mapping[str, float]) -> float:
     """Return minus the log posterior of the logarithms of variances (K,)."""
     of = np.array([means[name] for name in linear.sources])

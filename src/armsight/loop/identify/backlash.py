@@ -75,7 +75,7 @@ def joint_backlashes(found: Identified, measured: Measured) -> tuple[JointBackla
     scatter = None
     if found.joint_sigma_rad.any():
         weighted = with_joint_noise(found.model, found.solution.x, measured, found.joint_sigma_rad)
-        scatter = _Scatter(joint_noise(found.model, found.solution, weighted, measured), weighted)
+        scatter = _Scatter(joint_noise(found.model, found.solution, found.prior, measured), weighted)
     return tuple(_of_joint(i, found, measured, phi, scatter) for i in range(found.model.arm.joints))
 
 

@@ -1,8 +1,8 @@
 """Least-squares fit of an arm's parameters to measured poses, with priors, outlier rejection and sigmas.
 
-Gauss-Newton on whitened residuals, with the priors as further measurements. Where the instrument's covariance is given,
-what the residuals show beyond it (the arm's repeatability, what the model does not know) is estimated and added: one
-sigma of position, one of rotation. A pose further from the model than chance allows is left out; the median sets the
+Gauss-Newton (:mod:`armsight.estimate.solve`). Where the instrument's covariance is given, what the residuals show beyond it
+(the arm's repeatability, what the model does not know) is estimated by restricted likelihood and added: one sigma of
+position, one of rotation. A pose further from the model than chance allows is left out; the median sets the
 scale for that.
 
 The prior sigmas say how far each number can plausibly be off before anything is measured, in its own unit. Those of the
@@ -19,12 +19,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import brentq
 from scipy.special import chdtri
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
+from armsight.estimate.linear import Linear
+from armsight.estimate.solve import Solved, solve
+from armsight.estimate.variance import restricted
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 
@@ -77,10 +78,8 @@ STEPS, SMALL_STEP = 25, 1e-3
 ROUNDS = 6
 #: Where a fit has left less than this part of the residuals' degrees of freedom, they do not determine their noise.
 MIN_FREEDOM = 0.1
-#: Added to a normal matrix of unit diagonal, so that rounding leaves it positive: far below what the data determine.
-ROUNDING = 1e-12
-#: Noise below this, m or rad, is none: what rounding of a printed file leaves.
-MIN_NOISE = 1e-9
+#: Noise below this, m or rad, is none: what rounding of a printed file leaves; and above this it is no noise.
+MIN_NOISE, MAX_NOISE = 1e-9, 1e3
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +117,29 @@ def noise_cov(measured: Measured, noise: tuple[float, float]) -> Array:
     return np.asarray(base + np.diag(variances))
 
 
-def whitener(measured: Measured, noise: tuple[float, float]) -> Array:
-    """Return W (N, M, M) or, where all poses are alike, (M, M), with W^T W the inverse covariance."""
-    if measured.cov is None:
-        return np.diag(1 / np.sqrt(np.diag(noise_cov(measured.rows(np.arange(1)), noise)[0])))
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(noise_cov(measured, noise))))
+def linear_of(model: Model, x: Array, measured: Measured, phi: Array, free: Mask, prior: Array) -> Linear:
+    """Return the residuals of poses near a vector by the free parameters, with noise of position and of rotation.
+
+    Args:
+        model: the arm.
+        x: (P,) the vector.
+        measured: the poses.
+        phi: :meth:`Model.feature_values` of them.
+        free: (P,) what may be off.
+        prior: (P,) sigma about the nominal arm's values; infinite where nothing is known.
+    """
+    e, J = model.linearised(x, measured, phi)
+    each = np.broadcast_to(np.eye(measured.size), (len(e), measured.size, measured.size))
+    own = {"position": each} if measured.R_rig_body is None else {"position": each[..., :3], "rotation": each[..., 3:]}
+    given = np.zeros_like(each) if measured.cov is None else measured.cov
+    known = np.where(np.isfinite(prior) & (prior > 0), prior, np.inf) ** -2.0
+    at = np.where(np.isfinite(prior), x - model.nominal(), 0.0)
+    return Linear(e, J[:, :, free], given, own, {}, known[free], at[free])
+
+
+def variances_of(linear: Linear, noise: tuple[float, float]) -> Array:
+    """Return the variances of the sources of noise."""
+    return np.square(noise[: len(linear.own)])
 
 
 def fit(
@@ -151,27 +168,17 @@ def fit(
     noise = _robust_noise(model.residuals(x, measured, phi)) if noise is None else noise
     history: list[float] = []
     for _ in range(ROUNDS):
-        part, part_phi = measured.rows(keep), phi[keep]
-        x, H = _newton(model, x, part, part_phi, free, prior, noise, history)
-        e = model.residuals(x, measured, phi)
-        taken, before = _taken(H, free, prior), noise
-        if e[keep].size - taken >= MIN_FREEDOM * e[keep].size:
-            noise = _noise(part, e[keep], taken)
-        kept, keep = keep, (_sane(measured, e, noise) if used is None else keep)
+        x, linear, s = _newton(model, x, measured.rows(keep), phi[keep], free, prior, noise, history)
+        before = noise
+        taken = len(s.x) - float(linear.known @ (s.root**2).sum(axis=1))  # parameters, less what priors determine
+        if linear.e.size - taken >= MIN_FREEDOM * linear.e.size:
+            sigmas = np.sqrt(restricted(linear, variances_of(linear, noise), MIN_NOISE, MAX_NOISE))
+            noise = (float(sigmas[0]), float(sigmas[1]) if len(sigmas) > 1 else 0.0)
+        kept, keep = keep, (_sane(model, x, measured, phi, noise) if used is None else keep)
         if (kept == keep).all() and np.allclose(before, noise, rtol=1e-2, atol=MIN_NOISE):
             break
-    part = measured.rows(keep)
-    x, H = _newton(model, x, part, phi[keep], free, prior, noise, history)
-    cov = np.zeros((len(x), len(x)))
-    cov[np.ix_(free, free)] = np.linalg.inv(H)
-    return Solution(x, free, cov, noise, keep, tuple(history))
-
-
-def weighted(model: Model, x: Array, measured: Measured, phi: Array, noise: tuple[float, float]) -> tuple[Array, Array]:
-    """Return whitened residuals (N, M) and their derivative (N, M, P)."""
-    e, J = model.linearised(x, measured, phi)
-    W = whitener(measured, noise)
-    return (W @ e[..., None])[..., 0], W @ J
+    x, _, s = _newton(model, x, measured.rows(keep), phi[keep], free, prior, noise, history)
+    return Solution(x, free, _spread(s, free), noise, keep, tuple(history))
 
 
 def covariance(
@@ -184,23 +191,15 @@ def covariance(
     noise: tuple[float, float],
 ) -> Array:
     """Return the covariance (P, P) of the free parameters at a vector; zero for the others."""
-    _, J = _free(model, x, measured, phi, free, noise)
-    cov = np.zeros((len(x), len(x)))
-    cov[np.ix_(free, free)] = np.linalg.inv(J.T @ J + np.diag(_pull(prior, free)))
+    linear = linear_of(model, x, measured, phi, free, prior)
+    return _spread(solve(linear, variances_of(linear, noise)), free)
+
+
+def _spread(s: Solved, free: Mask) -> Array:
+    """Return the covariance (P, P) of all parameters; zero for those that are not free."""
+    cov = np.zeros((len(free), len(free)))
+    cov[np.ix_(free, free)] = s.root @ s.root.T
     return cov
-
-
-def _free(
-    model: Model, x: Array, measured: Measured, phi: Array, free: Mask, noise: tuple[float, float]
-) -> tuple[Array, Array]:
-    """Return whitened residuals (N M,) and their derivative (N M, F) by the free parameters."""
-    e, J = weighted(model, x, measured, phi, noise)
-    return e.ravel(), J[:, :, free].reshape(-1, int(free.sum()))
-
-
-def _pull(prior: Array, free: Mask) -> Array:
-    """Return the information (F,) that the priors of the free parameters add."""
-    return np.asarray(np.where(np.isfinite(prior) & (prior > 0), prior, np.inf)[free] ** -2.0)
 
 
 def _newton(
@@ -212,32 +211,18 @@ def _newton(
     prior: Array,
     noise: tuple[float, float],
     history: list[float],
-) -> tuple[Array, Array]:
-    """Return the best vector, and the information (F, F) about its free parameters."""
-    nominal, pull = _nominal(model, x, prior), _pull(prior, free)
+) -> tuple[Array, Linear, Solved]:
+    """Return the best vector, and the residuals and the solution before the last step to it."""
     for _ in range(STEPS):
-        e, J = _free(model, x, measured, phi, free, noise)
-        H, g = J.T @ J + np.diag(pull), J.T @ e + pull * (x - nominal)[free]
-        scale = 1 / np.sqrt(np.diag(H))
-        factor = cho_factor(scale[:, None] * H * scale + ROUNDING * np.eye(len(H)))
-        step = scale * cho_solve(factor, scale * g)
+        linear = linear_of(model, x, measured, phi, free, prior)
+        s = solve(linear, variances_of(linear, noise))
         x = x.copy()
-        x[free] -= step
-        history.append(float(np.sqrt(np.mean(e**2))))
-        if np.abs(step / scale).max(initial=0.0) < SMALL_STEP:
+        x[free] += s.x
+        weighted = np.einsum("ni,nij,nj->", linear.e, s.W, linear.e)
+        history.append(float(np.sqrt(weighted / linear.e.size)))
+        if (np.abs(s.x) < SMALL_STEP * np.linalg.norm(s.root, axis=1)).all():
             break
-    return x, H
-
-
-def _nominal(model: Model, x: Array, prior: Array) -> Array:
-    """Return what the priors pull towards: the nominal arm; base and tool are not pulled."""
-    return np.where(np.isfinite(prior), model.nominal(), x)
-
-
-def _taken(H: Array, free: Mask, prior: Array) -> float:
-    """Return how many measurements' freedom the fit has taken: parameters, less the share that priors determine."""
-    p = prior[free]
-    return float(len(H) - np.sum(np.diag(np.linalg.inv(H)) / np.where(p > 0, p, np.inf) ** 2))
+    return x, linear, s
 
 
 def _robust_noise(e: Array) -> tuple[float, float]:
@@ -248,38 +233,9 @@ def _robust_noise(e: Array) -> tuple[float, float]:
     return max(float(np.median(np.linalg.norm(positions, axis=1)) / middle), MIN_NOISE), max(angle, MIN_NOISE)
 
 
-def _noise(measured: Measured, e: Array, taken: float) -> tuple[float, float]:
-    """Return the sigmas that make the weighted squares as large as their number allows."""
-    share = max(1 - taken / e.size, 0.5 / len(e))
-    if measured.R_rig_body is None:
-        return _extra(e, measured.cov, share), 0.0
-    covs = (None, None) if measured.cov is None else (measured.cov[:, :3, :3], measured.cov[:, 3:, 3:])
-    return _extra(e[:, :3], covs[0], share), _extra(e[:, 3:], covs[1], share)
-
-
-def _extra(e: Array, cov: Array | None, share: float) -> float:
-    """Return sigma with sum e^T (cov + sigma^2)^-1 e = share x their number; the least where cov is already enough."""
-    whole = float(np.sqrt(np.mean(e**2) / share))
-    if cov is None:
-        return max(whole, MIN_NOISE)
-    values, vectors = np.linalg.eigh(cov)
-    squares = np.einsum("nji,nj->ni", vectors, e) ** 2
-
-    def over(sigma: float) -> float:
-        return float((squares / (np.maximum(values, 0) + sigma**2)).sum() - share * e.size)
-
-    if over(MIN_NOISE) <= 0 or whole <= MIN_NOISE:
-        return MIN_NOISE
-    return float(brentq(over, MIN_NOISE, whole * 1.01))
-
-
-def squares(measured: Measured, e: Array, noise: tuple[float, float]) -> Array:
-    """Return the squared Mahalanobis lengths (N,) of residuals."""
-    return np.asarray((((whitener(measured, noise) @ e[..., None])[..., 0]) ** 2).sum(axis=1))
-
-
-def _sane(measured: Measured, e: Array, noise: tuple[float, float]) -> Mask:
+def _sane(model: Model, x: Array, measured: Measured, phi: Array, noise: tuple[float, float]) -> Mask:
     """Return which poses (N,) are no outliers, by the scale of the median."""
-    far = squares(measured, e, noise)
+    e = model.residuals(x, measured, phi)
+    far = np.einsum("ni,ni->n", e, np.linalg.solve(noise_cov(measured, noise), e[..., None])[..., 0])
     scale = max(float(np.median(far)) / chdtri(measured.size, 0.5), 1e-300)
     return np.asarray(far / scale < chdtri(measured.size, CHANCE))

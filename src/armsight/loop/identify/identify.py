@@ -218,7 +218,7 @@ def _everything(
         seen = observed(model, start.x, weighted, prior, noise)
         whole = fit(model, whole.x, weighted, seen.possible, scaled, noise=noise)
         if measured.cov is not None:
-            scatter = joint_noise(model, whole, weighted, measured)
+            scatter = joint_noise(model, whole, scaled, measured)
             weighted = with_joint_noise(model, whole.x, measured, scatter.sigma_rad)
         noise, scaled = whole.noise, scaled_prior(model, whole, weighted, seen.possible, prior)
     return whole, scaled, observed(model, start.x, weighted, scaled, noise), scatter

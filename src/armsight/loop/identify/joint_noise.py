@@ -5,8 +5,7 @@ pose.
 
 What the residuals show beyond the instrument's covariance is attributed to the joints: each moves the body along its own
 column of the Jacobian, so that a joint that lies anywhere in its backlash affects nothing but its own direction. The
-variances are those of the greatest likelihood, found by expectation and maximisation (Dempster, Laird and Rubin, Journal of
-the Royal Statistical Society B 39, 1977).
+variances are those of the greatest restricted likelihood (:mod:`armsight.estimate.variance`).
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from armsight.data import Array
+from armsight.estimate.solve import covariances
+from armsight.estimate.variance import restricted
 from armsight.loop.identify import model as chain
-from armsight.loop.identify.fit import Solution, noise_cov
+from armsight.loop.identify.fit import MAX_NOISE, MIN_NOISE, Solution, linear_of
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 
-#: Steps; the variances have settled to some per cent by then, which is better than so few poses determine them.
-STEPS = 60
-#: Where a step starts, rad and m: what is not there shrinks from it.
+#: Where the search starts, rad and m: what is not there shrinks from it.
 START_RAD, START_M = 1e-3, 1e-4
 
 
@@ -47,39 +46,27 @@ def no_noise(joints: int) -> JointNoise:
     return JointNoise(np.zeros(joints), np.zeros((0, joints)), np.zeros((0, joints)))
 
 
-def joint_noise(model: Model, solution: Solution, weighted: Measured, measured: Measured) -> JointNoise:
+def joint_noise(model: Model, solution: Solution, prior: Array, measured: Measured) -> JointNoise:
     """Attribute residuals beyond the instrument's covariance to the joints.
 
     Args:
         model: the arm.
         solution: a fit of it.
-        weighted: the poses with the covariance that the fit used.
+        prior: (P,) the prior sigmas of that fit.
         measured: the poses, with the instrument's covariance alone.
     """
     phi = model.feature_values(measured.q, measured.approach)
-    e, J = model.linearised(solution.x, measured, phi)
-    free = J[:, :, solution.free]
-    spread = (free @ _part(solution)) @ free.swapaxes(1, 2)  # of the predictions
-    taken = float(np.einsum("nij,nji->", spread, _inverse_noise(weighted, solution)))
-    share = float(np.clip(1 - taken / e.size, 0.2, 1.0))  # what the fit has left of the residuals' variance
-    B = np.concatenate(
-        [by_joints(model, J), np.broadcast_to(np.eye(e.shape[1]), (len(e), e.shape[1], e.shape[1]))], axis=2
-    )
-    measured = with_joint_noise(model, solution.x, measured, np.zeros(model.arm.joints))
-    axes = np.arange(e.shape[1]) // 3  # the residual noise of position (0) and of rotation (1): one variance each
-    if not model.full:
-        axes[:] = 0
-    joints = model.arm.joints
-    variance = np.concatenate([np.full(joints, START_RAD**2), np.where(axes == 0, START_M, START_RAD) ** 2])
-    used = solution.used
-    for _ in range(STEPS):
-        mean, spread = _expected(e, B, variance, measured)
-        second = (mean**2 / share + spread)[used].mean(axis=0)
-        variance = second
-        for k in np.unique(axes):
-            variance[joints:][axes == k] = second[joints:][axes == k].mean()
-    mean, spread = _expected(e, B, variance, measured)
-    return JointNoise(np.sqrt(variance[:joints]), mean[:, :joints], np.sqrt(spread[:, :joints]))
+    with_sides = with_joint_noise(model, solution.x, measured, np.zeros(model.arm.joints))
+    linear = linear_of(model, solution.x, with_sides, phi, solution.free, prior)
+    B = by_joints(model, model.linearised(solution.x, measured, phi)[1])
+    joints = {name: B[:, :, [i]] for i, name in enumerate(model.arm.joint_names)}
+    linear = replace(linear, own=joints | linear.own)
+    start = np.array([START_RAD] * len(joints) + [START_M, START_RAD][: len(linear.own) - len(joints)]) ** 2
+    variances = restricted(linear.rows(np.flatnonzero(solution.used)), start, MIN_NOISE, MAX_NOISE)
+    of = variances[: len(joints)]
+    gain = of[:, None] * B.swapaxes(1, 2) @ np.linalg.inv(covariances(linear, variances))
+    spread = np.maximum(of - np.einsum("nkm,nmk->nk", gain, B * of), 0.0)
+    return JointNoise(np.sqrt(of), (gain @ linear.e[..., None])[..., 0], np.sqrt(spread))
 
 
 def with_joint_noise(model: Model, x: Array, measured: Measured, sigma_rad: Array) -> Measured:
@@ -112,20 +99,3 @@ def _of_sides(model: Model, x: Array, phi: Array) -> Array:
 def by_joints(model: Model, J: Array) -> Array:
     """Return the derivative (N, M, n) by the joints' angles, from that by all parameters (N, M, P)."""
     return np.asarray(J[:, :, model.table_at + chain.OFFSET : model.sources_at : len(chain.COLUMNS)])
-
-
-def _expected(e: Array, B: Array, variance: Array, measured: Measured) -> tuple[Array, Array]:
-    """Return mean (N, K) and variance (N, K) of every source at every pose, given the residuals."""
-    assert measured.cov is not None  # for the type checker: without it nothing is attributed to the joints
-    S = measured.cov + (B * variance) @ B.swapaxes(1, 2)
-    gain = variance[:, None] * np.linalg.solve(S, B).swapaxes(1, 2)
-    mean = (gain @ e[..., None])[..., 0]
-    return mean, np.maximum(variance - np.einsum("nkm,nmk->nk", gain, B * variance), 0.0)
-
-
-def _part(solution: Solution) -> Array:
-    return np.asarray(solution.cov[np.ix_(solution.free, solution.free)])
-
-
-def _inverse_noise(measured: Measured, solution: Solution) -> Array:
-    return np.asarray(np.linalg.inv(noise_cov(measured, solution.noise)))

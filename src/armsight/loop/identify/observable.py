@@ -14,8 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from armsight.data import Array
+from armsight.estimate.solve import whitened
 from armsight.loop.identify import model as chain
-from armsight.loop.identify.fit import Mask, weighted
+from armsight.loop.identify.fit import Mask, linear_of, variances_of
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 
@@ -120,7 +121,8 @@ def _triangle(model: Model, x: Array, measured: Measured, prior: Array, noise: t
     if len(measured) > MAX_POSES:
         measured = measured.rows(np.linspace(0, len(measured) - 1, MAX_POSES).astype(int))
     phi = model.feature_values(measured.q, measured.approach)
-    _, J = weighted(model, x, measured, phi, noise)
+    linear = linear_of(model, x, measured, phi, np.ones(len(x), bool), prior)
+    _, J = whitened(linear, variances_of(linear, noise))
     unit = np.where(np.isfinite(prior), prior, 1.0)
     J = J.reshape(-1, len(x)) * unit
     rows = max(len(x) - len(J), 0)

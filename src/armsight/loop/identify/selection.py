@@ -20,16 +20,17 @@ made of clusters of joint angles rather than of rows: what is kept must also hol
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
-from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize
 
 from armsight.data import Array
-from armsight.loop.identify.fit import Mask, Solution, weighted
+from armsight.estimate.solve import condensed, solve, whitened
+from armsight.estimate.variance import restricted
+from armsight.loop.identify.fit import Mask, Solution, linear_of, variances_of
 from armsight.loop.identify.measured import Measured, visits
 from armsight.loop.identify.model import Model
 
@@ -42,7 +43,6 @@ MIN_FACTOR, MAX_FACTOR = 0.01, 1.0
 #: other kinds are held at their best meanwhile: the interval is conditional, narrower than the profile's, in which they
 #: give way.
 FALLEN, WIDER = 1.0, 1.5
-_RIDGE = 1e-12
 
 
 def scaled_prior(model: Model, start: Solution, measured: Measured, free: Mask, prior: Array) -> Array:
@@ -59,22 +59,18 @@ def scaled_prior(model: Model, start: Solution, measured: Measured, free: Mask, 
     if not kinds:
         return prior
     of = np.array([kinds.index(p.kind) if p.kind in kinds else -1 for p in model.parameters])
-    H, b = _normal(model, start, measured, free, prior)
-    flat = ~np.isfinite(prior[free])
-    own = np.where(flat, 1.0, prior[free])
-    still = _RIDGE * np.eye(len(own))  # without noise, nothing but rounding bounds what is not observable
-
-    def cost(logs: Array) -> float:
-        sigma = own * _factors(of[free], logs)
-        D = np.where(flat, 0.0, sigma**-2.0)
-        A = H + np.diag(D)
-        scale = 1 / np.sqrt(np.diag(A))
-        factor = cho_factor(scale[:, None] * A * scale + still, lower=True)
-        size = 2 * np.log(np.diag(factor[0])).sum() - 2 * np.log(scale).sum()
-        return float(size + 2 * np.log(sigma[~flat]).sum() - b @ (scale * cho_solve(factor, scale * b)))
-
-    best = minimize(cost, np.full(len(kinds), np.log(0.2)), method="Nelder-Mead", options={"xatol": 0.05, "fatol": 0.1})
-    return np.asarray(prior * _factors(of, _upper_ends(cost, best.x)))
+    part = measured.rows(start.used)
+    phi = model.feature_values(part.q, part.approach)
+    linear = linear_of(model, start.x, part, phi, free, prior)
+    scaled, unit = of[free] >= 0, prior[free]
+    shared = {kind: linear.J[:, :, of[free] == k] * unit[of[free] == k] for k, kind in enumerate(kinds)}
+    at = np.where(scaled, linear.at, 0.0)  # what is scaled is about zero, at the nominal arm
+    rest = (linear.J[:, :, ~scaled], linear.known[~scaled], linear.at[~scaled])
+    linear = replace(linear, e=linear.e - linear.J @ at, J=rest[0], known=rest[1], at=rest[2], shared=shared)
+    few = condensed(linear, variances_of(linear, start.noise))
+    best = restricted(few, np.full(len(kinds), 0.04), MIN_FACTOR, MAX_FACTOR)
+    logs = _upper_ends(lambda logs: 2 * solve(few, np.exp(2 * logs)).cost, 0.5 * np.log(best))
+    return np.where(of < 0, prior, prior * np.exp(np.minimum(logs, np.log(MAX_FACTOR)))[of])
 
 
 def _upper_ends(cost: Callable[[Array], float], best: Array) -> Array:
@@ -89,21 +85,6 @@ def _upper_ends(cost: Callable[[Array], float], best: Array) -> Array:
                 break
         out[k] = max(out[k], best[k] + np.log(WIDER))
     return out
-
-
-def _factors(of: Array, logs: Array) -> Array:
-    """Return the factor of every parameter; ``of`` is the kind's number, -1 for what is not scaled."""
-    return np.where(of < 0, 1.0, np.exp(np.clip(logs, np.log(MIN_FACTOR), np.log(MAX_FACTOR)))[of])
-
-
-def _normal(model: Model, start: Solution, measured: Measured, free: Mask, prior: Array) -> tuple[Array, Array]:
-    """Return J^T J and J^T e of the free parameters, e being extrapolated to the nominal arm."""
-    part = measured.rows(start.used)
-    e, J = weighted(model, start.x, part, model.feature_values(part.q, part.approach), start.noise)
-    J = J[:, :, free].reshape(-1, int(free.sum()))
-    off = np.where(np.isfinite(prior), start.x - model.nominal(), 0.0)[free]
-    H = J.T @ J
-    return H, J.T @ e.ravel() - H @ off
 
 
 #: Folds; each is a random union of clusters of poses, of which there are at most so many, of a few poses each.
@@ -387,7 +368,8 @@ def _reasons(
 def _folds(model: Model, start: Solution, measured: Measured, labels: NDArray[np.int64], prior: Array) -> _Folds:
     """Sum up the normal equations fold by fold."""
     phi = model.feature_values(measured.q, measured.approach)
-    e, J = weighted(model, start.x, measured, phi, start.noise)
+    linear = linear_of(model, start.x, measured, phi, np.ones(len(prior), bool), prior)
+    e, J = whitened(linear, variances_of(linear, start.noise))
     size = e.shape[1]
     H, g, c, numbers = [], [], [], []
     for k in range(int(labels.max()) + 1):
@@ -397,9 +379,7 @@ def _folds(model: Model, start: Solution, measured: Measured, labels: NDArray[np
         g.append(Jk.T @ ek)
         c.append(float(ek @ ek))
         numbers.append(size * int(rows.sum()))
-    pull = np.where(np.isfinite(prior) & (prior > 0), prior, np.inf) ** -2.0
-    home = np.where(np.isfinite(prior), model.nominal() - start.x, 0.0)
-    return _Folds(np.array(H), np.array(g), np.array(c), np.array(numbers, float), pull, home)
+    return _Folds(np.array(H), np.array(g), np.array(c), np.array(numbers, float), linear.known, -linear.at)
 
 
 def _named(model: Model, mask: Mask) -> tuple[str, ...]:
