@@ -94,7 +94,7 @@ def restricted(linear: Linear, start: Array, low: float, high: float, steps: int
         begin,
         jac=True,
         method="L-BFGS-B",
-        bounds=bounds,
+        bounds=bounds.tolist(),
         options={"maxiter": steps, "ftol": 1e-9, "gtol": 0.02},
     )
     return np.asarray(np.exp(unit * found.x))
