@@ -61,7 +61,7 @@ def whitened(linear: Linear, variances: Array) -> tuple[Array, Array]:
 def condensed(linear: Linear, variances: Array) -> Linear:
     """Return as few numbers as there are unknowns that say the same of them, the variances of what is own being known."""
     e, A = whitened(linear, variances)
-    T = np.linalg.qr(np.column_stack([A.reshape(e.size, -1), e.ravel()]), mode="r")[:, None]
+    T = np.asarray(np.linalg.qr(np.column_stack([A.reshape(e.size, -1), e.ravel()]), mode="r"))[:, None]
     ends = np.cumsum([linear.J.shape[2], *(F.shape[2] for F in linear.shared.values())])
     J, *columns, left = np.split(T, ends, axis=2)
     shared = dict(zip(linear.shared, columns, strict=True))

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from worn_arm import distance_m, poses, worn
 
 from armsight.errors import CalibrationError, InputError
+from armsight.estimate.select import Folds
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.identify.backlash import joint_backlashes
 from armsight.loop.identify.corrected import Corrected, table_text
@@ -19,7 +20,7 @@ from armsight.loop.identify.model import FRICTION_M, Model
 from armsight.loop.identify.observable import observed
 from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.plan import free_of_collision, plan_poses
-from armsight.loop.identify.selection import PLACEMENT, _Folds, _improves
+from armsight.loop.identify.selection import PLACEMENT
 from armsight.loop.identify.validate import validate
 from armsight.robot.arm_file import open_arm
 
@@ -242,12 +243,12 @@ def test_with_plenty_of_numbers_the_fastest_harmonics_are_left_out():
 
 
 def test_one_pose_that_nothing_explains_does_not_rule_which_sources_are_selected():
-    folds = _Folds(*(np.zeros(0) for _ in range(3)), np.full(20, 18.0), *(np.zeros(0) for _ in range(2)))
+    folds = Folds(*(np.zeros(0) for _ in range(3)), np.full(20, 18.0), *(np.zeros(0) for _ in range(2)))
     without, with_it = np.full(20, 4.0), np.ones(20)
     with_it[3] = 100.0  # by the mean of squares it would cost more than it brings
     assert with_it.mean() > without.mean()
-    assert _improves(without, with_it, folds)
-    assert not _improves(without, without * (1 + 1e-12), folds)
+    assert folds.improves(without, with_it)
+    assert not folds.improves(without, without * (1 + 1e-12))
 
 
 def lever_of_rods(arm, q, joint):

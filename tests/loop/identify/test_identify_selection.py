@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from worn_arm import distance_m, poses, worn
 
+from armsight.estimate.select import Folds, Removal
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.selection import _Folds, _Removal
 
 PARAMETERS, FOLDS, ROWS = 9, 4, 15
 
@@ -22,7 +22,7 @@ def problem():
     home = np.where(np.isfinite(prior), rng.normal(size=PARAMETERS), 0.0)
     H, g = J.swapaxes(1, 2) @ J, (J.swapaxes(1, 2) @ e[..., None])[..., 0]
     numbers = np.full(FOLDS, float(ROWS))
-    return _Folds(H, g, (e**2).sum(axis=1), numbers, prior**-2.0, home), J, e, prior, home
+    return Folds(H, g, (e**2).sum(axis=1), numbers, prior**-2.0, home), J, e, prior, home
 
 
 def slow_losses(free, J, e, prior, home):
@@ -54,7 +54,7 @@ def test_all_candidates_of_a_step_are_scored_as_if_each_were_fitted(problem):
 
 def test_removals_are_scored_as_if_each_were_fitted(problem):
     folds, *rest = problem
-    now, groups = _Removal(folds, mask(0, 1, 2, 3, 4, 5, 7)), [mask(3), mask(4, 5), mask(7)]
+    now, groups = Removal(folds, mask(0, 1, 2, 3, 4, 5, 7)), [mask(3), mask(4, 5), mask(7)]
     for _ in range(2):
         for group, losses in zip(groups, now.losses_without(groups), strict=True):
             np.testing.assert_allclose(losses, slow_losses(now.kept & ~group, *rest), rtol=1e-9)

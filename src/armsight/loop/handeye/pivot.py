@@ -14,6 +14,8 @@ from scipy.special import chdtri
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
+from armsight.estimate.linear import Linear
+from armsight.estimate.solve import Solved, left_out, solve
 from armsight.geometry.check import checked
 
 #: Fewest poses, and the chance below which one is taken for a mistake.
@@ -59,41 +61,35 @@ def calibrate_pivot(Ts: ArrayLike) -> Pivot:
             f"pivot calibration needs {MIN_POSES} or more poses, got {len(poses)}; 30 and more are advised"
         )
     used = np.ones(len(poses), bool)
+    linear = _linear(poses)
     for _ in range(ROUNDS):
-        x, H = _solved(poses[used])
-        e = _residuals(poses, x)
-        scale = float(np.median(np.sum(e**2, axis=1)) / chdtri(3, 0.5))
-        sane = np.sum(e**2, axis=1) <= chdtri(3, CHANCE) * max(scale, 1e-18)
+        s = _solved(linear, used)
+        squares = np.sum((linear.e + linear.J @ s.x) ** 2, axis=1)
+        scale = float(np.median(squares) / chdtri(3, 0.5))
+        sane = squares <= chdtri(3, CHANCE) * max(scale, 1e-18)
         if (sane == used).all() or sane.sum() < MIN_POSES:
             break
         used = sane
-    x, H = _solved(poses[used])
-    e = _residuals(poses, x)[used]
-    cov = np.asarray(np.linalg.inv(H)) * float((e**2).sum() / max(e.size - 6, 1))
-    return Pivot(x[:3], x[3:], cov, _held_out(poses, used), used)
+    s = _solved(linear, used)
+    cov = s.root @ s.root.T * float((s.left**2).sum() / max(s.left.size - 6, 1))
+    held_out = np.full(len(poses), np.nan)
+    held_out[used] = np.linalg.norm(left_out(s)[0], axis=1)
+    return Pivot(s.x[:3], s.x[3:], cov, held_out, used)
 
 
-def _solved(Ts: Array) -> tuple[Array, Array]:
-    """Return tip and pivot (6,), and the normal matrix (6, 6)."""
-    M = np.concatenate([Ts[:, :3, :3], np.broadcast_to(-np.eye(3), (len(Ts), 3, 3))], axis=2).reshape(-1, 6)
-    H = M.T @ M
-    if np.sqrt(len(Ts) / max(float(np.linalg.eigvalsh(H)[0]), 1e-300)) > MAX_AMPLIFICATION:
+def _linear(Ts: Array) -> Linear:
+    """Return where the tip is, less where it should be, by tip and pivot (6,), from both at zero."""
+    J = np.concatenate([Ts[:, :3, :3], np.broadcast_to(-np.eye(3), (len(Ts), 3, 3))], axis=2)
+    given = np.broadcast_to(np.eye(3), (len(Ts), 3, 3))
+    return Linear(Ts[:, :3, 3], J, given, {}, {}, np.zeros(6), np.zeros(6))
+
+
+def _solved(linear: Linear, used: NDArray[np.bool_]) -> Solved:
+    """Return tip and pivot (6,) by the poses used, for a scatter of 1."""
+    s = solve(linear.rows(np.flatnonzero(used)), np.zeros(0))
+    if np.sqrt(float(np.linalg.eigvalsh(s.root @ s.root.T)[-1]) * used.sum()) > MAX_AMPLIFICATION:
         raise CalibrationError(
             "the tool was rotated too little, or about one axis only, to determine its tip: rotate it by 30 degrees and "
             "more to all sides while the tip stands still"
         )
-    return np.asarray(np.linalg.solve(H, -M.T @ Ts[:, :3, 3].ravel())), H
-
-
-def _residuals(Ts: Array, x: Array) -> Array:
-    """Return where the tip is, less where it should be, (N, 3)."""
-    return np.asarray(Ts[:, :3, :3] @ x[:3] + Ts[:, :3, 3] - x[3:])
-
-
-def _held_out(Ts: Array, used: NDArray[np.bool_]) -> Array:
-    """Return the distances of every used pose under a fit to the others."""
-    out = np.full(len(Ts), np.nan)
-    rows = np.flatnonzero(used)
-    for k in rows:
-        out[k] = float(np.linalg.norm(_residuals(Ts[k : k + 1], _solved(Ts[rows[rows != k]])[0])))
-    return out
+    return s

@@ -161,7 +161,7 @@ def _by_parameters(found: Identified, weighted: Measured, joint: int) -> Array:
     model = found.model
     J = model.linearised(found.solution.x, weighted, model.feature_values(weighted.q, weighted.approach))[1]
     B = by_joints(model, J)[:, :, joint]
-    pull = np.linalg.solve(weighted.cov + 1e-18 * np.eye(weighted.size), B[..., None])[..., 0]
+    pull = (np.linalg.inv(weighted.cov + 1e-18 * np.eye(weighted.size)) @ B[..., None])[..., 0]
     row = np.einsum("nm,nmp->np", pull, J) / np.einsum("nm,nm->n", pull, B)[:, None]
     return np.asarray(np.einsum("np,pq,nq->n", row, found.solution.cov, row))
 

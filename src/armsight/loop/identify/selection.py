@@ -11,15 +11,13 @@ added as a whole, as its harmonics hide each other at few poses; then every harm
 and so is every load of a compliance. The price (PRICE) is on top of held-out errors: of two models that predict alike, the
 smaller one stands. Then what the whole curves hid may be added.
 
-Everything is scored on one linearisation: with each fold's H = J^T J and g = J^T e, a fit to the other folds and its
-squared error on this one are a few small matrix products. One factorisation scores all candidates of a step, by Schur
-complements to add and by rows of the inverse to remove, so that hundreds of models cost little more than one. Folds are
-made of clusters of joint angles rather than of rows: what is kept must also hold where the arm was not measured.
+Everything is scored on one linearisation (:mod:`armsight.estimate.select`). Folds are made of clusters of joint angles
+rather than of rows: what is kept must also hold where the arm was not measured.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -28,9 +26,10 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from armsight.data import Array
-from armsight.estimate.solve import condensed, solve, whitened
+from armsight.estimate.select import Folds, Mask, Removal
+from armsight.estimate.solve import condensed, solve
 from armsight.estimate.variance import restricted
-from armsight.loop.identify.fit import Mask, Solution, linear_of, variances_of
+from armsight.loop.identify.fit import Solution, linear_of, variances_of
 from armsight.loop.identify.measured import Measured, visits
 from armsight.loop.identify.model import Model
 
@@ -89,19 +88,9 @@ def _upper_ends(cost: Callable[[Array], float], best: Array) -> Array:
 
 #: Folds; each is a random union of clusters of poses, of which there are at most so many, of a few poses each.
 FOLDS, CLUSTERS, CLUSTER = 20, 200, 3
-#: An error source is added where it lowers the held-out squares by this many standard errors of the fall over the folds.
-MIN_GAIN = 1.0
-#: Parameters further from nominal than this many sigmas are kept without trying their removal.
-SURE = 8.0
 #: Where numbers are few: what a harmonic's or load's coefficient costs, in the logarithms of the held-out squares summed
 #: over the numbers measured, which is minus twice a log likelihood. Without a price chance keeps half as many again.
 PRICE = 1.0
-#: A fall by less than this part is rounding's.
-ROUNDING = 1e-6
-#: Mean squared errors, in squared sigmas of the noise, below which an error is no longer noise but rounding: (1e-4)^2.
-NOISELESS = 1e-8
-#: Added to squares, so that the logarithm of none is a number.
-_NONE = 1e-200
 #: The kinds that say where the arm is: base in the rig, tool on the flange.
 PLACEMENT = ("base", "tool")
 #: A sensor's harmonics make one curve, and the links' loads one compliance: they may be added together, and priors keep
@@ -109,7 +98,6 @@ PLACEMENT = ("base", "tool")
 CURVE = ("wave", "ripple")
 TOGETHER = (*CURVE, "compliance")
 _GROUPS = {"offset": "joint zeros", "d": "lengths", "a": "lengths", "alpha": "axis angles", "beta": "axis angles"}
-_ROUNDED = 1e-10
 
 
 class SelectionStep(NamedTuple):
@@ -138,132 +126,6 @@ class Selection(NamedTuple):
     free: Mask
     steps: tuple[SelectionStep, ...]
     reasons: dict[str, str]
-
-
-class _Folds(NamedTuple):
-    """Normal equations of every fold at one linearisation."""
-
-    H: Array
-    g: Array
-    c: Array
-    numbers: Array
-    pull: Array
-    home: Array
-
-    def losses(self, free: Mask) -> Array:
-        """Return the mean squared error of every fold (F,) under a fit of ``free`` to the others."""
-        return np.asarray(self.losses_at(self.fits(free)[0][..., None])[0])
-
-    def losses_at(self, delta: Array) -> Array:
-        """Return the mean squared error of every fold (C, F) at each fold's vectors (F, P, C), from the linearisation."""
-        by_slope = 2 * (self.g[:, None] @ delta)[:, 0]
-        by_bend = np.einsum("fpc,fpc->fc", delta, self.H @ delta)
-        # Poses without noise: below this a difference of large numbers is rounding.
-        least = _ROUNDED * (self.c[:, None] + np.abs(by_slope) + np.abs(by_bend))
-        return np.asarray((np.maximum(self.c[:, None] + by_slope + by_bend, least) / self.numbers[:, None]).T)
-
-    def fits(self, free: Mask, beyond: Mask | None = None) -> tuple[Array, Array, Array]:
-        """Fit ``free`` to all but each fold.
-
-        Args:
-            free: (P,) the S parameters to fit; the others are nominal.
-            beyond: (P,) R others; None: none.
-
-        Returns:
-            The vectors (F, P), from the linearisation; the inverses (F, S, S) of the information about ``free``; and (F,
-            S, R) by how much the fit of each free parameter falls with one unit of each of the others.
-        """
-        rows = np.flatnonzero(free)
-        others = np.flatnonzero(beyond) if beyond is not None else rows[:0]
-        fixed = np.where(free, 0.0, self.home)  # from the linearisation back to nominal
-        H, g = self.H.sum(axis=0) - self.H, self.g.sum(axis=0) - self.g
-        A = H[:, rows[:, None], rows] + np.diag(self.pull[rows])
-        scale = 1 / np.sqrt(np.einsum("fii->fi", A))
-        C = np.linalg.inv(A * scale[:, :, None] * scale[:, None]) * scale[:, :, None] * scale[:, None]
-        b = g[:, rows] + H[:, rows] @ fixed - (self.pull * self.home)[rows]
-        delta = np.broadcast_to(fixed, self.g.shape).copy()
-        delta[:, rows] = -(C @ b[..., None])[..., 0]
-        return delta, C, C @ H[:, rows[:, None], others]
-
-    def losses_with(self, kept: Mask, groups: Mapping[str, Mask]) -> dict[str, Array]:
-        """Return the losses (F,) under a fit of ``kept`` and each group: one factorisation for all of the groups.
-
-        With A the information, S the parameters kept and G a group, the information about G beyond S is Schur's complement
-        A_GG - A_GS A_SS^-1 A_SG.
-        """
-        beyond = np.any(list(groups.values()), axis=0) & ~kept
-        delta, _, X = self.fits(kept, beyond)
-        rows, others = np.flatnonzero(kept), np.flatnonzero(beyond)
-        H, g = self.H.sum(axis=0) - self.H, self.g.sum(axis=0) - self.g
-        schur = H[:, others[:, None], others] + np.diag(self.pull[others]) - H[:, others[:, None], rows] @ X
-        slope = g[:, others] + (H[:, others] @ delta[..., None])[..., 0]
-        tried = np.repeat(delta[..., None], len(groups), axis=2)
-        for c, mask in enumerate(groups.values()):
-            at = np.flatnonzero(mask[others])
-            A = schur[:, at[:, None], at]
-            scale = 1 / np.sqrt(np.einsum("fii->fi", A))
-            z = (
-                np.linalg.solve(A * scale[:, :, None] * scale[:, None], (-slope[:, at] * scale)[..., None])
-                * scale[..., None]
-            )
-            tried[:, others[at], c] += z[..., 0]
-            tried[:, rows, c] -= (X[:, :, at] @ z)[..., 0]
-        return dict(zip(groups, self.losses_at(tried), strict=True))
-
-
-class _Removal:
-    """Fits of what is kept to all but each fold, from which groups are removed one after the other.
-
-    The fit without a group G follows from that with it: with C = A^-1, the free numbers move by C_:G C_GG^-1 times what
-    brings those of G back to nominal, and C falls by C_:G C_GG^-1 C_G:.
-    """
-
-    def __init__(self, folds: _Folds, kept: Mask) -> None:
-        self.folds, self.kept = folds, kept.copy()
-        self.rows = np.flatnonzero(kept)
-        self.delta, self.C, _ = folds.fits(kept)
-
-    def losses(self) -> Array:
-        """Return the losses (F,) of what is kept."""
-        return np.asarray(self.folds.losses_at(self.delta[..., None])[0])
-
-    def losses_without(self, groups: Sequence[Mask]) -> Array:
-        """Return the losses (G, F) without each group."""
-        tried = np.repeat(self.delta[..., None], len(groups), axis=2)
-        for c, mask in enumerate(groups):
-            tried[:, self.rows, c] += self._moved(np.flatnonzero(mask[self.rows]))
-        return self.folds.losses_at(tried)
-
-    def _moved(self, at: NDArray[np.int64]) -> Array:
-        """Return by how much the free numbers (F, S) move when those ``at`` come back to nominal."""
-        back = (self.folds.home - self.delta)[:, self.rows[at]]
-        return np.asarray((self.C[:, :, at] @ np.linalg.solve(self.C[:, at[:, None], at], back[..., None]))[..., 0])
-
-    def doubtful(self, groups: Sequence[Mask]) -> list[Mask]:
-        """Return the groups so near their nominal values that leaving them there may cost nothing."""
-        folds, rows = self.folds, self.rows
-        A = folds.H.sum(axis=0)[np.ix_(rows, rows)] + np.diag(folds.pull[rows])
-        scale = 1 / np.sqrt(np.diag(A))
-        cov = np.linalg.inv(scale[:, None] * A * scale) * np.outer(scale, scale)
-        fixed = np.where(self.kept, 0.0, folds.home)
-        b = folds.g.sum(axis=0)[rows] + folds.H.sum(axis=0)[rows] @ fixed - (folds.pull * folds.home)[rows]
-        off = -cov @ b - folds.home[rows]
-        found = []
-        for mask in groups:
-            at = np.flatnonzero(mask[rows])
-            if off[at] @ np.linalg.solve(cov[np.ix_(at, at)], off[at]) < SURE**2 * len(at):
-                found.append(mask)
-        return found
-
-    def remove(self, mask: Mask) -> None:
-        """Remove a group."""
-        at = np.flatnonzero(mask[self.rows])
-        self.delta[:, self.rows] += self._moved(at)
-        self.delta[:, self.rows[at]] = self.folds.home[self.rows[at]]
-        stay = np.flatnonzero(~mask[self.rows])
-        fall = np.linalg.solve(self.C[:, at[:, None], at], self.C[:, at[:, None], stay])
-        self.C = self.C[:, stay[:, None], stay] - self.C[:, stay[:, None], at] @ fall
-        self.rows, self.kept = self.rows[stay], self.kept & ~mask
 
 
 def folds_of(q: Array, folds: int = FOLDS) -> NDArray[np.int64]:
@@ -300,11 +162,13 @@ def forward_selection(
         progress: called with a line of text after each step.
     """
     part = measured.rows(start.used)
-    folds = _folds(model, start, part, folds_of(part.q), prior)
+    phi = model.feature_values(part.q, part.approach)
+    linear = linear_of(model, start.x, part, phi, np.ones(len(prior), bool), prior)
+    folds = Folds.of(linear, variances_of(linear, start.noise), folds_of(part.q))
     groups = _groups(model, free, together)
     kept = free & np.array([p.kind in PLACEMENT for p in model.parameters])
     losses = folds.losses(kept)
-    steps = [SelectionStep("base and tool", _named(model, kept), _rms(losses, folds))]
+    steps = [SelectionStep("base and tool", _named(model, kept), folds.rms(losses))]
     kept = _added(model, folds, groups, kept, steps, progress)
     if together.any():
         kept = _together(model, folds, groups, kept, steps)
@@ -319,7 +183,7 @@ def forward_selection(
 
 def _added(
     model: Model,
-    folds: _Folds,
+    folds: Folds,
     groups: dict[str, Mask],
     kept: Mask,
     steps: list[SelectionStep],
@@ -329,57 +193,40 @@ def _added(
     losses = folds.losses(kept)
     while groups:
         tried = folds.losses_with(kept, groups)
-        improving = [name for name in tried if _improves(losses, tried[name], folds)]
+        improving = [name for name in tried if folds.improves(losses, tried[name])]
         if not improving:
             break
-        name = min(improving, key=lambda n: _rms(tried[n], folds))
+        name = min(improving, key=lambda n: folds.rms(tried[n]))
         added = groups.pop(name)
         kept, losses = kept | added, tried[name]
-        steps.append(SelectionStep(name, _named(model, added), _rms(losses, folds)))
+        steps.append(SelectionStep(name, _named(model, added), folds.rms(losses)))
         progress(f"held-out error {steps[-1].rms / steps[0].rms:.2f} of nominal with {name}")
     return kept
 
 
-def _together(model: Model, folds: _Folds, groups: dict[str, Mask], kept: Mask, steps: list[SelectionStep]) -> Mask:
+def _together(model: Model, folds: Folds, groups: dict[str, Mask], kept: Mask, steps: list[SelectionStep]) -> Mask:
     """Add all that is left where it lowers the error only together, as two sources that hide each other do."""
     if not groups:
         return kept
     whole: Mask = kept | np.any(list(groups.values()), axis=0)
     losses = folds.losses(whole)
-    if not _improves(folds.losses(kept), losses, folds):
+    if not folds.improves(folds.losses(kept), losses):
         return kept
-    steps.append(SelectionStep(", ".join(groups), _named(model, whole & ~kept), _rms(losses, folds)))
+    steps.append(SelectionStep(", ".join(groups), _named(model, whole & ~kept), folds.rms(losses)))
     groups.clear()
     return whole
 
 
 def _reasons(
-    model: Model, folds: _Folds, kept: Mask, groups: dict[str, Mask], removed: dict[str, Array]
+    model: Model, folds: Folds, kept: Mask, groups: dict[str, Mask], removed: dict[str, Array]
 ) -> dict[str, str]:
     """Return name -> why a parameter was not kept."""
-    rms = _rms(folds.losses(kept), folds)
+    rms = folds.rms(folds.losses(kept))
     reasons: dict[str, str] = {}
     for name, losses in (folds.losses_with(kept, groups) if groups else {}).items():
         why = _not_improving(losses, folds, rms)
         reasons |= {model.names[k]: why for k in np.flatnonzero(groups[name])}
     return reasons | {name: _not_improving(losses, folds, rms) for name, losses in removed.items()}
-
-
-def _folds(model: Model, start: Solution, measured: Measured, labels: NDArray[np.int64], prior: Array) -> _Folds:
-    """Sum up the normal equations fold by fold."""
-    phi = model.feature_values(measured.q, measured.approach)
-    linear = linear_of(model, start.x, measured, phi, np.ones(len(prior), bool), prior)
-    e, J = whitened(linear, variances_of(linear, start.noise))
-    size = e.shape[1]
-    H, g, c, numbers = [], [], [], []
-    for k in range(int(labels.max()) + 1):
-        rows = labels == k
-        Jk, ek = J[rows].reshape(-1, J.shape[2]), e[rows].ravel()
-        H.append(Jk.T @ Jk)
-        g.append(Jk.T @ ek)
-        c.append(float(ek @ ek))
-        numbers.append(size * int(rows.sum()))
-    return _Folds(np.array(H), np.array(g), np.array(c), np.array(numbers, float), linear.known, -linear.at)
 
 
 def _named(model: Model, mask: Mask) -> tuple[str, ...]:
@@ -401,29 +248,13 @@ def _groups(model: Model, free: Mask, together: Mask) -> dict[str, Mask]:
     return groups
 
 
-def _rms(losses: Array, folds: _Folds) -> float:
-    """Return the RMS of all folds: the geometric mean of theirs, which one pose that nothing explains cannot rule."""
-    return float(np.exp(0.5 * np.sum(np.log(losses + _NONE) * folds.numbers) / folds.numbers.sum()))
-
-
-def _score(losses: Array, folds: _Folds) -> float:
-    """Return the held-out squares' logarithms, summed over the measured numbers: minus twice a log likelihood."""
-    return float(np.sum(np.log(losses + _NONE) * folds.numbers))
-
-
-def _improves(without: Array, with_it: Array, folds: _Folds) -> bool:
-    """Return whether the fall of the held-out squares' logarithms is more than chance over the folds."""
-    fall = np.log(np.maximum(without, NOISELESS) / np.maximum(with_it, NOISELESS)) * folds.numbers
-    return bool(fall.sum() > max(MIN_GAIN * np.sqrt(len(fall)) * fall.std(ddof=1), ROUNDING * folds.numbers.sum()))
-
-
 def _pruned(
-    model: Model, folds: _Folds, kept: Mask, together: Mask, steps: list[SelectionStep]
+    model: Model, folds: Folds, kept: Mask, together: Mask, steps: list[SelectionStep]
 ) -> tuple[Mask, dict[str, Array]]:
     """Remove, one at a time, parameters and harmonics without which the held-out error is no worse than their price."""
     removed: dict[str, Array] = {}
     units = _units(model, kept, together)
-    now = _Removal(folds, kept)
+    now = Removal(folds, kept)
     while True:
         units = [mask for mask in units if (mask & now.kept).any()]
         doubtful = now.doubtful(units)
@@ -431,7 +262,7 @@ def _pruned(
             return now.kept, removed
         losses, tried = now.losses(), now.losses_without(doubtful)
         rise = [
-            _score(t, folds) - _score(losses, folds) - PRICE * (mask & together).sum()
+            folds.score(t) - folds.score(losses) - PRICE * (mask & together).sum()
             for t, mask in zip(tried, doubtful, strict=True)
         ]
         best = int(np.argmin(rise))
@@ -440,7 +271,7 @@ def _pruned(
         now.remove(doubtful[best])
         names = _named(model, doubtful[best])
         removed |= dict.fromkeys(names, losses)
-        steps.append(SelectionStep(f"-{_common(names)}", names, _rms(tried[best], folds)))
+        steps.append(SelectionStep(f"-{_common(names)}", names, folds.rms(tried[best])))
 
 
 def _units(model: Model, kept: Mask, together: Mask) -> list[Mask]:
@@ -458,7 +289,7 @@ def _common(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0].split('_')[0]}_{names[0].split('_')[1][3:]}"
 
 
-def _not_improving(losses_with: Array, folds: _Folds, rms: float) -> str:
-    change = _rms(losses_with, folds) / rms - 1
+def _not_improving(losses_with: Array, folds: Folds, rms: float) -> str:
+    change = folds.rms(losses_with) / rms - 1
     text = f"falls by {-100 * change:.2g} %, no more than chance" if change < 0 else f"rises by {100 * change:.2g} %"
     return f"not selected: with it the held-out error {text}"
