@@ -33,29 +33,29 @@ def _not_json(text):
     raise AssertionError(f"{text} is not JSON")
 
 
-def keys_of(value, at=""):
-    """Return the keys of a JSON value with those within, ``poses[].name``; names out of the input are ``*``."""
+def objects_of(value, at=""):
+    """Yield path and keys of each object in a JSON value, such as ``poses[]``; names out of the input are ``*``."""
     if isinstance(value, list):
-        return {key for each in value for key in keys_of(each, f"{at}[]")}
-    if not isinstance(value, dict):
-        return set()
-    names = {k: f"{at}.{k if k.isidentifier() and (k.islower() or '_' in k) else '*'}".lstrip(".") for k in value}
-    return set(names.values()).union(*(keys_of(value[k], name) for k, name in names.items()))
+        for each in value:
+            yield from objects_of(each, f"{at}[]")
+    elif isinstance(value, dict):
+        names = {k: k if k.isidentifier() and (k.islower() or "_" in k) else "*" for k in value}
+        yield at, set(names.values()) - {"*"}
+        for key, name in names.items():
+            yield from objects_of(value[key], f"{at}.{name}")
 
 
 def hold_keys(arguments, out):
-    """Hold JSON to the keys that stood in each output of a command: somebody's program reads them.
-
-    After new ones: remove the file, and run the tests of tests/app with ``ARMSIGHT_KEYS=1`` and ``-n 0``.
-    """
+    """Hold JSON to the keys that programs read. After new ones: ``rm json_keys.json; ARMSIGHT_KEYS=1 pytest -n 0 app``."""
     command = " ".join(takewhile(str.isalpha, map(str, arguments)))
     known = json.loads(KEYS.read_text()) if KEYS.exists() else {}
-    for keys in (keys_of(json.loads(line)) for line in out.splitlines()):
-        if "ARMSIGHT_KEYS" in os.environ:
-            known[command] = sorted(keys.intersection(known.get(command, keys)))
-            KEYS.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
-        missing = set(known.get(command, [])) - keys
-        assert not missing, f"armsight {command} --json: keys are missing: {sorted(missing)}"
+    held = known.setdefault(command, {})
+    new = "ARMSIGHT_KEYS" in os.environ
+    for at, keys in (found for line in out.splitlines() for found in objects_of(json.loads(line))):
+        held[at] = sorted(keys.intersection(held.get(at, keys))) if new else held.get(at, [])
+        assert keys.issuperset(held[at]), f"armsight {command} --json: {at} has {sorted(keys)}, not {held[at]}"
+    if new:
+        KEYS.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
 
 
 def run(*arguments):

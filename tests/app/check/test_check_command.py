@@ -300,9 +300,9 @@ def test_a_motion_file_is_distinguished_from_attained_poses(tmp_path, capsys):
 
 def test_a_row_far_from_its_pose_is_named_and_the_sequence_of_rows_has_no_effect(tmp_path, capsys):
     rows = [row for row in rows_of() if row[0] == "pose"]
-    before = json.loads(said(capsys, file_of(tmp_path / "a.csv", rows), "--json").out)
+    before = said(capsys, file_of(tmp_path / "a.csv", rows), "--json").lines[0]
     assert not any("counts" in note for note in before["notes"])
-    after = json.loads(said(capsys, file_of(tmp_path / "b.csv", rows[::-1]), "--json").out)
+    after = said(capsys, file_of(tmp_path / "b.csv", rows[::-1]), "--json").lines[0]
     assert (before["distance"]["from"], before["drift"]["pose"]) == ("P2", "P1")
     assert (after["distance"]["to"], after["drift"]["pose"]) == ("P4", "P1")
     n = next(n for n, row in enumerate(rows) if row[1] == "P3" and row[2] == 7)

@@ -10,11 +10,13 @@ sources that call them roll, pitch, yaw put roll about z; ROS puts roll about x.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from armsight.app.show.encode import json_of
+from armsight.app.show.table import aligned
 from armsight.data import Array
 from armsight.geometry.rotation import euler_zyx
 from armsight.robot.arm import Arm
@@ -85,7 +87,7 @@ def show_text(arm: Arm) -> str:
     ]
     extent = reach(arm)
     lines = [f"{arm.name}: {arm.convention} Denavit-Hartenberg table; angles in deg, speeds in deg/s, deg/s^2, deg/s^3"]
-    lines += _table((head, *rows))
+    lines += aligned((head, *rows))
     for name, T in (("T_base_0", arm.T_base_0), ("T_flange_tool", arm.T_flange_tool)):
         if not np.array_equal(T, np.eye(4)):
             lines.append(f"{name}: {_pose_text(T)}")
@@ -181,7 +183,7 @@ def inverse_text(arm: Arm, T_base_tool: Array, found: Solutions) -> str:
         for i, configuration in enumerate(found.configurations)
     ]
     if rows:
-        lines += _table((("", *(f"q{i + 1}" for i in range(arm.joints)), "configuration", ""), *rows))
+        lines += aligned((("", *(f"q{i + 1}" for i in range(arm.joints)), "configuration", ""), *rows))
     if found.reason is not None:
         lines.append(found.reason)
     if (nearest := found.nearest) is not None:
@@ -203,7 +205,7 @@ def difference_json(nominal: Arm, arm: Arm, found: Difference) -> dict[str, Any]
         "tool_apart_max_m": found.most_m,
         "tool_rotated_mean_rad": found.mean_rad,
         "tool_rotated_max_rad": found.most_rad,
-        "changes": {name: [None if np.isnan(v) else v for v in values.tolist()] for name, values in changes.items()},
+        "changes": json_of(changes),
     }
 
 
@@ -222,7 +224,7 @@ def difference_text(nominal: Arm, arm: Arm, found: Difference) -> str:
         f"{1e3 * found.most_m:.3f} mm at most, rotated by {np.degrees(found.mean_rad):.3f} deg on the mean, "
         f"{np.degrees(found.most_rad):.3f} deg at most",
         "(the same joint angles and base; poses all over the joint limits)",
-        *_table((("changes", "a mm", "d mm", "alpha deg", "offset deg"), *rows)),
+        *aligned((("changes", "a mm", "d mm", "alpha deg", "offset deg"), *rows)),
     ]
     if np.isnan(found.a_m).any():
         lines.append("-: axes that were parallel no longer are, or another convention: these rows cannot be compared")
@@ -286,13 +288,3 @@ def _matrix(values: Array) -> list[str]:
 def _short(value: float) -> str:
     """Return a number with at most three decimals."""
     return f"{round(float(value), 3) + 0.0:.10g}"
-
-
-def _table(rows: Iterable[tuple[str, ...]]) -> list[str]:
-    """Return rows as lines with aligned columns, the first to the left."""
-    lines = list(rows)
-    widths = [max(len(row[i]) for row in lines) for i in range(len(lines[0]))]
-    return [
-        "  ".join([row[0].ljust(widths[0]), *(entry.rjust(w) for entry, w in zip(row[1:], widths[1:], strict=True))])
-        for row in lines
-    ]

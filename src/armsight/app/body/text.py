@@ -9,7 +9,8 @@ import numpy as np
 
 from armsight.app.body.check import SEPARATED_SIGMAS, sigma_px
 from armsight.app.body.finding import Assessment, Prediction, ambiguity_text
-from armsight.app.show.report import Block, Fact, Lines, Report, Text
+from armsight.app.show.report import Block, Fact, Report
+from armsight.app.show.table import TextTable
 from armsight.vision.markers.body_layout import Layout
 from armsight.vision.rig import StereoRig
 
@@ -68,6 +69,7 @@ def body_report(path: str, layout: Layout, rig: StereoRig, rig_path: str | None,
         "ambiguities": _ambiguities(layout, assessment),
         "findings": [{**vars(f), "text": f.text or None, "change": f.change or None} for f in assessment.findings],
     }
+    head = ("distance", "across", "depth", "tilt", "about sight", "disc across")
     blocks: list[Block] = [
         Fact(f"assessment: {assessment.grade}", {"assessment": assessment.grade}),
         Fact(f"unique: {_unique(layout, assessment)}"),
@@ -76,12 +78,8 @@ def body_report(path: str, layout: Layout, rig: StereoRig, rig_path: str | None,
             {"distances_mm": [{"from": a, "to": b, "mm": 1e3 * d} for a, b, d in distances]},
         ),
         Fact("closest: " + "; ".join(_closest(distances)) if len(distances) > 1 else ""),
-        Text(""),
-        Fact(
-            f"expected sigma: {cameras}; the body faces them",
-            {"cameras": cameras, "expected": [_expected(one) for one in assessment.predictions]},
-        ),
-        Lines([*_table(assessment), ""]),
+        Fact("", {"cameras": cameras, "expected": [_expected(one) for one in assessment.predictions]}),
+        TextTable(f"expected sigma: {cameras}; the body faces them", head, tuple(map(_row, assessment.predictions))),
     ]
     grades = {"bad": "bad ", "weak": "weak", "note": "note"}
     for finding in sorted(assessment.findings, key=lambda f: list(grades).index(f.grade)):
@@ -105,28 +103,11 @@ def _unique(layout: Layout, assessment: Assessment) -> str:
     return "yes, by distances"
 
 
-def _table(assessment: Assessment) -> list[str]:
-    """Return the expected sigma at each distance."""
-    rows = [("distance", "across", "depth", "tilt", "about sight", "disc across")]
-    for one in assessment.predictions:
-        if np.isnan(one.cov).any():
-            rows.append((f"{one.distance_m:g} m", "no pose", "", "", "", _pixels(one)))
-            continue
-        (across, depth), (tilt, roll) = one.position_mm, one.rotation_deg
-        rows.append(
-            (
-                f"{one.distance_m:g} m",
-                f"{across:.3f} mm",
-                f"{depth:.3f} mm",
-                f"{tilt:.4f} deg",
-                f"{roll:.4f} deg",
-                _pixels(one),
-            )
-        )
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    return [
-        "  " + "  ".join(entry.rjust(width) for entry, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    ]
+def _row(one: Prediction) -> tuple[str, ...]:
+    """Return the expected sigma at a distance."""
+    (across, depth), (tilt, roll) = one.position_mm, one.rotation_deg
+    known = (f"{across:.3f} mm", f"{depth:.3f} mm", f"{tilt:.4f} deg", f"{roll:.4f} deg")
+    return f"{one.distance_m:g} m", *(("no pose", "", "", "") if np.isnan(one.cov).any() else known), _pixels(one)
 
 
 def _pixels(one: Prediction) -> str:

@@ -100,14 +100,12 @@ def evaluated(
     if output is not None:
         require_matplotlib()
         check_folder(output, problem="no report can be written here")
-    if output is not None and output.is_dir():
-        if is_run(output):
+        if output.is_dir() and is_run(output):
             raise InputError(f"{output}: holds a run, whose report would be written over; choose another folder")
         if (output / PAGE).exists() and not (output / "check.json").exists():
             raise InputError(
                 f"{output}: holds another command's {PAGE}, which would be written over; choose another folder"
             )
-    if output is not None:
         check_folder(output, holding=REPORT_FILES, apart_from=(data, data / "check.csv"))
     limits = read_limits(limit_texts)
     attained = read_check(data, closed=closed, columns=columns)

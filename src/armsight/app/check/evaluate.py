@@ -24,6 +24,7 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop.iso9283 import poses as iso9283
 from armsight.loop.iso9283.paths import PathMetrics, circle_metrics, path_metrics, plane_axes
+from armsight.loop.iso9283.statistic import Metric
 
 #: Where no pose was attained often enough for a repeatability: this many poses and more give errors over the workspace.
 _WIDE = 10
@@ -72,27 +73,36 @@ def evaluate(attained: Attained) -> CheckResult:
         InputError: too few rows for any metric.
     """
     by_test = {test: [row for row in attained.rows if row.test == test] for test in TESTS}
-    notes = list(attained.notes)
-    seldom = _too_seldom(by_test["pose"])
-    groups = _groups(by_test["pose"], lambda row: row.pose) if seldom is None else {}
-    often = {name: groups[name] for name in sorted(groups, key=natural) if len(groups[name]) >= iso9283.MIN_POSES}
-    if often:
-        rare = [f"left out: {n}, attained too seldom ({len(group)})" for n, group in groups.items() if n not in often]
-        notes += first_few(rare, "poses, attained too seldom")
-        notes += [note for group in often.values() for note in _outliers(group)]
+    rows = by_test["pose"]
+    seldom = _too_seldom(rows)
+    often, said = ({}, []) if seldom else _often(rows)
     poses = {name: _pose(group) for name, group in often.items()}
-    ways = {name: [way for way in _groups(group, _approach).values() if len(way) > 1] for name, group in often.items()}
-    several = {n: iso9283.multi_directional([_positions(w) for w in each]) for n, each in ways.items() if len(each) > 1}
-    distance = _distance_of_two(often)
-    drift = _drift_of_first(often)
-    workspace = _workspace(by_test["pose"]) if groups and not often else None
+    workspace = _workspace(rows) if rows and not often and not seldom else None
     paths = _groups(by_test["path"], lambda row: row.approach or "path")
     followed = {name: _path(name, group) for name, group in paths.items()}
     circle = _circle(by_test["circle"], attained.reversals) if by_test["circle"] else None
+    notes = [*attained.notes, *said]
     if not (poses or workspace or followed or circle):
         raise InputError("; ".join(["nothing can be evaluated", *([seldom] if seldom else []), *notes]))
     notes += [f"left out: all poses, as none was attained {iso9283.MIN_POSES} times"] if seldom else []
-    return CheckResult(poses, several, workspace, distance, drift, followed, circle, notes)
+    distance, drift = _distance(often), _drift_of_first(often)
+    return CheckResult(poses, _several_ways(often), workspace, distance, drift, followed, circle, notes)
+
+
+def _often(rows: list[Row]) -> tuple[dict[str, list[Row]], list[str]]:
+    """Return the rows of each pose that was attained often enough, and what is said of the others and of outliers."""
+    groups = _groups(rows, lambda row: row.pose)
+    often = {name: groups[name] for name in sorted(groups, key=natural) if len(groups[name]) >= iso9283.MIN_POSES}
+    rare = [f"left out: {n}, attained too seldom ({len(group)})" for n, group in groups.items() if n not in often]
+    said = first_few(rare, "poses, attained too seldom") if often else []
+    return often, said + [note for group in often.values() for note in _outliers(group)]
+
+
+def _several_ways(often: dict[str, list[Row]]) -> dict[str, Metric]:
+    """Return vAP of each pose that was approached repeatedly from more than one direction."""
+    by_way = {name: _groups(rows, lambda row: row.approach).values() for name, rows in often.items()}
+    ways = {name: [way for way in each if len(way) > 1] for name, each in by_way.items()}
+    return {n: iso9283.multi_directional([_positions(w) for w in each]) for n, each in ways.items() if len(each) > 1}
 
 
 def _too_seldom(rows: list[Row]) -> str | None:
@@ -111,10 +121,6 @@ def _groups(rows: list[Row], key: Callable[[Row], str]) -> dict[str, list[Row]]:
     for row in rows:
         out.setdefault(key(row), []).append(row)
     return out
-
-
-def _approach(row: Row) -> str:
-    return row.approach
 
 
 def _positions(rows: list[Row]) -> Array:
@@ -137,15 +143,6 @@ def _workspace(rows: list[Row]) -> WorkspaceResult:
     """Return the errors over the workspace."""
     mean, largest = iso9283.anywhere(_positions(rows) - _commands(rows), _covs(rows), _common(rows))
     return WorkspaceResult(len(rows), mean, largest)
-
-
-def _distance_of_two(often: dict[str, list[Row]]) -> DistanceResult | None:
-    """Return the metrics of the distance from the second pose to the fourth, the standard's P2 and P4."""
-    names = list(often)
-    if len(names) <= 2:
-        return None
-    first, last = names[1], names[3] if len(names) > 3 else names[-1]
-    return _distance(first, often[first], last, often[last])
 
 
 def _drift_of_first(often: dict[str, list[Row]]) -> DriftResult | None:
@@ -190,14 +187,17 @@ def _pose(rows: list[Row]) -> iso9283.PoseMetrics:
     )
 
 
-def _distance(first: str, first_rows: list[Row], last: str, last_rows: list[Row]) -> DistanceResult | None:
-    """Return AD and RD between two poses, in the cycles that have both."""
+def _distance(often: dict[str, list[Row]]) -> DistanceResult | None:
+    """Return AD and RD from the second pose to the fourth, the standard's P2 and P4, in the cycles that have both."""
+    if len(often) <= 2:
+        return None
+    (first, rows), *_, (last, last_rows) = list(often.items())[1:4]
     there = {row.cycle: row for row in last_rows}
-    pairs = [(row, there[row.cycle]) for row in first_rows if row.cycle and row.cycle in there]
+    pairs = [(row, there[row.cycle]) for row in rows if row.cycle and row.cycle in there]
     if len(pairs) < iso9283.MIN_POSES:
         return None
     a, b = (_positions([p[k] for p in pairs]) for k in (0, 1))
-    commanded = float(np.linalg.norm((first_rows[0].T_command - last_rows[0].T_command)[:3, 3]))
+    commanded = float(np.linalg.norm((rows[0].T_command - last_rows[0].T_command)[:3, 3]))
     AD, RD = iso9283.distance_metrics(a, b, commanded, _covs([p[0] for p in pairs]))
     return DistanceResult(first, last, commanded, AD, RD)
 
@@ -222,7 +222,7 @@ def _path(name: str, rows: list[Row]) -> PathMetrics:
 
 
 def _circle(rows: list[Row], reversals: list[Reversal]) -> CircleResult:
-    ways = _groups(rows, _approach)
+    ways = _groups(rows, lambda row: row.approach)
     if set(ways) != {"1", "-1"}:
         raise InputError(
             "circle: approach must be 1 for counter-clockwise and -1 for clockwise, and both must be there"

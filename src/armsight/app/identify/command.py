@@ -106,10 +106,10 @@ def command(
             notes=notes,
             progress=progress,
         )
+        report = identify_report(run, everything=verbose)
         if output is not None:
             progress("writing")
-            write_results(run, output)
-    report = identify_report(run, everything=verbose)
+            write_results(run, report, output)
     report.echo(as_json=as_json, output=output, wall_s=time.perf_counter() - started)
     if output is not None:  # last: what was found is printed and stored before anything is drawn
         report.write(output)

@@ -310,14 +310,14 @@ def _values(run: Identification) -> dict[str, Any]:
     }
 
 
-def write_results(run: Identification, out: Path) -> None:
+def write_results(run: Identification, report: Report, out: Path) -> None:
     """Write the corrected arm, the board's zeros, the parameters and the summary into a folder."""
     corrected = Corrected.of(run.found)
     corrected.save(out / "corrected.toml")
     write_text(out / "corrected.urdf", corrected.urdf())
     write_text(out / "zeros.toml", zeros_text(run.found))
     write_text(out / "parameters.csv", _parameters_csv(run))
-    write_text(out / "identify.json", identify_report(run).json_text())
+    write_text(out / "identify.json", report.json_text())
 
 
 def _parameters_csv(run: Identification) -> str:

@@ -80,8 +80,8 @@ class IdentifyStep:
                 run = run_identify(
                     open_arm(arm_spec), read.measured, read.lines, None, notes=read.notes, progress=self._progress
                 )
-                write_results(run, out)
-            report = identify_report(run)
+                report = identify_report(run)
+                write_results(run, report, out)
             lines = (*(f"note: {note}" for note in run.notes), *report.text().splitlines()[1:])
             corrected = str(out / "corrected.toml")
             self.state = replace(self.state, headline=report.headline, lines=lines, corrected=corrected)

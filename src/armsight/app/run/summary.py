@@ -32,7 +32,7 @@ from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import RunData, ToolTrack
 from armsight.app.show.encode import json_of
 from armsight.app.show.messages import colour, weak
-from armsight.app.show.table import TextTable, print_table
+from armsight.app.show.table import TextTable, plain_text
 from armsight.loop.health import HealthFinding, health_lines, unseen_lines
 from armsight.loop.health.follow import RigCorrection, correction_lines
 from armsight.robot.arm import Arm
@@ -380,7 +380,7 @@ def print_summary(summary: RunSummary, folder: Path) -> None:
     """
     for table in (track_table(summary), loop_table(summary)):
         if table is not None:
-            print_table(table)
+            click.echo(plain_text(table))
     for line in health_lines(summary.health):
         click.echo(weak(line), err=True, color=colour())
     for line in (*unseen_lines(summary.fixed_unseen), *correction_lines(summary.corrections, summary.not_corrected)):

@@ -130,10 +130,8 @@ class Report:
         """Return what programs read: the values of all facts, and the notes."""
         found: dict[str, Any] = {"notes": self.noted("note"), **self.values}
         for block in self.blocks:
-            if isinstance(block, Fact):
-                found |= block.values
-        shown: dict[str, Any] = json_of(found)
-        return shown
+            found |= block.values if isinstance(block, Fact) else {}
+        return {key: json_of(value) for key, value in found.items()}
 
     def json_text(self) -> str:
         """Return a file of it."""
@@ -184,25 +182,19 @@ class Report:
         Raises:
             InputError: matplotlib is missing, or a file cannot be written; then none of the new ones is left.
         """
-        plots, images = [block for block in self.blocks if isinstance(block, Plot)], dict[str, bytes]()
+        plots = {f"{self.prefix}-{block.name}.png": block for block in self.blocks if isinstance(block, Plot)}
         if plots:
             require_matplotlib()
-        folder = page.writable_folder(folder, "no report")
+        folder, images, pictures = page.writable_folder(folder, "no report"), dict[str, bytes](), dict[str, bytes]()
         with drawing() if plots else contextlib.nullcontext():
-            for plot in plots:
+            for file, plot in plots.items():
                 if (figure := plot.draw()) is not None:
-                    images[plot.name] = png(figure)
-        pictures = {self.file(name): data for name, data in images.items()}
+                    images[plot.name] = pictures[file] = png(figure)
         beside = {name: data.encode() if isinstance(data, str) else data for name, data in files.items()}
         page.put_files(folder, {**pictures, **beside, page.PAGE: self.page(images).encode()})
-        for plot in plots:
-            if plot.name not in images:
-                (folder / self.file(plot.name)).unlink(missing_ok=True)
+        for file in plots.keys() - pictures.keys():
+            (folder / file).unlink(missing_ok=True)
         return folder / page.PAGE
-
-    def file(self, plot: str) -> str:
-        """Return the name of a figure's file."""
-        return f"{self.prefix}-{plot}.png"
 
     def echo(self, *, as_json: bool, written: str | None = None, **more: object) -> int:
         """Print the result, notes on stderr, and return the exit code.

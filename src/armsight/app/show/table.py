@@ -1,15 +1,9 @@
-"""Tables for people: one record, shown as HTML in a page, and in the terminal.
-
-On a terminal a table is printed with rich; elsewhere (a pipe, a file) it is plain text with aligned columns.
-"""
+"""Tables for people: one record, shown as HTML on a page, and as aligned text on the terminal."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-
-import click
-from rich.console import Console
-from rich.table import Table
 
 from armsight.app.show import page
 
@@ -37,38 +31,14 @@ def html_table(table: TextTable) -> str:
     return title + page.table(head, rows, "numbers")
 
 
-def print_table(table: TextTable) -> None:
-    """Print a table on stdout; colours and lines only where that is a terminal."""
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        click.echo(plain_text(table))
-        return
-    shown = Table(
-        title=table.title,
-        title_justify="left",
-        box=None,
-        pad_edge=False,
-        padding=(0, 2, 0, 0),
-        show_header=any(table.columns),
-    )
-    for number, column in enumerate(table.columns):
-        title = "\n".join(column.rsplit(" ", 1))
-        shown.add_column(title, justify="right" if number else "left", no_wrap=True)
-    for row in table.rows:
-        shown.add_row(*row)
-    console.print(shown)
-
-
 def plain_text(table: TextTable) -> str:
-    """Return a table as lines of text: names to the left, the other columns right-aligned."""
-    lines = [*([table.columns] if any(table.columns) else []), *table.rows]
-    widths = [max(len(line[k]) for line in lines) for k in range(len(table.columns))]
+    """Return a table as lines of text."""
+    lines = aligned([*([table.columns] if any(table.columns) else []), *table.rows])
+    return "\n".join([table.title, *lines])
 
-    def aligned(line: tuple[str, ...]) -> str:
-        cells = [
-            line[0].ljust(widths[0]),
-            *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True)),
-        ]
-        return "  ".join(cells).rstrip()
 
-    return "\n".join([table.title, *map(aligned, lines)])
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows as lines: the first column to the left, the others right-aligned."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    padded = [[row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in rows]
+    return ["  ".join(cells).rstrip() for cells in padded]
