@@ -24,7 +24,7 @@ from scipy.special import chdtri
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.estimate.linear import Linear
-from armsight.estimate.solve import Solved, solve
+from armsight.estimate.solve import Solved, solve, whitened
 from armsight.estimate.variance import restricted
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
@@ -106,15 +106,6 @@ class Solution(Record):
     def sigma(self) -> Array:
         """Return the sigma (P,) of every parameter."""
         return np.sqrt(np.diag(self.cov))
-
-
-def noise_cov(measured: Measured, noise: tuple[float, float]) -> Array:
-    """Return the covariance (N, M, M) of residuals."""
-    variances = np.full(measured.size, noise[0] ** 2)
-    if measured.R_rig_body is not None:
-        variances[3:] = noise[1] ** 2
-    base = np.zeros((len(measured), measured.size, measured.size)) if measured.cov is None else measured.cov
-    return np.asarray(base + np.diag(variances))
 
 
 def linear_of(model: Model, x: Array, measured: Measured, phi: Array, free: Mask, prior: Array) -> Linear:
@@ -235,7 +226,7 @@ def _robust_noise(e: Array) -> tuple[float, float]:
 
 def _sane(model: Model, x: Array, measured: Measured, phi: Array, noise: tuple[float, float]) -> Mask:
     """Return which poses (N,) are no outliers, by the scale of the median."""
-    e = model.residuals(x, measured, phi)
-    far = np.einsum("ni,ni->n", e, np.linalg.solve(noise_cov(measured, noise), e[..., None])[..., 0])
+    linear = linear_of(model, x, measured, phi, np.zeros(len(x), bool), np.full(len(x), np.inf))
+    far = (whitened(linear, variances_of(linear, noise))[0] ** 2).sum(axis=1)
     scale = max(float(np.median(far)) / chdtri(measured.size, 0.5), 1e-300)
     return np.asarray(far / scale < chdtri(measured.size, CHANCE))

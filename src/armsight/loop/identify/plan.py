@@ -14,7 +14,7 @@ The file in order: the choice itself, on whitened Jacobians alone; the plan for 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.loop.identify.fit import SIGMA, Mask, noise_cov
+from armsight.estimate.solve import whitened
+from armsight.loop.identify.fit import SIGMA, Mask, linear_of, variances_of
 from armsight.loop.identify.joint_noise import by_joints
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import FAST, RIPPLES, Model, all_features
@@ -297,10 +298,10 @@ class PlanningScene(NamedTuple):
     def whitened(self, measured: Measured) -> Array:
         """Return the whitened Jacobians (N, M, P)."""
         phi = self.model.feature_values(measured.q, measured.approach)
-        J = self.model.linearised(self.x, measured, phi)[1]
-        B = CHANCE_RAD * by_joints(self.model, J)
-        C = noise_cov(measured, self.noise) + B @ B.swapaxes(1, 2)
-        return np.asarray(np.linalg.solve(np.linalg.cholesky(C), J))
+        everything = np.ones(len(self.x), bool)
+        linear = linear_of(self.model, self.x, measured, phi, everything, np.full(len(self.x), np.inf))
+        variances = np.append(variances_of(linear, self.noise), CHANCE_RAD**2)
+        return whitened(replace(linear, own=linear.own | {"joints": by_joints(self.model, linear.J)}), variances)[1]
 
 
 def _candidates(scene: PlanningScene, rng: np.random.Generator) -> tuple[Array, Array, Measured]:

@@ -12,7 +12,8 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.loop.identify.fit import fit, noise_cov
+from armsight.estimate.solve import covariances
+from armsight.loop.identify.fit import fit, linear_of, variances_of
 from armsight.loop.identify.identify import Identified
 from armsight.loop.identify.joint_noise import with_joint_noise
 from armsight.loop.identify.measured import Measured
@@ -122,10 +123,10 @@ def placement_refitted(found: Identified, measured: Measured) -> tuple[Model, Ar
 
 def _over(model: Model, found: Identified, x: Array, measured: Measured) -> float:
     """Return the RMS of residuals over their predicted sigma: noise and the parameters' covariance."""
-    e, J = model.linearised(x, measured, model.feature_values(measured.q, measured.approach))
-    free = found.solution.free
-    P = found.solution.cov[np.ix_(free, free)]
-    weighted = with_joint_noise(model, x, measured, found.joint_sigma_rad)
-    C = noise_cov(weighted, found.solution.noise) + J[:, :, free] @ P @ J[:, :, free].swapaxes(1, 2)
-    whitened = np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e)
-    return float(np.sqrt(np.sum(whitened) / e.size))
+    weighted, free = with_joint_noise(model, x, measured, found.joint_sigma_rad), found.solution.free
+    phi = model.feature_values(measured.q, measured.approach)
+    linear = linear_of(model, x, weighted, phi, free, found.prior)
+    by_fit = linear.J @ found.solution.cov[np.ix_(free, free)] @ linear.J.swapaxes(1, 2)
+    C = covariances(linear, variances_of(linear, found.solution.noise)) + by_fit
+    squares = np.einsum("ni,nij,nj->", linear.e, np.linalg.inv(C), linear.e)
+    return float(np.sqrt(squares / linear.e.size))
