@@ -22,10 +22,10 @@ from scipy.stats import chi2
 
 from armsight.data import PoseEstimate, Shot
 from armsight.geometry.pose import inverse, log_se3
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import Composite
-from armsight.vision.measure import measure
+from armsight.vision.pose.measure import measure
 from camera_scene import CHESSBOARD, Scene, scene, smallest_px
 from marker_report import Report
 

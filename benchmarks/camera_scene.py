@@ -18,7 +18,7 @@ from armsight.sim.render.render import radiance
 from armsight.sim.render.scene import Pattern, PosedBody, chessboard, marker_bits, plate, tag
 from armsight.sim.workcell.body import body_patterns, body_target
 from armsight.vision.markers.chessboard import Chessboard
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.tag import Tag, TagTarget
 from armsight.vision.rig import StereoRig

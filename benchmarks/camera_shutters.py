@@ -16,9 +16,9 @@ from armsight.sim.render.background import BACKGROUNDS
 from armsight.sim.render.render import radiance
 from armsight.sim.render.scene import PosedBody
 from armsight.sim.workcell.body import body_patterns, body_target
-from armsight.vision.measure import measure
+from armsight.vision.pose.measure import measure
+from armsight.vision.pose.shutter import LOOSE_PX, Shutters, TimedShot, estimate_shutters, measure_moving
 from armsight.vision.rig import StereoRig
-from armsight.vision.shutter import LOOSE_PX, Shutters, TimedShot, estimate_shutters, measure_moving
 from marker_report import Report
 
 SIZE = (1280, 720)

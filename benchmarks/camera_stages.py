@@ -39,7 +39,7 @@ from armsight.sim.camera.stages import (
 from armsight.sim.render.render import radiance
 from armsight.sim.render.scene import PosedBody, plate
 from armsight.vision.camera import Camera
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from marker_report import Report
 
 SIZE, FOCAL, DISTANCE_M = (1280, 720), 900.0, 0.9  # a pixel is 1 mm

@@ -33,11 +33,11 @@ from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.sim.example_rig import board_poses, example_rig
 from armsight.sim.render.scene import chessboard
 from armsight.sim.workcell.workcell import Workcell
-from armsight.vision.bundle import Observations
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.heldout import pair_errors
 from armsight.vision.markers.board import open_board
 from armsight.vision.match import join
+from armsight.vision.pose.bundle import Observations
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from armsight.data import Discs, Missed
 from armsight.vision.discs.identify import identify
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from disc_bound import picture_bound
 from disc_images import WIDTH, Picture, disc_picture, exposed
 from disc_surround import ITEMS, TEXTURES, clutter, one_kind

@@ -12,7 +12,7 @@ from armsight.data import Missed, PoseEstimate, Shot
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.follow.follower import Follower
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.rig import StereoRig
 from disc_images import exposed
 from marker_plate import BLUR, LENS, cover_up, ellipses, in_view, light_of, parallel_rig, views

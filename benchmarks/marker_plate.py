@@ -14,7 +14,7 @@ import numpy as np
 from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.camera import Camera
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.rig import StereoRig
 from disc_bound import centre_bound
 from disc_images import HEIGHT, WIDTH, add_region, closed_border, exposed, polygon_border

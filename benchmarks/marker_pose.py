@@ -16,7 +16,7 @@ from armsight.sim.render.optics import Optics, Sensor
 from armsight.sim.render.render import render_pair
 from armsight.sim.render.scene import PosedBody, plate
 from armsight.vision.discs.bias import project_discs
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.rig import StereoRig
 from disc_images import add_region, closed_border, exposed
 from marker_plate import (

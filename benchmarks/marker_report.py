@@ -14,7 +14,7 @@ import numpy as np
 
 from armsight import open_target
 from armsight.data import Body
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.markers.marker import Target
 
 HD = (1280, 720)

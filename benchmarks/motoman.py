@@ -12,14 +12,14 @@ from armsight.errors import ArmsightError
 from armsight.geometry.pose import exp_se3, mean_pose, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import log_so3
-from armsight.vision.assign import candidates, instances
 from armsight.vision.calibrate.bodies import calibrate_bodies
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
-from armsight.vision.locate import locate
 from armsight.vision.markers.body_file import load_body_csv
 from armsight.vision.match import gate
-from armsight.vision.measure import measure_seen
+from armsight.vision.pose.assign import candidates, instances
+from armsight.vision.pose.locate import locate
+from armsight.vision.pose.measure import measure_seen
 from armsight.vision.triangulate import triangulate
 from real_sets import DATA
 

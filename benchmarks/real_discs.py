@@ -12,13 +12,13 @@ from armsight.sim.example_rig import board_poses, example_rig
 from armsight.sim.render.optics import Optics
 from armsight.sim.render.render import render_pair
 from armsight.sim.render.scene import PosedBody, circle_grid
-from armsight.vision.bundle import Observations
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.heldout import pair_errors, summary
 from armsight.vision.discs.bias import disc_bias
 from armsight.vision.image import grey, read_image
 from armsight.vision.markers.board import open_board
 from armsight.vision.match import join
+from armsight.vision.pose.bundle import Observations
 from armsight.vision.sources import PairsSource
 from real_sets import DATA, opencv_rig, ours_of
 

@@ -12,14 +12,14 @@ import numpy as np
 
 import real_mrcal
 from armsight.data import Correspondences, PoseEstimate
-from armsight.vision.bundle import Observations
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.heldout import pair_errors, summary
 from armsight.vision.camera import Camera
 from armsight.vision.image import grey
 from armsight.vision.markers.board import open_board
 from armsight.vision.match import join
-from armsight.vision.measure import measure_detections
+from armsight.vision.pose.bundle import Observations
+from armsight.vision.pose.measure import measure_detections
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import PairsSource
 

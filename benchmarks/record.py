@@ -31,7 +31,7 @@ from armsight.geometry.rotation import exp_so3
 from armsight.robot.arm_file import open_arm
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
-from armsight.vision.measure import measure_seen
+from armsight.vision.pose.measure import measure_seen
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import PairsSource, open_source
 

@@ -17,7 +17,7 @@ from armsight.sim.render.scene import PosedBody, chessboard
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.camera import Camera
 from armsight.vision.markers.board import open_board
-from armsight.vision.measure import measure, measure_detections
+from armsight.vision.pose.measure import measure, measure_detections
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 

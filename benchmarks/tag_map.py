@@ -20,13 +20,13 @@ from scipy.sparse import lil_matrix
 from armsight.data import Array, Body, Missed
 from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.geometry.rotation import skew
-from armsight.vision.assign import plain
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
 from armsight.vision.markers.tag import CORNERS
 from armsight.vision.match import gate
-from armsight.vision.measure import measure_seen
-from armsight.vision.pnp import consensus_poses
+from armsight.vision.pose.assign import plain
+from armsight.vision.pose.measure import measure_seen
+from armsight.vision.pose.pnp import consensus_poses
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources.bag import Bag
 from armsight.vision.sources.bag.tags import TAGS, read_tags

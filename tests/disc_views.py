@@ -8,7 +8,7 @@ from armsight.data import Body, Discs
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.camera import Camera
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.rig import StereoRig
 from disc_rims import disc_ellipses
 from views import pixels

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from armsight.data import Missed, PoseEstimate
-from armsight.vision.bundle import Observations
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.bodies import calibrate_bodies
 from armsight.vision.calibrate.heldout import pair_errors, summary
@@ -16,7 +15,8 @@ from armsight.vision.image import grey, read_image
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_file import load_body_csv
 from armsight.vision.match import join
-from armsight.vision.measure import measure_seen
+from armsight.vision.pose.bundle import Observations
+from armsight.vision.pose.measure import measure_seen
 from cli_runs import run
 
 

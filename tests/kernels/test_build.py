@@ -24,9 +24,8 @@ from armsight.loop.estimators.readings import Smoothed
 from armsight.loop.servo import LoopTiming, PoseServo
 from armsight.robot.kinematics import chain, structure
 from armsight.robot.trajectories import Tabled, point_to_point
-from armsight.vision import camera, match
+from armsight.vision import camera, match, normal
 from armsight.vision.dense import cost, scanline, semiglobal
-from armsight.vision.markers import normal
 
 compiled = pytest.mark.skipif(decorator.in_python(), reason="kernels run as plain Python")
 GREY = np.zeros((16, 64), np.uint8)

@@ -28,7 +28,7 @@ from armsight.vision.closed_form import (
     triangulate_parallel,
     triangulate_verging,
 )
-from armsight.vision.locate import locate
+from armsight.vision.pose.locate import locate
 from armsight.vision.triangulate import triangulate
 from asserts import assert_rotation
 from strategies import finite, poses, rotation_vectors, rotations, verging_rigs

@@ -1,10 +1,9 @@
 """Vision: two simultaneous images of a body with markers go in, the pose of the body with its covariance comes out.
 
-The stages, in order: ``sources/`` (shots), ``markers/`` (detections), ``match.py``, ``triangulate.py``, ``locate.py``;
-``measure.py`` runs them on one shot, ``follow/`` from shot to shot. ``discs/`` identifies plain discs.
+The stages, in order: ``sources/`` (shots), ``markers/`` (detections), ``match.py``, ``triangulate.py``, ``pose/``
+(runs them all on one shot), ``follow/`` from shot to shot. ``discs/`` identifies plain discs.
 
 - The rig: ``camera.py``, ``rig.py``, ``camera_file.py``, ``rigfiles/`` (other programs' files), ``rectify.py``.
-- Estimation: ``calibrate/`` on top of ``bundle.py`` with its model in ``projection.py``; ``posefit.py`` and ``pnp.py``
-  for single poses; ``assign.py`` for detections whose names repeat.
+- ``calibrate/``: both cameras from boards or bodies, on ``pose/bundle.py``.
 - ``dense/``: a disparity for every pixel. ``closed_form.py``: the published closed-form method, as a reference.
 """

@@ -228,6 +228,32 @@ def focal_and_centre(K: Any, name: str) -> Array:  # noqa: ANN401 - whatever the
 
 def _distortion(entry: Mapping[str, Any]) -> tuple[str, Array, list[str]]:
     """Return the model, its coefficients, and notes."""
+    kind = _kind(entry)
+    value, by_name = found(entry, DISTORTION), {plain(key): number for key, number in entry.items()}
+    if value is not None:
+        key = next(str(key) for key in entry if plain(key) in DISTORTION and entry[key] is not None)
+        d = checked(np.ravel(np.asarray(value, object)), (None,), key)
+    elif "k1" in by_name:
+        order = ("k1", "k2", "k3", "k4") if kind in FISHEYES else _PARAMETERS
+        d = checked([by_name.get(n, 0.0) for n in order], (None,), "k1 k2 ..")
+        d = d if kind in FISHEYES else _shortest(d)
+    elif kind in ("none", "rectified"):
+        d = np.zeros(0)
+    else:
+        raise InputError(
+            "has no distortion (distortion_coefficients, D, dist, or k1 k2 ..); an empty list or the model none is no "
+            f"distortion; there are {described(entry)}"
+        )
+    if kind in FISHEYES:
+        if d.size != 4:
+            raise InputError(f"a fisheye camera has four coefficients, k1 k2 k3 k4; got {d.size}")
+        return "fisheye", d, []
+    assumed = "no distortion model is named; OpenCV's default, Brown-Conrady, was assumed"
+    return (*brown(d), [] if kind or d.size != 4 else [assumed])
+
+
+def _kind(entry: Mapping[str, Any]) -> str:
+    """Return the distortion model that an entry names, one of FISHEYES and BROWNS."""
     name = next((n for n in _MODEL if isinstance(found(entry, (n,)), str | bool | np.bool_)), "")
     word = found(entry, (name,)) if name else ""
     if (other := found(entry, ("distortionmodel",))) is not None and not isinstance(other, str | bool):
@@ -248,30 +274,7 @@ def _distortion(entry: Mapping[str, Any]) -> tuple[str, Array, list[str]]:
             "supported; supported are plumb_bob, rational_polynomial, radtan (Brown-Conrady), equidistant or fisheye "
             "(Kannala-Brandt) and none: calibrate again with one of them"
         )
-    value = found(entry, DISTORTION)
-    by_name = {plain(key): number for key, number in entry.items()}
-    notes: list[str] = []
-    if value is None and "k1" in by_name:
-        order = ("k1", "k2", "k3", "k4") if kind in FISHEYES else _PARAMETERS
-        numbers = checked([by_name.get(n, 0.0) for n in order], (None,), "k1 k2 ..")
-        d = numbers if kind in FISHEYES else _shortest(numbers)
-    elif value is None and kind in ("none", "rectified"):
-        d = np.zeros(0)
-    elif value is None:
-        raise InputError(
-            "has no distortion (distortion_coefficients, D, dist, or k1 k2 ..); an empty list or the model none is no "
-            f"distortion; there are {described(entry)}"
-        )
-    else:
-        key = next(str(key) for key in entry if plain(key) in DISTORTION and entry[key] is not None)
-        d = checked(np.ravel(np.asarray(value, object)), (None,), key)
-    if kind in FISHEYES:
-        if d.size != 4:
-            raise InputError(f"a fisheye camera has four coefficients, k1 k2 k3 k4; got {d.size}")
-        return "fisheye", d, notes
-    if not kind and d.size == 4:
-        notes.append("no distortion model is named; OpenCV's default, Brown-Conrady, was assumed")
-    return (*brown(d), notes)
+    return kind
 
 
 def _shortest(numbers: Array) -> Array:

@@ -17,10 +17,10 @@ from armsight.data import Discs, Missed
 from armsight.geometry.pose import inverse, transform
 from armsight.vision.discs.bias import project_discs
 from armsight.vision.discs.identify import identify
-from armsight.vision.discs.predict import plain_rig, view
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_layout import read_layout
 from armsight.vision.markers.targets import open_target
+from armsight.vision.pose.predict import plain_rig, view
 from cli_runs import assert_rejected
 
 PLATE = Path(__file__).resolve().parents[3] / "examples" / "plate.toml"

@@ -14,7 +14,7 @@ from armsight.app.live.simulated import SimulatedCameras
 from armsight.data import PoseEstimate, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.vision.markers.targets import open_target
-from armsight.vision.measure import measure
+from armsight.vision.pose.measure import measure
 
 pytestmark = pytest.mark.real_time
 

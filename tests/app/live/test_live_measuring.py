@@ -11,9 +11,9 @@ from armsight.errors import InputError
 from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import example_rig
-from armsight.vision.locate import by_rig
 from armsight.vision.markers.board import open_board
-from armsight.vision.measure import measure_detections
+from armsight.vision.pose.locate import by_rig
+from armsight.vision.pose.measure import measure_detections
 from armsight.vision.rig import StereoRig
 
 BOARD = open_board("chessboard:5x4:20mm").body

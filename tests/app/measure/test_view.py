@@ -30,8 +30,8 @@ from armsight.errors import InputError
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import euler_zyx, exp_so3
 from armsight.vision.discs.bias import expect
-from armsight.vision.discs.locate import locate_composite
 from armsight.vision.markers.targets import open_body
+from armsight.vision.pose.locate_discs import locate_composite
 from armsight.vision.rig import StereoRig
 from cli_runs import assert_rejected
 from disc_views import PLATE, SIZE, discs_of, hd_rig, someplace, views

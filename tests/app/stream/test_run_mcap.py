@@ -26,7 +26,7 @@ from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3, quaternion_wxyz
 from armsight.robot.arm_file import open_arm
 from armsight.vision.detections import SeenShot
-from armsight.vision.measure import measure_seen
+from armsight.vision.pose.measure import measure_seen
 from strategies import ordinary_rig
 
 RIG = ordinary_rig("brown5")

@@ -21,7 +21,7 @@ from armsight.loop.servo import LoopTiming, PoseServo
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.example_rig import example_rig
 from armsight.sim.workcell.body import body_target
-from armsight.vision.posefit import PixelObservations, fit_pose, whitened
+from armsight.vision.pose.posefit import PixelObservations, fit_pose, whitened
 from armsight.vision.triangulate import triangulate
 from views import both_pixels
 

@@ -11,7 +11,7 @@ from numpy.polynomial.chebyshev import chebval
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.health import HealthMonitor, Trust
 from armsight.loop.health.rig import RigWatch
-from armsight.vision.posefit import PixelObservations, fit_pose, whitened
+from armsight.vision.pose.posefit import PixelObservations, fit_pose, whitened
 
 
 def test_nothing_is_found_where_nothing_is_wrong():

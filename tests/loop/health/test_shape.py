@@ -11,7 +11,7 @@ from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.health import HealthMonitor
 from armsight.loop.health.rig import RigWatch
-from armsight.vision.locate import locate
+from armsight.vision.pose.locate import locate
 from armsight.vision.triangulate import triangulate
 from views import both_pixels
 

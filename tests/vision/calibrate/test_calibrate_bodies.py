@@ -8,10 +8,10 @@ from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import exp_so3, log_so3
-from armsight.vision.assign import candidates, instances
 from armsight.vision.calibrate.bodies import LEAST_SHOTS, calibrate_bodies
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
+from armsight.vision.pose.assign import candidates, instances
 from armsight.vision.rig import StereoRig
 from views import both_pixels
 

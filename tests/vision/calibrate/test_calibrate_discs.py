@@ -13,7 +13,7 @@ from armsight.sim.render.scene import circle_grid
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.discs.bias import project_discs
 from armsight.vision.markers.board import open_board
-from armsight.vision.projection import BundleModel, BundleState, Observations, moved, of_middles, predict
+from armsight.vision.pose.projection import BundleModel, BundleState, Observations, moved, of_middles, predict
 from asserts import assert_jacobian
 from board_views import SIZE, SIZES, board_pairs, rig_and_board
 

@@ -8,13 +8,13 @@ from scipy.stats import chi2
 
 from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.bundle import BundleModel, BundleState, Observations, minimise
 from armsight.vision.calibrate import boards
 from armsight.vision.calibrate.boards import calibrate_boards, calibrate_recording
 from armsight.vision.calibrate.heldout import pair_errors, summary
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.match import join, renamed
-from armsight.vision.measure import measure_detections
+from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, minimise
+from armsight.vision.pose.measure import measure_detections
 from armsight.vision.triangulate import optimal_points
 from board_views import SIZES, board_pairs, rig_and_board, rig_error
 from views import both_pixels

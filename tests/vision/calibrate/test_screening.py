@@ -7,13 +7,13 @@ from armsight.data import Array
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, log_se3
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.bundle import BundleModel, BundleState, Observations, minimise
 from armsight.vision.calibrate.boards import calibrate_boards
 from armsight.vision.calibrate.heldout import cross_validate, folds_of, pair_errors, residual_epipolar_rms, summary
 from armsight.vision.calibrate.screen import correct_symmetries, merged_notes, noise_px, robust_sigma, screen
 from armsight.vision.calibrate.start import pinhole, relative_poses, start_board
 from armsight.vision.calibrate.weak import coverage, require_order, weaknesses
 from armsight.vision.match import join, renamed
+from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, minimise
 from board_views import SIZES, board_pairs, rig_and_board
 
 

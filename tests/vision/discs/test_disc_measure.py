@@ -14,7 +14,7 @@ from armsight.sim.render.optics import Optics
 from armsight.sim.render.render import render_pair
 from armsight.sim.render.scene import PosedBody, plate
 from armsight.vision.markers.targets import Composite, open_target
-from armsight.vision.measure import measure
+from armsight.vision.pose.measure import measure
 from disc_views import PLATE, hd_rig, someplace
 
 LIGHT = Optics(0.7, vignetting=0.2, light_gradient=(0.2, -0.1))

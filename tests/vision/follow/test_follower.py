@@ -12,7 +12,7 @@ from armsight.sim.example_rig import example_rig
 from armsight.sim.workcell.body import body_target
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.targets import Composite
-from armsight.vision.measure import measure
+from armsight.vision.pose.measure import measure
 from disc_views import PLATE, discs_of, hd_rig, someplace
 
 RIG = hd_rig()

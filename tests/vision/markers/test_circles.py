@@ -18,7 +18,7 @@ from armsight.vision.markers.board import open_board
 from armsight.vision.markers.circle_grid import skips_line
 from armsight.vision.markers.circles import unseen_row
 from armsight.vision.markers.grid import grid_points
-from armsight.vision.measure import measure
+from armsight.vision.pose.measure import measure
 
 SIZE = (640, 480)
 WIDE = Camera(SIZE, "brown4", np.array([230.0, 231.0, 322.0, 236.0]), np.array([-0.02, 0.004, 3e-4, -2e-4]))

@@ -7,7 +7,7 @@ from supersampled import checks, expose, paint, project, view
 
 from armsight.vision.markers import crossing
 from armsight.vision.markers.corner import MOVED_MAX_PX, OUTCOMES, refine_corners
-from armsight.vision.markers.normal import edge, edge_single
+from armsight.vision.normal import edge, edge_single
 from asserts import assert_jacobian
 
 NEIGHBOURS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])

@@ -25,11 +25,11 @@ from armsight.app.body.finding import (
 from armsight.data import Array, Ids
 from armsight.geometry.rotation import skew
 from armsight.vision.discs.pairing import SIZE_TOLERANCE, UNMODELLED_PX, UNMODELLED_SHARE
-from armsight.vision.discs.predict import FACING, look_direction, pose_covariance, separation, view
 from armsight.vision.discs.symmetry import Symmetry, flat, other_side, symmetries
 from armsight.vision.markers.body_file import collinear
 from armsight.vision.markers.body_layout import Layout
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
+from armsight.vision.pose.predict import FACING, look_direction, pose_covariance, separation, view
 from armsight.vision.rig import StereoRig
 
 #: A disc's diameter in an image that can be used, px.

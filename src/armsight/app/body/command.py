@@ -47,8 +47,8 @@ def check(path: str, rig_path: str | None, distances: tuple[float, ...], as_json
 
     from armsight.app.body.check import assess
     from armsight.app.body.text import body_report
-    from armsight.vision.discs.predict import plain_rig
     from armsight.vision.markers.body_layout import read_layout
+    from armsight.vision.pose.predict import plain_rig
     from armsight.vision.rig import StereoRig
 
     layout = read_layout(path)

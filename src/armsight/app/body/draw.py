@@ -28,7 +28,6 @@ from armsight.errors import InputError
 from armsight.files import read_bytes, replacing
 from armsight.geometry.pose import transform
 from armsight.sim.render.scene import CLEAR, Pattern, aprilgrid, charuco, chessboard, circle_grid, tag
-from armsight.vision.discs.predict import face_axes, look_direction
 from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.apriltag3 import LAYOUTS, printed
 from armsight.vision.markers.aruco import cells
@@ -37,7 +36,8 @@ from armsight.vision.markers.body_layout import Layout, read_layout
 from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.chessboard import Chessboard
 from armsight.vision.markers.circles import CircleGrid
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
+from armsight.vision.pose.predict import face_axes, look_direction
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -37,7 +37,7 @@ from armsight.sim.workcell.workcell import Workcell
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.follow.follower import Follower
 from armsight.vision.markers.board import open_board
-from armsight.vision.measure import measure
+from armsight.vision.pose.measure import measure
 from armsight.vision.rig import StereoRig
 
 _BOARD = "chessboard:9x6:25mm"

@@ -25,12 +25,12 @@ from armsight.tables.poses import PoseTable
 from armsight.vision.camera import Camera
 from armsight.vision.camera_file import read_camera
 from armsight.vision.image import grey, read_image
-from armsight.vision.locate import by_rig
 from armsight.vision.markers.circles import unseen_row
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_target
-from armsight.vision.measure import measure
-from armsight.vision.pnp import body_poses
+from armsight.vision.pose.locate import by_rig
+from armsight.vision.pose.measure import measure
+from armsight.vision.pose.pnp import body_poses
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources.source import Source
 

@@ -16,9 +16,9 @@ from armsight.app.body.draw import draw_body, is_board_spec
 from armsight.app.body.text import body_report
 from armsight.app.show.messages import Note
 from armsight.errors import ArmsightError
-from armsight.vision.discs.predict import plain_rig
 from armsight.vision.markers.body_layout import read_layout
 from armsight.vision.markers.targets import open_target
+from armsight.vision.pose.predict import plain_rig
 from armsight.vision.rig import StereoRig
 
 _DISTANCES_M = (0.6, 0.8, 1.2)

@@ -36,7 +36,7 @@ from armsight.vision.calibrate.weak import require_order
 from armsight.vision.image import grey
 from armsight.vision.markers.board import CalibrationBoard, open_board
 from armsight.vision.markers.chessboard import Chessboard
-from armsight.vision.pnp import body_poses
+from armsight.vision.pose.pnp import body_poses
 from armsight.vision.rig import StereoRig
 
 #: The board stands still when its corners moved less than this in so long, px and s, over so many detections.

@@ -18,11 +18,11 @@ from armsight.app.calibrate.assessment import corner_variance_px2
 from armsight.data import Array, Record
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.bundle import BundleModel, BundleState, Observations, predict
 from armsight.vision.calibrate.boards import printed_board, rigid_board
 from armsight.vision.calibrate.result import Calibration
 from armsight.vision.camera import Camera
 from armsight.vision.markers.board import CalibrationBoard
+from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, predict
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 

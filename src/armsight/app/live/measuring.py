@@ -32,11 +32,11 @@ from armsight.geometry.rotation import euler_zyx, skew
 from armsight.loop.handeye.pivot import MIN_POSES, Pivot, calibrate_pivot
 from armsight.loop.health import HealthMonitor
 from armsight.vision.follow.follower import Follower, follows
-from armsight.vision.locate import by_rig
 from armsight.vision.markers.calibrated_board import is_print
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_target
-from armsight.vision.measure import measure
+from armsight.vision.pose.locate import by_rig
+from armsight.vision.pose.measure import measure
 from armsight.vision.rig import StereoRig
 
 #: Health is asked for once a second; so many times as long as it took it is not.

@@ -20,7 +20,7 @@ from armsight.sim.example_rig import board_poses
 from armsight.sim.render.scene import chessboard
 from armsight.sim.workcell.workcell import CHESSBOARD, Workcell
 from armsight.vision.markers.board import open_board
-from armsight.vision.pnp import body_poses
+from armsight.vision.pose.pnp import body_poses
 
 ACTIONS = ("cover_left", "cover_right", "uncover", "unplug", "plug", "board", "no_board")
 #: A hand comes so near to an outline, m and rad; moves so fast, s per pose; and trembles, m and rad.

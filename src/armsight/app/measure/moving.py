@@ -17,8 +17,8 @@ import numpy as np
 from armsight.data import Body, Missed, PoseEstimate
 from armsight.errors import InputError
 from armsight.loop.health.record import HealthFinding
+from armsight.vision.pose.shutter import TimedShot, estimate_shutters, measure_moving
 from armsight.vision.rig import Shutters, StereoRig
-from armsight.vision.shutter import TimedShot, estimate_shutters, measure_moving
 
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 #: A skew beyond so many sigmas, and so many seconds, is said; from the first so many shots.

@@ -26,7 +26,7 @@ from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.discs.bias import expect
 from armsight.vision.image import grey
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.rig import StereoRig
 
 

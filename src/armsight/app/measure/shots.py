@@ -28,10 +28,10 @@ from armsight.vision.markers.calibrated_board import is_print
 from armsight.vision.markers.circles import unseen_row
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_target
-from armsight.vision.measure import measure, measure_seen, size_problem
-from armsight.vision.noise import DiscNoise
+from armsight.vision.pose.measure import measure, measure_seen, size_problem
+from armsight.vision.pose.noise import DiscNoise
+from armsight.vision.pose.shutter import LOOSE_PX
 from armsight.vision.rig import Shutters, StereoRig
-from armsight.vision.shutter import LOOSE_PX
 from armsight.vision.sources import PairsSource, Source, notes_of, open_source
 from armsight.vision.sources.bag import BagSource
 from armsight.vision.sources.bag.tags import read_tags

@@ -20,7 +20,7 @@ from armsight.app.show.plotting import require_matplotlib
 from armsight.data import Body, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.files import check_folder, replacing
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.rig import StereoRig
 
 CHART, PREFIX = "run.png", "view-"

@@ -35,7 +35,7 @@ from armsight.robot.arm import Arm
 from armsight.vision.detections import SeenShot
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.marker import Target
-from armsight.vision.measure import measure, measure_seen
+from armsight.vision.pose.measure import measure, measure_seen
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import Source
 from armsight.vision.sources.bag.states import JointStream

@@ -30,8 +30,8 @@ from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.result import Calibration
 from armsight.vision.image import grey
 from armsight.vision.markers.board import open_board
+from armsight.vision.pose.shutter import TimedShot, estimate_shutters, measure_moving
 from armsight.vision.rig import Shutters
-from armsight.vision.shutter import TimedShot, estimate_shutters, measure_moving
 
 Progress = Callable[[str], None]
 #: How long the arm stands before it is measured, and the least duration of the measurement, s.

@@ -32,7 +32,7 @@ from armsight.loop.identify.diagnose import check_plausible, without_tool
 from armsight.loop.identify.measured import Measured
 from armsight.robot.arm import Arm
 from armsight.vision.markers.marker import Target
-from armsight.vision.measure import measure
+from armsight.vision.pose.measure import measure
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import Source
 

@@ -46,8 +46,8 @@ from armsight.loop.sync_led import SyncLedWatch
 from armsight.robot.boards.codes import BoardState
 from armsight.vision.follow.follower import Follower, measurer
 from armsight.vision.markers.calibrated_board import is_print
+from armsight.vision.pose.shutter import Motion, TimedShot, measure_with_motion
 from armsight.vision.rig import Shutters, StereoRig
-from armsight.vision.shutter import Motion, TimedShot, measure_with_motion
 
 #: How long one thread may hold the interpreter lock, s. An iteration of the loop takes the lock back about twelve times;
 #: with Python's default of 5 ms it would last longer than a board waits for commands.

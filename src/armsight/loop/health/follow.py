@@ -26,8 +26,8 @@ from armsight.loop.health.record import Cause
 from armsight.loop.health.rig import TEST_S, RigWatch, differ
 from armsight.loop.health.update import LEAST_STAYS, RigUpdate, updated_rig
 from armsight.vision.detections import SeenShot
-from armsight.vision.locate import locate
 from armsight.vision.match import gate
+from armsight.vision.pose.locate import locate
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import triangulate
 

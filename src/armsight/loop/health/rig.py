@@ -60,7 +60,7 @@ from armsight.loop.health.passing import (
 from armsight.loop.health.record import COSTS_M, LEVER_M, HealthFinding, alarm_limit
 from armsight.loop.health.shape import FURTHEST_M, SMOOTH, ResidualSums, ShapeWatch, eliminated, total
 from armsight.vision.camera import pair_arguments
-from armsight.vision.posefit import differentiate
+from armsight.vision.pose.posefit import differentiate
 from armsight.vision.rig import StereoRig
 
 Part = Literal["rig", "body", "time"]

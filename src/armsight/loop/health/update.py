@@ -28,9 +28,9 @@ from armsight.loop.health.record import HealthFinding
 from armsight.loop.health.rig import RigWatch, free_directions
 from armsight.loop.health.shape import ResidualSums
 from armsight.vision.detections import SeenShot
-from armsight.vision.locate import locate
 from armsight.vision.match import epipolar_distances, gate
-from armsight.vision.measure import measure_seen
+from armsight.vision.pose.locate import locate
+from armsight.vision.pose.measure import measure_seen
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import triangulate
 

@@ -15,7 +15,7 @@ from armsight.data import Array, Body, Record
 from armsight.geometry.pose import pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.render.scene import Pattern, plate
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.markers.targets import Composite
 
 NAME = "tool_body"

@@ -29,7 +29,6 @@ from armsight.data import Array, Body, Detections, Ids, Missed, Record
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid
-from armsight.vision.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
 from armsight.vision.calibrate import FOLDS, MODELS
 from armsight.vision.calibrate.heldout import cross_validate, residual_epipolar_rms, rig_of, scaled, summary, unfinished
 from armsight.vision.calibrate.motion import ExposureMotion
@@ -50,10 +49,11 @@ from armsight.vision.discs.bias import apparent_radii
 from armsight.vision.markers.board import CalibrationBoard
 from armsight.vision.markers.circles import unseen_row
 from armsight.vision.match import join, renamed
-from armsight.vision.pnp import body_poses
-from armsight.vision.projection import of_middles, smooth
+from armsight.vision.pose.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
+from armsight.vision.pose.pnp import body_poses
+from armsight.vision.pose.projection import of_middles, smooth
+from armsight.vision.pose.shutter import TimedShot, aligned, at_one_time, estimate_shutters
 from armsight.vision.rig import Shutters, StereoRig
-from armsight.vision.shutter import TimedShot, aligned, at_one_time, estimate_shutters
 
 #: A later model must lower the held-out error by this share to be preferred; a fisheye, which other programs do not
 #: use for an ordinary lens, by more.
@@ -657,10 +657,10 @@ def calibrate_recording(
 ) -> Calibration:
     """Calibrate two cameras that may expose at different times, from a recording of a board that moves.
 
-    Skew and cameras are estimated alternately (:mod:`armsight.vision.shutter`), then every detection is moved to the time
-    of its left image, and the pairs are calibrated as simultaneous ones. Alternating leaves the sigma of the skew at given
-    cameras; with rho its correlation with them an error shrinks by rho^2 each round, so the sigma of both together is
-    that over sqrt(1 - shrinkage).
+    Skew and cameras are estimated alternately (:mod:`armsight.vision.pose.shutter`), then every detection is moved to
+    the time of its left image, and the pairs are calibrated as simultaneous ones. Alternating leaves the sigma of the skew
+    at given cameras; with rho its correlation with them an error shrinks by rho^2 each round, so the sigma of both is that
+    over sqrt(1 - shrinkage).
 
     Args:
         board: the board's drawing and its symmetries.

@@ -18,8 +18,6 @@ from armsight.data import Array, Body, Correspondences
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, log_se3, transform
 from armsight.geometry.rigid import fit_rigid
-from armsight.vision.assign import candidates, instances, plain
-from armsight.vision.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
 from armsight.vision.calibrate import FOLDS
 from armsight.vision.calibrate.heldout import (
     cross_validate,
@@ -36,8 +34,10 @@ from armsight.vision.calibrate.start import relative_poses
 from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
-from armsight.vision.pnp import Candidate
-from armsight.vision.projection import every_point
+from armsight.vision.pose.assign import candidates, instances, plain
+from armsight.vision.pose.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
+from armsight.vision.pose.pnp import Candidate
+from armsight.vision.pose.projection import every_point
 from armsight.vision.rig import StereoRig
 
 #: Tolerances that are tried: prior sigma of each coordinate of the body's points, m; the first is the exact drawing.

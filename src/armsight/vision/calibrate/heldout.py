@@ -16,11 +16,11 @@ from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
-from armsight.vision.bundle import BundleSolution, Observations
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.calibrate.result import HeldOutErrors, PairErrors
 from armsight.vision.discs.bias import disc_bias
 from armsight.vision.match import epipolar_distances
+from armsight.vision.pose.bundle import BundleSolution, Observations
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 
@@ -60,7 +60,7 @@ def pair_errors(
         estimated: (M, 3) points of the body as the calibration found it, against which the uncertainty is evaluated:
             the deviation of a print from its drawing is not an error of the cameras; the drawing by default.
         motion: how far the body is expected to move between the two exposures; it stands still by default.
-        disc_radius_m: radius of a board's discs, as in :class:`~armsight.vision.projection.BundleModel`.
+        disc_radius_m: radius of a board's discs, as in :class:`~armsight.vision.pose.projection.BundleModel`.
 
     Returns:
         One row for each shot that has three or more matched points.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Record
 from armsight.geometry.pose import transform
 from armsight.geometry.rotation import skew
-from armsight.vision.bundle import BundleSolution
+from armsight.vision.pose.bundle import BundleSolution
 
 #: Degrees of freedom of the motions' distribution: four leave the variance finite, and let one pair move five times as
 #: far as the rest.

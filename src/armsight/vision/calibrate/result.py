@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from armsight.data import Array, Body, Record
-from armsight.vision.bundle import BundleSolution, Observations
 from armsight.vision.calibrate.motion import ExposureMotion
+from armsight.vision.pose.bundle import BundleSolution, Observations
 from armsight.vision.rig import StereoRig
 
 

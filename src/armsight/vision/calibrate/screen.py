@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import inverse, transform
-from armsight.vision.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
 from armsight.vision.calibrate.result import RejectedPair
 from armsight.vision.camera import Camera
-from armsight.vision.pnp import body_poses
+from armsight.vision.pose.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
+from armsight.vision.pose.pnp import body_poses
 
 #: A corner this many standard deviations off the robust fit is gross: one in 10^7 for clean noise.
 CORNER_SIGMAS = 6.0

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, log_se3
-from armsight.vision.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
 from armsight.vision.camera import DISTORTION_MODELS, Camera
-from armsight.vision.pnp import MIN_POINTS, body_poses
+from armsight.vision.pose.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
+from armsight.vision.pose.pnp import MIN_POINTS, body_poses
 
 #: Focal lengths tried, in units of the image's longer side: fields of view from 115 to 11 degrees.
 _FOCAL_LADDER = np.geomspace(0.32, 5.0, 18)

@@ -1,4 +1,4 @@
-"""Bodies of plain discs: the ellipses that two cameras measured go in, named discs and the pose of the body come out.
+"""Bodies of plain discs: the ellipses that two cameras measured go in, named discs come out.
 
 Discs carry no code, so both cameras and the body's geometry identify them together.
 
@@ -6,7 +6,5 @@ Discs carry no code, so both cameras and the body's geometry identify them toget
   distances, and the Bayes factor of each hypothesis (``hypothesis.py``).
 - ``assign.py``: the same where the pose is known approximately.
 - ``bias.py``: the perspective bias of an ellipse's centre, and what both cameras should see at a pose.
-- ``locate.py``: the pose, from named discs and coded markers together.
-- ``predict.py`` and ``symmetry.py``: the predicted covariance of a pose, and the discs that may be taken for others,
-  before a body is built (``armsight body check``).
+- ``symmetry.py``: the discs that may be taken for others, before a body is built (``armsight body check``).
 """

@@ -18,7 +18,7 @@ from armsight.data import SIDES, Array, Correspondences, Discs, Dropped, Ids, Mi
 from armsight.geometry.pose import exp_se3
 from armsight.vision.discs.bias import Expected, expect, visible
 from armsight.vision.discs.pairing import DiscView
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.rig import StereoRig
 
 #: A detection beyond this quantile of the chi-square distribution of its distance is not of this disc.

@@ -34,7 +34,7 @@ from armsight.geometry.rotation import skew
 from armsight.kernels import kernel
 from armsight.vision.camera import Camera, distort
 from armsight.vision.markers.disc.fit import factor, solve
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.rig import StereoRig
 
 _STEP = 1e-4  # for the Hessian of the distortion, focal lengths

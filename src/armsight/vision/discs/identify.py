@@ -24,7 +24,7 @@ from armsight.data import SIDES, Array, Correspondences, Discs, Ids, Missed, Rec
 from armsight.kernels import kernel
 from armsight.vision.discs.hypothesis import Hypothesis, hypothesis
 from armsight.vision.discs.pairing import MOST_PAIRS, DiscView, Pairs, pair, wrong_size
-from armsight.vision.markers.disc.target import MOST_REPORTED, DiscTarget
+from armsight.vision.markers.discs import MOST_REPORTED, DiscTarget
 from armsight.vision.rig import StereoRig
 
 #: Distances that differ by more standard deviations than this are different.

@@ -26,7 +26,7 @@ from armsight.geometry.rotation import skew
 from armsight.kernels import kernel, kernel_types
 from armsight.vision.camera import Camera
 from armsight.vision.discs.bias import Expected
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.match import GATE_PX, epipolar_distances
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import midpoints, optimal_points

@@ -3,7 +3,7 @@
 The pose is extrapolated with the velocity of the last two; each disc is searched within a margin that adapts to the
 errors of the last predictions, and everything from pixels to covariance is one compiled call
 (:mod:`~armsight.vision.follow.kernel`). A shot that does not fit, and any first shot, is measured by
-:func:`~armsight.vision.measure.measure`, which searches the whole image and uses no prediction.
+:func:`~armsight.vision.pose.measure.measure`, which searches the whole image and uses no prediction.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ from armsight.vision.follow.kernel import (
     velocity,
 )
 from armsight.vision.image import grey
-from armsight.vision.locate import misfit_limit
 from armsight.vision.markers.disc import search
 from armsight.vision.markers.disc.fit import REASONS, workspace
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import Composite
-from armsight.vision.measure import measure
-from armsight.vision.posefit import moved
+from armsight.vision.pose.locate import misfit_limit
+from armsight.vision.pose.measure import measure
+from armsight.vision.pose.posefit import moved
+from armsight.vision.pose.shutter import LOOSE_PX
 from armsight.vision.rig import StereoRig
-from armsight.vision.shutter import LOOSE_PX
 
 #: A prediction expires after so many shots, or so many times the time between the last two poses; poses less than so
 #: many seconds apart give no velocity.

@@ -30,7 +30,7 @@ from armsight.vision.discs.bias import disc_image
 from armsight.vision.markers.disc.common import FIELDS, SHARED, common, correct
 from armsight.vision.markers.disc.fit import PARAMETERS, FitBuffers, factor, fit, shape_of, solve
 from armsight.vision.markers.disc.search import REACH, Room, outline
-from armsight.vision.posefit import moved
+from armsight.vision.pose.posefit import moved
 
 #: Code of a disc that was seen.
 SEEN = 0
@@ -288,7 +288,7 @@ def _inverse_normal(A: Array, out: Array) -> None:
 
 @kernel("const f8[:, ::1], const f8[:, ::1], f8, f8[::1]")
 def velocity(T_from: Array, T_to: Array, seconds: float, twist: Array) -> None:
-    """Fill the twist (6,), per second, by which :func:`~armsight.vision.posefit.moved` takes one pose to the other."""
+    """Fill the twist (6,), per second, by which :func:`~armsight.vision.pose.posefit.moved` takes one pose to the other."""
     R = np.empty((3, 3))
     for i in range(3):
         twist[i] = 0.0

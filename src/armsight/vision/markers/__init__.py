@@ -7,7 +7,7 @@ spec or its file.
   ``circles.py`` (with ``circle_blobs.py`` and ``circle_grid.py``), ``aprilgrid.py``, and ``grid.py`` for what regular
   grids share.
 - Bodies: ``body_file.py`` (file formats and checks), ``body_layout.py`` (markers by kind), ``tag.py``,
-  ``board_marker.py``, ``disc/`` (plain discs).
+  ``board_marker.py``, ``discs.py`` (plain discs; the search and the fit of one are in ``disc/``).
 - Sub-pixel fits: ``corner.py`` with its kernels in ``crossing.py``; ``square.py`` for tags found by ``aruco.py``;
-  ``normal.py`` for the edge profile and the normal equations that they share.
+  ``normal.py`` of vision has the edge profile and the normal equations that they share.
 """

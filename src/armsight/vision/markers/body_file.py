@@ -2,7 +2,7 @@
 
 A TOML body file goes in, a :class:`Marker` for each ``[[markers]]`` entry comes out. This file reads what every kind of
 marker shares: name, position and orientation in the body frame. The table of a marker's own kind is read by that kind
-(``tag.py``, ``board_marker.py``, ``disc/target.py``). The checks that no body may fail follow: markers at one position,
+(``tag.py``, ``board_marker.py``, ``discs.py``). The checks that no body may fail follow: markers at one position,
 on one line, too few, or of an implausible size. Last, bodies as CSV tables of named points, in metres.
 
 The format: docs/howto/targets.md. How well a body can be located is a separate question: ``armsight body check``.
@@ -165,6 +165,22 @@ def _marker(where: str, entry: Mapping[str, Any], kinds: Collection[str]) -> Mar
     if not isinstance(name, str) or not name or "," in name:
         raise InputError(f"{where}: needs a name, a text in quotes without commas, got {name!r}")
     where = f"{where} ({name})"
+    own = _own_table(where, entry, kinds)
+    if "position_mm" not in entry:
+        raise InputError(f"{where}: has no position_mm = [x, y, z]")
+    numbers = {}
+    for key in (key for key in _POSE_KEYS if key in entry):
+        if isinstance(entry[key], list) and any(isinstance(number, str | bool) for number in entry[key]):
+            raise InputError(f"{where}: {key} must be numbers without quotes, got {entry[key]!r}")
+        numbers[key] = checked(entry[key], (4 if key == "quaternion_wxyz" else 3,), f"{where}: {key}")
+    position = numbers.pop("position_mm") * 1e-3
+    if np.abs(position).max() > 100.0:
+        raise InputError(f"{where}: position_mm is {position.max():g} m from the body's origin; is it in mm?")
+    return Marker(where, name, own, entry[own], position, numbers)
+
+
+def _own_table(where: str, entry: Mapping[str, Any], kinds: Collection[str]) -> str:
+    """Return the name of the one table that says a marker's kind."""
     own = [key for key in entry if key not in ("name", *_POSE_KEYS)]
     known = ", ".join(sorted(kinds))
     for key in own:
@@ -178,27 +194,13 @@ def _marker(where: str, entry: Mapping[str, Any], kinds: Collection[str]) -> Mar
         )
     if not isinstance(entry[own[0]], dict):
         raise InputError(f"{where}: {own[0]} must be a table, such as {own[0]} = {{ ... }}")
-    if "position_mm" not in entry:
-        raise InputError(f"{where}: has no position_mm = [x, y, z]")
-    for key in _POSE_KEYS:
-        given = entry.get(key, [])
-        if isinstance(given, list) and any(isinstance(number, str | bool) for number in given):
-            raise InputError(f"{where}: {key} must be numbers without quotes, got {given!r}")
-    numbers = {
-        key: checked(entry[key], (4 if key == "quaternion_wxyz" else 3,), f"{where}: {key}")
-        for key in _POSE_KEYS
-        if key in entry
-    }
-    position = numbers.pop("position_mm") * 1e-3
-    if np.abs(position).max() > 100.0:
-        raise InputError(f"{where}: position_mm is {position.max():g} m from the body's origin; is it in mm?")
-    return Marker(where, name, own[0], entry[own[0]], position, numbers)
+    return own[0]
 
 
 #: Largest body with discs, and largest radius of a disc, m: a larger one has a wrong unit in its file.
 DISC_BODY_MAX_M, DISC_RADIUS_MAX_M = 10.0, 0.5
 #: Points lie on one line where their second singular value is below this share of the first, as in
-#: :mod:`~armsight.vision.locate`: the rotation of such a body about the line is unobservable.
+#: :mod:`~armsight.vision.pose.locate`: the rotation of such a body about the line is unobservable.
 COLLINEAR = 1e-3
 #: Two discs may share a position where they are the two faces of a thin plate: the cosine between their normals is
 #: below this.

@@ -12,7 +12,7 @@ from armsight.data import Array, Body, Record
 from armsight.errors import InputError
 from armsight.vision.markers.board_marker import BoardTarget, check_codes
 from armsight.vision.markers.body_file import check_points, read_body_file
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.markers.tag import TagTarget
 
 KINDS = ("disc", "tag", "board")

@@ -42,7 +42,7 @@ from armsight.vision.markers.crossing import (
     fit_crossing,
     rough_noise,
 )
-from armsight.vision.markers.normal import SIMD_WIDTH
+from armsight.vision.normal import SIMD_WIDTH
 
 #: How far the window extends along each square's side, as a share of the side, and at most in px. The next corners stay
 #: outside with their blur.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from armsight.data import Array
 from armsight.geometry.matrix import dot
 from armsight.kernels import kernel
-from armsight.vision.markers.normal import SIMD_WIDTH, decay_single, edge_single, factor, products, solve
+from armsight.vision.normal import SIMD_WIDTH, decay_single, edge_single, factor, products, solve
 
 Work = NDArray[np.float32]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from armsight.data import Body, Detections, Ids, Image
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 
 
 class Target(Protocol):

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids, Record
 from armsight.geometry.matrix import dot
 from armsight.kernels import kernel
-from armsight.vision.markers.normal import edge, edge_noise, factor, invert, normal_equations, solve
+from armsight.vision.normal import edge, edge_noise, factor, invert, normal_equations, solve
 
 FIELD = 12  # coefficients of the quadratic field over the marker
 PARAMETERS = FIELD + 6  # ..., squared blur, b, c, a, k (2)

@@ -20,7 +20,7 @@ from armsight.vision.markers.board_marker import BoardTarget, board_codes, check
 from armsight.vision.markers.body_file import Marker, check_points, load_body_csv, read_body_file
 from armsight.vision.markers.calibrated_board import EstimatedBoard, load_board_file
 from armsight.vision.markers.charuco import Charuco
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.tag import TagTarget
 

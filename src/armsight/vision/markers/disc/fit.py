@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.kernels import kernel, kernel_types
-from armsight.vision.markers.normal import SIMD_WIDTH, products
+from armsight.vision.normal import SIMD_WIDTH, products
 
 #: Most pixels that one fit takes; of larger discs every second, third ... row is.
 MOST_PIXELS = 3072

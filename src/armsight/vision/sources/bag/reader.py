@@ -156,6 +156,11 @@ def _files(path: str | Path, notes: list[str]) -> list[Path]:
     there = next((found for suffix in SUFFIXES if (found := [*given.glob(f"*{suffix}")])), [])
     if not there:
         raise InputError(f"{path}: this folder holds no recording: expected {', '.join(SUFFIXES)} files")
+    return _in_order(there, named, metadata, notes)
+
+
+def _in_order(there: list[Path], named: list[str], metadata: Path, notes: list[str]) -> list[Path]:
+    """Return files in the order that metadata names them in; those that it does not name come last."""
     there.sort(key=lambda each: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", each.name)])
     here = {each.name: each for each in there}
     notes += [f"{metadata} names {name}, which is missing: the rest is read" for name in named if name not in here]

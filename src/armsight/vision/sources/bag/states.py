@@ -82,11 +82,7 @@ def read_joints(bag: Bag, names: tuple[str, ...] | None = None) -> JointStream |
     rows: list[tuple[float, list[float]]] = []
     partial, known, theirs = 0, set[str](), None
     for message in bag.messages(topics):
-        decoded = message.decode()
-        if hasattr(decoded, "joints"):
-            found = {str(joint.name): float(joint.position) for joint in decoded.joints}
-        else:
-            found = {str(name): float(q) for name, q in zip(decoded.name, decoded.position, strict=False)}
+        found = _positions(message.decode())
         names = tuple(found) if names is None else names
         known |= found.keys()
         here = [_called(name, found) for name in names]
@@ -111,6 +107,13 @@ def read_joints(bag: Bag, names: tuple[str, ...] | None = None) -> JointStream |
     t_s, first = np.unique([t for t, _ in rows], return_index=True)
     notes = (f"{partial} joint states do not hold all of {', '.join(names)}: left out",) if partial else ()
     return JointStream(names, t_s, np.array([rows[k][1] for k in first]), notes)
+
+
+def _positions(decoded: Decoded) -> dict[str, float]:
+    """Return the joints' positions by name: of a controller's state, or of JointState."""
+    if hasattr(decoded, "joints"):
+        return {str(joint.name): float(joint.position) for joint in decoded.joints}
+    return {str(name): float(q) for name, q in zip(decoded.name, decoded.position, strict=False)}
 
 
 def _called(name: str, among: Mapping[str, float]) -> str:

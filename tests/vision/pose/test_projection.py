@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from armsight.geometry.rigid import fit_rigid
-from armsight.vision.projection import every_point, smooth, without_gauge
+from armsight.vision.pose.projection import every_point, smooth, without_gauge
 from views import board
 
 BALL = np.random.default_rng(0).normal(size=(9, 3)) * 0.05

@@ -13,8 +13,8 @@ from armsight.geometry.pose import inverse, transform
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
 from armsight.vision.match import join
-from armsight.vision.pnp import AGREE_PX, AGREE_SHARE, Candidate, consensus_poses
-from armsight.vision.posefit import PixelObservations, fit_pose
+from armsight.vision.pose.pnp import AGREE_PX, AGREE_SHARE, Candidate, consensus_poses
+from armsight.vision.pose.posefit import PixelObservations, fit_pose
 
 #: Fewest detections, both cameras together, that make a body: where names settle it, and where they do not.
 LEAST_DETECTIONS, LEAST_AMBIGUOUS = 4, 6

@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from armsight.data import SIDES, Body, Correspondences, Detections, Image, Missed, PoseEstimate, Shot
 from armsight.geometry.pose import inverse
-from armsight.vision.assign import candidates, instances, plain
 from armsight.vision.detections import SeenShot
 from armsight.vision.discs.bias import apparent_radii
-from armsight.vision.discs.locate import locate_composite, locate_discs
 from armsight.vision.image import darkness, grey
-from armsight.vision.locate import locate
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.markers.marker import Target
 from armsight.vision.match import gate, join, match
+from armsight.vision.pose.assign import candidates, instances, plain
+from armsight.vision.pose.locate import locate
+from armsight.vision.pose.locate_discs import locate_composite, locate_discs
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import triangulate
 

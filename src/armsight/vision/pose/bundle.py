@@ -1,7 +1,7 @@
 """Joint bundle adjustment of two cameras, their relative pose, the body's shape and its pose in every shot.
 
 Observations and a start go in, a maximum-likelihood state with the full covariance of the shared parameters comes out.
-Levenberg-Marquardt on the arrow-shaped normal equations (:mod:`~armsight.vision.bundle`). Robust by iteratively
+Levenberg-Marquardt on the arrow-shaped normal equations (:mod:`~armsight.vision.pose.bundle`). Robust by iteratively
 reweighted least squares with the Cauchy loss on each detection's whitened distance. Where the cameras are not
 synchronised, the body may move between the two exposures of a shot: six more parameters of that shot, held by a prior.
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids, Record
 from armsight.errors import CalibrationError
 from armsight.kernels import kernel
-from armsight.vision.projection import BundleModel, BundleState, Observations, moved, predict
+from armsight.vision.pose.projection import BundleModel, BundleState, Observations, moved, predict
 
 
 def _flat(blocks: Array) -> Array:

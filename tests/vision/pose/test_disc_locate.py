@@ -11,10 +11,10 @@ from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.geometry.rotation import euler_zyx, exp_so3
 from armsight.vision.closed_form import orientation
 from armsight.vision.discs.bias import expect
-from armsight.vision.discs.locate import locate_composite, locate_discs
-from armsight.vision.locate import locate
 from armsight.vision.markers.targets import Composite
-from armsight.vision.measure import measure
+from armsight.vision.pose.locate import locate
+from armsight.vision.pose.locate_discs import locate_composite, locate_discs
+from armsight.vision.pose.measure import measure
 from armsight.vision.triangulate import triangulate
 from disc_views import PLATE, SIZE, discs_of, hd_rig, someplace, views
 from views import both_pixels

@@ -29,11 +29,11 @@ from armsight.errors import InputError
 from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import inverse, log_se3
 from armsight.kernels import kernel
-from armsight.vision.bundle import CAUCHY_SCALE
 from armsight.vision.camera import distort, pair_arguments
-from armsight.vision.locate import locate, misfit_limit
 from armsight.vision.match import gate
-from armsight.vision.posefit import PixelObservations, fit_pose, whitened
+from armsight.vision.pose.bundle import CAUCHY_SCALE
+from armsight.vision.pose.locate import locate, misfit_limit
+from armsight.vision.pose.posefit import PixelObservations, fit_pose, whitened
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.triangulate import triangulate
 
@@ -155,35 +155,26 @@ def estimate_shutters(
     for _ in range(_STEPS):
         moving = motions(t_s, Ts, covs)
         exposed = [_exposed(rig, o, a, theta) for o, a in zip(observed, apart, strict=True)]
-        scores, curvatures, noises, distances, rows = [], [], [], [], []
-        for k, (o, motion) in enumerate(zip(observed, moving, strict=True)):
-            if motion is None or not motion.centred:
-                continue
-            score, curvature, noise, d2 = _linear(rig, body, o, Ts[k], motion, exposed[k], count, scale2)
-            rows.append(k)
-            scores.append(score + curvature[:, 0] * (apart[k] - stamped[k]))
-            curvatures.append(curvature)
-            noises.append(noise)
-            distances.append(d2)
-        if len(scores) < _SHOTS_MIN:
-            return Missed(f"{len(scores)} shots have neighbours on both sides, {_SHOTS_MIN} are needed")
-        jitter2 = _jitter2(np.array(scores), np.array(curvatures))
-        shares = [jitter2 / (1.0 + jitter2 * h[0, 0]) for h in curvatures]
-        marginal = np.array(
-            [s - share * h[:, 0] * s[0] for s, h, share in zip(scores, curvatures, shares, strict=True)]
-        )
-        H = np.sum([h - share * np.outer(h[0], h[0]) for h, share in zip(curvatures, shares, strict=True)], axis=0)
-        noise = np.sum(
-            [n * (1 - share * h[0, 0]) for n, h, share in zip(noises, curvatures, shares, strict=True)], axis=0
-        )
+        centred = {k: motion for k, motion in enumerate(moving) if motion is not None and motion.centred}
+        rows = list(centred)
+        if len(rows) < _SHOTS_MIN:
+            return Missed(f"{len(rows)} shots have neighbours on both sides, {_SHOTS_MIN} are needed")
+        terms = [_linear(rig, body, observed[k], Ts[k], centred[k], exposed[k], count, scale2) for k in rows]
+        firsts, seconds, noises, distances = zip(*terms, strict=True)
+        curvatures = np.array(seconds)
+        scores = np.array(firsts) + curvatures[:, :, 0] * (apart - stamped)[rows][:, None]
+        jitter2 = _jitter2(scores, curvatures)
+        shares = jitter2 / (1.0 + jitter2 * curvatures[:, 0, 0])
+        marginal = scores - (shares * scores[:, 0])[:, None] * curvatures[:, :, 0]
+        H = curvatures.sum(axis=0) - np.einsum("n,ni,nj->ij", shares, curvatures[:, 0], curvatures[:, 0])
+        noise = np.einsum("n,nij->ij", 1 - shares * curvatures[:, 0, 0], np.array(noises))
         d2 = np.concatenate(distances)
         scale2 = max(float(np.median(d2)) / (2 * math.log(2)) * 2 * len(d2) / (2 * len(d2) - 6 * len(scores)), 1e-6)
         if np.linalg.eigvalsh(H - noise / _NOISE_MOST)[0] <= 0:
             return Missed("the body does not move, or too slowly: when each camera exposes is not observable")
         step = np.linalg.solve(H - noise, marginal.sum(axis=0))
         theta[:count] += step
-        for k, s, h, share in zip(rows, scores, curvatures, shares, strict=True):
-            apart[k] = stamped[k] + share * (s[0] - h[0] @ step)
+        apart[rows] = stamped[rows] + shares * (scores[:, 0] - curvatures[:, 0] @ step)
         if abs(theta).max() > 1.0:
             return Missed("the shots do not agree with one skew: are times and order of the shots right?")
         moved_uv = [
@@ -194,26 +185,34 @@ def estimate_shutters(
         sigmas = np.sqrt(np.diag(np.linalg.inv(H - noise)))
         if (np.abs(step) < np.maximum(_DONE_S, _DONE_SIGMAS * sigmas)).all():
             break
-    cov = np.zeros((2, 2))
-    inverted = np.linalg.inv(H - noise)
-    scatter = _birge(marginal - step @ H / len(marginal), H) * H
+    inverted, scatter = np.linalg.inv(H - noise), _birge(marginal - step @ H / len(marginal), H) * H
     if calibrated:
         scored = [
-            _scored(rig, body, observed[k], Ts[k], motion, _exposed(rig, observed[k], apart[k], theta), share, scale2)
+            _scored(
+                rig, body, observed[k], Ts[k], centred[k], _exposed(rig, observed[k], apart[k], theta), share, scale2
+            )
             for k, share in zip(rows, shares, strict=True)
-            if (motion := moving[k]) is not None
         ]
-        scatter += _persistent([each for each in scored if each is not None], count, len(body.points))
+        scatter += _persistent(scored, count, len(body.points))
+    cov = np.zeros((2, 2))
     cov[:count, :count] = inverted @ scatter @ inverted
-    sigma = np.sqrt(np.diag(cov))
-    for name, value, s in zip(("skew", "readout"), theta[:count], sigma, strict=False):
-        if s > sigma_most * float(np.median(np.diff(t_s))):
+    if (
+        slow := _too_slow(theta[:count], np.sqrt(np.diag(cov)), sigma_most * float(np.median(np.diff(t_s))))
+    ) is not None:
+        return slow
+    # Of global shutters the noise makes half of the readouts negative; no camera's is.
+    return Shutters(float(theta[0]), max(float(theta[1]), 0.0), cov, math.sqrt(jitter2))
+
+
+def _too_slow(theta: Array, sigma: Array, most_s: float) -> Missed | None:
+    """Return why skew and readout are not found; None where both sigmas are at most ``most_s``."""
+    for name, value, s in zip(("skew", "readout"), theta, sigma, strict=False):
+        if s > most_s:
             return Missed(
                 f"the motion is too slow or too short to find the {name}: {1e3 * value:.2f} ± {1e3 * s:.2f} ms; move "
                 "the body faster, or longer"
             )
-    # Of global shutters the noise makes half of the readouts negative; no camera's is.
-    return Shutters(float(theta[0]), max(float(theta[1]), 0.0), cov, math.sqrt(jitter2))
+    return None
 
 
 def _jitter2(scores: Array, curvatures: Array) -> float:
@@ -287,7 +286,7 @@ def _scored(
     return _Scored(2 * o.point + o.camera, residual, M.reshape(-1, 2, 2), weight)
 
 
-def _persistent(scored: Sequence[_Scored], count: int, points: int) -> Array:
+def _persistent(every: Sequence[_Scored | None], count: int, points: int) -> Array:
     """Return the (P, P) covariance that errors of detections which persist from shot to shot add to that of the score.
 
     Of each lag between shots the covariance of a point's residuals, in the same camera and in the other, is estimated from
@@ -295,6 +294,7 @@ def _persistent(scored: Sequence[_Scored], count: int, points: int) -> Array:
     the next one, where a pose that follows the noise has no part in it. The sandwich of an M-estimator has the mean weight
     over that of its square (Huber, "Robust Statistics", 1981, section 6.3, for Cauchy's loss in two dimensions).
     """
+    scored = [each for each in every if each is not None]
     shots = len(scored)
     by, residual = np.zeros((shots, 2 * points, 2, count)), np.zeros((shots, 2 * points, 2, 1))
     seen, weights = np.zeros((shots, 2 * points, 1, 1)), np.concatenate([each.weight for each in scored])

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.bundle import BundleModel, BundleState, Observations, predict
 from armsight.vision.camera import Camera
 from armsight.vision.discs.symmetry import Symmetry
-from armsight.vision.posefit import PixelObservations, fit_pose
+from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, predict
+from armsight.vision.pose.posefit import PixelObservations, fit_pose
 from armsight.vision.rig import StereoRig
 
 #: A face is relied on where the cosine between its normal and the direction to the camera is above this (70 degrees).

@@ -14,7 +14,7 @@ from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import pose, transform
 from armsight.geometry.rotation import exp_so3, log_so3
 from armsight.vision.camera import Camera
-from armsight.vision.posefit import PixelObservations, fit_pose
+from armsight.vision.pose.posefit import PixelObservations, fit_pose
 
 MIN_POINTS = 4
 

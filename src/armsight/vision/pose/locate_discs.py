@@ -12,9 +12,9 @@ from armsight.data import SIDES, Array, Body, Correspondences, Detections, Discs
 from armsight.vision.discs.assign import assign
 from armsight.vision.discs.bias import centred
 from armsight.vision.discs.identify import IdentifiedDiscs, identify
-from armsight.vision.locate import locate
-from armsight.vision.markers.disc.target import DiscTarget
+from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.match import match
+from armsight.vision.pose.locate import locate
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import triangulate
 

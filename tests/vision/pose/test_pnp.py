@@ -5,7 +5,7 @@ import pytest
 
 from armsight.geometry.pose import log_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.pnp import body_poses, consensus_poses
+from armsight.vision.pose.pnp import body_poses, consensus_poses
 from strategies import CAMERAS
 from views import board, pixels
 

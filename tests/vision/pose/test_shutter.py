@@ -9,10 +9,10 @@ from armsight.data import Body, Correspondences, Missed, PoseEstimate
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import example_rig
-from armsight.vision import shutter
-from armsight.vision.bundle import CAUCHY_SCALE
-from armsight.vision.posefit import PixelObservations, whitened
-from armsight.vision.shutter import (
+from armsight.vision.pose import shutter
+from armsight.vision.pose.bundle import CAUCHY_SCALE
+from armsight.vision.pose.posefit import PixelObservations, whitened
+from armsight.vision.pose.shutter import (
     Motion,
     Shutters,
     TimedShot,

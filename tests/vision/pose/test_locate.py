@@ -12,8 +12,8 @@ from armsight.data import Body, Correspondences, Missed
 from armsight.geometry.pose import exp_se3, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.camera import Camera
-from armsight.vision.locate import locate
 from armsight.vision.markers.tag import CORNERS
+from armsight.vision.pose.locate import locate
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import triangulate
 from asserts import numeric_jacobian

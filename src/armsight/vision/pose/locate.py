@@ -23,8 +23,8 @@ from armsight.data import SIDES, Array, Body, Dropped, Missed, Points, PoseEstim
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
-from armsight.vision.pnp import consensus_poses
-from armsight.vision.posefit import PixelObservations, PoseFit, fit_pose, whitened
+from armsight.vision.pose.pnp import consensus_poses
+from armsight.vision.pose.posefit import PixelObservations, PoseFit, fit_pose, whitened
 from armsight.vision.rig import StereoRig
 
 _COLLINEAR = 1e-3

@@ -8,9 +8,9 @@ from armsight.data import Correspondences
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import example_rig
-from armsight.vision.locate import locate
 from armsight.vision.markers.targets import Composite
-from armsight.vision.noise import DiscNoise
+from armsight.vision.pose.locate import locate
+from armsight.vision.pose.noise import DiscNoise
 from armsight.vision.rig import CameraNoise
 from armsight.vision.triangulate import triangulate
 from disc_views import discs_of

@@ -10,8 +10,8 @@ from scipy.optimize import least_squares
 
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import exp_se3, log_se3
-from armsight.vision import bundle
-from armsight.vision.bundle import (
+from armsight.vision.pose import bundle
+from armsight.vision.pose.bundle import (
     CAUCHY_SCALE,
     BundleModel,
     BundleState,
@@ -21,7 +21,7 @@ from armsight.vision.bundle import (
     predict,
     whiteners,
 )
-from armsight.vision.projection import smooth
+from armsight.vision.pose.projection import smooth
 from asserts import assert_jacobian
 from strategies import CAMERAS, ordinary_rig
 from views import board, both_pixels, seen, somewhere

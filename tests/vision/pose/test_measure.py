@@ -12,7 +12,7 @@ from armsight.vision.discs.bias import project_discs
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.marker import Target
 from armsight.vision.match import renamed
-from armsight.vision.measure import measure, measure_detections, measure_seen, size_problem
+from armsight.vision.pose.measure import measure, measure_detections, measure_seen, size_problem
 from board_views import SIZE, board_pairs, detections, rig_and_board
 
 SIGMA = 0.1

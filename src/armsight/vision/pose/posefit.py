@@ -1,6 +1,6 @@
 """The pose of a body from detections of two known cameras: one compiled Levenberg-Marquardt.
 
-The same cost as :mod:`~armsight.vision.bundle` with everything but one pose held, for the functions that solve it
+The same cost as :mod:`~armsight.vision.pose.bundle` with everything but one pose held, for the functions that solve it
 thousands of times: locating, trying mirror solutions, distinguishing bodies.
 """
 
@@ -16,8 +16,8 @@ from armsight.data import Array, Correspondences, Ids, Record
 from armsight.geometry.matrix import product, solved_vector
 from armsight.geometry.pose import inverse
 from armsight.kernels import kernel
-from armsight.vision.bundle import CAUCHY_SCALE
 from armsight.vision.camera import Camera, distort, pair_arguments
+from armsight.vision.pose.bundle import CAUCHY_SCALE
 
 _STEPS = 40
 _DONE = 1e-8  # relative decrease of the cost

@@ -9,9 +9,9 @@ from scipy.stats import chi2
 
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
 from armsight.sim.example_rig import example_rig
-from armsight.vision.discs.predict import look_direction, plain_rig, pose_covariance, separation, view
 from armsight.vision.discs.symmetry import symmetries
-from armsight.vision.posefit import PixelObservations, fit_pose
+from armsight.vision.pose.posefit import PixelObservations, fit_pose
+from armsight.vision.pose.predict import look_direction, plain_rig, pose_covariance, separation, view
 from armsight.vision.rig import StereoRig
 
 PLATE = np.array([[-55, 0, 0], [55, 0, 0], [0, 85, 0.0]]) * 1e-3

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from armsight.geometry.pose import inverse, log_se3, transform
-from armsight.vision.assign import candidates, instances, plain
 from armsight.vision.detections import SeenShot
+from armsight.vision.pose.assign import candidates, instances, plain
 from strategies import ordinary_rig
 from views import both_pixels, somewhere
 

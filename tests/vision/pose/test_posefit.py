@@ -3,9 +3,9 @@ import pytest
 from scipy.optimize import least_squares
 
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
-from armsight.vision import posefit
-from armsight.vision.bundle import CAUCHY_SCALE, BundleModel, BundleState, Observations, minimise
-from armsight.vision.posefit import PixelObservations, fit_pose
+from armsight.vision.pose import posefit
+from armsight.vision.pose.bundle import CAUCHY_SCALE, BundleModel, BundleState, Observations, minimise
+from armsight.vision.pose.posefit import PixelObservations, fit_pose
 from asserts import assert_jacobian
 from strategies import ordinary_rig
 from views import pixels, seen, somewhere
