@@ -34,8 +34,8 @@ import numpy as np
 
 from armsight.app.board.scenarios import DRIVEN, BoardTestRig
 from armsight.firmware import build
+from armsight.robot.board_registry import configured
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.opening import configured
 from armsight.sim.joints import JointPlant
 from board import CLOCK_HZ, TICKS_PER_S, CountingEmulator
 

@@ -36,7 +36,7 @@ from armsight.geometry.pose import exp_se3, inverse, pose  # noqa: E402
 from armsight.loop.identify.model import gravity_levers  # noqa: E402
 from armsight.loop.servo import JointLoops, LoopTiming, PoseServo  # noqa: E402
 from armsight.robot.arm_file import open_arm  # noqa: E402
-from armsight.robot.boards.opening import slowed  # noqa: E402
+from armsight.robot.board_registry import slowed  # noqa: E402
 from armsight.robot.trajectories import point_to_point  # noqa: E402
 from armsight.sim.boards.device import STEP_S  # noqa: E402
 from armsight.sim.workcell.arm import imperfections, sample_arm  # noqa: E402

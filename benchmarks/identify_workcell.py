@@ -24,10 +24,10 @@ from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.plan import plan_poses
-from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
+from armsight.robot.board_registry import configured, open_emulator
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.opening import configured, open_emulator
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.workcell.arm import imperfections, sample_arm
 from armsight.sim.workcell.board import configuration, gravity_duty

@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from armsight.geometry.rotation import log_so3
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.models import MODELS
 from armsight.robot.trajectories import Trajectory, line, point_to_point, resolved_rate
 from armsight.robot.trajectories.line import LinePath

@@ -81,7 +81,7 @@ def test_every_layer_that_stands_is_known_and_seen():
 @pytest.mark.parametrize(
     ("file", "text", "said"),
     [
-        ("vision/a.py", "import armsight.robot.arm", "vision imports robot"),
+        ("vision/a.py", "import armsight.robot.kinematics.arm", "vision imports robot"),
         ("robot/a.py", "from armsight.vision.rig import StereoRig", "robot imports vision"),
         ("loop/a.py", "from armsight import sim", "loop imports sim"),
         ("geometry/a.py", "from armsight.vision import rig", "geometry imports vision"),
@@ -89,7 +89,7 @@ def test_every_layer_that_stands_is_known_and_seen():
         ("vision/deep/__init__.py", "from ...loop import servo", "vision imports loop"),
         ("vision/a.py", "from .. import app", "vision imports app"),
         ("sim/a.py", "def f():\n    import armsight.loop", "sim imports loop"),
-        ("vision/a.py", "if TYPE_CHECKING:\n    from armsight.robot import arm", "vision imports robot"),
+        ("vision/a.py", "if TYPE_CHECKING:\n    from armsight.robot.kinematics import arm", "vision imports robot"),
         ("data.py", "from armsight.files import read_text", "data imports files"),
         ("errors.py", "import armsight.data", "errors imports data"),
         ("__init__.py", "from armsight.app.main import main", "__init__ imports app"),
@@ -113,7 +113,7 @@ def test_the_checker_finds_a_planted_violation(tmp_path, file, text, said):
         ("vision/a.py", "from armsight.data import Shot\nfrom armsight.geometry.pose import pose\nimport cv2"),
         ("app/check/a.py", "import armsight.sim.render.render\nfrom armsight.loop import servo"),
         ("geometry/a.py", "import numpy\nfrom scipy import linalg\nimport math"),
-        ("sim/a.py", "from armsight.robot import arm\nfrom armsight.vision import rig"),
+        ("sim/a.py", "from armsight.robot.kinematics import arm\nfrom armsight.vision import rig"),
     ],
 )
 def test_the_checker_lets_right_imports_pass(tmp_path, file, text):

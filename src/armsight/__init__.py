@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from armsight.data import Body, Missed, PoseEstimate, Shot
     from armsight.errors import ArmsightError
     from armsight.loop.identify.corrected import Corrected, open_corrected
-    from armsight.robot.arm import Arm
     from armsight.robot.arm_file import open_arm
+    from armsight.robot.kinematics.arm import Arm
     from armsight.vision.calibrate.boards import Pair, calibrate_boards
     from armsight.vision.calibrate.bodies import calibrate_bodies
     from armsight.vision.camera import Camera
@@ -59,7 +59,7 @@ __all__ = [
 
 _HOME = {
     **dict.fromkeys(("Body", "Missed", "PoseEstimate", "Shot"), "armsight.data"),
-    "Arm": "armsight.robot.arm",
+    "Arm": "armsight.robot.kinematics.arm",
     "ArmsightError": "armsight.errors",
     **dict.fromkeys(("Pair", "calibrate_boards"), "armsight.vision.calibrate.boards"),
     "calibrate_bodies": "armsight.vision.calibrate.bodies",

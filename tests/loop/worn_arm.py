@@ -10,8 +10,8 @@ import numpy as np
 
 from armsight.geometry.pose import exp_se3
 from armsight.loop.identify.measured import Measured
-from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
+from armsight.robot.kinematics.arm import Arm
 
 MASS_KG, GRAVITY = np.array([1.0, 0.6, 0.4, 0.3, 0.2, 0.3, 0.2]), 9.81
 

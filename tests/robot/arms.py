@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from armsight.geometry.pose import exp_se3
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.table import BEND, KIND
 from armsight.robot.models import MODELS
 

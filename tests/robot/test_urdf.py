@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import strategies as ours
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.models import MODELS
 from armsight.robot.urdf.read import decompose, read_urdf
 from armsight.robot.urdf.write import urdf_text, write_urdf

@@ -19,7 +19,7 @@ from armsight.geometry.check import checked
 from armsight.geometry.rotation import log_so3
 from armsight.loop.estimators import Delay, KalmanEstimator, Outcome, PoseMeasurement, Prior
 from armsight.loop.estimators.clock import SYSTEMATIC_S
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 #: Lags that are tried, s: stamps may be early by a clock's offset, and late by a slow camera's buffers.
 LAGS_S = np.arange(-0.1, 0.6, 2e-3)

@@ -23,8 +23,8 @@ from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.kernels import kernel
 from armsight.loop.estimators.estimator import ArmEstimate, Estimator
-from armsight.loop.health.record import Trust
-from armsight.robot.arm import Arm
+from armsight.loop.finding import Trust
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import Joints, Trajectory
 from armsight.robot.trajectories.lookahead import behind
 from armsight.robot.trajectories.resolved_rate import position_first

@@ -30,7 +30,7 @@ import numpy as np
 from armsight.data import Array, Missed, Record, Shot
 from armsight.errors import InputError
 from armsight.loop.estimators import Delay
-from armsight.loop.health.record import HealthFinding
+from armsight.loop.finding import HealthFinding
 from armsight.vision.blinking import Spot, block_means, candidates, spot, window
 from armsight.vision.rig import Shutters
 

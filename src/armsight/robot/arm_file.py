@@ -41,7 +41,7 @@ from armsight.errors import InputError
 from armsight.files import read_toml
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_quaternion_wxyz
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS
 from armsight.robot.models import MODELS
 from armsight.robot.urdf.read import parse_urdf, read_urdf

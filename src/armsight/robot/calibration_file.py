@@ -26,7 +26,7 @@ from armsight.errors import InputError
 from armsight.files import read_text, write_text
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import log_so3
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.urdf.read import ChainLink, arm_rows, check_same, rotation_of
 from armsight.robot.urdf.write import roll_pitch_yaw
 from armsight.tables.document import read_yaml

@@ -11,7 +11,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.geometry.pose import pose
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 
 def _deg(*angles: float) -> Array:

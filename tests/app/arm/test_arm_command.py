@@ -10,8 +10,8 @@ import pytest
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_euler_zyx
 from armsight.robot.arm_file import split_arm
+from armsight.robot.kinematics.reach import reach
 from armsight.robot.models import MODELS
-from armsight.robot.reach import reach
 from armsight.robot.urdf.write import write_urdf
 from cli_runs import assert_rejected
 

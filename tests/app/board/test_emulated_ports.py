@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from armsight.errors import DeviceError
+from armsight.robot.board_registry import open_motion_board
 from armsight.robot.boards.ar4 import board as ar4
 from armsight.robot.boards.feetech import bus as feetech
-from armsight.robot.boards.opening import open_motion_board
 from armsight.sim.boards.ar4 import Ar4Teensy
 from armsight.sim.boards.device import serve
 from armsight.sim.boards.so101 import So101Bus

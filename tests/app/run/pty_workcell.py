@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from armsight.errors import DeviceError
-from armsight.robot.boards.opening import configured
+from armsight.robot.board_registry import configured
 from armsight.sim.workcell.workcell import Workcell
 
 #: The host's clock when the board's is 0, s; by how much it is faster; how far stamps are off, s.

@@ -20,8 +20,8 @@ from armsight.app.run import setup as run_setup
 from armsight.app.run.loop import Loop
 from armsight.app.run.setup import HostClock
 from armsight.geometry.pose import inverse
+from armsight.robot.board_registry import open_board
 from armsight.robot.boards.codes import BoardState, Fault
-from armsight.robot.boards.opening import open_board
 from cli_runs import assert_rejected
 
 pytestmark = [

@@ -6,8 +6,8 @@ import pytest
 from faults import ended, strained, watched_body
 
 from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.finding import HealthFinding, health_lines
 from armsight.loop.health.fixed import Unrest
-from armsight.loop.health.record import HealthFinding, health_lines
 from armsight.loop.health.rig import RigWatch
 
 X, Y = np.eye(3)[:2]

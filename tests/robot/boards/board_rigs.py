@@ -10,9 +10,9 @@ import tty
 from armsight.data import JointCommand
 from armsight.errors import DeviceError
 from armsight.firmware import dialect
+from armsight.robot.board_registry import configured, open_emulator
 from armsight.robot.boards.configuration import CONFIG, CONFIG_VERSION
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.opening import configured, open_emulator
 from armsight.sim.joints import JointPlant
 
 

@@ -9,11 +9,11 @@ from firmware_build import board_image
 
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import build
+from armsight.robot.board_registry import open_emulator
 from armsight.robot.boards import qemu
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.frames import ANSWER, REQUEST
 from armsight.robot.boards.host import HostEmulator
-from armsight.robot.boards.opening import open_emulator
 from armsight.robot.boards.qemu import QemuEmulator
 from armsight.robot.boards.unicorn import UnicornEmulator
 from armsight.sim.joints import JointPlant

@@ -8,11 +8,11 @@ import pytest
 
 from armsight.data import JointCommand
 from armsight.errors import ArmsightError, InputError
+from armsight.robot.board_registry import configured, open_emulator
 from armsight.robot.boards.board_file import configuration_text, read_configuration
 from armsight.robot.boards.codes import Command, Fault, SensorKind
 from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.opening import configured, open_emulator
 from armsight.robot.boards.reports import BoardAbilities
 from armsight.sim.encoders import EncodedPlant, EncoderFault, Encoders
 from armsight.sim.joints import JointPlant, drawn_model

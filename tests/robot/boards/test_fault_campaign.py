@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from armsight.robot.board_registry import open_emulator
 from armsight.robot.boards.frames import ANSWER, REQUEST
-from armsight.robot.boards.opening import open_emulator
 
 PATH = Path(__file__).resolve().parents[3] / "benchmarks" / "board_faults.py"
 

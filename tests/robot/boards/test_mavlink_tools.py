@@ -10,8 +10,8 @@ import pytest
 from board_rigs import PtyBoard
 
 from armsight.firmware import dialect
+from armsight.robot.board_registry import open_board
 from armsight.robot.boards.codes import BoardState, Rejection
-from armsight.robot.boards.opening import open_board
 
 mavutil = pytest.importorskip("pymavlink.mavutil", reason="needs pymavlink: pip install 'armsight[test]'")
 pytestmark = [

@@ -15,8 +15,8 @@ from board_rigs import PtyBoard, hold, keep_on
 
 from armsight.app.board.selftest import selftest
 from armsight.errors import DeviceError, InputError
+from armsight.robot.board_registry import open_board
 from armsight.robot.boards.codes import BoardState, Fault
-from armsight.robot.boards.opening import open_board
 from armsight.robot.boards.serial import SerialLink, list_ports
 from armsight.sim.joints import PotFault
 

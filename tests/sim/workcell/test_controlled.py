@@ -11,7 +11,7 @@ from armsight.data import JointCommand
 from armsight.errors import InputError
 from armsight.loop.servo import JointLoops, LoopTiming, PoseServo
 from armsight.robot.arm_file import open_arm
-from armsight.robot.boards.opening import slowed
+from armsight.robot.board_registry import slowed
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.workcell.arm import PRESETS
 from armsight.sim.workcell.controlled import CONTROLLED, ZERO_DEG, standing

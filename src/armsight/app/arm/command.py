@@ -15,7 +15,7 @@ from armsight.files import check_suffix, check_writable, read_text, write_text
 
 if TYPE_CHECKING:
     from armsight.data import Array
-    from armsight.robot.arm import Arm
+    from armsight.robot.kinematics.arm import Arm
 
 #: A minus before a number is no option.
 _NUMBERS = {"ignore_unknown_options": True}

@@ -19,10 +19,10 @@ from armsight.app.show.encode import json_of
 from armsight.app.show.table import aligned
 from armsight.data import Array
 from armsight.geometry.rotation import euler_zyx
-from armsight.robot.arm import Arm
 from armsight.robot.calibration_file import Difference
-from armsight.robot.reach import reach
-from armsight.robot.solutions import Solutions
+from armsight.robot.kinematics.arm import Arm
+from armsight.robot.kinematics.reach import reach
+from armsight.robot.kinematics.solutions import Solutions
 
 
 def list_json(models: Mapping[str, Arm]) -> list[dict[str, Any]]:

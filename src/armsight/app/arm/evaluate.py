@@ -46,8 +46,8 @@ from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import SENSOR, gravity_levers
 from armsight.loop.iso9283.poses import MIN_POSES
 from armsight.loop.iso9283.statistic import Metric
-from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.tables.columns import Columns
 
 #: So many rests that were left out are named.

@@ -10,7 +10,7 @@ import numpy as np
 from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png
 from armsight.data import Array
 from armsight.files import replacing
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -128,8 +128,8 @@ def monitor(
     Nothing is commanded: the drives stay as they are.
     """
     from armsight.app.board import text
+    from armsight.robot.board_registry import is_real
     from armsight.robot.boards.ar4.board import Ar4Board
-    from armsight.robot.boards.opening import is_real
 
     if seconds is None and not is_real(name):
         seconds = _WATCH_S
@@ -196,7 +196,7 @@ def selftest_(name: str, baud: int | None, drives: bool, as_json: bool) -> int:
     from armsight.app.board import text
     from armsight.app.board.selftest import selftest
     from armsight.app.progress import steps
-    from armsight.robot.boards.opening import SERIAL
+    from armsight.robot.board_registry import SERIAL
     from armsight.robot.boards.serial import BAUD
 
     if name.startswith(SERIAL):
@@ -269,9 +269,9 @@ def bringup(
     from armsight.app.show.page import writable_folder
     from armsight.app.show.plotting import require_matplotlib
     from armsight.files import check_folder
+    from armsight.robot.board_registry import SERIAL, emulator_name, open_board, open_emulator
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.emulated import EmulatedLink
-    from armsight.robot.boards.opening import SERIAL, emulator_name, open_board, open_emulator
     from armsight.robot.boards.serial import BAUD
     from armsight.sim.boards.workshop import WorkshopPerson, drawn_encoders, drawn_workshop
 
@@ -577,7 +577,7 @@ def emulate(arm: str, seconds: float | None, as_json: bool) -> None:
 
 def _open(name: str, baud: int | None) -> Board:
     """Open a board with our firmware; an emulated one has six free joints at its motors."""
-    from armsight.robot.boards.opening import SERIAL, open_board
+    from armsight.robot.board_registry import SERIAL, open_board
     from armsight.robot.boards.serial import BAUD
     from armsight.sim.joints import JointPlant
 
@@ -587,7 +587,7 @@ def _open(name: str, baud: int | None) -> Board:
 
 def _open_any(name: str, baud: int | None, calibration: Path | None = None) -> MotionBoard:
     """Open any board; an emulated one has six free joints at its motors."""
-    from armsight.robot.boards.opening import is_real, open_motion_board
+    from armsight.robot.board_registry import is_real, open_motion_board
     from armsight.sim.joints import JointPlant
 
     return open_motion_board(name, None if is_real(name) else JointPlant(), baud=baud, calibration=calibration)

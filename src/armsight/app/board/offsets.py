@@ -17,13 +17,13 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import check_outputs, check_writable, read_json, read_text, write_text
-from armsight.robot.arm import Arm
 from armsight.robot.boards.ar4.models import SENSE
 from armsight.robot.boards.configuration import Configuration, check_configuration
 from armsight.robot.boards.feetech.board import FeetechBoard
 from armsight.robot.boards.feetech.calibration import read_calibration, write_offsets
 from armsight.robot.boards.feetech.offsets import OffsetChange, corrected_offsets, require_released, write_changes
 from armsight.robot.boards.feetech.registers import MOST_OFFSET, RAD_PER_COUNT
+from armsight.robot.kinematics.arm import Arm
 
 #: Zeros of joints that home, or have a potentiometer, are off by a few degrees; more looks like a mistake, degrees.
 USUAL_CHANGE_DEG = 10.0

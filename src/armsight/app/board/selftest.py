@@ -17,10 +17,10 @@ from armsight.app.board.scenarios import AT_REST, DRIVEN, EMULATED_ONLY, BoardTe
 from armsight.data import Array
 from armsight.errors import ArmsightError
 from armsight.firmware.elf import read_elf
+from armsight.robot.board_registry import SERIAL, configured, emulator_name, open_emulator
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.link import Emulator
-from armsight.robot.boards.opening import SERIAL, configured, emulator_name, open_emulator
 from armsight.robot.boards.serial import BAUD, SerialLink
 from armsight.sim.joints import JointPlant
 

@@ -24,7 +24,7 @@ from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.iso9283.paths import plane_axes
 from armsight.loop.iso9283.plan import CLEAR_RAD, CheckPlan, everywhere, plan_check
 from armsight.loop.iso9283.poses import MIN_POSES
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import Trajectory, circle, line
 from armsight.vision.markers.targets import open_target
 from armsight.vision.rig import StereoRig

@@ -32,8 +32,8 @@ from armsight.errors import ArmsightError
 from armsight.files import write_text
 from armsight.geometry.pose import inverse
 from armsight.processes import Process, caller
-from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.sim.workcell.cameras import camera_name, open_cameras
 from armsight.sim.workcell.controlled import CONTROLLED
 from armsight.sim.workcell.workcell import DEFAULT_ARM, Workcell

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from armsight.app.handeye.images import Seen
     from armsight.app.handeye.report import HandEyeAnswer
-    from armsight.robot.arm import Arm
+    from armsight.robot.kinematics.arm import Arm
     from armsight.tables.poses import PoseTable
 
 _BY_RIG = "--rig with --left and --right, or with --source"

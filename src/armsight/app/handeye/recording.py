@@ -19,7 +19,7 @@ from armsight.errors import InputError
 from armsight.geometry.pose import adjoint, inverse, log_se3, mean_pose
 from armsight.loop.handeye.poses import MIN_POSES, Poses
 from armsight.loop.handeye.streams import GAP_S
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.tables.poses import PoseTable
 from armsight.vision.sources.bag import Bag
 from armsight.vision.sources.bag.reader import SUFFIXES

@@ -27,7 +27,7 @@ from armsight.errors import InputError
 from armsight.geometry.pose import inverse, log_se3, mean_pose
 from armsight.loop.handeye.handeye import CONTRADICTS, rotations_of, scale_between
 from armsight.loop.handeye.poses import LEVER_M, Poses, residuals, starts
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.models import MODELS
 from armsight.tables.misread import Misread, misreadings
 from armsight.tables.poses import MIXED

@@ -18,7 +18,7 @@ from armsight.loop.identify.identify import begun
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.plan import Plan, plan_poses
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.vision.rig import StereoRig
 
 #: Assumed of an instrument of which nothing is known: sigma of a position, m, and of a rotation, rad.

@@ -26,7 +26,7 @@ from armsight.loop.identify.model import Model
 from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.read import COLUMNS, Read, poses_in, read_poses
 from armsight.loop.identify.validate import MIN_POSES, Errors, Validation, errors, require_alike, validate
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.tables.cells import Cells, read_cells, read_columns
 from armsight.tables.columns import NAMES
 from armsight.tables.number import number

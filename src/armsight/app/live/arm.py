@@ -52,10 +52,10 @@ from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import read_text, write_text
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators import Mounting
-from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
+from armsight.robot.board_registry import emulator_name, is_real, open_motion_board, slowed
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Fault
-from armsight.robot.boards.opening import emulator_name, is_real, open_motion_board, slowed
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import point_to_point
 from armsight.vision.markers.targets import Composite, open_target
 from armsight.vision.rig import StereoRig

@@ -29,7 +29,7 @@ from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.poses import Poses
 from armsight.loop.identify.read import read_poses
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import point_to_point
 from armsight.vision.rig import StereoRig
 

@@ -32,7 +32,7 @@ from armsight.data import Record, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import check_folder, write_text
 from armsight.robot.arm_file import open_arm
-from armsight.robot.boards.opening import EMULATED, slowed
+from armsight.robot.board_registry import EMULATED, slowed
 from armsight.sim.workcell.workcell import CHESSBOARD
 from armsight.vision.image import grey
 from armsight.vision.markers.board import open_board

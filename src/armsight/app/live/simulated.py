@@ -15,7 +15,7 @@ import numpy as np
 from armsight.data import Array, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.sim.example_rig import board_poses
 from armsight.sim.render.scene import chessboard
 from armsight.sim.workcell.workcell import CHESSBOARD, Workcell

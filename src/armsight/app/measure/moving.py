@@ -16,7 +16,7 @@ import numpy as np
 
 from armsight.data import Body, Missed, PoseEstimate
 from armsight.errors import InputError
-from armsight.loop.health.record import HealthFinding
+from armsight.loop.finding import HealthFinding
 from armsight.vision.pose.shutter import TimedShot, estimate_shutters, measure_moving
 from armsight.vision.rig import Shutters, StereoRig
 

@@ -31,7 +31,7 @@ from armsight.loop.estimators import (
     Prior,
     Remembered,
 )
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.vision.detections import SeenShot
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.marker import Target

@@ -16,7 +16,7 @@ import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.tables.poses import read_pose_table
 
 #: Angles at the time of a shot are interpolated between rows at most so far apart, s.

@@ -24,7 +24,7 @@ from armsight.loop.estimators import Delay, Mounting, Prior
 from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, calibrate_handeye, require_known
 from armsight.loop.handeye.poses import require_fitting
 from armsight.loop.sync_led import with_led
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import point_to_point
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.result import Calibration

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from armsight.app.run.setup import Setup
     from armsight.app.run.summary import RunSummary
     from armsight.data import Array
-    from armsight.robot.arm import Arm
+    from armsight.robot.kinematics.arm import Arm
     from armsight.vision.rig import StereoRig
 
 _HANDEYE_POSES = 30

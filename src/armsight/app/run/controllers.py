@@ -19,7 +19,7 @@ from armsight.data import Array, JointCommand
 from armsight.loop.estimators import Estimator
 from armsight.loop.health import HealthMonitor, Trust
 from armsight.loop.servo import Aim, PoseServo
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import Joints, Tabled, Trajectory
 
 #: A joint that lifts the tool by more than this, m per rad, carries a gravity load.

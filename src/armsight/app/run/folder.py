@@ -45,7 +45,7 @@ from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.estimators import Mounting
 from armsight.loop.health import health_lines, unseen_lines
 from armsight.loop.health.follow import correction_lines
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.vision.detections import detections_text
 from armsight.vision.image import grey
 from armsight.vision.rig import StereoRig

@@ -17,7 +17,7 @@ from scipy.special import chdtri
 from armsight.app.run.record import RunData, ToolTrack, errors
 from armsight.data import Array, Record
 from armsight.loop.servo import CORRECTED_ABOVE
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 #: Kinds of motion that are evaluated along their path in space.
 PATHS = ("line", "circle")

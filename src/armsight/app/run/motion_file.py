@@ -17,7 +17,7 @@ from armsight.errors import InputError
 from armsight.files import read_toml
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3, from_euler_zyx
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import Trajectory, circle, line, point_to_point
 from armsight.robot.trajectories.circle import TOO_SMALL, ArcPath
 from armsight.robot.trajectories.line import LinePath

@@ -27,7 +27,7 @@ from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.estimators import ArmEstimate, Delay, Mounting, Outcome, PoseMeasurement
 from armsight.loop.health.change import Change, widened
 from armsight.loop.health.follow import RigCorrection
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import Trajectory
 from armsight.tables.columns import Columns
 from armsight.vision.rig import StereoRig

@@ -21,10 +21,10 @@ import numpy as np
 
 from armsight.data import Array, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
-from armsight.robot.arm import Arm
+from armsight.robot.board_registry import EMULATED, emulator_name, open_motion_board, slowed
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.contract import MotionBoard
-from armsight.robot.boards.opening import EMULATED, emulator_name, open_motion_board, slowed
+from armsight.robot.kinematics.arm import Arm
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import Composite
 from armsight.vision.sources import Source, open_source

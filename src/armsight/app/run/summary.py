@@ -35,7 +35,7 @@ from armsight.app.show.messages import colour, weak
 from armsight.app.show.table import TextTable, plain_text
 from armsight.loop.health import HealthFinding, health_lines, unseen_lines
 from armsight.loop.health.follow import RigCorrection, correction_lines
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.vision.rig import Shutters
 
 #: Version of the files of a run's folder; version 1 named the reference track and the reference angles differently.

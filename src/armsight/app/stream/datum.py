@@ -17,7 +17,7 @@ from armsight.app.shot_pose import left_axes, shot_pose
 from armsight.app.show.encode import json_of
 from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Record, Shot
 from armsight.loop.estimators import KalmanEstimator, Mounting, Remembered
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.vision.rig import StereoRig
 
 

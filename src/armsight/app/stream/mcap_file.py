@@ -28,7 +28,7 @@ from armsight.app.stream.sink import Sink
 from armsight.data import Shot
 from armsight.errors import InputError
 from armsight.processes import Process
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources.bag.camera_info import METADATA, RIG
 

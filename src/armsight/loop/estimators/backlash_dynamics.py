@@ -20,7 +20,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.kernels import kernel
 from armsight.loop.estimators.parabola import fit, span, window
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame, sincos
 from armsight.robot.kinematics.table import rows_of
 

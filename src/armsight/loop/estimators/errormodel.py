@@ -20,7 +20,7 @@ from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import Prior, layout, pose_and_derivative, tangent
 from armsight.loop.estimators.estimator import PoseMeasurement
 from armsight.loop.estimators.readings import Smoothed
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 #: After so long a joint has crept wherever it could, s.
 LONGEST_CREEP_S = 4.0

@@ -37,7 +37,7 @@ from armsight.loop.estimators.errormodel import (
 from armsight.loop.estimators.estimator import ArmEstimate, Delay, Innovation, Learned, Outcome, PoseMeasurement, Track
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
 from armsight.loop.estimators.smoothing import Interval, blended, by_state, intervals
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 #: A measurement less likely than this is an outlier.
 CHANCE = 1e-6

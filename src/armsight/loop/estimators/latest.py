@@ -9,7 +9,7 @@ from armsight.geometry.pose import inverse
 from armsight.loop.estimators.armerror import Prior
 from armsight.loop.estimators.estimator import ArmEstimate, Delay, Outcome, PoseMeasurement, Track
 from armsight.loop.estimators.kalman import KalmanEstimator
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 
 class LatestEstimator:

@@ -16,7 +16,7 @@ from armsight.geometry.pose import adjoint, inverse
 from armsight.kernels import kernel
 from armsight.loop.estimators.estimator import PoseMeasurement
 from armsight.loop.handeye.handeye import HandEye
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from armsight.geometry.check import checked
 from armsight.kernels import kernel
 from armsight.loop.estimators.backlash_dynamics import float_on, loose, masses
 from armsight.loop.estimators.parabola import LONG_SPAN_S, PARABOLA, SPAN_S, fit, span, window
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 #: A joint that shows no motion within this time around (or, where it is the newest, before) a time stands still there, s,
 #: and is averaged over it: the parabola's noise at its end is eight times the mean's.

@@ -31,7 +31,7 @@ from armsight.errors import CalibrationError, InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, mean_pose, pose, small_adjoint
 from armsight.geometry.rotation import nearest_rotation
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 #: A pose whose residual has a smaller chance than this is taken for a mistake and left out.
 CHANCE = 1e-5

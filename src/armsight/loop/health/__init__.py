@@ -5,7 +5,7 @@ what moved, since when, by how much and with which sigma, and what to do. The te
 docs/concepts/health.md.
 """
 
+from armsight.loop.finding import HealthFinding, Trust, health_lines, unseen_lines
 from armsight.loop.health.monitor import HealthMonitor
-from armsight.loop.health.record import HealthFinding, Trust, health_lines, unseen_lines
 
 __all__ = ["HealthFinding", "HealthMonitor", "Trust", "health_lines", "unseen_lines"]

@@ -18,7 +18,7 @@ from armsight.data import Array, Record
 from armsight.geometry.pose import adjoint, inverse
 from armsight.loop.estimators import PoseMeasurement
 from armsight.loop.estimators.armerror import ErrorLayout
-from armsight.loop.health.record import LEVER_M, Cause, HealthFinding
+from armsight.loop.finding import LEVER_M, Cause, HealthFinding
 
 #: Hypotheses whose scores differ by less than this from the best cannot be distinguished from it.
 ALIKE = 12.0

@@ -29,8 +29,8 @@ from scipy.linalg import solve_triangular
 from armsight.data import Array
 from armsight.loop.estimators import Innovation, Outcome
 from armsight.loop.estimators.armerror import layout
+from armsight.loop.finding import LEVER_M, alarm_limit
 from armsight.loop.health.change import MARGIN, RAMPS, Change, Suspect, changing, happened_besides, ranked, suspects
-from armsight.loop.health.record import LEVER_M, alarm_limit
 
 #: A block lasts so long, s, and until all joints together have travelled so far, rad, but at most so long, s: an arm that
 #: stands says the same thing again and again.

@@ -35,8 +35,8 @@ from scipy.special import chdtrc
 from armsight.data import Array, Ids
 from armsight.loop.estimators import Innovation, Outcome
 from armsight.loop.estimators.armerror import layout
+from armsight.loop.finding import COSTS_M, FALSE_ALARMS_PER_MINUTE, LEVER_M, HealthFinding, alarm_limit
 from armsight.loop.health.change import RAMPS, Change, Suspect, changing, ranked, suspects
-from armsight.loop.health.record import COSTS_M, FALSE_ALARMS_PER_MINUTE, LEVER_M, HealthFinding, alarm_limit
 
 #: A beginning is tried every so often, s; older than this many seconds their distances grow with their age.
 EVERY_S, _FINE_S, _RATIO = 0.2, 1.0, 1.4

@@ -20,9 +20,9 @@ from armsight.data import Array, Body, Missed, PoseEstimate, Record
 from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3
 from armsight.geometry.rotation import skew
 from armsight.loop.estimators import Mounting
+from armsight.loop.finding import Cause
 from armsight.loop.health.base_motion import BaseMotion, KeptMeasurement, Moved
 from armsight.loop.health.change import Change
-from armsight.loop.health.record import Cause
 from armsight.loop.health.rig import TEST_S, RigWatch, differ
 from armsight.loop.health.update import LEAST_STAYS, RigUpdate, updated_rig
 from armsight.vision.detections import SeenShot

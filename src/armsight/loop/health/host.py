@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from armsight.data import PoseEstimate
-from armsight.loop.health.record import HealthFinding
+from armsight.loop.finding import HealthFinding
 
 #: So many repeated shots, and this share of all, are reported.
 _LEAST, _SHARE = 3, 0.01

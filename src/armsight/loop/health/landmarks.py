@@ -21,8 +21,8 @@ from scipy.special import chdtri
 
 from armsight.data import Array, PoseEstimate
 from armsight.geometry.pose import adjoint, inverse, log_se3
+from armsight.loop.finding import FALSE_ALARMS_PER_MINUTE, HealthFinding
 from armsight.loop.health.change import FOCAL, along_axis
-from armsight.loop.health.record import FALSE_ALARMS_PER_MINUTE, HealthFinding
 
 #: Poses of a mean.
 _SHOTS = 5

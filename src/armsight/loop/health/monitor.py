@@ -11,6 +11,7 @@ import numpy as np
 from armsight.data import Array, Body, PoseEstimate
 from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement, Remembered
 from armsight.loop.estimators.clock import ClockFollower
+from armsight.loop.finding import HealthFinding, Trust
 from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health.base_motion import BaseMotion, KeptMeasurement, Measurements
 from armsight.loop.health.change import Change, doubtful, finding, happened_besides, suspected
@@ -19,9 +20,8 @@ from armsight.loop.health.fixed import FixedWatch, ShakeWatch
 from armsight.loop.health.follow import RigCorrection
 from armsight.loop.health.host import HostWatch
 from armsight.loop.health.landmarks import LandmarkWatch
-from armsight.loop.health.record import HealthFinding, Trust
 from armsight.loop.health.rig import TEST_S, RigWatch
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.vision.rig import StereoRig
 
 #: So long after measurements contradicted what was learned the cause is open, s: the tests need some shots to find it.

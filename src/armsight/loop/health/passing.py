@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.loop.health.record import HealthFinding
+from armsight.loop.finding import HealthFinding
 from armsight.loop.health.shape import ResidualSums, eliminated
 
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.

@@ -45,6 +45,7 @@ from armsight.data import Array, Body, Ids, PoseEstimate, Record
 from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import adjoint, inverse, log_se3, pose
 from armsight.kernels import kernel
+from armsight.loop.finding import COSTS_M, LEVER_M, HealthFinding, alarm_limit
 from armsight.loop.health.fixed import Unrest
 from armsight.loop.health.passing import (
     TRACK,
@@ -57,7 +58,6 @@ from armsight.loop.health.passing import (
     nodding,
     velocity,
 )
-from armsight.loop.health.record import COSTS_M, LEVER_M, HealthFinding, alarm_limit
 from armsight.loop.health.shape import FURTHEST_M, SMOOTH, ResidualSums, ShapeWatch, eliminated, total
 from armsight.vision.camera import pair_arguments
 from armsight.vision.pose.posefit import differentiate

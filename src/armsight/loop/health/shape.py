@@ -38,7 +38,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from armsight.data import Array, Ids, Record
-from armsight.loop.health.record import HealthFinding, alarm_limit
+from armsight.loop.finding import HealthFinding, alarm_limit
 
 #: A displacement may be so large, m: what is further off is another thing. So much may a focal length change, as a share.
 FURTHEST_M, _FOCAL = 5e-3, 0.05

@@ -24,7 +24,7 @@ import numpy as np
 
 from armsight.data import Array, Body, Correspondences, Missed, PoseEstimate, Record
 from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.health.record import HealthFinding
+from armsight.loop.finding import HealthFinding
 from armsight.loop.health.rig import RigWatch, free_directions
 from armsight.loop.health.shape import ResidualSums
 from armsight.vision.detections import SeenShot

@@ -1,6 +1,6 @@
 """Kinematic identification: what each number of an arm is, from joint angles and where its tool was measured.
 
-In: the nominal :class:`~armsight.robot.arm.Arm` and :class:`Measured` poses (``read`` has them from a CSV file). Out:
+In: the nominal :class:`~armsight.robot.kinematics.arm.Arm` and :class:`Measured` poses (``read`` reads a CSV file). Out:
 :class:`Identified`, every parameter with its sigma, and :class:`Corrected`, the arm in use.
 
     measured -> diagnose -> placement -> observable -> fit -> selection -> identify -> corrected

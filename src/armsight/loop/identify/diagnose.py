@@ -29,8 +29,8 @@ from armsight.loop.identify.fit import SIGMA
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.placement import angle_between, linear_placement, rigid_placement
 from armsight.loop.identify.read import AnglesMeasured, rotations_of
-from armsight.robot.arm import Arm
 from armsight.robot.kinematics import chain
+from armsight.robot.kinematics.arm import Arm
 from armsight.tables.rotations import ROTATIONS
 
 #: Worse than this part of the space that the points span (RMS about their middle), and this many m, is another arm.

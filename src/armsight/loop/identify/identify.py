@@ -23,7 +23,7 @@ from armsight.loop.identify.model import PLENTY, SENSOR, Model, approaches
 from armsight.loop.identify.observable import Observed, observed
 from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.selection import PLACEMENT, TOGETHER, SelectionStep, forward_selection, scaled_prior
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 #: Fewest poses: what base and tool need, with some to spare.
 MIN_POSES = 6

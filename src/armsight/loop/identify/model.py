@@ -37,7 +37,7 @@ from armsight.data import Array, Record
 from armsight.geometry.pose import inverse, left_jacobian
 from armsight.geometry.rotation import exp_so3, log_so3, skew
 from armsight.loop.identify.measured import Measured
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 #: Columns of a table of lengths and angles, (n, 5).
 COLUMNS = ("offset", "d", "a", "alpha", "beta")

@@ -12,7 +12,7 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 #: Smallest singular value of the Jacobian (linear rows over the arm's size) at a pose of the test. ISO 9283 sets no number:
 #: this one keeps the test where the outer loop still corrects every direction (``servo.UNCORRECTED_BELOW``).

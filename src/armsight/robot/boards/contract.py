@@ -15,9 +15,9 @@ import numpy as np
 
 from armsight.data import Array, JointCommand, JointStates
 from armsight.errors import InputError
-from armsight.robot.arm import Arm
 from armsight.robot.boards.codes import Command
 from armsight.robot.boards.reports import BoardStatus, JointReport, Welcome
+from armsight.robot.kinematics.arm import Arm
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from armsight.robot.trajectories.path import Path
 from armsight.robot.trajectories.trajectory import Joints, MotionRejected, check_duration, check_times, clamped, pieces
 
 if TYPE_CHECKING:
-    from armsight.robot.arm import Arm
+    from armsight.robot.kinematics.arm import Arm
 
 #: How far from the path a start's speeds and accelerations may point, as a share of the limits.
 ALONG = 1e-6

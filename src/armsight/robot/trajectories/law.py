@@ -31,7 +31,7 @@ from armsight.robot.trajectories.profile import Profile, plan_profile
 from armsight.robot.trajectories.trajectory import CHECK_RATE_HZ, Joints, check_times, clamped
 
 if TYPE_CHECKING:
-    from armsight.robot.arm import Arm
+    from armsight.robot.kinematics.arm import Arm
 
 #: Rounds of scaling a single law; from rest the second is exact up to where the samples fall.
 ROUNDS = 12

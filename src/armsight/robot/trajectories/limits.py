@@ -13,7 +13,7 @@ from armsight.geometry.check import checked
 from armsight.robot.trajectories.trajectory import Joints, MotionRejected, Trajectory, check_times, pieces
 
 if TYPE_CHECKING:
-    from armsight.robot.arm import Arm
+    from armsight.robot.kinematics.arm import Arm
 
 #: Relative excess of a limit that is rounding and no motion.
 ROUNDING = 1e-9

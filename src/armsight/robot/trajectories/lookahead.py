@@ -18,7 +18,7 @@ from armsight.robot.trajectories.limits import outside
 from armsight.robot.trajectories.path import ROTATION_M, Path, PathPoints
 
 if TYPE_CHECKING:
-    from armsight.robot.arm import Arm
+    from armsight.robot.kinematics.arm import Arm
 
 #: The smallest singular value of the Jacobian, its linear rows divided by the arm's size, below which a pose counts as
 #: singular: joints would rotate 200 times as fast as the tool. A wrist is there within about 0.4 degrees.

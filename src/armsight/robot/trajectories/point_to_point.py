@@ -11,7 +11,7 @@ from armsight.robot.trajectories.profile import Profile, plan_profile
 from armsight.robot.trajectories.trajectory import check_duration
 
 if TYPE_CHECKING:
-    from armsight.robot.arm import Arm
+    from armsight.robot.kinematics.arm import Arm
 
 
 def point_to_point(

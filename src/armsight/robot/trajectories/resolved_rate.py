@@ -33,7 +33,7 @@ from armsight.robot.trajectories.trajectory import (
 )
 
 if TYPE_CHECKING:
-    from armsight.robot.arm import Arm
+    from armsight.robot.kinematics.arm import Arm
 
 #: How fast the tool returns to its reference, 1/s: what is left of an error falls to a third in 1/GAIN.
 GAIN = 30.0

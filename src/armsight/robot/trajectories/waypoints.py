@@ -23,7 +23,7 @@ from armsight.robot.trajectories.cartesian import PathMotion, follow
 from armsight.robot.trajectories.path import PathPoints, checked_pose, way
 
 if TYPE_CHECKING:
-    from armsight.robot.arm import Arm
+    from armsight.robot.kinematics.arm import Arm
 
 
 @dataclass(frozen=True, eq=False)

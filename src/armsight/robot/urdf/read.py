@@ -25,7 +25,7 @@ from armsight.errors import InputError
 from armsight.files import read_text
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.table import exact_cos_sin
 from armsight.robot.urdf.tree import MOVING, Joint, Tree
 from armsight.tables.lengths import REACH, fitting_unit, metric

@@ -20,7 +20,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.files import write_text
 from armsight.geometry.pose import pose
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.table import exact_cos_sin
 
 #: Radius of the bars, as a share of the arm's length along its links, its bounds, m, and how it shrinks from link to link.

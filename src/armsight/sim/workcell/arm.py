@@ -17,7 +17,7 @@ import numpy as np
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import read_toml
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 #: Rows of the table whose amounts say more than where base and tool are.
 _LENGTHS, _OFFSETS, _TWISTS, _ZEROS = slice(0, -1), slice(1, -1), slice(0, -1), slice(1, -1)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from armsight.data import Array
-from armsight.robot.arm import Arm
 from armsight.robot.boards.codes import Reaction
 from armsight.robot.boards.configuration import (
     CONFIG,
@@ -20,6 +19,7 @@ from armsight.robot.boards.configuration import (
     check_configuration,
     pin_number,
 )
+from armsight.robot.kinematics.arm import Arm
 from armsight.sim.workcell.arm import pot_travel
 from armsight.sim.workcell.motors import SUPPLY_V, Motors, Solids, gravity_torque, inertia
 from armsight.sim.workcell.plant import COUNTS, HIGH_SHARE, LOW_SHARE

@@ -20,7 +20,7 @@ from armsight.data import Array, Image, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.processes import Process
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.sim.camera.pipeline import SimulatedCamera
 from armsight.sim.camera.stages import CameraPipeline, preset_names
 from armsight.sim.example_rig import example_rig

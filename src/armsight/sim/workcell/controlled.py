@@ -15,12 +15,12 @@ from typing import Protocol
 import numpy as np
 
 from armsight.data import Array, JointCommand
-from armsight.robot.arm import Arm
+from armsight.robot.board_registry import AR4, FEETECH
 from armsight.robot.boards.ar4.board import Ar4Board
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.boards.feetech.board import FeetechBoard
 from armsight.robot.boards.feetech.bus import ServoBus
-from armsight.robot.boards.opening import AR4, FEETECH
+from armsight.robot.kinematics.arm import Arm
 from armsight.sim.boards.ar4 import Ar4Mechanics, Ar4Teensy
 from armsight.sim.boards.device import STEP_S, Device, SteppedLink
 from armsight.sim.boards.so101 import SERVOS, So101Bus, So101Mechanics

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import transform
 from armsight.kernels import kernel
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.chain import after_link, after_rotation, first_frame, sincos, store
 from armsight.robot.kinematics.table import rows_of
 

@@ -28,8 +28,8 @@ from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3, quaternion_wxyz
 from armsight.kernels import kernel
-from armsight.robot.arm import Arm
 from armsight.robot.boards.link import Sensed
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.table import BASE, TOOL, link, rows_of
 from armsight.sim.workcell.arm import TrueArm, pot_travel
 from armsight.sim.workcell.motors import GRAVITY_M_S2, SUPPLY_V, Motors, Solids, chosen, inertia, solids

@@ -20,12 +20,12 @@ from armsight.data import Array, Image, Record, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
-from armsight.robot.arm import Arm
 from armsight.robot.arm_file import open_arm
+from armsight.robot.board_registry import configured, open_emulator, slowed
 from armsight.robot.boards.configuration import JOINTS
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.boards.emulated import EmulatedLink
-from armsight.robot.boards.opening import configured, open_emulator, slowed
+from armsight.robot.kinematics.arm import Arm
 from armsight.sim.camera.stages import CameraPipeline
 from armsight.sim.example_rig import board_poses
 from armsight.sim.render.optics import Sensor

@@ -12,7 +12,6 @@ from pathlib import Path
 
 from armsight import firmware
 from armsight.errors import InputError
-from armsight.robot.arm import Arm
 from armsight.robot.boards.ar4 import board as ar4_board
 from armsight.robot.boards.ar4.board import Ar4Board
 from armsight.robot.boards.board import Board
@@ -29,6 +28,7 @@ from armsight.robot.boards.link import Emulator, Plant
 from armsight.robot.boards.qemu import QemuEmulator
 from armsight.robot.boards.serial import BAUD, SerialLink
 from armsight.robot.boards.unicorn import UnicornEmulator
+from armsight.robot.kinematics.arm import Arm
 
 #: Name -> what opens the emulator of a file, and the file the package carries for it.
 EMULATORS: Mapping[str, tuple[Callable[[Path], Emulator], Callable[[], Path]]] = {

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from armsight.data import Array
-from armsight.robot.arm import Arm
+from armsight.robot.kinematics.arm import Arm
 
 #: Random poses looked at, and how many of the best are improved.
 POSES, IMPROVED = 20_000, 4
