@@ -166,7 +166,7 @@ def _back(L: Array, g: Array, x: Array) -> None:
 
 @kernel(
     "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], const f8[:, :, ::1], const f8[:, :, :, ::1], "
-    "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]",
+    "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]"
 )
 def _minimise(
     fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, uv: Array, cov_uv: Array,

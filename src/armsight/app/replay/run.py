@@ -81,11 +81,7 @@ def live_row(estimate: ArmEstimate) -> LiveRow:
     """Return an estimate as a row."""
     T = estimate.T_base_tool
     return LiveRow(
-        estimate.t_s,
-        T[:3, 3],
-        np.array(quaternion(T[:3, :3])),
-        left_axes(T, estimate.cov),
-        estimate.vision_age_s,
+        estimate.t_s, T[:3, 3], np.array(quaternion(T[:3, :3])), left_axes(T, estimate.cov), estimate.vision_age_s
     )
 
 

@@ -273,12 +273,7 @@ class Loop:
 
     @classmethod
     def open(
-        cls,
-        setup: Setup,
-        follower: Follower,
-        log: Log,
-        estimator: KalmanEstimator,
-        publisher: Publisher | None = None,
+        cls, setup: Setup, follower: Follower, log: Log, estimator: KalmanEstimator, publisher: Publisher | None = None
     ) -> Loop:
         """Return a loop that has received the first joint reading; arguments as for the class, and a publisher.
 

@@ -226,12 +226,7 @@ class ErrorModel:
         return z, H
 
     def predicted(
-        self,
-        state: ErrorState,
-        step: Propagation,
-        joints: Smoothed,
-        pose_measurement: PoseMeasurement,
-        jitter_s: float,
+        self, state: ErrorState, step: Propagation, joints: Smoothed, pose_measurement: PoseMeasurement, jitter_s: float
     ) -> tuple[Predicted, float]:
         """Return a state at a measurement, and the chi-square of that; arguments as for :meth:`innovation`."""
         x, P, n = state.x.copy(), state.P.copy(), self.layout.size
@@ -241,13 +236,7 @@ class ErrorModel:
         return at, _predicted(self._table, *moved, *seen, jitter_s, *at)
 
     def updated(
-        self,
-        at: Predicted,
-        joints: Smoothed,
-        pose_measurement: PoseMeasurement,
-        jitter_s: float,
-        *,
-        learns_delay: bool,
+        self, at: Predicted, joints: Smoothed, pose_measurement: PoseMeasurement, jitter_s: float, *, learns_delay: bool
     ) -> Array:
         """Use a measurement: overwrite ``at.x`` and ``at.P`` by state and covariance after it; return the gain (size, 6).
 
@@ -288,7 +277,7 @@ def _decayed(x: float) -> float:
 
 @kernel(
     "f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[:, ::1], "
-    "f8[:, ::1]",
+    "f8[:, ::1]"
 )
 def _forget(
     time: Array,

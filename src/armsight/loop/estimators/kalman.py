@@ -294,11 +294,7 @@ class KalmanEstimator:
             self._widths @ x,
             np.sqrt(np.diag(self._widths @ P @ self._widths.T)),
             now.unseen[0, 0],
-            replace(
-                self._delay,
-                delay_s=self._delay_s(self.span_s[1], x),
-                sigma_s=float(sigma[self._at.delay]),
-            ),
+            replace(self._delay, delay_s=self._delay_s(self.span_s[1], x), sigma_s=float(sigma[self._at.delay])),
         )
 
     def _backlash(self) -> Array:

@@ -232,7 +232,7 @@ def _round(variance: Array, lasts: Array, speeds: Array, step: float, sigma: flo
 
 @kernel(
     "f8[::1], f8[:, ::1], f8[:, :, ::1], i8, i8, f8[::1], f8, f8, f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], "
-    "f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1]",
+    "f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1]"
 )
 def _smooth(
     t: Array,

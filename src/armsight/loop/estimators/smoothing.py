@@ -14,14 +14,7 @@ import numpy as np
 
 from armsight.data import Array, Ids
 from armsight.geometry.pose import exp_se3, inverse, log_se3
-from armsight.loop.estimators.errormodel import (
-    ErrorModel,
-    ErrorState,
-    Propagation,
-    bridged,
-    shared,
-    smoothed_anew,
-)
+from armsight.loop.estimators.errormodel import ErrorModel, ErrorState, Propagation, bridged, shared, smoothed_anew
 from armsight.loop.estimators.estimator import Track
 from armsight.loop.estimators.readings import Readings, Smoothed
 

@@ -22,13 +22,7 @@ from armsight.geometry.rotation import nearest_rotation, quaternion_wxyz
 from armsight.loop.identify import model as chain
 from armsight.loop.identify.identify import Identified
 from armsight.loop.identify.model import FAST, RIPPLES, Feature, Model, all_features
-from armsight.robot.arm_file import (
-    LIMITS,
-    file_transform,
-    identified_table,
-    joint_numbers,
-    tilted_urdf,
-)
+from armsight.robot.arm_file import LIMITS, file_transform, identified_table, joint_numbers, tilted_urdf
 from armsight.robot.kinematics.arm import Arm
 
 #: Newton steps to a reading, and what counts as there, m and rad.

@@ -173,13 +173,7 @@ def fit(
 
 
 def covariance(
-    model: Model,
-    x: Array,
-    measured: Measured,
-    phi: Array,
-    free: Mask,
-    prior: Array,
-    noise: tuple[float, float],
+    model: Model, x: Array, measured: Measured, phi: Array, free: Mask, prior: Array, noise: tuple[float, float]
 ) -> Array:
     """Return the covariance (P, P) of the free parameters at a vector; zero for the others."""
     linear = linear_of(model, x, measured, phi, free, prior)

@@ -3,7 +3,7 @@
 In: a board's name (``emulated:unicorn``, ``emulated:qemu``, ``emulated:host``, ``serial:PORT``, ``feetech:PORT``,
 ``ar4:PORT``) and :class:`JointCommand`. Out: :class:`JointStates` and what the board says of itself.
 
-- ``opening``: opens a board by its name; ``contract``: what every board does, and says that it cannot do;
+- ``contract``: what every board does, and says that it cannot do;
 - ``board``: the host's end of our firmware, :class:`~armsight.robot.boards.board.Board`;
 - ``feetech``, ``ar4``: arms that keep their own controller;
 - ``wire``: messages over a link; ``codes``, ``configuration``, ``reports``: what their numbers mean;

@@ -1,7 +1,8 @@
-"""Kinematics as plain functions of (table, q), all kernels: no checks and no allocation; :class:`Arm` checks.
+"""Kinematics: :class:`~armsight.robot.kinematics.arm.Arm` checks, kernels of (table, q) compute without allocation.
 
 In: the packed table of an arm and joint angles, rad, or a pose T_base_tool, m. Out: poses, Jacobians, joint angles.
 
+- ``arm``, ``solutions``, ``reach``: the arm, its joint angles at a pose, its workspace;
 - ``table``: the packed form of a Denavit-Hartenberg table, which all kernels read;
 - ``chain``: forward kinematics, Jacobian and its rate, one configuration or a batch of eight;
 - ``structure``: which closed-form inverse a table of six joints has; ``closed``: that inverse;

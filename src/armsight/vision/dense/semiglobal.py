@@ -179,15 +179,7 @@ def forward(
 
 
 @kernel(nogil=True)
-def leftward(
-    work: PathBuffers,
-    image: Bytes,
-    y: int,
-    size: np.uintp,
-    at: np.uintp,
-    p1: np.uint8,
-    p2: Bytes,
-) -> None:
+def leftward(work: PathBuffers, image: Bytes, y: int, size: np.uintp, at: np.uintp, p1: np.uint8, p2: Bytes) -> None:
     """Go along row y to the left, and add to the totals; arguments as :func:`forward`."""
     width = image.shape[1]
     slot, costs = size + _GUARD, cost_base(width, size)

@@ -106,14 +106,7 @@ def _least_of(total: Counts, at: np.uintp, count: np.uintp, best_right: Counts, 
 
 @kernel(nogil=True)
 def choose_row(
-    total: Counts,
-    at: np.uintp,
-    best_right: Counts,
-    y: int,
-    first: int,
-    count: int,
-    size: np.uintp,
-    found: Winners,
+    total: Counts, at: np.uintp, best_right: Counts, y: int, first: int, count: int, size: np.uintp, found: Winners
 ) -> None:
     """Choose the disparities of row y.
 

@@ -212,7 +212,7 @@ def _refine(fisheye: bool, k: Array, d: Array, P: Array, n: Array, radius: float
 
 @kernel(
     "b1, const f8[::1], const f8[::1], f8[:, ::1], f8[:, ::1], const f8[::1], f8[:, ::1], f8[:, ::1], "
-    "f8[:, :, ::1], f8[:, :, ::1]",
+    "f8[:, :, ::1], f8[:, :, ::1]"
 )
 def _each(
     fisheye: bool,

@@ -17,17 +17,7 @@ from typing import Literal, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import (
-    SIDES,
-    Array,
-    Correspondences,
-    Dropped,
-    Missed,
-    Points,
-    PoseEstimate,
-    Record,
-    Shot,
-)
+from armsight.data import SIDES, Array, Correspondences, Dropped, Missed, Points, PoseEstimate, Record, Shot
 from armsight.geometry.pose import inverse, log_se3
 from armsight.vision.discs.bias import bias_normals
 from armsight.vision.follow.kernel import (

@@ -17,13 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.geometry.matrix import (
-    applied,
-    dot,
-    product,
-    solved,
-    solved_vector,
-)
+from armsight.geometry.matrix import applied, dot, product, solved, solved_vector
 from armsight.kernels import kernel, kernel_types
 from armsight.vision.camera import distort
 from armsight.vision.discs.bias import disc_image
@@ -522,7 +516,7 @@ def look(
 
 @kernel(
     "const u1[:, ::1], const u1[:, ::1], const f8[:, ::1], f8[::1], f8, DiscScene, f8, f8, f8, f8[::1], "
-    "DiscMeasurement, f8[:, ::1], FitBuffers, (f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])",
+    "DiscMeasurement, f8[:, ::1], FitBuffers, (f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
 )
 def follow_pair(
     left: NDArray[np.uint8], right: NDArray[np.uint8], T: Array, twist: Array, seconds: float, scene: DiscScene,

@@ -107,21 +107,11 @@ def _outlines(
     image: Grey, words: Words64, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
     signs: NDArray[np.int64], contrast: Array, room: Room,
 ) -> int:  # fmt: skip
-    """Search an image for outlines of discs.
+    """Search an image for outlines of discs; return their number.
 
-    Args:
-        image: as in :func:`~armsight.vision.markers.disc.search.search`, and words, bright, dark, codes, room.
-        words: see there.
-        bright: see there.
-        dark: see there.
-        starts: (N, 10) filled with the outlines: centre, M, blur, contrast, base, gradient.
-        codes: see there.
-        signs: (N,) filled with 1 for bright ones, -1 for dark ones.
-        contrast: (N,) filled with their contrast, grey levels.
-        room: see there.
-
-    Returns:
-        The number of outlines.
+    Filled are ``starts`` (N, 10), the outlines: centre, M, blur, contrast, base, gradient; ``signs`` (N,), 1 for bright
+    ones, -1 for dark ones; and ``contrast`` (N,), grey levels. The others are those of
+    :func:`~armsight.vision.markers.disc.search.search`.
     """
     n = search(image, words, noise_of(image), bright, dark, starts, codes, signs, room)
     across, good = np.empty(_RAYS), 0

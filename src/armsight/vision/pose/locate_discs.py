@@ -65,12 +65,7 @@ def locate_composite(
 
 
 def locate_discs(
-    rig: StereoRig,
-    body: Body,
-    target: DiscTarget,
-    coded: Correspondences,
-    seen: Correspondences,
-    T_left_body: Array,
+    rig: StereoRig, body: Body, target: DiscTarget, coded: Correspondences, seen: Correspondences, T_left_body: Array
 ) -> PoseEstimate | Missed:
     """Locate a body from named discs and coded points, the perspective bias of the discs subtracted.
 

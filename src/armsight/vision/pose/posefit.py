@@ -164,7 +164,7 @@ def _by_rotation(J: Array, p: Array) -> None:
 
 @kernel(
     "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], "
-    "f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]",
+    "f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]"
 )
 def differentiate(
     fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, p: Array, camera: Ids, uv: Array,
@@ -271,7 +271,7 @@ def moved(T: Array, xi: Array, out: Array) -> None:
 
 @kernel(
     "b1[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], "
-    "b1, i8, f8[:, ::1], f8[::1], f8[:, ::1]",
+    "b1, i8, f8[:, ::1], f8[::1], f8[:, ::1]"
 )
 def _fit(
     fisheye: NDArray[np.bool_], k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, uv: Array, weight: Array,

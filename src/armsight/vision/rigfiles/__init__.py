@@ -19,11 +19,7 @@ if TYPE_CHECKING:
 #: Format name -> the module here that reads it, imported when it is opened; those of ``programs.py`` are asked first.
 FORMATS = dict.fromkeys(
     ("stereolabs", "mrcal", "basalt", "orbslam", "multical", "caliscope", "stereoparams"), "programs"
-) | {
-    "kalibr": "kalibr",
-    "ros": "ros",
-    "opencv": "opencv",
-}
+) | {"kalibr": "kalibr", "ros": "ros", "opencv": "opencv"}
 #: Those that are written, too.
 EXPORTED = ("opencv", "ros", "kalibr")
 #: Standard deviation of a detection where a file does not give one: that of chessboard corners in fair webcam images. A

@@ -373,7 +373,7 @@ def search(
 
 @kernel(
     "const u1[:, ::1], const u8[:, ::1], b1, b1, f8[:, ::1], i8[::1], i8[::1], "
-    "(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])",
+    "(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
 )
 def outlines(
     image: Grey, words: Words64, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
@@ -408,7 +408,7 @@ def _again(n: int, starts: Array, signs: NDArray[np.int64], cells: NDArray[np.in
 
 @kernel(
     "const u1[:, ::1], const u8[:, ::1], b1, b1, i8, i8, i8, f8[:, ::1], i8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], "
-    "(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1]), FitBuffers",
+    "(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1]), FitBuffers"
 )
 def find(
     image: Grey, words: Words64, bright: bool, dark: bool, good: int, first: int, n: int, starts: Array,
