@@ -411,9 +411,12 @@ def _bounded(
     """Write a command with a changed correction, as far as the limits allow.
 
     Args:
-        q: (2, n) the motion's joints now and ahead, rad; the speeds ``qd`` likewise.
+        q: (2, n) the motion's joints now and ahead, rad, and so are the speeds.
+        qd: see ``q``.
         J: (6, n) Jacobian.
-        q_min: (n,) limits of the angles, rad, with ``q_max``; ``qd_max`` of the speeds, rad/s.
+        q_min: (n,) limits of the angles, rad.
+        q_max: (n,) the same.
+        qd_max: (n,) of the speeds, rad/s.
         most: (n,) of the change, rad.
         most_rad: of the correction, rad.
         most_m: of the tool's displacement by it, m.

@@ -267,16 +267,9 @@ def _completed(
 ) -> tuple[Ids, Array, NDArray[np.bool_]]:
     """Replace the odd outlines of a grid by what their neighbours let expect, and add discs that the search missed.
 
-    Args:
-        image: (H, W) grey.
-        cells: (N, 2) the grid's cells.
-        theta: (N, 10) its outlines.
-        sign: 1 for light discs, -1 for dark ones.
-        size_px: width and height of the image.
-        rings: whether the board has rings, of which a part may have been taken for a disc.
-
-    Returns:
-        (M, 2) cells, (M, 10) outlines, (M,) whether a disc has a hole.
+    In: its cells (N, 2) and outlines ``theta`` (N, 10) in a grey image (H, W); ``sign`` is 1 for light discs, -1 for dark
+    ones; ``rings``: whether the board has rings, of which a part may have been taken for a disc. Out: cells (M, 2),
+    outlines (M, 10), and whether a disc has a hole (M,).
     """
     kept = ~odd_sized(theta, _ODD_OUTLINE)
     if rings:
