@@ -3,6 +3,7 @@
     python digits.py                       all of digits.toml: what is outside its tolerance is printed, exit code 1
     python digits.py identify kinhec       the runs alone whose names contain one of these words
     python digits.py --write               take over what was measured, where it is better or new
+    python digits.py page                  write docs/measured.md: measured.md of this folder, then these figures
     python digits.py --outputs FOLDER      read what the commands printed there, NAME.txt, in place of running them
 
 ``digits.toml`` has by run its command (``{data}`` is ARMSIGHT_DATA, ``{work}`` a folder that is deleted) and its figures: a
@@ -27,6 +28,9 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 STORED = HERE / "digits.json"
+#: What people read, and its hand-written part.
+PAGE = HERE.parent / "docs" / "measured.md"
+WRITTEN = HERE / "measured.md"
 
 
 def output(run: dict[str, Any], outputs: Path | None, work: Path) -> str:
@@ -61,6 +65,32 @@ def is_worse(value: float, stored: float, each: dict[str, Any]) -> bool:
     return not off <= most
 
 
+def row(name: str, value: float | None, each: dict[str, Any]) -> str:
+    """Return a figure's row of the page: metres as mm, and what it may differ by before it counts as worse."""
+    tolerance = f"{100 * each.get('tolerance', 0.02):g} %" if "within" not in each else f"{each['within']:g}"
+    if name.endswith(", m"):
+        value = None if value is None else 1e3 * value
+        name = f"{name}m"
+        tolerance = tolerance if "within" not in each else f"{1e3 * each['within']:g}"
+    better = {"less": "less", "more": "more", "same": "neither"}[each.get("better", "less")]
+    return f"| {name} | {'not yet' if value is None else f'{value:.4g}'} | {better} | {tolerance} |"
+
+
+def page(written: str, runs: list[dict[str, Any]], stored: dict[str, float]) -> str:
+    """Return docs/measured.md: the hand-written part, and a table for each run with its command."""
+    lines = [
+        "## Figures that are held",
+        "",
+        "`python benchmarks/digits.py` measures these again and ends with 1 where one is worse by more than its tolerance.",
+        "`{data}` is ARMSIGHT_DATA, `{work}` a temporary folder. The whole list: `benchmarks/digits.toml`.",
+    ]
+    for run in runs:
+        lines += ["", f"### {run['name']}", "", f"`{run['command']}`", ""]
+        lines += ["| figure | value | better | tolerance |", "|---|---|---|---|"]
+        lines += [row(name, stored.get(f"{run['name']}: {name}"), each) for name, each in run["figures"].items()]
+    return written.rstrip() + "\n\n" + "\n".join(lines) + "\n"
+
+
 def main() -> int:
     """Measure, print, compare."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -70,6 +100,9 @@ def main() -> int:
     given = parser.parse_args()
     runs = tomllib.loads((HERE / "digits.toml").read_text(encoding="utf-8"))["run"]
     stored = json.loads(STORED.read_text(encoding="utf-8")) if STORED.exists() else {}
+    if given.names == ["page"]:
+        PAGE.write_text(page(WRITTEN.read_text(encoding="utf-8"), runs, stored), encoding="utf-8")
+        return 0
     worse = 0
     for run in runs:
         if given.names and not any(name in run["name"] for name in given.names):
