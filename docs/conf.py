@@ -39,12 +39,12 @@ nitpick_ignore_regex = [
     # Type aliases and private names that appear in signatures only.
     (r"py:(class|obj|data|attr)", r"armsight\.data\.(Array|Image)"),
     # Records inside one subject, named in signatures of public functions; the reference has the public names only.
-    (r"py:.*", r"armsight\.vision\.(bundle|detections|projection|rectify)\.\w+"),
+    (r"py:.*", r"armsight\.vision\.(pose\.)?(bundle|detections|projection|rectify)\.\w+"),
     (
         r"py:.*",
         r"armsight\.(loop\.estimators\.readings|loop\.identify\.(model|identify)|robot\.trajectories\.limits)\.\w+",
     ),
-    (r"py:.*", r"armsight\.vision\.(calibrate\.motion|markers\.(body_file|disc\.target|spec))\.\w+"),
+    (r"py:.*", r"armsight\.vision\.(calibrate\.motion|markers\.(body_file|disc\.target|discs|spec))\.\w+"),
 ]
 suppress_warnings = ["config.cache"]  # sphinx-gallery keeps functions in its configuration
 
