@@ -180,10 +180,7 @@ def test_a_gripper_on_tool0(name, caplog):
             [*serial(6), joint("a", "revolute", "link6", "x"), joint("b", "revolute", "link6", "y")],
             "do not follow one another.*--tool-link x, or y, or link6",
         ),
-        (
-            [*serial(3), joint("j4", "revolute", "link3", "l4", more='<mimic joint="joint2"/>')],
-            "'j4' is a mimic",
-        ),
+        ([*serial(3), joint("j4", "revolute", "link3", "l4", more='<mimic joint="joint2"/>')], "'j4' is a mimic"),
     ],
 )
 def test_what_is_no_one_arm_is_said_with_the_links_to_choose_from(tmp_path, joints, said):

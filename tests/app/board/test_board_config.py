@@ -21,10 +21,7 @@ def test_what_differs_is_printed_value_by_value(armsight, tmp_path):
     text = armsight("board", "config", "get", *HOST).out
     path.write_text(text.replace("soft_max_rad = 2.4", "soft_max_rad = 1.25", 1), encoding="utf-8")
     said = armsight("board", "config", "diff", str(path), *HOST)
-    assert (said.code, said.out.strip()) == (
-        1,
-        f"joint.1.soft_max_rad: 2.4 on the board, 1.25 in {path}",
-    )
+    assert (said.code, said.out.strip()) == (1, f"joint.1.soft_max_rad: 2.4 on the board, 1.25 in {path}")
     found = json.loads(armsight("board", "config", "diff", str(path), *HOST, "--json").out)
     assert found == {"joint.1.soft_max_rad": [2.4, 1.25]}
 

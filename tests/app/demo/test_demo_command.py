@@ -184,8 +184,7 @@ def test_a_demo_where_a_file_stands(armsight, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [("--seed", "-1"), ("--seed", "many"), ("--speed", "9"), ("--board", "serial:x"), ("--layout", "round")],
+    "options", [("--seed", "-1"), ("--seed", "many"), ("--speed", "9"), ("--board", "serial:x"), ("--layout", "round")]
 )
 def test_options_typed_wrong(armsight, options):
     assert armsight("demo", *options).code == 2

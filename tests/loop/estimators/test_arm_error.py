@@ -70,11 +70,7 @@ def test_it_is_a_slow_arm_with_the_same_errors():
     rng = np.random.default_rng(3)
     sigmas = Prior().sigmas(0.0)
     sigmas[READING:POSE] = 1e-4  # what smoothing leaves of the readings' noise: no amount of the prior
-    x, q, unseen = (
-        rng.normal(size=SIZE) * sigmas,
-        rng.uniform(-1, 1, 6) + MIDDLE,
-        rng.uniform(-1, 1, (3, 6)),
-    )
+    x, q, unseen = (rng.normal(size=SIZE) * sigmas, rng.uniform(-1, 1, 6) + MIDDLE, rng.uniform(-1, 1, (3, 6)))
     joints = q.copy()
     for i in range(6):
         c = x[LINEARITY + BASIS * i : LINEARITY + BASIS * (i + 1)]

@@ -96,6 +96,12 @@ def test_a_pivot_is_found_within_its_sigma():
 
 
 def test_a_tool_that_hardly_rotates_is_rejected():
+    phi = np.vstack([np.outer(np.linspace(-1, 1, 7), [0, 0, 1.0]), [1.0, 0, 0]])
+    Ts = np.tile(np.eye(4), (8, 1, 1))
+    Ts[:, :3, :3] = Rotation.from_rotvec(phi).as_matrix()
+    Ts[:, :3, 3] = -Ts[:, :3, :3] @ [0, 0, 0.2]
+    with pytest.raises(CalibrationError, match="one axis only"):  # one pose alone would decide
+        calibrate_pivot(Ts)
     with pytest.raises(CalibrationError, match="rotated too little"):
         calibrate_pivot(pivoting(1, spread=0.01)[0])
     with pytest.raises(InputError, match="4 or more"):

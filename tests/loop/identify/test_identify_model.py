@@ -46,12 +46,7 @@ def test_a_table_that_is_off_is_an_arm_that_is_off():
     table[:, chain.BETA] = 0.0
     x[model.table_at : model.sources_at] = table.ravel()
     off = replace(
-        model.arm,
-        offset=table[:, 0],
-        d=table[:, 1],
-        a=table[:, 2],
-        alpha=table[:, 3],
-        T_flange_tool=model.T_6_body(x),
+        model.arm, offset=table[:, 0], d=table[:, 1], a=table[:, 2], alpha=table[:, 3], T_flange_tool=model.T_6_body(x)
     )
     np.testing.assert_allclose(model.tool_in_base(x, measured.q, None), off.forward(measured.q), atol=1e-12)
 

@@ -83,8 +83,7 @@ def test_images_of_one_camera_alone_may_show_another_print_of_the_board():
 
 
 @pytest.mark.parametrize(
-    ("model", "focal_px", "tried"),
-    [("fisheye", 230.0, ("brown5", "fisheye")), ("brown4", 450.0, MODELS)],
+    ("model", "focal_px", "tried"), [("fisheye", 230.0, ("brown5", "fisheye")), ("brown4", 450.0, MODELS)]
 )
 def test_the_model_is_chosen_on_held_out_error(model, focal_px, tried):
     true, board, Ts = rig_and_board(model, focal_px, 14)

@@ -88,10 +88,7 @@ TARGETS = {
         "target_type: 'aprilgrid' #gridtype\ntagCols: 6\ntagRows: 6\ntagSize: 0.088\ntagSpacing: 0.3\n",
         "aprilgrid:6x6:88mm:0.3",
     ),
-    "checker": (
-        CHECKER + "rowSpacingMeters: 0.06\ncolSpacingMeters: 0.06\n",
-        "chessboard:6x7:60mm",
-    ),
+    "checker": (CHECKER + "rowSpacingMeters: 0.06\ncolSpacingMeters: 0.06\n", "chessboard:6x7:60mm"),
     "circles": (
         "target_type: 'circlegrid'\ntargetCols: 6\ntargetRows: 7\nspacingMeters: 0.02\nasymmetricGrid: False\n",
         "circles:6x7:20mm",
@@ -119,22 +116,13 @@ def test_kalibr_targets_are_boards(tmp_path, name):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (
-            CHECKER + "rowSpacingMeters: 0.06\ncolSpacingMeters: 0.05\n",
-            "squares are 50 x 60 mm",
-        ),
+        (CHECKER + "rowSpacingMeters: 0.06\ncolSpacingMeters: 0.05\n", "squares are 50 x 60 mm"),
         (
             "target_type: 'checkerboard'\ntargetCols: 6\ntargetRows: 7\n",
             "checkerboard has no rowSpacingMeters; needed are targetCols",
         ),
-        (
-            APRIL + "tagCols: 6\ntagSize: 88\n",
-            "tagSize is 88 m; Kalibr's lengths are in metres: is it in mm",
-        ),
-        (
-            APRIL + "tagCols: 6.5\ntagSize: 0.08\n",
-            "must be whole numbers, got 6.5 and 6",
-        ),
+        (APRIL + "tagCols: 6\ntagSize: 88\n", "tagSize is 88 m; Kalibr's lengths are in metres: is it in mm"),
+        (APRIL + "tagCols: 6.5\ntagSize: 0.08\n", "must be whole numbers, got 6.5 and 6"),
         (APRIL + "tagCols: six\ntagSize: 0.08\n", "must be numbers"),
         ("target_type: 'assymetric'\n", "target_type is 'assymetric'; expected Kalibr's target_type, one of aprilgrid"),
         ("cam0:\n  camera_model: pinhole\n", "no target: there are cam0; expected"),

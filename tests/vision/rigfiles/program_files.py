@@ -411,9 +411,7 @@ PROGRAMS = {
     "json lists": (
         "json.dump of lists",
         "opencv",
-        {
-            "c.json": json.dumps(lists(named("camera_matrix_left", "dist_left", "camera_matrix_right", "dist_right"))),
-        },
+        {"c.json": json.dumps(lists(named("camera_matrix_left", "dist_left", "camera_matrix_right", "dist_right")))},
         MM_SIZE,
     ),
     "json nested": ("json.dump of nested names", "opencv", {"c.json": json.dumps(_json_two)}, MM),

@@ -75,12 +75,7 @@ def command() -> None:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 def evaluated(
-    data: Path,
-    closed: bool,
-    output: Path | None,
-    columns: str | None,
-    limit_texts: tuple[str, ...],
-    as_json: bool,
+    data: Path, closed: bool, output: Path | None, columns: str | None, limit_texts: tuple[str, ...], as_json: bool
 ) -> int:
     """Evaluate an arm by ISO 9283: accuracy and repeatability of poses, distance, paths, drift, and a circle.
 

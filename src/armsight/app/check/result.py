@@ -120,7 +120,11 @@ class CheckResult:
             ends = {"from": d.first, "to": d.last}
             found["distance"] = {**ends, "commanded_m": d.commanded_m, "AD_m": d.AD_m, "RD_m": d.RD_m}
         if (c := self.circle) is not None:
-            found["circle"] = {**c.metrics._asdict(), "axes": c.axes, "reversals": c.reversals}
+            found["circle"] = {
+                **{k: v for k, v in c.metrics._asdict().items() if k != "jumps_m"},
+                "axes": c.axes,
+                "reversals": c.reversals,
+            }
         return found
 
 

@@ -70,6 +70,8 @@ def calibrate_pivot(Ts: ArrayLike) -> Pivot:
         if (sane == used).all() or sane.sum() < MIN_POSES:
             break
         used = sane
+    for k in np.flatnonzero(used):  # no single pose may decide
+        _solved(linear, used & (np.arange(len(used)) != k))
     s = _solved(linear, used)
     cov = s.root @ s.root.T * float((s.left**2).sum() / max(s.left.size - 6, 1))
     held_out = np.full(len(poses), np.nan)
@@ -88,8 +90,6 @@ def _solved(linear: Linear, used: NDArray[np.bool_]) -> Solved:
     """Return tip and pivot (6,) by the poses used, for a scatter of 1."""
     s = solve(linear.rows(np.flatnonzero(used)), np.zeros(0))
     if np.sqrt(float(np.linalg.eigvalsh(s.root @ s.root.T)[-1]) * used.sum()) > MAX_AMPLIFICATION:
-        raise CalibrationError(
-            "the tool was rotated too little, or about one axis only, to determine its tip: rotate it by 30 degrees and "
-            "more to all sides while the tip stands still"
-        )
+        why = "the tool was rotated too little, or about one axis only, to determine its tip"
+        raise CalibrationError(f"{why}: rotate it by 30 degrees and more to all sides while the tip stands still")
     return s

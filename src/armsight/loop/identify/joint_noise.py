@@ -59,7 +59,7 @@ def joint_noise(model: Model, solution: Solution, prior: Array, measured: Measur
     with_sides = with_joint_noise(model, solution.x, measured, np.zeros(model.arm.joints))
     linear = linear_of(model, solution.x, with_sides, phi, solution.free, prior)
     B = by_joints(model, model.linearised(solution.x, measured, phi)[1])
-    joints = {name: B[:, :, [i]] for i, name in enumerate(model.arm.joint_names)}
+    joints = {f"joint {i + 1}": B[:, :, [i]] for i in range(model.arm.joints)}
     linear = replace(linear, own=joints | linear.own)
     start = np.array([START_RAD] * len(joints) + [START_M, START_RAD][: len(linear.own) - len(joints)]) ** 2
     variances = restricted(linear.rows(np.flatnonzero(solution.used)), start, MIN_NOISE, MAX_NOISE)

@@ -26,16 +26,8 @@ PERIPHERALS = {
     "SPI3": (0x40003C00, {"CR1": 0x0, "CR2": 0x4, "SR": 0x8, "DR": 0xC}, ("APB1ENR", 15)),
     "PWR": (0x40007000, {"CR": 0x0, "CSR": 0x4}, ("APB1ENR", 28)),
     "IWDG": (0x40003000, {"KR": 0x0, "PR": 0x4, "RLR": 0x8, "SR": 0xC}, None),
-    "USART2": (
-        0x40004400,
-        {"SR": 0x0, "DR": 0x4, "BRR": 0x8, "CR1": 0xC, "CR2": 0x10, "CR3": 0x14},
-        ("APB1ENR", 17),
-    ),
-    "USART1": (
-        0x40011000,
-        {"SR": 0x0, "DR": 0x4, "BRR": 0x8, "CR1": 0xC, "CR2": 0x10, "CR3": 0x14},
-        ("APB2ENR", 4),
-    ),
+    "USART2": (0x40004400, {"SR": 0x0, "DR": 0x4, "BRR": 0x8, "CR1": 0xC, "CR2": 0x10, "CR3": 0x14}, ("APB1ENR", 17)),
+    "USART1": (0x40011000, {"SR": 0x0, "DR": 0x4, "BRR": 0x8, "CR1": 0xC, "CR2": 0x10, "CR3": 0x14}, ("APB2ENR", 4)),
     "TIM1": (0x40010000, TIM, ("APB2ENR", 0)),
     "TIM8": (0x40010400, TIM, ("APB2ENR", 1)),
     "ADC1": (

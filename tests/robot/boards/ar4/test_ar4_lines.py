@@ -21,14 +21,8 @@ from armsight.robot.boards.ar4.models import MODELS, SENSE
         (lines.speeds(), b"JV\n"),
         (lines.reset_stop(), b"RE\n"),
         (lines.home("0012345"), b"JC0012345\n"),
-        (
-            lines.move_to([1, -2.5, 0, 4, 5, -6]),
-            b"MTA1.000000B-2.500000C0.000000D4.000000E5.000000F-6.000000\n",
-        ),
-        (
-            lines.move_with([0.0] * 6),
-            b"MVA0.000000B0.000000C0.000000D0.000000E0.000000F0.000000\n",
-        ),
+        (lines.move_to([1, -2.5, 0, 4, 5, -6]), b"MTA1.000000B-2.500000C0.000000D4.000000E5.000000F-6.000000\n"),
+        (lines.move_with([0.0] * 6), b"MVA0.000000B0.000000C0.000000D0.000000E0.000000F0.000000\n"),
     ],
 )
 def test_what_is_sent(line, text):
