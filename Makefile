@@ -22,7 +22,9 @@ test: $(VENV)/.armsight-test $(VENV)/.opencv4 style  ## everything that must hol
 	$(BIN)/python -m armsight.kernels.build
 	+$(MAKE) --no-print-directory --jobs=2 types pytest
 
+# Collected once before, so that bytecode is compiled once and not by each worker: 17 s of a processor for each.
 pytest:
+	$(BIN)/python -m pytest --collect-only --quiet > /dev/null
 	$(BIN)/python -m pytest $(PARALLEL)
 	$(OPENCV4) -c "import cv2; assert cv2.__version__.startswith('4.'), cv2.__version__"
 	$(OPENCV4) -m pytest $(PARALLEL) -m opencv $$(grep -rl --include="test_*.py" "pytest.mark.opencv" tests)
@@ -55,12 +57,29 @@ $(VENV)/.armsight: pyproject.toml setup.py $(shell find firmware -type f)
 	$(BIN)/python -m pip install --quiet --compile --disable-pip-version-check -e ".[sim,record]"
 	touch $@
 
-$(VENV)/.armsight-test: pyproject.toml setup.py $(shell find firmware -type f)
+# What builds the package, in a folder of its own: pip would install its 600 MB once to build and once to stay.
+$(VENV)/.build: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -e ".[test]"
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --upgrade --target $(VENV)/build \
+		$$($(BIN)/python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['build-system']['requires'])")
+	$(BIN)/python -c "import site; print('$(abspath $(VENV)/build)', file=open(site.getsitepackages()[0] + '/build.pth', 'w'))"
+	touch $@
+
+# Kernels and firmware are compiled while pip unpacks all else, of which they need nothing.
+$(VENV)/.armsight-test: $(VENV)/.build setup.py $(shell find firmware -type f)
+	+$(MAKE) --no-print-directory --jobs=2 packages native $(VENV)/.opencv4
 	touch $(VENV)/.armsight $@
 
-$(VENV)/.opencv4: $(VENV)/.armsight-test
+.PHONY: packages native
+packages:
+	PYTHONPATH=$(abspath $(VENV)/build) ARMSIGHT_NATIVE=later $(BIN)/python -m pip install --quiet --no-compile \
+		--disable-pip-version-check --no-build-isolation -e ".[test]"
+
+native:
+	PYTHONPATH=src:$(abspath $(VENV)/build) $(BIN)/python -S -m armsight.kernels.build
+	PYTHONPATH=src:$(abspath $(VENV)/build) $(BIN)/python -S -m armsight.firmware.build
+
+$(VENV)/.opencv4: $(VENV)/.build
 	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --no-deps --upgrade --target $(VENV)/opencv4 "opencv-python-headless<5"
 	touch $@
 

@@ -1,6 +1,7 @@
 """Build the kernels and the firmware with the package: no binary is in the repository. All else is in pyproject.toml.
 
-ARMSIGHT_TARGET=linux-aarch64 (kernels/build.py has the list) makes a wheel for another kind of machine.
+ARMSIGHT_TARGET=linux-aarch64 (kernels/build.py has the list) makes a wheel for another kind of machine. With
+ARMSIGHT_NATIVE=later an editable installation leaves kernels and firmware to whoever asked for it: the Makefile.
 """
 
 import dataclasses
@@ -50,6 +51,8 @@ class BuildNative(build_py):
         if not self.editable_mode:  # what was built before may be for another target
             shutil.rmtree(self.build_lib, ignore_errors=True)
         super().run()
+        if self.editable_mode and os.environ.get("ARMSIGHT_NATIVE") == "later":
+            return
         package = ROOT / "src" / "armsight" if self.editable_mode else Path(self.build_lib) / "armsight"
         kernels.build(package / "kernels", TARGET)
         compiler, library = firmware.open_compiler(), HOST_LIBRARIES[PLATFORMS[TARGET or kernels.this_machine()][1]]

@@ -13,8 +13,6 @@ from armsight.sim.recording import Look, Truth, record, shot_names
 from armsight.sim.render.scene import aprilgrid, chessboard
 from armsight.vision.sources.folder import FolderSource
 
-pytestmark = pytest.mark.opencv
-
 
 @pytest.fixture(scope="module")
 def rig():
@@ -55,6 +53,7 @@ def test_a_recording_is_a_source(recording):
     assert all(shot.left.shape == shot.right.shape == (360, 640) for shot in shots)
 
 
+@pytest.mark.opencv
 def test_opencv_puts_the_corners_where_they_are(recording):
     """Noise of 2 grey levels on a contrast of 190 moves cornerSubPix by 0.025 px, the mean of 54 by a seventh of it."""
     folder, truth = recording

@@ -10,8 +10,6 @@ import pytest
 from armsight.errors import InputError
 from armsight.vision.image import grey, read_image
 
-pytestmark = pytest.mark.opencv
-
 RNG = np.random.default_rng(0)
 GREY = RNG.integers(0, 256, (40, 60), dtype=np.uint8)
 COLOUR = cv2.resize(RNG.integers(0, 256, (10, 15, 3), dtype=np.uint8), (60, 40))
@@ -23,11 +21,13 @@ def stored(tmp_path, name, image):
     return path
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("suffix", ["png", "bmp", "tif", "pgm"])
 def test_grey_comes_back_as_it_was(tmp_path, suffix):
     np.testing.assert_array_equal(read_image(stored(tmp_path, f"a.{suffix}", GREY)), GREY)
 
 
+@pytest.mark.opencv
 def test_sixteen_bits_and_colour_come_back_as_they_were(tmp_path):
     deep = GREY.astype(np.uint16) * 257
     np.testing.assert_array_equal(read_image(stored(tmp_path, "a.png", deep)), deep)
@@ -36,6 +36,7 @@ def test_sixteen_bits_and_colour_come_back_as_they_were(tmp_path):
     np.testing.assert_array_equal(read_image(stored(tmp_path, "c.png", alpha)), COLOUR)
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
 @pytest.mark.parametrize("share", [0.3, 0.9, 0.999])
 def test_a_truncated_file_is_rejected(tmp_path, suffix, share, capfd):
@@ -63,6 +64,7 @@ def with_exif(jpeg, orientation, thumbnail=b""):
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]
 
 
+@pytest.mark.opencv
 def test_exif_orientation_is_ignored(tmp_path):
     path = stored(tmp_path, "a.jpg", COLOUR)
     plain = read_image(path)
@@ -86,6 +88,7 @@ def test_what_is_no_image_is_rejected(tmp_path, data):
         read_image(path)
 
 
+@pytest.mark.opencv
 def test_damaged_png_data_is_rejected(tmp_path, capfd):
     chunk = b"IDAT" + b"not deflated"
     path = tmp_path / "a.png"

@@ -12,7 +12,6 @@ from armsight.vision.rig import StereoRig
 from strategies import CAMERAS, ordinary_rig
 from views import both_pixels
 
-pytestmark = pytest.mark.opencv
 OPENCV = int(cv2.__version__.split(".")[0])
 
 
@@ -35,6 +34,7 @@ def test_rows_are_common_and_disparity_is_depth(model):
         np.testing.assert_allclose(form.to_raw(rect, side), raw, atol=1e-8)
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("model", ["none", "brown5", "fisheye"])
 def test_images_show_at_each_pixel_what_the_map_says(model):
     rig = ordinary_rig(model)
@@ -79,6 +79,7 @@ def test_images_of_another_size_are_rejected():
         form.images(good, np.zeros((480, 640), np.uint8))
 
 
+@pytest.mark.opencv
 def test_a_verging_rig_agrees_with_opencv():
     rig, p_left = example_rig(), scene_points()
     form, uv = rig.rectify(), both_pixels(example_rig(), scene_points())

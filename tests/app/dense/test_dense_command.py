@@ -16,8 +16,6 @@ from armsight.vision.dense.middlebury import read_pfm
 from armsight.vision.rig import StereoRig
 from cli_runs import assert_rejected, said_of
 
-pytestmark = pytest.mark.opencv
-
 
 @pytest.fixture
 def dense(capsys):
@@ -155,6 +153,7 @@ def read_ply(path):
     return np.frombuffer(body, np.dtype(fields), count)
 
 
+@pytest.mark.opencv
 def test_a_rig_gives_depth_in_mm_and_a_cloud_in_the_left_cameras_frame(dense, seen, tmp_path):
     folder, rig, truth = seen
     out = tmp_path / "out"

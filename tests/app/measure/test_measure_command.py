@@ -23,8 +23,6 @@ from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.rig import StereoRig
 from cli_runs import assert_rejected
 
-pytestmark = pytest.mark.opencv
-
 KEYS = {
     "shot", "status", "reason", "t_s", "position_m", "quaternion_wxyz", "euler_zyx_deg", "covariance",
     "residual_rms_m", "reprojection_rms_px", "points_m",
@@ -69,6 +67,7 @@ def tangents(rendered, records):
     return np.array(errors), np.array(covs)
 
 
+@pytest.mark.opencv
 def test_every_shot_is_measured_within_its_uncertainty(rendered, measured):
     records, _, complained = measured
     assert [r["shot"] for r in records] == list(rendered.of_arm.shots)
@@ -162,6 +161,7 @@ def test_people_read_millimetres_and_a_sigma(start, arm, armsight):
     assert said.err.startswith("measured 3 of 3 shots")
 
 
+@pytest.mark.opencv
 def test_a_board_is_a_target(rendered, armsight):
     said = armsight("measure", rendered.rig, "--target", "chessboard:9x6:25mm", *rendered.images("board"), "--json")
     assert said.code == 0, said.err

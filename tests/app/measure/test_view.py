@@ -36,8 +36,6 @@ from armsight.vision.rig import StereoRig
 from cli_runs import assert_rejected
 from disc_views import PLATE, SIZE, discs_of, hd_rig, someplace, views
 
-pytestmark = pytest.mark.opencv
-
 matplotlib = pytest.importorskip("matplotlib", reason="the chart needs matplotlib: pip install armsight[report]")
 
 FIVE = discs_of([[-0.055, 0, 0], [0.055, 0, 0], [0, 0.085, 0], [-0.03, 0.05, 0], [0.02, -0.06, 0]])
@@ -97,6 +95,7 @@ def test_a_detail_is_centred_to_the_pixel_and_its_pixels_are_squares():
     assert (_Panel("left", None, (80, 60)).detail(np.array([33.0, 21.0]), 8.0) == tile[0, 0]).sum() == 0
 
 
+@pytest.mark.opencv
 def test_a_disc_that_one_camera_does_not_see_is_shown_with_its_reason():
     rig, result = located(FIVE, hidden=[(0, 1, 0)])
     dropped = (Dropped("P2", "left: not where it should be"), Dropped("somebody", "is no point"))
@@ -161,6 +160,7 @@ def test_a_missed_shot_is_shown_with_its_reason_in_red_and_without_images_too():
         assert (np.abs(canvas.astype(int) - (40, 40, 200)).max(axis=2) <= blended).any()
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("shape", [(120, 160), (120, 160, 3), (3000, 4000), (900, 90), (1, 1)])
 def test_images_of_any_kind_and_size(shape):
     rig, result = located()

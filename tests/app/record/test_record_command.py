@@ -22,8 +22,6 @@ from armsight.vision import sources
 from armsight.vision.sources import FolderSource, open_source
 from cli_runs import listening
 
-pytestmark = pytest.mark.opencv
-
 rng = np.random.default_rng(20240611)
 
 
@@ -75,6 +73,7 @@ def assert_nothing_else(folder, shots):
     assert len(names) == 1 + 2 * sum(shot.problem is None for shot in shots)
 
 
+@pytest.mark.opencv
 def test_what_was_recorded_comes_back_bit_by_bit(tmp_path):
     shots = [
         *some(2),

@@ -9,8 +9,6 @@ from armsight.geometry.pose import exp_se3, inverse
 from armsight.loop.handeye import poses as handeye_start
 from armsight.loop.handeye.handeye import calibrate_handeye
 
-pytestmark = pytest.mark.opencv
-
 
 @pytest.mark.parametrize("eye", ["to_hand", "in_hand"])
 def test_the_covariance_holds_the_error_and_blunders_are_left_out(eye):
@@ -49,6 +47,7 @@ def test_the_closed_form_start_is_exact_without_noise():
     np.testing.assert_allclose(found_Z, Z, rtol=0, atol=1e-9)
 
 
+@pytest.mark.opencv
 @pytest.mark.skipif(not hasattr(cv2, "calibrateHandEye"), reason="this OpenCV has no calibrateHandEye")
 def test_the_own_start_is_as_good_as_opencvs():
     A, B, _, _, _ = recording(2)

@@ -32,7 +32,6 @@ from armsight.sim.render.render import radiance
 from armsight.sim.render.scene import PosedBody, plate
 from armsight.vision.camera import Camera
 
-pytestmark = pytest.mark.opencv
 SIZE = (160, 96)
 SENSOR = Photosensor(1000, 2000, 5, 0, 0, 0, 0, 12, 0.05)
 IDEAL = Photosensor(1e6, 1e6, 0, 0, 0, 0, 0, 14, 0)
@@ -86,6 +85,7 @@ def test_hot_pixels_are_where_they_were():
     assert ((camera.expose(flat(0.01)) > 10) != hot).mean() < 1e-3
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("how", ["bilinear", "edge"])
 def test_grey_comes_back_through_the_mosaic(how):
     mosaic = Mosaic((0.5, 1.0, 0.625), (2.0, 1.0, 1.6), how)
@@ -125,6 +125,7 @@ def test_sharpening_overshoots_by_what_the_gaussian_takes_away(amount, sigma):
     assert image[48, 100] == 153
 
 
+@pytest.mark.opencv
 def test_jpeg_is_opencv_s():
     light = scene()
     plain = SimulatedCamera(CameraPipeline(), SIZE).expose(light)
@@ -134,6 +135,7 @@ def test_jpeg_is_opencv_s():
     assert (found != plain).any()
 
 
+@pytest.mark.opencv
 def test_chroma_is_subsampled_as_asked(monkeypatch):
     """The frame header of the file says so: the sampling factors of its first component."""
     files, encode = [], cv2.imencode
@@ -257,6 +259,7 @@ def test_clean_is_the_renderer_s_own_noise():
     np.testing.assert_array_equal(image, exposed(light, Sensor(read_noise=2.0), rng))
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("name", preset_names())
 def test_the_same_seed_gives_the_same_images(name):
     light = scene()

@@ -9,8 +9,6 @@ from armsight.errors import InputError
 from armsight.vision.dense.evaluate import TrueDisparity, evaluate_disparity, seen_by_right
 from armsight.vision.dense.middlebury import find_scenes, load_scene, read_pfm, write_pfm
 
-pytestmark = pytest.mark.opencv
-
 
 def test_metrics_are_those_counted_by_hand():
     truth = TrueDisparity(np.array([[10.0, 10.0, 10.0, 10.0, np.nan]]), np.array([[True, True, True, False, True]]))
@@ -39,6 +37,7 @@ def test_occlusion_follows_from_the_truth():
     assert list(np.flatnonzero(~seen)) == [0, 1, 9, 10, 11, 12, 13]
 
 
+@pytest.mark.opencv
 def test_pfm_goes_round_and_opencv_reads_it(tmp_path):
     rng = np.random.default_rng(0)
     image = rng.normal(size=(7, 5)).astype(np.float32)

@@ -12,8 +12,6 @@ from armsight.vision.dense.methods import METHODS, open_method
 from armsight.vision.dense.opencv import OpenCV
 from armsight.vision.dense.semiglobal import Semiglobal
 
-pytestmark = pytest.mark.opencv
-
 SEARCH = Search(0, 32)
 VARIANTS = {
     **{name: open_method(name) for name in METHODS},
@@ -26,6 +24,7 @@ VARIANTS = {
 }
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("name", VARIANTS)
 def test_flat_layers_are_found_to_a_tenth_of_a_pixel(name):
     left, right, truth = layers()
@@ -86,6 +85,7 @@ def test_a_search_may_begin_above_zero_and_have_any_length(name):
     assert result.disparity[result.measured].max() <= 25.5
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("name", METHODS)
 def test_small_images_are_matched_too(name):
     left, right, _ = layers()

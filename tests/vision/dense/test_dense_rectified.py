@@ -10,8 +10,6 @@ from armsight.vision.dense.method import Search
 from armsight.vision.dense.methods import METHODS, open_method
 from armsight.vision.dense.rectified import match_pair
 
-pytestmark = pytest.mark.opencv
-
 SEARCH = Search(0, 32)
 
 
@@ -26,6 +24,7 @@ def rejected(left, right, *texts, search=SEARCH):
         assert word in str(error.value)
 
 
+@pytest.mark.opencv
 def test_a_good_pair_passes_without_a_remark():
     said = []
     assert match_pair(open_method("block"), *pair(), SEARCH, said.append).problem is None
@@ -47,6 +46,7 @@ def test_rows_that_are_a_little_apart_are_a_remark():
     assert "2.0 px apart" in said[0]
 
 
+@pytest.mark.opencv
 def test_exchanged_images_are_reported():
     left, right = pair()
     rejected(right, left, "exchanged")

@@ -7,8 +7,6 @@ from dense_scenes import layers
 from armsight.vision.dense.block import RAW_MAX, Block
 from armsight.vision.dense.method import Search
 
-pytestmark = pytest.mark.opencv
-
 
 def raw_costs(left, right, first, count):
     """Twice the census bits that differ and half of the absolute difference, pixel by pixel."""

@@ -19,8 +19,6 @@ from armsight.vision.camera import Camera
 from armsight.vision.markers.aruco import cells
 from armsight.vision.markers.board import BOARDS, open_board
 
-pytestmark = pytest.mark.opencv
-
 SPECS = {
     "chessboard": "chessboard:9x6:25mm",
     "charuco": "charuco:8x6:30mm:22mm:DICT_5X5_100",
@@ -143,6 +141,7 @@ def test_what_a_board_leaves_open(spec, symmetries):
     assert len(open_board(spec).symmetries) == symmetries
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("kind", BOARDS)
 @pytest.mark.parametrize(("tilt", "rotation"), [(0.0, 0.1), (0.5, -0.3)])
 def test_boards_are_found_where_they_are(kind, tilt, rotation):
@@ -165,6 +164,7 @@ def test_boards_are_found_where_they_are(kind, tilt, rotation):
         assert (0.7 if kind == "aprilgrid" else 0.85) < np.sqrt(np.mean(normalised) / 2) < 1.2
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("kind", BOARDS)
 @pytest.mark.parametrize("image", ["black", "white", "noise", "tiny"])
 def test_nothing_found_is_a_reason_and_never_an_exception(kind, image):
@@ -201,6 +201,7 @@ def test_what_colours_leave_open_is_a_flip(spec, rotation):
         assert (off[0] < 0.1) == (across[0] > np.abs(across[1]) or abs(rotation) < 0.7)
 
 
+@pytest.mark.opencv
 def test_a_strongly_sharpened_chessboard_is_found_without_its_covered_corner():
     rng = np.random.default_rng(4)
     camera = Camera((640, 480), "brown4", np.array([700.0, 700.0, 320.0, 240.0]), np.zeros(4))
@@ -270,6 +271,7 @@ def test_markers_in_the_dark_are_found_where_they_are(kind):
     assert np.abs(found.uv - truth[found.ids]).max() < 0.5
 
 
+@pytest.mark.opencv
 def test_both_layouts_of_charuco_are_read():
     target = open_board("charuco:7x6:30mm:22mm:DICT_4X4_50")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)

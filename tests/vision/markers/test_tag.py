@@ -13,8 +13,6 @@ from armsight.vision.markers.aruco import APRILTAGS, FAMILIES, cells, family_nam
 from armsight.vision.markers.square import fit_square
 from armsight.vision.markers.tag import Tag, TagTarget
 
-pytestmark = pytest.mark.opencv
-
 OUTLINE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 
 
@@ -109,6 +107,7 @@ def test_upright_is_whose_name_it_bears():
     np.testing.assert_array_equal(cells("DICT_4X4_50", 7) > 0, rendered > 0)
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_family_is_found_upright(family):
     identity = family_size(family) - 1
@@ -143,6 +142,7 @@ def seen(*identities):
     return paint(marker, H, (120, 75 * len(identities) + 60), 0.7, 6), project(H, corners)
 
 
+@pytest.mark.opencv
 def test_a_body_is_found_with_its_points_in_order():
     painted, truth = seen(30, 2, 11)
     found = plate(30, 2, 11).detect(expose(painted, 130, 2, np.random.default_rng(5)))
@@ -169,6 +169,7 @@ def listed(path):
             yield np.array(corners, float)[::-1] - 0.5  # to upper left first; to pixels from the first pixel's centre
 
 
+@pytest.mark.opencv
 def test_photographs_agree_with_the_apriltag_library(data_dir):
     ours, rough, total = [], [], 0
     for path in sorted((data_dir / "tags").glob("*.txt")):

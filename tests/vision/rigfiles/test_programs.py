@@ -41,9 +41,8 @@ from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.rigfiles import FORMATS, import_rig, open_format
 
-pytestmark = pytest.mark.opencv
 
-
+@pytest.mark.opencv
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_the_rig_is_that_of_the_file(tmp_path, name):
     _, format_, files, options = PROGRAMS[name]

@@ -20,8 +20,6 @@ from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles import EXPORTED, FORMATS, export_rig, import_rig
 from strategies import CAMERAS, ordinary_rig
 
-pytestmark = pytest.mark.opencv
-
 FILES = {
     "opencv": ["intrinsics.yml", "extrinsics.yml"],
     "ros": ["left.yaml", "right.yaml"],
@@ -65,6 +63,7 @@ def test_every_exported_format_is_tried_here():
     assert set(FILES) == set(HELD) == set(EXPORTED) <= set(FORMATS)
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize(("name", "model"), [(name, model) for name in HELD for model in HELD[name]])
 def test_round_trip(tmp_path, name, model):
     rig = ordinary_rig(model)
@@ -159,6 +158,7 @@ def test_a_pair_in_the_wrong_order_is_remarked(tmp_path, name):
     assert any("left of the first" in note for note in back.provenance["notes"])
 
 
+@pytest.mark.opencv
 def test_vertical_pairs_survive_rectification(tmp_path):
     rig = ordinary_rig("brown5")
     T = rig.T_left_right.copy()
@@ -194,6 +194,7 @@ def stereo_calib(tmp_path, header="%YAML:1.0", files=2, **changes):
     return out
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("header", ["%YAML:1.0", "%YAML 1.2"])  # OpenCV 4 and 5
 @pytest.mark.parametrize("files", [1, 2])
 def test_opencv_files_project_as_opencv_does(tmp_path, header, files):
@@ -205,6 +206,7 @@ def test_opencv_files_project_as_opencv_does(tmp_path, header, files):
     np.testing.assert_array_equal(again.T_left_right, rig.T_left_right)
 
 
+@pytest.mark.opencv
 def test_opencv_xml_is_read_too(tmp_path):
     storage = cv2.FileStorage(str(tmp_path / "both.xml"), cv2.FILE_STORAGE_WRITE)
     entries = {"M1": K_LEFT, "D1": D_LEFT, "M2": K_RIGHT, "D2": D_RIGHT, "R": R_GIVEN, "T": T_GIVEN.reshape(3, 1)}
@@ -255,6 +257,7 @@ def test_opencv_fisheye_is_read_where_it_is_named(tmp_path):
     assert any("Brown-Conrady, was assumed" in note for note in bare.provenance["notes"])
 
 
+@pytest.mark.opencv
 def test_opencv_reads_back_what_was_exported(tmp_path):
     rig = ordinary_rig("brown5")
     export_rig(rig, "opencv", [tmp_path / "both.yml"])
@@ -285,6 +288,7 @@ def test_opencv_missing_entries(tmp_path, key, said):
         import_rig("opencv", stereo_calib(tmp_path, **{key: None}), unit_m=1.0, image_size_px=(1280, 720))
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -321,6 +325,7 @@ def test_opencv_damage(tmp_path, changes, said):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.opencv
 def test_opencv_says_where_the_parser_stopped(tmp_path):
     given = stereo_calib(tmp_path)
     text = given[1].read_text()
@@ -341,6 +346,7 @@ def test_opencv_other_files(tmp_path, text):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.opencv
 def test_opencv_truncations_are_reported(tmp_path):
     (path,) = stereo_calib(tmp_path, files=1)
     whole = path.read_text()

@@ -12,8 +12,6 @@ from armsight.errors import InputError
 from armsight.vision.sources import FolderSource, PairsSource, open_source
 from armsight.vision.sources.pairs import match, natural_key
 
-pytestmark = pytest.mark.opencv
-
 
 def shots(source):
     found = []
@@ -24,6 +22,7 @@ def shots(source):
     return found
 
 
+@pytest.mark.opencv
 def test_pairs_go_by_number_and_are_called_after_the_left_file(tmp_path, store, read_back):
     for k in (1, 2, 10):
         store(tmp_path / f"left{k}.png", "left", k)
@@ -39,6 +38,7 @@ def test_pairs_go_by_number_and_are_called_after_the_left_file(tmp_path, store, 
     assert all(shot.t_s is None and shot.problem is None for shot in found)
 
 
+@pytest.mark.opencv
 def test_a_damaged_image_is_a_shot_with_a_problem_and_the_run_goes_on(tmp_path, store):
     for k in range(3):
         store(tmp_path / f"left{k}.png", "left", k)

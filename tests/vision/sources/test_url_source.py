@@ -17,7 +17,7 @@ from armsight.errors import DeviceError, InputError
 from armsight.vision.sources import open_source, url
 from armsight.vision.sources.url import MjpegStream, RtspStream, UrlSource
 
-pytestmark = [pytest.mark.opencv, pytest.mark.real_time]
+pytestmark = pytest.mark.real_time
 
 PERIOD = 0.03
 BOUNDARY = "frameboundary"
@@ -97,6 +97,7 @@ def threads():
     return {thread.name for thread in threading.enumerate() if "://" in thread.name}
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize(
     ("length", "said"),
     [
@@ -121,6 +122,7 @@ def test_two_mjpeg_streams(server, films, read_back, length, said):
     assert times == sorted(times)
 
 
+@pytest.mark.opencv
 def test_grey_stays_grey_and_a_spoilt_frame_is_a_shot_with_a_problem(server):
     grey = jpeg(np.full((48, 64), 90, np.uint8))
     server.routes["/good"] = server.stream([grey])

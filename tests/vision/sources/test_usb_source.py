@@ -7,8 +7,6 @@ import pytest
 from armsight.errors import DeviceError, InputError
 from armsight.vision.sources import open_source, usb
 
-pytestmark = pytest.mark.opencv
-
 PERIOD = 1 / 30
 
 
@@ -120,6 +118,7 @@ def usb_pair(monkeypatch, tmp_path):
     return made
 
 
+@pytest.mark.opencv
 def test_both_are_grabbed_before_either_is_decoded(usb_pair):
     source = usb_pair.open()
     source.read()
@@ -166,6 +165,7 @@ def test_cameras_of_rates_that_never_meet_are_reported(usb_pair):
         source.read()
 
 
+@pytest.mark.opencv
 def test_all_settings_arrive_at_both_cameras(usb_pair):
     usb_pair.open("@1280x720@60,exposure=5ms,gain=20,format=MJPG")
     for capture in usb_pair.captures:
@@ -236,6 +236,7 @@ def test_a_hiccup_shorter_than_a_stall_is_waited_out(usb_pair):
     assert source.read().problem is None
 
 
+@pytest.mark.opencv
 def test_a_frame_that_does_not_decode_is_a_shot_with_a_problem(usb_pair):
     source = usb_pair.open()
     usb_pair.captures[1].undecodable = True
@@ -271,6 +272,7 @@ def test_one_camera_twice_is_an_error(tmp_path):
             usb.open_usb(rest)
 
 
+@pytest.mark.opencv
 def test_real_devices_that_are_not_there_or_no_cameras(tmp_path):
     with pytest.raises(DeviceError, match=r"/dev/video97: no such camera; `armsight cameras` lists those attached"):
         open_source("usb:97,98")

@@ -9,8 +9,6 @@ from armsight.errors import InputError
 from armsight.vision.sources import notes_of, open_source
 from armsight.vision.sources.video import Film
 
-pytestmark = pytest.mark.opencv
-
 
 @pytest.fixture
 def film(tmp_path):
@@ -232,6 +230,7 @@ def test_interpolated_frames_are_said(film, rates, share):
     assert f"frames {odd['interpolated'][0]}, {odd['interpolated'][1]}, " in note
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("degrees", [0, 90, 180, 270])
 def test_a_rotation_that_a_phone_noted_is_applied_as_opencv_does(tmp_path, degrees):
     stored = np.kron(np.random.default_rng(1).integers(0, 255, (6, 8, 3), np.uint8), np.ones((12, 12, 1), np.uint8))
