@@ -24,24 +24,9 @@ LOADED = re.compile(
 def site(tmp_path_factory):
     """Build the site; examples and tutorials are not run here."""
     folder = tmp_path_factory.mktemp("site")
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "sphinx",
-            "-W",
-            "--keep-going",
-            "-n",
-            "-q",
-            "-d",
-            folder / "doctrees",
-            DOCS,
-            folder / "html",
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    options = ["-m", "sphinx", "-W", "--keep-going", "-n", "-q"]
+    command = [sys.executable, *options, "-d", folder / "doctrees", DOCS, folder / "html"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return folder / "html"
 
