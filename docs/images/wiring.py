@@ -2,7 +2,7 @@
 
     python docs/images/wiring.py        (needs matplotlib)
 
-The pins are those of firmware/boards/stm32f4/pins.c; docs/howto/add_a_board.md has them as a table, which a test
+The pins are those of firmware/boards/stm32f4/pins.c; docs/howto/nucleo.md has them as a table, which a test
 holds to the code.
 """
 

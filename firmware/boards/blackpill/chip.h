@@ -1,5 +1,5 @@
 /* The Black Pill (WeAct, STM32F411CEU6): what the drivers of boards/stm32f4 reckon with there, and its pins for four
- * joints. docs/howto/add_a_board.md has the pin table and the wiring; a test holds them together. */
+ * joints. docs/howto/blackpill.md has the pin table and the wiring; a test holds them together. */
 #ifndef ARMSIGHT_CHIP_H
 #define ARMSIGHT_CHIP_H
 

@@ -1,4 +1,4 @@
-/* What the Nucleo-F446RE's drivers reckon with, and its pins. docs/howto/add_a_board.md has the pin table and the wiring;
+/* What the Nucleo-F446RE's drivers reckon with, and its pins. docs/howto/nucleo.md has the pin table and the wiring;
  * a test holds them together. Boards of the same family have a header of this name with the same definitions. */
 #ifndef ARMSIGHT_CHIP_H
 #define ARMSIGHT_CHIP_H
