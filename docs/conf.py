@@ -1,4 +1,4 @@
-"""Sphinx configuration of the site. `make docs` builds it; README of this folder: howto/write_docs.md."""
+"""Sphinx configuration of the site: `make docs` builds it."""
 
 from __future__ import annotations
 
