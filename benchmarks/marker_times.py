@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
+from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
 
-from armsight.data import Missed
+from armsight.data import Body, Detections, Missed
 from armsight.geometry.pose import inverse, log_se3, pose
+from armsight.vision.pose.measure import measure_detections
 from armsight.vision.rig import StereoRig
 from disc_images import disc_picture
 from marker_follow import Following
@@ -138,6 +142,60 @@ def pairs(seed: int, report: Report, count: int = 24) -> None:
     report.say(f"  {'its error':62s} {accuracy(np.array(xi).reshape(-1, 6))}")
 
 
+def few_points(seed: int, report: Report, count: int = 60, rounds: int = 12) -> None:
+    """Detections to a pose with covariance, of bodies of four, five and nine known points; peers on the same detections."""
+    rng, rig = np.random.default_rng(seed), replace(parallel_rig(LENS, 3.0), sigma_px=0.2)
+    x, y = np.meshgrid((-0.025, 0.0, 0.025), (-0.025, 0.0, 0.025))
+    nine = np.column_stack([x.ravel(), y.ravel(), np.zeros(9)])
+    corners = nine[[0, 2, 8, 6]]
+    us = {}
+    for points in (corners, np.vstack([corners, [[0.0, 0.0, 0.03]]]), nine):
+        n = len(points)
+        body, seen = Body("body", tuple(f"T.{i}" for i in range(n)), points), []
+        for T in poses(rig, disc_target(), count, rng, (0.6, 0.9), 25.0):
+            uv = [
+                project(camera, points @ at[:3, :3].T + at[:3, 3]) + rig.sigma_px * rng.normal(size=(n, 2))
+                for camera, at in zip(rig.cameras, views(rig, T), strict=True)
+            ]
+            seen.append([Detections(np.arange(n), each, np.zeros((n, 2, 2))) for each in uv])
+        ways = (f"{n}", f"{n}, solvePnP", f"{n}, triangulate and Kabsch")
+        functions = (
+            partial(measure_detections, rig, body),
+            partial(one_camera, rig, points),
+            partial(rigid, rig, points),
+        )
+        times = []
+        for detections in rounds * seen:
+            for function in functions:
+                began = time.process_time_ns()
+                function(*detections)
+                times.append(time.process_time_ns() - began)
+        for way, each in zip(ways, np.reshape(times, (-1, 3)).T / 1e3, strict=True):
+            us[way] = float(np.median(each))
+            report.say(f"  {f'pose of a body, points: {way}':62s} {us[way]:.0f} us, least {each.min():.0f}")
+    for n, most_us in ((4, 450), (5, 450), (9, 400)):
+        over = us[f"{n}"] / us["9"]
+        required, good = f"<= {most_us}, <= 1.3 times nine's", us[f"{n}"] <= most_us and over <= 1.3
+        report.metric(f"pose with covariance of {n} points", us[f"{n}"], required, form=".0f", unit="us", good=good)
+
+
+def one_camera(rig: StereoRig, points: np.ndarray, left: Detections, _: Detections) -> None:
+    """Solve for the pose in the left camera."""
+    method = cv2.SOLVEPNP_SQPNP if len(points) == 5 else cv2.SOLVEPNP_ITERATIVE
+    cv2.solvePnP(points, left.uv, rig.left.matrix, rig.left.distortion, flags=method)
+
+
+def rigid(rig: StereoRig, points: np.ndarray, left: Detections, right: Detections) -> np.ndarray:
+    """Triangulate undistorted points and fit the body to them."""
+    xy = [
+        cv2.undistortPoints(d.uv[:, None], camera.matrix, camera.distortion)[:, 0].T
+        for camera, d in zip(rig.cameras, (left, right), strict=True)
+    ]
+    p = cv2.triangulatePoints(np.eye(4)[:3], inverse(rig.T_left_right)[:3], *xy)
+    return kabsch(points, (p[:3] / p[3]).T)
+
+
 def metric(seed: int, report: Report) -> None:
     whole_image(seed, report)
+    few_points(seed, report)
     pairs(seed, report)

@@ -20,10 +20,10 @@ def pose(R: Array, t: Array) -> Array:
 
 def inverse(T: Array) -> Array:
     """Invert transforms (..., 4, 4) in closed form."""
-    out = np.zeros_like(T)
-    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    out = np.zeros(T.shape)
+    Rt = T[..., :3, :3].swapaxes(-1, -2)
     out[..., :3, :3] = Rt
-    out[..., :3, 3] = -(Rt @ T[..., :3, 3, None])[..., 0]
+    out[..., :3, 3:] = -(Rt @ T[..., :3, 3:])
     out[..., 3, 3] = 1.0
     return out
 

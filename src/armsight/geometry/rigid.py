@@ -28,10 +28,9 @@ def fit_rigid(p_b: Array, p_a: Array, weights: Array | None = None) -> Array:
     """
     if len(p_b) < 3 or len(p_b) != len(p_a):
         raise InputError(f"a rigid fit needs 3 or more matched points, got {len(p_b)} and {len(p_a)}")
-    w = np.ones(len(p_b)) if weights is None else np.asarray(weights, dtype=np.float64)
-    w = w / w.sum()
+    w = np.full(len(p_b), 1.0 / len(p_b)) if weights is None else weights / np.sum(weights)
     mean_b, mean_a = w @ p_b, w @ p_a
-    U, _, Vt = np.linalg.svd((w[:, None] * (p_a - mean_a)).T @ (p_b - mean_b))
+    U, _, Vt = np.linalg.svd((p_a - mean_a).T @ (w[:, None] * (p_b - mean_b)))
     R = U @ Vt
     if np.linalg.det(R) < 0:  # a mirror image fits better: flip the direction of least spread
         U[:, 2] = -U[:, 2]

@@ -8,7 +8,7 @@ as in OpenCV's ``fisheye``). All derivatives are analytic.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -238,7 +238,11 @@ class Camera(Record):
         return rays
 
 
+@lru_cache(maxsize=4)
 def pair_arguments(cameras: tuple[Camera, Camera]) -> tuple[NDArray[np.bool_], Array, Array]:
-    """Return what compiled kernels of two cameras take: (2,) fisheye or not, (2, 4) intrinsics, (2, 8) coefficients."""
+    """Return what compiled kernels of two cameras take: (2,) fisheye or not, (2, 4) intrinsics, (2, 8) coefficients.
+
+    No kernel writes to them: each shot of a pair takes the same ones.
+    """
     (fish_l, k_l, d_l), (fish_r, k_r, d_r) = (camera.kernel_arguments() for camera in cameras)
     return np.array([fish_l, fish_r]), np.array([k_l, k_r]), np.array([d_l, d_r])

@@ -24,12 +24,14 @@ FLIP_PX = 20.0
 
 def join(left: Detections, right: Detections) -> Correspondences:
     """Put the detections of both cameras side by side by identity, without any geometry."""
-    ids = np.union1d(left.ids, right.ids).astype(np.int64)
+    there = np.zeros(1 + max(left.ids.max(initial=-1), right.ids.max(initial=-1)), bool)
+    there[left.ids] = there[right.ids] = True
+    ids = np.flatnonzero(there)
     uv, cov = np.full((len(ids), 2, 2), np.nan), np.zeros((len(ids), 2, 2, 2))
     for side, found in enumerate((left, right)):
         rows = np.searchsorted(ids, found.ids)
         uv[rows, side], cov[rows, side] = found.uv, found.cov_uv
-    return Correspondences(ids, uv, cov, common=np.stack([left.common, right.common]))
+    return Correspondences(ids, uv, cov, common=np.array((left.common, right.common)))
 
 
 def epipolar_distances(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:

@@ -178,7 +178,8 @@ class StereoRig(Record):
         """
         cov = np.array(self.cov)
         for first, camera, shifts in zip((0, 4 + len(self.left.distortion)), self.cameras, common, strict=True):
-            by = shifts[:, 2:] * camera.intrinsics + np.pad(shifts[:, :2], ((0, 0), (2, 0)))
+            by = shifts[:, 2:] * camera.intrinsics
+            by[:, 2:] += shifts[:, :2]
             cov[first : first + 4, first : first + 4] += by.T @ by
         return cov
 

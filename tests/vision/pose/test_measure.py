@@ -147,20 +147,6 @@ def test_one_wrong_point_is_dropped_by_name_and_changes_little():
     assert gap @ np.linalg.solve(best.cov, gap) < 9 * 6 * 2 / 52
 
 
-def test_fewer_than_three_points_are_a_miss():
-    rig, board, _, pair = known()
-    two = [detections(d.ids[:2], d.uv[:2]) for d in (pair.left, pair.right)]
-    assert isinstance(measure_detections(rig, board.body, *two), Missed)
-    apart = measure_detections(
-        rig,
-        board.body,
-        detections(pair.left.ids[:2], pair.left.uv[:2]),
-        detections(pair.right.ids[5:], pair.right.uv[5:]),
-    )
-    assert isinstance(apart, Missed)
-    assert apart.reason
-
-
 def test_detections_of_a_file_are_measured_as_those_of_images():
     rig, board, _, pair = known()
     order = np.random.default_rng(0).permutation(54)

@@ -84,10 +84,6 @@ def test_what_does_not_determine_a_pose_has_none():
     assert body_poses(line, camera, pixels(camera, line + T[:3, 3])) == []
     assert body_poses(BODIES["cloud"][:3], camera, pixels(camera, BODIES["cloud"][:3] + T[:3, 3])) == []
     assert body_poses(BODIES["cloud"], camera, np.full((12, 2), np.nan)) == []
-    same = np.tile(camera.intrinsics[2:], (12, 1))
-    for T, rms in body_poses(BODIES["cloud"], camera, same):  # all points on one pixel: far away, or nothing
-        assert np.isfinite(T).all()
-        assert np.isfinite(rms)
 
 
 @pytest.mark.parametrize("name", ["corner", "cloud", "square"])

@@ -217,15 +217,7 @@ class Follower:
             self.way = "lost"
             self._vain += 1
             if track is not None:
-                self._track = BodyTrack(
-                    track.T_left_body,
-                    track.twist,
-                    track.t_s,
-                    track.shots + 1,
-                    _MARGIN_MOST_PX,
-                    track.step_s,
-                    track.proven,
-                )
+                self._track = replace(track, shots=track.shots + 1, margin_px=_MARGIN_MOST_PX)
             return result
         self.way = "searched"
         self._begin(shot, result, track, t_s)
@@ -312,18 +304,11 @@ class Follower:
             uv[~good], cov_uv[~good], dropped = np.nan, 0.0, self._dropped(fits)
             uv, cov_uv = uv[seen], cov_uv[seen]
             p_left, cov_p, by_rig = p_left[both], cov_p[both], by_rig[both]
-        noise = self._cov_noise * misfit
+        noise, (rms_m, rms_px) = self._cov_noise * misfit, np.sqrt(found.squares / (len(both), count))
+        correspondences = Correspondences(seen, uv, cov_uv, dropped, found.common.copy())
+        points = Points(both, p_left, cov_p, by_rig, correspondences, dropped)
         return PoseEstimate(
-            T,
-            found.cov + noise,
-            noise,
-            math.sqrt(found.squares[0] / len(both)),
-            math.sqrt(found.squares[1] / count),
-            math.sqrt(misfit),
-            Points(
-                both, p_left, cov_p, by_rig, Correspondences(seen, uv, cov_uv, dropped, found.common.copy()), dropped
-            ),
-            dropped,
+            T, found.cov + noise, noise, float(rms_m), float(rms_px), math.sqrt(misfit), points, dropped
         )
 
     def _dropped(self, good: NDArray[np.bool_]) -> tuple[Dropped, ...]:

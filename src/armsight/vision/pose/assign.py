@@ -7,13 +7,14 @@ that explains most detections takes them; what is left may be another body.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array, Correspondences, Detections, Ids
-from armsight.geometry.pose import inverse, transform
+from armsight.geometry.pose import inverse
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
 from armsight.vision.match import join
-from armsight.vision.pose.pnp import AGREE_PX, AGREE_SHARE, Candidate, consensus_poses
+from armsight.vision.pose.pnp import Candidate, agreeing, consensus_poses
 from armsight.vision.pose.posefit import PixelObservations, fit_pose
 
 #: Fewest detections, both cameras together, that make a body: where names settle it, and where they do not.
@@ -90,22 +91,17 @@ def _agreeing(
     T_left_right: Array,
     shot: SeenShot,
     T_left_body: Array,
-    free: tuple[Array, ...],
+    free: tuple[NDArray[np.bool_], ...],
 ) -> tuple[list[Ids], float]:
     """Return per camera the free detections that agree with a pose, and their summed squared distance, px^2."""
     rows, cost = [], 0.0
     for side, camera in enumerate(cameras):
         T = T_left_body if side == 0 else inverse(T_left_right) @ T_left_body
-        projected = camera.project(transform(T, points))
-        if not np.isfinite(projected).all():
+        row, rms = agreeing(points, camera, T, shot.ids[side], shot.uv[side], free[side])
+        if not np.isfinite(rms):
             return [np.zeros(0, np.int64), np.zeros(0, np.int64)], np.inf
-        size = float(np.sqrt(((projected - projected.mean(axis=0)) ** 2).sum(axis=1).mean()))
-        distance = np.linalg.norm(projected[shot.ids[side]] - shot.uv[side], axis=1)
-        near = np.flatnonzero((distance <= max(AGREE_PX, AGREE_SHARE * size)) & free[side])
-        near = near[np.argsort(distance[near], kind="stable")]
-        _, first = np.unique(shot.ids[side][near], return_index=True)
-        rows.append(near[first])
-        cost += float((distance[near[first]] ** 2).sum())
+        rows.append(row)
+        cost += len(row) * rms**2
     return rows, cost
 
 

@@ -13,6 +13,7 @@ the chi-square of the residuals.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from functools import lru_cache
 
 import numpy as np
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from armsight.data import SIDES, Array, Body, Dropped, Missed, Points, PoseEstimate
-from armsight.geometry.pose import inverse, transform
+from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
 from armsight.vision.pose.pnp import consensus_poses
@@ -41,7 +42,7 @@ _MISFIT_QUANTILE = 0.999
 
 def collinear(points: Array) -> bool:
     """Whether points (N, 3), N >= 3, lie on one line, about which a rotation is unobservable."""
-    centred = points - points.mean(axis=0)
+    centred = points - points.sum(axis=0) / len(points)
     spread = np.linalg.eigvalsh(centred.T @ centred)
     return bool(spread[1] <= _COLLINEAR**2 * spread[2])
 
@@ -114,11 +115,11 @@ def _wrong_size(rig: StereoRig, body: Body, points: Points, T_left_body: Array) 
 
 def _wrong_markers(rig: StereoRig, body: Body, points: Points, T_left_body: Array, whole: float) -> list[str]:
     """Return what each marker measures (points NAME.0, NAME.1, ...) whose size is neither its own nor the whole's."""
-    wrong, markers = list[str](), np.array([body.point_names[i].rpartition(".")[0] for i in points.ids])
-    for name in dict.fromkeys(markers[markers != ""].tolist()):
-        rows = markers == name
-        if rows.sum() < 3:
+    wrong, markers = list[str](), [body.point_names[i].rpartition(".")[0] for i in points.ids]
+    for name, count in Counter(markers).items():
+        if not name or not 3 <= count < len(markers):  # the only marker is the whole
             continue
+        rows = np.array([each == name for each in markers])
         arrays = (points.ids[rows], points.p_left[rows], points.cov[rows], points.calibration[rows])
         scale, sigma = _scale(rig, body.points[points.ids[rows]], Points(*arrays, points.seen), T_left_body)
         least = max(_SIZE_TOLERANCE, _SIZE_SIGMAS * sigma)
@@ -130,15 +131,14 @@ def _wrong_markers(rig: StereoRig, body: Body, points: Points, T_left_body: Arra
 
 
 def _scale(rig: StereoRig, p_body: Array, points: Points, T_left_body: Array) -> tuple[float, float]:
-    """Return by how many times points (N) lie further apart than p_body (N, 3), m, and its sigma.
+    """Return by how many times points (N) lie further apart than p_body (N, 3), m, and its sigma, the rig's included.
 
-    The scale is that of a similarity fit, ``T_left_body`` being the rigid one; its sigma includes pixel noise and the
-    rig's calibration.
+    The scale is that of a similarity fit, ``T_left_body`` being the rigid one.
     """
     p = (p_body - p_body.sum(axis=0) / len(p_body)) @ T_left_body[:3, :3].T
     spread = float(np.vdot(p, p))
-    by_rig = np.einsum("ni,nip->p", p, points.calibration) / spread
-    variance = float(np.einsum("ni,nij,nj->", p, points.cov, p)) / spread**2 + float(by_rig @ rig.cov @ by_rig)
+    by_rig = p.ravel() @ points.calibration.reshape(p.size, -1) / spread
+    variance = float(np.vdot(p, (points.cov @ p[..., None])[..., 0])) / spread**2 + float(by_rig @ rig.cov @ by_rig)
     return float(np.vdot(p, points.p_left)) / spread, float(np.sqrt(variance))
 
 
@@ -154,8 +154,8 @@ OUTLIER_QUANTILE = 1.0 - 1e-5
 _LIMIT, _MEDIAN = float(chdtri(2, 1 - OUTLIER_QUANTILE)), float(chdtri(2, 0.5))
 #: A shot in which less than this share of the detections agrees with one pose is missed.
 _AGREEING = 0.5
-#: With this many matched points the rigid fit alone is a safe start; with fewer, every pose that one camera allows is
-#: tried too, mirror solutions among them.
+#: With this many matched points the rigid fit alone is a safe start; with fewer, its mirror image is tried too, and where
+#: it leaves outliers every pose that one camera allows.
 _SAFE_POINTS = 8
 #: A robust fit whose median squared distance is this many times the expected one may be in a wrong minimum: then rigid
 #: fits of so many triples are compared, and the best few tried.
@@ -177,14 +177,13 @@ def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
     reason = _unlocatable(body, points)
     if reason is not None:
         return Missed(reason)
-    observations, rigid = (
-        PixelObservations.of(points.seen, rig.sigma_px),
-        fit_rigid(body.points[points.ids], points.p_left),
-    )
-    best = _best(rig, body, observations, _starts(rig, body, points, rigid))
+    observations = PixelObservations.of(points.seen, rig.sigma_px)
+    rigid = fit_rigid(body.points[points.ids], points.p_left)
+    best = _best(rig, body, observations, [rigid])
+    if len(points.ids) < _SAFE_POINTS:
+        best = _best(rig, body, observations, _starts(rig, body, points, best), best)
     if best is None or _median(best.distance2) > _SUSPECT * _MEDIAN:
-        others = _best(rig, body, observations, _agreed_starts(body, points))
-        best = min((fit for fit in (best, others) if fit is not None), key=lambda fit: fit.cost, default=None)
+        best = _best(rig, body, observations, _agreed_starts(body, points), best)
     if best is None:
         return Missed("no pose of the body fits the detections")
     good, fit = _without_outliers(rig, body, best, observations)
@@ -219,16 +218,32 @@ def _listed(dropped: tuple[Dropped, ...]) -> str:
     return shown + (f" and {len(dropped) - 3} more" if len(dropped) > 3 else "")
 
 
-def _starts(rig: StereoRig, body: Body, points: Points, rigid: Array) -> list[Array]:
-    """Return poses to start from: the rigid fit, and where points are few what each camera alone allows."""
-    starts = [rigid]
-    if len(points.ids) < _SAFE_POINTS:
-        seen = points.seen
-        for side, camera in enumerate(rig.cameras):
-            rows = seen.seen[:, side]
-            to_left = np.eye(4) if side == 0 else rig.T_left_right
-            found = consensus_poses(body.points, camera, seen.ids[rows], seen.uv[rows, side])
-            starts += [to_left @ candidate.T_camera_body for candidate in found]
+def _agrees(distance2: Array) -> NDArray[np.bool_]:
+    """Return which of N squared distances, in standard deviations, are no outliers; all are larger on a bent body."""
+    return np.asarray(distance2 <= _LIMIT * max(1.0, _median(distance2) / _MEDIAN))
+
+
+def _mirrored(body: Body, points: Points, T: Array) -> Array:
+    """Return the pose nearest to a body's mirror image in the plane across the line of sight (Necker's reversal)."""
+    p = body.points[points.ids]
+    middle = p.sum(axis=0) / len(p)
+    normal = np.linalg.eigh((p - middle).T @ (p - middle))[1][:, 0]
+    there = T[:3, :3] @ middle + T[:3, 3]
+    R = T[:3, :3] - np.outer(2 * there / (there @ there), there @ T[:3, :3])
+    R -= np.outer(2 * R @ normal, normal)
+    return pose(R, there - R @ middle)
+
+
+def _starts(rig: StereoRig, body: Body, points: Points, first: PoseFit | None) -> list[Array]:
+    """Return what else the pose of few points may be: a good first fit's mirror image, or all that one camera allows."""
+    if first is not None and _median(first.distance2) <= _SUSPECT * _MEDIAN and _agrees(first.distance2).all():
+        return [_mirrored(body, points, first.T_left_body)]
+    starts, seen = list[Array](), points.seen
+    for side, camera in enumerate(rig.cameras):
+        rows = seen.seen[:, side]
+        to_left = np.eye(4) if side == 0 else rig.T_left_right
+        found = consensus_poses(body.points, camera, seen.ids[rows], seen.uv[rows, side])
+        starts += [to_left @ candidate.T_camera_body for candidate in found]
     return starts
 
 
@@ -249,9 +264,12 @@ def _agreed_starts(body: Body, points: Points) -> list[Array]:
     return [T for _, T in sorted(fits, key=lambda fit: fit[0])[:_TRIED]]
 
 
-def _best(rig: StereoRig, body: Body, observations: PixelObservations, starts: list[Array]) -> PoseFit | None:
-    """Minimise robustly from every start and return the lowest; None where no start leads anywhere."""
+def _best(
+    rig: StereoRig, body: Body, observations: PixelObservations, starts: list[Array], first: PoseFit | None = None
+) -> PoseFit | None:
+    """Minimise robustly from every start and return the lowest, ``first`` included; None where no start leads anywhere."""
     fits = [fit_pose(rig.cameras, rig.T_left_right, body.points, observations, start, robust=True) for start in starts]
+    fits = [first, *fits]
     return min((fit for fit in fits if fit is not None), key=lambda fit: fit.cost, default=None)
 
 
@@ -262,7 +280,7 @@ def _without_outliers(
     d2, T = robust.distance2, robust.T_left_body
     good, fit = np.ones(len(d2), bool), None
     for _ in range(3):
-        now = d2 <= _LIMIT * max(1.0, _median(d2) / _MEDIAN)
+        now = _agrees(d2)
         if now.sum() < max(3, _AGREEING * len(now)) or np.count_nonzero(np.bincount(observations.point[now])) < 3:
             return now, None
         if fit is not None and (now == good).all():
@@ -290,23 +308,15 @@ def _estimate(
     """Assemble the estimate with its covariance: pixel noise; calibration and common shifts through the same fit."""
     used, T = _chosen(observations, good), fit.T_left_body
     W, A, B = whitened(rig.cameras, rig.T_left_right, body.points, used, T)
-    noise = np.linalg.inv(fit.information).astype(np.float64)
-    gain, cov_rig = noise @ (A.T @ B), rig.cov_with(points.seen.common)
-    misfit = 1.0
+    cov: Array = np.asarray(np.linalg.inv(fit.information), np.float64)
+    gain, cov_rig, misfit = cov @ (A.T @ B), rig.cov_with(points.seen.common), 1.0
     if fit.cost > misfit_limit(2 * len(used.point) - 6):
         misfit = _misfit((W @ fit.residuals_px[..., None]).ravel(), B - A @ gain, cov_rig)
+        cov = misfit * cov
     points, dropped = (points, ()) if good.all() else _thinned(rig, body, points, T, observations, good)
     gap = points.p_left - (body.points[points.ids] @ T[:3, :3].T + T[:3, 3])
-    return PoseEstimate(
-        T,
-        noise * misfit + gain @ cov_rig @ gain.T,
-        noise * misfit,
-        _rms(gap),
-        _rms(fit.residuals_px),
-        float(np.sqrt(misfit)),
-        points,
-        points.dropped + dropped,
-    )
+    rms, dropped = (_rms(gap), _rms(fit.residuals_px)), points.dropped + dropped
+    return PoseEstimate(T, cov + gain @ cov_rig @ gain.T, cov, *rms, math.sqrt(misfit), points, dropped)
 
 
 def _thinned(
@@ -341,8 +351,7 @@ def _misfit(residuals: Array, by_rig: Array, cov_rig: Array) -> float:
         cov_rig: (P, P) covariance of the rig's parameters.
 
     Returns:
-        The ratio, 1 where chance explains it: residuals weighted by the inverse of I + by_rig cov_rig by_rig^T (by
-        Woodbury's identity), per degree of freedom.
+        The ratio, 1 where chance explains it: residuals weighted by the inverse of I + by_rig cov_rig by_rig^T (Woodbury).
     """
     freedom, v = len(residuals) - 6, by_rig.T @ residuals
     explained = v @ np.linalg.solve(np.eye(len(cov_rig)) + cov_rig @ (by_rig.T @ by_rig), cov_rig @ v)

@@ -147,9 +147,4 @@ def measure_seen(rig: StereoRig, body: Body, shot: SeenShot) -> PoseEstimate | M
         if not bodies:
             return Missed("markers occur twice in one image, and no pose of the body agrees with them")
         seen = bodies[0][1]
-    return _located(rig, body, seen)
-
-
-def _located(rig: StereoRig, body: Body, seen: Correspondences) -> PoseEstimate | Missed:
-    """Gate, triangulate and locate correspondences."""
     return locate(rig, body, triangulate(rig, body, gate(rig, body, seen)))

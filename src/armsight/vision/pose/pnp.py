@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,6 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import pose, transform
-from armsight.geometry.rotation import exp_so3, log_so3
 from armsight.vision.camera import Camera
 from armsight.vision.pose.posefit import PixelObservations, fit_pose
 
@@ -48,7 +48,7 @@ def body_poses(points: Array, camera: Camera, uv: Array) -> list[tuple[Array, fl
             _, rotations, translations, _ = cv2.solvePnPGeneric(p, xy[:, None], np.eye(3), None, flags=flag)
         except cv2.error:
             continue
-        found += [_pose(r, t) for r, t in zip(rotations, translations, strict=True)]
+        found += _poses(rotations, translations)
     scored = []
     for T in found:
         error = camera.project(transform(T, points)) - uv
@@ -57,9 +57,12 @@ def body_poses(points: Array, camera: Camera, uv: Array) -> list[tuple[Array, fl
     return sorted(scored, key=lambda candidate: candidate[1])
 
 
-def _pose(rotation: NDArray[Any], translation: NDArray[Any]) -> Array:
-    """Return OpenCV's rotation vector and translation as a pose."""
-    return pose(exp_so3(np.asarray(rotation, np.float64).ravel()), np.asarray(translation, np.float64).ravel())
+def _poses(rotations: Sequence[NDArray[Any]], translations: Sequence[NDArray[Any]]) -> list[Array]:
+    """Return OpenCV's rotation vectors and translations as poses."""
+    return [
+        pose(np.asarray(cv2.Rodrigues(r)[0], np.float64), t.ravel())
+        for r, t in zip(rotations, translations, strict=True)
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +82,7 @@ class Candidate(Record):
 
 #: A detection agrees with a pose within this share of the body's apparent size, and at least so many px: wide, for the
 #: body may differ from its drawing; the joint adjustment is stricter.
-AGREE_SHARE, AGREE_PX = 0.03, 2.0
+_AGREE_SHARE, _AGREE_PX = 0.03, 2.0
 _MOST_TRIPLES = 600
 _SAME_ROTATION_RAD = 0.05
 _MOST_CANDIDATES = 8
@@ -105,29 +108,27 @@ def consensus_poses(points: Array, camera: Camera, ids: Ids, uv: Array) -> list[
     rays = camera.unproject(uv)
     ahead = np.flatnonzero(np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.1))
     xy = rays[:, :2] / rays[:, 2:]
-    hypotheses = []
+    scored = []
     for triple in _triples(ahead, ids):
         p = points[ids[triple]]
         if np.linalg.norm(np.cross(p[1] - p[0], p[2] - p[0])) < 1e-3 * np.ptp(points, axis=0).max() ** 2:
             continue
         _, rotations, translations = cv2.solveP3P(p, xy[triple][:, None], np.eye(3), None, flags=cv2.SOLVEPNP_AP3P)
-        hypotheses += [_pose(r, t) for r, t in zip(rotations, translations, strict=True)]
-    scored = []
-    for T in hypotheses:
-        rows, rms = _agreeing(points, camera, T, ids, uv)
-        if len(rows) >= 3:
-            scored.append((-len(rows), rms, T, rows))
-    scored.sort(key=lambda entry: entry[:2])
+        for T in _poses(rotations, translations):
+            rows, rms = agreeing(points, camera, T, ids, uv)
+            if len(rows) >= 3:
+                scored.append((-len(rows), rms, T, rows))
     found: list[Candidate] = []
-    for count, _, T, rows in scored:
+    for count, _, T, rows in sorted(scored, key=lambda entry: entry[:2]):
         if len(found) == _MOST_CANDIDATES:
             break
         if any(-count < len(c.rows) - 1 and np.isin(rows, c.rows).mean() > 0.5 for c in found):
             continue
         T = _polished(points[ids[rows]], camera, T, uv[rows])
-        rows, rms = _agreeing(points, camera, T, ids, uv)
-        angles = [np.linalg.norm(log_so3(c.T_camera_body[:3, :3].T @ T[:3, :3])) for c in found]
-        if len(rows) >= 3 and all(angle > _SAME_ROTATION_RAD for angle in angles):
+        rows, rms = agreeing(points, camera, T, ids, uv)
+        # ||R_1 - R_2|| = sqrt(8) sin(angle / 2)
+        apart = [float(np.linalg.norm((c.T_camera_body - T)[:3, :3])) for c in found]
+        if len(rows) >= 3 and min(apart, default=np.inf) > 8**0.5 * np.sin(_SAME_ROTATION_RAD / 2):
             found.append(Candidate(T, rows, rms))
     return sorted(found, key=lambda c: (-len(c.rows), c.rms_px))
 
@@ -141,18 +142,20 @@ def _triples(rows: Ids, ids: Ids) -> list[Ids]:
     return [np.array(t) for t in triples]
 
 
-def _agreeing(points: Array, camera: Camera, T: Array, ids: Ids, uv: Array) -> tuple[Ids, float]:
-    """Return the detections that agree with a pose, the nearest of each name, and their RMS distance, px."""
+def agreeing(
+    points: Array, camera: Camera, T: Array, ids: Ids, uv: Array, free: NDArray[np.bool_] | bool = True
+) -> tuple[Ids, float]:
+    """Return the free detections that agree with a pose, the nearest of each name, and their RMS distance, px."""
     projected = camera.project(transform(T, points))
     if not np.isfinite(projected).all():
         return np.zeros(0, np.int64), np.inf
     size = float(np.sqrt(((projected - projected.mean(axis=0)) ** 2).sum(axis=1).mean()))
     distance = np.linalg.norm(projected[ids] - uv, axis=1)
-    near = np.flatnonzero(distance <= max(AGREE_PX, AGREE_SHARE * size))
+    near = np.flatnonzero((distance <= max(_AGREE_PX, _AGREE_SHARE * size)) & free)
     near = near[np.argsort(distance[near], kind="stable")]
     _, first = np.unique(ids[near], return_index=True)
     rows = near[first]
-    return rows, float(np.sqrt((distance[rows] ** 2).mean())) if len(rows) else np.inf
+    return rows, float(np.linalg.norm(distance[rows])) / max(len(rows), 1) ** 0.5
 
 
 def _polished(p: Array, camera: Camera, T: Array, uv: Array) -> Array:

@@ -7,7 +7,6 @@ thousands of times: locating, trying mirror solutions, distinguishing bodies.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,16 +94,13 @@ def fit_pose(
         The minimum next to the start, or None where the start puts a point behind its camera or the
         observations do not determine a pose.
     """
-    T, p = np.array(start), np.ascontiguousarray(points[observations.point])
+    T, p = np.array(start), points[observations.point]
     n = len(p)
-    weight = np.empty((n, 2, 2))
-    _invert(np.array(observations.cov_uv), weight)
     residuals, d2, H = np.empty((n, 2)), np.empty(n), np.empty((6, 6))
-    arguments: tuple[Any, ...] = (
-        *pair_arguments(cameras), inverse(T_left_right), p, np.array(observations.camera), np.array(observations.uv),
-        weight, T, robust, steps, residuals, d2, H,
+    cost = _fit(
+        *pair_arguments(cameras), inverse(T_left_right), p, observations.camera, observations.uv,
+        observations.cov_uv, T, robust, steps, residuals, d2, H,
     )  # fmt: skip
-    cost = _fit(*arguments)
     return PoseFit(T, residuals, d2, H, cost) if np.isfinite(cost) else None
 
 
@@ -131,14 +127,14 @@ def whitened(
     n, counts = len(observations.point), np.array([camera.distortion.size for camera in cameras])
     W, by_pose, by_rig = np.zeros((n, 2, 2)), np.empty((2 * n, 6)), np.zeros((2 * n, 8 + counts.sum() + 6))
     differentiate(
-        *pair_arguments(cameras), counts, inverse(T_left_right), np.ascontiguousarray(points[observations.point]),
-        np.array(observations.camera), np.array(observations.uv), np.array(observations.cov_uv), np.array(T_left_body),
+        *pair_arguments(cameras), counts, inverse(T_left_right), points[observations.point], observations.camera,
+        observations.uv, observations.cov_uv, np.array(T_left_body),
         W, np.empty((n, 2)), by_pose, by_rig,
     )  # fmt: skip
     return W, by_pose, by_rig
 
 
-@kernel("f8[:, :, ::1], f8[:, :, ::1]")
+@kernel
 def _invert(cov: Array, weight: Array) -> None:
     """Fill the inverses of covariances (N, 2, 2)."""
     for n in range(len(cov)):
@@ -163,8 +159,8 @@ def _by_rotation(J: Array, p: Array) -> None:
 
 
 @kernel(
-    "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], "
-    "f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]"
+    "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], const i8[::1], const f8[:, ::1], "
+    "const f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]"
 )
 def differentiate(
     fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, p: Array, camera: Ids, uv: Array,
@@ -270,15 +266,17 @@ def moved(T: Array, xi: Array, out: Array) -> None:
 
 
 @kernel(
-    "b1[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], "
-    "b1, i8, f8[:, ::1], f8[::1], f8[:, ::1]"
+    "b1[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], const i8[::1], const f8[:, ::1], const f8[:, :, ::1], "
+    "f8[:, ::1], b1, i8, f8[:, ::1], f8[::1], f8[:, ::1]"
 )
 def _fit(
-    fisheye: NDArray[np.bool_], k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, uv: Array, weight: Array,
+    fisheye: NDArray[np.bool_], k: Array, d: Array, T_right_left: Array, p: Array, camera: Ids, uv: Array, cov: Array,
     T: Array, robust: bool, steps: int, residuals: Array, d2: Array, H: Array,
 ) -> float:  # fmt: skip
     """Levenberg-Marquardt; T is replaced by the minimum; residuals, distances and information are those of the result."""
     g, damped, trial = np.empty(6), np.empty((6, 6)), np.empty((4, 4))
+    weight = np.empty(cov.shape)
+    _invert(cov, weight)
     new_H, new_g, new_r, new_d2 = np.empty((6, 6)), np.empty(6), np.empty_like(residuals), np.empty_like(d2)
     cost = _assemble(fisheye, k, d, T_right_left, p, camera, uv, weight, T, robust, residuals, d2, H, g)
     damping = 1e-4
