@@ -89,6 +89,18 @@ def quick_demo() -> Path:
     return made_once("quick_demo", _demo)
 
 
+def _example(folder: Path) -> None:
+    command = [sys.executable, ROOT / "examples" / "05_render_a_recording.py", "recording", "--small"]
+    ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    (folder / "said.txt").write_text(ran.stdout, encoding="utf-8")
+
+
+@pytest.fixture(scope="session")
+def example_recording() -> Path:
+    """The folder in which the example renders into ``recording``, with what it printed in said.txt."""
+    return made_once("example_recording", _example)
+
+
 @pytest.fixture(scope="session")
 def host_firmware() -> None:
     """The firmware as code of this computer, or a skip that says why it is not there."""

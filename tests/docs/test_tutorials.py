@@ -12,9 +12,10 @@ from run_tutorials import PAGES, Runner, blocks, pictures  # noqa: E402
 
 
 @pytest.fixture(scope="module")
-def runner(tmp_path_factory, quick_demo):
+def runner(tmp_path_factory, quick_demo, example_recording):
     runner = Runner(tmp_path_factory.mktemp("tutorials"))
     runner.take(("armsight demo --quick -o demo",), quick_demo)
+    runner.take(("python examples/05_render_a_recording.py recording --small",), example_recording)
     return runner
 
 

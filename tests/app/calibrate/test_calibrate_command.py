@@ -165,8 +165,10 @@ def test_one_truncated_image_is_a_rejected_pair(few, armsight, tmp_path, keep):
 
 
 def test_the_wrong_board(few, armsight, tmp_path):
+    for path in few.glob("*00[4-8].png"):
+        path.unlink()
     said = armsight("calibrate", *images(few), "--target", "chessboard:8x5:25mm", "-o", tmp_path / "rig.json")
-    assert_rejected(said, "0 of 5 pairs are usable", "Is --target the board in the images")
+    assert_rejected(said, "0 of 2 pairs are usable", "Is --target the board in the images")
     assert not (tmp_path / "rig.json").exists()
 
 
@@ -254,9 +256,8 @@ def test_a_charuco_board_of_another_family_size_or_counts_is_named(armsight, tmp
     pattern, rng = charuco(4, 5, 0.05, 0.037, "DICT_4X4_50"), np.random.default_rng(1)
     T = pose(np.eye(3), np.array([-0.1, -0.1, 0.6]))
     image = render(example_rig((640, 360)).left, [PosedBody((pattern,), T)], plain((640, 360), rng), rng=rng)
-    for n in range(3):
-        cv2.imwrite(str(tmp_path / f"left{n}.png"), np.roll(image, n, axis=1))
-        cv2.imwrite(str(tmp_path / f"right{n}.png"), np.roll(image, n + 9, axis=1))
+    cv2.imwrite(str(tmp_path / "left0.png"), image)
+    cv2.imwrite(str(tmp_path / "right0.png"), np.roll(image, 9, axis=1))
     said = armsight("calibrate", *images(tmp_path), "--target", spec, "-o", tmp_path / "rig.json")
     assert_rejected(said, named)
 

@@ -200,10 +200,10 @@ def test_an_arm_in_motion_and_images_that_come_late(armsight, tmp_path):
         )
 
     sent = [STATIC]
-    for k in range(45):
+    for k in range(38):
         pair, _ = sent_at(0.5 + k / 5, T_rig_body(0.5 + k / 5), k, left_s=0.06)
         sent += pair
-    for k in range(500):
+    for k in range(430):
         sent.append(moved(k / 50, T_BASE_RIG @ T_rig_body(k / 50) @ inverse(T_FLANGE_BODY)))
     bag = write_bag(tmp_path / "run", "ros1", sorted(sent, key=lambda each: each.stamp_ns))
     rig.save(tmp_path / "rig.json")

@@ -1,6 +1,7 @@
 """Following: the same answers as searching, regained after a loss, jumps reported, and honest covariances."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -28,6 +29,11 @@ def shots(target, count, seed, hidden=None, start=None, rig=RIG):
         truth = T @ exp_se3(TWIST * k / 60)
         left, right = pair_of(rig, target, truth, rng, hidden=(hidden or {}).get(k, ()))
         yield truth, Shot(str(k), left, right, k / 60)
+
+
+@cache
+def seven():
+    return tuple(shots(PLATE, 7, 7))
 
 
 def test_following_gives_what_searching_gives():
@@ -166,7 +172,7 @@ def test_shots_without_time_and_shots_without_images():
 def test_times_that_are_odd_make_no_jumps(times):
     """Times in shots: missing, standing still, going back, a pause of ten seconds."""
     follower = Follower(RIG, BODY)
-    for (truth, shot), t in zip(shots(PLATE, 7, 7), times, strict=True):
+    for (truth, shot), t in zip(seven(), times, strict=True):
         result = follower.measure(Shot(shot.name, shot.left, shot.right, t / 60))
         assert isinstance(result, PoseEstimate)
         assert follower.jump is None
