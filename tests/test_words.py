@@ -77,25 +77,13 @@ LEGITIMATE = (
 )
 #: Files in which no word is looked for: what they hold is older words, or other people's.
 SPARED = (
-    r"CHANGELOG\.md",
-    r"docs/reference/old_names\.md",
-    r"tests/test_words\.py",
-    r".*/firmware/built/.*",
-    r"docs/_.*",
-    r"docs/gallery/.*",
-    r".*written_by_version_\d.*",
-)
+    r"CHANGELOG\.md", r"docs/reference/old_names\.md", r"tests/test_words\.py", r".*/firmware/built/.*", r"docs/_.*",
+    r"docs/gallery/.*", r".*written_by_version_\d.*",
+)  # fmt: skip
 WHERE = (
-    "src/armsight",
-    "firmware",
-    "docs",
-    "examples",
-    "benchmarks",
-    "tests",
-    "README.md",
-    "CONTRIBUTING.md",
+    "src/armsight", "firmware", "docs", "examples", "benchmarks", "tests", "README.md", "CONTRIBUTING.md",
     "Makefile",
-)
+)  # fmt: skip
 KINDS = {".py", ".md", ".toml", ".c", ".h", ".xml", ".rst", ".css", ""}
 
 

@@ -18,18 +18,8 @@ SHAKES = {"core": [HERE / "shake.c", *CORE], "wire": [HERE / "fuzz_wire.c", *BOA
 FUZZ_RUNS = 12000
 #: Python tests of the core; what they reach is counted.
 CORE_TESTS = (
-    "pid",
-    "setpoint",
-    "pot",
-    "states",
-    "faults",
-    "commands",
-    "config",
-    "encoder",
-    "random",
-    "motor",
-    "bridge",
-)
+    "pid", "setpoint", "pot", "states", "faults", "commands", "config", "encoder", "random", "motor", "bridge",
+)  # fmt: skip
 BRANCHES_PERCENT = 95.0
 
 

@@ -456,17 +456,8 @@ def test_a_rig_whose_camera_moved_is_named_and_the_exit_code_says_so(rendered, t
     assert said.code == 3, said.err
     assert found["cause"] == "rig"
     assert found.keys() == {
-        "cause",
-        "what",
-        "since_s",
-        "size",
-        "sigma",
-        "unit",
-        "advice",
-        "alternatives",
-        "corrected_s",
-        "cost_mm",
-    }
+        "cause", "what", "since_s", "size", "sigma", "unit", "advice", "alternatives", "corrected_s", "cost_mm",
+    }  # fmt: skip
     assert found["cost_mm"] > 1.0
     assert abs(found["size"] - 0.3) < 4 * found["sigma"]
     assert "do not trust this result: rig: " in said.err
