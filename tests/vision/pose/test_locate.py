@@ -268,7 +268,7 @@ def test_a_miss_says_what_was_dropped():
 @pytest.mark.parametrize("points", [board(2, 2, 0.042), CLOUD[:5], CLOUD[:3]], ids=["tag", "cloud", "triangle"])
 @pytest.mark.parametrize("far", [False, True])
 def test_few_points_are_where_all_poses_that_one_camera_allows_lead(points, far, monkeypatch):
-    """Near the limit of telling a body from its mirror image, with a displaced detection, and with one missing."""
+    """Near the limit of distinguishing a body from its mirror image, with a displaced detection, and with one missing."""
     rig, tried, starts = small_body_rig(0.03, 3.5) if far else rig_of(), [], module._starts
     rng = np.random.default_rng(15)
     for k in range(45):
