@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 # The environment's Python with OpenCV 4, which lies in a folder of its own, before the newer one.
-OPENCV4 := PYTHONPATH=$(abspath $(VENV)/opencv4) $(BIN)/python
+OPENCV4 := PYTHONPATH=$(abspath $(VENV)/opencv4) nice -n 10 $(BIN)/python
 # pip writes no bytecode where it builds the package (13 s of a processor): most of it is never imported.
 export PIP_COMPILE := 0
 # Python writes it for what is imported: without it each of a hundred processes compiles its imports again, for 3 s and more.
@@ -13,21 +13,24 @@ export OPENBLAS_NUM_THREADS ?= 1
 # A file is one worker's; files in their order, which begins with the longest.
 PARALLEL := -n 3 --dist=loadfile --no-loadscope-reorder
 
-.PHONY: demo test pytest lint style types docs bench clean
+.PHONY: demo test pytest opencv4 lint style types docs bench clean
 
 demo: $(VENV)/.armsight  ## the whole experiment in the simulated workcell, held against its truth
 	$(BIN)/armsight demo -o demo
 
 test: $(VENV)/.armsight-test $(VENV)/.opencv4 style  ## everything that must hold
 	$(BIN)/python -m armsight.kernels.build
-	+$(MAKE) --no-print-directory --jobs=2 types pytest
+	+$(MAKE) --no-print-directory --jobs=2 pytest types opencv4
 
 # Collected once before, so that bytecode is compiled once and not by each worker: 17 s of a processor for each.
 pytest:
 	$(BIN)/python -m pytest --collect-only --quiet > /dev/null
 	$(BIN)/python -m pytest $(PARALLEL)
+
+# Beside the others, once types are checked.
+opencv4: $(VENV)/.armsight-test $(VENV)/.opencv4
 	$(OPENCV4) -c "import cv2; assert cv2.__version__.startswith('4.'), cv2.__version__"
-	$(OPENCV4) -m pytest $(PARALLEL) -m opencv $$(grep -rl --include="test_*.py" "pytest.mark.opencv" tests)
+	$(OPENCV4) -m pytest -m opencv $$(grep -rl --include="test_*.py" "pytest.mark.opencv" tests)
 
 lint: style types
 

@@ -208,7 +208,7 @@ def swung(t_s):
     )
 
 
-def recorded(skew_s, count=20, rate_hz=12.0, seed=3):
+def recorded(skew_s, count=14, rate_hz=12.0, seed=3):
     """The true rig, the board, times and pairs of a swung board whose right images are late."""
     true, board, _ = rig_and_board()
     t_s = np.arange(count) / rate_hz
