@@ -30,17 +30,9 @@ MATRIX = (
     *("camera", "kmatrix", "mat", "intr", "a", "cm", "camintrinsics", "intrinsicparameters"),
 )
 DISTORTION = (
-    *(
-        "distortion",
-        "distortioncoefficients",
-        "distortioncoeffs",
-        "distortions",
-        "d",
-        "dist",
-        "distcoeffs",
-        "distcoefs",
-    ),
-    *("distcoeff", "distcoef", "kc", "coeffs", "distcoefficients", "distortionparameters", "distortionvector", "dc"),
+    *("distortion", "distortioncoefficients", "distortioncoeffs", "distortions", "d", "dist", "distcoeffs"),
+    *("distcoefs", "distcoeff", "distcoef", "kc", "coeffs", "distcoefficients", "distortionparameters"),
+    *("distortionvector", "dc"),
 )
 SIZE = (
     *("imagesizepx", "imagesize", "resolution", "size", "imagersize", "imgsize", "imshape", "imageshape", "imgshape"),

@@ -231,9 +231,8 @@ class Follower:
         if track is not None and track.proven and track.predicts(t_s):
             before = track.predicted(t_s)
             xi = log_se3(inverse(before) @ result.T_left_body)
-            px = (
-                self.rig.left.intrinsics[0] * float(np.linalg.norm(xi[:3])) / max(float(result.T_left_body[2, 3]), 1e-3)
-            )
+            away_m = max(float(result.T_left_body[2, 3]), 1e-3)
+            px = self.rig.left.intrinsics[0] * float(np.linalg.norm(xi[:3])) / away_m
             rotated_rad = float(np.linalg.norm(xi[3:]))
             if rotated_rad > _JUMP_RAD or px > _JUMP_PX:
                 self.jump = (
@@ -253,9 +252,8 @@ class Follower:
         self._found.contrast[:] = 0.0
         before = np.empty((4, 4))
         moved(T_left_body, -_BEFORE_S * twist, before)
-        result = self._followed(
-            shot, BodyTrack(before, twist, t_s - _BEFORE_S, 0, _MARGIN_FIRST_PX, math.inf, False), t_s
-        )
+        track = BodyTrack(before, twist, t_s - _BEFORE_S, 0, _MARGIN_FIRST_PX, math.inf, False)
+        result = self._followed(shot, track, t_s)
         if result is not None:  # one pose gives no velocity
             self._track = BodyTrack(result.T_left_body, twist, t_s, 0, _MARGIN_FIRST_PX, math.inf, False)
         return result
@@ -283,10 +281,7 @@ class Follower:
         """Run the compiled call."""
         least = max(search.LEAST_CONTRAST, 5.0 * self._noise)
         arguments = (self._limits, self._found, self._cov_noise, self._work, self._outline)
-        seen, chi_square, wrong = follow_pair(
-            left, right, T, twist, seconds, self._scene, margin, self._noise, least, *arguments
-        )
-        return seen, chi_square, wrong
+        return follow_pair(left, right, T, twist, seconds, self._scene, margin, self._noise, least, *arguments)
 
     def _estimate(self, T: Array, count: int, chi_square: float) -> PoseEstimate:
         """Make the record of the compiled call's result: ``count`` ellipses."""

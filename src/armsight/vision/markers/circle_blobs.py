@@ -113,7 +113,7 @@ def _outlines(
     ones, -1 for dark ones; and ``contrast`` (N,), grey levels. The others are those of
     :func:`~armsight.vision.markers.disc.search.search`.
     """
-    n = search(image, words, noise_of(image), bright, dark, starts, codes, signs, room)
+    n, _ = search(image, words, noise_of(image), bright, dark, starts, codes, signs, room)
     across, good = np.empty(_RAYS), 0
     for i in range(n):
         if codes[i] != 0:

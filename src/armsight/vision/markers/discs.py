@@ -75,20 +75,19 @@ class DiscTarget(Record):
     def find(self, image: NDArray[np.uint8]) -> Discs:
         """Find the discs in one grey image (H, W), of the kinds, bright or dark, that the body has.
 
-        Where fewer than the body has are found, larger ones are looked for in smaller copies of the image.
+        Where fewer than the body has are found and large parts of the image differ, smaller copies of it are searched too.
         """
         image = _padded(image)
         words, (bright, dark) = image.view(np.uint64), self._kinds
         theta, codes, signs, cov, shape, shared, room, work = _room()
         buffers = theta, codes, signs, cov, shape, room, work
-        good, n = search.find(image, words, bright, dark, 0, 0, 0, *buffers)
-        if good < len(self.radii_m):
+        good, n, large = search.find(image, words, bright, dark, 0, 0, 0, *buffers)
+        if large and good < len(self.radii_m):
             larger, kinds = _larger(image, bright, dark)
-            more = slice(n, min(n + len(larger), _MOST_CANDIDATES))
-            if more.start < more.stop:
-                k = more.stop - n
+            if (k := min(len(larger), _MOST_CANDIDATES - n)) > 0:
+                more = slice(n, n + k)
                 theta[more], codes[more], signs[more] = larger[:k], 0, kinds[:k]
-                good, n = search.find(image, words, bright, dark, good, n, more.stop, *buffers)
+                good, n, _ = search.find(image, words, bright, dark, good, n, n + k, *buffers)
         search.correct_all(image, good, theta, cov, shared, work)
         rejected = _rejected(theta[good:n], codes[good:n]) if n > good else ()
         if n == _MOST_CANDIDATES:  # rows are searched from the top

@@ -97,10 +97,8 @@ def _without_bias(
             f"{target.body.name}: a radius of {1e3 * radius_m:.4g} mm is given, and the images show {1e3 * seen_m:.4g} mm: "
             "measure pitch and radius (not the diameter), or leave the radius out"
         )
-    count = len(points)
-    discs = DiscTarget(
-        target.body, np.full(count, radius_m), np.zeros(count, bool), np.tile([0.0, 0.0, -1.0], (count, 1))
-    )
+    n = len(points)
+    discs = DiscTarget(target.body, np.full(n, radius_m), np.zeros(n, bool), np.tile([0.0, 0.0, -1.0], (n, 1)))
     nothing = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
     seen = match(rig, target.body, left, right, symmetries=target.symmetries)
     return locate_discs(rig, target.body, discs, nothing, seen, rough.T_left_body)

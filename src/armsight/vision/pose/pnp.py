@@ -36,8 +36,7 @@ def body_poses(points: Array, camera: Camera, uv: Array) -> list[tuple[Array, fl
     if ahead.sum() < MIN_POINTS:
         return []
     xy, p = rays[ahead, :2] / rays[ahead, 2:], points[ahead]
-    centred = p - p.mean(axis=0)
-    spread = np.linalg.svd(centred, compute_uv=False)
+    spread = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)
     if spread[1] < 1e-6 * spread[0]:
         return []
     flat = spread[2] < 1e-6 * spread[0]

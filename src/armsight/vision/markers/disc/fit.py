@@ -751,6 +751,12 @@ _LEAST_SNR = 3.0
 
 
 @kernel
+def narrow(m11: float, m12: float, m22: float) -> bool:
+    """Whether a matrix M, while it is fitted, is that of no ellipse, or its determinant is half the narrowest disc's."""
+    return bool(not m11 * m22 - m12 * m12 > 0.5 * (_LEAST_RATIO * (m11 + m22)) ** 2)
+
+
+@kernel
 def _step(
     n: int, theta: Array, x0: float, y0: float, slope: int, texture: float, work: FitBuffers
 ) -> tuple[float, float]:
@@ -779,7 +785,8 @@ def _step(
         theta[a] += shrink * x[a]
         square -= x[a] * g[a]
     theta[5] = max(theta[5], _BLUR_LEAST_PX)
-    if not theta[2] * theta[4] - theta[3] * theta[3] > 0.0:
+    blurred = theta[5] * theta[5] * (theta[2] + theta[4]) > 2.0  # by more than its half axes' mean
+    if blurred or narrow(theta[2], theta[3], theta[4]) or theta[6] * at[6] <= 0.0:
         return -1.0, square
     return (shift if shrink == 1.0 else max(shift, 1.0)), square
 
@@ -795,9 +802,9 @@ def minimise(
     """
     flat, H = work.sectors[0], work.H
     weighed = not weigh
-    for _ in range(_STEPS):
+    for round_ in range(_STEPS):
         shift, square = _step(n, theta, x0, y0, slope, texture, work)
-        if shift < 0.0:
+        if shift < 0.0 or (round_ > 1 and _LEAST_SNR * square > n * theta[6] * theta[6]):
             return -1.0, 0.0
         if shift < _WEIGH_PX and not weighed:
             weighed = True

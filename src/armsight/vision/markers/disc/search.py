@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from armsight.data import Array
 from armsight.kernels import kernel
 from armsight.vision.markers.disc.common import common, correct
-from armsight.vision.markers.disc.fit import FOUND_TWICE, PARAMETERS, UNKNOWNS, FitBuffers, factor, fit, shape_of, solve
+from armsight.vision.markers.disc.fit import FOUND_TWICE, PARAMETERS, FitBuffers, factor, fit, narrow, shape_of, solve
 
 #: Longest half chord, px: half of the largest disc of a search, blur and all. Larger ones are searched in smaller copies.
 REACH = 44
@@ -160,9 +160,9 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
     if not factor(H, L, scale):
         return 2
     solve(L, scale, g, p)
-    det = p[0] * p[2] - p[1] * p[1]
-    if not (p[0] > 0.0 and det > 1e-3 * p[0] * p[2]):
+    if not p[0] > 0.0 or narrow(p[0], p[1], p[2]):
         return 2
+    det = p[0] * p[2] - p[1] * p[1]
     cu, cv = -0.5 * (p[2] * p[3] - p[1] * p[4]) / det, -0.5 * (p[0] * p[4] - p[1] * p[3]) / det
     size = 1.0 + p[0] * cu * cu + 2 * p[1] * cu * cv + p[2] * cv * cv
     if not (size > 0.0 and cu * cu + cv * cv < within / _RAYS):
@@ -202,6 +202,7 @@ _HIGH = np.uint64(0x8080808080808080)
 _SIX = np.uint64(0x3F3F3F3F3F3F3F3F)
 _EVERY_BYTE = np.uint64(0x0101010101010101)
 _TWO, _MARK = np.uint64(2), np.uint64(0x80)
+_PAIRS, _FOURS = np.uint64(0x00FF00FF00FF00FF), np.uint64(0x0000FFFF0000FFFF)
 _EMPTY = np.uint64(0)
 
 Words64 = NDArray[np.uint64]
@@ -260,12 +261,18 @@ def differs(row: Words64, t: np.uint64) -> bool:
     return bool(every != _EMPTY)
 
 
+@kernel(forceinline=True)
+def _halves(word: np.uint64) -> np.uint64:
+    """Add the bytes of a word in pairs: four sums of 16 bits."""
+    return (word & _PAIRS) + ((word >> np.uint64(8)) & _PAIRS)
+
+
 @kernel
-def any_differs(words: Words64, y: int, t: np.uint64) -> bool:
+def any_differs(words: Words64, y: int, t: np.uint64, sums: Words64) -> bool:
     """Return whether any two pixels of the eight searched rows from y differ as in :func:`differs`.
 
-    An image that was not read before is not in the cache: one row at a time waits for each of its cache lines, eight at
-    a time wait for eight at once. This halves the time.
+    One row at a time waits for each of its cache lines, eight at a time wait for eight at once. ``sums`` (W / 8,)
+    are filled with those of the 64 pixels of a cell.
     """
     every = _EMPTY
     a, b, c, d = words[y], words[y + _ROW_STEP], words[y + 2 * _ROW_STEP], words[y + 3 * _ROW_STEP]
@@ -274,7 +281,21 @@ def any_differs(words: Words64, y: int, t: np.uint64) -> bool:
     for i in range(len(a) - 1):
         every |= _apart(a, i, t) | _apart(b, i, t) | _apart(c, i, t) | _apart(d, i, t)
         every |= _apart(e, i, t) | _apart(f, i, t) | _apart(g, i, t) | _apart(h, i, t)
+        s = _halves(a[i]) + _halves(b[i]) + _halves(c[i]) + _halves(d[i])
+        s += _halves(e[i]) + _halves(f[i]) + _halves(g[i]) + _halves(h[i])
+        s = (s & _FOURS) + ((s >> np.uint64(16)) & _FOURS)
+        sums[i] = (s + (s >> np.uint64(32))) & np.uint64(0xFFFF)
     return bool(every != _EMPTY)
+
+
+@kernel
+def _large(sums: Words64) -> bool:
+    """Whether the means of two cells of a row (W / 8,), 32 or 64 px apart, differ by half the least contrast."""
+    most = np.int64(0)
+    for apart in (4, 8):
+        for i in range(len(sums) - 1 - apart):
+            most = max(most, abs(np.int64(sums[i]) - np.int64(sums[i + apart])))
+    return bool(most > 32.0 * LEAST_CONTRAST)
 
 
 @kernel
@@ -309,7 +330,7 @@ def _note(n: int, starts: Array, cells: NDArray[np.int16]) -> None:
 def search(
     image: Grey, words: Words64, noise: float, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
     signs: NDArray[np.int64], room: Room,
-) -> int:  # fmt: skip
+) -> tuple[int, bool]:  # fmt: skip
     """Look for discs in a whole image.
 
     Args:
@@ -324,17 +345,18 @@ def search(
         room: what :func:`workspace` returns.
 
     Returns:
-        The number of candidates examined, at most N.
+        The number of candidates examined, at most N; whether there may be a disc that is too large.
     """
     height, width = image.shape
     contrast = max(LEAST_CONTRAST, _CONTRAST_SIGMAS * 1.4142 * noise)
     least = min(int(np.ceil(contrast / 4.0)), 60)
     t = np.uint64(least) * _EVERY_BYTE
     cells = np.empty((2, height // 8 + 1, width // 8 + 1), np.int16)
-    n, plain, begun = 0, False, False
+    n, plain, begun, large, sums = 0, False, False, False, np.zeros(width // 8, np.uint64)
     for y in range(1, height - 1, _ROW_STEP):
         if (y - 1) % _TOGETHER == 0:
-            plain = y + _TOGETHER < height and not any_differs(words, y, t)
+            plain = y + _TOGETHER < height and not any_differs(words, y, t, sums)
+            large |= _large(sums)
         row = words[y]
         if plain or not differs(row, t):
             continue
@@ -360,7 +382,7 @@ def search(
                     if _known(x, y, best, starts, codes, mine):
                         continue
                     if n == len(starts):
-                        return n
+                        return n, large
                     codes[n], signs[n] = outline(image, x, y, int(image[y, x - 8]), sign, starts[n], room, REACH), sign
                     if codes[n] == 0:
                         _note(n, starts, mine)
@@ -368,7 +390,7 @@ def search(
                         starts[n, 0], starts[n, 1] = x, y
                         mine[y >> 3, x >> 3] = n
                     n += 1
-    return n
+    return n, large
 
 
 @kernel(
@@ -380,7 +402,7 @@ def outlines(
     signs: NDArray[np.int64], room: Room,
 ) -> int:  # fmt: skip
     """Search an image as :func:`search` does; the outlines of discs come first. Return their number."""
-    n, good = search(image, words, noise_of(image), bright, dark, starts, codes, signs, room), 0
+    (n, _), good = search(image, words, noise_of(image), bright, dark, starts, codes, signs, room), 0
     for i in range(n):
         if codes[i] == 0:
             starts[good], signs[good] = starts[i], signs[i]
@@ -413,31 +435,19 @@ def _again(n: int, starts: Array, signs: NDArray[np.int64], cells: NDArray[np.in
 def find(
     image: Grey, words: Words64, bright: bool, dark: bool, good: int, first: int, n: int, starts: Array,
     codes: NDArray[np.int64], signs: NDArray[np.int64], cov: Array, shape: Array, room: Room, work: FitBuffers,
-) -> tuple[int, int]:  # fmt: skip
-    """Search an image and fit every candidate; or fit further candidates, which are given.
+) -> tuple[int, int, bool]:  # fmt: skip
+    """Search an image as :func:`search` does and fit every candidate; or fit further candidates, which are given.
 
-    Args:
-        image: as in :func:`search`, and words, bright, dark, starts, codes, signs and room.
-        words: see there.
-        bright: see there.
-        dark: see there.
-        good: how many discs, the first ones, are fitted already.
-        first: the first of the candidates that are not fitted.
-        n: how many candidates there are; 0: the image is searched for them.
-        starts: see there; in the end the discs come first, fitted, then the rejected candidates.
-        codes: see there; in the same order.
-        signs: see there; in the same order.
-        cov: (N, 2, 2) filled with the covariances of the discs' centres, px^2.
-        shape: (N, 3) filled with the discs' ellipses, px^2.
-        room: see there.
-        work: buffers for fits.
+    The first ``good`` of ``starts``, ``codes``, ``signs`` are fitted discs already, those from ``first`` to ``n`` are not;
+    with ``n`` 0 the image is searched for them. In the end the discs come first, then the rejected candidates; ``cov`` (N,
+    2, 2) are the covariances of the discs' centres, px^2, and ``shape`` (N, 3) their ellipses, px^2.
 
     Returns:
-        The number of discs, and the number of candidates in all.
+        The number of discs, and of candidates in all; whether the search found that there may be a disc too large for it.
     """
-    noise = noise_of(image)
+    noise, large = noise_of(image), False
     if n == 0:
-        n = search(image, words, noise, bright, dark, starts, codes, signs, room)
+        n, large = search(image, words, noise, bright, dark, starts, codes, signs, room)
     cells = np.full((image.shape[0] // 8 + 1, image.shape[1] // 8 + 1), -1, np.int16)
     for i in range(good):
         cells[int(starts[i, 1]) >> 3, int(starts[i, 0]) >> 3] = i
@@ -456,7 +466,7 @@ def find(
             shape_of(starts[good], shape[good])
             work.discs[good, :] = work.shown
             good += 1
-    return good, n
+    return good, n, large
 
 
 @kernel("const u1[:, ::1], i8, f8[:, ::1], f8[:, :, ::1], f8[::1], FitBuffers")
@@ -475,5 +485,5 @@ def correct_all(image: Grey, good: int, starts: Array, cov: Array, shared: Array
     common(image, good, work, shared)
     for i in range(good):
         correct(image, noise, work.discs[i], shared, cov[i], work)
-        for a in range(UNKNOWNS):
+        for a in range(starts.shape[1]):
             starts[i, a] = work.discs[i, PARAMETERS + a]
