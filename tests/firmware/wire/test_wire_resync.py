@@ -89,22 +89,12 @@ def test_a_begin_of_a_long_message_in_noise_swallows_nothing(working):
     assert board.answer.outputs.acknowledged_count - before == COMMANDS
 
 
-@pytest.mark.parametrize("flag", [1, 2, 0x80])
-def test_signed_and_other_kinds_of_messages_are_rejected_at_their_header(working, flag):
+@pytest.mark.parametrize(("at", "value"), [(2, 1), (2, 2), (2, 0x80), (1, 0), (1, 13), (1, 200), (1, 255)])
+def test_signed_and_other_kinds_of_messages_and_lengths_that_none_has_are_rejected_at_their_header(working, at, value):
     board, host = working
     before = settle(board, host)
     stream = bytearray(b"".join(disables(host)))
-    stream[2] = flag
-    board.run(10, bytes(stream))
-    assert board.answer.outputs.acknowledged_count - before == COMMANDS - 1
-
-
-@pytest.mark.parametrize("length", [0, 13, 200, 255])
-def test_a_length_no_message_has_is_rejected_at_the_header(working, length):
-    board, host = working
-    before = settle(board, host)
-    stream = bytearray(b"".join(disables(host)))
-    stream[1] = length
+    stream[at] = value
     board.run(10, bytes(stream))
     assert board.answer.outputs.acknowledged_count - before == COMMANDS - 1
 

@@ -11,9 +11,21 @@ from armsight.data import JointCommand
 from armsight.errors import DeviceError
 from armsight.firmware import dialect
 from armsight.robot.board_registry import configured, open_emulator
+from armsight.robot.boards.board_file import configuration_text
 from armsight.robot.boards.configuration import CONFIG, CONFIG_VERSION
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.sim.joints import JointPlant
+
+
+def written(tmp_path, config, *changes):
+    """A board.toml of a configuration with pieces of its text replaced."""
+    text = configuration_text(config, "pil")
+    for before, after in changes:
+        assert before in text
+        text = text.replace(before, after, 1)
+    path = tmp_path / "board.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
 
 
 def host_board(config=None, **options):

@@ -4,21 +4,11 @@ import re
 from pathlib import Path
 
 import pytest
+from board_rigs import written
 
 from armsight.errors import InputError
 from armsight.robot.boards.board_file import configuration_text, put, read_configuration
 from armsight.robot.boards.configuration import USED_PINS, lab_configuration
-
-
-def written(tmp_path, *changes):
-    """A board.toml of the lab's configuration with pieces of its text replaced."""
-    text = configuration_text(lab_configuration(), "pil")
-    for before, after in changes:
-        assert before in text
-        text = text.replace(before, after, 1)
-    path = tmp_path / "board.toml"
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 def test_what_is_written_is_read_back_to_the_bit(tmp_path):
@@ -61,7 +51,7 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path):
     ],
 )
 def test_what_is_wrong_is_named_with_the_file(tmp_path, change, said):
-    path = written(tmp_path, change)
+    path = written(tmp_path, lab_configuration(), change)
     with pytest.raises(InputError, match=rf"board\.toml.*{said}"):
         read_configuration(path)
 
@@ -114,6 +104,8 @@ def test_the_sync_led_takes_no_pin_that_has_another_use(tmp_path):
     with pytest.raises(
         InputError, match="sync_led_pin is PA8, which has another use on nucleo-f446re: take a free one"
     ):
-        read_configuration(written(tmp_path, nucleo, ('led_pin = "none"', 'led_pin = "PA8"')))
-    config, _ = read_configuration(written(tmp_path, nucleo, ('led_pin = "none"', 'led_pin = "PB13"')))
+        read_configuration(written(tmp_path, lab_configuration(), nucleo, ('led_pin = "none"', 'led_pin = "PA8"')))
+    config, _ = read_configuration(
+        written(tmp_path, lab_configuration(), nucleo, ('led_pin = "none"', 'led_pin = "PB13"'))
+    )
     assert config["sync_led_pin"] == 2 * 16 + 13

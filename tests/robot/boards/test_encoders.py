@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from board_rigs import written
 
 from armsight.data import JointCommand
 from armsight.errors import ArmsightError, InputError
@@ -119,18 +120,8 @@ def test_a_board_says_what_it_has_and_is_given_no_more():
             here.board.store(encoder_configuration())
 
 
-def written(tmp_path, *changes):
-    text = configuration_text(encoder_configuration(), "pil")
-    for before, after in changes:
-        assert before in text
-        text = text.replace(before, after, 1)
-    path = tmp_path / "board.toml"
-    path.write_text(text, encoding="utf-8")
-    return path
-
-
 def test_a_file_has_of_each_sensor_what_it_needs_and_is_read_back(tmp_path):
-    path = written(tmp_path)
+    path = written(tmp_path, encoder_configuration())
     assert "short_counts" not in path.read_text().split("[joint.2.pot]")[1].split("[joint.3]")[0]
     text = configuration_text(read_configuration(path)[0], "pil")
     assert text == path.read_text()
@@ -151,6 +142,6 @@ def test_a_file_has_of_each_sensor_what_it_needs_and_is_read_back(tmp_path):
     ],
 )
 def test_what_is_wrong_with_an_encoder_is_named_with_the_file(tmp_path, change, said):
-    path = written(tmp_path, change)
+    path = written(tmp_path, encoder_configuration(), change)
     with pytest.raises(InputError, match=rf"board\.toml: .*{said}"):
         read_configuration(path)
