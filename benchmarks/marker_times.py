@@ -15,7 +15,9 @@ from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.vision.pose.measure import measure_detections
 from armsight.vision.rig import StereoRig
 from disc_images import disc_picture
+from disc_surround import TEXTURES
 from marker_follow import Following
+from marker_peers import moments
 from marker_plate import LENS, parallel_rig, poses, project, shot, views
 from marker_report import Report, disc_target, last_level_cache_bytes, read_us, ring, timed
 
@@ -195,7 +197,28 @@ def rigid(rig: StereoRig, points: np.ndarray, left: Detections, right: Detection
     return kabsch(points, (p[:3] / p[3]).T)
 
 
+def textured(seed: int, report: Report, count: int = 4, rounds: int = 7) -> None:
+    """Search images of 16 discs before textures, and find contours and moments in the same ones: the least of the times."""
+    target = disc_target()
+    for kind, amplitude in (("plain", None), *((kind, spread) for spread in (5.0, 18.0) for kind in TEXTURES)):
+        rng, sums, found = np.random.default_rng(seed), np.zeros(2), 0
+        for _ in range(count):
+            kinds = {"kind": kind, "amplitude": amplitude, "bright": True, "noise": 2.0, "blur": 0.8}
+            image = disc_picture(rng, count=16, radius=(5.0, 15.0), contrast=(80.0, 160.0), **kinds).image
+            dark = 255 - image  # contours are those of dark things
+            searched, peer = (timed(f, [i], rounds)[0].min() for f, i in ((target.find, image), (moments, dark)))
+            sums += searched, peer
+            found += len(target.find(image).uv) / count
+        label = kind if amplitude is None else f"{kind}, {amplitude:.0f} levels"
+        report.say(
+            f"  {f'16 discs, {label} ({found:.1f} found), contours':62s} {sums[0] / count:.0f}, {sums[1] / count:.0f} us"
+        )
+        over = sums[0] / sums[1]
+        report.metric(f"16 discs, {label}: over contours", over, "<= 1.0", form=".2f", good=over <= 1)
+
+
 def metric(seed: int, report: Report) -> None:
     whole_image(seed, report)
+    textured(seed, report)
     few_points(seed, report)
     pairs(seed, report)
