@@ -60,11 +60,13 @@ $(VENV)/.armsight: pyproject.toml setup.py $(shell find firmware -type f)
 	$(BIN)/python -m pip install --quiet --compile --disable-pip-version-check -e ".[sim,record]"
 	touch $@
 
-# What builds the package, in a folder of its own: pip would install its 600 MB once to build and once to stay.
+# What builds the package, in a folder of its own: pip would install its 600 MB once to build and once to stay. The setuptools
+# that came with the environment is older, and would be found first.
 $(VENV)/.build: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --upgrade --target $(VENV)/build \
 		$$($(BIN)/python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['build-system']['requires'])")
+	$(BIN)/python -m pip uninstall --quiet --yes setuptools
 	$(BIN)/python -c "import site; print('$(abspath $(VENV)/build)', file=open(site.getsitepackages()[0] + '/build.pth', 'w'))"
 	touch $@
 
