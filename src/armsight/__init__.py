@@ -1,9 +1,23 @@
 """armsight: two USB cameras watch markers on a robot arm and say where its end-effector is, in mm, with an honest sigma.
 
-    camera --Shot--> markers --Detections--> match --Correspondences--> triangulate --Points--> locate --PoseEstimate
+    from armsight import calibrate, measure, measure_all, open_source, open_target
+    rig = calibrate("chessboard:9x6:25mm", "pictures of a board").rig      # once: the pair of cameras
+    target = open_target("plate.toml")                                     # what is on the arm
+    for shot in open_source("recording"):
+        print(measure(rig, target, shot))                                  # mm, degrees and sigma, or why there is none
+    table = measure_all(rig, target, open_source("recording")).columns()   # for pandas, polars
 
-``measure`` runs the line for one shot; the stages are plain functions of frozen records in :mod:`armsight.data`. Names are
-imported when they are first used, so that the command line starts at once.
+To open: ``open_source`` images or cameras, ``open_board`` a board, ``open_target`` and ``open_body`` what is measured,
+``StereoRig.load`` a rig, ``open_arm`` an arm, ``read_poses`` a table of its poses, ``open_corrected`` an identified arm.
+To compute: ``calibrate``, ``calibrate_boards``, ``calibrate_bodies`` the pair of cameras; ``measure``, ``measure_all``,
+``Follower`` the pose of a body; ``handeye`` where rig and body are on the arm; ``identify`` what the arm really is.
+Records: ``Shot``, ``Body``, ``PoseEstimate`` or ``Missed``, ``Pair``, ``Camera``, ``StereoRig``, ``Arm``, ``Corrected``.
+Wrong input raises ``ArmsightError``, with what was found, what was expected and what to do.
+
+Names are imported when they are first used, so that the command line starts at once. The stages are plain functions of
+frozen records in :mod:`armsight.data`:
+
+    camera --Shot--> markers --Detections--> match --Correspondences--> triangulate --Points--> locate --PoseEstimate-->
 """
 
 from __future__ import annotations
@@ -16,16 +30,21 @@ if TYPE_CHECKING:
     __version__: str
     from armsight.data import Body, Missed, PoseEstimate, Shot
     from armsight.errors import ArmsightError
+    from armsight.loop.handeye.handeye import calibrate_handeye as handeye
     from armsight.loop.identify.corrected import Corrected, open_corrected
+    from armsight.loop.identify.identify import identify
+    from armsight.loop.identify.read import read_poses
     from armsight.robot.arm_file import open_arm
     from armsight.robot.kinematics.arm import Arm
     from armsight.vision.calibrate.boards import Pair, calibrate_boards
     from armsight.vision.calibrate.bodies import calibrate_bodies
+    from armsight.vision.calibrate.images import calibrate
     from armsight.vision.camera import Camera
     from armsight.vision.follow.follower import Follower
     from armsight.vision.markers.board import open_board
     from armsight.vision.markers.targets import open_body, open_target
     from armsight.vision.pose.measure import measure
+    from armsight.vision.pose.measure_all import measure_all
     from armsight.vision.rig import StereoRig
     from armsight.vision.sources import open_source
 
@@ -46,33 +65,45 @@ __all__ = [
     "PoseEstimate",
     "Shot",
     "StereoRig",
+    "calibrate",
     "calibrate_boards",
     "calibrate_bodies",
+    "handeye",
+    "identify",
     "measure",
+    "measure_all",
     "open_arm",
     "open_board",
     "open_body",
     "open_corrected",
     "open_source",
     "open_target",
+    "read_poses",
 ]
 
 _HOME = {
     **dict.fromkeys(("Body", "Missed", "PoseEstimate", "Shot"), "armsight.data"),
     "Arm": "armsight.robot.kinematics.arm",
     "ArmsightError": "armsight.errors",
+    "calibrate": "armsight.vision.calibrate.images",
     **dict.fromkeys(("Pair", "calibrate_boards"), "armsight.vision.calibrate.boards"),
     "calibrate_bodies": "armsight.vision.calibrate.bodies",
     "Camera": "armsight.vision.camera",
     "Follower": "armsight.vision.follow.follower",
+    "handeye": "armsight.loop.handeye.handeye",
     **dict.fromkeys(("Corrected", "open_corrected"), "armsight.loop.identify.corrected"),
+    "identify": "armsight.loop.identify.identify",
+    "read_poses": "armsight.loop.identify.read",
     "open_arm": "armsight.robot.arm_file",
     "open_board": "armsight.vision.markers.board",
     **dict.fromkeys(("open_body", "open_target"), "armsight.vision.markers.targets"),
     "measure": "armsight.vision.pose.measure",
+    "measure_all": "armsight.vision.pose.measure_all",
     "StereoRig": "armsight.vision.rig",
     "open_source": "armsight.vision.sources",
 }
+#: Public name -> its name at home, where they differ.
+_THERE = {"handeye": "calibrate_handeye"}
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - a module's names are of any type
@@ -81,4 +112,9 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 - a module's names are of any
         return importlib.import_module("importlib.metadata").version("armsight")
     if name not in _HOME:
         raise AttributeError(f"module 'armsight' has no attribute {name!r}; public are {', '.join(__all__)}")
-    return getattr(importlib.import_module(_HOME[name]), name)
+    return getattr(importlib.import_module(_HOME[name]), _THERE.get(name, name))
+
+
+def __dir__() -> list[str]:
+    """Return the public names, for completion and ``help``."""
+    return [*__all__, "__version__"]

@@ -275,6 +275,70 @@ class PoseEstimate(Record):
     points: Points
     dropped: tuple[Dropped, ...] = ()
 
+    @property
+    def position_mm(self) -> Array:
+        """(3,) x, y, z of the body's origin in the left camera's frame, mm."""
+        return 1e3 * self.T_left_body[:3, 3]
+
+    @property
+    def sigma_mm(self) -> Array:
+        """(3,) one sigma of ``position_mm``, mm."""
+        return np.asarray(1e3 * np.sqrt(np.diag(self._of_left(self.cov[:3, :3]))))
+
+    @property
+    def angles_deg(self) -> Array:
+        """(3,) rz, ry, rx, degrees: the body's rotation is R_z R_y R_x, about the left camera's axes."""
+        from armsight.geometry.rotation import euler_zyx  # not above: it takes SciPy, which records do without
+
+        return np.degrees(euler_zyx(self.T_left_body[:3, :3])[0])
+
+    @property
+    def sigma_deg(self) -> Array:
+        """(3,) one sigma of ``angles_deg``, degrees; NaN where ry is +-90 and only rz and rx together are determined."""
+        from armsight.geometry.rotation import euler_zyx_sigmas
+
+        return np.degrees(euler_zyx_sigmas(self.T_left_body[:3, :3], self._of_left(self.cov[3:, 3:])))
+
+    def _of_left(self, cov: Array) -> Array:
+        """Return a covariance (3, 3) along the body's axes as one along the left camera's."""
+        R = self.T_left_body[:3, :3]
+        return np.asarray(R @ cov @ R.T)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what people read, as lists and numbers: mm, degrees, and one sigma of each."""
+        named = {"position_mm": self.position_mm, "sigma_mm": self.sigma_mm}
+        named |= {"angles_deg": self.angles_deg, "sigma_deg": self.sigma_deg}
+        return {name: value.tolist() for name, value in named.items()} | {
+            "reprojection_rms_px": self.reprojection_rms_px,
+            "misfit": self.misfit,
+            "points": len(self.points.ids),
+            "dropped": [f"{each.point}: {each.reason}" for each in self.dropped],
+        }
+
+    def _texts(self) -> tuple[tuple[str, str, str], ...]:
+        """Return name, value with sigma, and unit of each number."""
+        numbers = zip(
+            ("x", "y", "z", "rz", "ry", "rx"),
+            (*self.position_mm, *self.angles_deg),
+            (*self.sigma_mm, *self.sigma_deg),
+            ("mm",) * 3 + ("deg",) * 3,
+            strict=True,
+        )
+        return tuple((name, f"{value:.3f} +- {sigma:.3f}", unit) for name, value, sigma, unit in numbers)
+
+    def __repr__(self) -> str:
+        """Return position and angles with one sigma each, mm and degrees."""
+        x, y, z, rz, ry, rx = (f"{name} {value}" for name, value, _ in self._texts())
+        return f"PoseEstimate({x}, {y}, {z} mm; {rz}, {ry}, {rx} deg; {len(self.points.ids)} points)"
+
+    def _repr_html_(self) -> str:
+        """Return the same as a table, for notebooks."""
+        rows = "".join(
+            f"<tr><td>{name}</td><td>{value}</td><td>{unit}</td></tr>" for name, value, unit in self._texts()
+        )
+        foot = f"{len(self.points.ids)} points, {self.reprojection_rms_px:.3f} px RMS"
+        return f"<table><tr><th></th><th>value +- sigma</th><th>{foot}</th></tr>{rows}</table>"
+
 
 @dataclass(frozen=True, eq=False)
 class JointCommand(Record):

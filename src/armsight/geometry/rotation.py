@@ -95,3 +95,21 @@ def euler_zyx(R: Array) -> tuple[Array, bool]:
     s, c = np.sin(roll), np.cos(roll)
     yaw = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
     return np.array([roll, pitch, yaw]), False
+
+
+def euler_zyx_sigmas(R: Array, cov: Array) -> Array:
+    """Return (3,) one sigma of the angles of :func:`euler_zyx`, rad; NaN at the singularity.
+
+    A rotation by the vector w along the outer axes changes the angles by J^-1 w; the columns of J are the axes of rotation
+    of the three angles.
+
+    Args:
+        R: (3, 3) the rotation.
+        cov: (3, 3) covariance of w along the outer axes, rad^2.
+    """
+    angles, singular = euler_zyx(R)
+    if singular:
+        return np.full(3, np.nan)
+    (sz, sy, _), (cz, cy, _) = np.sin(angles), np.cos(angles)
+    back = np.linalg.inv(np.array([[0.0, -sz, cz * cy], [0.0, cz, sz * cy], [1.0, 0.0, -sy]]))
+    return np.asarray(np.sqrt(np.diag(back @ cov @ back.T)))

@@ -9,9 +9,9 @@ import pytest
 from armsight.app.live import calibration, records, simulated
 from armsight.app.live.server import LiveServer
 from armsight.app.live.session import LiveSession, SessionOptions, scaled_spec
-from armsight.app.shot_pose import CSV_COLUMNS
 from armsight.errors import InputError
 from armsight.files import read_table
+from armsight.vision.pose.shot_pose import CSV_COLUMNS
 from armsight.vision.rig import StereoRig
 
 pytestmark = pytest.mark.real_time

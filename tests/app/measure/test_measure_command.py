@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from armsight.app.measure.shots import _detected, reversed_notes
-from armsight.app.shot_pose import CSV_COLUMNS
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.vision.markers.body_file import save_body_csv
 from armsight.vision.markers.targets import open_body, open_target
+from armsight.vision.pose.shot_pose import CSV_COLUMNS
 from armsight.vision.rig import StereoRig
 from cli_runs import assert_rejected
 

@@ -23,7 +23,6 @@ from armsight.app.measure.picture import (
     wrapped,
 )
 from armsight.app.measure.view import CHART, EACH_UP_TO, PictureFolder, view_folder
-from armsight.app.shot_pose import ShotPose, shot_pose
 from armsight.app.show import page
 from armsight.data import SIDES, Detections, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
@@ -32,6 +31,7 @@ from armsight.geometry.rotation import euler_zyx, exp_so3
 from armsight.vision.discs.bias import expect
 from armsight.vision.markers.targets import open_body
 from armsight.vision.pose.locate_discs import locate_composite
+from armsight.vision.pose.shot_pose import ShotPose, shot_pose
 from armsight.vision.rig import StereoRig
 from cli_runs import assert_rejected
 from disc_views import PLATE, SIZE, discs_of, hd_rig, someplace, views

@@ -90,8 +90,8 @@ def _local(path: str) -> Iterator[str]:
 def _replay(path: str, options: BatchOptions) -> tuple[Row, list[Row]]:
     """Replay a recording."""
     from armsight.app.replay.open import Request, replay
-    from armsight.app.shot_pose import csv_text
     from armsight.files import read_table
+    from armsight.vision.pose.shot_pose import csv_text
 
     notes: list[str] = []
     request = Request(path, options.rig, options.target, options.arm, options.estimator)

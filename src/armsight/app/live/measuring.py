@@ -20,7 +20,6 @@ import numpy as np
 
 from armsight.app.live.capture import LiveShot
 from armsight.app.live.records import Drawn, polyline
-from armsight.app.shot_pose import csv_text, shot_pose
 from armsight.app.show.messages import Note
 from armsight.app.stream.datum import Published, ShotDatum
 from armsight.app.stream.mcap_file import LazyMcap, properties
@@ -37,6 +36,7 @@ from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_target
 from armsight.vision.pose.locate import by_rig
 from armsight.vision.pose.measure import measure
+from armsight.vision.pose.shot_pose import csv_text, shot_pose
 from armsight.vision.rig import StereoRig
 
 #: Health is asked for once a second; so many times as long as it took it is not.

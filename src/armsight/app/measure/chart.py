@@ -1,6 +1,6 @@
 """The strip chart of many shots: how each was found, the pose, its sigmas and the residuals, one above the other.
 
-In: the shots' :class:`~armsight.app.shot_pose.ShotPose`. Out: a PNG.
+In: the shots' :class:`~armsight.vision.pose.shot_pose.ShotPose`. Out: a PNG.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.measure.picture import angle_sigmas_deg
-from armsight.app.shot_pose import ANGLES, ShotPose
 from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png
 from armsight.data import Array, Record
+from armsight.vision.pose.shot_pose import ANGLES, ShotPose
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -19,14 +19,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.shot_pose import ANGLES, ShotPose
 from armsight.app.show.plotting import nice, plain
 from armsight.data import SIDES, Array, Body, Dropped, Image, PoseEstimate, Record
 from armsight.geometry.pose import inverse, transform
-from armsight.geometry.rotation import exp_so3
 from armsight.vision.discs.bias import expect
 from armsight.vision.image import grey
 from armsight.vision.markers.discs import DiscTarget
+from armsight.vision.pose.shot_pose import ANGLES, ShotPose
 from armsight.vision.rig import StereoRig
 
 
@@ -268,7 +267,7 @@ def header(shot: ShotPose) -> list[str]:
     if not shot.ok:
         return [", ".join(first)]
     position = _pairs(("x", "y", "z"), 1e3 * shot.position_m, 1e3 * np.sqrt(np.diag(shot.cov)[:3]))
-    rotation = _pairs(ANGLES, shot.euler_zyx_deg, angle_sigmas_deg(shot))
+    rotation = _pairs(ANGLES, shot.euler_zyx_deg, shot.angle_sigmas_deg)
     count, dropped = len(shot.points_m), len(shot.dropped)
     _, precision, calibration = (1e3 * sigma for sigma in shot.position_sigmas_m)
     fit = (
@@ -288,21 +287,6 @@ def _pairs(names: tuple[str, ...], values: Array, sigmas: Array) -> str:
         f"{name} {value:.3f}" + (f" +- {sigma:.3f}" if np.isfinite(sigma) else "")
         for name, value, sigma in zip(names, values, sigmas, strict=True)
     )
-
-
-def angle_sigmas_deg(shot: ShotPose) -> Array:
-    """Return (3,) one sigma of the angles about z, y, x of a measured shot, degrees; NaN at the singularity.
-
-    A rotation of the body by the rotation vector w along the left camera's axes changes the angles by J^-1 w; the columns
-    of J are the axes of rotation of the three angles, R = R_z R_y R_x.
-    """
-    if shot.pitch_singular:
-        return np.full(3, np.nan)
-    about_z, about_y, _ = np.radians(shot.euler_zyx_deg)
-    R_z, R_y = exp_so3(np.array([0.0, 0.0, about_z])), exp_so3(np.array([0.0, about_y, 0.0]))
-    J = np.column_stack([[0.0, 0.0, 1.0], R_z[:, 1], (R_z @ R_y)[:, 0]])
-    back = np.linalg.inv(J)
-    return np.asarray(np.degrees(np.sqrt(np.diag(back @ shot.cov[3:, 3:] @ back.T))))
 
 
 #: What is printed behind the angles at their singularity.

@@ -17,7 +17,6 @@ from armsight.app.measure.picture import SINGULAR
 from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, MeasureOptions, Result, open_shots
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.progress import bar
-from armsight.app.shot_pose import ANGLES, ShotPose, csv_text, shot_pose
 from armsight.app.show.messages import colour, weak
 from armsight.app.stream.datum import Published, ShotDatum
 from armsight.app.stream.sink import Fanout, Publisher
@@ -30,6 +29,7 @@ from armsight.vision.follow.follower import measurer
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_fixed
 from armsight.vision.match import gate
+from armsight.vision.pose.shot_pose import ANGLES, ShotPose, csv_text, shot_pose
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources.bag.camera_info import open_rig
 

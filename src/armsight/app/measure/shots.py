@@ -16,7 +16,6 @@ import click
 import numpy as np
 
 from armsight.app.measure.moving import NOTED_SHOTS, Requested, moved_results, skew_finding
-from armsight.app.shot_pose import ShotPose
 from armsight.data import SIDES, Body, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.files import check_writable
@@ -30,6 +29,7 @@ from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.pose.measure import measure, measure_seen, size_problem
 from armsight.vision.pose.noise import DiscNoise
+from armsight.vision.pose.shot_pose import ShotPose
 from armsight.vision.pose.shutter import LOOSE_PX
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.sources import PairsSource, Source, notes_of, open_source

@@ -14,13 +14,13 @@ import cv2
 
 from armsight.app.measure.chart import chart
 from armsight.app.measure.picture import draw_shot, header, marks_of
-from armsight.app.shot_pose import ShotPose
 from armsight.app.show.page import writable_folder
 from armsight.app.show.plotting import require_matplotlib
 from armsight.data import Body, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.files import check_folder, replacing
 from armsight.vision.markers.discs import DiscTarget
+from armsight.vision.pose.shot_pose import ShotPose
 from armsight.vision.rig import StereoRig
 
 CHART, PREFIX = "run.png", "view-"

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from armsight.app.replay.recorded import EventDatum, JointsDatum, RecordedDatum, RecordedRun, ShotDatum
-from armsight.app.shot_pose import ShotPose, left_axes, shot_pose
 from armsight.app.stream.datum import quaternion
 from armsight.app.stream.sink import Publisher
 from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Shot
@@ -36,6 +35,7 @@ from armsight.vision.detections import SeenShot
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.marker import Target
 from armsight.vision.pose.measure import measure, measure_seen
+from armsight.vision.pose.shot_pose import ShotPose, left_axes, shot_pose
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import Source
 from armsight.vision.sources.bag.states import JointStream

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from armsight.app.replay.run import LiveRow, Replayed
-from armsight.app.shot_pose import UPPER, ShotPose, csv_text
 from armsight.data import Array
 from armsight.files import write_text
+from armsight.vision.pose.shot_pose import UPPER, ShotPose, csv_text
 from armsight.vision.sources.bag.states import JointStream
 
 POSES, LIVE = "poses.csv", "live.csv"

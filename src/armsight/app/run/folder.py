@@ -34,7 +34,6 @@ from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import Log, RunData, ToolTrack, assembled, cut, joints_of, write_columns, write_track
 from armsight.app.run.report import NAMES, Beside, RunReport, drawn_beside, write_run_report
 from armsight.app.run.summary import RunSummary, summary_of
-from armsight.app.shot_pose import UPPER, ShotPose, csv_text, left_axes, shot_pose
 from armsight.app.show.page import PAGE, writable_folder
 from armsight.app.stream.mcap_file import RUN_MCAP
 from armsight.data import Array, Correspondences, Image, Missed, PoseEstimate, Shot
@@ -48,6 +47,7 @@ from armsight.loop.health.follow import correction_lines
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.detections import detections_text
 from armsight.vision.image import grey
+from armsight.vision.pose.shot_pose import UPPER, ShotPose, csv_text, left_axes, shot_pose
 from armsight.vision.rig import StereoRig
 
 

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.shot_pose import left_axes, shot_pose
 from armsight.app.show.encode import json_of
 from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Record, Shot
 from armsight.loop.estimators import KalmanEstimator, Mounting, Remembered
 from armsight.robot.kinematics.arm import Arm
+from armsight.vision.pose.shot_pose import left_axes, shot_pose
 from armsight.vision.rig import StereoRig
 
 

@@ -12,10 +12,10 @@ from typing import Any, TypeAlias
 import cv2
 import numpy as np
 
-from armsight.app.shot_pose import left_axes
 from armsight.app.stream.datum import EventDatum, JointsDatum, NoteDatum, Published, ShotDatum, quaternion
 from armsight.data import SIDES, Array, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
+from armsight.vision.pose.shot_pose import left_axes
 from armsight.vision.rigfiles.rigfile import rectification
 
 #: A protobuf message.

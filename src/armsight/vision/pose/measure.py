@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import SIDES, Body, Correspondences, Detections, Image, Missed, PoseEstimate, Shot
+from armsight.errors import InputError
 from armsight.geometry.pose import inverse
 from armsight.vision.detections import SeenShot
 from armsight.vision.discs.bias import apparent_radii
@@ -43,7 +44,11 @@ def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed
 
     Returns:
         The pose of the target's body in the left camera's frame, or why there is none.
+
+    Raises:
+        InputError: an argument has another type.
     """
+    _require_arguments(rig, target, shot)
     if shot.problem is not None or shot.left is None or shot.right is None:
         return Missed(shot.problem or "no image")
     images = (shot.left, shot.right)
@@ -56,6 +61,17 @@ def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed
         return result
     dark = [f"{side}: {d}" for side, d in zip(SIDES, map(darkness, (left, right)), strict=True) if d]
     return replace(result, reason="; ".join([result.reason, *dark]))
+
+
+def _require_arguments(rig: object, target: object, shot: object) -> None:
+    """Raise an InputError that names the argument which is not what its place needs, and what opens it."""
+    for name, value, fits, opener in (
+        ("rig", rig, isinstance(rig, StereoRig), 'StereoRig.load("rig.json")'),
+        ("target", target, hasattr(target, "detect"), 'open_target("chessboard:9x6:25mm")'),
+        ("shot", shot, isinstance(shot, Shot), 'open_source("recording").read()'),
+    ):
+        if not fits:
+            raise InputError(f"measure(rig, target, shot): {name} is a {type(value).__name__}; expected {opener}")
 
 
 def _measured(

@@ -20,6 +20,7 @@ from armsight.data import SIDES, Array, Image, Record, Shot
 from armsight.errors import InputError
 from armsight.files import opened, read_json
 from armsight.vision.image import decoded
+from armsight.vision.sources.source import Source
 from armsight.vision.sources.video import Film
 
 #: Columns of a table by name.
@@ -192,7 +193,7 @@ class LeRobotDataset:
         raise InputError(f"{self.folder}: meta/episodes does not describe episode {episode}")
 
 
-class LeRobotSource:
+class LeRobotSource(Source):
     """Two cameras of a dataset; a frame that cannot be decoded is a shot with a problem.
 
     Attributes:

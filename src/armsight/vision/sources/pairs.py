@@ -20,6 +20,7 @@ import numpy as np
 from armsight.data import Image, Shot
 from armsight.errors import InputError
 from armsight.vision.image import read_image
+from armsight.vision.sources.source import Source
 
 #: Endings of image files, in lower case.
 IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
@@ -66,7 +67,7 @@ def halves(file: Path) -> tuple[Image, Image]:
     return np.ascontiguousarray(image[:, : width // 2]), np.ascontiguousarray(image[:, width // 2 :])
 
 
-class StoredSource:
+class StoredSource(Source):
     """A source over pairs of image files, read one by one.
 
     Attributes:
@@ -86,6 +87,10 @@ class StoredSource:
     def files(self) -> tuple[Path, ...]:
         """The image files of all pairs."""
         return tuple(file for pair in self.pairs for file in (pair.left, pair.right) if file is not None)
+
+    def __getitem__(self, row: int) -> Shot:
+        """Load one shot by its place in the recording; what is read next stays."""
+        return self.pairs[row].load()
 
     def read(self) -> Shot | None:
         """Return the next shot, or None at the end."""

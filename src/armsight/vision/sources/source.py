@@ -1,18 +1,23 @@
 """The contract of a source: it returns one :class:`~armsight.data.Shot` after another.
 
-To add a kind of source: write one file with a class that fulfils :class:`Source`, and add one line to the registry in
+To add a kind of source: write one file with a class that derives from :class:`Source`, and add one line to the registry in
 ``__init__.py``.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Iterator
+from typing import Protocol, Self
 
 from armsight.data import Shot
 
 
 class Source(Protocol):
-    """Two cameras, or a recording of them."""
+    """Two cameras, or a recording of them.
+
+    Derive from this class to inherit what goes around ``count``, ``read`` and ``close``: ``for shot in source``,
+    ``len(source)``, and ``with``, which closes it.
+    """
 
     @property
     def count(self) -> int | None:
@@ -30,3 +35,26 @@ class Source(Protocol):
     def close(self) -> None:
         """Release files and devices; a second call has no effect."""
         ...
+
+    def __iter__(self) -> Iterator[Shot]:
+        """Read the shots that are left, one after another."""
+        while (shot := self.read()) is not None:
+            yield shot
+
+    def __len__(self) -> int:
+        """Return how many shots there are in all; a TypeError where that is not known."""
+        if self.count is None:
+            raise TypeError("how many shots a video or live cameras have is not known before they end")
+        return self.count
+
+    def __bool__(self) -> bool:
+        """Return True: a source without a shot, or of unknown length, is a source."""
+        return True
+
+    def __enter__(self) -> Self:
+        """Return the source; ``with`` closes it at its end."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()

@@ -27,6 +27,7 @@ import numpy as np
 from armsight.data import Image, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.vision.sources.capture import open_capture
+from armsight.vision.sources.source import Source
 from armsight.vision.sources.timing import Rhythm, allowed_skew
 
 TIMEOUT_S = 5.0  # without data for that long a stream has stalled
@@ -212,7 +213,7 @@ class _Reader(threading.Thread):
                 self.changed.notify_all()
 
 
-class UrlSource:
+class UrlSource(Source):
     """Two live streams."""
 
     count: int | None = None

@@ -25,6 +25,7 @@ from armsight import MOST_PIXELS
 from armsight.data import Array, Image, Shot
 from armsight.errors import InputError
 from armsight.files import check_readable
+from armsight.vision.sources.source import Source
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -54,7 +55,7 @@ _MOVED_LEAST = 0.002
 _OPTIONS = {"protocol_whitelist": "file"}
 
 
-class VideoSource:
+class VideoSource(Source):
     """Two video files, or one side-by-side file."""
 
     count: int | None = None  # what a container promises is an estimate

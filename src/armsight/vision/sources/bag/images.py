@@ -23,6 +23,7 @@ from armsight.errors import InputError
 from armsight.vision.image import decoded
 from armsight.vision.sources.bag.pairing import Pairing, Stamps, pair, stamps_of
 from armsight.vision.sources.bag.reader import Bag, BagMessage, Decoded
+from armsight.vision.sources.source import Source
 
 #: Types of messages that hold one image.
 IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")
@@ -83,7 +84,7 @@ class _Planned:
     problem: str | None
 
 
-class BagSource:
+class BagSource(Source):
     """The stereo images of a recording in the order of time; two messages that belong together are a shot.
 
     An image without a partner is a shot with a problem, which says so.

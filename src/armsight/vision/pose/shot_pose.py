@@ -18,12 +18,14 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from armsight.data import Array, Body, Dropped, Missed, PoseEstimate, Record
-from armsight.geometry.rotation import euler_zyx, quaternion_wxyz
+from armsight.files import write_text
+from armsight.geometry.rotation import euler_zyx, euler_zyx_sigmas, from_euler_zyx, quaternion_wxyz
 from armsight.vision.rig import Shutters
 
 #: Elements of a 6x6 covariance that are written.
@@ -49,6 +51,8 @@ CSV_COLUMNS = (
     *(f"sigma_{share}_{axis}" for share in ("precision", "calibration") for axis in _AXES),
 )
 
+#: So many columns are text: shot, status, reason.
+_TEXTS = 3
 SHUTTER_COLUMNS = ("skew_s", "readout_s", "sigma_skew_s", "sigma_readout_s")
 
 
@@ -115,6 +119,13 @@ class ShotPose(Record):
         traces = (float(np.trace(cov[:3, :3])) for cov in (self.cov, self.cov_precision, self.cov_calibration))
         total, precision, calibration = (math.sqrt(max(trace, 0.0)) for trace in traces)
         return total, precision, calibration
+
+    @property
+    def angle_sigmas_deg(self) -> Array:
+        """(3,) one sigma of ``euler_zyx_deg``, degrees; NaN at the singularity."""
+        if self.pitch_singular:
+            return np.full(3, np.nan)
+        return np.degrees(euler_zyx_sigmas(from_euler_zyx(*np.radians(self.euler_zyx_deg)), self.cov[3:, 3:]))
 
     @property
     def status(self) -> str:
@@ -187,16 +198,13 @@ def left_axes(T_left_body: Array, cov: Array) -> Array:
     return np.asarray((R @ blocks @ R.T).swapaxes(1, 2).reshape(6, 6))
 
 
-def csv_text(poses: Sequence[ShotPose]) -> str:
-    """Return the CSV of many shots; ``cov_ij`` is the upper triangle of ``covariance``.
+def rows_of(poses: Sequence[ShotPose]) -> tuple[tuple[str, ...], list[list[Any]]]:
+    """Return the columns of a table of shots and its rows; None where a shot has no value.
 
-    Where shots were moved to one time, the columns of SHUTTER_COLUMNS follow.
+    ``cov_ij`` is the upper triangle of ``covariance``. Where shots were moved to one time, SHUTTER_COLUMNS follow.
     """
-    output = io.StringIO()
-    writer = csv.writer(output, lineterminator="\n")
-    moved = any(p.shutters is not None for p in poses)
-    columns = CSV_COLUMNS + (SHUTTER_COLUMNS if moved else ())
-    writer.writerow(columns)
+    columns = CSV_COLUMNS + (SHUTTER_COLUMNS if any(p.shutters is not None for p in poses) else ())
+    rows = []
     for p in poses:
         row: list[Any] = [p.shot, p.status, p.reason, p.t_s]
         if p.ok:
@@ -207,7 +215,66 @@ def csv_text(poses: Sequence[ShotPose]) -> str:
             for share in (p.cov_precision, p.cov_calibration):
                 row += np.sqrt(np.maximum(np.diag(share), 0.0)).tolist()
         if p.shutters is not None:
-            row += [""] * (len(CSV_COLUMNS) - len(row))
+            row += [None] * (len(CSV_COLUMNS) - len(row))
             row += [p.shutters.skew_s, p.shutters.readout_s, *p.shutters.sigmas.tolist()]
-        writer.writerow(["" if value is None else value for value in row] + [""] * (len(columns) - len(row)))
+        rows.append(row + [None] * (len(columns) - len(row)))
+    return columns, rows
+
+
+def csv_text(poses: Sequence[ShotPose]) -> str:
+    """Return the CSV of many shots."""
+    output = io.StringIO()
+    columns, rows = rows_of(poses)
+    csv.writer(output, lineterminator="\n").writerows([columns, *rows])
     return output.getvalue()
+
+
+@dataclass(frozen=True, repr=False)
+class PoseTable:
+    """The poses of many shots, as :func:`~armsight.vision.pose.measure_all.measure_all` returns them.
+
+    ``pandas.DataFrame(table.columns())`` and ``polars.DataFrame(table.columns())`` make a frame of it, as does whatever
+    reads Arrow's interface where pyarrow is installed. The columns are those of ``armsight measure -o``.
+
+    Attributes:
+        poses: one a shot, missed ones included.
+    """
+
+    poses: tuple[ShotPose, ...]
+
+    def __len__(self) -> int:
+        """Return how many shots there are."""
+        return len(self.poses)
+
+    def __getitem__(self, row: int) -> ShotPose:
+        """Return the pose of one shot."""
+        return self.poses[row]
+
+    def columns(self) -> dict[str, Array | list[str | None]]:
+        """Return the columns by name: (N,) numbers, NaN where a shot was missed; lists of text."""
+        names, rows = rows_of(self.poses)
+        found: dict[str, Array | list[str | None]] = {}
+        for k, name in enumerate(names):
+            cells = [row[k] for row in rows]
+            found[name] = cells if k < _TEXTS else np.array([math.nan if v is None else v for v in cells], float)
+        return found
+
+    def write_csv(self, path: str | Path) -> None:
+        """Write the file that ``armsight measure -o`` writes.
+
+        Raises:
+            InputError: it cannot be written; then nothing is.
+        """
+        write_text(Path(path), csv_text(self.poses))
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        """Return the table by Arrow's C interface; it needs pyarrow."""
+        import pyarrow
+
+        return pyarrow.table(self.columns()).__arrow_c_stream__(requested_schema)
+
+    def __repr__(self) -> str:
+        """Return how many shots were measured, and the sigma of a position in the middle, mm."""
+        good = [1e3 * pose.position_sigmas_m[0] for pose in self.poses if pose.ok]
+        sigma = f", sigma {np.median(good):.3f} mm (median)" if good else ""
+        return f"PoseTable({len(good)} of {len(self)} shots measured{sigma})"
