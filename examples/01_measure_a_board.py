@@ -26,19 +26,15 @@ def main(folder: Path) -> None:
     """Render a recording into ``folder``, measure the board in it, and print where it is."""
     truth, _ = demo_recording(folder, image_size_px=(640, 360), boards=5, shots=1)
     target = open_target(BOARD)
-    source = open_source(str(folder / "board"))
-    for T_true in truth.Ts_left_body:
-        shot = source.read()
-        assert shot is not None
+    for shot, T_true in zip(open_source(str(folder / "board")), truth.Ts_left_body, strict=True):
         estimate = measure(truth.rig, target, shot)
         if isinstance(estimate, Missed):
             print(f"{shot.name}: missed: {estimate.reason}")
             continue
-        position = estimate.T_left_body[:3, 3]
-        sigma = np.sqrt(np.trace(estimate.cov[:3, :3]))
-        error = np.linalg.norm(position - T_true[:3, 3])
-        x, y, z = 1e3 * position
-        print(f"{shot.name}: x {x:.2f} y {y:.2f} z {z:.2f} mm, sigma {1e3 * sigma:.3f} mm, error {1e3 * error:.3f} mm")
+        x, y, z = estimate.position_mm
+        sigma = np.linalg.norm(estimate.sigma_mm)
+        error = np.linalg.norm(estimate.position_mm - 1e3 * T_true[:3, 3])
+        print(f"{shot.name}: x {x:.2f} y {y:.2f} z {z:.2f} mm, sigma {sigma:.3f} mm, error {error:.3f} mm")
 
 
 # %%

@@ -8,14 +8,14 @@ Calibrate two cameras from pairs of images of a board, and save the rig.
 
     $ python examples/02_calibrate_in_python.py
 
-The images are rendered here. For your own images give their folder to ``open_source``, your board to ``open_board`` and the
-size of the images to ``calibrate_boards``, and leave ``models`` out: the held-out error then selects the lens model.
+The images are rendered here. For your own images give their folder and your board to ``calibrate``, and leave ``models``
+out: the held-out error then selects the lens model.
 """
 
 import tempfile
 from pathlib import Path
 
-from armsight import Pair, calibrate_boards, open_board, open_source
+from armsight import calibrate, open_board, open_source
 from armsight.sim.example_rig import BOARD, demo_recording
 from armsight.vision.image import grey
 
@@ -24,13 +24,7 @@ def main(folder: Path) -> None:
     """Render a recording into ``folder``, calibrate on its board, print the held-out errors, save ``rig.json``."""
     truth, _ = demo_recording(folder, image_size_px=(640, 360), boards=12, shots=1)
 
-    board = open_board(BOARD)
-    source = open_source(str(folder / "board"))
-    pairs = []
-    while (shot := source.read()) is not None:
-        if shot.left is not None and shot.right is not None:
-            pairs.append(Pair(shot.name, board.detect(grey(shot.left)), board.detect(grey(shot.right))))
-    calibration = calibrate_boards(board, pairs, ((640, 360), (640, 360)), models=("brown5",))
+    calibration = calibrate(BOARD, str(folder / "board"), models=("brown5",))
     calibration.rig.save(folder / "rig.json")
 
     heldout, rig = calibration.heldout, calibration.rig
@@ -48,9 +42,9 @@ def plot(folder: Path) -> None:
     """Show where the corners of all pairs are in both images; needs matplotlib."""
     import matplotlib.pyplot as plt
 
-    board, source = open_board(BOARD), open_source(str(folder / "board"))
+    board = open_board(BOARD)
     _, axes = plt.subplots(1, 2, figsize=(10, 3.2), layout="constrained")
-    while (shot := source.read()) is not None:
+    for shot in open_source(str(folder / "board")):
         for ax, image in zip(axes, (shot.left, shot.right), strict=True):
             uv = board.detect(grey(image)).uv
             ax.plot(uv[:, 0], uv[:, 1], ".", markersize=3)

@@ -315,16 +315,12 @@ class PoseEstimate(Record):
             "dropped": [f"{each.point}: {each.reason}" for each in self.dropped],
         }
 
-    def _texts(self) -> tuple[tuple[str, str, str], ...]:
+    def _texts(self) -> list[tuple[str, str, str]]:
         """Return name, value with sigma, and unit of each number."""
-        numbers = zip(
-            ("x", "y", "z", "rz", "ry", "rx"),
-            (*self.position_mm, *self.angles_deg),
-            (*self.sigma_mm, *self.sigma_deg),
-            ("mm",) * 3 + ("deg",) * 3,
-            strict=True,
-        )
-        return tuple((name, f"{value:.3f} +- {sigma:.3f}", unit) for name, value, sigma, unit in numbers)
+        mm = zip("xyz", self.position_mm, self.sigma_mm, strict=True)
+        deg = zip(("rz", "ry", "rx"), self.angles_deg, self.sigma_deg, strict=True)
+        texts = [(name, f"{value:.3f} +- {sigma:.3f}", "mm") for name, value, sigma in mm]
+        return [*texts, *((name, f"{value:.4f} +- {sigma:.4f}", "deg") for name, value, sigma in deg)]
 
     def __repr__(self) -> str:
         """Return position and angles with one sigma each, mm and degrees."""

@@ -14,7 +14,6 @@ from armsight.app.measure.chart import SHOT, TIME, _intervals, chart, chart_data
 from armsight.app.measure.picture import (
     WIDTH,
     _Panel,
-    angle_sigmas_deg,
     ascii_text,
     draw_shot,
     ellipse,
@@ -196,8 +195,8 @@ def test_the_sigmas_of_the_angles_are_those_of_random_rotations():
     R = result.T_left_body[:3, :3]
     angles = np.degrees([euler_zyx(exp_so3(w) @ R)[0] for w in rotations])
     # A sample's standard deviation has a relative error of 1/sqrt(2 n): four of them.
-    np.testing.assert_allclose(angles.std(axis=0), angle_sigmas_deg(record), rtol=4 / np.sqrt(2 * count))
-    assert np.isnan(angle_sigmas_deg(replace(record, pitch_singular=True))).all()
+    np.testing.assert_allclose(angles.std(axis=0), record.angle_sigmas_deg, rtol=4 / np.sqrt(2 * count))
+    assert np.isnan(replace(record, pitch_singular=True).angle_sigmas_deg).all()
     assert "only rz and rx together" in header(replace(record, pitch_singular=True))[1]
 
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.measure.picture import angle_sigmas_deg
 from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png
 from armsight.data import Array, Record
 from armsight.vision.pose.shot_pose import ANGLES, ShotPose
@@ -68,7 +67,7 @@ def chart_data(poses: Sequence[ShotPose]) -> ChartData:
         if p.ok:
             each = np.sqrt(np.diag(p.cov))
             pose[n] = [*(1e3 * p.position_m), *p.euler_zyx_deg]
-            sigma[n] = [*(1e3 * each[:3]), *angle_sigmas_deg(p)]
+            sigma[n] = [*(1e3 * each[:3]), *p.angle_sigmas_deg]
             rotation[n], rms[n] = np.degrees(each[3:]), p.reprojection_rms_px
     good = np.isfinite(rms[:, 0])
     pose[good, 3:] = np.unwrap(pose[good, 3:], period=360.0, axis=0)
