@@ -32,7 +32,7 @@ from armsight.vision.pose.locate import by_rig
 from armsight.vision.pose.measure import measure
 from armsight.vision.pose.pnp import body_poses
 from armsight.vision.rig import StereoRig
-from armsight.vision.sources.source import Source
+from armsight.vision.source import Source
 
 #: Steps of the refinement of a pose, and the change, m and rad, below which it has settled.
 STEPS, SETTLED = 20, 1e-10

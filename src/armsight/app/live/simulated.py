@@ -21,6 +21,7 @@ from armsight.sim.render.scene import chessboard
 from armsight.sim.workcell.workcell import CHESSBOARD, Workcell
 from armsight.vision.markers.board import open_board
 from armsight.vision.pose.pnp import body_poses
+from armsight.vision.sources import Source
 
 ACTIONS = ("cover_left", "cover_right", "uncover", "unplug", "plug", "board", "no_board")
 #: A hand comes so near to an outline, m and rad; moves so fast, s per pose; and trembles, m and rad.
@@ -136,8 +137,8 @@ def _where(way: tuple[Array, Array, float]) -> Array:
     return np.asarray(start @ exp_se3(smooth * log_se3(inverse(start) @ end)))
 
 
-class SimulatedCameras:
-    """The workcell's cameras as a source; fulfils :class:`~armsight.vision.sources.source.Source`.
+class SimulatedCameras(Source):
+    """The workcell's cameras as a source.
 
     Args:
         cameras: as the workcell names them, such as 1280x720@15.

@@ -22,8 +22,8 @@ from armsight.app.interrupts import uninterrupted
 from armsight.data import SIDES, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder, replacing
+from armsight.vision.source import Source
 from armsight.vision.sources.folder import COLUMNS, INDEX
-from armsight.vision.sources.source import Source
 
 
 @dataclass(frozen=True)

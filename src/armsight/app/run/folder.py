@@ -49,6 +49,7 @@ from armsight.vision.detections import detections_text
 from armsight.vision.image import grey
 from armsight.vision.pose.shot_pose import UPPER, ShotPose, csv_text, left_axes, shot_pose
 from armsight.vision.rig import StereoRig
+from armsight.vision.sources import Source
 
 
 def joint_columns(t_s: Array, q: Array, q_ref: Array) -> dict[str, Any]:
@@ -113,7 +114,7 @@ def write_shots(folder: Path, shots: Sequence[Shot]) -> None:
     """
     left = iter(shots)
 
-    class Kept:
+    class Kept(Source):
         count = len(shots)
 
         def read(self) -> Shot | None:

@@ -33,6 +33,7 @@ from armsight.sim.workcell.motors import Solids, row_frames
 from armsight.sim.workcell.plant import TICK_S, ArmPlant
 from armsight.sim.workcell.raycast import arm_capsules, capsule_boxes
 from armsight.vision.rig import StereoRig
+from armsight.vision.sources import Source
 
 _FORM = "WIDTHxHEIGHT@HZ, NAME or NAME:WIDTHxHEIGHT@HZ; such as 1280x720@60 or webcams:640x480@30"
 #: Focal length over the image's width: 900 px at 1280.
@@ -352,11 +353,13 @@ def _q(seen: _Exposed, t_s: Array) -> Array:
     return np.asarray(sum(w * q for w, q in zip(weights, p, strict=True)))
 
 
-class WorkcellSource:
+class WorkcellSource(Source):
     """The workcell's cameras.
 
-    Fulfils :class:`armsight.vision.sources.source.Source`: ``read`` waits for the next shot, in the workcell's time.
+    Fulfils :class:`armsight.vision.source.Source`: ``read`` waits for the next shot, in the workcell's time.
     """
+
+    count: int | None = None
 
     def __init__(
         self,

@@ -1,6 +1,6 @@
 """Sources of shots: a spec such as ``KIND:...`` or the path of a folder goes in, one shot after another comes out.
 
-The contract is in ``source.py``; :func:`open_source` opens a spec.
+The contract is in ``vision/source.py``; :func:`open_source` opens a spec.
 
 - Recordings: ``folder.py``, ``pairs.py`` (two globs of images), ``video.py``, ``bag/`` (of ROS and Foxglove),
   ``lerobot.py``.
@@ -15,12 +15,12 @@ import os
 from collections.abc import Callable
 
 from armsight.errors import InputError
+from armsight.vision.source import Source
 from armsight.vision.sources.bag import open_bag_source
 from armsight.vision.sources.bag.reader import SUFFIXES
 from armsight.vision.sources.folder import FolderSource
 from armsight.vision.sources.lerobot import open_lerobot
 from armsight.vision.sources.pairs import PairsSource
-from armsight.vision.sources.source import Source
 from armsight.vision.sources.url import open_url
 from armsight.vision.sources.usb import open_usb
 from armsight.vision.sources.video import open_video

@@ -20,7 +20,7 @@ from armsight.data import SIDES, Array, Image, Record, Shot
 from armsight.errors import InputError
 from armsight.files import opened, read_json
 from armsight.vision.image import decoded
-from armsight.vision.sources.source import Source
+from armsight.vision.source import Source
 from armsight.vision.sources.video import Film
 
 #: Columns of a table by name.

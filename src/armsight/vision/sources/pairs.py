@@ -20,7 +20,7 @@ import numpy as np
 from armsight.data import Image, Shot
 from armsight.errors import InputError
 from armsight.vision.image import read_image
-from armsight.vision.sources.source import Source
+from armsight.vision.source import Source
 
 #: Endings of image files, in lower case.
 IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}

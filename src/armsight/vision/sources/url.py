@@ -26,8 +26,8 @@ import numpy as np
 
 from armsight.data import Image, Shot
 from armsight.errors import DeviceError, InputError
+from armsight.vision.source import Source
 from armsight.vision.sources.capture import open_capture
-from armsight.vision.sources.source import Source
 from armsight.vision.sources.timing import Rhythm, allowed_skew
 
 TIMEOUT_S = 5.0  # without data for that long a stream has stalled

@@ -23,8 +23,8 @@ import numpy as np
 
 from armsight.data import Image, Shot
 from armsight.errors import DeviceError, InputError
+from armsight.vision.source import Source
 from armsight.vision.sources.capture import open_capture
-from armsight.vision.sources.source import Source
 from armsight.vision.sources.timing import Rhythm, allowed_skew
 from armsight.vision.sources.v4l2 import EXPOSURE_UNIT_MS
 

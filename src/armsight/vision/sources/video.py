@@ -25,7 +25,7 @@ from armsight import MOST_PIXELS
 from armsight.data import Array, Image, Shot
 from armsight.errors import InputError
 from armsight.files import check_readable
-from armsight.vision.sources.source import Source
+from armsight.vision.source import Source
 
 if TYPE_CHECKING:
     from av.container import InputContainer

@@ -21,9 +21,9 @@ from armsight import MOST_PIXELS
 from armsight.data import SIDES, Image, Shot
 from armsight.errors import InputError
 from armsight.vision.image import decoded
+from armsight.vision.source import Source
 from armsight.vision.sources.bag.pairing import Pairing, Stamps, pair, stamps_of
 from armsight.vision.sources.bag.reader import Bag, BagMessage, Decoded
-from armsight.vision.sources.source import Source
 
 #: Types of messages that hold one image.
 IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")

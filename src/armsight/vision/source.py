@@ -1,7 +1,7 @@
 """The contract of a source: it returns one :class:`~armsight.data.Shot` after another.
 
 To add a kind of source: write one file with a class that derives from :class:`Source`, and add one line to the registry in
-``__init__.py``.
+``sources/__init__.py``.
 """
 
 from __future__ import annotations
