@@ -91,7 +91,7 @@ def test_pictures_to_a_rig_to_a_table(boards):
     rig.save(boards / "found.json")
     assert rig.baseline_m == pytest.approx(0.2, abs=1e-4)
     table = measure_all(boards / "found.json", BOARD, str(boards / "board"))
-    assert repr(table).startswith("PoseTable(12 of 12 shots measured, sigma 0.")
+    assert repr(table).startswith("ShotPoses(12 of 12 shots measured, sigma 0.")
     columns = table.columns()
     assert tuple(columns) == CSV_COLUMNS
     assert columns["shot"] == [shot.shot for shot in table]

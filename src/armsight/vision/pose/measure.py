@@ -64,7 +64,7 @@ def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed
 
 
 def _require_arguments(rig: object, target: object, shot: object) -> None:
-    """Raise an InputError that names the argument which is not what its place needs, and what opens it."""
+    """Raise an InputError that names the argument of a wrong type, and what opens a right one."""
     for name, value, fits, opener in (
         ("rig", rig, isinstance(rig, StereoRig), 'StereoRig.load("rig.json")'),
         ("target", target, hasattr(target, "detect"), 'open_target("chessboard:9x6:25mm")'),

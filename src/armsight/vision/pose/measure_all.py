@@ -12,7 +12,7 @@ from pathlib import Path
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_target
 from armsight.vision.pose.measure import measure
-from armsight.vision.pose.shot_pose import PoseTable, ShotPose, shot_pose
+from armsight.vision.pose.shot_pose import ShotPose, ShotPoses, shot_pose
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import Source, open_source
 
@@ -23,7 +23,7 @@ def measure_all(
     source: Source | str,
     *,
     progress: Callable[[int, int | None], None] = lambda done, total: None,
-) -> PoseTable:
+) -> ShotPoses:
     """Measure every shot by itself, until the source ends.
 
     Args:
@@ -46,4 +46,4 @@ def measure_all(
         for shot in shots:
             poses.append(shot_pose(shot.name, shot.t_s, target.body, measure(rig, target, shot)))
             progress(len(poses), shots.count)
-    return PoseTable(tuple(poses))
+    return ShotPoses(tuple(poses))

@@ -51,8 +51,6 @@ CSV_COLUMNS = (
     *(f"sigma_{share}_{axis}" for share in ("precision", "calibration") for axis in _AXES),
 )
 
-#: So many columns are text: shot, status, reason.
-_TEXTS = 3
 SHUTTER_COLUMNS = ("skew_s", "readout_s", "sigma_skew_s", "sigma_readout_s")
 
 
@@ -230,7 +228,7 @@ def csv_text(poses: Sequence[ShotPose]) -> str:
 
 
 @dataclass(frozen=True, repr=False)
-class PoseTable:
+class ShotPoses:
     """The poses of many shots, as :func:`~armsight.vision.pose.measure_all.measure_all` returns them.
 
     ``pandas.DataFrame(table.columns())`` and ``polars.DataFrame(table.columns())`` make a frame of it, as does whatever
@@ -256,7 +254,11 @@ class PoseTable:
         found: dict[str, Array | list[str | None]] = {}
         for k, name in enumerate(names):
             cells = [row[k] for row in rows]
-            found[name] = cells if k < _TEXTS else np.array([math.nan if v is None else v for v in cells], float)
+            found[name] = (
+                cells
+                if k < CSV_COLUMNS.index("t_s")
+                else np.array([math.nan if v is None else v for v in cells], float)
+            )
         return found
 
     def write_csv(self, path: str | Path) -> None:
@@ -277,4 +279,4 @@ class PoseTable:
         """Return how many shots were measured, and the sigma of a position in the middle, mm."""
         good = [1e3 * pose.position_sigmas_m[0] for pose in self.poses if pose.ok]
         sigma = f", sigma {np.median(good):.3f} mm (median)" if good else ""
-        return f"PoseTable({len(good)} of {len(self)} shots measured{sigma})"
+        return f"ShotPoses({len(good)} of {len(self)} shots measured{sigma})"

@@ -89,7 +89,7 @@ class StoredSource(Source):
         return tuple(file for pair in self.pairs for file in (pair.left, pair.right) if file is not None)
 
     def __getitem__(self, row: int) -> Shot:
-        """Load one shot by its place in the recording; what is read next stays."""
+        """Load one shot by its row in the recording; what is read next stays."""
         return self.pairs[row].load()
 
     def read(self) -> Shot | None:
