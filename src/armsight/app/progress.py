@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 import time
 from collections.abc import Callable, Iterator
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 _EVERY_S = 5.0
 
@@ -29,18 +28,21 @@ def _lines() -> Callable[[str], None]:
 @contextlib.contextmanager
 def bar(what: str, total: int | None) -> Iterator[Callable[[], None]]:
     """Show a progress bar; the block is given a function that advances it by one."""
-    console, say, done = Console(stderr=True), _lines(), 0
+    say, done = _lines(), 0
 
     def one_more() -> None:
         nonlocal done
         done += 1
         say(f"{what}: {done}" if total is None else f"{what}: {done} of {total}")
 
-    if not console.is_terminal:
+    if not sys.stderr.isatty():
         yield one_more
         return
+    from rich.console import Console  # not above: it takes longer than a pair of images
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
     columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(what, total=total)
         yield lambda: progress.advance(task)
 
@@ -48,11 +50,13 @@ def bar(what: str, total: int | None) -> Iterator[Callable[[], None]]:
 @contextlib.contextmanager
 def steps() -> Iterator[Callable[[str], None]]:
     """Show what is being done; the block is given a function that sets the line."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
+    if not sys.stderr.isatty():
         yield _lines()
         return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("", total=None)
         yield lambda line: progress.update(task, description=line)

@@ -11,9 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.special import chdtri, gammaln, ndtri
-from scipy.stats import qmc
 
 from armsight.data import Array
 from armsight.estimate.linear import Linear
@@ -54,6 +52,8 @@ def most_probable(
         start: source -> variance to begin at.
         steps: iterations at most.
     """
+    from scipy.optimize import minimize
+
     of = np.array([means[name] for name in linear.sources])
     begin = np.log([(start or {}).get(name, 0.25 * means[name] ** 2) for name in linear.sources])
     bounds = np.log(of[:, None] ** 2) + 2 * np.log([LOW, HIGH])
@@ -79,6 +79,8 @@ def restricted(linear: Linear, start: Array, low: float, high: float, steps: int
         high: the greatest sigma.
         steps: iterations at most.
     """
+    from scipy.optimize import minimize
+
     numbers = [linear.e.size] * len(linear.own) + [F.shape[2] for F in linear.shared.values()]
     unit = np.sqrt(2 / np.array(numbers, float))  # about the sigma of a logarithm
 
@@ -145,6 +147,8 @@ def integrate(
     slopes = np.array([_cost(logs + d, linear, of)[1] - _cost(logs - d, linear, of)[1] for d in STEP * np.eye(K)])
     values, vectors = np.linalg.eigh((slopes + slopes.T) / (4 * STEP))
     values = np.maximum(values, WIDEST**-2)
+    from scipy.stats import qmc  # takes half a second, which most programs never need
+
     uniform = np.clip(qmc.Sobol(K + 1, seed=0).random(DRAWS), 1e-6, 1 - 1e-6)
     z = ndtri(uniform[:, :K]) * np.sqrt(FREEDOM / chdtri(FREEDOM, uniform[:, K:]))
     drawn = np.clip(logs + (z / np.sqrt(values)) @ vectors.T, *(2 * np.log(of * r) for r in (LOW, HIGH)))

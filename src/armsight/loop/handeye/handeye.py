@@ -23,8 +23,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import chdtri, expit
-from scipy.stats import f as f_distribution
+from scipy.special import chdtri, expit, fdtri
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
@@ -642,7 +641,7 @@ def _settled(
         solved = solve(linear, found)
         far = _far(whole, guess, variances, rows, linear, solved)
         # Variances come from these residuals, too: Fisher's distribution in place of chi-square.
-        limit = 6 * f_distribution.isf(CHANCE, 6, max(6 * int(used.sum()) - 12, 6))
+        limit = 6 / fdtri(max(6 * int(used.sum()) - 12, 6), 6, CHANCE)
         keep = (far < limit) | (used & (far < 0.3 * far[used].max()))
         if keep.sum() < max(MIN_POSES, len(keep) // 3):
             keep = used

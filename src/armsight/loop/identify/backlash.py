@@ -18,7 +18,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.special import ndtr, ndtri
 
 from armsight.data import Array
@@ -174,6 +173,7 @@ def _between_stops(joint: int, stood: Array, noise: Array) -> JointBacklash:
         stood: (N,) where it stood, rad.
         noise: (N,) sigmas of these, rad.
     """
+    from scipy.optimize import minimize
 
     def cost(at: Array) -> float:
         """Return minus the log likelihood of (middle, log of half the backlash, logit of the share at a stop)."""

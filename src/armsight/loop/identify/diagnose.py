@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import orth
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from armsight.data import Array
 from armsight.errors import InputError
@@ -372,7 +372,7 @@ def find_step(arm: Arm, measured: Measured) -> Step | None:
     one = total - steps[joint][0] < SIMPLER**2 * (total - whole[0])
     by, at, x = steps[joint] if one else whole
     free = n * min(3 * K, 6) - Q.shape[1] - len(x)
-    if f_distribution.sf(by / len(x) / (total - by) * free, len(x), free) > CHANCE:
+    if fdtrc(len(x), free, by / len(x) / (total - by) * free) > CHANCE:
         return None
     ways = [joints[joint]] if one else base
     if any(2 * explained(ways, np.argsort(angles))[0] > by for angles in q.T):

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 
 from armsight.data import Array
 from armsight.robot.kinematics.arm import Arm
@@ -52,6 +51,7 @@ def reach(arm: Arm) -> Reach:
 
 def _most(arm: Arm, q: Array, values: Array, measure: Callable[[Array], tuple[float, Array]]) -> float:
     """Return the largest value of a measure of the tool's point, which also gives its gradient by that point."""
+    from scipy.optimize import minimize
 
     def cost(angles: Array) -> tuple[float, Array]:
         value, gradient = measure(arm.forward(angles)[:3, 3])

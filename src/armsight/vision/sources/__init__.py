@@ -21,17 +21,23 @@ from armsight.vision.sources.bag.reader import SUFFIXES
 from armsight.vision.sources.folder import FolderSource
 from armsight.vision.sources.lerobot import open_lerobot
 from armsight.vision.sources.pairs import PairsSource
-from armsight.vision.sources.url import open_url
 from armsight.vision.sources.usb import open_usb
 from armsight.vision.sources.video import open_video
 
 __all__ = ["SOURCES", "FolderSource", "PairsSource", "Source", "check_source", "notes_of", "open_source"]
 
+
+def _open_url(rest: str) -> Source:
+    from armsight.vision.sources.url import open_url  # not above: with it come http and TLS
+
+    return open_url(rest)
+
+
 #: Kind -> what opens the rest of the text; another kind of source is one line here.
 SOURCES: dict[str, Callable[[str], Source]] = {
     "folder": FolderSource.open,
     "video": open_video,
-    "url": open_url,
+    "url": _open_url,
     "usb": open_usb,
     "bag": open_bag_source,
     "lerobot": open_lerobot,

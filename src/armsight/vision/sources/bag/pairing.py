@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from armsight.data import Array
 from armsight.errors import InputError
@@ -121,6 +120,8 @@ def _jumps(t: _Times, arrival: _Times) -> tuple[tuple[int, int], ...]:
 
     A single message that comes late is none, nor a burst of them: their stamps fill the gap that they left.
     """
+    from scipy.ndimage import median_filter
+
     if len(t) <= _TOGETHER:
         return ()
     order = np.lexsort((t, arrival))
