@@ -80,6 +80,37 @@ def first_measurement(folder: Path) -> None:
             times.append(float(np.median([seconds(*command) for _ in range(repeats)])))
         report(f"import cv2, {name}", times[0], None)
         report(f"measure one pair, beyond import cv2, {name}", times[1] - times[0], 2.0)
+    beside_opencv(measure, (one[1], one[3]))
+
+
+#: What a user of OpenCV writes for it: corners, triangulation without distortion, a rigid fit.
+SCRIPT = """
+import sys, cv2, numpy as np
+images = [cv2.imread(name, 0) for name in sys.argv[1:]]
+stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
+rough = [cv2.findChessboardCorners(image, (9, 6))[1] for image in images]
+uv = [cv2.cornerSubPix(*both, (7, 7), (-1, -1), stop).reshape(-1, 2).T for both in zip(images, rough)]
+K = np.array([[535.0, 0, 320], [0, 535, 240], [0, 0, 1]])
+X = cv2.triangulatePoints(K @ np.eye(3, 4), K @ np.eye(3, 4) - K @ [[0, 0, 0, 0.083], [0] * 4, [0] * 4], *uv)
+p = (X[:3] / X[3]).T
+board = np.array([[0.025 * x, 0.025 * y, 0] for y in range(6) for x in range(9)])
+U, _, Vt = np.linalg.svd((board - board.mean(0)).T @ (p - p.mean(0)))
+print(Vt.T @ np.diag([1, 1, np.linalg.det(Vt.T @ U.T)]) @ U.T, p.mean(0))
+"""
+
+
+def beside_opencv(measure: tuple[str, ...], images: tuple[str, ...]) -> None:
+    """Compare processor time and memory of measuring one pair in a process of its own with a script of OpenCV."""
+    least = np.full((2, 2), np.inf)
+    for _ in range(REPEATS):
+        for k, command in enumerate((measure, (sys.executable, "-c", SCRIPT, *images))):
+            process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=ENVIRONMENT)
+            _, status, used = os.wait4(process.pid, 0)
+            if status:
+                raise SystemExit(f"{' '.join(command)}: ended with {status}")
+            least[k] = np.minimum(least[k], (used.ru_utime + used.ru_stime, used.ru_maxrss / 1024))
+    report("measure one pair, processor time over OpenCV's script", least[0, 0] / least[1, 0], 2.2, "")
+    report("the same, memory", least[0, 1] / least[1, 1], 1.5, "")
 
 
 def calibration(folder: Path) -> None:
