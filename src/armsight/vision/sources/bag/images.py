@@ -185,7 +185,7 @@ def decoded_image(kind: str, message: Decoded) -> tuple[Image, bytes | None]:
     dtype = np.dtype(f"{'>' if bigendian else '<'}{kind_}")
     height, width, step = int(message.height), int(message.width), int(message.step)
     height = height * 3 // 2 if message.encoding in _PLANAR else height
-    raw = np.frombuffer(bytes(message.data), np.uint8)
+    raw = np.frombuffer(message.data, np.uint8)
     row = width * channels * dtype.itemsize
     if (
         height < 1
@@ -197,9 +197,10 @@ def decoded_image(kind: str, message: Decoded) -> tuple[Image, bytes | None]:
         raise InputError(
             f"{width}x{height} {message.encoding} with rows of {step} bytes needs {step * height} bytes, it has {raw.size}"
         )
-    padded = np.zeros(step * height, np.uint8)
-    padded[: min(raw.size, padded.size)] = raw[: padded.size]
-    pixels = padded.reshape(height, step)[:, :row].copy().view(dtype).astype(dtype.newbyteorder("="))
+    if raw.size < step * height:  # the last row's padding may be left out
+        raw = np.concatenate([raw, np.zeros(step * height - raw.size, np.uint8)])
+    bytes_ = np.ascontiguousarray(raw[: step * height].reshape(height, step)[:, :row])
+    pixels = np.require(bytes_.view(dtype), dtype.newbyteorder("="), "A")
     image = pixels.reshape(height, width, channels) if channels > 1 else pixels.reshape(height, width)
     return (image if convert is None else cv2.cvtColor(image, convert)), None
 

@@ -235,8 +235,8 @@ class _RosFiles:
             with self._opened(file) as reader:
                 connections = [each for each in reader.connections if each.topic in topics]
                 for connection, arrival_ns, data in reader.messages(connections) if connections else ():
-                    decode = self._decoder(bytes(data), connection.msgtype)
-                    yield connection.topic, arrival_ns, encoding, bytes(data), decode
+                    content = bytes(data)
+                    yield connection.topic, arrival_ns, encoding, content, self._decoder(content, connection.msgtype)
 
     def _decoder(self, data: bytes, kind: str) -> Callable[[], Decoded]:
         store = self._store
