@@ -21,7 +21,7 @@ from armsight import (
     open_target,
 )
 from armsight.data import Correspondences, Points
-from armsight.geometry.pose import exp_se3, pose
+from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.geometry.rotation import euler_zyx, from_euler_zyx
 from armsight.sim.example_rig import BOARD, demo_recording
 from armsight.vision.pose.shot_pose import CSV_COLUMNS
@@ -77,6 +77,19 @@ def test_a_pose_prints_mm_degrees_and_sigma():
     assert np.isnan(estimate(pose(from_euler_zyx(0.1, np.pi / 2, 0.0), np.zeros(3)), np.eye(6)).sigma_deg).all()
 
 
+def test_a_hand_eye_calibration_prints_its_error_and_sigma():
+    """The sigmas that it prints are those along the base's axes, within which the truth is (4 of them)."""
+    rng = np.random.default_rng(3)
+    A = exp_se3(rng.normal(size=(12, 6)) * [0.2, 0.2, 0.2, 1, 1, 1])
+    Z, X = (exp_se3(x) for x in np.array([[0.5, 0.2, 0.1, 0.3, -1.2, 2.0], [0.01, 0.02, 0.1, 0.1, 0.5, -0.3]]))
+    cov = np.diag([1e-3, 1e-4, 3e-4, 1e-3, 1e-3, 1e-3]) ** 2
+    B = inverse(Z) @ A @ X @ exp_se3(rng.multivariate_normal(np.zeros(6), cov, 12))
+    text = repr(armsight.handeye(A, B, np.tile(cov, (12, 1, 1)), quick=True))
+    assert text.startswith("HandEye(to_hand, 12 of 12 poses; held out ")
+    still = np.array(re.findall(r"(-?[\d.]+) \+- ([\d.]+)", text), float)[:3]
+    assert (np.abs(still[:, 0] - 1e3 * Z[:3, 3]) < 4 * still[:, 1] + 0.005).all()
+
+
 def test_a_source_is_iterated_counted_and_indexed(boards):
     with open_source(str(boards / "board")) as source:
         assert len(source) == 12
@@ -87,7 +100,9 @@ def test_a_source_is_iterated_counted_and_indexed(boards):
 
 
 def test_pictures_to_a_rig_to_a_table(boards):
-    rig = calibrate(BOARD, str(boards / "board"), models=("brown5",)).rig
+    found = calibrate(BOARD, str(boards / "board"), models=("brown5",))
+    assert re.match(r"Calibration\(12 of 12 pairs; held out 0\.\d+ px epipolar, 0\.\d+ mm; brown5, ", repr(found))
+    rig = found.rig
     rig.save(boards / "found.json")
     assert rig.baseline_m == pytest.approx(0.2, abs=1e-4)
     table = measure_all(boards / "found.json", BOARD, str(boards / "board"))

@@ -145,6 +145,19 @@ class HandEye(Record):
     common: Array
     common_m: float
 
+    def __repr__(self) -> str:
+        """Return the error on poses left out of the fit, and both translations with one sigma, mm."""
+        position_m, angle_rad = self.held_out.rms()
+        shown = []
+        for k, (name, T) in enumerate((("still", self.T_base_still), ("held", self.T_flange_held))):
+            R, cov = T[:3, :3], self.cov[6 * k : 6 * k + 3, 6 * k : 6 * k + 3]
+            both = zip(1e3 * T[:3, 3], 1e3 * np.sqrt(np.diag(R @ cov @ R.T)), strict=True)
+            shown.append(f"{name} at {', '.join(f'{x:.2f} +- {sigma:.2f}' for x, sigma in both)} mm")
+        return (
+            f"HandEye({self.eye}, {int(self.used.sum())} of {len(self.used)} poses; held out {1e3 * position_m:.3f} mm, "
+            f"{np.degrees(angle_rad):.3f} deg; {'; '.join(shown)})"
+        )
+
     @property
     def T_base_rig(self) -> Array:
         """(4, 4) the rig in the base; eye to hand only."""

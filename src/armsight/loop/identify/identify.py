@@ -71,6 +71,14 @@ class Identified(Record):
     moved: Array
     joint_sigma_rad: Array
 
+    def __repr__(self) -> str:
+        """Return how many numbers were fitted, and from how many poses."""
+        used, free = self.solution.used, self.solution.free
+        return (
+            f"Identified({self.model.arm.name}, {int(free.sum())} of {len(free)} numbers fitted, {int(used.sum())} of "
+            f"{len(used)} poses used; value(NAME) and sigma, NAME out of model.names)"
+        )
+
     @property
     def left_out(self) -> NDArray[np.int64]:
         """Return the rows that were taken for mistakes."""

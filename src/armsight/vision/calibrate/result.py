@@ -111,6 +111,15 @@ class Calibration(Record):
     disc_radius_m: float | None = None
     recorded: bool = False
 
+    def __repr__(self) -> str:
+        """Return the errors on pairs left out of the fit, px and mm."""
+        errors, rig = self.heldout, self.rig
+        return (
+            f"Calibration({len(self.pairs)} of {self.pairs_found} pairs; held out {errors.epipolar_rms_px:.3f} px "
+            f"epipolar, {1e3 * errors.rigid_rms_m:.3f} mm; {rig.left.model}, baseline {1e3 * rig.baseline_m:.3f} mm; "
+            f"{len(self.weaknesses)} weaknesses)"
+        )
+
     @property
     def reprojection_rms_px(self) -> float:
         """RMS distance of the fitted detections from their projections, px."""
