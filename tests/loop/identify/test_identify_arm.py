@@ -1,5 +1,6 @@
 """Identification of a worn arm whose truth is known."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -142,6 +143,9 @@ def test_several_points_do_as_poses_do(scene):
     body = np.array([[0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05], [-0.05, 0.02, 0.0]])
     seen = points_of(measured, w, body)
     found = identify(w.nominal, seen)
+    assert re.fullmatch(
+        rf"Identified\({w.nominal.name}, \d+ of \d+ numbers fitted, \d+ of {len(seen)} poses used; .*\)", repr(found)
+    )
     rng = np.random.default_rng(3)
     q, approach = poses(w.nominal, 100, rng)
     v = validate(found, points_of(Measured(q, np.zeros((100, 1, 3)), None, None, approach), w, body))
