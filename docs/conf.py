@@ -42,7 +42,8 @@ nitpick_ignore_regex = [
     (r"py:.*", r"armsight\.vision\.(pose\.)?(bundle|detections|projection|rectify)\.\w+"),
     (
         r"py:.*",
-        r"armsight\.(loop\.estimators\.readings|loop\.identify\.(model|identify)|robot\.trajectories\.limits)\.\w+",
+        r"armsight\.(loop\.(estimators\.readings|handeye\.poses|identify\.(fit|model|identify|selection))"
+        r"|robot\.trajectories\.limits|tables\.poses)\.\w+",
     ),
     (r"py:.*", r"armsight\.vision\.(calibrate\.motion|markers\.(body_file|disc\.target|discs|spec))\.\w+"),
 ]
