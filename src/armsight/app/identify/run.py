@@ -105,35 +105,35 @@ def _with_joints(data: Path, read: Cells, table: PoseTable) -> tuple[Cells, list
     head, rows = read.head, [(line, row) for line, row in read.rows if any(row)]
     if own := next((name for name in head if re.fullmatch(r"q\d+_(rad|deg)", name)), None):
         raise InputError(f"{data}: line 1: has joint angles of its own ({own}): leave them out, or --joints")
-    lines = [line for line, _ in rows]
-
-    def cells(name: str) -> list[str]:
-        return [row[head.index(name)] for _, row in rows]
-
-    key = next((name for name in NAMES if name in head), None)
-    if table.names is None and len(table.q) != len(rows) and table.t_s is not None and "t_s" in head:
-        angles, notes = _at_rest(data, cells("t_s"), lines, table)
-    elif table.names is not None and key is None:
-        raise InputError(
-            f"{data}: line 1: no column {', '.join(NAMES)}, by which {table.path} names its rows; there are "
-            f"{', '.join(head)}"
-        )
-    else:
-        at, among = matched_rows(table, [f"line {line}" for line in lines] if key is None else cells(key))
-        angles = {lines[i]: table.q[row] for row, i in zip(at, among, strict=True)}
-        alone = len(rows) - len(angles)
-        notes = [f"{alone} of {len(rows)} poses have no row in {table.path}, and are left out"] if alone else []
-    missed = (
-        {line for line, status in zip(lines, cells("status"), strict=True) if status == "missed"}
-        if "status" in head
-        else set()
-    )
+    angles, notes = _angles(data, head, rows, table)
+    missed = {line for line, row in rows if "status" in head and row[head.index("status")] == "missed"}
     if missed:
         notes.append(f"{len(missed)} of {len(rows)} shots were missed, and are left out")
     joined = [
         (line, [*row, *map(repr, angles[line].tolist())]) for line, row in rows if line in angles and line not in missed
     ]
     return read._replace(head=[*head, *(f"q{k}_rad" for k in range(1, table.q.shape[1] + 1))], rows=joined), notes
+
+
+def _angles(
+    data: Path, head: list[str], rows: list[tuple[int, list[str]]], table: PoseTable
+) -> tuple[dict[int, Array], list[str]]:
+    """Return the joint angles of a table by the lines of the data, paired by time, name or order; and notes."""
+    assert table.q is not None
+    lines = [line for line, _ in rows]
+    if table.names is None and len(table.q) != len(rows) and table.t_s is not None and "t_s" in head:
+        return _at_rest(data, [row[head.index("t_s")] for _, row in rows], lines, table)
+    key = next((name for name in NAMES if name in head), None)
+    if table.names is not None and key is None:
+        raise InputError(
+            f"{data}: line 1: no column {', '.join(NAMES)}, by which {table.path} names its rows; there are "
+            f"{', '.join(head)}"
+        )
+    names = [f"line {line}" if key is None else row[head.index(key)] for line, row in rows]
+    at, among = matched_rows(table, names)
+    angles = {lines[i]: table.q[row] for row, i in zip(at, among, strict=True)}
+    alone = len(rows) - len(angles)
+    return angles, [f"{alone} of {len(rows)} poses have no row in {table.path}, and are left out"] if alone else []
 
 
 def _at_rest(data: Path, times: list[str], lines: list[int], table: PoseTable) -> tuple[dict[int, Array], list[str]]:

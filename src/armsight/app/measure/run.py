@@ -87,8 +87,7 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
         shots.finish(records)
         contradicted = missed.finding()
         if records and not any(record.ok for record in records):
-            written = "" if options.output is None else f" (the reason of each is in {options.output})"
-            raise ArmsightError(_nothing_measured(records, shots.mistake(), contradicted) + written)
+            raise ArmsightError(_nothing_measured(records, shots.mistake(), contradicted, options.output))
     _close(records, time.perf_counter() - started, options.output, view, _board_file(options.rig, rig, options.target))
     saved = _keep_noise(rig, shots, records, options.save_rig)
     health = _concluded(monitor, shots, contradicted)
@@ -312,12 +311,15 @@ def _board_file(path: Path, rig: StereoRig, target: str) -> Path | None:
     return beside if beside.exists() else None
 
 
-def _nothing_measured(records: list[ShotPose], mistake: str, contradicted: HealthFinding | None) -> str:
+def _nothing_measured(
+    records: list[ShotPose], mistake: str, contradicted: HealthFinding | None, output: Path | None
+) -> str:
     """Return why no shot could be measured: what was done to the images, or the first reason and what explains it."""
     why = mistake or f"{records[0].shot}: {records[0].reason}"
     if contradicted is not None and contradicted.cause == "rig" and not mistake:
         why += f"; {contradicted.what}; {contradicted.advice}"
-    return f"none of {len(records)} shots could be measured: {why}"
+    written = "" if output is None else f" (the reason of each is in {output})"
+    return f"none of {len(records)} shots could be measured: {why}{written}"
 
 
 def _close(

@@ -74,11 +74,16 @@ def _difference(one: str, other: str) -> float:
     return np.nan if x is None or y is None else x - y
 
 
+def _poses(path: Path) -> Columns:
+    """Read a table of poses."""
+    table = Columns.of_csv(path)
+    if next(iter(table.at), None) not in ("shot", "t_s"):
+        raise InputError(f"{path}: line 1: expected a table of poses whose first column is shot or t_s")
+    return table
+
+
 def _compared(first: Path, second: Path) -> TableDifference:
-    tables = [Columns.of_csv(path) for path in (first, second)]
-    for table in tables:
-        if next(iter(table.at), None) not in ("shot", "t_s"):
-            raise InputError(f"{table.path}: line 1: expected a table of poses whose first column is shot or t_s")
+    tables = [_poses(path) for path in (first, second)]
     a, b = ({row[0]: row for _, row in table.rows} for table in tables)
     columns = [name for name in list(tables[0].at)[1:] if name in tables[1].at]
     both = [(a[key], b[key]) for key in a if key in b]

@@ -126,11 +126,7 @@ def run_logged(
     Ts, covs = np.array([pose.T_left_body for _, pose, _ in good]), np.array([pose.cov for _, pose, _ in good])
     progress("hand-eye: calibrating")
     centre = target.body.points.mean(axis=0)
-    found = _calibrated(arm, q, Ts, covs, centre)
-    if isinstance(found, CalibrationError):
-        shift = _shift(arm, q, Ts, covs, centre, np.inf)
-        why = SHIFTED.format("before" if shift > 0 else "behind") if shift else _implausible(arm, q, Ts)
-        raise found if why is None else CalibrationError(f"{why} ({found})")
+    found = _required(arm, q, Ts, covs, centre)
     steps = np.diff(q, axis=0, prepend=q[:1])
     approach = np.sign(np.where(np.abs(steps) > _MOVED_RAD, steps, 0.0))
     mounting = replace(Mounting.of(found, arm), cov=np.zeros((12, 12)))
@@ -141,6 +137,16 @@ def run_logged(
     if not shift and implausible is None:
         require_known(found, TRUSTED_M, TRUSTED_RAD)
     return LoggedRun(run, tuple(name for name, _, _ in good), len(names), unpaired, shift, implausible)
+
+
+def _required(arm: Arm, q: Array, Ts: Array, covs: Array, centre: Array) -> HandEye:
+    """Calibrate hand and eye; raise a CalibrationError that says what is wrong with the rows, where that is known."""
+    found = _calibrated(arm, q, Ts, covs, centre)
+    if isinstance(found, HandEye):
+        return found
+    shift = _shift(arm, q, Ts, covs, centre, np.inf)
+    why = SHIFTED.format("before" if shift > 0 else "behind") if shift else _implausible(arm, q, Ts)
+    raise found if why is None else CalibrationError(f"{why} ({found})")
 
 
 def _measured(

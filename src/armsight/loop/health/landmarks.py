@@ -158,6 +158,12 @@ class LandmarkWatch:
             return _finding(most, f"the cameras moved, or the {some}: {coarse}"), ()
         if len(known) == 1:
             return _finding(most, f"the cameras moved, or the {some}: with one alone the two look alike"), ()
+        return self._all_moved(known, most, some)
+
+    def _all_moved(
+        self, known: list[_Landmark], most: _Landmark, some: str
+    ) -> tuple[HealthFinding | None, tuple[HealthFinding, ...]]:
+        """Return what it means that every body in view moved: the cameras did, or all but one of the bodies say so."""
         together = _common(known)
         if together is not None:
             self.cameras_moved, self._common = True, together

@@ -189,6 +189,26 @@ class _ShotResiduals(NamedTuple):
     exposed: tuple[ExposedShot, ExposedShot]
 
 
+class _Newest(NamedTuple):
+    """The newest test.
+
+    Attributes:
+        whole: sums of all that may have changed, of the points that fit.
+        every: the same of every point.
+        noise: variance of the noise.
+        evidence: log-evidence of what the lenses leave.
+        test: sums of the parameters and the seven numbers, the lenses' coefficients eliminated.
+        own: times of exposure that explain it; None without.
+    """
+
+    whole: ResidualSums
+    every: ResidualSums
+    noise: float
+    evidence: Array
+    test: ResidualSums
+    own: Apart | None
+
+
 class RigWatch:
     """Watches the calibrated pose of the cameras and the size and shape of the body.
 
@@ -567,68 +587,107 @@ class RigWatch:
         if not stays:
             return
         self._poses += len(stays)
-        whole, left = self._in_units(stays), self._leftover
-        all_fit = all(each.every is each.rows for stay in stays for each in stay)
-        every = whole if all_fit else self._in_units(stays, every=True)
-        moments = [stay[0] for stay in stays if len(stay) == 1]
-        share, seven = len(stays) / sum(map(len, stays)), slice(1 + self._size, 1 + self._size + len(_WIDE))
-        noise, evidence = left.seen(whole, _LENS, 3 * len(self._points), seven, share)
-        test = left.without(whole, _LENS, noise).of(len(self._window.b))
-        weight = float(np.exp(-1.0 / FORGET_TESTS))
-        self._window.scale(weight)
-        self._window.add(test, 1.0)
-        change, own = self._estimated(self._window), None
-        if self.passing.now or change.chi_square > _SUSPECTED:
-            passes, found = self._passes(stays, every.of(len(every.b) - _LENS))
-            if passes == "time":
-                own, moments = found, []
-                whole = self._in_units(stays, own=own)
-                every = whole if all_fit else self._in_units(stays, every=True, own=own)
-            if passes is not None:
-                self._window.add(test, -1.0)
-                rest = whole.without(self._size + len(_WIDE)) if passes == "lens" else whole
-                noise, evidence = left.seen(rest, _LENS, 3 * len(self._points), seven, share)
-                test = left.without(rest, _LENS, noise).of(len(self._window.b))
-                self._window.add(test, 1.0)
-                change = self._estimated(self._window)
-        left.passed(test)
+        newest, change = self._tested(stays)
+        self._leftover.passed(newest.test)
         # A point that is displaced looks like it, for some tests before it is found.
-        self._counted = [*self._counted, evidence] if self._shape.found is None else []
+        self._counted = [*self._counted, newest.evidence] if self._shape.found is None else []
         if len(self._counted) > _BEFORE:
-            left.take(self._counted.pop(0))
-        nodded = stays if self._timed and own is None else []
-        odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
-        usual = every.less(self._in_units(odd, every=True, own=own)) if odd else every
-        self._shape.decide(*(left.without(each, _LENS, noise) for each in (every, usual)), ends=ends)
-        alarm = self._is_alarm(change)
-        doubted, self._doubted = self._doubted, None
+            self._leftover.take(self._counted.pop(0))
+        nodded = stays if self._timed and newest.own is None else []
+        self._judge_shape(stays, newest, ends=ends)
+        alarm, doubted = self._is_alarm(change), self._doubted
+        self._doubted = None
+        moments = [] if newest.own is not None else [stay[0] for stay in stays if len(stay) == 1]
         if alarm and moments and not self._alarms and self._poses > 1:
-            rest = whole.less(self._worst(moments))
-            left_out = test.less(left.without(rest, _LENS, noise).of(len(test.b)))
-            without = self._window.less(left_out)
-            if not self._is_alarm(estimated := self._estimated(without)):
-                # Images that do not belong together are no moved camera; newer shots that agree with them are.
-                if doubted is not None:
-                    self._window.add(doubted, 1.0)
-                else:
-                    whole, test = rest, test.less(left_out)
-                    self._window, self._doubted, change, alarm = without, left_out, estimated, False
-        if len(self._history) < _KEPT:
-            self._whole.add(whole.over(noise), 1.0)
-        self._plain.append(whole.of(len(test.b)).over(noise))
-        self._history.append(test)
-        self._alarms = self._alarms + 1 if alarm else 0
-        if 0 < self._alarms <= _FRESH:
-            change = self._begun(change)
-        self.suspected = (
-            change if alarm or (change.chi_square > _SUSPECTED and self._matters(change, slice(None))) else None
-        )
-        self.alarm, self.alarmed = alarm, self.alarmed or alarm
+            newest, change, alarm = self._less_worst(moments, newest, change, doubted)
+        self._keep(newest, change, alarm)
         if nodded:
             self._take_unrest(nodded)
         due = 0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0
         if due and 0 < len(self._history) < _KEPT and self._poses >= _LENS_POSES:
             self.lens = self._lens()
+
+    def _keep(self, newest: _Newest, change: RigChange, alarm: bool) -> None:
+        """Keep the newest test, and what it says of the rig."""
+        if len(self._history) < _KEPT:
+            self._whole.add(newest.whole.over(newest.noise), 1.0)
+        self._plain.append(newest.whole.of(len(newest.test.b)).over(newest.noise))
+        self._history.append(newest.test)
+        self._alarms = self._alarms + 1 if alarm else 0
+        if 0 < self._alarms <= _FRESH:
+            change = self._begun(change)
+        matters = alarm or (change.chi_square > _SUSPECTED and self._matters(change, slice(None)))
+        self.suspected = change if matters else None
+        self.alarm, self.alarmed = alarm, self.alarmed or alarm
+
+    def _tested(self, stays: Sequence[Sequence[_ShotResiduals]]) -> tuple[_Newest, RigChange]:
+        """Return the newest test and the change by the window with it; what a passing cause explains is taken off."""
+        whole, every = self._sums_of(stays, None)
+        newest = self._without_lens(stays, whole, every, whole, None)
+        self._window.scale(float(np.exp(-1.0 / FORGET_TESTS)))
+        self._window.add(newest.test, 1.0)
+        change = self._estimated(self._window)
+        if not self.passing.now and change.chi_square <= _SUSPECTED:
+            return newest, change
+        passes, own = self._passes(stays, every.of(len(every.b) - _LENS))
+        if passes is None:
+            return newest, change
+        self._window.add(newest.test, -1.0)
+        if passes == "time":
+            whole, every = self._sums_of(stays, own)
+        rest = whole.without(self._size + len(_WIDE)) if passes == "lens" else whole
+        newest = self._without_lens(stays, whole, every, rest, own if passes == "time" else None)
+        self._window.add(newest.test, 1.0)
+        return newest, self._estimated(self._window)
+
+    def _sums_of(
+        self, stays: Sequence[Sequence[_ShotResiduals]], own: Apart | None
+    ) -> tuple[ResidualSums, ResidualSums]:
+        """Return the sums of the points that fit, and of every point."""
+        whole = self._in_units(stays, own=own)
+        if all(each.every is each.rows for stay in stays for each in stay):
+            return whole, whole
+        return whole, self._in_units(stays, every=True, own=own)
+
+    def _without_lens(
+        self,
+        stays: Sequence[Sequence[_ShotResiduals]],
+        whole: ResidualSums,
+        every: ResidualSums,
+        rest: ResidualSums,
+        own: Apart | None,
+    ) -> _Newest:
+        """Return the test of what is to be explained, ``rest``, with the lenses' coefficients eliminated."""
+        share, seven = len(stays) / sum(map(len, stays)), slice(1 + self._size, 1 + self._size + len(_WIDE))
+        noise, evidence = self._leftover.seen(rest, _LENS, 3 * len(self._points), seven, share)
+        test = self._leftover.without(rest, _LENS, noise).of(len(self._window.b))
+        return _Newest(whole, every, noise, evidence, test, own)
+
+    def _judge_shape(self, stays: Sequence[Sequence[_ShotResiduals]], newest: _Newest, *, ends: bool) -> None:
+        """Test for displaced points, with all shots and without those that fit worst."""
+        odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
+        every = newest.every
+        usual = every.less(self._in_units(odd, every=True, own=newest.own)) if odd else every
+        self._shape.decide(*(self._leftover.without(each, _LENS, newest.noise) for each in (every, usual)), ends=ends)
+
+    def _less_worst(
+        self, moments: list[_ShotResiduals], newest: _Newest, change: RigChange, doubted: ResidualSums | None
+    ) -> tuple[_Newest, RigChange, bool]:
+        """Return the newest test, the change, and whether it is one: without the images that fit worst, if only these say so.
+
+        Images that do not belong together are no moved camera; newer shots that agree with them are.
+        """
+        rest = newest.whole.less(self._worst(moments))
+        left_out = newest.test.less(self._leftover.without(rest, _LENS, newest.noise).of(len(newest.test.b)))
+        without = self._window.less(left_out)
+        estimated = self._estimated(without)
+        if self._is_alarm(estimated):
+            return newest, change, True
+        if doubted is not None:
+            self._window.add(doubted, 1.0)
+            return newest, change, True
+        self._window, self._doubted = without, left_out
+        return newest._replace(whole=rest, test=newest.test.less(left_out)), estimated, False
 
     def _is_alarm(self, change: RigChange) -> bool:
         """Return whether a change is certain, beyond the sigmas of poses, and displaces them by what matters."""

@@ -192,6 +192,10 @@ class ShapeError(Record):
         """Whether a change of the seven numbers is needed besides."""
         return bool(self.seven > chdtri(7, _NECESSARY))
 
+    def is_of(self, other: ShapeError | None) -> bool:
+        """Whether both name the same candidate first."""
+        return other is not None and self.chosen[0] == other.chosen[0]
+
 
 #: Stand for the focal lengths and for a smooth deformation among the rows of the points.
 FOCAL, SMOOTH = -1, -2
@@ -370,20 +374,10 @@ class ShapeWatch:
             _running(self._settled[0], [each.sums for each in tests]),
             _running(self._settled[1], [each.usual for each in tests]),
         )
-        if before is None:
-            counts = (1, len(tests)) if self.doubt is None else (*self._counts(), 1)
-            self._suspect = next(filter(None, (self._shown(len(tests) - count) for count in counts)), None)
-        else:
-            later = sum(each.sums.begin_s >= before.begin_s for each in tests)
-            self._suspect = self._shown(len(tests) - max(later, 1))
-        if self._suspect is not None and self._alarms < _FRESH:
-            self._suspect = self._dated()
-        elif self._suspect is not None and before is not None and before.chosen[0] == self._suspect.chosen[0]:
-            # Though the tests of that time are no longer kept.
-            self._suspect = replace(self._suspect, begin_s=before.begin_s)
+        self._suspect = self._suspected(tests, before)
         self._alarms = 0 if self._suspect is None else self._alarms + 1
         # What a change leaves in the test in which it began may look like a displaced point, once.
-        again = self._suspect is not None and before is not None and before.chosen[0] == self._suspect.chosen[0]
+        again = before is not None and before.is_of(self._suspect)
         self.found = self._suspect if again or (ends and len(tests) == 1) else None
         self.said = self.found or self.said
         doubted_s, self.doubt = self._doubted()
@@ -393,6 +387,20 @@ class ShapeWatch:
             self._changed_s = None
         elif self._changed_s is None:
             self._changed_s = doubted_s
+
+    def _suspected(self, tests: list[_ShapeTest], before: ShapeError | None) -> ShapeError | None:
+        """Return what the tests show now, since when; ``before`` is what they showed last time."""
+        if before is None:
+            counts = (1, len(tests)) if self.doubt is None else (*self._counts(), 1)
+            shown = next(filter(None, (self._shown(len(tests) - count) for count in counts)), None)
+        else:
+            later = sum(each.sums.begin_s >= before.begin_s for each in tests)
+            shown = self._shown(len(tests) - max(later, 1))
+        if shown is not None and self._alarms < _FRESH:
+            return self._dated()
+        if shown is not None and before is not None and before.is_of(shown):
+            return replace(shown, begin_s=before.begin_s)  # though the tests of that time are no longer kept
+        return shown
 
     def _counts(self) -> tuple[int, ...]:
         """Return how many newest tests may be those after a change."""

@@ -114,11 +114,19 @@ def poses_in(path: str | Path, cells: Cells, *, rotation: str | None = None, arm
     notes = (*cells.notes, *notes, *notes_of, *_gaps(table, requested, numbers), *_repeated(table, numbers, good))
     table = Columns(table.path, head, [row for row, kept in zip(table.rows, good, strict=True) if kept], joint_names)
     p = np.stack([unit * table.numbers(point) for point in points], axis=1)
-    sides = table.numbers(approach) if approach else None
-    if sides is not None and not np.isin(sides, (-1, 0, 1)).all():
-        raise InputError(f"{path}: a direction of approach must be 1 (the angle grew), -1 (it fell) or 0 (not known)")
+    sides = _sides(table, approach)
     lines = np.array([line for line, _ in table.rows], float)
     return Read(_measured(table, joints, p, rotated, convention, sides), lines, notes)
+
+
+def _sides(table: Columns, columns: list[str]) -> Array | None:
+    """Return from which side each joint came, (N, n); None without the columns."""
+    sides = table.numbers(columns) if columns else None
+    if sides is not None and not np.isin(sides, (-1, 0, 1)).all():
+        raise InputError(
+            f"{table.path}: a direction of approach must be 1 (the angle grew), -1 (it fell) or 0 (not known)"
+        )
+    return sides
 
 
 def _joints(table: Columns, arm: ArmJoints | None) -> list[str]:
