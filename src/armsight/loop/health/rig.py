@@ -673,7 +673,7 @@ class RigWatch:
     def _less_worst(
         self, moments: list[_ShotResiduals], newest: _Newest, change: RigChange, doubted: ResidualSums | None
     ) -> tuple[_Newest, RigChange, bool]:
-        """Return the newest test, the change, and whether it is one: without the images that fit worst, if only these say so.
+        """Return the newest test, the change, and whether it is one, without images that alone say so.
 
         Images that do not belong together are no moved camera; newer shots that agree with them are.
         """
