@@ -22,7 +22,7 @@ from armsight.errors import ArmsightError
 #: ``command.py`` holds a click command called ``command``. Their list imports none of them.
 SECTIONS: dict[str, dict[str, str]] = {
     "See it live": {
-        "live": "Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.",
+        "live": "Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step."
     },
     "Calibrate cameras": {
         "calibrate": "Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.",
@@ -50,7 +50,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "each with sigma.",
     },
     "Simulate": {
-        "demo": "Calibrate, measure the moving arm, compare the tracks, and close the loop, in a simulated workcell.",
+        "demo": "Calibrate, measure the moving arm, compare the tracks, and close the loop, in a simulated workcell."
     },
 }
 COMMANDS = tuple(sorted(name for names in SECTIONS.values() for name in names))

@@ -61,13 +61,7 @@ class PotFault(IntEnum):
     LAG = 10
 
 
-_USUAL_SIZE = {
-    PotFault.JUMP: 0.35,
-    PotFault.SLIP: 0.3,
-    PotFault.DRIFT: 0.36,
-    PotFault.SCALED: 0.5,
-    PotFault.LAG: 0.2,
-}
+_USUAL_SIZE = {PotFault.JUMP: 0.35, PotFault.SLIP: 0.3, PotFault.DRIFT: 0.36, PotFault.SCALED: 0.5, PotFault.LAG: 0.2}
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,16 +11,7 @@ import pytest
 from armsight.app.measure import shots as measure_module
 from armsight.app.measure import view as view_module
 from armsight.app.measure.chart import SHOT, TIME, _intervals, chart, chart_data
-from armsight.app.measure.picture import (
-    WIDTH,
-    _Panel,
-    ascii_text,
-    draw_shot,
-    ellipse,
-    header,
-    marks_of,
-    wrapped,
-)
+from armsight.app.measure.picture import WIDTH, _Panel, ascii_text, draw_shot, ellipse, header, marks_of, wrapped
 from armsight.app.measure.view import CHART, EACH_UP_TO, PictureFolder, view_folder
 from armsight.app.show import page
 from armsight.data import SIDES, Detections, Dropped, Missed, PoseEstimate, Shot

@@ -228,15 +228,7 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
     "-o", "--output", required=True, metavar="FILE.toml", type=click.Path(path_type=Path), help="The motions to write."
 )
 @_JSON
-def plan(
-    arm_name: str,
-    around: Path,
-    poses: int,
-    cycles: int,
-    seed: int,
-    output: Path,
-    as_json: bool,
-) -> None:
+def plan(arm_name: str, around: Path, poses: int, cycles: int, seed: int, output: Path, as_json: bool) -> None:
     """Plan the recording of `arm report`: motions for `armsight run --open-loop --motion FILE.toml`.
 
     Poses all over where the body is seen, each from both sides of every joint, and five of them again and again.

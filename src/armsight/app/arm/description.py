@@ -112,12 +112,7 @@ def _coupling(arm: Arm) -> list[str]:
 
 def forward_json(arm: Arm, q: Array, T: Array) -> dict[str, Any]:
     """Return the pose T (4, 4) of the tool in the base at joint angles (n,), rad."""
-    return {
-        "arm": arm.name,
-        **_angles_json(q),
-        "within_limits": bool(arm.within_limits(q)),
-        **_pose_json(T),
-    }
+    return {"arm": arm.name, **_angles_json(q), "within_limits": bool(arm.within_limits(q)), **_pose_json(T)}
 
 
 def forward_text(T: Array) -> str:

@@ -139,8 +139,7 @@ def monitor(
         click.echo(text.welcome_text(board), err=True)
         if isinstance(board, Ar4Board) and not board.homed:
             click.echo(
-                "note: not homed since switched on: these are not the arm's angles (armsight board home)",
-                err=True,
+                "note: not homed since switched on: these are not the arm's angles (armsight board home)", err=True
             )
         passed = 0.0
         while seconds is None or passed < seconds - 1e-9:

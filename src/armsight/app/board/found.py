@@ -348,10 +348,7 @@ def _put_pot(pot: Configuration, found: JointFound) -> None:
     pot["short_counts"], pot["open_counts"] = (
         (0, 65535)
         if found.range_counts is None
-        else (
-            max(1, min(1000, counts[0] // 2)),
-            min(65000, (counts[-1] + 65535) // 2 + 1),
-        )
+        else (max(1, min(1000, counts[0] // 2)), min(65000, (counts[-1] + 65535) // 2 + 1))
     )
 
 

@@ -168,13 +168,7 @@ class GivenImages:
 
 
 def _calibrate_images(
-    source: Source,
-    alone: tuple[list[Path], list[Path]],
-    spec: str,
-    models: tuple[str, ...],
-    *,
-    flat: bool,
-    folds: int,
+    source: Source, alone: tuple[list[Path], list[Path]], spec: str, models: tuple[str, ...], *, flat: bool, folds: int
 ) -> Calibration:
     """Detect a board, given by its spec, in every shot, and in images of one camera alone, and calibrate.
 

@@ -260,10 +260,7 @@ def _studies(
         return _workcell(demo, cameras_at(cameras, rate_hz), workcell)
 
     # The rate's loops are mostly Python, which runs one at a time in a process: those of vision take the other core.
-    with (
-        contextlib.closing(Process(caller, "armsight.app.demo.studies")) as other,
-        ThreadPoolExecutor(1) as beside,
-    ):
+    with contextlib.closing(Process(caller, "armsight.app.demo.studies")) as other, ThreadPoolExecutor(1) as beside:
         of_vision = beside.submit(other, partial(vision_studies, seed=demo.seed, shots=shots))
         try:
             of_rate = rate_study(at_rate, setup_of, calibration.rig, outcome, plan, progress)

@@ -137,12 +137,7 @@ class PairResult:
 
 
 def run_shot(
-    shot: Shot,
-    folder: Path,
-    form: Rectification | None,
-    method: Method,
-    search: Search,
-    note: Callable[[str], None],
+    shot: Shot, folder: Path, form: Rectification | None, method: Method, search: Search, note: Callable[[str], None]
 ) -> PairResult:
     """Match a shot, make a folder and write its files there.
 

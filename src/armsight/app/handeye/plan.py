@@ -109,10 +109,7 @@ def _lowered(before: Array, after: Array, R: Array) -> str:
 
 def worst_sigmas(cov: Array) -> tuple[float, float]:
     """Return the sigmas of the mounting along its worst axes, m and rad, of a covariance (12, 12)."""
-    return (
-        float(np.sqrt(np.linalg.eigvalsh(cov[6:9, 6:9])[-1])),
-        float(np.sqrt(np.linalg.eigvalsh(cov[9:, 9:])[-1])),
-    )
+    return (float(np.sqrt(np.linalg.eigvalsh(cov[6:9, 6:9])[-1])), float(np.sqrt(np.linalg.eigvalsh(cov[9:, 9:])[-1])))
 
 
 def _candidates(found: HandEye, poses: Poses, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -145,12 +145,7 @@ def _angles(Ts: Array) -> Array:
 
 
 def require_plausible(
-    recording: PairedPoses,
-    arm: Arm | None,
-    *,
-    detect_units: bool = False,
-    scale: bool = False,
-    streams: bool = False,
+    recording: PairedPoses, arm: Arm | None, *, detect_units: bool = False, scale: bool = False, streams: bool = False
 ) -> PairedPoses:
     """Reject data that fit far better read in another way.
 

@@ -168,13 +168,7 @@ def _band(axes: Axes, run: ChartData) -> None:
         axes.plot(run.along[run.jumped], np.full(int(run.jumped.sum()), 1.25), **style)
         handles.append(Line2D([], [], label=f"{run.jumped.sum()} jumped", **style))
     position: Any = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.15), "borderaxespad": 0.0, "handlelength": 1.2}
-    axes.legend(
-        handles=handles,
-        ncols=len(handles),
-        title=f"shots: {len(run.way)}",
-        alignment="left",
-        **position,
-    )
+    axes.legend(handles=handles, ncols=len(handles), title=f"shots: {len(run.way)}", alignment="left", **position)
     axes.set_ylim(0.0, 1.0)
     low, high = _edges(run.along)
     axes.set_xlim(float(low[0]), float(high[-1]))

@@ -37,11 +37,7 @@ RUN_MCAP = "run.mcap"
 #: Keys of its metadata beside the rig file: the body file, and the nominal arm.
 BODY, ARM = "body.toml", "arm.json"
 #: Topics of the data as JSON, by kind.
-TOPICS: dict[type, str] = {
-    ShotDatum: "/armsight/shot",
-    JointsDatum: "/armsight/joints",
-    EventDatum: "/armsight/event",
-}
+TOPICS: dict[type, str] = {ShotDatum: "/armsight/shot", JointsDatum: "/armsight/joints", EventDatum: "/armsight/event"}
 #: A shot that is younger by its own stamp was stamped by a live camera, s.
 _LIVE_S = 10.0
 _WAKES = 64  # data that are written together, where they come fast

@@ -112,11 +112,7 @@ CONFIG = np.dtype(
 )
 
 #: Name -> smallest and largest value, as config.c holds them.
-_POT_RANGES = {
-    "jump_rad": (1e-4, 1.0),
-    "frozen_rad": (1e-3, 1.0),
-    "inverted_rad": (1e-3, 1.0),
-}
+_POT_RANGES = {"jump_rad": (1e-4, 1.0), "frozen_rad": (1e-3, 1.0), "inverted_rad": (1e-3, 1.0)}
 _MOTOR_RANGES = {
     "resistance_ohm": (0.0, 1000.0),
     "constant_v_s": (1e-3, 1e3),

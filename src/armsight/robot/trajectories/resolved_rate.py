@@ -24,13 +24,7 @@ from armsight.robot.trajectories.limits import ROUNDING, Worst, outside, start_s
 from armsight.robot.trajectories.lookahead import behind
 from armsight.robot.trajectories.path import Path, PathPoints
 from armsight.robot.trajectories.profile import Profile, plan_profile
-from armsight.robot.trajectories.trajectory import (
-    CHECK_RATE_HZ,
-    Joints,
-    MotionRejected,
-    check_duration,
-    clamped,
-)
+from armsight.robot.trajectories.trajectory import CHECK_RATE_HZ, Joints, MotionRejected, check_duration, clamped
 
 if TYPE_CHECKING:
     from armsight.robot.kinematics.arm import Arm

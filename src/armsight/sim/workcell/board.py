@@ -12,13 +12,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.robot.boards.codes import Reaction
-from armsight.robot.boards.configuration import (
-    CONFIG,
-    SYNC_LED_TICKS,
-    Configuration,
-    check_configuration,
-    pin_number,
-)
+from armsight.robot.boards.configuration import CONFIG, SYNC_LED_TICKS, Configuration, check_configuration, pin_number
 from armsight.robot.kinematics.arm import Arm
 from armsight.sim.workcell.arm import pot_travel
 from armsight.sim.workcell.motors import SUPPLY_V, Motors, Solids, gravity_torque, inertia

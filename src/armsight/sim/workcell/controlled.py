@@ -147,10 +147,7 @@ def _ar4(true: Arm, given: Imperfections, seed: int) -> tuple[ControlledArm, Mot
 
 
 #: Name of an arm's model -> its controller.
-CONTROLLED: Mapping[str, Controlled] = {
-    "so101": Controlled(FEETECH, _so101),
-    "ar4": Controlled(AR4, _ar4),
-}
+CONTROLLED: Mapping[str, Controlled] = {"so101": Controlled(FEETECH, _so101), "ar4": Controlled(AR4, _ar4)}
 _UR = (0.0, -105.0, -108.0, 23.0, 73.0, 80.0)
 #: Name of an arm's model -> joint angles at which it stands before the cameras, degrees: its tool looks at them, away from
 #: its base, and no joint is near a limit or a singularity. Another stands at its own home.

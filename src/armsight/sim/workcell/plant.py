@@ -318,10 +318,7 @@ class ArmPlant:
         """Return what the converters read now."""
         amperes = self._force / self._newton_metre_per_a
         return Sensed(
-            self.pots.read(self._qpos[:6]),
-            np.rint(1e3 * amperes).astype(np.int32),
-            self.supply_mv,
-            self.stop_pressed,
+            self.pots.read(self._qpos[:6]), np.rint(1e3 * amperes).astype(np.int32), self.supply_mv, self.stop_pressed
         )
 
     def step(self, duty: Array, awake: bool, braked: bool = False) -> None:

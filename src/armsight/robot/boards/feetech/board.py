@@ -144,13 +144,7 @@ class FeetechBoard:
         states = self._states
         none = (Limited(0),) * self.abilities.joints
         return JointReport(
-            self._t_s,
-            states.speed * RAD_PER_COUNT,
-            self._goal,
-            self._goal_speed,
-            states.load,
-            none,
-            states.celsius,
+            self._t_s, states.speed * RAD_PER_COUNT, self._goal, self._goal_speed, states.load, none, states.celsius
         )
 
     @property

@@ -12,14 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from armsight.errors import DeviceError, InputError
-from armsight.robot.boards.feetech.packets import (
-    Instruction,
-    PacketReader,
-    StatusPacket,
-    packet,
-    sync_read,
-    sync_write,
-)
+from armsight.robot.boards.feetech.packets import Instruction, PacketReader, StatusPacket, packet, sync_read, sync_write
 from armsight.robot.boards.feetech.registers import (
     LOCK,
     MODEL,

@@ -116,10 +116,5 @@ def states_of(blocks: list[bytes], errors: tuple[int, ...]) -> ServoStates:
         return np.array([register.decode(block[at:]) for block in blocks], dtype=float)
 
     return ServoStates(
-        column(POSITION),
-        column(SPEED),
-        LOAD_UNIT * column(LOAD),
-        VOLTS * column(VOLTAGE),
-        column(TEMPERATURE),
-        errors,
+        column(POSITION), column(SPEED), LOAD_UNIT * column(LOAD), VOLTS * column(VOLTAGE), column(TEMPERATURE), errors
     )
