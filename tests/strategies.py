@@ -1,12 +1,12 @@
 """What tests draw from: rotations near nothing and near pi, poses, cameras, rigs. One file, used everywhere."""
 
 import numpy as np
+from closed_form import VergingRig
 from hypothesis import strategies as st
 
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.camera import Camera
-from armsight.vision.closed_form import VergingRig
 from armsight.vision.rig import StereoRig
 
 SIZE = (1280, 720)

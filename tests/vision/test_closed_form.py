@@ -7,17 +7,10 @@ import operator
 import re
 from pathlib import Path
 
+import closed_form
 import numpy as np
 import pytest
-from hypothesis import assume, given
-
-from armsight.data import Body, Correspondences, PoseEstimate
-from armsight.errors import InputError
-from armsight.geometry.pose import inverse, pose, transform
-from armsight.geometry.rigid import fit_rigid
-from armsight.geometry.rotation import euler_zyx, exp_so3
-from armsight.vision import closed_form
-from armsight.vision.closed_form import (
+from closed_form import (
     T_world_camera,
     VergingRig,
     image_coordinates,
@@ -28,6 +21,13 @@ from armsight.vision.closed_form import (
     triangulate_parallel,
     triangulate_verging,
 )
+from hypothesis import assume, given
+
+from armsight.data import Body, Correspondences, PoseEstimate
+from armsight.errors import InputError
+from armsight.geometry.pose import inverse, pose, transform
+from armsight.geometry.rigid import fit_rigid
+from armsight.geometry.rotation import euler_zyx, exp_so3
 from armsight.vision.pose.locate import locate
 from armsight.vision.triangulate import triangulate
 from asserts import assert_rotation

@@ -5,5 +5,5 @@ The stages, in order: ``sources/`` (shots), ``markers/`` (detections), ``match.p
 
 - The rig: ``camera.py``, ``rig.py``, ``camera_file.py``, ``rigfiles/`` (other programs' files), ``rectify.py``.
 - ``calibrate/``: both cameras from boards or bodies, on ``pose/bundle.py``.
-- ``dense/``: a disparity for every pixel. ``closed_form.py``: the published closed-form method, as a reference.
+- ``dense/``: a disparity for every pixel.
 """

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from closed_form import orientation
 from scipy.stats import chi2
 
 from armsight.data import Body, Correspondences, Detections, PoseEstimate, Shot
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.geometry.rotation import euler_zyx, exp_so3
-from armsight.vision.closed_form import orientation
 from armsight.vision.discs.bias import expect
 from armsight.vision.markers.targets import Composite
 from armsight.vision.pose.locate import locate

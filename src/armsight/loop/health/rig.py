@@ -594,7 +594,7 @@ class RigWatch:
         if len(self._counted) > _BEFORE:
             self._leftover.take(self._counted.pop(0))
         nodded = stays if self._timed and newest.own is None else []
-        self._judge_shape(stays, newest, ends=ends)
+        self._test_shape(stays, newest, ends=ends)
         alarm, doubted = self._is_alarm(change), self._doubted
         self._doubted = None
         moments = [] if newest.own is not None else [stay[0] for stay in stays if len(stay) == 1]
@@ -663,7 +663,7 @@ class RigWatch:
         test = self._leftover.without(rest, _LENS, noise).of(len(self._window.b))
         return _Newest(whole, every, noise, evidence, test, own)
 
-    def _judge_shape(self, stays: Sequence[Sequence[_ShotResiduals]], newest: _Newest, *, ends: bool) -> None:
+    def _test_shape(self, stays: Sequence[Sequence[_ShotResiduals]], newest: _Newest, *, ends: bool) -> None:
         """Test for displaced points, with all shots and without those that fit worst."""
         odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
         every = newest.every

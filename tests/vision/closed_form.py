@@ -77,18 +77,9 @@ def rotation(beta: float) -> Array:
 
 
 def triangulate_verging(rig: VergingRig, u1: ArrayLike, v1: ArrayLike, u2: ArrayLike) -> Array:
-    """Triangulate points seen by two verging cameras in closed form (18.7, 18.8).
+    """Return points (N, 3), m, seen by two verging cameras (18.7, 18.8); NaN where the rays are parallel.
 
     The two rays meet in the X-Z plane, and Y comes from camera 1 alone: v2 would be redundant.
-
-    Args:
-        rig: the two cameras.
-        u1: (N,) image coordinates of camera 1, m (see :func:`image_coordinates`).
-        v1: (N,) the same, down the image.
-        u2: (N,) image coordinates of camera 2, m.
-
-    Returns:
-        (N, 3) points, m, the method's world frame; NaN where the rays are parallel.
     """
     F1, F2, X01, X02, Y01, Z01, Z02 = rig.F1, rig.F2, rig.X01, rig.X02, rig.Y01, rig.Z01, rig.Z02
     u1, v1, u2 = (np.atleast_1d(np.asarray(a, dtype=np.float64)) for a in (u1, v1, u2))
@@ -108,18 +99,7 @@ def triangulate_verging(rig: VergingRig, u1: ArrayLike, v1: ArrayLike, u2: Array
 
 
 def triangulate_parallel(F: float, B: float, u1: ArrayLike, v1: ArrayLike, u2: ArrayLike) -> Array:
-    """Triangulate points seen by two equal parallel cameras in closed form (18.10).
-
-    Args:
-        F: focal length of both cameras, m.
-        B: baseline, m; the origin is half-way.
-        u1: (N,) image coordinates of camera 1 (left), m.
-        v1: (N,) the same, down the image.
-        u2: (N,) image coordinates of camera 2 (right), m.
-
-    Returns:
-        (N, 3) points, m, the method's world frame; NaN where there is no disparity.
-    """
+    """Return points (N, 3), m, of two equal parallel cameras (18.10), origin half-way; NaN where there is no disparity."""
     u1, v1, u2 = (np.atleast_1d(np.asarray(a, dtype=np.float64)) for a in (u1, v1, u2))
     disparity = np.where(u1 == u2, np.nan, u1 - u2)
     Z = F - B * F / disparity  # 18.10, corrected: u1 - u2
@@ -141,16 +121,7 @@ def T_world_camera(rig: VergingRig, side: Side) -> Array:
 
 
 def stereo_rig(rig: VergingRig, *, pitch: float, image_size_px: tuple[int, int]) -> StereoRig:
-    """Build the same two cameras as a StereoRig, for the general functions.
-
-    Args:
-        rig: two verging cameras.
-        pitch: width of a pixel on the sensor, m.
-        image_size_px: (width, height); the optical axis meets the image in its middle.
-
-    Returns:
-        The rig, without distortion, everything given and nothing estimated (zero covariance).
-    """
+    """Build the same two cameras as a StereoRig, for the general functions."""
     cx, cy = _middle(image_size_px)
     left, right = (
         Camera(image_size_px, "none", np.array([F / pitch, F / pitch, cx, cy]), np.zeros(0)) for F in (rig.F1, rig.F2)
@@ -160,16 +131,7 @@ def stereo_rig(rig: VergingRig, *, pitch: float, image_size_px: tuple[int, int])
 
 
 def image_coordinates(uv: Array, *, pitch: float, image_size_px: tuple[int, int]) -> tuple[Array, Array]:
-    """Convert raw pixels of :func:`stereo_rig` to the image coordinates of the method.
-
-    Args:
-        uv: (N, 2) raw pixels.
-        pitch: width of a pixel on the sensor, m.
-        image_size_px: (width, height).
-
-    Returns:
-        (N,) u and (N,) v, m: inverted, since the method's image plane lies behind the projection centre (18.6).
-    """
+    """Convert raw pixels of :func:`stereo_rig` to the image coordinates of the method."""
     cx, cy = _middle(image_size_px)
     return (cx - uv[:, 0]) * pitch, (cy - uv[:, 1]) * pitch  # 18.6
 
@@ -208,14 +170,6 @@ def orientation(P1: ArrayLike, P2: ArrayLike, P3: ArrayLike) -> Orientation:
     x_b runs along P1 P2, and z_b from P3 to their middle. Where P3 is not equally far from both, these two are not
     perpendicular; x_b, the measured line, is then kept and z_b rotated within the plane of the three points: it runs
     from P3 to the nearest point of the line P1 P2 instead of its middle.
-
-    Args:
-        P1: (3,) first point, m.
-        P2: (3,) second point.
-        P3: (3,) third point.
-
-    Raises:
-        InputError: a point is not three finite numbers, two points coincide, or all three lie on one line.
     """
     p1, p2, p3 = checked(P1, (3,), "P1"), checked(P2, (3,), "P2"), checked(P3, (3,), "P3")
     x_b = _direction(p2 - p1, "P1 and P2 coincide: they fix no x axis")  # 18.11 to 18.14
