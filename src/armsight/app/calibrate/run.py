@@ -24,9 +24,10 @@ from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
 from armsight.vision.image import darkness, grey, one_image, read_image
 from armsight.vision.markers.aruco import FAMILIES, detect_markers, family_size
-from armsight.vision.markers.board import CalibrationBoard, open_board
+from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_file import load_body_csv, save_body_csv
 from armsight.vision.markers.calibrated_board import save_board_file
+from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.rig import CONTRADICTED
 from armsight.vision.sources import PairsSource, Source, notes_of, open_source
 from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files

@@ -34,8 +34,9 @@ from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.result import Calibration
 from armsight.vision.calibrate.weak import require_order
 from armsight.vision.image import grey
-from armsight.vision.markers.board import CalibrationBoard, open_board
+from armsight.vision.markers.board import open_board
 from armsight.vision.markers.chessboard import Chessboard
+from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.pose.pnp import body_poses
 from armsight.vision.rig import StereoRig
 

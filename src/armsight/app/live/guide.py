@@ -21,7 +21,7 @@ from armsight.geometry.rotation import exp_so3
 from armsight.vision.calibrate.boards import printed_board, rigid_board
 from armsight.vision.calibrate.result import Calibration
 from armsight.vision.camera import Camera
-from armsight.vision.markers.board import CalibrationBoard
+from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, predict
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points

@@ -67,32 +67,43 @@ def polyline(uv: Array, *, closed: bool = False) -> tuple[tuple[float, float], .
     return (*points, *(points[:1] if closed else []))
 
 
+#: Name -> command.
+COMMANDS: dict[str, type[Command]] = {}
+
+
 @dataclass(frozen=True)
-class GoTo:
+class Command:
+    """What the page asks for."""
+
+    def __init_subclass__(cls) -> None:
+        """Make the command known by its name."""
+        COMMANDS[cls.__name__] = cls
+
+
+@dataclass(frozen=True)
+class GoTo(Command):
     """Go to a step; the one before can be left at any time."""
 
     step: str
 
 
 @dataclass(frozen=True)
-class UseCameras:
+class UseCameras(Command):
     """Open other cameras."""
 
     source: str
 
 
-@dataclass(frozen=True)
-class FindLeft:
+class FindLeft(Command):
     """Find out which view is the left camera's: a person covers it."""
 
 
-@dataclass(frozen=True)
-class Swap:
+class Swap(Command):
     """Exchange left and right."""
 
 
 @dataclass(frozen=True)
-class UseBoard:
+class UseBoard(Command):
     """Use another calibration board; ``measured_mm`` is the length of the printed bar, 0 where nobody measured it."""
 
     spec: str
@@ -100,41 +111,37 @@ class UseBoard:
 
 
 @dataclass(frozen=True)
-class DrawBoard:
+class DrawBoard(Command):
     """Draw the calibration board as a PDF to scale."""
 
     paper: str = "a4"
 
 
-@dataclass(frozen=True)
-class Calibrate:
+class Calibrate(Command):
     """Begin the guided calibration, or continue it."""
 
 
-@dataclass(frozen=True)
-class PauseCalibration:
+class PauseCalibration(Command):
     """Take no more shots for now."""
 
 
-@dataclass(frozen=True)
-class TakeShot:
+class TakeShot(Command):
     """Take a shot of the board as it is now."""
 
 
 @dataclass(frozen=True)
-class DropShot:
+class DropShot(Command):
     """Leave out a shot."""
 
     name: str
 
 
-@dataclass(frozen=True)
-class FinishCalibration:
+class FinishCalibration(Command):
     """Choose the lens model by held-out errors, and write rig.json."""
 
 
 @dataclass(frozen=True)
-class SetAim:
+class SetAim(Command):
     """Say what the calibration is to be good for."""
 
     error_mm: float
@@ -142,154 +149,106 @@ class SetAim:
 
 
 @dataclass(frozen=True)
-class UseBody:
+class UseBody(Command):
     """Use a body file, or the board, as what is measured."""
 
     target: str
 
 
 @dataclass(frozen=True)
-class DrawBody:
+class DrawBody(Command):
     """Draw the body as a PDF to scale."""
 
     paper: str = "a4"
 
 
-@dataclass(frozen=True)
-class Zero:
+class Zero(Command):
     """Show poses relative to the present one."""
 
 
-@dataclass(frozen=True)
-class ClearZero:
+class ClearZero(Command):
     """Show poses in the left camera's frame again."""
 
 
-@dataclass(frozen=True)
-class PivotTip:
+class PivotTip(Command):
     """Collect poses for the calibration of a tip that stands still; a second time: compute it."""
 
 
-@dataclass(frozen=True)
-class MarkPosition:
+class MarkPosition(Command):
     """Mark the present position: distances are measured from it."""
 
 
-@dataclass(frozen=True)
-class RecordPoses:
+class RecordPoses(Command):
     """Write every measured pose to a new file; a second time: stop."""
 
 
-@dataclass(frozen=True)
-class OpenArm:
+class OpenArm(Command):
     """Connect to the arm's board; the drives stay as they are."""
 
 
 @dataclass(frozen=True)
-class RunMotions:
+class RunMotions(Command):
     """Calibrate hand and eye and make the motions; ``closed``: a second time with the loop closed on vision."""
 
     closed: bool = True
 
 
 @dataclass(frozen=True)
-class UseSecondBody:
+class UseSecondBody(Command):
     """Measure a second body too, and each relative to the other; an empty ``target`` ends it."""
 
     target: str
 
 
-@dataclass(frozen=True)
-class TakePose:
+class TakePose(Command):
     """Take the pose in which the arm rests now for the hand-eye calibration."""
 
 
-@dataclass(frozen=True)
-class GuideHandEye:
+class GuideHandEye(Command):
     """Let the arm visit the poses of the hand-eye calibration by itself."""
 
 
-@dataclass(frozen=True)
-class GoToStart:
+class GoToStart(Command):
     """Move the arm slowly to where the motions start, as after a stop."""
 
 
-@dataclass(frozen=True)
-class ClearHandEye:
+class ClearHandEye(Command):
     """Forget the hand-eye calibration and its poses."""
 
 
-@dataclass(frozen=True)
-class Identify:
+class Identify(Command):
     """Identify the arm from the poses of the hand-eye calibration."""
 
 
 @dataclass(frozen=True)
-class UseArm:
+class UseArm(Command):
     """Use another model of the arm: a name, a TOML or a URDF file, such as the corrected one."""
 
     arm: str
 
 
 @dataclass(frozen=True)
-class UseMotion:
+class UseMotion(Command):
     """Use the motions of another file."""
 
     path: str
 
 
-@dataclass(frozen=True)
-class Hold:
+class Hold(Command):
     """Bring the arm to rest and hold it."""
 
 
-@dataclass(frozen=True)
-class ClearStop:
+class ClearStop(Command):
     """Allow the drives again after a stop; they stay off until the next motion."""
 
 
 @dataclass(frozen=True)
-class PersonAction:
+class PersonAction(Command):
     """What the simulated person does: cover_left, cover_right, uncover, unplug, plug, knock, board, no_board."""
 
     action: str
 
 
-Command = (
-    GoTo
-    | UseCameras
-    | FindLeft
-    | Swap
-    | UseBoard
-    | DrawBoard
-    | Calibrate
-    | PauseCalibration
-    | TakeShot
-    | DropShot
-    | FinishCalibration
-    | SetAim
-    | UseBody
-    | DrawBody
-    | Zero
-    | ClearZero
-    | PivotTip
-    | MarkPosition
-    | RecordPoses
-    | OpenArm
-    | RunMotions
-    | UseSecondBody
-    | TakePose
-    | GuideHandEye
-    | GoToStart
-    | ClearHandEye
-    | Identify
-    | UseArm
-    | UseMotion
-    | Hold
-    | ClearStop
-    | PersonAction
-)
-COMMANDS: dict[str, type[Command]] = {kind.__name__: kind for kind in Command.__args__}
 _KINDS = {"str": str, "float": float, "bool": bool}
 
 

@@ -46,8 +46,8 @@ from armsight.vision.calibrate.start import agreed_symmetries, fits, imitated, r
 from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.camera import DISTORTION_MODELS, Camera
 from armsight.vision.discs.bias import apparent_radii
-from armsight.vision.markers.board import CalibrationBoard
 from armsight.vision.markers.circles import unseen_row
+from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.match import join, renamed
 from armsight.vision.pose.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
 from armsight.vision.pose.pnp import body_poses

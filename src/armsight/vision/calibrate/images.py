@@ -14,7 +14,8 @@ from armsight.vision.calibrate import FOLDS, MODELS
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.result import Calibration
 from armsight.vision.image import grey
-from armsight.vision.markers.board import CalibrationBoard, open_board
+from armsight.vision.markers.board import open_board
+from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.sources import Source, open_source
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.vision.markers.aruco import cells, family_size, find_squares
-from armsight.vision.markers.marker import Target
+from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.markers.spec import Fields, first_id
 from armsight.vision.markers.square import SquareFit, fit_square
 
@@ -27,7 +27,7 @@ BORDERS = (2, 1)
 
 
 @dataclass(frozen=True, eq=False)
-class AprilGrid(Record, Target):
+class AprilGrid(Record, CalibrationBoard):
     """A grid of AprilTags.
 
     Attributes:

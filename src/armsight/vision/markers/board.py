@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 from armsight.errors import InputError
 from armsight.geometry.check import checked
@@ -17,26 +16,8 @@ from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.chessboard import Chessboard
 from armsight.vision.markers.circles import CircleGrid
-from armsight.vision.markers.marker import Target
+from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.markers.spec import Fields
-
-
-class CalibrationBoard(Target, Protocol):
-    """A flat target whose points lie in z = 0, the first at the origin, x along the columns; m, board frame.
-
-    ``symmetries`` is empty for a board that shows which way up it is.
-    """
-
-    @property
-    def y_up(self) -> bool:
-        """Whether y runs up and z points out of its face, as on Kalibr's boards; else they run down and into it."""
-        ...
-
-    @property
-    def codes(self) -> tuple[str, range]:
-        """The family of its tags, and their ids; "" and none where it has no tags."""
-        ...
-
 
 #: Kind -> (form, maker).
 BOARDS: dict[str, tuple[str, Callable[[Fields], CalibrationBoard]]] = {

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from armsight.data import Array, Body, Detections, Record
 from armsight.geometry.pose import transform
 from armsight.vision.markers.aruco import APRILTAGS, tag_family
-from armsight.vision.markers.board import CalibrationBoard, open_board
+from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_file import Marker
-from armsight.vision.markers.marker import Target
+from armsight.vision.markers.marker import CalibrationBoard, Target
 
 #: T_marker_board of a board whose y axis runs up and whose z axis points out of the face.
 _ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -23,9 +23,9 @@ from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.errors import InputError
 from armsight.files import read_toml, write_text
 from armsight.geometry.check import checked
-from armsight.vision.markers.board import CalibrationBoard, open_board
+from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_file import VERSION
-from armsight.vision.markers.marker import Target
+from armsight.vision.markers.marker import CalibrationBoard, Target
 
 #: A point further from its drawing than this share of the board's size is a mistake in the file, not a bent sheet.
 _MOST_OFF = 0.1

@@ -22,7 +22,7 @@ from armsight.errors import InputError
 from armsight.vision.markers.aruco import charuco_detector, detect_markers, family_name, family_size, marker_corners
 from armsight.vision.markers.chessboard import fit_grid, misfits
 from armsight.vision.markers.grid import completed, grid_points
-from armsight.vision.markers.marker import Target
+from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.markers.spec import Fields, first_id
 
 #: Markers from whose neighbours the image's scale at one follows, it included, and how far they may be from it, squares;
@@ -44,7 +44,7 @@ _GAP_SHARE, _GAP_PX, _STEP = 0.04, 1.5, 0.4
 
 
 @dataclass(frozen=True, eq=False)
-class Charuco(Record, Target):
+class Charuco(Record, CalibrationBoard):
     """A chessboard with markers in its bright squares.
 
     Attributes:
@@ -78,11 +78,6 @@ class Charuco(Record, Target):
             raise fields.error(f"has an {error}") from None
         first = fields.first(columns * rows // 2, family, family_size(family))
         return Charuco(columns, rows, square_m, marker_m, family, first)
-
-    @property
-    def y_up(self) -> bool:
-        """Whether its y axis runs up."""
-        return False
 
     @property
     def codes(self) -> tuple[str, range]:

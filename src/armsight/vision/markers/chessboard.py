@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.vision.markers.corner import OUTCOMES, CornerFits, crossing_signs, refine_corners
 from armsight.vision.markers.grid import grid_points, local_squares, rotations
-from armsight.vision.markers.marker import Target
+from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.markers.spec import Fields
 
 #: Above this many pixels a side the grid is looked for in a smaller copy first; corners are fitted in the full image.
@@ -43,7 +43,7 @@ _ENDS = ((np.s_[0], np.s_[1]), (np.s_[-1], np.s_[-2]), (np.s_[:, 0], np.s_[:, 1]
 
 
 @dataclass(frozen=True, eq=False)
-class Chessboard(Record, Target):
+class Chessboard(Record, CalibrationBoard):
     """A chessboard; its points are the inner corners, row by row.
 
     Attributes:
@@ -63,16 +63,6 @@ class Chessboard(Record, Target):
         """Build the board a spec names."""
         columns, rows = fields.counts(0, least=3)
         return Chessboard(columns, rows, fields.length_m(1))
-
-    @property
-    def y_up(self) -> bool:
-        """Whether its y axis runs up."""
-        return False
-
-    @property
-    def codes(self) -> tuple[str, range]:
-        """Family and numbers of its tags."""
-        return "", range(0)
 
     @cached_property
     def body(self) -> Body:

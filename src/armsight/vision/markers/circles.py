@@ -43,7 +43,7 @@ from armsight.vision.markers.circle_grid import (
 )
 from armsight.vision.markers.disc.search import Grey
 from armsight.vision.markers.grid import grid_points, rotations
-from armsight.vision.markers.marker import Target
+from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.markers.spec import Fields
 
 #: The share of a board's discs that must be measured; with rings a smaller part is enough.
@@ -64,7 +64,7 @@ POLARITIES = {False: "dark", True: "light"}
 
 
 @dataclass(frozen=True, eq=False)
-class CircleGrid(Record, Target):
+class CircleGrid(Record, CalibrationBoard):
     """A grid of discs.
 
     Attributes:
@@ -97,16 +97,6 @@ class CircleGrid(Record, Target):
     def staggered_from_fields(fields: Fields) -> CircleGrid:
         """Build the staggered grid a spec names."""
         return _from_fields(fields, staggered=True)
-
-    @property
-    def y_up(self) -> bool:
-        """Whether its y axis runs up."""
-        return False
-
-    @property
-    def codes(self) -> tuple[str, range]:
-        """Family and numbers of its tags."""
-        return "", range(0)
 
     @cached_property
     def spec(self) -> str:

@@ -53,3 +53,20 @@ class Target(Protocol):
             covariance that the image itself supports. Nothing found is ``Detections.none(reason)``, never an exception.
         """
         ...
+
+
+class CalibrationBoard(Target, Protocol):
+    """A flat target whose points lie in z = 0, the first at the origin, x along the columns; m, board frame.
+
+    ``symmetries`` is empty for a board that shows which way up it is.
+    """
+
+    @property
+    def y_up(self) -> bool:
+        """Whether y runs up and z points out of its face, as on Kalibr's boards; else they run down and into it."""
+        return False
+
+    @property
+    def codes(self) -> tuple[str, range]:
+        """The family of its tags, and their ids; "" and none where it has no tags."""
+        return "", range(0)
