@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import gc
-import json
 from pathlib import Path
 
 import click
 
 from armsight.app.arm_option import arm_option
-from armsight.app.show.messages import UNTRUSTED, require
+from armsight.app.show.messages import require
 
 
 @click.command("demo")
@@ -92,7 +91,7 @@ def command(
 
     from armsight.app.demo.demo import Demo, run_demo
     from armsight.app.progress import steps
-    from armsight.app.run.summary import print_summary
+    from armsight.app.run.summary import show_summary
     from armsight.robot.arm_file import open_arm
 
     gc.freeze()  # what was imported stays: no collection has to look at it
@@ -104,9 +103,4 @@ def command(
     except KeyboardInterrupt:
         click.echo(f"the arm was stopped; what was measured until then is in {output}", err=True)
         raise
-    if as_json:
-        click.echo(json.dumps(summary.to_json()))
-    else:
-        print_summary(summary, output)
-    if any(each.forbids for each in summary.health):
-        click.get_current_context().exit(UNTRUSTED)
+    show_summary(summary, output, as_json=as_json)

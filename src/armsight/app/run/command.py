@@ -179,7 +179,7 @@ def command(
     from armsight.app.run.folder import make_room, open_folder
     from armsight.app.run.motion_file import DEFAULT_MOTION
     from armsight.app.run.setup import Devices, open_devices, planned_for
-    from armsight.app.run.summary import print_summary
+    from armsight.app.run.summary import show_summary
     from armsight.robot.arm_file import open_arm
     from armsight.vision.follow.follower import follows
     from armsight.vision.markers.targets import open_fixed, open_target
@@ -220,12 +220,7 @@ def command(
         if begun:  # said once the progress is off the terminal
             click.echo(f"the arm was stopped; what was measured until then is in {output}", err=True)
         raise
-    if as_json:
-        click.echo(json.dumps(summary.to_json()))
-    else:
-        print_summary(summary, output)
-    if any(each.forbids for each in summary.health):
-        click.get_current_context().exit(UNTRUSTED)
+    show_summary(summary, output, as_json=as_json)
 
 
 def _run_logged(

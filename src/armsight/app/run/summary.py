@@ -6,6 +6,7 @@ In: what a run measured. Out: a :class:`RunSummary`; its JSON is made in :meth:`
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -31,7 +32,7 @@ from armsight.app.run.metrics import (
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import RunData, ToolTrack
 from armsight.app.show.encode import json_of
-from armsight.app.show.messages import colour, weak
+from armsight.app.show.messages import UNTRUSTED, colour, weak
 from armsight.app.show.table import TextTable, plain_text
 from armsight.loop.health import HealthFinding, health_lines, unseen_lines
 from armsight.loop.health.follow import RigCorrection, correction_lines
@@ -371,13 +372,17 @@ def loop_table(summary: RunSummary) -> TextTable | None:
     return TextTable("Distance of the tool from its command", columns, tuple(rows))
 
 
-def print_summary(summary: RunSummary, folder: Path) -> None:
-    """Print a run's summary on stdout, mm and degrees.
+def show_summary(summary: RunSummary, folder: Path, *, as_json: bool) -> None:
+    """Print a run's summary on stdout, mm and degrees or JSON; end with UNTRUSTED where it must not be trusted."""
+    if as_json:
+        click.echo(json.dumps(summary.to_json()))
+    else:
+        _print(summary, folder)
+    if any(each.forbids for each in summary.health):
+        click.get_current_context().exit(UNTRUSTED)
 
-    Args:
-        summary: of the run.
-        folder: of the run.
-    """
+
+def _print(summary: RunSummary, folder: Path) -> None:
     for table in (track_table(summary), loop_table(summary)):
         if table is not None:
             click.echo(plain_text(table))

@@ -31,7 +31,7 @@ from armsight.robot.boards.configuration import (
     check_gains,
     check_pin,
 )
-from armsight.robot.boards.contract import Abilities, MotionBoard
+from armsight.robot.boards.contract import Abilities
 from armsight.robot.boards.link import Link
 from armsight.robot.boards.reports import (
     BoardStatus,
@@ -255,7 +255,7 @@ _SET_MESSAGE_INTERVAL, _REBOOT = 511, 246  # MAV_CMD_
 _SLOW_ANGLES_US = 20000
 
 
-class Board(MotionBoard):
+class Board:
     """A board behind a link, connected by :meth:`connect`.
 
     Args:
@@ -459,6 +459,12 @@ class Board(MotionBoard):
     def close(self) -> None:
         """Close the link; a driven arm then does what its board does without commands."""
         self._link.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def _next(self) -> int:
         """Return the number of the next command."""

@@ -148,13 +148,9 @@ class MotionBoard(Protocol):
         """Close the link; a driven arm then does what its board does without commands."""
         ...
 
-    def __enter__(self) -> Self:
-        """Return the board; ``with`` closes it at its end."""
-        return self
+    def __enter__(self) -> Self: ...
 
-    def __exit__(self, *_: object) -> None:
-        """Close it."""
-        self.close()
+    def __exit__(self, *_: object) -> None: ...
 
 
 def checked_goals(command: JointCommand, count: int) -> Array:

@@ -43,7 +43,7 @@ from armsight.vision.markers.circle_grid import (
 )
 from armsight.vision.markers.disc.search import Grey
 from armsight.vision.markers.grid import grid_points, rotations
-from armsight.vision.markers.marker import CalibrationBoard
+from armsight.vision.markers.marker import CalibrationBoard, Target
 from armsight.vision.markers.spec import Fields
 
 #: The share of a board's discs that must be measured; with rings a smaller part is enough.

@@ -31,7 +31,7 @@ from armsight.robot.boards.ar4.models import (
     Ar4Model,
 )
 from armsight.robot.boards.codes import Alarm, BoardState, Command, Limited
-from armsight.robot.boards.contract import Abilities, MotionBoard, checked_goals
+from armsight.robot.boards.contract import Abilities, checked_goals
 from armsight.robot.boards.link import Link
 from armsight.robot.boards.reports import BoardStatus, JointFault, JointReport, Welcome, plain_status
 
@@ -72,7 +72,7 @@ ABILITIES = Abilities(
 )
 
 
-class Ar4Board(MotionBoard):
+class Ar4Board:
     """The joints of an AR4; :meth:`connect` makes one.
 
     Args:
@@ -271,6 +271,12 @@ class Ar4Board(MotionBoard):
     def close(self) -> None:
         """Close the port; the arm goes to its last goal and is held there."""
         self._link.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def _q(self) -> Array:
         """Return the newest joint angles (6,), rad."""

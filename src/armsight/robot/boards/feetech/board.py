@@ -15,7 +15,7 @@ import numpy as np
 from armsight.data import Array, JointCommand, JointStates
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.codes import BoardState, Command, Limited
-from armsight.robot.boards.contract import Abilities, MotionBoard, checked_goals
+from armsight.robot.boards.contract import Abilities, checked_goals
 from armsight.robot.boards.feetech.bus import ServoBus
 from armsight.robot.boards.feetech.calibration import NAMES, ServoCalibration, uncalibrated
 from armsight.robot.boards.feetech.registers import (
@@ -65,7 +65,7 @@ ABILITIES = Abilities(
 )
 
 
-class FeetechBoard(MotionBoard):
+class FeetechBoard:
     """The joints of an arm on a servo bus; :meth:`connect` makes one.
 
     Args:
@@ -144,7 +144,13 @@ class FeetechBoard(MotionBoard):
         states = self._states
         none = (Limited(0),) * self.abilities.joints
         return JointReport(
-            self._t_s, states.speed * RAD_PER_COUNT, self._goal, self._goal_speed, states.load, none, states.celsius
+            self._t_s,
+            states.speed * RAD_PER_COUNT,
+            self._goal,
+            self._goal_speed,
+            states.load,
+            none,
+            states.celsius,
         )
 
     @property
@@ -243,6 +249,12 @@ class FeetechBoard(MotionBoard):
     def close(self) -> None:
         """Close the port; servos whose torque is on hold their last goal."""
         self._bus.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def _q(self) -> Array:
         """Return the newest joint angles (n,), rad."""
