@@ -334,7 +334,9 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
     if len(found.left_out):
         times = ", ".join(f"{t:.0f}" for t in rests.t_s[found.left_out][:_NAMED])
         more = ", ..." if len(found.left_out) > _NAMED else ""
-        notes.append(f"{len(found.left_out)} rests were left out as mistakes: at {times}{more} s of the run")
+        notes.append(
+            f"left out as mistakes: {len(found.left_out)} of {len(rests.q)} rests, at {times}{more} s of the run"
+        )
     off, parts = _split(arm, kept, found)
     lever = gravity_levers(arm, kept.q)
     seen_off = rests.T_seen[:, :3, 3] - rests.T_ref[:, :3, 3]

@@ -68,7 +68,7 @@ def tables(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> list[Text
     rows = [
         (
             name,
-            f"{100 * p.share:.0f} %" if p.determined else "not determined",
+            f"{round(100 * p.share)} %" if p.determined else "not determined",
             f"{p.rms_mm:.3f} ± {p.sigma_mm:.3f}" if p.determined else f"± {p.sigma_mm:.3f}",
             f"{p.without_mm:.3f}" if p.remedy and p.determined else "–",
             p.remedy,

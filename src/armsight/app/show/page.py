@@ -53,7 +53,9 @@ table.numbers td { font-variant-numeric: tabular-nums; } td.number { white-space
 figure { margin: 0 0 1rem; } figure img { width: 100%; height: auto; display: block; }
 figcaption { background: var(--soft); padding: .6rem 1.1rem; margin-top: .6rem; font-size: .95rem; }
 figcaption p { margin: .3rem 0; }
-@media (max-width: 48rem) { table { display: block; overflow-x: auto; } }
+@media (max-width: 48rem) { table { display: block; overflow-x: auto; }
+  th, td { overflow-wrap: break-word; } td:not(.number) { min-width: 7rem; }
+  table.numbers tbody th { white-space: normal; } }
 @media print { body { max-width: none; padding: 0; } nav { display: none; } figure { break-inside: avoid; } }
 """
 
