@@ -53,7 +53,7 @@ from armsight.tables.rotations import ROTATIONS
     type=click.Path(path_type=Path),
     help="Folder for the corrected arm and the report.",
 )
-@click.option("-v", "--verbose", is_flag=True, help="Also print why the other parameters were not fitted.")
+@click.option("-v", "--verbose", is_flag=True, help="Print all numbers, and why the others were not fitted.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 @click.pass_context
 def command(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -179,6 +179,8 @@ def sources_figure(run: Identification) -> Figure:
     return figure
 
 
+#: Lines of the terminal without -v: the largest error sources, and the numbers that are most surely not nominal.
+_SOURCES, _PARAMETERS = 4, 8
 #: Name -> the function that plots it, its title and its caption.
 FIGURES: dict[str, tuple[Callable[[Identification], Figure], str, str]] = {
     "map": (
@@ -213,7 +215,7 @@ FIGURES: dict[str, tuple[Callable[[Identification], Figure], str, str]] = {
 
 
 def identify_report(run: Identification, *, everything: bool = False) -> Report:
-    """Return what an identification says; ``everything`` has also why the rest was not fitted printed."""
+    """Return what an identification says; ``everything``: all is printed, not the most important numbers alone."""
     found = run.found
     noise = f"noise {1e3 * found.solution.noise[0]:.3f} mm"
     if found.model.full:
@@ -224,14 +226,17 @@ def identify_report(run: Identification, *, everything: bool = False) -> Report:
         f"{run.held_out.residual_over_predicted:.2f} (1: the sigmas are right)"
     )
     parts = contributions(found, run.measured).items()
-    backlash = [f"joint {p.joint + 1}  {_backlash_text(p)}" for p in joint_backlashes(found, run.measured)]
+    backlashes = joint_backlashes(found, run.measured)
+    backlash = [f"joint {p.joint + 1}  {_backlash_text(p)}" for p in backlashes]
+    wide, most = max((len(source) for source, _ in parts), default=0), None if everything else _SOURCES
     moved = "displacement of the tool by each error source, RMS, beyond what the sources before it explain:"
     pairs = [f"{a} and {b}: {c:+.3f}" for a, b, c in found.correlated()]
     result: list[Block] = [
         Fact(fact, _values(run)),
-        Lines([f"{source:<28} {1e3 * size:8.3f} mm" for source, size in parts], moved),
-        Lines(backlash, "backlash of each joint, stop to stop:"),
-        Lines(pairs, "correlations over 0.9 (more varied poses distinguish them):"),
+        Lines([f"{source:<{wide}} {1e3 * size:8.3f} mm" for source, size in parts], moved, most),
+        Lines(backlash, "backlash of each joint, stop to stop:", None if everything else 0),
+        Lines(pairs, "correlations over 0.9 (more varied poses distinguish them):", None if everything else 0),
+        *([] if everything else [Text(_in_short(backlashes, len(pairs)))]),
     ]
     return Report(
         "identification of an arm",
@@ -241,7 +246,7 @@ def identify_report(run: Identification, *, everything: bool = False) -> Report:
         {
             "result": ("Result", result),
             **figures(FIGURES, run),
-            "ranges": ("Ranges of the joints", _ranges(run)),
+            "ranges": ("Ranges of the joints", _ranges(run, everything=everything)),
             "parameters": ("Parameters", [*_printed(run, everything=everything), _parameters(run)]),
         },
         [Note("note", each) for each in run.notes],
@@ -351,23 +356,42 @@ def value_text(p: Parameter, value: float) -> str:
     return f"{100 * value:.4f} %"
 
 
+def _in_short(backlashes: Sequence[JointBacklash], pairs: int) -> str:
+    """Return a line on backlash, and one on correlations where there are any."""
+    known = [p for p in backlashes if np.isfinite(p.value_rad)]
+    values = [f"joint {p.joint + 1} {np.degrees(p.value_rad):.3f} +- {np.degrees(p.sigma_rad):.3f} deg" for p in known]
+    others = ", ".join(str(p.joint + 1) for p in backlashes if p not in known)
+    lines = [
+        "\nbacklash: " + "; ".join([*values, *([f"not determined of joints {others} (-v says why)"] if others else [])])
+    ]
+    if pairs:
+        lines.append(f"{pairs} pairs of numbers are correlated by over 0.9 (-v lists them): take more varied poses")
+    return "\n".join(lines)
+
+
 def _printed(run: Identification, *, everything: bool) -> list[Block]:
-    """Return the parameters that were fitted, for the terminal, and why others were not."""
+    """Return the parameters that were fitted, for the terminal: all, or those that are surely not nominal."""
     found, nominal = run.found, run.found.model.nominal()
-    rows = []
-    for k, p in enumerate(found.model.parameters):
-        if found.solution.free[k] and p.kind not in ("base", "tool", *([] if everything else ["ripple"])):
-            cells = [value_text(p, value) for value in (nominal[k], *found.value(p.name))]
-            tied = "with others (-v)" if p.name in found.reasons and not everything else ""
-            rows.append((p.name, *cells, tied))
-    left = sum(
-        not free and p.kind not in ("base", "tool")
-        for p, free in zip(found.model.parameters, found.solution.free, strict=True)
-    )
-    shown = Text(plain_text(TextTable("", ("parameter", "nominal", "identified", "sigma", ""), tuple(rows))))
+    rows, sizes = [], []
+    kept = [
+        (k, p)
+        for k, p in enumerate(found.model.parameters)
+        if found.solution.free[k] and p.kind not in ("base", "tool")
+    ]
+    for k, p in kept:
+        value, sigma = found.value(p.name)
+        tied = "with others (-v)" if p.name in found.reasons and not everything else ""
+        rows.append((p.name, *(value_text(p, each) for each in (nominal[k], value, sigma)), tied))
+        sizes.append(abs(value - nominal[k]) / max(sigma, 1e-12))
+    left = len(found.model.parameters) - len(kept) - sum(p.kind in ("base", "tool") for p in found.model.parameters)
+    head = ("parameter", "nominal", "identified", "sigma", "")
     if everything:
+        shown = Text("\n" + plain_text(TextTable("", head, tuple(rows))).strip("\n"))
         return [shown, Text("\n".join(["\nnot fitted, or not alone:", *(f"  {line}" for line in _not_fitted(run))]))]
-    return [shown, *map(Text, _ripples(run)), Text(f"\n{left} more parameters were not fitted; -v says why")]
+    first = sorted(k for k in np.argsort(sizes)[-_PARAMETERS:] if sizes[k] > 2)  # sigmas
+    table_shown = Text("\n" + plain_text(TextTable("", head, tuple(rows[k] for k in first))).strip("\n"))
+    more = f"{len(rows) - len(first)} more are fitted, {left} are not (-v lists all)"
+    return [table_shown, Text(more)] if first else [Text(f"\n{more}")]
 
 
 def ranges_seen(found: Identified) -> list[tuple[float, float]]:
@@ -376,7 +400,7 @@ def ranges_seen(found: Identified) -> list[tuple[float, float]]:
     return [(float(low), float(high)) for low, high in found.model.q_seen]
 
 
-def _ranges(run: Identification) -> list[Block]:
+def _ranges(run: Identification, *, everything: bool) -> list[Block]:
     """Return the readings that the poses have shown of each joint."""
     fade, seen = np.degrees(run.found.model.fade_rad), [np.degrees(each) for each in ranges_seen(run.found)]
     rows = [[escaped(n), f"{a:.1f}", f"{b:.1f}"] for n, (a, b) in zip(run.arm.joint_names, seen, strict=True)]
@@ -390,7 +414,7 @@ def _ranges(run: Identification) -> list[Block]:
     )
     lines = [f"  joint {i + 1}  {a:.1f} to {b:.1f} deg" for i, (a, b) in enumerate(seen)]
     shown = table(("joint", "least reading, deg", "greatest reading, deg"), rows, "numbers")
-    return [Text("\n".join([title, *lines])), Html(curves + shown)]
+    return [*([Text("\n".join([title, *lines]))] if everything else []), Html(curves + shown)]
 
 
 def _parameters(run: Identification) -> Html:
@@ -404,20 +428,6 @@ def _parameters(run: Identification) -> Html:
         row = (p.name, was, now, value_text(p, sigma[k]) if free else "", found.reasons.get(p.name, ""))
         rows.append([escaped(entry) for entry in row])
     return Html(table(("parameter", "nominal", "identified", "sigma", "why not, or with what"), rows, "numbers"))
-
-
-def _ripples(run: Identification) -> list[str]:
-    """Return how large the fast part of each sensor's curve is: its many numbers say nothing one by one."""
-    found, lines = run.found, []
-    for i in range(found.model.arm.joints):
-        rows = [k for k, p in enumerate(found.model.parameters) if p.kind == "ripple" and p.joint == i]
-        rows = [k for k in rows if found.solution.free[k]]
-        if rows:
-            size = np.degrees(np.sqrt(np.sum(found.solution.x[rows] ** 2) / 2))
-            lines.append(
-                f"  ripple{i + 1}_.. {len(rows)} numbers, together {size:.4f} deg RMS over a revolution (-v lists them)"
-            )
-    return lines
 
 
 def _backlash_text(backlash: JointBacklash) -> str:

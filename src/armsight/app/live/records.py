@@ -68,11 +68,11 @@ def polyline(uv: Array, *, closed: bool = False) -> tuple[tuple[float, float], .
 
 
 #: Name -> command.
-COMMANDS: dict[str, type[Command]] = {}
+COMMANDS: dict[str, type[PageCommand]] = {}
 
 
 @dataclass(frozen=True)
-class Command:
+class PageCommand:
     """What the page asks for."""
 
     def __init_subclass__(cls) -> None:
@@ -81,29 +81,29 @@ class Command:
 
 
 @dataclass(frozen=True)
-class GoTo(Command):
+class GoTo(PageCommand):
     """Go to a step; the one before can be left at any time."""
 
     step: str
 
 
 @dataclass(frozen=True)
-class UseCameras(Command):
+class UseCameras(PageCommand):
     """Open other cameras."""
 
     source: str
 
 
-class FindLeft(Command):
+class FindLeft(PageCommand):
     """Find out which view is the left camera's: a person covers it."""
 
 
-class Swap(Command):
+class Swap(PageCommand):
     """Exchange left and right."""
 
 
 @dataclass(frozen=True)
-class UseBoard(Command):
+class UseBoard(PageCommand):
     """Use another calibration board; ``measured_mm`` is the length of the printed bar, 0 where nobody measured it."""
 
     spec: str
@@ -111,37 +111,37 @@ class UseBoard(Command):
 
 
 @dataclass(frozen=True)
-class DrawBoard(Command):
+class DrawBoard(PageCommand):
     """Draw the calibration board as a PDF to scale."""
 
     paper: str = "a4"
 
 
-class Calibrate(Command):
+class Calibrate(PageCommand):
     """Begin the guided calibration, or continue it."""
 
 
-class PauseCalibration(Command):
+class PauseCalibration(PageCommand):
     """Take no more shots for now."""
 
 
-class TakeShot(Command):
+class TakeShot(PageCommand):
     """Take a shot of the board as it is now."""
 
 
 @dataclass(frozen=True)
-class DropShot(Command):
+class DropShot(PageCommand):
     """Leave out a shot."""
 
     name: str
 
 
-class FinishCalibration(Command):
+class FinishCalibration(PageCommand):
     """Choose the lens model by held-out errors, and write rig.json."""
 
 
 @dataclass(frozen=True)
-class SetAim(Command):
+class SetAim(PageCommand):
     """Say what the calibration is to be good for."""
 
     error_mm: float
@@ -149,101 +149,101 @@ class SetAim(Command):
 
 
 @dataclass(frozen=True)
-class UseBody(Command):
+class UseBody(PageCommand):
     """Use a body file, or the board, as what is measured."""
 
     target: str
 
 
 @dataclass(frozen=True)
-class DrawBody(Command):
+class DrawBody(PageCommand):
     """Draw the body as a PDF to scale."""
 
     paper: str = "a4"
 
 
-class Zero(Command):
+class Zero(PageCommand):
     """Show poses relative to the present one."""
 
 
-class ClearZero(Command):
+class ClearZero(PageCommand):
     """Show poses in the left camera's frame again."""
 
 
-class PivotTip(Command):
+class PivotTip(PageCommand):
     """Collect poses for the calibration of a tip that stands still; a second time: compute it."""
 
 
-class MarkPosition(Command):
+class MarkPosition(PageCommand):
     """Mark the present position: distances are measured from it."""
 
 
-class RecordPoses(Command):
+class RecordPoses(PageCommand):
     """Write every measured pose to a new file; a second time: stop."""
 
 
-class OpenArm(Command):
+class OpenArm(PageCommand):
     """Connect to the arm's board; the drives stay as they are."""
 
 
 @dataclass(frozen=True)
-class RunMotions(Command):
+class RunMotions(PageCommand):
     """Calibrate hand and eye and make the motions; ``closed``: a second time with the loop closed on vision."""
 
     closed: bool = True
 
 
 @dataclass(frozen=True)
-class UseSecondBody(Command):
+class UseSecondBody(PageCommand):
     """Measure a second body too, and each relative to the other; an empty ``target`` ends it."""
 
     target: str
 
 
-class TakePose(Command):
+class TakePose(PageCommand):
     """Take the pose in which the arm rests now for the hand-eye calibration."""
 
 
-class GuideHandEye(Command):
+class GuideHandEye(PageCommand):
     """Let the arm visit the poses of the hand-eye calibration by itself."""
 
 
-class GoToStart(Command):
+class GoToStart(PageCommand):
     """Move the arm slowly to where the motions start, as after a stop."""
 
 
-class ClearHandEye(Command):
+class ClearHandEye(PageCommand):
     """Forget the hand-eye calibration and its poses."""
 
 
-class Identify(Command):
+class Identify(PageCommand):
     """Identify the arm from the poses of the hand-eye calibration."""
 
 
 @dataclass(frozen=True)
-class UseArm(Command):
+class UseArm(PageCommand):
     """Use another model of the arm: a name, a TOML or a URDF file, such as the corrected one."""
 
     arm: str
 
 
 @dataclass(frozen=True)
-class UseMotion(Command):
+class UseMotion(PageCommand):
     """Use the motions of another file."""
 
     path: str
 
 
-class Hold(Command):
+class Hold(PageCommand):
     """Bring the arm to rest and hold it."""
 
 
-class ClearStop(Command):
+class ClearStop(PageCommand):
     """Allow the drives again after a stop; they stay off until the next motion."""
 
 
 @dataclass(frozen=True)
-class PersonAction(Command):
+class PersonAction(PageCommand):
     """What the simulated person does: cover_left, cover_right, uncover, unplug, plug, knock, board, no_board."""
 
     action: str
@@ -252,7 +252,7 @@ class PersonAction(Command):
 _KINDS = {"str": str, "float": float, "bool": bool}
 
 
-def command_of(text: str) -> Command:
+def command_of(text: str) -> PageCommand:
     """Read a command.
 
     Args:

@@ -24,7 +24,7 @@ from armsight.app.live.capture import CameraCapture, LiveShot
 from armsight.app.live.guide import CalibrationAim
 from armsight.app.live.measuring import MeasureState, MeasureStep
 from armsight.app.live.quality import FlickerWatch, ImageQuality, image_quality, quality_notes, same_camera
-from armsight.app.live.records import Command, Event
+from armsight.app.live.records import Event, PageCommand
 from armsight.app.live.simulated import ACTIONS, SimulatedCameras
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK
 from armsight.app.show.messages import Note
@@ -384,7 +384,7 @@ class LiveSession:
         with self._lock:
             return tuple(event for event in self._events if event.number > after)
 
-    def execute(self, command: Command) -> None:
+    def execute(self, command: PageCommand) -> None:
         """Carry out a command; what takes long is done in the background, and events say how it ended.
 
         Raises:
@@ -394,7 +394,7 @@ class LiveSession:
         if isinstance(command, records.RunMotions | records.GuideHandEye | records.GoToStart):
             self._held = ""
 
-    def _actions(self) -> dict[type[Command], Callable[..., None]]:
+    def _actions(self) -> dict[type[PageCommand], Callable[..., None]]:
         """Return what each command does."""
         calibration, measuring, arm = self.calibration, self.measuring, self.arm
         return {

@@ -47,7 +47,7 @@ class Lines:
     Attributes:
         lines: plain text.
         title: stands above them on the terminal, where they are indented; empty: they are not.
-        most: so many are printed; the page has them all.
+        most: so many are printed, and how many more there are; 0: none; the page has them all.
         none: what is said instead where there are none.
     """
 
@@ -224,9 +224,13 @@ def _printed(block: Lines) -> list[str]:
     """Return lines as a terminal shows them."""
     if not block.lines:
         return [block.none] if block.none else []
+    if block.most == 0:
+        return []
     if not block.title:
         return list(block.lines)
-    return ["", block.title, *(f"  {line}" for line in block.lines[: block.most])]
+    shown = [f"  {line}" for line in block.lines[: block.most]]
+    more = len(block.lines) - len(shown)
+    return ["", block.title, *shown, *([f"  and {more} more"] if more else [])]
 
 
 def assessment(headlines: Sequence[str], meaning: str = "", grade: str = "") -> str:
