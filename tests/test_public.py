@@ -25,7 +25,6 @@ from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.geometry.rotation import euler_zyx, from_euler_zyx
 from armsight.sim.example_rig import BOARD, demo_recording
 from armsight.vision.pose.shot_pose import CSV_COLUMNS
-from armsight.vision.sources import Source
 from made_once import made_once
 from strategies import ordinary_rig
 
@@ -100,7 +99,7 @@ def test_a_source_is_iterated_counted_and_indexed(boards):
 
 
 def test_pictures_to_a_rig_to_a_table(boards):
-    found = calibrate(BOARD, str(boards / "board"), models=("brown5",))
+    found = calibrate(BOARD, boards / "board", models=("brown5",))
     assert re.match(r"Calibration\(12 of 12 pairs; held out 0\.\d+ px epipolar, 0\.\d+ mm; brown5, ", repr(found))
     rig = found.rig
     rig.save(boards / "found.json")
@@ -117,29 +116,45 @@ def test_pictures_to_a_rig_to_a_table(boards):
     np.testing.assert_allclose(one.position_mm, 1e3 * np.array([columns[f"{axis}_m"][0] for axis in "xyz"]), atol=1e-9)
 
 
+class Lost:
+    """The least that a source is; it is not closed by whom it is lent to."""
+
+    def __init__(self, shots):
+        self.count, self.rest, self.closed = len(shots), list(shots), False
+
+    def read(self):
+        return self.rest.pop() if self.rest else None
+
+    def close(self):
+        self.closed = True
+
+
 def test_a_missed_shot_stays_in_the_table():
-    class Dark(Source):
-        count, rest = 1, [Shot("a", None, None, None, "lost")]
-
-        def read(self):
-            return self.rest.pop() if self.rest else None
-
-        def close(self):
-            pass
-
-    table = measure_all(ordinary_rig(), BOARD, Dark())
-    assert (table[0].reason, len(table)) == ("lost", 1)
+    source = Lost([Shot("a", None, None, None, "lost")])
+    table = measure_all(ordinary_rig(), BOARD, source)
+    assert (table[0].reason, len(table), source.closed) == ("lost", 1, False)
     assert np.isnan(table.columns()["x_m"][0])
-    Dark.rest = [Shot("a", None, None, None, "lost")]
     with pytest.raises(ArmsightError, match="no pair of images: shot a: lost"):
-        calibrate(BOARD, Dark())
+        calibrate(BOARD, Lost([Shot("a", None, None, None, "lost")]))
 
 
 @pytest.mark.parametrize(
-    "wrong", ["target, rig, shot", "'rig.json', target, shot", "rig, 'board', shot", "rig, target, None"]
+    "call",
+    [
+        "measure(target, rig, shot)",
+        "measure('rig.json', target, shot)",
+        "measure(rig, 'board', shot)",
+        "measure(rig, target, None)",
+        "measure_all(rig, target.body, source)",
+        "measure_all(target, target, source)",
+        "measure_all(rig, target, shot)",
+        "calibrate(target.body, source)",
+        "calibrate(target, rig)",
+    ],
 )
-def test_wrong_arguments_are_named(wrong):
+def test_wrong_arguments_are_named(call):
     given = {"rig": ordinary_rig(), "target": open_target(BOARD), "shot": Shot("a", None, None, None, "lost")}
     assert measure(**given) == Missed("lost")
-    with pytest.raises(ArmsightError, match=r"measure\(rig, target, shot\): (rig|target|shot) is a \w+; expected \w+"):
-        eval(f"measure({wrong})", {"measure": measure, **given})
+    names = {"measure": measure, "measure_all": measure_all, "calibrate": calibrate, "source": Lost([given["shot"]])}
+    with pytest.raises(ArmsightError, match=r"^\w+\([a-z, ]+\): (rig|target|board|shot|source) is a \w+; expected \w+"):
+        eval(call, names | given)

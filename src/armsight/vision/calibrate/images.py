@@ -8,6 +8,7 @@ calibration.rig.save("rig.json")
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 from armsight.errors import InputError
 from armsight.vision.calibrate import FOLDS, MODELS
@@ -16,12 +17,13 @@ from armsight.vision.calibrate.result import Calibration
 from armsight.vision.image import grey
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.marker import CalibrationBoard
-from armsight.vision.sources import Source, open_source
+from armsight.vision.pose.measure import require_arguments
+from armsight.vision.sources import Source, lent
 
 
 def calibrate(
     board: CalibrationBoard | str,
-    source: Source | str,
+    source: Source | str | Path,
     *,
     models: tuple[str, ...] = MODELS,
     flat: bool = False,
@@ -34,7 +36,7 @@ def calibrate(
 
     Args:
         board: the board, or its text as the command line takes it.
-        source: the pairs, or the text that :func:`~armsight.vision.sources.open_source` opens.
+        source: the pairs, or what :func:`~armsight.vision.sources.open_source` opens; a source that was open stays open.
         models: distortion models to choose from by held-out error.
         flat: hold the board to its drawing.
         folds: how many parts the pairs are split into for the held-out errors.
@@ -49,8 +51,9 @@ def calibrate(
     """
     board = open_board(board) if isinstance(board, str) else board
     pairs, sizes, problem = list[Pair](), None, "it has no shots"
-    with open_source(source) if isinstance(source, str) else source as shots:
-        for shot in shots:
+    with lent(source) as shots:
+        require_arguments("calibrate(board, source)", board=board, source=shots)
+        for shot in iter(shots.read, None):
             if shot.left is None or shot.right is None:
                 problem = f"shot {shot.name}: {shot.problem}"
                 continue

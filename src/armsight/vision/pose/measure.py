@@ -7,6 +7,7 @@ estimate = measure(rig, target, open_source("recording").read())
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -48,7 +49,7 @@ def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed
     Raises:
         InputError: an argument has another type.
     """
-    _require_arguments(rig, target, shot)
+    require_arguments("measure(rig, target, shot)", rig=rig, target=target, shot=shot)
     if shot.problem is not None or shot.left is None or shot.right is None:
         return Missed(shot.problem or "no image")
     images = (shot.left, shot.right)
@@ -63,15 +64,22 @@ def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed
     return replace(result, reason="; ".join([result.reason, *dark]))
 
 
-def _require_arguments(rig: object, target: object, shot: object) -> None:
+#: Argument -> whether a value is one, and what opens one.
+_ARGUMENTS: dict[str, tuple[Callable[[object], bool], str]] = {
+    "rig": (lambda value: isinstance(value, StereoRig), 'StereoRig.load("rig.json")'),
+    "target": (lambda value: hasattr(value, "detect"), 'open_target("chessboard:9x6:25mm")'),
+    "board": (lambda value: hasattr(value, "codes"), 'open_board("chessboard:9x6:25mm")'),
+    "shot": (lambda value: isinstance(value, Shot), 'open_source("recording").read()'),
+    "source": (lambda value: hasattr(value, "read") and hasattr(value, "count"), 'open_source("recording")'),
+}
+
+
+def require_arguments(call: str, **given: object) -> None:
     """Raise an InputError that names the argument of a wrong type, and what opens a right one."""
-    for name, value, fits, opener in (
-        ("rig", rig, isinstance(rig, StereoRig), 'StereoRig.load("rig.json")'),
-        ("target", target, hasattr(target, "detect"), 'open_target("chessboard:9x6:25mm")'),
-        ("shot", shot, isinstance(shot, Shot), 'open_source("recording").read()'),
-    ):
-        if not fits:
-            raise InputError(f"measure(rig, target, shot): {name} is a {type(value).__name__}; expected {opener}")
+    for name, value in given.items():
+        fits, opener = _ARGUMENTS[name]
+        if not fits(value):
+            raise InputError(f"{call}: {name} is a {type(value).__name__}; expected {opener}")
 
 
 def _measured(

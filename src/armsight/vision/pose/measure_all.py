@@ -11,16 +11,16 @@ from pathlib import Path
 
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_target
-from armsight.vision.pose.measure import measure
+from armsight.vision.pose.measure import measure, require_arguments
 from armsight.vision.pose.shot_pose import ShotPose, ShotPoses, shot_pose
 from armsight.vision.rig import StereoRig
-from armsight.vision.sources import Source, open_source
+from armsight.vision.sources import Source, lent
 
 
 def measure_all(
     rig: StereoRig | str | Path,
     target: Target | str,
-    source: Source | str,
+    source: Source | str | Path,
     *,
     progress: Callable[[int, int | None], None] = lambda done, total: None,
 ) -> ShotPoses:
@@ -29,7 +29,7 @@ def measure_all(
     Args:
         rig: the calibrated pair, or its file.
         target: the body to find, or its text as the command line takes it.
-        source: the shots, or the text that :func:`~armsight.vision.sources.open_source` opens.
+        source: the shots, or what :func:`~armsight.vision.sources.open_source` opens; a source that was open stays open.
         progress: called after each shot with how many are done, and how many there are (None: not known).
 
     Returns:
@@ -41,9 +41,10 @@ def measure_all(
     """
     rig = StereoRig.load(rig) if isinstance(rig, str | Path) else rig
     target = open_target(target) if isinstance(target, str) else target
-    poses: list[ShotPose] = []
-    with open_source(source) if isinstance(source, str) else source as shots:
-        for shot in shots:
+    poses = list[ShotPose]()
+    with lent(source) as shots:
+        require_arguments("measure_all(rig, target, source)", rig=rig, target=target, source=shots)
+        for shot in iter(shots.read, None):
             poses.append(shot_pose(shot.name, shot.t_s, target.body, measure(rig, target, shot)))
             progress(len(poses), shots.count)
     return ShotPoses(tuple(poses))

@@ -11,8 +11,10 @@ The contract is in ``vision/source.py``; :func:`open_source` opens a spec.
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 from armsight.errors import InputError
 from armsight.vision.source import Source
@@ -24,7 +26,7 @@ from armsight.vision.sources.pairs import PairsSource
 from armsight.vision.sources.usb import open_usb
 from armsight.vision.sources.video import open_video
 
-__all__ = ["SOURCES", "FolderSource", "PairsSource", "Source", "check_source", "notes_of", "open_source"]
+__all__ = ["SOURCES", "FolderSource", "PairsSource", "Source", "check_source", "lent", "notes_of", "open_source"]
 
 
 def _open_url(rest: str) -> Source:
@@ -75,6 +77,16 @@ def open_source(spec: str) -> Source:
     check_source(spec)
     kind, colon, rest = spec.partition(":")
     return SOURCES[kind](rest) if colon and kind in SOURCES else FolderSource.open(spec)
+
+
+@contextlib.contextmanager
+def lent(source: Source | str | Path) -> Iterator[Source]:
+    """Open what :func:`open_source` opens for a block; a source that is open already stays open."""
+    if not isinstance(source, str | Path):
+        yield source
+        return
+    with contextlib.closing(open_source(str(source))) as opened:
+        yield opened
 
 
 def notes_of(source: Source) -> tuple[str, ...]:

@@ -382,7 +382,7 @@ def search(
                     if _known(x, y, best, starts, codes, mine):
                         continue
                     if n == len(starts):
-                        return n, large
+                        return n, True  # the rest was not looked at
                     codes[n], signs[n] = outline(image, x, y, int(image[y, x - 8]), sign, starts[n], room, REACH), sign
                     if codes[n] == 0:
                         _note(n, starts, mine)
