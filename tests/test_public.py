@@ -90,7 +90,7 @@ def test_a_hand_eye_calibration_prints_its_error_and_sigma():
 
 
 def test_a_source_is_iterated_counted_and_indexed(boards):
-    with open_source(str(boards / "board")) as source:
+    with open_source(boards / "board") as source:
         assert len(source) == 12
         assert source[3].name == "003"
         assert [shot.name for shot in source] == [f"{k:03d}" for k in range(12)]

@@ -19,7 +19,7 @@ from armsight.vision.sources import Source, lent
 
 def measure_all(
     rig: StereoRig | str | Path,
-    target: Target | str,
+    target: Target | str | Path,
     source: Source | str | Path,
     *,
     progress: Callable[[int, int | None], None] = lambda done, total: None,
@@ -40,7 +40,7 @@ def measure_all(
         DeviceError: a camera is gone.
     """
     rig = StereoRig.load(rig) if isinstance(rig, str | Path) else rig
-    target = open_target(target) if isinstance(target, str) else target
+    target = open_target(str(target)) if isinstance(target, str | Path) else target
     poses = list[ShotPose]()
     with lent(source) as shots:
         require_arguments("measure_all(rig, target, source)", rig=rig, target=target, source=shots)

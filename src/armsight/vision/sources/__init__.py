@@ -63,7 +63,7 @@ def check_source(spec: str) -> None:
         raise InputError(f"{spec}: not a source{hint}: known are {known}, or the path of a folder")
 
 
-def open_source(spec: str) -> Source:
+def open_source(spec: str | Path) -> Source:
     """Open a source.
 
     Args:
@@ -74,7 +74,7 @@ def open_source(spec: str) -> Source:
         InputError: an unknown kind, or what is named is not there or not usable.
         DeviceError: a camera does not answer.
     """
-    check_source(spec)
+    check_source(spec := str(spec))
     kind, colon, rest = spec.partition(":")
     return SOURCES[kind](rest) if colon and kind in SOURCES else FolderSource.open(spec)
 
@@ -85,7 +85,7 @@ def lent(source: Source | str | Path) -> Iterator[Source]:
     if not isinstance(source, str | Path):
         yield source
         return
-    with contextlib.closing(open_source(str(source))) as opened:
+    with contextlib.closing(open_source(source)) as opened:
         yield opened
 
 
