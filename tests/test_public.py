@@ -96,6 +96,10 @@ def test_a_source_is_iterated_counted_and_indexed(boards):
         assert [shot.name for shot in source] == [f"{k:03d}" for k in range(12)]
         assert list(source) == []
         assert source
+        assert [shot.name for shot in source[2:8:3]] == ["002", "005"]
+        assert repr(source) == "FolderSource(12 shots)"
+        with pytest.raises(ArmsightError, match="no shot left"):
+            measure_all(ordinary_rig(), BOARD, source)
 
 
 def test_pictures_to_a_rig_to_a_table(boards):
@@ -158,3 +162,27 @@ def test_wrong_arguments_are_named(call):
     names = {"measure": measure, "measure_all": measure_all, "calibrate": calibrate, "source": Lost([given["shot"]])}
     with pytest.raises(ArmsightError, match=r"^\w+\([a-z, ]+\): (rig|target|board|shot|source) is a \w+; expected \w+"):
         eval(call, names | given)
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        ({"models": ("brown",)}, "models is .'brown',.: expected some of"),
+        ({"models": "brown5"}, "models is 'brown5': expected some of"),
+        ({"models": ()}, "models is ..: expected some of"),
+        ({"folds": 1}, "folds is 1: expected 2 or more"),
+    ],
+)
+def test_a_wrong_choice_of_models_or_folds_is_rejected_before_working(choice, message):
+    with pytest.raises(ArmsightError, match=message):
+        armsight.calibrate_boards(armsight.open_board(BOARD), [], ((480, 270), (480, 270)), **choice)
+
+
+def test_paths_are_taken_wherever_texts_are(tmp_path):
+    path = tmp_path / "points.csv"
+    path.write_text("marker,x_m,y_m,z_m\nA,0,0,0\nB,0.1,0,0\nC,0,0.1,0\n")
+    assert armsight.open_body(path).point_names == ("A", "B", "C")
+    with pytest.raises(ArmsightError, match="a CSV body has points"):
+        open_target(path)
+    with pytest.raises(ArmsightError, match="unknown board"):
+        armsight.open_board(path)

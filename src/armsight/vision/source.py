@@ -37,7 +37,7 @@ class Source(Protocol):
         ...
 
     def __iter__(self) -> Iterator[Shot]:
-        """Read the shots that are left, one after another."""
+        """Read the shots that are left, one after another: none, where all were read."""
         while (shot := self.read()) is not None:
             yield shot
 
@@ -46,6 +46,10 @@ class Source(Protocol):
         if self.count is None:
             raise TypeError("how many shots a video or live cameras have is not known before they end")
         return self.count
+
+    def __repr__(self) -> str:
+        """Return its kind, and how many shots it has."""
+        return f"{type(self).__name__}({self.count} shots)" if self.count is not None else f"{type(self).__name__}()"
 
     def __bool__(self) -> bool:
         """Return True: a source without a shot, or of unknown length, is a source."""

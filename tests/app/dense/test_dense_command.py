@@ -65,6 +65,7 @@ def test_a_rectified_pair(dense, flat, tmp_path, method):
     }  # fmt: skip
 
 
+@pytest.mark.opencv
 def test_floats_are_read_as_grey_levels(dense, flat, tmp_path):
     left, right, truth = flat
     cv2.imwrite(str(tmp_path / "left.tiff"), cv2.imread(str(left), cv2.IMREAD_UNCHANGED).astype(np.float32))
@@ -205,6 +206,7 @@ def test_a_depth_too_near_is_reported(dense, seen, tmp_path):
     assert_rejected(dense(folder / "rig.json", *pair[::-1], "-o", tmp_path / "out"), "by the rig")
 
 
+@pytest.mark.opencv
 def test_evaluation_has_every_method_and_metric(dense, flat, tmp_path):
     left, right, truth = flat
     scene = tmp_path / "scenes" / "Wall"

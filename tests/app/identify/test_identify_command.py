@@ -74,7 +74,9 @@ def test_a_person_reads_the_held_out_line_first(tmp_path, capsys):
     assert "in five rounds" in lines[0]
     assert len(lines) <= 25
     assert "not fitted, or not alone" not in answer.out
-    assert re.search(r"^\d+ more are fitted, \d+ are not \(-v lists all\)$", answer.out, re.MULTILINE)
+    assert re.search(
+        r"^\d+ more are fitted beside base and tool, \d+ are not \(-v lists all\)$", answer.out, re.MULTILINE
+    )
     few = poses_csv(tmp_path / "few.csv", n=24)
     everything = said(capsys, "--arm", "six_r", "--data", few, "-v").out
     assert "not fitted, or not alone" in everything

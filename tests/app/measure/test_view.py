@@ -220,6 +220,7 @@ def run_of_shots(folder, total, count, odd=(), way=None):
     return view, {int(path.stem.removeprefix("view-")) for path in folder.glob("view-*.png")}
 
 
+@pytest.mark.opencv
 def test_a_short_run_is_shown_whole_and_a_long_one_in_part(stub, tmp_path):
     assert run_of_shots(tmp_path / "a", EACH_UP_TO, EACH_UP_TO)[1] == set(range(60))
     view, pictures = run_of_shots(tmp_path / "b", 150, 150, odd={7, 8, 100})

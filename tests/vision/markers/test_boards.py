@@ -221,6 +221,7 @@ def test_a_strongly_sharpened_chessboard_is_found_without_its_covered_corner():
     assert np.sqrt(np.mean(off.min(axis=1) ** 2)) < 0.2
 
 
+@pytest.mark.opencv
 def test_a_chessboard_out_of_focus_in_a_large_image_is_as_exact_as_it_is_said_to_be():
     camera = Camera((1600, 1200), "brown4", np.array([1750.0, 1750.0, 800.0, 600.0]), np.zeros(4))
     T = pose(exp_so3(np.array([0.3, -0.2, 0.4])), np.array([-0.06, -0.08, 0.6]))
@@ -261,6 +262,7 @@ def test_part_of_an_aprilgrid_will_do_and_a_covered_tag_is_not_made_up():
     assert np.abs(found.uv - truth[found.ids]).max() < 0.1
 
 
+@pytest.mark.opencv
 @pytest.mark.parametrize("kind", ["charuco", "aprilgrid"])
 def test_markers_in_the_dark_are_found_where_they_are(kind):
     target, image, truth = painted(kind, 0.3, 0.1, samples=4)

@@ -281,6 +281,7 @@ def test_real_devices_that_are_not_there_or_no_cameras(tmp_path):
         open_source(f"usb:{tmp_path}/file,98")
 
 
+@pytest.mark.opencv
 def test_the_jpeg_of_a_camera_is_kept_as_it_came(usb_pair):
     """OpenCV hands out the driver's buffer, behind the frame the rest of an older and longer one."""
     scene = np.random.default_rng(8).integers(0, 255, (480, 640, 3), np.uint8)

@@ -229,7 +229,7 @@ def identify_report(run: Identification, *, everything: bool = False) -> Report:
     backlashes = joint_backlashes(found, run.measured)
     backlash = [f"joint {p.joint + 1}  {_backlash_text(p)}" for p in backlashes]
     wide, most = max((len(source) for source, _ in parts), default=0), None if everything else _SOURCES
-    moved = "displacement of the tool by each error source, RMS, beyond what the sources before it explain:"
+    moved = "displacement of the tool by each error source as selected, RMS, beyond what those before explain:"
     pairs = [f"{a} and {b}: {c:+.3f}" for a, b, c in found.correlated()]
     result: list[Block] = [
         Fact(fact, _values(run)),
@@ -390,7 +390,7 @@ def _printed(run: Identification, *, everything: bool) -> list[Block]:
         return [shown, Text("\n".join(["\nnot fitted, or not alone:", *(f"  {line}" for line in _not_fitted(run))]))]
     first = sorted(k for k in np.argsort(sizes)[-_PARAMETERS:] if sizes[k] > 2)  # sigmas
     table_shown = Text("\n" + plain_text(TextTable("", head, tuple(rows[k] for k in first))).strip("\n"))
-    more = f"{len(rows) - len(first)} more are fitted, {left} are not (-v lists all)"
+    more = f"{len(rows) - len(first)} more are fitted beside base and tool, {left} are not (-v lists all)"
     return [table_shown, Text(more)] if first else [Text(f"\n{more}")]
 
 

@@ -1,7 +1,7 @@
 """Calibration: detections of pairs of images go in, a rig with its covariance and held-out errors comes out.
 
-``boards.py`` calibrates cameras from a board, ``bodies.py`` the relative pose of known cameras from a known body; both
-return a :class:`~armsight.vision.calibrate.result.Calibration`.
+``images.py`` calibrates cameras from the images of a source, ``boards.py`` from detections of a board, ``bodies.py`` the
+relative pose of known cameras from a known body; all return a :class:`~armsight.vision.calibrate.result.Calibration`.
 
 - ``start.py``: focal lengths and poses from nothing. ``screen.py``: robust rejection of gross errors.
 - ``motion.py``: motion of the board between the two exposures of a pair.

@@ -30,7 +30,15 @@ from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.vision.calibrate import FOLDS, MODELS
-from armsight.vision.calibrate.heldout import cross_validate, residual_epipolar_rms, rig_of, scaled, summary, unfinished
+from armsight.vision.calibrate.heldout import (
+    cross_validate,
+    require_choice,
+    residual_epipolar_rms,
+    rig_of,
+    scaled,
+    summary,
+    unfinished,
+)
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.calibrate.result import Calibration, HeldOutErrors, PairErrors, RejectedPair
 from armsight.vision.calibrate.screen import (
@@ -371,6 +379,7 @@ def calibrate_boards(
     Raises:
         CalibrationError: fewer than three usable pairs, or views that do not determine the cameras.
     """
+    require_choice(folds, models)
     points = board.body.points
     usable, rejected = _usable(pairs)
     _enough(len(usable), len(pairs), rejected)

@@ -22,6 +22,7 @@ from armsight.vision.calibrate import FOLDS
 from armsight.vision.calibrate.heldout import (
     cross_validate,
     folds_of,
+    require_choice,
     residual_epipolar_rms,
     rig_of,
     scaled,
@@ -77,6 +78,7 @@ def calibrate_bodies(
     Raises:
         CalibrationError: too few shots, or no relative pose that they agree on.
     """
+    require_choice(folds)
     progress("looking for the body in every image")
     found = [candidates(body.points, cameras, shot) for shot in shots]
     progress("estimating the relative pose of the cameras")

@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Correspondences
-from armsight.errors import CalibrationError
+from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
+from armsight.vision.calibrate import MODELS
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.calibrate.result import HeldOutErrors, PairErrors
+from armsight.vision.camera import DISTORTION_MODELS
 from armsight.vision.discs.bias import disc_bias
 from armsight.vision.match import epipolar_distances
 from armsight.vision.pose.bundle import BundleSolution, Observations
@@ -167,6 +169,14 @@ def _range(A: Array) -> Array:
     """Return orthonormal columns that span those of A (M, 6): fewer than six where points lie on a line."""
     U, sizes, _ = np.linalg.svd(A, full_matrices=False)
     return np.asarray(U[:, sizes > 1e-15 * sizes[0]])
+
+
+def require_choice(folds: int, models: tuple[str, ...] = MODELS) -> None:
+    """Raise an InputError unless there are parts to hold out, and distortion models to choose from."""
+    if folds < 2:
+        raise InputError(f"folds is {folds}: expected 2 or more, as each part is held out of a fit to the others")
+    if not models or any(model not in DISTORTION_MODELS for model in models):
+        raise InputError(f"models is {models!r}: expected some of {MODELS}")
 
 
 def folds_of(count: int, folds: int) -> list[NDArray[np.intp]]:

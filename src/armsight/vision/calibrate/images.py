@@ -50,7 +50,7 @@ def calibrate(
         CalibrationError: fewer than three usable pairs, or views that do not determine the cameras.
     """
     board = open_board(board) if isinstance(board, str) else board
-    pairs, sizes, problem = list[Pair](), None, "it has no shots"
+    pairs, sizes, problem = list[Pair](), None, "no shot is left in it: open it again, or take source[:]"
     with lent(source) as shots:
         require_arguments("calibrate(board, source)", board=board, source=shots)
         for shot in iter(shots.read, None):

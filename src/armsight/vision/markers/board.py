@@ -70,7 +70,7 @@ def kalibr_spec(path: str) -> str:
     return f"{board}:{numbers[0]:.0f}x{numbers[1]:.0f}:{numbers[2]:.9g}m{tail}"
 
 
-def open_board(spec: str) -> CalibrationBoard:
+def open_board(spec: str | Path) -> CalibrationBoard:
     """Make the board that a spec names.
 
     Args:
@@ -80,6 +80,7 @@ def open_board(spec: str) -> CalibrationBoard:
     Raises:
         InputError: unknown kind or malformed fields; the message shows the form and the known kinds.
     """
+    spec = str(spec)
     if Path(spec).suffix.lower() in KALIBR and Path(spec).suffix != spec:
         spec = kalibr_spec(spec)
     kind, *values = spec.strip().split(":")

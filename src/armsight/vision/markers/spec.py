@@ -29,7 +29,7 @@ class Fields:
     def __post_init__(self) -> None:
         """Check how many fields there are."""
         if len(self.values) < self._count or (len(self.values) > self._count and "[" not in self.form):
-            raise self.error(f"has {len(self.values)} fields after its kind")
+            raise self.error(f"has {len(self.values)} field{'s' * (len(self.values) != 1)} after its kind")
 
     @property
     def _count(self) -> int:

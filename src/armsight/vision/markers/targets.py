@@ -93,7 +93,7 @@ def load_body_toml(path: str | Path) -> Target:
     return target
 
 
-def open_target(spec: str) -> Target:
+def open_target(spec: str | Path) -> Target:
     """Make a target that can be found in images.
 
     Args:
@@ -102,7 +102,7 @@ def open_target(spec: str) -> Target:
     Raises:
         InputError: neither, malformed, or a CSV body, which has points but no description of its markers.
     """
-    kind = _kind(spec)
+    kind = _kind(spec := str(spec))
     if kind == ".csv":
         raise InputError(
             f"{spec}: a CSV body has points but no description of its markers, so it cannot be found in images; give "
@@ -170,13 +170,13 @@ def _is_board_file(path: str) -> bool:
     return "board" in read_toml(path)
 
 
-def open_body(spec: str) -> Body:
+def open_body(spec: str | Path) -> Body:
     """Return the body that a board's spec, a TOML body file or a CSV of points describes.
 
     Raises:
         InputError: none of these, or malformed.
     """
-    return load_body_csv(spec) if _kind(spec) == ".csv" else open_target(spec).body
+    return load_body_csv(spec) if _kind(str(spec)) == ".csv" else open_target(spec).body
 
 
 def _kind(spec: str) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from armsight.errors import InputError
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_target
 from armsight.vision.pose.measure import measure, require_arguments
@@ -36,15 +37,19 @@ def measure_all(
         A row a shot, missed ones included, each with its reason.
 
     Raises:
-        InputError: a file or text is wrong, or an argument has another type.
+        InputError: a file or text is wrong, an argument has another type, or all shots were read before.
         DeviceError: a camera is gone.
     """
     rig = StereoRig.load(rig) if isinstance(rig, str | Path) else rig
-    target = open_target(str(target)) if isinstance(target, str | Path) else target
+    target = open_target(target) if isinstance(target, str | Path) else target
     poses = list[ShotPose]()
     with lent(source) as shots:
         require_arguments("measure_all(rig, target, source)", rig=rig, target=target, source=shots)
         for shot in iter(shots.read, None):
             poses.append(shot_pose(shot.name, shot.t_s, target.body, measure(rig, target, shot)))
             progress(len(poses), shots.count)
+    if not poses:
+        raise InputError(
+            "measure_all(rig, target, source): the source has no shot left: open it again, or take source[:]"
+        )
     return ShotPoses(tuple(poses))

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 
@@ -88,9 +89,13 @@ class StoredSource(Source):
         """The image files of all pairs."""
         return tuple(file for pair in self.pairs for file in (pair.left, pair.right) if file is not None)
 
-    def __getitem__(self, row: int) -> Shot:
-        """Load one shot by its row in the recording; what is read next stays."""
-        return self.pairs[row].load()
+    @overload
+    def __getitem__(self, row: int) -> Shot: ...
+    @overload
+    def __getitem__(self, row: slice) -> StoredSource: ...
+    def __getitem__(self, row: int | slice) -> Shot | StoredSource:
+        """Load a shot by its row in the recording, or return a source of some of them; what is read next here stays."""
+        return StoredSource(self.pairs[row]) if isinstance(row, slice) else self.pairs[row].load()
 
     def read(self) -> Shot | None:
         """Return the next shot, or None at the end."""
