@@ -57,7 +57,7 @@ from armsight.vision.discs.bias import apparent_radii
 from armsight.vision.markers.circles import unseen_row
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.match import join, renamed
-from armsight.vision.pose.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
+from armsight.vision.pose.bundle import NEAR, BundleModel, BundleSolution, BundleState, Observations, minimise
 from armsight.vision.pose.pnp import body_poses
 from armsight.vision.pose.projection import of_middles, smooth
 from armsight.vision.pose.shutter import TimedShot, aligned, at_one_time, estimate_shutters
@@ -299,10 +299,12 @@ class LensModelSearch(Record):
         """Adjust with the noise of the residuals and the estimated tolerances of the board and of its motion."""
         model, motion, sigma, modes = self.model, self.motion, 0.1, len(self.model.modes)
         observations = self.screened.observations
+        roughly: dict[str, Any] = {"max_steps": _STEPS, "least_decrease": _ROUGHLY}
         for _ in range(_NOISE_ROUNDS if motion is None else _MOTION_ROUNDS):
             if motion is not None:
                 model = replace(model, motion_sigmas=motion.sigmas)
-            solution = minimise(model, state, observations, sigma, max_steps=_STEPS, least_decrease=_ROUGHLY)
+            solution = minimise(model, state, observations, sigma, **roughly)
+            roughly["damping"] = NEAR
             state, freed = solution.state, _freed(model, solution)
             if modes:
                 posterior = np.diag(solution.cov_shared)[-modes:]
@@ -312,7 +314,7 @@ class LensModelSearch(Record):
                 motion, taken = motion.updated(solution)
                 freed += taken
             sigma = noise_px(solution, observations, freed)
-        return model, motion, minimise(model, state, observations, sigma)
+        return model, motion, minimise(model, state, observations, sigma, damping=NEAR)
 
     def _fold(
         self, model: BundleModel, motion: ExposureMotion | None, full: BundleSolution, rows: NDArray[np.intp]
@@ -323,7 +325,7 @@ class LensModelSearch(Record):
             motion = motion.shots(rows)
             model, state = replace(model, motion_sigmas=motion.sigmas), replace(state, motions=state.motions[rows])
         seen = self.screened.observations.shots(rows)
-        solution = minimise(model, state, seen, full.sigma_px, max_steps=_STEPS, least_decrease=_ROUGHLY)
+        solution = minimise(model, state, seen, full.sigma_px, max_steps=_STEPS, least_decrease=_ROUGHLY, damping=NEAR)
         if motion is not None:
             motion = motion.updated(solution)[0]
         return rig_of(solution), model.body(solution.state.shape), motion

@@ -16,7 +16,7 @@ from armsight.data import Array, Ids, Record
 from armsight.geometry.pose import inverse, transform
 from armsight.vision.calibrate.result import RejectedPair
 from armsight.vision.camera import Camera
-from armsight.vision.pose.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
+from armsight.vision.pose.bundle import DAMPING, NEAR, BundleModel, BundleSolution, BundleState, Observations, minimise
 from armsight.vision.pose.pnp import body_poses
 
 #: A corner this many standard deviations off the robust fit is gross: one in 10^7 for clean noise.
@@ -107,10 +107,10 @@ def screen(
     kept = np.setdiff1d(np.arange(observations.shot_count), list(known or ()))
     good = np.ones(len(observations.shot), bool)
     state, sigma = replace(start, Ts_left_body=start.Ts_left_body[kept]), sigma_px
-    for _ in range(_ROUNDS):
+    for k in range(_ROUNDS):
         rows = good & np.isin(observations.shot, kept)
         now = _renumbered(observations, rows, kept)
-        solution = minimise(_of_shots(model, kept), state, now, sigma)
+        solution = minimise(_of_shots(model, kept), state, now, sigma, damping=NEAR if k else DAMPING)
         new_sigma = robust_sigma(solution)
         distance = np.full(len(good), np.nan)
         distance[rows] = _whitened(solution, now)
@@ -136,7 +136,7 @@ def screen(
             which = " of both images" if len(set(observations.camera[mine])) > 1 else ""
             notes.append(f"{names[j]}: {lost} of {mine.sum()} points{which} {_DROPPED}")
     unscreened = _renumbered(observations, np.isin(observations.shot, kept), kept)
-    solution = minimise(_of_shots(model, kept), state, final, sigma)
+    solution = minimise(_of_shots(model, kept), state, final, sigma, damping=NEAR)
     return Screened(final, unscreened, kept, solution, tuple(rejected), tuple(notes))
 
 

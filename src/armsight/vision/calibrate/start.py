@@ -6,8 +6,6 @@ to be frontal, tilted or complete; several good starts are then adjusted and the
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +25,9 @@ _FOCAL_VIEWS = 12
 #: lens that imitates another one, to begin with.
 _FITS_PX, _IMITATES_PX = 0.1, 1.0
 _IMITATION_STEPS = 10
+#: Two starts whose costs differ by less than this share lead to one minimum; half: a third is tried now and then, double:
+#: nothing, as other minima cost several times as much.
+_SAME_COST = 1e-3
 #: Relative poses closer than this, rad or share of the distance, are one hypothesis.
 _SAME_POSE = 0.1
 _MOST_HYPOTHESES = 600
@@ -63,6 +64,13 @@ def _focal_candidates(
     return [focal for _, focal in sorted(scores)[:_STARTS_KEPT]]
 
 
+def _apart(a: Array, b: Array, scale_m: float = 1.0) -> Array:
+    """Return (N, M) how far poses (N, 4, 4) and (M, 4, 4) are apart: distance over a scale, and angle in rad."""
+    cosine = (np.einsum("nij,mij->nm", a[:, :3, :3], b[:, :3, :3]) - 1) / 2
+    ways = np.linalg.norm(a[:, None, :3, 3] - b[None, :, :3, 3], axis=2)
+    return np.asarray(np.hypot(ways / scale_m, np.arccos(np.clip(cosine, -1, 1))))
+
+
 def relative_poses(left: list[list[Array]], right: list[list[Array]], scale_m: float) -> list[Array]:
     """Return the relative poses of two cameras that most shots agree on.
 
@@ -75,45 +83,35 @@ def relative_poses(left: list[list[Array]], right: list[list[Array]], scale_m: f
         A few different T_left_right (4, 4), the one with the widest agreement first; none where no shot has candidates
         in both cameras.
     """
-    pairs = [
-        (j, Tl @ inverse(Tr))
-        for j, (ls, rs) in enumerate(zip(left, right, strict=True))
-        for Tl, Tr in itertools.product(ls, rs)
-    ]
-    if not pairs:
+    each = [[Tl @ inverse(Tr) for Tl in ls for Tr in rs] for ls, rs in zip(left, right, strict=True)]
+    each = [of_shot for of_shot in each if of_shot]
+    if not each:
         return []
-    weights = np.r_[np.ones(3) / scale_m, np.ones(3)]
-    shots = np.array([j for j, _ in pairs])
-    Ts = np.stack([T for _, T in pairs])
+    Ts = np.stack([T for of_shot in each for T in of_shot])
     tried = np.arange(len(Ts))
     if len(tried) > _MOST_HYPOTHESES:
         tried = np.random.default_rng(0).choice(tried, _MOST_HYPOTHESES, replace=False)
-    costs = []
-    for i in tried:
-        distance = np.linalg.norm(log_se3(inverse(Ts[i]) @ Ts) * weights, axis=1)
-        best = np.full(len(left), np.inf)
-        np.minimum.at(best, shots, distance)
-        best = best[np.isfinite(best)]
-        costs.append(np.median(best) + 1e-3 * np.minimum(best, 1.0).mean())
-    chosen: list[Array] = []
+    first = np.cumsum([0, *(len(of_shot) for of_shot in each[:-1])])
+    best = np.minimum.reduceat(_apart(Ts[tried], Ts, scale_m), first, axis=1)
+    costs = np.median(best, axis=1) + 1e-3 * np.minimum(best, 1.0).mean(axis=1)
+    chosen = Ts[:0]
     for i in tried[np.argsort(costs)]:
-        apart = [np.linalg.norm(log_se3(inverse(T) @ Ts[i]) * weights) for T in chosen]
-        if all(a > _SAME_POSE for a in apart):
-            chosen.append(Ts[i])
+        if (_apart(chosen, Ts[i : i + 1], scale_m) > _SAME_POSE).all():
+            chosen = np.concatenate([chosen, Ts[i : i + 1]])
         if len(chosen) == _STARTS_KEPT:
             break
-    return chosen
+    return list(chosen)
 
 
 def _agreeing_poses(left: list[list[Array]], right: list[list[Array]], T_left_right: Array) -> list[Array] | None:
     """Return per shot the T_left_body that agrees best with a relative pose; None where a shot has no candidate."""
     chosen = []
     for ls, rs in zip(left, right, strict=True):
-        from_right = [T_left_right @ T for T in rs]
-        pairs = [(np.linalg.norm(log_se3(inverse(a) @ b)), i) for i, a in enumerate(ls) for b in from_right]
         if not (ls or rs):
             return None
-        chosen.append(ls[min(pairs)[1]] if pairs else (ls or from_right)[0])
+        from_right = [T_left_right @ T for T in rs]
+        best = _apart(np.stack(ls), np.stack(from_right)).min(axis=1).argmin() if ls and rs else 0
+        chosen.append((ls or from_right)[best])
     return chosen
 
 
@@ -213,9 +211,12 @@ def start_board(
         if state is None:
             continue
         solution = _staged(plain, state, observations)
-        if solution is not None and (best is None or solution.cost < best.cost):
+        if solution is None:
+            continue
+        again = best is not None and abs(solution.cost - best.cost) < _SAME_COST * best.cost
+        if best is None or solution.cost < best.cost:
             best = solution
-        if best is not None and fits(best):
+        if again or fits(best):
             break
     if best is None:
         raise CalibrationError("no start of the calibration fits the detections: are all images of the same board?")

@@ -21,12 +21,74 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids, Record
 from armsight.errors import CalibrationError
 from armsight.kernels import kernel
-from armsight.vision.pose.projection import BundleModel, BundleState, Observations, moved, predict
+from armsight.vision.pose.projection import (
+    BundleModel,
+    BundleState,
+    Observations,
+    derivatives,
+    moved,
+    predict,
+)
+
+
+@kernel(nogil=True)
+def _add(a: float, u: Array, b: float, v: Array, out: Array) -> None:
+    """Add a u + b v to out, as far as it goes."""
+    for j in range(out.size):
+        out[j] += a * u[j] + b * v[j]
+
+
+@kernel(
+    "const f8[:, :, ::1], const f8[:, :, ::1], const f8[:, ::1], (const i8[::1], const i8[::1], const i8[::1]), "
+    "(f8[:, :, :, ::1], f8[:, :, :, ::1], f8[:, :, :, ::1])",
+    nogil=True,
+)
+def _accumulate(J: Array, W: Array, r: Array, rows: tuple[Ids, Ids, Ids], sums: tuple[Array, Array, Array]) -> None:
+    """Add the products of every detection's weighted derivatives, the residual being one more column.
+
+    Args:
+        J: (N, 2, m) derivatives, those by the point last.
+        W: (N, 2, 2) weights.
+        r: (N, 2) weighted residuals.
+        rows: camera, point and shot of each, (N,).
+        sums: of each shot and camera (S, 2, m - 2, m - 2) without the point, upper triangles; of each point and camera, its
+            three derivatives by all (M, 2, 3, m + 1), residual before point; of each shot its own k by each point
+            (S, M, k, 3).
+    """
+    shots, points, cross = sums
+    m, k = J.shape[2] - 3, cross.shape[2]
+    u, v = np.empty(m + 4), np.empty(m + 4)
+    for row in range(J.shape[0]):
+        side, p, s = rows[0][row], rows[1][row], rows[2][row]
+        w = W[row]
+        for c in range(m + 3):
+            at = c if c < m else c + 1
+            u[at], v[at] = (
+                w[0, 0] * J[row, 0, c] + w[0, 1] * J[row, 1, c],
+                w[1, 0] * J[row, 0, c] + w[1, 1] * J[row, 1, c],
+            )
+        u[m], v[m] = r[row, 0], r[row, 1]
+        for i in range(m):
+            _add(u[i], u[i:], v[i], v[i:], shots[s, side, i, i:])
+        for i in range(m + 1, m + 4):
+            _add(u[i], u, v[i], v, points[p, side, i - m - 1])
+        for i in range(k):
+            _add(u[m - k + i], u[m + 1 :], v[m - k + i], v[m + 1 :], cross[s, p, i])
+
+
+def _whole(upper: Array) -> Array:
+    """Return symmetric matrices (..., K, K) of their upper triangles, zero below."""
+    return upper + np.triu(upper, 1).swapaxes(-1, -2)
 
 
 def _flat(blocks: Array) -> Array:
     """Return blocks (S, K, Q) one below the other, (S K, Q)."""
     return blocks.reshape(blocks.shape[0] * blocks.shape[1], blocks.shape[2])
+
+
+#: Least diagonal element of the Cholesky factor of a scaled system that is solved by LU; half: systems of which rounding
+#: leaves no digit are, double: more least-norm solutions, which take ten times as long.
+_SOUND = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,27 +112,49 @@ class Arrow(Record):
     cost: float
 
     @staticmethod
-    def impossible() -> Arrow:
-        """Return equations of infinite cost: a state that no detection allows."""
-        nothing = np.zeros(0)
-        return Arrow(nothing, nothing, nothing, nothing, nothing, np.inf)
+    def of(
+        J: Array, W: Array, r: Array, observations: Observations, sizes: tuple[int, int], modes: Array, cost: float
+    ) -> Arrow:
+        """Assemble from what each detection depends on; the shape's modes come last, once a point.
 
-    @staticmethod
-    def of(A: Array, B: Array, r: Array, shot: Ids, shot_count: int, cost: float) -> Arrow:
-        """Assemble from whitened residuals r (N, 2), their derivatives A (N, 2, Q), B (N, 2, K) and shots (N,), sorted."""
-        q, k = A.shape[2], B.shape[2]
-        counts = np.bincount(shot, minlength=shot_count)
-        most = int(counts.max(initial=0))
-        if most * shot_count > len(shot):  # shots of unequal size are filled up with zeros: their products come at once
-            rows = np.arange(len(shot)) + np.repeat(np.arange(shot_count) * most - np.cumsum(counts) + counts, counts)
-            full = [np.zeros((shot_count * most, *each.shape[1:])) for each in (A, B, r)]
-            for each, given in zip(full, (A, B, r), strict=True):
-                each[rows] = given
-            A, B, r = full
-        a, b = A.reshape(shot_count, 2 * most, q), B.reshape(shot_count, 2 * most, k).transpose(0, 2, 1)
-        flat, e = A.reshape(2 * len(A), q), r.reshape(-1)
-        g_shots = (b @ e.reshape(shot_count, 2 * most, 1))[..., 0]
-        return Arrow(flat.T @ flat, b @ a, b @ b.transpose(0, 2, 1), flat.T @ e, g_shots, cost)
+        Args:
+            J: (N, 2, ...) as :func:`~armsight.vision.pose.projection.derivatives` returns it.
+            W: (N, 2, 2) weights: whiteners, times the roots of robust weights.
+            r: (N, 2) weighted residuals.
+            observations: of which camera, point and shot they are.
+            sizes: parameters of the left and of the right camera.
+            modes: (K, M, 3) the shape's modes.
+            cost: what is minimised.
+        """
+        count, M, n, m = observations.shot_count, modes.shape[1], sum(sizes), J.shape[2] - 3
+        own = max(sizes) + 6  # first column of the shot's own
+        shots, points = np.zeros((count, 2, m + 1, m + 1)), np.zeros((M, 2, 3, m + 4))
+        by_point = np.zeros((count, M, m - own, 3))
+        rows = observations.camera, observations.point, observations.shot
+        _accumulate(J, W, r, rows, (shots, points, by_point))
+        H, g, H_points = np.zeros((n + 6, n + 6)), np.zeros(n + 6), np.zeros((3 * M, n + 6))
+        cross = np.zeros((count, m - own, n + 6))
+        for side, start in enumerate((0, sizes[0])):
+            ours = np.concatenate([np.arange(sizes[side]), np.arange(own - 6, own)])
+            there = np.concatenate([np.arange(start, start + sizes[side]), np.arange(n, n + 6)])
+            G = shots[:, side].sum(axis=0)
+            H[np.ix_(there, there)] += G[np.ix_(ours, ours)]
+            g[there] += G[ours, m]
+            cross[:, :, there] += shots[:, side, ours, own:m].transpose(0, 2, 1)
+            H_points[:, there] += points[:, side].reshape(3 * M, -1)[:, ours]
+        flat, each = modes.reshape(len(modes), 3 * M).T, points.sum(axis=1)
+        by_shape = H_points.T @ flat
+        H_shape = flat.T @ (each[:, :, m + 1 :] @ flat.reshape(M, 3, -1)).reshape(3 * M, -1)
+        cross_shape = by_point.transpose(0, 2, 1, 3).reshape(count, m - own, 3 * M) @ flat
+        H_shots = shots[:, :, own:m, own:].sum(axis=1)
+        return Arrow(
+            np.block([[_whole(H), by_shape], [by_shape.T, H_shape]]),
+            np.concatenate([cross, cross_shape], axis=2),
+            _whole(H_shots[:, :, :-1]),
+            np.concatenate([g, each[:, :, m].ravel() @ flat]),
+            H_shots[:, :, -1],
+            cost,
+        )
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Solve for the shared step (Q,) and the shots' steps (S, K) with Marquardt's damping."""
@@ -83,6 +167,10 @@ class Arrow(Record):
         shared = solve_scaled(S, g)
         shots = np.linalg.solve(Hs, (self.g_shots - self.H_cross @ shared)[..., None])[..., 0]
         return shared, np.asarray(shots, np.float64)
+
+    def promises(self, shared: Array, shots: Array) -> float:
+        """Return by how much a step lowers the cost if the equations hold that far and nothing damps it."""
+        return float(self.g_shared @ shared + (self.g_shots * shots).sum())
 
     def schur(self) -> Array:
         """(Q, Q) information of the shared parameters with the shots' own marginalised."""
@@ -100,12 +188,19 @@ def solve_scaled(H: Array, g: Array) -> Array:
     if not len(g):
         return g
     d = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
-    return np.asarray(d * np.linalg.lstsq(d[:, None] * H * d, d * g, rcond=1e-14)[0])
+    unit = d[:, None] * H * d
+    try:
+        sound = np.diag(np.linalg.cholesky(unit)).min() > _SOUND
+    except np.linalg.LinAlgError:
+        sound = False
+    return np.asarray(d * (np.linalg.solve(unit, d * g) if sound else np.linalg.lstsq(unit, d * g, rcond=1e-14)[0]))
 
 
 #: Together with the solver stands what it is about.
 __all__ = [
     "CAUCHY_SCALE",
+    "DAMPING",
+    "NEAR",
     "BundleModel",
     "BundleSolution",
     "BundleState",
@@ -123,6 +218,13 @@ CAUCHY_SCALE = 3.0
 #: Rational distortion makes long curved valleys: from a rough start a hundred steps are needed now and then.
 _MAX_STEPS = 200
 _RELATIVE_DECREASE = 1e-7
+#: Marquardt's damping to begin with, as a share of each parameter's own information, and near a minimum; half and double
+#: change nothing, a hundred times as much costs two steps each, a hundredth makes far starts fail at first.
+DAMPING, NEAR = 1e-4, 1e-9
+#: Damping up to which a step is the Newton step: what it promises is what is left. Half and double change nothing.
+_UNDAMPED = 1e-6
+#: Least curvature of the loss along an outlier's residual, as a share of its weight; half and double: a step more or less.
+_LEAST_BENT = 1e-2
 
 
 def _robust_excess() -> float:
@@ -171,44 +273,85 @@ def whiteners(observations: Observations, sigma_px: float) -> Array:
     return np.linalg.inv(np.linalg.cholesky(cov))
 
 
-def _normal(
-    model: BundleModel, state: BundleState, observations: Observations, W: Array, free: NDArray[np.bool_], robust: bool
-) -> tuple[Arrow, Array]:
-    """Assemble the normal equations at a state; also return the raw residuals (N, 2), px."""
-    uv, J_shared, J_shot = predict(model, state, observations)
+@dataclass(frozen=True, eq=False)
+class _Near(Record):
+    """The problem near a state.
+
+    Attributes:
+        state: the state.
+        residuals_px: (N, 2) detection minus projection.
+        J: (N, 2, ...) as :func:`~armsight.vision.pose.projection.derivatives` returns it.
+        white: (N, 2) whitened residuals.
+        squares: (N,) their squares.
+        cost: what is minimised; infinite where a detection is impossible.
+    """
+
+    state: BundleState
+    residuals_px: Array
+    J: Array
+    white: Array
+    squares: Array
+    cost: float
+
+
+def _near(model: BundleModel, state: BundleState, observations: Observations, W: Array, robust: bool) -> _Near:
+    """Project and differentiate at a state."""
+    uv, J = derivatives(model, state, observations)
     residuals = observations.uv - uv
-    r = (W @ residuals[..., None])[..., 0]
-    d2 = np.einsum("ni,ni->n", r, r)
-    if not np.isfinite(d2).all():
-        return Arrow.impossible(), residuals
+    white = (W @ residuals[..., None])[..., 0]
+    squares = np.einsum("ni,ni->n", white, white)
+    cost = np.inf
+    if np.isfinite(squares).all():
+        cost = float((CAUCHY_SCALE**2 * np.log1p(squares / CAUCHY_SCALE**2)).sum() if robust else squares.sum())
+        cost += float((state.shape**2).sum()) / model.shape_sigma_m**2
+        cost += float((model.motion_sigmas**-2.0 * state.motions**2).sum())
+    return _Near(state, residuals, J, white, squares, cost)
+
+
+def _normal(
+    model: BundleModel, near: _Near, observations: Observations, W: Array, free: NDArray[np.bool_], robust: bool
+) -> Arrow:
+    """Assemble the normal equations of reweighted least squares."""
+    root = (1.0 / np.sqrt(1.0 + near.squares / CAUCHY_SCALE**2) if robust else np.ones(len(W)))[:, None]
+    return _assembled(model, near, observations, root[..., None] * W, root * near.white, free)
+
+
+def _newton(
+    model: BundleModel, near: _Near, observations: Observations, W: Array, free: NDArray[np.bool_], robust: bool
+) -> Arrow:
+    """Assemble the same with the loss's own curvature along each residual (Triggs et al., 2000, section 4.3).
+
+    It is smaller than the weight, and below zero beyond the loss's scale, where it is held positive.
+    """
+    if not robust:
+        return _normal(model, near, observations, W, free, robust)
     c2 = CAUCHY_SCALE**2
-    weight = 1.0 / (1.0 + d2 / c2) if robust else np.ones(len(d2))
-    prior = _prior(model, J_shared.shape[2])
-    shape = np.concatenate([np.zeros(J_shared.shape[2] - len(state.shape)), state.shape])
-    still = model.motion_sigmas**-2.0
-    cost = float((c2 * np.log1p(d2 / c2)).sum() if robust else d2.sum())
-    cost += float(prior @ shape**2) + float((still * state.motions**2).sum())
-    root = np.sqrt(weight)[:, None]
-    A, B = J_shared if free.all() else J_shared[:, :, free], J_shot
-    for J in (A, B):
-        _weigh(root[..., None] * W, J)
-    arrow = Arrow.of(A, B, r * root, observations.shot, observations.shot_count, cost)
+    root = 1.0 / np.sqrt(1.0 + near.squares / c2)
+    bent = np.sqrt(np.maximum((c2 - near.squares) / (c2 + near.squares), _LEAST_BENT))
+    along = near.white / np.sqrt(np.maximum(near.squares, 1e-300))[:, None]
+    bend = np.eye(2) - (1 - bent)[:, None, None] * along[:, :, None] * along[:, None, :]
+    weights, r = root[:, None, None] * (bend @ W), (root / bent)[:, None] * near.white
+    return _assembled(model, near, observations, weights, r, free)
+
+
+def _assembled(
+    model: BundleModel, near: _Near, observations: Observations, weights: Array, r: Array, free: NDArray[np.bool_]
+) -> Arrow:
+    """Assemble normal equations of weighted derivatives and residuals r (N, 2), with the priors of shape and motion."""
+    state, prior = near.state, _prior(model, len(free))
+    sizes = (state.cameras[0].parameters.size, state.cameras[1].parameters.size)
+    arrow = Arrow.of(near.J, weights, r, observations, sizes, model.modes, near.cost)
     H_shots, g_shots = np.array(arrow.H_shots), np.array(arrow.g_shots)
-    if len(still):
+    if len(state.motions):
+        still = model.motion_sigmas**-2.0
         H_shots[:, 6:, 6:] += still[:, :, None] * np.eye(6)
         g_shots[:, 6:] -= still * state.motions
-    H_shared, g_shared = arrow.H_shared + np.diag(prior[free]), arrow.g_shared - (prior * shape)[free]
-    return replace(arrow, H_shared=H_shared, g_shared=g_shared, H_shots=H_shots, g_shots=g_shots), residuals
-
-
-@kernel("f8[:, :, ::1], f8[:, :, ::1]", "f8[:, :, ::1], f8[:, :, :]")
-def _weigh(W: Array, J: Array) -> None:
-    """Replace matrices J (N, 2, K) by W @ J for W (N, 2, 2), where they stand."""
-    for n in range(J.shape[0]):
-        for k in range(J.shape[2]):
-            u, v = J[n, 0, k], J[n, 1, k]
-            J[n, 0, k] = W[n, 0, 0] * u + W[n, 0, 1] * v
-            J[n, 1, k] = W[n, 1, 0] * u + W[n, 1, 1] * v
+    H_shared, g_shared = arrow.H_shared + np.diag(prior), np.array(arrow.g_shared)
+    g_shared[len(free) - len(state.shape) :] -= state.shape / model.shape_sigma_m**2
+    H_cross = arrow.H_cross
+    if not free.all():
+        H_shared, H_cross, g_shared = H_shared[np.ix_(free, free)], H_cross[:, :, free], g_shared[free]
+    return Arrow(H_shared, H_cross, H_shots, g_shared, g_shots, near.cost)
 
 
 def _prior(model: BundleModel, count: int) -> Array:
@@ -241,6 +384,7 @@ def minimise(
     free: NDArray[np.bool_] | None = None,
     max_steps: int = _MAX_STEPS,
     least_decrease: float = _RELATIVE_DECREASE,
+    damping: float = DAMPING,
 ) -> BundleSolution:
     """Find the minimum next to ``start`` for a given noise.
 
@@ -253,6 +397,7 @@ def minimise(
         free: (Q,) which shared parameters move, all that the model frees by default.
         max_steps: iterations at the most.
         least_decrease: a step that lowers the cost by less than this share of it is the last.
+        damping: Marquardt's damping to begin with, NEAR where the start is a neighbouring problem's minimum.
 
     Returns:
         The minimum with its covariance.
@@ -265,29 +410,37 @@ def minimise(
         raise CalibrationError(f"shot {empty[0]} of {observations.shot_count} in the adjustment has no detections")
     W = whiteners(observations, sigma_px)
     free = free_parameters(model, start) if free is None else free
-    state, damping, steps, converged = _with_motions(model, start), 1e-4, 0, False
-    normal, residuals = _normal(model, state, observations, W, free, robust)
-    if not np.isfinite(normal.cost):
+    now, steps, converged = _near(model, _with_motions(model, start), observations, W, robust), 0, False
+    if not np.isfinite(now.cost):
         raise CalibrationError("the start of the adjustment puts a detected point behind its camera")
+    assemble = _newton if damping <= _UNDAMPED else _normal
+    normal = assemble(model, now, observations, W, free, robust)
     while steps < max_steps and not converged:
         steps += 1
         step, shots = normal.step(damping)
+        if damping <= _UNDAMPED and normal.promises(step, shots) <= 0.5 * least_decrease * now.cost:
+            converged = True
+            break
         shared = np.zeros(len(free))
         shared[free] = step
-        trial = _trial(state, shared, shots)
-        if trial is not None:
-            new, new_residuals = _normal(model, trial, observations, W, free, robust)
-            if new.cost <= normal.cost:
-                converged = normal.cost - new.cost <= least_decrease * new.cost
-                state, normal, residuals, damping = trial, new, new_residuals, max(damping / 10, 1e-12)
-                continue
-        damping *= 10
-        converged = damping >= 1e12  # not even the smallest step lowers the cost
+        trial = _trial(now.state, shared, shots)
+        there = None if trial is None else _near(model, trial, observations, W, robust)
+        if there is not None and there.cost <= now.cost:
+            converged = now.cost - there.cost <= least_decrease * there.cost
+            now, damping = there, max(damping / 10, 1e-12)
+            assemble = _newton if damping <= _UNDAMPED else _normal
+            normal = normal if converged else assemble(model, now, observations, W, free, robust)
+        else:
+            damping *= 10
+            converged = damping >= 1e12  # not even the smallest step lowers the cost
+    normal = _normal(model, now, observations, W, free, robust)
     cov = np.zeros((len(free), len(free)))
     if free.any():
         cov[np.ix_(free, free)] = _covariance(normal, _prior(model, len(free))[free], robust)
-    cov_motions = normal.cov_shots(cov[np.ix_(free, free)])[:, 6:, 6:] if len(state.motions) else np.zeros((0, 6, 6))
-    return BundleSolution(state, residuals, sigma_px, cov, normal.cost, steps, converged, cov_motions)
+    cov_motions = np.zeros((0, 6, 6))
+    if len(now.state.motions):
+        cov_motions = normal.cov_shots(cov[np.ix_(free, free)])[:, 6:, 6:]
+    return BundleSolution(now.state, now.residuals_px, sigma_px, cov, now.cost, steps, converged, cov_motions)
 
 
 def _with_motions(model: BundleModel, state: BundleState) -> BundleState:

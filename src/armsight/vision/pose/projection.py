@@ -179,44 +179,37 @@ def _by(row: Array, M: Array, out: Array) -> None:
 
 @kernel(
     "i8[::1], (i8, i8), (f8[:, :, ::1], f8[:, :, :], f8[:, :, ::1]), (f8[:, ::1], f8[:, ::1], f8[:, ::1]), "
-    "(f8[:, :, :], f8[:, :, :], f8[:, :, :]), i8[::1], const f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1]",
+    "(f8[:, :, :], f8[:, :, :], f8[:, :, :]), f8[:, :, ::1]",
     nogil=True,
 )
 def _fill(
     rows: NDArray[np.intp],
-    columns: tuple[int, int],
+    ends: tuple[int, int],
     Js: tuple[Array, Array, Array],
     ps: tuple[Array, Array, Array],
     Rs: tuple[Array, Array, Array],
-    points: Ids,
-    modes: Array,
-    J_shared: Array,
-    J_shot: Array,
+    J: Array,
 ) -> None:
-    """Write one camera's rows of both derivatives of :func:`predict`, zero before: the chain rule, row by row.
+    """Write one camera's rows of :func:`derivatives`, zero before: the chain rule, row by row.
 
     Args:
         rows: (n,) which rows.
-        columns: of the camera's first parameter, of the relative pose; below zero for the left camera, which has none.
+        ends: columns of a camera's parameters; whether this camera is the right one.
         Js: derivatives by the point (n, 2, 3), by the camera's parameters (n, 2, c), by the disc's normal (n or 0, 2, 3).
         ps: the point in the camera's frame (n, 3), in the body's frame (n, 3) and from its middle (n, 3), m.
         Rs: (n, 3, 3) rotations to the camera's frame of the body as it stood, and as it has moved; right Jacobians of
             its motion; (0, 3, 3) where it stood still.
-        points: (n,) which points.
-        modes: (M, 3, K) the shape's modes by point.
-        J_shared: to be written.
-        J_shot: to be written.
+        J: to be written.
     """
-    start, rig = columns
+    cameras, right = ends
     J_p, J_k, J_normal = Js
     side, by_body, by_point, normal, tilt = np.empty(3), np.empty(3), np.empty(3), np.zeros(3), np.zeros(3)
-    first = abs(rig)
     for n in range(rows.size):
-        mode = modes[points[n]]
         for i in range(2):
-            shared, own = J_shared[rows[n], i], J_shot[rows[n], i]
+            row = J[rows[n], i]
             for k in range(J_k.shape[2]):
-                shared[start + k] = J_k[n, i, k]
+                row[k] = J_k[n, i, k]
+            rig, own, point = row[cameras:], row[cameras + 6 :], row[row.size - 3 :]
             _by(J_p[n, i], Rs[0][n], by_body)
             _by(J_p[n, i], Rs[1][n], by_point)
             if J_normal.shape[0]:
@@ -224,22 +217,20 @@ def _fill(
                 _by(normal, Rs[0][n], tilt)
             _cross(ps[1][n], by_body, side)
             for c in range(3):
-                own[c], own[3 + c] = by_body[c], side[c] - tilt[c]
-            if rig >= 0:
+                point[c], own[c], own[3 + c] = by_point[c], by_body[c], side[c] - tilt[c]
+            if right:
                 _cross(J_p[n, i], ps[0][n], side)
                 for c in range(3):
-                    shared[rig + c], shared[rig + 3 + c] = -J_p[n, i, c], side[c] + normal[c]
+                    rig[c], rig[3 + c] = -J_p[n, i, c], side[c] + normal[c]
                 if Rs[2].shape[0]:
                     _cross(ps[2][n], by_point, side)
                     _by(side, Rs[2][n], own[9:])
                     for c in range(3):
                         own[6 + c] = by_body[c]
-            for k in range(mode.shape[1]):
-                shared[first + 6 + k] = by_point[0] * mode[0, k] + by_point[1] * mode[1, k] + by_point[2] * mode[2, k]
 
 
-def predict(model: BundleModel, state: BundleState, observations: Observations) -> tuple[Array, Array, Array]:
-    """Project every observation and differentiate.
+def derivatives(model: BundleModel, state: BundleState, observations: Observations) -> tuple[Array, Array]:
+    """Project every observation and differentiate by what it depends on.
 
     Args:
         model: the body and its modes.
@@ -247,16 +238,14 @@ def predict(model: BundleModel, state: BundleState, observations: Observations) 
         observations: N rows.
 
     Returns:
-        (N, 2) pixels; (N, 2, Q) derivative by the shared parameters; (N, 2, 6) derivative by the tangent of the shot's
-        pose (perturbation on the right), or (N, 2, 12) by that and the shot's motion.
+        (N, 2) pixels; (N, 2, c + 6 + k + 3) derivative by the parameters of its own camera (c of the camera that has more),
+        by the tangent of the relative pose, by that of its shot's pose (perturbation on the right) and the shot's motion (k
+        is 6, or 12 with motions), and by its point of the body.
     """
-    sizes = [camera.parameters.size for camera in state.cameras]
-    n_cameras = sum(sizes)
-    count = n_cameras + 6 + len(model.modes)
+    most = max(camera.parameters.size for camera in state.cameras)
     uv = np.empty((len(observations.shot), 2))
-    J_shared, J_shot = np.zeros((len(uv), 2, count)), np.zeros((len(uv), 2, 12 if len(state.motions) else 6))
+    J = np.zeros((len(uv), 2, most + 9 + (12 if len(state.motions) else 6)))
     body, middle = model.body(state.shape), model.points.mean(axis=0)
-    modes = np.ascontiguousarray(model.modes.transpose(1, 2, 0))
     moves, still = len(state.motions) > 0, np.zeros((0, 3, 3))
     for side, camera in enumerate(state.cameras):
         rows = np.flatnonzero(observations.camera == side)
@@ -274,19 +263,30 @@ def predict(model: BundleModel, state: BundleState, observations: Observations) 
         J_normal = np.zeros((0, 2, 3))
         if model.disc_radius_m > 0:
             uv[rows], J_p, J_normal = _ellipses(camera, p, by_point[:, :, 2], model.disc_radius_m, uv[rows], J_p)
-        columns = (0, -n_cameras) if side == 0 else (sizes[0], n_cameras)
-        _fill(
-            rows,
-            columns,
-            (J_p, J_k, J_normal),
-            (p, p_body, arm),
-            (by_body, by_point, jacobians),
-            points,
-            modes,
-            J_shared,
-            J_shot,
-        )
-    return uv, J_shared, J_shot
+        _fill(rows, (most, side), (J_p, J_k, J_normal), (p, p_body, arm), (by_body, by_point, jacobians), J)
+    return uv, J
+
+
+def predict(model: BundleModel, state: BundleState, observations: Observations) -> tuple[Array, Array, Array]:
+    """Project every observation and differentiate by all that is shared.
+
+    Args:
+        model: the body and its modes.
+        state: cameras, poses and shape.
+        observations: N rows.
+
+    Returns:
+        (N, 2) pixels; (N, 2, Q) derivative by the shared parameters; (N, 2, 6) derivative by the tangent of the shot's
+        pose (perturbation on the right), or (N, 2, 12) by that and the shot's motion.
+    """
+    uv, J = derivatives(model, state, observations)
+    left, right = (camera.parameters.size for camera in state.cameras)
+    most, n, sides = max(left, right), left + right, observations.camera
+    J_shared = np.zeros((len(uv), 2, n + 6 + len(model.modes)))
+    J_shared[sides == 0, :, :left], J_shared[sides == 1, :, left:n] = J[sides == 0, :, :left], J[sides == 1, :, :right]
+    J_shared[:, :, n : n + 6] = J[:, :, most : most + 6]
+    J_shared[:, :, n + 6 :] = J[:, :, -3:] @ model.modes.transpose(1, 2, 0)[observations.point]
+    return uv, J_shared, np.ascontiguousarray(J[:, :, most + 6 : -3])
 
 
 def _ellipses(
