@@ -1,11 +1,14 @@
-"""``armsight board``: build and flash the firmware, watch a board, tune its gains, test it."""
+"""``armsight board``: build and flash the firmware, watch a board, tune its gains, test it, bring it up.
+
+In: the name of a board, emulated or at a port. Out: JSON objects in SI units, text in degrees.
+"""
 
 from __future__ import annotations
 
 import json
 import re
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,24 +16,37 @@ import click
 from click.core import ParameterSource
 
 from armsight.app.arm_option import arm_option
-from armsight.app.board.config import config_group
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
 from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import DeviceError, InputError
 
 if TYPE_CHECKING:
     from armsight.app.board.bringup import Operator
-    from armsight.data import Array
+    from armsight.app.board.offsets import Zeros
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.codes import SensorKind
     from armsight.robot.boards.contract import MotionBoard
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-_DEFAULT = "emulated:unicorn"
+_FILE = click.argument("file", type=click.Path(path_type=Path))
 #: How long an emulated board is watched where nobody says how long.
 _WATCH_S = 2.0
-#: Steps of a bring-up, as ``bringup`` has them, which is not imported for a help text.
-STEPS = ("readings", "potentiometers", "motors", "swing", "verify", "store")
+#: The steps of a bring-up, in their order, and what each finds of a joint (``found.JointFound``).
+STEPS = {
+    "readings": "noise_counts",
+    "potentiometers": "range_counts",
+    "motors": "motor_direction",
+    "swing": "resistance_ohm",
+    "verify": "following_rms_rad",
+    "store": "",
+}
+
+
+def _path(*names: str, metavar: str = "FILE", default: str | None = None, **given: Any) -> Callable[..., Any]:  # noqa: ANN401
+    """Return an option that names a file or folder."""
+    start = None if default is None else Path(default)
+    kind, shown = click.Path(path_type=Path), default is not None
+    return click.option(*names, metavar=metavar, type=kind, default=start, show_default=shown, **given)
 
 
 def _board(action: Callable[..., Any]) -> Callable[..., Any]:
@@ -39,15 +55,40 @@ def _board(action: Callable[..., Any]) -> Callable[..., Any]:
         "--baud", type=click.IntRange(min=1), help="Baud rate of a port; by default the one of its kind of board."
     )
     what = "emulated:unicorn, emulated:qemu, emulated:host, serial:PORT, feetech:PORT or ar4:PORT."
-    return click.option("--board", "name", default=_DEFAULT, show_default=True, metavar="BOARD", help=what)(
+    return click.option("--board", "name", default="emulated:unicorn", show_default=True, metavar="BOARD", help=what)(
         baud(action)
     )
 
 
 _compiler = click.option("--compiler", metavar="NAME", help="zig or gcc; by default the first one that is installed.")
-_folder = click.option(
-    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), default=Path("firmware-build"), show_default=True
+_folder = _path("-o", "--output", metavar="DIR", default="firmware-build")
+_calibration = _path(
+    "--calibration", help="LeRobot's calibration of a feetech: bus; without, a joint is at 0 at count 2048."
 )
+_yes = click.option("--yes", is_flag=True, help="Do not ask.")
+
+
+def _show(as_json: bool, value: object, text: str) -> None:
+    """Print a result: an object for programs, or text."""
+    click.echo(json.dumps(value) if as_json else text)
+
+
+def _open(name: str, baud: int | None) -> Board:
+    """Open a board with our firmware; an emulated one has six free joints at its motors."""
+    from armsight.robot.board_registry import SERIAL, open_board
+    from armsight.robot.boards.serial import BAUD
+    from armsight.sim.joints import JointPlant
+
+    plant = None if name.startswith(SERIAL) else JointPlant()
+    return open_board(name, plant, baud=BAUD if baud is None else baud)
+
+
+def _open_any(name: str, baud: int | None, calibration: Path | None = None) -> MotionBoard:
+    """Open any board; an emulated one has six free joints at its motors."""
+    from armsight.robot.board_registry import is_real, open_motion_board
+    from armsight.sim.joints import JointPlant
+
+    return open_motion_board(name, None if is_real(name) else JointPlant(), baud=baud, calibration=calibration)
 
 
 @click.group("board")
@@ -71,7 +112,7 @@ def build_(name: str | None, output: Path, compiler: str | None, as_json: bool) 
     """Build the firmware: for the emulated boards where armsight finds it, or a real board's image into a folder."""
     from armsight import firmware
     from armsight.app.board import text
-    from armsight.app.board.flash import build_firmware
+    from armsight.app.board.flash import build_firmware, package_build
     from armsight.app.progress import steps
     from armsight.firmware import build
 
@@ -79,10 +120,8 @@ def build_(name: str | None, output: Path, compiler: str | None, as_json: bool) 
         progress("compiling")
         if name is None:
             build.build_package(firmware.BUILT, build.open_compiler(compiler))
-            built = text.package_build()
-        else:
-            built = build_firmware(name, output, compiler)
-    click.echo(json.dumps(text.built_json(built)) if as_json else text.built_text(built))
+        built = package_build() if name is None else build_firmware(name, output, compiler)
+    _show(as_json, text.built_json(built), text.built_text(built))
 
 
 @command.command("flash")
@@ -103,15 +142,7 @@ def flash_(name: str, programmer: str | None, output: Path, compiler: str | None
         progress("writing")
         used = flash(built, programmer)
     answer = {**text.built_json(built), "programmer": used}
-    click.echo(json.dumps(answer) if as_json else f"{built.image} is on the board, written by {used}")
-
-
-_calibration = click.option(
-    "--calibration",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="LeRobot's calibration of a feetech: bus; without, a joint is at 0 at count 2048.",
-)
+    _show(as_json, answer, f"{built.image} is on the board, written by {used}")
 
 
 @command.command()
@@ -138,14 +169,13 @@ def monitor(
     with _open_any(name, baud, calibration) as board:
         click.echo(text.welcome_text(board), err=True)
         if isinstance(board, Ar4Board) and not board.homed:
-            click.echo(
-                "note: not homed since switched on: these are not the arm's angles (armsight board home)", err=True
-            )
+            angles = "these are not the arm's angles (armsight board home)"
+            click.echo(f"note: not homed since switched on: {angles}", err=True)
         passed = 0.0
         while seconds is None or passed < seconds - 1e-9:
             states = board.receive(every)
             passed += every
-            click.echo(json.dumps(text.status_json(board, states)) if as_json else text.status_text(board, states))
+            _show(as_json, text.status_json(board, states), text.status_text(board, states))
 
 
 @command.command()
@@ -172,14 +202,12 @@ def gains(name: str, baud: int | None, changes: tuple[str, ...], store: bool, as
             board.confirm(board.set_gains(values))
         if store:
             board.store(text.with_gains(config, values))
-    click.echo(json.dumps(text.gains_json(values)) if as_json else text.gains_text(values))
+    _show(as_json, text.gains_json(values), text.gains_text(values))
     if store:
         click.echo("stored: in use after the board's next start, too", err=True)
         if board.welcome.config_source == ConfigSource.FACTORY:
-            click.echo(
-                "the rest of what was stored are factory values: see docs/reference/firmware.md before motors move",
-                err=True,
-            )
+            look = "see docs/reference/firmware.md before motors move"
+            click.echo(f"the rest of what was stored are factory values: {look}", err=True)
 
 
 @command.command("selftest")
@@ -199,15 +227,11 @@ def selftest_(name: str, baud: int | None, drives: bool, as_json: bool) -> int:
     from armsight.robot.boards.serial import BAUD
 
     if name.startswith(SERIAL):
-        moves = (
-            "the arm will move by up to 3 degrees, keep clear of it"
-            if drives
-            else "drives stay off; --drives moves the arm"
-        )
-        click.echo(f"{name}: {moves}", err=True)
+        keep_clear = "the arm will move by up to 3 degrees, keep clear of it"
+        click.echo(f"{name}: {keep_clear if drives else 'drives stay off; --drives moves the arm'}", err=True)
     with steps() as progress:
         result = selftest(name, drives=drives, baud=BAUD if baud is None else baud, progress=progress)
-    click.echo(json.dumps(result.record()) if as_json else text.selftest_text(result))
+    _show(as_json, result.record(), text.selftest_text(result))
     for scenario, found in result.scenarios.items():
         for problem in found.problems:
             click.echo(f"{scenario}: {problem}", err=True)
@@ -216,17 +240,15 @@ def selftest_(name: str, baud: int | None, drives: bool, as_json: bool) -> int:
 
 @command.command()
 @_board
-@click.option(
-    "-o",
-    "--output",
-    "folder",
+@_path(
+    *("-o", "--output", "folder"),
     metavar="DIR",
-    type=click.Path(path_type=Path),
-    default=Path("bringup"),
-    show_default=True,
+    default="bringup",
     help="Folder of board.toml, report.html, and bringup.json, where what was found is kept.",
 )
-@click.option("--step", "steps", multiple=True, type=click.Choice(STEPS), help="Only this step; may be repeated.")
+@click.option(
+    "--step", "steps", multiple=True, type=click.Choice(tuple(STEPS)), help="Only this step; may be repeated."
+)
 @click.option("--joint", "joints", multiple=True, type=click.IntRange(1, 6), help="Only this joint; may be repeated.")
 @click.option(
     "--encoder",
@@ -237,8 +259,7 @@ def selftest_(name: str, baud: int | None, drives: bool, as_json: bool) -> int:
 )
 @click.option("--again", is_flag=True, help="Do also what was found before.")
 @click.option(
-    "--current",
-    "most_current_a",
+    *("--current", "most_current_a"),
     type=click.FloatRange(0.05, 30),
     default=2.0,
     show_default=True,
@@ -264,14 +285,12 @@ def bringup(
     What was found is kept: the same command goes on where it ended. On an emulated board an arm and a person are drawn.
     """
     from armsight.app.board.bringup import Bringup, TerminalOperator
-    from armsight.app.board.found import found_json
     from armsight.app.show.page import writable_folder
     from armsight.app.show.plotting import require_matplotlib
     from armsight.files import check_folder
-    from armsight.robot.board_registry import SERIAL, emulator_name, open_board, open_emulator
+    from armsight.robot.board_registry import SERIAL, emulator_name, open_emulator
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.emulated import EmulatedLink
-    from armsight.robot.boards.serial import BAUD
     from armsight.sim.boards.workshop import WorkshopPerson, drawn_encoders, drawn_workshop
 
     def echo(line: str) -> None:
@@ -281,7 +300,7 @@ def bringup(
     kinds = _encoders(encoders)
     check_folder(folder, problem="nothing of a bring-up can be written here")
     if name.startswith(SERIAL):
-        board = open_board(name, baud=BAUD if baud is None else baud)
+        board = _open(name, baud)
         person: Operator = TerminalOperator(echo)
     else:
         plant, _ = drawn_workshop(seed, encoders=drawn_encoders(seed, {j: kind for j, (kind, _) in kinds.items()}))
@@ -291,9 +310,9 @@ def bringup(
         writable_folder(folder, "nothing of a bring-up")
         chosen = [joint - 1 for joint in sorted(set(joints))] or range(6)
         session = Bringup(board, person, folder, chosen, encoders=kinds, again=again, most_current_a=most_current_a)
-        session.run(steps or STEPS)
+        session.run(steps or tuple(STEPS))
     if as_json:
-        click.echo(json.dumps(found_json(session.found)))
+        click.echo(json.dumps(session.found.json()))
     if session.refuted:
         click.get_current_context().exit(UNTRUSTED)
 
@@ -306,12 +325,11 @@ def _encoders(given: tuple[str, ...]) -> dict[int, tuple[SensorKind, int]]:
     for each in given:
         match = re.fullmatch(r"([1-6]):(?:(absolute)|quadrature:([1-6]))", each)
         if match is None:
-            raise InputError(
-                f"--encoder {each}: a joint and a kind are needed: 2:absolute, or 3:quadrature:1 with its input"
-            )
-        kind = SensorKind.ABSOLUTE if match[2] else SensorKind.QUADRATURE
+            needed = "a joint and a kind are needed: 2:absolute, or 3:quadrature:1 with its input"
+            raise InputError(f"--encoder {each}: {needed}")
         if int(match[1]) - 1 in found:
             raise InputError(f"--encoder {each}: joint {match[1]} has two encoders; one is needed")
+        kind = SensorKind.ABSOLUTE if match[2] else SensorKind.QUADRATURE
         found[int(match[1]) - 1] = (kind, int(match[3] or 0))
     inputs = [which for kind, which in found.values() if kind == SensorKind.QUADRATURE]
     if len(set(inputs)) < len(inputs):
@@ -324,55 +342,41 @@ def _encoders(given: tuple[str, ...]) -> dict[int, tuple[SensorKind, int]]:
 @click.option(
     "--at-once", type=click.Choice(["1", "2", "3", "6"]), default="6", show_default=True, help="Joints at a time."
 )
-@click.option("--yes", is_flag=True, help="Do not ask.")
+@_yes
 @_JSON
 def home(name: str, baud: int | None, at_once: str, yes: bool, as_json: bool) -> None:
     """Home an AR4: its joints go to their limit switches, where the encoders are set, and then to rest at 0.
 
     A board with our firmware moves nothing: quadrature encoders take where the arm stands, drives off, for their home_rad.
     """
+    import numpy as np
+
     from armsight.robot.boards.ar4.board import Ar4Board
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.codes import Command, SensorKind
 
     with _open_any(name, baud) as board:
-        if (
-            isinstance(board, Board)
-            and (board.configuration()["joint"]["encoder"]["sensor"] == SensorKind.QUADRATURE).any()
-        ):
-            if not yes:
-                click.confirm(
-                    "is the arm where its encoders have home_rad, and does it stay there?", abort=True, err=True
-                )
-            board.confirm(board.command(Command.HOME))
-            q = board.receive(0.05).q
-            if not len(q):
-                raise DeviceError(f"{name} reports no angles after it was homed")
-            _print_home(q[-1], as_json)
-            return
-        if not isinstance(board, Ar4Board):
+        if isinstance(board, Ar4Board):
+            question = "the arm will move to the ends of all joints: is everything out of its reach?"
+        elif isinstance(board, Board) and SensorKind.QUADRATURE in board.configuration()["joint"]["encoder"]["sensor"]:
+            question = "is the arm where its encoders have home_rad, and does it stay there?"
+        else:
             raise InputError(f"{name} has no limit switches to be homed at; its sensors are absolute")
         if not yes:
-            click.confirm(
-                "the arm will move to the ends of all joints: is everything out of its reach?", abort=True, err=True
-            )
-        try:
-            board.home(at_once=int(at_once))
-        except KeyboardInterrupt:
-            click.echo(
-                "the AR4 goes on homing by itself, and answers nothing until then: its emergency stop stops it",
-                err=True,
-            )
-            raise
-        q = board.receive().q[-1]
-    _print_home(q, as_json)
-
-
-def _print_home(q: Array, as_json: bool) -> None:
-    import numpy as np
-
-    degrees = [round(float(each), 3) for each in np.degrees(q)]
-    click.echo(json.dumps({"q_rad": [round(float(each), 6) for each in q]}) if as_json else f"homed, at {degrees} deg")
+            click.confirm(question, abort=True, err=True)
+        if not isinstance(board, Ar4Board):
+            board.confirm(board.command(Command.HOME))
+        else:
+            try:
+                board.home(at_once=int(at_once))
+            except KeyboardInterrupt:
+                goes_on = "the AR4 goes on homing by itself, and answers nothing until then"
+                click.echo(f"{goes_on}: its emergency stop stops it", err=True)
+                raise
+        if not len(q := board.receive(0.05).q):
+            raise DeviceError(f"{name} reports no angles after it was homed")
+    degrees = [round(float(each), 3) for each in np.degrees(q[-1])]
+    _show(as_json, {"q_rad": [round(float(each), 6) for each in q[-1]]}, f"homed, at {degrees} deg")
 
 
 @command.command()
@@ -387,13 +391,9 @@ def clear(name: str, baud: int | None, as_json: bool) -> None:
             board.confirm(board.command(Command.CLEAR_STOP))
         board.confirm(board.command(Command.CLEAR_FAULTS))
         board.receive(0.05)
-        status = board.status
-    faults = "; ".join(map(str, status.faults))
-    click.echo(
-        json.dumps({"state": status.state.name, "faults": [each.fault.name for each in status.faults]})
-        if as_json
-        else f"{status.state.name}: {faults or 'no fault'}"
-    )
+        state, faults = board.status.state.name, board.status.faults
+    said = "; ".join(map(str, faults)) or "no fault"
+    _show(as_json, {"state": state, "faults": [each.fault.name for each in faults]}, f"{state}: {said}")
 
 
 @command.command()
@@ -407,7 +407,7 @@ def release(name: str, baud: int | None, as_json: bool) -> None:
         board.confirm(board.command(Command.DISABLE))
         board.receive(0.05)
         state = board.status.state.name
-    click.echo(json.dumps({"state": state}) if as_json else state)
+    _show(as_json, {"state": state}, state)
 
 
 @command.command()
@@ -420,22 +420,10 @@ def release(name: str, baud: int | None, as_json: bool) -> None:
 @click.option(
     "--further", metavar="DEG,...", help="Correct by these: true angle less reported one of each joint, degrees."
 )
-@click.option("--restore", metavar="FILE", type=click.Path(path_type=Path), help="Write back what --keep has kept.")
-@click.option(
-    "--ar4-offsets",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="Correct the joint_offsets file of ar4_ros_driver, such as mk3.yaml; no board is opened.",
-)
-@click.option(
-    "--keep",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    default=Path("old_offsets.json"),
-    show_default=True,
-    help="New file for the offsets as they were.",
-)
-@click.option("--yes", is_flag=True, help="Do not ask.")
+@_path("--restore", help="Write back what --keep has kept.")
+@_path("--ar4-offsets", help="Correct the joint_offsets file of ar4_ros_driver, such as mk3.yaml; no board is opened.")
+@_path("--keep", default="old_offsets.json", help="New file for the offsets as they were.")
+@_yes
 @_JSON
 def offsets(
     name: str,
@@ -457,98 +445,41 @@ def offsets(
     off (`armsight board release`). A servo's offset is -2047 to 2047 counts; what looks like a mistake, such as
     more than a tooth of the horn (14.4 degrees), is not written with --yes.
     """
-    import numpy as np
-
-    from armsight.app.board import offsets as changed
+    from armsight.app.board import offsets as kept
     from armsight.robot.arm_file import open_arm
     from armsight.robot.boards.feetech.board import FeetechBoard
-    from armsight.robot.boards.feetech.offsets import doubts
 
     given = [each for each in (identified, further, restore) if each is not None]
     if len(given) > 1 or (identified is None) != (nominal is None):
         raise InputError("give one of --identified ARM with --arm ARM, --further DEG,... and --restore FILE")
-    angles = None if further is None else changed.parsed_degrees(further)
+    angles = None if further is None else kept.parsed_degrees(further)
     if identified is not None and nominal is not None:
-        angles = changed.further_of(open_arm(identified), open_arm(nominal))
-    if name.startswith("ar4:") and ar4_offsets is None:
-        raise InputError(f"{name}: an AR4 keeps no zeros; its driver's joint_offsets file does: --ar4-offsets mk3.yaml")
-    if not name.startswith("feetech:") or ar4_offsets is not None:
-        _zeros(name, baud, ar4_offsets, angles, restore, keep, yes, as_json)
-        return
-    with _open_any(name, baud, calibration) as board:
-        assert isinstance(board, FeetechBoard)
-        if restore is not None:
-            changes = changed.restored_changes(board, restore)
-        else:
-            none = np.zeros(board.abilities.joints)
-            changes = changed.planned_changes(board, none if angles is None else angles)
+        angles = kept.further_of(open_arm(identified), open_arm(nominal))
+
+    def offer(zeros: Zeros) -> None:
+        """Show the zeros, and write them where others are given, after asking."""
+        if given and zeros.doubts and yes:
+            raise InputError(f"{zeros.doubts[0]}; --yes does not write this: without it you are asked")
+        if given and not yes:
+            click.echo("\n".join([zeros.text(), *(f"note: {each}" for each in zeros.doubts)]), err=True)
+            click.confirm(zeros.question, abort=True, err=True)
         if given:
-            doubtful = [] if restore is not None else doubts(changes, board.calibration)
-            _confirm(changed.changes_text(changes), doubtful, "write the new offsets to the servos?", yes)
-            changed.apply(board, changes, keep, calibration)
-    click.echo(json.dumps(changed.changes_json(changes, bool(given))) if as_json else changed.changes_text(changes))
-    if given:
-        click.echo(f"written; the old offsets are in {keep}", err=True)
+            zeros.write(keep)
+        _show(as_json, {"written": bool(given), "joints": zeros.json()}, zeros.text())
+        if given:
+            click.echo(f"written; the old offsets are in {keep}", err=True)
 
-
-def _confirm(text: str, doubts: Sequence[str], question: str, yes: bool) -> None:
-    """Ask before something is written; what is doubtful is not written without being asked."""
-    if doubts and yes:
-        raise InputError(f"{doubts[0]}; --yes does not write this: without it you are asked")
-    if not yes:
-        click.echo("\n".join([text, *(f"note: {each}" for each in doubts)]), err=True)
-        click.confirm(question, abort=True, err=True)
-
-
-def _zeros(
-    name: str,
-    baud: int | None,
-    file: Path | None,
-    angles: Array | None,
-    restore: Path | None,
-    keep: Path,
-    yes: bool,
-    as_json: bool,
-) -> None:
-    """Print or correct zeros that are angles: of a file of the AR4's driver, or of the potentiometers on our board."""
-    import numpy as np
-
-    from armsight.app.board import offsets as changed
-    from armsight.files import check_outputs, check_writable, read_text, write_text
-    from armsight.robot.boards.board_file import configuration_text, read_configuration
-
-    def asked(changes: list[changed.ZeroChange]) -> None:
-        doubtful = [] if restore is not None else changed.zero_doubts(changes)
-        _confirm(changed.zeros_text(changes), doubtful, "write the new zeros?", yes)
-
-    written = angles is not None or restore is not None
-    none = np.zeros(6) if angles is None else angles
-    if file is not None:
-        check_outputs([keep], [file, restore])
-        check_writable(file)
-        text, changes = changed.ar4_changes(file if restore is None else restore, none)
-        if restore is not None:
-            new = {each.name: each.new_deg for each in changes}
-            changes = [each._replace(new_deg=new[each.name]) for each in changed.ar4_changes(file, none)[1]]
-        if written:
-            asked(changes)
-            changed.keep_old(keep, read_text(file))
-            write_text(file, text)
+    if ar4_offsets is not None:
+        offer(kept.Ar4Zeros(ar4_offsets, angles, restore, keep))
+    elif name.startswith("ar4:"):
+        raise InputError(f"{name}: an AR4 keeps no zeros; its driver's joint_offsets file does: --ar4-offsets mk3.yaml")
+    elif name.startswith("feetech:"):
+        with _open_any(name, baud, calibration) as board:
+            assert isinstance(board, FeetechBoard)
+            offer(kept.ServoZeros.of(board, angles, restore, calibration))
     else:
-        with _open(name, baud) as board:
-            before = configuration_text(board.configuration(), board.welcome.board)
-            config = board.configuration() if restore is None else read_configuration(restore)[0]
-            changes = changed.pot_changes(config, none)
-            if restore is not None:
-                old = changed.pot_changes(board.configuration(), none)
-                changes = [a._replace(old_deg=b.old_deg) for a, b in zip(changes, old, strict=True)]
-            if written:
-                asked(changes)
-                changed.keep_old(keep, before)
-                board.store(config)
-    click.echo(json.dumps(changed.zeros_json(changes, written)) if as_json else changed.zeros_text(changes))
-    if written:
-        click.echo(f"written; what was there before is in {keep}", err=True)
+        with _open(name, baud) as own:
+            offer(kept.PotZeros(own, angles, restore))
 
 
 @command.command()
@@ -566,30 +497,109 @@ def emulate(arm: str, seconds: float | None, as_json: bool) -> None:
     from armsight.sim.boards.device import serve
     from armsight.sim.boards.so101 import So101Bus
 
-    kind, device, baud = (
-        ("feetech", So101Bus.made(), feetech.BAUD) if arm == "so101" else ("ar4", Ar4Teensy(), ar4.BAUD)
-    )
-    with serve(device, baud) as port:
-        click.echo(json.dumps({"board": f"{kind}:{port.name}"}) if as_json else f"{kind}:{port.name}")
+    servos = arm == "so101"
+    with serve(So101Bus.made() if servos else Ar4Teensy(), feetech.BAUD if servos else ar4.BAUD) as port:
+        board = f"{'feetech' if servos else 'ar4'}:{port.name}"
+        _show(as_json, {"board": board}, board)
         threading.Event().wait(seconds)
 
 
-def _open(name: str, baud: int | None) -> Board:
-    """Open a board with our firmware; an emulated one has six free joints at its motors."""
-    from armsight.robot.board_registry import SERIAL, open_board
-    from armsight.robot.boards.serial import BAUD
-    from armsight.sim.joints import JointPlant
-
-    plant = None if name.startswith(SERIAL) else JointPlant()
-    return open_board(name, plant, baud=BAUD if baud is None else baud)
+@command.group()
+def config() -> None:
+    """Read, compare, change and store a board's whole configuration, also as a file: board.toml."""
 
 
-def _open_any(name: str, baud: int | None, calibration: Path | None = None) -> MotionBoard:
-    """Open any board; an emulated one has six free joints at its motors."""
-    from armsight.robot.board_registry import is_real, open_motion_board
-    from armsight.sim.joints import JointPlant
+@config.command()
+@_board
+@_path("-o", "--output", help="Write it there.")
+@_JSON
+def get(name: str, baud: int | None, output: Path | None, as_json: bool) -> None:
+    """Print the configuration in use as a board.toml, or write it to a file."""
+    from armsight.files import write_text
+    from armsight.robot.boards.board_file import configuration_text, entries
 
-    return open_motion_board(name, None if is_real(name) else JointPlant(), baud=baud, calibration=calibration)
+    with _open(name, baud) as board:
+        used = board.configuration()
+        text = configuration_text(used, board.welcome.board)
+    if output is not None:
+        write_text(output, text)
+    if as_json:
+        click.echo(json.dumps(dict(entries(used))))
+    elif output is None:
+        click.echo(text, nl=False)
 
 
-command.add_command(config_group(_board, _JSON, _open))
+@config.command()
+@_FILE
+@_board
+@_JSON
+def diff(file: Path, name: str, baud: int | None, as_json: bool) -> int:
+    """Print what differs between a board.toml and the board; exit code 1 where anything does."""
+    from armsight.robot.boards.board_file import entries, read_configuration
+
+    ours, board_name = read_configuration(file)
+    with _open(name, baud) as board:
+        _same_board(file, board_name, board)
+        theirs = dict(entries(board.configuration()))
+    found = {path: [theirs.get(path), value] for path, value in entries(ours) if theirs.get(path) != value}
+    if as_json:
+        click.echo(json.dumps(found))
+    for path, (on_board, in_file) in ({} if as_json else found).items():
+        click.echo(f"{path}: {on_board} on the board, {in_file} in {file}")
+    return 1 if found else 0
+
+
+@config.command()
+@_FILE
+@_board
+@_JSON
+def store(file: Path, name: str, baud: int | None, as_json: bool) -> None:
+    """Store a board.toml on the board, with the drives off; it is in use after the board's next start."""
+    from armsight.robot.boards.board_file import read_configuration
+
+    stored, board_name = read_configuration(file)
+    with _open(name, baud) as board:
+        _same_board(file, board_name, board)
+        board.store(stored)
+    _stored(as_json)
+
+
+@config.command("set")
+@click.argument("changes", nargs=-1, required=True, metavar="PATH=VALUE...")
+@_board
+@_JSON
+def set_(changes: tuple[str, ...], name: str, baud: int | None, as_json: bool) -> None:
+    """Change single values and store them, such as joint.3.soft_max_rad=1.2 or arm.silence_ticks=200."""
+    import tomllib
+
+    from armsight.robot.boards.board_file import put
+
+    with _open(name, baud) as board:
+        changed, seen = board.configuration(), set[str]()
+        for change in changes:
+            path, _, text = (part.strip() for part in change.partition("="))
+            if path in seen:
+                raise InputError(f"{path} is given twice; nothing was changed")
+            seen.add(path)
+            try:
+                put(changed, path, tomllib.loads(f"value = {text}")["value"])
+            except tomllib.TOMLDecodeError:
+                if not path.endswith(
+                    (".sync_led_pin", ".encoder.sensor")
+                ):  # names, which a shell takes the quotes from
+                    raise InputError(f"{change}: a path, = and a number are needed: joint.3.soft_max_rad=1.2") from None
+                put(changed, path, text)
+        board.store(changed)
+    _stored(as_json)
+
+
+def _same_board(file: Path, name: str, board: Board) -> None:
+    """Raise InputError where a file is for another board."""
+    if name != board.welcome.board:
+        raise InputError(f"{file} is for board {name}; this one is {board.welcome.board}; nothing was changed")
+
+
+def _stored(as_json: bool) -> None:
+    if as_json:
+        click.echo(json.dumps({"stored": True}))
+    click.echo("stored: in use after the board's next start", err=True)

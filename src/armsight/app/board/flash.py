@@ -6,14 +6,16 @@ image fills is written: what a board stores between its pieces (its configuratio
 
 from __future__ import annotations
 
+import json
 import subprocess
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import which
 
+from armsight import firmware
 from armsight.errors import DeviceError, InputError
-from armsight.files import check_folder, replacing
+from armsight.files import check_folder, read_text, replacing
 from armsight.firmware import build
 from armsight.firmware.elf import read_elf
 
@@ -23,25 +25,22 @@ FLASHED = ("stm32f4", "blackpill")
 
 @dataclass(frozen=True)
 class Built:
-    """A board's firmware.
+    """A board's firmware."""
 
-    Attributes:
-        board: its name.
-        compiler: what built it.
-        image: the ELF file.
-        pieces: what goes where in flash memory: (address, .bin file).
-        flash_bytes: its size.
-        ram_bytes: of its variables, without the stack.
-        hard_float: whether it is built for the processor's floating-point unit.
-    """
+    board: str  #: its name
+    compiler: str  #: what built it
+    image: Path  #: the ELF file
+    pieces: tuple[tuple[int, Path], ...]  #: what goes where in flash memory: (address, .bin file)
+    flash_bytes: int  #: its size
+    ram_bytes: int  #: of its variables, without the stack
+    hard_float: bool  #: whether it is built for the processor's floating-point unit
 
-    board: str
-    compiler: str
-    image: Path
-    pieces: tuple[tuple[int, Path], ...]
-    flash_bytes: int
-    ram_bytes: int
-    hard_float: bool
+
+def package_build() -> Built:
+    """Return armsight's own build, as emulated boards run it."""
+    elf = read_elf(firmware.image())
+    about = json.loads(read_text(firmware.BUILT / "build.json"))
+    return Built("pil", about["compiler"], firmware.image(), (), elf.flash_bytes, elf.ram_bytes, elf.hard_float)
 
 
 def build_firmware(board: str, folder: Path, compiler: str | None = None) -> Built:

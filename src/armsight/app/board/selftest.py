@@ -26,55 +26,35 @@ from armsight.sim.joints import JointPlant
 
 #: A real arm swings by this much where it may move, rad: less than 3 degrees.
 _SMALL_RAD = 0.05
-#: The speed of an emulated board is measured over this many ticks.
-_SPEED_TICKS = 4000
-#: The speed of a real board is measured over this time, s.
-_SPEED_S = 1.0
+#: Over how much the speed is measured: of an emulated board ticks, of a real one s.
+_SPEED_TICKS, _SPEED_S = 4000, 1.0
 
 
 @dataclass(frozen=True)
 class ScenarioResult:
-    """What one scenario found.
+    """What one scenario found."""
 
-    Attributes:
-        problems: what was not as it must be; empty where it passed.
-        trace_sha256: of every answer frame of the run, by time; None on a real board, which has none.
-    """
-
-    problems: tuple[str, ...]
-    trace_sha256: str | None
+    problems: tuple[str, ...]  #: what was not as it must be; empty where it passed
+    trace_sha256: str | None  #: of every answer frame of the run, by time; None on a real board, which has none
 
 
 @dataclass(frozen=True)
 class ImageSize:
-    """The size of an emulated image; None each where the image is not known.
+    """The size of an emulated image; None each where the image is not known."""
 
-    Attributes:
-        flash_bytes: of flash memory.
-        ram_bytes: of its variables, without the stack.
-        hard_float: whether it is built for the processor's floating-point unit.
-    """
-
-    flash_bytes: int | None
-    ram_bytes: int | None
-    hard_float: bool | None
+    flash_bytes: int | None = None  #: of flash memory
+    ram_bytes: int | None = None  #: of its variables, without the stack
+    hard_float: bool | None = None  #: whether it is built for the processor's floating-point unit
 
 
 @dataclass(frozen=True)
 class SelftestResult:
-    """What the self-test found.
+    """What the self-test found."""
 
-    Attributes:
-        board: its name.
-        scenarios: by name.
-        ticks_per_s: how fast the board runs, plant and telemetry with it; a real one by this computer's clock.
-        elf: size of the emulated image.
-    """
-
-    board: str
-    scenarios: Mapping[str, ScenarioResult]
-    ticks_per_s: float
-    elf: ImageSize
+    board: str  #: its name
+    scenarios: Mapping[str, ScenarioResult]  #: by name
+    ticks_per_s: float  #: how fast the board runs, plant and telemetry with it; a real one by this computer's clock
+    elf: ImageSize  #: size of the emulated image
 
     @property
     def passed(self) -> bool:
@@ -83,22 +63,18 @@ class SelftestResult:
 
     def record(self) -> dict[str, Any]:
         """Return it ready for JSON."""
-        return {
-            "board": self.board,
-            "scenarios": {
-                name: {"passed": not each.problems, "trace_sha256": each.trace_sha256}
-                for name, each in self.scenarios.items()
-            },
-            "ticks_per_s": round(self.ticks_per_s, 1),
-            "elf": dataclasses.asdict(self.elf),
+        scenarios = {
+            name: {"passed": not each.problems, "trace_sha256": each.trace_sha256}
+            for name, each in self.scenarios.items()
         }
+        speed = round(self.ticks_per_s, 1)
+        return {"board": self.board, "scenarios": scenarios, "ticks_per_s": speed, "elf": dataclasses.asdict(self.elf)}
 
 
 def run_scenario(scenario: Scenario, emulator: Emulator) -> ScenarioResult:
     """Run a scenario on a fresh emulated board; the emulator is closed after it."""
-    trace, plant = hashlib.sha256(), JointPlant()
+    trace, plant, problems = hashlib.sha256(), JointPlant(), list[str]()
     link = EmulatedLink(emulator, plant, watch=trace.update)
-    problems: list[str] = []
     try:
         configured(link)
         scenario(BoardTestRig.connect(link, plant, problems))
@@ -136,10 +112,15 @@ def selftest(
         DeviceError: the board is not there, or of another version.
         InputError: there is no such kind of board.
     """
-    if board.startswith(SERIAL):
-        return _of_real(board, drives, baud, progress)
-    emulator = emulator_name(board)
     scenarios = {}
+    if board.startswith(SERIAL):
+        port, home_rad = board.removeprefix(SERIAL), None
+        for name in [each for each in DRIVEN if (each not in EMULATED_ONLY if drives else each in AT_REST)]:
+            progress(name)
+            scenarios[name], home_rad = _on_real(port, baud, DRIVEN[name], drives, home_rad)
+        progress("speed")
+        return SelftestResult(board, scenarios, _ticks_per_s(port, baud), ImageSize())
+    emulator = emulator_name(board)
     for name, scenario in DRIVEN.items():
         progress(name)
         scenarios[name] = run_scenario(scenario, open_emulator(emulator))
@@ -149,27 +130,21 @@ def selftest(
     return SelftestResult(board, scenarios, speed(open_emulator(emulator)), size)
 
 
-def _of_real(board: str, drives: bool, baud: int, progress: Callable[[str], None]) -> SelftestResult:
-    """Run what is safe on a real board; its drives stay off, or are switched off after it has moved."""
-    port = board.removeprefix(SERIAL)
-    chosen = {name: run for name, run in DRIVEN.items() if name not in EMULATED_ONLY} if drives else AT_REST
-    scenarios = {}
-    home_rad: Array | None = None
-    for name, scenario in chosen.items():
-        progress(name)
-        problems: list[str] = []
-        link = SerialLink.open(port, baud)
-        test_rig = BoardTestRig.connect(link, None, problems, amplitude_rad=_SMALL_RAD, home_rad=home_rad, name=port)
-        home_rad = test_rig.home_rad
-        try:
-            scenario(test_rig)
-        except ArmsightError as error:
-            problems.append(str(error))
-        finally:
-            test_rig.end()
-        scenarios[name] = ScenarioResult(tuple(problems), None)
-    progress("speed")
-    return SelftestResult(board, scenarios, _ticks_per_s(port, baud), ImageSize(None, None, None))
+def _on_real(
+    port: str, baud: int, scenario: Scenario, drives: bool, home_rad: Array | None
+) -> tuple[ScenarioResult, Array]:
+    """Run a scenario on a real board, its drives off afterwards; returns where its joints are at home, too."""
+    problems, link = list[str](), SerialLink.open(port, baud)
+    rig = BoardTestRig.connect(
+        link, None, problems, amplitude_rad=_SMALL_RAD, home_rad=home_rad, driven=drives, name=port
+    )
+    try:
+        scenario(rig)
+    except ArmsightError as error:
+        problems.append(str(error))
+    finally:
+        rig.end()
+    return ScenarioResult(tuple(problems), None), rig.home_rad
 
 
 def _ticks_per_s(port: str, baud: int) -> float:

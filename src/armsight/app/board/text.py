@@ -6,20 +6,16 @@ In: records of a board and of a build. Out: for each a function NAME_json and a 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from armsight import firmware
 from armsight.app.board.flash import Built
 from armsight.app.board.selftest import SelftestResult
 from armsight.data import Array, JointStates
 from armsight.errors import InputError
-from armsight.files import read_text
-from armsight.firmware.elf import read_elf
 from armsight.robot.boards.codes import STATE_TEXTS, ConfigSource
 from armsight.robot.boards.configuration import JOINTS, Configuration
 from armsight.robot.boards.contract import MotionBoard
@@ -32,13 +28,6 @@ _SOURCES = {
 }
 
 
-def package_build() -> Built:
-    """Return armsight's own build, as emulated boards run it."""
-    elf = read_elf(firmware.image())
-    about = json.loads(read_text(firmware.BUILT / "build.json"))
-    return Built("pil", about["compiler"], firmware.image(), (), elf.flash_bytes, elf.ram_bytes, elf.hard_float)
-
-
 def built_json(built: Built) -> dict[str, Any]:
     """Return a build as JSON has it."""
     pieces = [[address, str(piece)] for address, piece in built.pieces]
@@ -47,12 +36,13 @@ def built_json(built: Built) -> dict[str, Any]:
 
 def built_text(built: Built) -> str:
     """Return a build as lines."""
-    float_text = "hardware" if built.hard_float else "software"
-    lines = [
-        f"{built.image}: {built.board}, by {built.compiler}, flash {built.flash_bytes} bytes,"
-        f" RAM {built.ram_bytes} bytes, {float_text} floating point"
-    ]
+    sizes = f"flash {built.flash_bytes} bytes, RAM {built.ram_bytes} bytes, {_floats(built.hard_float)}"
+    lines = [f"{built.image}: {built.board}, by {built.compiler}, {sizes}"]
     return "\n".join(lines + [f"{piece}: to {address:#010x}" for address, piece in built.pieces])
+
+
+def _floats(hard: bool | None) -> str:
+    return f"{'hardware' if hard else 'software'} floating point"
 
 
 def welcome_text(board: MotionBoard) -> str:
@@ -61,12 +51,11 @@ def welcome_text(board: MotionBoard) -> str:
     text = f"board {welcome.board}, firmware {welcome.firmware}"
     if welcome.config_source is None:
         return "; ".join([f"{text}, {welcome.baud} baud", *board.abilities.missing])
-    source = _SOURCES[welcome.config_source]
     text = f"{text}, {welcome.ticks_per_s} ticks/s, {welcome.baud} baud"
     if has := welcome.abilities:
-        kinds = [f"{kind.name.lower()}" for kind in has.sensors]
-        text = f"{text}, {has.joints} joints by {', '.join(kinds)} (quadrature inputs: {has.quadrature_inputs})"
-    return f"{text}, runs on {source}"
+        kinds = ", ".join(kind.name.lower() for kind in has.sensors)
+        text = f"{text}, {has.joints} joints by {kinds} (quadrature inputs: {has.quadrature_inputs})"
+    return f"{text}, runs on {_SOURCES[welcome.config_source]}"
 
 
 def status_json(board: MotionBoard, states: JointStates) -> dict[str, Any]:
@@ -81,25 +70,20 @@ def status_json(board: MotionBoard, states: JointStates) -> dict[str, Any]:
         "supply_v": None if math.isnan(status.supply_v) else round(status.supply_v, 3),
         "temperature_c": None if celsius is None else [float(each) for each in celsius],
         "readings": len(states.t_s),
-        "crc_errors": status.crc_errors,
-        "lost_bytes": status.lost_bytes,
-        "overrun_bytes": status.overrun_bytes,
+        **{name: getattr(status, name) for name in ("crc_errors", "lost_bytes", "overrun_bytes")},
         "broken_messages": board.broken_messages,
     }
 
 
 def status_text(board: MotionBoard, states: JointStates) -> str:
     """Return a board's state, newest angles and faults in a line."""
-    status = board.status
+    status, celsius = board.status, board.joints.temperature_c
     faults = ", ".join(f.fault.name + ("" if f.joint is None else f" joint {f.joint + 1}") for f in status.faults)
     angles = " ".join(f"{np.degrees(q):7.2f}" for q in states.q[-1]) + " deg" if len(states.q) else "no readings"
-    state = STATE_TEXTS[status.state].split(":")[0]
-    line = f"{status.t_s:8.2f} s  {state:14} {angles}"
-    if not math.isnan(status.supply_v):
-        line += f"  {status.supply_v:5.2f} V"
-    if (celsius := board.joints.temperature_c) is not None:
-        line += f"  {celsius.max():.0f} deg C"
-    return f"{line}  {faults}" if faults else line
+    parts = [f"{status.t_s:8.2f} s", f"{STATE_TEXTS[status.state].split(':')[0]:14} {angles}"]
+    parts += [] if math.isnan(status.supply_v) else [f"{status.supply_v:5.2f} V"]
+    parts += [] if celsius is None else [f"{celsius.max():.0f} deg C"]
+    return "  ".join([*parts, faults] if faults else parts)
 
 
 def gains_json(values: Array) -> dict[str, Any]:
@@ -121,17 +105,16 @@ def changed_gains(values: Array, changes: Sequence[str]) -> Array:
         InputError: a change is not of this form.
     """
     changed, names = values.copy(), list(GAIN_RANGES)
+    rows = {**{str(j + 1): slice(j, j + 1) for j in range(JOINTS)}, "all": slice(None)}
     for change in changes:
         joint, _, rest = change.partition(":")
         name, _, text = rest.partition("=")
-        known = (*(str(j + 1) for j in range(JOINTS)), "all")
-        if joint not in known or name not in names:
+        if joint not in rows or name not in names:
             raise InputError(f"{change!r}: JOINT:NAME=VALUE is needed, JOINT 1 to 6 or all, NAME {', '.join(names)}")
         try:
-            value = float(text)
+            changed[rows[joint], names.index(name)] = float(text)
         except ValueError:
             raise InputError(f"{change!r}: {text!r} is no number") from None
-        changed[slice(None) if joint == "all" else int(joint) - 1, names.index(name)] = value
     return changed
 
 
@@ -151,6 +134,6 @@ def selftest_text(result: SelftestResult) -> str:
     ]
     lines.append(f"{result.ticks_per_s:.0f} ticks/s, {result.ticks_per_s / 1000:.1f} times real time")
     if result.elf.flash_bytes is not None:
-        float_text = "hardware" if result.elf.hard_float else "software"
-        lines.append(f"flash {result.elf.flash_bytes}, RAM {result.elf.ram_bytes} bytes, {float_text} floating point")
+        size = f"flash {result.elf.flash_bytes}, RAM {result.elf.ram_bytes} bytes"
+        lines.append(f"{size}, {_floats(result.elf.hard_float)}")
     return "\n".join(lines)
