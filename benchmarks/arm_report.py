@@ -57,7 +57,7 @@ def world(name: str, seed: int, half_rad: float, poses: int = 40) -> tuple[dict[
     truth = {k: 1e3 * float(np.sqrt(((a - b)[:, :3, 3] ** 2).sum(axis=1).mean())) for k, (a, b) in alone.items()}
     cov = np.tile(np.diag(SIGMA**2), (len(q), 1, 1))
     noise = Noise(np.eye(3) * SIGMA[0] ** 2, np.zeros((3, 3)), np.full(3, SIGMA[0] ** 2))
-    rests = RestPoses(np.arange(len(q)) * 3.0, T, arm.forward(q_ref), cov, q, q_ref, side, np.full(len(q), 9), noise)
+    rests = RestPoses(np.arange(len(q)) * 3.0, T, arm.forward(q_ref), cov, q, q_ref, side, noise)
     found = identify(arm, rests.measured(), priors={"ripple": 0.0})
     return truth, _split(arm, rests.rows(found.solution.used), found)[1]
 

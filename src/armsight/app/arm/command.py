@@ -1,11 +1,11 @@
-"""``armsight arm``: an arm's table, forward and inverse kinematics, Jacobian, and URDF."""
+"""``armsight arm``: an arm's table, forward and inverse kinematics, Jacobian, URDF, its calibration and its report."""
 
 from __future__ import annotations
 
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,24 +14,37 @@ from armsight.errors import InputError
 from armsight.files import check_suffix, check_writable, read_text, write_text
 
 if TYPE_CHECKING:
+    from armsight.app.arm.description import Shown
     from armsight.data import Array
     from armsight.robot.kinematics.arm import Arm
 
 #: A minus before a number is no option.
 _NUMBERS = {"ignore_unknown_options": True}
-_JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 #: Over less than this, m, poses distinguish an arm's zeros badly from its base and tool. Half: fewer notes; double: more.
 _NARROW_M = 0.15
 _POSE = ("x", "y", "z", "euler_z", "euler_y", "euler_x")
 
+_PATH = click.Path(path_type=Path)
 _ARM = arm_option("arm_name", metavar="ARM")
+_JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+_ANGLES = click.argument("angles", nargs=-1, metavar="Q1 Q2 ...")
 
 
-def _file(arm: str) -> str:
-    """Return the file, or name, of an arm."""
+def _print(shown: Shown, as_json: bool) -> None:
+    click.echo(json.dumps(shown[0]) if as_json else "\n".join(shown[1]))
+
+
+def _note(text: str) -> None:
+    click.echo(f"note: {text}", err=True)
+
+
+def _check_written(output: Path, arm: str, *also: str | Path, suffix: str = "", what: str = "") -> None:
+    """Check that a file can be written and is none of those that are read."""
     from armsight.robot.arm_file import split_arm
 
-    return split_arm(arm)[0]
+    if suffix:
+        check_suffix(output, suffix, what)
+    check_writable(output, apart_from=(split_arm(arm)[0], *also))
 
 
 @click.group("arm")
@@ -49,18 +62,17 @@ def list_(as_json: bool) -> None:
     from armsight.app.arm import description
     from armsight.robot.models import MODELS
 
-    click.echo(json.dumps(description.list_json(MODELS)) if as_json else description.list_text(MODELS))
+    _print(description.models(MODELS), as_json)
 
 
 @command.command()
 @_ARM
-@click.option("-o", "--output", metavar="ARM.png", type=click.Path(path_type=Path), help="Draw the arm at home.")
+@click.option("-o", "--output", metavar="ARM.png", type=_PATH, help="Draw the arm at home.")
 @_JSON
 def show(arm_name: str, output: Path | None, as_json: bool) -> None:
     """Print an arm's table, limits and reach."""
     if output is not None:
-        check_suffix(output, ".png", "a figure of the arm")
-        check_writable(output, apart_from=(_file(arm_name),))
+        _check_written(output, arm_name, suffix=".png", what="a figure of the arm")
 
     from armsight.app.arm import description
     from armsight.app.arm.figure import write_arm_figure
@@ -69,12 +81,12 @@ def show(arm_name: str, output: Path | None, as_json: bool) -> None:
     arm = open_arm(arm_name)
     if output is not None:
         write_arm_figure(arm, output)
-    click.echo(json.dumps(description.show_json(arm)) if as_json else description.show_text(arm))
+    _print(description.show(arm), as_json)
 
 
 @command.command(context_settings=_NUMBERS)
 @_ARM
-@click.argument("angles", nargs=-1, metavar="Q1 Q2 ...")
+@_ANGLES
 @_JSON
 def fk(arm_name: str, angles: tuple[str, ...], as_json: bool) -> None:
     """Print the pose of the tool at joint angles, in degrees.
@@ -91,17 +103,15 @@ def fk(arm_name: str, angles: tuple[str, ...], as_json: bool) -> None:
     if is_corrected(arm_name):
         corrected = open_corrected(arm_name)
         T = corrected.forward(q[None])[0]
-        for note in corrected.notes:
-            click.echo(f"note: {note}", err=True)
-        click.echo(
-            "note: with the sensors' curves and compliance; from which sides the joints came is not known", err=True
-        )
-    click.echo(json.dumps(description.forward_json(arm, q, T)) if as_json else description.forward_text(T))
+        sides = "with the sensors' curves and compliance; from which sides the joints came is not known"
+        for note in (*corrected.notes, sides):
+            _note(note)
+    _print(description.forward(arm, q, T), as_json)
 
 
 @command.command(context_settings=_NUMBERS)
 @_ARM
-@click.argument("angles", nargs=-1, metavar="Q1 Q2 ...")
+@_ANGLES
 @_JSON
 def jacobian(arm_name: str, angles: tuple[str, ...], as_json: bool) -> None:
     """Print the Jacobian of the tool's point in base axes at joint angles, in degrees."""
@@ -109,8 +119,7 @@ def jacobian(arm_name: str, angles: tuple[str, ...], as_json: bool) -> None:
     from armsight.robot.arm_file import open_arm
 
     arm = open_arm(arm_name)
-    q = _joints(arm, angles)
-    click.echo(json.dumps(description.jacobian_json(arm, q)) if as_json else description.jacobian_text(arm, q))
+    _print(description.jacobian(arm, _joints(arm, angles)), as_json)
 
 
 @command.command(context_settings=_NUMBERS)
@@ -136,38 +145,33 @@ def ik(arm_name: str, numbers: tuple[str, ...], as_json: bool) -> int:
     x, y, z, *euler = (_number(text, name) for text, name in zip(numbers, _POSE, strict=True))
     T = pose(from_euler_zyx(*np.radians(euler)), np.array([x, y, z]) / 1e3)
     found = arm.inverse(T)
-    answer = description.inverse_json if as_json else description.inverse_text
-    click.echo(json.dumps(answer(arm, T, found)) if as_json else answer(arm, T, found))
+    _print(description.inverse(arm, T, found), as_json)
     return 0 if found.within_limits.any() else 1
 
 
 @command.command()
 @_ARM
-@click.option(
-    "-o", "--output", required=True, metavar="ARM.urdf", type=click.Path(path_type=Path), help="The file to write."
-)
+@click.option("-o", "--output", required=True, metavar="ARM.urdf", type=_PATH, help="The file to write.")
 @_JSON
 def urdf(arm_name: str, output: Path, as_json: bool) -> None:
     """Write an arm as a URDF file."""
-    check_suffix(output, ".urdf", "an arm")
-    check_writable(output, apart_from=(_file(arm_name),))
+    _check_written(output, arm_name, suffix=".urdf", what="an arm")
 
     from armsight.robot.arm_file import open_arm
     from armsight.robot.urdf.write import write_urdf
 
     arm = open_arm(arm_name)
     write_urdf(arm, output)
-    click.echo(json.dumps({"arm": arm.name, "output": str(output)}) if as_json else str(output))
+    _print(({"arm": arm.name, "output": str(output)}, [str(output)]), as_json)
 
 
 @command.command()
 @_ARM
 @click.argument("file", metavar="FILE")
 @click.option(
-    "-o",
-    "--output",
+    *("-o", "--output"),
     metavar="OUT",
-    type=click.Path(path_type=Path),
+    type=_PATH,
     help="Write FILE's arm: .urdf, or .yaml as the maker's driver reads it; one that exists is kept as OUT.old.",
 )
 @click.option("--yes", is_flag=True, help="Do not ask before OUT is replaced.")
@@ -186,26 +190,19 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
     if output is not None:
         if output.suffix not in (".urdf", ".yaml"):
             raise InputError(f"{output}: an arm is written as .urdf or .yaml")
-        check_writable(output, apart_from=(_file(arm_name), file))
+        _check_written(output, arm_name, file)
     nominal = open_arm(arm_name)
-    kept = file.lower().endswith((".yaml", ".yml", ".conf"))
-    arm = read_calibration(file, nominal) if kept else open_arm(file)
-    left = (0.0, 0.0)
+    arm = read_calibration(file, nominal) if file.lower().endswith((".yaml", ".yml", ".conf")) else open_arm(file)
     if output is not None and output.exists():
         _keep(output, yes)
     if output is not None and output.suffix == ".yaml":
-        left = write_calibration(arm, nominal, output)
+        off_m, off_rad = write_calibration(arm, nominal, output)
+        if max(off_m, off_rad) > 1e-9:
+            off = f"{1e3 * off_m:.3f} mm and {math.degrees(off_rad):.3f} deg off the last joint's axis"
+            _note(f"{output} cannot hold the flange's {off}: give them to the tool")
     elif output is not None:
         write_urdf(arm, output)
-    if max(left) > 1e-9:
-        click.echo(
-            f"note: {output} cannot hold the flange's {1e3 * left[0]:.3f} mm and {math.degrees(left[1]):.3f} deg off "
-            "the last joint's axis: give them to the tool",
-            err=True,
-        )
-    found = difference(nominal, arm)
-    answer = description.difference_json if as_json else description.difference_text
-    click.echo(json.dumps(answer(nominal, arm, found)) if as_json else answer(nominal, arm, found))
+    _print(description.difference(nominal, arm, difference(nominal, arm)), as_json)
 
 
 @command.command()
@@ -214,7 +211,7 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
     "--around",
     required=True,
     metavar="RUN",
-    type=click.Path(path_type=Path),
+    type=_PATH,
     help="An earlier run of this arm before these cameras, such as with the default motion: where the body was seen.",
 )
 @click.option(
@@ -224,45 +221,38 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
     "--cycles", type=click.IntRange(0, 1000), default=30, show_default=True, help="How often five poses come again."
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the choice.")
-@click.option(
-    "-o", "--output", required=True, metavar="FILE.toml", type=click.Path(path_type=Path), help="The motions to write."
-)
+@click.option("-o", "--output", required=True, metavar="FILE.toml", type=_PATH, help="The motions to write.")
 @_JSON
-def plan(arm_name: str, around: Path, poses: int, cycles: int, seed: int, output: Path, as_json: bool) -> None:
+def plan(arm_name: str, around: Path, output: Path, as_json: bool, **chosen: int) -> None:
     """Plan the recording of `arm report`: motions for `armsight run --open-loop --motion FILE.toml`.
 
     Poses all over where the body is seen, each from both sides of every joint, and five of them again and again.
     """
-    check_suffix(output, ".toml", "a plan of motions")
-    check_writable(output, apart_from=(_file(arm_name), around))
+    _check_written(output, arm_name, around, suffix=".toml", what="a plan of motions")
 
     from armsight.app.arm.evaluate import plan_report, seen_angles
     from armsight.app.check.plan import seen_by
     from armsight.robot.arm_file import open_arm
 
     arm = open_arm(arm_name)
-    q = seen_angles(around, arm)
-    text, extent = plan_report(arm, q, seen_by(around), poses=poses, cycles=cycles, seed=seed)
+    text, extent = plan_report(arm, seen_angles(around, arm), seen_by(around), **chosen)
     write_text(output, text)
+    size = " x ".join(f"{100 * each:.0f}" for each in extent) + " cm"
     if extent.min() < _NARROW_M:
-        click.echo(
-            f"note: the poses are between those at which {around} saw the body, and cover only {_cm(extent)}: zeros, base "
-            "and tool, and lengths will hardly be distinguished; first record a run whose hand-eye poses cover more",
-            err=True,
+        _note(
+            f"the poses are between those at which {around} saw the body, and cover only {size}: zeros, base "
+            "and tool, and lengths will hardly be distinguished; first record a run whose hand-eye poses cover more"
         )
-    answer = {"arm": arm.name, "poses": poses, "cycles": cycles, "extent_m": extent.tolist(), "output": str(output)}
-    click.echo(json.dumps(answer) if as_json else f"{output}: {poses} poses over {_cm(extent)}")
+    answer: dict[str, Any] = {"arm": arm.name, "poses": chosen["poses"], "cycles": chosen["cycles"]}
+    answer |= {"extent_m": extent.tolist(), "output": str(output)}
+    _print((answer, [f"{output}: {chosen['poses']} poses over {size}"]), as_json)
 
 
 @command.command()
-@click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+@click.argument("run", metavar="RUN", type=_PATH)
 @arm_option("--arm", "arm_name", metavar="ARM", help="The nominal arm; by default the one that the run names.")
-@click.option(
-    "--compare", multiple=True, metavar="FILE.json", type=click.Path(path_type=Path), help="Another arm's report.json."
-)
-@click.option(
-    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Folder for report.html, .pdf and .json."
-)
+@click.option("--compare", multiple=True, metavar="FILE.json", type=_PATH, help="Another arm's report.json.")
+@click.option("-o", "--output", metavar="DIR", type=_PATH, help="Folder for report.html, .pdf and .json.")
 @_JSON
 def report(run: Path, arm_name: str | None, compare: tuple[Path, ...], output: Path | None, as_json: bool) -> None:
     """Report what an arm does, what explains its error, and what each remedy would bring.
@@ -291,11 +281,6 @@ def report(run: Path, arm_name: str | None, compare: tuple[Path, ...], output: P
         write_report(shown, found, output)
     if output is not None and not as_json:
         click.echo(f"\nwritten: {output}/report.html, report.pdf, report.json")
-
-
-def _cm(extent: Array) -> str:
-    """Return the size (3,) of a space, m, as text."""
-    return " x ".join(f"{100 * size:.0f}" for size in extent) + " cm"
 
 
 def _keep(output: Path, yes: bool) -> None:
@@ -343,9 +328,8 @@ def _joints(arm: Arm, texts: tuple[str, ...]) -> Array:
         raise InputError(f"{arm.name} has {arm.joints} joints; {len(texts)} angles were given, in degrees: {want}")
     degrees = np.array([_number(text, f"q{i + 1}") for i, text in enumerate(texts)])
     most = np.floor(np.degrees(MOST_RADIANS))
-    if np.abs(degrees).max() > most:
-        i = int(np.argmax(np.abs(degrees)))
+    for i in np.flatnonzero(np.abs(degrees) > most)[:1]:
         raise InputError(f"q{i + 1} is {texts[i]} degrees; no joint rotates further than {most:.0f}")
     for note in description.beyond(arm, np.radians(degrees)):
-        click.echo(f"note: {note}", err=True)
+        _note(note)
     return np.asarray(np.radians(degrees))

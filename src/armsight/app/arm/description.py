@@ -1,7 +1,7 @@
 """What ``armsight arm`` answers, as JSON objects (units in the keys) and as text (mm and degrees).
 
 In: an arm, joint angles (n,) in rad or a pose (4, 4), the inverse solutions of a pose. Out: for each subcommand a function
-NAME_json and a function NAME_text of the same records.
+of the same name that returns both, the object and the lines.
 
 Angles of a rotation are Euler angles about z, y and x, in that sequence: R = Rz(euler_z) Ry(euler_y) Rx(euler_x). Robot
 sources that call them roll, pitch, yaw put roll about z; ROS puts roll about x.
@@ -10,7 +10,7 @@ sources that call them roll, pitch, yaw put roll about z; ROS puts roll about x.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -24,195 +24,136 @@ from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.reach import reach
 from armsight.robot.kinematics.solutions import Solutions
 
+#: What is shown: an object, and lines.
+Shown = tuple[Any, list[str]]
 
-def list_json(models: Mapping[str, Arm]) -> list[dict[str, Any]]:
+
+def _fixed(value: float) -> str:
+    """Return a number with three decimals, and no minus before a zero."""
+    return f"{round(float(value), 3) + 0.0:.3f}"
+
+
+def _short(value: float) -> str:
+    """Return a number with at most three decimals."""
+    return f"{round(float(value), 3) + 0.0:.10g}"
+
+
+def _deg(value: float) -> str:
+    return _short(np.degrees(value))
+
+
+def _mm(value: float) -> str:
+    return f"{1e3 * value:.3f}"
+
+
+#: Of a joint: its key in JSON, the array of the arm, the column's title (none: it is not shown), and how it is written.
+_JOINT: tuple[tuple[str, str, str, Callable[[float], str]], ...] = (
+    ("a_m", "a", "a mm", _mm),
+    ("d_m", "d", "d mm", _mm),
+    ("alpha_rad", "alpha", "alpha", _deg),
+    ("offset_rad", "offset", "offset", _deg),
+    ("direction", "direction", "dir", "{:+.0f}".format),
+    ("q_min_rad", "q_min", "from", _deg),
+    ("q_max_rad", "q_max", "to", _deg),
+    ("qd_max_rad_s", "qd_max", "speed", _deg),
+    ("qdd_max_rad_s2", "qdd_max", "accel.", _deg),
+    ("qddd_max_rad_s3", "qddd_max", "jerk", _deg),
+    ("home_rad", "home", "home", _deg),
+)
+
+
+def models(of: Mapping[str, Arm]) -> Shown:
     """Return each arm's name, reach and source."""
-    return [{"arm": name, "radius_m": reach(arm).radius_m, "source": arm.source} for name, arm in models.items()]
+    wide, far = max(map(len, of)), {name: reach(arm).radius_m for name, arm in of.items()}
+    lines = [f"{name:{wide}}  reach {1e3 * far[name]:6.0f} mm  {arm.source}" for name, arm in of.items()]
+    return [{"arm": name, "radius_m": far[name], "source": arm.source} for name, arm in of.items()], lines
 
 
-def list_text(models: Mapping[str, Arm]) -> str:
-    """Return the arms as lines."""
-    wide = max(map(len, models))
-    return "\n".join(
-        f"{name:{wide}}  reach {1e3 * reach(arm).radius_m:6.0f} mm  {arm.source}" for name, arm in models.items()
-    )
-
-
-def show_json(arm: Arm) -> dict[str, Any]:
+def show(arm: Arm) -> Shown:
     """Return an arm's table, limits and reach."""
+    extent, home = reach(arm), arm.forward(arm.home)
     joints = [
-        {
-            "name": arm.joint_names[i],
-            "a_m": arm.a[i],
-            "d_m": arm.d[i],
-            "alpha_rad": arm.alpha[i],
-            "offset_rad": arm.offset[i],
-            "direction": int(arm.direction[i]),
-            "q_min_rad": arm.q_min[i],
-            "q_max_rad": arm.q_max[i],
-            "qd_max_rad_s": arm.qd_max[i],
-            "qdd_max_rad_s2": arm.qdd_max[i],
-            "qddd_max_rad_s3": arm.qddd_max[i],
-            "home_rad": arm.home[i],
-        }
-        for i in range(arm.joints)
+        {"name": name, **{key: getattr(arm, array)[i] for key, array, *_ in _JOINT}, "direction": int(arm.direction[i])}
+        for i, name in enumerate(arm.joint_names)
     ]
-    return {
-        "arm": arm.name,
-        "convention": arm.convention,
-        "joints": joints,
-        "coupling": arm.coupling.tolist(),
-        "T_base_0": arm.T_base_0.tolist(),
-        "T_flange_tool": arm.T_flange_tool.tolist(),
-        "T_base_tool_home": arm.forward(arm.home).tolist(),
-        "reach_m": reach(arm)._asdict(),
-        "source": arm.source,
-    }
-
-
-def show_text(arm: Arm) -> str:
-    """Return an arm's table, limits and reach as a table and lines."""
-    deg = np.degrees
-    head = ("joint", "a mm", "d mm", "alpha", "offset", "dir", "from", "to", "speed", "accel.", "jerk", "home")
     rows = [
-        (
-            arm.joint_names[i],
-            *(f"{1e3 * x:.3f}" for x in (arm.a[i], arm.d[i])),
-            *(_short(deg(x)) for x in (arm.alpha[i], arm.offset[i])),
-            f"{arm.direction[i]:+.0f}",
-            *(_short(deg(x)) for x in (arm.q_min[i], arm.q_max[i], arm.qd_max[i], arm.qdd_max[i], arm.qddd_max[i])),
-            _short(deg(arm.home[i])),
-        )
-        for i in range(arm.joints)
+        (name, *(form(getattr(arm, array)[i]) for _, array, _, form in _JOINT))
+        for i, name in enumerate(arm.joint_names)
     ]
-    extent = reach(arm)
     lines = [f"{arm.name}: {arm.convention} Denavit-Hartenberg table; angles in deg, speeds in deg/s, deg/s^2, deg/s^3"]
-    lines += aligned((head, *rows))
+    lines += aligned((("joint", *(title for _, _, title, _ in _JOINT)), *rows))
     for name, T in (("T_base_0", arm.T_base_0), ("T_flange_tool", arm.T_flange_tool)):
         if not np.array_equal(T, np.eye(4)):
             lines.append(f"{name}: {_pose_text(T)}")
-    lines += _coupling(arm)
-    lines.append(f"tool at home: {_pose_text(arm.forward(arm.home))}")
-    lines.append(
-        f"reach of the tool: {1e3 * extent.radius_m:.1f} mm from joint 1's axis, from {1e3 * extent.low_m:.1f} to "
-        f"{1e3 * extent.high_m:.1f} mm along it"
-    )
-    return "\n".join([*lines, f"source: {arm.source}"])
-
-
-def _coupling(arm: Arm) -> list[str]:
-    """Return which joints more than one motor moves, as lines."""
-    lines = []
     for name, row, one in zip(arm.joint_names, arm.coupling, np.eye(arm.joints), strict=True):
         if (row != one).any():
             parts = [f"{factor:+g} {other}" for factor, other in zip(row, arm.joint_names, strict=True) if factor]
             lines.append(f"coupling: the angle of {name} is that of the motors {' '.join(parts)}")
-    return lines
+    lines.append(f"tool at home: {_pose_text(home)}")
+    lines.append(
+        f"reach of the tool: {1e3 * extent.radius_m:.1f} mm from joint 1's axis, from {1e3 * extent.low_m:.1f} to "
+        f"{1e3 * extent.high_m:.1f} mm along it"
+    )
+    found: dict[str, Any] = {"arm": arm.name, "convention": arm.convention, "joints": joints}
+    found |= {name: getattr(arm, name) for name in ("coupling", "T_base_0", "T_flange_tool")}
+    found |= {"T_base_tool_home": home, "reach_m": extent, "source": arm.source}
+    return json_of(found), [*lines, f"source: {arm.source}"]
 
 
-def forward_json(arm: Arm, q: Array, T: Array) -> dict[str, Any]:
+def forward(arm: Arm, q: Array, T: Array) -> Shown:
     """Return the pose T (4, 4) of the tool in the base at joint angles (n,), rad."""
-    return {"arm": arm.name, **_angles_json(q), "within_limits": bool(arm.within_limits(q)), **_pose_json(T)}
+    found = {"arm": arm.name, **_angles_json(q), "within_limits": bool(arm.within_limits(q)), **_pose_json(T)}
+    return found, [f"tool at {_pose_text(T)}", "T_base_tool, m:", *_matrix(T)]
 
 
-def forward_text(T: Array) -> str:
-    """Return the pose T (4, 4) of the tool in the base as lines."""
-    return "\n".join([f"tool at {_pose_text(T)}", "T_base_tool, m:", *_matrix(T)])
-
-
-def jacobian_json(arm: Arm, q: Array) -> dict[str, Any]:
+def jacobian(arm: Arm, q: Array) -> Shown:
     """Return the Jacobian in base axes at joint angles (n,), rad."""
-    return {
-        "arm": arm.name,
-        **_angles_json(q),
-        "within_limits": bool(arm.within_limits(q)),
-        "J_base": arm.jacobian(q).tolist(),
-        "manipulability": float(arm.manipulability(q)),
-    }
+    J, w = arm.jacobian(q), float(arm.manipulability(q))
+    found = {"arm": arm.name, **_angles_json(q), "within_limits": bool(arm.within_limits(q))}
+    lines = ["J_base: m/s and rad/s of the tool, base axes, for 1 rad/s of each joint", *_matrix(J)]
+    return {**found, "J_base": J.tolist(), "manipulability": w}, [*lines, f"manipulability: {w:.6g} (0 is singular)"]
 
 
-def jacobian_text(arm: Arm, q: Array) -> str:
-    """Return the Jacobian in base axes at joint angles (n,), rad, as lines."""
-    lines = ["J_base: m/s and rad/s of the tool, base axes, for 1 rad/s of each joint", *_matrix(arm.jacobian(q))]
-    return "\n".join([*lines, f"manipulability: {float(arm.manipulability(q)):.6g} (0 is singular)"])
-
-
-def inverse_json(arm: Arm, T_base_tool: Array, found: Solutions) -> dict[str, Any]:
+def inverse(arm: Arm, T_base_tool: Array, found: Solutions) -> Shown:
     """Return the inverse solutions of a pose (4, 4), or why there is none."""
-    solutions = [
-        {
-            "configuration": None if configuration is None else dataclasses.asdict(configuration),
-            **_angles_json(found.q[i]),
-            "within_limits": bool(found.within_limits[i]),
-            "outside": beyond(arm, found.q[i]),
-            "singular": bool(found.singular[i]),
-            "residual_m": float(found.residual_m[i]),
-            "residual_rad": float(found.residual_rad[i]),
-        }
-        for i, configuration in enumerate(found.configurations)
-    ]
-    nearest = None
-    if found.nearest is not None:
-        off = {"off_m": found.nearest.off_m, "off_rad": found.nearest.off_rad}
-        nearest = {**_angles_json(found.nearest.q), **_pose_json(found.nearest.T_base_tool), **off}
-    return {
-        "arm": arm.name,
-        **_pose_json(T_base_tool),
-        "reachable": bool(found.within_limits.any()),
-        "reason": found.reason,
-        "solutions": solutions,
-        "nearest": nearest,
-    }
-
-
-def inverse_text(arm: Arm, T_base_tool: Array, found: Solutions) -> str:
-    """Return the inverse solutions of a pose (4, 4) as a table and lines."""
-    lines = [f"{arm.name}: tool at {_pose_text(T_base_tool)}"]
-    rows = [
-        (
-            f"{i + 1}",
-            *(_fixed(angle) for angle in np.degrees(found.q[i])),
-            "-" if configuration is None else " ".join(dataclasses.asdict(configuration).values()),
-            _remark(arm, found.q[i], singular=bool(found.singular[i])),
+    solutions, rows, lines = list[Any](), list[tuple[str, ...]](), [f"{arm.name}: tool at {_pose_text(T_base_tool)}"]
+    for i, configuration in enumerate(found.configurations):
+        kind, q = None if configuration is None else dataclasses.asdict(configuration), found.q[i]
+        outside, singular = beyond(arm, q), bool(found.singular[i])
+        solutions.append(
+            {
+                "configuration": kind,
+                **_angles_json(q),
+                "within_limits": bool(found.within_limits[i]),
+                "outside": outside,
+                "singular": singular,
+                "residual_m": float(found.residual_m[i]),
+                "residual_rad": float(found.residual_rad[i]),
+            }
         )
-        for i, configuration in enumerate(found.configurations)
-    ]
+        remark = "outside limits: " + " ".join(text.split(" at ")[0] for text in outside) if outside else ""
+        angles, names = map(_fixed, np.degrees(q)), "-" if kind is None else " ".join(kind.values())
+        rows.append((f"{i + 1}", *angles, names, remark or "singular" * singular))
     if rows:
         lines += aligned((("", *(f"q{i + 1}" for i in range(arm.joints)), "configuration", ""), *rows))
-    if found.reason is not None:
-        lines.append(found.reason)
-    if (nearest := found.nearest) is not None:
-        lines.append(f"nearest pose within limits: {_pose_text(nearest.T_base_tool)}")
-        lines.append(
-            f"  {1e3 * nearest.off_m:.3f} mm and {np.degrees(nearest.off_rad):.3f} deg away, at q "
-            + " ".join(_fixed(angle) for angle in np.degrees(nearest.q))
-        )
-    return "\n".join(lines)
+    lines += [] if found.reason is None else [found.reason]
+    nearest = None
+    if (near := found.nearest) is not None:
+        nearest = {**_angles_json(near.q), **_pose_json(near.T_base_tool), "off_m": near.off_m, "off_rad": near.off_rad}
+        lines.append(f"nearest pose within limits: {_pose_text(near.T_base_tool)}")
+        angle, q_deg = np.degrees(near.off_rad), " ".join(map(_fixed, np.degrees(near.q)))
+        lines.append(f"  {1e3 * near.off_m:.3f} mm and {angle:.3f} deg away, at q {q_deg}")
+    reachable, of = bool(found.within_limits.any()), {"arm": arm.name, **_pose_json(T_base_tool)}
+    return {**of, "reachable": reachable, "reason": found.reason, "solutions": solutions, "nearest": nearest}, lines
 
 
-def difference_json(nominal: Arm, arm: Arm, found: Difference) -> dict[str, Any]:
+def difference(nominal: Arm, arm: Arm, found: Difference) -> Shown:
     """Return how far an arm puts its tool from where the nominal one does, and the changes of its table."""
     changes = {name: getattr(found, name) for name in ("a_m", "d_m", "alpha_rad", "offset_rad")}
-    return {
-        "nominal": nominal.name,
-        "arm": arm.name,
-        "tool_apart_mean_m": found.mean_m,
-        "tool_apart_max_m": found.most_m,
-        "tool_rotated_mean_rad": found.mean_rad,
-        "tool_rotated_max_rad": found.most_rad,
-        "changes": json_of(changes),
-    }
-
-
-def difference_text(nominal: Arm, arm: Arm, found: Difference) -> str:
-    """Return the same as lines."""
+    scaled = np.stack([(1e3 if name.endswith("_m") else np.degrees(1.0)) * each for name, each in changes.items()], 1)
     rows = [
-        (
-            nominal.joint_names[i],
-            *(_change(1e3 * x) for x in (found.a_m[i], found.d_m[i])),
-            *(_change(np.degrees(x)) for x in (found.alpha_rad[i], found.offset_rad[i])),
-        )
-        for i in range(nominal.joints)
+        (name, *("-" if np.isnan(value) else f"{value:+.4f}" for value in row))
+        for name, row in zip(nominal.joint_names, scaled, strict=True)
     ]
     lines = [
         f"{arm.name} puts its tool {1e3 * found.mean_m:.3f} mm from {nominal.name} on the mean, "
@@ -223,11 +164,9 @@ def difference_text(nominal: Arm, arm: Arm, found: Difference) -> str:
     ]
     if np.isnan(found.a_m).any():
         lines.append("-: axes that were parallel no longer are, or another convention: these rows cannot be compared")
-    return "\n".join(lines)
-
-
-def _change(value: float) -> str:
-    return "-" if np.isnan(value) else f"{value:+.4f}"
+    values = {"tool_apart_mean_m": found.mean_m, "tool_apart_max_m": found.most_m}
+    values |= {"tool_rotated_mean_rad": found.mean_rad, "tool_rotated_max_rad": found.most_rad}
+    return {"nominal": nominal.name, "arm": arm.name, **values, "changes": json_of(changes)}, lines
 
 
 def beyond(arm: Arm, q: Array) -> list[str]:
@@ -247,12 +186,8 @@ def _angles_json(q: Array) -> dict[str, Any]:
 def _pose_json(T: Array) -> dict[str, Any]:
     """Return a pose: the matrix, and mm and degrees."""
     angles, singular = euler_zyx(T[:3, :3])
-    return {
-        "T_base_tool": T.tolist(),
-        "position_mm": (1e3 * T[:3, 3]).tolist(),
-        "euler_zyx_deg": np.degrees(angles).tolist(),
-        "pitch_singular": singular,
-    }
+    found = {"T_base_tool": T.tolist(), "position_mm": (1e3 * T[:3, 3]).tolist()}
+    return {**found, "euler_zyx_deg": np.degrees(angles).tolist(), "pitch_singular": singular}
 
 
 def _pose_text(T: Array) -> str:
@@ -263,23 +198,6 @@ def _pose_text(T: Array) -> str:
     return f"({xyz}) mm, euler zyx ({zyx}) deg{note}"
 
 
-def _remark(arm: Arm, q: Array, *, singular: bool) -> str:
-    """Return what is special about a solution."""
-    if outside := beyond(arm, q):
-        return "outside limits: " + " ".join(text.split(" at ")[0] for text in outside)
-    return "singular" if singular else ""
-
-
-def _fixed(value: float) -> str:
-    """Return a number with three decimals, and no minus before a zero."""
-    return f"{round(float(value), 3) + 0.0:.3f}"
-
-
 def _matrix(values: Array) -> list[str]:
     """Return a matrix as lines."""
     return ["  " + " ".join(f"{v + 0.0:11.6f}" for v in row) for row in np.round(values, 9)]
-
-
-def _short(value: float) -> str:
-    """Return a number with at most three decimals."""
-    return f"{round(float(value), 3) + 0.0:.10g}"

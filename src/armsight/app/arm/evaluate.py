@@ -16,7 +16,7 @@ less that part.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -72,29 +72,16 @@ _PRIORS = {"ripple": 0.0}
 
 @dataclass(frozen=True, eq=False)
 class RestPoses(Record):
-    """The rests of a run in open loop that vision saw.
+    """The rests of a run in open loop that vision saw."""
 
-    Attributes:
-        t_s: (N,) their ends, board's clock, s.
-        T_seen: (N, 4, 4) mean poses of the tool at their ends, in the base of the run.
-        T_ref: (N, 4, 4) commanded ones.
-        cov: (N, 6, 6) covariances of what was seen, right tangents [m; rad].
-        q: (N, n) mean readings, rad.
-        q_ref: (N, n) commands, rad.
-        approach: (N, n) from which side each joint came: 1 with rising angle, -1 with falling, 0 unmoved.
-        shots: (N,) how many each was seen in.
-        noise: of one shot.
-    """
-
-    t_s: Array
-    T_seen: Array
-    T_ref: Array
-    cov: Array
-    q: Array
-    q_ref: Array
-    approach: Array
-    shots: NDArray[np.int64]
-    noise: Noise
+    t_s: Array  #: (N,) their ends, board's clock, s
+    T_seen: Array  #: (N, 4, 4) mean poses of the tool at their ends, in the base of the run
+    T_ref: Array  #: (N, 4, 4) commanded ones
+    cov: Array  #: (N, 6, 6) covariances of what was seen, right tangents [m; rad]
+    q: Array  #: (N, n) mean readings, rad
+    q_ref: Array  #: (N, n) commands, rad
+    approach: Array  #: (N, n) from which side each joint came: 1 with rising angle, -1 with falling, 0 unmoved
+    noise: Noise  #: of one shot
 
     def __len__(self) -> int:
         """Return N."""
@@ -106,17 +93,8 @@ class RestPoses(Record):
 
     def rows(self, rows: NDArray[np.bool_]) -> RestPoses:
         """Return some of the rests."""
-        return RestPoses(
-            self.t_s[rows],
-            self.T_seen[rows],
-            self.T_ref[rows],
-            self.cov[rows],
-            self.q[rows],
-            self.q_ref[rows],
-            self.approach[rows],
-            self.shots[rows],
-            self.noise,
-        )
+        names = [each.name for each in fields(self) if each.name != "noise"]
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def visits(self) -> tuple[NDArray[np.int64], int]:
         """Return which pose each rest was at (N,), and how many there are."""
@@ -139,76 +117,51 @@ def rests_of(folder: Path, arm: Arm) -> RestPoses:
     segments = segments_of(folder, closed=False)
     track = joint_track(folder, arm.joints)
     seen, sigmas = read_track(folder / "vision.csv", _SIGMAS)
-    noise, rows = noise_of(segments), list[tuple[Any, ...]]()
+    rows = list[tuple[Any, ...]]()
     for segment in (each for each in segments if each.kind == "rest"):
         end_s, begin_s = float(segment.reference.t_s[-1]), float(segment.reference.t_s[0])
         looked = np.flatnonzero((seen.t_s > max(end_s - WINDOW_S, begin_s)) & (seen.t_s <= end_s))
-        read = (track.t_s > end_s - WINDOW_S) & (track.t_s <= end_s)
-        if len(looked) < _SHOTS or not read.any():
+        read = np.flatnonzero((track.t_s > end_s - WINDOW_S) & (track.t_s <= end_s))
+        if len(looked) < _SHOTS or not len(read):
             continue
-        T = mean_pose(seen.Ts_base_tool[looked])
-        R, variance = T[:3, :3], (sigmas[looked] ** 2).mean(axis=0)
-        cov = np.zeros((6, 6))
+        T, variance, cov = mean_pose(seen.Ts_base_tool[looked]), (sigmas[looked] ** 2).mean(axis=0), np.zeros((6, 6))
         for part in (slice(0, 3), slice(3, 6)):
-            cov[part, part] = R.T @ np.diag(variance[part]) @ R
-        q_ref = track.q_ref[np.flatnonzero(read)[-1]]
-        rows.append(
-            (end_s, T, arm.forward(q_ref), cov, track.q[read].mean(axis=0), q_ref, track.sides(end_s), len(looked))
-        )
+            cov[part, part] = T[:3, :3].T @ np.diag(variance[part]) @ T[:3, :3]
+        q_ref = track.q_ref[read[-1]]
+        rows.append((end_s, T, arm.forward(q_ref), cov, track.q[read].mean(axis=0), q_ref, track.sides(end_s)))
     if len(rows) < MIN_RESTS:
         raise InputError(
             f"{folder}: {len(rows)} rests were seen in open loop, {MIN_RESTS} at least are needed: armsight arm plan "
             "writes the motions of such a recording"
         )
-    t_s, T_seen, T_ref, cov, q, q_ref, came, shots = (np.array(part) for part in zip(*rows, strict=True))
-    return RestPoses(t_s, T_seen, T_ref, cov, q, q_ref, came, shots, noise)
+    t_s, T_seen, T_ref, cov, q, q_ref, came = (np.array(part) for part in zip(*rows, strict=True))
+    return RestPoses(t_s, T_seen, T_ref, cov, q, q_ref, came, noise_of(segments))
 
 
 @dataclass(frozen=True)
 class JointFigures:
-    """What a run shows of one joint; None where it does not.
+    """What a run shows of one joint; None where it does not. Pairs are a value and its sigma."""
 
-    Attributes:
-        name: of the joint.
-        zero_deg: true angle less reading, mean over the rests, and its sigma; None of the first and the last joint, whose
-            zeros are base and tool.
-        backlash_deg: behind the sensor, stop to stop, and its sigma.
-        backlash_how: what showed it, or why it does not show.
-        hysteresis_deg: of the reading against the command: from above less from below, mean, and its sigma.
-        droop_deg_per_m: reading less command for a metre of the gravity load's lever, and its sigma.
-        droop_deg: that at the greatest lever of these poses.
-        once_per_revolution_deg: amplitude of the sensor's error once per revolution, and its sigma.
-        latency_s: from command to reading in motion.
-    """
-
-    name: str
-    zero_deg: tuple[float, float] | None
-    backlash_deg: tuple[float, float] | None
-    backlash_how: str
-    hysteresis_deg: tuple[float, float] | None
-    droop_deg_per_m: tuple[float, float] | None
-    droop_deg: float | None
-    once_per_revolution_deg: tuple[float, float] | None
-    latency_s: float | None
+    name: str  #: of the joint
+    zero_deg: tuple[float, float] | None  #: true angle less reading, mean; None of those that are base and tool
+    backlash_deg: tuple[float, float] | None  #: behind the sensor, stop to stop
+    backlash_how: str  #: what showed it, or why it does not show
+    hysteresis_deg: tuple[float, float] | None  #: reading against command: from above less from below, mean
+    droop_deg_per_m: tuple[float, float] | None  #: reading less command for a metre of the gravity load's lever
+    droop_deg: float | None  #: that at the greatest lever of these poses
+    once_per_revolution_deg: tuple[float, float] | None  #: amplitude of the sensor's error once per revolution
+    latency_s: float | None  #: from command to reading in motion
 
 
 @dataclass(frozen=True)
 class ErrorPart:
-    """A part of the error.
+    """A part of the error."""
 
-    Attributes:
-        share: of the mean square error; all sum to 1.
-        rms_mm: what it moves the tool by, RMS.
-        sigma_mm: sigma of that: the RMS of its own error.
-        without_mm: RMS error that its remedy alone would leave.
-        remedy: what would take it away; empty where nothing does.
-    """
-
-    share: float
-    rms_mm: float
-    sigma_mm: float
-    without_mm: float
-    remedy: str
+    share: float  #: of the mean square error; all sum to 1
+    rms_mm: float  #: what it moves the tool by, RMS
+    sigma_mm: float  #: sigma of that: the RMS of its own error
+    without_mm: float  #: RMS error that its remedy alone would leave
+    remedy: str  #: what would take it away; empty where nothing does
 
     @property
     def determined(self) -> bool:
@@ -218,97 +171,59 @@ class ErrorPart:
 
 @dataclass(frozen=True, eq=False)
 class ArmReport(Record):
-    """An arm in numbers.
+    """An arm in numbers; None where the run does not show it."""
 
-    Attributes:
-        arm: its model.
-        board: its controller, as the run names it.
-        poses: number of different poses.
-        rests: number of rests that were seen.
-        hours: from the first rest to the last.
-        accuracy_mm: RMS and largest distance from the command in the frames of the run.
-        placed_mm: RMS distance from the command after base and tool were fitted to these poses.
-        pose_accuracy_mm: accuracy AP (ISO 9283) of the poses of ``one_side_mm``, mean; None likewise.
-        one_side_mm: repeatability RP (ISO 9283) of poses approached from the same side; None where none was three times.
-        both_sides_mm: mean and largest distance between a pose from one side and from the other; None likewise.
-        drift_mm_per_h: drift of the pose that came most often, and its sigma; None likewise.
-        cycles: how often that pose came.
-        latency_s: median of the joints'; None where no joint moved enough.
-        joints: of each joint.
-        parts: of the error, by name.
-        noise_mm: of vision at rest, one shot.
-        health: what the run's health monitor found, as text.
-        notes: what could not be evaluated, and why.
-        at: (N, 3) commanded positions of the rests, m, and ``off`` the errors there after base and tool were fitted.
-        off: (N, 3) see ``at``, m.
-        lever: (N, n) levers of the gravity load, m; ``lag`` readings less commands there.
-        lag: (N, n) see ``lever``, rad.
-        drift: (C, 2) time, h, and distance from the first visit, mm, of the pose that came most often.
-    """
-
-    arm: str
-    board: str
-    poses: int
-    rests: int
-    hours: float
-    accuracy_mm: tuple[float, float]
-    placed_mm: float
-    pose_accuracy_mm: float | None
-    one_side_mm: float | None
-    both_sides_mm: tuple[float, float] | None
-    drift_mm_per_h: tuple[float, float] | None
-    cycles: int
-    latency_s: float | None
-    joints: tuple[JointFigures, ...]
-    parts: dict[str, ErrorPart]
-    noise_mm: float
-    health: tuple[str, ...]
-    notes: tuple[str, ...]
-    at: Array
-    off: Array
-    lever: Array
-    lag: Array
-    drift: Array
+    arm: str  #: its model
+    board: str  #: its controller, as the run names it
+    poses: int  #: number of different poses
+    rests: int  #: number of rests that were seen
+    hours: float  #: from the first rest to the last
+    placed_mm: float  #: RMS distance from the command after base and tool were fitted to these poses
+    pose_accuracy_mm: float | None  #: accuracy AP (ISO 9283) of the poses of ``one_side_mm``, mean
+    one_side_mm: float | None  #: repeatability RP (ISO 9283) of poses that came three times from the same side
+    cycles: int  #: how often the pose came that came most often
+    latency_s: float | None  #: median of the joints'
+    noise_mm: float  #: of vision at rest, one shot
+    accuracy_mm: tuple[float, float]  #: RMS and largest distance from the command in the frames of the run
+    both_sides_mm: tuple[float, float] | None  #: mean and largest distance between a pose from either side
+    drift_mm_per_h: tuple[float, float] | None  #: of the pose that came most often, and its sigma
+    joints: tuple[JointFigures, ...]  #: of each joint
+    parts: dict[str, ErrorPart]  #: of the error, by name
+    health: tuple[str, ...]  #: what the run's health monitor found, as text
+    notes: tuple[str, ...]  #: what could not be evaluated, and why
+    at: Array  #: (N, 3) commanded positions of the rests, m
+    off: Array  #: (N, 3) the errors there after base and tool were fitted, m
+    lever: Array  #: (N, n) levers of the gravity load, m
+    lag: Array  #: (N, n) readings less commands there, rad
+    drift: Array  #: (C, 2) time, h, and distance from the first visit, mm, of the pose that came most often
 
     def to_json(self) -> dict[str, Any]:
         """Return the object of report.json: pairs are a value and its sigma, or as the key says."""
+        names = [each.name for each in fields(self)]
         shown: dict[str, Any] = {"version": VERSION, "kind": "arm report"}
-        for name in (
-            "arm",
-            "board",
-            "poses",
-            "rests",
-            "hours",
-            "placed_mm",
-            "pose_accuracy_mm",
-            "one_side_mm",
-            "cycles",
-            "latency_s",
-            "noise_mm",
-        ):
-            shown[name] = getattr(self, name)
-        shown["accuracy_rms_mm"], shown["accuracy_max_mm"] = self.accuracy_mm
-        shown["both_sides_mean_mm"], shown["both_sides_max_mm"] = self.both_sides_mm or (None, None)
-        shown["drift_mm_per_h"], shown["drift_sigma_mm_per_h"] = self.drift_mm_per_h or (None, None)
+        shown |= {name: getattr(self, name) for name in names[: names.index("accuracy_mm")]}
+        for name, keys in _PAIRS.items():
+            shown |= zip(keys, getattr(self, name) or (None, None), strict=True)
         shown["joints"] = [_with_sigmas(asdict(joint)) for joint in self.joints]
         shown["parts"] = {n: {**asdict(part), "determined": part.determined} for n, part in self.parts.items()}
-        shown["health"], shown["notes"] = list(self.health), list(self.notes)
-        shown["map"] = [
-            {"at_m": p, "error_mm": e} for p, e in zip(self.at.tolist(), (1e3 * self.off).tolist(), strict=True)
-        ]
+        shown["health"], shown["notes"] = self.health, self.notes
+        shown["map"] = [{"at_m": p, "error_mm": e} for p, e in zip(self.at, 1e3 * self.off, strict=True)]
         known: dict[str, Any] = json_of(shown)
         return known
 
 
+#: Pairs of the report -> their keys in JSON.
+_PAIRS = {
+    "accuracy_mm": ("accuracy_rms_mm", "accuracy_max_mm"),
+    "both_sides_mm": ("both_sides_mean_mm", "both_sides_max_mm"),
+    "drift_mm_per_h": ("drift_mm_per_h", "drift_sigma_mm_per_h"),
+}
+
+
 def _with_sigmas(values: dict[str, Any]) -> dict[str, Any]:
     """Return values whose pairs stand as NAME and sigma_NAME."""
-    shown: dict[str, Any] = {}
-    for name, value in values.items():
-        pair = isinstance(value, tuple)
-        shown[name] = value[0] if pair else value
-        if pair:
-            shown[f"sigma_{name}"] = value[1]
-    return shown
+    shown = {name: value[0] if isinstance(value, tuple) else value for name, value in values.items()}
+    return shown | {f"sigma_{name}": value[1] for name, value in values.items() if isinstance(value, tuple)}
 
 
 def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = lambda line: None) -> ArmReport:
@@ -338,15 +253,11 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
             f"left out as mistakes: {len(found.left_out)} of {len(rests.q)} rests, at {times}{more} s of the run"
         )
     off, parts = _split(arm, kept, found)
-    lever = gravity_levers(arm, kept.q)
-    seen_off = rests.T_seen[:, :3, 3] - rests.T_ref[:, :3, 3]
-    distance = np.linalg.norm(seen_off, axis=1)
+    lever, backlash, latencies = gravity_levers(arm, kept.q), joint_backlashes(found, measured), _latencies(folder, arm)
+    joints = [_joint(arm, i, kept, found, lever[:, i], backlash[i]._asdict(), latencies[i]) for i in range(arm.joints)]
+    distance = np.linalg.norm(rests.T_seen[:, :3, 3] - rests.T_ref[:, :3, 3], axis=1)
     which, visits = rests.visits()
     drift, per_h = _drift(kept)
-    latencies, joints = _latencies(folder, arm), []
-    backlash = joint_backlashes(found, measured)
-    for i, name in enumerate(arm.joint_names):
-        joints.append(_joint(arm, i, name, kept, found, lever[:, i], backlash[i]._asdict(), latencies[i]))
     known = [each for each in latencies if each is not None]
     attained, both = evaluate(attained_in(folder, closed=False)).poses.values(), _both_sides(rests, which)
     accuracy, one = (_mean_mm([getattr(p, name) for p in attained]) for name in ("AP_m", "RP_m"))
@@ -355,29 +266,29 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
     if both is None:
         notes.append("no pose was approached from both sides")
     return ArmReport(
-        arm.name,
-        str(summary.get("board", "unknown")),
-        visits,
-        len(rests),
-        float(np.ptp(rests.t_s)) / 3600.0,
-        (1e3 * float(np.sqrt((distance**2).mean())), 1e3 * float(distance.max())),
-        1e3 * float(np.sqrt((off**2).sum(axis=1).mean())),
-        accuracy,
-        one,
-        both,
-        per_h,
-        len(drift),
-        float(np.median(known)) if known else None,
-        tuple(joints),
-        parts,
-        1e3 * float(np.sqrt(np.trace(rests.noise.own))),
-        tuple(str(each.get("what")) for each in summary.get("health", [])),
-        tuple(notes),
-        kept.T_ref[:, :3, 3],
-        off,
-        lever,
-        kept.q - kept.q_ref,
-        drift,
+        arm=arm.name,
+        board=str(summary.get("board", "unknown")),
+        poses=visits,
+        rests=len(rests),
+        hours=float(np.ptp(rests.t_s)) / 3600.0,
+        placed_mm=_rms_mm(off),
+        pose_accuracy_mm=accuracy,
+        one_side_mm=one,
+        cycles=len(drift),
+        latency_s=float(np.median(known)) if known else None,
+        noise_mm=1e3 * float(np.sqrt(np.trace(rests.noise.own))),
+        accuracy_mm=(1e3 * float(np.sqrt((distance**2).mean())), 1e3 * float(distance.max())),
+        both_sides_mm=both,
+        drift_mm_per_h=per_h,
+        joints=tuple(joints),
+        parts=parts,
+        health=tuple(str(each.get("what")) for each in summary.get("health", [])),
+        notes=tuple(notes),
+        at=kept.T_ref[:, :3, 3],
+        off=off,
+        lever=lever,
+        lag=kept.q - kept.q_ref,
+        drift=drift,
     )
 
 
@@ -439,23 +350,15 @@ def _rms_mm(values: Array) -> float:
 
 
 def _joint(
-    arm: Arm,
-    i: int,
-    name: str,
-    rests: RestPoses,
-    found: Identified,
-    lever: Array,
-    backlash: dict[str, Any],
-    latency: float | None,
+    arm: Arm, i: int, rests: RestPoses, found: Identified, lever: Array, backlash: dict[str, Any], latency: float | None
 ) -> JointFigures:
     """Return the figures of one joint."""
-    names, deg = found.model.names, float(np.degrees(1.0))
-    free = {n for n, f in zip(names, found.solution.free, strict=True) if f}
-    zero, once = _zero(arm, i, rests, found), None
+    deg, zero, once = float(np.degrees(1.0)), _zero(arm, i, rests, found), None
     waves = [f"wave{i + 1}_{phase}1" for phase in ("sin", "cos")]
-    if any(wave in free for wave in waves):
-        both = np.array([found.value(wave) for wave in waves if wave in free])
-        once = (deg * float(np.linalg.norm(both[:, 0])), deg * float(np.linalg.norm(both[:, 1])))
+    free = [w for w in waves if w in found.model.names and found.solution.free[found.model.names.index(w)]]
+    if free:
+        value, sigma = deg * np.linalg.norm([found.value(wave) for wave in free], axis=0)
+        once = (float(value), float(sigma))
     gap = None if not np.isfinite(backlash["value_rad"]) else (deg * backlash["value_rad"], deg * backlash["sigma_rad"])
     lag, side = rests.q[:, i] - rests.q_ref[:, i], rests.approach[:, i]
     loaded = float(np.abs(lever).max()) > _LEVER_M
@@ -464,20 +367,20 @@ def _joint(
     hysteresis = (-2 * deg * fitted[1], 2 * deg * sigmas[1]) if side.any() else None
     droop = (deg * fitted[-1], deg * sigmas[-1]) if loaded else None
     most = None if droop is None else droop[0] * float(lever[np.argmax(np.abs(lever))])
-    return JointFigures(name, zero, gap, str(backlash["how"]), hysteresis, droop, most, once, latency)
+    return JointFigures(arm.joint_names[i], zero, gap, str(backlash["how"]), hysteresis, droop, most, once, latency)
 
 
 def _zero(arm: Arm, i: int, rests: RestPoses, found: Identified) -> tuple[float, float] | None:
     """Return by how much a joint really is further than it reads, deg, on the mean over the rests, and its sigma.
 
-    The sensor's curve has a mean over these poses, which hardly differs from another zero: the two count together. Sigma
-    is that of the fitted numbers, and how far leaving out the others (a length, a compliance) has moved the zero.
+    The mean of the sensor's curve hardly differs from another zero: the two count together. Sigma is that of the fitted
+    numbers, and how far leaving out the others (a length, a compliance) has moved the zero.
     """
     model, solution = found.model, found.solution
-    weight = np.zeros(len(solution.x))
-    if not solution.free[model.names.index(f"offset{i + 1}")]:
+    weight, at = np.zeros(len(solution.x)), model.names.index(f"offset{i + 1}")
+    if not solution.free[at]:
         return None
-    weight[model.names.index(f"offset{i + 1}")] = arm.direction[i]
+    weight[at] = arm.direction[i]
     phi = model.feature_values(rests.q, rests.approach).mean(axis=0)
     for k, feature in enumerate(model.features):
         if feature.joint == i and feature.kind in SENSOR:
@@ -541,15 +444,10 @@ def _drift(rests: RestPoses) -> tuple[Array, tuple[float, float] | None]:
     track = np.column_stack([hours, 1e3 * np.linalg.norm(p - p[0], axis=1)])
     if len(rows) < 2 * MIN_POSES or hours[-1] <= 0:
         return track, None
-    slopes, sigmas = zip(*(_slope(hours, 1e3 * p[:, k]) for k in range(3)), strict=True)
+    columns = np.column_stack([np.ones(len(hours)), hours])
+    slopes, sigmas = np.array([least_squares(columns, 1e3 * y, None) for y in p.T])[:, :, 1].T
     rate = float(np.linalg.norm(slopes))
-    along = np.array(slopes) / max(rate, 1e-12)
-    return track, (rate, float(np.sqrt((along**2 * np.square(sigmas)).sum())))
-
-
-def _slope(t: Array, y: Array) -> tuple[float, float]:
-    fitted, sigmas = least_squares(np.column_stack([np.ones(len(t)), t]), y, None)
-    return fitted[1], sigmas[1]
+    return track, (rate, float(np.linalg.norm(slopes * sigmas)) / max(rate, 1e-12))
 
 
 def _latencies(folder: Path, arm: Arm) -> list[float | None]:
@@ -571,12 +469,8 @@ def _latencies(folder: Path, arm: Arm) -> list[float | None]:
     for i in range(arm.joints):
         moved = [rows for rows in spans if len(rows) and np.ptp(track.q_ref[rows, i]) > _MOVED_RAD]
         moved = [rows for rows in moved if np.isfinite(_left(track, i, rows, _DELAYS_S[-1]))][:_MOTIONS]
-        if not moved:
-            found.append(None)
-            continue
-        left = [sum(_left(track, i, rows, delay) for rows in moved) for delay in _DELAYS_S]
-        best = int(np.argmin(left))
-        found.append(float(_DELAYS_S[best]) if best < len(_DELAYS_S) - 1 else None)
+        best = int(np.argmin([sum(_left(track, i, rows, delay) for rows in moved) for delay in _DELAYS_S]))
+        found.append(float(_DELAYS_S[best]) if moved and best < len(_DELAYS_S) - 1 else None)
     return found
 
 

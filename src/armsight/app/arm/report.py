@@ -28,11 +28,40 @@ if TYPE_CHECKING:
 FILES = (PAGE, "report.pdf", "report.json")
 
 
-def _pair(value: tuple[float, float] | None, digits: int = 3) -> str:
+#: What the arm does: title, key of report.json, unit.
+_NUMBERS = (
+    ("distance from the command, RMS", "accuracy_rms_mm", "mm"),
+    ("distance from the command, largest", "accuracy_max_mm", "mm"),
+    ("RMS after base and tool were fitted", "placed_mm", "mm"),
+    ("accuracy AP of poses that came again, mean", "pose_accuracy_mm", "mm"),
+    ("repeatability RP, from one side", "one_side_mm", "mm"),
+    ("between both sides, mean distance", "both_sides_mean_mm", "mm"),
+    ("between both sides, largest", "both_sides_max_mm", "mm"),
+    ("drift", "drift_mm_per_h", "mm/h"),
+    ("sigma of the drift", "drift_sigma_mm_per_h", "mm/h"),
+    ("command to motion", "latency_s", "s"),
+    ("noise of vision, one shot", "noise_mm", "mm"),
+)
+#: Of a joint: title, what the record calls it, digits.
+_OF_JOINT = (
+    ("zero, deg", "zero_deg", 3),
+    ("backlash, deg", "backlash_deg", 3),
+    ("sides, deg", "hysteresis_deg", 3),
+    ("droop, deg/m", "droop_deg_per_m", 2),
+    ("most, deg", "droop_deg", 2),
+    ("once per rev., deg", "once_per_revolution_deg", 3),
+    ("latency, s", "latency_s", 3),
+)
+
+
+def _text(value: float | tuple[float, float] | None, digits: int = 3) -> str:
+    """Return a number, or one with its sigma, as far as it is determined."""
     if value is None:
         return "–"
-    pair = f"{value[0]:.{digits}f} ± {value[1]:.{digits}f}"
-    return pair if determined(value) else f"not determined (± {value[1]:.{digits}f})"
+    if not isinstance(value, tuple):
+        return f"{value:.{digits}f}"
+    sigma = f"± {value[1]:.{digits}f}"
+    return f"{value[0]:.{digits}f} {sigma}" if determined(value) else f"not determined ({sigma})"
 
 
 def determined(value: tuple[float, float] | None) -> bool:
@@ -40,32 +69,14 @@ def determined(value: tuple[float, float] | None) -> bool:
     return value is not None and abs(value[0]) > SURE * value[1]
 
 
-def _one(value: float | None, unit: str, digits: int = 3) -> str:
-    return "–" if value is None else f"{value:.{digits}f} {unit}"
-
-
 def tables(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> list[TextTable]:
     """Return the tables of a report; ``others`` are the JSON objects of other arms by their names."""
-    mine = report.to_json()
-    columns = [mine, *others.values()]
-    rows = [
-        (title, *(_one(each.get(key), unit) for each in columns))
-        for title, key, unit in (
-            ("distance from the command, RMS", "accuracy_rms_mm", "mm"),
-            ("distance from the command, largest", "accuracy_max_mm", "mm"),
-            ("RMS after base and tool were fitted", "placed_mm", "mm"),
-            ("accuracy AP of poses that came again, mean", "pose_accuracy_mm", "mm"),
-            ("repeatability RP, from one side", "one_side_mm", "mm"),
-            ("between both sides, mean distance", "both_sides_mean_mm", "mm"),
-            ("between both sides, largest", "both_sides_max_mm", "mm"),
-            ("drift", "drift_mm_per_h", "mm/h"),
-            ("sigma of the drift", "drift_sigma_mm_per_h", "mm/h"),
-            ("command to motion", "latency_s", "s"),
-            ("noise of vision, one shot", "noise_mm", "mm"),
-        )
-    ]
-    found = [TextTable("What the arm does", ("", report.arm, *others), tuple(rows))]
-    rows = [
+    columns = [report.to_json(), *others.values()]
+    does = tuple(
+        (title, *("–" if each.get(key) is None else f"{each[key]:.3f} {unit}" for each in columns))
+        for title, key, unit in _NUMBERS
+    )
+    parts = tuple(
         (
             name,
             f"{round(100 * p.share)} %" if p.determined else "not determined",
@@ -74,35 +85,22 @@ def tables(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> list[Text
             p.remedy,
         )
         for name, p in report.parts.items()
-    ]
+    )
+    joints = tuple(
+        (j.name, *(_text(getattr(j, key), digits) if _shown(j, key) else "–" for _, key, digits in _OF_JOINT))
+        for j in report.joints
+    )
     title = f"What the {report.accuracy_mm[0]:.2f} mm are made of, and what each remedy alone would leave"
-    parts = TextTable(title, ("", "share", "itself, mm", "left by the remedy, mm", "remedy"), tuple(rows))
-    found.insert(0, parts)
-    head = (
-        "",
-        "zero, deg",
-        "backlash, deg",
-        "sides, deg",
-        "droop, deg/m",
-        "most, deg",
-        "once per rev., deg",
-        "latency, s",
-    )
-    found.append(TextTable("Joints; sigma after ±", head, tuple(_joint_row(joint) for joint in report.joints)))
-    return found
+    return [
+        TextTable(title, ("", "share", "itself, mm", "left by the remedy, mm", "remedy"), parts),
+        TextTable("What the arm does", ("", report.arm, *others), does),
+        TextTable("Joints; sigma after ±", ("", *(title for title, *_ in _OF_JOINT)), joints),
+    ]
 
 
-def _joint_row(j: JointFigures) -> tuple[str, ...]:
-    return (
-        j.name,
-        _pair(j.zero_deg),
-        _pair(j.backlash_deg),
-        _pair(j.hysteresis_deg),
-        _pair(j.droop_deg_per_m, 2),
-        "–" if j.droop_deg is None or not determined(j.droop_deg_per_m) else f"{j.droop_deg:.2f}",
-        _pair(j.once_per_revolution_deg),
-        "–" if j.latency_s is None else f"{j.latency_s:.3f}",
-    )
+def _shown(joint: JointFigures, key: str) -> bool:
+    """Return whether a number of a joint says anything: a droop at most only where there is one."""
+    return key != "droop_deg" or determined(joint.droop_deg_per_m)
 
 
 def remarks(report: ArmReport) -> list[str]:
