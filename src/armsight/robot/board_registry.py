@@ -39,11 +39,7 @@ EMULATORS: Mapping[str, tuple[Callable[[Path], Emulator], Callable[[], Path]]] =
 
 
 def open_emulator(name: str, image: Path | None = None) -> Emulator:
-    """Start an emulator with a fresh board: nothing is stored on it.
-
-    Args:
-        name: one of :data:`EMULATORS`.
-        image: another image (for host: library) than the package's.
+    """Start an emulator with a fresh board, on the package's image (for host: library) or another one.
 
     Raises:
         InputError: there is no such emulator, or what it needs is not installed.
@@ -74,7 +70,7 @@ def open_motion_board(
     baud: int | None = None,
     calibration: Path | None = None,
 ) -> MotionBoard:
-    """Open any board that moves an arm.
+    """Open any board that moves an arm: see :func:`open_board`, and the module for names.
 
     Args:
         name: see the module; ``ar4:PORT,mk2`` names another model than mk3.
@@ -91,7 +87,8 @@ def open_motion_board(
         raise InputError(f"{name} needs no --calibration: that is LeRobot's file, of {FEETECH}PORT")
     if name.startswith(FEETECH):
         servos = None if calibration is None else read_calibration(calibration)
-        return FeetechBoard.connect(open_bus(name, baud), servos)
+        port, baud = name.removeprefix(FEETECH), feetech_bus.BAUD if baud is None else baud
+        return FeetechBoard.connect(ServoBus(SerialLink.open(port, baud), port, baud), servos)
     if name.startswith(AR4):
         port, _, model = name.removeprefix(AR4).partition(",")
         link = SerialLink.open(port, ar4_board.BAUD if baud is None else baud)
@@ -105,29 +102,10 @@ def slowed(arm: Arm, name: str) -> Arm:
     return next((abilities.slowed(arm) for kind, abilities in own.items() if name.startswith(kind)), arm)
 
 
-def open_bus(name: str, baud: int | None = None) -> ServoBus:
-    """Open the servo bus of ``feetech:PORT``; nothing is asked yet.
-
-    Raises:
-        InputError: it is no such name.
-        DeviceError: the port cannot be opened.
-    """
-    if not name.startswith(FEETECH):
-        raise InputError(f"{name} is no servo bus; {FEETECH}PORT is needed, such as feetech:/dev/ttyACM0")
-    port, baud = name.removeprefix(FEETECH), feetech_bus.BAUD if baud is None else baud
-    return ServoBus(SerialLink.open(port, baud), port, baud)
-
-
 def open_board(
     name: str, plant: Plant | None = None, *, config: Configuration | None = None, baud: int = BAUD
 ) -> Board:
-    """Open a board with our firmware; the time of an emulated one passes in ``receive`` only.
-
-    Args:
-        name: see the module.
-        plant: the arm at an emulated board's motors.
-        config: of an emulated board; the lab's without. A serial board keeps its own.
-        baud: of a serial port.
+    """Open a board with our firmware, an emulated one with a configuration (the lab's without) that waits for ``receive``.
 
     Raises:
         InputError: there is no such kind of board, it has another controller, or an emulated one has no plant.

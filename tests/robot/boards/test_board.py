@@ -8,7 +8,7 @@ from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError
 from armsight.robot.board_registry import open_emulator
 from armsight.robot.boards.board import Board
-from armsight.robot.boards.codes import FAULT_TEXTS, BoardState, Command, ConfigSource, Fault, Limited, Rejection
+from armsight.robot.boards.codes import BoardState, Command, ConfigSource, Fault, Limited, Rejection
 from armsight.robot.boards.configuration import CONFIG, gains_array, lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.sim.joints import JointPlant, PotFault
@@ -158,7 +158,7 @@ def test_numbers_go_on_behind_those_of_an_earlier_host():
         last = board.send(hold(ZERO))
     board.receive(0.02)
     other = Board.connect(link)
-    assert [str(fault) for fault in other.status.faults] == [FAULT_TEXTS[Fault.TAKEN_OVER]]
+    assert [str(fault) for fault in other.status.faults] == [Fault.TAKEN_OVER.text]
     assert other.command(Command.CLEAR_FAULTS) == last + 1
     other.receive(0.05)
     assert other.status.acknowledged_sequence == last + 1

@@ -12,16 +12,16 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 
 from armsight.data import Array, JointCommand, JointStates
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import dialect
-from armsight.robot.boards.codes import REJECTION_TEXTS, Command, Reaction, Rejection, SensorKind
+from armsight.robot.boards.codes import Command, Reaction, Rejection, SensorKind
 from armsight.robot.boards.configuration import (
     CONFIG,
     CONFIG_VERSION,
@@ -43,11 +43,12 @@ from armsight.robot.boards.reports import (
     status_of,
     welcome_of,
 )
-from armsight.robot.boards.wire import Message, Wire
+from armsight.robot.boards.wire import BOARD_COMPONENT, BOARD_SYSTEM, Message, Wire
 
 #: A board that sends nothing for so long is gone: its slowest message comes every few hundredths of a second.
 SILENT_S = 1.0
 STEP_S = 0.01
+_Answer = TypeVar("_Answer")
 _HELLOS = 20
 _STEPS = 5  # between one hello and the next
 _TELEMETRY_STEPS = 300  # the rarest message comes once a second at 9600 baud
@@ -75,7 +76,7 @@ class Session:
         self.name = name
         self.wire = Wire(link)
         self._angles: list[tuple[float, list[float]]] = []
-        self.ticks_per_s = 1000
+        self.ticks_per_s, self.number = 1000, 0  # number: of the session, which commands carry
         self._tick = 0
         self._started = False
         self._quiet_s = 0.0
@@ -95,11 +96,15 @@ class Session:
         self._first_telemetry()
         self._reaction = self._ask_reaction()
 
+    def send(self, kind: str, *values: object) -> None:
+        """Send a message of the dialect; an error of the link then says what the arm does without a host."""
+        with self._reached():
+            self.wire.send(kind, *values)
+
     @contextmanager
-    def reached(self) -> Iterator[Wire]:
-        """Yield the wire; an error of the link then says what the arm does without a host."""
+    def _reached(self) -> Iterator[None]:
         try:
-            yield self.wire
+            yield
         except DeviceError as error:
             raise DeviceError(f"{error}{self._reaction}") from None
 
@@ -113,6 +118,16 @@ class Session:
         taken, self._sensed = self._sensed, []
         return readings_of([message for message, _ in taken], [t_s for _, t_s in taken])
 
+    def ask(self, answers: Mapping[int, _Answer], key: int, kind: str, *values: object) -> _Answer | None:
+        """Send a message until an answer of this key is among ``answers``; None where none comes."""
+        for _ in range(_HELLOS):
+            self.send(kind, *values)
+            for _ in range(_STEPS):
+                self.pump(STEP_S)
+                if key in answers:
+                    return answers[key]
+        return None
+
     def command_long(self, kind: int, param1: float, param2: float = 0.0) -> None:
         """Send one of MAVLink's own commands until the board answers it.
 
@@ -120,21 +135,16 @@ class Session:
             DeviceError: it rejects it, or does not answer.
         """
         self._answers.clear()
-        for _ in range(_HELLOS):
-            with self.reached() as wire:
-                wire.command_long(kind, param1, param2)
-            for _ in range(_STEPS):
-                self.pump(STEP_S)
-                if (result := self._answers.get(kind)) is not None:
-                    if result:
-                        raise DeviceError(f"{self.name} rejected MAVLink command {kind} with result {result}")
-                    return
-        raise DeviceError(f"{self.name} does not answer MAVLink command {kind}")
+        sent = (BOARD_SYSTEM, BOARD_COMPONENT, kind, 0, param1, param2, 0, 0, 0, 0, 0)
+        if (result := self.ask(self._answers, kind, "command_long", *sent)) is None:
+            raise DeviceError(f"{self.name} does not answer MAVLink command {kind}")
+        if result:
+            raise DeviceError(f"{self.name} rejected MAVLink command {kind} with result {result}")
 
     def pump(self, wait_s: float) -> None:
         """Let ``wait_s`` pass and take the messages that come."""
-        with self.reached() as wire:
-            messages = wire.receive(wait_s)
+        with self._reached():
+            messages = self.wire.receive(wait_s)
         self._quiet_s = 0.0 if messages else self._quiet_s + wait_s
         for message in messages:
             try:
@@ -149,31 +159,26 @@ class Session:
     def config_part(self, offset: int) -> bytes:
         """Return the configuration in use from a byte on, as many bytes as one message holds."""
         self._parts.clear()
-        for _ in range(_HELLOS):
-            with self.reached() as wire:
-                wire.config_read(offset)
-            for _ in range(_STEPS):
-                self.pump(STEP_S)
-                if offset in self._parts:
-                    return self._parts[offset]
-        raise DeviceError(f"{self.name} does not report its configuration")
+        if (part := self.ask(self._parts, offset, "config_read", offset)) is None:
+            raise DeviceError(f"{self.name} does not report its configuration")
+        return part
 
     def _take(self, message: Message) -> None:
-        kind = message.get_type()
-        if kind == "ANGLES":
-            self._angles.append((self._time_s(message.tick), message.angle_rad))
-        elif kind == "JOINTS":
-            self.joints = joints_of(message, self._time_s(message.tick))
-        elif kind == "BOARD_STATUS":
-            self._take_status(status_of(message, self._time_s(message.tick)))
-        elif kind == "WELCOME":
-            self._greeting = message
-        elif kind == "SENSED":
-            self._sensed.append((message, self._time_s(message.tick)))
-        elif kind == "COMMAND_ACK":
-            self._answers[message.command] = message.result
-        elif kind == "CONFIG_PART":
-            self._parts[message.offset] = bytes(message.bytes[: message.length])
+        match message.get_type():
+            case "ANGLES":
+                self._angles.append((self._time_s(message.tick), message.angle_rad))
+            case "JOINTS":
+                self.joints = joints_of(message, self._time_s(message.tick))
+            case "BOARD_STATUS":
+                self._take_status(status_of(message, self._time_s(message.tick)))
+            case "WELCOME":
+                self._greeting = message
+            case "SENSED":
+                self._sensed.append((message, self._time_s(message.tick)))
+            case "COMMAND_ACK":
+                self._answers[message.command] = message.result
+            case "CONFIG_PART":
+                self._parts[message.offset] = bytes(message.bytes[: message.length])
 
     def _take_status(self, status: BoardStatus) -> None:
         """Keep a status; where it newly rejects commands because no hello came, the board has restarted."""
@@ -197,8 +202,7 @@ class Session:
     def _hello(self) -> None:
         ours = dialect().ARMSIGHT_DIALECT_VERSION
         for nonce in range(1, _HELLOS + 1):
-            with self.reached() as wire:
-                wire.hello(ours, CONFIG_VERSION, nonce)
+            self.send("hello", ours, CONFIG_VERSION, nonce)
             for _ in range(_STEPS):
                 self.pump(STEP_S)
                 if self._greeting is not None:
@@ -221,7 +225,7 @@ class Session:
                 " no command"
             )
         self.ticks_per_s, self._tick = welcome.ticks_per_s, message.tick
-        self.wire.session = message.session
+        self.number = message.session
 
     def _first_telemetry(self) -> None:
         for _ in range(_TELEMETRY_STEPS):
@@ -324,22 +328,17 @@ class Board:
             )
         q_ref, qd_ref = _six("q_ref", command.q_ref), _six("qd_ref", command.qd_ref)
         gravity_duty = _six("gravity_duty", command.gravity_duty)
-        with self._session.reached() as wire:
-            wire.move(self._next(), round(ticks), q_ref, qd_ref, gravity_duty)
-        return self._sequence
+        return self._send("move", round(ticks), q_ref, qd_ref, gravity_duty)
 
     def command(self, command: Command) -> int:
         """Send a command and return its number; :meth:`confirm` waits until the board acknowledges or rejects it."""
-        with self._session.reached() as wire:
-            wire.command(self._next(), int(command))
-        return self._sequence
+        return self._send("command", int(command))
 
     def stop(self) -> None:
         """Stop in an emergency: the drives go off until ``Command.CLEAR_STOP``."""
         sequence = self._next()
         for _ in range(_STOPS):
-            with self._session.reached() as wire:
-                wire.stop(sequence)
+            self._session.send("stop", sequence)
 
     def set_gains(self, gains: Array, *, checked: bool = True) -> int:
         """Send a gain set and return its number.
@@ -352,9 +351,7 @@ class Board:
             InputError: a gain is outside its range; nothing was sent.
         """
         values = check_gains(gains) if checked else np.asarray(gains, dtype=float)
-        with self._session.reached() as wire:
-            wire.gains(self._next(), values.ravel().tolist())
-        return self._sequence
+        return self._send("gains", values.ravel().tolist())
 
     def confirm(self, sequence: int, wait_s: float = 0.5) -> None:
         """Wait until the board acknowledged the command of this number.
@@ -366,7 +363,7 @@ class Board:
             self._session.pump(STEP_S)
             status = self.status
             if status.rejected_sequence == sequence and status.rejected_count:
-                raise DeviceError(f"{self._session.name} rejected the command: {REJECTION_TEXTS[status.rejection]}")
+                raise DeviceError(f"{self._session.name} rejected the command: {status.rejection.text}")
             if status.acknowledged_count and not _older(status.acknowledged_sequence, sequence):
                 return
         raise DeviceError(
@@ -449,11 +446,9 @@ class Board:
         data, session = config.tobytes(), self._session
         for offset in range(0, len(data), _PART):
             part = data[offset : offset + _PART]
-            with session.reached() as wire:
-                wire.config_part(offset, len(data), len(part), list(part.ljust(_PART, b"\0")))
+            session.send("config_part", offset, len(data), len(part), list(part.ljust(_PART, b"\0")))
             session.pump(STEP_S)  # no faster than a slow wire and the board take it
-        with session.reached() as wire:
-            wire.config_store(self._next(), zlib.crc32(data))
+        session.send("config_store", self._next(), zlib.crc32(data), session.number)
         self.confirm(self._sequence, _STORE_S)
 
     def close(self) -> None:
@@ -465,6 +460,11 @@ class Board:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _send(self, kind: str, *values: object) -> int:
+        """Send a numbered command of this session and return its number."""
+        self._session.send(kind, self._next(), self._session.number, *values)
+        return self._sequence
 
     def _next(self) -> int:
         """Return the number of the next command."""

@@ -68,29 +68,23 @@ def entries(config: Configuration) -> Iterator[tuple[str, Any]]:
         if name != "joint":
             value = config[name].item()
             yield f"arm.{name}", pin_name(value) if name == _PIN else value
-    for j in range(int(config["joint_count"])):
-        joint = config["joint"][j]
+    for j, joint in enumerate(config["joint"][: int(config["joint_count"])], start=1):
         sensor = SensorKind(int(joint["encoder"]["sensor"]))
-        used = {"sensor", *ENCODER_FIELDS[sensor]}
-        for path, value in _of(joint, f"joint.{j + 1}", joint["pot"]):
-            part, name = path.split(".")[2], path.rpartition(".")[2]
-            if part == "encoder" and name == "sensor":
-                yield path, sensor.name.lower()
-            elif name in used if part == "encoder" else not (part == "pot" and name in _POT_ONLY and used > {"sensor"}):
-                yield path, value
-
-
-def _of(record: Configuration, path: str, pot: Configuration) -> Iterator[tuple[str, Any]]:
-    plain = [name for name in record.dtype.names or () if name not in (*_PARTS, "node_count")]
-    for name in plain:
-        value = record[name]
-        if name in _TABLES:
-            yield f"{path}.{name}", [_number(each) for each in value[: int(pot["node_count"])]]
-        else:
-            yield f"{path}.{name}", _number(value)
-    for part in _PARTS:
-        if part in (record.dtype.names or ()):
-            yield from _of(record[part], f"{path}.{part}", pot)
+        parts = {"": [each for each in joint.dtype.names if each not in _PARTS]}
+        parts |= {part: list(joint.dtype[part].names or ()) for part in _PARTS}
+        parts["encoder"] = [each for each in parts["encoder"] if each in ("sensor", *ENCODER_FIELDS[sensor])]
+        unused = ("node_count",) if sensor == SensorKind.POTENTIOMETER else ("node_count", *_POT_ONLY)
+        parts["pot"] = [each for each in parts["pot"] if each not in unused]
+        for part, names in parts.items():
+            for name in names:
+                value, path = (
+                    (joint[part] if part else joint)[name],
+                    ".".join(filter(None, ("joint", str(j), part, name))),
+                )
+                if name in _TABLES:
+                    yield path, [_number(each) for each in value[: int(joint["pot"]["node_count"])]]
+                else:
+                    yield path, sensor.name.lower() if name == "sensor" else _number(value)
 
 
 def _number(value: Any) -> float | int:  # noqa: ANN401 - a numpy scalar
@@ -100,20 +94,17 @@ def _number(value: Any) -> float | int:  # noqa: ANN401 - a numpy scalar
 
 def configuration_text(config: Configuration, board: str) -> str:
     """Write a configuration of the board of this name as the text of a ``board.toml``."""
-    lines = [f"version = {CONFIG_VERSION}  # layout of the configuration", f'board = "{board}"', ""]
-    table = ""
+    lines, table = [f"version = {CONFIG_VERSION}  # layout of the configuration", f'board = "{board}"', ""], ""
     for path, value in entries(config):
         here, _, name = path.rpartition(".")
         if here != table:
             lines += [""] * bool(table) + [f"[{here}]"]
             table = here
-        low, high = RANGES.get(name, (None, None))
-        if name == _PIN:
-            value = f'"{value}"'
-        elif isinstance(value, str):
-            lines.append(f'{name} = "{value}"  # {", ".join(_SENSORS)}')
-            continue
-        lines.append(f"{name} = {value}" + (f"  # {low:g} to {high:g}" if low is not None and high is not None else ""))
+        said = ", ".join(_SENSORS) if name == "sensor" else ""
+        if name in RANGES:
+            said = "{:g} to {:g}".format(*RANGES[name])
+        shown = f'"{value}"' if isinstance(value, str) else value
+        lines.append(f"{name} = {shown}" + (f"  # {said}" if said else ""))
     return "\n".join(lines) + "\n"
 
 

@@ -1,7 +1,7 @@
 """A board's configuration as the host edits it: gains, limits and tables of all joints, with the ranges of each.
 
-A :data:`Configuration` is a structured numpy array of shape () laid out as ``core_config`` in ``firmware/core/types.h``
-(a test holds both together), so that its bytes are the board's bytes::
+A :data:`Configuration` is a structured numpy array of shape () laid out as ``core_config`` in ``firmware/core/types.h``, so
+that its bytes are the board's bytes::
 
     config = board.configuration()
     config["joint"]["soft_max_rad"][2] = 1.2        # third joint
@@ -19,148 +19,36 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.robot.boards import headers
 from armsight.robot.boards.codes import Reaction, SensorKind
 from armsight.robot.boards.tuning import GAIN_RANGES, MotorFigures, tuned_gains
 
 Configuration = NDArray[np.void]
-JOINTS, POT_NODES = 6, 9
+JOINTS, POT_NODES = headers.number("JOINTS"), headers.number("POT_NODES")
 #: Counts of an absolute encoder's revolution.
-ENCODER_REV = 16384
+ENCODER_REV = headers.number("ENCODER_REV")
 #: Layout of the configuration this armsight knows: ``firmware/core/config.h``.
-CONFIG_VERSION = 6
-
-GAINS = np.dtype(
-    [
-        ("kp_per_rad", "<f4"),
-        ("ki_per_rad_s", "<f4"),
-        ("kd_s_per_rad", "<f4"),
-        ("kv_s_per_rad", "<f4"),
-        ("ka_s2_per_rad", "<f4"),
-        ("kf_duty", "<f4"),
-        ("derivative_filter_s", "<f4"),
-        ("anti_windup_per_s", "<f4"),
-    ]
-)
-POT = np.dtype(
-    [
-        ("node_count", "<u2"),
-        ("counts", "<u2", POT_NODES),
-        ("short_counts", "<u2"),
-        ("open_counts", "<u2"),
-        ("angle_rad", "<f4", POT_NODES),
-        ("direction", "<i4"),
-        ("jump_rad", "<f4"),
-        ("frozen_rad", "<f4"),
-        ("inverted_rad", "<f4"),
-    ]
-)
-MOTOR = np.dtype([("resistance_ohm", "<f4"), ("constant_v_s", "<f4"), ("apart_rad", "<f4"), ("backlash_rad", "<f4")])
-TRANSMISSION = np.dtype([("twist_rad_per_a", "<f4"), ("uneven", "<f4"), ("damping_share", "<f4")])
-ENCODER = np.dtype(
-    [
-        ("sensor", "<u4"),
-        ("input", "<u4"),
-        ("counts_per_rev", "<f4"),
-        ("direction", "<i4"),
-        ("zero_counts", "<u4"),
-        ("home_rad", "<f4"),
-    ]
-)
-JOINT = np.dtype(
-    [
-        ("gains", GAINS),
-        ("pot", POT),
-        ("motor", MOTOR),
-        ("soft_min_rad", "<f4"),
-        ("soft_max_rad", "<f4"),
-        ("speed_limit_rad_s", "<f4"),
-        ("deceleration_rad_s2", "<f4"),
-        ("acceleration_rad_s2", "<f4"),
-        ("jerk_rad_s3", "<f4"),
-        ("duty_limit", "<f4"),
-        ("duty_slew_per_s", "<f4"),
-        ("gravity_slew_per_s", "<f4"),
-        ("current_cut_per_a_s", "<f4"),
-        ("following_rad", "<f4"),
-        ("stall_duty", "<f4"),
-        ("stall_rad", "<f4"),
-        ("current_limit_ma", "<u4"),
-        ("motor_direction", "<i4"),
-        ("encoder", ENCODER),
-        ("transmission", TRANSMISSION),
-    ]
-)
-CONFIG = np.dtype(
-    [
-        ("joint", JOINT, JOINTS),
-        ("joint_count", "<u4"),
-        ("supply_min_mv", "<u4"),
-        ("supply_max_mv", "<u4"),
-        ("supply_nominal_mv", "<u4"),
-        ("supply_ticks", "<u4"),
-        ("pot_ticks", "<u4"),
-        ("following_ticks", "<u4"),
-        ("stall_ticks", "<u4"),
-        ("overload_ticks", "<u4"),
-        ("brake_release_ticks", "<u4"),
-        ("brake_engage_ticks", "<u4"),
-        ("silence_ticks", "<u4"),
-        ("silence_reaction", "<u4"),
-        ("sync_led_pin", "<u4"),
-        ("sync_led_ticks", "<u4"),
-    ]
-)
-
-#: Name -> smallest and largest value, as config.c holds them.
-_POT_RANGES = {"jump_rad": (1e-4, 1.0), "frozen_rad": (1e-3, 1.0), "inverted_rad": (1e-3, 1.0)}
-_MOTOR_RANGES = {
-    "resistance_ohm": (0.0, 1000.0),
-    "constant_v_s": (1e-3, 1e3),
-    "apart_rad": (1e-3, 1.0),
-    "backlash_rad": (0.0, 1.0),
+CONFIG_VERSION = headers.number("CONFIG_VERSION")
+#: Part of a configuration -> its record; a joint is the parts and its own numbers.
+_RECORDS = {
+    "gains": "joint_gains",
+    "pot": "pot_config",
+    "motor": "motor_config",
+    "encoder": "encoder_config",
+    "transmission": "transmission_config",
+    "joint": "joint_config",
+    "arm": "core_config",
 }
-_TRANSMISSION_RANGES = {"twist_rad_per_a": (0.0, 1.0), "uneven": (0.0, 0.5), "damping_share": (0.0, 1.0)}
-_TABLE_RANGES = {"node_count": (2, POT_NODES)}
-_ENCODER_RANGES = {
-    "input": (1, JOINTS),
-    "counts_per_rev": (16.0, 1e7),
-    "zero_counts": (0, ENCODER_REV - 1),
-    "home_rad": (-13.0, 13.0),
-}
+GAINS, POT, MOTOR, ENCODER, TRANSMISSION, JOINT, CONFIG = map(headers.record, _RECORDS.values())
+#: Part -> name -> smallest and largest value.
+_RANGES = {part: headers.ranges(record) for part, record in _RECORDS.items()}
+#: All of them by name; no name stands for two things.
+RANGES: Mapping[str, tuple[float, float]] = {name: each for of in _RANGES.values() for name, each in of.items()}
 #: What of an encoder's configuration each kind of sensor needs beside the kind itself.
 ENCODER_FIELDS: Mapping[SensorKind, tuple[str, ...]] = {
     SensorKind.POTENTIOMETER: (),
     SensorKind.QUADRATURE: ("input", "counts_per_rev", "direction", "home_rad"),
     SensorKind.ABSOLUTE: ("counts_per_rev", "direction", "zero_counts", "home_rad"),
-}
-_JOINT_RANGES = {
-    "soft_min_rad": (-13.0, 13.0),
-    "soft_max_rad": (-13.0, 13.0),
-    "speed_limit_rad_s": (0.01, 20.0),
-    "deceleration_rad_s2": (0.1, 1000.0),
-    "acceleration_rad_s2": (0.1, 1000.0),
-    "jerk_rad_s3": (1.0, 1e6),
-    "duty_limit": (0.0, 1.0),
-    "duty_slew_per_s": (0.1, 1000.0),
-    "gravity_slew_per_s": (0.1, 1000.0),
-    "current_cut_per_a_s": (0.0, 1000.0),
-    "following_rad": (1e-3, 13.0),
-    "stall_duty": (0.01, 1.0),
-    "stall_rad": (1e-4, 1.0),
-    "current_limit_ma": (10, 500000),
-}
-_ARM_RANGES = {
-    "joint_count": (1, JOINTS),
-    "supply_nominal_mv": (1000, 100000),
-    "supply_ticks": (1, 1000),
-    "pot_ticks": (1, 100),
-    "following_ticks": (1, 10000),
-    "stall_ticks": (1, 10000),
-    "overload_ticks": (1, 10000),
-    "brake_release_ticks": (0, 1000),
-    "brake_engage_ticks": (0, 1000),
-    "silence_ticks": (2, 60000),
-    "sync_led_ticks": (1, 100),
 }
 
 #: Pins as ``sync_led_pin`` has them, 0 for none: 16 (port + 1) + pin.
@@ -215,60 +103,37 @@ def check_pin(config: Configuration, board: str) -> None:
         )
 
 
-#: All of them by name; no name stands for two things.
-RANGES: Mapping[str, tuple[float, float]] = {
-    **GAIN_RANGES,
-    **_POT_RANGES,
-    **_TABLE_RANGES,
-    **_ENCODER_RANGES,
-    **_MOTOR_RANGES,
-    **_TRANSMISSION_RANGES,
-    **_JOINT_RANGES,
-    **_ARM_RANGES,
-}
-
 #: The simulated arm's motors (:mod:`armsight.sim.joints`), and how stiffly they are driven.
 _LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S = MotorFigures(6.0, 2.4, 0.03, 0.02, 0.2), 12.0, 24.0
 #: At most 10 mrad of backlash; it and five sigma of 20 counts of noise.
 LAB_BACKLASH_RAD, _LAB_APART_RAD = 0.01, 0.02
 
 
+def put_values(record: Configuration, **values: object) -> None:
+    """Put values into a part of a configuration, in-place."""
+    for name, value in values.items():
+        record[name] = value
+
+
 def lab_configuration() -> Configuration:
     """Return a configuration for the simulated arm: firm gains, +-2.4 rad, 2 rad/s, 12 V, host silent after 100 ms."""
     config = np.zeros((), CONFIG)
-    joint = config["joint"]
+    joint, pot = config["joint"], config["joint"]["pot"]
     joint["gains"] = np.array(tuple(tuned_gains(_LAB_MOTOR, _LAB_SUPPLY_V, _LAB_BANDWIDTH_RAD_S)), GAINS)
     motor = (_LAB_MOTOR.resistance_ohm, _LAB_MOTOR.constant_v_s, _LAB_APART_RAD, LAB_BACKLASH_RAD)
     joint["motor"] = np.array(motor, MOTOR)
-    pot = joint["pot"]
-    pot["node_count"], pot["short_counts"], pot["open_counts"], pot["direction"] = 2, 1000, 64500, 1
+    put_values(pot, node_count=2, short_counts=1000, open_counts=64500, direction=1)
+    put_values(pot, jump_rad=0.02, frozen_rad=0.02, inverted_rad=0.15)
     pot["counts"][:, :2], pot["angle_rad"][:, :2] = (3277, 62258), (-2.6, 2.6)
-    pot["jump_rad"], pot["frozen_rad"], pot["inverted_rad"] = 0.02, 0.02, 0.15
-    values = {
-        "soft_min_rad": -2.4,
-        "soft_max_rad": 2.4,
-        "speed_limit_rad_s": 2.0,
-        "deceleration_rad_s2": 10.0,
-        "acceleration_rad_s2": 10.0,
-        "jerk_rad_s3": 1000.0,
-        "gravity_slew_per_s": 5.0,
-        "duty_limit": 0.8,
-        "duty_slew_per_s": 500.0,
-        "current_cut_per_a_s": 5.0,
-        "following_rad": 0.3,
-        "stall_duty": 0.5,
-        "stall_rad": 0.01,
-        "current_limit_ma": 1600,
-        "motor_direction": 1,
-    }
-    for name, value in values.items():
-        joint[name] = value
-    config["joint_count"] = JOINTS
-    config["supply_min_mv"], config["supply_max_mv"], config["supply_ticks"] = 10000, 14000, 5
-    config["supply_nominal_mv"], config["overload_ticks"] = round(1e3 * _LAB_SUPPLY_V), 200
-    config["pot_ticks"], config["following_ticks"], config["stall_ticks"] = 5, 20, 200
-    config["silence_ticks"], config["silence_reaction"] = 100, Reaction.HOLD
-    config["sync_led_ticks"] = SYNC_LED_TICKS
+    put_values(joint, soft_min_rad=-2.4, soft_max_rad=2.4, speed_limit_rad_s=2.0, deceleration_rad_s2=10.0)
+    put_values(joint, acceleration_rad_s2=10.0, jerk_rad_s3=1000.0, gravity_slew_per_s=5.0, duty_limit=0.8)
+    put_values(joint, duty_slew_per_s=500.0, current_cut_per_a_s=5.0, following_rad=0.3, stall_duty=0.5)
+    put_values(joint, stall_rad=0.01, current_limit_ma=1600, motor_direction=1)
+    put_values(config, joint_count=JOINTS, supply_min_mv=10000, supply_max_mv=14000, supply_ticks=5, pot_ticks=5)
+    put_values(config, supply_nominal_mv=round(1e3 * _LAB_SUPPLY_V), overload_ticks=200, following_ticks=20)
+    put_values(
+        config, stall_ticks=200, silence_ticks=100, silence_reaction=Reaction.HOLD, sync_led_ticks=SYNC_LED_TICKS
+    )
     return config
 
 
@@ -312,7 +177,7 @@ def check_configuration(config: Configuration) -> None:
 
 
 def _problems(config: Configuration) -> Iterator[str]:
-    yield from _outside(config, _ARM_RANGES)
+    yield from _outside(config, _RANGES["arm"])
     joints, count = config["joint"], min(int(config["joint_count"]), JOINTS)
     check_gains(gains_array(config), count)
     for j in range(count):
@@ -334,14 +199,16 @@ def _problems(config: Configuration) -> Iterator[str]:
         yield f"silence_reaction is {config['silence_reaction']}; 1 (hold) or 2 (release) is allowed"
 
 
-def _ranged(joint: Configuration) -> tuple[tuple[Configuration, Mapping[str, tuple[float, float]]], ...]:
-    motor = (joint["motor"], _MOTOR_RANGES), (joint["transmission"], _TRANSMISSION_RANGES)
-    plain = (joint, _JOINT_RANGES), (joint["pot"], _POT_RANGES), *motor
+def _ranged(joint: Configuration) -> Iterator[tuple[Configuration, Mapping[str, tuple[float, float]]]]:
+    """Yield each part of a joint with the ranges that count for its sensor."""
     sensor = int(joint["encoder"]["sensor"])
-    if sensor == SensorKind.POTENTIOMETER:
-        return *plain, (joint["pot"], _TABLE_RANGES)
+    yield joint, _RANGES["joint"]
+    for part in ("motor", "transmission"):
+        yield joint[part], _RANGES[part]
+    table = "" if sensor == SensorKind.POTENTIOMETER else "node_count"
+    yield joint["pot"], {name: each for name, each in _RANGES["pot"].items() if name != table}
     needed = ENCODER_FIELDS[SensorKind(sensor)] if sensor in tuple(SensorKind) else ()
-    return *plain, (joint["encoder"], {name: each for name, each in _ENCODER_RANGES.items() if name in needed})
+    yield joint["encoder"], {name: each for name, each in _RANGES["encoder"].items() if name in needed}
 
 
 def _outside(values: Configuration, ranges: Mapping[str, tuple[float, float]]) -> Iterator[str]:

@@ -1,7 +1,4 @@
-"""The lock-step frames of the emulated boards as numpy sees them: ``firmware/boards/pil/frame.h`` and ``core_outputs``.
-
-A test reads the headers and holds the layouts to them.
-"""
+"""The lock-step frames of the emulated boards as numpy sees them, as ``firmware/boards/pil/frame.h`` has them."""
 
 from __future__ import annotations
 
@@ -9,64 +6,13 @@ import struct
 
 import numpy as np
 
-JOINTS = 6
-REQUEST_MAGIC, ANSWER_MAGIC, VERSION = 0x51525341, 0x4E415341, 3
+from armsight.robot.boards import headers
+
+JOINTS, WIRE_BYTES = headers.number("JOINTS"), headers.number("FRAME_BYTES")  # most bytes either way in one tick
+REQUEST_MAGIC, ANSWER_MAGIC, VERSION = (headers.number(f"FRAME_{name}") for name in ("REQUEST", "ANSWER", "VERSION"))
 #: What a request may do before its tick.
 RESTART_POWER, RESTART_WATCHDOG = 1, 2
-#: Most bytes of the wire either way in one tick.
-WIRE_BYTES = 512
-
-REQUEST = np.dtype(
-    [
-        ("magic", "<u4"),
-        ("version", "<u4"),
-        ("tick", "<u4"),
-        ("restart", "<u4"),
-        ("overrun", "<u4"),
-        ("stop_pressed", "<u4"),
-        ("supply_mv", "<u4"),
-        ("counts", "<u4", JOINTS),
-        ("current_ma", "<i4", JOINTS),
-        ("length", "<u4"),
-        ("bytes", "u1", WIRE_BYTES),
-    ]
-)
-OUTPUTS = np.dtype(
-    [
-        ("tick", "<u4"),
-        ("drives_on", "<u4"),
-        ("windings_shorted", "<u4"),
-        ("brakes_open", "<u4"),
-        ("feed_watchdog", "<u4"),
-        ("state", "<u4"),
-        ("faults", "<u4"),
-        ("joint_faults", "<u4", JOINTS),
-        ("first_fault", "<u4"),
-        ("first_joint", "<u4"),
-        ("acknowledged_sequence", "<u4"),
-        ("acknowledged_count", "<u4"),
-        ("rejected_sequence", "<u4"),
-        ("rejected_count", "<u4"),
-        ("rejection", "<u4"),
-        ("limited", "<u4", JOINTS),
-        ("duty", "<f4", JOINTS),
-        ("angle_rad", "<f4", JOINTS),
-        ("speed_rad_s", "<f4", JOINTS),
-        ("reference_rad", "<f4", JOINTS),
-        ("reference_rad_s", "<f4", JOINTS),
-    ]
-)
-ANSWER = np.dtype(
-    [
-        ("magic", "<u4"),
-        ("version", "<u4"),
-        ("tick", "<u4"),
-        ("outputs", OUTPUTS),
-        ("sync_led", "<u4"),
-        ("length", "<u4"),
-        ("bytes", "u1", WIRE_BYTES),
-    ]
-)
+REQUEST, OUTPUTS, ANSWER = (headers.record(name) for name in ("pil_request", "core_outputs", "pil_answer"))
 
 
 def _at(frame: np.dtype[np.void], name: str) -> int:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from armsight.data import Array, Record
 from armsight.robot.boards.codes import (
-    ALARM_TEXTS,
-    FAULT_TEXTS,
     Alarm,
     BoardState,
     ConfigSource,
@@ -26,98 +24,58 @@ _NO_JOINT = 255
 
 @dataclass(frozen=True)
 class BoardAbilities:
-    """What a board has for joints.
+    """What a board has for joints."""
 
-    Attributes:
-        joints: how many.
-        sensors: the kinds of sensors it reads.
-        quadrature_inputs: how many quadrature encoders it counts: inputs 1 to so many.
-    """
-
-    joints: int
-    sensors: tuple[SensorKind, ...]
-    quadrature_inputs: int
+    joints: int  #: how many
+    sensors: tuple[SensorKind, ...]  #: the kinds of sensors it reads
+    quadrature_inputs: int  #: how many quadrature encoders it counts: inputs 1 to so many
 
 
 @dataclass(frozen=True)
 class Welcome:
-    """The identity of a board.
+    """The identity of a board."""
 
-    Attributes:
-        board: its name.
-        firmware: its firmware's version.
-        ticks_per_s: how many ticks its clock has a second; 0 where it has none and the host stamps its readings.
-        baud: bits a second on its wire.
-        config_source: where its configuration came from; None where it has none of ours.
-        crash: where the firmware crashed before it started: exception, pc, lr and CFSR; None where it did not.
-        abilities: what it has for joints; None where it does not say.
-    """
-
-    board: str
-    firmware: str
-    ticks_per_s: int
-    baud: int
-    config_source: ConfigSource | None
-    crash: tuple[int, ...] | None = None
-    abilities: BoardAbilities | None = None
+    board: str  #: its name
+    firmware: str  #: its firmware's version
+    ticks_per_s: int  #: how many ticks its clock has a second; 0 where it has none and the host stamps its readings
+    baud: int  #: bits a second on its wire
+    config_source: ConfigSource | None  #: where its configuration came from; None where it has none of ours
+    crash: tuple[int, ...] | None = None  #: where the firmware crashed before it started: exception, pc, lr and CFSR
+    abilities: BoardAbilities | None = None  #: what it has for joints; None where it does not say
 
 
 @dataclass(frozen=True)
 class JointFault:
-    """A latched fault.
+    """A latched fault."""
 
-    Attributes:
-        fault: which.
-        joint: of which joint, from 0; None where it belongs to none.
-    """
-
-    fault: Fault | Alarm
-    joint: int | None = None
+    fault: Fault | Alarm  #: which
+    joint: int | None = None  #: of which joint, from 0; None where it belongs to none
 
     def __str__(self) -> str:
         where = "" if self.joint is None else f"joint {self.joint + 1}: "
-        return where + (ALARM_TEXTS[self.fault] if isinstance(self.fault, Alarm) else FAULT_TEXTS[self.fault])
+        return where + self.fault.text
 
 
 @dataclass(frozen=True)
 class BoardStatus:
-    """The status of a board.
+    """The status of a board; what it does not count is 0."""
 
-    Attributes:
-        t_s: when, s on the board's clock.
-        state: what it does with its drives.
-        faults: all that are latched.
-        first_fault: the one that came first since the last clear; None without.
-        acknowledged_sequence: number of the last command acknowledged.
-        acknowledged_count: how many were.
-        rejected_sequence: number of the last command rejected.
-        rejected_count: how many were.
-        rejection: why that one was.
-        supply_v: motor supply, V.
-        crc_errors: messages from the host that were broken.
-        lost_bytes: bytes from the host that belonged to no message.
-        overrun_bytes: bytes from the host for which there was no room.
-        stale_commands: commands dropped because a newer one had come already.
-        lost_messages: messages from the host that are missing in the count of the frames.
-        config_stored: configurations stored since the start.
-    """
-
-    t_s: float
-    state: BoardState
-    faults: tuple[JointFault, ...]
-    first_fault: JointFault | None
-    acknowledged_sequence: int
-    acknowledged_count: int
-    rejected_sequence: int
-    rejected_count: int
-    rejection: Rejection
-    supply_v: float
-    crc_errors: int
-    lost_bytes: int
-    overrun_bytes: int
-    stale_commands: int
-    lost_messages: int
-    config_stored: int
+    t_s: float  #: when, s on the board's clock
+    state: BoardState  #: what it does with its drives
+    faults: tuple[JointFault, ...]  #: all that are latched
+    first_fault: JointFault | None  #: the one that came first since the last clear
+    supply_v: float  #: motor supply, V; NaN where nobody measures it
+    acknowledged_sequence: int  #: number of the last command acknowledged
+    acknowledged_count: int  #: how many were
+    rejected_sequence: int = 0  #: number of the last command rejected
+    rejected_count: int = 0  #: how many were
+    rejection: Rejection = Rejection.NONE  #: why that one was
+    crc_errors: int = 0  #: messages from the host that were broken
+    lost_bytes: int = 0  #: bytes from the host that belonged to no message
+    overrun_bytes: int = 0  #: bytes from the host for which there was no room
+    stale_commands: int = 0  #: commands dropped because a newer one had come already
+    lost_messages: int = 0  #: messages from the host that are missing in the count of the frames
+    config_stored: int = 0  #: configurations stored since the start
 
     @property
     def drives_on(self) -> bool:
@@ -127,78 +85,30 @@ class BoardStatus:
 
 @dataclass(frozen=True, eq=False)
 class JointReport(Record):
-    """How the joints are driven.
+    """How the joints are driven."""
 
-    Attributes:
-        t_s: when, s on the board's clock.
-        speed_rad_s: (n,) measured speeds, filtered.
-        reference_rad: (n,) where the joints are to be.
-        reference_rad_s: (n,) how fast they are to move.
-        duty: (n,) to the motors, -1 to 1.
-        limited: what holds each joint back without being a fault.
-        temperature_c: (n,) of the motors, degrees Celsius; None where nothing measures it.
-    """
-
-    t_s: float
-    speed_rad_s: Array
-    reference_rad: Array
-    reference_rad_s: Array
-    duty: Array
-    limited: tuple[Limited, ...]
-    temperature_c: Array | None = None
+    t_s: float  #: when, s on the board's clock
+    speed_rad_s: Array  #: (n,) measured speeds, filtered
+    reference_rad: Array  #: (n,) where the joints are to be
+    reference_rad_s: Array  #: (n,) how fast they are to move
+    duty: Array  #: (n,) to the motors, -1 to 1
+    limited: tuple[Limited, ...]  #: what holds each joint back without being a fault
+    temperature_c: Array | None = None  #: (n,) of the motors, degrees Celsius; None where nothing measures it
 
 
 @dataclass(frozen=True, eq=False)
 class SensorReadings(Record):
-    """What a board's converters read over some time.
+    """What a board's converters read over some time."""
 
-    Attributes:
-        t_s: (n,) when, s on the board's clock.
-        counts: (n, 6) potentiometers, 16-bit fractions of their supply.
-        current_a: (n, 6) motor currents, A, positive where a positive duty drives them.
-        duty: (n, 6) to the motors while this was read, -1 to 1.
-    """
-
-    t_s: Array
-    counts: Array
-    current_a: Array
-    duty: Array
-
-
-def plain_status(
-    t_s: float, state: BoardState, faults: tuple[JointFault, ...], supply_v: float, sent: int
-) -> BoardStatus:
-    """Return the status of a controller that keeps none of our firmware's counts.
-
-    Args:
-        t_s: when, s.
-        state: of its drives.
-        faults: all that stand.
-        supply_v: motor supply, V; NaN where nobody measures it.
-        sent: commands sent, which count as acknowledged.
-    """
-    return BoardStatus(
-        t_s=t_s,
-        state=state,
-        faults=faults,
-        first_fault=faults[0] if faults else None,
-        acknowledged_sequence=sent,
-        acknowledged_count=sent,
-        rejected_sequence=0,
-        rejected_count=0,
-        rejection=Rejection.NONE,
-        supply_v=supply_v,
-        crc_errors=0,
-        lost_bytes=0,
-        overrun_bytes=0,
-        stale_commands=0,
-        lost_messages=0,
-        config_stored=0,
-    )
+    t_s: Array  #: (n,) when, s on the board's clock
+    counts: Array  #: (n, 6) potentiometers, 16-bit fractions of their supply
+    current_a: Array  #: (n, 6) motor currents, A, positive where a positive duty drives them
+    duty: Array  #: (n, 6) to the motors while this was read, -1 to 1
 
 
 def welcome_of(message: Message) -> Welcome:
     """Return what a WELCOME says."""
+    sensors = tuple(kind for kind in SensorKind if message.sensors >> kind & 1)
     return Welcome(
         board=_text(message.board),
         firmware=_text(message.firmware),
@@ -206,62 +116,43 @@ def welcome_of(message: Message) -> Welcome:
         baud=message.baud,
         config_source=ConfigSource(message.config_source),
         crash=tuple(map(int, message.crash)) if any(message.crash) else None,
-        abilities=_abilities_of(message) if message.sensors else None,
+        abilities=BoardAbilities(message.joints, sensors, message.quadrature_inputs) if sensors else None,
     )
-
-
-def _abilities_of(message: Message) -> BoardAbilities:
-    sensors = tuple(kind for kind in SensorKind if message.sensors >> kind & 1)
-    return BoardAbilities(int(message.joints), sensors, int(message.quadrature_inputs))
 
 
 def status_of(message: Message, t_s: float) -> BoardStatus:
     """Return what a BOARD_STATUS says."""
     first = None
     if message.first_fault:
-        first = JointFault(
-            Fault(message.first_fault), None if message.first_joint == _NO_JOINT else message.first_joint
-        )
+        joint = None if message.first_joint == _NO_JOINT else message.first_joint
+        first = JointFault(Fault(message.first_fault), joint)
+    names = [each.name for each in fields(BoardStatus)]
     return BoardStatus(
-        t_s=t_s,
-        state=BoardState(message.state),
-        faults=_faults(message.faults, message.joint_faults),
-        first_fault=first,
-        acknowledged_sequence=message.acknowledged_sequence,
-        acknowledged_count=message.acknowledged_count,
-        rejected_sequence=message.rejected_sequence,
-        rejected_count=message.rejected_count,
+        t_s,
+        BoardState(message.state),
+        _faults(message.faults, message.joint_faults),
+        first,
+        message.supply_mv * 1e-3,
         rejection=Rejection(message.rejection),
-        supply_v=message.supply_mv * 1e-3,
-        crc_errors=message.crc_errors,
-        lost_bytes=message.lost_bytes,
-        overrun_bytes=message.overrun_bytes,
-        stale_commands=message.stale_commands,
-        lost_messages=message.lost_messages,
-        config_stored=message.config_stored,
+        **{name: getattr(message, name) for name in names[names.index("supply_v") + 1 :] if name != "rejection"},
     )
 
 
 def joints_of(message: Message, t_s: float) -> JointReport:
     """Return what a JOINTS says."""
-    return JointReport(
-        t_s=t_s,
-        speed_rad_s=np.array(message.speed_rad_s),
-        reference_rad=np.array(message.reference_rad),
-        reference_rad_s=np.array(message.reference_rad_s),
-        duty=np.array(message.duty),
-        limited=tuple(Limited(bits) for bits in message.limited),
+    speed, reference, reference_speed, duty = (
+        np.array(each) for each in (message.speed_rad_s, message.reference_rad, message.reference_rad_s, message.duty)
     )
+    return JointReport(t_s, speed, reference, reference_speed, duty, tuple(map(Limited, message.limited)))
 
 
 def readings_of(messages: list[Message], times_s: list[float]) -> SensorReadings:
     """Return what SENSED messages say."""
-    return SensorReadings(
-        t_s=np.array(times_s),
-        counts=np.array([each.counts for each in messages], dtype=float).reshape(-1, 6),
-        current_a=1e-3 * np.array([each.current_ma for each in messages], dtype=float).reshape(-1, 6),
-        duty=np.array([each.duty for each in messages], dtype=float).reshape(-1, 6),
+    counts, current_ma, duty = (
+        np.array([getattr(each, name) for each in messages], dtype=float).reshape(-1, 6)
+        for name in ("counts", "current_ma", "duty")
     )
+    return SensorReadings(np.array(times_s), counts, 1e-3 * current_ma, duty)
 
 
 def _faults(bits: int, joint_bits: list[int]) -> tuple[JointFault, ...]:

@@ -28,18 +28,10 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.robot.boards import headers
 
-#: Gain -> smallest and largest value, as config.c holds them.
-GAIN_RANGES = {
-    "kp_per_rad": (0.0, 100.0),
-    "ki_per_rad_s": (0.0, 1000.0),
-    "kd_s_per_rad": (0.0, 100.0),
-    "kv_s_per_rad": (0.0, 100.0),
-    "ka_s2_per_rad": (0.0, 10.0),
-    "kf_duty": (0.0, 1.0),
-    "derivative_filter_s": (0.0, 1.0),
-    "anti_windup_per_s": (0.0, 1000.0),
-}
+#: Gain -> smallest and largest value.
+GAIN_RANGES = headers.ranges("joint_gains")
 _PAIRS = 0.35
 #: Dry friction is compensated by a little less than it is, so that it never drives.
 _FRICTION_SHARE = 0.9

@@ -37,27 +37,16 @@ class _Frame:
 
     def __init__(self, name: str, fields: dict[str, Any]) -> None:
         self.__dict__ = fields
-        self._name = name
-
-    def get_type(self) -> str:
-        """Return the message's name."""
-        return self._name
+        self.get_type = lambda: name
 
 
 class _Layout(NamedTuple):
-    """How a kind of message lies in its payload.
+    """How a kind of message lies in its payload."""
 
-    Attributes:
-        name: of the message.
-        extra: what its checksum counts beside its bytes.
-        unpacker: of its payload.
-        fields: each field's name, and its number, or for an array its slice, of what is unpacked.
-    """
-
-    name: str
-    extra: bytes
-    unpacker: struct.Struct
-    fields: tuple[tuple[str, int | slice], ...]
+    name: str  #: of the message
+    extra: bytes  #: what its checksum counts beside its bytes
+    unpacker: struct.Struct  #: of its payload
+    fields: tuple[tuple[str, int | slice], ...]  #: each field's name, and its number or slice of what is unpacked
 
     @classmethod
     def of(cls, kind: Any) -> _Layout:  # noqa: ANN401 - a class of the generated dialect
@@ -91,49 +80,15 @@ class Wire:
         }
         self._kinds = frozenset(spoken.mavlink_map)
         self._mav.robust_parsing = True
-        self._close = link.close
+        self.close = link.close
         self.heard = False
         self.session = 0
         self.broken = self.lost = 0
         self._count: int | None = None
 
-    def hello(self, dialect_version: int, config_version: int, nonce: int) -> None:
-        """Ask who the board is."""
-        self._mav.hello_send(dialect_version, config_version, nonce)
-
-    def move(
-        self, sequence: int, ticks: int, q_ref: list[float], qd_ref: list[float], gravity_duty: list[float]
-    ) -> None:
-        """Send a motion command: joint angles (6,), rad, and speeds (6,), rad/s, to be reached after so many ticks."""
-        self._mav.move_send(sequence, self.session, ticks, q_ref, qd_ref, gravity_duty)
-
-    def command(self, sequence: int, kind: int) -> None:
-        """Send a command without arguments: enable, disable, clear."""
-        self._mav.command_send(sequence, self.session, kind)
-
-    def stop(self, sequence: int) -> None:
-        """Send the emergency stop."""
-        self._mav.stop_send(sequence)
-
-    def gains(self, sequence: int, gains: list[float]) -> None:
-        """Send a gain set: six joints of kp, ki, kd, kv, ka, kf, derivative filter, anti-windup (48,)."""
-        self._mav.gains_send(sequence, self.session, gains)
-
-    def config_read(self, offset: int) -> None:
-        """Ask for the part of the configuration in use that begins at this byte."""
-        self._mav.config_read_send(offset)
-
-    def config_part(self, offset: int, total: int, length: int, data: list[int]) -> None:
-        """Send a part of a configuration to be stored."""
-        self._mav.config_part_send(offset, total, length, data)
-
-    def config_store(self, sequence: int, crc: int) -> None:
-        """Ask the board to check and store the configuration that the parts made up."""
-        self._mav.config_store_send(sequence, crc, self.session)
-
-    def command_long(self, kind: int, param1: float, param2: float = 0.0) -> None:
-        """Send one of MAVLink's own commands (MAV_CMD_) to the board."""
-        self._mav.command_long_send(BOARD_SYSTEM, BOARD_COMPONENT, kind, 0, param1, param2, 0, 0, 0, 0, 0)
+    def send(self, kind: str, *values: object) -> None:
+        """Send a message of the dialect by its name in small letters, with the values of its fields in order."""
+        getattr(self._mav, f"{kind}_send")(*values)
 
     def receive(self, wait_s: float) -> list[Message]:
         """Let ``wait_s`` pass, s, and return the complete messages that came."""
@@ -180,10 +135,6 @@ class Wire:
             found.append(cast(Message, _Frame(layout.name, fields)))
             at = end + _CHECK.size
         return at
-
-    def close(self) -> None:
-        """Close the link."""
-        self._close()
 
     def _count_frame(self, number: int) -> None:
         if self._count is not None:

@@ -17,7 +17,7 @@ from typing import NoReturn, Self
 
 import numpy as np
 
-from armsight.data import Array, JointCommand, JointStates
+from armsight.data import Array, JointCommand
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.ar4 import lines
 from armsight.robot.boards.ar4.lines import JOINTS, Ar4Start, Ar4Stopped, Ar4Text, Ar4Values, Heading, LineReader
@@ -30,10 +30,10 @@ from armsight.robot.boards.ar4.models import (
     SENSE,
     Ar4Model,
 )
-from armsight.robot.boards.codes import Alarm, BoardState, Command, Limited
-from armsight.robot.boards.contract import Abilities, checked_goals
+from armsight.robot.boards.codes import Alarm, BoardState, Command
+from armsight.robot.boards.contract import Abilities, PolledBoard
 from armsight.robot.boards.link import Link
-from armsight.robot.boards.reports import BoardStatus, JointFault, JointReport, Welcome, plain_status
+from armsight.robot.boards.reports import BoardStatus, JointFault, JointReport, Welcome
 
 BAUD = 115200
 #: The firmware's version that this codec was written for; others of the same first number are spoken to as well.
@@ -48,8 +48,6 @@ MOST_SPEED_RAD_S, LATENCY_S = float(np.radians(20.0)), 0.7
 _BACK_S, _STILL_RAD_S = 0.25, 0.02
 #: The longer way, of up to 2 DEAD_STEPS + 1 steps or 0.23 degree, takes 2 sqrt(0.23 / 30) s.
 _RESPONSE_S = 2 * _BACK_S
-#: A goal further from the present position than this is a mistake, not a step of a motion.
-MOST_STEP_RAD = float(np.radians(20.0))
 _ANSWER_S, _START_S, _TRIES = 0.2, 0.6, 4
 _POLL_S, _DRAIN_S = 0.001, 0.05
 #: Homing of a group of joints: to the switches, away from them, to the rest position.
@@ -72,7 +70,7 @@ ABILITIES = Abilities(
 )
 
 
-class Ar4Board:
+class Ar4Board(PolledBoard):
     """The joints of an AR4; :meth:`connect` makes one.
 
     Args:
@@ -83,20 +81,13 @@ class Ar4Board:
     """
 
     def __init__(self, link: Link, name: str, model: Ar4Model, now: Callable[[], float] = time.monotonic) -> None:
-        self.name, self.model = name, model
-        self.abilities = replace(ABILITIES, steps_rad=tuple(np.radians(1 / model.steps_per_deg).tolist()))
-        self.welcome = Welcome(f"ar4 {model.name}", VERSION, 0, BAUD, None)
-        self._link, self._now = link, now
-        self._reader = LineReader()
-        self._begin_s = now()
-        self._sent = self._broken = 0
-        self._enabled = self._stopped = False
-        self._t_s = 0.0
-        self._heard_s = self._begin_s  # the first byte after the newest question
+        abilities = replace(ABILITIES, steps_rad=tuple(np.radians(1 / model.steps_per_deg).tolist()))
+        super().__init__(name, abilities, Welcome(f"ar4 {model.name}", VERSION, 0, BAUD, None), now)
+        self.model, self._link = model, link
+        self._reader, self._broken, self._stopped = LineReader(), 0, False
+        self._begin_s = self._heard_s = now()  # heard: the first byte after the newest question
         self._reported: Array = np.zeros(JOINTS)  # degrees of the encoders
         self._speed_rad_s: Array = np.zeros(JOINTS)
-        self._goal: Array = np.zeros(JOINTS)
-        self._goal_speed: Array = np.zeros(JOINTS)
         self._written_s = self._back_s = -np.inf
         self._back = np.zeros(JOINTS)  # motor steps from which a goal is approached
         self._near = np.zeros(JOINTS, bool)  # the joints that are on the way there
@@ -123,7 +114,7 @@ class Ar4Board:
                 raise InputError(f"no AR4 {model!r}; there are {', '.join(MODELS)}")
             board = cls(link, name, MODELS[model], now)
             board._start(VERSION)
-            board._read()
+            board._read_positions()
             board._goal = board._q()
             return board
         except BaseException:
@@ -140,13 +131,12 @@ class Ar4Board:
         """The newest status; nobody measures the supply."""
         faults = (JointFault(Alarm.EMERGENCY_STOP),) if self._stopped else ()
         state = BoardState.ENABLED if self._enabled else BoardState.DISABLED
-        return plain_status(self._t_s, BoardState.STOPPED if self._stopped else state, faults, float("nan"), self._sent)
+        return self._status(BoardState.STOPPED if self._stopped else state, faults, float("nan"))
 
     @property
     def joints(self) -> JointReport:
         """The newest report; duties are not known and 0."""
-        none = (Limited(0),) * JOINTS
-        return JointReport(self._t_s, self._speed_rad_s, self._goal, self._goal_speed, np.zeros(JOINTS), none)
+        return self._report(self._speed_rad_s, np.zeros(JOINTS))
 
     @property
     def broken_messages(self) -> int:
@@ -164,28 +154,11 @@ class Ar4Board:
             InputError: the arm is not homed, a goal is outside the limits, or more than 20 degrees away.
             DeviceError: the port is gone.
         """
-        q_ref = checked_goals(command, JOINTS)
         self._require_homed()
-        goal = np.degrees(q_ref)
-        beyond = (goal < self.model.low_deg - 1e-6) | (goal > self.model.high_deg + 1e-6)
-        far = np.abs(q_ref - self._q()) > MOST_STEP_RAD
-        if beyond.any():
-            k = int(np.argmax(beyond))
-            raise InputError(
-                f"joint {k + 1} is to go to {goal[k]:.1f} deg; the AR4 {self.model.name} is allowed"
-                f" {self.model.low_deg[k]:.1f} to {self.model.high_deg[k]:.1f}"
-            )
-        if far.any():
-            k = int(np.argmax(far))
-            raise InputError(
-                f"joint {k + 1} is at {np.degrees(self._q()[k]):.1f} deg and is to go to {goal[k]:.1f} at once;"
-                f" {np.degrees(MOST_STEP_RAD):.0f} at most: send goals step by step"
-            )
-        self._goal, self._goal_speed = q_ref, np.asarray(command.qd_ref, float)
+        self._take_goal(command, f"the AR4 {self.model.name}")
         if self._now() - self._written_s >= 1 / RATE_HZ:
             self._write_goal()
-        self._sent += 1
-        return self._sent
+        return self._count()
 
     def command(self, command: Command) -> int:
         """Take the arm over, or reset the emergency stop.
@@ -198,28 +171,15 @@ class Ar4Board:
             self._take_over()
         elif command is Command.CLEAR_STOP:
             self._enabled = False
-            self._listen(_DRAIN_S)  # answers to goals say what was before
+            self._wait(_DRAIN_S)  # answers to goals say what was before
             self._ask(lines.reset_stop(), Ar4Stopped)
             if self._stopped:
                 raise DeviceError(f"{self.name}: the emergency stop is still pressed")
         elif command is Command.CLEAR_FAULTS:
-            self._read()
+            self._read_positions()
         else:
             raise InputError(f"{self.name}: an AR4's drives stay on; switch its supply off")
-        self._sent += 1
-        return self._sent
-
-    def confirm(self, sequence: int, wait_s: float = 0.5) -> None:
-        """Do nothing: the Teensy answers as it is asked, or :meth:`command` raises."""
-
-    def enable(self, *, inward: bool = False) -> None:
-        """Take the arm over where it is.
-
-        Raises:
-            InputError: it is not homed.
-            DeviceError: the emergency stop was pressed.
-        """
-        self.command(Command.ENABLE)
+        return self._count()
 
     def stop(self) -> None:
         """Slow all joints down to rest, where the drives hold them; they cannot be switched off by the host."""
@@ -242,41 +202,13 @@ class Ar4Board:
         question = lines.home(HOMING_GROUPS[at_once] + "012345")
         self._ask(question, Ar4Values, wait_s=_HOMING_S * JOINTS / at_once, tries=1, heading=Heading.HOMED)
         self._t_s = -np.inf  # the encoders were set anew: a jump
-        self._read()
+        self._read_positions()
         self._require_homed()
         self._goal = self._q()
-
-    def receive(self, wait_s: float = 0.0) -> JointStates:
-        """Read the joints, as often as ``RATE_HZ`` allows and once at least, and let the rest of ``wait_s`` pass.
-
-        Raises:
-            DeviceError: the Teensy does not answer any more, has restarted, or reports an error.
-        """
-        begin = self._now()
-        times, read = [], []
-        for k in range(1 + int(wait_s * RATE_HZ)):
-            if k:
-                self._listen(max(0.0, begin + k / RATE_HZ - self._now()))
-                if self._now() - begin >= wait_s:
-                    break
-            homed = self.homed
-            self._read()
-            if homed and not self.homed:
-                raise DeviceError(f"{self.name}: all encoders read 0: the Teensy has restarted; home the arm again")
-            times.append(self._t_s)
-            read.append(self._q())
-        self._listen(max(0.0, begin + wait_s - self._now()))
-        return JointStates(np.array(times), np.array(read))
 
     def close(self) -> None:
         """Close the port; the arm goes to its last goal and is held there."""
         self._link.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _q(self) -> Array:
         """Return the newest joint angles (6,), rad."""
@@ -305,7 +237,7 @@ class Ar4Board:
 
     def _take_over(self) -> None:
         """Make the present position the goal; the answer says whether the emergency stop was pressed."""
-        self._read()
+        self._read_positions()
         self._require_homed()
         self._goal = self._q()
         self._ask(lines.move_to(self._reported.tolist()), Ar4Stopped)
@@ -345,6 +277,12 @@ class Ar4Board:
         self._written_s = now
 
     def _read(self) -> None:
+        homed = self.homed
+        self._read_positions()
+        if homed and not self.homed:
+            raise DeviceError(f"{self.name}: all encoders read 0: the Teensy has restarted; home the arm again")
+
+    def _read_positions(self) -> None:
         """Read the positions; a reading that no joint can have is a disturbed one.
 
         The Teensy reads its encoders after the question and before the answer's first byte: the stamp is between. The last
@@ -409,7 +347,7 @@ class Ar4Board:
             self._broken += 1
         self._silent(question, heard)
 
-    def _listen(self, wait_s: float) -> None:
+    def _wait(self, wait_s: float) -> None:
         """Let time pass and take what comes; a goal that had to wait is written when its time has come."""
         until = self._now() + wait_s
         while True:

@@ -12,10 +12,10 @@ from typing import Self
 
 import numpy as np
 
-from armsight.data import Array, JointCommand, JointStates
+from armsight.data import Array, JointCommand
 from armsight.errors import DeviceError, InputError
-from armsight.robot.boards.codes import BoardState, Command, Limited
-from armsight.robot.boards.contract import Abilities, checked_goals
+from armsight.robot.boards.codes import BoardState, Command
+from armsight.robot.boards.contract import Abilities, PolledBoard
 from armsight.robot.boards.feetech.bus import ServoBus
 from armsight.robot.boards.feetech.calibration import NAMES, ServoCalibration, uncalibrated
 from armsight.robot.boards.feetech.registers import (
@@ -32,7 +32,7 @@ from armsight.robot.boards.feetech.registers import (
     TORQUE,
     ServoStates,
 )
-from armsight.robot.boards.reports import BoardStatus, JointFault, JointReport, Welcome, plain_status
+from armsight.robot.boards.reports import BoardStatus, JointFault, JointReport, Welcome
 
 #: Readings a second: a sync read of five servos takes 1 ms on the wire, and USB adapters add 1 to 4 ms.
 RATE_HZ = 200.0
@@ -40,8 +40,6 @@ RATE_HZ = 200.0
 LATENCY_S = 0.115
 #: Until a joint has made a step of a count or two at rest: near its goal a servo creeps against its friction.
 _RESPONSE_S = 0.25
-#: A goal further from the present position than this is a mistake, not a step of a motion.
-MOST_STEP_RAD = float(np.radians(20.0))
 #: Speed and acceleration of the servos towards a goal: 2.6 rad/s, 25 rad/s^2 (100 counts/s^2 a unit).
 _GOAL_SPEED, _ACCELERATION = 1700, 164
 #: What they follow with LATENCY_S, rad/s and rad/s^2.
@@ -65,7 +63,7 @@ ABILITIES = Abilities(
 )
 
 
-class FeetechBoard:
+class FeetechBoard(PolledBoard):
     """The joints of an arm on a servo bus; :meth:`connect` makes one.
 
     Args:
@@ -78,22 +76,14 @@ class FeetechBoard:
     def __init__(
         self, bus: ServoBus, calibration: ServoCalibration, *, enabled: bool, begin_s: float | None = None
     ) -> None:
-        self._bus, self.calibration = bus, calibration
         count = len(calibration.ids)
-        self.abilities = replace(ABILITIES, joints=count, steps_rad=(RAD_PER_COUNT,) * count)
-        self.welcome = Welcome("feetech: " + ", ".join(calibration.names), "STS3215", 0, bus.baud, None)
+        welcome = Welcome("feetech: " + ", ".join(calibration.names), "STS3215", 0, bus.baud, None)
+        abilities = replace(ABILITIES, joints=count, steps_rad=(RAD_PER_COUNT,) * count)
+        super().__init__(bus.name, abilities, welcome, bus.now)
+        self.bus, self.calibration, self._enabled = bus, calibration, enabled  #: the bus, for registers
         self._begin_s = bus.now() if begin_s is None else begin_s
-        self._sent = 0
-        self._enabled = enabled
         self._states = bus.states(calibration.ids)
-        self._t_s = 0.0
         self._goal = self._q()
-        self._goal_speed = np.zeros(count)
-
-    @property
-    def bus(self) -> ServoBus:
-        """The bus, for registers."""
-        return self._bus
 
     @classmethod
     def connect(
@@ -136,27 +126,18 @@ class FeetechBoard:
             if bits & bit
         )
         state = BoardState.FAULTED if faults else BoardState.ENABLED if self._enabled else BoardState.DISABLED
-        return plain_status(self._t_s, state, faults, float(self._states.volts.min()), self._sent)
+        return self._status(state, faults, float(self._states.volts.min()))
 
     @property
     def joints(self) -> JointReport:
         """The newest report: speeds, loads (as duties) and temperatures are the servos' own."""
         states = self._states
-        none = (Limited(0),) * self.abilities.joints
-        return JointReport(
-            self._t_s,
-            states.speed * RAD_PER_COUNT,
-            self._goal,
-            self._goal_speed,
-            states.load,
-            none,
-            states.celsius,
-        )
+        return self._report(states.speed * RAD_PER_COUNT, states.load, states.celsius)
 
     @property
     def broken_messages(self) -> int:
         """Number of answers that were broken or did not come."""
-        return self._bus.broken
+        return self.bus.broken
 
     def soft_limits(self) -> tuple[Array, Array]:
         """Return the joint angles (n,) that the calibration allows, rad."""
@@ -169,27 +150,10 @@ class FeetechBoard:
             InputError: a goal outside the limits, or more than 20 degrees from where the joint is; nothing was sent.
             DeviceError: the bus is gone.
         """
-        q_ref = checked_goals(command, self.abilities.joints)
-        goal, names = self.calibration.counts(q_ref), self.calibration.names
-        beyond = (goal < self.calibration.lowest) | (goal > self.calibration.highest)
-        far = np.abs(q_ref - self._q()) > MOST_STEP_RAD
-        if beyond.any():
-            k = int(np.argmax(beyond))
-            low, high = (np.degrees(each[k]) for each in self.soft_limits())
-            raise InputError(
-                f"joint {k + 1} ({names[k]}) is to go to {np.degrees(q_ref[k]):.1f} deg; its servo is allowed {low:.1f} to"
-                f" {high:.1f}"
-            )
-        if far.any():
-            k = int(np.argmax(far))
-            raise InputError(
-                f"joint {k + 1} ({names[k]}) is at {np.degrees(self._q()[k]):.1f} deg and is to go to"
-                f" {np.degrees(q_ref[k]):.1f} at once; {np.degrees(MOST_STEP_RAD):.0f} at most: send goals step by step"
-            )
-        self._write_goals(goal)
-        self._goal, self._goal_speed = q_ref, np.asarray(command.qd_ref, float)
-        self._sent += 1
-        return self._sent
+        # The margin is what rounds to a count that is allowed.
+        q_ref = self._take_goal(command, "its servo", self.calibration.names, margin_rad=RAD_PER_COUNT / 2)
+        self._write_goals(self.calibration.counts(q_ref))
+        return self._count()
 
     def command(self, command: Command) -> int:
         """Switch the torque on or off, or read whether an alarm still stands.
@@ -204,57 +168,21 @@ class FeetechBoard:
         elif command is Command.CLEAR_FAULTS:
             self._read()
         else:
-            raise InputError(f"{self._bus.name}: servos know no {command.name}: enable them again")
-        self._sent += 1
-        return self._sent
-
-    def confirm(self, sequence: int, wait_s: float = 0.5) -> None:
-        """Do nothing: a servo acknowledges as it is asked, or :meth:`command` raises."""
-
-    def enable(self, *, inward: bool = False) -> None:
-        """Switch the torque on at the present position.
-
-        Raises:
-            DeviceError: an alarm stands.
-        """
-        self.command(Command.ENABLE)
+            raise InputError(f"{self.bus.name}: servos know no {command.name}: enable them again")
+        return self._count()
 
     def stop(self) -> None:
         """Switch the torque off at once: the arm sinks."""
         for _ in range(_STOPS):
-            self._bus.write_all(TORQUE, {id: TORQUE.encode(0) for id in self.calibration.ids})
+            self.bus.write_all(TORQUE, {id: TORQUE.encode(0) for id in self.calibration.ids})
         self._enabled = False
-
-    def receive(self, wait_s: float = 0.0) -> JointStates:
-        """Read the servos, as often as ``RATE_HZ`` allows and once at least, and let the rest of ``wait_s`` pass.
-
-        Raises:
-            DeviceError: a servo does not answer any more.
-        """
-        begin, bus = self._bus.now(), self._bus
-        times, read = [], []
-        for k in range(1 + int(wait_s * RATE_HZ)):
-            ahead_s = begin + k / RATE_HZ - bus.now()
-            if k and ahead_s > 0:
-                bus.wait(ahead_s)
-            if k and bus.now() - begin >= wait_s:
-                break
-            self._read()
-            times.append(self._t_s)
-            read.append(self._q())
-        if (left_s := begin + wait_s - bus.now()) > 0:
-            bus.wait(left_s)
-        return JointStates(np.array(times), np.array(read))
 
     def close(self) -> None:
         """Close the port; servos whose torque is on hold their last goal."""
-        self._bus.close()
+        self.bus.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def _wait(self, wait_s: float) -> None:
+        self.bus.wait(wait_s)
 
     def _q(self) -> Array:
         """Return the newest joint angles (n,), rad."""
@@ -262,16 +190,16 @@ class FeetechBoard:
 
     def _read(self) -> ServoStates:
         """Read all servos; their time is the middle of the question and the answers."""
-        asked = self._bus.now()
-        self._states = self._bus.states(self.calibration.ids)
-        self._t_s = (asked + self._bus.now()) / 2 - self._begin_s
+        asked = self.bus.now()
+        self._states = self.bus.states(self.calibration.ids)
+        self._t_s = (asked + self.bus.now()) / 2 - self._begin_s
         return self._states
 
     def _switch_on(self) -> None:
         """Make the present position the goal, then switch the torque on."""
         states = self._read()
         if faults := self.status.faults:
-            raise DeviceError(f"{self._bus.name} cannot be enabled: {'; '.join(map(str, faults))}")
+            raise DeviceError(f"{self.bus.name} cannot be enabled: {'; '.join(map(str, faults))}")
         self._write_goals(np.clip(states.counts, self.calibration.lowest, self.calibration.highest))
         self._goal = self._q()
         self._torque(1)
@@ -280,11 +208,11 @@ class FeetechBoard:
         time = bytes(GOAL_SPEED.address - GOAL_POSITION.address - GOAL_POSITION.width)
         ahead, behind = ACCELERATION.encode(_ACCELERATION), time + GOAL_SPEED.encode(_GOAL_SPEED)
         goals = zip(self.calibration.ids, counts.tolist(), strict=True)
-        self._bus.write_all(ACCELERATION, {id: ahead + GOAL_POSITION.encode(int(goal)) + behind for id, goal in goals})
+        self.bus.write_all(ACCELERATION, {id: ahead + GOAL_POSITION.encode(int(goal)) + behind for id, goal in goals})
 
     def _torque(self, on: int) -> None:
         for id in self.calibration.ids:
-            self._bus.write(id, TORQUE, on)
+            self.bus.write(id, TORQUE, on)
         self._enabled = bool(on)
 
 
