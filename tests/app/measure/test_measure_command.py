@@ -532,3 +532,11 @@ def test_a_board_that_looks_the_same_upside_down_is_noted_where_it_flips():
     (note,) = reversed_notes(same, shots)
     assert note.startswith("s2, s4: rotated by 180 degrees or so")
     assert reversed_notes(same, shots[:2]) == reversed_notes(same, []) == []
+
+
+def test_shots_that_no_file_needs_are_counted_and_forgotten(armsight, rendered, monkeypatch, tmp_path):
+    monkeypatch.setattr("armsight.app.measure.run._KEPT", 3)
+    arguments = ("measure", rendered.rig, "--target", rendered.plate, "--source", rendered.folder / "arm")
+    assert "measured 16 of 16 shots" in armsight(*arguments).err
+    armsight(*arguments, "-o", tmp_path / "poses.csv")
+    assert len((tmp_path / "poses.csv").read_text().splitlines()) == 17

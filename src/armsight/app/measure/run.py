@@ -6,7 +6,7 @@ import contextlib
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import click
@@ -18,7 +18,7 @@ from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, Measure
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.progress import bar
 from armsight.app.show.messages import colour, weak
-from armsight.app.stream.datum import Published, ShotDatum
+from armsight.app.stream.datum import NoteDatum, Published, ShotDatum
 from armsight.app.stream.sink import Fanout, Publisher
 from armsight.data import Body, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
@@ -41,6 +41,10 @@ _WIDE_PX, _AGAIN = 2.0, 60
 _RECORDED = "they are no new measurements: leave them out, and record at the rate that the cameras really give"
 #: A shot that is younger by its own stamp was stamped by a live camera, s.
 _LIVE_S = 10.0
+#: Shots that are kept for the lines at the end where no file needs all of them; half, double: so much memory.
+_KEPT = 10_000
+#: s, between two looks at the health of live cameras; half: nothing, double: a warning comes later.
+_HEALTH_S = 1.0
 
 
 def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
@@ -55,16 +59,11 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
     requested = requested_shutters(options.skew, options.readout)
     _check_detections(options, requested)
     fixed = open_fixed(options.fixed, options.target)
-    if options.save_rig is not None:
-        check_writable(options.save_rig, apart_from=(options.rig, options.target, options.output))
     rig = open_rig(options.rig)
-    folder = None if options.view_dir is None else view_folder(options.view_dir)
-    if options.output is not None:
-        chart = folder and folder / CHART
-        check_writable(options.output, apart_from=(options.rig, options.target, options.detections, folder, chart))
+    folder = _checked_outputs(options)
     if not rig.cov.any():
         click.echo(f"note: {options.rig} has no covariance: every ± is the share of the pixel noise alone", err=True)
-    records: list[ShotPose] = []
+    records, past = list[ShotPose](), _Past(options.output is None and options.view_dir is None)
     started = time.perf_counter()
     with contextlib.ExitStack() as stack:
         shots = stack.enter_context(contextlib.closing(open_shots(options, rig, requested, folder is not None)))
@@ -79,16 +78,17 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
         missed = _Contradicting(rig, shots.body, shots.again)
         results = _watched(rig, fixed, missed.keeping(shots.results), monitor)
         try:
-            _run(results, shots, records, options.as_json, view, monitor, publisher)
+            _run(results, shots, records, past, options.as_json, view, monitor, publisher)
         except KeyboardInterrupt:
             kept = f", kept in {options.output}" if options.output is not None and records else ""
-            click.echo(f"armsight: stopped after {len(records)} shots{kept}", err=True)
+            click.echo(f"armsight: stopped after {past.shots + len(records)} shots{kept}", err=True)
             raise
         shots.finish(records)
         contradicted = missed.finding()
         if records and not any(record.ok for record in records):
             raise ArmsightError(_nothing_measured(records, shots.mistake(), contradicted, options.output))
-    _close(records, time.perf_counter() - started, options.output, view, _board_file(options.rig, rig, options.target))
+    board_file = _board_file(options.rig, rig, options.target)
+    _close(records, past, time.perf_counter() - started, options.output, view, board_file)
     saved = _keep_noise(rig, shots, records, options.save_rig)
     health = _concluded(monitor, shots, contradicted)
     if options.as_json and health:
@@ -96,6 +96,39 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
     if not saved and not health:
         click.get_current_context().exit(1)
     return health
+
+
+@dataclass
+class _Past:
+    """Shots of days, of which no file needs all: counted and forgotten.
+
+    Attributes:
+        forgets: whether any are.
+        shots: forgotten.
+        good: those of them that were measured.
+    """
+
+    forgets: bool
+    shots: int = 0
+    good: int = 0
+
+    def thin(self, records: list[ShotPose]) -> None:
+        """Forget the older half once there are many."""
+        if self.forgets and len(records) >= 2 * _KEPT:
+            self.shots += _KEPT
+            self.good += sum(record.ok for record in records[:_KEPT])
+            del records[:_KEPT]
+
+
+def _checked_outputs(options: MeasureOptions) -> Path | None:
+    """Check that what is written can be; return the folder of the pictures, None without any."""
+    if options.save_rig is not None:
+        check_writable(options.save_rig, apart_from=(options.rig, options.target, options.output))
+    folder = None if options.view_dir is None else view_folder(options.view_dir)
+    if options.output is not None:
+        chart = folder and folder / CHART
+        check_writable(options.output, apart_from=(options.rig, options.target, options.detections, folder, chart))
+    return folder
 
 
 def _check_detections(options: MeasureOptions, requested: Requested | None) -> None:
@@ -253,12 +286,14 @@ def _run(
     results: Iterator[Result],
     shots: DetectedShots | ImageShots,
     records: list[ShotPose],
+    past: _Past,
     as_json: bool,
     view: PictureFolder | None,
     monitor: HealthMonitor,
     publisher: Publisher,
 ) -> None:
-    """Measure every shot, print its line, keep its record and draw it."""
+    """Measure every shot, print its line, keep its record and draw it; of live cameras also warn at once."""
+    warned, looked_s = set[str](), 0.0
     with bar("measuring", shots.total) as advance:
         for shot, measured, followed, shutters in results:
             result = monitor.measured(measured, shot.t_s) if isinstance(measured, PoseEstimate) else measured
@@ -266,7 +301,16 @@ def _run(
             if followed is not None:
                 record = replace(record, way=followed.way, jump=followed.jump, took_ms=followed.took_ms)
             records.append(record)
-            publisher.put(ShotDatum(shot, result, _arrival_s(shot)))
+            past.thin(records)
+            arrival_s = _arrival_s(shot)
+            publisher.put(ShotDatum(shot, result, arrival_s))
+            if arrival_s is not None and arrival_s - looked_s > _HEALTH_S:
+                looked_s = arrival_s
+                for found in monitor.findings():
+                    if found.cause not in warned:
+                        warned.add(found.cause)
+                        click.echo(weak(found.line()), err=True, color=colour())
+                        publisher.put(NoteDatum(arrival_s, found.line(), "warning"))
             click.echo(json.dumps(record.to_json()) if as_json else _line(record))
             if view is not None:
                 view.add(shot, result, record)
@@ -323,15 +367,20 @@ def _nothing_measured(
 
 
 def _close(
-    records: list[ShotPose], seconds: float, output: Path | None, view: PictureFolder | None, board_file: Path | None
+    records: list[ShotPose],
+    past: _Past,
+    seconds: float,
+    output: Path | None,
+    view: PictureFolder | None,
+    board_file: Path | None,
 ) -> None:
     """Print on stderr what was measured and missed; raise an error if nothing was measured."""
     if not records:
         raise ArmsightError("the source ended without a single shot")
     good = [r for r in records if r.ok]
-    missed = len(records) - len(good)
+    missed = past.shots - past.good + len(records) - len(good)
     said = [
-        f"measured {len(good)} of {len(records)} shots in {seconds:.1f} s"
+        f"measured {past.good + len(good)} of {past.shots + len(records)} shots in {seconds:.1f} s"
         + (f", {missed} missed (their lines have the reasons)" if missed else ""),
         _ways(records),
     ]

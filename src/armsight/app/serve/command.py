@@ -1,0 +1,29 @@
+"""``armsight serve``: keep measuring for days."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+
+@click.command("serve")
+@click.argument("config", metavar="CONFIG.toml", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print each event as one JSON object.")
+def command(config: Path, as_json: bool) -> None:
+    """Keep `armsight measure` or `armsight run` going for days.
+
+    CONFIG.toml has the options of the command by their long names, and how it is served (docs/howto/serve.md). A camera or
+    a board that is lost is tried again until it is back; each loss is said once. /healthz and /metrics show the state.
+    Ctrl-C and SIGTERM stop it: the arm is held and all files are whole.
+    """
+    from armsight.app.serve.config import read_config
+    from armsight.app.serve.service import Service
+
+    def report(event: dict[str, Any]) -> None:
+        if as_json:
+            click.echo(json.dumps(event))
+
+    click.get_current_context().exit(Service(read_config(config), report).run())

@@ -1,0 +1,145 @@
+"""The file of ``armsight serve``: a table of the command with its options by their long names, and a table ``serve``."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+
+from armsight.errors import InputError
+from armsight.files import read_toml
+
+#: Commands that can be kept going.
+COMMANDS = ("measure", "run")
+#: Keys of the table ``serve`` that are texts, and numbers.
+_TEXTS, _NUMBERS = ("http", "log"), ("log_mb", "log_files", "stale_s", "retry_s")
+#: Options that the service itself needs, or that would let memory grow.
+_OWN = {
+    "json": "the service reads what the command publishes",
+    "help": "type it on the command line",
+    "save_rig": "it is written when the command ends",
+    "view": "pictures of days fill the disk",
+}
+
+
+@dataclass(frozen=True)
+class ServeConfig:
+    """What is kept going, and how.
+
+    Attributes:
+        command: the command.
+        arguments: of the command.
+        folder: where relative paths begin: that of the file.
+        output: folder of a run's folders, one each start; None for ``measure``.
+        http: where /healthz and /metrics are, ``host:port``; empty for nowhere.
+        log: file of the log, empty for stderr.
+        log_mb: size at which it is begun anew, MB.
+        log_files: older logs that are kept.
+        stale_s: time without a shot after which the command is started again, s.
+        retry_s: longest time between two tries, s.
+    """
+
+    command: str
+    arguments: tuple[str, ...]
+    folder: Path
+    output: Path | None = None
+    http: str = "127.0.0.1:9110"
+    log: str = ""
+    log_mb: float = 10.0
+    log_files: int = 5
+    stale_s: float = 10.0
+    retry_s: float = 3.0
+
+
+def read_config(path: Path) -> ServeConfig:
+    """Read a file of ``armsight serve``; its relative paths begin at its own folder.
+
+    Raises:
+        InputError: it cannot be read, has an unknown key, or an option that its command rejects.
+    """
+    document = read_toml(path)
+    chosen = [name for name in COMMANDS if name in document]
+    if unknown := sorted(document.keys() - {*COMMANDS, "serve"}):
+        raise InputError(f"{path}: unknown table [{unknown[0]}]; known are [measure] or [run], and [serve]")
+    if len(chosen) != 1 or not isinstance(document[chosen[0]], dict):
+        raise InputError(
+            f"{path}: expected one table [measure] or [run], with the command's options by their long names"
+        )
+    name, given = chosen[0], dict(document[chosen[0]])
+    service = _service(path, document.get("serve", {}))
+    folder = path.expanduser().resolve().parent
+    output = Path(str(given.pop("output", "runs"))) if name == "run" else None
+    command: click.Command = importlib.import_module(f"armsight.app.{name}.command").command
+    arguments = _arguments(path, name, command, given)
+    try:
+        command.make_context(name, list(arguments)).close()
+    except click.UsageError as error:
+        raise InputError(f"{path}: [{name}]: {error.format_message()}") from None
+    _check(folder, given)
+    return ServeConfig(name, arguments, folder, output, **service)
+
+
+def _service(path: Path, given: Any) -> dict[str, Any]:  # noqa: ANN401 - whatever TOML holds
+    """Return the values of the table ``serve``."""
+    if not isinstance(given, dict):
+        raise InputError(f"{path}: serve is {given!r}: expected a table [serve]")
+    found: dict[str, Any] = {}
+    for key, value in given.items():
+        if key not in _TEXTS and key not in _NUMBERS:
+            raise InputError(f"{path}: [serve] has an unknown key {key!r}{_near(key, [*_TEXTS, *_NUMBERS])}")
+        if key in _TEXTS and not isinstance(value, str):
+            raise InputError(f"{path}: [serve] {key} is {value!r}: expected a text")
+        if key in _NUMBERS and (isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e6):
+            raise InputError(f"{path}: [serve] {key} is {value!r}: expected a number above 0")
+        found[key] = int(value) if key == "log_files" else value
+    return found
+
+
+def _arguments(path: Path, name: str, command: click.Command, given: dict[str, Any]) -> tuple[str, ...]:
+    """Return a table's keys and values as arguments of the command."""
+    known = {_key(each): each for each in command.params}
+    out: list[str] = []
+    for key, value in given.items():
+        if key in _OWN:
+            raise InputError(f"{path}: [{name}] {key}: not for a service: {_OWN[key]}")
+        if key not in known:
+            raise InputError(
+                f"{path}: [{name}] has an unknown key {key!r}{_near(key, [k for k in known if k not in _OWN])}"
+            )
+        option = known[key]
+        values = value if isinstance(value, list) else [value]
+        if not all(isinstance(each, str | int | float) for each in values) or (len(values) > 1 and not option.multiple):
+            raise InputError(f"{path}: [{name}] {key} is {value!r}: expected one text, number or true")
+        for each in values:
+            if isinstance(option, click.Argument):
+                out.insert(0, str(each))
+            elif not isinstance(each, bool):
+                out.append(f"{max(option.opts, key=len)}={each}")
+            elif each:
+                out.append(max(option.opts, key=len))
+    return tuple(out)
+
+
+def _key(parameter: click.Parameter) -> str:
+    """Return what a file calls a parameter: its longest option, with underscores."""
+    return max(parameter.opts, key=len).lstrip("-").replace("-", "_")
+
+
+def _near(key: str, known: list[str]) -> str:
+    """Return which known key is meant, or all of them."""
+    near = difflib.get_close_matches(key, known, 1)
+    return f": did you mean {near[0]}?" if near else f"; known are {', '.join(sorted(known))}"
+
+
+def _check(folder: Path, given: dict[str, Any]) -> None:
+    """Open rig and target once: a mistake in them ends the service before it begins."""
+    from armsight.vision.markers.targets import open_target
+    from armsight.vision.sources.bag.camera_info import open_rig
+
+    target = folder / str(given["target"])
+    open_rig(folder / str(given["rig"]))
+    open_target(str(target) if target.exists() else str(given["target"]))

@@ -1,0 +1,257 @@
+"""The child process of a service: started, watched by what it publishes, ended, and started again when it was lost."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import re
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime
+from logging.handlers import RotatingFileHandler
+from pathlib import Path
+from typing import Any
+
+from armsight.app.serve.config import ServeConfig
+from armsight.app.serve.page import StatePage
+from armsight.errors import InputError
+
+#: s; a child without a shot for so long after its start is started again; half: a slow computer never begins, double: a
+#: driver that hangs at the start is noticed later.
+_BEGIN_S = 60.0
+#: s; a child has so long to hold the arm and to write its files; half: a slow disk loses a file, double: a child that hangs
+#: delays the end.
+_END_S = 10.0
+#: s, between two looks at the child; half: nothing, double: a camera is back later.
+_LOOK_S = 0.2
+#: s; the first pause before the next try, doubled up to the file's retry_s; half: an attempt more, double: one less.
+_PAUSE_S = 0.5
+
+
+#: What is started; the command and its options follow.
+_ARMSIGHT = (sys.executable, "-P", "-m", "armsight")
+#: Lines of the child that only say that it goes on.
+_PROGRESS = re.compile(r"[a-z ]+: \d+( of \d+)?$")
+
+
+class Service:
+    """Keeps one command going.
+
+    Args:
+        config: what, and how.
+        report: takes each event, as an object for JSON.
+    """
+
+    def __init__(self, config: ServeConfig, report: Callable[[dict[str, Any]], None]) -> None:
+        self._config, self._report = config, report
+        self._log = _logger(config)
+        self._child: subprocess.Popen[bytes] | None = None
+        self._said: set[str] = set()  # by the child, during one loss
+        self._last_line = ""
+        self._began = self._newest = time.monotonic()
+        self._lost_since: float | None = None
+        self._why, self._tries = "starting", 0
+        self._counts = {"shots_total": 0.0, "missed_total": 0.0, "losses_total": 0.0}
+        self._values: dict[str, float] = {}
+
+    def run(self) -> int:
+        """Keep the command going until it ends by itself; return its exit code, 0 or 3.
+
+        Raises:
+            InputError: something listens at the address of the pages.
+            KeyboardInterrupt: Ctrl-C or SIGTERM; the child has ended and its arm is held.
+        """
+        page = None if not self._config.http else StatePage(self._config.http, self.state, self.values)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
+            heard.bind(("127.0.0.1", 0))
+            heard.setblocking(False)
+            try:
+                if page is not None:
+                    self._event("began", f"/healthz and /metrics on port {page.port}", port=page.port)
+                pause = _PAUSE_S
+                while True:
+                    code = self._one(heard)
+                    if code is not None and code in (0, 3):
+                        self._event("ended", f"armsight {self._config.command} has ended", code=code)
+                        return code
+                    pause = _PAUSE_S if self._lost_since is None else min(2 * pause, self._config.retry_s)
+                    self._lost(self._last_line or f"armsight {self._config.command} ended with {code}")
+                    time.sleep(pause)
+            except KeyboardInterrupt:
+                self._event("stopped", "stopped")
+                raise
+            finally:
+                if page is not None:
+                    page.close()
+                _close(self._log)
+
+    def state(self) -> dict[str, Any]:
+        """Return what /healthz shows."""
+        now = time.monotonic()
+        lost = self._lost_since
+        return {
+            "healthy": lost is None and self._why == "",
+            "why": self._why or None,
+            "for_s": round(now - (self._began if lost is None else lost), 1),
+            "shot_age_s": round(now - self._newest, 2) if self._counts["shots_total"] else None,
+            "tries": self._tries,
+        }
+
+    def values(self) -> dict[str, float]:
+        """Return what /metrics shows."""
+        found = {"up": float(self.state()["healthy"]), **self._counts, **self._values}
+        if self._counts["shots_total"]:
+            found["shot_age_seconds"] = time.monotonic() - self._newest
+        if (child := self._child) is not None:
+            with suppress(OSError, IndexError):
+                pages = int(Path(f"/proc/{child.pid}/statm").read_text().split()[1])
+                found["process_resident_bytes"] = float(pages * os.sysconf("SC_PAGE_SIZE"))
+        return found
+
+    def _one(self, heard: socket.socket) -> int | None:
+        """Start the child and listen to it until it ends or falls silent; return its exit code, None where it was ended."""
+        arguments = [*self._config.arguments, f"--stream=json+udp:127.0.0.1:{heard.getsockname()[1]}"]
+        if self._config.output is not None:
+            name = datetime.now(UTC).strftime("%Y-%m-%dT%H-%M-%S")
+            arguments.append(f"--output={self._config.output / name}")
+        self._tries, self._last_line = self._tries + 1, ""
+        self._child = subprocess.Popen(
+            [*_ARMSIGHT, self._config.command, *arguments],
+            cwd=self._config.folder,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+        )
+        listener = threading.Thread(target=self._listen, args=(self._child,), daemon=True)
+        listener.start()
+        try:
+            code = self._heard(heard, self._child)
+        finally:
+            self._end()
+            listener.join()
+        if code is None:
+            self._last_line = f"no shot for {self._config.stale_s:.0f} s"
+        return code
+
+    def _heard(self, heard: socket.socket, child: subprocess.Popen[bytes]) -> int | None:
+        """Take what the child publishes; return its exit code, None where it fell silent."""
+        started, shots = time.monotonic(), self._counts["shots_total"]
+        while (code := child.poll()) is None:
+            select.select([heard], [], [], _LOOK_S)
+            self._take_all(heard)
+            began = self._counts["shots_total"] > shots
+            limit_s, since = (self._config.stale_s, self._newest) if began else (_BEGIN_S, started)
+            if time.monotonic() - since > limit_s:
+                return None
+        self._take_all(heard)
+        return code
+
+    def _take_all(self, heard: socket.socket) -> None:
+        """Take what has come."""
+        with suppress(BlockingIOError):
+            while True:
+                self._take(heard.recv(65536))
+
+    def _take(self, datagram: bytes) -> None:
+        """Take one published datum."""
+        datum = json.loads(datagram)
+        if datum.get("kind") != "shot":
+            return
+        self._newest = time.monotonic()
+        self._counts["shots_total"] += 1
+        self._counts["missed_total"] += datum["status"] != "ok"
+        if datum.get("age_s") is not None:
+            self._values["latency_seconds"] = datum["age_s"]
+        if datum["status"] == "ok":
+            self._values["sigma_metres"] = math.sqrt(sum(datum["covariance"][i][i] for i in range(3)))
+        if self._lost_since is not None:
+            gone_s = self._newest - self._lost_since
+            text = f"back after {gone_s:.1f} s (tries: {self._tries})"
+            self._event("back", text, gone_s=round(gone_s, 2), tries=self._tries)
+        elif self._why:
+            self._event("measuring", "the first shot has arrived")
+        if self._why:
+            self._began, self._lost_since, self._why = self._newest, None, ""
+            self._tries = 0
+            self._said.clear()
+
+    def _lost(self, why: str) -> None:
+        """Say that the child was lost: once, and again where another reason shows."""
+        if self._lost_since is None:
+            self._lost_since = time.monotonic()
+            self._counts["losses_total"] += 1
+        if why != self._why:
+            self._why = why
+            self._event("lost", f"lost: {why}; trying again", why=why)
+
+    def _listen(self, child: subprocess.Popen[bytes]) -> None:
+        """Log the lines of the child, each once during one loss; the last one says why it ended."""
+        assert child.stderr is not None
+        with child.stderr as lines:
+            for data in lines:
+                self._hear(data.decode(errors="replace").rstrip())
+
+    def _hear(self, line: str) -> None:
+        """Take a line of the child."""
+        self._last_line = line.removeprefix("armsight: error: ") or self._last_line
+        if not _PROGRESS.match(line) and (self._lost_since is None or line not in self._said):
+            self._said.add(line)
+            self._log.info("%s: %s", self._config.command, line)
+
+    def _end(self) -> None:
+        """End the child as Ctrl-C does, so that its arm is held and its files are whole; kill it where it does not."""
+        child = self._child
+        if child is None or child.poll() is not None:
+            return
+        child.send_signal(signal.SIGTERM)
+        try:
+            child.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+
+    def _event(self, event: str, text: str, **values: object) -> None:
+        """Log an event, and report it."""
+        self._log.info("%s", text)
+        self._report({"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, **values})
+
+
+def _logger(config: ServeConfig) -> logging.Logger:
+    """Return the log: a file that is begun anew when it is full, or stderr.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    logger = logging.getLogger("armsight.serve")
+    logging.raiseExceptions = False  # a full disk ends no service
+    try:
+        most = round(1e6 * config.log_mb)
+        handler = (
+            RotatingFileHandler(config.folder / config.log, maxBytes=most, backupCount=config.log_files)
+            if config.log
+            else logging.StreamHandler(sys.stderr)
+        )
+    except OSError as error:
+        raise InputError(f"[serve] log {config.log}: cannot be written ({error.strerror})") from None
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%Y-%m-%dT%H:%M:%S"))
+    _close(logger)
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    logger.propagate = False
+    return logger
+
+
+def _close(logger: logging.Logger) -> None:
+    """Close the log."""
+    for handler in logger.handlers[:]:
+        logger.removeHandler(handler)
+        handler.close()

@@ -1,0 +1,196 @@
+"""``armsight serve``: its file, its child that is lost and comes back, its pages; a stub publishes what a child would."""
+
+import configparser
+import json
+import signal
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from armsight.app.serve import service
+from armsight.app.serve.config import ServeConfig, read_config
+from armsight.app.serve.page import METRICS, StatePage, metrics_text
+from armsight.app.serve.service import Service
+from armsight.errors import InputError
+from cli_runs import assert_rejected
+
+ROOT = Path(__file__).parents[3]
+SHOT = {"kind": "shot", "status": "ok", "age_s": 0.02, "covariance": [[9e-10, 0, 0], [0, 4e-10, 0], [0, 0, 3.6e-9]]}
+#: Sends shots, then fails as its next line of the plan says: `N REASON` (exit 2 after N shots), `N silent`, `N ends`.
+STUB = """
+import json, pathlib, socket, sys, time
+plan = pathlib.Path("plan"); lines = plan.read_text().splitlines()
+plan.write_text("\\n".join(lines[1:]))
+count, reason = lines[0].split(" ", 1)
+port = int(sys.argv[-1].rpartition(":")[2])
+out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+for k in range(int(count)):
+    shot = json.loads(sys.argv[1]) | ({"status": "missed"} if k == 1 else {})
+    out.sendto(json.dumps(shot).encode(), ("127.0.0.1", port))
+if reason == "silent":
+    try:
+        time.sleep(60)
+    except KeyboardInterrupt:
+        pass
+print("armsight: error: " + reason, file=sys.stderr)
+sys.exit(0 if reason == "ends" else 2)
+"""
+
+
+@pytest.fixture
+def serving(tmp_path, monkeypatch):
+    """Serve a stub that does what a plan says; returns the exit code, the events and the log."""
+    monkeypatch.setattr(service, "_ARMSIGHT", (sys.executable, "-S", "-c", STUB, json.dumps(SHOT)))
+    monkeypatch.setattr(service, "_PAUSE_S", 0.01)
+    monkeypatch.setattr(service, "_LOOK_S", 0.02)
+
+    def serve(*plan, **options):
+        (tmp_path / "plan").write_text("\n".join(plan))
+        events = []
+        served = Service(ServeConfig("measure", (), tmp_path, http="", log="log", **options), events.append)
+        return served.run(), events, (tmp_path / "log").read_text(), served
+
+    return serve
+
+
+def test_each_loss_is_said_once_and_the_return_with_its_tries(serving):
+    gone = "0 camera gone"
+    code, events, log, served = serving(
+        "3 camera gone", gone, gone, "0 board gone", "2 camera gone", "4 ends", retry_s=0.02
+    )
+    assert code == 0
+    assert [each["event"] for each in events] == ["measuring", "lost", "lost", "back", "lost", "back", "ended"]
+    assert [each.get("why") for each in events[1:3]] == ["camera gone", "board gone"]
+    assert (events[3]["tries"], events[5]["tries"]) == (4, 1)
+    assert log.count("lost: camera gone; trying again") == 2
+    assert log.count("measure: armsight: error: camera gone") == 2  # one for each loss, not for each try
+    values = served.values()
+    assert (values["shots_total"], values["missed_total"], values["losses_total"]) == (9, 3, 2)
+    assert values["sigma_metres"] == pytest.approx(7e-5)
+
+
+def test_days_of_losses_leave_one_line_each(serving):
+    _, events, log, _ = serving(*(f"2 camera {k} gone" for k in range(20)), "1 ends", log_mb=0.002, log_files=2)
+    assert sum(each["event"] == "lost" for each in events) == sum(each["event"] == "back" for each in events) == 20
+    assert len(log) <= 2200  # the log does not grow
+
+
+def test_a_driver_that_falls_silent_is_started_again(serving):
+    code, events, *_ = serving("2 silent", "1 ends", stale_s=0.2)
+    assert code == 0
+    assert [each["why"] for each in events if each["event"] == "lost"] == ["no shot for 0 s"]
+
+
+def test_an_interrupt_ends_the_child(serving):
+    threading.Timer(0.6, signal.raise_signal, (signal.SIGINT,)).start()
+    before = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        serving("2 silent")
+    assert time.monotonic() - before < service._END_S  # the child was not waited for in vain
+
+
+def fetch(port, path):
+    """Return the code and the text of a page."""
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=5) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
+
+
+def test_the_pages():
+    state = {"healthy": False, "why": "camera gone"}
+    page = StatePage("127.0.0.1:0", lambda: state, lambda: {"up": 0.0, "shots_total": 12.0})
+    try:
+        assert fetch(page.port, "/healthz") == (503, json.dumps(state) + "\n")
+        state["healthy"] = True
+        assert fetch(page.port, "/healthz")[0] == 200
+        assert fetch(page.port, "/metrics")[1].splitlines()[2] == "armsight_up 0"
+        assert fetch(page.port, "/else")[0] == 404
+        with pytest.raises(InputError, match="does another service run"):
+            StatePage(f"127.0.0.1:{page.port}", lambda: state, dict)
+    finally:
+        page.close()
+    with pytest.raises(InputError, match="expected HOST:PORT"):
+        StatePage("9110", lambda: state, dict)
+
+
+def test_metrics_are_in_prometheus_form():
+    lines = metrics_text(dict.fromkeys(METRICS, 1.5)).splitlines()
+    assert len(lines) == 3 * len(METRICS)
+    for name, (kind, _) in METRICS.items():
+        assert {f"# TYPE armsight_{name} {kind}", f"armsight_{name} 1.5"} <= set(lines)
+
+
+def write(path, text):
+    """Write a file of serve, and return its path."""
+    path.write_text(text)
+    return path
+
+
+def test_a_recording_is_measured_once(armsight, rendered, tmp_path):
+    file = write(
+        tmp_path / "serve.toml",
+        f'[measure]\nrig = "{rendered.rig}"\ntarget = "{rendered.plate}"\nsource = "{rendered.folder / "arm"}"\n'
+        '[serve]\nhttp = ""\nlog = "serve.log"\n',
+    )
+    said = armsight("serve", file, "--json")
+    assert said.code == 0
+    assert [json.loads(line)["event"] for line in said.out.splitlines()] == ["measuring", "ended"]
+    assert "measured 16 of 16 shots" in (tmp_path / "serve.log").read_text()
+
+
+def test_a_run_gets_a_folder_each_time_and_options_become_arguments(rendered, tmp_path):
+    text = f'[run]\nrig = "{rendered.rig}"\ntarget = "{rendered.plate}"\nsource = "usb:0,1"\nboard = "serial:/dev/x"\n'
+    found = read_config(
+        write(tmp_path / "a.toml", text + 'rate = 30\nopen_loop = true\nstream = ["json+tcp:1", "json+tcp:2"]\n')
+    )
+    assert (found.command, str(found.output), found.folder) == ("run", "runs", tmp_path)
+    assert {"--rate=30", "--open-loop", "--stream=json+tcp:1", "--stream=json+tcp:2"} <= set(found.arguments)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("source =", "sorce =", "[measure] has an unknown key 'sorce': did you mean source?"),
+        ("[measure]", "[mesure]", "unknown table [mesure]; known are [measure] or [run], and [serve]"),
+        ("[measure]", "[serve]", "expected one table [measure] or [run]"),
+        ("[measure]", "[measure]\njson = true", "json: not for a service"),
+        ("[measure]", "[measure]\nskew = [1, 2]", "skew is [1, 2]: expected one text, number or true"),
+        ("target =", "#", "[measure]: Missing option '--target'"),
+        ("rig.json", "none.json", "none.json"),
+        ("chessboard:9x6:25mm", "chessbord:9x6:25mm", "chessbord"),
+        ("[measure]", "[serve]\nstale_s = 0\n[measure]", "[serve] stale_s is 0: expected a number above 0"),
+        ("[measure]", "[serve]\nstale = 3\n[measure]", "[serve] has an unknown key 'stale': did you mean stale_s?"),
+        ("[measure]", "[serve]\nhttp = 9110\n[measure]", "[serve] http is 9110: expected a text"),
+        ("[measure]", '[serve]\nlog = "no/where.log"\n[measure]', "cannot be written"),
+    ],
+)
+def test_a_wrong_file_is_one_line(armsight, rendered, tmp_path, old, new, words):
+    text = f'[measure]\nrig = "{rendered.rig}"\ntarget = "chessboard:9x6:25mm"\nsource = "usb:0,1"\n'
+    assert_rejected(armsight("serve", write(tmp_path / "serve.toml", text.replace(old, new))), words)
+
+
+def test_the_examples_are_what_is_served(rendered, tmp_path):
+    here = ROOT / "examples" / "serve"
+    text = (
+        (here / "serve.toml")
+        .read_text()
+        .replace("rig.json", str(rendered.rig))
+        .replace("body.toml", str(rendered.plate))
+    )
+    found = read_config(write(tmp_path / "serve.toml", text))
+    assert (found.command, found.http, found.log) == ("measure", "127.0.0.1:9110", "armsight.log")
+    unit = configparser.ConfigParser()
+    unit.read(here / "armsight.service")
+    assert unit["Service"]["ExecStart"].split()[1:] == ["serve", "/etc/armsight/serve.toml"]
+    assert unit["Service"]["SuccessExitStatus"] == "130"  # an interrupt is no failure
+    assert float(unit["Service"]["TimeoutStopSec"]) > service._END_S
+    container = (here / "Containerfile").read_text()
+    assert 'ENTRYPOINT ["armsight", "serve", "/cell/serve.toml"]' in container
+    assert "STOPSIGNAL SIGTERM" in container
