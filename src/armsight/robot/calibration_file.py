@@ -39,29 +39,18 @@ _POSES, _FAR_M = 1000, 0.1
 
 
 class Difference(NamedTuple):
-    """How far apart two arms put their tools at the same joint angles, over poses within the limits.
+    """How far apart two arms put their tools at the same joint angles, over poses within the limits."""
 
-    Attributes:
-        mean_m: mean distance, m.
-        most_m: greatest, m.
-        mean_rad: mean angle between the tools, rad.
-        most_rad: greatest, rad.
-        a_m: (n,) what the second arm's link lengths are more, m; NaN where a row's axes are no longer parallel or have
-        become
-            so, and lengths cannot be compared.
-        d_m: (n,) link offsets likewise, m.
-        alpha_rad: (n,) twists, rad.
-        offset_rad: (n,) zeros, rad.
-    """
-
-    mean_m: float
-    most_m: float
-    mean_rad: float
-    most_rad: float
+    mean_m: float  #: mean distance, m
+    most_m: float  #: greatest, m
+    mean_rad: float  #: mean angle between the tools, rad
+    most_rad: float  #: greatest, rad
+    #: (n,) what the second arm's link lengths are more, m; NaN where a row's axes are no longer parallel or have become
+    #: so, and lengths cannot be compared
     a_m: Array
-    d_m: Array
-    alpha_rad: Array
-    offset_rad: Array
+    d_m: Array  #: (n,) link offsets likewise, m
+    alpha_rad: Array  #: (n,) twists, rad
+    offset_rad: Array  #: (n,) zeros, rad
 
 
 def read_calibration(path: str | Path, nominal: Arm) -> Arm:

@@ -61,16 +61,11 @@ class Session:
     Args:
         link: the wire to it.
         name: what errors call it.
-
-    Attributes:
-        welcome: who it is.
-        status: its newest status.
-        joints: its newest report of how the joints are driven.
     """
 
-    welcome: Welcome
-    status: BoardStatus
-    joints: JointReport
+    welcome: Welcome  #: who it is
+    status: BoardStatus  #: its newest status
+    joints: JointReport  #: its newest report of how the joints are driven
 
     def __init__(self, link: Link, name: str) -> None:
         self.name = name

@@ -69,13 +69,7 @@ def entries(config: Configuration) -> Iterator[tuple[str, Any]]:
             value = config[name].item()
             yield f"arm.{name}", pin_name(value) if name == _PIN else value
     for j, joint in enumerate(config["joint"][: int(config["joint_count"])], start=1):
-        sensor = SensorKind(int(joint["encoder"]["sensor"]))
-        parts = {"": [each for each in joint.dtype.names if each not in _PARTS]}
-        parts |= {part: list(joint.dtype[part].names or ()) for part in _PARTS}
-        parts["encoder"] = [each for each in parts["encoder"] if each in ("sensor", *ENCODER_FIELDS[sensor])]
-        unused = ("node_count",) if sensor == SensorKind.POTENTIOMETER else ("node_count", *_POT_ONLY)
-        parts["pot"] = [each for each in parts["pot"] if each not in unused]
-        for part, names in parts.items():
+        for part, names in _named(joint).items():
             for name in names:
                 value, path = (
                     (joint[part] if part else joint)[name],
@@ -84,7 +78,18 @@ def entries(config: Configuration) -> Iterator[tuple[str, Any]]:
                 if name in _TABLES:
                     yield path, [_number(each) for each in value[: int(joint["pot"]["node_count"])]]
                 else:
-                    yield path, sensor.name.lower() if name == "sensor" else _number(value)
+                    yield path, SensorKind(int(value)).name.lower() if name == "sensor" else _number(value)
+
+
+def _named(joint: Configuration) -> dict[str, list[str]]:
+    """Return the names of a joint's own numbers, and of those of each part, that count for its sensor."""
+    sensor = SensorKind(int(joint["encoder"]["sensor"]))
+    unused = {"node_count", *(() if sensor == SensorKind.POTENTIOMETER else _POT_ONLY)}
+    parts = {"": [each for each in joint.dtype.names or () if each not in _PARTS]}
+    parts |= {part: list(joint.dtype[part].names or ()) for part in _PARTS}
+    parts["encoder"] = [each for each in parts["encoder"] if each in ("sensor", *ENCODER_FIELDS[sensor])]
+    parts["pot"] = [each for each in parts["pot"] if each not in unused]
+    return parts
 
 
 def _number(value: Any) -> float | int:  # noqa: ANN401 - a numpy scalar

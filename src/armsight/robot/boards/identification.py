@@ -51,27 +51,16 @@ _LONGEST_DAMPING_S = 0.02  # of damping over stiffness: a spring with more is no
 
 @dataclass(frozen=True, eq=False)
 class JointFit(Record):
-    """What a swing says of a joint.
+    """What a swing says of a joint."""
 
-    Attributes:
-        motor: its motor.
-        backlash_rad: between motor and potentiometer, from stop to stop.
-        gravity_n_m: greatest torque of gravity over all angles, as far as the swing shows it.
-        resistance_sigma_ohm: standard deviation of the resistance, by the residuals.
-        constant_sigma_v_s: of the motor constant.
-        t_s: (n,) the readings' times from the first one on, s.
-        voltage_v: (n,) what the board put to the motor, smoothed.
-        predicted_v: (n,) what the fit says of it.
-    """
-
-    motor: MotorFigures
-    backlash_rad: float
-    gravity_n_m: float
-    resistance_sigma_ohm: float
-    constant_sigma_v_s: float
-    t_s: Array
-    voltage_v: Array
-    predicted_v: Array
+    motor: MotorFigures  #: its motor
+    backlash_rad: float  #: between motor and potentiometer, from stop to stop
+    gravity_n_m: float  #: greatest torque of gravity over all angles, as far as the swing shows it
+    resistance_sigma_ohm: float  #: standard deviation of the resistance, by the residuals
+    constant_sigma_v_s: float  #: of the motor constant
+    t_s: Array  #: (n,) the readings' times from the first one on, s
+    voltage_v: Array  #: (n,) what the board put to the motor, smoothed
+    predicted_v: Array  #: (n,) what the fit says of it
 
 
 def fit_swing(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) -> JointFit:

@@ -15,19 +15,12 @@ from armsight.data import Array
 
 
 class Sensed(NamedTuple):
-    """What a board's converters read at the beginning of a tick; a tuple, as one is made every millisecond.
+    """What a board's converters read at the beginning of a tick; a tuple, as one is made every millisecond."""
 
-    Attributes:
-        counts: (6,) potentiometers, 16-bit fractions of their supply, uint32.
-        current_ma: (6,) motor currents, mA, positive where a positive duty drives them, int32.
-        supply_mv: motor supply, mV.
-        stop_pressed: whether the emergency stop button is pressed.
-    """
-
-    counts: NDArray[np.uint32]
-    current_ma: NDArray[np.int32]
-    supply_mv: int = 24000
-    stop_pressed: bool = False
+    counts: NDArray[np.uint32]  #: (6,) potentiometers, 16-bit fractions of their supply, uint32
+    current_ma: NDArray[np.int32]  #: (6,) motor currents, mA, positive where a positive duty drives them, int32
+    supply_mv: int = 24000  #: motor supply, mV
+    stop_pressed: bool = False  #: whether the emergency stop button is pressed
 
 
 class Plant(Protocol):

@@ -41,36 +41,22 @@ _TICK_S = 1e-3
 
 @dataclass(frozen=True)
 class MotorFigures:
-    """A motor with its gear, at the joint.
+    """A motor with its gear, at the joint."""
 
-    Attributes:
-        resistance_ohm: of the winding.
-        constant_v_s: motor constant, V s/rad and N m/A.
-        inertia_kg_m2: of rotor, gear and what it moves.
-        viscous_n_m_s: friction that grows with speed, N m s/rad.
-        dry_n_m: dry friction, N m.
-    """
-
-    resistance_ohm: float
-    constant_v_s: float
-    inertia_kg_m2: float
-    viscous_n_m_s: float
-    dry_n_m: float
+    resistance_ohm: float  #: of the winding
+    constant_v_s: float  #: motor constant, V s/rad and N m/A
+    inertia_kg_m2: float  #: of rotor, gear and what it moves
+    viscous_n_m_s: float  #: friction that grows with speed, N m s/rad
+    dry_n_m: float  #: dry friction, N m
 
 
 @dataclass(frozen=True)
 class Elasticity:
-    """A transmission that twists between the motor and what is read.
+    """A transmission that twists between the motor and what is read."""
 
-    Attributes:
-        stiffness_n_m: of the spring, N m/rad.
-        damping_n_m_s: of the spring, N m s/rad.
-        link_share: share of the joint's inertia behind the spring.
-    """
-
-    stiffness_n_m: float
-    damping_n_m_s: float
-    link_share: float
+    stiffness_n_m: float  #: of the spring, N m/rad
+    damping_n_m_s: float  #: of the spring, N m s/rad
+    link_share: float  #: share of the joint's inertia behind the spring
 
     def held_hz(self, inertia_kg_m2: float) -> float:
         """Return the resonance of the joint while its motor is held, Hz, of an inertia of motor and joint together."""

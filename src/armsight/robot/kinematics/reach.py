@@ -15,17 +15,11 @@ POSES, IMPROVED = 20_000, 4
 
 
 class Reach(NamedTuple):
-    """The workspace of the tool's point, m.
+    """The workspace of the tool's point, m."""
 
-    Attributes:
-        radius_m: furthest from joint 1's axis.
-        low_m: lowest along that axis, counted from the base.
-        high_m: highest along it.
-    """
-
-    radius_m: float
-    low_m: float
-    high_m: float
+    radius_m: float  #: furthest from joint 1's axis
+    low_m: float  #: lowest along that axis, counted from the base
+    high_m: float  #: highest along it
 
 
 def reach(arm: Arm) -> Reach:

@@ -23,17 +23,13 @@ _POSITION, _ANGLE, _CONFIGURATION, _STATE = (column - WIDTH for column in (POSIT
 
 @dataclass(frozen=True)
 class Configuration:
-    """Which of the up to eight ways an arm takes to a pose; see the documentation's page on the arm.
+    """Which of the up to eight ways an arm takes to a pose; see the documentation's page on the arm."""
 
-    Attributes:
-        shoulder: "front" where the wrist is ahead of axis 1 along link 1's x axis, "back" where the arm reaches over.
-        elbow: "up" where the elbow is above the line from shoulder to wrist, seen with the wrist ahead.
-        wrist: "noflip" where sin(theta_5) is positive or 0, "flip" where it is negative.
-    """
-
+    #: "front" where the wrist is ahead of axis 1 along link 1's x axis, "back" where the arm reaches over
     shoulder: Literal["front", "back"]
+    #: "up" where the elbow is above the line from shoulder to wrist, seen with the wrist ahead
     elbow: Literal["up", "down"]
-    wrist: Literal["noflip", "flip"]
+    wrist: Literal["noflip", "flip"]  #: "noflip" where sin(theta_5) is positive or 0, "flip" where it is negative
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,18 +37,12 @@ class Nearest(Record):
     """The pose within the joints' limits that comes closest to one that cannot be reached.
 
     1 mm of position counts as much as 1 mrad of orientation.
-
-    Attributes:
-        q: (n,) joint angles, rad.
-        T_base_tool: (4, 4) where they bring the tool, m.
-        off_m: how far that is from the requested position, m.
-        off_rad: how far it is rotated from the requested orientation, rad.
     """
 
-    q: Array
-    T_base_tool: Array
-    off_m: float
-    off_rad: float
+    q: Array  #: (n,) joint angles, rad
+    T_base_tool: Array  #: (4, 4) where they bring the tool, m
+    off_m: float  #: how far that is from the requested position, m
+    off_rad: float  #: how far it is rotated from the requested orientation, rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,17 +51,15 @@ class Solutions:
 
     Those within limits come first; then by distance from ``near`` where that was given. The columns of one table, which
     is the quick way to make a record.
-
-    Attributes:
-        rows: (N, n + 7) a row for each solution: its joint angles, then the columns that ``kinematics.inverse`` names; the
-            properties return them.
-        reason: what is special about the result: "singular: ...", "outside limits: ...", "unreachable: ..."; None
-            where nothing does.
-        find_nearest: how to find ``nearest``; None where a solution is within limits.
     """
 
+    #: (N, n + 7) a row for each solution: its joint angles, then the columns that ``kinematics.inverse`` names; the
+    #: properties return them
     rows: Array
+    #: what is special about the result: "singular: ...", "outside limits: ...", "unreachable: ..."; None where nothing
+    #: does
     reason: str | None = None
+    #: how to find ``nearest``; None where a solution is within limits
     find_nearest: Callable[[], Nearest] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -138,25 +126,15 @@ def _configuration(shoulder: float, elbow: float, wrist: float) -> Configuration
 
 @dataclass(frozen=True, eq=False)
 class ManySolutions(Record):
-    """The solutions of many poses; what stands beyond a pose's count is 0.
+    """The solutions of many poses; what stands beyond a pose's count is 0."""
 
-    Attributes:
-        count: (N,) how many solutions each pose has.
-        q: (N, M, n) joint angles, rad, those within limits first.
-        residual_m: (N, M) as in :class:`Solutions`.
-        residual_rad: (N, M) likewise.
-        within_limits: (N, M) likewise.
-        singular: (N, M) likewise.
-        signs: (N, M, 3) likewise.
-    """
-
-    count: Ids
-    q: Array
-    residual_m: Array
-    residual_rad: Array
-    within_limits: NDArray[np.bool_]
-    singular: NDArray[np.bool_]
-    signs: Array
+    count: Ids  #: (N,) how many solutions each pose has
+    q: Array  #: (N, M, n) joint angles, rad, those within limits first
+    residual_m: Array  #: (N, M) as in :class:`Solutions`
+    residual_rad: Array  #: (N, M) likewise
+    within_limits: NDArray[np.bool_]  #: (N, M) likewise
+    singular: NDArray[np.bool_]  #: (N, M) likewise
+    signs: Array  #: (N, M, 3) likewise
 
     @staticmethod
     def of(counts: Ids, rows: Array) -> ManySolutions:

@@ -28,19 +28,12 @@ ALONG = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class PathMotion:
-    """A path of the tool over time.
+    """A path of the tool over time."""
 
-    Attributes:
-        arm: the arm that travels it.
-        path: the path.
-        law: share of the way over time.
-        guide: the joints along the path, near which the inverse kinematics takes its solution.
-    """
-
-    arm: Arm
-    path: Path
-    law: Law
-    guide: Walk
+    arm: Arm  #: the arm that travels it
+    path: Path  #: the path
+    law: Law  #: share of the way over time
+    guide: Walk  #: the joints along the path, near which the inverse kinematics takes its solution
 
     @property
     def duration_s(self) -> float:

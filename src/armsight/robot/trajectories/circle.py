@@ -24,19 +24,12 @@ TOO_SMALL = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ArcPath(Record):
-    """A rotation of the tool's position about an axis in space, with an even rotation of its orientation.
+    """A rotation of the tool's position about an axis in space, with an even rotation of its orientation."""
 
-    Attributes:
-        T_base_start: (4, 4) where it starts.
-        center_base: (3,) a point of the axis, m.
-        sweep: (3,) the axis times the angle travelled, rad, base axes.
-        rotation_base: (3,) how far the tool rotates, rad, base axes.
-    """
-
-    T_base_start: Array
-    center_base: Array
-    sweep: Array
-    rotation_base: Array
+    T_base_start: Array  #: (4, 4) where it starts
+    center_base: Array  #: (3,) a point of the axis, m
+    sweep: Array  #: (3,) the axis times the angle travelled, rad, base axes
+    rotation_base: Array  #: (3,) how far the tool rotates, rad, base axes
 
     def at(self, share: Array) -> PathPoints:
         """Return the path at shares (N,)."""

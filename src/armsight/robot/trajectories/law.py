@@ -91,17 +91,11 @@ class Law(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SingleLaw:
-    """One jerk-limited rise of the share.
+    """One jerk-limited rise of the share."""
 
-    Attributes:
-        start: (1,) the share to start from, its speed and acceleration.
-        limits: (3,) of the share's speed, acceleration and jerk.
-        profile: the share over time.
-    """
-
-    start: Joints
-    limits: Array
-    profile: Profile
+    start: Joints  #: (1,) the share to start from, its speed and acceleration
+    limits: Array  #: (3,) of the share's speed, acceleration and jerk
+    profile: Profile  #: the share over time
 
     @property
     def duration_s(self) -> float:
@@ -256,15 +250,10 @@ def _tried(arm: Arm, guide: Walk, start: Joints, limits: Array) -> tuple[float, 
 
 @dataclass(frozen=True, eq=False)
 class ChainLaw:
-    """Profiles of the share of the way, one after another.
+    """Profiles of the share of the way, one after another."""
 
-    Attributes:
-        parts: the profiles.
-        time_scale: how many times slower they are run; 1 as planned.
-    """
-
-    parts: tuple[Profile, ...]
-    time_scale: float = 1.0
+    parts: tuple[Profile, ...]  #: the profiles
+    time_scale: float = 1.0  #: how many times slower they are run; 1 as planned
 
     @property
     def duration_s(self) -> float:
@@ -288,17 +277,11 @@ class ChainLaw:
 
 
 class _Plan(NamedTuple):
-    """What a chain is made from.
+    """What a chain is made from."""
 
-    Attributes:
-        edges: (2 G + 2,) shares at which parts begin and end: straight, bend, straight, ..., straight.
-        limits: (G + 1, 3) of the straight parts.
-        speeds: (G,) of the bends.
-    """
-
-    edges: Array
-    limits: Array
-    speeds: Array
+    edges: Array  #: (2 G + 2,) shares at which parts begin and end: straight, bend, straight, ..., straight
+    limits: Array  #: (G + 1, 3) of the straight parts
+    speeds: Array  #: (G,) of the bends
 
 
 def fit_chain(arm: Arm, guide: Walk, start: Joints, cruises: Array) -> Law:

@@ -20,19 +20,12 @@ ROUNDING = 1e-9
 
 
 class Worst(NamedTuple):
-    """Where a motion comes nearest to a limit, or passes it furthest.
+    """Where a motion comes nearest to a limit, or passes it furthest."""
 
-    Attributes:
-        ratio: the value over its limit; at most 1 within it.
-        time_scale: how many times longer the motion would have to take to be just at that limit.
-        what: the limited quantity in words, with its values.
-        t_s: when, s.
-    """
-
-    ratio: float
-    time_scale: float
-    what: str
-    t_s: float
+    ratio: float  #: the value over its limit; at most 1 within it
+    time_scale: float  #: how many times longer the motion would have to take to be just at that limit
+    what: str  #: the limited quantity in words, with its values
+    t_s: float  #: when, s
 
 
 def start_state(arm: Arm, q: ArrayLike, qd: ArrayLike | None, qdd: ArrayLike | None) -> Joints:

@@ -20,17 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class LinePath(Record):
-    """A straight line with an even rotation.
+    """A straight line with an even rotation."""
 
-    Attributes:
-        T_base_start: (4, 4) where it starts.
-        step: (3,) how far it goes, m, base axes.
-        rotation: (3,) how far it rotates, rad, axes of the tool.
-    """
-
-    T_base_start: Array
-    step: Array
-    rotation: Array
+    T_base_start: Array  #: (4, 4) where it starts
+    step: Array  #: (3,) how far it goes, m, base axes
+    rotation: Array  #: (3,) how far it rotates, rad, axes of the tool
 
     @staticmethod
     def between(T_base_start: Array, T_base_goal: Array) -> LinePath:

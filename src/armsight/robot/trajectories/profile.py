@@ -21,15 +21,10 @@ DURATION_TOLERANCE_S = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Axes over time, exact between its instants.
+    """Axes over time, exact between its instants."""
 
-    Attributes:
-        duration_s: when all axes have arrived, s.
-        solved: ruckig's solution.
-    """
-
-    duration_s: float
-    solved: ruckig.Trajectory
+    duration_s: float  #: when all axes have arrived, s
+    solved: ruckig.Trajectory  #: ruckig's solution
 
     def at(self, t_s: float | Array) -> Joints:
         """Return the axes' positions, speeds and accelerations, (n,) or (N, n), ``t_s`` seconds after the start."""

@@ -50,23 +50,14 @@ SHAPE = (1.6, 8.0, 80.0)
 
 @dataclass(frozen=True, eq=False)
 class TrackedMotion:
-    """The joints as the tracker moved them, between its steps as a cubic spline.
+    """The joints as the tracker moved them, between its steps as a cubic spline."""
 
-    Attributes:
-        duration_s: how long the motion takes, the settling at its end included, s.
-        deviation_m: the furthest the tool is from its reference at any step, m.
-        deviation_rad: the furthest its orientation is from the reference's, rad.
-        least_singular: the smallest singular value met; damping sets in below :data:`SOFT`.
-        least_singular_t_s: when, s.
-        spline: the joints over time.
-    """
-
-    duration_s: float
-    deviation_m: float
-    deviation_rad: float
-    least_singular: float
-    least_singular_t_s: float
-    spline: CubicSpline
+    duration_s: float  #: how long the motion takes, the settling at its end included, s
+    deviation_m: float  #: the furthest the tool is from its reference at any step, m
+    deviation_rad: float  #: the furthest its orientation is from the reference's, rad
+    least_singular: float  #: the smallest singular value met; damping sets in below :data:`SOFT`
+    least_singular_t_s: float  #: when, s
+    spline: CubicSpline  #: the joints over time
 
     def at(self, t_s: float | Array) -> Joints:
         """Return the joints, (n,) or (N, n), ``t_s`` seconds after the start."""

@@ -25,17 +25,11 @@ PIECE = 20_000
 
 
 class Joints(NamedTuple):
-    """The joints at an instant, or at N of them with a leading axis.
+    """The joints at an instant, or at N of them with a leading axis."""
 
-    Attributes:
-        q: (n,) or (N, n) angles, rad.
-        qd: the same of the speeds, rad/s.
-        qdd: the same of the accelerations, rad/s^2.
-    """
-
-    q: Array
-    qd: Array
-    qdd: Array
+    q: Array  #: (n,) or (N, n) angles, rad
+    qd: Array  #: the same of the speeds, rad/s
+    qdd: Array  #: the same of the accelerations, rad/s^2
 
 
 class Trajectory(Protocol):

@@ -28,21 +28,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class BlendedPath(Record):
-    """Straight lines through corners that are blended.
+    """Straight lines through corners that are blended."""
 
-    Attributes:
-        Ts_base_corner: (C, 4, 4) poses of the corners, without start and goal.
-        rates: (C + 1, 6) what each line travels and rotates in a unit of its way: [m/m base axes; rad/m tool's axes].
-        corners_m: (C,) where the corners lie on the way, m.
-        blends_m: (C,) how far each blend reaches to both sides, m.
-        length_m: the whole way.
-    """
-
-    Ts_base_corner: Array
+    Ts_base_corner: Array  #: (C, 4, 4) poses of the corners, without start and goal
+    #: (C + 1, 6) what each line travels and rotates in a unit of its way: [m/m base axes; rad/m tool's axes]
     rates: Array
-    corners_m: Array
-    blends_m: Array
-    length_m: float
+    corners_m: Array  #: (C,) where the corners lie on the way, m
+    blends_m: Array  #: (C,) how far each blend reaches to both sides, m
+    length_m: float  #: the whole way
 
     def at(self, share: Array) -> PathPoints:
         """Return the path at shares (N,)."""

@@ -236,15 +236,10 @@ def _limits(where: str, element: ET.Element) -> tuple[float, float, float, float
 
 
 class ChainLink(NamedTuple):
-    """A joint of the chain, or its end.
+    """A joint of the chain, or its end."""
 
-    Attributes:
-        T_before: (4, 4) where the joint stands in the frame that rotates with the joint before.
-        axis: (3,) its unit axis there; zero for the chain's end.
-    """
-
-    T_before: Array
-    axis: Array
+    T_before: Array  #: (4, 4) where the joint stands in the frame that rotates with the joint before
+    axis: Array  #: (3,) its unit axis there; zero for the chain's end
 
 
 class TableRows(NamedTuple):

@@ -33,44 +33,28 @@ _UPPER_ARM_M, _FOREARM_M, _LOADED_M = 0.305, 0.223, 0.05
 
 @dataclass(frozen=True)
 class Ar4Mechanics:
-    """What is wrong with an AR4; six numbers each.
+    """What is wrong with an AR4; six numbers each."""
 
-    Attributes:
-        backlash_deg: of the gearboxes.
-        homing_deg: true angle less reported one after homing: the switches are off by this.
-        scatter_deg: sigma of a switch, from one homing to the next.
-    """
-
-    backlash_deg: tuple[float, ...] = (0.05, 0.1, 0.1, 0.15, 0.2, 0.1)
+    backlash_deg: tuple[float, ...] = (0.05, 0.1, 0.1, 0.15, 0.2, 0.1)  #: of the gearboxes
+    #: true angle less reported one after homing: the switches are off by this
     homing_deg: tuple[float, ...] = (1.0, -0.6, 0.8, -1.0, 0.5, 0.9)
-    scatter_deg: float = 0.02
+    scatter_deg: float = 0.02  #: sigma of a switch, from one homing to the next
 
 
 @dataclass
 class Ar4Teensy:
-    """An AR4 with its Teensy: a ``Device``.
+    """An AR4 with its Teensy: a ``Device``."""
 
-    Attributes:
-        model: which AR4.
-        mechanics: what is wrong with it.
-        version: of its firmware.
-        homing_s: how long homing takes, s.
-        stuck: a joint whose switch is never reached, from 0; None without.
-        seed: of the switches' scatter.
-        q_deg: (6,) true joint angles at power-on.
-        stop_pressed: whether the emergency stop button is in.
-        t_s: how much time has passed, s.
-    """
-
-    model: Ar4Model = field(default_factory=lambda: MODELS["mk3"])
-    mechanics: Ar4Mechanics = field(default_factory=Ar4Mechanics)
-    version: str = "2.1.0"
-    homing_s: float = 20.0
-    stuck: int | None = None
-    seed: int = 0
+    model: Ar4Model = field(default_factory=lambda: MODELS["mk3"])  #: which AR4
+    mechanics: Ar4Mechanics = field(default_factory=Ar4Mechanics)  #: what is wrong with it
+    version: str = "2.1.0"  #: of its firmware
+    homing_s: float = 20.0  #: how long homing takes, s
+    stuck: int | None = None  #: a joint whose switch is never reached, from 0; None without
+    seed: int = 0  #: of the switches' scatter
+    #: (6,) true joint angles at power-on
     q_deg: Array = field(default_factory=lambda: np.array([10.0, 5.0, -20.0, 15.0, 30.0, -10.0]))
-    stop_pressed: bool = False
-    t_s: float = 0.0
+    stop_pressed: bool = False  #: whether the emergency stop button is in
+    t_s: float = 0.0  #: how much time has passed, s
     _in: bytearray = field(default_factory=bytearray)
     _out: list[tuple[float, bytes]] = field(default_factory=list)
     _free_s: float = 0.0

@@ -28,27 +28,17 @@ _TABLE = 86
 
 @dataclass(frozen=True)
 class So101Mechanics:
-    """What is wrong with an SO-101's joints; six numbers each are the five joints and the gripper.
+    """What is wrong with an SO-101's joints; six numbers each are the five joints and the gripper."""
 
-    Attributes:
-        backlash_rad: of the gear, between motor and output shaft.
-        stiffness_n_m_rad: torque of the controller for an error of position: its inverse is the droop.
-        friction_n_m: dry friction at the motor.
-        dead_counts: an error of so many counts is left alone.
-        delay_s: until a goal is acted on.
-        lag_s: time constant of the motor.
-        zero_rad: true joint angle where the sensor says 0.
-        torque_n_m: the greatest.
-    """
-
-    backlash_rad: float = float(np.radians(1.0))
+    backlash_rad: float = float(np.radians(1.0))  #: of the gear, between motor and output shaft
+    #: torque of the controller for an error of position: its inverse is the droop
     stiffness_n_m_rad: float = float(1.04 / np.radians(2.1))
-    friction_n_m: float = 0.05
-    dead_counts: float = 1.0
-    delay_s: float = 0.085
-    lag_s: float = 0.03
-    zero_rad: tuple[float, ...] = (0.0,) * SERVOS
-    torque_n_m: float = 2.9
+    friction_n_m: float = 0.05  #: dry friction at the motor
+    dead_counts: float = 1.0  #: an error of so many counts is left alone
+    delay_s: float = 0.085  #: until a goal is acted on
+    lag_s: float = 0.03  #: time constant of the motor
+    zero_rad: tuple[float, ...] = (0.0,) * SERVOS  #: true joint angle where the sensor says 0
+    torque_n_m: float = 2.9  #: the greatest
 
 
 def arm_load(q: Array) -> Array:
@@ -172,21 +162,14 @@ _SLOW = 100
 
 @dataclass
 class So101Bus:
-    """The servos' registers on a wire: a ``Device``.
+    """The servos' registers on a wire: a ``Device``."""
 
-    Attributes:
-        servos: the mechanics.
-        ids: id of each servo; two the same answer at the same time, an id that nobody has is silent.
-        powered: whether the servos' own supply is on.
-        tables: (6,) registers of each servo.
-        t_s: how much time has passed, s.
-    """
-
-    servos: So101Servos
+    servos: So101Servos  #: the mechanics
+    #: id of each servo; two the same answer at the same time, an id that nobody has is silent
     ids: list[int] = field(default_factory=lambda: list(range(1, SERVOS + 1)))
-    powered: bool = True
-    tables: list[bytearray] = field(init=False)
-    t_s: float = 0.0
+    powered: bool = True  #: whether the servos' own supply is on
+    tables: list[bytearray] = field(init=False)  #: (6,) registers of each servo
+    t_s: float = 0.0  #: how much time has passed, s
     _in: bytearray = field(default_factory=bytearray)
     _out: list[tuple[float, bytes]] = field(default_factory=list)
     _free_s: float = 0.0

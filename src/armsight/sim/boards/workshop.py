@@ -29,24 +29,15 @@ _SETTLE_S = 0.6
 
 @dataclass(frozen=True)
 class Wiring:
-    """How an arm is wired; joints are counted from 0.
+    """How an arm is wired; joints are counted from 0."""
 
-    Attributes:
-        motors: (6,) which joint the motor output of each joint drives.
-        potentiometers: (6,) which joint the potentiometer input of each joint reads.
-        motor_signs: (6,) 1 or -1.
-        potentiometer_signs: (6,) 1, or -1 where counts fall with the angle.
-        dead_motors: motor outputs without a motor.
-        open_potentiometers: inputs whose wiper has no contact.
-        dead_spot: a joint, and from which to which angle, rad, its wiper has no contact; None without.
-    """
-
-    motors: tuple[int, ...] = _IN_ORDER
-    potentiometers: tuple[int, ...] = _IN_ORDER
-    motor_signs: tuple[int, ...] = (1,) * JOINTS
-    potentiometer_signs: tuple[int, ...] = (1,) * JOINTS
-    dead_motors: frozenset[int] = frozenset()
-    open_potentiometers: frozenset[int] = frozenset()
+    motors: tuple[int, ...] = _IN_ORDER  #: (6,) which joint the motor output of each joint drives
+    potentiometers: tuple[int, ...] = _IN_ORDER  #: (6,) which joint the potentiometer input of each joint reads
+    motor_signs: tuple[int, ...] = (1,) * JOINTS  #: (6,) 1 or -1
+    potentiometer_signs: tuple[int, ...] = (1,) * JOINTS  #: (6,) 1, or -1 where counts fall with the angle
+    dead_motors: frozenset[int] = frozenset()  #: motor outputs without a motor
+    open_potentiometers: frozenset[int] = frozenset()  #: inputs whose wiper has no contact
+    #: a joint, and from which to which angle, rad, its wiper has no contact; None without
     dead_spot: tuple[int, float, float] | None = None
 
     def mended(self) -> Wiring:

@@ -37,32 +37,20 @@ class Heading(Enum):
 
 @dataclass(frozen=True)
 class Ar4Start:
-    """Answer to the start.
+    """Answer to the start."""
 
-    Attributes:
-        version_matches: whether the version that the host named is the firmware's.
-        version: the firmware's.
-        model_matches: whether the firmware knows the model that the host named.
-        model: mk1, mk2 or mk3; empty before one was accepted.
-    """
-
-    version_matches: bool
-    version: str
-    model_matches: bool
-    model: str
+    version_matches: bool  #: whether the version that the host named is the firmware's
+    version: str  #: the firmware's
+    model_matches: bool  #: whether the firmware knows the model that the host named
+    model: str  #: mk1, mk2 or mk3; empty before one was accepted
 
 
 @dataclass(frozen=True)
 class Ar4Values:
-    """Six numbers: positions (degrees), speeds (degrees/s) or encoder counts at the limit switches.
+    """Six numbers: positions (degrees), speeds (degrees/s) or encoder counts at the limit switches."""
 
-    Attributes:
-        heading: which of these.
-        values: joint by joint.
-    """
-
-    heading: Heading
-    values: tuple[float, ...]
+    heading: Heading  #: which of these
+    values: tuple[float, ...]  #: joint by joint
 
 
 @dataclass(frozen=True)
@@ -74,15 +62,10 @@ class Ar4Stopped:
 
 @dataclass(frozen=True)
 class Ar4Text:
-    """An error, a warning or a remark in words.
+    """An error, a warning or a remark in words."""
 
-    Attributes:
-        heading: which of these.
-        text: the words.
-    """
-
-    heading: Heading
-    text: str
+    heading: Heading  #: which of these
+    text: str  #: the words
 
 
 Ar4Answer = Ar4Start | Ar4Values | Ar4Stopped | Ar4Text

@@ -34,19 +34,12 @@ HOMING_GROUPS = {1: "3", 2: "2", 3: "1", 6: "0"}
 
 @dataclass(frozen=True, eq=False)
 class Ar4Model(Record):
-    """A model of the AR4.
+    """A model of the AR4."""
 
-    Attributes:
-        name: as the firmware knows it.
-        steps_per_deg: (6,) motor steps of a degree.
-        low_deg: (6,) lower limits; joint 1 has the same to either side.
-        high_deg: (6,) upper limits.
-    """
-
-    name: str
-    steps_per_deg: Array
-    low_deg: Array
-    high_deg: Array
+    name: str  #: as the firmware knows it
+    steps_per_deg: Array  #: (6,) motor steps of a degree
+    low_deg: Array  #: (6,) lower limits; joint 1 has the same to either side
+    high_deg: Array  #: (6,) upper limits
 
     @property
     def offset_deg(self) -> Array:

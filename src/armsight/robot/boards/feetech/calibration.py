@@ -30,22 +30,14 @@ _FIELDS |= {"range_min": (0, COUNTS - 1), "range_max": (0, COUNTS - 1)}
 
 @dataclass(frozen=True, eq=False)
 class ServoCalibration(Record):
-    """Which servo drives which joint, and at which counts.
+    """Which servo drives which joint, and at which counts."""
 
-    Attributes:
-        names: (n,) of the joints, from the base on.
-        ids: (n,) of their servos.
-        middle: (n,) counts at 0 rad.
-        lowest: (n,) counts that a joint must not go below.
-        highest: (n,) counts that it must not exceed.
-        offsets: (n,) homing offsets that the counts were taken with; None where nobody says.
-    """
-
-    names: tuple[str, ...]
-    ids: tuple[int, ...]
-    middle: Array
-    lowest: Array
-    highest: Array
+    names: tuple[str, ...]  #: (n,) of the joints, from the base on
+    ids: tuple[int, ...]  #: (n,) of their servos
+    middle: Array  #: (n,) counts at 0 rad
+    lowest: Array  #: (n,) counts that a joint must not go below
+    highest: Array  #: (n,) counts that it must not exceed
+    #: (n,) homing offsets that the counts were taken with; None where nobody says
     offsets: tuple[int, ...] | None = None
 
     def angles(self, counts: Array) -> Array:

@@ -26,19 +26,12 @@ SPARE_COUNTS = 23
 
 
 class OffsetChange(NamedTuple):
-    """The homing offset of a joint.
+    """The homing offset of a joint."""
 
-    Attributes:
-        name: of the joint.
-        id: of its servo.
-        old: what its register holds, counts.
-        new: what it is to hold.
-    """
-
-    name: str
-    id: int
-    old: int
-    new: int
+    name: str  #: of the joint
+    id: int  #: of its servo
+    old: int  #: what its register holds, counts
+    new: int  #: what it is to hold
 
 
 def corrected_offsets(bus: ServoBus, calibration: ServoCalibration, further_rad: Array) -> list[OffsetChange]:

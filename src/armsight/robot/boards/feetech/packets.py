@@ -30,17 +30,11 @@ class Instruction(IntEnum):
 
 
 class StatusPacket(NamedTuple):
-    """A servo's answer.
+    """A servo's answer."""
 
-    Attributes:
-        id: which servo.
-        error: its error bits.
-        parameters: what it was asked for.
-    """
-
-    id: int
-    error: int
-    parameters: bytes
+    id: int  #: which servo
+    error: int  #: its error bits
+    parameters: bytes  #: what it was asked for
 
 
 def checksum(body: bytes) -> int:

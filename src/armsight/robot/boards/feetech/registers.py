@@ -26,17 +26,11 @@ MOST_OFFSET = 2047
 
 
 class Register(NamedTuple):
-    """A register.
+    """A register."""
 
-    Attributes:
-        address: of its first byte.
-        width: how many bytes it has, 1 or 2.
-        sign_bit: which bit is the sign of a sign-and-magnitude number; None of one without a sign.
-    """
-
-    address: int
-    width: int
-    sign_bit: int | None = None
+    address: int  #: of its first byte
+    width: int  #: how many bytes it has, 1 or 2
+    sign_bit: int | None = None  #: which bit is the sign of a sign-and-magnitude number; None of one without a sign
 
     def decode(self, data: bytes) -> int:
         """Return the number that its bytes are."""
@@ -89,23 +83,14 @@ ALARMS = {
 
 
 class ServoStates(NamedTuple):
-    """The states of some servos at one time.
+    """The states of some servos at one time."""
 
-    Attributes:
-        counts: (n,) positions of the output shafts, homing offsets subtracted, counts.
-        speed: (n,) counts/s.
-        load: (n,) duty of the motors, -1 to 1.
-        volts: (n,) supply, V.
-        celsius: (n,) temperatures, degrees Celsius.
-        errors: (n,) error bits.
-    """
-
-    counts: Array
-    speed: Array
-    load: Array
-    volts: Array
-    celsius: Array
-    errors: tuple[int, ...]
+    counts: Array  #: (n,) positions of the output shafts, homing offsets subtracted, counts
+    speed: Array  #: (n,) counts/s
+    load: Array  #: (n,) duty of the motors, -1 to 1
+    volts: Array  #: (n,) supply, V
+    celsius: Array  #: (n,) temperatures, degrees Celsius
+    errors: tuple[int, ...]  #: (n,) error bits
 
 
 def states_of(blocks: list[bytes], errors: tuple[int, ...]) -> ServoStates:
