@@ -23,7 +23,7 @@ from armsight.robot.boards.ar4.models import (
     SWITCH_AT,
     Ar4Model,
 )
-from armsight.sim.boards.device import STEP_S
+from armsight.sim.boards.device import STEP_S, Wired
 
 _JOINTS = 6
 _BYTE_S = 10 / 115200
@@ -42,7 +42,7 @@ class Ar4Mechanics:
 
 
 @dataclass
-class Ar4Teensy:
+class Ar4Teensy(Wired):
     """An AR4 with its Teensy: a ``Device``."""
 
     model: Ar4Model = field(default_factory=lambda: MODELS["mk3"])  #: which AR4
@@ -54,10 +54,6 @@ class Ar4Teensy:
     #: (6,) true joint angles at power-on
     q_deg: Array = field(default_factory=lambda: np.array([10.0, 5.0, -20.0, 15.0, 30.0, -10.0]))
     stop_pressed: bool = False  #: whether the emergency stop button is in
-    t_s: float = 0.0  #: how much time has passed, s
-    _in: bytearray = field(default_factory=bytearray)
-    _out: list[tuple[float, bytes]] = field(default_factory=list)
-    _free_s: float = 0.0
     _name: str = ""
     _homing: tuple[float, str] | None = None
 
@@ -108,16 +104,6 @@ class Ar4Teensy:
         self._name, self._homing = "", None
         self._target, self._encoder_zero = self._motor.copy(), self._motor.copy()
         self._speed[:] = 0.0
-
-    def write(self, data: bytes) -> None:
-        """Take bytes from the host."""
-        self._in += data
-
-    def read(self) -> bytes:
-        """Return the bytes that have left for the host."""
-        gone = b"".join(data for due, data in self._out if due <= self.t_s)
-        self._out = [(due, data) for due, data in self._out if due > self.t_s]
-        return gone
 
     def step(self) -> None:
         """Let STEP_S pass: one line at most, then the steppers."""

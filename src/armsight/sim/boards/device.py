@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from armsight.errors import DeviceError, InputError
@@ -21,24 +22,37 @@ STEP_S = 0.001
 
 
 class Device(Protocol):
-    """A controller with an arm: bytes go in, bytes come out, time passes in ``step``."""
+    """A controller with an arm: bytes go in, bytes come out, time passes in ``step``; all that :class:`Wired` has."""
 
     @property
-    def t_s(self) -> float:
-        """How much time has passed, s."""
-        ...
+    def t_s(self) -> float: ...  # noqa: D102
+    def write(self, data: bytes) -> None: ...  # noqa: D102
+    def read(self) -> bytes: ...  # noqa: D102
+    def step(self) -> None: ...  # noqa: D102
+
+
+@dataclass(kw_only=True)
+class Wired:
+    """What emulated controllers have in common: a :class:`Device` behind a wire that takes its time."""
+
+    t_s: float = 0.0  #: how much time has passed, s
+    _in: bytearray = field(default_factory=bytearray)
+    _out: list[tuple[float, bytes]] = field(default_factory=list)  # when they have left for the host, s
+    _free_s: float = 0.0  # from when on the wire is free
 
     def write(self, data: bytes) -> None:
         """Take bytes from the host."""
-        ...
+        self._in += data
 
     def read(self) -> bytes:
         """Return the bytes that have left for the host."""
-        ...
+        gone = b"".join(data for due, data in self._out if due <= self.t_s)
+        self._out = [(due, data) for due, data in self._out if due > self.t_s]
+        return gone
 
     def step(self) -> None:
         """Let STEP_S pass."""
-        ...
+        raise NotImplementedError
 
 
 class SteppedLink:

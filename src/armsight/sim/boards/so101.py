@@ -17,7 +17,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.robot.boards.feetech.registers import COUNTS, MIDDLE, RAD_PER_COUNT, STS3215
-from armsight.sim.boards.device import STEP_S
+from armsight.sim.boards.device import STEP_S, Wired
 
 SERVOS = 6
 _BROADCAST = 0xFE
@@ -161,7 +161,7 @@ _SLOW = 100
 
 
 @dataclass
-class So101Bus:
+class So101Bus(Wired):
     """The servos' registers on a wire: a ``Device``."""
 
     servos: So101Servos  #: the mechanics
@@ -169,10 +169,6 @@ class So101Bus:
     ids: list[int] = field(default_factory=lambda: list(range(1, SERVOS + 1)))
     powered: bool = True  #: whether the servos' own supply is on
     tables: list[bytearray] = field(init=False)  #: (6,) registers of each servo
-    t_s: float = 0.0  #: how much time has passed, s
-    _in: bytearray = field(default_factory=bytearray)
-    _out: list[tuple[float, bytes]] = field(default_factory=list)
-    _free_s: float = 0.0
 
     def __post_init__(self) -> None:
         """Fill the registers as a servo leaves LeRobot's setup."""
@@ -212,14 +208,8 @@ class So101Bus:
     def write(self, data: bytes) -> None:
         """Take bytes from the host."""
         if self.powered:
-            self._in += data
+            super().write(data)
             self._take()
-
-    def read(self) -> bytes:
-        """Return the bytes that have left for the host."""
-        gone = b"".join(data for due, data in self._out if due <= self.t_s)
-        self._out = [(due, data) for due, data in self._out if due > self.t_s]
-        return gone
 
     def step(self) -> None:
         """Let STEP_S pass."""

@@ -17,12 +17,12 @@ from armsight.robot.boards.ar4.models import MODELS, SENSE
     ("line", "text"),
     [
         (lines.start("2.1.0", "mk3"), b"STA2.1.0Bmk3\n"),
-        (lines.positions(), b"JP\n"),
-        (lines.speeds(), b"JV\n"),
-        (lines.reset_stop(), b"RE\n"),
+        (lines.POSITIONS, b"JP\n"),
+        (lines.SPEEDS, b"JV\n"),
+        (lines.RESET_STOP, b"RE\n"),
         (lines.home("0012345"), b"JC0012345\n"),
-        (lines.move_to([1, -2.5, 0, 4, 5, -6]), b"MTA1.000000B-2.500000C0.000000D4.000000E5.000000F-6.000000\n"),
-        (lines.move_with([0.0] * 6), b"MVA0.000000B0.000000C0.000000D0.000000E0.000000F0.000000\n"),
+        (lines.move([1, -2.5, 0, 4, 5, -6]), b"MTA1.000000B-2.500000C0.000000D4.000000E5.000000F-6.000000\n"),
+        (lines.move([0.0] * 6, speeds=True), b"MVA0.000000B0.000000C0.000000D0.000000E0.000000F0.000000\n"),
     ],
 )
 def test_what_is_sent(line, text):
@@ -62,7 +62,7 @@ numbers = st.floats(-400, 400).map(lambda value: round(value, 6))
 @settings(deadline=None, max_examples=50)
 @given(st.lists(numbers, min_size=6, max_size=6))
 def test_positions_come_back_as_they_were_sent(values):
-    text = lines.move_to(values).decode().strip()
+    text = lines.move(values).decode().strip()
     read = read_line("JP" + text[2:])
     assert read.values == pytest.approx(values, abs=1e-6)
 

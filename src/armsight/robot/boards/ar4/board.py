@@ -172,7 +172,7 @@ class Ar4Board(PolledBoard):
         elif command is Command.CLEAR_STOP:
             self._enabled = False
             self._wait(_DRAIN_S)  # answers to goals say what was before
-            self._ask(lines.reset_stop(), Ar4Stopped)
+            self._ask(lines.RESET_STOP, Ar4Stopped)
             if self._stopped:
                 raise DeviceError(f"{self.name}: the emergency stop is still pressed")
         elif command is Command.CLEAR_FAULTS:
@@ -184,7 +184,7 @@ class Ar4Board(PolledBoard):
     def stop(self) -> None:
         """Slow all joints down to rest, where the drives hold them; they cannot be switched off by the host."""
         for _ in range(_STOPS):
-            self._link.write(lines.move_with([0.0] * JOINTS))
+            self._link.write(lines.move([0.0] * JOINTS, speeds=True))
         self._enabled = False
 
     def home(self, *, at_once: int = JOINTS) -> None:
@@ -240,7 +240,7 @@ class Ar4Board(PolledBoard):
         self._read_positions()
         self._require_homed()
         self._goal = self._q()
-        self._ask(lines.move_to(self._reported.tolist()), Ar4Stopped)
+        self._ask(lines.move(self._reported.tolist()), Ar4Stopped)
         if self._stopped:
             raise DeviceError(f"{self.name}: the emergency stop was pressed: release it, then `armsight board clear`")
         self._enabled = True
@@ -273,7 +273,7 @@ class Ar4Board(PolledBoard):
                 self._approached, self._near, self._back, self._back_s = goal, near, back, now
                 goal = np.where(near, back, goal)
         # Half a step more, as the firmware cuts off what is not a whole one.
-        self._link.write(lines.move_to(((goal + 0.5 * np.sign(goal)) / self.model.steps_per_deg).tolist()))
+        self._link.write(lines.move(((goal + 0.5 * np.sign(goal)) / self.model.steps_per_deg).tolist()))
         self._written_s = now
 
     def _read(self) -> None:
@@ -290,7 +290,7 @@ class Ar4Board(PolledBoard):
         """
         for _ in range(_TRIES):
             asked = self._now()
-            answer = self._ask(lines.positions(), Ar4Values, heading=Heading.POSITIONS)
+            answer = self._ask(lines.POSITIONS, Ar4Values, heading=Heading.POSITIONS)
             assert isinstance(answer, Ar4Values)
             t_s, reported = (asked + self._heard_s) / 2 - self._begin_s, np.array(answer.values)
             if self._possible(reported, t_s):

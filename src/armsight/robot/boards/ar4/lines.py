@@ -71,43 +71,25 @@ class Ar4Text:
 Ar4Answer = Ar4Start | Ar4Values | Ar4Stopped | Ar4Text
 
 
+#: What is asked: the joints' positions, their speeds, to reset the emergency stop where its button is out again.
+POSITIONS, SPEEDS, RESET_STOP = b"JP\n", b"JV\n", b"RE\n"
+
+
 def start(version: str, model: str) -> bytes:
     """Return the line that names the host's version and the arm's model; nothing else is answered before."""
     return f"STA{version}B{model}\n".encode("ascii")
 
 
-def positions() -> bytes:
-    """Return the line that asks for the joint positions."""
-    return b"JP\n"
-
-
-def speeds() -> bytes:
-    """Return the line that asks for the joint speeds."""
-    return b"JV\n"
-
-
-def reset_stop() -> bytes:
-    """Return the line that resets the emergency stop, where its button is out again."""
-    return b"RE\n"
-
-
 def home(sequence: str) -> bytes:
-    """Return the line that homes the joints at their limit switches, in groups.
-
-    Args:
-        sequence: seven digits: how many joints at once, then the joints' numbers from 0.
-    """
+    """Return the line that homes joints in groups: seven digits, how many at once, then the joints' numbers from 0."""
     return f"JC{sequence}\n".encode("ascii")
 
 
-def move_to(degrees: Sequence[float]) -> bytes:
-    """Return the line that moves six joints to positions, degrees of the encoders."""
-    return _six("MT", degrees)
-
-
-def move_with(degrees_s: Sequence[float]) -> bytes:
-    """Return the line that moves six joints with speeds, degrees/s, until the next line."""
-    return _six("MV", degrees_s)
+def move(values: Sequence[float], *, speeds: bool = False) -> bytes:
+    """Return the line that moves six joints to positions, degrees of the encoders, or with speeds, degrees/s."""
+    assert all(map(math.isfinite, values))
+    six = "".join(f"{letter}{value:.6f}" for letter, value in zip(LETTERS, values, strict=True))
+    return f"{'MV' if speeds else 'MT'}{six}\n".encode()
 
 
 def read_line(line: str) -> Ar4Answer | None:
@@ -155,11 +137,3 @@ class LineReader:
     def clear(self) -> None:
         """Drop an incomplete line."""
         self._data.clear()
-
-
-def _six(word: str, values: Sequence[float]) -> bytes:
-    assert len(values) == JOINTS
-    assert all(map(math.isfinite, values))
-    return (
-        word + "".join(f"{letter}{value:.6f}" for letter, value in zip(LETTERS, values, strict=True)) + "\n"
-    ).encode()
