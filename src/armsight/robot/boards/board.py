@@ -3,8 +3,7 @@
 In: :class:`~armsight.data.JointCommand`. Out: :class:`~armsight.data.JointStates` and what the board says of itself. The
 messages are ``firmware/wire/armsight.xml``'s. Commands are numbered; the board names the last one it acknowledged and the
 last one it rejected, so that the host learns what became of each. Time passes only in :meth:`Board.connect`,
-:meth:`Board.receive` and the methods that wait. :class:`Session` has the hello, the clock and the newest of every report;
-an error of the link says what the arm does without a host.
+:meth:`Board.receive` and the methods that wait. An error of the link says what the arm does without a host.
 """
 
 from __future__ import annotations
@@ -53,10 +52,23 @@ _HELLOS = 20
 _STEPS = 5  # between one hello and the next
 _TELEMETRY_STEPS = 300  # the rarest message comes once a second at 9600 baud
 _WRAP = 1 << 32
+_LONGEST_TICKS = 10000
+#: An emergency stop goes out so many times: a disturbed byte must not swallow it.
+_STOPS = 3
+_STORE_S = 3.0  # a flash memory takes its time
+_PART = 200  # bytes of a CONFIG_PART
+_FIELDS = CONFIG.fields
+assert _FIELDS is not None
+_SILENCE_AT: int = _FIELDS["silence_ticks"][1]  # bytes; silence_reaction follows
+#: By how much readings are older than the tick that reports them, and its standard deviation, s: half of the sixteen scans
+#: that are added up; what the potentiometers' wires and filters add is not known.
+_READING_AGE_S = {"nucleo-f446re": (4e-4, 1e-4)}
+_SET_MESSAGE_INTERVAL, _REBOOT = 511, 246  # MAV_CMD_
+_SLOW_ANGLES_US = 20000
 
 
-class Session:
-    """A conversation with a board; :meth:`open` begins it.
+class Board:
+    """A board behind a link, connected by :meth:`connect`; the link is closed with it.
 
     Args:
         link: the wire to it.
@@ -66,35 +78,51 @@ class Session:
     welcome: Welcome  #: who it is
     status: BoardStatus  #: its newest status
     joints: JointReport  #: its newest report of how the joints are driven
+    abilities: Abilities  #: what it can do
 
     def __init__(self, link: Link, name: str) -> None:
-        self.name = name
-        self.wire = Wire(link)
+        self.name, self._link, self._wire = name, link, Wire(link)
         self._angles: list[tuple[float, list[float]]] = []
-        self.ticks_per_s, self.number = 1000, 0  # number: of the session, which commands carry
-        self._tick = 0
-        self._started = False
-        self._quiet_s = 0.0
-        self._reaction = ""
+        self._sensed: list[tuple[Message, float]] = []
+        self._ticks_per_s, self._number = 1000, 0  # number: of the session, which commands carry
+        self._tick = self._sequence = 0
+        self._started, self._quiet_s, self._reaction = False, 0.0, ""
         self._greeting: Message | None = None
         self._parts: dict[int, bytes] = {}
-        self._sensed: list[tuple[Message, float]] = []
         self._answers: dict[int, int] = {}
 
-    def open(self) -> None:
-        """Say hello and wait for the first telemetry.
+    @classmethod
+    def connect(cls, link: Link, *, name: str = "the board") -> Self:
+        """Say hello to the board behind a link, and wait for the first telemetry.
+
+        Args:
+            link: the wire to it; closed where this raises.
+            name: what errors call the board, such as its port.
 
         Raises:
-            DeviceError: the board does not answer, or is of another version.
+            DeviceError: it does not answer, or is of another version.
         """
+        board = cls(link, name)
+        try:
+            board._open()
+        except BaseException:
+            link.close()
+            raise
+        return board
+
+    def _open(self) -> None:
         self._hello()
         self._first_telemetry()
         self._reaction = self._ask_reaction()
+        age_s = _READING_AGE_S.get(self.welcome.board, (0.0, 0.0))
+        self.abilities = Abilities(JOINTS, self._ticks_per_s, reading_age_s=age_s)
+        # The board may remember commands of an earlier host: ours are newer than all of them.
+        self._sequence = max(self.status.acknowledged_sequence, self.status.rejected_sequence)
 
-    def send(self, kind: str, *values: object) -> None:
+    def _say(self, kind: str, *values: object) -> None:
         """Send a message of the dialect; an error of the link then says what the arm does without a host."""
         with self._reached():
-            self.wire.send(kind, *values)
+            self._wire.send(kind, *values)
 
     @contextmanager
     def _reached(self) -> Iterator[None]:
@@ -103,58 +131,44 @@ class Session:
         except DeviceError as error:
             raise DeviceError(f"{error}{self._reaction}") from None
 
-    def take_angles(self) -> list[tuple[float, list[float]]]:
-        """Return the readings since the last call: time, s, and six angles, rad, each."""
-        taken, self._angles = self._angles, []
-        return taken
-
-    def take_sensed(self) -> SensorReadings:
-        """Return what the converters read since the last call, where the board was asked for it."""
-        taken, self._sensed = self._sensed, []
-        return readings_of([message for message, _ in taken], [t_s for _, t_s in taken])
-
-    def ask(self, answers: Mapping[int, _Answer], key: int, kind: str, *values: object) -> _Answer | None:
+    def _ask(self, answers: Mapping[int, _Answer], key: int, kind: str, *values: object) -> _Answer | None:
         """Send a message until an answer of this key is among ``answers``; None where none comes."""
         for _ in range(_HELLOS):
-            self.send(kind, *values)
+            self._say(kind, *values)
             for _ in range(_STEPS):
-                self.pump(STEP_S)
+                self._pump(STEP_S)
                 if key in answers:
                     return answers[key]
         return None
 
-    def command_long(self, kind: int, param1: float, param2: float = 0.0) -> None:
-        """Send one of MAVLink's own commands until the board answers it.
-
-        Raises:
-            DeviceError: it rejects it, or does not answer.
-        """
+    def _command_long(self, kind: int, param1: float, param2: float = 0.0) -> None:
+        """Send one of MAVLink's own commands until the board answers it."""
         self._answers.clear()
         sent = (BOARD_SYSTEM, BOARD_COMPONENT, kind, 0, param1, param2, 0, 0, 0, 0, 0)
-        if (result := self.ask(self._answers, kind, "command_long", *sent)) is None:
+        if (result := self._ask(self._answers, kind, "command_long", *sent)) is None:
             raise DeviceError(f"{self.name} does not answer MAVLink command {kind}")
         if result:
             raise DeviceError(f"{self.name} rejected MAVLink command {kind} with result {result}")
 
-    def pump(self, wait_s: float) -> None:
+    def _pump(self, wait_s: float) -> None:
         """Let ``wait_s`` pass and take the messages that come."""
         with self._reached():
-            messages = self.wire.receive(wait_s)
+            messages = self._wire.receive(wait_s)
         self._quiet_s = 0.0 if messages else self._quiet_s + wait_s
         for message in messages:
             try:
                 self._take(message)
             except ValueError:  # a code nobody knows: broken, though its CRC fits by chance
-                self.wire.broken += 1
+                self._wire.broken += 1
         if self._started and self._quiet_s >= SILENT_S:
             raise DeviceError(
                 f"{self.name} has sent nothing for {self._quiet_s:.1f} s: is it off, or its cable pulled?{self._reaction}"
             )
 
-    def config_part(self, offset: int) -> bytes:
+    def _config_part(self, offset: int) -> bytes:
         """Return the configuration in use from a byte on, as many bytes as one message holds."""
         self._parts.clear()
-        if (part := self.ask(self._parts, offset, "config_read", offset)) is None:
+        if (part := self._ask(self._parts, offset, "config_read", offset)) is None:
             raise DeviceError(f"{self.name} does not report its configuration")
         return part
 
@@ -189,21 +203,21 @@ class Session:
     def _time_s(self, tick: int) -> float:
         """Return the time of a tick, s: ticks wrap, and messages of neighbouring ticks may come in any order."""
         ahead = (tick - self._tick + _WRAP // 2) % _WRAP - _WRAP // 2
-        if self._started and ahead < -self.ticks_per_s:
+        if self._started and ahead < -self._ticks_per_s:
             raise self._restarted()
         self._tick += ahead
-        return self._tick / self.ticks_per_s
+        return self._tick / self._ticks_per_s
 
     def _hello(self) -> None:
         ours = dialect().ARMSIGHT_DIALECT_VERSION
         for nonce in range(1, _HELLOS + 1):
-            self.send("hello", ours, CONFIG_VERSION, nonce)
+            self._say("hello", ours, CONFIG_VERSION, nonce)
             for _ in range(_STEPS):
-                self.pump(STEP_S)
+                self._pump(STEP_S)
                 if self._greeting is not None:
                     self._meet(self._greeting, ours)
                     return
-        heard = "bytes come, but no answer to the hello" if self.wire.heard else "nothing comes"
+        heard = "bytes come, but no answer to the hello" if self._wire.heard else "nothing comes"
         raise DeviceError(
             f"{self.name}: no board answers ({heard}): is it the right port and baud rate, and is the firmware on the board"
             " (`armsight board flash`)?"
@@ -219,12 +233,12 @@ class Session:
                 " version's firmware on it with `armsight board flash`, or install the armsight it came with; it was sent"
                 " no command"
             )
-        self.ticks_per_s, self._tick = welcome.ticks_per_s, message.tick
-        self.number = message.session
+        self._ticks_per_s, self._tick = welcome.ticks_per_s, message.tick
+        self._number = message.session
 
     def _first_telemetry(self) -> None:
         for _ in range(_TELEMETRY_STEPS):
-            self.pump(STEP_S)
+            self._pump(STEP_S)
             if hasattr(self, "status") and hasattr(self, "joints"):
                 self._angles.clear()
                 self._started = True
@@ -233,80 +247,15 @@ class Session:
 
     def _ask_reaction(self) -> str:
         """Return in words what the arm does by itself without a host, as its configuration has it."""
-        ticks, reaction = struct.unpack_from("<II", self.config_part(_SILENCE_AT))
+        ticks, reaction = struct.unpack_from("<II", self._config_part(_SILENCE_AT))
         does = "holds the arm where it comes to rest" if reaction == Reaction.HOLD else "switches the drives off"
         slows = "slows down and " if reaction == Reaction.HOLD else ""
-        return f"; without commands the board {slows}{does} after {ticks / self.ticks_per_s * 1e3:.0f} ms"
-
-
-_LONGEST_TICKS = 10000
-#: An emergency stop goes out so many times: a disturbed byte must not swallow it.
-_STOPS = 3
-_STORE_S = 3.0  # a flash memory takes its time
-_PART = 200  # bytes of a CONFIG_PART
-_FIELDS = CONFIG.fields
-assert _FIELDS is not None
-_SILENCE_AT: int = _FIELDS["silence_ticks"][1]  # bytes; silence_reaction follows
-#: By how much readings are older than the tick that reports them, and its standard deviation, s: half of the sixteen scans
-#: that are added up; what the potentiometers' wires and filters add is not known.
-_READING_AGE_S = {"nucleo-f446re": (4e-4, 1e-4)}
-_SET_MESSAGE_INTERVAL, _REBOOT = 511, 246  # MAV_CMD_
-_SLOW_ANGLES_US = 20000
-
-
-class Board:
-    """A board behind a link, connected by :meth:`connect`.
-
-    Args:
-        link: the wire to it; closed with the board.
-        session: the conversation over it, open.
-
-    Attributes:
-        abilities: what it can do.
-        welcome: who it is.
-    """
-
-    def __init__(self, link: Link, session: Session) -> None:
-        self._link, self._session = link, session
-        age_s = _READING_AGE_S.get(session.welcome.board, (0.0, 0.0))
-        self.abilities = Abilities(JOINTS, session.ticks_per_s, reading_age_s=age_s)
-        self.welcome: Welcome = session.welcome
-        # The board may remember commands of an earlier host: ours are newer than all of them.
-        self._sequence = max(session.status.acknowledged_sequence, session.status.rejected_sequence)
-
-    @classmethod
-    def connect(cls, link: Link, *, name: str = "the board") -> Self:
-        """Say hello to the board behind a link.
-
-        Args:
-            link: the wire to it; closed where this raises.
-            name: what errors call the board, such as its port.
-
-        Raises:
-            DeviceError: it does not answer, or is of another version.
-        """
-        session = Session(link, name)
-        try:
-            session.open()
-        except BaseException:
-            link.close()
-            raise
-        return cls(link, session)
-
-    @property
-    def status(self) -> BoardStatus:
-        """The newest status."""
-        return self._session.status
-
-    @property
-    def joints(self) -> JointReport:
-        """The newest report of how the joints are driven."""
-        return self._session.joints
+        return f"; without commands the board {slows}{does} after {ticks / self._ticks_per_s * 1e3:.0f} ms"
 
     @property
     def broken_messages(self) -> int:
         """Number of broken or missing messages from the board."""
-        return self._session.wire.broken + self._session.wire.lost
+        return self._wire.broken + self._wire.lost
 
     def send(self, command: JointCommand) -> int:
         """Send a motion command and return its number; :attr:`status` says whether it was acknowledged.
@@ -315,11 +264,11 @@ class Board:
             InputError: a shape, a number that is not finite, or a duration that is no whole number of ticks.
             DeviceError: the board is gone.
         """
-        ticks = command.duration_s * self._session.ticks_per_s
+        ticks = command.duration_s * self._ticks_per_s
         if not 0.5 <= ticks <= _LONGEST_TICKS or abs(ticks - round(ticks)) > 1e-6 * ticks:
             raise InputError(
                 f"duration_s is {command.duration_s}; a whole number of the board's ticks is needed,"
-                f" of 1/{self._session.ticks_per_s} s, {_LONGEST_TICKS} at most"
+                f" of 1/{self._ticks_per_s} s, {_LONGEST_TICKS} at most"
             )
         q_ref, qd_ref = _six("q_ref", command.q_ref), _six("qd_ref", command.qd_ref)
         gravity_duty = _six("gravity_duty", command.gravity_duty)
@@ -333,7 +282,7 @@ class Board:
         """Stop in an emergency: the drives go off until ``Command.CLEAR_STOP``."""
         sequence = self._next()
         for _ in range(_STOPS):
-            self._session.send("stop", sequence)
+            self._say("stop", sequence)
 
     def set_gains(self, gains: Array, *, checked: bool = True) -> int:
         """Send a gain set and return its number.
@@ -355,14 +304,14 @@ class Board:
             DeviceError: it was rejected (and why), or nothing was heard of it.
         """
         for _ in range(max(1, round(wait_s / STEP_S))):
-            self._session.pump(STEP_S)
+            self._pump(STEP_S)
             status = self.status
             if status.rejected_sequence == sequence and status.rejected_count:
-                raise DeviceError(f"{self._session.name} rejected the command: {status.rejection.text}")
+                raise DeviceError(f"{self.name} rejected the command: {status.rejection.text}")
             if status.acknowledged_count and not _older(status.acknowledged_sequence, sequence):
                 return
         raise DeviceError(
-            f"{self._session.name} did not say within {wait_s:g} s whether it acknowledged; it is {self.status.state.name}"
+            f"{self.name} did not say within {wait_s:g} s whether it acknowledged; it is {self.status.state.name}"
         )
 
     def enable(self, *, inward: bool = False) -> None:
@@ -379,8 +328,8 @@ class Board:
         Raises:
             DeviceError: the board is gone or has restarted; the message says what its arm does.
         """
-        self._session.pump(wait_s)
-        taken = self._session.take_angles()
+        self._pump(wait_s)
+        taken, self._angles = self._angles, []
         t_s = np.array([t for t, _ in taken])
         return JointStates(t_s, np.array([q for _, q in taken], dtype=float).reshape(-1, JOINTS))
 
@@ -390,7 +339,7 @@ class Board:
         Raises:
             DeviceError: it does not answer.
         """
-        ask = self._session.command_long
+        ask = self._command_long
         ask(_SET_MESSAGE_INTERVAL, dialect().MAVLINK_MSG_ID_SENSED, 1e6 * every_s)
         # Both at full rate would fill the wire.
         ask(_SET_MESSAGE_INTERVAL, dialect().MAVLINK_MSG_ID_ANGLES, _SLOW_ANGLES_US if every_s else 0)
@@ -401,9 +350,10 @@ class Board:
         Raises:
             DeviceError: the board is gone or has restarted.
         """
-        self._session.pump(wait_s)
-        self._session.take_angles()
-        return self._session.take_sensed()
+        self._pump(wait_s)
+        self._angles.clear()
+        taken, self._sensed = self._sensed, []
+        return readings_of([message for message, _ in taken], [t_s for _, t_s in taken])
 
     def restart(self) -> None:
         """Start the board anew, with the drives off, and say hello again: what was stored is in use from now on.
@@ -411,10 +361,10 @@ class Board:
         Raises:
             DeviceError: the drives are on, or it does not come back.
         """
-        self._session.command_long(_REBOOT, 1)
-        session = Session(self._link, self._session.name)
-        session.open()
-        self._session, self.welcome, self._sequence = session, session.welcome, 0
+        self._command_long(_REBOOT, 1)
+        anew = Board(self._link, self.name)
+        anew._open()
+        vars(self).update(vars(anew))
 
     def soft_limits(self) -> tuple[Array, Array]:
         """Return the soft limits (6,) of its configuration, rad."""
@@ -425,7 +375,7 @@ class Board:
         """Return the configuration in use, to be changed and given to :meth:`store`."""
         data = b""
         while len(data) < CONFIG.itemsize:
-            data += self._session.config_part(len(data))
+            data += self._config_part(len(data))
         return np.frombuffer(bytearray(data[: CONFIG.itemsize]), CONFIG).reshape(())
 
     def store(self, config: Configuration) -> None:
@@ -438,12 +388,12 @@ class Board:
         check_configuration(config)
         check_pin(config, self.welcome.board)
         _check_abilities(config, self.welcome)
-        data, session = config.tobytes(), self._session
+        data = config.tobytes()
         for offset in range(0, len(data), _PART):
             part = data[offset : offset + _PART]
-            session.send("config_part", offset, len(data), len(part), list(part.ljust(_PART, b"\0")))
-            session.pump(STEP_S)  # no faster than a slow wire and the board take it
-        session.send("config_store", self._next(), zlib.crc32(data), session.number)
+            self._say("config_part", offset, len(data), len(part), list(part.ljust(_PART, b"\0")))
+            self._pump(STEP_S)  # no faster than a slow wire and the board take it
+        self._say("config_store", self._next(), zlib.crc32(data), self._number)
         self.confirm(self._sequence, _STORE_S)
 
     def close(self) -> None:
@@ -458,7 +408,7 @@ class Board:
 
     def _send(self, kind: str, *values: object) -> int:
         """Send a numbered command of this session and return its number."""
-        self._session.send(kind, self._next(), self._session.number, *values)
+        self._say(kind, self._next(), self._number, *values)
         return self._sequence
 
     def _next(self) -> int:
