@@ -41,7 +41,7 @@ from armsight.errors import InputError
 from armsight.files import read_toml
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_quaternion_wxyz
-from armsight.robot.kinematics.arm import Arm
+from armsight.robot.kinematics.arm import Arm, Convention
 from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS
 from armsight.robot.models import MODELS
 from armsight.robot.urdf.read import parse_urdf, read_urdf
@@ -107,11 +107,8 @@ def read_arm_toml(path: str | Path) -> Arm:
     given = read_toml(path)
     if "identified" in given:
         return _identified(path, given)
-    rows = given.pop("joint", None)
-    rows = joint_rows(path, rows)
-    name, convention = given.pop("name", Path(path).stem), given.pop("convention", None)
-    if convention not in ("standard", "modified"):
-        raise InputError(f'{path}: convention = "standard" or "modified" is needed, got {convention!r}')
+    rows = joint_rows(path, given.pop("joint", None))
+    name, convention = given.pop("name", Path(path).stem), _convention(path, given.pop("convention", None))
     source, coupling = given.pop("source", str(path)), given.pop("coupling", None)
     if given:
         known = "name, convention, source, coupling, joint"
@@ -130,11 +127,17 @@ def read_arm_toml(path: str | Path) -> Arm:
         qddd_max=np.full(len(rows), _JERK),
         offset=at["offset"],
         direction=at["direction"],
-        convention="standard" if convention == "standard" else "modified",
+        convention=convention,
         coupling=np.eye(len(rows)) if coupling is None else _matrix(path, coupling, len(rows)),
         joint_names=tuple(str(row["name"] or f"joint{i + 1}") for i, row in enumerate(read)),
         source=str(source),
     )
+
+
+def _convention(path: str | Path, given: object) -> Convention:
+    if given not in ("standard", "modified"):
+        raise InputError(f'{path}: convention = "standard" or "modified" is needed, got {given!r}')
+    return "standard" if given == "standard" else "modified"
 
 
 def joint_rows(path: str | Path, rows: object) -> list[dict[str, Any]]:
@@ -165,10 +168,8 @@ def _matrix(path: str | Path, given: object, joints: int) -> Array:
 def _row(where: str, row: dict[str, Any]) -> dict[str, Any]:
     """Read one joint, in SI."""
     row = dict(row)
-    out: dict[str, Any] = {
-        "name": row.pop("name", None),
-        "direction": _number(where, "direction", row.pop("direction", 1)),
-    }
+    out: dict[str, Any] = {"name": row.pop("name", None)}
+    out["direction"] = _number(where, "direction", row.pop("direction", 1))
     for key, (units, default) in _NUMBERS.items():
         given = [unit for unit in units if f"{key}_{unit}" in row]
         if len(given) > 1:
@@ -209,13 +210,9 @@ def identified_table(path: str | Path, given: dict[str, Any]) -> tuple[Arm, Arra
     Raises:
         InputError: something is missing, or no number; the message names it.
     """
-    rows = given.get("joint")
-    rows = joint_rows(path, rows)
+    rows = joint_rows(path, given.get("joint"))
     at = {column: joint_numbers(path, rows, f"{column}_{unit}") for column, unit in _COLUMNS.items()}
     limits = {key: joint_numbers(path, rows, f"{key}_{unit}") for key, unit in LIMITS.items()}
-    convention = given.get("convention")
-    if convention not in ("standard", "modified"):
-        raise InputError(f'{path}: convention = "standard" or "modified" is needed, got {convention!r}')
     arm = Arm(
         name=str(given.get("name", Path(path).stem)),
         a=at["a"],
@@ -223,7 +220,7 @@ def identified_table(path: str | Path, given: dict[str, Any]) -> tuple[Arm, Arra
         alpha=at["alpha"],
         offset=at["offset"],
         direction=joint_numbers(path, rows, "direction"),
-        convention="modified" if convention == "modified" else "standard",
+        convention=_convention(path, given.get("convention")),
         T_base_0=file_transform(path, given, "T_base_0"),
         T_flange_tool=file_transform(path, given, "T_flange_body"),
         joint_names=tuple(str(row.get("name", f"joint{i + 1}")) for i, row in enumerate(rows)),
@@ -240,13 +237,7 @@ def joint_numbers(path: str | Path, rows: list[dict[str, Any]], key: str) -> Arr
     Raises:
         InputError: it is missing, or no number.
     """
-    out = np.empty(len(rows))
-    for i, row in enumerate(rows):
-        value = row.get(key)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            raise InputError(f"{path}: joint {i + 1}: {key} is {value!r}, must be a number")
-        out[i] = value
-    return out
+    return np.array([_number(f"{path}: joint {i + 1}", key, row.get(key)) for i, row in enumerate(rows)])
 
 
 def file_transform(path: str | Path, given: dict[str, Any], name: str) -> Array:

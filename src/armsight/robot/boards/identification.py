@@ -37,12 +37,8 @@ _LEAST_SWING_RAD = 0.02
 #: Frequencies, Hz, of the duties that show a spring; apart by more than a segment of the recording blurs them.
 DITHER_HZ = np.array([4, 5, 6, 7, 9, 11, 13, 16, 19, 23, 28, 34], dtype=float)
 _SEGMENT_S, _ROUNDS = 1.0, 10
-_SLOW_SMOOTH_S = (
-    0.04  # s; takes the dither out of a slow swing; half: the resonance stays in, double: so does the swing go
-)
-_SPRING_SIGMAS = (
-    7.0  # of a compliance that is a spring: backlash shows 5; half: backlash is one, double: stiff ones are none
-)
+_SLOW_SMOOTH_S = 0.04  # s; takes the dither out of a slow swing; half: the resonance stays, double: the swing goes
+_SPRING_SIGMAS = 7.0  # of a compliance that is a spring: backlash shows 5; half: it is one, double: stiff ones are none
 _SPRING_EXPLAINED = 0.7  # share of what lies between joint and motor; half: noise is a spring, double: none is
 _LEAST_LINK_SHARE = 0.15  # of the inertia; less behind a spring is no matter, and noise alone looks like it
 _READING_NOISE_RAD, _CURRENT_NOISE_A = 5e-4, 0.02  # relative weight of both in the lines
@@ -80,15 +76,12 @@ def fit_swing(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) 
             f"{len(t_s)} readings over {np.ptp(angle_rad) if len(t_s) else 0:.4f} rad are too few to identify a motor by;"
             f" {_LEAST_READINGS} over {_LEAST_SWING_RAD} rad are needed"
         )
-    step_s = float(np.median(np.diff(t_s)))
-    t = np.arange(0.0, float(t_s[-1] - t_s[0]) + 0.5 * step_s, step_s)
-    volts, amperes, q = (np.interp(t, t_s - t_s[0], each) for each in (voltage_v, current_a, angle_rad))
+    step_s, t, (volts, amperes, q) = _evenly(t_s, voltage_v, current_a, angle_rad)
     speed = _smooth(q, step_s, derivative=True)
     sure = _sure(speed, step_s, _SURE)
     if (amperes > -0.02 * np.abs(amperes).max()).all():
         amperes = _signed(t, volts, amperes, q, speed, sure)
-    flux = _fit_flux(t, volts, amperes, q, speed, sure)
-    (resistance, constant, half), sigma = flux
+    (resistance, constant, half), sigma = _fit_flux(t, volts, amperes, q, speed, sure)
     if not (resistance > 0 and constant > 0):
         raise InputError(
             f"the swing fits no motor: resistance {resistance:.3g} ohm, constant {constant:.3g} V s/rad; both must be"
@@ -101,6 +94,13 @@ def fit_swing(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) 
     smooth_v = _smooth(volts, step_s)
     predicted = resistance * _smooth(amperes, step_s) + constant * speed
     return JointFit(motor, max(2 * half, 0.0), gravity, sigma[0], sigma[1], t, smooth_v, predicted)
+
+
+def _evenly(t_s: Array, *recorded: Array) -> tuple[float, Array, list[Array]]:
+    """Return the step, s, times from 0 on in such steps, and what was recorded at them."""
+    step_s = float(np.median(np.diff(t_s)))
+    t = np.arange(0.0, float(t_s[-1] - t_s[0]) + 0.5 * step_s, step_s)
+    return step_s, t, [np.interp(t, t_s - t_s[0], each) for each in recorded]
 
 
 def fit_spring(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) -> tuple[JointFit, Elasticity] | None:
@@ -118,9 +118,7 @@ def fit_spring(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array)
         or np.ptp(angle_rad) < _LEAST_SWING_RAD
     ):
         return None  # fit_swing says what is missing
-    step_s = float(np.median(np.diff(t_s)))
-    t = np.arange(0.0, float(t_s[-1] - t_s[0]) + 0.5 * step_s, step_s)
-    volts, amperes, q = (np.interp(t, t_s - t_s[0], each) for each in (voltage_v, current_a, angle_rad))
+    step_s, t, (volts, amperes, q) = _evenly(t_s, voltage_v, current_a, angle_rad)
     if t[-1] < 1.5 * _SEGMENT_S or (amperes > -0.02 * np.abs(amperes).max()).all():
         return None
     w = 2 * np.pi * DITHER_HZ
@@ -176,9 +174,7 @@ def fit_drum(
     """
     if len(t_s) < _LEAST_READINGS or np.ptp(angle_rad) < _LEAST_SWING_RAD:
         return None
-    step_s = float(np.median(np.diff(t_s)))
-    t = np.arange(0.0, float(t_s[-1] - t_s[0]) + 0.5 * step_s, step_s)
-    volts, amperes, q = (np.interp(t, t_s - t_s[0], each) for each in (voltage_v, current_a, angle_rad))
+    step_s, t, (volts, amperes, q) = _evenly(t_s, voltage_v, current_a, angle_rad)
     flux = _smooth(_integral(t, volts - motor.resistance_ohm * amperes), step_s, sigma_s=_SLOW_SMOOTH_S)
     angle = _smooth(q + twist_rad_per_a * amperes, step_s, sigma_s=_SLOW_SMOOTH_S)
     load = _smooth(_integral(t, amperes), step_s, sigma_s=_SLOW_SMOOTH_S)

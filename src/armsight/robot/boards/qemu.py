@@ -10,7 +10,7 @@ import contextlib
 import shutil
 import subprocess
 from pathlib import Path
-from typing import IO, Self
+from typing import IO, Self, cast
 
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.frames import ANSWER
@@ -32,7 +32,8 @@ class QemuEmulator:
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self._process = process
-        self._in, self._out, self._said = _pipes(process)
+        pipes = (process.stdin, process.stdout, process.stderr)
+        self._in, self._out, self._said = (cast(IO[bytes], pipe) for pipe in pipes)
 
     @classmethod
     def open(cls, image: Path) -> Self:
@@ -84,10 +85,3 @@ class QemuEmulator:
         self._process.wait(_END_S)
         said = self._said.read().decode(errors="replace").strip()
         return f": {said}" if said else ""
-
-
-def _pipes(process: subprocess.Popen[bytes]) -> tuple[IO[bytes], IO[bytes], IO[bytes]]:
-    assert process.stdin is not None
-    assert process.stdout is not None
-    assert process.stderr is not None
-    return process.stdin, process.stdout, process.stderr

@@ -49,6 +49,15 @@ class MotorFigures:
     viscous_n_m_s: float  #: friction that grows with speed, N m s/rad
     dry_n_m: float  #: dry friction, N m
 
+    def stall_n_m(self, supply_v: float) -> float:
+        """Return the torque at rest under full duty."""
+        return self.constant_v_s * supply_v / self.resistance_ohm
+
+    @property
+    def own_damping_n_m_s(self) -> float:
+        """What damps it by itself, N m s/rad: its back-EMF and its friction."""
+        return self.constant_v_s**2 / self.resistance_ohm + self.viscous_n_m_s
+
 
 @dataclass(frozen=True)
 class Elasticity:
@@ -86,8 +95,7 @@ def tuned_gains(
     for name, value in needed.items():
         if not value > 0:
             raise InputError(f"{name} is {value:g}; it must be positive")
-    stall = motor.constant_v_s * supply_v / motor.resistance_ohm
-    own = motor.constant_v_s**2 / motor.resistance_ohm + motor.viscous_n_m_s
+    stall, own = motor.stall_n_m(supply_v), motor.own_damping_n_m_s
     per_rad_s2 = motor.inertia_kg_m2 / stall
     slow, fast = ((1.0, 2 * damping * w, w * w) for w in (bandwidth_rad_s, bandwidth_rad_s / pairs))
     _, c3, c2, c1, c0 = np.polymul(slow, fast)
@@ -140,8 +148,7 @@ def elastic_gains(motor: MotorFigures, supply_v: float, elastic: Elasticity, noi
 
 
 def _three_pole_gains(motor: MotorFigures, supply_v: float, bandwidth: float, third: float) -> Array:
-    stall = motor.constant_v_s * supply_v / motor.resistance_ohm
-    own = motor.constant_v_s**2 / motor.resistance_ohm + motor.viscous_n_m_s
+    stall, own = motor.stall_n_m(supply_v), motor.own_damping_n_m_s
     per_rad_s2, double = motor.inertia_kg_m2 / stall, 2 * _ELASTIC_DAMPING
     kp, ki = (1 + double * third) * bandwidth**2 * per_rad_s2, third * bandwidth**3 * per_rad_s2
     kd = max((double + third) * bandwidth * per_rad_s2 - 0.5 * own / stall, 0.0)
@@ -153,8 +160,7 @@ def _three_pole_gains(motor: MotorFigures, supply_v: float, bandwidth: float, th
 
 def _holds(motor: MotorFigures, supply_v: float, elastic: Elasticity, gains: Array, share: float) -> bool:
     """Return whether the loop with share of the spring's stiffness is stable, with margin."""
-    stall = motor.constant_v_s * supply_v / motor.resistance_ohm
-    own = motor.constant_v_s**2 / motor.resistance_ohm + motor.viscous_n_m_s
+    stall, own = motor.stall_n_m(supply_v), motor.own_damping_n_m_s
     link = elastic.link_share * motor.inertia_kg_m2
     rotor, k, c = motor.inertia_kg_m2 - link, share * elastic.stiffness_n_m, elastic.damping_n_m_s
     kp, ki, kd = gains[:3]
@@ -218,7 +224,7 @@ def quiet_gains(motor: MotorFigures, supply_v: float, noise_rad: float, gravity_
     Returns:
         (8,) as those of :func:`tuned_gains`.
     """
-    stall = motor.constant_v_s * supply_v / motor.resistance_ohm
+    stall = motor.stall_n_m(supply_v)
     speed_rad_s, acceleration_rad_s2 = motion_limits(motor, supply_v, gravity_n_m)
     w = 2 * np.pi * _SWING_HZ
     gravity_n_m_s = gravity_n_m * min(_SWING_RAD * w, speed_rad_s, acceleration_rad_s2 / w) / np.sqrt(2)
@@ -259,7 +265,7 @@ def motion_limits(motor: MotorFigures, supply_v: float, gravity_n_m: float) -> t
         supply_v: nominal supply, V.
         gravity_n_m: greatest torque of gravity.
     """
-    stall = motor.constant_v_s * supply_v / motor.resistance_ohm
+    stall = motor.stall_n_m(supply_v)
     free_rad_s = supply_v / motor.constant_v_s
     load = min((gravity_n_m + motor.dry_n_m) / stall, _MOVING)
     speed = min(max(_MOVING * (_USED - load) * free_rad_s, 0.05), _MOST_SPEED_RAD_S)
