@@ -74,8 +74,32 @@ def render_a_recording(main, folder, capsys):
     assert [float(text) for text in printed] == pytest.approx(baseline_mm(folder / "recording", "arm"), abs=5.1e-4)
 
 
+def handeye_for_a_paper(main, folder, capsys):
+    main(folder)
+    out = capsys.readouterr().out
+    assert_honest(errors_mm(out), 1)
+    (left_out,) = re.findall(r"left out of the fit: ([\d.]+) mm", out)
+    assert 0.2 < float(left_out) < 0.8  # three axes of 0.2 mm and the fit's own error: 0.32 mm in the mean
+    lines = (folder / "handeye.tex").read_text().splitlines()
+    assert [line.count("&") for line in lines] == [0, 8, 0, 8, 8, 0]
+
+
+def recording_into_pandas(main, folder, capsys):
+    main(folder)
+    assert capsys.readouterr().out.startswith("12 of 12 shots\n")
+    assert len((folder / "poses.csv").read_text().splitlines()) == 13
+
+
 #: Number of an example -> what runs it and holds what it prints.
-CHECKS = {"01": measure_a_board, "02": calibrate_in_python, "03": follow_a_plate, "04": dense, "05": render_a_recording}
+CHECKS = {
+    "01": measure_a_board,
+    "02": calibrate_in_python,
+    "03": follow_a_plate,
+    "04": dense,
+    "05": render_a_recording,
+    "06": handeye_for_a_paper,
+    "07": recording_into_pandas,
+}
 
 
 def test_every_example_has_a_number_and_a_check():

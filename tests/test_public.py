@@ -3,6 +3,7 @@
 import inspect
 import pydoc
 import re
+import sys
 
 import numpy as np
 import pyarrow
@@ -24,7 +25,7 @@ from armsight.data import Correspondences, Points
 from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.geometry.rotation import euler_zyx, from_euler_zyx
 from armsight.sim.example_rig import BOARD, demo_recording
-from armsight.vision.pose.shot_pose import CSV_COLUMNS
+from armsight.vision.pose.shot_pose import CSV_COLUMNS, ShotPoses
 from made_once import made_once
 from strategies import ordinary_rig
 
@@ -118,6 +119,19 @@ def test_pictures_to_a_rig_to_a_table(boards):
     assert (boards / "poses.csv").read_text().splitlines()[0] == ",".join(CSV_COLUMNS)
     one = measure(rig, open_target(BOARD), open_source(str(boards / "board"))[0])
     np.testing.assert_allclose(one.position_mm, 1e3 * np.array([columns[f"{axis}_m"][0] for axis in "xyz"]), atol=1e-9)
+    x, _, z = table.plot()
+    np.testing.assert_allclose(x.lines[0].get_ydata(), 1e3 * columns["x_m"], atol=1e-9)
+    low, high = z.collections[0].get_paths()[0].get_extents().intervaly  # the band has two sigmas to either side
+    wide = 2e3 * columns["sigma_z_m"]
+    assert (low, high) == pytest.approx(((1e3 * columns["z_m"] - wide).min(), (1e3 * columns["z_m"] + wide).max()))
+    mm, _ = found.plot()
+    assert [bar.get_height() for bar in mm.patches] == pytest.approx((1e3 * found.errors.rigid_m).tolist())
+
+
+def test_a_plot_without_matplotlib_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    with pytest.raises(ArmsightError, match=r'pip install "armsight\[report\]"'):
+        ShotPoses(()).plot()
 
 
 class Lost:

@@ -11,6 +11,7 @@ To open: ``open_source`` images or cameras, ``open_board`` a board, ``open_targe
 ``StereoRig.load`` a rig, ``open_arm`` an arm, ``read_poses`` a table of its poses, ``open_corrected`` an identified arm.
 To compute: ``calibrate``, ``calibrate_boards``, ``calibrate_bodies`` the pair of cameras; ``measure``, ``measure_all``,
 ``Follower`` the pose of a body; ``handeye`` where rig and body are on the arm; ``identify`` what the arm really is.
+To exchange: ``as_transform`` reads a transform of pinocchio, SciPy, spatialmath or ROS, ``ros_fields`` writes ROS' fields.
 Records: ``Shot``, ``Body``, ``PoseEstimate`` or ``Missed``, ``Pair``, ``Camera``, ``StereoRig``, ``Arm``, ``Corrected``.
 Wrong input raises ``ArmsightError``, with what was found, what was expected and what to do.
 
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     __version__: str
     from armsight.data import Body, Missed, PoseEstimate, Shot
     from armsight.errors import ArmsightError
+    from armsight.geometry.convert import as_transform, ros_fields
     from armsight.loop.handeye.handeye import calibrate_handeye as handeye
     from armsight.loop.identify.corrected import Corrected, open_corrected
     from armsight.loop.identify.identify import identify
@@ -65,6 +67,7 @@ __all__ = [
     "PoseEstimate",
     "Shot",
     "StereoRig",
+    "as_transform",
     "calibrate",
     "calibrate_boards",
     "calibrate_bodies",
@@ -79,12 +82,14 @@ __all__ = [
     "open_source",
     "open_target",
     "read_poses",
+    "ros_fields",
 ]
 
 _HOME = {
     **dict.fromkeys(("Body", "Missed", "PoseEstimate", "Shot"), "armsight.data"),
     "Arm": "armsight.robot.kinematics.arm",
     "ArmsightError": "armsight.errors",
+    **dict.fromkeys(("as_transform", "ros_fields"), "armsight.geometry.convert"),
     "calibrate": "armsight.vision.calibrate.images",
     **dict.fromkeys(("Pair", "calibrate_boards"), "armsight.vision.calibrate.boards"),
     "calibrate_bodies": "armsight.vision.calibrate.bodies",

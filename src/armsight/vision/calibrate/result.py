@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from armsight.data import Array, Body, Record
 from armsight.vision.calibrate.motion import ExposureMotion
+from armsight.vision.plots import new_axes
 from armsight.vision.pose.bundle import BundleSolution, Observations
 from armsight.vision.rig import StereoRig
 
@@ -119,6 +121,19 @@ class Calibration(Record):
             f"epipolar, {1e3 * errors.rigid_rms_m:.3f} mm; {rig.left.model}, baseline {1e3 * rig.baseline_m:.3f} mm; "
             f"{len(self.weaknesses)} weaknesses)"
         )
+
+    def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
+        """Draw the errors of every pair when it was left out of the fit, mm and px; return both axes.
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
+        axes = new_axes(2)
+        axes[0].bar(self.errors.pair, 1e3 * self.errors.rigid_m)
+        axes[1].bar(self.errors.pair, self.errors.epipolar_px)
+        axes[0].set(ylabel="board's points, mm RMS", title="errors of pairs left out of the fit")
+        axes[1].set(ylabel="epipolar, px RMS", xlabel="pair")
+        return axes
 
     @property
     def reprojection_rms_px(self) -> float:

@@ -26,6 +26,7 @@ import numpy as np
 from armsight.data import Array, Body, Dropped, Missed, PoseEstimate, Record
 from armsight.files import write_text
 from armsight.geometry.rotation import euler_zyx, euler_zyx_sigmas, from_euler_zyx, quaternion_wxyz
+from armsight.vision.plots import new_axes
 from armsight.vision.rig import Shutters
 
 #: Elements of a 6x6 covariance that are written.
@@ -274,6 +275,26 @@ class ShotPoses:
         import pyarrow
 
         return pyarrow.table(self.columns()).__arrow_c_stream__(requested_schema)
+
+    def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
+        """Draw the position over time or shots, mm, with two sigmas; return the three axes.
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
+        axes = new_axes(3)
+        timed = all(pose.t_s is not None for pose in self.poses)
+        at = [pose.t_s if timed else k for k, pose in enumerate(self.poses) if pose.ok]
+        good = [pose for pose in self.poses if pose.ok]
+        for k, (ax, name) in enumerate(zip(axes, "xyz", strict=True)):
+            centre = np.array([1e3 * pose.position_m[k] for pose in good])
+            wide = np.array([2e3 * np.sqrt(pose.cov[k, k]) for pose in good])
+            ax.fill_between(at, centre - wide, centre + wide, alpha=0.3, linewidth=0)
+            ax.plot(at, centre, ".-", markersize=3)
+            ax.set_ylabel(f"{name}, mm")
+        axes[-1].set_xlabel("time, s" if timed else "shot")
+        axes[0].set_title(f"{len(good)} of {len(self)} shots measured; band: two sigmas", fontsize="medium")
+        return axes
 
     def __repr__(self) -> str:
         """Return how many shots were measured, and the sigma of a position in the middle, mm."""

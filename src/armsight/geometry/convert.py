@@ -1,0 +1,70 @@
+"""Transforms of other libraries: objects in, 4x4 matrices out, and ROS' fields of a matrix.
+
+The other way most take the matrix: ``pinocchio.SE3(T)``, ``RigidTransform.from_matrix(T)``, ``spatialmath.SE3(T)``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from armsight.errors import InputError
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import Array, from_quaternion_wxyz, quaternion_wxyz
+
+#: Deviation of a rotation from orthonormal that rounding leaves; half: float32 is rejected, double: more drift passes.
+_ROUNDING = 1e-5
+
+
+def as_transform(given: object) -> Array:
+    """Return the (4, 4) transform, m, that an object of another library holds.
+
+    Args:
+        given: a 4x4 matrix; pinocchio's, SciPy's (RigidTransform) or spatialmath's transform; a ROS Pose, Transform, or a
+            message that holds one (``pose``, ``transform``, also with covariance), whose quaternions are x y z w.
+
+    Raises:
+        InputError: it is none of these, or no rigid transform.
+    """
+    T = _matrix(given)
+    R = T[:3, :3]
+    rigid = np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < _ROUNDING and np.linalg.det(R) > 0
+    if not rigid or (T[3] != [0, 0, 0, 1]).any():
+        raise InputError(
+            f"{type(given).__name__}: no rigid transform: expected a rotation, a translation and the row 0 0 0 1"
+        )
+    return T
+
+
+def _matrix(given: Any) -> Array:  # noqa: ANN401 - any library's object
+    """Return the matrix of a transform of another library."""
+    for name in ("transform", "pose"):  # what ROS wraps
+        if hasattr(given, name):
+            return _matrix(getattr(given, name))
+    for moves, rotates in (("translation", "rotation"), ("position", "orientation")):
+        t, q = getattr(given, moves, None), getattr(given, rotates, None)
+        if hasattr(t, "x") and hasattr(q, "w"):
+            wxyz = np.array([q.w, q.x, q.y, q.z], float)
+            if not np.linalg.norm(wxyz) > 0:
+                raise InputError(f"{type(given).__name__}: its quaternion is zero: was it never set?")
+            return pose(from_quaternion_wxyz(wxyz), np.array([t.x, t.y, t.z], float))
+    given = (
+        given.as_matrix() if hasattr(given, "as_matrix") else getattr(given, "homogeneous", getattr(given, "A", given))
+    )
+    try:
+        T = np.array(given, dtype=float)
+    except (TypeError, ValueError):
+        T = np.zeros(0)
+    if T.shape != (4, 4):
+        raise InputError(
+            f"{type(given).__name__}: expected a 4x4 matrix, or a transform of pinocchio, SciPy, spatialmath or ROS"
+        )
+    return T
+
+
+def ros_fields(T: Array) -> dict[str, dict[str, float]]:
+    """Return ``translation`` and ``rotation`` of a ROS Transform as plain numbers, m and quaternion x y z w."""
+    w, x, y, z = quaternion_wxyz(np.asarray(T)[:3, :3]).tolist()
+    tx, ty, tz = np.asarray(T)[:3, 3].tolist()
+    return {"translation": {"x": tx, "y": ty, "z": tz}, "rotation": {"x": x, "y": y, "z": z, "w": w}}
