@@ -43,12 +43,13 @@ def _matrix(given: Any) -> Array:  # noqa: ANN401 - any library's object
         if hasattr(given, name):
             return _matrix(getattr(given, name))
     for moves, rotates in (("translation", "rotation"), ("position", "orientation")):
-        t, q = getattr(given, moves, None), getattr(given, rotates, None)
+        t: Any = getattr(given, moves, None)
+        q: Any = getattr(given, rotates, None)
         if hasattr(t, "x") and hasattr(q, "w"):
-            wxyz = np.array([q.w, q.x, q.y, q.z], float)
+            wxyz = np.array([q.w, q.x, q.y, q.z], np.float64)
             if not np.linalg.norm(wxyz) > 0:
                 raise InputError(f"{type(given).__name__}: its quaternion is zero: was it never set?")
-            return pose(from_quaternion_wxyz(wxyz), np.array([t.x, t.y, t.z], float))
+            return pose(from_quaternion_wxyz(wxyz), np.array([t.x, t.y, t.z], np.float64))
     given = (
         given.as_matrix() if hasattr(given, "as_matrix") else getattr(given, "homogeneous", getattr(given, "A", given))
     )
