@@ -19,11 +19,9 @@ import numpy as np
 from armsight.data import JointCommand
 from armsight.geometry.pose import exp_se3, inverse
 from armsight.loop.identify.backlash import joint_backlashes
-from armsight.loop.identify.fit import prior_sigma
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.model import Model
-from armsight.loop.identify.plan import plan_poses
+from armsight.loop.identify.plan import plan_joints
 from armsight.robot.arm_file import open_arm
 from armsight.robot.board_registry import configured, open_emulator
 from armsight.robot.boards.emulated import EmulatedLink
@@ -53,10 +51,7 @@ def planned_poses(model: Arm) -> list:
     """Return goals and sides chosen in the same box."""
     low, high = model.home - REACH_RAD, model.home + REACH_RAD
     box = replace(model, q_min=np.maximum(model.q_min, low), q_max=np.minimum(model.q_max, high))
-    T = box.forward(box.home[None])
-    start = Model.of(box, Measured(box.home[None], T[:, None, :3, 3], T[:, :3, :3]), backlash=True)
-    noise = (SIGMA[0], SIGMA[-1])
-    plan = plan_poses(start, start.nominal(), prior_sigma(start), noise, PLANNED, floor_m=HIGH_M)
+    plan = plan_joints(box, None, None, PLANNED, 0, noise=(SIGMA[0], SIGMA[-1]), floor_m=HIGH_M)
     return list(zip(plan.q, plan.approach, strict=True))
 
 

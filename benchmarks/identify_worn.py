@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 from worn_arm import distance_m, poses, worn
 
-from armsight.loop.identify.fit import prior_sigma
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.model import Model
-from armsight.loop.identify.placement import with_placement
-from armsight.loop.identify.plan import free_of_collision, plan_poses
+from armsight.loop.identify.plan import free_of_collision, plan_joints
 
 POSES, UNSEEN, FIRST = 60, 200, 15
 
@@ -62,8 +60,8 @@ def planned(report, seeds: int) -> None:
     for seed in range(seeds):
         rng, w = np.random.default_rng(200 + seed), worn(seed)
         first = w.seen(*poses(w.nominal, FIRST, rng), rng)
-        model, x = with_placement(Model.of(w.nominal, first, backlash=True), first)
-        plan = plan_poses(model, x, prior_sigma(model), (1e-4, 5e-4), more, done=first, seed=seed)
+        model = Model.of(w.nominal, first, backlash=True)
+        plan = plan_joints(w.nominal, first, None, more, seed)
         q = rng.uniform(np.maximum(w.nominal.q_min, -np.pi), np.minimum(w.nominal.q_max, np.pi), (4000, 6))
         q = q[free_of_collision(model, q)]
         side = rng.choice([-1.0, 1.0], q.shape)

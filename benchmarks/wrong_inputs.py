@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from armsight.app.handeye.recording import paired, seen_in_table
-from armsight.app.handeye.suspect import require_plausible
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse
+from armsight.loop.handeye.recording import paired, seen_in_table
+from armsight.loop.identify.misread import require_plausible
 from armsight.robot.arm_file import open_arm
 from armsight.robot.calibration_file import read_calibration
 from armsight.robot.models import MODELS

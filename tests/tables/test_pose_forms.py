@@ -83,6 +83,29 @@ DTX = '<Database><Datas><Data name="p" access="public" xsi:type="array" type="po
 
 #: Program and its source -> file name, text, options. All give the poses A.
 FORMS = {
+    "quaternions by their names": ("q.csv", csv("x_m,y_m,z_m,qw,qx,qy,qz", P, WXYZ), {}),
+    "quaternions without names": ("q.csv", csv("", P, WXYZ), {"rotation": "wxyz"}),
+    "rotation vectors, mm": ("v.csv", csv("x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad", MM, VECTOR), {}),
+    "columns named by hand": (
+        "e.csv",
+        csv("X,Y,Z,A,B,C", MM, KUKA[:, ::-1]),
+        {"rotation": "ZYX", "unit": "mm", "columns": "x=X,y=Y,z=Z,rx_deg=A,ry_deg=B,rz_deg=C"},
+    ),
+    "geometry_msgs/Pose (rostopic echo -p)": (
+        "ros.csv",
+        csv(
+            ",".join(["%time", *(f"pose.position.{k}" for k in "xyz"), *(f"pose.orientation.{k}" for k in "xyzw")]),
+            np.arange(N),
+            P,
+            XYZW,
+        ),
+        {},
+    ),
+    "KUKA's columns": ("k.csv", csv("X,Y,Z,A,B,C", MM, KUKA), {}),
+    "Fanuc's columns": ("f.csv", csv("X,Y,Z,W,P,R", MM, FIXED), {}),
+    "lists of a UR's poses": ("l.csv", rows("[{}, {}, {}, {}, {}, {}]", P, VECTOR), {}),
+    "matrices of four lines": ("m.txt", "\n".join(" ".join(map(repr, row)) for row in A.reshape(-1, 4).tolist()), {}),
+    "units in brackets": ("b.csv", csv("X [mm],Y [mm],Z [mm],Roll [deg],Pitch [deg],Yaw [deg]", MM, FIXED), {}),
     "easy_handeye 0.4 samples (TakeSample)": (
         "samples.yaml",
         yaml.safe_dump([{"robot": a, "tracking": b} for a, b in zip(ros(), ros(T=B), strict=True)]),
@@ -414,6 +437,11 @@ def test_files_of_one_pose_each_are_one_table(tmp_path):
 
 SIX = open_arm("six_r")
 JOINTS = {
+    "names of joints in another order": (
+        "n.csv",
+        csv(",".join(SIX.joint_names[k] for k in (2, 0, 1, 5, 4, 3)), Q[:, [2, 0, 1, 5, 4, 3]]),
+        {},
+    ),
     "KUKA {A1 ..}": ("a.dat", rows("PTP {{A1 {},A2 {},A3 {},A4 {},A5 {},A6 {}}}", DEG), {}),
     "FANUC .LS joints": (
         "j.LS",

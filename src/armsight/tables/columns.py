@@ -165,9 +165,10 @@ class Columns:
     """Columns of a table by their names."""
 
     def __init__(self, path: Path, head: list[str], rows: Rows, links: Sequence[str] = ()) -> None:
-        self.path, self.at, self.rows = path, {name: k for k, name in enumerate(head) if name}, rows
+        self.path, self.head, self.rows = path, head, rows
+        self.at = {name: k for k, name in enumerate(head) if name}
         self.used: set[str] = set()
-        self._links = links
+        self.links = links
 
     @classmethod
     def of_csv(cls, path: Path, columns: Mapping[str, str] | Sequence[str] = ()) -> Columns:
@@ -255,7 +256,7 @@ class Columns:
         unknown = next((name for name in self.at if name and name not in COLUMNS), None)
         if unknown is None:
             return "" if gone is None else f"; column {gone}{names[0][2:]} is missing"
-        known = [*self._links, *(f"{name}_joint" for name in self._links), *COLUMNS]
+        known = [*self.links, *(f"{name}_joint" for name in self.links), *COLUMNS]
         near = get_close_matches(unknown, known, 1)
         return f"; column {unknown!r} is not known" + (f": is it {near[0]}?" if near else "")
 

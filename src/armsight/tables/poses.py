@@ -10,7 +10,8 @@ x, y, z and a quaternion; 6: x, y, z and three numbers of a rotation, whose conv
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -20,7 +21,8 @@ from numpy.typing import NDArray
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import columns_unused
-from armsight.tables.cells import Rows, read_cells, read_columns
+from armsight.geometry.pose import pose
+from armsight.tables.cells import Cells, Rows, read_cells, read_columns
 from armsight.tables.columns import COLUMNS, Columns, degree_columns, is_unitless, understood
 from armsight.tables.lengths import REACH, UNITS_M
 from armsight.tables.rotations import CONVENTIONS
@@ -60,7 +62,7 @@ class PoseTable(Record):
         path: the file.
         lines: (N,) the line of each row.
         Ts: (N, 4, 4) the poses, m.
-        numbers: (N, K) the numbers of the rotations as in the file; (N, 0) for matrices and joints.
+        numbers: (N, K) the numbers of the rotations as in the file; K is 0 for matrices and joints.
         written: (N, 6) or (N, 7) position and rotation as in the file, where its columns have this order; (N, 0) else.
         convention: what they were taken for, one of CONVENTIONS; "" for matrices and joints.
         q: (N, J) joint angles, rad; None where there are none.
@@ -76,15 +78,15 @@ class PoseTable(Record):
     path: Path
     lines: NDArray[np.int64]
     Ts: Array
-    numbers: Array
-    written: Array
-    convention: str
-    q: Array | None
-    t_s: Array | None
-    names: tuple[str, ...] | None
-    unit_m: float
-    notes: tuple[str, ...]
-    missed: tuple[str, ...]
+    numbers: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    written: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    convention: str = ""
+    q: Array | None = None
+    t_s: Array | None = None
+    names: tuple[str, ...] | None = None
+    unit_m: float = 1.0
+    notes: tuple[str, ...] = ()
+    missed: tuple[str, ...] = ()
     of_joints: bool = False
     unused: tuple[str, ...] = ()
 
@@ -129,7 +131,7 @@ def read_pose_table(
         notes = (*notes, *found_out)
         R, numbers, convention, written = table.rotations(rotation)
         written = np.hstack([p / unit_m, written]) if written.shape[1] else written
-        Ts = stacked(R, p)
+        Ts = pose(R, p)
     elif arm is None:
         raise InputError(f"{path}: joint angles need the arm: give --model, a name (armsight arm list) or a .urdf file")
     else:
@@ -152,16 +154,33 @@ def _table(
     if rotation is not None and rotation not in CONVENTIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
     cells = read_cells(path, read_columns(columns, (*COLUMNS, "pose")), side)
+    if cells.listed:
+        notes = _notes_of_lists(path, cells.rows[0], arm, unit, rotation)
+        names = ["x", "y", "z", "rx_rad", "ry_rad", "rz_rad"] if len(cells.head) == 6 else cells.head
+        cells = cells._replace(head=names, notes=(*cells.notes, *notes))
+    table, rotation, notes = columns_in(path, cells, () if arm is None else arm.joint_names, unit, rotation)
+    if not set(table.at) >= _MEASURED:
+        return table, rotation, notes, ("",) * len(table.rows)
+    rows, missed = _shown(path, table.head, table.rows)
+    return Columns(path, table.head, rows, table.links), rotation, notes, missed
+
+
+def columns_in(
+    path: Path, cells: Cells, links: Sequence[str], unit: str | None, rotation: str | None
+) -> tuple[Columns, str | None, tuple[str, ...]]:
+    """Return the columns of a file's cells by our names, the convention of its rotations, and notes.
+
+    Args:
+        path: the file.
+        cells: what it holds.
+        links: names of the joints of an arm.
+        unit: of lengths whose columns name none.
+        rotation: the convention where it is given.
+    """
     head, *body = degree_columns(path, [cells.head, *(row for _, row in cells.rows)])
+    head, convention, notes = understood(path, head, links, unit, rotation or cells.rotation)
     rows: Rows = [(line, row) for (line, _), row in zip(cells.rows, body, strict=True)]
-    links = () if arm is None else arm.joint_names
-    notes = _notes_of_lists(path, rows[0], arm, unit, rotation) if cells.listed else ()
-    if cells.listed and len(head) == 6:
-        head = ["x", "y", "z", "rx_rad", "ry_rad", "rz_rad"]
-    else:
-        head, rotation, notes = understood(path, head, links, unit, rotation or cells.rotation)
-    rows, missed = _shown(path, head, rows) if set(head) >= _MEASURED else (rows, ("",) * len(rows))
-    return Columns(path, head, rows, links), rotation, (*cells.notes, *notes), missed
+    return Columns(path, head, rows, links), convention, (*cells.notes, *notes)
 
 
 def _shown(path: Path, head: list[str], rows: Rows) -> tuple[Rows, tuple[str, ...]]:
@@ -188,13 +207,6 @@ def _notes_of_lists(
     what = "UR's pose" if rotation is None else "poses"
     how = f"{unit or 'm'} and {rotation or 'rotation vector'}, rad"
     return (f"{path}: lists read as {what}: {how}",) if len(cells) == 6 else ()
-
-
-def stacked(R: Array, p: Array) -> Array:
-    """Return poses (N, 4, 4) of rotations (N, 3, 3) and positions (N, 3)."""
-    Ts = np.tile(np.eye(4), (len(R), 1, 1))
-    Ts[:, :3, :3], Ts[:, :3, 3] = R, p
-    return Ts
 
 
 def _positions(table: Columns, unit: str | None, detect: bool, side: str) -> tuple[Array, float, tuple[str, ...]]:

@@ -11,12 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from armsight.app.handeye.command import Options, calibrate
-from armsight.app.handeye.images import steady, upright
-from armsight.app.handeye.recording import matched_rows, paired, seen_in_table
 from armsight.app.handeye.report import handeye_report
-from armsight.app.handeye.suspect import _nearer_models
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
+from armsight.loop.handeye.recording import matched_rows, paired, seen_in_table, steady, upright
+from armsight.loop.identify.misread import _nearer_models
 from armsight.robot.arm_file import open_arm
 from armsight.tables.poses import read_pose_table
 from cli_runs import assert_rejected
@@ -66,62 +65,13 @@ def assert_right(document):
     assert np.abs(log_se3(inverse(X) @ np.array(document["T_flange_rig"]))).max() < 2e-3
 
 
-def table(tmp_path, form, A, q):
-    """The robot's poses in one of the forms, and the options that go with it."""
-    p, angles = A[:, :3, 3], Rotation.from_matrix(A[:, :3, :3])
-    path = tmp_path / "robot.csv"
-    if form == "quaternion":
-        return named(path, "x_m,y_m,z_m,qw,qx,qy,qz", np.hstack([p, quaternions(A)])), ()
-    if form == "bare quaternion":
-        np.savetxt(path, np.hstack([p, quaternions(A)]), delimiter=",")
-        return path, ("--rotation", "wxyz")
-    if form == "ur":
-        vectors = np.hstack([p, angles.as_rotvec()])
-        path.write_text("".join("p[" + ", ".join(f"{v:.7f}" for v in row) + "]\n" for row in vectors))
-        return path, ()
-    if form == "euler, mm":
-        zyx = angles.as_euler("ZYX", degrees=True)[:, ::-1]
-        return named(path, "X,Y,Z,A,B,C", np.hstack([1e3 * p, zyx])), (
-            *("--rotation", "ZYX", "--units", "mm"),
-            *("--columns", "x=X,y=Y,z=Z,rx_deg=A,ry_deg=B,rz_deg=C"),
-        )
-    if form == "rotation vector, mm":
-        return named(path, "x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad", np.hstack([1e3 * p, angles.as_rotvec()])), ()
-    if form == "joints":
-        head = ",".join(f"q{i}_deg" for i in range(1, 7))
-        return named(path, head, np.degrees(q)), ("--model", "six_r")
-    if form == "ros":
-        head = [f"pose.position.{axis}" for axis in "xyz"] + [f"pose.orientation.{axis}" for axis in "xyzw"]
-        return named(path, ",".join(["%time", *head]), np.hstack([np.arange(len(A))[:, None], p, angles.as_quat()])), ()
-    if form in ("KUKA", "Fanuc"):  # A, B, C rotate about z, y' and x''; W, P, R about the fixed x, y, z
-        order = angles.as_euler("ZYX" if form == "KUKA" else "xyz", degrees=True)
-        return named(path, "X,Y,Z,A,B,C" if form == "KUKA" else "X,Y,Z,W,P,R", np.hstack([1e3 * p, order])), ()
-    if form == "lists":
-        path.write_text("".join(f"{list(map(float, row))}\n" for row in np.hstack([p, angles.as_rotvec()])))
-        return path, ()
-    if form == "four lines":
-        np.savetxt(path, A.reshape(-1, 4))
-        return path, ()
-    if form == "units in brackets":
-        xyz = np.hstack([1e3 * p, angles.as_euler("xyz", degrees=True)])
-        return named(path, "X [mm],Y [mm],Z [mm],Roll [deg],Pitch [deg],Yaw [deg]", xyz), ()
-    if form == "names of joints":
-        arm = open_arm("six_r")
-        order = [2, 0, 1, 5, 4, 3]
-        return named(path, ",".join(arm.joint_names[k] for k in order), q[:, order]), ("--model", "six_r")
-    return matrices(path, A), ()
-
-
-@pytest.mark.parametrize(
-    "form",
-    [
-        *("matrix", "quaternion", "bare quaternion", "ur", "euler, mm", "rotation vector, mm", "joints", "ros", "KUKA"),
-        *("Fanuc", "lists", "four lines", "units in brackets", "names of joints"),
-    ],
-)
-def test_every_form_of_a_table_gives_the_same(armsight, tmp_path, seen, form):
+@pytest.mark.parametrize("joints", [False, True])
+def test_poses_and_joints_give_the_same(armsight, tmp_path, seen, joints):
     q, A, _ = motion()
-    robot, options = table(tmp_path, form, A, q)
+    robot, options = matrices(tmp_path / "robot.csv", A), ()
+    if joints:
+        robot = named(robot, ",".join(f"q{i}_deg" for i in range(1, 7)), np.degrees(q))
+        options = ("--model", "six_r")
     document, _ = found(armsight, robot, seen, *options)
     assert_right(document)
     assert document["held_out_rms_m"] < 2e-3
@@ -693,7 +643,7 @@ def test_a_board_that_looks_the_same_rotated_is_rotated_back(in_hand):
     flip[:2, 3] = 0.2, 0.1
     rotated = B.copy()
     rotated[[2, 5, 6]] = rotated[[2, 5, 6]] @ flip
-    back, which = upright(A, rotated, (flip,), in_hand)
+    back, which = upright(A, rotated, (flip,))
     np.testing.assert_allclose(back, B, atol=1e-12)
     assert list(np.flatnonzero(which >= 0)) == [2, 5, 6]
 

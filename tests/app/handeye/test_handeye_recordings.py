@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armsight.app.handeye.images import Seen
-from armsight.app.handeye.recording import at_shots, links_of, paired
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
+from armsight.loop.handeye.recording import Seen, at_shots, links_of, paired, robot_in_recording
 from armsight.robot.arm_file import open_arm
 from armsight.sim.example_rig import board_poses, example_rig
 from armsight.sim.render.optics import Optics, Sensor
@@ -105,8 +104,6 @@ def test_poses_at_the_times_of_the_shots(armsight, at_rest):
 
 
 def test_joints_are_read_by_their_names(at_rest):
-    from armsight.app.handeye.recording import robot_in_recording
-
     bag, _, joints = at_rest
     arm = open_arm("ur3e")
     table = robot_in_recording(bag, None, arm)
@@ -169,8 +166,8 @@ def test_poses_of_a_tcp_beside_the_joints_are_those_of_the_tcp():
     assert any("are of a TCP at [0.0 0.0 150.0] mm" in note for note in recording.notes)
     own = paired(replace(table, Ts=np.asarray(arm.forward(q)), of_joints=True), shots(np.arange(12.0)), True, arm)
     assert not any("TCP" in note for note in own.notes)
-    lever = links_of(recording, arm)[0, 0, :3, 3]
-    assert np.linalg.norm(lever - links_of(own, arm)[0, 0, :3, 3]) == pytest.approx(0.15, abs=1e-6)
+    levers = [links_of(one.robot, arm, np.arange(12.0))(np.zeros(1))[0, 0, :3, 3] for one in (recording, own)]
+    assert np.linalg.norm(levers[0] - levers[1]) == pytest.approx(0.15, abs=1e-6)
 
 
 def test_what_a_recording_lacks_is_said(armsight, at_rest, tmp_path):

@@ -19,13 +19,12 @@ from scipy.spatial.transform import Rotation
 from worn_arm import worn
 
 from armsight.app.identify.report import headline
-from armsight.app.identify.run import read_measured
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.loop.identify.corrected import Corrected
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
-from armsight.loop.identify.read import read_poses
+from armsight.loop.identify.read import read_measured, read_poses
 from armsight.loop.identify.validate import Errors, Validation
 from armsight.robot.arm_file import open_arm, read_arm_toml
 from armsight.robot.models import MODELS

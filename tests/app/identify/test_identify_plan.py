@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from identify_files import poses_csv
 
-from armsight.app.identify.plan import plan_from
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.plan import plan_joints
 from armsight.robot.arm_file import open_arm
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
@@ -59,7 +59,7 @@ def done_before(rig, T_rig, n, *, points=0):
 def test_a_rig_nearer_than_the_arms_reach_sees_every_planned_pose(away_m, points):
     """The arm reaches 1.3 m: behind cameras 1.1 m away, where nothing is seen and no covariance stands for it."""
     rig, T_rig = rig_in_front(), T_base_rig(away_m)
-    plan, _ = plan_from(open_arm("ur10"), done_before(rig, T_rig, 15, points=points), rig, 3, 0)
+    plan = plan_joints(open_arm("ur10"), done_before(rig, T_rig, 15, points=points), rig, 3, 0)
     assert (np.diff(plan.sigma_m) < 0).all()
     assert seen_by(rig, T_rig, plan.q)[1].all()
 
@@ -71,7 +71,7 @@ def test_poses_that_rotate_the_body_further_away_than_it_was_seen_are_not_planne
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     near = np.flatnonzero(toward[:, 2] > np.cos(np.radians(40)))  # seen from its +z only
     assert len(near) >= 15
-    plan, _ = plan_from(open_arm("ur10"), done.rows(near[:15]), rig, 3, 0)
+    plan = plan_joints(open_arm("ur10"), done.rows(near[:15]), rig, 3, 0)
     T, inside = seen_by(rig, T_rig, plan.q)
     ray = np.einsum("nji,nj->ni", T[:, :3, :3], -T[:, :3, 3])
     assert inside.all()
@@ -86,7 +86,7 @@ def test_a_rig_that_sees_no_pose_of_the_arm_is_reported():
     q = rng.uniform(-1, 1, (15, 6))
     T = inverse(T_away) @ open_arm("ur10").forward(q) @ T_FLANGE_BODY
     with pytest.raises(InputError, match="can be reached and seen"):
-        plan_from(open_arm("ur10"), Measured(q, T[:, None, :3, 3], T[:, :3, :3]), rig, 3, 0)
+        plan_joints(open_arm("ur10"), Measured(q, T[:, None, :3, 3], T[:, :3, :3]), rig, 3, 0)
 
 
 def said(capsys, *arguments):

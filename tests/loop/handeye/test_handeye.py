@@ -5,7 +5,7 @@ from handeye_motions import error, recording
 from scipy.stats import chi2
 
 from armsight.errors import CalibrationError, InputError
-from armsight.geometry.pose import exp_se3, inverse
+from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.loop.handeye import poses as handeye_start
 from armsight.loop.handeye.handeye import calibrate_handeye
 
@@ -48,13 +48,13 @@ def test_the_closed_form_start_is_exact_without_noise():
 
 
 @pytest.mark.opencv
-@pytest.mark.skipif(not hasattr(cv2, "calibrateHandEye"), reason="this OpenCV has no calibrateHandEye")
+@pytest.mark.skipif(not hasattr(cv2, "calibrateRobotWorldHandEye"), reason="this OpenCV has no hand-eye calibration")
 def test_the_own_start_is_as_good_as_opencvs():
     A, B, _, _, _ = recording(2)
-    own = handeye_start.kronecker(A, B)
-    for X_cv, Z_cv in handeye_start._opencv(A, B):
-        assert np.abs(own[0] - X_cv).max() < 0.02
-        assert np.abs(own[1] - Z_cv).max() < 0.02
+    parts = [[T[:3, :3] for T in A], [T[:3, 3] for T in A], [T[:3, :3] for T in B], [T[:3, 3] for T in B]]
+    RX, tX, RZ, tZ = cv2.calibrateRobotWorldHandEye(*parts, method=cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH)
+    for own, R, t in zip(handeye_start.kronecker(A, B), (RX, RZ), (tX, tZ), strict=True):
+        assert np.abs(own - pose(R, t.ravel())).max() < 0.02
 
 
 def test_rotations_about_one_axis_are_rejected():

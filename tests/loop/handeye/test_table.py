@@ -7,7 +7,7 @@ import pytest
 from arm_rig import ARM, MIDDLE, mounts, seen, worn
 
 from armsight.errors import CalibrationError
-from armsight.loop.handeye.poses import require_fitting
+from armsight.loop.identify.misread import require_fitting
 
 JOINT = np.arange(6)
 

@@ -13,14 +13,13 @@ from armsight.estimate.select import Folds
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.identify.backlash import joint_backlashes
 from armsight.loop.identify.corrected import Corrected, table_text
-from armsight.loop.identify.fit import fit, prior_sigma
+from armsight.loop.identify.fit import fit, prior_sigma, with_joint_noise
 from armsight.loop.identify.identify import contributions, identify
-from armsight.loop.identify.joint_noise import with_joint_noise
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import FRICTION_M, Model
 from armsight.loop.identify.observable import observed
 from armsight.loop.identify.placement import with_placement
-from armsight.loop.identify.plan import free_of_collision, plan_poses
+from armsight.loop.identify.plan import free_of_collision, plan_joints
 from armsight.loop.identify.selection import PLACEMENT
 from armsight.loop.identify.validate import validate
 from armsight.robot.arm_file import open_arm
@@ -319,13 +318,12 @@ def test_a_joint_that_lies_anywhere_in_its_backlash_spoils_only_its_own_directio
 def test_planned_poses_inform_more_than_random_ones(scene):
     w, measured, _, _ = scene
     few = measured.rows(np.arange(15))
-    model, x = with_placement(Model.of(w.nominal, few, backlash=True), few)
-    plan = plan_poses(model, x, prior_sigma(model), (1e-4, 5e-4), 12, done=few)
+    plan = plan_joints(w.nominal, few, None, 12, 0)
     assert (np.diff(plan.sigma_m) < 0).all()
     assert plan.sigma_m[12] < plan.random_sigma_m[12]
     assert plan.random_for(12) >= 15
     assert w.nominal.within_limits(plan.q).all()
-    assert free_of_collision(model, plan.q).all()
+    assert free_of_collision(Model.of(w.nominal, few, backlash=True), plan.q).all()
 
 
 def test_poses_all_alike_are_rejected(scene):

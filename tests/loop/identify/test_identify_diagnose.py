@@ -9,8 +9,8 @@ from worn_arm import poses, worn
 
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse
-from armsight.loop.identify.diagnose import check_plausible, find_step, misfit, without_tool
 from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.misread import check_plausible, find_step, points_off, without_tool
 from armsight.loop.identify.read import read_poses
 from armsight.robot.arm_file import open_arm
 from armsight.tables.rotations import ROTATIONS
@@ -70,8 +70,8 @@ def test_a_left_handed_frame_is_reported(name, seed, mirror):
 @pytest.mark.parametrize("name", ARMS)
 def test_the_handedness_is_that_of_the_frame(name):
     w, measured = made(name, 4)
-    right = misfit(without_tool(w.nominal), measured.q, measured.p_rig)
-    left = misfit(without_tool(w.nominal), measured.q, measured.p_rig @ np.diag([1.0, -1, 1]))
+    right = points_off(without_tool(w.nominal), measured.q, measured.p_rig)
+    left = points_off(without_tool(w.nominal), measured.q, measured.p_rig @ np.diag([1.0, -1, 1]))
     assert (left.left, left.right) == pytest.approx((right.right, right.left), rel=1e-6)
     assert left.scale == pytest.approx(right.scale, rel=1e-9)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import click
 
@@ -15,8 +15,9 @@ from armsight.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from armsight.app.handeye.images import Seen
     from armsight.app.handeye.report import HandEyeAnswer
+    from armsight.loop.handeye.handeye import HandEye
+    from armsight.loop.handeye.recording import PairedPoses, Seen
     from armsight.robot.kinematics.arm import Arm
     from armsight.tables.poses import PoseTable
 
@@ -109,8 +110,7 @@ def command(**given: object) -> int:
     blunders, half of them are off by more than 20 mm, or a transform is known no better: the result must not be trusted.
     Forms of tables, and examples: docs/howto/handeye.md.
     """
-    options = _with_both(Options(**given))  # type: ignore[arg-type]
-    _require_one_way(options)
+    options = _checked(Options(**given))  # type: ignore[arg-type]
 
     from armsight.app.handeye.report import handeye_report, plan_csv
     from armsight.app.progress import steps
@@ -134,35 +134,29 @@ def command(**given: object) -> int:
 
 def _columns(options: Options, side: str) -> str | None:
     """Return what --columns says of one table, "robot" or "seen"."""
-    seen = [text.removeprefix("seen:") for text in options.columns if text.startswith("seen:")]
-    robot = [text.removeprefix("robot:") for text in options.columns if not text.startswith("seen:")]
-    return ",".join(robot if side == "robot" else seen) or None
+    parts = [text if text.startswith("seen:") else f"robot:{text.removeprefix('robot:')}" for text in options.columns]
+    return ",".join(text.partition(":")[2] for text in parts if text.startswith(f"{side}:")) or None
 
 
-def _with_both(options: Options) -> Options:
-    """Return the options with the robot's file as that of what was seen, where it holds both and nothing else is given."""
+def _checked(options: Options) -> Options:
+    """Reject options that do not go together; a robot's file that holds both sides is that of what was seen, too."""
     from armsight.tables.nested import has_both
 
     given = (options.seen, options.images, options.camera, options.rig, options.left, options.right, options.source)
-    return replace(options, seen=options.robot) if not any(given) and has_both(options.robot) else options
-
-
-def _require_one_way(options: Options) -> None:
-    """Reject options that do not go together."""
-    from armsight.tables.nested import has_both
-
+    if not any(given) and has_both(options.robot):
+        options = replace(options, seen=options.robot)
     ways = {
         "--seen": options.seen is not None,
         "--images with --camera": options.images is not None or options.camera is not None,
-        _BY_RIG: any(given is not None for given in (options.rig, options.left, options.right, options.source)),
+        _BY_RIG: any(given[3:]),
     }
+    pair = (options.left, options.right)
     if options.seen is not None and options.seen.resolve() == options.robot.resolve() and not has_both(options.robot):
         raise InputError(f"{options.seen}: one file for both: --robot has the arm's poses, --seen what the camera saw")
     if sum(ways.values()) != 1:
-        raise InputError(f"give what the camera saw in one way: {', or '.join(ways)}")
+        raise InputError(f"give what the camera saw in one way: {', '.join(ways)}")
     if (options.images is None) != (options.camera is None):
         raise InputError("--images and --camera belong together: --camera CAMERA.json, or --camera fit")
-    pair = (options.left, options.right)
     if ways[_BY_RIG] and (options.rig is None or (any(pair) if options.source is not None else not all(pair))):
         raise InputError("--rig, --left and --right belong together, or --rig and --source")
     if options.seen is None and options.target is None:
@@ -171,6 +165,7 @@ def _require_one_way(options: Options) -> None:
         raise InputError(
             "--streams needs times: --seen, a table of the target's poses with t_s, or --source, a recording"
         )
+    return options
 
 
 def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswer:
@@ -179,137 +174,118 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
     Raises:
         ArmsightError: the input is wrong, or the motions leave a direction open.
     """
-    from armsight.app.handeye.plan import plan_poses
-    from armsight.app.handeye.recording import at_shots, links_of, paired, recording_of, robot_in_recording
+    import numpy as np
+
     from armsight.app.handeye.report import HandEyeAnswer
-    from armsight.app.handeye.suspect import require_plausible
     from armsight.loop.handeye.handeye import calibrate_poses
+    from armsight.loop.handeye.recording import at_shots, links_of, paired, recording_of, robot_in_recording
+    from armsight.loop.identify.misread import require_plausible
+    from armsight.loop.identify.plan import plan_mounting
     from armsight.robot.arm_file import open_arm
-    from armsight.tables.poses import read_pose_table
 
     progress("reading")
     arm = None if options.model is None else open_arm(options.model)
     bag = recording_of(options.robot)
-    if bag is not None:
-        for name in ("rotation", "units", "columns"):
-            if getattr(options, name):
-                raise InputError(f"{options.robot}: a recording: --{name} belongs to tables")
-        robot = robot_in_recording(bag, options.frames, arm)
-    elif options.frames is not None:
+    if bag is None and options.frames is not None:
         raise InputError(f"{options.robot}: a table: --frames belongs to recordings (bag:FILE)")
-    else:
-        robot = read_pose_table(
-            options.robot,
-            rotation=options.rotation,
-            unit=options.units,
-            detect_units=options.detect_units,
-            columns=_columns(options, "robot"),
-            arm=arm,
-        )
+    for name in ("rotation", "units", "columns") if bag is not None else ():
+        if getattr(options, name):
+            raise InputError(f"{options.robot}: a recording: --{name} belongs to tables")
+    robot = _table(options, "robot", arm) if bag is None else robot_in_recording(bag, options.frames, arm)
     seen = _seen(options, progress)
+    offset_s, sigma_s = None, 0.0
     if options.streams:
-        return _streams(options, robot, seen, arm, progress)
-    if bag is not None:
-        robot = at_shots(robot, seen)
-    recording = paired(robot, seen, options.eye == "in-hand", arm)
-    progress("looking at whether both sides fit")
-    recording = require_plausible(recording, arm, detect_units=options.detect_units, scale=options.scale)
-    links = None if arm is None else links_of(recording, arm)
-    found = calibrate_poses(recording.poses, t_s=recording.t_s, links=links, scale=options.scale, progress=progress)
+        recording, found, offset_s, sigma_s = _streams(options, robot, seen, arm, progress)
+    else:
+        robot = robot if bag is None else at_shots(robot, seen)
+        recording = paired(robot, seen, options.eye == "in-hand", arm)
+        progress("looking at whether both sides fit")
+        recording = require_plausible(recording, arm, detect_units=options.detect_units, scale=options.scale)
+        links_at = links_of(recording.robot, arm, np.arange(len(robot.Ts), dtype=float))
+        links = None if links_at is None else links_at(recording.rows.astype(float))
+        found = calibrate_poses(recording.poses, t_s=recording.t_s, links=links, scale=options.scale, progress=progress)
     progress("choosing poses")
-    plan = plan_poses(found, recording.poses, options.plan) if options.plan else None
-    return HandEyeAnswer(recording, found, None, 0.0, plan)
+    plan = plan_mounting(found, recording.poses, options.plan) if options.plan else None
+    return HandEyeAnswer(recording, found, offset_s, sigma_s, plan)
+
+
+def _table(options: Options, side: str, arm: Arm | None = None) -> PoseTable:
+    """Read a table, of the side "robot" or "seen"."""
+    from armsight.tables.poses import read_pose_table
+
+    robot = side == "robot" or options.seen is None
+    robot = side == "robot"
+    return read_pose_table(
+        options.robot if robot or options.seen is None else options.seen,
+        rotation=options.rotation if robot else options.seen_rotation,
+        unit=options.units if robot else options.seen_units,
+        detect_units=options.detect_units,
+        columns=_columns(options, side),
+        arm=arm,
+        side=side,
+    )
 
 
 def _seen(options: Options, progress: Callable[[str], None]) -> Seen:
     """Read or measure the poses of the target."""
     from armsight.app.handeye.images import see_with_camera, see_with_rig
-    from armsight.app.handeye.recording import seen_in_table
-    from armsight.tables.poses import read_pose_table
+    from armsight.loop.handeye.recording import seen_in_table
     from armsight.vision.sources import PairsSource, Source, open_source
 
-    if options.seen is not None:
-        table = read_pose_table(
-            options.seen,
-            rotation=options.seen_rotation,
-            unit=options.seen_units,
-            detect_units=options.detect_units,
-            columns=_columns(options, "seen"),
-            side="seen",
-        )
-        return seen_in_table(table)
     target = str(options.target)
+    if options.seen is not None:
+        return seen_in_table(_table(options, "seen"))
     if options.images is not None:
         return see_with_camera(options.images, str(options.camera), target, progress)
     assert options.rig is not None
-    if options.source is not None:
-        source: Source = open_source(options.source)
-    else:
-        source = PairsSource.open(str(options.left), str(options.right))
+    by_globs = options.source is None
+    source: Source = (
+        PairsSource.open(str(options.left), str(options.right)) if by_globs else open_source(str(options.source))
+    )
     with contextlib.closing(source):
         return see_with_rig(options.rig, source, target, progress)
 
 
 def _streams(
     options: Options, robot: PoseTable, seen: Seen, arm: Arm | None, progress: Callable[[str], None]
-) -> HandEyeAnswer:
-    """Calibrate two streams with an unknown clock offset."""
+) -> tuple[PairedPoses, HandEye, float, float]:
+    """Calibrate two streams with an unknown clock offset; return it and its sigma, s, too."""
     import numpy as np
 
-    from armsight.app.handeye.images import steady
-    from armsight.app.handeye.plan import plan_poses
-    from armsight.app.handeye.recording import links_between, of_streams
-    from armsight.app.handeye.report import HandEyeAnswer
-    from armsight.app.handeye.suspect import require_plausible, resized
     from armsight.loop.handeye.poses import MIN_POSES
+    from armsight.loop.handeye.recording import links_of, of_streams, steady
     from armsight.loop.handeye.streams import PoseStream, calibrate_streams, coarse_offset
+    from armsight.loop.identify.misread import require_plausible, resized
 
-    for path, t_s in ((options.robot, robot.t_s), (options.seen or options.source, seen.t_s)):
+    eye_path, in_hand = options.seen or options.source, options.eye == "in-hand"
+    for path, t_s in ((options.robot, robot.t_s), (eye_path, seen.t_s)):
         if t_s is None:
             raise InputError(f"{path}: --streams needs times: a column t_s in line 1, seconds, or a recording")
     assert robot.t_s is not None
     assert seen.t_s is not None
     shown = np.array([not why for why in seen.missed])
     names = tuple(name for name, why in zip(seen.names, seen.missed, strict=True) if not why)
-    t_s = seen.t_s[shown]
-    seen = replace(
-        seen,
-        Ts=steady(seen.Ts[shown], seen.symmetries),
-        covs=seen.covs[shown],
-        names=names,
-        missed=("",) * len(names),
-        t_s=t_s,
-    )
-    hand = PoseStream.of(robot.t_s, robot.Ts, str(options.robot))
-    eye_stream = PoseStream.of(t_s, seen.Ts, str(options.seen or options.source))
-    eye: Literal["in_hand", "to_hand"] = "in_hand" if options.eye == "in-hand" else "to_hand"
+    Ts, t_s = steady(seen.Ts[shown], seen.symmetries), seen.t_s[shown]
+    seen = replace(seen, Ts=Ts, covs=seen.covs[shown], names=names, missed=("",) * len(names), t_s=t_s)
+    hand, eye = PoseStream.of(robot.t_s, robot.Ts, str(options.robot)), PoseStream.of(t_s, seen.Ts, str(eye_path))
     notes = (*robot.notes, *seen.notes)
     progress("looking at whether both sides fit")
-    roughly_s = coarse_offset(hand, eye_stream)
-    A, there = hand.at(eye_stream.t_s + roughly_s)
+    roughly_s = coarse_offset(hand, eye)
+    A, there = hand.at(eye.t_s + roughly_s)
     if there.sum() >= MIN_POSES:
-        pairs = of_streams(
-            robot, seen, (A[there], eye_stream.Ts[there]), eye_stream.t_s[there], roughly_s, eye == "in_hand"
-        )
+        pairs = of_streams(robot, seen, (A[there], eye.Ts[there]), eye.t_s[there], roughly_s, in_hand)
         checked = require_plausible(pairs, arm, detect_units=options.detect_units, scale=options.scale, streams=True)
-        notes = checked.notes
-        hand, eye_stream = (
-            replace(stream, Ts=resized(stream.Ts, before, after))
-            for stream, before, after in (
-                (hand, pairs.poses.A, checked.poses.A),
-                (eye_stream, pairs.poses.B, checked.poses.B),
-            )
-        )
+        notes, before, after = checked.notes, pairs.poses, checked.poses
+        hand = replace(hand, Ts=resized(hand.Ts, before.A, after.A))
+        eye = replace(eye, Ts=resized(eye.Ts, before.B, after.B))
     found = calibrate_streams(
         hand,
-        eye_stream,
-        eye=eye,
+        eye,
+        eye="in_hand" if in_hand else "to_hand",
         centre=seen.centre,
         scale=options.scale,
-        links_at=None if arm is None else links_between(robot, arm),
+        links_at=links_of(robot, arm, robot.t_s),
         progress=progress,
     )
-    recording = of_streams(robot, seen, (found.A, found.B), found.t_s, found.offset_s, eye == "in_hand")
-    recording = replace(recording, notes=notes)
-    plan = plan_poses(found.handeye, recording.poses, options.plan) if options.plan else None
-    return HandEyeAnswer(recording, found.handeye, found.offset_s, found.sigma_offset_s, plan)
+    recording = of_streams(robot, seen, (found.A, found.B), found.t_s, found.offset_s, in_hand)
+    return replace(recording, notes=notes), found.handeye, found.offset_s, found.sigma_offset_s

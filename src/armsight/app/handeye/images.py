@@ -7,21 +7,18 @@ covariance from the pixels' scatter over all images; the camera may be calibrate
 from __future__ import annotations
 
 import glob
-import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from armsight.data import Array, Detections, Missed, Record
+from armsight.data import Array, Detections, Missed
 from armsight.errors import InputError
-from armsight.geometry.pose import exp_se3, transform
-from armsight.geometry.rotation import skew
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import nearest_rotation
 from armsight.loop.handeye.poses import LEVER_M
-from armsight.tables.poses import PoseTable
+from armsight.loop.handeye.recording import Seen
 from armsight.vision.camera import Camera
 from armsight.vision.camera_file import read_camera
 from armsight.vision.image import grey, read_image
@@ -31,46 +28,15 @@ from armsight.vision.markers.targets import open_target
 from armsight.vision.pose.locate import by_rig
 from armsight.vision.pose.measure import measure
 from armsight.vision.pose.pnp import body_poses
+from armsight.vision.pose.posefit import PixelObservations, fit_pose
 from armsight.vision.rig import StereoRig
 from armsight.vision.source import Source
+from armsight.vision.sources.pairs import natural_key
 
-#: Steps of the refinement of a pose, and the change, m and rad, below which it has settled.
-STEPS, SETTLED = 20, 1e-10
-#: Fewest images to calibrate a camera from.
+#: Fewest images to calibrate a camera from; half: a camera of two views, double: sets of eight are rejected.
 MIN_IMAGES = 5
 #: Errors of the rig that do less than this part of what its largest one does, or of this, m, are nothing.
 COMMON, LEAST_COMMON_M = 1e-2, 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class Seen(Record):
-    """Poses of the target.
-
-    Attributes:
-        Ts: (N, 4, 4) T_rig_body, m; where the target was not found, the identity.
-        covs: (N, 6, 6) their covariance, right tangent; zero where it is not known.
-        names: of the images.
-        missed: (N,) why there is no pose; "" where there is one.
-        t_s: (N,) times, s; None where there are none.
-        centre: (3,) the middle of the target's points, body frame, m.
-        symmetries: motions (4, 4) of the body that change nothing to see.
-        scatter_px: RMS of the reprojection; 0 where there are no images.
-        notes: what was found out.
-        common: (N, 6, K) what K independent errors of the rig of one sigma do to the poses; None where unknown.
-        table: the table that the poses are from; None where they are from images.
-    """
-
-    Ts: Array
-    covs: Array
-    names: tuple[str, ...]
-    missed: tuple[str, ...]
-    t_s: Array | None
-    centre: Array
-    symmetries: tuple[Array, ...] = ()
-    scatter_px: float = 0.0
-    notes: tuple[str, ...] = ()
-    common: Array | None = None
-    table: PoseTable | None = None
 
 
 def see_with_camera(
@@ -87,14 +53,13 @@ def see_with_camera(
     Raises:
         InputError: no such images, of another size than the camera's, or hardly one with the target.
     """
-    files = sorted(map(Path, glob.glob(str(Path(pattern).expanduser()))), key=_natural)
+    files = sorted(map(Path, glob.glob(str(Path(pattern).expanduser()))), key=natural_key)
     if not files:
         raise InputError(f"{pattern}: no such images; quote the glob")
     if len(files) == 1 and files[0].is_dir():
         raise InputError(f"{pattern}: a folder; give a glob of its images, quoted: '{files[0]}/*.png'")
-    found = open_target(target)
+    found, detections = open_target(target), list[Detections]()
     camera = None if camera_file == "fit" else read_camera(Path(camera_file))
-    detections: list[Detections] = []
     size: tuple[int, int] | None = None if camera is None else camera.image_size_px
     for file in files:
         progress(f"reading {file.name}")
@@ -114,11 +79,6 @@ def see_with_camera(
         )
     assert camera is not None
     return _posed(found, camera, detections, files, notes)
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Return a key that sorts image2 before image10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def fit_camera(target: Target, detections: Sequence[Detections], size: tuple[int, int]) -> Camera:
@@ -146,25 +106,22 @@ def _posed(
     points = target.body.points
     Ts, informations, missed, squares, count = [], [], [], 0.0, 0
     for d in detections:
-        candidates = body_poses(points[d.ids], camera, d.uv) if len(d.ids) >= 4 else []
-        if not candidates:
-            Ts.append(np.eye(4))
-            informations.append(np.eye(6))
-            missed.append(d.problem or "its points do not determine a pose")
-            continue
-        refined = [_refined(points[d.ids], camera, T, d.uv) for T, _ in candidates[:2]]
-        T, H, left = min(refined, key=lambda one: one[2])
-        Ts.append(T)
-        informations.append(H)
-        missed.append("")
-        squares, count = squares + left, count + 2 * len(d.ids) - 6
+        p, n = points[d.ids], len(d.ids)
+        seen = PixelObservations(np.zeros(n, np.int64), np.arange(n), d.uv, np.tile(np.eye(2), (n, 1, 1)))
+        candidates = body_poses(p, camera, d.uv) if n >= 4 else []
+        fits = (fit_pose((camera, camera), np.eye(4), p, seen, T, robust=False) for T, _ in candidates[:2])
+        best = min((fit for fit in fits if fit is not None), key=lambda fit: fit.cost, default=None)
+        Ts.append(np.eye(4) if best is None else best.T_left_body)
+        informations.append(np.eye(6) if best is None else best.information)
+        missed.append((d.problem or "its points do not determine a pose") if best is None else "")
+        if best is not None:
+            squares, count = squares + best.cost, count + 2 * n - 6
     if count == 0:
         raise InputError(f"the target was found in none of {len(files)} images ({missed[0]}): is --target right?")
     variance = squares / count
-    covs = np.array([np.linalg.inv(H) * variance for H in informations])
     return Seen(
         np.array(Ts),
-        covs,
+        np.linalg.inv(np.array(informations)) * variance,
         tuple(file.name for file in files),
         tuple(missed),
         None,
@@ -175,33 +132,14 @@ def _posed(
     )
 
 
-def _refined(p: Array, camera: Camera, T: Array, uv: Array) -> tuple[Array, Array, float]:
-    """Return the pose of least reprojection error, its information per px^2, and the sum of squares, px^2."""
-    by_body = np.concatenate([np.broadcast_to(np.eye(3), (len(p), 3, 3)), -skew(p)], axis=2)
-    H = np.eye(6)
-    e = np.zeros_like(uv)
-    for _ in range(STEPS):
-        at, J_p, _ = camera.project_jacobians(transform(T, p))
-        e, J = at - uv, J_p @ T[:3, :3] @ by_body
-        H = np.einsum("nki,nkj->ij", J, J)
-        step = -np.linalg.solve(H, np.einsum("nki,nk->i", J, e))
-        T = T @ exp_se3(step)
-        if np.abs(step).max() < SETTLED:
-            break
-    return T, H, float((e**2).sum())
-
-
 def _motions(target: Target) -> tuple[Array, ...]:
     """Return the motions of the body under which it looks the same."""
-    p = target.body.points
+    p, middle = target.body.points, target.body.points.mean(axis=0)
     out = []
     for permutation in target.symmetries:
         q = p[permutation]
-        U, _, Vt = np.linalg.svd((p - p.mean(axis=0)).T @ (q - q.mean(axis=0)))
-        R = Vt.T @ np.diag([1.0, 1.0, np.linalg.det(Vt.T @ U.T)]) @ U.T
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, q.mean(axis=0) - R @ p.mean(axis=0)
-        out.append(T)
+        R = nearest_rotation((q - q.mean(axis=0)).T @ (p - middle))
+        out.append(pose(R, q.mean(axis=0) - R @ middle))
     return tuple(out)
 
 
@@ -232,9 +170,9 @@ def see_with_rig(
             covs.append(np.eye(6))
             missed.append(result.reason)
             continue
+        by[len(Ts)] = by_rig(result)
         Ts.append(result.T_left_body)
         covs.append(result.cov_noise)
-        by[len(Ts) - 1] = by_rig(result)
         missed.append("")
         shown.append(result.points.ids)
         squares.append(result.reprojection_rms_px**2)
@@ -257,12 +195,9 @@ def see_with_rig(
 
 
 def _common(cov: Array, by: dict[int, Array], count: int) -> Array | None:
-    """Return what the independent errors of a rig of one sigma do to the poses (N, 6, K); None where they do nothing.
+    """Return what the independent errors of a rig of one sigma do to N poses (N, 6, K); None where they do nothing.
 
-    Args:
-        cov: (P, P) covariance of the rig's parameters.
-        by: pose -> (6, P) its derivative by them.
-        count: N; poses that are missing are zero.
+    ``by`` has the poses' derivatives (6, P) by the rig's parameters; poses that are missing are zero.
     """
     values, vectors = np.linalg.eigh(cov)
     J = np.zeros((count, 6, len(cov)))
@@ -272,54 +207,3 @@ def _common(cov: Array, by: dict[int, Array], count: int) -> Array | None:
     _, s, Vt = np.linalg.svd((sizes * J).reshape(-1, J.shape[2]), full_matrices=False)
     kept = s > COMMON * max(float(s[0]), LEAST_COMMON_M)
     return np.asarray(J @ Vt[kept].T) if kept.any() else None
-
-
-def upright(A: Array, B: Array, symmetries: tuple[Array, ...], in_hand: bool) -> tuple[Array, NDArray[np.int64]]:
-    """Decide which way up a board was that looks the same rotated: angles between poses are the same on both sides.
-
-    Args:
-        A: (N, 4, 4) poses of the flange.
-        B: (N, 4, 4) poses of the body, some of them rotated by a symmetry.
-        symmetries: the motions of the body that change nothing to see.
-        in_hand: whether the eye is in the hand.
-
-    Returns:
-        B with the rotated ones rotated back to agree with the first, and which symmetry was used, -1 for none.
-    """
-    choices = [np.eye(4), *symmetries]
-    options = np.stack([B @ S for S in choices])  # (S, N, 4, 4)
-    RA = A[:, :3, :3]
-    angle_A = _angles(np.swapaxes(RA, 1, 2)[:, None] @ RA[None])
-    chosen = np.zeros(len(A), np.int64)
-    for _ in range(20):
-        R = options[chosen, np.arange(len(A))][:, :3, :3]
-        costs = []
-        for option in options[:, :, :3, :3]:
-            if in_hand:  # A_i X B_i = Z: relative rotations of B_i^-1
-                angle_B = _angles(option[:, None] @ np.swapaxes(R, 1, 2)[None])
-            else:
-                angle_B = _angles(np.swapaxes(option, 1, 2)[:, None] @ R[None])
-            costs.append(np.abs(angle_B - angle_A).sum(axis=1))
-        cost = np.array(costs)
-        gain = cost[chosen, np.arange(len(A))] - cost.min(axis=0)
-        gain[0] = 0.0
-        worst = int(np.argmax(gain))
-        if gain[worst] < 1e-6:
-            break
-        chosen[worst] = int(np.argmin(cost[:, worst]))
-    return np.asarray(options[chosen, np.arange(len(A))]), chosen - 1
-
-
-def steady(B: Array, symmetries: tuple[Array, ...]) -> Array:
-    """Return poses B (N, 4, 4) of a stream, each rotated by the symmetry (4, 4) that is nearest to the pose before it."""
-    out = B.copy()
-    choices = np.stack([np.eye(4), *symmetries])
-    for k in range(1, len(B)):
-        options = B[k] @ choices
-        out[k] = options[int(np.argmin(_angles(out[k - 1, :3, :3].T @ options[:, :3, :3])))]
-    return out
-
-
-def _angles(R: Array) -> Array:
-    """Return the angles of rotations (..., 3, 3), rad."""
-    return np.asarray(np.arccos(np.clip((np.trace(R, axis1=-2, axis2=-1) - 1) / 2, -1, 1)))

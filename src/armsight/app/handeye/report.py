@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from armsight.app.handeye.plan import PosePlan, worst_sigmas
-from armsight.app.handeye.recording import PairedPoses
 from armsight.app.show.messages import Note
 from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, new_figure
-from armsight.app.show.report import Block, Fact, Lines, Report, Section, figures
+from armsight.app.show.report import Block, Fact, Grade, Lines, Report, Section, figures
 from armsight.app.show.table import TextTable
-from armsight.data import Record
+from armsight.data import Array, Record
 from armsight.geometry.pose import inverse, log_se3, mean_pose, transform
 from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye
+from armsight.loop.handeye.recording import PairedPoses
 from armsight.loop.handeye.sources import OF_THE_ARM
+from armsight.loop.identify.plan import MountingPlan, worst_sigmas
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 _MANY = 0.25
 #: Sources whose mean log density of a pose left out is within this of the best are not distinguished from them.
 DISTINGUISHED = 0.2
+#: Fewer poses than these are few, and so many more are advised then.
+ADVISED, MORE = 15, 6
 _POSE = ("x, mm", "y, mm", "z, mm", "rx, deg", "ry, deg", "rz, deg")
 
 
@@ -45,7 +47,7 @@ class HandEyeAnswer(Record):
     found: HandEye
     offset_s: float | None
     sigma_offset_s: float
-    plan: PosePlan | None
+    plan: MountingPlan | None
 
 
 def names(run: HandEyeAnswer) -> tuple[str, str]:
@@ -119,7 +121,21 @@ def handeye_report(run: HandEyeAnswer) -> Report:
         sections,
         [*(Note("untrusted", each) for each in why), *(Note("note", each) for each in run.recording.notes)],
         values,
+        assessed=assess(run, why),
     )
+
+
+def assess(run: HandEyeAnswer, why: list[str]) -> tuple[Grade, str]:
+    """Return the grade of a calibration, and in one sentence what to do with it; ``why`` it must not be trusted."""
+    found, position_m = run.found, run.found.held_out.rms()[0]
+    used, (worst_m, _) = int(found.used.sum()), worst_sigmas(found.cov)
+    if why:
+        return "poor", "Do not use this calibration; do what is said above, and calibrate again."
+    said = f"{used} poses, those left out are off by {1e3 * position_m:.2f} mm, {names(run)[0]} is known to"
+    said += f" {1e3 * worst_m:.2f} mm"
+    if worst_m > position_m or used < ADVISED:
+        return "fair", f"Usable: {said} along its worst axis; more poses lower that: --plan {MORE} chooses them."
+    return "good", f"Good: {said}; leave camera and tool as they are mounted."
 
 
 def _with_sigma(value: float, sigma: float, decimals: int) -> str:
@@ -136,9 +152,8 @@ def _transforms_table(run: HandEyeAnswer) -> TextTable:
     rows = []
     for name, T, s in zip(names(run), (found.T_flange_held, found.T_base_still), (sigma[6:], sigma[:6]), strict=True):
         along = np.sqrt(np.square(T[:3, :3]) @ np.square(s[:3]))  # the tangent's sigmas are along its own axes
-        angles = Rotation.from_matrix(np.array(T[:3, :3])).as_euler("xyz", degrees=True)
         cells = [_with_sigma(1e3 * v, 1e3 * e, 2) for v, e in zip(T[:3, 3], along, strict=True)]
-        cells += [_with_sigma(v, np.degrees(e), 3) for v, e in zip(angles, s[3:], strict=True)]
+        cells += [_with_sigma(v, np.degrees(e), 3) for v, e in zip(_angles_deg(T), s[3:], strict=True)]
         rows.append((name, *cells))
     return TextTable("angles: xyz about fixed axes; ± sigma", ("", *_POSE), tuple(rows))
 
@@ -268,39 +283,40 @@ def _untrusted(run: HandEyeAnswer) -> list[str]:
     return why
 
 
-def _plan(plan: PosePlan, names: tuple[str, ...], structure: str) -> list[Block]:
+def _plan(plan: MountingPlan, names: tuple[str, ...], structure: str) -> list[Block]:
     """Return the next poses; names are those of the poses that were taken."""
-    values = {
-        "T_base_flange": plan.Ts_base_flange,
-        "sigma_m": plan.sigma_m,
-        "sigma_rad": plan.sigma_rad,
-        "nearest": [names[k] for k in plan.nearest],
-        "rotated_from_nearest_rad": plan.rotated_rad,
-        "moved_from_nearest_m": plan.moved_m,
-        "lowers_most": plan.reasons,
-    }
-    bounds = f"these sigmas are lower bounds: with {structure} new poses share errors with the others"
-    return [_plan_table(plan, names), Fact("" if structure == "robot and camera" else bounds, {"plan": values})]
-
-
-def _plan_table(plan: PosePlan, names: tuple[str, ...]) -> TextTable:
-    """Return the next poses as a table for people; names are those of the poses that were taken."""
-    rows = []
-    for k, (T, m, rad) in enumerate(zip(plan.Ts_base_flange, plan.sigma_m, plan.sigma_rad, strict=True), 1):
-        p, angles = 1e3 * T[:3, 3], Rotation.from_matrix(np.array(T[:3, :3])).as_euler("xyz", degrees=True)
-        values = [*(f"{v:.1f}" for v in p), *(f"{v:.1f}" for v in angles), f"{1e3 * m:.2f}", f"{np.degrees(rad):.3f}"]
-        far = f"{np.degrees(plan.rotated_rad[k - 1]):.0f} deg, {1e3 * plan.moved_m[k - 1]:.0f} mm"
-        rows.append((str(k), *values, f"{far} from {names[plan.nearest[k - 1]]}", plan.reasons[k - 1]))
-    head = ("next", *_POSE, "sigma, mm", "deg", "near", "lowers most")
+    near, rows = [names[k] for k in plan.nearest], []
+    for k, T in enumerate(plan.Ts_base_flange):
+        cells = [f"{v:.1f}" for v in (*1e3 * T[:3, 3], *_angles_deg(T))]
+        cells += [f"{1e3 * plan.sigma_m[k]:.2f}", f"{np.degrees(plan.sigma_rad[k]):.3f}"]
+        far = f"{np.degrees(plan.rotated_rad[k]):.0f} deg, {1e3 * plan.moved_m[k]:.0f} mm"
+        rows.append((str(k + 1), *cells, f"{far} from {near[k]}", plan.reasons[k]))
     title = (
         f"poses of the flange to take next (sigma along the worst axis now {1e3 * plan.before[0]:.2f} mm, "
         f"{np.degrees(plan.before[1]):.3f} deg); each is near one that was taken, with the target in view; check that your "
         "arm reaches them freely"
     )
-    return TextTable(title, head, tuple(rows))
+    values = {
+        "T_base_flange": plan.Ts_base_flange,
+        "sigma_m": plan.sigma_m,
+        "sigma_rad": plan.sigma_rad,
+        "nearest": near,
+        "rotated_from_nearest_rad": plan.rotated_rad,
+        "moved_from_nearest_m": plan.moved_m,
+        "lowers_most": plan.reasons,
+    }
+    bounds = f"these sigmas are lower bounds: with {structure} new poses share errors with the others"
+    head = ("next", *_POSE, "sigma, mm", "deg", "near", "lowers most")
+    fact = Fact("" if structure == "robot and camera" else bounds, {"plan": values})
+    return [TextTable(title, head, tuple(rows)), fact]
 
 
-def plan_csv(plan: PosePlan) -> str:
+def _angles_deg(T: Array) -> Array:
+    """Return the angles (3,) of a pose about the fixed x, y and z, degrees."""
+    return np.asarray(Rotation.from_matrix(np.array(T[:3, :3])).as_euler("xyz", degrees=True))
+
+
+def plan_csv(plan: MountingPlan) -> str:
     """Return the next poses as a table that the command reads."""
     lines = ["x_m,y_m,z_m,qw,qx,qy,qz"]
     for T in plan.Ts_base_flange:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import time
 from contextlib import nullcontext
+from math import degrees
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -13,6 +15,9 @@ from armsight.app.arm_option import arm_option
 from armsight.errors import InputError
 from armsight.files import check_writable, write_text
 from armsight.tables.rotations import ROTATIONS
+
+if TYPE_CHECKING:
+    from armsight.loop.identify.plan import Plan
 
 
 @click.group("identify", invoke_without_command=True)
@@ -79,9 +84,10 @@ def command(
         raise InputError("give --arm and --data: armsight identify --arm ur10 --data poses.csv -o corrected/")
 
     from armsight.app.identify.report import identify_report, write_results
-    from armsight.app.identify.run import FILES, read_measured, results_in, run_identify
+    from armsight.app.identify.run import FILES, results_in, run_identify
     from armsight.app.progress import steps
     from armsight.app.show.plotting import require_matplotlib
+    from armsight.loop.identify.read import read_measured
     from armsight.robot.arm_file import open_arm, split_arm
 
     arm = open_arm(arm_name)
@@ -142,8 +148,8 @@ def plan(
             raise InputError(f"{output}: poses are written as .csv; name it so")
         check_writable(output, apart_from=(data, rig))
 
-    from armsight.app.identify.plan import plan_csv, plan_from, plan_json, plan_text
     from armsight.app.progress import steps
+    from armsight.loop.identify.plan import plan_joints
     from armsight.loop.identify.read import read_poses
     from armsight.robot.arm_file import open_arm
     from armsight.vision.rig import StereoRig
@@ -151,15 +157,43 @@ def plan(
     with steps() as progress:
         progress("choosing poses")
         done = None if data is None else read_poses(data).measured
-        chosen, _ = plan_from(open_arm(arm_name), done, None if rig is None else StereoRig.load(rig), count, seed)
+        chosen = plan_joints(open_arm(arm_name), done, None if rig is None else StereoRig.load(rig), count, seed)
     if output is not None:
-        write_text(output, plan_csv(chosen))
+        write_text(output, _plan_csv(chosen))
     if as_json:
-        click.echo(json.dumps(plan_json(chosen)))
+        keys = {"q_rad": chosen.q, "approach": chosen.approach, "sigma_m": chosen.sigma_m}
+        click.echo(json.dumps({k: v.tolist() for k, v in (keys | {"random_sigma_m": chosen.random_sigma_m}).items()}))
     else:
-        click.echo(plan_text(chosen))
+        click.echo("\n".join(_plan_lines(chosen)))
         if output is not None:
             click.echo(f"\nwritten: {output}")
+
+
+def _plan_lines(plan: Plan) -> list[str]:
+    """Return the predicted error after so many poses, then the poses, deg, as text."""
+    n = len(plan.q)
+    lines = ["predicted error of the tool over the workspace, RMS:"]
+    for k in sorted({0, n // 4, n // 2, 3 * n // 4, n}):
+        compared = f"more than {len(plan.random_sigma_m) - 1} at random would do"
+        if random := plan.random_for(k):
+            compared = f"as good as {random} at random"
+        lines.append(f"  after {k:3d} more poses {1e3 * plan.sigma_m[k]:9.3f} mm" + (f"  ({compared})" if k else ""))
+    lines.append(
+        "joints, deg; approach each from the side given (+: its angle increases), over the last half degree in 1 to 2 s:"
+    )
+    for k, (q, sides) in enumerate(zip(plan.q, plan.approach, strict=True), 1):
+        angles = (f"{degrees(v):9.2f} {'+' if s > 0 else '-'}" for v, s in zip(q, sides, strict=True))
+        lines.append(f"  {k:3d} {''.join(angles)}")
+    return lines
+
+
+def _plan_csv(plan: Plan) -> str:
+    """Return the poses as CSV: joint angles, and the direction of approach of each."""
+    joints = range(1, plan.q.shape[1] + 1)
+    rows = [[*(f"q{i}_rad" for i in joints), *(f"approach{i}" for i in joints), "sigma_after_mm"]]
+    for q, sides, sigma in zip(plan.q, plan.approach, plan.sigma_m[1:], strict=True):
+        rows.append([*(f"{v:.6f}" for v in q), *(f"{v:.0f}" for v in sides), f"{1e3 * sigma:.4f}"])
+    return "".join(f"{','.join(row)}\n" for row in rows)
 
 
 def _priors(texts: tuple[str, ...]) -> dict[str, float]:

@@ -22,7 +22,7 @@ from armsight.geometry.rotation import exp_so3
 from armsight.loop.delay import MIN_MEASUREMENTS, estimate_delay
 from armsight.loop.estimators import Delay, Mounting, Prior
 from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, calibrate_handeye, require_known
-from armsight.loop.handeye.poses import require_fitting
+from armsight.loop.identify.misread import require_fitting
 from armsight.loop.sync_led import with_led
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import point_to_point

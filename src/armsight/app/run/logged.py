@@ -28,8 +28,8 @@ from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators import Mounting
 from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, calibrate_handeye, require_known
-from armsight.loop.identify.diagnose import check_plausible, without_tool
 from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.misread import check_plausible, without_tool
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.markers.marker import Target
 from armsight.vision.pose.measure import measure

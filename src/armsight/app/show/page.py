@@ -50,6 +50,7 @@ table.headline { font-weight: 400; font-size: .95rem; }
 table.prose th { font-weight: 400; } table.prose td { min-width: 18rem; }
 table.numbers tbody th { white-space: nowrap; } table.numbers thead th { overflow-wrap: normal; }
 table.numbers td { font-variant-numeric: tabular-nums; } td.number { white-space: nowrap; }
+summary { cursor: pointer; color: #2b6cb0; margin: .6rem 0; }
 figure { margin: 0 0 1rem; } figure img { width: 100%; height: auto; display: block; }
 figcaption { background: var(--soft); padding: .6rem 1.1rem; margin-top: .6rem; font-size: .95rem; }
 figcaption p { margin: .3rem 0; }
@@ -87,6 +88,11 @@ def bullets(lines: Iterable[str]) -> str:
     """Return a list of plain lines, escaped; nothing where there are none."""
     items = "".join(f"<li>{text(line)}</li>\n" for line in lines)
     return f"<ul>{items}</ul>\n" if items else ""
+
+
+def folded(summary: str, body: str) -> str:
+    """Return HTML that is shown when a reader asks for it, under one line of plain text; nothing where there is none."""
+    return f"<details><summary>{text(summary)}</summary>\n{body}</details>\n" if body else ""
 
 
 def picture(data: bytes, description: str, *, kind: str = "png", attributes: str = "") -> str:

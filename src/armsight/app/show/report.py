@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -66,12 +66,14 @@ class Plot:
         draw: plots it; None where there is nothing to plot.
         caption: HTML.
         description: for who cannot see it.
+        folded: whether it stands beneath its description until a reader asks for it.
     """
 
     name: str
     draw: Callable[[], Figure | None]
     caption: str
     description: str
+    folded: bool = False
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,7 @@ class Text:
     text: str
 
 
+Grade = Literal["good", "fair", "poor"]
 Block = Fact | Lines | TextTable | Plot | Html | Text
 #: Title on the page, and what stands there.
 Section = tuple[str, Sequence[Block]]
@@ -102,6 +105,7 @@ class Report:
         heading: first line of the page.
         sub: the line below it.
         headline: the result in one line; empty: the first section says it.
+        assessed: grade and sentence: what was done, how good it is, and what to do next; None: the first section says it.
         sections: by their anchors, in order.
         notes: remarks.
         values: what programs read besides the facts.
@@ -116,6 +120,7 @@ class Report:
     notes: Sequence[Note] = ()
     values: Mapping[str, Any] = field(default_factory=dict)
     prefix: str = "report"
+    assessed: tuple[Grade, str] | None = None
 
     @property
     def blocks(self) -> list[Block]:
@@ -140,6 +145,7 @@ class Report:
     def text(self) -> str:
         """Return what people read on a terminal."""
         lines = [*(f"do not trust this result: {why}" for why in self.noted("untrusted")), self.headline]
+        lines += [self.assessed[1]] if self.assessed else []
         for block in self.blocks:
             match block:
                 case Fact(sentence) if sentence:
@@ -155,12 +161,14 @@ class Report:
 
     def page(self, images: Mapping[str, bytes]) -> str:
         """Return the page; ``images`` maps the names of figures to PNG data."""
-        said = [*(f"do not trust this result: {why}" for why in self.noted("untrusted")), self.headline]
+        said = [*(f"do not trust this result: {why}" for why in self.noted("untrusted"))]
+        grade, sentence = self.assessed or ("", self.headline)
+        box = assessment([*said, sentence], self.headline if self.assessed else "", "poor" if said else grade)
         bodies = {
             anchor: "".join(_html(block, images) for block in blocks) for anchor, (_, blocks) in self.sections.items()
         }
         first = next(iter(bodies))
-        bodies[first] = assessment(said) + page.bullets([*self.noted("weak"), *self.noted("note")]) + bodies[first]
+        bodies[first] = box + page.bullets([*self.noted("weak"), *self.noted("note")]) + bodies[first]
         shown = {
             anchor: (self.sections[anchor][0], body.replace("</ul>\n<ul>", ""))
             for anchor, body in bodies.items()
@@ -212,12 +220,20 @@ class Report:
         return UNTRUSTED if self.noted("untrusted") else 0
 
 
-def figures(plots: Mapping[str, tuple[Callable[..., Figure | None], str, str]], *of: object) -> dict[str, Section]:
-    """Return a section for each figure: name -> (what plots it from ``of``, title, caption as HTML)."""
-    return {
-        name: (title, [Plot(name, partial(draw, *of), caption, title)])
+def figures(
+    plots: Mapping[str, tuple[Callable[..., Figure | None], str, str]], *of: object, folded: Sequence[str] = ()
+) -> dict[str, Section]:
+    """Return a section for each figure: name -> (what plots it from ``of``, title, caption as HTML).
+
+    Those whose names are in ``folded`` are one section, each beneath a line.
+    """
+    blocks = {
+        name: Plot(name, partial(draw, *of), caption, title, name in folded)
         for name, (draw, title, caption) in plots.items()
     }
+    shown: dict[str, Section] = {name: (plots[name][1], [plot]) for name, plot in blocks.items() if not plot.folded}
+    more = [plot for plot in blocks.values() if plot.folded]
+    return shown | ({"more": ("More figures", more)} if more else {})
 
 
 def _printed(block: Lines) -> list[str]:
@@ -247,10 +263,11 @@ def _html(block: Block, images: Mapping[str, bytes]) -> str:
             return html
         case TextTable():
             return html_table(block)
-        case Plot(name, _, caption, description) if name in images:
+        case Plot(name, _, caption, description, folded) if name in images:
             said = caption if caption.startswith("<p") else f"<p>{caption}</p>"
             shown = page.picture(images[name], description)
-            return f"<figure>{shown}<figcaption>{said}</figcaption></figure>\n"
+            figure = f"<figure>{shown}<figcaption>{said}</figcaption></figure>\n"
+            return page.folded(description, figure) if folded else figure
         case Fact(sentence) if sentence:
             return page.bullets([sentence])
         case Lines() if block.lines or block.none:

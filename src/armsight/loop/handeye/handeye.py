@@ -18,7 +18,7 @@ The rows are put into an order of their own first (by time, else by content), so
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -90,8 +90,21 @@ SURELY, SETTLED = 5.0, 0.1
 #: Times the error of a position that the flange's must spread for a scale. half: noise is taken for a motion; double:
 #: recordings of a few cm are rejected.
 STILL = 3.0
+#: Sources that change over time.
+_TIMED = {name for pair in OVER_TIME for name in pair}
 #: Rounds of least squares and of leaving out.
 ROUNDS = 6
+
+
+def _transform_of(eye: Eye, name: str, field_name: str, what: str) -> property:
+    """Return the property of a transform that is constant with one mounting of the eye only."""
+
+    def of(self: HandEye) -> Array:
+        if self.eye != eye:
+            raise InputError(f"{name} is not constant with the eye {self.eye!r}; it belongs to {eye!r}")
+        return np.asarray(getattr(self, field_name))
+
+    return property(of, doc=f"(4, 4) {what}; eye {eye.replace('_', ' ')} only.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,44 +171,24 @@ class HandEye(Record):
             f"{np.degrees(angle_rad):.3f} deg; {'; '.join(shown)})"
         )
 
-    @property
-    def T_base_rig(self) -> Array:
-        """(4, 4) the rig in the base; eye to hand only."""
-        return self._of("to_hand", "T_base_rig", self.T_base_still)
-
-    @property
-    def T_flange_body(self) -> Array:
-        """(4, 4) the body on the flange; eye to hand only."""
-        return self._of("to_hand", "T_flange_body", self.T_flange_held)
-
-    @property
-    def T_flange_rig(self) -> Array:
-        """(4, 4) the rig on the flange; eye in hand only."""
-        return self._of("in_hand", "T_flange_rig", self.T_flange_held)
-
-    @property
-    def T_base_body(self) -> Array:
-        """(4, 4) the body in the base; eye in hand only."""
-        return self._of("in_hand", "T_base_body", self.T_base_still)
-
-    def _of(self, eye: Eye, name: str, T: Array) -> Array:
-        if self.eye != eye:
-            raise InputError(f"{name} is not constant with the eye {self.eye!r}; it belongs to {eye!r}")
-        return T
+    T_base_rig = _transform_of("to_hand", "T_base_rig", "T_base_still", "the rig in the base")
+    T_flange_body = _transform_of("to_hand", "T_flange_body", "T_flange_held", "the body on the flange")
+    T_flange_rig = _transform_of("in_hand", "T_flange_rig", "T_flange_held", "the rig on the flange")
+    T_base_body = _transform_of("in_hand", "T_base_body", "T_base_still", "the body in the base")
 
     @property
     def sigma_flange(self) -> tuple[float, float]:
         """Error of the flange by the joints from pose to pose: sigmas along one axis, m, and about one, rad."""
         return self.sigmas.get("flange_m", 0.0), self.sigmas.get("flange_rad", 0.0)
 
-    def informations(self, poses: Poses) -> Array:
-        """Return the information (N, 12, 12) about the right tangents that each of further poses would give."""
+    def whitened(self, poses: Poses) -> Array:
+        """Return the derivative (N, 6, 12) of further poses by the right tangents, over the root of their covariance."""
         e, J, carry = residuals(poses, self.T_base_still, self.T_flange_held)
         maps, C = error_maps(poses, 0 * e, carry, None), poses.cov + np.diag(np.repeat([LEAST_M**2, LEAST_RAD**2], 3))
         for name, sigma in self.sigmas.items():
             if (M := maps.get(MAP_OF.get(name, name))) is not None:
                 C = C + sigma**2 * M @ np.swapaxes(M, 1, 2)
-        return np.asarray(np.swapaxes(J, 1, 2) @ np.linalg.solve(C, J))
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(C)) @ J)
 
     def predict(self, Ts_base_flange: Array) -> Array:
         """Return T_rig_body (..., 4, 4) at poses of the flange (..., 4, 4)."""
@@ -252,12 +245,8 @@ class _Problem(Record):
     def linear(self, guess: _Guess, arm: bool = False, times: bool = False) -> Linear:
         """Return the residuals at a guess, with the sources of their error.
 
-        Vision's shared errors are unknowns where the guess has them.
-
-        Args:
-            guess: the transforms.
-            arm: whether with what is the arm's own in all poses.
-            times: whether with what changes over time.
+        Vision's shared errors are unknowns where the guess has them; ``arm``: with what is the arm's own in all poses;
+        ``times``: with what changes over time.
         """
         poses = self.scaled(guess)
         e, J, carry = residuals(poses, guess.Z, guess.X)
@@ -374,42 +363,26 @@ def calibrate_poses(
     n = len(poses.A)
     if n < MIN_POSES:
         raise InputError(f"hand-eye calibration needs {MIN_POSES} or more poses, got {n}; 15 and more are advised")
-    order = _own_order(poses, t_s)
+    keys = np.concatenate([poses.B[:, :3].reshape(n, -1), poses.A[:, :3].reshape(n, -1)], axis=1)
+    order = np.lexsort(keys.T if t_s is None else np.vstack([keys.T, t_s]))  # one that does not depend on theirs
     whole = _Problem(poses, t_s, speed, (False, speed is not None), links).rows(order)
     progress("hand-eye: start")
     if scale:
         whole, guess, used = _with_scale(whole)
     else:
-        guess, used = _robust(whole, _first(whole))
+        guess, used = _robust(whole, _first(whole.poses))
     require_rotations(whole.poses.rows(used), whole.linear(guess).e[used])
     if poses.common is not None:
         guess = replace(guess, common=np.zeros(poses.common.shape[2]))
-    found, used = _weighed(whole, guess, used, quick, progress)
-    used_rows, distance = np.zeros(n, bool), np.full(n, np.nan)
-    used_rows[order], distance[order] = used, found.distance
-    geometry = None if found.held_out_geometry is None else _unsorted(found.held_out_geometry, order)
+    found, back = _weighed(whole, guess, used, quick, progress), np.argsort(order)
     return replace(
         found,
-        used=used_rows,
-        distance=distance,
-        held_out=_unsorted(found.held_out, order),
-        held_out_nominal=_unsorted(found.held_out_nominal, order),
-        held_out_geometry=geometry,
+        used=found.used[back],
+        distance=found.distance[back],
+        held_out=found.held_out.rows(back),
+        held_out_nominal=found.held_out_nominal.rows(back),
+        held_out_geometry=None if found.held_out_geometry is None else found.held_out_geometry.rows(back),
     )
-
-
-def _unsorted(of: HeldOut, order: NDArray[np.int64]) -> HeldOut:
-    """Return the errors of poses in their own order in that in which they were given."""
-    back = np.argsort(order)
-    return HeldOut(of.position_m[back], of.angle_rad[back])
-
-
-def _own_order(poses: Poses, t_s: Array | None) -> NDArray[np.int64]:
-    """Return an order of the rows that does not depend on theirs: by time, else by what they hold."""
-    keys = np.concatenate([poses.B[:, :3].reshape(len(poses.B), -1), poses.A[:, :3].reshape(len(poses.A), -1)], axis=1)
-    if t_s is not None:
-        keys = np.concatenate([keys, t_s[:, None]], axis=1)
-    return np.asarray(np.lexsort(keys.T))
 
 
 def _spread(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
@@ -419,9 +392,9 @@ def _spread(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     return np.asarray(rows[np.linspace(0, len(rows) - 1, most).round().astype(int)])
 
 
-def _first(problem: _Problem) -> list[_Guess]:
+def _first(poses: Poses) -> list[_Guess]:
     """Return closed-form starts, most plausible first."""
-    part = problem.rows(_spread(np.arange(len(problem.poses.A)), 300)).poses
+    part = poses.rows(_spread(np.arange(len(poses.A)), 300))
     return [_Guess(Z, X) for X, Z in starts(part.A, part.right_side)[:3]]
 
 
@@ -464,11 +437,10 @@ def _robust(problem: _Problem, guesses: list[_Guess]) -> tuple[_Guess, NDArray[n
 
 def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]:
     """Return the problem, with the scale free where it is surely not 1, and its robust solution."""
-    known, used_known = _robust(problem, _first(problem))
+    known, used_known = _robust(problem, _first(problem.poses))
     free = replace(problem, free=(True, problem.free[1]))
     per_m = 1 / scale_between(problem.poses)
-    scaled = replace(problem, poses=problem.scaled(_Guess(np.eye(4), np.eye(4), per_m)))
-    guesses = [replace(guess, per_m=per_m) for guess in _first(scaled)]
+    guesses = [replace(one, per_m=per_m) for one in _first(problem.scaled(_Guess(np.eye(4), np.eye(4), per_m)))]
     found, used = _robust(free, guesses)
     rows = _spread(np.flatnonzero(used), MAX_VARIANCE)
     at, sure = found, False
@@ -518,11 +490,9 @@ def scale_between(poses: Poses) -> float:
 
 
 def rotations_of(poses: Poses, e: Array) -> tuple[Array, Array, float, float]:
-    """Return how far the flange rotates, and how far it must for both transforms to be determined.
+    """Return how far the flange of poses rotates, and how far it must for both transforms to be determined.
 
-    Args:
-        poses: the poses used.
-        e: (N, 6) their residuals, which say how large the noise of rotations is.
+    ``e`` are their residuals (N, 6), which say how large the noise of rotations is.
 
     Returns:
         Root mean squares (3,) of the rotations about each principal axis, rad, largest first; these axes (3, 3), columns,
@@ -535,17 +505,13 @@ def rotations_of(poses: Poses, e: Array) -> tuple[Array, Array, float, float]:
 
 
 def require_rotations(poses: Poses, e: Array) -> None:
-    """Reject motions whose rotations are about one axis only, as far as the noise shows.
-
-    Args:
-        poses: the poses used.
-        e: (N, 6) their residuals, which say how large the noise of rotations is.
+    """Reject motions whose rotations are about one axis only, as far as the noise in the residuals e (N, 6) shows.
 
     Raises:
         CalibrationError: the open direction, by name.
     """
     spread, axes, noise, least = rotations_of(poses, e)
-    held = _held(poses)
+    held = "flange-rig" if poses.in_hand else "flange-body"
     if noise > CONTRADICTS and spread[0] > LEAST_ROTATION:
         raise CalibrationError(
             f"the rotations of both sides contradict each other by {np.degrees(noise):.0f} deg: they are not of the same "
@@ -567,12 +533,7 @@ def require_rotations(poses: Poses, e: Array) -> None:
 
 
 def require_known(found: HandEye, most_m: float, most_rad: float) -> None:
-    """Reject a result one of whose directions is known so badly that it is no calibration.
-
-    Args:
-        found: the result.
-        most_m: largest sigma of a translation, m.
-        most_rad: largest sigma of a rotation, rad.
+    """Reject a result one of whose directions is known worse than by these sigmas, m and rad.
 
     Raises:
         CalibrationError: the open direction, by name.
@@ -597,10 +558,6 @@ def require_known(found: HandEye, most_m: float, most_rad: float) -> None:
                 f"sigma is {times * sigma:.0f} {unit}; rotate the flange about two axes that are not parallel, by 20 "
                 "degrees and more, and take more poses"
             )
-
-
-def _held(poses: Poses) -> str:
-    return "flange-rig" if poses.in_hand else "flange-body"
 
 
 def _taken_up(problem: _Problem, guess: _Guess, quick: bool) -> dict[str, float]:
@@ -648,7 +605,7 @@ def _settled(
     for _ in range(ROUNDS):
         rows = _spread(np.flatnonzero(used), most)
         few, part = whole.rows(_spread(rows, min(most, MAX_VARIANCE))), whole.rows(rows)
-        estimated, linear = (p.linear(guess, times=_timed(variances)).of(variances) for p in (few, part))
+        estimated, linear = (p.linear(guess, times=not _TIMED.isdisjoint(variances)).of(variances) for p in (few, part))
         found = most_probable(estimated, few.means(estimated, guess), variances)
         variances = dict(zip(linear.sources, found.tolist(), strict=True))
         solved = solve(linear, found)
@@ -666,13 +623,9 @@ def _settled(
     return guess, used, variances, most
 
 
-def _timed(names: Collection[str]) -> bool:
-    return any(name in names for pair in OVER_TIME for name in pair)
-
-
 def _weighed(
     whole: _Problem, guess: _Guess, used: NDArray[np.bool_], quick: bool, progress: Callable[[str], None]
-) -> tuple[HandEye, NDArray[np.bool_]]:
+) -> HandEye:
     """Settle, then weigh an arm that is as its model says against one that is not."""
     progress("hand-eye: sources of the error")
     guess, used, variances, most = _settled(whole, guess, used, quick)
@@ -728,7 +681,7 @@ def _weighed(
         common_m=_common_m(whole.poses, moved),
     )
     require_known(found, OPEN_M, OPEN_RAD)
-    return found, used
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -752,7 +705,7 @@ class _Model(Record):
         """Weigh the sources of ``start``, and with ``arm`` the arm's own; ``quick``: without integrating."""
         few, part = whole.rows(_spread(rows, MAX_VARIANCE)), whole.rows(rows)
         names = (*start, *((LINKS if whole.links is not None else DRIFT) if arm else ()))
-        estimated, linear = (p.linear(guess, arm, _timed(names)).of(names) for p in (few, part))
+        estimated, linear = (p.linear(guess, arm, not _TIMED.isdisjoint(names)).of(names) for p in (few, part))
         means = few.means(estimated, guess)
         probable = most_probable(estimated, means, {name: v for name, v in start.items() if v > 0})
         solved, P = solve(linear, probable), linear.J.shape[2]

@@ -7,31 +7,22 @@ are A_i X = Z B_i. Equations: docs/howto/handeye.md.
 The residual of a pose is the tangent of the motion left over, in the axes of what the camera measured. Starts
 (:func:`starts`) come from all poses and from small parts of them: rotations by the leading singular vectors of the
 Kronecker sum, translations by linear least squares (Shah, "Solving the robot-world/hand-eye calibration problem using the
-Kronecker product", J. Mechanisms Robotics 5(3), 2013). OpenCV's solvers are tried beside it where the installed OpenCV has
-them (5.0 has not).
-
-A table that is grossly wrong is rejected before a loop is closed on it (:func:`require_fitting`): single mistakes (a twist,
-a length or a direction of the wrong sign, a zero off by a right angle, two lengths exchanged) are tried by the closed form.
+Kronecker product", J. Mechanisms Robotics 5(3), 2013).
 """
 
 from __future__ import annotations
 
-import contextlib
-import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from armsight.data import Array, Record
-from armsight.errors import CalibrationError, InputError
+from armsight.errors import InputError
 from armsight.geometry.check import checked
-from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, mean_pose, pose, small_adjoint
+from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, pose, small_adjoint
 from armsight.geometry.rotation import nearest_rotation
-from armsight.robot.kinematics.arm import Arm
 
 #: A pose whose residual has a smaller chance than this is taken for a mistake and left out.
 CHANCE = 1e-5
@@ -95,8 +86,6 @@ def residuals(poses: Poses, Z: Array, X: Array) -> tuple[Array, Array, Array]:
     return e, np.concatenate([bend @ by_z, bend @ by_x], axis=2), adjoint(inverse(M))
 
 
-#: OpenCV as it is at run time: its type stubs are those of one version.
-_CV: Any = cv2
 #: Parts of this many poses are tried too, so that some of them are free of gross errors.
 PART = 6
 #: How many parts: with 20 % gross errors all of them would hold one with a chance of (1 - 0.8^6)^24, 0.1 %.
@@ -109,15 +98,6 @@ MIDDLE = 0.4
 AGREE, MOST_AGREEING = 0.15, 300
 #: Weight of a rotation in the score, m/rad: 1 mrad counts as 0.3 mm, as it does at a tool 0.3 m from the wrist.
 LEVER_M = 0.3
-#: OpenCV's solvers of A X = Z B, by the names it gives them; 5.0 has none of them.
-_OPENCV = ("CALIB_ROBOT_WORLD_HAND_EYE_SHAH", "CALIB_ROBOT_WORLD_HAND_EYE_LI")
-_OPENCV_MOTIONS = (
-    "CALIB_HAND_EYE_TSAI",
-    "CALIB_HAND_EYE_PARK",
-    "CALIB_HAND_EYE_HORAUD",
-    "CALIB_HAND_EYE_ANDREFF",
-    "CALIB_HAND_EYE_DANIILIDIS",
-)
 
 
 def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
@@ -129,7 +109,7 @@ def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
         seed: of the choice of parts.
     """
     rng = np.random.default_rng(seed)
-    found = [kronecker(A, B), *_opencv(A, B)]
+    found = [kronecker(A, B)]
     if len(A) > PART:
         parts = np.array([rng.choice(len(A), PART, replace=False) for _ in range(PARTS)])
         found += zip(*kronecker(A[parts], B[parts]), strict=True)
@@ -146,7 +126,7 @@ def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
 def _agreeing(A: Array, B: Array) -> NDArray[np.int64]:
     """Return the rows that agree with that with which most do: between two rows both sides rotate by one angle.
 
-    Blunders hardly agree with anything, so these are good ones though half of the rows are not.
+    Blunders hardly agree with anything, so these are good ones even where half of the rows are not.
     """
     if len(A) > MOST_AGREEING:
         return np.zeros(0, np.int64)
@@ -178,25 +158,6 @@ def _rotation(columns: Array) -> Array:
     """Return the rotations nearest to multiples, of either sign, of rotations given by their columns (..., 9)."""
     M = np.swapaxes(columns.reshape(*columns.shape[:-1], 3, 3), -1, -2)
     return nearest_rotation(M * np.sign(np.linalg.det(M))[..., None, None])
-
-
-def _opencv(A: Array, B: Array) -> Iterator[tuple[Array, Array]]:
-    """Yield what OpenCV's solvers find, where it has them and they accept the poses."""
-    back = inverse(B)
-    for name in _OPENCV_MOTIONS if hasattr(cv2, "calibrateHandEye") else ():
-        with contextlib.suppress(cv2.error):
-            R, t = _CV.calibrateHandEye(*_parts(A), *_parts(back), method=getattr(cv2, name))
-            X = pose(R, t.ravel())
-            if np.isfinite(X).all():  # OpenCV 4 answers degenerate poses with NaN
-                yield X, mean_pose(A @ X @ back)
-    for name in _OPENCV if hasattr(cv2, "calibrateRobotWorldHandEye") else ():
-        with contextlib.suppress(cv2.error):
-            RX, tX, RZ, tZ = _CV.calibrateRobotWorldHandEye(*_parts(A), *_parts(B), method=getattr(cv2, name))
-            yield pose(RX, tX.ravel()), pose(RZ, tZ.ravel())
-
-
-def _parts(Ts: Array) -> tuple[list[Array], list[Array]]:
-    return [T[:3, :3] for T in Ts], [T[:3, 3] for T in Ts]
 
 
 def _is_rigid(Ts: Array) -> NDArray[np.bool_]:
@@ -238,6 +199,10 @@ class HeldOut(Record):
         """Return the root mean squares, m and rad."""
         return float(np.sqrt(np.nanmean(self.position_m**2))), float(np.sqrt(np.nanmean(self.angle_rad**2)))
 
+    def rows(self, rows: NDArray[np.int64]) -> HeldOut:
+        """Return a part of the poses."""
+        return HeldOut(self.position_m[rows], self.angle_rad[rows])
+
     def most(self) -> tuple[float, float]:
         """Return the greatest, m and rad."""
         return float(np.nanmax(self.position_m)), float(np.nanmax(self.angle_rad))
@@ -264,95 +229,3 @@ def checked_poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, 
         raise InputError(f"hand-eye calibration needs {MIN_POSES} or more poses, got {n}; 15 and more are advised")
     cov = np.zeros((n, 6, 6)) if covs is None else checked(covs, (n, 6, 6), "covs")
     return Poses(Ts_base_flange, Ts_rig_body, cov, eye == "in_hand", checked(centre, (3,), "centre"))
-
-
-#: Errors of a cheap arm: a single mistake of the table is looked for beyond them. m and rad, RMS;
-#: half: ordinary arms are searched, double: a joint that is off by a few degrees is not.
-_USUAL = 0.015, float(np.radians(2.0))
-#: Nothing moves by a table that is off by more, whatever the mistake; m and rad. Half: an SO-101 whose zeros are off by
-#: three degrees is rejected; double: a wrist with a wrong sign passes.
-_GROSS = 0.04, float(np.radians(8.0))
-#: A single mistake must fit so many times better; half: errors of a cheap arm imitate one, double: a good explanation of
-#: an arm that has ordinary errors besides is not named.
-_BETTER = 4.0
-#: Mistakes that fit within this factor of the best are named, too; half: exact ties alone, double: weak ones as well.
-_ALIKE = 1.25
-#: Lengths that differ by less are not exchanged, m.
-_LEAST_M = 0.002
-
-
-def require_fitting(arm: Arm, q: Array, Ts_rig_body: Array) -> None:
-    """Reject a table with which no loop may be closed.
-
-    Args:
-        arm: as its table says it is.
-        q: (N, n) joint angles of the poses, rad.
-        Ts_rig_body: (N, 4, 4) measured poses of the body, m.
-
-    Raises:
-        CalibrationError: the poses contradict the table by far more than a cheap arm's errors.
-    """
-    Ts = arm.forward(q)
-    X, Z = starts(Ts, Ts_rig_body)[0]
-    off = _errors(Ts, Ts_rig_body, Z, X)
-    if all(size <= usual for size, usual in zip(off, _USUAL, strict=True)):
-        return
-    given = _size(off)
-    sizes = {name: _size(_misfit(other, q, Ts_rig_body)) for name, other in _mistakes(arm)}
-    best = min(sizes.values())
-    explained = given > _BETTER * best
-    if not explained and all(size <= gross for size, gross in zip(off, _GROSS, strict=True)):
-        return
-    names = " or ".join(name for name, size in sorted(sizes.items(), key=lambda each: each[1]) if size < _ALIKE * best)
-    advice = (
-        f"they fit within {1e3 * best:.1f} mm if {names}: correct the table"
-        if explained
-        else "no single sign, zero or pair of lengths explains it: check the table and the joint angles of several poses "
-        "(armsight identify)"
-    )
-    raise CalibrationError(
-        f"the table of {arm.name} contradicts the measured poses by {1e3 * off[0]:.0f} mm and {np.degrees(off[1]):.1f} deg "
-        f"RMS, with which no loop is closed: {advice}"
-    )
-
-
-def _errors(Ts_base_tool: Array, Ts_rig_body: Array, Z: Array, X: Array) -> tuple[float, float]:
-    """Return by how much poses are off, position, m, and rotation, rad: RMS of those within three medians."""
-    e = log_se3(inverse(Z @ Ts_rig_body) @ Ts_base_tool @ X)
-    parts = (np.linalg.norm(part, axis=1) for part in (e[:, :3], e[:, 3:]))
-    shift, angle = (float(np.sqrt(np.mean(each[each <= 3.0 * np.median(each)] ** 2))) for each in parts)
-    return shift, angle
-
-
-def _misfit(arm: Arm, q: Array, Ts_rig_body: Array) -> tuple[float, float]:
-    """Return the same of the best hand-eye calibration of an arm."""
-    Ts = arm.forward(q)
-    X, Z = kronecker(Ts, Ts_rig_body)
-    return _errors(Ts, Ts_rig_body, Z, X)
-
-
-def _size(off: tuple[float, float]) -> float:
-    return float(np.hypot(off[0], LEVER_M * off[1]))
-
-
-def _mistakes(arm: Arm) -> Iterator[tuple[str, Arm]]:
-    """Yield tables that differ by a single mistake, and what that is."""
-    for i, name in enumerate(arm.joint_names):
-        at = np.arange(arm.joints) == i
-        if abs(np.sin(arm.alpha[i])) > 0.1:
-            yield f"alpha of {name} has the other sign", replace(arm, alpha=np.where(at, -arm.alpha, arm.alpha))
-        for key in ("a", "d"):
-            length = getattr(arm, key)
-            if abs(length[i]) > _LEAST_M:
-                yield f"{key} of {name} has the other sign", replace(arm, **{key: np.where(at, -length, length)})
-        yield f"{name} rotates the other way", replace(arm, direction=np.where(at, -arm.direction, arm.direction))
-        for deg in (90, -90, 180):
-            yield f"the zero of {name} is off by {deg} deg", replace(arm, offset=arm.offset + np.radians(deg) * at)
-    lengths = np.concatenate([arm.a, arm.d])
-    names = [f"{key} of {name}" for key in ("a", "d") for name in arm.joint_names]
-    for i, k in itertools.combinations(range(len(lengths)), 2):
-        if abs(lengths[i] - lengths[k]) > _LEAST_M:
-            other = lengths.copy()
-            other[[i, k]] = lengths[[k, i]]
-            a, d = np.split(other, 2)
-            yield f"{names[i]} and {names[k]} are exchanged", replace(arm, a=a, d=d)

@@ -13,14 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, log_se3
+from armsight.geometry.rotation import log_so3
 from armsight.loop.handeye.handeye import HandEye, calibrate_poses
 from armsight.loop.handeye.poses import Eye, Poses
+from armsight.vision.sources.bag.states import PoseTrack
 
 #: Poses used at most for the fit, spread evenly: a stream's neighbours say the same.
 MAX_POSES = 600
@@ -64,19 +65,13 @@ class PoseStream(Record):
         """Return poses (M, 4, 4) at times, interpolated, and whether a time is within the stream and in no gap."""
         after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
         good = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1]) & (self.t_s[after] - self.t_s[after - 1] <= GAP_S)
-        inside = np.clip(t_s, self.t_s[0], self.t_s[-1])
-        T = np.zeros((len(t_s), 4, 4))
-        T[:, :3, :3] = Slerp(self.t_s.copy(), Rotation.from_matrix(self.Ts[:, :3, :3].copy()))(inside).as_matrix()
-        for k in range(3):
-            T[:, k, 3] = np.interp(inside, self.t_s, self.Ts[:, k, 3])
-        T[:, 3, 3] = 1.0
-        return T, good
+        return PoseTrack(self.t_s, self.Ts).at(t_s), good
 
     def angular_speed(self, t_s: Array, over_s: float) -> tuple[Array, NDArray[np.bool_]]:
         """Return angular speeds (M,), rad/s, about times, and whether the stream covers them."""
         (early, first), (late, last) = self.at(t_s - over_s / 2), self.at(t_s + over_s / 2)
-        rotation = Rotation.from_matrix(early[:, :3, :3]).inv() * Rotation.from_matrix(late[:, :3, :3])
-        return np.asarray(rotation.magnitude() / over_s), first & last
+        rotated = log_so3(np.swapaxes(early[:, :3, :3], 1, 2) @ late[:, :3, :3])
+        return np.asarray(np.linalg.norm(rotated, axis=1) / over_s), first & last
 
 
 @dataclass(frozen=True, eq=False)

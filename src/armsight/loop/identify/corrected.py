@@ -8,6 +8,7 @@ with everything that corrects; :mod:`armsight.robot.arm_file` reads its table al
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,19 +22,20 @@ from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import nearest_rotation, quaternion_wxyz
 from armsight.loop.identify import model as chain
 from armsight.loop.identify.identify import Identified
-from armsight.loop.identify.model import FAST, RIPPLES, Feature, Model, all_features
+from armsight.loop.identify.model import FAST, RIPPLES, SENSOR, Feature, Model, all_features
 from armsight.robot.arm_file import LIMITS, file_transform, identified_table, joint_numbers, tilted_urdf
 from armsight.robot.kinematics.arm import Arm
 
-#: Newton steps to a reading, and what counts as there, m and rad.
-STEPS, THERE = 30, 1e-9
+#: Newton steps to a reading, what counts as there, m and rad, and the step of differences, rad.
+STEPS, THERE, STEP_RAD = 30, 1e-9, 1e-6
 #: Version of corrected.toml. Version 1, which said no version, had [[cause]] tables and other names of the kinds of
 #: gravity; version 2 had no ranges of the readings and no nominal table.
 VERSION = 3
 #: Names of version 1 -> names now.
 _OLD_NAMES = {"slack": "gravity_backlash", "sag": "compliance"}
-#: Columns of the nominal table, which gives the levers of gravity -> their units.
-_NOMINAL = {"offset": "rad", "d": "m", "a": "m", "alpha": "rad"}
+#: Columns of the table -> their units; of the nominal one, which gives the levers of gravity.
+_UNITS = {"offset": "rad", "d": "m", "a": "m", "alpha": "rad", "beta": "rad"}
+_NOMINAL = {key: unit for key, unit in _UNITS.items() if key != "beta"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,22 +79,16 @@ class Corrected(Record):
             near: (n,) readings to start from.
             approach: (n,) from which sides the joints will come.
         """
-        q, side = np.array(near, float), None if approach is None else approach[None]
+        q, near_by = np.array(near, float), np.vstack([np.zeros(len(near)), STEP_RAD * np.eye(len(near))])
+        sides = None if approach is None else np.tile(approach, (len(near_by), 1))
         for _ in range(STEPS):
-            T = self.forward(q[None], side)[0]
-            e = log_se3(inverse(T) @ T_base_body)
+            back = inverse(T := self.forward(q + near_by, sides))[0]
+            e = log_se3(back @ T_base_body)
             if np.abs(e).max() < THERE:
                 return q
-            step = np.linalg.lstsq(self._jacobian(q, side, T), e, rcond=1e-9)[0]
+            step = np.linalg.lstsq(log_se3(back @ T[1:]).T / STEP_RAD, e, rcond=1e-9)[0]
             q = q + step * min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-12))
         return None
-
-    def _jacobian(self, q: Array, side: Array | None, T: Array) -> Array:
-        """Return the derivative (6, n) of the right tangent by the readings, by differences over 1e-6 rad."""
-        h = 1e-6
-        many = np.repeat(q[None], len(q), axis=0) + h * np.eye(len(q))
-        sides = None if side is None else np.repeat(side, len(q), axis=0)
-        return np.asarray(log_se3(inverse(T) @ self.forward(many, sides)).T / h)
 
     def save(self, path: str | Path) -> None:
         """Write corrected.toml, which :func:`open_corrected` reads as the same arm.
@@ -124,45 +120,60 @@ class Corrected(Record):
 def table_text(arm: Corrected) -> str:
     """Return the corrected arm as TOML, m and rad; every value with its sigma. :func:`open_corrected` reads it."""
     model, x = arm.model, arm.x
-    table, sigma = model.table(x), model.table(arm.sigma)
+    table, sigma, seen = model.table(x), model.table(arm.sigma), model.q_seen is not None
     lines = [
-        f"name = {_quoted(model.arm.name)}",
-        f"convention = {_quoted(model.arm.convention)}",
-        "identified = true",
-        f"version = {VERSION}",
+        *_toml({"name": model.arm.name, "convention": model.arm.convention, "identified": True, "version": VERSION}),
         "# theta = direction (q + error sources) + offset; beta is Hayati's angle, a rotation about y after alpha",
-        *_transform("T_rig_base", model.T_rig_base(x)),
-        *_transform("T_base_0", model.arm.T_base_0),
-        *_transform("T_flange_body", model.T_6_body(x)),
-        f"up_base = [{', '.join(repr(float(v)) for v in model.up_base)}]",
+        *_toml({"T_rig_base": _pose(model.T_rig_base(x)), "T_base_0": _pose(model.arm.T_base_0)}),
+        *_toml({"T_flange_body": _pose(model.T_6_body(x)), "up_base": model.up_base.tolist()}),
     ]
     if (model.arm.coupling != np.eye(model.arm.joints)).any():
-        lines.append(f"coupling = {model.arm.coupling.tolist()!r}")
-    if model.q_seen is not None:
+        lines += _toml({"coupling": model.arm.coupling.tolist()})
+    if seen:
         lines += [
             "# A sensor's curve (gain, wave, ripple) holds from seen_min_rad to seen_max_rad of its joint.",
             "# Beyond, it fades to its mean over that range: with t = distance / curve_fade_rad, 1 - t^2 (3 - 2 t)",
             "# of its deviation from the mean is left, and none from t = 1 on.",
-            f"curve_fade_rad = {float(model.fade_rad)!r}",
+            *_toml({"curve_fade_rad": float(model.fade_rad)}),
         ]
     for i, name in enumerate(model.arm.joint_names):
-        lines += ["", "[[joint]]", f"name = {_quoted(name)}", f"direction = {model.arm.direction[i]:.0f}"]
-        for c, column in enumerate(chain.COLUMNS):
-            unit = "m" if c in (chain.D, chain.A) else "rad"
-            lines.append(f"{column}_{unit} = {float(table[i, c])!r}")
-            lines.append(f"sigma_{column}_{unit} = {float(sigma[i, c])!r}")
-        lines += [f"nominal_{key}_{unit} = {float(getattr(model.arm, key)[i])!r}" for key, unit in _NOMINAL.items()]
-        if model.q_seen is not None:
-            lines += [f"seen_{end}_rad = {float(v)!r}" for end, v in zip(("min", "max"), model.q_seen[i], strict=True)]
-        for key, unit in LIMITS.items():
-            lines.append(f"{key}_{unit} = {float(getattr(model.arm, key)[i])!r}")
-    for k, feature in enumerate(model.features):
-        at = model.sources_at + k
-        if x[at] != 0.0:
-            lines += ["", "[[error_source]]", f"name = {_quoted(feature.name)}", f"kind = {_quoted(feature.kind)}"]
-            lines += [f"joint = {feature.joint + 1}", f"unit = {_quoted(feature.unit)}"]
-            lines += [f"value = {float(x[at])!r}", f"sigma = {float(arm.sigma[at])!r}"]
+        row: dict[str, Any] = {"name": name, "direction": int(model.arm.direction[i])}
+        for c, (column, unit) in enumerate(_UNITS.items()):
+            row |= {f"{column}_{unit}": float(table[i, c]), f"sigma_{column}_{unit}": float(sigma[i, c])}
+        row |= {f"nominal_{key}_{unit}": float(getattr(model.arm, key)[i]) for key, unit in _NOMINAL.items()}
+        row |= _seen(model, i)
+        row |= {f"{key}_{unit}": float(getattr(model.arm, key)[i]) for key, unit in LIMITS.items()}
+        lines += ["", "[[joint]]", *_toml(row)]
+    for k, f in enumerate(model.features):
+        if x[at := model.sources_at + k] != 0.0:
+            numbers = {"value": float(x[at]), "sigma": float(arm.sigma[at])}
+            source = {"name": f.name, "kind": f.kind, "joint": f.joint + 1, "unit": f.unit} | numbers
+            lines += ["", "[[error_source]]", *_toml(source)]
     return "\n".join(lines) + "\n"
+
+
+def _seen(model: Model, joint: int) -> dict[str, float]:
+    """Return the readings of a joint that the poses have shown; {} where they are not known."""
+    ends = () if model.q_seen is None else model.q_seen[joint]
+    return {f"seen_{end}_rad": float(v) for end, v in zip(("min", "max"), ends, strict=False)}
+
+
+def _toml(values: Mapping[str, Any]) -> list[str]:
+    """Return lines of TOML: of texts, numbers, lists of numbers, and poses, in one line each."""
+
+    def text(value: Any) -> str:  # noqa: ANN401
+        if isinstance(value, Mapping):
+            return f"{{ {', '.join(_toml(value))} }}"
+        if isinstance(value, str):  # JSON's escapes, but every character above ASCII as itself
+            return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        return str(value).lower() if isinstance(value, bool) else repr(value)
+
+    return [f"{key} = {text(value)}" for key, value in values.items()]
+
+
+def _pose(T: Array) -> dict[str, list[float]]:
+    """Return a pose as position and quaternion wxyz."""
+    return {"position_m": T[:3, 3].tolist(), "quaternion_wxyz": quaternion_wxyz(T[:3, :3]).tolist()}
 
 
 def is_corrected(path: str | Path) -> bool:
@@ -198,7 +209,9 @@ def open_corrected(path: str | Path) -> Corrected:
     q_seen, fade_rad = None, chain.FADE_RAD
     if "seen_min_rad" in rows[0]:
         q_seen = np.stack([joint_numbers(path, rows, f"seen_{end}_rad") for end in ("min", "max")], axis=1)
-        fade_rad = _positive(path, given, "curve_fade_rad")
+        fade_rad = _finite(path, "curve_fade_rad", given.get("curve_fade_rad"))
+        if fade_rad <= 0:
+            raise InputError(f"{path}: curve_fade_rad is {fade_rad}, must be more than 0")
     else:
         notes.append(
             f"{path}: an old file without the ranges of the readings seen: sensors' curves do not fade beyond them"
@@ -211,8 +224,7 @@ def open_corrected(path: str | Path) -> Corrected:
     x[:3], x[model.tool_at : model.tool_at + 3] = T_rig_base[:3, 3], T_6_body[:3, 3]
     x[model.table_at : model.sources_at] = table.ravel()
     sigma = np.zeros(len(x))
-    columns = [(key, "m" if key in ("a", "d") else "rad") for key in chain.COLUMNS]
-    numbers = [joint_numbers(path, rows, f"sigma_{key}_{unit}") for key, unit in columns]
+    numbers = [joint_numbers(path, rows, f"sigma_{key}_{unit}") for key, unit in _UNITS.items()]
     sigma[model.table_at : model.sources_at] = np.stack(numbers, axis=1).ravel()
     x[model.sources_at :], sigma[model.sources_at :] = coefficients
     return Corrected(model, x, sigma, tuple(notes))
@@ -235,13 +247,6 @@ def _error_sources(path: str | Path, given: dict[str, Any]) -> tuple[tuple[Featu
     return tuple(features), np.array(values).reshape(-1, 2).T
 
 
-def _positive(path: str | Path, given: dict[str, Any], key: str) -> float:
-    value = _finite(path, key, given.get(key))
-    if value <= 0:
-        raise InputError(f"{path}: {key} is {value}, must be more than 0")
-    return value
-
-
 def _finite(path: str | Path, key: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise InputError(f"{path}: {key} is {value!r}, must be a number")
@@ -256,34 +261,12 @@ def zeros_text(found: Identified) -> str:
         "# zero: to be added to every node of the joint's potentiometer table. Backlash and compliance stay uncorrected.",
         "# It holds for readings from seen_min_rad to seen_max_rad, and says nothing of others.",
     ]
-    nominal = model.table(model.nominal())
-    for i, name in enumerate(model.arm.joint_names):
-        zero = float((model.table(found.solution.x) - nominal)[i, chain.OFFSET] * model.arm.direction[i])
-        sigma = found.value(f"offset{i + 1}")[1]
-        lines += [
-            "",
-            "[[joint]]",
-            f"name = {_quoted(name)}",
-            f"zero_rad = {zero!r}",
-            f"zero_deg = {np.degrees(zero):.5f}",
-        ]
-        lines.append(f"sigma_zero_rad = {sigma!r}")
-        if model.q_seen is not None:
-            lines += [f"seen_{end}_rad = {float(v)!r}" for end, v in zip(("min", "max"), model.q_seen[i], strict=True)]
+    offsets = (model.table(found.solution.x) - model.table(model.nominal()))[:, chain.OFFSET] * model.arm.direction
+    for i, (name, zero) in enumerate(zip(model.arm.joint_names, offsets.tolist(), strict=True)):
+        lines += ["", "[[joint]]", *_toml({"name": name, "zero_rad": zero}), f"zero_deg = {np.degrees(zero):.5f}"]
+        row = {"sigma_zero_rad": found.value(f"offset{i + 1}")[1]} | _seen(model, i)
         for f in model.features:
-            if f.joint == i and f.kind in ("gain", "wave", "ripple") and found.value(f.name)[0] != 0.0:
-                key = "gain" if f.kind == "gain" else f"{f.name.split('_')[1]}_rad"
-                lines.append(f"{key} = {found.value(f.name)[0]!r}")
+            if f.joint == i and f.kind in SENSOR and (value := found.value(f.name)[0]) != 0.0:
+                row["gain" if f.kind == "gain" else f"{f.name.split('_')[1]}_rad"] = value
+        lines += _toml(row)
     return "\n".join(lines) + "\n"
-
-
-def _transform(name: str, T: Array) -> list[str]:
-    """Return a pose as position and quaternion wxyz."""
-    position = ", ".join(repr(float(v)) for v in T[:3, 3])
-    quaternion = ", ".join(repr(float(v)) for v in quaternion_wxyz(T[:3, :3]))
-    return [f"{name} = {{ position_m = [{position}], quaternion_wxyz = [{quaternion}] }}"]
-
-
-def _quoted(text: str) -> str:
-    """Return a basic string of TOML: JSON's escapes, but every character above ASCII as itself."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -2,8 +2,11 @@
 
 Gauss-Newton (:mod:`armsight.estimate.solve`). Where the instrument's covariance is given, what the residuals show beyond it
 (the arm's repeatability, what the model does not know) is estimated by restricted likelihood and added: one sigma of
-position, one of rotation. A pose further from the model than chance allows is left out; the median sets the
-scale for that.
+position, one of rotation. A pose further from the model than chance allows is left out; the median sets the scale for that.
+
+Scatter of the joints from pose to pose (backlash that nothing holds on one side, jitter; :func:`joint_noise`): what the
+residuals show beyond the instrument's covariance is attributed to the joints, each of which moves the body along its own
+column of the Jacobian, so that a joint that lies anywhere in its backlash affects nothing but its own direction.
 
 The prior sigmas say how far each number can plausibly be off before anything is measured, in its own unit. Those of the
 table: what cheap arms are made to and published identifications of them find (some mm, a degree). Those of the error
@@ -15,7 +18,8 @@ servos (backlash up to a degree), and compliance that lets a joint droop half a 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +28,10 @@ from scipy.special import chdtri
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.estimate.linear import Linear
-from armsight.estimate.solve import Solved, solve, whitened
+from armsight.estimate.solve import Solved, covariances, solve, whitened
 from armsight.estimate.variance import restricted
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.model import Model
+from armsight.loop.identify.model import COLUMNS, OFFSET, Model
 
 #: Kind of parameter -> prior sigma of its deviation from nominal, m, rad or its own unit; base and tool have no prior.
 SIGMA: dict[str, float] = {
@@ -172,12 +176,11 @@ def fit(
     return Solution(x, free, _spread(s, free), noise, keep, tuple(history))
 
 
-def covariance(
-    model: Model, x: Array, measured: Measured, phi: Array, free: Mask, prior: Array, noise: tuple[float, float]
-) -> Array:
-    """Return the covariance (P, P) of the free parameters at a vector; zero for the others."""
-    linear = linear_of(model, x, measured, phi, free, prior)
-    return _spread(solve(linear, variances_of(linear, noise)), free)
+def covariance(model: Model, s: Solution, measured: Measured, free: Mask, prior: Array) -> Array:
+    """Return the covariance (P, P) of the free parameters at a solution, with its noise; zero for the others."""
+    part = measured.rows(s.used)
+    linear = linear_of(model, s.x, part, model.feature_values(part.q, part.approach), free, prior)
+    return _spread(solve(linear, variances_of(linear, s.noise)), free)
 
 
 def _spread(s: Solved, free: Mask) -> Array:
@@ -224,3 +227,76 @@ def _sane(model: Model, x: Array, measured: Measured, phi: Array, noise: tuple[f
     far = (whitened(linear, variances_of(linear, noise))[0] ** 2).sum(axis=1)
     scale = max(float(np.median(far)) / chdtri(measured.size, 0.5), 1e-300)
     return np.asarray(far / scale < chdtri(measured.size, CHANCE))
+
+
+#: Where the search starts, rad and m: what is not there shrinks from it.
+START_RAD, START_M = 1e-3, 1e-4
+
+
+class JointNoise(NamedTuple):
+    """What is off by chance.
+
+    Attributes:
+        sigma_rad: (n,) of each joint.
+        off_rad: (N, n) by how much each joint was off at each pose, as far as the residuals show it.
+        sigma_off_rad: (N, n) their sigmas.
+    """
+
+    sigma_rad: Array
+    off_rad: Array
+    sigma_off_rad: Array
+
+
+def joint_noise(model: Model, solution: Solution, prior: Array, measured: Measured) -> JointNoise:
+    """Attribute residuals beyond the instrument's covariance to the joints.
+
+    Args:
+        model: the arm.
+        solution: a fit of it.
+        prior: (P,) the prior sigmas of that fit.
+        measured: the poses, with the instrument's covariance alone.
+    """
+    phi = model.feature_values(measured.q, measured.approach)
+    with_sides = with_joint_noise(model, solution.x, measured, np.zeros(model.arm.joints))
+    linear = linear_of(model, solution.x, with_sides, phi, solution.free, prior)
+    B = by_joints(model, model.linearised(solution.x, measured, phi)[1])
+    joints = {f"joint {i + 1}": B[:, :, [i]] for i in range(model.arm.joints)}
+    linear = replace(linear, own=joints | linear.own)
+    start = np.array([START_RAD] * len(joints) + [START_M, START_RAD][: len(linear.own) - len(joints)]) ** 2
+    variances = restricted(linear.rows(np.flatnonzero(solution.used)), start, MIN_NOISE, MAX_NOISE)
+    of = variances[: len(joints)]
+    gain = of[:, None] * B.swapaxes(1, 2) @ np.linalg.inv(covariances(linear, variances))
+    spread = np.maximum(of - np.einsum("nkm,nmk->nk", gain, B * of), 0.0)
+    return JointNoise(np.sqrt(of), (gain @ linear.e[..., None])[..., 0], np.sqrt(spread))
+
+
+def with_joint_noise(model: Model, x: Array, measured: Measured, sigma_rad: Array) -> Measured:
+    """Return the poses with the joints' scatter added to their covariance.
+
+    Added, too, is the uncertainty on which side of its backlash a joint lies where gravity and friction are about as
+    strong.
+    """
+    if measured.cov is None:
+        return measured
+    phi = model.feature_values(measured.q, measured.approach)
+    variance = sigma_rad**2 + _of_sides(model, x, phi)
+    if not variance.any():
+        return measured
+    _, J = model.linearised(x, measured, phi)
+    B = by_joints(model, J) * np.sqrt(variance)[:, None]
+    return replace(measured, cov=measured.cov + B @ B.swapaxes(1, 2))
+
+
+def _of_sides(model: Model, x: Array, phi: Array) -> Array:
+    """Return the variance (N, n), rad^2, of joints in backlash that gravity closes: 1 - mean^2 of a side of +-1."""
+    out = np.zeros((len(phi), model.arm.joints))
+    for k, f in enumerate(model.features):
+        if f.kind == "gravity_backlash":
+            half = 0.5 * x[model.sources_at + k]
+            out[:, f.joint] = half**2 * (1 - (2 * phi[:, k]) ** 2) * phi[:, k].any()
+    return out
+
+
+def by_joints(model: Model, J: Array) -> Array:
+    """Return the derivative (N, M, n) by the joints' angles, from that by all parameters (N, M, P)."""
+    return np.asarray(J[:, :, model.table_at + OFFSET : model.sources_at : len(COLUMNS)])

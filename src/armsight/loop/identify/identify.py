@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
-from armsight.loop.identify.diagnose import check_plausible, without_tool
-from armsight.loop.identify.fit import Mask, Solution, covariance, fit, prior_sigma
-from armsight.loop.identify.joint_noise import JointNoise, joint_noise, no_noise, with_joint_noise
+from armsight.loop.identify.fit import Mask, Solution, covariance, fit, joint_noise, prior_sigma, with_joint_noise
 from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.misread import check_plausible, without_tool
 from armsight.loop.identify.model import PLENTY, SENSOR, Model, approaches
 from armsight.loop.identify.observable import Observed, observed
 from armsight.loop.identify.placement import with_placement
@@ -134,28 +133,16 @@ def identify(
     return _identified(model, start, measured, prior, placement, progress)
 
 
-def begun(
-    arm: Arm,
-    measured: Measured,
-    *,
-    priors: Mapping[str, float] | None = None,
-    progress: Callable[[str], None] = lambda line: None,
-) -> tuple[Model, Array, Array]:
+def begun(arm: Arm, measured: Measured) -> tuple[Model, Array, Array]:
     """Return the model, the vector (P,) of the nominal arm with base and tool estimated, and prior sigmas (P,).
 
-    Every identification, and the choice of its next poses, starts from this; poses that are not enough for it are rejected.
-
-    Args:
-        arm: the nominal arm.
-        measured: joint angles, and where the tool was measured.
-        priors: as in :func:`identify`.
-        progress: called with the name of each step as it begins.
+    The choice of the next poses starts from this.
 
     Raises:
         InputError: too few poses, or data that cannot be of this arm.
         CalibrationError: poses so alike that not even base and tool are observable.
     """
-    model, x, prior, seen = _begun(arm, measured, priors, progress)
+    model, x, prior, seen = _begun(arm, measured, None, lambda line: None)
     lost = [model.names[k] for k in np.flatnonzero(_of(model, PLACEMENT) & ~seen.free)]
     if lost:
         raise CalibrationError(
@@ -169,7 +156,12 @@ def _begun(
     arm: Arm, measured: Measured, priors: Mapping[str, float] | None, progress: Callable[[str], None]
 ) -> tuple[Model, Array, Array, Observed]:
     """Return what :func:`begun` does, and which parameters of base and tool the poses show."""
-    _require_enough(measured)
+    if len(measured) < MIN_POSES:
+        raise InputError(
+            f"{len(measured)} poses are fewer than {MIN_POSES}, which base and tool alone need; 50 and more are advised"
+        )
+    if np.ptp(measured.q, axis=0).max() < ALIKE:
+        raise CalibrationError("the poses are too alike: no joint moves; move every joint by 20 degrees and more")
     arm = without_tool(arm)
     progress("is this the arm")
     check_plausible(arm, measured)
@@ -177,7 +169,7 @@ def _begun(
     still = np.ptp(measured.q, axis=0) < ALIKE  # the curve of a joint that does not move is its zero
     curves = np.array([p.kind in SENSOR and bool(still[p.joint]) for p in model.parameters])
     prior = np.where(curves, 0.0, prior_sigma(model, priors))
-    at = _first(model, x, measured, prior)
+    at = fit(model, x, measured, np.arange(len(x)) == 0, prior)  # for the noise of the closed form's residuals
     placement = np.where(_of(model, PLACEMENT), prior, 0.0)
     return model, at.x, prior, observed(model, at.x, measured, placement, at.noise)
 
@@ -192,8 +184,8 @@ def _identified(
     table = observed(model, start.x, part, prior, start.noise).free & _of(model, (*PLACEMENT, *_TABLE))
     geometric = fit(model, start.x, part, table, prior)
     progress("every error source at once")
-    whole, prior, observable, scatter = _everything(model, start, geometric, part, prior)
-    part, measured = (with_joint_noise(model, whole.x, m, scatter.sigma_rad) for m in (part, measured))
+    whole, prior, observable, scatter_rad = _everything(model, start, geometric, part, prior)
+    part, measured = (with_joint_noise(model, whole.x, m, scatter_rad) for m in (part, measured))
     progress("which error sources lower the held-out error")
     # A curve's harmonics and a joint's loads are selected together: each alone may hardly show at these poses.
     candidates = observable.free | (observable.possible & _of(model, TOGETHER))
@@ -207,55 +199,31 @@ def _identified(
     kept_together = {model.names[k] for k in np.flatnonzero(selection.free & ~observable.free)}
     reasons = {**{n: why for n, why in observable.reasons.items() if n not in kept_together}, **selection.reasons}
     model = model.with_seen(measured.q[solution.used])
-    everything = _whole(model, solution, measured, observable.possible, prior)
+    everything = covariance(model, solution, measured, observable.possible, prior)
     moved = solution.x - whole.x
     cov = np.where(selection.free[:, None] & selection.free, everything + np.diag(moved**2), 0.0)
     found = (model, nominal.x, solution, reasons, selection.steps, observable.singular_values)
-    return Identified(*found, prior, cov, everything, moved, scatter.sigma_rad)
+    return Identified(*found, prior, cov, everything, moved, scatter_rad)
 
 
 def _everything(
     model: Model, start: Solution, geometric: Solution, measured: Measured, prior: Array
-) -> tuple[Solution, Array, Observed, JointNoise]:
+) -> tuple[Solution, Array, Observed, Array]:
     """Fit all that may be off, in rounds: each fit's noise gives the size of the error sources and the joints' scatter."""
-    noise = geometric.noise
-    whole = geometric
-    scaled = prior
-    weighted, scatter = measured, no_noise(model.arm.joints)
+    noise, whole, scaled = geometric.noise, geometric, prior
+    weighted, scatter_rad = measured, np.zeros(model.arm.joints)
     for _ in range(ROUNDS if measured.cov is not None else 2):
         seen = observed(model, start.x, weighted, prior, noise)
         whole = fit(model, whole.x, weighted, seen.possible, scaled, noise=noise)
         if measured.cov is not None:
-            scatter = joint_noise(model, whole, scaled, measured)
-            weighted = with_joint_noise(model, whole.x, measured, scatter.sigma_rad)
+            scatter_rad = joint_noise(model, whole, scaled, measured).sigma_rad
+            weighted = with_joint_noise(model, whole.x, measured, scatter_rad)
         noise, scaled = whole.noise, scaled_prior(model, whole, weighted, seen.possible, prior)
-    return whole, scaled, observed(model, start.x, weighted, scaled, noise), scatter
+    return whole, scaled, observed(model, start.x, weighted, scaled, noise), scatter_rad
 
 
 def _of(model: Model, kinds: tuple[str, ...]) -> Mask:
     return np.array([p.kind in kinds for p in model.parameters])
-
-
-def _whole(model: Model, solution: Solution, measured: Measured, free: Mask, prior: Array) -> Array:
-    """Return the covariance (P, P) of the free parameters at the solution, with its noise."""
-    part = measured.rows(solution.used)
-    return covariance(model, solution.x, part, model.feature_values(part.q, part.approach), free, prior, solution.noise)
-
-
-def _first(model: Model, x: Array, measured: Measured, prior: Array) -> Solution:
-    """Return the closed-form placement as a solution, with the noise of its residuals."""
-    none = np.zeros(len(x), bool)
-    none[0] = True
-    return fit(model, x, measured, none, prior)
-
-
-def _require_enough(measured: Measured) -> None:
-    if len(measured) < MIN_POSES:
-        raise InputError(
-            f"{len(measured)} poses are fewer than {MIN_POSES}, which base and tool alone need; 50 and more are advised"
-        )
-    if np.ptp(measured.q, axis=0).max() < ALIKE:
-        raise CalibrationError("the poses are too alike: no joint moves; move every joint by 20 degrees and more")
 
 
 def contributions(found: Identified, measured: Measured) -> dict[str, float]:
@@ -284,10 +252,6 @@ def contributions(found: Identified, measured: Measured) -> dict[str, float]:
         new = np.linalg.qr(columns)[0]
         taken = new @ (new.T @ left)
         left, Q = left - taken, np.column_stack([Q, new])
-        if set(names) - set(_named_kinds(model, PLACEMENT)):
+        if any(model.parameters[model.names.index(name)].kind not in PLACEMENT for name in names):
             out[step.source] = float(np.sqrt(np.sum(taken**2) / (len(measured) * measured.points)))
     return out
-
-
-def _named_kinds(model: Model, kinds: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(p.name for p in model.parameters if p.kind in kinds)

@@ -33,6 +33,8 @@ class Measured(Record):
             M = 6, of the right tangent [translation; rotation], as ``PoseEstimate.cov``.
         approach: (N, n) from which side each joint came to rest: +1 while its angle grew, -1 while it fell, 0 unknown;
             None where nothing is known.
+        angles_deg: (N, 3) rx, ry, rz as in the file, degrees, where the rotations came as angles; None else.
+        rotation: the convention that these were read in, one of ROTATIONS; "" else.
     """
 
     q: Array
@@ -40,6 +42,8 @@ class Measured(Record):
     R_rig_body: Array | None = None
     cov: Array | None = None
     approach: Array | None = None
+    angles_deg: Array | None = None
+    rotation: str = ""
 
     def __post_init__(self) -> None:
         """Check shapes.
@@ -75,8 +79,9 @@ class Measured(Record):
 
     def rows(self, rows: Rows) -> Measured:
         """Return a part of the poses."""
-        parts = (None if a is None else a[rows] for a in (self.R_rig_body, self.cov, self.approach))
-        return Measured(self.q[rows], self.p_rig[rows], *parts)
+        own = (self.R_rig_body, self.cov, self.approach, self.angles_deg)
+        R, cov, approach, angles = (None if a is None else a[rows] for a in own)
+        return Measured(self.q[rows], self.p_rig[rows], R, cov, approach, angles, self.rotation)
 
 
 #: Poses whose joints all read within this, rad, of each other's are one pose, visited again.

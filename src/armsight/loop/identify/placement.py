@@ -14,8 +14,8 @@ from scipy.linalg import orth
 from scipy.spatial.transform import Rotation
 
 from armsight.data import Array
-from armsight.geometry.pose import inverse
-from armsight.geometry.rotation import exp_so3, log_so3, skew
+from armsight.geometry.pose import inverse, pose
+from armsight.geometry.rotation import exp_so3, skew
 from armsight.loop.handeye.poses import starts
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
@@ -34,7 +34,7 @@ def with_placement(model: Model, measured: Measured) -> tuple[Model, Array]:
     x = model.nominal()
     m = model.motion(x, measured.q, model.feature_values(measured.q, measured.approach))
     if measured.R_rig_body is not None:
-        A, B = _stacked(m.R, m.o), _stacked(measured.R_rig_body, measured.p_rig[:, 0])
+        A, B = pose(m.R, m.o), pose(measured.R_rig_body, measured.p_rig[:, 0])
         X, Z = starts(A, B)[0]  # A: frame 6 in the base; Z: the rig in the base; X: the body on frame 6
         T = inverse(Z)
         model, t = replace(model, R_start=T[:3, :3], R_tool=X[:3, :3]), X[None, :3, 3]
@@ -113,14 +113,3 @@ def _linear_system(R: Array, o: Array, p_rig: Array) -> tuple[Array, Array, Arra
 def _solved(G: Array, right: Array) -> Array:
     size = np.linalg.norm(G, axis=0) + 1e-300
     return np.asarray(np.linalg.lstsq(G / size, right, rcond=1e-12)[0] / size)
-
-
-def _stacked(R: Array, o: Array) -> Array:
-    T = np.zeros((len(R), 4, 4))
-    T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = R, o, 1.0
-    return T
-
-
-def angle_between(R_a: Array, R_b: Array) -> Array:
-    """Return the angles (N,) between rotations (N, 3, 3), rad."""
-    return np.asarray(np.linalg.norm(log_so3(R_a.swapaxes(-1, -2) @ R_b), axis=-1))

@@ -1,21 +1,19 @@
-"""Optimal choice of the next poses to measure, and the predicted position error after each.
+"""The poses to take next: those that lower what is not known most, of those that can be reached and seen.
 
-In: the model with its priors, what was measured already, and which poses the cameras see. Out: a :class:`Plan`.
+In: a hand-eye calibration and its poses, or a nominal arm with what was measured of it and the cameras. Out:
+:class:`MountingPlan`, poses of the flange; or :class:`Plan`, joint angles with the predicted error after each.
 
-The criterion is I-optimality: the mean variance of predicted tool positions over the workspace, to first order in the
-parameters' covariance. A pose adds the information J^T C^-1 J, with the covariance C of the instrument there. A greedy
-choice among random candidates that can be reached and seen is improved by coordinate exchange (Meyer and Nachtsheim,
-Technometrics 37, 1995): every joint of every pose, one after the other, goes to the best of some levels, as long as that
-lowers the criterion.
-
-The file in order: the choice itself, on whitened Jacobians alone; the plan for an arm; the poses that are allowed.
+A pose adds the information J^T C^-1 J, with the covariance C of what is measured there. The criterion is I-optimality: the
+mean variance of what is requested, to first order. :func:`greedy` chooses among candidates; for joints its choice is
+improved by coordinate exchange (:func:`exchanged`; Meyer and Nachtsheim, Technometrics 37, 1995): every joint of every pose
+goes to the best of some levels, as long as that lowers the criterion.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,25 +21,30 @@ from numpy.typing import NDArray
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.estimate.solve import whitened
-from armsight.loop.identify.fit import SIGMA, Mask, linear_of, variances_of
-from armsight.loop.identify.joint_noise import by_joints
+from armsight.geometry.pose import inverse, log_se3, pose, transform
+from armsight.geometry.rotation import exp_so3
+from armsight.loop.handeye.handeye import HandEye
+from armsight.loop.handeye.poses import LEVER_M, Poses
+from armsight.loop.identify.fit import SIGMA, Mask, by_joints, linear_of, prior_sigma, variances_of
+from armsight.loop.identify.identify import begun
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import FAST, RIPPLES, Model, all_features
 from armsight.loop.identify.observable import observed
 from armsight.loop.identify.selection import SCALED
+from armsight.robot.kinematics.arm import Arm
+from armsight.vision.rig import StereoRig
 
+#: Returns the whitened Jacobians (N, M, F) of poses q (N, J) approached from sides (N, J), and which of them are allowed.
+#: Those of poses that are not allowed do not count, except the first.
+Information = Callable[[Array, Array], tuple[Array, Mask]]
 #: Candidates compared at once: bounds the memory.
 _BATCH = 250
 #: Levels that a joint is tried at, from both sides; most sweeps over all poses; least relative gain of a sweep to go on.
 LEVELS, SWEEPS, MIN_GAIN = 7, 3, 0.01
 
-#: Returns the whitened Jacobians (N, M, F) of poses q (N, J) approached from sides (N, J), and which of them are allowed.
-#: Those of poses that are not allowed do not count, except the first.
-Information = Callable[[Array, Array], tuple[Array, Mask]]
-
 
 def greedy(J: Array, P: Array, requested: Array, n: int, *, in_order: bool = False) -> tuple[Array, Array]:
-    """Return rows chosen one by one, and the predicted RMS position error before and after each.
+    """Return rows chosen one by one, and the predicted RMS error before and after each.
 
     Args:
         J: (N, M, F) whitened Jacobians of the candidates.
@@ -50,36 +53,29 @@ def greedy(J: Array, P: Array, requested: Array, n: int, *, in_order: bool = Fal
         n: how many to choose.
         in_order: take them as they come instead.
     """
-    P = P.copy()
-    left = np.ones(len(J), bool)
-    chosen: list[int] = []
+    left, chosen = np.ones(len(J), bool), list[int]()
     W = requested.T @ requested
-    sigma = [rms(P, W, len(requested))]
+    sigma = [_rms(P, W, len(requested))]
     for k in range(n):
-        if in_order:
-            best = k
-        else:
-            rows = np.flatnonzero(left)
-            best = int(rows[np.argmax(gains(J[rows], P, W))])
+        rows = np.flatnonzero(left)
+        best = k if in_order else int(rows[np.argmax(_gains(J[rows], P, W))])
         G = P @ J[best].T
-        S = np.eye(J.shape[1]) + J[best] @ G
-        P = P - G @ np.linalg.solve(S, G.T)
+        P = P - G @ np.linalg.solve(np.eye(J.shape[1]) + J[best] @ G, G.T)
         P = (P + P.T) / 2
         left[best] = False
         chosen.append(best)
-        sigma.append(rms(P, W, len(requested)))
+        sigma.append(_rms(P, W, len(requested)))
     return np.array(chosen), np.array(sigma)
 
 
-def rms(P: Array, W: Array, numbers: int) -> float:
+def _rms(P: Array, W: Array, numbers: int) -> float:
     """Return the RMS length of the error of positions whose derivatives' squares sum to W, three numbers each."""
     return float(np.sqrt(3 * np.einsum("ij,ji->", W, P) / numbers))
 
 
-def gains(J: Array, P: Array, W: Array) -> Array:
+def _gains(J: Array, P: Array, W: Array) -> Array:
     """Return by how much each pose lowers trace(W P): trace(S^-1 J P W P J^T)."""
-    PWP = P @ W @ P
-    out = np.empty(len(J))
+    PWP, out = P @ W @ P, np.empty(len(J))
     for at in range(0, len(J), _BATCH):
         part = J[at : at + _BATCH]
         S = np.eye(J.shape[1]) + part @ P @ part.swapaxes(1, 2)
@@ -104,19 +100,19 @@ def exchanged(
         information: of poses, and which are allowed.
         P: (F, F) covariance before.
         requested: (3 K, F) derivative of K positions, whose error is to be low.
-        limits: (6,) and (6,) least and greatest angles, rad.
+        limits: (J,) and (J,) least and greatest angles, rad.
         rng: sets the levels, and the order of the joints.
     """
     q, approach, W = q.copy(), approach.copy(), requested.T @ requested
     J, _ = information(q, approach)
     H = np.linalg.inv(P) + np.einsum("nki,nkj->ij", J, J)
-    reached = rms(np.linalg.inv(H), W, len(requested))
+    reached = _rms(np.linalg.inv(H), W, len(requested))
     for _ in range(SWEEPS):
         for k in range(len(q)):
             others = H - J[k].T @ J[k]
             q[k], approach[k], J[k] = _best(q[k], approach[k], information, np.linalg.inv(others), W, limits, rng)
             H = others + J[k].T @ J[k]
-        before, reached = reached, rms(np.linalg.inv(H), W, len(requested))
+        before, reached = reached, _rms(np.linalg.inv(H), W, len(requested))
         if reached > (1 - MIN_GAIN) * before:
             break
     return q, approach
@@ -141,7 +137,7 @@ def _best(
         sides[1 + LEVELS :, joint] *= -1
         J, allowed = information(tried, sides)
         allowed[0] = True  # the pose as it was: it stays where nothing is better
-        best = int(np.argmax(np.where(allowed, gains(J, P, W), -np.inf)))
+        best = int(np.argmax(np.where(allowed, _gains(J, P, W), -np.inf)))
         q, approach, kept = tried[best], sides[best], J[best]
     return q, approach, kept
 
@@ -161,6 +157,17 @@ TYPICAL_SHARE = 1 / 3
 #: Joints scatter by about this much from pose to pose, rad (0.1 mm at 1 m): friction, a sensor's noise. Without it an
 #: instrument of 0.03 mm would seem to learn everything from a few poses.
 CHANCE_RAD = 1e-4
+#: Assumed of an instrument of which nothing is known, and beyond the cameras' covariance: sigma of a position, m, and of a
+#: rotation, rad.
+NOISE, BESIDES = (1e-4, 5e-4), (1e-6, 1e-6)
+#: A body in the cameras: RMS distance of its markers from their middle, m, how many there are, and the sigma of each in an
+#: image, px. Half the distance: its rotation is known half as well.
+SPREAD_M, MARKERS, SIGMA_PX = 0.04, 6, 0.1
+#: A pose is seen where its body is this far from the images' edges, px.
+MARGIN_PX = 60.0
+#: Markers are on one side of a body: it is taken to be visible up to the rotation at which it was seen already, and this
+#: much more, rad.
+MORE_RAD = np.radians(10.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,171 +192,68 @@ class Plan(Record):
         return int(reached[0]) if len(reached) else None
 
 
-def plan_poses(
-    model: Model,
-    x: Array,
-    prior: Array,
-    noise: tuple[float, float],
+def plan_joints(
+    arm: Arm,
+    done: Measured | None,
+    rig: StereoRig | None,
     n: int,
+    seed: int,
     *,
-    done: Measured | None = None,
-    visible: Callable[[Array], NDArray[np.bool_]] = lambda T_rig_body: np.ones(len(T_rig_body), bool),
-    cov: Callable[[Array], Array] | None = None,
+    noise: tuple[float, float] = NOISE,
     floor_m: float = FLOOR_M,
-    seed: int = 0,
 ) -> Plan:
-    """Choose the poses that lower the position error most.
+    """Choose the poses that lower the position error of an identification most.
 
     Args:
-        model: the arm with every parameter.
-        x: (P,) the vector, with base and tool known at least roughly.
-        prior: (P,) prior sigmas, as of a fit.
-        noise: sigmas of position, m, and rotation, rad, of the instrument, where ``cov`` is None.
-        n: how many poses.
-        done: what was measured already.
-        visible: returns which poses T_rig_body (N, 4, 4) the cameras can see.
-        cov: returns the covariance (N, M, M) of the measurement of poses T_rig_body (N, 4, 4).
-        floor_m: how far above the base's plane the links must stay, m.
+        arm: the nominal arm.
+        done: what was measured already, which locates base and tool; None: all that can be reached counts as seen.
+        rig: the stereo rig; None: all that can be reached counts as seen, equally well.
+        n: how many.
         seed: of the candidates.
+        noise: sigmas of position, m, and rotation, rad, of the instrument where there is no rig.
+        floor_m: how far above the base's plane the links must stay, m.
 
     Raises:
-        InputError: fewer candidates than ``n`` can be reached and seen.
+        InputError: ``done`` is too few poses, or not of this arm; or fewer than ``n`` poses can be reached and seen.
+        CalibrationError: the poses of ``done`` are so alike that they do not determine where the arm is.
     """
     rng = np.random.default_rng(seed)
+    if done is None:
+        T = arm.forward(arm.home[None])
+        model = Model.of(arm, Measured(arm.home[None], T[:, None, :3, 3], T[:, :3, :3]), backlash=True)
+        x, prior = model.nominal(), prior_sigma(model)
+    else:
+        model, x, prior = begun(arm, done)
     model, x, prior = _with_curves(model, x, prior)
-    scene = PlanningScene(model, x, noise, visible, cov, floor_m)
-    q, approach, seen = _candidates(scene, rng)
+    scene = _Scene.of(model, x, noise, floor_m, None if done is None else rig, done)
+    q, approach, seen = scene.candidates(rng)
     if len(q) < n:
         raise InputError(f"only {len(q)} poses that can be reached and seen were found; {n} were asked for")
     prior = np.where([p.kind in SCALED for p in model.parameters], TYPICAL_SHARE * prior, prior)
-    free = observed(model, x, seen, prior, noise).possible
-    P = _prior_covariance(prior, free)
+    free = observed(model, x, seen, prior, scene.noise).possible
+    P = np.diag(np.where(np.isfinite(prior), prior, UNKNOWN)[free] ** 2)
     if done is not None:
         Jd = scene.whitened(done)[:, :, free].reshape(-1, int(free.sum()))
-        P = np.asarray(np.linalg.inv(np.linalg.inv(P) + Jd.T @ Jd))
+        P = np.linalg.inv(np.linalg.inv(P) + Jd.T @ Jd)
     J = scene.whitened(seen)[:, :, free]
-    requested = _position_derivative(model, x, seen, free, rng)
+    part = seen.rows(rng.choice(len(seen), min(PROBES, len(seen)), replace=False))
+    by = model.linearised(x, part, model.feature_values(part.q, part.approach))[1]
+    requested = by[:, :3, free].reshape(-1, int(free.sum()))
 
     def information(q: Array, approach: Array) -> tuple[Array, Mask]:
-        return scene.information(q, approach, free)
+        # Poses that are not allowed have zeros: behind a camera there is no covariance. The first is the pose as it was.
+        allowed = scene.allowed(q, approach)
+        rows = np.flatnonzero(allowed | (np.arange(len(q)) == 0))
+        part = scene.whitened(scene.seen(q[rows], approach[rows]))[:, :, free]
+        out = np.zeros((len(q), *part.shape[1:]))
+        out[rows] = part
+        return out, allowed
 
     chosen, _ = greedy(J, P, requested, n)
     better, sides = exchanged(q[chosen], approach[chosen], information, P, requested, scene.limits, rng)
     order, sigma = greedy(information(better, sides)[0], P, requested, n)
     _, random_sigma = greedy(J[rng.permutation(len(J))[: 4 * n]], P, requested, min(4 * n, len(J)), in_order=True)
     return Plan(better[order], sides[order], sigma, random_sigma)
-
-
-class PlanningScene(NamedTuple):
-    """The measurements that poses would give, and which poses are allowed.
-
-    Attributes:
-        model: the arm with every parameter.
-        x: (P,) the vector.
-        noise: sigmas of position, m, and rotation, rad, beyond ``cov``.
-        visible: returns which poses T_rig_body (N, 4, 4) the cameras can see.
-        cov: returns the covariance (N, M, M) of their measurement; None: ``noise`` is all.
-        floor_m: how far above the base's plane the links must stay, m.
-    """
-
-    model: Model
-    x: Array
-    noise: tuple[float, float]
-    visible: Callable[[Array], NDArray[np.bool_]]
-    cov: Callable[[Array], Array] | None
-    floor_m: float
-
-    @property
-    def limits(self) -> tuple[Array, Array]:
-        """Return least and greatest joint angles (6,), rad, of a plan."""
-        arm = self.model.arm
-        return np.maximum(arm.q_min + ROOM_RAD, -np.pi), np.minimum(arm.q_max - ROOM_RAD, np.pi)
-
-    def T_rig_body(self, q: Array, approach: Array) -> Array:
-        """Return the body (N, 4, 4) in the rig."""
-        return np.asarray(self.model.T_rig_base(self.x) @ self.model.tool_in_base(self.x, q, approach))
-
-    def allowed(self, q: Array, approach: Array) -> Mask:
-        """Return which poses (N,) are free of collision and visible."""
-        out = self.visible(self.T_rig_body(q, approach))
-        out[out] = free_of_collision(self.model, q[out], self.floor_m)
-        return out
-
-    def seen(self, q: Array, approach: Array) -> Measured:
-        """Return the measurements of poses without noise."""
-        model, T = self.model, self.T_rig_body(q, approach)
-        m = model.motion(self.x, q, model.feature_values(q, approach))
-        p = m.o[:, None] + (m.R @ model.tool_points(self.x).T).swapaxes(1, 2)
-        return Measured(q, p, T[:, :3, :3] if model.full else None, None if self.cov is None else self.cov(T), approach)
-
-    def information(self, q: Array, approach: Array, free: Mask) -> tuple[Array, Mask]:
-        """Return whitened Jacobians (N, M, F) by the free parameters, and which poses (N,) are allowed.
-
-        Poses that are not allowed have zeros (behind a camera there is no covariance). The first is the pose as it was, and
-        always has its Jacobian.
-        """
-        allowed = self.allowed(q, approach)
-        rows = np.flatnonzero(allowed | (np.arange(len(q)) == 0))
-        part = self.whitened(self.seen(q[rows], approach[rows]))[:, :, free]
-        J = np.zeros((len(q), *part.shape[1:]))
-        J[rows] = part
-        return J, allowed
-
-    def whitened(self, measured: Measured) -> Array:
-        """Return the whitened Jacobians (N, M, P)."""
-        phi = self.model.feature_values(measured.q, measured.approach)
-        everything = np.ones(len(self.x), bool)
-        linear = linear_of(self.model, self.x, measured, phi, everything, np.full(len(self.x), np.inf))
-        variances = np.append(variances_of(linear, self.noise), CHANCE_RAD**2)
-        return whitened(replace(linear, own=linear.own | {"joints": by_joints(self.model, linear.J)}), variances)[1]
-
-
-def _candidates(scene: PlanningScene, rng: np.random.Generator) -> tuple[Array, Array, Measured]:
-    """Return joint angles, directions of approach and measurements of poses that are reachable, free and visible.
-
-    They are uniform over all such joint angles; where cameras see little of what an arm reaches, more are sampled.
-    """
-    angles, sides, found = [], [], 0
-    for _ in range(SAMPLING_ROUNDS):
-        q = rng.uniform(*scene.limits, (4 * CANDIDATES, len(scene.limits[0])))
-        approach = rng.choice([-1.0, 1.0], q.shape)
-        rows = np.flatnonzero(scene.allowed(q, approach))[: CANDIDATES - found]
-        angles.append(q[rows])
-        sides.append(approach[rows])
-        found += len(rows)
-        if found == CANDIDATES:
-            break
-    q, approach = np.concatenate(angles), np.concatenate(sides)
-    return q, approach, scene.seen(q, approach)
-
-
-def free_of_collision(model: Model, q: Array, floor_m: float = FLOOR_M) -> Mask:
-    """Return which joint angles (N, J) keep the arm above the base's plane and apart from itself.
-
-    Links are the straight lines between the axes' frames; the first two and neighbours are not compared.
-    """
-    if not len(q):
-        return np.zeros(0, bool)
-    o = np.stack([model.arm.links(angles)[:, :3, 3] for angles in q])
-    along = (o - model.arm.T_base_0[:3, 3]) @ model.up_base
-    out = np.asarray((along[:, 2:] > floor_m).all(axis=1))
-    out[out] = _segments_apart(o[out])
-    return out
-
-
-def _segments_apart(o: Array) -> Mask:
-    """Return whether the base's column and the links (N, J + 2, 3) from the elbow on stay apart, at steps along them."""
-    steps = np.linspace(0, 1, 9)[:, None]
-
-    def line(i: int, points: Array) -> Array:
-        return np.asarray(o[:, i, None] + points * (o[:, i + 1] - o[:, i])[:, None])
-
-    out = np.ones(len(o), bool)
-    for other in (line(0, steps), line(1, steps[:5])):
-        for i in range(3, o.shape[1] - 1):
-            between = line(i, steps)[:, :, None] - other[:, None]
-            out &= (np.einsum("nabk,nabk->nab", between, between) > APART_M**2).all(axis=(1, 2))
-    return out
 
 
 def _with_curves(model: Model, x: Array, prior: Array) -> tuple[Model, Array, Array]:
@@ -364,14 +268,262 @@ def _with_curves(model: Model, x: Array, prior: Array) -> tuple[Model, Array, Ar
     return whole, both[:, 0], both[:, 1]
 
 
-def _prior_covariance(prior: Array, free: Mask) -> Array:
-    sigma = np.where(np.isfinite(prior), prior, UNKNOWN)[free]
-    return np.asarray(np.diag(sigma**2))
+@dataclass(frozen=True, eq=False)
+class _Scene(Record):
+    """The measurements that poses would give, and which poses are allowed.
+
+    Attributes:
+        model: the arm with every parameter.
+        x: (P,) the vector.
+        noise: sigmas of position, m, and rotation, rad, beyond what the rig's geometry gives.
+        floor_m: how far above the base's plane the links must stay, m.
+        rig: the cameras; None: everything is seen.
+        sides: (2, 3) unit vectors in the body's axes from which each camera saw it on the whole, and (2,) the largest
+            rotation from them, rad; None where its rotation is not measured.
+    """
+
+    model: Model
+    x: Array
+    noise: tuple[float, float]
+    floor_m: float
+    rig: StereoRig | None
+    sides: tuple[Array, Array] | None = None
+
+    @staticmethod
+    def of(
+        model: Model,
+        x: Array,
+        noise: tuple[float, float],
+        floor_m: float,
+        rig: StereoRig | None,
+        done: Measured | None,
+    ) -> _Scene:
+        """Return the scene; ``done`` shows from which sides the body is seen."""
+        scene = _Scene(model, x, noise if rig is None else BESIDES, floor_m, rig)
+        if rig is None or done is None or done.R_rig_body is None:
+            return scene
+        Ts = pose(done.R_rig_body, done.p_rig[:, 0])
+        axes = _to_cameras(rig, Ts).mean(axis=0)
+        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+        return replace(scene, sides=(axes, _rotated(rig, Ts, axes).max(axis=0)))
+
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Return least and greatest joint angles (J,), rad, of a plan."""
+        arm = self.model.arm
+        return np.maximum(arm.q_min + ROOM_RAD, -np.pi), np.minimum(arm.q_max - ROOM_RAD, np.pi)
+
+    def T_rig_body(self, q: Array, approach: Array) -> Array:
+        """Return the body (N, 4, 4) in the rig."""
+        return np.asarray(self.model.T_rig_base(self.x) @ self.model.tool_in_base(self.x, q, approach))
+
+    def allowed(self, q: Array, approach: Array) -> Mask:
+        """Return which poses (N,) are visible and free of collision."""
+        out, Ts = np.ones(len(q), bool), self.T_rig_body(q, approach)
+        if self.rig is not None:
+            for camera, p in zip(self.rig.cameras, _in_cameras(self.rig, Ts), strict=True):
+                with np.errstate(invalid="ignore"):
+                    inside = np.abs(camera.project(p) - np.array(camera.image_size_px) / 2)
+                    room = np.array(camera.image_size_px) / 2 - MARGIN_PX
+                    out &= (p[:, 2] > 0) & (inside < room).all(axis=1)
+            if self.sides is not None:
+                out &= (_rotated(self.rig, Ts, self.sides[0]) <= self.sides[1] + MORE_RAD).all(axis=1)
+        out[out] = free_of_collision(self.model, q[out], self.floor_m)
+        return out
+
+    def seen(self, q: Array, approach: Array) -> Measured:
+        """Return the measurements of poses without noise."""
+        model, T = self.model, self.T_rig_body(q, approach)
+        m = model.motion(self.x, q, model.feature_values(q, approach))
+        p = m.o[:, None] + (m.R @ model.tool_points(self.x).T).swapaxes(1, 2)
+        return Measured(q, p, T[:, :3, :3] if model.full else None, self._cov(T), approach)
+
+    def _cov(self, Ts: Array) -> Array | None:
+        """Return the covariance of bodies: of their middle from all markers, of their rotation from the markers' spread.
+
+        Of the tool's points instead of its full pose: theirs, each from its share of the markers.
+        """
+        if self.rig is None:
+            return None
+        H, points = np.zeros((len(Ts), 3, 3)), self.model.points
+        rotations = (np.eye(3), inverse(self.rig.T_left_right)[:3, :3])
+        for camera, p, R in zip(self.rig.cameras, _in_cameras(self.rig, Ts), rotations, strict=True):
+            J = camera.project_jacobians(p)[1] @ R
+            H += J.swapaxes(1, 2) @ J / SIGMA_PX**2
+        C = np.linalg.inv(H) / MARKERS
+        if not self.model.full:
+            return np.asarray(np.kron(np.eye(points), min(points, MARKERS) * C))
+        out = np.zeros((len(Ts), 6, 6))
+        out[:, :3, :3] = Ts[:, :3, :3].swapaxes(1, 2) @ C @ Ts[:, :3, :3]
+        # A rotation about one axis shows as displacement along the two others, so their mean stands for it.
+        out[:, 3:, 3:] = np.eye(3) * (np.einsum("nii->n", C) / 3 / SPREAD_M**2)[:, None, None]
+        return out
+
+    def whitened(self, measured: Measured) -> Array:
+        """Return the whitened Jacobians (N, M, P)."""
+        phi = self.model.feature_values(measured.q, measured.approach)
+        everything = np.ones(len(self.x), bool)
+        linear = linear_of(self.model, self.x, measured, phi, everything, np.full(len(self.x), np.inf))
+        variances = np.append(variances_of(linear, self.noise), CHANCE_RAD**2)
+        return whitened(replace(linear, own=linear.own | {"joints": by_joints(self.model, linear.J)}), variances)[1]
+
+    def candidates(self, rng: np.random.Generator) -> tuple[Array, Array, Measured]:
+        """Return joint angles, directions of approach and measurements of poses that are reachable, free and visible.
+
+        They are uniform over all such joint angles; where cameras see little of what an arm reaches, more are sampled.
+        """
+        angles, sides, found = [], [], 0
+        for _ in range(SAMPLING_ROUNDS):
+            q = rng.uniform(*self.limits, (4 * CANDIDATES, len(self.limits[0])))
+            approach = rng.choice([-1.0, 1.0], q.shape)
+            rows = np.flatnonzero(self.allowed(q, approach))[: CANDIDATES - found]
+            angles.append(q[rows])
+            sides.append(approach[rows])
+            found += len(rows)
+            if found == CANDIDATES:
+                break
+        q, approach = np.concatenate(angles), np.concatenate(sides)
+        return q, approach, self.seen(q, approach)
 
 
-def _position_derivative(model: Model, x: Array, seen: Measured, free: Mask, rng: np.random.Generator) -> Array:
-    """Return the derivative (PROBES * 3, F) of positions in the rig at poses over the workspace."""
-    rows = rng.choice(len(seen), min(PROBES, len(seen)), replace=False)
-    part = seen.rows(rows)
-    _, J = model.linearised(x, part, model.feature_values(part.q, part.approach))
-    return J[:, :3, free].reshape(-1, int(free.sum()))
+def _in_cameras(rig: StereoRig, Ts: Array) -> tuple[Array, Array]:
+    """Return the bodies' origins (N, 3) in either camera."""
+    return Ts[:, :3, 3], transform(inverse(rig.T_left_right), Ts[:, :3, 3])
+
+
+def _to_cameras(rig: StereoRig, Ts: Array) -> Array:
+    """Return the unit vectors (N, 2, 3) from the body to both cameras, in its own axes."""
+    cameras = np.stack([np.zeros(3), rig.T_left_right[:3, 3]])
+    rays = (cameras - Ts[:, None, :3, 3]) @ Ts[:, :3, :3]
+    return np.asarray(rays / np.linalg.norm(rays, axis=2, keepdims=True))
+
+
+def _rotated(rig: StereoRig, Ts: Array, axes: Array) -> Array:
+    """Return the rotations (N, 2) of bodies from the sides ``axes`` (2, 3), rad."""
+    return np.asarray(np.arccos(np.clip(np.einsum("nci,ci->nc", _to_cameras(rig, Ts), axes), -1, 1)))
+
+
+def free_of_collision(model: Model, q: Array, floor_m: float = FLOOR_M) -> Mask:
+    """Return which joint angles (N, J) keep the arm above the base's plane and apart from itself.
+
+    Links are the straight lines between the axes' frames; the first two and neighbours are not compared.
+    """
+    if not len(q):
+        return np.zeros(0, bool)
+    o = np.stack([model.arm.links(angles)[:, :3, 3] for angles in q])
+    out = np.asarray((((o - model.arm.T_base_0[:3, 3]) @ model.up_base)[:, 2:] > floor_m).all(axis=1))
+    steps = np.linspace(0, 1, 9)[:, None]
+
+    def line(i: int, points: Array) -> Array:
+        return np.asarray(o[out, i, None] + points * (o[out, i + 1] - o[out, i])[:, None])
+
+    apart = np.ones(int(out.sum()), bool)
+    for other in (line(0, steps), line(1, steps[:5])):  # the base's column, and the links from the elbow on
+        for i in range(3, o.shape[1] - 1):
+            between = line(i, steps)[:, :, None] - other[:, None]
+            apart &= (np.einsum("nabk,nabk->nab", between, between) > APART_M**2).all(axis=(1, 2))
+    out[out] = apart
+    return out
+
+
+#: Candidates for a mounting: how far the flange is rotated at most from the nearest pose it had, rad, how much larger its
+#: space may become, and by how much the target may leave the part of the image in which its middle was seen, as a tangent.
+POSES, NEAR_RAD, WIDER, BESIDE = 1500, np.radians(25), 0.2, 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class MountingPlan(Record):
+    """Poses of the flange to take.
+
+    Attributes:
+        Ts_base_flange: (K, 4, 4) the poses.
+        sigma_m: (K,) sigma of the mounting's translation along its worst axis after each, m.
+        sigma_rad: (K,) the same of its rotation, rad.
+        before: the two sigmas now.
+        nearest: (K,) the pose, of those given, from which the flange rotates least.
+        rotated_rad: (K,) by how much, rad.
+        moved_m: (K,) the distance from it, m.
+        reasons: what each pose lowers most.
+    """
+
+    Ts_base_flange: Array
+    sigma_m: Array
+    sigma_rad: Array
+    before: tuple[float, float]
+    nearest: NDArray[np.int64]
+    rotated_rad: Array
+    moved_m: Array
+    reasons: tuple[str, ...]
+
+
+def plan_mounting(found: HandEye, poses: Poses, count: int, seed: int = 0) -> MountingPlan:
+    """Choose the poses that lower the sigma of the mounting most (a radian counting as 0.3 m).
+
+    Candidates lie near poses that the arm has taken: each rotates one of them about the target's middle, the flange stays
+    within its space, a fifth more, and the target within the part of the image and the distances in which it was seen.
+
+    Args:
+        found: the calibration.
+        poses: the poses it was made from.
+        count: how many to choose.
+        seed: of the candidates.
+    """
+    A, B = _near(found, poses.rows(found.used), np.random.default_rng(seed))
+    J = found.whitened(Poses(A, B, np.tile(poses.cov.mean(axis=0), (len(A), 1, 1)), poses.in_hand, poses.centre))
+    chosen, _ = greedy(J, found.cov, np.diag(np.concatenate([np.zeros(6), np.repeat([1.0, LEVER_M], 3)])), count)
+    informations = np.cumsum(J[chosen].swapaxes(1, 2) @ J[chosen], axis=0)
+    covs = [found.cov, *np.linalg.inv(np.linalg.inv(found.cov) + informations)]
+    sigma = np.array([worst_sigmas(cov) for cov in covs[1:]])
+    R = found.T_flange_held[:3, :3]
+    reasons = tuple(_lowered(one[6:, 6:], after[6:, 6:], R) for one, after in itertools.pairwise(covs))
+    angle = np.linalg.norm(log_se3(inverse(poses.A)[None] @ A[chosen][:, None])[..., 3:], axis=2)
+    nearest = np.argmin(angle, axis=1)
+    moved = np.linalg.norm(A[chosen][:, :3, 3] - poses.A[nearest, :3, 3], axis=1)
+    now, rotated = worst_sigmas(found.cov), angle[np.arange(count), nearest]
+    return MountingPlan(A[chosen], sigma[:, 0], sigma[:, 1], now, nearest, rotated, moved, reasons)
+
+
+def _lowered(before: Array, after: Array, R: Array) -> str:
+    """Say which sigma of the mounting falls most from one covariance (6, 6) to another; R gives the flange's axes."""
+    falls = []
+    for part, unit, times, size in ((slice(0, 3), "mm", 1e3, 1.0), (slice(3, 6), "deg", np.degrees(1.0), LEVER_M)):
+        values, vectors = np.linalg.eigh(before[part, part] - after[part, part])
+        axis = vectors[:, -1]
+        named = R @ axis * np.sign((R @ axis)[np.argmax(np.abs(R @ axis))])
+        sigmas = [times * float(np.sqrt(axis @ C[part, part] @ axis)) for C in (before, after)]
+        along = "along" if unit == "mm" else "about"
+        said = f"{along} [{' '.join(f'{v:.1f}' for v in named)}] {sigmas[0]:.3g} to {sigmas[1]:.3g} {unit}"
+        falls.append((size**2 * float(values[-1]), said))
+    return max(falls)[1]
+
+
+def worst_sigmas(cov: Array) -> tuple[float, float]:
+    """Return the sigmas of the mounting along its worst axes, m and rad, of a covariance (12, 12)."""
+    return (float(np.sqrt(np.linalg.eigvalsh(cov[6:9, 6:9])[-1])), float(np.sqrt(np.linalg.eigvalsh(cov[9:, 9:])[-1])))
+
+
+def _near(found: HandEye, poses: Poses, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return candidates: poses of the flange, and of the body as it would be seen there."""
+    p = transform(poses.B, poses.centre)
+    distance = np.linalg.norm(p, axis=1)
+    k, other = rng.integers(0, len(p), (2, POSES))
+    axis = rng.standard_normal((POSES, 3))
+    angle = NEAR_RAD * rng.uniform(0, 1, POSES) ** (1 / 3)
+    R = exp_so3(axis * (angle / np.linalg.norm(axis, axis=1))[:, None]) @ poses.B[k, :3, :3]
+    middle = p[other] * (rng.uniform(distance.min(), distance.max(), POSES) / distance[other])[:, None]
+    B = pose(R, middle - R @ poses.centre)
+    Z, X = found.T_base_still, found.T_flange_held
+    A = Z @ inverse(X @ B) if poses.in_hand else Z @ B @ inverse(X)
+    seen, was = middle[:, :2] / middle[:, 2:], p[:, :2] / p[:, 2:]
+    low, high = poses.A[:, :3, 3].min(axis=0), poses.A[:, :3, 3].max(axis=0)
+    margin = WIDER * (high - low) + 0.02
+    facing = np.einsum("ni,ni->n", B[:, :3, 2], middle) / np.linalg.norm(middle, axis=1)
+    faced = np.einsum("ni,ni->n", poses.B[:, :3, 2], p) / distance
+    good = (
+        (seen >= was.min(axis=0) - BESIDE).all(axis=1)
+        & (seen <= was.max(axis=0) + BESIDE).all(axis=1)
+        & (A[:, :3, 3] >= low - margin).all(axis=1)
+        & (A[:, :3, 3] <= high + margin).all(axis=1)
+        & (facing * np.sign(np.median(faced)) > min(0.6, float(np.abs(faced).min())))
+    )
+    return (A[good], B[good]) if good.any() else (poses.A, poses.B)

@@ -3,12 +3,13 @@
 Columns, in any order; others are ignored: joints q1_rad .. (or q1_deg .., or the arm's own names); then tracked points
 p1_x_mm, p1_y_mm, p1_z_mm, p2_x_mm, .. (or _m), or one, x_m, y_m, z_m (or _mm), with rx_deg, ry_deg, rz_deg where an
 instrument gives angles and their convention is given; or full poses x_m, y_m, z_m, qw, qx, qy, qz (or r11 .. r33), with
-cov_00 .. cov_55 as ``armsight measure`` writes them; approach1 .. (1, -1, 0).
+cov_00 .. cov_55 as ``armsight measure`` writes them; approach1 .. (1, -1, 0). The joints may be in a table of their own.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,19 +18,19 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.loop.handeye.recording import matched_rows
 from armsight.loop.identify.measured import Measured
+from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS
-from armsight.tables.cells import Cells, read_cells, read_columns
+from armsight.tables.cells import Cells, Rows, read_cells, read_columns
 from armsight.tables.columns import COLUMNS as _COLUMNS
-from armsight.tables.columns import Columns, degree_columns, understood
-from armsight.tables.poses import ArmJoints
-from armsight.tables.rotations import ROTATIONS, rotations_by
+from armsight.tables.columns import NAMES, Columns
+from armsight.tables.number import number
+from armsight.tables.poses import ArmJoints, PoseTable, columns_in, read_pose_table
+from armsight.tables.rotations import ROTATIONS
 
 _UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
 _COV = [f"cov_{i}{j}" for i, j in _UPPER]
-_QUATERNION = ["qw", "qx", "qy", "qz"]
-_MATRIX = [f"r{i}{j}" for i in "123" for j in "123"]
-_METRES = {"mm": 1e-3, "m": 1.0, "": 1.0}
 #: The names that ``columns`` may say the file's own for.
 COLUMNS = (
     *_COLUMNS,
@@ -37,19 +38,9 @@ COLUMNS = (
     *_COV,
     *(f"approach{i}" for i in range(1, MOST_JOINTS + 1)),
 )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class AnglesMeasured(Measured):
-    """Full poses whose rotations came as three angles, which may follow another convention than was given.
-
-    Attributes:
-        angles_deg: (N, 3) rx, ry, rz as in the file, degrees.
-        rotation: the convention given for them, one of ROTATIONS.
-    """
-
-    angles_deg: Array
-    rotation: str
+#: Joined by time, a shot counts where no joint reads further from its angle than this, rad, so long before and after, s: an
+#: offset of the clocks would be taken for an error of a moving arm.
+REST_RAD, REST_S = 3e-3, 0.2
 
 
 class Read(NamedTuple):
@@ -80,43 +71,127 @@ def read_poses(
     Raises:
         InputError: unreadable, columns missing, fields that are no numbers, or hardly a row without gaps.
     """
-    cells = read_cells(Path(path), read_columns(columns, (*COLUMNS, "pose")))
-    return poses_in(path, cells, rotation=rotation, arm=arm)
+    return _poses_in(Path(path), read_cells(Path(path), read_columns(columns, (*COLUMNS, "pose"))), rotation, arm)
 
 
-def poses_in(path: str | Path, cells: Cells, *, rotation: str | None = None, arm: ArmJoints | None = None) -> Read:
-    """Read the cells of a file as :func:`read_poses` does; blank rows are passed over.
+def read_measured(
+    data: Path, arm: Arm, joints: Path | None = None, *, rotation: str | None = None, columns: str | None = None
+) -> Read:
+    """Read measured poses with their joint angles, of one file or of two.
 
     Args:
-        path: the file, for errors.
-        cells: its names and rows.
+        data: the poses; with their joint angles if ``joints`` is None.
+        arm: whose joints they are.
+        joints: a table of joint angles, joined to the poses by the names of their rows (``image``, ``name``, ``shot``), by
+            order where there are none, or by time (``t_s``) where the tables have other numbers of rows.
         rotation: as in :func:`read_poses`.
-        arm: likewise.
+        columns: as in :func:`read_poses`; joints, times and names may be those of ``joints``.
 
     Raises:
-        InputError: as :func:`read_poses`.
+        InputError: either file, or they do not fit together.
     """
+    if joints is None:
+        return read_poses(data, rotation=rotation, columns=columns, arm=arm)
+    parts = [] if columns is None else columns.split(",")
+    theirs = [part for part in parts if re.match(r"\s*(?:q\d+_|image|name|shot)", part)]
+    table = read_pose_table(joints, columns=",".join(theirs) or None, arm=arm, only_joints=True)
+    ours = ",".join(part for part in parts if part not in theirs) or None
+    cells, notes = _with_joints(data, read_cells(data, read_columns(ours, COLUMNS), "seen"), table)
+    read = _poses_in(data, cells, rotation)
+    return read._replace(notes=(*table.notes, *notes, *read.notes))
+
+
+def _with_joints(data: Path, read: Cells, table: PoseTable) -> tuple[Cells, list[str]]:
+    """Return a table's cells with the joint angles of each row, without those that have none or no pose, and notes."""
+    assert table.q is not None
+    head, rows = read.head, [(line, row) for line, row in read.rows if any(row)]
+    if own := next((name for name in head if re.fullmatch(r"q\d+_(rad|deg)", name)), None):
+        raise InputError(f"{data}: line 1: has joint angles of its own ({own}): leave them out, or --joints")
+    angles, notes = _angles(data, head, rows, table)
+    missed = {line for line, row in rows if "status" in head and row[head.index("status")] == "missed"}
+    if missed:
+        notes.append(f"{len(missed)} of {len(rows)} shots were missed, and are left out")
+    joined = [
+        (line, [*row, *map(repr, angles[line].tolist())]) for line, row in rows if line in angles and line not in missed
+    ]
+    return read._replace(head=[*head, *(f"q{k}_rad" for k in range(1, table.q.shape[1] + 1))], rows=joined), notes
+
+
+def _angles(data: Path, head: list[str], rows: Rows, table: PoseTable) -> tuple[dict[int, Array], list[str]]:
+    """Return the joint angles (J,), rad, of rows by their lines, paired by time, name or order; and notes."""
+    assert table.q is not None
+    if table.names is None and len(table.q) != len(rows) and table.t_s is not None and "t_s" in head:
+        return _at_rest(data, [(line, row[head.index("t_s")]) for line, row in rows], table)
+    key = next((name for name in NAMES if name in head), None)
+    if table.names is not None and key is None:
+        raise InputError(
+            f"{data}: line 1: no column {', '.join(NAMES)}, by which {table.path} names its rows; there are "
+            f"{', '.join(head)}"
+        )
+    names = [f"line {line}" if key is None else row[head.index(key)] for line, row in rows]
+    angles = {rows[i][0]: table.q[row] for row, i in zip(*matched_rows(table, names), strict=True)}
+    alone = len(rows) - len(angles)
+    return angles, [f"{alone} of {len(rows)} poses have no row in {table.path}, and are left out"] if alone else []
+
+
+def _at_rest(data: Path, shots: list[tuple[int, str]], table: PoseTable) -> tuple[dict[int, Array], list[str]]:
+    """Return the joint angles (J,), rad, at the middle shot of each rest, by its line, and notes; shots: lines, times."""
+    assert table.t_s is not None
+    assert table.q is not None
+    order = np.argsort(table.t_s, kind="stable")
+    t_s, q = table.t_s[order], table.q[order]
+    rests, inside = list[list[tuple[int, Array]]](), 0
+    for line, cell in shots:
+        at = number(cell)
+        if at is None:
+            raise InputError(f"{data}: line {line}: t_s is {cell!r}, must be a number, s")
+        if not t_s[0] <= at <= t_s[-1]:
+            continue
+        inside += 1
+        near = q[max(np.searchsorted(t_s, at - REST_S) - 1, 0) : np.searchsorted(t_s, at + REST_S, side="right") + 1]
+        here = np.array([np.interp(at, t_s, column) for column in q.T])
+        if np.abs(near - here).max() > REST_RAD:
+            continue
+        if not rests or np.abs(rests[-1][0][1] - here).max() > REST_RAD:
+            rests.append([])
+        rests[-1].append((line, here))
+    if not inside:
+        raise InputError(
+            f"{data}: no time t_s is within those of {table.path}, {t_s[0]:.1f} to {t_s[-1]:.1f} s: other clocks? name the "
+            f"rows of both tables instead ({', '.join(NAMES)})"
+        )
+    if not rests:
+        raise InputError(
+            f"{data}: the arm never rests at a shot, by {table.path}: let it rest {2 * REST_S:g} s and more at each pose"
+        )
+    notes = [f"{len(rests)} rests of the arm, by {table.path}; of each the middle shot counts, of {len(shots)} shots"]
+    return dict(rest[len(rest) // 2] for rest in rests), notes
+
+
+def _poses_in(path: Path, cells: Cells, rotation: str | None, arm: ArmJoints | None = None) -> Read:
+    """Read the cells of a file as :func:`read_poses` does; blank rows are passed over."""
     if rotation is not None and rotation not in ROTATIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(ROTATIONS)}")
-    rows = [(line, row) for line, row in cells.rows if any(row)]
-    joint_names = () if arm is None else arm.joint_names
-    head, *body = degree_columns(path, [cells.head, *(row for _, row in rows)])
-    head, convention, notes = understood(Path(path), head, joint_names, None, rotation or cells.rotation)
-    table = Columns(Path(path), head, [(line, row) for (line, _), row in zip(rows, body, strict=True)], joint_names)
+    cells, links = (
+        cells._replace(rows=[row for row in cells.rows if any(row[1])]),
+        () if arm is None else arm.joint_names,
+    )
+    table, convention, notes = columns_in(path, cells, links, None, rotation)
     joints = _joints(table, arm)
     points, unit = _points(table)
-    rotated, notes_of = _rotation_columns(table, convention)
-    covariance = _COV if rotated is not None and "cov_00" in table.at else []
+    rotated, unused = _rotation_columns(table, convention)
+    covariance = _COV if rotated and not rotated[0].startswith("rx") and "cov_00" in table.at else []
     approach = [f"approach{i + 1}" for i in range(len(joints))] if "approach1" in table.at else []
-    requested = [*joints, *(name for point in points for name in point), *(rotated or []), *covariance, *approach]
+    requested = [*joints, *(name for point in points for name in point), *rotated, *covariance, *approach]
     numbers = table.numbers(requested, gaps=True)
     good = np.array(np.isfinite(numbers).all(axis=1))
-    notes = (*cells.notes, *notes, *notes_of, *_gaps(table, requested, numbers), *_repeated(table, numbers, good))
-    table = Columns(table.path, head, [row for row, kept in zip(table.rows, good, strict=True) if kept], joint_names)
-    p = np.stack([unit * table.numbers(point) for point in points], axis=1)
-    sides = _sides(table, approach)
-    lines = np.array([line for line, _ in table.rows], float)
-    return Read(_measured(table, joints, p, rotated, convention, sides), lines, notes)
+    notes = (*notes, *unused, *_gaps(table, requested, numbers), *_repeated(table, numbers, good))
+    table = Columns(path, table.head, [row for row, kept in zip(table.rows, good, strict=True) if kept], links)
+    p, q = np.stack([unit * table.numbers(point) for point in points], axis=1), table.joints(joints)
+    measured = Measured(q, p, approach=_sides(table, approach))
+    if rotated:
+        measured = _rotated(table, measured, rotated, convention)
+    return Read(measured, np.array([line for line, _ in table.rows], float), notes)
 
 
 def _sides(table: Columns, columns: list[str]) -> Array | None:
@@ -127,6 +202,16 @@ def _sides(table: Columns, columns: list[str]) -> Array | None:
             f"{table.path}: a direction of approach must be 1 (the angle grew), -1 (it fell) or 0 (not known)"
         )
     return sides
+
+
+def _rotated(table: Columns, measured: Measured, rotated: list[str], convention: str | None) -> Measured:
+    """Return the poses with the body's rotations, and its covariance where the table has one."""
+    if measured.points != 1:
+        raise InputError(f"{table.path}: angles go with one point, p1; there are {measured.points}")
+    R, angles, used, _ = table.rotations(convention)
+    if rotated[0].startswith("rx"):
+        return replace(measured, R_rig_body=R, angles_deg=angles, rotation=used)
+    return replace(measured, R_rig_body=R, cov=_covariance(table, R) if "cov_00" in table.at else None)
 
 
 def _joints(table: Columns, arm: ArmJoints | None) -> list[str]:
@@ -149,34 +234,33 @@ def _joints(table: Columns, arm: ArmJoints | None) -> list[str]:
 def _points(table: Columns) -> tuple[list[list[str]], float]:
     """Return the columns of the points, or of the one position, and their unit, m."""
     if "qw" not in table.at and "r11" not in table.at:
-        for unit in ("mm", "m"):
+        for unit, metres in (("mm", 1e-3), ("m", 1.0)):
             points: list[list[str]] = []
             while f"p{len(points) + 1}_x_{unit}" in table.at:
                 points.append([f"p{len(points) + 1}_{axis}_{unit}" for axis in "xyz"])
             if points:
-                return points, _METRES[unit]
-    for unit in ("m", "mm", ""):
-        names = [f"{axis}_{unit}".rstrip("_") for axis in "xyz"]
-        if names[0] in table.at:
-            return [names], _METRES[unit]
+                return points, metres
+    for suffix, metres in (("_m", 1.0), ("_mm", 1e-3), ("", 1.0)):
+        if f"x{suffix}" in table.at:
+            return [[f"{axis}{suffix}" for axis in "xyz"]], metres
     raise InputError(
         f"{table.path}: line 1: no point 1; columns p1_x_mm .. p1_z_mm, or x_m .. z_m, are needed, there are "
         f"{', '.join(list(table.at)[:8])}: --columns p1_x_mm=NAME,... gives yours"
     )
 
 
-def _rotation_columns(table: Columns, convention: str | None) -> tuple[list[str] | None, tuple[str, ...]]:
-    """Return the columns of the rotation, None where there are none that are used, and a note then."""
-    for names in (_QUATERNION, _MATRIX):
+def _rotation_columns(table: Columns, convention: str | None) -> tuple[list[str], tuple[str, ...]]:
+    """Return the columns of the rotation, [] where there are none that are used, and a note then."""
+    for names in (["qw", "qx", "qy", "qz"], [f"r{i}{j}" for i in "123" for j in "123"]):
         if names[0] in table.at:
             return names, ()
     unit = next((unit for unit in ("_deg", "_rad", "") if f"rx{unit}" in table.at), None)
     if unit is None:
         if convention is not None:
-            table.numbers(["rx_deg", "ry_deg", "rz_deg"])
-        return None, ()
+            table.require("rx_deg", "ry_deg", "rz_deg")
+        return [], ()
     if convention is None:
-        return None, (f"rx{unit}, ry{unit}, rz{unit} are not used: give their convention with --rotation",)
+        return [], (f"rx{unit}, ry{unit}, rz{unit} are not used: give their convention with --rotation",)
     return [f"r{axis}{unit}" for axis in "xyz"], ()
 
 
@@ -204,38 +288,12 @@ def _repeated(table: Columns, numbers: Array, good: NDArray[np.bool_]) -> tuple[
     return (f"{len(again)} rows repeat another to the last digit, and are left out: {where}",) if len(again) else ()
 
 
-def _measured(
-    table: Columns,
-    joints: list[str],
-    p: Array,
-    rotated: list[str] | None,
-    convention: str | None,
-    approach: Array | None,
-) -> Measured:
-    """Assemble the columns, in SI units."""
-    q = table.joints(joints)
-    if rotated is None:
-        return Measured(q, p, None, None, approach)
-    if p.shape[1] != 1:
-        raise InputError(f"{table.path}: angles go with one point, p1; there are {p.shape[1]}")
-    R, angles, used, _ = table.rotations(convention)
-    if rotated[0].startswith("rx"):
-        return AnglesMeasured(q, p, R, None, approach, angles_deg=angles, rotation=used)
-    return Measured(q, p, R, _covariance(table, R) if "cov_00" in table.at else None, approach)
-
-
-def rotations_of(angles_deg: Array, rotation: str) -> Array:
-    """Return the rotations (N, 3, 3) of angles rx, ry, rz (N, 3), degrees, in one of the conventions of ROTATIONS."""
-    return rotations_by(angles_deg, rotation, Path())
-
-
 def _covariance(table: Columns, R: Array) -> Array:
     """Return covariances of the right tangent from those along the rig's axes that ``armsight measure`` writes."""
     C = np.zeros((len(R), 6, 6))
     for (i, j), column in zip(_UPPER, table.numbers(_COV).T, strict=True):
         C[:, i, j] = C[:, j, i] = column
-    back = np.zeros_like(C)
-    back[:, :3, :3] = back[:, 3:, 3:] = R.swapaxes(1, 2)
+    back = np.kron(np.eye(2), R.swapaxes(1, 2))
     C = back @ C @ back.swapaxes(1, 2)
     if np.linalg.eigvalsh(C).min() < 0:
         raise InputError(f"{table.path}: cov_00 .. cov_55 are no covariance: an eigenvalue is negative")

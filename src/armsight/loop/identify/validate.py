@@ -13,9 +13,8 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.estimate.solve import covariances
-from armsight.loop.identify.fit import fit, linear_of, variances_of
+from armsight.loop.identify.fit import fit, linear_of, variances_of, with_joint_noise
 from armsight.loop.identify.identify import Identified
-from armsight.loop.identify.joint_noise import with_joint_noise
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.placement import with_placement
@@ -84,17 +83,18 @@ def validate(found: Identified, measured: Measured) -> Validation:
     Raises:
         InputError: another number of points, or points instead of poses.
     """
-    model = found.model
-    require_alike(measured, model.points, model.full)
-    kept = [errors(model, x, measured) for x in (found.nominal, found.solution.x)]
-    kept_m = float(np.median(kept[1].position_m))
+    require_alike(measured, found.model.points, found.model.full)
+
+    def of(model: Model, nominal: Array, x: Array, refitted: bool) -> Validation:
+        both = errors(model, nominal, measured), errors(model, x, measured)
+        return Validation(*both, refitted, _over(model, found, x, measured))
+
+    kept = of(found.model, found.nominal, found.solution.x, False)
+    kept_m = float(np.median(kept.identified.position_m))
     if len(measured) < MIN_POSES or kept_m < OTHER_M:
-        return Validation(kept[0], kept[1], False, _over(model, found, found.solution.x, measured))
-    new_model, nominal, x = placement_refitted(found, measured)
-    new = [errors(new_model, nominal, measured), errors(new_model, x, measured)]
-    if kept_m < OTHER * float(np.median(new[1].position_m)):
-        return Validation(kept[0], kept[1], False, _over(model, found, found.solution.x, measured))
-    return Validation(new[0], new[1], True, _over(new_model, found, x, measured))
+        return kept
+    new = of(*placement_refitted(found, measured), True)
+    return kept if kept_m < OTHER * float(np.median(new.identified.position_m)) else new
 
 
 def require_alike(measured: Measured, points: int, full: bool) -> None:

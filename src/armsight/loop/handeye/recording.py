@@ -13,7 +13,6 @@ from pathlib import Path, PureWindowsPath
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.handeye.images import Seen, upright
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import adjoint, inverse, log_se3, mean_pose
@@ -23,20 +22,51 @@ from armsight.robot.kinematics.arm import Arm
 from armsight.tables.poses import PoseTable
 from armsight.vision.sources.bag import Bag
 from armsight.vision.sources.bag.reader import SUFFIXES
-from armsight.vision.sources.bag.states import PoseTrack, read_joints, read_track
+from armsight.vision.sources.bag.states import JointStream, PoseTrack, read_joints, read_track
 
-#: Files, and the file in a folder, that are recordings of ROS or Foxglove.
-RECORDING_INDEX = "metadata.yaml"
+Rows = NDArray[np.int64]
 #: An arm that moves further than this in LATE_S, m, at half of the shots moves on while images are on their way.
 LATE_S, MOVING_M = 0.02, 1e-3
 #: An arm is taken to rest between two poses of a recording that differ by less, m and rad.
 STILL_M, STILL_RAD = 1e-4, 1e-3
 #: So many rows of one very pose are a log that stopped, where the target was seen this far apart, m.
 STOPPED, STOPPED_M = 3, 0.01
-#: Poses of one TCP agree within this, m and rad, with a constant transform from the model's flange.
+#: Poses of one TCP agree within this, m and rad, with a constant transform from the model's flange; half: arms whose table
+#: is off by a degree have no TCP, double: other tools count as one.
 TCP_M, TCP_RAD = 5e-3, 0.02
 #: Step of a joint for differences, rad.
 STEP_RAD = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Seen(Record):
+    """Poses of the target.
+
+    Attributes:
+        Ts: (N, 4, 4) T_rig_body, m; where the target was not found, the identity.
+        covs: (N, 6, 6) their covariance, right tangent; zero where it is not known.
+        names: of the images.
+        missed: (N,) why there is no pose; "" where there is one.
+        t_s: (N,) times, s; None where there are none.
+        centre: (3,) the middle of the target's points, body frame, m.
+        symmetries: motions (4, 4) of the body that change nothing to see.
+        scatter_px: RMS of the reprojection; 0 where there are no images.
+        notes: what was found out.
+        common: (N, 6, K) what K independent errors of the rig of one sigma do to the poses; None where unknown.
+        table: the table that the poses are from; None where they are from images.
+    """
+
+    Ts: Array
+    covs: Array
+    names: tuple[str, ...]
+    missed: tuple[str, ...]
+    t_s: Array | None
+    centre: Array
+    symmetries: tuple[Array, ...] = ()
+    scatter_px: float = 0.0
+    notes: tuple[str, ...] = ()
+    common: Array | None = None
+    table: PoseTable | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,20 +85,20 @@ class PairedPoses(Record):
     """
 
     poses: Poses
-    rows: NDArray[np.int64]
+    rows: Rows
     names: tuple[str, ...]
     t_s: Array | None
     robot: PoseTable
     seen: Seen
-    matched: NDArray[np.int64]
+    matched: Rows
     notes: tuple[str, ...]
 
 
 def seen_in_table(table: PoseTable) -> Seen:
     """Return the target's poses of a table as what was seen."""
-    n = len(table.Ts)
     names = table.names or tuple(f"line {line}" for line in table.lines)
-    return Seen(table.Ts, np.zeros((n, 6, 6)), names, table.missed, table.t_s, np.zeros(3), table=table)
+    covs = np.zeros((len(table.Ts), 6, 6))
+    return Seen(table.Ts, covs, names, table.missed, table.t_s, np.zeros(3), table=table)
 
 
 def recording_of(robot: Path) -> Path | None:
@@ -76,7 +106,7 @@ def recording_of(robot: Path) -> Path | None:
     text = str(robot)
     if text.startswith("bag:"):
         return Path(text[4:])
-    return robot if robot.suffix in SUFFIXES or (robot / RECORDING_INDEX).is_file() else None
+    return robot if robot.suffix in SUFFIXES or (robot / "metadata.yaml").is_file() else None
 
 
 def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseTable:
@@ -91,13 +121,10 @@ def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseT
         InputError: no such recording, frames that it does not have, or joints of other names.
     """
     bag = Bag(path)
-    notes: tuple[str, ...] = ()
-    joints = None
-    if arm is not None:
-        joints = read_joints(bag, arm.joint_names)
-        if joints is None:
-            raise InputError(f"{path}: no joint states for --model {arm.name}; it holds {bag.holds()}")
-        notes = joints.notes
+    joints = None if arm is None else read_joints(bag, arm.joint_names)
+    if arm is not None and joints is None:
+        raise InputError(f"{path}: no joint states for --model {arm.name}; it holds {bag.holds()}")
+    notes = () if joints is None else joints.notes
     if frames is not None:
         base, _, flange = frames.partition(":")
         if not base or not flange:
@@ -111,15 +138,11 @@ def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseT
             f"{path}: a recording needs --frames BASE:FLANGE, frames of its transforms such as base_link:tool0, or --model,"
             " the arm whose joint states it holds"
         )
-    there: NDArray[np.bool_] = np.ones(len(track.t_s), bool)
-    if q is not None:
-        there = np.asarray(np.isfinite(q).all(axis=1))
+    there = np.asarray(np.isfinite(np.zeros((len(track.t_s), 0)) if q is None else q).all(axis=1))
     n = int(there.sum())
     if n < len(there):
-        notes = (
-            *notes,
-            f"{path}: {len(there) - n} of {len(there)} transforms have no joint states around them: left out",
-        )
+        lost = f"{path}: {len(there) - n} of {len(there)} transforms have no joint states around them: left out"
+        notes = (*notes, lost)
     if n < MIN_POSES:
         raise InputError(
             f"{path}: {frames or 'the joints'}: {n} poses over time, {MIN_POSES} and more are needed: is it a fixed"
@@ -129,13 +152,8 @@ def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseT
         path=path,
         lines=1 + np.flatnonzero(there),
         Ts=track.Ts[there],
-        numbers=np.zeros((n, 0)),
-        written=np.zeros((n, 0)),
-        convention="",
         q=None if q is None else q[there],
         t_s=track.t_s[there],
-        names=None,
-        unit_m=1.0,
         notes=(*bag.notes, *notes),
         missed=("",) * n,
         of_joints=frames is None,
@@ -162,35 +180,28 @@ def at_shots(robot: PoseTable, seen: Seen) -> PoseTable:
     moved = log_se3(inverse(robot.Ts[after - 1]) @ robot.Ts[after])
     apart = (np.linalg.norm(moved[:, :3], axis=1) > STILL_M) | (np.linalg.norm(moved[:, 3:], axis=1) > STILL_RAD)
     lost = (robot.t_s[after] - robot.t_s[after - 1] > GAP_S) & apart
-    holes = (
-        (f"{robot.path}: {int(lost.sum())} shots are in gaps of over {GAP_S:g} s in which the arm moved: left out",)
-        if lost.any()
-        else ()
-    )
-    inside = inside[~lost]
+    notes, inside = list(robot.notes), inside[~lost]
+    if lost.any():
+        notes.append(
+            f"{robot.path}: {int(lost.sum())} shots are in gaps of over {GAP_S:g} s in which the arm moved: left out"
+        )
     t_s, track = seen.t_s[inside], PoseTrack(robot.t_s, robot.Ts)
     Ts = track.at(t_s)
-    moved = np.linalg.norm(track.at(t_s + LATE_S)[:, :3, 3] - Ts[:, :3, 3], axis=1)
-    late = (
-        (
-            f"{robot.path}: in half of the shots the arm moves by {1e3 * np.median(moved):.1f} mm and more in"
-            f" {1e3 * LATE_S:.0f} ms, and images come later than their stamps say: --streams finds by how much",
+    late_m = np.linalg.norm(track.at(t_s + LATE_S)[:, :3, 3] - Ts[:, :3, 3], axis=1)
+    if len(late_m) and np.median(late_m) > MOVING_M:
+        notes.append(
+            f"{robot.path}: in half of the shots the arm moves by {1e3 * np.median(late_m):.1f} mm and more in"
+            f" {1e3 * LATE_S:.0f} ms, and images come later than their stamps say: --streams finds by how much"
         )
-        if len(moved) and np.median(moved) > MOVING_M
-        else ()
-    )
-    n = len(inside)
     return replace(
         robot,
         lines=1 + inside,
         Ts=Ts,
-        numbers=np.zeros((n, 0)),
-        written=np.zeros((n, 0)),
-        q=None if robot.q is None else np.stack([np.interp(t_s, robot.t_s, each) for each in robot.q.T], axis=1),
+        q=None if robot.q is None else JointStream((), robot.t_s, robot.q).at(t_s),
         t_s=t_s,
         names=tuple(seen.names[k] for k in inside),
-        notes=(*robot.notes, *holes, *late),
-        missed=("",) * n,
+        notes=tuple(notes),
+        missed=("",) * len(inside),
     )
 
 
@@ -200,31 +211,27 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
     Raises:
         InputError: rows and images do not pair up, or hardly one shows the target.
     """
-    notes = [*robot.notes, *seen.notes]
     rows, matched = matched_rows(robot, seen.names)
-    notes += _alone(robot, seen, rows, matched)
+    notes = [*robot.notes, *seen.notes, *_alone(robot, seen, rows, matched)]
     rows, matched = _once(robot, seen, rows, matched, notes)
     shown = np.array([not seen.missed[k] for k in matched])
     lost = [f"{seen.names[k]} ({seen.missed[k]})" for k in matched[~shown]]
     if lost:
-        more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
-        notes.append(f"no target in {', '.join(lost[:3])}{more}")
+        notes.append(f"no target in {', '.join(lost[:3])}{f' and {len(lost) - 3} more' if len(lost) > 3 else ''}")
     rows, matched = rows[shown], matched[shown]
     if len(rows) < MIN_POSES:
         raise InputError(f"{len(rows)} poses have both sides; {MIN_POSES} and more are needed, 15 are advised")
     A, B, covs = robot.Ts[rows], seen.Ts[matched], seen.covs[matched]
     common = None if seen.common is None else seen.common[matched]
     if seen.symmetries:
-        B, rotated = upright(A, B, seen.symmetries, in_hand)
-        for k in np.flatnonzero(rotated >= 0):
-            Ad = adjoint(inverse(seen.symmetries[rotated[k]]))
-            covs[k] = Ad @ covs[k] @ Ad.T
-            if common is not None:
-                common[k] = Ad @ common[k]
-        if (rotated >= 0).any():
-            notes.append(
-                f"the board looks the same rotated: {int((rotated >= 0).sum())} of {len(B)} were rotated to agree"
-            )
+        B, rotated = upright(A, B, seen.symmetries)
+        flipped = np.flatnonzero(rotated >= 0)
+        Ad = adjoint(inverse(np.array(seen.symmetries)))[rotated[flipped]]
+        covs[flipped] = Ad @ covs[flipped] @ np.swapaxes(Ad, 1, 2)
+        if common is not None:
+            common[flipped] = Ad @ common[flipped]
+        if len(flipped):
+            notes.append(f"the board looks the same rotated: {len(flipped)} of {len(B)} were rotated to agree")
     _require_moving(robot, rows, B)
     both_clocks = robot.t_s is not None and seen.t_s is not None
     t_s = robot.t_s[rows] if robot.t_s is not None and (both_clocks or seen.t_s is None) else None
@@ -234,9 +241,47 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
     return PairedPoses(poses, rows, names, t_s, robot, seen, matched, tuple(notes))
 
 
-def _require_moving(robot: PoseTable, rows: NDArray[np.int64], B: Array) -> None:
+def upright(A: Array, B: Array, symmetries: Sequence[Array]) -> tuple[Array, Rows]:
+    """Decide which way up a board was that looks the same rotated: angles between poses are the same on both sides.
+
+    Args:
+        A: (N, 4, 4) poses of the flange.
+        B: (N, 4, 4) poses of the body, some of them rotated by a symmetry.
+        symmetries: the motions of the body that change nothing to see.
+
+    Returns:
+        B with the rotated ones rotated back to agree with the first, and which symmetry was used, -1 for none.
+    """
+
+    def angles(Rs: Array, others: Array) -> Array:
+        traces = np.einsum("...nab,mab->...nm", Rs[..., :3, :3], others[:, :3, :3])
+        return np.asarray(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+
+    options = np.stack([B @ S for S in (np.eye(4), *symmetries)])  # (S, N, 4, 4)
+    rows, chosen, hand = np.arange(len(A)), np.zeros(len(A), np.int64), angles(A, A)
+    for _ in range(20):
+        cost = np.abs(angles(options, options[chosen, rows]) - hand).sum(axis=2)
+        gain = cost[chosen, rows] - cost.min(axis=0)
+        gain[0] = 0.0
+        worst = int(np.argmax(gain))
+        if gain[worst] < 1e-6:
+            break
+        chosen[worst] = int(np.argmin(cost[:, worst]))
+    return np.asarray(options[chosen, rows]), chosen - 1
+
+
+def steady(B: Array, symmetries: Sequence[Array]) -> Array:
+    """Return poses B (N, 4, 4) of a stream, each rotated by the symmetry (4, 4) that is nearest to the pose before it."""
+    out, choices = B.copy(), np.stack([np.eye(4), *symmetries])
+    for k in range(1, len(B)):
+        options = B[k] @ choices
+        out[k] = options[int(np.argmax(np.einsum("ab,nab->n", out[k - 1, :3, :3], options[:, :3, :3])))]
+    return out
+
+
+def _require_moving(robot: PoseTable, rows: Rows, B: Array) -> None:
     """Raise an InputError where rows of the table hold one pose while the target was seen in several."""
-    same = np.unique(robot.Ts[rows].reshape(-1, 16), axis=0, return_inverse=True)[1].ravel()
+    same = _alike(robot.Ts[rows])
     for k in np.flatnonzero(np.bincount(same) >= STOPPED):
         stopped = np.flatnonzero(same == k)
         apart_m = float(np.linalg.norm(B[stopped, :3, 3] - B[stopped[0], :3, 3], axis=1).max())
@@ -248,7 +293,12 @@ def _require_moving(robot: PoseTable, rows: NDArray[np.int64], B: Array) -> None
             )
 
 
-def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _alike(Ts: Array) -> Rows:
+    """Return a number (N,) for each pose that only the very same ones share."""
+    return np.asarray(np.unique(Ts.reshape(-1, 16), axis=0, return_inverse=True)[1].ravel())
+
+
+def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[Rows, Rows]:
     """Return the rows of both sides that belong together: by name where the robot's table has names, else by order.
 
     Args:
@@ -260,10 +310,9 @@ def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[NDArray[np.int6
     """
     if robot.names is not None:
         there = {name: k for k, name in enumerate(seen)} | {Path(name).stem: k for k, name in enumerate(seen)}
-        paths = [PureWindowsPath(name) for name in robot.names]  # its separators are / too
         keys = [
-            next((key for key in (name, path.name, path.stem) if key in there), None)
-            for name, path in zip(robot.names, paths, strict=True)
+            next((key for key in (name, PureWindowsPath(name).name, PureWindowsPath(name).stem) if key in there), None)
+            for name in robot.names  # Windows' separators are / too
         ]
         found = [(r, there[key]) for r, key in enumerate(keys) if key is not None]
         if not found:
@@ -271,7 +320,7 @@ def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[NDArray[np.int6
                 f"{robot.path}: none of its names ({robot.names[0]}, ...) is among those seen ({seen[0]}, ...): write in "
                 "that column what the images are called"
             )
-        rows, matched = (np.array(part) for part in zip(*found, strict=True))
+        rows, matched = np.array(found).T
         return rows, matched
     if len(robot.Ts) != len(seen):
         raise InputError(
@@ -281,7 +330,7 @@ def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[NDArray[np.int6
     return np.arange(len(robot.Ts)), np.arange(len(seen))
 
 
-def _alone(robot: PoseTable, seen: Seen, rows: NDArray[np.int64], matched: NDArray[np.int64]) -> list[str]:
+def _alone(robot: PoseTable, seen: Seen, rows: Rows, matched: Rows) -> list[str]:
     """Return notes of rows and images that have no other side."""
     sides = (
         (np.setdiff1d(np.arange(len(robot.Ts)), rows), robot.names or (), f"rows of {robot.path} without an image"),
@@ -294,12 +343,9 @@ def _alone(robot: PoseTable, seen: Seen, rows: NDArray[np.int64], matched: NDArr
     ]
 
 
-def _once(
-    robot: PoseTable, seen: Seen, rows: NDArray[np.int64], matched: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _once(robot: PoseTable, seen: Seen, rows: Rows, matched: Rows, notes: list[str]) -> tuple[Rows, Rows]:
     """Return the rows without those that repeat another on both sides; views that repeat while the arm moved are noted."""
-    hands = np.unique(robot.Ts[rows].reshape(-1, 16), axis=0, return_inverse=True)[1].ravel()
-    eyes = np.unique(seen.Ts[matched].reshape(-1, 16), axis=0, return_inverse=True)[1].ravel()
+    hands, eyes = _alike(robot.Ts[rows]), _alike(seen.Ts[matched])
     eyes = np.where([bool(seen.missed[k]) for k in matched], len(eyes) + np.arange(len(eyes)), eyes)
     first = np.sort(np.unique(np.stack([hands, eyes], axis=1), axis=0, return_index=True)[1])
     if len(first) < len(rows):
@@ -321,10 +367,8 @@ def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:
     offset = inverse(np.asarray(arm.forward(robot.q))) @ robot.Ts
     mean = mean_pose(offset)
     left = log_se3(inverse(mean) @ offset)
-    if (
-        np.median(np.linalg.norm(left[:, :3], axis=1)) > TCP_M
-        or np.median(np.linalg.norm(left[:, 3:], axis=1)) > TCP_RAD
-    ):
+    off_m, off_rad = (np.median(np.linalg.norm(part, axis=1)) for part in (left[:, :3], left[:, 3:]))
+    if off_m > TCP_M or off_rad > TCP_RAD:
         return [
             f"{robot.path}: its poses are not those of the joints by {arm.name}, at no constant offset; the poses count"
         ]
@@ -338,43 +382,31 @@ def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:
     ]
 
 
-def links_of(recording: PairedPoses, arm: Arm) -> Array | None:
-    """Return T_link_flange (N, L, 4, 4) of all links by the joints of the table; None where it has none."""
-    if recording.robot.q is None:
-        return None
-    q, T_flange_tcp = _joints_of(recording.robot, arm, recording.robot.q)
-    frames = np.array([arm.links(one) for one in q[recording.rows]])
-    return np.asarray(inverse(frames) @ frames[:, -1:] @ T_flange_tcp)
+def links_of(robot: PoseTable, arm: Arm | None, at: Array) -> Callable[[Array], Array] | None:
+    """Return what gives T_link_flange (M, L, 4, 4) of all links between rows of a table; None without a model or joints.
 
+    The joints are taken to give the table's very poses: such as scatter against them would be explained by errors of links.
 
-def _joints_of(robot: PoseTable, arm: Arm, q: Array) -> tuple[Array, Array]:
-    """Return joints that give the table's very poses, and the TCP (4, 4) that these are of, in the flange.
-
-    Poses that scatter against their joints would otherwise be explained by errors of links, as what the joints show of it.
+    Args:
+        robot: the table, N rows.
+        arm: the model.
+        at: (N,) what is called with, of each row: its number, or its time.
     """
-    if robot.of_joints:
-        return q, np.eye(4)
-    T_flange_tcp = mean_pose(inverse(np.asarray(arm.forward(q))) @ robot.Ts)
-    goal, q = robot.Ts @ inverse(T_flange_tcp), q.copy()
-    for _ in range(2):
-        back = inverse(np.asarray(arm.forward(q)))
-        by = [log_se3(back @ np.asarray(arm.forward(q + STEP_RAD * one))) / STEP_RAD for one in np.eye(q.shape[1])]
-        off = log_se3(back @ goal)
-        q += np.einsum("nji,ni->nj", np.linalg.pinv(np.stack(by, axis=2), rcond=1e-2), off)
-    return q, T_flange_tcp
-
-
-def links_between(robot: PoseTable, arm: Arm) -> Callable[[Array], Array] | None:
-    """Return what gives T_link_flange (N, L, 4, 4) at times (N,), robot's clock, s; None where the table has no joints."""
-    if robot.q is None or robot.t_s is None:
+    if arm is None or robot.q is None:
         return None
-    t_s, rows = np.unique(robot.t_s, return_index=True)
-    q, T_flange_tcp = _joints_of(robot, arm, robot.q)
-    q = q[rows]
+    at, rows = np.unique(at, return_index=True)
+    q, Ts, T_flange_tcp = robot.q[rows], robot.Ts[rows], np.eye(4)
+    if not robot.of_joints:
+        T_flange_tcp = mean_pose(inverse(np.asarray(arm.forward(q))) @ Ts)
+        goal = Ts @ inverse(T_flange_tcp)
+        for _ in range(2):
+            back = inverse(np.asarray(arm.forward(q)))
+            by = [log_se3(back @ np.asarray(arm.forward(q + STEP_RAD * one))) / STEP_RAD for one in np.eye(q.shape[1])]
+            q = q + np.einsum("nji,ni->nj", np.linalg.pinv(np.stack(by, axis=2), rcond=1e-2), log_se3(back @ goal))
 
-    def links(times: Array) -> Array:
-        between = np.stack([np.interp(times, t_s, column) for column in q.T], axis=1)
-        frames = np.array([arm.links(one) for one in between])
+    def links(between: Array) -> Array:
+        joints = np.stack([np.interp(between, at, column) for column in q.T], axis=1)
+        frames = np.array([arm.links(one) for one in joints])
         return np.asarray(inverse(frames) @ frames[:, -1:] @ T_flange_tcp)
 
     return links
@@ -396,7 +428,6 @@ def of_streams(
     assert robot.t_s is not None
     assert seen.t_s is not None
     rows = np.clip(np.searchsorted(robot.t_s, t_s + offset_s), 0, len(robot.t_s) - 1)
-    matched = np.searchsorted(seen.t_s, t_s)
     poses = Poses(*sides, np.zeros((len(t_s), 6, 6)), in_hand, seen.centre)
-    names = tuple(f"t {t:.3f} s" for t in t_s)
-    return PairedPoses(poses, rows, names, t_s, robot, seen, matched, (*robot.notes, *seen.notes))
+    names, notes = tuple(f"t {t:.3f} s" for t in t_s), (*robot.notes, *seen.notes)
+    return PairedPoses(poses, rows, names, t_s, robot, seen, np.searchsorted(seen.t_s, t_s), notes)
