@@ -156,8 +156,23 @@ def images(folder):
 def test_people_read_millimetres_and_a_sigma(start, arm, armsight):
     said = armsight(*start, *images(arm))
     assert said.code == 0, said.err
-    assert [line.split(":")[0] for line in said.out.splitlines()] == ["left000", "left005", "left010"]
-    assert all("±" in line and " mm, " in line and " deg ± " in line for line in said.out.splitlines())
+    head, *lines = said.out.splitlines()
+    names = "shot x mm ± y mm ± z mm ± rz deg ry deg rx deg ± prec. pts"
+    assert head.split() == names.split()
+    assert [line.split()[0] for line in lines] == ["left000", "left005", "left010"]
+    assert max(map(len, said.out.splitlines())) <= 100
+    for line, shot in zip(
+        lines, map(json.loads, armsight(*start, *images(arm), "--json").out.splitlines()), strict=True
+    ):
+        sigma = np.sqrt(np.diag(shot["covariance"]))
+        expected = [
+            *(1e3 * v for pair in zip(shot["position_m"], sigma, strict=False) for v in pair),
+            *shot["euler_zyx_deg"],
+            np.degrees(np.linalg.norm(sigma[3:])),
+            1e3 * np.sqrt(np.trace(np.array(shot["covariance_precision"])[:3, :3])),
+            len(shot["points_m"]),
+        ]
+        np.testing.assert_allclose([float(word) for word in line.split()[1:]], expected, atol=5.1e-4)
     assert said.err.startswith("measured 3 of 3 shots")
 
 
@@ -321,7 +336,7 @@ def test_a_full_disk(start, arm, armsight, full_disk):
     out = full_disk / "poses.csv"
     said = armsight(*start, *images(arm), "-o", out)
     assert said.code == 2
-    assert len(said.out.splitlines()) == 3, "what was measured was printed before"
+    assert len(said.out.splitlines()) == 4, "what was measured was printed before, below its head"
     assert said.err.splitlines() == [f"armsight: error: {out}: cannot be written: No space left on device"]
     assert os.listdir(full_disk) == ["ballast"]
 
@@ -384,7 +399,7 @@ def test_a_shot_of_which_most_points_contradict_each_other_is_named(
             lines[row] = ",".join([*start, str(float(v) - off_px)])
     (seen / "d.csv").write_text("\n".join(lines) + "\n")
     said = armsight(*by_detections(rendered, seen))
-    assert "12 points dropped" in next(line for line in said.out.splitlines() if line.startswith("7:"))
+    assert "12 points dropped" in next(line for line in said.out.splitlines() if line.startswith("7 "))
     assert f"in {', '.join(shots)} most points contradict each other: do not use it" in said.err
     assert said.code == code, said.err
     assert health in said.err

@@ -293,7 +293,7 @@ def _run(
     publisher: Publisher,
 ) -> None:
     """Measure every shot, print its line, keep its record and draw it; of live cameras also warn at once."""
-    warned, looked_s = set[str](), 0.0
+    warned, looked_s, width, headed = set[str](), 0.0, 0, False
     with bar("measuring", shots.total) as advance:
         for shot, measured, followed, shutters in results:
             result = monitor.measured(measured, shot.t_s) if isinstance(measured, PoseEstimate) else measured
@@ -311,7 +311,14 @@ def _run(
                         warned.add(found.cause)
                         click.echo(weak(found.line()), err=True, color=colour())
                         publisher.put(NoteDatum(arrival_s, found.line(), "warning"))
-            click.echo(json.dumps(record.to_json()) if as_json else _line(record))
+            if as_json:
+                click.echo(json.dumps(record.to_json()))
+            else:
+                width = width or max(4, len(record.shot))
+                if record.ok and not headed:
+                    headed = True
+                    click.echo(_head(width))
+                click.echo(_line(record, width))
             if view is not None:
                 view.add(shot, result, record)
             advance()
@@ -323,27 +330,43 @@ def _write(output: Path, records: list[ShotPose]) -> None:
         write_text(output, csv_text(records))
 
 
-def _line(record: ShotPose) -> str:
-    """Return one shot as a line for people: mm and degrees, one sigma."""
+#: Columns of the table for people, their widths and digits; the shot's name is before them.
+_TABLE = (
+    *((f"{axis} mm", 9, 3) if k == 0 else ("±", 6, 3) for axis in "xyz" for k in (0, 1)),
+    *((f"{angle} deg", 9, 3) for angle in ANGLES),
+    ("±", 6, 3),
+    ("prec.", 7, 3),
+    ("pts", 4, 0),
+)
+
+
+def _head(width: int) -> str:
+    """Return the names of the columns: each ± is one sigma of what is before it, prec. what differs from shot to shot."""
+    return f"{'shot':<{width}}" + "".join(f"{name:>{wide}}" for name, wide, _ in _TABLE)
+
+
+def _line(record: ShotPose, width: int) -> str:
+    """Return one shot as a row of the table for people: mm and degrees, one sigma; what is unusual comes last."""
     if not record.ok:
         return f"{record.shot}: missed: {record.reason}"
     sigma = np.sqrt(np.diag(record.cov))
-    position = " ".join(
-        f"{axis} {1e3 * value:.3f} ± {1e3 * s:.3f}"
-        for axis, value, s in zip("xyz", record.position_m, sigma[:3], strict=True)
-    )
-    angles = " ".join(f"{name} {value:.3f}" for name, value in zip(ANGLES, record.euler_zyx_deg, strict=True))
-    sigma_deg = np.degrees(np.linalg.norm(sigma[3:]))
+    each = [1e3 * v for pair in zip(record.position_m, sigma[:3], strict=True) for v in pair]
+    values = [
+        *each,
+        *record.euler_zyx_deg,
+        np.degrees(np.linalg.norm(sigma[3:])),
+        1e3 * record.position_sigmas_m[1],
+        len(record.points_m),
+    ]
+    row = "".join(f"{value:>{wide}.{digits}f}" for value, (_, wide, digits) in zip(values, _TABLE, strict=True))
     dropped = len(record.dropped)
-    note = f", {dropped} point{'' if dropped == 1 else 's'} dropped" if dropped else ""
-    note += f", misfit {record.misfit:.1f}" if record.misfit > 1 else ""
-    note += f", {record.jump}" if record.jump else ""
-    singular = SINGULAR if record.pitch_singular else ""
-    _, precision, calibration = (1e3 * sigma for sigma in record.position_sigmas_m)
-    return (
-        f"{record.shot}: {position} mm, {angles} deg ± {sigma_deg:.3f}{singular}; precision {precision:.3f} mm, "
-        f"calibration {calibration:.3f} mm; {len(record.points_m)} points{note}"
+    notes = (
+        f"{dropped} point{'' if dropped == 1 else 's'} dropped" if dropped else "",
+        f"misfit {record.misfit:.1f}" if record.misfit > 1 else "",
+        record.jump,
+        SINGULAR.strip(", ") if record.pitch_singular else "",
     )
+    return f"{record.shot:<{width}}{row}  {', '.join(filter(None, notes))}".rstrip()
 
 
 def _board_file(path: Path, rig: StereoRig, target: str) -> Path | None:
