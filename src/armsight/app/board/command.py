@@ -461,25 +461,25 @@ def offsets(
         if given and zeros.doubts and yes:
             raise InputError(f"{zeros.doubts[0]}; --yes does not write this: without it you are asked")
         if given and not yes:
-            click.echo("\n".join([zeros.text(), *(f"note: {each}" for each in zeros.doubts)]), err=True)
+            click.echo("\n".join([zeros.text, *(f"note: {each}" for each in zeros.doubts)]), err=True)
             click.confirm(zeros.question, abort=True, err=True)
         if given:
             zeros.write(keep)
-        _show(as_json, {"written": bool(given), "joints": zeros.json()}, zeros.text())
+        _show(as_json, {"written": bool(given), "joints": zeros.json}, zeros.text)
         if given:
             click.echo(f"written; the old offsets are in {keep}", err=True)
 
     if ar4_offsets is not None:
-        offer(kept.Ar4Zeros(ar4_offsets, angles, restore, keep))
+        offer(kept.ar4_zeros(ar4_offsets, angles, restore, keep))
     elif name.startswith("ar4:"):
         raise InputError(f"{name}: an AR4 keeps no zeros; its driver's joint_offsets file does: --ar4-offsets mk3.yaml")
     elif name.startswith("feetech:"):
         with _open_any(name, baud, calibration) as board:
             assert isinstance(board, FeetechBoard)
-            offer(kept.ServoZeros.of(board, angles, restore, calibration))
+            offer(kept.servo_zeros(board, angles, restore, calibration))
     else:
         with _open(name, baud) as own:
-            offer(kept.PotZeros(own, angles, restore))
+            offer(kept.pot_zeros(own, angles, restore))
 
 
 @command.command()

@@ -4,16 +4,17 @@ In: an identified arm or angles, and where the zeros are: register 31 of the ser
 beside it; the ``joint_offsets`` file of ar4_ros_driver; the tables of the potentiometers on a board with our firmware. Out:
 the same with other zeros, and a file of the old ones, written first; ``--restore`` writes that back.
 
-Each of the three is a :class:`Zeros`: what would change, what looks like a mistake in it, how it is shown and written.
+Each of the three is :class:`Zeros`: what would change, what looks like a mistake in it, how it is written.
 """
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,7 +28,6 @@ from armsight.robot.boards.configuration import JOINTS, Configuration, check_con
 from armsight.robot.boards.feetech.board import FeetechBoard
 from armsight.robot.boards.feetech.calibration import read_calibration, write_offsets
 from armsight.robot.boards.feetech.offsets import (
-    OffsetChange,
     corrected_offsets,
     doubts,
     require_released,
@@ -66,23 +66,15 @@ def parsed_degrees(text: str) -> Array:
         raise InputError(f"--further {text}: numbers of degrees with commas between are needed, one a joint") from None
 
 
-class Zeros(Protocol):
-    """Where an arm keeps its zeros, with what would be written: by angles, or of a file of old zeros."""
+@dataclass(frozen=True)
+class Zeros:
+    """The zeros where an arm keeps them, and what would be written there."""
 
-    question: str
-    doubts: list[str]
-
-    def json(self) -> list[dict[str, Any]]:
-        """Return the changes, a joint each."""
-        ...
-
-    def text(self) -> str:
-        """Return the changes as a table."""
-        ...
-
-    def write(self, keep: Path) -> None:
-        """Keep the old zeros in a new file, then write the new ones."""
-        ...
+    question: str  #: before it is written
+    json: list[dict[str, Any]]  #: the changes, a joint each
+    text: str  #: the same as a table
+    doubts: list[str]  #: what looks like a mistake, a sentence each
+    write: Callable[[Path], None]  #: keeps the old ones in a new file, then writes the new ones
 
 
 class ZeroChange(NamedTuple):
@@ -93,135 +85,87 @@ class ZeroChange(NamedTuple):
     new_deg: float  #: what it is to be
 
 
-class _Angles:
-    """Zeros that are angles."""
-
-    question = "write the new zeros?"
-
-    def __init__(self, changes: list[ZeroChange], restored: list[ZeroChange] | None) -> None:
-        """Take what is as it is to be; of old zeros that come back, large changes are no mistakes."""
-        self.changes = changes
-        if restored is not None:
-            self.changes = [old._replace(new_deg=new.new_deg) for old, new in zip(changes, restored, strict=True)]
-        off = {} if restored is not None else {c.name: abs(c.new_deg - c.old_deg) for c in changes}
-        self.doubts = [
-            f"{name}: {by:.1f} deg is more than zeros are usually off by, {USUAL_CHANGE_DEG:g} deg: a wrong number,"
-            " radians or another arm, or an arm that was not homed"
-            for name, by in off.items()
-            if by > USUAL_CHANGE_DEG
-        ]
-
-    def json(self) -> list[dict[str, Any]]:
-        return [each._asdict() for each in self.changes]
-
-    def text(self) -> str:
-        lines = [f"{'joint':16}{'old, deg':>12}{'new, deg':>12}{'change':>14}"]
-        lines += [
-            f"{c.name:16}{c.old_deg:12.4f}{c.new_deg:12.4f}{c.new_deg - c.old_deg:10.4f} deg" for c in self.changes
-        ]
-        return "\n".join(lines)
+def _of_angles(changes: list[ZeroChange], restored: bool, write: Callable[[Path], None]) -> Zeros:
+    """Return zeros that are angles; of old ones that come back, large changes are no mistakes."""
+    lines = [f"{'joint':16}{'old, deg':>12}{'new, deg':>12}{'change':>14}"]
+    lines += [f"{c.name:16}{c.old_deg:12.4f}{c.new_deg:12.4f}{c.new_deg - c.old_deg:10.4f} deg" for c in changes]
+    said = [
+        f"{c.name}: {abs(c.new_deg - c.old_deg):.1f} deg is more than zeros are usually off by, {USUAL_CHANGE_DEG:g} deg:"
+        " a wrong number, radians or another arm, or an arm that was not homed"
+        for c in changes
+        if not restored and abs(c.new_deg - c.old_deg) > USUAL_CHANGE_DEG
+    ]
+    return Zeros("write the new zeros?", [c._asdict() for c in changes], "\n".join(lines), said, write)
 
 
-class Ar4Zeros(_Angles):
-    """The zeros of a ``joint_offsets`` file of ar4_ros_driver.
+def ar4_zeros(file: Path, further_rad: Array | None, restore: Path | None, keep: Path) -> Zeros:
+    """Return the zeros of a ``joint_offsets`` file of ar4_ros_driver: corrected (6,), rad, or of a file that was kept."""
+    check_outputs([keep], [file, restore])
+    check_writable(file)
+    none = np.zeros(len(SENSE))
+    text, changes = ar4_changes(file, none if further_rad is None else further_rad)
+    if restore is not None:
+        text, new = ar4_changes(restore, none)
+        deg = {each.name: each.new_deg for each in new}
+        changes = [each._replace(new_deg=deg[each.name]) for each in changes]
 
-    Args:
-        file: joint_1: 170.0 and so on.
-        further_rad: (6,) true angle less reported one of each joint of ``ar4``; zeros without.
-        restore: file of the old ones.
+    def write(keep: Path) -> None:
+        keep_old(keep, read_text(file))
+        write_text(file, text)
+
+    return _of_angles(changes, restore is not None, write)
+
+
+def pot_zeros(board: Board, further_rad: Array | None, restore: Path | None) -> Zeros:
+    """Return the zeros of the potentiometers of a board with our firmware: corrected (6,), rad, or of a file."""
+    config, none = board.configuration(), np.zeros(JOINTS)
+    old = configuration_text(config, board.welcome.board)
+    changes = pot_changes(config, none if further_rad is None else further_rad)
+    if restore is not None:
+        config = read_configuration(restore)[0]
+        new = pot_changes(config, none)
+        changes = [a._replace(new_deg=b.new_deg) for a, b in zip(changes, new, strict=True)]
+
+    def write(keep: Path) -> None:
+        keep_old(keep, old)
+        board.store(config)
+
+    return _of_angles(changes, restore is not None, write)
+
+
+def servo_zeros(
+    board: FeetechBoard, further_rad: Array | None, restore: Path | None, calibration: Path | None
+) -> Zeros:
+    """Return the homing offsets of the servos of a bus, and of LeRobot's file where there is one; torques must be off.
+
+    Raises:
+        InputError: a correction that is none, no file that was kept, or one of another arm.
     """
+    none, bus = np.zeros(board.abilities.joints), board.bus
+    changes = corrected_offsets(bus, board.calibration, none if further_rad is None else further_rad)
+    said = doubts(changes, board.calibration) if restore is None else []
+    if restore is not None:
+        wished = _kept_offsets(board, restore)
+        changes = [each._replace(new=wished[each.id]) for each in changes]
+    require_released(bus, changes)
 
-    def __init__(self, file: Path, further_rad: Array | None, restore: Path | None, keep: Path) -> None:
-        check_outputs([keep], [file, restore])
-        check_writable(file)
-        self._file = file
-        self._text, changes = ar4_changes(file, np.zeros(len(SENSE)) if further_rad is None else further_rad)
-        restored = None
-        if restore is not None:
-            self._text, restored = ar4_changes(restore, np.zeros(len(SENSE)))
-            restored = [next(new for new in restored if new.name == old.name) for old in changes]
-        super().__init__(changes, restored)
-
-    def write(self, keep: Path) -> None:
-        """Keep the old file, and write the new one."""
-        keep_old(keep, read_text(self._file))
-        write_text(self._file, self._text)
-
-
-class PotZeros(_Angles):
-    """The zeros of the potentiometers of a board with our firmware: see :class:`Ar4Zeros`."""
-
-    def __init__(self, board: Board, further_rad: Array | None, restore: Path | None) -> None:
-        self._board, self._new = board, board.configuration()
-        self._old = configuration_text(self._new, board.welcome.board)
-        changes, restored = pot_changes(self._new, np.zeros(JOINTS) if further_rad is None else further_rad), None
-        if restore is not None:
-            self._new = read_configuration(restore)[0]
-            restored = pot_changes(self._new, np.zeros(JOINTS))
-        super().__init__(changes, restored)
-
-    def write(self, keep: Path) -> None:
-        """Keep the old configuration, and store the new one."""
-        keep_old(keep, self._old)
-        self._board.store(self._new)
-
-
-@dataclass
-class ServoZeros:
-    """The homing offsets of the servos of a bus, and of LeRobot's file where there is one."""
-
-    board: FeetechBoard
-    changes: list[OffsetChange]
-    doubts: list[str]
-    calibration: Path | None
-    question: str = "write the new offsets to the servos?"
-
-    @classmethod
-    def of(
-        cls, board: FeetechBoard, further_rad: Array | None, restore: Path | None, calibration: Path | None
-    ) -> ServoZeros:
-        """Return what changes, checked against the torques that are on; nothing is written.
-
-        Raises:
-            InputError: a correction that is none, or no file that this command kept, or one of another arm.
-        """
-        none, said = np.zeros(board.abilities.joints), list[str]()
-        changes = corrected_offsets(board.bus, board.calibration, none if further_rad is None else further_rad)
-        if restore is not None:
-            wished = _kept_offsets(board, restore)
-            changes = [each._replace(new=wished[each.id]) for each in changes]
-        else:
-            said = doubts(changes, board.calibration)
-        require_released(board.bus, changes)
-        return cls(board, changes, said, calibration)
-
-    def json(self) -> list[dict[str, Any]]:
-        """Return the changes, a joint each."""
-        return [{"name": c.name, "id": c.id, "old_counts": c.old, "new_counts": c.new} for c in self.changes]
-
-    def text(self) -> str:
-        """Return the changes as a table."""
-        lines = [f"{'joint':16}{'id':>4}{'old':>8}{'new':>8}{'change':>12}"]
-        for c in self.changes:
-            lines.append(f"{c.name:16}{c.id:4}{c.old:8}{c.new:8}{np.degrees((c.new - c.old) * RAD_PER_COUNT):8.2f} deg")
-        return "\n".join(lines)
-
-    def write(self, keep: Path) -> None:
-        """Keep the old offsets, write the new ones to the servos, and to LeRobot's file.
-
-        Raises:
-            InputError: a file exists, or cannot be written; nothing was changed on the servos.
-            DeviceError: a servo does not keep its offset; the old ones are back.
-        """
-        check_outputs([keep], [self.calibration])
-        if self.calibration is not None:
-            read_calibration(self.calibration)
-            check_writable(self.calibration)
-        old = {"homing_offsets": {str(c.id): c.old for c in self.changes}, "names": [c.name for c in self.changes]}
+    def write(keep: Path) -> None:
+        check_outputs([keep], [calibration])
+        if calibration is not None:
+            read_calibration(calibration)
+            check_writable(calibration)
+        old = {"homing_offsets": {str(c.id): c.old for c in changes}, "names": [c.name for c in changes]}
         keep_old(keep, json.dumps(old, indent=1) + "\n")
-        write_changes(self.board.bus, self.changes)
-        if self.calibration is not None:
-            write_offsets(self.calibration, self.calibration, {c.id: c.new for c in self.changes})
+        write_changes(bus, changes)
+        if calibration is not None:
+            write_offsets(calibration, calibration, {c.id: c.new for c in changes})
+
+    lines = [f"{'joint':16}{'id':>4}{'old':>8}{'new':>8}{'change':>12}"]
+    lines += [
+        f"{c.name:16}{c.id:4}{c.old:8}{c.new:8}{np.degrees((c.new - c.old) * RAD_PER_COUNT):8.2f} deg" for c in changes
+    ]
+    shown = [{"name": c.name, "id": c.id, "old_counts": c.old, "new_counts": c.new} for c in changes]
+    return Zeros("write the new offsets to the servos?", shown, "\n".join(lines), said, write)
 
 
 def _kept_offsets(board: FeetechBoard, path: Path) -> dict[int, int]:

@@ -5,7 +5,6 @@ In: the name of a board. Out: a :class:`SelftestResult`.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import time
 from collections.abc import Callable, Mapping
@@ -28,6 +27,8 @@ from armsight.sim.joints import JointPlant
 _SMALL_RAD = 0.05
 #: Over how much the speed is measured: of an emulated board ticks, of a real one s.
 _SPEED_TICKS, _SPEED_S = 4000, 1.0
+#: Of an emulated image: flash memory, its variables without the stack, whether it is built for the floating-point unit.
+_SIZES = ("flash_bytes", "ram_bytes", "hard_float")
 
 
 @dataclass(frozen=True)
@@ -39,22 +40,13 @@ class ScenarioResult:
 
 
 @dataclass(frozen=True)
-class ImageSize:
-    """The size of an emulated image; None each where the image is not known."""
-
-    flash_bytes: int | None = None  #: of flash memory
-    ram_bytes: int | None = None  #: of its variables, without the stack
-    hard_float: bool | None = None  #: whether it is built for the processor's floating-point unit
-
-
-@dataclass(frozen=True)
 class SelftestResult:
     """What the self-test found."""
 
     board: str  #: its name
     scenarios: Mapping[str, ScenarioResult]  #: by name
     ticks_per_s: float  #: how fast the board runs, plant and telemetry with it; a real one by this computer's clock
-    elf: ImageSize  #: size of the emulated image
+    elf: dict[str, int | bool | None]  #: sizes of the emulated image, None where it is not known
 
     @property
     def passed(self) -> bool:
@@ -68,7 +60,7 @@ class SelftestResult:
             for name, each in self.scenarios.items()
         }
         speed = round(self.ticks_per_s, 1)
-        return {"board": self.board, "scenarios": scenarios, "ticks_per_s": speed, "elf": dataclasses.asdict(self.elf)}
+        return {"board": self.board, "scenarios": scenarios, "ticks_per_s": speed, "elf": self.elf}
 
 
 def run_scenario(scenario: Scenario, emulator: Emulator) -> ScenarioResult:
@@ -119,15 +111,15 @@ def selftest(
             progress(name)
             scenarios[name], home_rad = _on_real(port, baud, DRIVEN[name], drives, home_rad)
         progress("speed")
-        return SelftestResult(board, scenarios, _ticks_per_s(port, baud), ImageSize())
+        return SelftestResult(board, scenarios, _ticks_per_s(port, baud), dict.fromkeys(_SIZES))
     emulator = emulator_name(board)
     for name, scenario in DRIVEN.items():
         progress(name)
         scenarios[name] = run_scenario(scenario, open_emulator(emulator))
     progress("speed")
     elf = read_elf(firmware.image())
-    size = ImageSize(elf.flash_bytes, elf.ram_bytes, elf.hard_float)
-    return SelftestResult(board, scenarios, speed(open_emulator(emulator)), size)
+    sizes = {name: getattr(elf, name) for name in _SIZES}
+    return SelftestResult(board, scenarios, speed(open_emulator(emulator)), sizes)
 
 
 def _on_real(

@@ -41,7 +41,7 @@ def built_text(built: Built) -> str:
     return "\n".join(lines + [f"{piece}: to {address:#010x}" for address, piece in built.pieces])
 
 
-def _floats(hard: bool | None) -> str:
+def _floats(hard: int | None) -> str:
     return f"{'hardware' if hard else 'software'} floating point"
 
 
@@ -133,7 +133,6 @@ def selftest_text(result: SelftestResult) -> str:
         for name, each in result.scenarios.items()
     ]
     lines.append(f"{result.ticks_per_s:.0f} ticks/s, {result.ticks_per_s / 1000:.1f} times real time")
-    if result.elf.flash_bytes is not None:
-        size = f"flash {result.elf.flash_bytes}, RAM {result.elf.ram_bytes} bytes"
-        lines.append(f"{size}, {_floats(result.elf.hard_float)}")
+    if (sizes := result.elf)["flash_bytes"] is not None:
+        lines.append(f"flash {sizes['flash_bytes']}, RAM {sizes['ram_bytes']} bytes, {_floats(sizes['hard_float'])}")
     return "\n".join(lines)
