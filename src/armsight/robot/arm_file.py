@@ -141,11 +141,7 @@ def _convention(path: str | Path, given: object) -> Convention:
 
 
 def joint_rows(path: str | Path, rows: object) -> list[dict[str, Any]]:
-    """Return the [[joint]] tables of an arm's file.
-
-    Raises:
-        InputError: there are too few or too many.
-    """
+    """Return the [[joint]] tables of an arm's file, or raise InputError: there are too few or too many."""
     there = rows if isinstance(rows, list) and all(isinstance(row, dict) for row in rows) else []
     if not FEWEST_JOINTS <= len(there) <= MOST_JOINTS:
         raise InputError(

@@ -261,11 +261,7 @@ def _pdf(figures: Sequence[Figure]) -> bytes:
 
 
 def read_report(path: Path) -> dict[str, Any]:
-    """Read the report.json of another arm.
-
-    Raises:
-        InputError: it is none, or of another version.
-    """
+    """Read the report.json of another arm, or raise InputError: it is none, or of another version."""
     found = read_json(path)
     if not isinstance(found, dict) or found.get("kind") != "arm report":
         raise InputError(f"{path}: no report of an arm; armsight arm report RUN -o DIR writes DIR/report.json")

@@ -225,11 +225,7 @@ class Found:
 
     @classmethod
     def read(cls, path: Path) -> Found:
-        """Read what an earlier run kept.
-
-        Raises:
-            InputError: it is no such file.
-        """
+        """Read what an earlier run kept, or raise InputError: it is no such file."""
         try:
             data = read_json(path)
             names = {each.name for each in fields(JointFound)}

@@ -240,11 +240,7 @@ def _checked(further_rad: Array, count: int) -> Array:
 
 
 def keep_old(keep: Path, text: str) -> None:
-    """Write what was there before into a new file.
-
-    Raises:
-        InputError: it exists, or cannot be written.
-    """
+    """Write what was there before into a new file, or raise InputError: it exists, or cannot be written."""
     check_writable(keep)
     if keep.exists():
         raise InputError(f"{keep}: exists; old offsets are never written over: name another file with --keep")

@@ -75,11 +75,7 @@ def pin_name(number: int) -> str:
 
 
 def pin_number(name: object) -> int:
-    """Return a pin as the configuration has it: 0 for "none".
-
-    Raises:
-        InputError: it is no pin's name.
-    """
+    """Return a pin as the configuration has it: 0 for "none", or raise InputError: it is no pin's name."""
     match = re.fullmatch(r"P([A-H])(\d|1[0-5])", name) if isinstance(name, str) else None
     if name != NO_PIN and match is None:
         raise InputError(f"sync_led_pin is {name!r}; {_PIN_FORM}")

@@ -120,11 +120,7 @@ class MotionBoard(Protocol):
         ...
 
     def receive(self, wait_s: float = 0.0) -> JointStates:
-        """Let ``wait_s`` pass and return all readings since the last call.
-
-        Raises:
-            DeviceError: the board is gone.
-        """
+        """Let ``wait_s`` pass and return all readings since the last call, or raise DeviceError: the board is gone."""
         ...
 
     def close(self) -> None:

@@ -27,11 +27,7 @@ class HostEmulator:
 
     @classmethod
     def open(cls, library: Path) -> Self:
-        """Load a library of the board ``host`` and start it.
-
-        Raises:
-            InputError: it cannot be loaded.
-        """
+        """Load a library of the board ``host`` and start it, or raise InputError: it cannot be loaded."""
         # A library's variables exist once however often it is loaded: a second board needs a second file.
         handle, name = tempfile.mkstemp(suffix=library.suffix)
         os.close(handle)

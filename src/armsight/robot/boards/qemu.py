@@ -37,11 +37,7 @@ class QemuEmulator:
 
     @classmethod
     def open(cls, image: Path) -> Self:
-        """Start QEMU on an ELF file of the board ``pil``.
-
-        Raises:
-            InputError: QEMU is not installed.
-        """
+        """Start QEMU on an ELF file of the board ``pil``, or raise InputError: QEMU is not installed."""
         program = shutil.which(PROGRAM)
         if program is None:
             raise InputError(f"{PROGRAM} is not installed: apt install qemu-system-arm, or use emulated:unicorn")

@@ -121,11 +121,7 @@ def _from_moving(
 
 
 def _lasting(shortest: PathMotion, duration_s: float) -> PathMotion:
-    """Return a motion from rest slowed down to a duration.
-
-    Raises:
-        InputError: that is shorter than the shortest.
-    """
+    """Return a motion from rest slowed down to a duration, or raise InputError: that is shorter than the shortest."""
     k = duration_s / shortest.duration_s
     motion = replace(shortest, law=shortest.law.slower(k)) if k >= 1 else shortest
     if k < 1 or _check_whole(motion).ratio > 1 + ROUNDING:

@@ -28,11 +28,7 @@ class LinePath(Record):
 
     @staticmethod
     def between(T_base_start: Array, T_base_goal: Array) -> LinePath:
-        """Return the line from one pose (4, 4) to another.
-
-        Raises:
-            InputError: they are the same.
-        """
+        """Return the line from one pose (4, 4) to another, or raise InputError: they are the same."""
         step, rotation, length = way(T_base_start, T_base_goal)
         if length == 0:
             raise InputError("T_base_goal is where the tool already is: there is nothing to travel")

@@ -66,11 +66,7 @@ class MotionRejected(InputError):
 
 
 def clamped(t_s: float | Array, duration_s: float) -> Array:
-    """Return times, () or (N,), within the motion.
-
-    Raises:
-        InputError: not a number.
-    """
+    """Return times, () or (N,), within the motion, or raise InputError: not a number."""
     times = np.asarray(t_s, dtype=np.float64)
     if not np.isfinite(times).all():
         raise InputError(f"t_s is {t_s}; it must be a finite number of seconds")

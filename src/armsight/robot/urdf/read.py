@@ -308,11 +308,7 @@ def arm_rows(where: str, names: list[str], links: list[ChainLink], first_fixed: 
 
 
 def check_same(where: str, arm: Arm, links: list[ChainLink]) -> None:
-    """Compare an arm with the chain it was read from.
-
-    Raises:
-        InputError: they differ by more than rounding.
-    """
+    """Compare an arm with the chain it was read from, or raise InputError: they differ by more than rounding."""
     rng = np.random.default_rng(0)
     for q in rng.uniform(-np.pi, np.pi, (PROBES, arm.joints)):
         T = np.eye(4)

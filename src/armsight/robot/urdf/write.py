@@ -130,11 +130,7 @@ def _along(vector: Array) -> Array:
 
 
 def write_urdf(arm: Arm, path: str | Path) -> None:
-    """Write an arm as a URDF file.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """Write an arm as a URDF file, or raise InputError: it cannot be written."""
     write_text(path, '<?xml version="1.0"?>\n' + urdf_text(arm))
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NoReturn, Self
+from typing import NoReturn, Self, TypeVar
 
 import numpy as np
 
@@ -55,6 +55,7 @@ _HOMING_S = 60.0
 _STOPS = 3
 #: What an encoder may show beyond the limits and beyond the fastest motion, degrees.
 _MARGIN_DEG = 5.0
+_Answer = TypeVar("_Answer", Ar4Start, Ar4Values, Ar4Stopped)
 ABILITIES = Abilities(
     JOINTS,
     RATE_HZ,
@@ -217,7 +218,6 @@ class Ar4Board(PolledBoard):
     def _start(self, version: str) -> None:
         """Name version and model; a firmware of another version of the same kind is asked again in its own."""
         answer = self._ask(lines.start(version, self.model.name), Ar4Start, wait_s=_START_S)
-        assert isinstance(answer, Ar4Start)
         self.welcome = Welcome(f"ar4 {self.model.name}", answer.version, 0, BAUD, None)
         if not answer.version_matches:
             if answer.version.partition(".")[0] != VERSION.partition(".")[0] or answer.version == version:
@@ -291,7 +291,6 @@ class Ar4Board(PolledBoard):
         for _ in range(_TRIES):
             asked = self._now()
             answer = self._ask(lines.POSITIONS, Ar4Values, heading=Heading.POSITIONS)
-            assert isinstance(answer, Ar4Values)
             t_s, reported = (asked + self._heard_s) / 2 - self._begin_s, np.array(answer.values)
             if self._possible(reported, t_s):
                 passed = t_s - self._t_s
@@ -321,12 +320,12 @@ class Ar4Board(PolledBoard):
     def _ask(
         self,
         question: bytes,
-        kind: type[Ar4Start] | type[Ar4Values] | type[Ar4Stopped],
+        kind: type[_Answer],
         *,
         wait_s: float = _ANSWER_S,
         tries: int = _TRIES,
         heading: Heading | None = None,
-    ) -> Ar4Start | Ar4Values | Ar4Stopped:
+    ) -> _Answer:
         """Ask and return the answer of this kind; what else comes meanwhile is taken.
 
         Raises:

@@ -72,42 +72,19 @@ class ServoBus:
         return any(self._heard(packet(id, Instruction.PING)) for _ in range(2))
 
     def read(self, id: int, register: Register) -> int:
-        """Return what a register of a servo holds.
-
-        Raises:
-            DeviceError: it does not answer.
-        """
+        """Return what a register of a servo holds, or raise DeviceError: it does not answer."""
         question = packet(id, Instruction.READ, bytes((register.address, register.width)))
-        for _ in range(TRIES):
-            answers = self._ask(question, [id], register.width)
-            if id in answers:
-                return register.decode(answers[id].parameters)
-        self._explain([id])
+        return register.decode(self._asked(question, [id], register.width)[id].parameters)
 
     def write(self, id: int, register: Register, value: int) -> None:
-        """Write a register of a servo, which acknowledges it.
-
-        Raises:
-            DeviceError: it does not.
-        """
+        """Write a register of a servo, which acknowledges it, or raise DeviceError: it does not."""
         data = bytes((register.address,)) + register.encode(value)
-        for _ in range(TRIES):
-            if id in self._ask(packet(id, Instruction.WRITE, data), [id], 0):
-                return
-        self._explain([id])
+        self._asked(packet(id, Instruction.WRITE, data), [id], 0)
 
     def states(self, ids: Sequence[int]) -> ServoStates:
-        """Return the states of servos, all read with one question.
-
-        Raises:
-            DeviceError: one does not answer.
-        """
-        question = sync_read(POSITION.address, STATE_BYTES, ids)
-        for _ in range(TRIES):
-            answers = self._ask(question, ids, STATE_BYTES)
-            if len(answers) == len(ids):
-                return states_of([answers[id].parameters for id in ids], tuple(answers[id].error for id in ids))
-        self._explain([id for id in ids if id not in answers])
+        """Return the states of servos, all read with one question, or raise DeviceError: one does not answer."""
+        answers = self._asked(sync_read(POSITION.address, STATE_BYTES, ids), ids, STATE_BYTES)
+        return states_of([answers[id].parameters for id in ids], tuple(answers[id].error for id in ids))
 
     def write_all(self, register: Register, values: dict[int, bytes]) -> None:
         """Write bytes from a register on to each servo; nobody acknowledges."""
@@ -145,8 +122,16 @@ class ServoBus:
         if kept != value:
             raise DeviceError(f"{self.name}: id {id} keeps {kept} in register {register.address} instead of {value}")
 
+    def _asked(self, question: bytes, ids: Sequence[int], count: int) -> dict[int, StatusPacket]:
+        """Ask until all of these ids have answered with ``count`` bytes; say what is wrong where they do not."""
+        for _ in range(TRIES):
+            answers = self._ask(question, ids, count)
+            if len(answers) == len(ids):
+                return answers
+        self._explain([id for id in ids if id not in answers])
+
     def _ask(self, question: bytes, ids: Sequence[int], count: int) -> dict[int, StatusPacket]:
-        """Ask once and return the whole answers of these ids with ``count`` bytes; without those that came twice."""
+        """Ask once and return the whole answers of these ids; without those that came twice."""
         self._link.read(0.0)  # what came late answers nothing
         self._reader.clear()
         self._link.write(question)

@@ -38,11 +38,7 @@ class Register(NamedTuple):
         return word if self.sign_bit is None else signed(word, self.sign_bit)
 
     def encode(self, value: int) -> bytes:
-        """Return the bytes of a number.
-
-        Raises:
-            OverflowError: it does not fit.
-        """
+        """Return the bytes of a number, or raise OverflowError: it does not fit."""
         if self.sign_bit is not None:
             if abs(value) >= 1 << self.sign_bit:
                 raise OverflowError(f"{value} has more than {self.sign_bit} bits")
