@@ -34,7 +34,7 @@ import test_firmware_pid as pid_tests  # noqa: E402
 from firmware_stack import stack_use  # noqa: E402
 
 from armsight import firmware  # noqa: E402
-from armsight.app.board.scenarios import DRIVEN, BoardTestRig  # noqa: E402
+from armsight.app.board.selftest import DRIVEN, BoardTestRig  # noqa: E402
 from armsight.firmware import build  # noqa: E402
 from armsight.firmware.elf import read_elf  # noqa: E402
 from armsight.robot.board_registry import configured, open_emulator  # noqa: E402

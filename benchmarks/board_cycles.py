@@ -32,7 +32,7 @@ from pathlib import Path
 
 import numpy as np
 
-from armsight.app.board.scenarios import DRIVEN, BoardTestRig
+from armsight.app.board.selftest import DRIVEN, BoardTestRig
 from armsight.firmware import build
 from armsight.robot.board_registry import configured
 from armsight.robot.boards.emulated import EmulatedLink

@@ -8,8 +8,7 @@ from firmware_build import FIRMWARE, board_image, build_host, compilers
 from firmware_layout import c
 
 from armsight import firmware
-from armsight.app.board.scenarios import DRIVEN
-from armsight.app.board.selftest import run_scenario
+from armsight.app.board.selftest import DRIVEN, run_scenario
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import build
 from armsight.firmware.elf import read_elf

@@ -9,7 +9,7 @@ from firmware_build import board_image
 
 from armsight.app.board import selftest as board_selftest
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
-from armsight.app.board.scenarios import AT_REST, DRIVEN
+from armsight.app.board.selftest import AT_REST, DRIVEN
 from armsight.firmware import build, host_library
 from armsight.robot.board_registry import EMULATORS
 from armsight.robot.boards.codes import BoardState, Fault

@@ -6,5 +6,5 @@ self-test.
 - ``command``: the command line.
 - ``text``: what is printed, as JSON and as text.
 - ``flash``: a board's image, and the programmers that write it.
-- ``selftest``: all scenarios on a board; ``scenarios``: each of them, and the test rig that they use.
+- ``selftest``: all scenarios on a board, and the test rig that they use.
 """
