@@ -192,11 +192,7 @@ _MOST_SPEED_RAD_S, _MOST_RAD_S2 = 2.0, 10.0
 def quiet_bandwidth(motor: MotorFigures, supply_v: float, noise_rad: float, duty_noise: float) -> float:
     """Return the greatest bandwidth, rad/s, not too stiff, with gains a board takes, at which noise hardly moves the duty.
 
-    Args:
-        motor: its motor.
-        supply_v: nominal supply, V.
-        noise_rad: standard deviation of a reading.
-        duty_noise: standard deviation of the duty that this noise may cause.
+    Noise is the standard deviation of a reading, and of the duty that it may cause.
     """
     for bandwidth in _bandwidths(motor, 1.0):
         if _is_quiet(tuned_gains(motor, supply_v, bandwidth), noise_rad, duty_noise):

@@ -6,7 +6,7 @@ In: an arm, a path and a start state. Out: a :class:`PathMotion`, checked; or :c
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +24,14 @@ if TYPE_CHECKING:
 
 #: How far from the path a start's speeds and accelerations may point, as a share of the limits.
 ALONG = 1e-6
+
+
+class Beginning(TypedDict, total=False):
+    """How a motion along a path begins, and how long it takes; from rest, and as short as the limits allow, without."""
+
+    qd_start: ArrayLike | None  #: (n,) speeds to start with, rad/s; they must carry the tool along the path
+    qdd_start: ArrayLike | None  #: (n,) accelerations to start with, rad/s^2, likewise
+    duration_s: float | None  #: how long it is to take, s
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +12,7 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.rotation import exp_so3, log_so3
-from armsight.robot.trajectories.cartesian import PathMotion, follow
+from armsight.robot.trajectories.cartesian import Beginning, PathMotion, follow
 from armsight.robot.trajectories.path import PathPoints, checked_pose
 
 if TYPE_CHECKING:
@@ -51,9 +51,7 @@ def circle(
     angle_rad: float = 2 * np.pi,
     *,
     rotation_base: ArrayLike = (0.0, 0.0, 0.0),
-    qd_start: ArrayLike | None = None,
-    qdd_start: ArrayLike | None = None,
-    duration_s: float | None = None,
+    **begin: Unpack[Beginning],
 ) -> PathMotion:
     """Plan a circle of the tool about an axis in space, from where it is.
 
@@ -65,9 +63,7 @@ def circle(
         angle_rad: how far round, rad; a full circle by default, negative for the other way.
         rotation_base: (3,) rotation vector the orientation goes through on the way, rad, base axes; zero keeps it, the
             axis times ``angle_rad`` rotates the tool with the circle.
-        qd_start: (n,) speeds to start with, rad/s; they must carry the tool along the circle. None for rest.
-        qdd_start: (n,) accelerations to start with, rad/s^2, as ``qd_start``.
-        duration_s: how long it is to take, s; None for as short as the limits allow.
+        begin: speeds, accelerations and duration: :class:`~armsight.robot.trajectories.cartesian.Beginning`.
 
     Raises:
         MotionRejected: the circle leaves the reach or the joint limits, or meets a singularity.
@@ -83,7 +79,7 @@ def circle(
     if np.linalg.norm(np.cross(axis, T_base_start[:3, 3] - center)) < TOO_SMALL:
         raise InputError("the tool is on the circle's axis: there is no circle to travel")
     path = ArcPath(T_base_start, center, axis * angle_rad, checked(rotation_base, (3,), "rotation_base"))
-    return follow(arm, path, q_start, qd_start=qd_start, qdd_start=qdd_start, duration_s=duration_s)
+    return follow(arm, path, q_start, **begin)
 
 
 def arc(
@@ -91,10 +87,7 @@ def arc(
     q_start: ArrayLike,
     via_base: ArrayLike,
     T_base_goal: ArrayLike,
-    *,
-    qd_start: ArrayLike | None = None,
-    qdd_start: ArrayLike | None = None,
-    duration_s: float | None = None,
+    **begin: Unpack[Beginning],
 ) -> PathMotion:
     """Plan the arc of the tool from where it is through a point to a pose, the orientation rotating evenly (slerp).
 
@@ -103,9 +96,7 @@ def arc(
         q_start: (n,) angles to start from, rad; their configuration is kept.
         via_base: (3,) a point on the arc between start and goal, m, base frame.
         T_base_goal: (4, 4) pose of the tool to end at.
-        qd_start: (n,) speeds to start with, rad/s; they must carry the tool along the arc. None for rest.
-        qdd_start: (n,) accelerations to start with, rad/s^2, as ``qd_start``.
-        duration_s: how long it is to take, s; None for as short as the limits allow.
+        begin: speeds, accelerations and duration: :class:`~armsight.robot.trajectories.cartesian.Beginning`.
 
     Raises:
         MotionRejected: the arc leaves the reach or the joint limits, or meets a singularity.
@@ -116,7 +107,7 @@ def arc(
     center, sweep = through(T_base_start[:3, 3], checked(via_base, (3,), "via_base"), goal[:3, 3])
     rotation_base = log_so3(np.ascontiguousarray(goal[:3, :3] @ T_base_start[:3, :3].T))
     path = ArcPath(T_base_start, center, sweep, rotation_base)
-    return follow(arm, path, q_start, qd_start=qd_start, qdd_start=qdd_start, duration_s=duration_s)
+    return follow(arm, path, q_start, **begin)
 
 
 def through(a: Array, via: Array, b: Array) -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.rotation import exp_so3
-from armsight.robot.trajectories.cartesian import PathMotion, follow
+from armsight.robot.trajectories.cartesian import Beginning, PathMotion, follow
 from armsight.robot.trajectories.path import PathPoints, checked_pose, way
 
 if TYPE_CHECKING:
@@ -47,10 +47,7 @@ def line(
     arm: Arm,
     q_start: ArrayLike,
     T_base_goal: ArrayLike,
-    *,
-    qd_start: ArrayLike | None = None,
-    qdd_start: ArrayLike | None = None,
-    duration_s: float | None = None,
+    **begin: Unpack[Beginning],
 ) -> PathMotion:
     """Plan a straight line of the tool from where it is.
 
@@ -58,13 +55,11 @@ def line(
         arm: the arm.
         q_start: (n,) angles to start from, rad; their configuration is kept.
         T_base_goal: (4, 4) pose of the tool to end at.
-        qd_start: (n,) speeds to start with, rad/s; they must carry the tool along the line. None for rest.
-        qdd_start: (n,) accelerations to start with, rad/s^2, as ``qd_start``.
-        duration_s: how long it is to take, s; None for as short as the limits allow.
+        begin: speeds, accelerations and duration: :class:`~armsight.robot.trajectories.cartesian.Beginning`.
 
     Raises:
         MotionRejected: the line leaves the reach or the joint limits, or meets a singularity.
         InputError: bad numbers, nothing to travel, or a duration that cannot be met.
     """
     path = LinePath.between(arm.forward(q_start), checked_pose(T_base_goal, "T_base_goal"))
-    return follow(arm, path, q_start, qd_start=qd_start, qdd_start=qdd_start, duration_s=duration_s)
+    return follow(arm, path, q_start, **begin)
