@@ -57,23 +57,20 @@ def test_a_board_of_another_version_is_rejected_by_name(versions):
     assert link.closed
 
 
-def test_nothing_on_the_wire_is_reported_as_such():
-    link = ScriptedLink()
-    with pytest.raises(DeviceError, match=r"no board answers .nothing comes.: is it the right port"):
+@pytest.mark.parametrize(
+    ("answer", "said", "waited_s"),
+    [
+        (lambda data: b"", r"no board answers .nothing comes.: is it the right port", 1.0),  # 20 hellos, 50 ms each
+        (lambda data: b"Marlin 2.1\nok\n\xfd\x00\xff", "bytes come, but no answer", 1.0),
+        (lambda data: Speaker().welcome(), "answers the hello, but sends no telemetry", 3.01),
+    ],
+)
+def test_a_wire_without_a_board_is_reported_as_such(answer, said, waited_s):
+    link = ScriptedLink(answer)
+    with pytest.raises(DeviceError, match=said):
         Board.connect(link)
     assert link.closed
-    assert link.waited_s == pytest.approx(1.0)  # 20 hellos, 50 ms each
-
-
-def test_something_else_on_the_wire_is_reported_as_such():
-    with pytest.raises(DeviceError, match="bytes come, but no answer"):
-        Board.connect(ScriptedLink(lambda data: b"Marlin 2.1\nok\n\xfd\x00\xff"))
-
-
-def test_a_board_without_telemetry_is_reported_as_such():
-    speaker = Speaker()
-    with pytest.raises(DeviceError, match="answers the hello, but sends no telemetry"):
-        Board.connect(ScriptedLink(lambda data: speaker.welcome()))
+    assert link.waited_s == pytest.approx(waited_s)
 
 
 def test_motion_is_followed_and_every_reading_arrives_in_order():
