@@ -63,8 +63,7 @@ _NUMBERS: dict[str, tuple[tuple[str, str], float]] = {
 }
 #: Limits of speed (rad/s), acceleration and jerk of every joint, for a table that gives none.
 _SPEED, _ACCELERATION, _JERK = 1.0, 5.0, 50.0
-#: A longer link is rejected as a mistake of units, m.
-_LONGEST = 20.0
+_LONGEST = 20.0  # a longer link is rejected as a mistake of units, m
 
 
 def open_arm(name_or_path: str | Path) -> Arm:

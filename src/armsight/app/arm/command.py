@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from armsight.data import Array
     from armsight.robot.kinematics.arm import Arm
 
-#: A minus before a number is no option.
-_NUMBERS = {"ignore_unknown_options": True}
+_NUMBERS = {"ignore_unknown_options": True}  # a minus before a number is no option
 #: Over less than this, m, poses distinguish an arm's zeros badly from its base and tool. Half: fewer notes; double: more.
 _NARROW_M = 0.15
 _POSE = ("x", "y", "z", "euler_z", "euler_y", "euler_x")

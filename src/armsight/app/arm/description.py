@@ -24,8 +24,7 @@ from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.reach import reach
 from armsight.robot.kinematics.solutions import Solutions
 
-#: What is shown: an object, and lines.
-Shown = tuple[Any, list[str]]
+Shown = tuple[Any, list[str]]  # what is shown: an object, and lines
 
 
 def _fixed(value: float) -> str:

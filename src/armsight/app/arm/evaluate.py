@@ -42,18 +42,15 @@ from armsight.robot.arm_file import open_arm
 from armsight.robot.kinematics.arm import Arm
 from armsight.tables.columns import Columns
 
-#: So many rests that were left out are named.
-_NAMED = 5
-#: Version of report.json.
-VERSION = 1
+_NAMED = 5  # so many rests that were left out are named
+VERSION = 1  # version of report.json
 #: Fewest rests, and shots of one.
 MIN_RESTS, _SHOTS = 12, 2
 _SIGMAS = tuple(f"sigma_{name}" for name in ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"))
 #: Delays of the joints that are tried, s; how much a joint must move in a motion to show its delay, rad; how much of the
 #: rest after it counts, s; and so many motions at most.
 _DELAYS_S, _MOVED_RAD, _AFTER_S, _MOTIONS = np.arange(0.0, 1.2, 0.005), np.radians(2.0), 0.5, 60
-#: Poses that are at most this far apart by their commands, rad, are one pose.
-_SAME_RAD = 1e-6
+_SAME_RAD = 1e-6  # poses that are at most this far apart by their commands, rad, are one pose
 #: Part of the error -> the kinds of parameters that make it, and its remedy.
 _PARTS = {
     "base and tool": (("base", "tool"), "calibrate hand and eye anew, over more of the room"),
@@ -390,8 +387,7 @@ def _zero(arm: Arm, i: int, rests: RestPoses, found: Identified) -> tuple[float,
     return float(np.degrees(value)), float(np.degrees(sigma))
 
 
-#: A joint whose gravity load has a lever below this at all poses carries none, m.
-_LEVER_M = 0.02
+_LEVER_M = 0.02  # a joint whose gravity load has a lever below this at all poses carries none, m
 
 
 def least_squares(A: Array, y: Array, groups: list[NDArray[np.int64]] | None) -> tuple[list[float], list[float]]:

@@ -189,8 +189,7 @@ _FIGURES: dict[str, tuple[str, float, Callable[[ArmReport, FigureBase], None]]] 
     ),
     "drift": ("The pose that came most often.", 2.8, _drift_figure),
 }
-#: Height of a page of the PDF, inches.
-_PAGE = 13.0
+_PAGE = 13.0  # height of a page of the PDF, inches
 
 
 def arm_report(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> Report:

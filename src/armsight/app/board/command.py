@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _FILE = click.argument("file", type=click.Path(path_type=Path))
-#: How long an emulated board is watched where nobody says how long.
-_WATCH_S = 2.0
+_WATCH_S = 2.0  # how long an emulated board is watched where nobody says how long
 #: The steps of a bring-up, in their order, and what each finds of a joint (``found.JointFound``).
 STEPS = {
     "readings": "noise_counts",

@@ -19,8 +19,7 @@ from armsight.files import check_folder, read_text, replacing
 from armsight.firmware import build
 from armsight.firmware.elf import read_elf
 
-#: Boards a programmer can write; the emulated one needs none.
-FLASHED = ("stm32f4", "blackpill")
+FLASHED = ("stm32f4", "blackpill")  # boards a programmer can write; the emulated one needs none
 
 
 @dataclass(frozen=True)

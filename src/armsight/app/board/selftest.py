@@ -30,12 +30,9 @@ from armsight.robot.boards.link import Emulator, Link
 from armsight.robot.boards.serial import BAUD, SerialLink
 from armsight.sim.joints import JointPlant, PotFault
 
-#: The host's period, s.
-PERIOD_S = 0.01
-#: Frequency of the swing, Hz.
-_SINE_HZ = 0.5
-#: The joints stay this near to their commanded angles while they swing, rad.
-_NEAR_RAD = 0.1
+PERIOD_S = 0.01  # the host's period, s
+_SINE_HZ = 0.5  # frequency of the swing, Hz
+_NEAR_RAD = 0.1  # the joints stay this near to their commanded angles while they swing, rad
 #: How long an arm may take to come to rest without a host, and what its board is then.
 _REST_S = 3.0
 _AT_REST_STATES = (BoardState.HOLDING, BoardState.FAULTED)
@@ -376,8 +373,7 @@ def _expect_fault(rig: BoardTestRig, fault: Fault, joint: int | None) -> None:
         rig.expect(not driven, f"{fault.name} leaves the drive of joint {joint + 1} on")
 
 
-#: A real arm swings by this much where it may move, rad: less than 3 degrees.
-_SMALL_RAD = 0.05
+_SMALL_RAD = 0.05  # a real arm swings by this much where it may move, rad: less than 3 degrees
 #: Over how much the speed is measured: of an emulated board ticks, of a real one s.
 _SPEED_TICKS, _SPEED_S = 4000, 1.0
 #: Of an emulated image: flash memory, its variables without the stack, whether it is built for the floating-point unit.

@@ -53,8 +53,7 @@ _STEPS = 5  # between one hello and the next
 _TELEMETRY_STEPS = 300  # the rarest message comes once a second at 9600 baud
 _WRAP = 1 << 32
 _LONGEST_TICKS = 10000
-#: An emergency stop goes out so many times: a disturbed byte must not swallow it.
-_STOPS = 3
+_STOPS = 3  # an emergency stop goes out so many times: a disturbed byte must not swallow it
 _STORE_S = 3.0  # a flash memory takes its time
 _PART = 200  # bytes of a CONFIG_PART
 _FIELDS = CONFIG.fields

@@ -47,8 +47,7 @@ from armsight.robot.boards.configuration import (
     pin_number,
 )
 
-#: Parts of a joint that are tables of their own.
-_PARTS = ("gains", "pot", "motor", "encoder", "transmission")
+_PARTS = ("gains", "pot", "motor", "encoder", "transmission")  # parts of a joint that are tables of their own
 _PIN = "sync_led_pin"  # a name in the file: "PB13", or "none"
 #: Version of a file -> what it did not have yet, of every joint: all of it is 0 there.
 _NEW_SINCE: Mapping[int, tuple[str, ...]] = {

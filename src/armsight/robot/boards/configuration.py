@@ -25,8 +25,7 @@ from armsight.robot.boards.tuning import GAIN_RANGES, MotorFigures, tuned_gains
 
 Configuration = NDArray[np.void]
 JOINTS, POT_NODES = headers.number("JOINTS"), headers.number("POT_NODES")
-#: Counts of an absolute encoder's revolution.
-ENCODER_REV = headers.number("ENCODER_REV")
+ENCODER_REV = headers.number("ENCODER_REV")  # counts of an absolute encoder's revolution
 #: Layout of the configuration this armsight knows: ``firmware/core/config.h``.
 CONFIG_VERSION = headers.number("CONFIG_VERSION")
 #: Part of a configuration -> its record; a joint is the parts and its own numbers.

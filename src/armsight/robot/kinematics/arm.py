@@ -32,16 +32,14 @@ from armsight.robot.kinematics.table import FEWEST_JOINTS, KIND, MOST_JOINTS, li
 #: Axes further apart than this, rad, are not meant to be parallel.
 TILT_RAD = np.deg2rad(3.0)
 _A, _D, _COS, _SIN, _OFFSET, _DIRECTION = range(6)
-#: A coupling of a greater condition number is taken for singular.
-_SINGULAR_COUPLING = 1e6
+_SINGULAR_COUPLING = 1e6  # a coupling of a greater condition number is taken for singular
 #: What an error adds where angles are too large for radians.
 DEGREES = "are these degrees? give radians: numpy.deg2rad(...)"
 Convention = Literal["standard", "modified"]
 Axes = Literal["base", "tool"]
 _AXES = {"base": False, "tool": True}
 
-#: Attribute -> what every joint has where it is not given.
-_DEFAULTS = {"offset": 0.0, "direction": 1.0, "home": 0.0}
+_DEFAULTS = {"offset": 0.0, "direction": 1.0, "home": 0.0}  # attribute -> what every joint has where it is not given
 
 
 def _not_given() -> Array:

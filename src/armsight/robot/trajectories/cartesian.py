@@ -22,8 +22,7 @@ from armsight.robot.trajectories.trajectory import Joints, MotionRejected, check
 if TYPE_CHECKING:
     from armsight.robot.kinematics.arm import Arm
 
-#: How far from the path a start's speeds and accelerations may point, as a share of the limits.
-ALONG = 1e-6
+ALONG = 1e-6  # how far from the path a start's speeds and accelerations may point, as a share of the limits
 
 
 class Beginning(TypedDict, total=False):

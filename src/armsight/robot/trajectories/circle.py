@@ -18,8 +18,7 @@ from armsight.robot.trajectories.path import PathPoints, checked_pose
 if TYPE_CHECKING:
     from armsight.robot.kinematics.arm import Arm
 
-#: A radius, m, or the sine of an angle below which three points say nothing about a circle.
-TOO_SMALL = 1e-6
+TOO_SMALL = 1e-6  # a radius, m, or the sine of an angle below which three points say nothing about a circle
 
 
 @dataclass(frozen=True, eq=False)

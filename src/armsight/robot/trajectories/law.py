@@ -33,18 +33,15 @@ from armsight.robot.trajectories.trajectory import CHECK_RATE_HZ, Joints, check_
 if TYPE_CHECKING:
     from armsight.robot.kinematics.arm import Arm
 
-#: Rounds of scaling a single law; from rest the second is exact up to where the samples fall.
-ROUNDS = 12
+ROUNDS = 12  # rounds of scaling a single law; from rest the second is exact up to where the samples fall
 #: Relative distance from its limit to which the fastest joint is brought; smaller: faster motions, more rounds.
 CLOSE = 1e-3
 #: Proportions of speed, acceleration and jerk, of what the joints could do at most, that are tried for a motion from rest.
 SHAPES = tuple(product((1.0, 0.7, 0.5, 0.3), (1.0, 0.6, 0.3), (1.0, 0.5, 0.2)))
-#: Instants at which each of these proportions is evaluated.
-INSTANTS = 200
+INSTANTS = 200  # instants at which each of these proportions is evaluated
 #: From a moving start every proportion is tried at these time scales too: below 1 is slower.
 SCALES = (1.03, 1.0, 0.97, 0.93, 0.87, 0.8, 0.7, 0.6, 0.5, 0.4)
-#: At most so many laws from a moving start, the shortest first, are checked at 1 kHz by inverse kinematics.
-TRIED = 20
+TRIED = 20  # at most so many laws from a moving start, the shortest first, are checked at 1 kHz by inverse kinematics
 #: Where none of these keeps the limits: speeds, as shares of what the joints could do at most, that are tried.
 SPEEDS = np.array([4.0, 1.0, 0.7, 0.5, 0.3])
 #: Accelerations, as shares likewise, that are tried with each of these speeds.
@@ -53,26 +50,19 @@ ACCELERATIONS = np.array([4.0, 1.0, 0.6, 0.3])
 ALIKE = 1e-7
 #: Powers of one factor by which speed, acceleration and jerk are raised: the jerk alone, or all three as time is scaled.
 JERK_ONLY, ALL_LIMITS = np.array([0.0, 0.0, 1.0]), np.array([1.0, 2.0, 3.0])
-#: The largest such factor that is tried.
-HARDEST = 2.0
+HARDEST = 2.0  # the largest such factor that is tried
 #: Halvings of the interval from 0 to :data:`HARDEST` in which the largest factor that keeps the limits is found.
 HARDER = 14
 #: Relative error of the walk's derivatives between its points: how far within the limits a law must stay there.
 HAIR = 2e-4
-#: How long a start's own state, which may be at a limit, may last, s.
-FIRST_S = 5e-3
-#: A moving start's laws are evaluated at every so many-th instant of the later check at 1 kHz.
-EVERY = 2
-#: Halvings of a duration that find when a share is reached.
-HALVINGS = 40
-#: Rounds in which the parts of a chain are slowed down.
-CHAIN_ROUNDS = 40
-#: Factor by which a bend's speed is reduced when the straight part beside it is too short.
-GENTLER = 0.9
+FIRST_S = 5e-3  # how long a start's own state, which may be at a limit, may last, s
+EVERY = 2  # a moving start's laws are evaluated at every so many-th instant of the later check at 1 kHz
+HALVINGS = 40  # halvings of a duration that find when a share is reached
+CHAIN_ROUNDS = 40  # rounds in which the parts of a chain are slowed down
+GENTLER = 0.9  # factor by which a bend's speed is reduced when the straight part beside it is too short
 #: How far within the limits, relative, a chain from a moving start stays: its duration cannot be scaled afterwards.
 MARGIN = 0.01
-#: Bends nearer to each other than this share of the way are passed as one.
-TOUCHING = 1e-6
+TOUCHING = 1e-6  # bends nearer to each other than this share of the way are passed as one
 
 
 class Law(Protocol):

@@ -15,8 +15,7 @@ from armsight.robot.trajectories.trajectory import Joints, MotionRejected, Traje
 if TYPE_CHECKING:
     from armsight.robot.kinematics.arm import Arm
 
-#: Relative excess of a limit that is rounding and no motion.
-ROUNDING = 1e-9
+ROUNDING = 1e-9  # relative excess of a limit that is rounding and no motion
 
 
 class Worst(NamedTuple):

@@ -29,21 +29,17 @@ from armsight.robot.trajectories.trajectory import CHECK_RATE_HZ, Joints, Motion
 if TYPE_CHECKING:
     from armsight.robot.kinematics.arm import Arm
 
-#: How fast the tool returns to its reference, 1/s: what is left of an error falls to a third in 1/GAIN.
-GAIN = 30.0
+GAIN = 30.0  # how fast the tool returns to its reference, 1/s: what is left of an error falls to a third in 1/GAIN
 #: Damping sets in below this singular value (linear rows over the arm's size) and reaches its square's share of DAMPING.
 SOFT, DAMPING = 0.04, 0.03
 #: After the reference stands, the tool settles until the joints are slower than this share of their limits, or this long.
 #: A speed that is left is taken off within the last step of 1 ms: by a jerk some 1e7 times as large.
 SETTLED, SETTLE_S = 2e-6, 2.0
-#: The longest motion that may be asked for, s: each second of it is a thousand steps.
-LONGEST_S = 300.0
+LONGEST_S = 300.0  # the longest motion that may be asked for, s: each second of it is a thousand steps
 #: How far from the path a start's speeds may point, of their limits, and its accelerations, rad/s^2 at the arm's size.
 ALONG = 1e-5
-#: Rounds of slowing down until the limits hold.
-ROUNDS = 12
-#: A singular value below this is none.
-_RANK = 1e-9
+ROUNDS = 12  # rounds of slowing down until the limits hold
+_RANK = 1e-9  # a singular value below this is none
 #: How the share of the way moves, in units of its duration: limits of speed, acceleration and jerk.
 SHAPE = (1.6, 8.0, 80.0)
 

@@ -16,12 +16,9 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError
 
-#: Every trajectory is checked at this rate when it is made, Hz.
-CHECK_RATE_HZ = 1000.0
-#: The longest motion that may be asked for, s: it is looked through at that rate.
-LONGEST_S = 3600.0
-#: How many instants are looked at together.
-PIECE = 20_000
+CHECK_RATE_HZ = 1000.0  # every trajectory is checked at this rate when it is made, Hz
+LONGEST_S = 3600.0  # the longest motion that may be asked for, s: it is looked through at that rate
+PIECE = 20_000  # how many instants are looked at together
 
 
 class Joints(NamedTuple):

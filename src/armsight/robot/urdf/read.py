@@ -32,13 +32,11 @@ from armsight.tables.lengths import REACH, fitting_unit, metric
 
 #: What an arm is given where its URDF has no accelerations and jerks: full speed in 0.25 s, full acceleration in 0.1 s.
 TO_SPEED_S, TO_ACCELERATION_S = 0.25, 0.1
-#: Two frames differ by rounding below this, m and rad: numbers written with ten digits.
-EXACT = 1e-9
+EXACT = 1e-9  # two frames differ by rounding below this, m and rad: numbers written with ten digits
 #: A common normal further away than this many times the chain's length leaves no digits to hold the chain exactly. Nearer
 #: ones do: an identified arm's axes are a little off parallel, and are meant to be.
 FAR = 1e6
-#: Random poses at which the table is compared with the chain.
-PROBES = 16
+PROBES = 16  # random poses at which the table is compared with the chain
 #: A continuous joint has no limits: here it goes a revolution either way, at this speed where the file gives none, rad/s.
 _REVOLUTION, _SPEED = 2 * np.pi, 1.0
 #: The largest angle of an origin, rad: none writes two revolutions; half: some write one; double: 20 deg passes.

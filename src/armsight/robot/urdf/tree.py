@@ -20,10 +20,8 @@ from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS
 
 ROTARY = ("revolute", "continuous")
 MOVING = (*ROTARY, "prismatic", "floating", "planar")
-#: Names that a message lists at most.
-_SHOWN = 6
-#: What ROS calls an arm's flange where a tool is mounted (REP 199).
-_FLANGE = "tool0"
+_SHOWN = 6  # names that a message lists at most
+_FLANGE = "tool0"  # what ROS calls an arm's flange where a tool is mounted (REP 199)
 #: A last joint of such a name is a gripper's.
 _GRIPPERS = ("grip", "jaw", "finger", "knuckle", "thumb")
 _COUNT = f"{FEWEST_JOINTS} to {MOST_JOINTS}"

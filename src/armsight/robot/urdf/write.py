@@ -25,8 +25,7 @@ from armsight.robot.kinematics.table import exact_cos_sin
 
 #: Radius of the bars, as a share of the arm's length along its links, its bounds, m, and how it shrinks from link to link.
 _RADIUS, _THINNEST_M, _THICKEST_M, _TAPER = 0.04, 0.01, 0.08, 0.9
-#: Density of the bars, kg/m^3: a hollow aluminium casting with its motors.
-_DENSITY = 1500.0
+_DENSITY = 1500.0  # density of the bars, kg/m^3: a hollow aluminium casting with its motors
 #: Length of a joint's drum, in radii; greatest effort, in torques that hold the straight arm; its least, N m.
 _DRUM, _EFFORT, _LEAST_EFFORT_NM = 2.4, 3.0, 1.0
 _GRAVITY_M_S2 = 9.81

@@ -156,8 +156,7 @@ class So101Servos:
 
 #: Acceleration of a setpoint, rad/s^2; how fast a motor is, and how fast a shaft falls through its backlash, rad/s.
 _ACCELERATION, _MOST_RAD_S, _FALL_RAD_S = 25.0, 5.0, 2.0
-#: Steps between two of the temperatures.
-_SLOW = 100
+_SLOW = 100  # steps between two of the temperatures
 
 
 @dataclass

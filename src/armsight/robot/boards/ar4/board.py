@@ -38,8 +38,7 @@ from armsight.robot.boards.reports import BoardStatus, JointFault, JointReport, 
 BAUD = 115200
 #: The firmware's version that this codec was written for; others of the same first number are spoken to as well.
 VERSION = "2.1.0"
-#: Readings a second: a position line takes 7 ms at 115200 baud.
-RATE_HZ = 50.0
+RATE_HZ = 50.0  # readings a second: a position line takes 7 ms at 115200 baud
 #: Steppers slow down towards every goal as if it were the last: they follow goals that move with v at a distance of
 #: v^2 / (2 a). At 20 degrees/s and 30 degrees/s^2 that is 6.7 degrees, or 0.33 s, and as much again from and to rest.
 MOST_SPEED_RAD_S, LATENCY_S = float(np.radians(20.0)), 0.7
@@ -53,8 +52,7 @@ _POLL_S, _DRAIN_S = 0.001, 0.05
 #: Homing of a group of joints: to the switches, away from them, to the rest position.
 _HOMING_S = 60.0
 _STOPS = 3
-#: What an encoder may show beyond the limits and beyond the fastest motion, degrees.
-_MARGIN_DEG = 5.0
+_MARGIN_DEG = 5.0  # what an encoder may show beyond the limits and beyond the fastest motion, degrees
 _Answer = TypeVar("_Answer", Ar4Start, Ar4Values, Ar4Stopped)
 ABILITIES = Abilities(
     JOINTS,

@@ -18,8 +18,7 @@ LETTERS = "ABCDEF"
 _NUMBER = r"([+-]?\d+(?:\.\d+)?)"
 _SIX = re.compile("".join(letter + _NUMBER for letter in LETTERS))
 _START = re.compile(r"A([01])B([^C]*)C([01])D(.*)")
-#: Longest line, characters: six values of 13, and errors in words.
-LONGEST = 200
+LONGEST = 200  # longest line, characters: six values of 13, and errors in words
 
 
 class Heading(Enum):

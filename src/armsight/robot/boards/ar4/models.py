@@ -16,18 +16,15 @@ import numpy as np
 
 from armsight.data import Array, Record
 
-#: Sense of the encoders.
-ENCODER_DIRECTION = np.array([-1, 1, 1, 1, 1, 1])
+ENCODER_DIRECTION = np.array([-1, 1, 1, 1, 1, 1])  # sense of the encoders
 #: Sense of the driver's joints in armsight's ``ar4``.
 SENSE = np.array([-1, 1, 1, 1, 1, 1])
 #: Where a joint's limit switch is: -1 at its lower limit, +1 at its upper one.
 SWITCH_AT = np.array([-1, -1, 1, -1, -1, 1])
-#: Encoder counts of a motor step.
-COUNTS_PER_STEP = np.array([10, 10, 10, 10, 5, 10])
+COUNTS_PER_STEP = np.array([10, 10, 10, 10, 5, 10])  # encoder counts of a motor step
 #: What the firmware moves with: degrees/s, degrees/s^2.
 MOST_SPEED_DEG_S, MOST_ACCELERATION_DEG_S2 = 60.0, 30.0
-#: A goal closer than this is reached, motor steps.
-DEAD_STEPS = 2
+DEAD_STEPS = 2  # a goal closer than this is reached, motor steps
 #: Homing: all joints at once, then in groups of three, of two, one after the other: the first digit.
 HOMING_GROUPS = {1: "3", 2: "2", 3: "1", 6: "0"}
 

@@ -34,18 +34,15 @@ from armsight.robot.boards.feetech.registers import (
 )
 from armsight.robot.boards.reports import BoardStatus, JointFault, JointReport, Welcome
 
-#: Readings a second: a sync read of five servos takes 1 ms on the wire, and USB adapters add 1 to 4 ms.
-RATE_HZ = 200.0
-#: From a command to the state that shows it (SO-ARM100 issue 134).
-LATENCY_S = 0.115
+RATE_HZ = 200.0  # readings a second: a sync read of five servos takes 1 ms on the wire, and USB adapters add 1 to 4 ms
+LATENCY_S = 0.115  # from a command to the state that shows it (SO-ARM100 issue 134)
 #: Until a joint has made a step of a count or two at rest: near its goal a servo creeps against its friction.
 _RESPONSE_S = 0.25
 #: Speed and acceleration of the servos towards a goal: 2.6 rad/s, 25 rad/s^2 (100 counts/s^2 a unit).
 _GOAL_SPEED, _ACCELERATION = 1700, 164
 #: What they follow with LATENCY_S, rad/s and rad/s^2.
 _MOST_SPEED, _MOST_ACCELERATION = 1.5, 10.0
-#: A count that comes and goes between two readings looks like a speed of up to this, rad/s.
-_REST_RAD_S = 0.35
+_REST_RAD_S = 0.35  # a count that comes and goes between two readings looks like a speed of up to this, rad/s
 #: The torque goes off so many times: a disturbed byte must not swallow it.
 _STOPS = 3
 ABILITIES = Abilities(

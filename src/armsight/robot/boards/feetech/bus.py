@@ -31,8 +31,7 @@ BAUD = 1_000_000
 ANSWER_S = 0.03
 _POLL_S = 0.0005
 TRIES = 4
-#: Ids that are looked for where an expected one does not answer.
-LOOKED_FOR = range(1, 13)
+LOOKED_FOR = range(1, 13)  # ids that are looked for where an expected one does not answer
 
 
 class ServoBus:

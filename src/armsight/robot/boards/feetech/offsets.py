@@ -21,8 +21,7 @@ from armsight.robot.boards.feetech.registers import COUNTS, HOMING_OFFSET, MOST_
 #: The horn's teeth: a joint's zero is off by less than one, unless the horn is mounted wrongly; and in counts.
 HORN_TEETH = 25
 TOOTH_COUNTS = COUNTS / HORN_TEETH
-#: Counts that are to be left to the end of the register: two degrees, for the next correction.
-SPARE_COUNTS = 23
+SPARE_COUNTS = 23  # counts that are to be left to the end of the register: two degrees, for the next correction
 
 
 class OffsetChange(NamedTuple):

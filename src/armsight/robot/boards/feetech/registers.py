@@ -16,13 +16,11 @@ from armsight.robot.boards.feetech.packets import sign_magnitude, signed
 #: Counts of a revolution of the output shaft: 0.088 degree each.
 COUNTS = 4096
 RAD_PER_COUNT = 2 * np.pi / COUNTS
-#: Count that is 0 rad without a calibration: the middle.
-MIDDLE = COUNTS // 2
+MIDDLE = COUNTS // 2  # count that is 0 rad without a calibration: the middle
 #: What MODEL reads on an STS3215.
 STS3215 = 777
 POSITION_MODE = 0
-#: Largest size of a homing offset: its sign is bit 11.
-MOST_OFFSET = 2047
+MOST_OFFSET = 2047  # largest size of a homing offset: its sign is bit 11
 
 
 class Register(NamedTuple):
@@ -55,8 +53,7 @@ TORQUE = Register(40, 1)
 ACCELERATION = Register(41, 1)
 GOAL_POSITION = Register(42, 2, 15)
 GOAL_SPEED = Register(46, 2, 15)
-#: 0 while the stored registers (below 40) may be written.
-LOCK = Register(55, 1)
+LOCK = Register(55, 1)  # 0 while the stored registers (below 40) may be written
 #: From here on a state.
 POSITION = Register(56, 2, 15)
 SPEED = Register(58, 2, 15)
