@@ -105,8 +105,7 @@ def _shown(joint: JointFigures, key: str) -> bool:
 
 def remarks(report: ArmReport) -> list[str]:
     """Return what a reader must know beside the tables."""
-    lines = [f"do not trust this recording: {line}" for line in report.health]
-    lines += [*report.notes]
+    lines = [*(f"do not trust this recording: {line}" for line in report.health), *report.notes]
     lines += [f"backlash of {j.name}: {j.backlash_how}" for j in report.joints if j.backlash_deg is None]
     lines += [
         "Zero: true angle less reading; that of the first and of the last joint looks like another base and another tool.",
@@ -130,9 +129,7 @@ def _map_figure(report: ArmReport, figure: FigureBase) -> None:
         axes.margins(0.15)
         axes.set_aspect("equal", adjustable="datalim")
         arrows(axes, report.at[:, [i, k]], 1e3 * report.off[:, [i, k]], enlarged / 1e3, INK, 0.003, "mm", 0.05)
-        axes.set_xlabel("x, m")
-        axes.set_ylabel(f"{'xyz'[k]}, m")
-        axes.set_title(f"error, {title}")
+        axes.set(title=f"error, {title}", xlabel="x, m", ylabel=f"{'xyz'[k]}, m")
     figure.colorbar(shown, ax=both, label="mm", shrink=0.8)
 
 
@@ -161,9 +158,7 @@ def _joints_figure(report: ArmReport, figure: FigureBase) -> None:
             ends = np.array([report.lever[:, i].min(), report.lever[:, i].max()])
             mean = float(np.degrees(report.lag[:, i].mean()))
             axes.plot(1e3 * ends, mean + slope[0] * (ends - middle), color=RED, linewidth=1)
-        axes.set_title(report.joints[i].name)
-        axes.set_xlabel("lever of the load, mm")
-        axes.set_ylabel("difference, deg")
+        axes.set(title=report.joints[i].name, xlabel="lever of the load, mm", ylabel="difference, deg")
         low, high = axes.get_xlim()
         if high - low < 1.0:  # a joint that gravity does not load: no digits of rounding
             axes.set_xlim((low + high) / 2 - 0.5, (low + high) / 2 + 0.5)
@@ -173,9 +168,7 @@ def _drift_figure(report: ArmReport, figure: FigureBase) -> None:
     """Plot how far the pose that came most often went from where it was first."""
     axes = figure.subplots()
     axes.plot(60 * report.drift[:, 0], report.drift[:, 1], color=BLUE, marker="o", markersize=3)
-    axes.set_xlabel("min")
-    axes.set_ylabel("mm from the first visit")
-    axes.set_title(f"one pose, {report.cycles} times")
+    axes.set(title=f"one pose, {report.cycles} times", xlabel="min", ylabel="mm from the first visit")
 
 
 #: Name -> caption, height in inches, and what draws it.
