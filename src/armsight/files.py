@@ -427,7 +427,7 @@ def check_folder(
     problem: str = "nothing can be written here",
     advice: str = "",
 ) -> Path:
-    """Find out before long work whether files can be written to a folder; one that is missing is not made.
+    """Return a folder, ``~`` expanded, if files can be written to it, before long work; a missing one is not made.
 
     Args:
         path: the folder to be.
@@ -436,18 +436,17 @@ def check_folder(
         problem: what does not work, as the message has it: "no report can be written here".
         advice: what to do, at the end of the message.
 
-    Returns:
-        The folder, ``~`` expanded.
-
     Raises:
         InputError: it cannot be made or written to, or it or one of its files is one of ``apart_from``.
     """
     _check_name(path)
     folder = Path(path).expanduser()
     try:
-        with contextlib.suppress(FileNotFoundError):
-            folder.stat()
-        there = next(p for p in (folder.absolute(), *folder.absolute().parents) if os.path.lexists(p))
+        whole = Path(os.path.abspath(folder))  # a/../b is b, also where there is no a yet
+        there = next(p for p in (whole, *whole.parents) if os.path.lexists(p))
+        for part in whole.relative_to(there).parts:
+            with contextlib.suppress(FileNotFoundError):
+                (there / part).lstat()  # a name too long comes up here
         with tempfile.TemporaryFile(dir=there):
             pass
     except OSError as error:

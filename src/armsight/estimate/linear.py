@@ -21,25 +21,15 @@ MAX_RANK, LEAST_LEFT = 24, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Linear(Record):
-    """Residuals near a state: e + J x, and what their errors come from.
+    """Residuals near a state: e + J x, and what their errors come from."""
 
-    Attributes:
-        e: (N, m) residuals.
-        J: (N, m, P) their derivative by the unknowns.
-        given: (N, m, m) covariance that is known.
-        own: source -> (N, m, k) what k unit errors of a measurement alone do to it.
-        shared: source -> (N, m, c) what c unit errors that all measurements share do to each.
-        known: (P,) information about each unknown beside the residuals, zero for most.
-        at: (P,) where each unknown is, from where that information has it.
-    """
-
-    e: Array
-    J: Array
-    given: Array
-    own: dict[str, Array]
-    shared: dict[str, Array]
-    known: Array
-    at: Array
+    e: Array  #: (N, m) residuals
+    J: Array  #: (N, m, P) their derivative by the unknowns
+    given: Array  #: (N, m, m) covariance that is known
+    own: dict[str, Array]  #: source -> (N, m, k) what k unit errors of a measurement alone do to it
+    shared: dict[str, Array]  #: source -> (N, m, c) what c unit errors that all measurements share do to each
+    known: Array  #: (P,) information about each unknown beside the residuals, zero for most
+    at: Array  #: (P,) where each unknown is, from where that information has it
 
     @property
     def sources(self) -> tuple[str, ...]:

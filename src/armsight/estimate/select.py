@@ -36,22 +36,14 @@ _ROUNDED = 1e-10
 
 
 class Folds(NamedTuple):
-    """Normal equations of every fold at one linearisation.
+    """Normal equations of every fold at one linearisation."""
 
-    Attributes:
-        H, g: (F, P, P) and (F, P) each fold's J^T J and J^T e.
-        c: (F,) its squared residuals.
-        numbers: (F,) how many numbers were measured in it.
-        pull: (P,) information that the priors add.
-        home: (P,) where they pull to, from the linearisation.
-    """
-
-    H: Array
-    g: Array
-    c: Array
-    numbers: Array
-    pull: Array
-    home: Array
+    H: Array  #: (F, P, P) each fold's J^T J
+    g: Array  #: (F, P) each fold's J^T e
+    c: Array  #: (F,) its squared residuals
+    numbers: Array  #: (F,) how many numbers were measured in it
+    pull: Array  #: (P,) information that the priors add
+    home: Array  #: (P,) where they pull to, from the linearisation
 
     @staticmethod
     def of(linear: Linear, variances: Array, labels: NDArray[np.int64]) -> Folds:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
+from scipy.special import chdtri
 
 from armsight.data import Array, Record
 from armsight.estimate.linear import Linear
@@ -21,25 +22,15 @@ OPEN = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class Solved(Record):
-    """Weighted least squares at given variances.
+    """Weighted least squares at given variances."""
 
-    Attributes:
-        x: (Q,) step of the P unknowns, then the shared errors.
-        root: (Q, Q) root @ root.T is its covariance.
-        W: (N, m, m) inverse covariance of the measurements' own errors.
-        left: (N, m) what is left of the residuals.
-        A: (N, m, Q) derivative by all.
-        of: (Q,) of which source a column is, -1 for the unknowns.
-        cost: minus the restricted log-likelihood.
-    """
-
-    x: Array
-    root: Array
-    W: Array
-    left: Array
-    A: Array
-    of: NDArray[np.int64]
-    cost: float
+    x: Array  #: (Q,) step of the P unknowns, then the shared errors
+    root: Array  #: (Q, Q) root @ root.T is its covariance
+    W: Array  #: (N, m, m) inverse covariance of the measurements' own errors
+    left: Array  #: (N, m) what is left of the residuals
+    A: Array  #: (N, m, Q) derivative by all
+    of: NDArray[np.int64]  #: (Q,) of which source a column is, -1 for the unknowns
+    cost: float  #: minus the restricted log-likelihood
 
 
 def covariances(linear: Linear, variances: Array) -> Array:
@@ -116,6 +107,19 @@ def left_out(s: Solved) -> tuple[Array, Array]:
     kept[:, i, i] += 1e-9 * own[:, i, i]
     gain = own @ np.linalg.inv(kept)
     return (gain @ s.left[..., None])[..., 0], np.asarray(gain @ own)
+
+
+def by_chance(squares: Array, numbers: int, chance: float, least: float = 1e-300) -> NDArray[np.bool_]:
+    """Return which squared distances (N,), of so many numbers each, chance explains, by the scale of their median.
+
+    Args:
+        squares: Mahalanobis, or of one unknown scale.
+        numbers: how many numbers a measurement has.
+        chance: of a larger one, below which a measurement is a mistake.
+        least: scale at least.
+    """
+    scale = max(float(np.median(squares)) / float(chdtri(numbers, 0.5)), least)
+    return np.asarray(squares <= scale * chdtri(numbers, chance))
 
 
 def log_density(left: Array, cov: Array) -> Array:

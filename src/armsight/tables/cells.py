@@ -33,21 +33,13 @@ _FORMS = {8: ["t_s", *BY_COUNT[7]], **BY_COUNT}
 
 
 class Cells(NamedTuple):
-    """What a file holds.
+    """What a file holds."""
 
-    Attributes:
-        head: the names of its columns; n1.. of a rotation and _0.. of a last row where the file has no names.
-        rows: the line, or the number of the record, and the cells of each row.
-        rotation: the convention of its rotations, where the program that wrote it has one.
-        notes: what it was read as.
-        listed: whether its rows are lists of numbers without names, which may be joints as well.
-    """
-
-    head: list[str]
-    rows: Rows
-    rotation: str | None = None
-    notes: tuple[str, ...] = ()
-    listed: bool = False
+    head: list[str]  #: the names of its columns; n1.. of a rotation and _0.. of a last row where the file has no names.
+    rows: Rows  #: the line, or the number of the record, and the cells of each row
+    rotation: str | None = None  #: the convention of its rotations, where the program that wrote it has one
+    notes: tuple[str, ...] = ()  #: what it was read as
+    listed: bool = False  #: whether its rows are lists of numbers without names, which may be joints as well
 
 
 def read_columns(text: str | None, known: Collection[str]) -> Mapping[str, str] | list[str]:

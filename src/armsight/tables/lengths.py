@@ -15,17 +15,11 @@ UNITS_M = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "in": 0.0254}
 
 
 class Usual(NamedTuple):
-    """What a kind of length may be.
+    """What a kind of length may be."""
 
-    Attributes:
-        what: its name in messages: "baseline".
-        least_m: m.
-        most_m: m.
-    """
-
-    what: str
-    least_m: float
-    most_m: float
+    what: str  #: its name in messages: "baseline"
+    least_m: float  #: m
+    most_m: float  #: m
 
 
 #: Two cameras that measure together; a stereo endoscope has 4 mm.

@@ -21,19 +21,12 @@ from armsight.tables.rotations import CONVENTIONS, rotations_by
 
 
 class Misread(NamedTuple):
-    """The poses of a table read in another way.
+    """The poses of a table read in another way."""
 
-    Attributes:
-        kind: what is other; of two tables of one program both may be.
-        Ts: (N, 4, 4) the poses then, m.
-        said: what it would mean, and what to do.
-        path: the table's file.
-    """
-
-    kind: str
-    Ts: Array
-    said: str
-    path: Path
+    kind: str  #: what is other; of two tables of one program both may be
+    Ts: Array  #: (N, 4, 4) the poses then, m
+    said: str  #: what it would mean, and what to do
+    path: Path  #: the table's file
 
 
 def misreadings(table: PoseTable, rows: NDArray[np.int64], Ts: Array, option: str) -> Iterator[Misread]:

@@ -56,39 +56,25 @@ class ArmJoints(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PoseTable(Record):
-    """The poses of a file.
+    """The poses of a file."""
 
-    Attributes:
-        path: the file.
-        lines: (N,) the line of each row.
-        Ts: (N, 4, 4) the poses, m.
-        numbers: (N, K) the numbers of the rotations as in the file; K is 0 for matrices and joints.
-        written: (N, 6) or (N, 7) position and rotation as in the file, where its columns have this order; (N, 0) else.
-        convention: what they were taken for, one of CONVENTIONS; "" for matrices and joints.
-        q: (N, J) joint angles, rad; None where there are none.
-        t_s: (N,) times, s; None where there are none.
-        names: of the rows, or of their images; None where there are none.
-        unit_m: the unit that lengths were read in, m.
-        notes: what was found out while reading.
-        missed: (N,) why a shot that `armsight measure` wrote has no pose, and another's stands there; "" where it has one.
-        of_joints: whether the poses are those of the joints by the model.
-        unused: the columns that were not read.
-    """
-
-    path: Path
-    lines: NDArray[np.int64]
-    Ts: Array
+    path: Path  #: the file
+    lines: NDArray[np.int64]  #: (N,) the line of each row
+    Ts: Array  #: (N, 4, 4) the poses, m
+    #: (N, K) the numbers of the rotations as in the file; K is 0 for matrices and joints
     numbers: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    #: (N, 6) or (N, 7) position and rotation as in the file, where its columns have this order; (N, 0) else
     written: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    convention: str = ""
-    q: Array | None = None
-    t_s: Array | None = None
-    names: tuple[str, ...] | None = None
-    unit_m: float = 1.0
-    notes: tuple[str, ...] = ()
+    convention: str = ""  #: what they were taken for, one of CONVENTIONS; "" for matrices and joints
+    q: Array | None = None  #: (N, J) joint angles, rad; None where there are none
+    t_s: Array | None = None  #: (N,) times, s; None where there are none
+    names: tuple[str, ...] | None = None  #: of the rows, or of their images; None where there are none
+    unit_m: float = 1.0  #: the unit that lengths were read in, m
+    notes: tuple[str, ...] = ()  #: what was found out while reading
+    #: (N,) why a shot that `armsight measure` wrote has no pose, and another's stands there; "" where it has one
     missed: tuple[str, ...] = ()
-    of_joints: bool = False
-    unused: tuple[str, ...] = ()
+    of_joints: bool = False  #: whether the poses are those of the joints by the model
+    unused: tuple[str, ...] = ()  #: the columns that were not read
 
 
 def read_pose_table(

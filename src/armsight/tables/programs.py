@@ -40,25 +40,15 @@ _SPEL = "".join(rf"(?:\s*,\s*|\s*r{name}\s*=\s*)({_N})" for name in "YZUVW")
 
 
 class Program(NamedTuple):
-    """A maker's way to write poses.
+    """A maker's way to write poses."""
 
-    Attributes:
-        maker: its name.
-        mark: what shows that a text is of this maker; None: the patterns.
-        pose: a pattern with its numbers as groups, in the order of ``names``.
-        names: of the numbers of a pose; () where the pattern names them itself.
-        rotation: the convention of its angles; "" for quaternions.
-        joints: a pattern of joints, degrees, one group with commas, or named groups.
-        beside: a pattern of lines that hold such numbers, but no pose to read: tools, frames.
-    """
-
-    maker: str
-    mark: str | None
-    pose: str
-    names: tuple[str, ...]
-    rotation: str
-    joints: str | None = None
-    beside: str | None = None
+    maker: str  #: its name
+    mark: str | None  #: what shows that a text is of this maker; None: the patterns
+    pose: str  #: a pattern with its numbers as groups, in the order of ``names``
+    names: tuple[str, ...]  #: of the numbers of a pose; () where the pattern names them itself
+    rotation: str  #: the convention of its angles; "" for quaternions
+    joints: str | None = None  #: a pattern of joints, degrees, one group with commas, or named groups
+    beside: str | None = None  #: a pattern of lines that hold such numbers, but no pose to read: tools, frames
 
 
 PROGRAMS = (

@@ -135,36 +135,30 @@ def test_plan(tmp_path, capsys):
     assert printed.endswith(f"written: {tmp_path / 'plan.csv'}\n")
 
 
+def in_degrees(lines):
+    """The same with degrees under the names of radians."""
+    rows = [line.split(",") for line in lines]
+    return [lines[0], *(",".join([*(str(np.degrees(float(q))) for q in row[:6]), *row[6:]]) for row in rows[1:])]
+
+
+SIX_NAMES = ",".join(f"q{i}_rad" for i in range(1, 7))
+
+
 @pytest.mark.parametrize(
-    ("header", "rows", "parts"),
+    ("spoil", "parts"),
     [
-        ("q1_rad,q2_rad", ["1,2"], ["line 1", "q3_rad"]),
-        ("a,b", ["1,2"], ["line 1", "q1_rad", "q1_deg"]),
-        (",".join(f"q{i}_rad" for i in range(1, 7)), ["0,0,0,0,0,0"], ["line 1", "p1_x_mm"]),
-        (",".join([*(f"q{i}_rad" for i in range(1, 7)), "p1_x_mm", "p1_y_mm"]), ["0,0,0,0,0,0,1,2"], ["p1_z_mm"]),
+        (lambda lines: ["q1_rad,q2_rad", "1,2"], ["line 1", "q3_rad"]),
+        (lambda lines: ["a,b", "1,2"], ["line 1", "q1_rad", "q1_deg"]),
+        (lambda lines: [SIX_NAMES, "0,0,0,0,0,0"], ["line 1", "p1_x_mm"]),
+        (lambda lines: [f"{SIX_NAMES},p1_x_mm,p1_y_mm", "0,0,0,0,0,0,1,2"], ["p1_z_mm"]),
+        (lambda lines: [*lines[:4], "x" + lines[4], *lines[5:]], ["line 5", "q1_rad"]),
+        (in_degrees, ["degrees", "q1_deg"]),
     ],
 )
-def test_columns_that_are_missing_are_named(tmp_path, capsys, header, rows, parts):
-    path = tmp_path / "bad.csv"
-    path.write_text("\n".join([header, *rows]) + "\n")
+def test_a_file_that_cannot_be_read_is_explained(tmp_path, capsys, spoil, parts):
+    path = poses_csv(tmp_path / "bad.csv")
+    path.write_text("\n".join(spoil(path.read_text().splitlines())) + "\n")
     assert_rejected(said(capsys, "--arm", "six_r", "--data", path), "bad.csv", *parts)
-
-
-def test_an_entry_that_is_no_number_is_named(tmp_path, capsys):
-    path = poses_csv(tmp_path / "p.csv")
-    lines = path.read_text().splitlines()
-    lines[4] = "x" + lines[4]
-    path.write_text("\n".join(lines))
-    assert_rejected(said(capsys, "--arm", "six_r", "--data", path), "line 5", "q1_rad")
-
-
-def test_degrees_under_the_name_of_radians_are_reported(tmp_path, capsys):
-    path = poses_csv(tmp_path / "p.csv")
-    rows = [line.split(",") for line in path.read_text().splitlines()]
-    for row in rows[1:]:
-        row[:6] = [str(np.degrees(float(entry))) for entry in row[:6]]
-    path.write_text("\n".join(",".join(row) for row in rows))
-    assert_rejected(said(capsys, "--arm", "six_r", "--data", path), "degrees", "q1_deg")
 
 
 def test_mistakes_at_the_command_line(tmp_path, capsys):
@@ -198,14 +192,10 @@ def test_mistakes_in_the_data_are_named_and_do_not_spoil_the_held_out_line(tmp_p
     assert parameters["a2"]["value"] == pytest.approx(0.2535, abs=3 * parameters["a2"]["sigma"])
 
 
-def test_poses_to_validate_with_that_cannot_be_of_the_arm_are_explained(tmp_path, capsys):
-    data, other = poses_csv(tmp_path / "p.csv", n=40), poses_csv(tmp_path / "o.csv", n=30, seed=1)
-    rows = [line.split(",") for line in other.read_text().splitlines()]
-    for row in rows[1:]:
-        row[1] = str(-float(row[1]))
-    other.write_text("\n".join(",".join(row) for row in rows))
-    parts = ("to validate with", "the sign is wrong of joint 2")
-    assert_rejected(said(capsys, "--arm", "six_r", "--data", data, "--validate", other), *parts)
+def with_sign(line):
+    """A row whose second joint counts the other way."""
+    row = line.split(",")
+    return ",".join([row[0], str(-float(row[1])), *row[2:]])
 
 
 @pytest.mark.parametrize(
@@ -227,6 +217,14 @@ def test_poses_to_validate_with_that_cannot_be_of_the_arm_are_explained(tmp_path
             "order",
         ),
         (lambda lines: [lines[0], *(",".join(["1.5", *line.split(",")[1:]]) for line in lines[1:6])], "other joints"),
+        (
+            lambda lines: [lines[0], *map(with_sign, lines[1:])],
+            "to validate with: the data fit this arm if the sign is",
+        ),
+        (
+            lambda lines: [f"{lines[0]},p2_x_mm,p2_y_mm,p2_z_mm", *(f"{line},1,2,3" for line in lines[1:])],
+            "have 2 tracked points a pose; those identified with have 1 tracked point a pose",
+        ),
     ],
 )
 def test_a_wrong_file_to_validate_with_is_rejected_before_the_fit(tmp_path, capsys, monkeypatch, spoil, said_of_it):
@@ -241,18 +239,6 @@ def test_a_wrong_file_to_validate_with_is_rejected_before_the_fit(tmp_path, caps
     assert_rejected(answer, str(other), said_of_it)
     missing = said(capsys, "--arm", "six_r", "--data", data, "--validate", tmp_path / "none.csv")
     assert_rejected(missing, "none.csv")
-
-
-def test_poses_to_validate_with_have_the_points_of_those_fitted(tmp_path, capsys):
-    data, other = poses_csv(tmp_path / "p.csv", n=40), poses_csv(tmp_path / "o.csv", n=30, seed=1)
-    lines = other.read_text().splitlines()
-    lines = [
-        f"{line},{','.join(('p2_x_mm', 'p2_y_mm', 'p2_z_mm') if k == 0 else ('1', '2', '3'))}"
-        for k, line in enumerate(lines)
-    ]
-    other.write_text("\n".join(lines))
-    answer = said(capsys, "--arm", "six_r", "--data", data, "--validate", other)
-    assert_rejected(answer, str(other), "2 tracked points a pose", "1 tracked point a pose")
 
 
 @pytest.mark.parametrize(("own", "threads"), [(None, "1"), ("2", "2")])

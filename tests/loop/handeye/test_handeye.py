@@ -4,8 +4,8 @@ import pytest
 from handeye_motions import error, recording
 from scipy.stats import chi2
 
-from armsight.errors import CalibrationError, InputError
-from armsight.geometry.pose import exp_se3, inverse, pose
+from armsight.errors import InputError
+from armsight.geometry.pose import inverse, pose
 from armsight.loop.handeye import poses as handeye_start
 from armsight.loop.handeye.handeye import calibrate_handeye
 
@@ -55,20 +55,6 @@ def test_the_own_start_is_as_good_as_opencvs():
     RX, tX, RZ, tZ = cv2.calibrateRobotWorldHandEye(*parts, method=cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH)
     for own, R, t in zip(handeye_start.kronecker(A, B), (RX, RZ), (tX, tZ), strict=True):
         assert np.abs(own - pose(R, t.ravel())).max() < 0.02
-
-
-def test_rotations_about_one_axis_are_rejected():
-    A, _, _, Z, X = recording(3)
-    rotation = exp_se3(np.array([0, 0, 0, 0, 0, 1.0])[None] * np.linspace(-1, 1, 20)[:, None])
-    A = rotation @ A[0]
-    with pytest.raises(CalibrationError, match="rotates about one axis only"):
-        calibrate_handeye(A, inverse(Z) @ A @ X)
-
-
-def test_poses_all_alike_are_rejected():
-    A, B, cov, _, _ = recording(3, still=True)
-    with pytest.raises(CalibrationError, match="rotate the wrist"):
-        calibrate_handeye(A, B, cov)
 
 
 @pytest.mark.parametrize(

@@ -34,20 +34,13 @@ _POSE = ("x, mm", "y, mm", "z, mm", "rx, deg", "ry, deg", "rz, deg")
 
 @dataclass(frozen=True, eq=False)
 class HandEyeAnswer(Record):
-    """A calibration with what it was made from.
+    """A calibration with what it was made from."""
 
-    Attributes:
-        recording: both sides.
-        found: the calibration.
-        offset_s: to be added to the eye's times; None where there are no streams; sigma_offset_s its sigma.
-        plan: the poses to take next; None where not asked for.
-    """
-
-    recording: PairedPoses
-    found: HandEye
-    offset_s: float | None
+    recording: PairedPoses  #: both sides
+    found: HandEye  #: the calibration
+    offset_s: float | None  #: to be added to the eye's times; None where there are no streams; sigma_offset_s its sigma
     sigma_offset_s: float
-    plan: MountingPlan | None
+    plan: MountingPlan | None  #: the poses to take next; None where not asked for
 
 
 def names(run: HandEyeAnswer) -> tuple[str, str]:

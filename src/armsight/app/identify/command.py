@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from contextlib import nullcontext
 from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +12,7 @@ import click
 
 from armsight.app.arm_option import arm_option
 from armsight.errors import InputError
-from armsight.files import check_writable, write_text
+from armsight.files import check_folder, check_writable, write_text
 from armsight.tables.rotations import ROTATIONS
 
 if TYPE_CHECKING:
@@ -84,7 +83,7 @@ def command(
         raise InputError("give --arm and --data: armsight identify --arm ur10 --data poses.csv -o corrected/")
 
     from armsight.app.identify.report import identify_report, write_results
-    from armsight.app.identify.run import FILES, results_in, run_identify
+    from armsight.app.identify.run import FILES, run_identify
     from armsight.app.progress import steps
     from armsight.app.show.plotting import require_matplotlib
     from armsight.loop.identify.read import read_measured
@@ -93,11 +92,10 @@ def command(
     arm = open_arm(arm_name)
     if output is not None:
         require_matplotlib()
+        given = (data, joints, other, Path(split_arm(arm_name)[0]))
+        check_folder(output, holding=FILES, apart_from=given, problem="cannot be made")
     started = time.perf_counter()
-    with (
-        nullcontext() if output is None else results_in(output, (data, joints, other, Path(split_arm(arm_name)[0]))),
-        steps() as progress,
-    ):
+    with steps() as progress:
         progress("reading")
         read = read_measured(data, arm, joints, rotation=rotation, columns=columns)
         held = None if other is None else read_measured(other, arm, joints, rotation=rotation, columns=columns)
@@ -120,7 +118,7 @@ def command(
     if output is not None:  # last: what was found is printed and stored before anything is drawn
         report.write(output)
     if output is not None and not as_json:
-        click.echo(f"\nwritten: {output}/{', '.join([*FILES, 'report.html'])}")
+        click.echo(f"\nwritten: {output}/{', '.join(FILES)}")
 
 
 @command.command()

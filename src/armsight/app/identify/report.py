@@ -261,23 +261,14 @@ def assess(run: Identification) -> tuple[Grade, str]:
 
 
 class ParameterRow(NamedTuple):
-    """One parameter of the model, as parameters.csv and the JSON object have it: the fields are their columns and keys.
+    """One parameter of the model, as parameters.csv and the JSON object have it: the fields are their columns and keys."""
 
-    Attributes:
-        name: of the parameter.
-        unit: m, rad, rad/m or 1.
-        nominal: value of the nominal arm; None of base and tool.
-        value: identified; the nominal one where it was not fitted.
-        sigma: standard deviation; None where it was not fitted.
-        frozen: why it was not fitted, or not alone; None where it was.
-    """
-
-    name: str
-    unit: str
-    nominal: float | None
-    value: float
-    sigma: float | None
-    frozen: str | None
+    name: str  #: of the parameter
+    unit: str  #: m, rad, rad/m or 1
+    nominal: float | None  #: value of the nominal arm; None of base and tool
+    value: float  #: identified; the nominal one where it was not fitted
+    sigma: float | None  #: standard deviation; None where it was not fitted
+    frozen: str | None  #: why it was not fitted, or not alone; None where it was
 
 
 def parameter_rows(run: Identification) -> list[ParameterRow]:
@@ -321,6 +312,7 @@ def _values(run: Identification) -> dict[str, Any]:
 
 def write_results(run: Identification, report: Report, out: Path) -> None:
     """Write the corrected arm, the board's zeros, the parameters and the summary into a folder."""
+    out.mkdir(parents=True, exist_ok=True)
     corrected, parameters = Corrected.of(run.found), io.StringIO()
     writer = csv.writer(parameters, lineterminator="\n")
     writer.writerow(ParameterRow._fields)
@@ -335,12 +327,12 @@ def write_results(run: Identification, report: Report, out: Path) -> None:
 def headline(run: Identification) -> str:
     """Return the held-out errors, of the nominal and of the identified arm, in one line."""
     before, after = run.held_out.nominal.summary(), run.held_out.identified.summary()
-    line = f"held-out error {1e3 * before['mean_m']:.3f} -> {1e3 * after['mean_m']:.3f} mm mean"
-    line += f", {1e3 * before['max_m']:.2f} -> {1e3 * after['max_m']:.2f} mm largest"
+    line = f"held-out error {1e3 * after['mean_m']:.2f} mm mean (nominal arm {1e3 * before['mean_m']:.2f})"
+    line += f", {1e3 * after['max_m']:.2f} mm largest ({1e3 * before['max_m']:.2f})"
     if "mean_rad" in after:
-        line += f", {np.degrees(before['mean_rad']):.3f} -> {np.degrees(after['mean_rad']):.3f} deg mean"
+        line += f", {np.degrees(after['mean_rad']):.3f} deg mean ({np.degrees(before['mean_rad']):.3f})"
     no_better = "; no better than the nominal arm: keep that one, or take more poses"
-    return f"{line} ({run.how}){no_better if after['mean_m'] >= before['mean_m'] else ''}"
+    return f"{line}, on {run.how}{no_better if after['mean_m'] >= before['mean_m'] else ''}"
 
 
 def value_text(p: Parameter, value: float) -> str:

@@ -5,17 +5,14 @@ In: the nominal arm and measured poses. Out: an :class:`Identification`, whose R
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from scipy.special import chdtri
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
-from armsight.files import check_writable
 from armsight.loop.identify.identify import ALIKE, Identified, identify
 from armsight.loop.identify.measured import Measured, visits
 from armsight.loop.identify.misread import check_plausible, find_step, without_tool
@@ -31,33 +28,22 @@ FOLDS, MANY = 5, 500
 TOO_SMALL = 1e-3
 #: Few poses to validate with that are further from the nominal arm than this, m, are not of it: no arm is so inaccurate.
 FAR_M = 0.1
-#: What is written beside the report.
-FILES = ("corrected.toml", "corrected.urdf", "zeros.toml", "parameters.csv", "identify.json")
+#: What is written.
+FILES = ("corrected.toml", "corrected.urdf", "zeros.toml", "parameters.csv", "identify.json", "report.html")
 
 
 @dataclass(frozen=True, eq=False)
 class Identification(Record):
-    """The result of an identification.
+    """The result of an identification."""
 
-    Attributes:
-        arm: the nominal arm.
-        measured: what it was identified from.
-        found: the identified arm.
-        held_out: nominal and identified arm on poses that were not fitted to.
-        held_out_poses: (H, n) joint angles of those, rad.
-        how: which poses those are, as text.
-        lines: (N,) lines of the file that the poses come from.
-        notes: what a person should know.
-    """
-
-    arm: Arm
-    measured: Measured
-    found: Identified
-    held_out: Validation
-    held_out_poses: Array
-    how: str
-    lines: Array
-    notes: tuple[str, ...]
+    arm: Arm  #: the nominal arm
+    measured: Measured  #: what it was identified from
+    found: Identified  #: the identified arm
+    held_out: Validation  #: nominal and identified arm on poses that were not fitted to
+    held_out_poses: Array  #: (H, n) joint angles of those, rad
+    how: str  #: which poses those are, as text
+    lines: Array  #: (N,) lines of the file that the poses come from
+    notes: tuple[str, ...]  #: what a person should know
 
 
 def run_identify(
@@ -185,33 +171,6 @@ def _notes(arm: Arm, found: Identified, measured: Measured, lines: Array) -> lis
     if numbers < 3 * parameters:
         notes.append(
             f"{len(measured)} poses are {numbers} numbers for {parameters} parameters: only {found.solution.free.sum()} "
-            "that the poses determine, and that lower the held-out error, were fitted; `armsight identify plan` chooses "
-            "more"
+            "that the poses determine, and that lower the held-out error, were fitted; armsight identify plan chooses more"
         )
     return notes
-
-
-@contextmanager
-def results_in(out: Path, apart_from: tuple[Path | None, ...]) -> Iterator[None]:
-    """Make the folder of the results before long work; where that fails, no folder made for it stays behind.
-
-    Raises:
-        InputError: it cannot be made or written to, or a result would replace what is read.
-    """
-    made: list[Path] = []
-    try:
-        try:
-            for folder in (*reversed(out.parents), out):  # each is noted as it is made: those before one that fails
-                if not folder.is_dir():
-                    folder.mkdir(exist_ok=True)
-                    made.append(folder)
-        except OSError as error:
-            raise InputError(f"{out}: cannot be made: {error.strerror}") from None
-        for name in (*FILES, "report.html"):
-            check_writable(out / name, apart_from=apart_from)
-        yield
-    except BaseException:  # an interrupt, too, must not leave an empty folder
-        for folder in reversed(made):
-            with suppress(OSError):  # one that holds something stays
-                folder.rmdir()
-        raise

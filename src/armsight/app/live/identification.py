@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from armsight.app.identify.report import identify_report, write_results
-from armsight.app.identify.run import results_in, run_identify
+from armsight.app.identify.run import run_identify
 from armsight.app.show.messages import Note
 from armsight.app.show.plotting import require_matplotlib
 from armsight.errors import ArmsightError, InputError
@@ -75,13 +75,12 @@ class IdentifyStep:
 
     def _identify(self, arm_spec: str, poses: Path, out: Path) -> None:
         try:
-            with results_in(out, (poses,)):
-                read = read_poses(poses)
-                run = run_identify(
-                    open_arm(arm_spec), read.measured, read.lines, None, notes=read.notes, progress=self._progress
-                )
-                report = identify_report(run)
-                write_results(run, report, out)
+            read = read_poses(poses)
+            run = run_identify(
+                open_arm(arm_spec), read.measured, read.lines, None, notes=read.notes, progress=self._progress
+            )
+            report = identify_report(run)
+            write_results(run, report, out)
             lines = (*(f"note: {note}" for note in run.notes), *report.text().splitlines()[1:])
             corrected = str(out / "corrected.toml")
             self.state = replace(self.state, headline=report.headline, lines=lines, corrected=corrected)

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import chdtri
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.estimate.linear import Linear
-from armsight.estimate.solve import Solved, left_out, solve
+from armsight.estimate.solve import Solved, by_chance, left_out, solve
 from armsight.geometry.check import checked
 
 #: Fewest poses, and the chance below which one is taken for a mistake.
@@ -28,21 +27,14 @@ ROUNDS = 10
 
 @dataclass(frozen=True, eq=False)
 class Pivot(Record):
-    """A tool's tip.
+    """A tool's tip."""
 
-    Attributes:
-        p_body: (3,) the tip in what is tracked, m.
-        p_pivot: (3,) where it stood, m.
-        cov: (6, 6) covariance of both, in this order.
-        held_out_m: (N,) distance of the tip from where it stood, each pose by a fit to the others; NaN where not used.
-        used: (N,) whether a pose was used.
-    """
-
-    p_body: Array
-    p_pivot: Array
-    cov: Array
+    p_body: Array  #: (3,) the tip in what is tracked, m
+    p_pivot: Array  #: (3,) where it stood, m
+    cov: Array  #: (6, 6) covariance of both, in this order
+    #: (N,) distance of the tip from where it stood, each pose by a fit to the others; NaN where not used
     held_out_m: Array
-    used: NDArray[np.bool_]
+    used: NDArray[np.bool_]  #: (N,) whether a pose was used
 
 
 def calibrate_pivot(Ts: ArrayLike) -> Pivot:
@@ -64,9 +56,7 @@ def calibrate_pivot(Ts: ArrayLike) -> Pivot:
     linear = _linear(poses)
     for _ in range(ROUNDS):
         s = _solved(linear, used)
-        squares = np.sum((linear.e + linear.J @ s.x) ** 2, axis=1)
-        scale = float(np.median(squares) / chdtri(3, 0.5))
-        sane = squares <= chdtri(3, CHANCE) * max(scale, 1e-18)
+        sane = by_chance(np.sum((linear.e + linear.J @ s.x) ** 2, axis=1), 3, CHANCE, 1e-18)
         if (sane == used).all() or sane.sum() < MIN_POSES:
             break
         used = sane

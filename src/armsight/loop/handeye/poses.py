@@ -30,23 +30,15 @@ CHANCE = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Poses(Record):
-    """What a hand-eye calibration is made from.
+    """What a hand-eye calibration is made from."""
 
-    Attributes:
-        A: (N, 4, 4) T_base_flange, m.
-        B: (N, 4, 4) T_rig_body, m.
-        cov: (N, 6, 6) covariance of B, right tangent, zero where unknown.
-        in_hand: whether the rig is on the flange and the body stands still; else the body is on the flange.
-        centre: (3,) the middle of what is seen of the body, body frame, m.
-        common: (N, 6, K) what K independent errors that all poses share (the rig's calibration), of one sigma each, do to
-            B, right tangent; None where unknown.
-    """
-
-    A: Array
-    B: Array
-    cov: Array
-    in_hand: bool
-    centre: Array
+    A: Array  #: (N, 4, 4) T_base_flange, m
+    B: Array  #: (N, 4, 4) T_rig_body, m
+    cov: Array  #: (N, 6, 6) covariance of B, right tangent, zero where unknown
+    in_hand: bool  #: whether the rig is on the flange and the body stands still; else the body is on the flange
+    centre: Array  #: (3,) the middle of what is seen of the body, body frame, m
+    #: (N, 6, K) what K independent errors that all poses share (the rig's calibration), of one sigma each, do to B,
+    #: right tangent; None where unknown
     common: Array | None = None
 
     def rows(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Poses:
@@ -181,15 +173,10 @@ MIN_POSES = 4
 
 @dataclass(frozen=True, eq=False)
 class HeldOut(Record):
-    """Prediction errors of poses left out of the fit.
+    """Prediction errors of poses left out of the fit."""
 
-    Attributes:
-        position_m: (N,) distance between the body's middle measured and predicted; NaN where a pose was not used.
-        angle_rad: (N,) angle between the body's rotations measured and predicted.
-    """
-
-    position_m: Array
-    angle_rad: Array
+    position_m: Array  #: (N,) distance between the body's middle measured and predicted; NaN where a pose was not used
+    angle_rad: Array  #: (N,) angle between the body's rotations measured and predicted
 
     def mean(self) -> tuple[float, float]:
         """Return the means, m and rad."""
@@ -212,7 +199,7 @@ def checked_poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, 
     """Return poses as given, checked.
 
     Raises:
-        InputError: wrong shapes, NaN, no rigid motions, fewer than 4 poses, an unknown eye.
+        InputError: wrong shapes, NaN, no rigid motions, an unknown eye.
     """
     if eye not in ("to_hand", "in_hand"):
         raise InputError(f"eye is {eye!r}; known are to_hand, in_hand")
@@ -224,8 +211,6 @@ def checked_poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, 
         bad = (off > 1e-4) | (np.linalg.det(R) < 0) if len(Ts) else np.zeros(0, bool)
         if bad.any():
             raise InputError(f"{name}: pose {int(np.argmax(bad))} is no rigid motion: its 3x3 part is no rotation")
-    n = len(Ts_base_flange)
-    if n < MIN_POSES:
-        raise InputError(f"hand-eye calibration needs {MIN_POSES} or more poses, got {n}; 15 and more are advised")
-    cov = np.zeros((n, 6, 6)) if covs is None else checked(covs, (n, 6, 6), "covs")
+    shape = (len(Ts_base_flange), 6, 6)
+    cov = np.zeros(shape) if covs is None else checked(covs, shape, "covs")
     return Poses(Ts_base_flange, Ts_rig_body, cov, eye == "in_hand", checked(centre, (3,), "centre"))

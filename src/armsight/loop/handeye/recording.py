@@ -40,58 +40,34 @@ STEP_RAD = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Seen(Record):
-    """Poses of the target.
+    """Poses of the target."""
 
-    Attributes:
-        Ts: (N, 4, 4) T_rig_body, m; where the target was not found, the identity.
-        covs: (N, 6, 6) their covariance, right tangent; zero where it is not known.
-        names: of the images.
-        missed: (N,) why there is no pose; "" where there is one.
-        t_s: (N,) times, s; None where there are none.
-        centre: (3,) the middle of the target's points, body frame, m.
-        symmetries: motions (4, 4) of the body that change nothing to see.
-        scatter_px: RMS of the reprojection; 0 where there are no images.
-        notes: what was found out.
-        common: (N, 6, K) what K independent errors of the rig of one sigma do to the poses; None where unknown.
-        table: the table that the poses are from; None where they are from images.
-    """
-
-    Ts: Array
-    covs: Array
-    names: tuple[str, ...]
-    missed: tuple[str, ...]
-    t_s: Array | None
-    centre: Array
-    symmetries: tuple[Array, ...] = ()
-    scatter_px: float = 0.0
-    notes: tuple[str, ...] = ()
+    Ts: Array  #: (N, 4, 4) T_rig_body, m; where the target was not found, the identity
+    covs: Array  #: (N, 6, 6) their covariance, right tangent; zero where it is not known
+    names: tuple[str, ...]  #: of the images
+    missed: tuple[str, ...]  #: (N,) why there is no pose; "" where there is one
+    t_s: Array | None  #: (N,) times, s; None where there are none
+    centre: Array  #: (3,) the middle of the target's points, body frame, m
+    symmetries: tuple[Array, ...] = ()  #: motions (4, 4) of the body that change nothing to see
+    scatter_px: float = 0.0  #: RMS of the reprojection; 0 where there are no images
+    notes: tuple[str, ...] = ()  #: what was found out
+    #: (N, 6, K) what K independent errors of the rig of one sigma do to the poses; None where unknown
     common: Array | None = None
-    table: PoseTable | None = None
+    table: PoseTable | None = None  #: the table that the poses are from; None where they are from images
 
 
 @dataclass(frozen=True, eq=False)
 class PairedPoses(Record):
-    """Rows of both sides.
+    """Rows of both sides."""
 
-    Attributes:
-        poses: the rows that have both sides.
-        rows: (N,) the row of the robot's table that each is from.
-        names: what each is called in messages.
-        t_s: (N,) times, s, on one clock; None where there are none.
-        robot: the robot's table.
-        seen: what was seen.
-        matched: (N,) the row of ``seen`` that each is from.
-        notes: what was found out.
-    """
-
-    poses: Poses
-    rows: Rows
-    names: tuple[str, ...]
-    t_s: Array | None
-    robot: PoseTable
-    seen: Seen
-    matched: Rows
-    notes: tuple[str, ...]
+    poses: Poses  #: the rows that have both sides
+    rows: Rows  #: (N,) the row of the robot's table that each is from
+    names: tuple[str, ...]  #: what each is called in messages
+    t_s: Array | None  #: (N,) times, s, on one clock; None where there are none
+    robot: PoseTable  #: the robot's table
+    seen: Seen  #: what was seen
+    matched: Rows  #: (N,) the row of ``seen`` that each is from
+    notes: tuple[str, ...]  #: what was found out
 
 
 def seen_in_table(table: PoseTable) -> Seen:

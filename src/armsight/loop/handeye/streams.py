@@ -37,15 +37,10 @@ OVER, FASTER = (4, 12, 36), 1.3
 
 @dataclass(frozen=True, eq=False)
 class PoseStream(Record):
-    """Poses over time.
+    """Poses over time."""
 
-    Attributes:
-        t_s: (N,) strictly increasing times, s, on the stream's own clock.
-        Ts: (N, 4, 4) poses.
-    """
-
-    t_s: Array
-    Ts: Array
+    t_s: Array  #: (N,) strictly increasing times, s, on the stream's own clock
+    Ts: Array  #: (N, 4, 4) poses
 
     @staticmethod
     def of(t_s: ArrayLike, Ts: ArrayLike, name: str) -> PoseStream:
@@ -76,22 +71,14 @@ class PoseStream(Record):
 
 @dataclass(frozen=True, eq=False)
 class HandEyeStreams(Record):
-    """A hand-eye calibration of two streams.
+    """A hand-eye calibration of two streams."""
 
-    Attributes:
-        handeye: the calibration; its rows are those of the eye's poses that were used, in the order of time.
-        offset_s: to be added to the eye's times to give the hand's; sigma_offset_s its sigma.
-        t_s: (M,) the eye's times of these rows, s, on the eye's clock.
-        A: (M, 4, 4) the flange at these times.
-        B: (M, 4, 4) the body as seen.
-    """
-
-    handeye: HandEye
-    offset_s: float
+    handeye: HandEye  #: the calibration; its rows are those of the eye's poses that were used, in the order of time
+    offset_s: float  #: to be added to the eye's times to give the hand's; sigma_offset_s its sigma
     sigma_offset_s: float
-    t_s: Array
-    A: Array
-    B: Array
+    t_s: Array  #: (M,) the eye's times of these rows, s, on the eye's clock
+    A: Array  #: (M, 4, 4) the flange at these times
+    B: Array  #: (M, 4, 4) the body as seen
 
 
 def calibrate_streams(

@@ -36,19 +36,12 @@ _SHOWN_BY = {"backlash": "the side it came from", "gravity_backlash": "the side 
 
 
 class JointBacklash(NamedTuple):
-    """The backlash of a joint, stop to stop.
+    """The backlash of a joint, stop to stop."""
 
-    Attributes:
-        joint: from 0.
-        value_rad: the estimate, rad; NaN where the poses do not show it.
-        sigma_rad: its sigma, rad; NaN likewise.
-        how: what showed it, or why it does not show.
-    """
-
-    joint: int
-    value_rad: float
-    sigma_rad: float
-    how: str
+    joint: int  #: from 0
+    value_rad: float  #: the estimate, rad; NaN where the poses do not show it
+    sigma_rad: float  #: its sigma, rad; NaN likewise
+    how: str  #: what showed it, or why it does not show
 
 
 def joint_backlashes(found: Identified, measured: Measured) -> tuple[JointBacklash, ...]:

@@ -40,19 +40,12 @@ _NOMINAL = {key: unit for key, unit in _UNITS.items() if key != "beta"}
 
 @dataclass(frozen=True, eq=False)
 class Corrected(Record):
-    """An identified arm.
+    """An identified arm."""
 
-    Attributes:
-        model: the nominal arm with every parameter.
-        x: (P,) the vector.
-        sigma: (P,) of every parameter, zero where it was not fitted.
-        notes: what was missing in the file that it was read from, as text.
-    """
-
-    model: Model
-    x: Array
-    sigma: Array
-    notes: tuple[str, ...] = ()
+    model: Model  #: the nominal arm with every parameter
+    x: Array  #: (P,) the vector
+    sigma: Array  #: (P,) of every parameter, zero where it was not fitted
+    notes: tuple[str, ...] = ()  #: what was missing in the file that it was read from, as text
 
     @staticmethod
     def of(found: Identified) -> Corrected:
@@ -195,7 +188,7 @@ def open_corrected(path: str | Path) -> Corrected:
     """
     given = read_toml(path)
     if "identified" not in given:
-        raise InputError(f"{path}: no identified arm; `armsight identify -o DIR` writes DIR/corrected.toml")
+        raise InputError(f"{path}: no identified arm; armsight identify -o DIR writes DIR/corrected.toml")
     arm, beta = identified_table(path, given)
     rows, notes = given["joint"], []
     table = np.stack([arm.offset, arm.d, arm.a, arm.alpha, beta], axis=1)

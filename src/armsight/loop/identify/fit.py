@@ -28,7 +28,7 @@ from scipy.special import chdtri
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.estimate.linear import Linear
-from armsight.estimate.solve import Solved, covariances, solve, whitened
+from armsight.estimate.solve import Solved, by_chance, covariances, solve, whitened
 from armsight.estimate.variance import restricted
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import COLUMNS, OFFSET, Model
@@ -88,24 +88,15 @@ MIN_NOISE, MAX_NOISE = 1e-9, 1e3
 
 @dataclass(frozen=True, eq=False)
 class Solution(Record):
-    """A fitted model.
+    """A fitted model."""
 
-    Attributes:
-        x: (P,) the vector.
-        free: (P,) which of its numbers were fitted.
-        cov: (P, P) their covariance; zero where not fitted.
-        noise: sigma, beyond the covariance given, of the position along one axis, m, and of the rotation about
-            one, rad.
-        used: (N,) whether a pose was used.
-        history: RMS of the weighted residuals after every step.
-    """
-
-    x: Array
-    free: Mask
-    cov: Array
+    x: Array  #: (P,) the vector
+    free: Mask  #: (P,) which of its numbers were fitted
+    cov: Array  #: (P, P) their covariance; zero where not fitted
+    #: sigma, beyond the covariance given, of the position along one axis, m, and of the rotation about one, rad
     noise: tuple[float, float]
-    used: Mask
-    history: tuple[float, ...]
+    used: Mask  #: (N,) whether a pose was used
+    history: tuple[float, ...]  #: RMS of the weighted residuals after every step
 
     def sigma(self) -> Array:
         """Return the sigma (P,) of every parameter."""
@@ -225,8 +216,7 @@ def _sane(model: Model, x: Array, measured: Measured, phi: Array, noise: tuple[f
     """Return which poses (N,) are no outliers, by the scale of the median."""
     linear = linear_of(model, x, measured, phi, np.zeros(len(x), bool), np.full(len(x), np.inf))
     far = (whitened(linear, variances_of(linear, noise))[0] ** 2).sum(axis=1)
-    scale = max(float(np.median(far)) / chdtri(measured.size, 0.5), 1e-300)
-    return np.asarray(far / scale < chdtri(measured.size, CHANCE))
+    return by_chance(far, measured.size, CHANCE)
 
 
 #: Where the search starts, rad and m: what is not there shrinks from it.
@@ -234,17 +224,11 @@ START_RAD, START_M = 1e-3, 1e-4
 
 
 class JointNoise(NamedTuple):
-    """What is off by chance.
+    """What is off by chance."""
 
-    Attributes:
-        sigma_rad: (n,) of each joint.
-        off_rad: (N, n) by how much each joint was off at each pose, as far as the residuals show it.
-        sigma_off_rad: (N, n) their sigmas.
-    """
-
-    sigma_rad: Array
-    off_rad: Array
-    sigma_off_rad: Array
+    sigma_rad: Array  #: (n,) of each joint
+    off_rad: Array  #: (N, n) by how much each joint was off at each pose, as far as the residuals show it
+    sigma_off_rad: Array  #: (N, n) their sigmas
 
 
 def joint_noise(model: Model, solution: Solution, prior: Array, measured: Measured) -> JointNoise:

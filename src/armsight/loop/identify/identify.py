@@ -18,7 +18,7 @@ from armsight.errors import CalibrationError, InputError
 from armsight.loop.identify.fit import Mask, Solution, covariance, fit, joint_noise, prior_sigma, with_joint_noise
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.misread import check_plausible, without_tool
-from armsight.loop.identify.model import PLENTY, SENSOR, Model, approaches
+from armsight.loop.identify.model import PLENTY, SENSOR, Model
 from armsight.loop.identify.observable import Observed, observed
 from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.selection import PLACEMENT, TOGETHER, SelectionStep, forward_selection, scaled_prior
@@ -39,35 +39,24 @@ _TABLE = ("offset", "d", "a", "alpha", "beta")
 
 @dataclass(frozen=True, eq=False)
 class Identified(Record):
-    """An identified arm.
+    """An identified arm."""
 
-    Attributes:
-        model: the nominal arm with every parameter.
-        nominal: (P,) base and tool fitted, the rest nominal.
-        solution: the fit.
-        reasons: name -> why a parameter is not fitted, or what its value shares.
-        steps: of the forward selection.
-        singular_values: of the Jacobian of the observable parameters, in units of prior sigmas.
-        prior: (P,) prior sigmas, those of the error sources as large as the data show them to be.
-        joint_sigma_rad: (n,) scatter of each joint from pose to pose, rad; zero where the instrument's covariance is not
-            known, because the joints' and the instrument's share cannot be separated then.
-        cov: (P, P) covariance of all that may be off, fitted or not: a fitted number's sigma includes what the error
-            sources that were not selected, or hardly show, could still be, and how far leaving them out has moved it.
-            ``solution.cov`` is that of the fitted ones, the rest taken for nominal.
-        cov_everything: (P, P) covariance of all that may be off in the fit of all of it, ``solution.x - moved``.
-        moved: (P,) fitted numbers less those of the fit of everything that can be observed: what the selection has moved.
-    """
-
-    model: Model
-    nominal: Array
-    solution: Solution
-    reasons: Mapping[str, str]
-    steps: tuple[SelectionStep, ...]
-    singular_values: Array
-    prior: Array
+    model: Model  #: the nominal arm with every parameter
+    nominal: Array  #: (P,) base and tool fitted, the rest nominal
+    solution: Solution  #: the fit
+    reasons: Mapping[str, str]  #: name -> why a parameter is not fitted, or what its value shares
+    steps: tuple[SelectionStep, ...]  #: of the forward selection
+    singular_values: Array  #: of the Jacobian of the observable parameters, in units of prior sigmas
+    prior: Array  #: (P,) prior sigmas, those of the error sources as large as the data show them to be
+    #: (P, P) covariance of all that may be off, fitted or not: a fitted number's sigma includes what the error sources
+    #: that were not selected, or hardly show, could still be, and how far leaving them out has moved it.
+    #: ``solution.cov`` is that of the fitted ones, the rest taken for nominal.
     cov: Array
-    cov_everything: Array
+    cov_everything: Array  #: (P, P) covariance of all that may be off in the fit of all of it, ``solution.x - moved``
+    #: (P,) fitted numbers less those of the fit of everything that can be observed: what the selection has moved
     moved: Array
+    #: (n,) scatter of each joint from pose to pose, rad; zero where the instrument's covariance is not known, because
+    #: the joints' and the instrument's share cannot be separated then
     joint_sigma_rad: Array
 
     def __repr__(self) -> str:
@@ -165,7 +154,8 @@ def _begun(
     arm = without_tool(arm)
     progress("is this the arm")
     check_plausible(arm, measured)
-    model, x = with_placement(Model.of(arm, measured, backlash=approaches(measured)), measured)
+    sides = measured.approach is not None and bool(measured.approach.any())
+    model, x = with_placement(Model.of(arm, measured, backlash=sides), measured)
     still = np.ptp(measured.q, axis=0) < ALIKE  # the curve of a joint that does not move is its zero
     curves = np.array([p.kind in SENSOR and bool(still[p.joint]) for p in model.parameters])
     prior = np.where(curves, 0.0, prior_sigma(model, priors))

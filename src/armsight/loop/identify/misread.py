@@ -65,21 +65,13 @@ A_UNIT = 0.1
 
 
 class _Reading(NamedTuple):
-    """The rows read in another way.
+    """The rows read in another way."""
 
-    Attributes:
-        poses: what they are then.
-        said: what it would mean, and what to do.
-        path: the file that it is about; None: the robot's table.
-        of_length: how long 1 m of the robot's is in this reading, m.
-        of_units: whether all lengths of one side are in another unit: they can be converted.
-    """
-
-    poses: Poses
-    said: str
-    path: Path | None = None
-    of_length: float = 1.0
-    of_units: bool = False
+    poses: Poses  #: what they are then
+    said: str  #: what it would mean, and what to do
+    path: Path | None = None  #: the file that it is about; None: the robot's table
+    of_length: float = 1.0  #: how long 1 m of the robot's is in this reading, m
+    of_units: bool = False  #: whether all lengths of one side are in another unit: they can be converted
 
 
 def require_plausible(
@@ -531,19 +523,12 @@ class Off(NamedTuple):
 
 
 class Mistakes(NamedTuple):
-    """A guess at the mistakes in the data, and how well it fits.
+    """A guess at the mistakes in the data, and how well it fits."""
 
-    Attributes:
-        joint_order: the column of the data that each joint is in.
-        signs: of each joint.
-        left: whether the instrument's frame is left-handed.
-        off: RMS distance of the points from the arm under this guess, m.
-    """
-
-    joint_order: tuple[int, ...]
-    signs: tuple[int, ...]
-    left: bool
-    off: float
+    joint_order: tuple[int, ...]  #: the column of the data that each joint is in
+    signs: tuple[int, ...]  #: of each joint
+    left: bool  #: whether the instrument's frame is left-handed
+    off: float  #: RMS distance of the points from the arm under this guess, m
 
     @property
     def number(self) -> int:
@@ -732,18 +717,12 @@ def _fitting(arm: Arm, q: Array, p: Array, tried: list[Mistakes], limit: float) 
 
 
 class Step(NamedTuple):
-    """A change of state between two poses.
+    """A change of state between two poses."""
 
-    Attributes:
-        row: the first pose after it, in the order of the rows.
-        text: what changed.
-        before, left: RMS of the points off the arm without and with it, m.
-    """
-
-    row: int
-    text: str
-    before: float
-    left: float
+    row: int  #: the first pose after it, in the order of the rows
+    text: str  #: what changed
+    before: float  #: RMS of the points off the arm without it, m
+    left: float  #: the same with it, m
 
     @property
     def clear(self) -> bool:

@@ -50,19 +50,12 @@ _SHIFTS = (D, A)
 
 
 class TableMotion(NamedTuple):
-    """Pose of an arm's last frame, and the axes along or about which each number of the table moves it.
+    """Pose of an arm's last frame, and the axes along or about which each number of the table moves it."""
 
-    Attributes:
-        R: (N, 3, 3) rotation of the last frame in the rig.
-        o: (N, 3) origin of the last frame in the rig, m.
-        axis: (n, 5, N, 3) unit axes that each number rotates about or translates along, rig.
-        through: (n, 5, N, 3) points on those axes, rig, m.
-    """
-
-    R: Array
-    o: Array
-    axis: Array
-    through: Array
+    R: Array  #: (N, 3, 3) rotation of the last frame in the rig
+    o: Array  #: (N, 3) origin of the last frame in the rig, m
+    axis: Array  #: (n, 5, N, 3) unit axes that each number rotates about or translates along, rig
+    through: Array  #: (n, 5, N, 3) points on those axes, rig, m
 
 
 def nominal_table(arm: Arm) -> Array:
@@ -71,14 +64,14 @@ def nominal_table(arm: Arm) -> Array:
 
 
 def motion(table: Array, theta: Array, modified: bool, R_rig_0: Array, o_rig_0: Array) -> TableMotion:
-    """Move a frame along the chain, and note the axis of every number of the table.
+    """Move frame 0, R_rig_0 (3, 3) and o_rig_0 (3,), along the chain, and note the axis of every number of the table.
 
     Args:
         table: (n, 5) by COLUMNS, m and rad.
         theta: (N, n) rotation of each joint without its offset, rad.
         modified: whether the table follows the modified convention.
-        R_rig_0: (3, 3) rotation of frame 0 in the rig.
-        o_rig_0: (3,) origin of frame 0 in the rig, m.
+        R_rig_0: rotation of frame 0.
+        o_rig_0: its origin, m.
     """
     n = len(theta)
     R, o = np.broadcast_to(R_rig_0, (n, 3, 3)).copy(), np.broadcast_to(o_rig_0, (n, 3)).copy()
@@ -106,20 +99,6 @@ def _rotate(R: Array, k: int, angle: Array) -> None:
     R[:, :, (k + 2) % 3] = c * v - s * u
 
 
-def point_derivative(m: TableMotion, p: Array) -> Array:
-    """Return the derivative (n, 5, N, 3) of points p (N, 3), rig, by every number of the table."""
-    out = np.cross(m.axis, p - m.through)
-    out[:, _SHIFTS] = m.axis[:, _SHIFTS]
-    return out
-
-
-def rotation_derivative(m: TableMotion) -> Array:
-    """Return the derivative (n, 5, N, 3) of the last frame's rotation, as a rotation vector in the rig's axes."""
-    out = m.axis.copy()
-    out[:, _SHIFTS] = 0.0
-    return out
-
-
 #: Harmonics of one revolution of a joint's sensor: the slow ones that its mounting makes, those of its track and gears, and
 #: the fastest: the workcell's potentiometers oscillate up to nine times over their travel of about 270 degrees.
 WAVES, RIPPLES, FAST = (1, 2), (3, 4, 5, 6, 7, 8), (9, 10, 11, 12)
@@ -142,21 +121,13 @@ FADE_RAD = np.deg2rad(20.0)
 
 
 class Feature(NamedTuple):
-    """An error source that moves one joint.
+    """An error source that moves one joint."""
 
-    Attributes:
-        name: of the coefficient.
-        kind: "gain", "wave", "ripple", "backlash", "gravity_backlash" or "compliance".
-        joint: from 0.
-        unit: of the coefficient.
-        detail: the harmonic with its phase (n, 0 sine or 1 cosine), or the link whose gravity loads the gear; (0, 0)
-            elsewhere.
-    """
-
-    name: str
-    kind: str
-    joint: int
-    unit: str
+    name: str  #: of the coefficient
+    kind: str  #: "gain", "wave", "ripple", "backlash", "gravity_backlash" or "compliance"
+    joint: int  #: from 0
+    unit: str  #: of the coefficient
+    #: the harmonic with its phase (n, 0 sine or 1 cosine), or the link whose gravity loads the gear; (0, 0) elsewhere
     detail: tuple[int, int] = (0, 0)
 
 
@@ -190,21 +161,7 @@ def values(
     q_seen: Array | None = None,
     fade_rad: float = FADE_RAD,
 ) -> Array:
-    """Return what one unit of every coefficient adds to its joint's angle.
-
-    Args:
-        arm: the nominal arm, whose links give the levers of gravity.
-        features: F of them.
-        q: (N, n) joint angles, rad.
-        approach: (N, n) directions of approach, or None.
-        up_base: (3,) unit vector against gravity, base.
-        q_seen: (n, 2) least and greatest reading of each joint that the sensors' curves were fitted to, rad, beyond which
-            they fade to their means over that range; None: they never do.
-        fade_rad: how far beyond it they have faded, rad.
-
-    Returns:
-        (N, F).
-    """
+    """Return what one unit of every coefficient adds to its joint's angle, (N, F), rad per unit; see :class:`Model`."""
     out = np.zeros((len(q), len(features)))
     by_gravity = any(f.kind in ("compliance", "gravity_backlash") for f in features)
     levers = _levers(arm, q, up_base) if by_gravity else np.zeros((len(q), arm.joints, arm.joints))
@@ -244,9 +201,7 @@ def fade(angle: Array, low: float, high: float, width: float = FADE_RAD) -> Arra
 def _gravity_lever(arm: Arm, levers: Array, joint: int) -> Array:
     """Return the lever (N,), m, of the gravity load beyond a joint, for links that are rods of one mass per metre."""
     mass = np.hypot(arm.a, arm.d)[joint:] + 1e-9
-    beyond = (
-        np.cumsum(mass[::-1])[::-1] - 0.5 * mass
-    )  # carried by a link's vector: half of its own mass, and all after it
+    beyond = np.cumsum(mass[::-1])[::-1] - 0.5 * mass  # carried by a link's vector: half of its own, and all after it
     return np.asarray(levers[:, joint, joint:] @ beyond / mass.sum())
 
 
@@ -282,58 +237,36 @@ def _levers(arm: Arm, q: Array, up_base: Array) -> Array:
     return np.asarray(np.einsum("i,inx,jnx->nij", arm.direction, z, pull))
 
 
-def approaches(measured: Measured) -> bool:
-    """Return whether directions of approach are known."""
-    return measured.approach is not None and bool(np.any(measured.approach != 0))
-
-
 BASE = ("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz")
-_LENGTHS = (D, A)
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number that can be off.
+    """One number that can be off."""
 
-    Attributes:
-        name: such as "a2", "offset3", "gain1", "tool1_x".
-        kind: "base", "tool", a column of the table, or a feature's kind.
-        unit: "m", "rad", "rad/rad" (of a scale) or "rad/m".
-        joint: from 0; -1 for base and tool.
-    """
-
-    name: str
-    kind: str
-    unit: str
-    joint: int
+    name: str  #: such as "a2", "offset3", "gain1", "tool1_x"
+    kind: str  #: "base", "tool", a column of the table, or a feature's kind
+    unit: str  #: "m", "rad", "rad/rad" (of a scale) or "rad/m"
+    joint: int  #: from 0; -1 for base and tool
 
 
 @dataclass(frozen=True, eq=False)
 class Model(Record):
-    """An arm with everything that can be off about it.
+    """An arm with everything that can be off about it."""
 
-    Attributes:
-        arm: the nominal arm; its T_base_0 holds, its tool is not used.
-        points: how many points are tracked; 1 with full poses.
-        full: whether full poses are measured.
-        features: the error sources beyond the table.
-        R_start: (3, 3) rotation of the base in the rig that the base's rotation parameters start from.
-        R_tool: (3, 3) rotation of the body in the last frame that the tool's rotation parameters start from, with full
-        poses. up_base: (3,) unit vector against gravity, base.
-        q_seen: (n, 2) least and greatest reading of each joint in the poses fitted, rad, beyond which the sensors' curves
-            fade; None before the fit is done, and of an arm whose file does not say it.
-        fade_rad: how far beyond them the curves have faded, rad.
-    """
-
-    arm: Arm
-    points: int
-    full: bool
-    features: tuple[Feature, ...]
+    arm: Arm  #: the nominal arm; its T_base_0 holds, its tool is not used
+    points: int  #: how many points are tracked; 1 with full poses
+    full: bool  #: whether full poses are measured
+    features: tuple[Feature, ...]  #: the error sources beyond the table
+    #: (3, 3) rotation of the base in the rig that the base's rotation parameters start from
     R_start: Array = field(default_factory=lambda: np.eye(3))
+    #: (3, 3) rotation of the body in the last frame that the tool's start from, with full poses
     R_tool: Array = field(default_factory=lambda: np.eye(3))
-    up_base: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    up_base: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  #: (3,) unit vector against gravity, base
+    #: (n, 2) least and greatest reading of each joint in the poses fitted, rad, beyond which the sensors' curves fade;
+    #: None before the fit is done, and of an arm whose file does not say it
     q_seen: Array | None = None
-    fade_rad: float = FADE_RAD
+    fade_rad: float = FADE_RAD  #: how far beyond them the curves have faded, rad
 
     @staticmethod
     def of(arm: Arm, measured: Measured, *, backlash: bool) -> Model:
@@ -355,7 +288,7 @@ class Model(Record):
             found += [Parameter(f"tool1_r{axis}", "tool", "rad", -1) for axis in "xyz"]
         for i in range(self.arm.joints):
             for c, column in enumerate(COLUMNS):
-                found.append(Parameter(f"{column}{i + 1}", column, "m" if c in _LENGTHS else "rad", i))
+                found.append(Parameter(f"{column}{i + 1}", column, "m" if c in _SHIFTS else "rad", i))
         found += [Parameter(f.name, f.kind, f.unit, f.joint) for f in self.features]
         return tuple(found)
 
@@ -440,12 +373,9 @@ class Model(Record):
         modified = self.arm.convention == "modified"
         return motion(self.table(x), self.theta(x, q, phi), modified, T[:3, :3], T[:3, 3])
 
-    def residuals(self, x: Array, measured: Measured, phi: Array) -> Array:
-        """Return predicted minus measured, (N, M); see :class:`Measured` for its axes."""
-        return self._residuals(self.motion(x, measured.q, phi), x, measured)
-
-    def _residuals(self, m: TableMotion, x: Array, measured: Measured) -> Array:
-        t = self.tool_points(x)
+    def residuals(self, x: Array, measured: Measured, phi: Array, m: TableMotion | None = None) -> Array:
+        """Return predicted minus measured, (N, M); see :class:`Measured` for its axes. ``m``: the motion, where known."""
+        m, t = self.motion(x, measured.q, phi) if m is None else m, self.tool_points(x)
         off = m.o[:, None] + (m.R @ t.T).swapaxes(1, 2) - measured.p_rig
         if measured.R_rig_body is None:
             return np.asarray(off.reshape(len(off), -1))
@@ -456,7 +386,7 @@ class Model(Record):
     def linearised(self, x: Array, measured: Measured, phi: Array) -> tuple[Array, Array]:
         """Return predicted minus measured (N, M), and its derivative (N, M, P) by the vector."""
         m = self.motion(x, measured.q, phi)
-        e = self._residuals(m, x, measured)
+        e = self.residuals(x, measured, phi, m)
         t, n, at = self.tool_points(x), len(measured), self.table_at
         J = np.zeros((n, measured.size, len(self.parameters)))
         for k in range(self.points):
@@ -464,7 +394,8 @@ class Model(Record):
             J[:, rows, 0:3] = np.eye(3)
             J[:, rows, 3:6] = -skew(p - x[:3]) @ left_jacobian(x[3:6])
             J[:, rows, self.tool_at + 3 * k : self.tool_at + 3 * k + 3] = m.R
-            table = point_derivative(m, p)
+            table = np.cross(m.axis, p - m.through)  # the derivative (n, 5, N, 3) by every number of the table
+            table[:, _SHIFTS] = m.axis[:, _SHIFTS]
             J[:, rows, at : self.sources_at] = table.reshape(-1, n, 3).transpose(1, 2, 0)
             if self.features:
                 J[:, rows, self.sources_at :] = self._by_source(table[:, OFFSET], phi)
@@ -479,7 +410,8 @@ class Model(Record):
         J[:, :3] = measured.R_rig_body.swapaxes(1, 2) @ J[:, :3]
         R_hat = m.R @ self.T_6_body(x)[:3, :3]
         to_log = (np.eye(3) + 0.5 * skew(e[:, 3:]) + _second(e[:, 3:])) @ R_hat.swapaxes(1, 2)
-        by_rotation = rotation_derivative(m)
+        by_rotation = m.axis.copy()  # the derivative (n, 5, N, 3) of a rotation vector in the rig's axes
+        by_rotation[:, _SHIFTS] = 0.0
         W = np.zeros((n, 3, J.shape[2]))
         W[:, :, 3:6] = left_jacobian(x[3:6])
         W[:, :, at : self.sources_at] = by_rotation.reshape(-1, n, 3).transpose(1, 2, 0)

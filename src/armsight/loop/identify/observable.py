@@ -39,20 +39,14 @@ _PREFERENCE = ("base", "tool", "offset", "a", "alpha", "d", "beta", *ERROR_SOURC
 
 
 class Observed(NamedTuple):
-    """What can be fitted.
+    """What can be fitted."""
 
-    Attributes:
-        free: (P,) whether a parameter is observable.
-        possible: (P,) what may be off though not all of it is observable: ``free``, what moves the tool too little, and
-            error sources that are tied to others, which only their priors distinguish.
-        reasons: name -> why it is not observable, or with what its value is shared.
-        singular_values: of the Jacobian of the free parameters, each column in units of a prior sigma (base and tool: 1
-            m, 1 rad).
-    """
-
-    free: Mask
+    free: Mask  #: (P,) whether a parameter is observable
+    #: (P,) what may be off though not all of it is observable: ``free``, what moves the tool too little, and error
+    #: sources that are tied to others, which only their priors distinguish
     possible: Mask
-    reasons: dict[str, str]
+    reasons: dict[str, str]  #: name -> why it is not observable, or with what its value is shared
+    #: of the Jacobian of the free parameters, each column in units of a prior sigma (base and tool: 1 m, 1 rad)
     singular_values: Array
 
 

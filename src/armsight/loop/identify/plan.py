@@ -172,19 +172,12 @@ MORE_RAD = np.radians(10.0)
 
 @dataclass(frozen=True, eq=False)
 class Plan(Record):
-    """The poses to measure next, best first.
+    """The poses to measure next, best first."""
 
-    Attributes:
-        q: (n, J) joint angles, rad.
-        approach: (n, J) from which side to come to each.
-        sigma_m: (n + 1,) predicted RMS position error over the workspace, m, before and after each pose.
-        random_sigma_m: (n + 1,) the same for random poses.
-    """
-
-    q: Array
-    approach: Array
-    sigma_m: Array
-    random_sigma_m: Array
+    q: Array  #: (n, J) joint angles, rad
+    approach: Array  #: (n, J) from which side to come to each
+    sigma_m: Array  #: (n + 1,) predicted RMS position error over the workspace, m, before and after each pose
+    random_sigma_m: Array  #: (n + 1,) the same for random poses
 
     def random_for(self, n: int) -> int | None:
         """Return how many random poses reach the error of the first ``n`` planned ones; None: more than were sampled."""
@@ -270,23 +263,15 @@ def _with_curves(model: Model, x: Array, prior: Array) -> tuple[Model, Array, Ar
 
 @dataclass(frozen=True, eq=False)
 class _Scene(Record):
-    """The measurements that poses would give, and which poses are allowed.
+    """The measurements that poses would give, and which poses are allowed."""
 
-    Attributes:
-        model: the arm with every parameter.
-        x: (P,) the vector.
-        noise: sigmas of position, m, and rotation, rad, beyond what the rig's geometry gives.
-        floor_m: how far above the base's plane the links must stay, m.
-        rig: the cameras; None: everything is seen.
-        sides: (2, 3) unit vectors in the body's axes from which each camera saw it on the whole, and (2,) the largest
-            rotation from them, rad; None where its rotation is not measured.
-    """
-
-    model: Model
-    x: Array
-    noise: tuple[float, float]
-    floor_m: float
-    rig: StereoRig | None
+    model: Model  #: the arm with every parameter
+    x: Array  #: (P,) the vector
+    noise: tuple[float, float]  #: sigmas of position, m, and rotation, rad, beyond what the rig's geometry gives
+    floor_m: float  #: how far above the base's plane the links must stay, m
+    rig: StereoRig | None  #: the cameras; None: everything is seen
+    #: (2, 3) unit vectors in the body's axes from which each camera saw it on the whole, and (2,) the largest rotation
+    #: from them, rad; None where its rotation is not measured
     sides: tuple[Array, Array] | None = None
 
     @staticmethod
@@ -433,27 +418,16 @@ POSES, NEAR_RAD, WIDER, BESIDE = 1500, np.radians(25), 0.2, 0.02
 
 @dataclass(frozen=True, eq=False)
 class MountingPlan(Record):
-    """Poses of the flange to take.
+    """Poses of the flange to take."""
 
-    Attributes:
-        Ts_base_flange: (K, 4, 4) the poses.
-        sigma_m: (K,) sigma of the mounting's translation along its worst axis after each, m.
-        sigma_rad: (K,) the same of its rotation, rad.
-        before: the two sigmas now.
-        nearest: (K,) the pose, of those given, from which the flange rotates least.
-        rotated_rad: (K,) by how much, rad.
-        moved_m: (K,) the distance from it, m.
-        reasons: what each pose lowers most.
-    """
-
-    Ts_base_flange: Array
-    sigma_m: Array
-    sigma_rad: Array
-    before: tuple[float, float]
-    nearest: NDArray[np.int64]
-    rotated_rad: Array
-    moved_m: Array
-    reasons: tuple[str, ...]
+    Ts_base_flange: Array  #: (K, 4, 4) the poses
+    sigma_m: Array  #: (K,) sigma of the mounting's translation along its worst axis after each, m
+    sigma_rad: Array  #: (K,) the same of its rotation, rad
+    before: tuple[float, float]  #: the two sigmas now
+    nearest: NDArray[np.int64]  #: (K,) the pose, of those given, from which the flange rotates least
+    rotated_rad: Array  #: (K,) by how much, rad
+    moved_m: Array  #: (K,) the distance from it, m
+    reasons: tuple[str, ...]  #: what each pose lowers most
 
 
 def plan_mounting(found: HandEye, poses: Poses, count: int, seed: int = 0) -> MountingPlan:

@@ -44,17 +44,11 @@ REST_RAD, REST_S = 3e-3, 0.2
 
 
 class Read(NamedTuple):
-    """The contents of a file.
+    """The contents of a file."""
 
-    Attributes:
-        measured: its good rows.
-        lines: (N,) the line of the file that each row comes from.
-        notes: what was left out, and why, as text.
-    """
-
-    measured: Measured
-    lines: Array
-    notes: tuple[str, ...]
+    measured: Measured  #: its good rows
+    lines: Array  #: (N,) the line of the file that each row comes from
+    notes: tuple[str, ...]  #: what was left out, and why, as text
 
 
 def read_poses(

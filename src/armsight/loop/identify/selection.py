@@ -101,31 +101,19 @@ _GROUPS = {"offset": "joint zeros", "d": "lengths", "a": "lengths", "alpha": "ax
 
 
 class SelectionStep(NamedTuple):
-    """One step of the forward selection.
+    """One step of the forward selection."""
 
-    Attributes:
-        source: the error source that was added or, with a minus, removed.
-        names: its parameters.
-        rms: held-out RMS of the weighted residuals after it: the geometric mean over the folds.
-    """
-
-    source: str
-    names: tuple[str, ...]
-    rms: float
+    source: str  #: the error source that was added or, with a minus, removed
+    names: tuple[str, ...]  #: its parameters
+    rms: float  #: held-out RMS of the weighted residuals after it: the geometric mean over the folds
 
 
 class Selection(NamedTuple):
-    """The parameters selected.
+    """The parameters selected."""
 
-    Attributes:
-        free: (P,) the parameters kept.
-        steps: of the selection, in order.
-        reasons: name -> why a parameter was not kept.
-    """
-
-    free: Mask
-    steps: tuple[SelectionStep, ...]
-    reasons: dict[str, str]
+    free: Mask  #: (P,) the parameters kept
+    steps: tuple[SelectionStep, ...]  #: of the selection, in order
+    reasons: dict[str, str]  #: name -> why a parameter was not kept
 
 
 def folds_of(q: Array, folds: int = FOLDS) -> NDArray[np.int64]:
