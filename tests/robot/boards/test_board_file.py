@@ -97,7 +97,7 @@ def test_a_file_of_an_arm_with_fewer_joints_has_only_these(tmp_path):
 
 def test_the_sync_led_takes_no_pin_that_has_another_use(tmp_path):
     """The pins in use are those of the documentation's table, which a test holds to the firmware's, and the debugger's."""
-    table = Path(__file__).resolve().parents[3] / "docs" / "howto" / "nucleo.md"
+    table = Path(__file__).resolve().parents[3] / "docs" / "reference" / "nucleo_pins.md"
     documented = re.findall(r"^\| [^|]+ \| (P[ABC]\d+) \|", table.read_text(encoding="utf-8"), flags=re.MULTILINE)
     assert USED_PINS["nucleo-f446re"] == {*documented, "PA13", "PA14"}
     nucleo = ('board = "pil"', 'board = "nucleo-f446re"')

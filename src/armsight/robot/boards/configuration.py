@@ -55,7 +55,7 @@ PIN_NUMBERS = (16, 143)
 NO_PIN, _PIN_FORM = "none", "none or a pin such as PB13 is allowed"
 #: How long each bit of the sync LED's code lasts by default, ticks: no divisor of the usual periods of cameras.
 SYNC_LED_TICKS = 3
-#: Pins of a board that have another use, docs/howto/nucleo.md and blackpill.md; its debugger's too.
+#: Pins of a board that have another use, docs/reference/nucleo_pins.md and blackpill.md; its debugger's too.
 USED_PINS: Mapping[str, frozenset[str]] = {
     "nucleo-f446re": frozenset(
         [f"PA{pin}" for pin in (*range(11), 13, 14, 15)]
@@ -94,7 +94,7 @@ def check_pin(config: Configuration, board: str) -> None:
         free = next(pin for pin in ("PB13", "PA12") if pin not in used)
         raise InputError(
             f"sync_led_pin is {name}, which {use} on {board}: take a free one, such as {free}"
-            " (docs/howto/nucleo.md has the table); nothing was changed"
+            " (docs/reference/nucleo_pins.md has the table); nothing was changed"
         )
 
 

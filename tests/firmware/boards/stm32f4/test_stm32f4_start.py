@@ -148,7 +148,7 @@ def test_a_debugger_that_stops_the_processor_stops_the_motors(booted):
 
 def documented() -> list[tuple[str, str, str, str]]:
     """Return what, pin, connector and peripheral of each row of the documentation's pin table."""
-    text = (ROOT / "docs" / "howto" / "nucleo.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "nucleo_pins.md").read_text(encoding="utf-8")
     return re.findall(r"^\| ([^|]+) \| (P[ABC]\d+) \| ([^|]+) \| [^|]*\| (\w+) \|$", text, flags=re.MULTILINE)
 
 
