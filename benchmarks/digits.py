@@ -65,29 +65,31 @@ def is_worse(value: float, stored: float, each: dict[str, Any]) -> bool:
     return not off <= most
 
 
-def row(name: str, value: float | None, each: dict[str, Any]) -> str:
-    """Return a figure's row of the page: metres as mm, and what it may differ by before it counts as worse."""
-    tolerance = f"{100 * each.get('tolerance', 0.02):g} %" if "within" not in each else f"{each['within']:g}"
-    if name.endswith(", m"):
-        value = None if value is None else 1e3 * value
-        name = f"{name}m"
-        tolerance = tolerance if "within" not in each else f"{1e3 * each['within']:g}"
-    better = {"less": "less", "more": "more", "same": "neither"}[each.get("better", "less")]
-    return f"| {name} | {'not yet' if value is None else f'{value:.4g}'} | {better} | {tolerance} |"
+def items(run: dict[str, Any], stored: dict[str, float]) -> list[str]:
+    """Return a run's figures as items of a list, metres as mm, those of one kind in one item; what has no value is left out."""
+    kinds: dict[str, list[str]] = {}
+    for name in run["figures"]:
+        value = stored.get(f"{run['name']}: {name}")
+        if value is None:
+            continue
+        name, value = (f"{name}m", 1e3 * value) if name.endswith(", m") else (name, value)
+        whose, _, kind = name.partition(", ")
+        if sum(other.endswith(f", {kind}") for other in run["figures"]) < 2 or len(kind) <= 2:  # of one alone, or a unit
+            whose, kind = "", name
+        kinds.setdefault(kind, []).append(f"{whose} {value:.4g}".strip())
+    return [f"- {kind}: {'; '.join(known)}" for kind, known in kinds.items()] or ["- not measured yet"]
 
 
 def page(written: str, runs: list[dict[str, Any]], stored: dict[str, float]) -> str:
-    """Return docs/measured.md: the hand-written part, and a table for each run with its command."""
+    """Return docs/measured.md: the hand-written part, and a list for each run with its command."""
     lines = [
         "## Figures that are held",
         "",
         "`python benchmarks/digits.py` measures these again and ends with 1 where one is worse by more than its tolerance.",
-        "`{data}` is ARMSIGHT_DATA, `{work}` a temporary folder. The whole list: `benchmarks/digits.toml`.",
+        "`{data}` is ARMSIGHT_DATA, `{work}` a temporary folder. Tolerances: `benchmarks/digits.toml`.",
     ]
     for run in runs:
-        lines += ["", f"### {run['name']}", "", f"`{run['command']}`", ""]
-        lines += ["| figure | value | better | tolerance |", "|---|---|---|---|"]
-        lines += [row(name, stored.get(f"{run['name']}: {name}"), each) for name, each in run["figures"].items()]
+        lines += ["", f"### {run['name']}", "", f"`{run['command']}`", "", *items(run, stored)]
     return written.rstrip() + "\n\n" + "\n".join(lines) + "\n"
 
 

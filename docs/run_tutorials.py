@@ -27,7 +27,7 @@ from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
-#: Pages whose commands are run: the first steps, then the tutorials in their order.
+#: Pages whose commands are run: the first steps, then the tutorials in their order, then the pages of arms.
 PAGES = (
     "start",
     "tutorials/calibrate_two_webcams",
@@ -35,6 +35,9 @@ PAGES = (
     "tutorials/close_the_loop",
     "tutorials/identify_an_arm",
     "tutorials/iso9283_test",
+    "arms/so101",
+    "arms/ur",
+    "arms/another_arm",
 )
 _BLOCK = re.compile(r"(?:<!-- run: (?P<how>\w+) -->\n)?^```console\n(?P<text>.*?)^```$", re.DOTALL | re.MULTILINE)
 _PICTURE = re.compile(r"\((?:\.\./)?_made/(?P<page>\w+)/(?P<file>[^)\s]+)\)")
