@@ -66,7 +66,7 @@ def is_worse(value: float, stored: float, each: dict[str, Any]) -> bool:
 
 
 def items(run: dict[str, Any], stored: dict[str, float]) -> list[str]:
-    """Return a run's figures as items of a list, metres as mm, those of one kind in one item; what has no value is left out."""
+    """Return a run's figures as items of a list, metres as mm, those of one kind in one item."""
     kinds: dict[str, list[str]] = {}
     for name in run["figures"]:
         value = stored.get(f"{run['name']}: {name}")

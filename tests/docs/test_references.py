@@ -34,7 +34,7 @@ def missing_names(text: str) -> list[str]:
     missing = []
     for name in sorted(set(MODULE.findall(text))):
         parts = name.split(".")
-        if parts[-1] in ("xml", "toml", "json", "fish"):  # a file's name
+        if parts[-1] in ("xml", "toml", "json", "fish", "log"):  # a file's name
             continue
         if not _imports(name):
             missing.append(name)
