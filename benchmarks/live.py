@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from armsight.app.live import records
+from armsight.app.live.capture import CameraCapture
 from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, working_points
 from armsight.app.live.server import LiveServer
 from armsight.app.live.session import LiveSession, SessionOptions
@@ -92,7 +93,7 @@ def stop(count: int, *, moving: bool) -> None:
     for n in range(count):
         if moving:
             session.execute(records.GuideHandEye() if n % 2 else records.RunMotions())
-            until(lambda: session.arm.state.drives_on)
+            until(lambda: session.arm._board.status.drives_on)
             time.sleep(rng.uniform(0.2, 6.0))
             phase = session.arm.state.running or "between"
             phases[phase.split(":")[0]] = phases.get(phase.split(":")[0], 0) + 1
@@ -286,7 +287,7 @@ def first(seeds: int) -> None:
         press("k-finish")
         until(lambda s=session: s.calibration.state.rig, 300.0)
         shots, minutes = len(session.calibration.state.shots), (time.monotonic() - began) / 60
-        true, rig = session._simulated.workcell.truth.rig, StereoRig.load(session.folder / "rig.json")
+        true, rig = session.shared.simulated.workcell.truth.rig, StereoRig.load(session.folder / "rig.json")
         points = working_points(true, 0.8)
         p_right = transform(inverse(true.T_left_right), points)
         uv = np.stack([true.left.project(points), true.right.project(p_right)], axis=1)
@@ -326,15 +327,6 @@ class Pictures:
         """Do nothing."""
 
 
-class OfPictures(LiveSession):
-    """A session whose cameras are pictures."""
-
-    rate_hz = 15.0
-
-    def _open(self):
-        return Pictures(self.rate_hz)
-
-
 def resident_mb() -> float:
     """Return the memory of this process that is resident, MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
@@ -343,7 +335,8 @@ def resident_mb() -> float:
 
 def cost() -> None:
     """Measure the processor's share, the first picture, and memory."""
-    session = OfPictures(SessionOptions(Path(tempfile.mkdtemp()) / "live", "folder:none"))
+    session = LiveSession(SessionOptions(Path(tempfile.mkdtemp()) / "live", "folder:none"))
+    session.shared.capture = CameraCapture(lambda: Pictures(15.0))
     session.start()
     server = LiveServer(session, port=0)
     server.start()
@@ -366,8 +359,7 @@ def cost() -> None:
         f"{100 * alone:.1f}% without a page"
     )
     session.capture.close()
-    OfPictures.rate_hz = 150.0
-    session.capture = type(session.capture)(session._open)
+    session.shared.capture = CameraCapture(lambda: Pictures(150.0))
     session.capture.start()
     until(lambda: session.newest is not None and session.newest.number > 500)
     first, begun = session.newest.number, resident_mb()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import parsed_json, read_text, write_text
 from armsight.geometry.check import checked
-from armsight.geometry.pose import exp_se3
+from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.vision.camera import DISTORTION_MODELS, Camera
 
 if TYPE_CHECKING:
@@ -168,6 +168,10 @@ class StereoRig(Record):
         """Left and right."""
         return self.left, self.right
 
+    def project(self, p_left: Array) -> tuple[Array, Array]:
+        """Return points (..., 3), m, left camera's frame, as both cameras see them: (..., 2) raw pixels each."""
+        return self.left.project(p_left), self.right.project(transform(inverse(self.T_left_right), p_left))
+
     def cov_with(self, common: Array) -> Array:
         """Return the covariance (P, P) of the rig's parameters as an image shows them.
 
@@ -223,15 +227,11 @@ class StereoRig(Record):
     def perturbed(self, delta: Array) -> StereoRig:
         """Return the rig moved by ``delta`` (P,) along its parameter vector; covariance and the rest unchanged."""
         n_left, n = self.left.parameters.size, self.parameter_count - 6
-        return StereoRig(
-            self.left.with_parameters(self.left.parameters + delta[:n_left]),
-            self.right.with_parameters(self.right.parameters + delta[n_left:n]),
-            self.T_left_right @ exp_se3(delta[n:]),
-            self.cov,
-            self.sigma_px,
-            self.provenance,
-            self.shutters,
-            self.disc_noise,
+        return replace(
+            self,
+            left=self.left.with_parameters(self.left.parameters + delta[:n_left]),
+            right=self.right.with_parameters(self.right.parameters + delta[n_left:n]),
+            T_left_right=self.T_left_right @ exp_se3(delta[n:]),
         )
 
     def rectify(self) -> Rectification:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from armsight.app.live import arm
-from armsight.app.live.arm import ArmOptions, ArmStep
+from armsight.app.live.arm import ArmStep
 from armsight.app.live.board import StoppableBoard
+from armsight.app.live.step import SessionOptions, Shared
 from armsight.data import JointStates, Missed
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.codes import BoardState, Command
@@ -143,11 +144,9 @@ def test_a_board_with_another_controller_is_stopped_when_it_follows_no_command()
 
 
 def arm_step(tmp_path, board, measuring=None):
-    arm = MODELS["six_r"]
-    options = ArmOptions(arm, "six_r", board, tmp_path / "motion.toml", 30.0, 1e-3, "usb:0,1")
-    measuring = measuring or SimpleNamespace(rig=None, rig_path=None, target_spec=None, newest=None)
-    said = []
-    return ArmStep(tmp_path, options, SimpleNamespace(), measuring, None, said.append), said
+    options = SessionOptions(tmp_path, "usb:0,1", board=board)
+    measuring = measuring or SimpleNamespace(rig=None, rig_path=None, target_spec=None, newest=None, lacking="")
+    return ArmStep(Shared(options, tmp_path, lambda level, text: None), measuring, MODELS["six_r"])
 
 
 @pytest.mark.parametrize(
@@ -167,17 +166,17 @@ def test_a_board_that_cannot_be_right_is_rejected(name, source, says):
 def test_logged_joint_angles_stand_beside_the_shot_they_belong_to(tmp_path):
     (tmp_path / "q.csv").write_text("shot,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\na,1,2,3,4,5,6\nb,2,2,3,4,5,6\n")
     newest = SimpleNamespace(shot=SimpleNamespace(name="b", t_s=None)), None
-    measuring = SimpleNamespace(rig=None, rig_path=None, target_spec=None, newest=newest)
-    step, _ = arm_step(tmp_path, f"poses:{tmp_path}/q.csv", measuring)
-    step.open()
+    measuring = SimpleNamespace(rig=None, rig_path=None, target_spec=None, newest=newest, lacking="")
+    step = arm_step(tmp_path, f"poses:{tmp_path}/q.csv", measuring)
+    step.open_arm()
     assert step.state.q_deg == pytest.approx((2, 2, 3, 4, 5, 6))
     assert not step.state.moves
     with pytest.raises(InputError, match="commands no motion"):
-        step.run(closed=False)
+        step.run_motions(closed=False)
     (tmp_path / "q.csv").write_text("q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n1,2,3,4,5,6\n2,2,3,4,5,6\n")
-    other, _ = arm_step(tmp_path, f"poses:{tmp_path}/q.csv")
+    other = arm_step(tmp_path, f"poses:{tmp_path}/q.csv")
     with pytest.raises(InputError, match="neither a column shot nor t_s"):
-        other.open()
+        other.open_arm()
     step.close()
     other.close()
 
@@ -185,9 +184,9 @@ def test_logged_joint_angles_stand_beside_the_shot_they_belong_to(tmp_path):
 def test_what_is_shown_waits_for_the_command_of_a_shot(tmp_path, monkeypatch):
     monkeypatch.setattr(arm, "_PATIENCE_S", 60.0)
     monkeypatch.setattr(arm, "_WATCHES_S", 60.0)
-    step, _ = arm_step(tmp_path, None)
+    step = arm_step(tmp_path, None)
     step.between_shots()  # nothing moves: at once
-    step.capture = SimpleNamespace(newest=None)
+    step.shared.capture = SimpleNamespace(newest=None)
     loop = SimpleNamespace(log=SimpleNamespace(joints=[], poses=[]), mounting=None)
     step._begun(loop)
     step.between_shots()  # it watches no shot yet: at once

@@ -15,6 +15,7 @@ from armsight.data import PoseEstimate, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.vision.markers.targets import open_target
 from armsight.vision.pose.measure import measure
+from waiting import until
 
 pytestmark = pytest.mark.real_time
 
@@ -59,13 +60,6 @@ def capture(cable):
     made.start()
     yield made
     made.close()
-
-
-def until(true, patience_s=60.0):
-    end = time.monotonic() + patience_s
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.005)
 
 
 def test_whoever_waits_gets_the_newest_shot(capture):

@@ -7,7 +7,7 @@ from armsight.app.live import calibration
 from armsight.app.live.calibration import quick_look
 from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, error_weights, guessed_rig, working_points
 from armsight.data import Detections
-from armsight.geometry.pose import inverse, transform
+from armsight.geometry.pose import transform
 from armsight.sim.example_rig import board_poses, example_rig
 from armsight.sim.render.scene import chessboard
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
@@ -24,8 +24,9 @@ def seen(T, name, rng):
     """What both cameras detect of the board at a pose, with noise."""
     p, count = transform(T, BOARD.body.points), len(BOARD.body.points)
     cov = np.tile(SIGMA_PX**2 * np.eye(2), (count, 1, 1))
-    views = RIG.left.project(p), RIG.right.project(transform(inverse(RIG.T_left_right), p))
-    return Pair(name, *(Detections(np.arange(count), uv + rng.normal(0, SIGMA_PX, uv.shape), cov) for uv in views))
+    return Pair(
+        name, *(Detections(np.arange(count), uv + rng.normal(0, SIGMA_PX, uv.shape), cov) for uv in RIG.project(p))
+    )
 
 
 def calibrated(Ts, seed=1):
@@ -59,7 +60,7 @@ def test_the_predicted_error_is_that_of_triangulated_points(five):
     knowledge, rig = Knowledge.of(five, BOARD, CalibrationAim()), five.rig
     points = working_points(rig, 0.8)
     weights, rng = error_weights(rig, points), np.random.default_rng(0)
-    uv = np.stack([rig.left.project(points), rig.right.project(transform(inverse(rig.T_left_right), points))], axis=1)
+    uv = np.stack(rig.project(points), axis=1)
     cov_uv = np.tile(np.eye(2), (len(uv), 2, 1, 1))
     drawn = [
         ((optimal_points(rig.perturbed(d), uv, cov_uv)[0] - points) ** 2).sum(axis=1).mean()
@@ -84,8 +85,8 @@ def test_candidates_and_first_poses_are_in_view_of_both_cameras():
     rig = guessed_rig(SIZES, RIG.T_left_right)
     first = [guide.first(n, rig).T_left_board for n in range(5)]
     for cameras, shown in ((RIG, Ts), (rig, np.array(first))):
-        for camera, to in zip(cameras.cameras, (np.eye(4), inverse(cameras.T_left_right)), strict=True):
-            uv = camera.project(transform(to @ shown[:, None], BOARD.body.points[None]).reshape(-1, 3))
+        views = cameras.project(transform(shown[:, None], BOARD.body.points[None]).reshape(-1, 3))
+        for camera, uv in zip(cameras.cameras, views, strict=True):
             assert ((uv > 0) & (uv < np.array(camera.image_size_px) - 1)).all()
 
 

@@ -8,7 +8,8 @@ import pytest
 
 from armsight.app.live import handeye
 from armsight.app.live.handeye import LEAST_POSES, MOST_POSES, HandEyeGuide, likely_joint_errors
-from armsight.app.live.session import LiveSession, SessionOptions
+from armsight.app.live.session import LiveSession
+from armsight.app.live.step import SessionOptions, Shared
 from armsight.app.run.calibrate import VisitedPose, handeye_poses
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, pose
@@ -29,7 +30,8 @@ def calibrated(tmp_path_factory):
     rng = np.random.default_rng(7)
     rig, T_tool_body = example_rig((1280, 720), 900.0), pose(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 0.03]))
     T_base_rig = rig_pose(ARM, rig, T_tool_body, 7)
-    guide = HandEyeGuide(tmp_path_factory.mktemp("live"), ARM, "six_r", lambda note: pytest.fail(note.text))
+    folder = tmp_path_factory.mktemp("live")
+    guide = HandEyeGuide(Shared(SessionOptions(folder), folder, lambda level, text: pytest.fail(text)), ARM, "six_r")
     guide.begin(handeye_poses(ARM, ARM.home[None], 3, 1), (ARM.q_min, ARM.q_max), rig)
     while (q := guide.next_q) is not None:
         seen = inverse(T_base_rig) @ ARM.forward(q) @ exp_se3(NOISE * rng.standard_normal(6)) @ T_tool_body
@@ -95,7 +97,8 @@ def test_poses_seen_by_another_rig_or_arm_are_not_used(calibrated, tmp_path, new
     if newer != "rig":
         os.utime(tmp_path / "rig.json", (1.0, 1.0))
     said = []
-    other = HandEyeGuide(tmp_path, ARM if newer == "rig" else MODELS["so101"], "", said.append)
+    shared = Shared(SessionOptions(tmp_path), tmp_path, lambda level, text: said.append(text))
+    other = HandEyeGuide(shared, ARM if newer == "rig" else MODELS["so101"], "")
     other.recall(tmp_path / "rig.json")
     assert other.state.poses == 0
     assert len(said) == (newer != "rig")

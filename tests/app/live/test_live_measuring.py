@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from armsight.app.live.measuring import MeasureStep, relative_pose
+from armsight.app.live.step import SessionOptions, Shared
 from armsight.data import Detections, Missed, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, pose, transform
@@ -23,8 +24,7 @@ SIGMA_PX = 0.05
 def detected(rig, T, noise):
     p, n = transform(T, BOARD.points), len(BOARD.points)
     cov = np.tile(SIGMA_PX**2 * np.eye(2), (n, 1, 1))
-    views = rig.left.project(p), rig.right.project(transform(inverse(rig.T_left_right), p))
-    return [Detections(np.arange(n), uv + e, cov) for uv, e in zip(views, noise, strict=True)]
+    return [Detections(np.arange(n), uv + e, cov) for uv, e in zip(rig.project(p), noise, strict=True)]
 
 
 @pytest.fixture(scope="module")
@@ -88,8 +88,7 @@ def live(number):
 
 @pytest.fixture
 def step(rig, tmp_path):
-    said = []
-    made = MeasureStep(tmp_path, "usb:0,1", said.append)
+    made = MeasureStep(Shared(SessionOptions(tmp_path), tmp_path, lambda level, text: None, "usb:0,1"))
     made.use_rig(rig, tmp_path / "rig.json")
     made.use_target("chessboard:5x4:20mm")
     yield made
@@ -99,7 +98,7 @@ def step(rig, tmp_path):
 def test_a_tip_is_found_by_pivoting(step, rig):
     rng, p_tip, p_stands = np.random.default_rng(5), np.array([0.02, 0.01, -0.12]), np.array([0.0, 0.05, 0.75])
     with pytest.raises(InputError, match="no pose is measured yet"):
-        step.pivot()
+        step.pivot_tip()
 
     def show(k):
         R = exp_so3(rng.uniform(-0.35, 0.35, 3))
@@ -107,12 +106,12 @@ def test_a_tip_is_found_by_pivoting(step, rig):
         step.take(live(k), measure_detections(rig, BOARD, *detected(rig, pose(R, p_stands - R @ p_tip), noise)))
 
     show(0)
-    step.pivot()
+    step.pivot_tip()
     assert step.state.pivoting
     for k in range(1, 30):
         show(k)
     assert "rotated by up to" in step.state.pivot
-    step.pivot()
+    step.pivot_tip()
     at, sigma = step.state.tip_mm
     assert np.linalg.norm(np.array(at) - 1e3 * p_stands) < 4.0 * np.linalg.norm(sigma)
     assert not step.state.pivoting
@@ -120,16 +119,16 @@ def test_a_tip_is_found_by_pivoting(step, rig):
 
 def test_a_second_body_is_another_one_and_says_why_it_is_missed(step, rig):
     with pytest.raises(InputError, match="must be another one"):
-        step.use_second("chessboard:5x4:20mm")
-    step.use_second("chessboard:9x6:25mm")
+        step.use_second_body("chessboard:5x4:20mm")
+    step.use_second_body("chessboard:9x6:25mm")
     first, second = (measure_detections(rig, BOARD, *detected(rig, T, np.zeros((2, 1, 1)))) for T in POSES)
     step.take(live(1), first)
     assert step.state.second.reason == "no shot yet"
-    step._second.newest = 1, Missed("left: the board is not in view")
+    step._second.newest = live(1), Missed("left: the board is not in view")
     assert step.state.second.reason == "left: the board is not in view"
-    step._second.newest = 1, second
+    step._second.newest = live(1), second
     shown = step.state.second
     assert shown.reason is None
     assert shown.distance_mm[0] == pytest.approx(1e3 * np.linalg.norm((inverse(POSES[0]) @ POSES[1])[:3, 3]), abs=0.01)
-    step.use_second("")
+    step.use_second_body("")
     assert step.state.second is None

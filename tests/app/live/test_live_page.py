@@ -1,18 +1,20 @@
 """The page in a headless browser, step by step by clicking, on rendered cameras and the emulated board; and the session."""
 
 import shutil
-import time
 import urllib.request
 
 import pytest
 
 from armsight.app.live import calibration, records, simulated
+from armsight.app.live.body import scaled_spec
 from armsight.app.live.server import LiveServer
-from armsight.app.live.session import LiveSession, SessionOptions, scaled_spec
+from armsight.app.live.session import LiveSession
+from armsight.app.live.step import SessionOptions
 from armsight.errors import InputError
 from armsight.files import read_table
 from armsight.vision.pose.shot_pose import CSV_COLUMNS
 from armsight.vision.rig import StereoRig
+from waiting import until
 
 pytestmark = pytest.mark.real_time
 
@@ -71,14 +73,6 @@ def page(server, browsers):
     return browsers(server.address)
 
 
-def until(true, patience_s=120.0, why=lambda: ""):
-    end = time.monotonic() + patience_s
-    while not (found := true()):
-        assert time.monotonic() < end, f"did not happen in time {why()}"
-        time.sleep(0.05)
-    return found
-
-
 def click(page, name):
     until(
         lambda: page.execute_script(
@@ -132,7 +126,7 @@ def test_calibrate(page, session):
     until(lambda: {each["kind"] for each in page.execute_script("return drawn")} >= {"next"})
     click(page, "k-finish")
     until(lambda: state(page, "calibrate.rig"))
-    rig, truth = StereoRig.load(session.folder / "rig.json"), session._simulated.workcell.truth.rig
+    rig, truth = StereoRig.load(session.folder / "rig.json"), session.shared.simulated.workcell.truth.rig
     assert rig.baseline_m == pytest.approx(truth.baseline_m, rel=5e-3)
     assert rig.left.intrinsics[0] == pytest.approx(truth.left.intrinsics[0], rel=5e-3)
     progress = state(page, "calibrate.progress")
@@ -150,7 +144,7 @@ def of_true_rig(now):
 def test_body_and_measure(page, session):
     rigs = (session.folder / "rig.json", session.folder / "true.json")  # the second: this test ran before
     until(lambda: session.measuring.rig_path in rigs)
-    truth = session._simulated.workcell.truth
+    truth = session.shared.simulated.workcell.truth
     truth.rig.save(session.folder / "true.json")  # a rig of six shots is good or poor by chance
     session.measuring.use_rig(truth.rig, session.folder / "true.json")
     click(page, "step-body")
@@ -194,9 +188,9 @@ def test_a_full_disk_ends_the_recording_with_a_line(session):
 
     session.execute(records.RecordPoses())
     measuring, before = session.measuring, len(session.events())
-    with measuring._lock:
-        measuring._file.close()
-        measuring._file = Full()
+    with measuring.lock:
+        measuring._recording.file.close()
+        measuring._recording.file = Full()
     until(lambda: any("No space left" in event.text for event in session.events()[before - 1 :]))
     assert measuring.state.recording is None
     until(lambda: measuring.state.pose is not None)

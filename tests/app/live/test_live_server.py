@@ -21,6 +21,7 @@ from armsight.app.live.records import Event, Hold
 from armsight.app.live.server import LiveServer
 from armsight.data import Shot
 from armsight.errors import InputError
+from waiting import until
 
 pytest.importorskip("websockets")
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -62,8 +63,8 @@ class FakeSession:
     def hold(self, why):
         self.held.append(why)
 
-    def say(self, note):
-        self.said.append(note)
+    def say(self, level, text):
+        self.said.append(text)
 
 
 @pytest.fixture
@@ -99,13 +100,6 @@ def heard(opened, key, patience_s=60.0):
         if key in said:
             return said[key]
     raise AssertionError(f"no {key}")
-
-
-def until(true, patience_s=60.0):
-    end = time.monotonic() + patience_s
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def get(server, path="/", host=None):

@@ -15,7 +15,7 @@ import pytest
 from pty_workcell import SILENT_TICKS, HostStamped, PtyWorkcell
 
 from armsight.app.run import calibrate as run_calibrate
-from armsight.app.run import command, experiment
+from armsight.app.run import command, experiment, folder
 from armsight.app.run import setup as run_setup
 from armsight.app.run.loop import Loop
 from armsight.app.run.setup import HostClock
@@ -160,7 +160,7 @@ def meanwhile(monkeypatch, stage, happens):
 
         return real(*arguments, progress=watched, **options)
 
-    monkeypatch.setattr(experiment, "run_experiment", run_experiment)
+    monkeypatch.setattr(folder, "run_experiment", run_experiment)
     return done
 
 

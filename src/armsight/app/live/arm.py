@@ -8,48 +8,42 @@ itself reports. With ``poses:FILE`` nothing is driven: another program moves the
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from armsight.app.live.board import StoppableBoard
-from armsight.app.live.capture import CameraCapture
-from armsight.app.live.handeye import HandEyeGuide, HandEyeState, likely_joint_errors, visit_poses
+from armsight.app.live.handeye import HandEyeGuide, HandEyeState, go, likely_joint_errors, visit_poses
 from armsight.app.live.identification import IdentifyState, IdentifyStep
 from armsight.app.live.measuring import MeasureStep
-from armsight.app.live.simulated import SimulatedCameras
+from armsight.app.live.records import asked
+from armsight.app.live.step import SIM, PageStep, Shared, unused, why
 from armsight.app.run.angles import LoggedAngles, read_angles
 from armsight.app.run.calibrate import VisitedPose, handeye_poses
-from armsight.app.run.controllers import Planned
 from armsight.app.run.experiment import (
     RunResult,
     passed,
     require_followed,
     require_range,
     require_start,
-    run_experiment,
     run_visits,
     start_rad,
 )
-from armsight.app.run.folder import Finished, finish, make_room
+from armsight.app.run.folder import Finished, finish, run_in
 from armsight.app.run.loop import Loop
 from armsight.app.run.motion_file import MotionPlan, read_motions
-from armsight.app.run.record import RunSegment, require_pyarrow
+from armsight.app.run.record import require_pyarrow
 from armsight.app.run.setup import HostClock, Setup, require_joints, setup_of
-from armsight.app.show.messages import Note
 from armsight.app.show.plotting import require_matplotlib
-from armsight.app.stream.datum import Published
-from armsight.app.stream.mcap_file import LazyMcap, properties
 from armsight.data import Array, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
-from armsight.files import read_text, write_text
+from armsight.files import read_text
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators import Mounting
 from armsight.robot.arm_file import open_arm
@@ -73,41 +67,8 @@ _SLOWLY = 0.25  # share of the arm's limits on the way to the start
 
 
 @dataclass(frozen=True)
-class ArmOptions:
-    """What the arm is.
-
-    Attributes:
-        arm: the nominal arm.
-        arm_spec: its name or file.
-        board: the controller board's spec, such as serial:/dev/ttyACM0, feetech:PORT or poses:FILE; None without one.
-        motion: file of the motions.
-        rate_hz: rate of the cameras, Hz.
-        sync_s: standard deviation of the time between the two exposures of a shot, s.
-        source: spec of the cameras.
-        calibration: LeRobot's calibration file of a servo bus; None without.
-        follow_rig: whether a rig that moves during a run is put right.
-    """
-
-    arm: Arm
-    arm_spec: str
-    board: str | None
-    motion: Path
-    rate_hz: float
-    sync_s: float
-    source: str
-    calibration: Path | None = None
-    follow_rig: bool = False
-
-
-@dataclass(frozen=True)
 class StopAnswer:
-    """The answer to a stop.
-
-    Attributes:
-        stopped: whether the board itself says that it stopped.
-        state: the board's state, in words.
-        took_ms: from the request to the board's state, ms.
-    """
+    """The answer to a stop: whether the board itself says that it stopped, its state in words, and how long it took."""
 
     stopped: bool
     state: str
@@ -116,116 +77,66 @@ class StopAnswer:
 
 @dataclass(frozen=True)
 class ArmState:
-    """What a page shows of the arm.
+    """What a page shows of the arm."""
 
-    Attributes:
-        arm: its name.
-        board: name of the board; None while it is not connected.
-        missing: what is missing, one line.
-        state: the board's state, in words.
-        drives_on: whether the motors are driven.
-        stopped: whether the board is in its emergency stop, or a person stopped it.
-        moves: whether this page can move the arm.
-        lacks: what this board cannot do.
-        faults: latched faults.
-        q_deg: joint angles by the potentiometers, degrees.
-        vision_deg: joint angles that explain the pose that vision measures, less those, degrees; empty while unknown.
-        running: what is being done; None while nothing is.
-        phase: calibration, open_loop, closed_loop, rest; empty while nothing runs.
-        motion: name of the motion.
-        error_mm: (time, s; distance of the tool, as the loop estimates it, from the reference, mm; whether the loop is
-            closed).
-        handeye: the guided hand-eye calibration.
-        identify: the identification.
-        motion_file: the file of the motions.
-        away: whether the arm is elsewhere than where the motions start.
-        results: the results of the last run, line by line.
-        folder: of the last run.
-        scene: (N, 3) the arm's joints in the left camera's frame, m; empty before the hand-eye calibration.
-        command: the command line that does the same.
-    """
-
-    arm: str
-    board: str | None = None
+    arm: str = ""
+    board: str | None = None  # None while it is not connected
     missing: str = ""
-    state: str = "not connected"
-    drives_on: bool = False
-    stopped: bool = False
-    moves: bool = False
-    lacks: tuple[str, ...] = ()
+    state: str = "not connected"  # the board's, in words
+    stopped: bool = False  # the board is in its emergency stop, or a person stopped it
+    moves: bool = False  # this page can move the arm
+    lacks: tuple[str, ...] = ()  # what this board cannot do
     faults: tuple[str, ...] = ()
-    q_deg: tuple[float, ...] = ()
-    vision_deg: tuple[float, ...] = ()
-    running: str | None = None
-    phase: str = ""
-    motion: str = ""
-    error_mm: tuple[tuple[float, float, bool], ...] = ()
+    q_deg: tuple[float, ...] = ()  # joint angles by the potentiometers
+    vision_deg: tuple[float, ...] = ()  # those that explain the pose that vision measures, less q_deg
+    running: str | None = None  # what is being done
+    error_mm: tuple[tuple[float, float, bool], ...] = ()  # time, s; tool from its reference, mm; loop closed
     handeye: HandEyeState = field(default_factory=HandEyeState)
     identify: IdentifyState = field(default_factory=IdentifyState)
     motion_file: str = ""
-    away: bool = False
-    results: tuple[str, ...] = ()
-    folder: str | None = None
-    scene: tuple[tuple[float, ...], ...] = ()
-    command: str = ""
+    away: bool = False  # the arm is elsewhere than where the motions start
+    results: tuple[str, ...] = ()  # of the last run
+    folder: str | None = None  # of the last run
+    scene: tuple[tuple[float, ...], ...] = ()  # (N, 3) the joints in the left camera's frame, m
+    command: str = ""  # the command line that does the same
 
 
-class ArmStep:
-    """The arm's board, in a thread of its own.
+class ArmStep(PageStep[ArmState]):
+    """The arm's board, in a thread of its own; runs go to ``run``, ``run-2``, ... in the folder of the session.
 
     Args:
-        folder: of the session; runs go to ``run``, ``run-2``, ... in it.
-        options: what the arm is.
-        capture: the session's cameras.
+        shared: what all steps share.
         measuring: has rig and body; is given the poses that the loop measures.
-        simulated: the workcell where it stands for the devices; else None.
-        say: called with a note for the person.
+        model: the nominal arm.
 
     Attributes:
-        capture: the session's cameras.
-        options: what the arm is.
-        handeye: the guided hand-eye calibration.
-        identify: the identification.
+        held: why the arm was held, until it is moved again; empty where it was not.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        options: ArmOptions,
-        capture: CameraCapture,
-        measuring: MeasureStep,
-        simulated: SimulatedCameras | None,
-        say: Callable[[Note], None],
-    ) -> None:
-        self.folder, self.options, self._say = folder, options, say
-        self.capture, self._measuring, self._simulated = capture, measuring, simulated
+    def __init__(self, shared: Shared, measuring: MeasureStep, model: Arm) -> None:
+        super().__init__(shared, ArmState())
+        self.model, self._measuring, self._simulated = model, measuring, shared.simulated
+        self.handeye, self._identifying = HandEyeGuide(shared, model, shared.options.arm), IdentifyStep(shared)
+        self.held = ""
         self._board: StoppableBoard | None = None
         self._logged: LoggedAngles | None = None
         self._thread: threading.Thread | None = None
         self._closing = threading.Event()
         self._hold: str | None = None
         self._requested: Callable[[], None] | None = None
-        self.handeye = HandEyeGuide(folder, options.arm, options.arm_spec, say)
-        self.identify = IdentifyStep(folder, say)
         self._lately: deque[tuple[float, Array]] = deque(maxlen=1000)
-        self._writing = ThreadPoolExecutor(1, thread_name_prefix="write")
         self._q: Array | None = None
         self._mounting: Mounting | None = None
-        self._running: str | None = None
         self._loop: Loop | None = None
         self._answered, self._answered_s = threading.Event(), -np.inf  # a command has followed from a shot
         self._seen = 0
         self._chart: deque[tuple[float, float, bool]] = deque(maxlen=_CHART)
-        self._results, self._run_folder, self._start = (), None, None
-
-    _results: tuple[str, ...]
-    _run_folder: Path | None
-    _start: Array | None
+        self._start: Array | None = None
 
     @property
     def busy(self) -> bool:
         """Whether a motion runs, or is about to."""
-        return self._running is not None or self._requested is not None
+        return self.shown.running is not None or self._requested is not None
 
     @staticmethod
     def check_board(name: str | None, source: str, arm: Arm) -> None:
@@ -238,49 +149,44 @@ class ArmStep:
             return
         if name.startswith(LOGGED) and name != LOGGED:
             read_angles(name.removeprefix(LOGGED), arm)
-            return
-        if emulator_name(name) and not source.startswith("sim:"):
+        elif emulator_name(name) and not source.startswith(SIM):
             raise InputError(f"--board {name}: the emulated board and the workcell go together: --source sim:")
 
-    def open(self) -> None:
-        """Connect to the board; its drives stay as they are.
-
-        Raises:
-            InputError: no board was named.
-            DeviceError: it does not answer.
-        """
+    @asked("arm")
+    def open_arm(self) -> None:
+        """Connect to the arm's board; the drives stay as they are."""
+        name = self.shared.options.board
         if self._board is not None or self._logged is not None:
             return
-        options = self.options
-        if self._simulated is not None:
-            self.capture.pause()
-            self._board = StoppableBoard(self._simulated.workcell.board)
-        elif options.board is None:
+        if name is None:
             raise InputError(
                 "no board was named: start with --board serial:/dev/ttyACM0, feetech:PORT, ar4:PORT (docs/howto/board.md), "
                 "or poses:FILE where another program moves the arm"
             )
-        elif options.board.startswith(LOGGED):
-            angles = read_angles(options.board.removeprefix(LOGGED), options.arm)
+        if name.startswith(LOGGED):
+            angles = read_angles(name.removeprefix(LOGGED), self.model)
             if angles.shots is None and angles.t_s is None:
                 raise InputError(
                     f"{angles.path}: has neither a column shot nor t_s: which image does each row belong to?"
                 )
             self._logged = angles
             return
+        if self._simulated is not None:
+            self.shared.capture.pause()
+            self._board = StoppableBoard(self._simulated.workcell.board)
         else:
-            board = StoppableBoard(open_motion_board(options.board, calibration=options.calibration))
+            board = StoppableBoard(open_motion_board(name, calibration=self.shared.options.servo_calibration))
             try:
-                require_joints(board, options.board, options.arm)
+                require_joints(board, name, self.model)
             except InputError:
                 board.close()
                 raise
             self._board = board
         try:
-            self._start = read_motions(options.arm, options.motion).start
+            self._start = read_motions(self.model, self.shared.motion).start
         except InputError as error:
-            self._say(Note("warn", f"{error}: name a file with motions of this arm"))
-        self._thread = threading.Thread(target=self._work, name="arm", daemon=True)
+            self.say("warn", f"{error}: name a file with motions of this arm")
+        self._thread = threading.Thread(target=self._work, args=(self._board,), name="arm", daemon=True)
         self._thread.start()
 
     def stop(self) -> StopAnswer:
@@ -290,67 +196,65 @@ class ArmStep:
             return StopAnswer(False, "no board is connected: nothing moves by this page", 0.0)
         try:
             board.stop()
+            stopped, state = board.rests, _state_text(board)
+            self.say("warn", f"stop: {state}")
         except ArmsightError as error:
-            took = 1e3 * (time.perf_counter() - began)
-            return StopAnswer(False, f"the board is gone, it reacts to the silence itself: {error}", took)
-        answer = StopAnswer(board.rests, _state_text(board), 1e3 * (time.perf_counter() - began))
-        self._say(Note("warn", f"stop: {answer.state}"))
-        return answer
+            stopped, state = False, f"the board is gone, it reacts to the silence itself: {error}"
+        return StopAnswer(stopped, state, 1e3 * (time.perf_counter() - began))
 
-    def hold(self, why: str) -> None:
+    def hold_for(self, reason: str) -> None:
         """Bring the arm to rest and hold it, if it moves."""
         if self.busy:
-            self._hold = why
+            self._hold = self.held = reason
+            self.say("warn", f"the arm is held: {reason}")
 
-    def run(self, *, closed: bool) -> None:
-        """Make the motions; calibrate hand and eye before, unless it was done.
+    @asked("arm")
+    def hold(self) -> None:
+        """Bring the arm to rest and hold it."""
+        self.hold_for("a person requested it")
 
-        Raises:
-            InputError: something is missing or a motion runs already.
-        """
-        self._require_ready()
+    @asked("arm")
+    def run_motions(self, closed: bool = True) -> None:
+        """Calibrate hand and eye and make the motions; ``closed``: a second time with the loop closed on vision."""
         if self.handeye.state.fitting:
             raise InputError("the hand-eye calibration is being computed: a moment")
         require_matplotlib()
         require_pyarrow()
-        self._hold = None
-        self._requested = lambda: self._run(closed=closed)
+        self._move(partial(self._run, closed))
 
-    def guide_handeye(self) -> None:
-        """Let the arm visit the poses of the guided hand-eye calibration by itself, until it is good.
+    @asked("arm")
+    def guide_hand_eye(self) -> None:
+        """Let the arm visit the poses of the hand-eye calibration by itself, until it is good."""
+        self._move(self._visit)
 
-        Raises:
-            InputError: as for :meth:`run`.
-        """
-        self._require_ready()
-        self._hold = None
-        self._requested = self._visit
-
+    @asked("arm")
     def go_to_start(self) -> None:
-        """Move the arm slowly to where the motions start.
+        """Move the arm slowly to where the motions start, as after a stop."""
+        self._move(self._to_start)
 
-        Raises:
-            InputError: as for :meth:`run`.
-        """
-        self._require_ready()
-        self._hold = None
-        self._requested = self._to_start
+    def _move(self, work: Callable[[], None]) -> None:
+        """Have the thread of the board do something that moves the arm, if nothing is missing."""
+        if missing := self._lacking():
+            raise InputError(missing)
+        self._require_rest()
+        if self._stopped():
+            raise InputError("the arm was stopped: allow the drives again first")
+        self._hold, self.held = None, ""
+        self._requested = work
 
+    @asked("arm")
     def take_pose(self) -> None:
-        """Take the pose in which the arm rests now for the hand-eye calibration.
-
-        Raises:
-            InputError: no joints are read, the body is not seen, something moves, or a pose like it was taken.
-        """
-        if self._running is not None:
+        """Take the pose in which the arm rests now for the hand-eye calibration."""
+        if self.shown.running is not None:
             raise InputError("the arm takes its poses by itself now: hold it first")
-        seen = self._measuring.lately(_REST_S if self._logged is None else np.inf)
-        if len(seen) < (_FEWEST_SEEN if self._logged is None else 1):
+        logged = self._logged
+        seen = self._measuring.lately(_REST_S if logged is None else np.inf)
+        if len(seen) < (_FEWEST_SEEN if logged is None else 1):
             raise InputError(self._measuring.why_missed or "the body is not seen now")
-        if self._logged is not None:
+        if logged is not None:
             seen, q = seen[-1:], self._logged_q()
             if q is None:
-                raise InputError(f"{self._logged.path}: no row belongs to this image")
+                raise InputError(f"{logged.path}: no row belongs to this image")
         else:
             now = time.monotonic()
             qs = np.array([q for at, q in list(self._lately) if now - at < _REST_S])
@@ -359,58 +263,51 @@ class ArmStep:
             if np.ptp(qs, axis=0).max() > _REST_RAD:
                 raise InputError("a joint moves: take poses at rest")
             q = qs.mean(axis=0)
-        p = np.array([pose.T_left_body[:3, 3] for pose in seen])
-        if np.ptp(p, axis=0).max() > _REST_M:
+        if np.ptp([pose.T_left_body[:3, 3] for pose in seen], axis=0).max() > _REST_M:
             raise InputError("the body moves: take poses at rest")
         self.handeye.add(VisitedPose.of(q, seen, np.zeros_like(q)))
         if self.handeye.next_q is None and self._measuring.rig is not None:
             self.handeye.begin(q[None], None, self._measuring.rig)
         self.handeye.fit_soon()
 
-    def identify_arm(self) -> None:
-        """Identify the arm from the poses of the hand-eye calibration, or of the last run.
+    @asked("arm", rest=True)
+    def clear_hand_eye(self) -> None:
+        """Forget the hand-eye calibration and its poses."""
+        self.handeye.clear()
 
-        Raises:
-            InputError: there are none.
-        """
-        poses = self.handeye.poses_file
-        if poses is None and self._run_folder is not None:
-            poses = self._run_folder / "handeye_poses.csv"
-        self.identify.start(self.options.arm_spec, poses)
+    @asked("arm")
+    def identify(self) -> None:
+        """Identify the arm from the poses of the hand-eye calibration, or of the last run."""
+        poses, folder = self.handeye.poses_file, self.shown.folder
+        if poses is None and folder is not None:
+            poses = Path(folder) / "handeye_poses.csv"
+        self._identifying.start(self.shared.options.arm, poses)
 
-    def use_arm(self, spec: str) -> None:
-        """Take another model of the arm, such as the corrected one; the hand-eye calibration is made anew from its poses.
+    @asked("arm")
+    def use_arm(self, arm: str) -> None:
+        """Use another model of the arm: a name, a TOML or a URDF file, such as the corrected one.
 
-        Raises:
-            InputError: it cannot be opened, or it has another number of joints.
+        The hand-eye calibration is made anew from its poses.
         """
         self._require_rest()
-        arm = slowed(open_arm(spec), self.options.board or "")
-        if arm.joints != self.options.arm.joints:
-            raise InputError(f"{spec} has {arm.joints} joints, {self.options.arm.name} {self.options.arm.joints}")
-        self.options = replace(self.options, arm=arm, arm_spec=spec)
-        self._mounting = None
-        self.handeye.use_arm(arm, spec)
-        self._say(Note("good", f"arm: {arm.name} ({spec})"))
+        model = slowed(open_arm(arm), self.shared.options.board or "")
+        if model.joints != self.model.joints:
+            raise InputError(f"{arm} has {model.joints} joints, {self.model.name} {self.model.joints}")
+        self.shared.options, self.model, self._mounting = replace(self.shared.options, arm=arm), model, None
+        self.handeye.use_arm(model, arm)
+        self.say("good", f"arm: {model.name} ({arm})")
 
+    @asked("arm")
     def use_motion(self, path: str) -> None:
-        """Take the motions of another file.
-
-        Raises:
-            InputError: it cannot be read, or the arm cannot make a motion.
-        """
+        """Use the motions of another file."""
         self._require_rest()
-        plan = read_motions(self.options.arm, path)
-        self.options, self._start = replace(self.options, motion=Path(path)), plan.start
-        self._say(Note("good", f"motions: {', '.join(each.name for each in plan.motions)} ({path})"))
+        plan = read_motions(self.model, path)
+        self.shared.motion, self._start = Path(path), plan.start
+        self.say("good", f"motions: {', '.join(each.name for each in plan.motions)} ({path})")
 
+    @asked("arm")
     def clear_stop(self) -> None:
-        """Allow the drives again after a stop.
-
-        Raises:
-            InputError: no board is connected.
-            DeviceError: the board rejects it.
-        """
+        """Allow the drives again after a stop; they stay off until the next motion."""
         if self._board is None:
             raise InputError("no board is connected")
         self._board.clear_stop()
@@ -419,146 +316,118 @@ class ArmStep:
         if self.busy:
             raise InputError("a motion runs already: hold or stop it first")
 
-    def _require_ready(self) -> None:
-        if missing := self._lacking():
-            raise InputError(missing)
-        self._require_rest()
-        if self._board is not None and self._stopped():
-            raise InputError("the arm was stopped: allow the drives again first")
-
     def _stopped(self) -> bool:
         board = self._board
         return board is not None and (board.stopped or board.status.state is BoardState.STOPPED)
 
     def close(self) -> None:
         """Hold the arm, end the thread, close the board."""
-        self.hold("the session has ended")
+        self.hold_for("the session has ended")
         self._closing.set()
         if self._thread is not None:
             self._thread.join(5.0)
-        self._writing.shutdown(wait=True)
+        self._pool.shutdown(wait=True)  # a run is being written
         self.handeye.close()
-        self.identify.close()
+        self._identifying.close()
         if self._board is not None and self._simulated is None:
             self._board.close()
 
     def _lacking(self) -> str:
         """Return what is missing for a run; empty where nothing is."""
-        measuring = self._measuring
         if self._logged is not None:
-            return f"{self.options.board} commands no motion: another program moves the arm"
+            return f"{self.shared.options.board} commands no motion: another program moves the arm"
         if self._board is None:
             return "the board is not connected"
-        if measuring.rig is None:
-            return "no calibrated rig yet: finish the calibration first, or give --rig"
-        if measuring.target_spec is None:
-            return "no body yet: choose one in the step Body"
-        if not measuring.followed:
-            return f"{measuring.target_spec} cannot be followed: the loop needs a body of three discs or more"
+        if lacking := self._measuring.lacking:
+            return lacking
+        if not self._measuring.followed:
+            return f"{self._measuring.target_spec} cannot be followed: the loop needs a body of three discs or more"
         return ""
 
-    def _work(self) -> None:
-        """Read the board until the session ends."""
-        board = self._board
-        assert board is not None
-        due = time.monotonic()
+    def _work(self, board: StoppableBoard) -> None:
+        """Read the board until the session ends, and do what is requested."""
+        due, simulated = time.monotonic(), self._simulated
         try:
             while not self._closing.is_set():
                 if self._requested is not None:
                     self._requested()
                     due = time.monotonic()
-                elif self._simulated is not None and self._simulated.workcell.source.rendering:
+                elif simulated is not None and simulated.workcell.source.rendering:
                     time.sleep(_ASK_S)  # its time waits for the images, and a stop does not
                     continue
                 states = board.receive(_IDLE_S)
                 if len(states.q):
                     self._q = states.q[-1]
                     self._lately.append((time.monotonic(), states.q[-1]))
-                if self._simulated is not None:
-                    simulated = (
-                        self._simulated
-                    )  # polled in every period, so that no image is rendered while a stop waits
+                if simulated is not None:  # polled in every period, so that no image is rendered while a stop waits
                     self._look(simulated.poll if simulated.person.holds else simulated.poll_now)
                     due = max(due + _IDLE_S, time.monotonic() - 0.1)
                     time.sleep(max(0.0, due - time.monotonic()))
-        except ArmsightError as error:
-            self._gone(board, str(error))
         except Exception as error:  # noqa: BLE001 - nobody else watches this thread; the board reacts to the silence itself
-            self._gone(board, f"{type(error).__name__}: {error}")
-
-    def _gone(self, board: StoppableBoard, why: str) -> None:
-        """Give the board up."""
-        self._say(Note("error", f"the board is disconnected: {why}"))
-        self._board, self._running, self._requested = None, None, None
-        if self._simulated is None:
-            board.close()
-        else:
-            self.capture.resume()
+            self.say("error", f"the board is disconnected: {why(error)}")
+            self._board = self._requested = None
+            self.show(running=None)
+            if simulated is None:
+                board.close()
+            else:
+                self.shared.capture.resume()
 
     def _look(self, poll: Callable[[], Shot | None]) -> Shot | None:
         """Return the newest shot of the workcell, and show it; a camera that is gone is only shown."""
+        capture = self.shared.capture
         try:
             shot = poll()
         except DeviceError as error:
-            if self.capture.problem != str(error):
-                self._say(Note("error", str(error)))
-            self.capture.problem = str(error)
-            if self._running is not None:
+            if capture.problem != str(error):
+                self.say("error", str(error))
+            capture.problem = str(error)
+            if self.shown.running is not None:
                 raise
             return None
-        if shot is not None:
-            self.capture.offer(shot)
-            newest = self.capture.newest
-            return None if newest is None else newest.shot
-        return None
+        if shot is None:
+            return None
+        capture.offer(shot)
+        newest = capture.newest
+        return None if newest is None else newest.shot
 
-    def _run(self, *, closed: bool) -> None:
+    def _run(self, closed: bool) -> None:
         """Run the experiment, and write its folder in another thread."""
-        began, handeye = time.perf_counter(), self.handeye.run
+        handeye, follow, folder = self.handeye.run, self.shared.options.follow_rig, unused(self.folder / "run")
         self._chart.clear()
-        folder: Path | None = None
         finished: Finished | None = None
 
         def work(setup: Setup, rig: StereoRig, plan: MotionPlan, targets: Array) -> RunResult:
-            nonlocal folder, finished
-            if self.options.follow_rig:
+            nonlocal finished
+            if follow:
                 require_followed(rig, Path(self._measuring.rig_path or "rig.json"))
-            folder = self._fresh()
-            make_room(folder)
-            write_text(folder / "motion.toml", read_text(self.options.motion))
-            body_text = read_text(str(self._measuring.target_spec))
-            write_text(folder / "body.toml", body_text)
-            rig.save(folder / "rig.json")
-            texts = properties(rig, body_text, setup.arm, command="live")
-            published = Published(rig, setup.target.body, setup.arm, texts)
-            warn = lambda line: self._say(Note("warn", line.removeprefix("note: ")))  # noqa: E731
-            with contextlib.closing(LazyMcap(folder, published, warn)) as file:
-                outcome = run_experiment(
-                    setup,
-                    rig,
-                    plan,
-                    targets,
-                    progress=self._progress,
-                    close_loop=closed,
-                    begun=self._begun,
-                    handeye=handeye,
-                    publisher=file,
-                    follow_rig=self.options.follow_rig,
-                )
-            of_run = {"arm": setup.arm.name, "board": setup.board.welcome.board}
-            finished = Finished(setup.arm, rig, outcome, plan, None, of_run, began, [], None)
-            return outcome
-
-        outcome = self._moving(work)
-        if outcome is None or finished is None or folder is None:
-            return
-        if outcome.ended_text is not None:
-            self._say(
-                Note("warn", f"the run has ended early: {outcome.ended_text}; what was measured is being written")
+            texts = (read_text(self.shared.motion), read_text(str(self._measuring.target_spec)))
+            finished = run_in(
+                folder,
+                setup,
+                rig,
+                plan,
+                targets,
+                dict(zip(("motion.toml", "body.toml"), texts, strict=True)),
+                command="live",
+                say=lambda line: self.say("warn", line.removeprefix("note: ")),
+                progress=self._progress,
+                close_loop=closed,
+                begun=self._begun,
+                handeye=handeye,
+                follow_rig=follow,
             )
-        self._take(outcome)
-        self._run_folder = folder
-        self._writing.submit(self._write, finished, folder)
+            return finished.outcome
+
+        outcome = self._moving("the run has ended early: {}; what was measured is being written", work)
+        if outcome is not None and finished is not None:
+            self.show(results=self._results(outcome), folder=str(folder))
+            self.later(str(folder), self._write, finished, folder)
+
+    def _write(self, finished: Finished, folder: Path) -> None:
+        summary = finish(finished, folder)
+        self.say("good", f"the run is written to {folder}: report.html, summary.json")
+        if summary.health:
+            self.say("error", f"do not trust this run: {summary.health[0].line()}")
 
     def _visit(self) -> None:
         """Visit the poses of the guided hand-eye calibration."""
@@ -566,22 +435,13 @@ class ArmStep:
         def work(setup: Setup, rig: StereoRig, plan: MotionPlan, targets: Array) -> RunResult:
             self.handeye.clear()
             self.handeye.begin(np.vstack([plan.start, targets]), setup.board.soft_limits(), rig)
-            return run_visits(
-                setup,
-                rig,
-                plan,
-                lambda loop: visit_poses(loop, self.handeye, plan.start, self._progress),
-                progress=self._progress,
-                begun=self._begun,
-            )
+            visit = lambda loop: visit_poses(loop, self.handeye, plan.start, self._progress)  # noqa: E731
+            return run_visits(setup, rig, plan, visit, progress=self._progress, begun=self._begun)
 
-        outcome = self._moving(work)
-        if outcome is not None and outcome.ended_text is not None:
-            self._say(Note("warn", f"the hand-eye calibration has ended early: {outcome.ended_text}"))
-        elif outcome is not None and (run := self.handeye.run) is not None:
+        outcome = self._moving("the hand-eye calibration has ended early: {}", work)
+        if outcome is not None and outcome.ended_text is None and (run := self.handeye.run) is not None:
             self._mounting = run.mounting
-            mm = 1e3 * run.found.held_out.rms()[0]
-            self._say(Note("good", f"hand-eye: {len(run.q)} poses, held out {mm:.2f} mm RMS"))
+            self.say("good", f"hand-eye: {len(run.q)} poses, held out {1e3 * run.found.held_out.rms()[0]:.2f} mm RMS")
 
     def _to_start(self) -> None:
         """Move slowly from where the arm is to the start."""
@@ -592,26 +452,18 @@ class ArmStep:
             here = np.clip(q, *setup.board.soft_limits())
             way = point_to_point(slow, np.clip(here, slow.q_min, slow.q_max), plan.start)
             require_range(setup, passed(way))
-
-            def move(loop: Loop) -> None:
-                self._running = "to the start"
-                segment = RunSegment("calibration", "to the start", "joints", False, trajectory=way)
-                loop.run(Planned(way, loop.t_s, setup.gravity), way.duration_s + 0.3, segment, watch=False)
-
+            move = lambda loop: go(loop, way, self._progress)  # noqa: E731
             return run_visits(setup, rig, plan, move, progress=self._progress, begun=self._begun, look=False)
 
-        outcome = self._moving(work, at_start=False)
-        if outcome is not None and outcome.ended_text is not None:
-            self._say(Note("warn", f"the way to the start has ended early: {outcome.ended_text}"))
+        self._moving("the way to the start has ended early: {}", work, at_start=False)
 
     def _moving(
-        self, work: Callable[[Setup, StereoRig, MotionPlan, Array], RunResult], *, at_start: bool = True
+        self, ended: str, work: Callable[[Setup, StereoRig, MotionPlan, Array], RunResult], *, at_start: bool = True
     ) -> RunResult | None:
-        """Do something that moves the arm, once all is there that it needs; None where it could not begin."""
-        measuring = self._measuring
-        self._running, self._seen = "preparing", 0
-        self._requested = None
-        rig, spec = measuring.rig, measuring.target_spec
+        """Do something that moves the arm; None where it could not begin; ``ended`` is said where it ends early."""
+        self.show(running="preparing")
+        self._seen, self._requested = 0, None
+        rig, spec = self._measuring.rig, self._measuring.target_spec
         assert rig is not None
         assert spec is not None
         try:
@@ -621,84 +473,57 @@ class ArmStep:
             plan, targets = self._plan()
             if at_start:
                 require_start(setup, plan, targets)
-            return work(setup, rig, plan, targets)
+            outcome = work(setup, rig, plan, targets)
         except ArmsightError as error:
-            self._say(Note("error", str(error)))
+            self.say("error", str(error))
             return None
         finally:
-            self._running, self._loop = None, None
-
-    def _write(self, finished: Finished, folder: Path) -> None:
-        try:
-            summary = finish(finished, folder)
-        except Exception as error:  # noqa: BLE001 - nobody else watches this thread
-            why = str(error) if isinstance(error, ArmsightError) else f"not written: {type(error).__name__}: {error}"
-            self._say(Note("error", f"{folder}: {why}"))
-            return
-        self._say(Note("good", f"the run is written to {folder}: report.html, summary.json"))
-        if summary.health:
-            self._say(Note("error", f"do not trust this run: {summary.health[0].line()}"))
+            self._loop = None
+            self.show(running=None)
+        if outcome.ended_text is not None:
+            self.say("warn", ended.format(outcome.ended_text))
+        return outcome
 
     def _setup(self, target: Composite) -> Setup:
         """Return the devices as the loop takes them."""
-        board, options = self._board, self.options
+        board, options, cameras = self._board, self.shared.options, self.shared.capture
         assert board is not None
         if self._simulated is not None:
-            simulated = self._simulated
-            poll = lambda: self._look(simulated.poll_now)  # noqa: E731
-            return replace(setup_of(simulated.workcell), arm=options.arm, board=board, target=target, poll=poll)
-        return Setup(
-            options.arm,
-            board,
-            self.capture.poll,
-            target,
-            np.zeros_like,
-            self.capture.rate_hz or options.rate_hz,
-            options.sync_s,
-            HostClock(),
-        )
+            poll = partial(self._look, self._simulated.poll_now)
+            return replace(setup_of(self._simulated.workcell), arm=self.model, board=board, target=target, poll=poll)
+        rate_hz = cameras.rate_hz or options.rate_hz
+        return Setup(self.model, board, cameras.poll, target, np.zeros_like, rate_hz, options.sync_s, HostClock())
 
     def _plan(self) -> tuple[MotionPlan, Array]:
         """Return the motions, and the joint angles (N, 6) of the hand-eye poses, rad."""
-        arm = self.options.arm
-        plan = read_motions(arm, self.options.motion)
+        arm = self.model
+        plan = read_motions(arm, self.shared.motion)
         ends = [plan.start, *(m.trajectory.at(m.trajectory.duration_s).q for m in plan.motions)]
         if self._simulated is not None:
             ends = list(np.vstack([arm.home, self._simulated.workcell.poses]))
         return plan, handeye_poses(arm, np.array(ends), _HANDEYE_POSES[self._simulated is not None], 0)
 
-    def _fresh(self) -> Path:
-        number, path = 1, self.folder / "run"
-        while path.exists():
-            number += 1
-            path = self.folder / f"run-{number}"
-        return path
-
     def _progress(self, line: str) -> None:
-        self._running = line
+        self.show(running=line)
 
     def _begun(self, loop: Loop) -> None:
         self._loop = loop
         loop.on_period = lambda: self._period(loop)
 
     def _period(self, loop: Loop) -> None:
-        """Look after a running loop, once a period: stop, hold, and what is to be shown.
-
-        Raises:
-            DeviceError: a person stopped or held the arm.
-        """
+        """Look after a running loop, once a period: end it by a DeviceError after a stop or a hold; and show it."""
         if self._board is not None and self._board.stopped:
             raise DeviceError(f"stopped by a person: {_state_text(self._board)}")
         if self._closing.is_set() or self._hold is not None:
-            why, self._hold = self._hold or "the session has ended", None
-            raise DeviceError(f"the arm is held: {why}")
+            reason, self._hold = self._hold or "the session has ended", None
+            raise DeviceError(f"the arm is held: {reason}")
         if len(loop.log.joints):
             self._q = loop.log.joints[-1].q[-1]
         if len(loop.log.poses) == self._seen:
             return
         self._seen = len(loop.log.poses)
         name, _, result = loop.log.poses[-1]
-        newest = self.capture.newest
+        newest = self.shared.capture.newest
         if newest is not None and newest.shot.name == name:
             self._measuring.take(newest, result)
         if isinstance(result, PoseEstimate) and loop.mounting is not None:
@@ -724,12 +549,12 @@ class ArmStep:
             return
         way = segment.trajectory
         since = way.duration_s if segment.phase == "rest" else now.t_s - segment.begin_s
-        reference = self.options.arm.forward(way.at(since).q)
+        reference = self.model.forward(way.at(since).q)
         away = now.T_base_tool[:3, 3] - reference[:3, 3]
         self._chart.append((now.t_s, 1e3 * float(np.linalg.norm(away)), segment.closed))
 
-    def _take(self, outcome: RunResult) -> None:
-        """Take in what a run found."""
+    def _results(self, outcome: RunResult) -> tuple[str, ...]:
+        """Return what a run found, line by line."""
         lines = []
         if outcome.handeye is not None:
             self._mounting, (position_m, angle_rad) = outcome.handeye.mounting, outcome.handeye.found.held_out.rms()
@@ -746,7 +571,7 @@ class ArmStep:
         if len(outcome.log.latency_s):
             p50, p99 = 1e3 * np.percentile(outcome.log.latency_s, (50, 99))
             lines.append(f"image to command: p50 {p50:.1f} ms, p99 {p99:.1f} ms")
-        self._results = tuple(lines)
+        return tuple(lines)
 
     @property
     def latency_s(self) -> tuple[float, float] | None:
@@ -757,61 +582,53 @@ class ArmStep:
         p50, p99 = np.percentile(list(loop.log.latency_s), (50, 99))
         return float(p50), float(p99)
 
-    @property
-    def state(self) -> ArmState:
-        """What to show now."""
-        options, board, loop = self.options, self._board, self._loop
-        plain = ArmState(
-            options.arm.name,
-            missing=self._lacking(),
-            handeye=self.handeye.state,
-            identify=self.identify.state,
-            motion_file=str(options.motion),
-            command=self._command(),
-        )
+    def now(self) -> ArmState:
+        """Return what is shown, with what joints and vision say now."""
+        options, board = self.shared.options, self._board
         q = self._q if self._logged is None else self._logged_q()
         vision, scene = self._vision(q)
-        plain = replace(
-            plain, q_deg=() if q is None else tuple(float(x) for x in np.degrees(q)), vision_deg=vision, scene=scene
+        shown = replace(
+            self.shown,
+            arm=self.model.name,
+            missing=self._lacking(),
+            handeye=self.handeye.state,
+            identify=self._identifying.state,
+            motion_file=str(self.shared.motion),
+            command=self._command(),
+            q_deg=() if q is None else tuple(np.degrees(q).tolist()),
+            vision_deg=vision,
+            scene=scene,
         )
         if self._logged is not None:
-            return replace(plain, board=options.board, state="joint angles of another program")
+            return replace(shown, board=options.board, state="joint angles of another program")
         if board is None:
-            return plain
+            return shown
         status = board.status
-        segment = None if loop is None else loop.segment
         state, faults = _state_text(board), tuple(str(fault) for fault in status.faults)
         if all(each.fault is Fault.HOST_SILENT for each in status.faults):  # as after every motion
             state = "held at rest by the board since the last motion" if status.state is BoardState.HOLDING else state
             faults = ()
+        off = 0.0 if q is None or self._start is None else float(np.abs(q - self._start).max())
         return replace(
-            plain,
+            shown,
             board=board.welcome.board,
             state=state,
-            drives_on=status.drives_on,
             stopped=self._stopped(),
             moves=True,
             lacks=board.abilities.missing,
             faults=faults,
-            running=self._running,
-            away=q is not None
-            and self._start is not None
-            and bool(np.abs(q - self._start).max() > start_rad(board.abilities)),
-            phase="" if segment is None else segment.phase,
-            motion="" if segment is None else segment.motion,
+            away=off > start_rad(board.abilities),
             error_mm=tuple((round(t, 3), round(e, 4), c) for t, e, c in list(self._chart)),
-            results=self._results,
-            folder=None if self._run_folder is None else str(self._run_folder),
         )
 
     def _command(self) -> str:
         """The command that runs the same."""
-        options, measuring = self.options, self._measuring
-        motion = f" --motion {options.motion}{' --follow-rig' * options.follow_rig}" if self._logged is None else ""
+        options, measuring = self.shared.options, self._measuring
+        motion = f" --motion {self.shared.motion}{' --follow-rig' * options.follow_rig}" if self._logged is None else ""
         return (
-            f"armsight run --source {options.source} --board {options.board or 'serial:PORT'} --rig "
+            f"armsight run --source {self.shared.source} --board {options.board or 'serial:PORT'} --rig "
             f"{measuring.rig_path or 'rig.json'} --target {measuring.target_spec or 'body.toml'} "
-            f"--arm {options.arm_spec}{motion} -o run"
+            f"--arm {options.arm}{motion} -o run"
         )
 
     def _logged_q(self) -> Array | None:
@@ -829,16 +646,16 @@ class ArmStep:
         """Return vision's joint angles less the readings, degrees, and the arm's joints in the left camera's frame, m."""
         run = self.handeye.run
         mounting = run.mounting if run is not None and self._loop is None else self._mounting
-        newest, arm = self._measuring.newest, self.options.arm
+        newest, arm = self._measuring.newest, self.model
         if mounting is None or q is None:
             return (), ()
         T_left_base = inverse(mounting.T_base_rig)
         frames = np.concatenate([arm.T_base_0[None], arm.links(q), arm.forward(q)[None]])
-        scene = tuple(tuple(round(float(x), 4) for x in T[:3, 3]) for T in T_left_base @ frames)
+        scene = tuple(map(tuple, (T_left_base @ frames)[:, :3, 3].round(4).tolist()))
         if newest is None or isinstance(newest[1], Missed):
             return (), scene
         T = mounting.pose_measurement(newest[1], newest[0].shot.t_s or 0.0).T_base_tool
-        return tuple(float(x) for x in np.degrees(likely_joint_errors(arm, q, T))), scene
+        return tuple(np.degrees(likely_joint_errors(arm, q, T)).tolist()), scene
 
 
 def _state_text(board: StoppableBoard) -> str:

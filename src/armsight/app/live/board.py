@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -32,15 +32,13 @@ _SLICE_S = 0.004
 _ENDED = (BoardState.STOPPED, BoardState.DISABLED, BoardState.FAULTED)
 
 
+def _of_board(name: str) -> Any:  # noqa: ANN401 - a property
+    """Return the property of that name of the board inside, which is read without waiting."""
+    return property(lambda self: getattr(self._board, name))
+
+
 class StoppableBoard:
-    """A board that any thread can stop.
-
-    Args:
-        board: the board; nobody else may use it from now on.
-
-    Attributes:
-        stopped: whether a person stopped it, until :meth:`clear_stop`.
-    """
+    """A board that any thread can stop; ``stopped`` says whether a person did, until :meth:`clear_stop`."""
 
     def __init__(self, board: MotionBoard) -> None:
         self._board, self.stopped = board, False
@@ -49,30 +47,11 @@ class StoppableBoard:
         self._free.set()
         self._kept: list[JointStates] = []
 
-    @property
-    def abilities(self) -> Abilities:
-        """What it can do."""
-        return self._board.abilities
-
-    @property
-    def welcome(self) -> Welcome:
-        """Who it is."""
-        return self._board.welcome
-
-    @property
-    def status(self) -> BoardStatus:
-        """Its newest status."""
-        return self._board.status
-
-    @property
-    def joints(self) -> JointReport:
-        """Its newest report of how the joints are driven."""
-        return self._board.joints
-
-    @property
-    def broken_messages(self) -> int:
-        """Number of broken or missing messages from it."""
-        return self._board.broken_messages
+    abilities: Abilities = _of_board("abilities")
+    welcome: Welcome = _of_board("welcome")
+    status: BoardStatus = _of_board("status")
+    joints: JointReport = _of_board("joints")
+    broken_messages: int = _of_board("broken_messages")
 
     @contextmanager
     def _held(self) -> Iterator[MotionBoard]:
@@ -124,13 +103,14 @@ class StoppableBoard:
     def receive(self, wait_s: float = 0.0) -> JointStates:
         """Let ``wait_s`` pass and return all readings since the last call, those too that came during a stop."""
         parts: list[JointStates] = []
-        for part_s in (*[_SLICE_S] * max(math.ceil(wait_s / _SLICE_S - 1e-9) - 1, 0), None):
+        slices = max(math.ceil(wait_s / _SLICE_S - 1e-9) - 1, 0)
+        for part_s in (*[_SLICE_S] * slices, max(wait_s - slices * _SLICE_S, 0.0)):
             with self._held() as board:
-                rest_s = wait_s - _SLICE_S * len(parts) if part_s is None else part_s
-                states = board.receive(max(rest_s, 0.0))
-                kept, self._kept = self._kept, []
-            parts.append(_joined([*kept, states]))
-        return _joined(parts)
+                states, kept, self._kept = board.receive(part_s), self._kept, []
+                parts += [*kept, states]
+        if len(parts) == 1:
+            return parts[0]
+        return JointStates(np.concatenate([each.t_s for each in parts]), np.concatenate([each.q for each in parts]))
 
     def stop(self) -> None:
         """Stop in an emergency, from any thread, and wait until the board says that it did, ``ANSWER_S`` at most."""
@@ -167,10 +147,3 @@ class StoppableBoard:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _joined(parts: list[JointStates]) -> JointStates:
-    """Return batches of readings as one."""
-    if len(parts) == 1:
-        return parts[0]
-    return JointStates(np.concatenate([each.t_s for each in parts]), np.concatenate([each.q for each in parts]))

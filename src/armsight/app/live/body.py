@@ -1,128 +1,169 @@
-"""The body that is measured: drawn to scale, and checked before it is built.
+"""What is printed: the calibration board, and the body that is measured; drawn to scale, the body checked before.
 
-In: a body file or a board's spec. Out: a :class:`BodyState`, and a PDF in the folder of the session. What is checked is
-what ``armsight body check`` checks, with the session's own rig once there is one.
+In: a board's spec, a body file. Out: a :class:`BoardChoice` and a :class:`BodyState`, and PDFs in the folder of the
+session. What is checked is what ``armsight body check`` checks, with the session's own rig once there is one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from armsight.app.body.check import assess
 from armsight.app.body.draw import draw_body, is_board_spec
 from armsight.app.body.text import body_report
-from armsight.app.show.messages import Note
-from armsight.errors import ArmsightError
+from armsight.app.live.calibration import CalibrationStep
+from armsight.app.live.guide import CalibrationAim
+from armsight.app.live.measuring import MeasureStep
+from armsight.app.live.records import asked
+from armsight.app.live.step import PageStep, S, Shared
+from armsight.errors import ArmsightError, InputError
+from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_layout import read_layout
 from armsight.vision.markers.targets import open_target
 from armsight.vision.pose.predict import plain_rig
 from armsight.vision.rig import StereoRig
 
 _DISTANCES_M = (0.6, 0.8, 1.2)
+_BAR_MM = 100.0  # the bar on a drawing
+
+
+class _Drawn(PageStep[S]):
+    """A step with a drawing."""
+
+    def draw(self, target: str, name: str, paper: str) -> None:
+        """Draw a body or a board to NAME.pdf in the background."""
+        self.later("the drawing cannot be made", self._draw, target, self.folder / f"{name}.pdf", paper)
+
+    def _draw(self, target: str, path: Path, paper: str) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for note in draw_body(target, path, paper=paper, split=True).notes:
+            self.say("hint", note)
+        self.say("good", f"drawn to {path}: print at 100%, and measure the bar")
+        self.show(drawing=str(path))
+
+
+@dataclass(frozen=True)
+class BoardChoice:
+    """The calibration board."""
+
+    spec: str = ""  # as it is used
+    size_mm: tuple[float, float] = (0.0, 0.0)  # from the first to the last point
+    points: int = 0
+    drawing: str | None = None
+    measured_mm: float | None = None  # length of the bar on the print; None where nobody measured it
+    command: str = ""  # the command line that draws it
+
+
+class BoardStep(_Drawn[BoardChoice]):
+    """Chooses the board, and has the calibration by it; ``changed`` is called with a rig once it is written."""
+
+    def __init__(self, shared: Shared, spec: str, changed: Callable[[StereoRig, Path], None]) -> None:
+        super().__init__(shared, BoardChoice())
+        self._changed = changed
+        self.calibration = self._begin(spec, CalibrationAim())
+
+    def _begin(self, spec: str, aim: CalibrationAim) -> CalibrationStep:
+        step = CalibrationStep(self.shared, spec, aim, self._changed)
+        width, height, _ = 1e3 * np.ptp(step.board.body.points, axis=0)
+        command = f"armsight body draw {spec} -o {self.folder}/board.pdf"
+        self.show(spec=spec, size_mm=(width, height), points=len(step.board.body.points), command=command)
+        return step
+
+    @asked("board", rest=True)
+    def use_board(self, spec: str, measured_mm: float = 0.0) -> None:
+        """Use another calibration board; ``measured_mm`` is the length of the printed bar, 0 where nobody measured it."""
+        board = open_board(spec)
+        if measured_mm and not 0.8 * _BAR_MM < measured_mm < 1.2 * _BAR_MM:
+            raise InputError(
+                f"the bar on the print is {_BAR_MM:g} mm long by the drawing; {measured_mm:g} mm cannot be right"
+            )
+        before = self.calibration
+        self.calibration = self._begin(scaled_spec(spec, measured_mm / _BAR_MM) if measured_mm else spec, before.aim)
+        before.close()
+        self.show(measured_mm=measured_mm or None)
+        self.say("good", f"board: {board.body.name}")
+
+    @asked("board")
+    def draw_board(self, paper: str = "a4") -> None:
+        """Draw the calibration board as a PDF to scale."""
+        self.draw(self.shown.spec, "board", paper)
+
+    def close(self) -> None:
+        """End the threads."""
+        super().close()
+        self.calibration.close()
+
+
+def scaled_spec(spec: str, factor: float) -> str:
+    """Return a board's spec with its lengths multiplied: as it was printed."""
+    kind, *fields = spec.split(":")
+    scaled = []
+    for field in fields:
+        for unit in ("mm", "cm", "in", "m"):
+            number = field.removesuffix(unit)
+            if field.endswith(unit) and number.replace(".", "", 1).isdigit():
+                field = f"{float(number) * factor:.6g}{unit}"
+                break
+        scaled.append(field)
+    return ":".join((kind, *scaled))
 
 
 @dataclass(frozen=True)
 class BodyState:
-    """What a page shows of the body.
+    """What a page shows of the body."""
 
-    Attributes:
-        target: body file or spec of a board; None without one.
-        points: how many points it has.
-        size_mm: its extent along its axes, mm.
-        working: what is being computed; None while nothing is.
-        lines: the assessment, as ``armsight body check`` prints it.
-        grade: usable, weak or bad; empty where nothing was assessed.
-        drawing: the PDF; None before it is drawn.
-        command: the command lines that do the same.
-    """
-
-    target: str | None = None
+    target: str | None = None  # body file or spec of a board
     points: int = 0
-    size_mm: tuple[float, ...] = ()
-    working: str | None = None
-    lines: tuple[str, ...] = ()
-    grade: str = ""
+    size_mm: tuple[float, ...] = ()  # its extent along its axes
+    working: str | None = None  # what is being computed
+    lines: tuple[str, ...] = ()  # the assessment, as ``armsight body check`` prints it
+    grade: str = ""  # usable, weak or bad; empty where nothing was assessed
     drawing: str | None = None
-    command: str = ""
+    command: str = ""  # the command lines that do the same
 
 
-class BodyStep:
-    """Assesses and draws one body.
+class BodyStep(_Drawn[BodyState]):
+    """Assesses and draws one body, and has it measured."""
 
-    Args:
-        folder: of the session.
-        say: called with a note for the person.
-    """
+    def __init__(self, shared: Shared, measuring: MeasureStep) -> None:
+        super().__init__(shared, BodyState())
+        self._measuring = measuring
 
-    def __init__(self, folder: Path, say: Callable[[Note], None]) -> None:
-        self.folder, self._say = folder, say
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="body")
-        self._state = BodyState()
-
-    @property
-    def state(self) -> BodyState:
-        """What to show now."""
-        return self._state
-
-    def use(self, target: str, rig: tuple[StereoRig, Path] | None) -> None:
-        """Take a body, and assess it in the background.
-
-        Args:
-            target: a body file or the spec of a board.
-            rig: the calibrated cameras and their file; two perfect HD cameras by default.
-
-        Raises:
-            InputError: it is neither.
-        """
+    @asked("body", rest=True)
+    def use_body(self, target: str) -> None:
+        """Use a body file, or the board, as what is measured; it is assessed in the background."""
         points = open_target(target).body.points
-        size = tuple(float(1e3 * x) for x in points.max(axis=0) - points.min(axis=0))
-        at = f" --rig {rig[1]}" if rig is not None else ""
-        check = "" if is_board_spec(target) else f"armsight body check {target}{at}; "
-        command = f"{check}armsight body draw {target} -o {self.folder}/body.pdf"
-        working = None if is_board_spec(target) else "assessing"
-        self._state = BodyState(target, len(points), size, working, command=command)
-        if working is not None:
-            self._pool.submit(self._assess, target, rig)
-
-    def _assess(self, target: str, rig: tuple[StereoRig, Path] | None) -> None:
-        begun = self._state
-        lines: tuple[str, ...]
-        try:
-            layout = read_layout(target)
-            cameras = plain_rig() if rig is None else rig[0]
-            found = assess(layout, cameras, _DISTANCES_M)
-            report = body_report(target, layout, cameras, None if rig is None else str(rig[1]), found)
-            lines, grade = tuple(report.text().splitlines()), str(found.grade)
-        except ArmsightError as error:
-            lines, grade = (str(error),), "bad"
-        if self._state is begun:
-            self._state = BodyState(
-                begun.target, begun.points, begun.size_mm, None, lines, grade, begun.drawing, begun.command
-            )
-
-    def draw(self, target: str, name: str, paper: str) -> None:
-        """Draw a body or a board to NAME.pdf in the background."""
-        self._pool.submit(self._draw, target, self.folder / f"{name}.pdf", paper)
-
-    def _draw(self, target: str, path: Path, paper: str) -> None:
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            drawing = draw_body(target, path, paper=paper, split=True)
-        except (ArmsightError, OSError) as error:
-            self._say(Note("error", f"the drawing cannot be made: {error}"))
+        self._measuring.use_target(target)
+        size = tuple(float(1e3 * x) for x in np.ptp(points, axis=0))
+        draw, rig_path = f"armsight body draw {target} -o {self.folder}/body.pdf", self._measuring.rig_path
+        if is_board_spec(target):
+            self.shown = BodyState(target, len(points), size, command=draw)
             return
-        for note in drawing.notes:
-            self._say(Note("hint", note))
-        self._say(Note("good", f"drawn to {path}: print at 100%, and measure the bar"))
-        now = self._state
-        if path.stem == "body":
-            self._state = BodyState(
-                now.target, now.points, now.size_mm, now.working, now.lines, now.grade, str(path), now.command
-            )
+        at = "" if rig_path is None else f" --rig {rig_path}"
+        command = f"armsight body check {target}{at}; {draw}"
+        self.shown = BodyState(target, len(points), size, "assessing", command=command)
+        self.later("the body was not assessed", self._assess, target, self._measuring.rig, rig_path)
 
-    def close(self) -> None:
-        """End the thread."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+    def _assess(self, target: str, rig: StereoRig | None, path: Path | None) -> None:
+        lines: list[str]
+        try:
+            layout, cameras = read_layout(target), plain_rig() if rig is None else rig
+            found = assess(layout, cameras, _DISTANCES_M)
+            lines = body_report(target, layout, cameras, None if rig is None else str(path), found).text().splitlines()
+            grade = str(found.grade)
+        except ArmsightError as error:
+            lines, grade = [str(error)], "bad"
+        with self.lock:
+            if self.shown.target == target:  # no other one was chosen meanwhile
+                self.shown = replace(self.shown, working=None, lines=tuple(lines), grade=grade)
+
+    @asked("body")
+    def draw_body(self, paper: str = "a4") -> None:
+        """Draw the body as a PDF to scale."""
+        if self.shown.target is None:
+            raise InputError("no body yet: choose one first")
+        self.draw(self.shown.target, "body", paper)

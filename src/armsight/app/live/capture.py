@@ -6,6 +6,7 @@ opened again every few seconds: a cable that is put back continues the work.
 
 from __future__ import annotations
 
+import contextlib
 import statistics
 import threading
 import time
@@ -26,13 +27,7 @@ _UNTIMED_S, _LONGEST_PAUSE_S = 0.1, 1.0  # between shots of a recording without 
 
 @dataclass(frozen=True, eq=False)
 class LiveShot(Record):
-    """A shot and when it came.
-
-    Attributes:
-        shot: the shot; left and right as the user has them.
-        number: counts the shots of this capture from 1.
-        arrived_s: when it came, time.monotonic, s.
-    """
+    """A shot, left and right as the user has them; its number in this capture, from 1; when it came, time.monotonic, s."""
 
     shot: Shot
     number: int
@@ -51,34 +46,22 @@ class CameraCapture:
     Args:
         opening: opens the source; called in the thread.
         failed: called with why there are no images, once for each cause.
-
-    Attributes:
-        swapped: whether left and right are exchanged.
-        problem: why there are no images now; None while there are.
     """
 
     def __init__(self, opening: Callable[[], Source], failed: Callable[[str], None] = lambda problem: None) -> None:
         self._opening, self._say = opening, failed
-        self.swapped, self.problem = False, None
+        self.newest: LiveShot | None = None
+        self.swapped = False  # left and right are exchanged
+        self.problem: str | None = None  # why there are no images now
         self._changed = threading.Condition()
-        self._newest: LiveShot | None = None
         self._polled = 0
         self._intervals: deque[float] = deque(maxlen=_INTERVALS)
-        self._ended = threading.Event()
-        self._paused = threading.Event()
-        self._idle = threading.Event()
+        self._ended, self._paused, self._idle = threading.Event(), threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
-
-    problem: str | None
 
     def start(self) -> None:
         """Start reading."""
         self._thread.start()
-
-    @property
-    def newest(self) -> LiveShot | None:
-        """The newest shot."""
-        return self._newest
 
     @property
     def rate_hz(self) -> float | None:
@@ -95,17 +78,12 @@ class CameraCapture:
     def after(self, number: int, patience_s: float) -> LiveShot | None:
         """Wait for a shot newer than the one of a number; None where none comes in time."""
         with self._changed:
-            self._changed.wait_for(lambda: self._newest is not None and self._newest.number > number, patience_s)
-            newest = self._newest
-        return newest if newest is not None and newest.number > number else None
+            newer = self._changed.wait_for(lambda: self.newest is not None and self.newest.number > number, patience_s)
+            return self.newest if newer else None
 
     def poll(self) -> Shot | None:
-        """Return the newest shot not returned yet, for a control loop.
-
-        Raises:
-            DeviceError: a camera is gone.
-        """
-        newest = self._newest
+        """Return the newest shot not returned yet, for a control loop."""
+        newest = self.newest
         if newest is not None and newest.number > self._polled:
             self._polled = newest.number
             return newest.shot
@@ -118,10 +96,10 @@ class CameraCapture:
             shot = replace(shot, left=shot.right, right=shot.left, encoded=encoded)
         now = time.monotonic()
         with self._changed:
-            before = self._newest
+            before = self.newest
             if before is not None:
                 self._intervals.append(now - before.arrived_s)
-            self._newest = LiveShot(shot, 1 if before is None else before.number + 1, now)
+            self.newest = LiveShot(shot, 1 if before is None else before.number + 1, now)
             self.problem = None
             self._changed.notify_all()
 
@@ -143,17 +121,18 @@ class CameraCapture:
     def _run(self) -> None:
         while not self._ended.is_set():
             try:
-                source = self._opening()
+                with contextlib.closing(self._opening()) as source:
+                    self._read(source)
+                problem = "the recording has ended; it is shown again"
             except ArmsightError as error:
-                self._failed(str(error))
-                continue
-            try:
-                self._read(source)
-            finally:
-                source.close()
+                problem = str(error)
+            except Exception as error:  # noqa: BLE001 - nobody else watches this thread
+                problem = f"reading the cameras failed: {type(error).__name__}: {error}"
+            if not self._ended.is_set():
+                self._failed(problem)
 
     def _read(self, source: Source) -> None:
-        """Read until the source fails or ends."""
+        """Read until the source ends."""
         before: Shot | None = None
         while not self._ended.is_set():
             if self._paused.is_set():
@@ -161,16 +140,7 @@ class CameraCapture:
                 time.sleep(0.02)
                 continue
             self._idle.clear()
-            try:
-                shot = source.read()
-            except ArmsightError as error:
-                self._failed(str(error))
-                return
-            except Exception as error:  # noqa: BLE001 - nobody else watches this thread
-                self._failed(f"reading the cameras failed: {type(error).__name__}: {error}")
-                return
-            if shot is None:
-                self._failed("the recording has ended; it is shown again")
+            if (shot := source.read()) is None:
                 return
             if shot.problem is not None:
                 self.problem = shot.problem
@@ -181,7 +151,7 @@ class CameraCapture:
 
     def _pace(self, before: Shot | None, shot: Shot) -> None:
         """Wait until a recorded shot is due: a recording is shown at its own pace."""
-        newest, now = self._newest, time.monotonic()
+        newest, now = self.newest, time.monotonic()
         if before is None or newest is None or (shot.t_s is not None and 0.0 <= now - shot.t_s < _LIVE_S):
             return
         apart_s = _UNTIMED_S if shot.t_s is None or before.t_s is None else shot.t_s - before.t_s

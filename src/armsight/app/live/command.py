@@ -6,11 +6,12 @@ import json
 import secrets
 import time
 from pathlib import Path
+from typing import Any
 
 import click
 
 from armsight.app.arm_option import arm_option
-from armsight.errors import InputError
+from armsight.app.show.messages import require
 
 _HERE = ("127.0.0.1", "localhost", "::1")
 
@@ -25,14 +26,22 @@ _HERE = ("127.0.0.1", "localhost", "::1")
     help="The arm's controller: serial:PORT, feetech:PORT, ar4:PORT; poses:FILE where another program moves it.",
 )
 @click.option(
-    "--calibration", type=click.Path(path_type=Path), help="LeRobot's calibration file of the servo bus, with feetech:."
+    "--calibration",
+    "servo_calibration",
+    type=click.Path(path_type=Path),
+    help="LeRobot's calibration file of the servo bus, with feetech:.",
 )
 @arm_option(
     "--arm", default="six_r", show_default=True, help="The arm: a name (armsight arm list), a .toml or a .urdf file."
 )
 @click.option("--motion", type=click.Path(path_type=Path), help="The motions (TOML, docs/howto/run.md).")
 @click.option(
-    "--rate", type=click.FloatRange(0.1, 1000.0), default=30.0, show_default=True, help="Rate of the cameras, Hz."
+    "--rate",
+    "rate_hz",
+    type=click.FloatRange(0.1, 1000.0),
+    default=30.0,
+    show_default=True,
+    help="Rate of the cameras, Hz.",
 )
 @click.option(
     "--sync-ms",
@@ -44,6 +53,7 @@ _HERE = ("127.0.0.1", "localhost", "::1")
 @click.option(
     "-o",
     "--output",
+    "folder",
     default="live",
     show_default=True,
     metavar="DIR",
@@ -60,27 +70,11 @@ _HERE = ("127.0.0.1", "localhost", "::1")
     help="Put the rig right during a run where its cameras, or both, moved (docs/concepts/health.md).",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the simulated workcell.")
-@click.option("--stream", multiple=True, metavar="STREAM", help="Publish every shot measured: see armsight measure -h.")
+@click.option(
+    "--stream", "streams", multiple=True, metavar="STREAM", help="Publish every shot measured: see armsight measure -h."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the address as one JSON object.")
-def command(
-    source: str | None,
-    rig: Path | None,
-    target: str | None,
-    calibration_board: str | None,
-    board: str | None,
-    calibration: Path | None,
-    arm: str,
-    motion: Path | None,
-    rate: float,
-    sync_ms: float,
-    output: Path,
-    host: str,
-    port: int,
-    follow_rig: bool,
-    seed: int,
-    stream: tuple[str, ...],
-    as_json: bool,
-) -> None:
+def command(host: str, port: int, sync_ms: float, as_json: bool, **given: Any) -> None:  # noqa: ANN401 - options' fields
     """Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.
 
     The steps: cameras, board, calibration, body, measuring, arm, health; each shows the command line that does the same.
@@ -88,39 +82,23 @@ def command(
     The page is for this computer alone. With --host it is opened from another one, by the address with the token that is
     printed. The button on the page and the space key stop the arm; the wired stop is the safety device.
     """
-    try:
-        import websockets  # noqa: F401 - only whether it is there
-    except ImportError:
-        raise InputError('the page needs websockets, which is not installed: pip install "armsight[live]"') from None
+    require("the page", "live", "websockets")
 
     from armsight.app.live.server import LiveServer
-    from armsight.app.live.session import SIM, LiveSession, SessionOptions
+    from armsight.app.live.session import LiveSession
+    from armsight.app.live.step import SIM, SessionOptions
     from armsight.app.stream.datum import Published
     from armsight.app.stream.streams import open_streams
     from armsight.vision.sources import check_source
     from armsight.vision.sources.usb import is_one, parsed_usb
 
-    if source is not None and not source.startswith(SIM):
+    options = SessionOptions(**given, sync_s=1e-3 * sync_ms)
+    source = options.source or ""
+    if options.source is not None and not source.startswith(SIM):
         check_source(source)
-    if source is not None and source.startswith("usb:") and not is_one(source.removeprefix("usb:")):
+    if source.startswith("usb:") and not is_one(source.removeprefix("usb:")):
         parsed_usb(source.removeprefix("usb:"))  # cameras may come later, their names may not; one alone the page says
-    open_streams(stream, Published(), lambda line: click.echo(line, err=True)).close()  # a mistake is said now
-    options = SessionOptions(
-        output,
-        source,
-        rig,
-        target,
-        calibration_board,
-        board,
-        arm,
-        motion,
-        rate,
-        1e-3 * sync_ms,
-        seed,
-        calibration,
-        stream,
-        follow_rig,
-    )
+    open_streams(options.streams, Published(), lambda line: click.echo(line, err=True)).close()  # a mistake is said now
     session = LiveSession(options)
     server = LiveServer(session, host, port, None if host in _HERE else secrets.token_urlsafe(18))
     try:

@@ -42,29 +42,17 @@ _SHOTS_AHEAD = 12
 
 @dataclass(frozen=True)
 class CalibrationAim:
-    """What a calibration is to be good for.
+    """What a calibration is to be good for."""
 
-    Attributes:
-        error_m: predicted error that the calibration may leave in a point, RMS over the working volume, m.
-        distance_m: distance of the working volume's middle, m; it reaches a quarter nearer and farther.
-    """
-
-    error_m: float = 2e-4
-    distance_m: float = 0.8
+    error_m: float = 2e-4  # predicted error that it may leave in a point, RMS over the working volume
+    distance_m: float = 0.8  # of the volume's middle; it reaches a quarter nearer and farther
 
 
 @dataclass(frozen=True, eq=False)
 class NextPose(Record):
-    """The pose to show next.
-
-    Attributes:
-        T_left_board: (4, 4) the pose, left camera's frame.
-        now_m: predicted error now, m; NaN before the first calibration.
-        then_m: predicted error after a shot of it, m.
-    """
+    """The pose to show next, left camera's frame, and the predicted error after a shot of it (NaN before the first fit)."""
 
     T_left_board: Array
-    now_m: float
     then_m: float
 
 
@@ -75,15 +63,14 @@ def working_points(rig: StereoRig, distance_m: float) -> Array:
     rays = rig.left.unproject(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
     rays = rays[np.isfinite(rays).all(axis=1)]
     points = np.concatenate([share * distance_m * rays for share in _DEPTHS])
-    uv = rig.right.project(transform(inverse(rig.T_left_right), points))
-    size = np.array(rig.right.image_size_px)
+    uv, size = rig.project(points)[1], np.array(rig.right.image_size_px)
     with np.errstate(invalid="ignore"):
         return np.asarray(points[((uv > 0) & (uv < size - 1)).all(axis=1)])
 
 
 def error_weights(rig: StereoRig, points: Array) -> Array:
     """Return W (P, P): the mean squared error of points (N, 3) under a covariance C of the rig's parameters is tr(W C)."""
-    uv = np.stack([rig.left.project(points), rig.right.project(transform(inverse(rig.T_left_right), points))], axis=1)
+    uv = np.stack(rig.project(points), axis=1)
     _, _, by_rig = optimal_points(rig, uv, np.tile(np.eye(2), (len(uv), 2, 1, 1)))
     by_rig = by_rig[np.isfinite(by_rig).all(axis=(1, 2))]
     flat = by_rig.reshape(-1, by_rig.shape[2])
@@ -92,21 +79,13 @@ def error_weights(rig: StereoRig, points: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Knowledge(Record):
-    """What the shots so far determine about the Q shared parameters of bundle adjustment.
-
-    Attributes:
-        model: the board.
-        state: cameras, relative pose, shape; no shots.
-        root: (Q, Q) L of the covariance L L^T.
-        sigma_px: standard deviation of a detection, px.
-        weights: (P, P) as :func:`error_weights`.
-    """
+    """What the shots so far determine about the Q shared parameters of bundle adjustment."""
 
     model: BundleModel
-    state: BundleState
-    root: Array
-    sigma_px: float
-    weights: Array
+    state: BundleState  # cameras, relative pose, shape; no shots
+    root: Array  # (Q, Q) L of the covariance L L^T
+    sigma_px: float  # of a detection
+    weights: Array  # (P, P) as error_weights
 
     @staticmethod
     def of(calibration: Calibration, board: CalibrationBoard, aim: CalibrationAim) -> Knowledge:
@@ -146,8 +125,7 @@ class Knowledge(Record):
             count,
         )
         _, J_shared, J_shot = predict(self.model, replace(self.state, Ts_left_body=Ts_left_board), observations)
-        A = J_shared.reshape(count, 2 * rows, -1) / self.sigma_px
-        B = J_shot.reshape(count, 2 * rows, -1) / self.sigma_px
+        A, B = (J.reshape(count, 2 * rows, -1) / self.sigma_px for J in (J_shared, J_shot))
         A = A @ self.root
         cross = B.transpose(0, 2, 1) @ A
         own = np.linalg.solve(B.transpose(0, 2, 1) @ B, cross)
@@ -165,24 +143,15 @@ class Knowledge(Record):
 
 
 class Guide:
-    """Chooses poses of a board.
-
-    Args:
-        board: the board.
-        seed: of the candidates.
-    """
+    """Chooses poses of a board; ``outline`` is its sheet: (4, 3) corners, m, board frame."""
 
     def __init__(self, board: CalibrationBoard, seed: int = 0) -> None:
         self._rng = np.random.default_rng([seed, 22])
         points = board.body.points
-        low, high = points.min(axis=0), points.max(axis=0)
-        pitch = float(np.linalg.norm(points[1] - points[0]))
-        border = np.array([pitch, pitch, 0.0])
-        low, high = low - border, high + border
-        self._middle = (low + high) / 2
-        self.diagonal_m = float(np.linalg.norm(high - low))
+        border = np.linalg.norm(points[1] - points[0]) * np.array([1.0, 1.0, 0.0])
+        low, high = points.min(axis=0) - border, points.max(axis=0) + border
+        self._middle, self._diagonal_m = (low + high) / 2, float(np.linalg.norm(high - low))
         edges = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
-        #: (4, 3) corners of the board's sheet, m, board frame.
         self.outline = np.array([(x, y, 0.0) for x, y in edges])
         self._flip = np.diag([1.0, -1.0, -1.0]) if board.y_up else np.eye(3)
 
@@ -217,7 +186,7 @@ class Guide:
             n = 2 * count
             uv = self._rng.uniform(0.05, 0.95, (n, 2)) * (width, height)
             fill = self._rng.uniform(*_FILL, n)
-            distance = rig.left.intrinsics[0] * self.diagonal_m / (fill * height)
+            distance = rig.left.intrinsics[0] * self._diagonal_m / (fill * height)
             about, tilt = self._rng.uniform(0, 2 * np.pi, n), _TILT_RAD * np.sqrt(self._rng.uniform(0, 1, n))
             roll = self._rng.uniform(-_ROLL_RAD, _ROLL_RAD, n)
             rotation = np.stack([tilt * np.cos(about), tilt * np.sin(about), roll], axis=1)
@@ -234,7 +203,7 @@ class Guide:
             return None
         errors = knowledge.errors_after_m(Ts)
         k = int(np.nanargmin(errors))
-        return NextPose(Ts[k], knowledge.error_m, float(errors[k]))
+        return NextPose(Ts[k], float(errors[k]))
 
     def shots_missing(self, knowledge: Knowledge, rig: StereoRig, aim: CalibrationAim) -> int | None:
         """Return how many more guided shots are predicted to reach the aim; None where more than a dozen."""
@@ -250,13 +219,13 @@ class Guide:
     def first(self, number: int, rig: StereoRig) -> NextPose | None:
         """Return one of the poses before the first calibration, in view of the guessed cameras; None where none is."""
         rotation = np.radians(FIRST_DEG[number % len(FIRST_DEG)])
-        near = rig.left.intrinsics[0] * self.diagonal_m / (0.75 * rig.left.image_size_px[1])
+        near = rig.left.intrinsics[0] * self._diagonal_m / (0.75 * rig.left.image_size_px[1])
         for share in np.linspace(1.0, 2.5, 7):
             ahead = np.array([0.0, 0.0, share * near])
             middle = (ahead + transform(rig.T_left_right, ahead)) / 2
             T = self.facing(middle, rotation)
             if self.in_view(rig, T[None])[0]:
-                return NextPose(T, float("nan"), float("nan"))
+                return NextPose(T, float("nan"))
         return None
 
 

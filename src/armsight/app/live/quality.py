@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.show.messages import Note
+from armsight.app.show.messages import Level, Note
 from armsight.data import Array
 
 Grey = NDArray[np.uint8]
@@ -35,17 +35,11 @@ _SAME_DIFFERENCE = 4.0  # mean grey levels by which two views of one camera diff
 
 @dataclass(frozen=True)
 class ImageQuality:
-    """Figures of one image.
+    """Figures of one image."""
 
-    Attributes:
-        edge_px: edge spread, px; None where no edge has contrast enough.
-        mean: mean grey level.
-        saturated: share of pixels that are saturated.
-    """
-
-    edge_px: float | None
-    mean: float
-    saturated: float
+    edge_px: float | None  # edge spread; None where no edge has contrast enough
+    mean: float  # grey level
+    saturated: float  # share of the pixels
 
 
 def image_quality(image: Grey) -> ImageQuality:
@@ -55,7 +49,7 @@ def image_quality(image: Grey) -> ImageQuality:
 
 
 def edge_spread_px(image: Grey) -> float | None:
-    """Return the spread of the sharper half of an image's edges, px; None where there are too few."""
+    """Return the spread of the sharper half of an image's edges, px; None where fewer than four have contrast."""
     smooth = cv2.GaussianBlur(image, (3, 3), 0.8)
     dx, dy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
     slope = cv2.magnitude(dx, dy)
@@ -69,20 +63,9 @@ def edge_spread_px(image: Grey) -> float | None:
     r = border + np.repeat(np.arange(rows), columns) * h + at // w
     c = border + np.tile(np.arange(columns), rows) * w + at % w
     along = np.stack([dx[r, c], dy[r, c]], axis=1) / np.maximum(slope[r, c], 1e-6)[:, None]
-    return spread_of_edges(image, np.stack([c, r], axis=1).astype(float), along)
-
-
-def spread_of_edges(image: Grey, uv: Array, along: Array) -> float | None:
-    """Return the spread of the sharper half of edges, px; None where fewer than four have contrast.
-
-    Args:
-        image: (H, W) grey.
-        uv: (N, 2) points on the edges, px.
-        along: (N, 2) unit directions across the edges.
-    """
     t = np.arange(-_REACH_PX, _REACH_PX + 1e-9, _STEP_PX)
-    at = uv[:, None] + t[:, None] * along[:, None]
-    profile = cv2.remap(image, at[..., 0].astype(np.float32), at[..., 1].astype(np.float32), cv2.INTER_LINEAR)
+    across = (np.stack([c, r], axis=1)[:, None] + t[:, None] * along[:, None]).astype(np.float32)
+    profile = cv2.remap(image, across[..., 0], across[..., 1], cv2.INTER_LINEAR)
     profile = cv2.blur(profile.astype(np.float32), (5, 1))
     n = len(t)
     # The plateaus nearest to the edge: further away the profile may meet the next edge.
@@ -100,23 +83,23 @@ def spread_of_edges(image: Grey, uv: Array, along: Array) -> float | None:
 
 def quality_notes(quality: ImageQuality) -> tuple[Note, ...]:
     """Return what is wrong with an image, in words."""
-    notes = []
-    if quality.edge_px is not None and quality.edge_px > BLURRED_PX:
-        notes.append(
-            Note("error", f"out of focus: edges are {quality.edge_px:.1f} px wide; focus until below {SHARP_PX:g}")
-        )
-    elif quality.edge_px is not None and quality.edge_px > SHARP_PX:
-        notes.append(
-            Note("hint", f"a little soft: edges are {quality.edge_px:.1f} px wide; {SHARP_PX:g} or less is sharp")
-        )
-    if quality.saturated > _SATURATED_SHARE:
-        share = 100 * quality.saturated
-        notes.append(Note("warn", f"saturated: {share:.0f}% of the pixels are white; lower exposure or gain"))
-    if quality.mean < _DARK_MEAN:
-        notes.append(
-            Note("warn", f"too dark: mean grey level {quality.mean:.0f} of 255; more light, or longer exposure")
-        )
-    return tuple(notes)
+    edge_px, white = quality.edge_px or 0.0, 100 * quality.saturated
+    wide = f"edges are {edge_px:.1f} px wide"
+    found: tuple[tuple[bool, Level, str], ...] = (
+        (edge_px > BLURRED_PX, "error", f"out of focus: {wide}; focus until below {SHARP_PX:g}"),
+        (SHARP_PX < edge_px <= BLURRED_PX, "hint", f"a little soft: {wide}; {SHARP_PX:g} or less is sharp"),
+        (
+            quality.saturated > _SATURATED_SHARE,
+            "warn",
+            f"saturated: {white:.0f}% of the pixels are white; lower exposure or gain",
+        ),
+        (
+            quality.mean < _DARK_MEAN,
+            "warn",
+            f"too dark: mean grey level {quality.mean:.0f} of 255; more light, or longer exposure",
+        ),
+    )
+    return tuple(Note(level, text) for there, level, text in found if there)
 
 
 def same_camera(left: Grey, right: Grey) -> bool:

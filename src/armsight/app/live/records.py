@@ -1,17 +1,19 @@
-"""The typed records of a session: commands that it takes, events and drawings that it gives out; and both as JSON.
+"""What pages and a session say to each other: commands, events and drawings; and records as JSON.
 
-A command is a frozen record of plain values; :func:`command_of` reads one from JSON and rejects everything else with one
-line that lists what is known. States are the records of the steps (``CalibrationState`` and so on); :func:`json_text` makes
-JSON of any of these records: arrays become lists, and numbers that are not finite become null.
+A command is a frozen record of plain values, made from the method of a step that does it (:func:`asked`);
+:func:`command_of` reads one from JSON and rejects everything else with one line that lists what is known.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import importlib
+import inspect
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -20,22 +22,15 @@ from armsight.app.show.messages import Level
 from armsight.data import Array
 from armsight.errors import InputError
 
+F = TypeVar("F", bound=Callable[..., None])
 #: The steps in their order, by the names that commands and states use.
 STEPS = ("cameras", "board", "calibrate", "body", "measure", "arm", "health")
-#: No command is longer, characters.
-LONGEST = 4096
+LONGEST = 4096  # characters of a command; half: a long list of devices is rejected, double: nothing
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened.
-
-    Attributes:
-        number: counts the events of a session from 1.
-        at: time of day, HH:MM:SS.
-        level: good, hint, warn, error.
-        text: one line.
-    """
+    """Something that happened: its number in the session, time of day, level and one line."""
 
     number: int
     at: str
@@ -45,19 +40,11 @@ class Event:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Lines to be drawn over an image.
+    """Lines to be drawn over an image."""
 
-    Attributes:
-        side: 0 left, 1 right.
-        kind: next (the outline to be reached), seen (what was found), body, second, axis0, axis1, axis2.
-        lines: polylines of (column, row), raw pixels; a line of one point is a dot.
-        label: a word beside the first point; may be empty.
-    """
-
-    side: int
-    kind: str
-    lines: tuple[tuple[tuple[float, float], ...], ...]
-    label: str = ""
+    side: int  # 0 left, 1 right
+    kind: str  # next (the outline to be reached), seen (what was found), body, second, axis0, axis1, axis2
+    lines: tuple[tuple[tuple[float, float], ...], ...]  # of (column, row), raw pixels; a line of one point is a dot
 
 
 def polyline(uv: Array, *, closed: bool = False) -> tuple[tuple[float, float], ...]:
@@ -67,196 +54,52 @@ def polyline(uv: Array, *, closed: bool = False) -> tuple[tuple[float, float], .
     return (*points, *(points[:1] if closed else []))
 
 
-#: Name -> command.
+def dots(kind: str, views: tuple[Array, Array]) -> tuple[Drawn, ...]:
+    """Return points (N, 2) of both views as dots."""
+    return tuple(Drawn(side, kind, tuple(polyline(p[None]) for p in uv)) for side, uv in enumerate(views))
+
+
+#: Name -> record of the command.
 COMMANDS: dict[str, type[PageCommand]] = {}
 
 
 @dataclass(frozen=True)
 class PageCommand:
-    """What the page asks for."""
+    """What the page asks for; records of single commands are made by :func:`asked`."""
 
-    def __init_subclass__(cls) -> None:
-        """Make the command known by its name."""
-        COMMANDS[cls.__name__] = cls
+    at: ClassVar[str]  # the step that does it, an attribute of the session; empty: the session itself
+    rest: ClassVar[bool]  # whether the arm must not move meanwhile
+    method: ClassVar[str]
 
 
-@dataclass(frozen=True)
-class GoTo(PageCommand):
-    """Go to a step; the one before can be left at any time."""
+def asked(at: str, *, rest: bool = False) -> Callable[[F], F]:
+    """Let pages ask for a method of a step: its command has its name in CamelCase, its parameters and its docstring."""
 
-    step: str
+    def known(method: F) -> F:
+        name = method.__name__.title().replace("_", "")
+        given = list(inspect.signature(method).parameters.values())[1:]
+        fields = [(p.name, p.annotation, *([] if p.default is p.empty else [p.default])) for p in given]
+        of = {"at": at, "rest": rest, "method": method.__name__, "__doc__": method.__doc__, "__module__": __name__}
+        COMMANDS[name] = dataclasses.make_dataclass(name, fields, bases=(PageCommand,), namespace=of, frozen=True)
+        return method
 
+    return known
 
-@dataclass(frozen=True)
-class UseCameras(PageCommand):
-    """Open other cameras."""
 
-    source: str
-
-
-class FindLeft(PageCommand):
-    """Find out which view is the left camera's: a person covers it."""
-
-
-class Swap(PageCommand):
-    """Exchange left and right."""
-
-
-@dataclass(frozen=True)
-class UseBoard(PageCommand):
-    """Use another calibration board; ``measured_mm`` is the length of the printed bar, 0 where nobody measured it."""
-
-    spec: str
-    measured_mm: float = 0.0
-
-
-@dataclass(frozen=True)
-class DrawBoard(PageCommand):
-    """Draw the calibration board as a PDF to scale."""
-
-    paper: str = "a4"
-
-
-class Calibrate(PageCommand):
-    """Begin the guided calibration, or continue it."""
-
-
-class PauseCalibration(PageCommand):
-    """Take no more shots for now."""
-
-
-class TakeShot(PageCommand):
-    """Take a shot of the board as it is now."""
-
-
-@dataclass(frozen=True)
-class DropShot(PageCommand):
-    """Leave out a shot."""
-
-    name: str
-
-
-class FinishCalibration(PageCommand):
-    """Choose the lens model by held-out errors, and write rig.json."""
-
-
-@dataclass(frozen=True)
-class SetAim(PageCommand):
-    """Say what the calibration is to be good for."""
-
-    error_mm: float
-    distance_m: float
-
-
-@dataclass(frozen=True)
-class UseBody(PageCommand):
-    """Use a body file, or the board, as what is measured."""
-
-    target: str
-
-
-@dataclass(frozen=True)
-class DrawBody(PageCommand):
-    """Draw the body as a PDF to scale."""
-
-    paper: str = "a4"
-
-
-class Zero(PageCommand):
-    """Show poses relative to the present one."""
-
-
-class ClearZero(PageCommand):
-    """Show poses in the left camera's frame again."""
-
-
-class PivotTip(PageCommand):
-    """Collect poses for the calibration of a tip that stands still; a second time: compute it."""
-
-
-class MarkPosition(PageCommand):
-    """Mark the present position: distances are measured from it."""
-
-
-class RecordPoses(PageCommand):
-    """Write every measured pose to a new file; a second time: stop."""
-
-
-class OpenArm(PageCommand):
-    """Connect to the arm's board; the drives stay as they are."""
-
-
-@dataclass(frozen=True)
-class RunMotions(PageCommand):
-    """Calibrate hand and eye and make the motions; ``closed``: a second time with the loop closed on vision."""
-
-    closed: bool = True
-
-
-@dataclass(frozen=True)
-class UseSecondBody(PageCommand):
-    """Measure a second body too, and each relative to the other; an empty ``target`` ends it."""
-
-    target: str
-
-
-class TakePose(PageCommand):
-    """Take the pose in which the arm rests now for the hand-eye calibration."""
-
-
-class GuideHandEye(PageCommand):
-    """Let the arm visit the poses of the hand-eye calibration by itself."""
-
-
-class GoToStart(PageCommand):
-    """Move the arm slowly to where the motions start, as after a stop."""
-
-
-class ClearHandEye(PageCommand):
-    """Forget the hand-eye calibration and its poses."""
-
-
-class Identify(PageCommand):
-    """Identify the arm from the poses of the hand-eye calibration."""
-
-
-@dataclass(frozen=True)
-class UseArm(PageCommand):
-    """Use another model of the arm: a name, a TOML or a URDF file, such as the corrected one."""
-
-    arm: str
-
-
-@dataclass(frozen=True)
-class UseMotion(PageCommand):
-    """Use the motions of another file."""
-
-    path: str
-
-
-class Hold(PageCommand):
-    """Bring the arm to rest and hold it."""
-
-
-class ClearStop(PageCommand):
-    """Allow the drives again after a stop; they stay off until the next motion."""
-
-
-@dataclass(frozen=True)
-class PersonAction(PageCommand):
-    """What the simulated person does: cover_left, cover_right, uncover, unplug, plug, knock, board, no_board."""
-
-    action: str
+def __getattr__(name: str) -> Any:  # noqa: ANN401 - a class
+    """Return the record of a command, as in ``records.Calibrate``."""
+    if name[:1].isupper():
+        importlib.import_module("armsight.app.live.session")  # the steps, whose methods they are
+    if name in COMMANDS:
+        return COMMANDS[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 _KINDS = {"str": str, "float": float, "bool": bool}
 
 
 def command_of(text: str) -> PageCommand:
-    """Read a command.
-
-    Args:
-        text: JSON such as ``{"command": "UseBoard", "spec": "chessboard:9x6:25mm"}``.
+    """Read a command such as ``{"command": "UseBoard", "spec": "chessboard:9x6:25mm"}``.
 
     Raises:
         InputError: anything else; the message says what.

@@ -25,8 +25,10 @@ import errno
 import hmac
 import importlib.resources
 import json
+import logging
 import re
 import secrets
+import socket
 import struct
 import sys
 import threading
@@ -34,7 +36,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
 import cv2
@@ -42,20 +44,18 @@ import cv2
 from armsight.app.live.capture import LiveShot
 from armsight.app.live.records import command_of, json_text
 from armsight.app.live.session import LiveSession
+from armsight.app.live.step import why
 from armsight.app.run.loop import SWITCH_S
-from armsight.app.show.messages import Note
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import read_bytes
 from armsight.vision.image import grey
 
 if TYPE_CHECKING:
-    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
-#: How often states are looked at, s; how often a page is sent the age of what it sees.
-_STATE_S = 0.1
-#: How often a newer shot is looked for while a page waits for one, s.
-_POLL_S = 0.01
+#: How often states are looked at, s; how often a newer shot is looked for while a page waits for one, s.
+_STATE_S, _POLL_S = 0.1, 0.01
 #: JPEG quality of the views, and the longest side that is sent, px.
 _JPEG, _SIDE_PX = 72, 1280
 #: A page that commands and says nothing for so long is gone, s; pages say something twice a second.
@@ -68,7 +68,6 @@ _CSP = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src blob: data:; "
     "connect-src 'self'{sockets}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-PAGE = "page.html"
 #: Drawings in the folder of the session that a page can open.
 DRAWINGS = ("/board.pdf", "/body.pdf")
 
@@ -88,6 +87,11 @@ class _Client:
     malformed: int = 0
     wake: asyncio.Event = field(default_factory=asyncio.Event)
 
+    def send(self, text: str) -> None:
+        """Send in the background; a page that is gone is noticed elsewhere."""
+        task = asyncio.ensure_future(self.socket.send(text))
+        task.add_done_callback(lambda done: done.exception() if not done.cancelled() else None)
+
 
 class LiveServer:
     """Serves one session, in a thread of its own.
@@ -95,11 +99,8 @@ class LiveServer:
     Args:
         session: what is served.
         host: address to bind to.
-        port: port; 0 takes a free one.
+        port: port; 0 takes a free one, which the attribute ``port`` has once :meth:`start` has returned.
         token: what the address must carry; None where it is bound to this computer alone.
-
-    Attributes:
-        port: the port that is bound, once :meth:`start` has returned.
     """
 
     def __init__(
@@ -107,11 +108,10 @@ class LiveServer:
     ) -> None:
         self.session, self.host, self.port, self.token = session, host, port, token
         self._clients: dict[int, _Client] = {}
-        self._commander: int | None = None
-        self._number = 0
+        self._commander, self._number = 0, 0  # number of the page that commands, and of the newest
         self._loop: asyncio.AbstractEventLoop | None = None
         self._work, self._stops = ThreadPoolExecutor(8, "serve"), ThreadPoolExecutor(2, "stop")
-        self._page = importlib.resources.files(__package__).joinpath(PAGE).read_text(encoding="utf-8")
+        self._page = importlib.resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
         self._jpeg: list[tuple[int, bytes]] = [(0, b""), (0, b"")]
         self._encoding: list[asyncio.Lock] = []
         self._ended: asyncio.Event | None = None
@@ -122,16 +122,12 @@ class LiveServer:
     @property
     def address(self) -> str:
         """The address to open in a browser."""
-        host = self.host if self.host not in ("0.0.0.0", "::") else _own_name()
+        host = self.host if self.host not in ("0.0.0.0", "::") else socket.gethostname()
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
 
     def start(self) -> None:
-        """Begin to serve.
-
-        Raises:
-            InputError: the port is in use, or the host is none of this computer's.
-        """
+        """Begin to serve; an error says why the address cannot be bound."""
         sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_S))  # a stop waits no longer for whoever computes
         self._thread.start()
         self._ready.wait()
@@ -157,6 +153,8 @@ class LiveServer:
 
         self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
         self._encoding = [asyncio.Lock(), asyncio.Lock()]
+        silent = logging.getLogger("armsight.live")  # what fails is handled here, and not logged
+        silent.setLevel(logging.CRITICAL)
         try:
             server = await serve(
                 self._connected,
@@ -169,7 +167,7 @@ class LiveServer:
                 ping_interval=5,
                 ping_timeout=10,
                 write_limit=1 << 16,
-                logger=_silent(),
+                logger=silent,
             )
         except OSError as error:
             self._failed = _bind_error(error, self.host, self.port)
@@ -179,68 +177,53 @@ class LiveServer:
         states = asyncio.create_task(self._states())
         await self._ended.wait()
         states.cancel()
-        await _closed(server)
+        server.close()
+        with contextlib.suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(server.wait_closed(), 2.0)
 
     def _request(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answer plain HTTP, and check who opens a WebSocket."""
-        url = urlsplit(request.path)
-        host = request.headers.get("Host", "")
+        url, host = urlsplit(request.path), request.headers.get("Host", "")
+        rejected: tuple[HTTPStatus, str] | None = None
         if not self._named(host):
-            return _text(connection, HTTPStatus.MISDIRECTED_REQUEST, "this server is not the one of that name\n")
-        if not self._knows(url.query):
-            return _text(
-                connection,
-                HTTPStatus.UNAUTHORIZED,
-                "open the address that armsight live printed: its token is missing\n",
-            )
-        if url.path in ("/live", "/stop"):
-            if request.headers.get("Origin") not in (f"http://{host}", f"https://{host}"):
-                return _text(connection, HTTPStatus.FORBIDDEN, "only pages of this server may connect\n")
-            return None
-        if url.path == "/":
+            rejected = HTTPStatus.MISDIRECTED_REQUEST, "this server is not the one of that name\n"
+        elif not self._knows(url.query):
+            rejected = HTTPStatus.UNAUTHORIZED, "open the address that armsight live printed: its token is missing\n"
+        elif url.path in ("/live", "/stop"):
+            if request.headers.get("Origin") in (f"http://{host}", f"https://{host}"):
+                return None
+            rejected = HTTPStatus.FORBIDDEN, "only pages of this server may connect\n"
+        elif url.path == "/":
             return self._html(connection, host)
-        if url.path in DRAWINGS:
-            return self._drawing(connection, url.path)
-        return _text(connection, HTTPStatus.NOT_FOUND, "there is only /\n")
-
-    def _drawing(self, connection: ServerConnection, path: str) -> Response:
-        """Answer with a drawing, to be printed from the computer that shows the page."""
-        try:
-            data = read_bytes(self.session.folder / path.removeprefix("/"))
-        except InputError:
-            return _text(connection, HTTPStatus.NOT_FOUND, "it is not drawn yet\n")
-        response = _text(connection, HTTPStatus.OK, "")
-        response.body = data
-        for name, value in (("Content-Type", "application/pdf"), ("Content-Length", str(len(data)))):
-            del response.headers[name]
-            response.headers[name] = value
-        return response
+        elif url.path in DRAWINGS:  # to be printed from the computer that shows the page
+            try:
+                pdf = read_bytes(self.session.folder / url.path.removeprefix("/"))
+                return _answer(connection, pdf, {"Content-Type": "application/pdf"})
+            except InputError:
+                rejected = HTTPStatus.NOT_FOUND, "it is not drawn yet\n"
+        return connection.respond(*(rejected or (HTTPStatus.NOT_FOUND, "there is only /\n")))
 
     def _named(self, host: str) -> bool:
         """Whether a Host header is one of ours: a foreign name on our address is another page's (DNS rebinding)."""
-        if self.token is not None:
-            return True
-        return host in {f"{name}:{self.port}" for name in ("127.0.0.1", "localhost", "[::1]", self.host)}
+        ours = {f"{name}:{self.port}" for name in ("127.0.0.1", "localhost", "[::1]", self.host)}
+        return self.token is not None or host in ours
 
     def _knows(self, query: str) -> bool:
         """Whether an address carries the token."""
-        if self.token is None:
-            return True
         given = parse_qs(query).get("token", [""])[0]
-        return hmac.compare_digest(given.encode(), self.token.encode())
+        return self.token is None or hmac.compare_digest(given.encode(), self.token.encode())
 
     def _html(self, connection: ServerConnection, host: str) -> Response:
         nonce = secrets.token_urlsafe(16)
-        response = _text(connection, HTTPStatus.OK, self._page.replace("NONCE", nonce))
-        headers = response.headers
-        del headers["Content-Type"]
-        headers["Content-Type"] = "text/html; charset=utf-8"
         safe = f" ws://{host} wss://{host}" if re.fullmatch(r"[\w.\-:\[\]]+", host) else ""
-        headers["Content-Security-Policy"] = _CSP.format(nonce=nonce, sockets=safe)
-        headers["Referrer-Policy"] = "no-referrer"
-        headers["X-Content-Type-Options"] = "nosniff"
-        headers["Cache-Control"] = "no-store"
-        return response
+        headers = {
+            "Content-Type": "text/html; charset=utf-8",
+            "Content-Security-Policy": _CSP.format(nonce=nonce, sockets=safe),
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+            "Cache-Control": "no-store",
+        }
+        return _answer(connection, self._page.replace("NONCE", nonce).encode(), headers)
 
     async def _connected(self, socket: ServerConnection) -> None:
         """Serve one WebSocket until it closes."""
@@ -248,26 +231,20 @@ class LiveServer:
 
         assert socket.request is not None
         with contextlib.suppress(ConnectionClosed):
-            if urlsplit(socket.request.path).path == "/stop":
-                await self._stop_socket(socket)
-            else:
+            if urlsplit(socket.request.path).path == "/live":
                 await self._live_socket(socket)
-
-    async def _stop_socket(self, socket: ServerConnection) -> None:
-        """Answer stops, and the question whether this socket is alive."""
-        async for message in socket:
-            if message == "stop":
-                answer = await asyncio.get_running_loop().run_in_executor(self._stops, self.session.stop)
-                await socket.send(json_text(answer))
-            elif message == "alive":
-                await socket.send("alive")
+                return
+            async for message in socket:  # stops, and the question whether this socket is alive
+                if message == "stop":
+                    answer = await asyncio.get_running_loop().run_in_executor(self._stops, self.session.stop)
+                    await socket.send(json_text(answer))
+                elif message == "alive":
+                    await socket.send("alive")
 
     async def _live_socket(self, socket: ServerConnection) -> None:
         self._number += 1
-        client = _Client(socket, self._number)
-        self._clients[client.number] = client
-        if self._commander is None:
-            self._commander = client.number
+        client = self._clients[self._number] = _Client(socket, self._number)
+        self._commander = self._commander or client.number
         images = asyncio.create_task(self._images(client))
         try:
             self._introduce()
@@ -278,37 +255,19 @@ class LiveServer:
         finally:
             images.cancel()
             del self._clients[client.number]
-            self._gone(client)
-
-    def _gone(self, client: _Client) -> None:
-        """A page is gone: if it commanded, the arm is held, and the next page may command."""
-        if client.number != self._commander:
-            return
-        self._hold("the page that commanded was closed, or its connection was lost")
-        self._commander = min(self._clients, default=None)
-        self._introduce()
+            if client.number == self._commander:
+                self._hold("the page that commanded was closed, or its connection was lost")
+                self._commander = min(self._clients, default=0)
+                self._introduce()
 
     def _hold(self, why: str) -> None:
         self._stops.submit(self.session.hold, why)
 
     def _introduce(self) -> None:
         """Say to every page whether it commands."""
-        for client in self._clients.values():
-            self._send(
-                client,
-                {
-                    "you": {
-                        "number": client.number,
-                        "commands": client.number == self._commander,
-                        "pages": len(self._clients),
-                    }
-                },
-            )
-
-    def _send(self, client: _Client, message: dict[str, Any]) -> None:
-        """Send in the background."""
-        task = asyncio.ensure_future(client.socket.send(json.dumps(message)))
-        task.add_done_callback(lambda done: done.exception() if not done.cancelled() else None)
+        for number, client in self._clients.items():
+            you = {"number": number, "commands": number == self._commander, "pages": len(self._clients)}
+            client.send(json.dumps({"you": you}))
 
     async def _heard(self, client: _Client, message: str | bytes) -> bool:
         """Take a message of a page; False ends its connection."""
@@ -324,22 +283,16 @@ class LiveServer:
             if client.number != self._commander:
                 raise InputError("another page commands: this one looks on, and can stop; or take over")
             await asyncio.get_running_loop().run_in_executor(self._work, self.session.execute, command)
-        except ArmsightError as error:
+        except Exception as error:  # noqa: BLE001 - a mistake of ours is said, and does not look like a page that left
             client.malformed += isinstance(error, InputError) and str(error).startswith(_MALFORMED_BEGIN)
             if client.malformed > _MALFORMED:
                 client.socket.transport.abort()
                 return False
-            self._send(client, {"rejected": str(error)})
-        except Exception as error:  # noqa: BLE001 - a mistake of ours is said, and does not look like a page that left
-            self._send(client, {"rejected": f"{type(error).__name__}: {error}"})
+            client.send(json.dumps({"rejected": why(error)}))
         return True
 
     def _said(self, client: _Client, message: str) -> None:
-        """Take what a page says of itself: what it showed, whether it is visible, that it takes over.
-
-        Raises:
-            InputError: it is none of this.
-        """
+        """Take what a page says of itself: what it showed, whether it is visible, that it takes over."""
         try:
             said = json.loads(message)
         except (json.JSONDecodeError, RecursionError):
@@ -407,17 +360,17 @@ class LiveServer:
             if not self._clients:
                 continue
             texts: dict[str, str] = {}
+            wrong = ""
             try:
                 texts = await asyncio.get_running_loop().run_in_executor(self._work, self._texts)
-                said = ""
             except Exception as error:  # noqa: BLE001 - this task also watches the page that commands
-                why = str(error) if isinstance(error, ArmsightError) else f"{type(error).__name__}: {error}"
-                if why != said:
-                    self.session.say(Note("error", why))
-                said = why
+                wrong = why(error)
+            if wrong and wrong != said:
+                self.session.say("error", wrong)
+            said = wrong
             for client in list(self._clients.values()):
                 self._update(client, texts)
-            commander = self._clients.get(self._commander or 0)
+            commander = self._clients.get(self._commander)
             if commander is not None and time.monotonic() - commander.heard_s > SILENT_S and self.session.arm.busy:
                 self._hold("the page that commands does not answer")
 
@@ -433,11 +386,10 @@ class LiveServer:
         for name, text in texts.items():
             if client.sent.get(name) != text:
                 client.sent[name] = text
-                task = asyncio.ensure_future(client.socket.send(text))
-                task.add_done_callback(lambda done: done.exception() if not done.cancelled() else None)
+                client.send(text)
         for event in self.session.events(client.event):
             client.event = event.number
-            self._send(client, {"event": vars(event)})
+            client.send(json.dumps({"event": vars(event)}))
 
 
 def _jpeg(live: LiveShot, side: int) -> bytes:
@@ -451,14 +403,15 @@ def _jpeg(live: LiveShot, side: int) -> bytes:
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG])[1].tobytes()
 
 
-def _text(connection: ServerConnection, status: HTTPStatus, text: str) -> Response:
-    return connection.respond(status, text)
-
-
-async def _closed(server: Server) -> None:
-    server.close()
-    with contextlib.suppress(asyncio.TimeoutError):
-        await asyncio.wait_for(server.wait_closed(), 2.0)
+def _answer(connection: ServerConnection, body: bytes, headers: dict[str, str]) -> Response:
+    """Return an answer whose body is no plain text."""
+    response = connection.respond(HTTPStatus.OK, "")
+    response.body = body
+    for name, value in {"Content-Length": str(len(body)), **headers}.items():
+        with contextlib.suppress(KeyError):
+            del response.headers[name]
+        response.headers[name] = value
+    return response
 
 
 def _bind_error(error: OSError, host: str, port: int) -> ArmsightError:
@@ -468,18 +421,3 @@ def _bind_error(error: OSError, host: str, port: int) -> ArmsightError:
     if error.errno == errno.EACCES:
         return InputError(f"port {port} needs rights that you do not have: give one above 1023 with --port")
     return DeviceError(f"{host}:{port} cannot be bound: {error.strerror or error}; is it an address of this computer?")
-
-
-def _own_name() -> str:
-    import socket
-
-    return socket.gethostname()
-
-
-def _silent() -> Any:  # noqa: ANN401 - a logger
-    """Return a logger for the library: what fails is handled here, and not logged."""
-    import logging
-
-    logger = logging.getLogger("armsight.live")
-    logger.setLevel(logging.CRITICAL)
-    return logger

@@ -32,31 +32,20 @@ _PACE_HZ = 15.0
 
 
 class Person:
-    """A person with a board before the workcell's cameras.
-
-    Args:
-        workcell: the workcell.
-        seed: of the hand.
-    """
+    """A person with a board before the workcell's cameras; ``seed`` is of the hand."""
 
     def __init__(self, workcell: Workcell, seed: int) -> None:
-        self._workcell = workcell
-        self._rng = np.random.default_rng([seed, 21])
+        self._workcell, self._rng = workcell, np.random.default_rng([seed, 21])
         self._pattern = chessboard(9, 6, 0.030)
         self._points = open_board(CHESSBOARD).body.points
         #: From where, to where, T_left_board (4, 4), and since when the board moves; None before it is held.
         self._way: tuple[Array, Array, float] | None = None
         self._shown: Array | None = None  # the outline that is being reached
         self.covered: set[str] = set()
-        self.unplugged = False
-        self.holds = False
+        self.unplugged = self.holds = False
 
     def act(self, action: str) -> None:
-        """Do something.
-
-        Raises:
-            InputError: an unknown action.
-        """
+        """Do something."""
         if action not in ACTIONS:
             raise InputError(f"the simulated person does not know {action!r}; known are {', '.join(ACTIONS)}")
         if action.startswith("cover_"):
@@ -87,12 +76,10 @@ class Person:
             if self._visible(near):
                 self._move(near)
                 return
-        middle = rig.T_left_right[:3, 3] / 2
-        for step in np.linspace(
-            0.02, 0.9, 30
-        ):  # the outline is drawn for other cameras than these: as near as can be seen
+        middle = np.array([*rig.T_left_right[:2, 3] / 2, 1.3 * T[2, 3]])
+        for step in np.linspace(0.02, 0.9, 30):  # the outline is of other cameras than these: as near as can be seen
             near = np.array(T)
-            near[:3, 3] += step * (np.array([middle[0], middle[1], 1.3 * T[2, 3]]) - T[:3, 3])
+            near[:3, 3] += step * (middle - T[:3, 3])
             if self._visible(near):
                 break
         self._move(near)
@@ -109,12 +96,10 @@ class Person:
 
     def _visible(self, T_left_board: Array) -> bool:
         """Return whether both cameras see all of the board's points, and a little around them."""
-        rig, p = self._workcell.truth.rig, transform(T_left_board, 1.1 * self._points - 0.1 * self._points.mean(axis=0))
-        views = rig.left.project(p), rig.right.project(transform(inverse(rig.T_left_right), p))
-        return all(
-            bool(((uv > 4) & (uv < np.array(camera.image_size_px) - 5)).all())
-            for camera, uv in zip(rig.cameras, views, strict=True)
-        )
+        rig, around = self._workcell.truth.rig, 1.1 * self._points - 0.1 * self._points.mean(axis=0)
+        sizes = (np.array(camera.image_size_px) for camera in rig.cameras)
+        views = zip(rig.project(transform(T_left_board, around)), sizes, strict=True)
+        return all(bool(((uv > 4) & (uv < size - 5)).all()) for uv, size in views)
 
     def _move(self, T: Array) -> None:
         way = self._way
@@ -138,15 +123,7 @@ def _where(way: tuple[Array, Array, float]) -> Array:
 
 
 class SimulatedCameras(Source):
-    """The workcell's cameras as a source.
-
-    Args:
-        cameras: as the workcell names them, such as 1280x720@15.
-        arm: nominal, used, worn, or a TOML file.
-        seed: of all that is sampled.
-        emulator: what runs the board's firmware.
-        model: the nominal arm.
-    """
+    """The workcell's cameras as a source, at their pace; what it is made of as :meth:`Workcell.open` takes it."""
 
     count: int | None = None
 
@@ -159,43 +136,32 @@ class SimulatedCameras(Source):
     def read(self) -> Shot | None:
         """Return the next shot, at the cameras' pace at most."""
         while (shot := self.poll()) is None:
-            if self.person.holds:
-                time.sleep(max(0.0, self._due_s - time.monotonic()))
-                continue
             time.sleep(max(0.0, self._due_s - time.monotonic()))
-            self._due_s = max(time.monotonic(), self._due_s + self.period_s)
-            waited = self.workcell.source.read()
-            self.workcell.board.receive()  # what the board said meanwhile must not pile up
-            return None if waited is None else self.seen(waited)
+            if not self.person.holds:
+                self._due_s = max(time.monotonic(), self._due_s + self.period_s)
+                waited = self.workcell.source.read()
+                self.workcell.board.receive()  # what the board said meanwhile must not pile up
+                return None if waited is None else self.seen(waited)
         return shot
 
     def poll(self) -> Shot | None:
-        """Return the next shot if it is there; no time passes in the workcell.
-
-        Raises:
-            DeviceError: the person pulled a cable.
-        """
-        shot = None
+        """Return the next shot if it is due and there, a DeviceError once a cable is pulled; no time passes meanwhile."""
+        self._require_plugged()
         if time.monotonic() < self._due_s:
-            self._require_plugged()
-        elif self.person.holds:
-            self._require_plugged()
+            return None
+        if not self.person.holds:
+            shot = self.poll_now()
+        else:
             self.person.reach(self.outline())
             self._number += 1
-            shot = self.person.shot(self._number)
-            shot = None if shot is None else self.seen(shot)
-        else:
-            shot = self.poll_now()
+            held = self.person.shot(self._number)
+            shot = None if held is None else self.seen(held)
         if shot is not None:
             self._due_s = max(time.monotonic(), self._due_s + self.period_s)
         return shot
 
     def poll_now(self) -> Shot | None:
-        """Return the newest shot of the workcell, however fast its time passes, for its control loop.
-
-        Raises:
-            DeviceError: the person pulled a cable.
-        """
+        """Return the newest shot of the workcell, however fast its time passes, for its control loop."""
         self._require_plugged()
         shot = self.workcell.poll()
         return None if shot is None else self.seen(shot)
@@ -211,11 +177,10 @@ class SimulatedCameras(Source):
 
     def seen(self, shot: Shot) -> Shot:
         """Return a shot as it is with the lenses that are covered."""
-        if shot.left is not None and "left" in self.person.covered:
-            shot = replace(shot, left=np.full_like(shot.left, 3))
-        if shot.right is not None and "right" in self.person.covered:
-            shot = replace(shot, right=np.full_like(shot.right, 3))
-        return shot
+        dark = {
+            side: np.full_like(image, 3) for side in self.person.covered if (image := getattr(shot, side)) is not None
+        }
+        return replace(shot, **dark)
 
     def close(self) -> None:
         """Do nothing: the workcell ends with the session."""

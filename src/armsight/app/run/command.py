@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,42 +12,15 @@ import click
 from armsight.app.arm_option import arm_option
 from armsight.app.show.messages import UNTRUSTED, require
 from armsight.errors import InputError
-from armsight.files import read_text, write_text
+from armsight.files import read_text
 
 if TYPE_CHECKING:
-    from armsight.app.run.experiment import Progress
     from armsight.app.run.motion_file import MotionPlan
-    from armsight.app.run.setup import Setup
-    from armsight.app.run.summary import RunSummary
     from armsight.data import Array
     from armsight.robot.kinematics.arm import Arm
-    from armsight.vision.rig import StereoRig
 
 _HANDEYE_POSES = 30
 _POSES = "poses:"
-
-
-@dataclass(frozen=True)
-class RunPlan:
-    """What is to be run.
-
-    Attributes:
-        rig: the calibrated cameras.
-        motions: the motions.
-        targets: (N, n) joint angles of the hand-eye poses, rad.
-        close_loop: whether the motions are made a second time with the loop closed.
-        follow_rig: whether a rig that moved is put right.
-        streams: what to publish to.
-        began: when the command began, by ``time.perf_counter``, s.
-    """
-
-    rig: StereoRig
-    motions: MotionPlan
-    targets: Array
-    close_loop: bool
-    follow_rig: bool
-    streams: tuple[str, ...]
-    began: float
 
 
 @click.command("run")
@@ -176,7 +147,7 @@ def command(
     from armsight.app.progress import steps
     from armsight.app.run.calibrate import handeye_poses
     from armsight.app.run.experiment import require_followed, require_start
-    from armsight.app.run.folder import make_room, open_folder
+    from armsight.app.run.folder import finish, open_folder, run_in
     from armsight.app.run.motion_file import DEFAULT_MOTION
     from armsight.app.run.setup import Devices, open_devices, planned_for
     from armsight.app.run.summary import show_summary
@@ -201,7 +172,6 @@ def command(
     targets = handeye_poses(arm, np.array(ends), _HANDEYE_POSES, 0)
     files = {"motion.toml": read_text(motion), "body.toml": read_text(target_spec)}
     open_folder(output)
-    plan = RunPlan(rig, motions, targets, not open_loop, follow_rig, stream, time.perf_counter())
     devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms, calibration, sync_led)
     begun = False
     try:
@@ -210,12 +180,23 @@ def command(
             with open_devices(devices) as setup:
                 setup = replace(setup, fixed=fixed_targets)
                 require_start(setup, motions, targets)
-                make_room(output)
-                for name, text in files.items():
-                    write_text(output / name, text)
-                rig.save(output / "rig.json")
                 begun = True
-                summary = _run(setup, plan, output, files["body.toml"], progress)
+                finished = run_in(
+                    output,
+                    setup,
+                    rig,
+                    motions,
+                    targets,
+                    files,
+                    command="run",
+                    say=lambda line: click.echo(line, err=True),
+                    streams=stream,
+                    progress=progress,
+                    close_loop=not open_loop,
+                    follow_rig=follow_rig,
+                )
+                progress("writing and plotting")
+                summary = finish(finished, output)
     except KeyboardInterrupt:
         if begun:  # said once the progress is off the terminal
             click.echo(f"the arm was stopped; what was measured until then is in {output}", err=True)
@@ -272,35 +253,3 @@ def _motions(arm: Arm, arm_spec: str, path: Path) -> MotionPlan:
             f"--arm {arm_spec}: the built-in motion is made for six_r ({reason}); give this arm's own with --motion FILE "
             "(docs/howto/run.md), or plan one: armsight check plan"
         ) from None
-
-
-def _run(setup: Setup, plan: RunPlan, output: Path, body_text: str, progress: Progress) -> RunSummary:
-    """Run and write; raises what ended the run early after everything is written."""
-    from armsight.app.run.experiment import run_experiment
-    from armsight.app.run.folder import Finished, finish
-    from armsight.app.stream.datum import Published
-    from armsight.app.stream.mcap_file import LazyMcap, properties
-    from armsight.app.stream.sink import Fanout
-    from armsight.app.stream.streams import open_streams
-
-    def say(line: str) -> None:
-        click.echo(line, err=True)
-
-    texts = properties(plan.rig, body_text, setup.arm, command="run")
-    published = Published(plan.rig, setup.target.body, setup.arm, texts)
-    with contextlib.ExitStack() as stack:
-        file = stack.enter_context(contextlib.closing(LazyMcap(output, published, say)))
-        streams = stack.enter_context(contextlib.closing(open_streams(plan.streams, published, say)))
-        outcome = run_experiment(
-            setup,
-            plan.rig,
-            plan.motions,
-            plan.targets,
-            progress=progress,
-            close_loop=plan.close_loop,
-            follow_rig=plan.follow_rig,
-            publisher=Fanout((file, streams)),
-        )
-    progress("writing and plotting")
-    of_run = {"arm": setup.arm.name, "board": setup.board.welcome.board}
-    return finish(Finished(setup.arm, plan.rig, outcome, plan.motions, None, of_run, plan.began, [], None), output)

@@ -2,7 +2,8 @@
 
 In: a :class:`Finished` run. Out: tracks and joints as CSV and Parquet, the hand-eye calibration, the kept shots,
 summary.json, run.log, the report and its figures. Each file is complete or not there at all; a run that ended early has
-everything that was measured until then. :func:`open_folder` and :func:`make_room` prepare a folder before the run.
+everything that was measured until then. :func:`open_folder` and :func:`make_room` prepare a folder before the run,
+:func:`run_in` runs on real devices.
 """
 
 from __future__ import annotations
@@ -28,14 +29,18 @@ import numpy as np
 from armsight.app.interrupts import uninterrupted
 from armsight.app.record.recording import record
 from armsight.app.run.calibrate import HandEyeRun
-from armsight.app.run.experiment import RunResult
+from armsight.app.run.experiment import RunResult, run_experiment
 from armsight.app.run.metrics import Study
 from armsight.app.run.motion_file import MotionPlan
 from armsight.app.run.record import Log, RunData, ToolTrack, assembled, cut, joints_of, write_columns, write_track
 from armsight.app.run.report import NAMES, Beside, RunReport, drawn_beside, write_run_report
+from armsight.app.run.setup import Setup
 from armsight.app.run.summary import RunSummary, summary_of
 from armsight.app.show.page import PAGE, writable_folder
-from armsight.app.stream.mcap_file import RUN_MCAP
+from armsight.app.stream.datum import Published
+from armsight.app.stream.mcap_file import RUN_MCAP, LazyMcap, properties
+from armsight.app.stream.sink import Fanout
+from armsight.app.stream.streams import open_streams
 from armsight.data import Array, Correspondences, Image, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder, write_text
@@ -184,6 +189,39 @@ class Finished:
     studies: Sequence[Study]
     overview: Callable[[], Image] | None
     second: Callable[..., Any] | None = None
+
+
+def run_in(
+    folder: Path,
+    setup: Setup,
+    rig: StereoRig,
+    plan: MotionPlan,
+    targets: Array,
+    files: Mapping[str, str],
+    *,
+    command: str,
+    say: Callable[[str], None],
+    streams: Sequence[str] = (),
+    **how: Any,  # noqa: ANN401 - options of run_experiment
+) -> Finished:
+    """Run the experiment on real devices, with run.mcap in its folder and streams beside.
+
+    ``files`` are the texts of motion.toml and body.toml, which are written first; run.mcap says which ``command`` made it;
+    ``say`` is given what could not be recorded or published; ``how`` and the rest is as :func:`run_experiment` takes it.
+    """
+    began = time.perf_counter()
+    make_room(folder)
+    for name, text in files.items():
+        write_text(folder / name, text)
+    rig.save(folder / "rig.json")
+    texts = properties(rig, files["body.toml"], setup.arm, command=command)
+    published = Published(rig, setup.target.body, setup.arm, texts)
+    with contextlib.ExitStack() as stack:
+        file = stack.enter_context(contextlib.closing(LazyMcap(folder, published, say)))
+        beside = stack.enter_context(contextlib.closing(open_streams(streams, published, say)))
+        outcome = run_experiment(setup, rig, plan, targets, publisher=Fanout((file, beside)), **how)
+    of_run = {"arm": setup.arm.name, "board": setup.board.welcome.board}
+    return Finished(setup.arm, rig, outcome, plan, None, of_run, began, [], None)
 
 
 def finish(finished: Finished, folder: Path) -> RunSummary:

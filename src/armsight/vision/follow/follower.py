@@ -82,9 +82,9 @@ class BodyTrack(Record):
         return T
 
 
-def measurer(rig: StereoRig, target: Target) -> Callable[[Shot], PoseEstimate | Missed]:
+def measurer(rig: StereoRig, target: Target, apart_s: float = 0.0) -> Callable[[Shot], PoseEstimate | Missed]:
     """Return what measures a target shot by shot: a follower where it can be followed, else :func:`measure`."""
-    return Follower(rig, target).measure if follows(target) else partial(measure, rig, target)
+    return Follower(rig, target, apart_s).measure if follows(target) else partial(measure, rig, target)
 
 
 Way = Literal["followed", "searched", "lost"]

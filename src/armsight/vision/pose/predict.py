@@ -117,8 +117,7 @@ def _axes(z: Array, x: Array) -> Array:
 def _seen(rig: StereoRig, T_left_body: Array, points: Array, normals: Array) -> NDArray[np.bool_]:
     """(M, 2) whether a camera has a point in its image, its face not rotated away."""
     columns = []
-    for camera, T in ((rig.left, T_left_body), (rig.right, inverse(rig.T_left_right) @ T_left_body)):
-        uv = camera.project(transform(T, points))
+    for camera, uv in zip(rig.cameras, rig.project(transform(T_left_body, points)), strict=True):
         with np.errstate(invalid="ignore"):
             columns.append(((uv >= 0) & (uv <= np.array(camera.image_size_px) - 1)).all(axis=1))
     return np.stack(columns, axis=1) & _facing(rig, T_left_body, points, normals)
@@ -200,7 +199,7 @@ def separation(
         if not _facing(rig, start, points[taken], normals[taken]).all():
             continue
         p = transform(true.T_left_body, points[seen])
-        uv = np.concatenate([rig.left.project(p), rig.right.project(transform(inverse(rig.T_left_right), p))])
+        uv = np.concatenate(rig.project(p))
         count = len(seen)
         observations = PixelObservations(
             np.repeat([0, 1], count), np.tile(taken, 2), uv, np.tile(sigma_px**2 * np.eye(2), (2 * count, 1, 1))
