@@ -74,7 +74,9 @@ def items(run: dict[str, Any], stored: dict[str, float]) -> list[str]:
             continue
         name, value = (f"{name}m", 1e3 * value) if name.endswith(", m") else (name, value)
         whose, _, kind = name.partition(", ")
-        if sum(other.endswith(f", {kind}") for other in run["figures"]) < 2 or len(kind) <= 2:  # of one alone, or a unit
+        if (
+            sum(other.endswith(f", {kind}") for other in run["figures"]) < 2 or len(kind) <= 2
+        ):  # of one alone, or a unit
             whose, kind = "", name
         kinds.setdefault(kind, []).append(f"{whose} {value:.4g}".strip())
     return [f"- {kind}: {'; '.join(known)}" for kind, known in kinds.items()] or ["- not measured yet"]
