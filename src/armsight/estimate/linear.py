@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 
-#: Columns of a kernel's factor at most, and the share of its trace that is left out.
-MAX_RANK, LEAST_LEFT = 24, 1e-3
+MAX_RANK, LEAST_LEFT = 24, 1e-3  # columns of a kernel's factor at most, and the share of its trace that is left out
 
 
 @dataclass(frozen=True, eq=False)

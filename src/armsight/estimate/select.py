@@ -23,16 +23,12 @@ from armsight.estimate.solve import whitened
 Mask = NDArray[np.bool_]
 #: An error source is added where it lowers the held-out squares by this many standard errors of the fall over the folds.
 MIN_GAIN = 1.0
-#: Parameters further from nominal than this many sigmas are kept without trying their removal.
-SURE = 8.0
-#: A fall by less than this part is rounding's.
-ROUNDING = 1e-6
+SURE = 8.0  # parameters further from nominal than this many sigmas are kept without trying their removal
+ROUNDING = 1e-6  # a fall by less than this part is rounding's
 #: Mean squared errors, in squared sigmas of the noise, below which an error is no longer noise but rounding: (1e-4)^2.
 NOISELESS = 1e-8
-#: Added to squares, so that the logarithm of none is a number.
-_NONE = 1e-200
-#: A difference of large numbers below this part of them is rounding.
-_ROUNDED = 1e-10
+_NONE = 1e-200  # added to squares, so that the logarithm of none is a number
+_ROUNDED = 1e-10  # a difference of large numbers below this part of them is rounding
 
 
 class Folds(NamedTuple):

@@ -16,8 +16,7 @@ from scipy.special import chdtri
 from armsight.data import Array, Record
 from armsight.estimate.linear import Linear
 
-#: Information about a direction, as a share of each unknown's own, below which it is open.
-OPEN = 1e-13
+OPEN = 1e-13  # information about a direction, as a share of each unknown's own, below which it is open
 
 
 @dataclass(frozen=True, eq=False)

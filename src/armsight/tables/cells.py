@@ -22,14 +22,12 @@ from armsight.tables.programs import program_rows
 Rows = list[tuple[int, list[str]]]
 #: A number with its unit.
 _WITH_UNIT = re.compile(rf"({NUMBER}|{DECIMAL_COMMA.pattern})\s*(mm|m|deg|\N{{DEGREE SIGN}}|rad|s)")
-#: A list alone in its line.
-_LIST = re.compile(r"\[([^\[\]{}\"]*)\],?")
+_LIST = re.compile(r"\[([^\[\]{}\"]*)\],?")  # a list alone in its line
 #: The line that stands beneath the names in Markdown or psql, and psql's last line.
 _RULE = re.compile(r"[\s|+:-]*-[\s|+:-]*|\(\d+ rows?\)")
 #: The first line of a text that is no table: of a document, of a program, a call.
 _NO_TABLE = re.compile(r"[{<\[/]|\.[A-Z]|(?:DEF|MODULE|PROC)\b|.*(?::=|=|\(\)|[\[{]$)|.*\w\s*\(\s*[\"\[{\d.+-]")
-#: Names for columns that have none, by how many they are.
-_FORMS = {8: ["t_s", *BY_COUNT[7]], **BY_COUNT}
+_FORMS = {8: ["t_s", *BY_COUNT[7]], **BY_COUNT}  # names for columns that have none, by how many they are
 
 
 class Cells(NamedTuple):

@@ -21,10 +21,8 @@ from armsight.tables.cells import Rows, renamed
 from armsight.tables.number import number
 from armsight.tables.rotations import QUATERNION_OFF, rotations_by
 
-#: Columns whose cells name the rows.
-NAMES = ("image", "name", "shot")
-#: Joints that an arm may have.
-MOST_JOINTS = 7
+NAMES = ("image", "name", "shot")  # columns whose cells name the rows
+MOST_JOINTS = 7  # joints that an arm may have
 #: Names that ``--columns`` may give the file's own for.
 COLUMNS = (
     *(f"{axis}{unit}" for axis in "xyz" for unit in ("", "_m", "_mm")),
@@ -34,10 +32,8 @@ COLUMNS = (
     *(f"q{i}_{unit}" for i in range(1, MOST_JOINTS + 1) for unit in ("rad", "deg")),
     *("t_s", *NAMES),
 )
-#: No joint rotates further, rad; larger numbers of radians are degrees.
-MOST_RAD = 4 * np.pi
-#: How far a matrix may be from a rotation: what six digits leave.
-LOOSE = 2e-3
+MOST_RAD = 4 * np.pi  # no joint rotates further, rad; larger numbers of radians are degrees
+LOOSE = 2e-3  # how far a matrix may be from a rotation: what six digits leave
 #: LeRobot's names of an SO-100's or SO-101's joints, from the base on; its position columns end so; percent reach this.
 LEROBOT = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 _LEROBOT_POSITION, _LEROBOT_GRIPPER, _MOST_PERCENT = ".pos", "gripper", 100.001
@@ -47,10 +43,8 @@ _ROS = re.compile(r"(?:.*[./_])?(?:(position|translation)|orientation|rotation)[
 _THEIRS = {"tx": "x", "ty": "y", "tz": "z", "roll": "rx", "pitch": "ry", "yaw": "rz"}
 #: Angles of robots' makers: the columns beside X, Y and Z, mm, whose rotations about fixed x, y and z they are, degrees.
 _MAKERS = {"KUKA": ("c", "b", "a"), "Fanuc": ("w", "p", "r")}
-#: A column of theirs, in small letters.
-_OF_A_MAKER = re.compile(r"(?:([xyz])(?:_(m|mm))?|([abcwpr])(?:_(deg|rad))?)")
-#: A joint without a unit.
-_UNITLESS = re.compile(r"(?:q|j|joint)_?([1-7])")
+_OF_A_MAKER = re.compile(r"(?:([xyz])(?:_(m|mm))?|([abcwpr])(?:_(deg|rad))?)")  # a column of theirs, in small letters
+_UNITLESS = re.compile(r"(?:q|j|joint)_?([1-7])")  # a joint without a unit
 _JOINT = re.compile(r"q(\d+)_(rad|deg)")
 
 

@@ -32,8 +32,7 @@ from armsight.tables.number import number
 
 #: A value of a file of another program: a number, a text, a list or a mapping, unknown until checked.
 Foreign: TypeAlias = Any
-#: An event of PyYAML's parser; its kinds have no common type with a tag and an anchor.
-_Event: TypeAlias = Any
+_Event: TypeAlias = Any  # an event of PyYAML's parser; its kinds have no common type with a tag and an anchor
 
 #: What is read, for messages.
 KINDS = "YAML, JSON, TOML, INI, OpenCV's XML, mrcal's .cameramodel, .npz or .npy, each also as .gz"
@@ -55,8 +54,8 @@ _VALUES: dict[str, Callable[[str], Foreign]] = {
     "float": float,
     "special": lambda text: float(text.replace(".", "")),
 }
-#: Tags that change nothing of what is plain to see.
 _CORE = "tag:yaml.org,2002:"
+#: Tags that change nothing of what is plain to see.
 _HARMLESS = {None, "!", *(_CORE + name for name in (
     "seq", "map", "int", "float", "bool", "null", "opencv-matrix", "opencv-nd-matrix", "python/tuple"))}  # fmt: skip
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

@@ -31,12 +31,9 @@ from armsight.tables.rotations import CONVENTIONS
 _, NEAR_M, FAR_M = REACH
 #: No arm here reaches further, m; half: a large KUKA in cm is taken for mm alone, double: small ones in inches are named.
 REACH_M = 3.0
-#: An angle in degrees is not larger.
-MOST_DEG = 360.0
-#: Lengths that differ by more than this factor in one table are not in one unit.
-MIXED = 200.0
-#: Columns of the poses that `armsight measure -o` wrote.
-_MEASURED = {"shot", "status", "reason", "x_m"}
+MOST_DEG = 360.0  # an angle in degrees is not larger
+MIXED = 200.0  # lengths that differ by more than this factor in one table are not in one unit
+_MEASURED = {"shot", "status", "reason", "x_m"}  # columns of the poses that `armsight measure -o` wrote
 
 
 class ArmJoints(Protocol):

@@ -13,10 +13,8 @@ if TYPE_CHECKING:
 #: Conventions of three angles: a rotation vector; or rotations about x, y, z in the order given, about fixed axes (lower
 #: case) or about the axes of the rotated frame (capitals).
 ROTATIONS = ("rotvec", "xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
-#: How far the length of a quaternion may be from 1: what two digits leave.
-QUATERNION_OFF = 1e-2
-#: What three or four numbers of a rotation may mean.
-CONVENTIONS = ("wxyz", "xyzw", *ROTATIONS)
+QUATERNION_OFF = 1e-2  # how far the length of a quaternion may be from 1: what two digits leave
+CONVENTIONS = ("wxyz", "xyzw", *ROTATIONS)  # what three or four numbers of a rotation may mean
 
 
 def rotations_by(numbers: Array, convention: str, path: Path) -> Array:

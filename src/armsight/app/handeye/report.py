@@ -23,12 +23,10 @@ from armsight.loop.identify.plan import MountingPlan, worst_sigmas
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: As many blunders as this share of the poses are no calibration to trust.
-_MANY = 0.25
+_MANY = 0.25  # as many blunders as this share of the poses are no calibration to trust
 #: Sources whose mean log density of a pose left out is within this of the best are not distinguished from them.
 DISTINGUISHED = 0.2
-#: Fewer poses than these are few, and so many more are advised then.
-ADVISED, MORE = 15, 6
+ADVISED, MORE = 15, 6  # fewer poses than these are few, and so many more are advised then
 _POSE = ("x, mm", "y, mm", "z, mm", "rx, deg", "ry, deg", "rz, deg")
 
 

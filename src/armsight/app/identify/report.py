@@ -197,8 +197,7 @@ FIGURES: dict[str, tuple[Callable[[Identification], Figure], str, str]] = {
         "Strong colours off the diagonal: these poses distinguish the two badly; their sigmas say so.",
     ),
 }
-#: Figures that stand beneath a line until a reader asks for them.
-_FOLDED = ("sources", "selection", "correlation")
+_FOLDED = ("sources", "selection", "correlation")  # figures that stand beneath a line until a reader asks for them
 
 
 def identify_report(run: Identification, *, everything: bool = False) -> Report:

@@ -63,8 +63,7 @@ MAX_FIT, MAX_VARIANCE = 1000, 120
 #: Poses that sources over time are chosen from at most, and everything where something walks: each step of it is an
 #: unknown; half: walks are seen badly, double: eight times the time.
 MAX_WALK = 60
-#: Fewest poses for errors that poses share.
-MIN_SHARED = 12
+MIN_SHARED = 12  # fewest poses for errors that poses share
 #: Rotation about a second axis must exceed the noise of rotations by this factor, and this angle, rad.
 CLEARLY_ROTATED, LEAST_ROTATION = 3.0, np.radians(0.5)
 #: Rotations of half of the poses that differ by more than this, rad, are not of one motion.
@@ -82,18 +81,15 @@ LINK, DRIFT_SIZE, ARM_OFF = (1e-3, 1e-3), (1e-3, 1e-3), 0.5
 #: Sigma of rotations that have hardly any weight, rad; by how many sigmas, and by which factor, errors of positions left
 #: out must be lower without them. half: chance weights positions alone, double: contradictions spoil the nominal arm's use.
 HARDLY, SURELY_LOWER, CLEARLY = 0.005, 3.0, 1.1
-#: Degrees of freedom of Student's t in the robust start.
-FREEDOM = 4.0
+FREEDOM = 4.0  # degrees of freedom of Student's t in the robust start
 #: A scale must be off by this many sigmas to be taken, and has settled where a step is below this share of one: where the
 #: flange hardly moves it runs away.
 SURELY, SETTLED = 5.0, 0.1
 #: Times the error of a position that the flange's must spread for a scale. half: noise is taken for a motion; double:
 #: recordings of a few cm are rejected.
 STILL = 3.0
-#: Sources that change over time.
-_TIMED = {name for pair in OVER_TIME for name in pair}
-#: Rounds of least squares and of leaving out.
-ROUNDS = 6
+_TIMED = {name for pair in OVER_TIME for name in pair}  # sources that change over time
+ROUNDS = 6  # rounds of least squares and of leaving out
 
 
 def _transform_of(eye: Eye, name: str, field_name: str, what: str) -> property:

@@ -17,12 +17,10 @@ from armsight.estimate.linear import Linear
 from armsight.estimate.solve import Solved, by_chance, left_out, solve
 from armsight.geometry.check import checked
 
-#: Fewest poses, and the chance below which one is taken for a mistake.
-MIN_POSES, CHANCE = 4, 1e-4
+MIN_POSES, CHANCE = 4, 1e-4  # fewest poses, and the chance below which one is taken for a mistake
 #: Largest share of the scatter with which the tip may be known, along its worst axis: more rotation lowers it.
 MAX_AMPLIFICATION = 20.0
-#: Rounds of leaving out mistakes.
-ROUNDS = 10
+ROUNDS = 10  # rounds of leaving out mistakes
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,7 @@ from armsight.geometry.check import checked
 from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, pose, small_adjoint
 from armsight.geometry.rotation import nearest_rotation
 
-#: A pose whose residual has a smaller chance than this is taken for a mistake and left out.
-CHANCE = 1e-5
+CHANCE = 1e-5  # a pose whose residual has a smaller chance than this is taken for a mistake and left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +77,8 @@ def residuals(poses: Poses, Z: Array, X: Array) -> tuple[Array, Array, Array]:
     return e, np.concatenate([bend @ by_z, bend @ by_x], axis=2), adjoint(inverse(M))
 
 
-#: Parts of this many poses are tried too, so that some of them are free of gross errors.
-PART = 6
-#: How many parts: with 20 % gross errors all of them would hold one with a chance of (1 - 0.8^6)^24, 0.1 %.
-PARTS = 24
+PART = 6  # parts of this many poses are tried too, so that some of them are free of gross errors
+PARTS = 24  # how many parts: with 20 % gross errors all of them would hold one with a chance of (1 - 0.8^6)^24, 0.1 %
 #: Share of the poses that must be good: the scale of residuals is that of the best so many. A median breaks down where half
 #: are blunders.
 MIDDLE = 0.4
@@ -167,8 +164,7 @@ def _scores(A: Array, B: Array, Xs: Array, Zs: Array) -> Array:
 
 
 Eye = Literal["to_hand", "in_hand"]
-#: Fewest poses: three determine both transforms, and what is left out must leave three.
-MIN_POSES = 4
+MIN_POSES = 4  # fewest poses: three determine both transforms, and what is left out must leave three
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,8 +34,7 @@ STOPPED, STOPPED_M = 3, 0.01
 #: Poses of one TCP agree within this, m and rad, with a constant transform from the model's flange; half: arms whose table
 #: is off by a degree have no TCP, double: other tools count as one.
 TCP_M, TCP_RAD = 5e-3, 0.02
-#: Step of a joint for differences, rad.
-STEP_RAD = 1e-6
+STEP_RAD = 1e-6  # step of a joint for differences, rad
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,8 +45,7 @@ OVER_TIME = (
     ("walk_m", "walk_rad"),
     ("scale_walk",),
 )
-#: Sources that are the arm's.
-OF_THE_ARM = ("flange_m", "flange_rad", *LINKS, *DRIFT, *OVER_TIME[0], *OVER_TIME[1])
+OF_THE_ARM = ("flange_m", "flange_rad", *LINKS, *DRIFT, *OVER_TIME[0], *OVER_TIME[1])  # sources that are the arm's
 #: Shared source -> the map that says what it does to a pose.
 MAP_OF = {name: f"flange_{name.rpartition('_')[2]}" for name in (*DRIFT, *OVER_TIME[0], *OVER_TIME[1])} | {
     "scale_walk": "scale"

@@ -23,14 +23,10 @@ from armsight.loop.handeye.handeye import HandEye, calibrate_poses
 from armsight.loop.handeye.poses import Eye, Poses
 from armsight.vision.sources.bag.states import PoseTrack
 
-#: Poses used at most for the fit, spread evenly: a stream's neighbours say the same.
-MAX_POSES = 600
-#: A gap in the flange's stream longer than this, s, is not interpolated over.
-GAP_S = 0.25
-#: Rotation slower than this, rad/s, does not determine the time offset.
-MIN_SPEED_RAD_S = 0.02
-#: Over this time the speed of the flange is measured, s.
-SPEED_S = 0.02
+MAX_POSES = 600  # poses used at most for the fit, spread evenly: a stream's neighbours say the same
+GAP_S = 0.25  # a gap in the flange's stream longer than this, s, is not interpolated over
+MIN_SPEED_RAD_S = 0.02  # rotation slower than this, rad/s, does not determine the time offset
+SPEED_S = 0.02  # over this time the speed of the flange is measured, s
 #: Steps between poses over which angular speeds are taken, and how much faster than the slower stream is a blunder.
 OVER, FASTER = (4, 12, 36), 1.3
 

@@ -30,8 +30,7 @@ from armsight.loop.identify.measured import Measured
 LOOSE, LOOSE_SHARE = 2.0, 0.12
 #: Where gravity holds the joint on one of its sides at less than this part of the poses, they are too few to show it.
 BOTH_SIDES = 0.02
-#: A fitted backlash of fewer sigmas than this does not show.
-SURE = 3.0
+SURE = 3.0  # a fitted backlash of fewer sigmas than this does not show
 _SHOWN_BY = {"backlash": "the side it came from", "gravity_backlash": "the side gravity pulls to"}
 
 

@@ -31,8 +31,7 @@ STEPS, THERE, STEP_RAD = 30, 1e-9, 1e-6
 #: Version of corrected.toml. Version 1, which said no version, had [[cause]] tables and other names of the kinds of
 #: gravity; version 2 had no ranges of the readings and no nominal table.
 VERSION = 3
-#: Names of version 1 -> names now.
-_OLD_NAMES = {"slack": "gravity_backlash", "sag": "compliance"}
+_OLD_NAMES = {"slack": "gravity_backlash", "sag": "compliance"}  # names of version 1 -> names now
 #: Columns of the table -> their units; of the nominal one, which gives the levers of gravity.
 _UNITS = {"offset": "rad", "d": "m", "a": "m", "alpha": "rad", "beta": "rad"}
 _NOMINAL = {key: unit for key, unit in _UNITS.items() if key != "beta"}

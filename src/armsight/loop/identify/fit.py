@@ -74,12 +74,9 @@ def prior_sigma(model: Model, named: Mapping[str, float] | None = None) -> Array
 
 
 Mask = NDArray[np.bool_]
-#: A pose whose residual has a smaller chance than this is taken for a mistake.
-CHANCE = 1e-7
-#: Gauss-Newton steps at most; it stops when no step is more than this part of a sigma.
-STEPS, SMALL_STEP = 25, 1e-3
-#: Rounds of leaving out gross errors and estimating the noise.
-ROUNDS = 6
+CHANCE = 1e-7  # a pose whose residual has a smaller chance than this is taken for a mistake
+STEPS, SMALL_STEP = 25, 1e-3  # Gauss-Newton steps at most; it stops when no step is more than this part of a sigma
+ROUNDS = 6  # rounds of leaving out gross errors and estimating the noise
 #: Where a fit has left less than this part of the residuals' degrees of freedom, they do not determine their noise.
 MIN_FREEDOM = 0.1
 #: Noise below this, m or rad, is none: what rounding of a printed file leaves; and above this it is no noise.
@@ -219,8 +216,7 @@ def _sane(model: Model, x: Array, measured: Measured, phi: Array, noise: tuple[f
     return by_chance(far, measured.size, CHANCE)
 
 
-#: Where the search starts, rad and m: what is not there shrinks from it.
-START_RAD, START_M = 1e-3, 1e-4
+START_RAD, START_M = 1e-3, 1e-4  # where the search starts, rad and m: what is not there shrinks from it
 
 
 class JointNoise(NamedTuple):

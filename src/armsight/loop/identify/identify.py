@@ -24,16 +24,11 @@ from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.selection import PLACEMENT, TOGETHER, SelectionStep, forward_selection, scaled_prior
 from armsight.robot.kinematics.arm import Arm
 
-#: Fewest poses: what base and tool need, with some to spare.
-MIN_POSES = 6
-#: Joints that move less than this, rad, do not move.
-ALIKE = 0.02
-#: Most poses that the error sources are selected on; the final fit is to all of them.
-MAX_SELECTION_POSES = 4000
-#: Rounds of fitting everything and attributing what is left to the joints.
-ROUNDS = 3
-#: Correlations larger than this are reported.
-CORRELATED = 0.9
+MIN_POSES = 6  # fewest poses: what base and tool need, with some to spare
+ALIKE = 0.02  # joints that move less than this, rad, do not move
+MAX_SELECTION_POSES = 4000  # most poses that the error sources are selected on; the final fit is to all of them
+ROUNDS = 3  # rounds of fitting everything and attributing what is left to the joints
+CORRELATED = 0.9  # correlations larger than this are reported
 _TABLE = ("offset", "d", "a", "alpha", "beta")
 
 

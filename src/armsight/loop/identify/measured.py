@@ -78,8 +78,7 @@ class Measured(Record):
         return Measured(self.q[rows], self.p_rig[rows], R, cov, approach, angles, self.rotation)
 
 
-#: Poses whose joints all read within this, rad, of each other's are one pose, visited again.
-SAME_RAD = 5e-3
+SAME_RAD = 5e-3  # poses whose joints all read within this, rad, of each other's are one pose, visited again
 
 
 def visits(q: Array) -> NDArray[np.int64]:

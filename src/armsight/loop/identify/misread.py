@@ -44,21 +44,16 @@ Rows = NDArray[np.int64]
 #: Of hand-eye residuals: the median, and what nine of ten are below; data whose median is below this, m, are taken as they
 #: are, if nine of ten are plausible.
 QUANTILES, FITS_M = (0.5, 0.9), 2e-3
-#: Another reading must fit better by this factor, and be below this, m.
-BETTER, PLAUSIBLE_M = 4.0, 0.02
+BETTER, PLAUSIBLE_M = 4.0, 0.02  # another reading must fit better by this factor, and be below this, m
 #: A reading is preferred to those before it where its residual is smaller by this: xyz and ZYX are the same.
 SMALLER = 0.99
-#: Poses that a reading is evaluated by at most.
-EVALUATED = 60
+EVALUATED = 60  # poses that a reading is evaluated by at most
 #: Rows that both sides have in common at least where they are shifted (half of them besides: few rows fit anything), and
 #: shifts that are tried: those for which both sides rotate alike.
 COMMON, SHIFTS = 6, 4
-#: Rows at least on either side of where something may have been displaced, and rows that are tried.
-PART, TRIED = 6, 12
-#: Orders of the joints that are looked at: the angles between poses do not distinguish parallel axes.
-ORDERS = 12
-#: Mirrors one axis; the other two are this one rotated.
-MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+PART, TRIED = 6, 12  # rows at least on either side of where something may have been displaced, and rows that are tried
+ORDERS = 12  # orders of the joints that are looked at: the angles between poses do not distinguish parallel axes
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])  # mirrors one axis; the other two are this one rotated
 #: Units that lengths may be in, m; scales that differ from a unit's by less than this part are the unit.
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "metres": 1.0}
 A_UNIT = 0.1
@@ -411,8 +406,7 @@ _USUAL = 0.015, float(np.radians(2.0))
 _GROSS = 0.04, float(np.radians(8.0))
 #: Mistakes that fit within this factor of the best are named, too; half: exact ties alone, double: weak ones as well.
 _ALIKE = 1.25
-#: Lengths that differ by less are not exchanged, m.
-_LEAST_M = 0.002
+_LEAST_M = 0.002  # lengths that differ by less are not exchanged, m
 
 
 def require_fitting(arm: Arm, q: Array, Ts_rig_body: Array) -> None:
@@ -491,8 +485,7 @@ BAD_SHARE, BAD_M = 0.08, 0.015
 CLEAR = 2.0
 #: Fits better than this, m and rad, are alike: files are rounded, instruments resolve hundredths of a degree.
 ALIKE_M, ALIKE_RAD = 1e-6, np.deg2rad(0.01)
-#: A scale off by more than this is a unit.
-SCALE_OFF = 0.2
+SCALE_OFF = 0.2  # a scale off by more than this is a unit
 #: Rotations off by more than this, rad, are not of this arm: twice the prior of zeros and twists of six joints.
 BAD_RAD = 2 * np.sqrt(6) * np.hypot(SIGMA["offset"], SIGMA["alpha"])
 #: Poses looked at, those that every order and sign is tried on, and the fewest of which rows that are shifted do not fit by
@@ -500,12 +493,9 @@ BAD_RAD = 2 * np.sqrt(6) * np.hypot(SIGMA["offset"], SIGMA["alpha"])
 POSES, FEW, FEWEST = 80, 24, 12
 #: Poses on either side of a step, RMS of what is looked into, m, length of a body's axes, m, and step of differences, rad.
 FEWEST_A_PART, LEAST_M, AXES_M, STEP_RAD = 6, 2e-4, 0.1, 1e-6
-#: One joint is preferred to the whole base where it explains all but this many times as well.
-SIMPLER = 1.2
-#: A step is one where chance explains as much with this probability at most, by one row and one joint.
-CHANCE = 1e-8
-#: Orders whose signs are tried, best first.
-MAX_JOINT_ORDERS = 40
+SIMPLER = 1.2  # one joint is preferred to the whole base where it explains all but this many times as well
+CHANCE = 1e-8  # a step is one where chance explains as much with this probability at most, by one row and one joint
+MAX_JOINT_ORDERS = 40  # orders whose signs are tried, best first
 _SCALES = {1e-3: "m, not mm", 1e3: "mm, not m", 1e-1: "dm or cm", 10.0: "cm", 1 / 25.4: "inches", 25.4: "inches"}
 
 

@@ -39,13 +39,11 @@ from armsight.geometry.rotation import exp_so3, log_so3, skew
 from armsight.loop.identify.measured import Measured
 from armsight.robot.kinematics.arm import Arm
 
-#: Columns of a table of lengths and angles, (n, 5).
-COLUMNS = ("offset", "d", "a", "alpha", "beta")
+COLUMNS = ("offset", "d", "a", "alpha", "beta")  # columns of a table of lengths and angles, (n, 5)
 OFFSET, D, A, ALPHA, BETA = range(5)
 _STANDARD = (OFFSET, D, A, ALPHA, BETA)
 _MODIFIED = (ALPHA, A, BETA, OFFSET, D)
-#: Column -> the axis it rotates about or translates along.
-_AXIS = {OFFSET: 2, D: 2, A: 0, ALPHA: 0, BETA: 1}
+_AXIS = {OFFSET: 2, D: 2, A: 0, ALPHA: 0, BETA: 1}  # column -> the axis it rotates about or translates along
 _SHIFTS = (D, A)
 
 
@@ -110,10 +108,8 @@ PLENTY = 10
 #: A bearing's friction holds a link inside its backlash against gravity with up to about this lever, m: some per cent of
 #: the lever of such arms' links, as a bearing's friction is some per cent of its load. Over half of it the backlash closes.
 FRICTION_M = 2e-3
-#: Against gravity, of an arm that stands upright.
-UP = np.array([0.0, 0.0, 1.0])
-#: Kinds that make up the curve of a joint's sensor: functions of its reading.
-SENSOR = ("gain", "wave", "ripple")
+UP = np.array([0.0, 0.0, 1.0])  # against gravity, of an arm that stands upright
+SENSOR = ("gain", "wave", "ripple")  # kinds that make up the curve of a joint's sensor: functions of its reading
 #: Beyond the range of readings that the poses have shown, a sensor's curve fades over so much, rad. Over more, a fast
 #: harmonic would swing where nothing was measured; over less, what holds a few degrees on would be lost (half of 0.2 mm at
 #: 6 degrees, of the synthetic worn arms).

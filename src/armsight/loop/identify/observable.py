@@ -22,17 +22,12 @@ from armsight.loop.identify.model import Model
 
 #: Less than this part of a column left over counts as nothing: rounding leaves 1e-12, the nearest real case 1e-4.
 NOTHING = 1e-7
-#: A parameter is worth fitting where the data alone would give it a sigma below this many prior sigmas.
-WORTH = 1.0
-#: What moves the tool by less than this part of the noise, a prior sigma off, moves nothing at all.
-STILL = 1e-6
+WORTH = 1.0  # a parameter is worth fitting where the data alone would give it a sigma below this many prior sigmas
+STILL = 1e-6  # what moves the tool by less than this part of the noise, a prior sigma off, moves nothing at all
 _MOVES_NOTHING = "it moves nothing at these poses"
-#: A tie names the parameters that contribute at least this part of it.
-NAMED = 0.02
-#: Poses over the joints' whole range that reveal which ties no poses can resolve.
-PROBES = 300
-#: Poses looked at; more change nothing.
-MAX_POSES = 3000
+NAMED = 0.02  # a tie names the parameters that contribute at least this part of it
+PROBES = 300  # poses over the joints' whole range that reveal which ties no poses can resolve
+MAX_POSES = 3000  # poses looked at; more change nothing
 #: Kinds that belong to no row of the table.
 ERROR_SOURCES = ("gain", "wave", "ripple", "backlash", "gravity_backlash", "compliance")
 _PREFERENCE = ("base", "tool", "offset", "a", "alpha", "d", "beta", *ERROR_SOURCES)

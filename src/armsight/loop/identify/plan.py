@@ -37,8 +37,7 @@ from armsight.vision.rig import StereoRig
 #: Returns the whitened Jacobians (N, M, F) of poses q (N, J) approached from sides (N, J), and which of them are allowed.
 #: Those of poses that are not allowed do not count, except the first.
 Information = Callable[[Array, Array], tuple[Array, Mask]]
-#: Candidates compared at once: bounds the memory.
-_BATCH = 250
+_BATCH = 250  # candidates compared at once: bounds the memory
 #: Levels that a joint is tried at, from both sides; most sweeps over all poses; least relative gain of a sweep to go on.
 LEVELS, SWEEPS, MIN_GAIN = 7, 3, 0.01
 
@@ -142,16 +141,12 @@ def _best(
     return q, approach, kept
 
 
-#: Candidates sampled, and positions of the workspace at which the error is predicted.
-CANDIDATES, PROBES = 800, 200
-#: Most rounds of sampling four times as many, of which those allowed become candidates.
-SAMPLING_ROUNDS = 40
+CANDIDATES, PROBES = 800, 200  # candidates sampled, and positions of the workspace at which the error is predicted
+SAMPLING_ROUNDS = 40  # most rounds of sampling four times as many, of which those allowed become candidates
 #: Links must stay this far above the base's plane, m, and parts of the arm that are not neighbours this far apart.
 FLOOR_M, APART_M = 0.02, 0.06
-#: Prior sigma of base and tool, m and rad, which have none in a fit.
-UNKNOWN = 0.1
-#: Poses keep this far from the joints' limits, rad: a joint must have room to come from either side.
-ROOM_RAD = 0.03
+UNKNOWN = 0.1  # prior sigma of base and tool, m and rad, which have none in a fit
+ROOM_RAD = 0.03  # poses keep this far from the joints' limits, rad: a joint must have room to come from either side
 #: A prior sigma of an error source says how large it may be (a data sheet's limit); it mostly is this part of it.
 TYPICAL_SHARE = 1 / 3
 #: Joints scatter by about this much from pose to pose, rad (0.1 mm at 1 m): friction, a sensor's noise. Without it an
@@ -163,8 +158,7 @@ NOISE, BESIDES = (1e-4, 5e-4), (1e-6, 1e-6)
 #: A body in the cameras: RMS distance of its markers from their middle, m, how many there are, and the sigma of each in an
 #: image, px. Half the distance: its rotation is known half as well.
 SPREAD_M, MARKERS, SIGMA_PX = 0.04, 6, 0.1
-#: A pose is seen where its body is this far from the images' edges, px.
-MARGIN_PX = 60.0
+MARGIN_PX = 60.0  # a pose is seen where its body is this far from the images' edges, px
 #: Markers are on one side of a body: it is taken to be visible up to the rotation at which it was seen already, and this
 #: much more, rad.
 MORE_RAD = np.radians(10.0)

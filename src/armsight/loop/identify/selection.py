@@ -91,8 +91,7 @@ FOLDS, CLUSTERS, CLUSTER = 20, 200, 3
 #: Where numbers are few: what a harmonic's or load's coefficient costs, in the logarithms of the held-out squares summed
 #: over the numbers measured, which is minus twice a log likelihood. Without a price chance keeps half as many again.
 PRICE = 1.0
-#: The kinds that say where the arm is: base in the rig, tool on the flange.
-PLACEMENT = ("base", "tool")
+PLACEMENT = ("base", "tool")  # the kinds that say where the arm is: base in the rig, tool on the flange
 #: A sensor's harmonics make one curve, and the links' loads one compliance: they may be added together, and priors keep
 #: them small. One of these numbers alone may hardly show at the poses measured.
 CURVE = ("wave", "ripple")

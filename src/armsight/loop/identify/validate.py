@@ -20,12 +20,9 @@ from armsight.loop.identify.model import Model
 from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.selection import PLACEMENT
 
-#: Another set-up: the error is this many times that with base and tool fitted again,
-OTHER = 5.0
-#: and this far, m: no arm moves so far by itself between two recordings of one set-up.
-OTHER_M = 0.02
-#: Poses needed to fit base and tool again.
-MIN_POSES = 10
+OTHER = 5.0  # another set-up: the error is this many times that with base and tool fitted again,
+OTHER_M = 0.02  # and this far, m: no arm moves so far by itself between two recordings of one set-up
+MIN_POSES = 10  # poses needed to fit base and tool again
 
 
 class Errors(NamedTuple):
