@@ -116,7 +116,8 @@ class ArmStep(PageStep[ArmState]):
     def __init__(self, shared: Shared, measuring: MeasureStep, model: Arm) -> None:
         super().__init__(shared, ArmState())
         self.model, self._measuring, self._simulated = model, measuring, shared.simulated
-        self.handeye, self._identifying = HandEyeGuide(shared, model, shared.options.arm), IdentifyStep(shared)
+        self.handeye = HandEyeGuide(shared, model, shared.options.arm)
+        self._identifying = IdentifyStep(shared, IdentifyState())
         self.held = ""
         self._board: StoppableBoard | None = None
         self._logged: LoggedAngles | None = None
@@ -236,7 +237,8 @@ class ArmStep(PageStep[ArmState]):
         """Have the thread of the board do something that moves the arm, if nothing is missing."""
         if missing := self._lacking():
             raise InputError(missing)
-        self._require_rest()
+        if self.busy:
+            raise InputError("a motion runs already: hold or stop it first")
         if self._stopped():
             raise InputError("the arm was stopped: allow the drives again first")
         self._hold, self.held = None, ""
@@ -283,13 +285,12 @@ class ArmStep(PageStep[ArmState]):
             poses = Path(folder) / "handeye_poses.csv"
         self._identifying.start(self.shared.options.arm, poses)
 
-    @asked("arm")
+    @asked("arm", rest=True)
     def use_arm(self, arm: str) -> None:
         """Use another model of the arm: a name, a TOML or a URDF file, such as the corrected one.
 
         The hand-eye calibration is made anew from its poses.
         """
-        self._require_rest()
         model = slowed(open_arm(arm), self.shared.options.board or "")
         if model.joints != self.model.joints:
             raise InputError(f"{arm} has {model.joints} joints, {self.model.name} {self.model.joints}")
@@ -297,10 +298,9 @@ class ArmStep(PageStep[ArmState]):
         self.handeye.use_arm(model, arm)
         self.say("good", f"arm: {model.name} ({arm})")
 
-    @asked("arm")
+    @asked("arm", rest=True)
     def use_motion(self, path: str) -> None:
         """Use the motions of another file."""
-        self._require_rest()
         plan = read_motions(self.model, path)
         self.shared.motion, self._start = Path(path), plan.start
         self.say("good", f"motions: {', '.join(each.name for each in plan.motions)} ({path})")
@@ -311,10 +311,6 @@ class ArmStep(PageStep[ArmState]):
         if self._board is None:
             raise InputError("no board is connected")
         self._board.clear_stop()
-
-    def _require_rest(self) -> None:
-        if self.busy:
-            raise InputError("a motion runs already: hold or stop it first")
 
     def _stopped(self) -> bool:
         board = self._board
@@ -409,7 +405,7 @@ class ArmStep(PageStep[ArmState]):
                 targets,
                 dict(zip(("motion.toml", "body.toml"), texts, strict=True)),
                 command="live",
-                say=lambda line: self.say("warn", line.removeprefix("note: ")),
+                say=self.warn,
                 progress=self._progress,
                 close_loop=closed,
                 begun=self._begun,
@@ -504,7 +500,7 @@ class ArmStep(PageStep[ArmState]):
         return plan, handeye_poses(arm, np.array(ends), _HANDEYE_POSES[self._simulated is not None], 0)
 
     def _progress(self, line: str) -> None:
-        self.show(running=line)
+        self.shown = replace(self.shown, running=line)  # the loop waits for no lock
 
     def _begun(self, loop: Loop) -> None:
         self._loop = loop

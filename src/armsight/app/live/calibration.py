@@ -435,8 +435,10 @@ class CalibrationStep(Guided[CalibrationState]):
         counts = np.zeros((2, *CELLS[::-1]), int)
         for pair in self._shots.values():
             for side, found in enumerate((pair.left, pair.right)):
-                (u, v), (width, height) = found.uv.T, sizes[side]
-                counts[side] += (np.histogram2d(u, v, CELLS, ((0, width), (0, height)))[0] > 0).T
+                hit = np.zeros(CELLS[::-1], bool)
+                u, v = np.clip(found.uv / sizes[side] * CELLS, 0, np.subtract(CELLS, 1)).astype(int).T
+                hit[v, u] = True
+                counts[side] += hit
         return tuple(tuple(map(tuple, side)) for side in counts.tolist())
 
     def _drawings(self, seen: Pair | None) -> tuple[Drawn, ...]:

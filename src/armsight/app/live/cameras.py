@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -64,7 +65,7 @@ class CamerasStep(PageStep[CamerasState]):
         simulated = (shared.options.source or "").startswith(SIM)
         self._found = [] if simulated else find_cameras()
         shared.source = _best_source(self._found) if shared.options.source is None else shared.options.source
-        shared.capture = CameraCapture(self._open, self._failed)
+        shared.capture = CameraCapture(self._open, partial(self.say, "error"))
         self._flicker: tuple[FlickerWatch, FlickerWatch] | None = None
         self._bright: tuple[float, ...] | None = None  # mean grey levels when a person was asked to cover a lens
         self._quality_s = 0.0
@@ -78,7 +79,7 @@ class CamerasStep(PageStep[CamerasState]):
         if source.startswith("usb:"):
             parsed_usb(source.removeprefix("usb:"))  # else those that are open would be closed for nothing
         shared.capture.close()
-        shared.source, shared.capture = source, CameraCapture(self._open, self._failed)
+        shared.source, shared.capture = source, CameraCapture(self._open, partial(self.say, "error"))
         shared.capture.start()
         self._flicker = None
         self.show(left_known=False)
@@ -185,9 +186,6 @@ class CamerasStep(PageStep[CamerasState]):
             ACTIONS if simulated else (),
             "armsight demo" if simulated else f"armsight record {self.shared.source or 'usb:LEFT,RIGHT'} -o shots",
         )
-
-    def _failed(self, problem: str) -> None:
-        self.say("error", problem)
 
     def _open(self) -> Source:
         """Open the cameras, in the thread that reads them."""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from armsight.app.identify.report import identify_report, write_results
 from armsight.app.identify.run import run_identify
-from armsight.app.live.step import PageStep, Shared, unused
+from armsight.app.live.step import PageStep, unused
 from armsight.app.show.plotting import require_matplotlib
 from armsight.app.show.report import Report
 from armsight.errors import InputError
@@ -32,9 +32,6 @@ class IdentifyState:
 
 class IdentifyStep(PageStep[IdentifyState]):
     """Identifies one arm at a time; results go to ``identify``, ``identify-2``, ... in the folder of the session."""
-
-    def __init__(self, shared: Shared) -> None:
-        super().__init__(shared, IdentifyState())
 
     def start(self, arm_spec: str, poses: Path | None) -> None:
         """Identify an arm from a table of poses, in the background."""

@@ -195,7 +195,7 @@ class MeasureStep(PageStep[MeasureState]):
         self._pivot_poses: list[Array] | None = None
         self._tip: Pivot | None = None
         self._recording: _PoseFile | None = None
-        self._streams = open_streams((), Published(), self._said)
+        self._streams = open_streams((), Published(), self.warn)
         self._clear()
 
     def _clear(self) -> None:
@@ -259,7 +259,7 @@ class MeasureStep(PageStep[MeasureState]):
             return
         self._monitor = HealthMonitor(rig, body.target.body, sync_s, printed=is_print(body.target))
         try:
-            self._streams = open_streams(self.shared.options.streams, Published(rig, body.target.body), self._said)
+            self._streams = open_streams(self.shared.options.streams, Published(rig, body.target.body), self.warn)
         except InputError as error:
             self.say("error", str(error))
 
@@ -361,11 +361,7 @@ class MeasureStep(PageStep[MeasureState]):
             elif self.rig is None or self._body is None:
                 raise InputError(self.lacking)
             else:
-                self._recording = _PoseFile(self.folder, self.rig, self._body.target.body, self._said)
-
-    def _said(self, line: str) -> None:
-        """Pass a line about the recording or a stream on to the person."""
-        self.say("warn", line.removeprefix("note: "))
+                self._recording = _PoseFile(self.folder, self.rig, self._body.target.body, self.warn)
 
     def _write(self, live: LiveShot, result: Measured) -> None:
         """Write a row, whole; a full disk ends the recording."""

@@ -6,6 +6,7 @@ the page shows of it, :meth:`PageStep.later` does in a thread of its own what ta
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -79,6 +80,10 @@ class PageStep(Generic[S]):
         with self.lock:
             self.shown = replace(self.shown, **values)  # type: ignore[type-var]
 
+    def warn(self, line: str) -> None:
+        """Pass a line about a recording or a stream on to the person."""
+        self.say("warn", line.removeprefix("note: "))
+
     def later(self, failure: str, work: Callable[..., None], *given: object) -> None:
         """Do something in the background; what goes wrong is said after the words ``failure``."""
 
@@ -88,7 +93,8 @@ class PageStep(Generic[S]):
             except Exception as error:  # noqa: BLE001 - nobody else watches this thread
                 self.say("error", f"{failure}: {why(error)}")
 
-        self._pool.submit(watched)
+        with contextlib.suppress(RuntimeError):  # the step was closed meanwhile
+            self._pool.submit(watched)
 
     def close(self) -> None:
         """End the thread."""
