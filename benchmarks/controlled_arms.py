@@ -27,13 +27,13 @@ from faults import SIGMA_PX, SIGMAS, measured  # noqa: E402
 import armsight.app.run.experiment as experiment  # noqa: E402
 from armsight.app.arm.evaluate import evaluate_arm, plan_report  # noqa: E402
 from armsight.app.demo.demo import motion_text  # noqa: E402
-from armsight.app.run.calibrate import handeye_poses  # noqa: E402
-from armsight.app.run.folder import Finished, finish, make_room  # noqa: E402
+from armsight.app.run.folder import finish, make_room  # noqa: E402
 from armsight.app.run.motion_file import read_motions  # noqa: E402
-from armsight.app.run.setup import Setup  # noqa: E402
 from armsight.data import Shot  # noqa: E402
 from armsight.geometry.pose import exp_se3, inverse, pose  # noqa: E402
 from armsight.loop.identify.model import gravity_levers  # noqa: E402
+from armsight.loop.running.calibrate import handeye_poses  # noqa: E402
+from armsight.loop.running.setup import Setup  # noqa: E402
 from armsight.loop.servo import JointLoops, LoopTiming, PoseServo  # noqa: E402
 from armsight.robot.arm_file import open_arm  # noqa: E402
 from armsight.robot.board_registry import slowed  # noqa: E402
@@ -144,14 +144,15 @@ def in_motion(cell, found):
     T_run_base, T_body_tool = mounting.T_base_rig @ inverse(cell.T_base_rig), MOUNT @ inverse(mounting.T_tool_body)
     off, variance, inside = [], [], []
     motions = [each for each in found.log.segments if each.phase in ("open_loop", "closed_loop")]
-    for part in found.log.fused:
-        moves = np.any([(part.t_s >= each.begin_s) & (part.t_s < each.end_s) for each in motions], axis=0)
-        for t_s, T, cov in zip(part.t_s[moves], part.Ts_base_tool[moves], part.covs[moves], strict=True):
-            true = T_run_base @ cell.arm.arm.forward(cell.true_q(t_s)) @ T_body_tool
-            e, own = T[:3, :3].T @ (T[:3, 3] - true[:3, 3]), cov[:3, :3]
-            off.append(e @ e)
-            variance.append(np.trace(own))
-            inside.append(e @ np.linalg.solve(own, e) < CHI2_95)
+    rows = found.log.fused.array(53)
+    moves = np.any([(rows[:, 0] >= each.begin_s) & (rows[:, 0] < each.end_s) for each in motions], axis=0)
+    for row in rows[moves]:
+        t_s, T, own = row[0], row[1:17].reshape(4, 4), row[17:].reshape(6, 6)[:3, :3]
+        true = T_run_base @ cell.arm.arm.forward(cell.true_q(t_s)) @ T_body_tool
+        e = T[:3, :3].T @ (T[:3, 3] - true[:3, 3])
+        off.append(e @ e)
+        variance.append(np.trace(own))
+        inside.append(e @ np.linalg.solve(own, e) < CHI2_95)
     return 1e3 * float(np.sqrt(np.mean(off))), 1e3 * float(np.sqrt(np.mean(variance))), float(np.mean(inside))
 
 
@@ -264,12 +265,13 @@ def report(name, seed, poses=20, cycles=4):
     found.kept, found.picture = [], None  # there are no images
     make_room(folder)
     (folder / "motion.toml").write_text(text)
-    of_run = {"nominal_arm": name, "board": cell.board.welcome.board}
-    finish(Finished(cell.model, cell.given, found, plan, None, of_run, 0.0, [], None), folder)
+    found.properties = {"nominal_arm": name, "board": cell.board.welcome.board}
+    finish(found, folder)
     result = evaluate_arm(folder, open_arm(name))
     device = cell.arm.device
     ar4 = name == "ar4"
-    times, read = (np.concatenate([getattr(each, field) for each in found.log.joints]) for field in ("t_s", "q"))
+    rows = found.log.readings.array(1 + cell.model.joints)
+    times, read = rows[:, 0], rows[:, 1:]
     ends = [segment.end_s for segment in found.log.segments if segment.phase == "rest"]
     zeros = np.degrees(np.mean([cell.true_q(times[k]) - read[k] for k in np.searchsorted(times, ends) - 1], axis=0))
     backlash = np.array(device.mechanics.backlash_deg) if ar4 else np.full(5, np.nan)

@@ -63,7 +63,7 @@ def run(seed: int, quick: bool, found: dict[str, list[float]]) -> None:
     """Run a seed and add its metrics."""
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        s = run_demo(Demo(Path(folder), seed=seed, quick=quick)).to_json()
+        s = run_demo(Demo(Path(folder), seed=seed, quick=quick)).json()
     for name, (part, key, factor, _, _) in METRICS.items():
         found[name].append(factor * s[part][key])
     c = s["closed_loop"]

@@ -530,16 +530,16 @@ def rendered(case: str) -> None:
     try:
         with tempfile.TemporaryDirectory() as folder:
             began = time.perf_counter()
-            summary = demo.run_demo(demo.Demo(Path(folder), quick=True))
+            report = demo.run_demo(demo.Demo(Path(folder), quick=True))
     finally:
         demo.run_experiment, Mounting.pose_measurement = run, carry
-    tracks = {name: summary.tracks[name] for name in ("vision", "fused") if name in summary.tracks}
-    for name, track in tracks.items():
-        claimed = np.nan if track.claimed is None else 1e3 * track.claimed.position_sigma_rms_m
-        print(f"{case:6s} {name:7s} {1e3 * track.position_rms_m:.2f} mm RMS, claimed {claimed:.2f} mm")
-    for found in summary.health:
-        print(f"{case:6s} {found.line()} ({found.size:.3f} ± {found.sigma:.3f} {found.unit})")
-    print(f"{case:6s} {len(summary.health)} findings; {time.perf_counter() - began:.0f} s", flush=True)
+    for name, track in ((name, report.json().get(name)) for name in ("vision", "fused")):
+        if track is not None:
+            rms, claimed = (1e3 * track.get(key, np.nan) for key in ("position_rms_m", "position_sigma_rms_m"))
+            print(f"{case:6s} {name:7s} {rms:.2f} mm RMS, claimed {claimed:.2f} mm")
+    for note in report.notes:
+        print(f"{case:6s} {note.text}")
+    print(f"{case:6s} {len(report.json()['health'])} findings; {time.perf_counter() - began:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

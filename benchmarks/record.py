@@ -22,12 +22,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from armsight.app.replay.compare import compare
-from armsight.app.stream.datum import JointsDatum, Published, ShotDatum
+from armsight.app.replay.tables import compare
+from armsight.app.stream.datum import Published
 from armsight.app.stream.mcap_file import McapSink, properties
 from armsight.data import Body, JointStates, PoseEstimate, Shot
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rotation import exp_so3
+from armsight.loop.running.data import JointsDatum, ShotDatum
 from armsight.robot.arm_file import open_arm
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
@@ -147,8 +148,8 @@ def cost() -> None:
 
 def beside(blocks: int = 40, shots: int = 60) -> None:
     """3. A loop at 60 Hz in real time, recorded in every other second: image to command, side by side in one run."""
-    from armsight.app.run.loop import SWITCH_S
     from armsight.loop.estimators import Delay, KalmanEstimator
+    from armsight.loop.running.loop import SWITCH_S
     from armsight.vision.follow.follower import Follower
     from disc_images import exposed
     from marker_follow import path
@@ -268,7 +269,8 @@ KILLED = """
 import sys, time
 import numpy as np
 from pathlib import Path
-from armsight.app.stream.datum import NoteDatum, Published
+from armsight.app.stream.datum import Published
+from armsight.loop.running.data import NoteDatum
 from armsight.app.stream.mcap_file import McapSink
 sink = McapSink(Path(sys.argv[1]), Published())
 sink.start()

@@ -14,9 +14,8 @@ from armsight.app.arm.evaluate import evaluate_arm, least_squares, plan_report
 from armsight.app.arm.report import write_report
 from armsight.app.check.evaluate import evaluate as evaluate_check
 from armsight.app.check.run_folder import attained_in
-from armsight.app.run.folder import joint_columns
 from armsight.app.run.motion_file import read_motions
-from armsight.app.run.record import ToolTrack, write_columns, write_track
+from armsight.app.run.tracks import ToolTrack, joint_columns, write_columns, write_track
 from armsight.geometry.pose import exp_se3
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
@@ -58,7 +57,7 @@ def run(tmp_path_factory):
     covs = np.tile(np.diag(SIGMA**2), (len(q), 1, 1))
     write_track(folder, "vision", ToolTrack(t_s, T, phase, name, covs))
     write_track(folder, "reference", ToolTrack(t_s, ARM.forward(q_ref), phase, name))
-    write_columns(folder, "joints", joint_columns(t_s, q, q_ref))
+    write_columns(folder, "joints", [joint_columns(t_s, q, q_ref)])
     (folder / "summary.json").write_text(json.dumps({"nominal_arm": "so101", "board": "feetech", "health": []}))
     return folder
 

@@ -93,7 +93,6 @@ def test_the_folder_holds_what_its_page_says(quick):
     assert summary["version"] == 2
     for name in ("truth", "vision", "potentiometers", "fused", "live", "reference", "joints"):
         assert (folder / f"{name}.csv").stat().st_size > 1000
-        assert (folder / f"{name}.parquet").stat().st_size > 1000
     for name in ("joints", "path", "errors", "loop", "latency", "pose", "workcell"):
         assert (folder / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
     page = (folder / "report.html").read_text()

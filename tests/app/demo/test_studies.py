@@ -132,9 +132,8 @@ def test_vision_is_studied_in_a_process_beside_the_rates(monkeypatch, tmp_path, 
 
     monkeypatch.setattr(demo, "vision_studies", dict)  # returns what it is asked for
     monkeypatch.setattr(demo, "rate_study", rate_study)
-    whole = SimpleNamespace(closed_s=(0.0, 1.0), ended_by=None, interrupted=False)
-    rig = SimpleNamespace(rig=None)
-    given = (Demo(tmp_path, seed=3), "1280x720@60", None, rig, whole, None, 8, lambda line: None)
+    whole = SimpleNamespace(closed_s=(0.0, 1.0), ended_text=None)
+    given = (Demo(tmp_path, seed=3), "1280x720@60", None, whole, 8, lambda line: None)
     if interrupted:  # the other process is in the middle of an hour, for which nobody waits
         monkeypatch.setattr(demo, "partial", lambda function, **options: functools.partial(time.sleep, 3600))
         with pytest.raises(KeyboardInterrupt):

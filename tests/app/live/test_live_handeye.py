@@ -10,10 +10,10 @@ from armsight.app.live import handeye
 from armsight.app.live.handeye import LEAST_POSES, MOST_POSES, HandEyeGuide, likely_joint_errors
 from armsight.app.live.session import LiveSession
 from armsight.app.live.step import SessionOptions, Shared
-from armsight.app.run.calibrate import VisitedPose, handeye_poses
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.loop.identify.read import read_poses
+from armsight.loop.running.calibrate import VisitedPose, handeye_poses
 from armsight.robot.models import MODELS
 from armsight.sim.example_rig import example_rig
 from armsight.sim.workcell.cameras import rig_pose

@@ -10,12 +10,13 @@ pytest.importorskip("mcap_protobuf")
 pytest.importorskip("foxglove_schemas_protobuf")
 pytest.importorskip("rosbags")
 
-from armsight.app.replay.compare import compare
-from armsight.app.stream.datum import EventDatum, JointsDatum, Published, ShotDatum, estimator_event, mounting_event
+from armsight.app.replay.tables import compare
+from armsight.app.stream.datum import Published
 from armsight.app.stream.mcap_file import McapSink, properties
-from armsight.data import Correspondences, JointStates, Missed, Points, PoseEstimate, Shot
+from armsight.data import JointStates, Missed, PoseEstimate, Shot
 from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.loop.estimators import Delay, KalmanEstimator, Mounting
+from armsight.loop.running.data import NO_POINTS, EventDatum, JointsDatum, ShotDatum, estimator_event, mounting_event
 from armsight.robot.arm_file import open_arm
 from armsight.vision.markers.targets import open_target
 from armsight.vision.rig import StereoRig
@@ -38,9 +39,7 @@ MOUNTING = Mounting(
 
 
 def estimate(T, cov):
-    nothing = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
-    points = Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 0)), nothing)
-    return PoseEstimate(T, cov, 0.9 * cov, 1e-4, 0.1, 1.0, points)
+    return PoseEstimate(T, cov, 0.9 * cov, 1e-4, 0.1, 1.0, NO_POINTS)
 
 
 @pytest.fixture(scope="module")

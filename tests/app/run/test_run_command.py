@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from armsight.app.progress import steps
-from armsight.app.run import calibrate as run_calibrate
 from armsight.app.run import command
+from armsight.loop.running import calibrate as run_calibrate
 from armsight.sim.workcell.workcell import Workcell
 from cli_runs import assert_rejected
 

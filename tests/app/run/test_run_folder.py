@@ -4,42 +4,48 @@ import csv
 import json
 import os
 import signal
-import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from armsight.app.demo import demo
-from armsight.app.run import folder as run_files
 from armsight.app.run import folder as run_folder
 from armsight.app.run.experiment import RunResult
-from armsight.app.run.folder import Finished, finish, make_room, write_run, write_shots
-from armsight.app.run.report import RunReport, _page
-from armsight.app.run.summary import RunSummary
+from armsight.app.run.folder import finish, make_room, write_shots
+from armsight.app.run.report import report_of
 from armsight.data import Body, JointStates, Missed, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.health import HealthFinding
+from armsight.robot.arm_file import open_arm
 
 BODY = Body("plate", ("A", "B", "C"), np.eye(3))
 
 
-def finished(readings=400, **said):
+ARM = open_arm("six_r")
+SETUP = SimpleNamespace(arm=ARM, target=SimpleNamespace(body=BODY))
+PROPERTIES = {"arm": "six_r", "sigma_m": float("nan"), "values": [1.0, float("inf")], "count": 3, "said": True}
+
+
+def broken_off(readings=400, **said):
     """A run that was broken off before the cameras were found."""
-    outcome = RunResult(BODY)
-    t_s = 1e-3 * np.arange(readings)
-    outcome.log.joints.append(JointStates(t_s, np.random.default_rng(0).standard_normal((readings, 6))))
-    outcome.log.poses.append(("000000", 0.1, Missed("nothing is seen")))
+    result = RunResult(SETUP, None, None, PROPERTIES)
+    if readings:
+        t_s = 1e-3 * np.arange(readings)
+        result.log.read(JointStates(t_s, np.random.default_rng(0).standard_normal((readings, 6))))
+        result.log.seen("000000", 0.1, Missed("nothing is seen"))
     for name, value in said.items():
-        setattr(outcome, name, value)
-    properties = {"arm": "six_r", "sigma_m": float("nan"), "values": [1.0, float("inf")], "count": 3, "said": True}
-    return Finished(
-        SimpleNamespace(), None, outcome, SimpleNamespace(), None, properties, time.perf_counter(), [], None
-    )
+        setattr(result, name, value)
+    return result
+
+
+def finished(folder, *given, **said):
+    return finish(broken_off(*given, **said), folder)
 
 
 def test_what_is_not_known_is_null(tmp_path):
-    summary = write_run(finished(), tmp_path).to_json()
+    summary = finished(tmp_path).json()
     text = (tmp_path / "summary.json").read_text()
     assert json.loads(text, parse_constant=pytest.fail) == summary
     assert summary["sigma_m"] is None
@@ -47,35 +53,20 @@ def test_what_is_not_known_is_null(tmp_path):
     assert summary["count"] == 3
     assert summary["said"] is True
     assert summary["ended_by"] is None
-    assert list(summary) == [
-        "version",
-        "health",
-        "fixed_unseen",
-        "rig_corrections",
-        "rig_not_corrected",
-        "arm",
-        "sigma_m",
-        "values",
-        "count",
-        "said",
-        "wall_s",
-        "ended_by",
-    ]
+    own = {"version", "notes", "health", "fixed_unseen", "rig_corrections", "rig_not_corrected", "wall_s", "ended_by"}
+    assert set(summary) == own | set(PROPERTIES)
 
 
 def test_nothing_measured_at_all_is_a_folder_all_the_same(tmp_path):
-    nothing = finished(interrupted=True)
-    nothing.outcome.log.joints.clear()
-    nothing.outcome.log.poses.clear()
     with pytest.raises(KeyboardInterrupt):
-        finish(nothing, tmp_path)
+        finished(tmp_path, 0, interrupted=True)
     assert json.loads((tmp_path / "summary.json").read_text())["ended_by"] == "interrupted"
 
 
 def test_a_full_disk_is_one_line_and_keeps_what_fits(small_disk):
     disk, gone = small_disk("96k"), DeviceError("left camera: gone")
     with pytest.raises(InputError) as caught:
-        finish(finished(readings=4000, ended_by=gone), disk)
+        finished(disk, 4000, ended_by=gone)
     said = str(caught.value)
     assert "\n" not in said
     assert said.startswith("left camera: gone; the arm was stopped, and not all could be written: ")
@@ -94,14 +85,15 @@ def test_what_must_not_be_trusted_is_in_the_summary_and_in_the_error(tmp_path):
     with pytest.raises(
         ArmsightError, match=r"gone; .*; do not trust this result: rig: a camera is rotated since 1\.5 s;"
     ):
-        finish(finished(ended_by=gone, health=(FOUND,)), tmp_path)
+        finished(tmp_path, ended_by=gone, health=(FOUND,))
     (found,) = json.loads((tmp_path / "summary.json").read_text())["health"]
     assert found == json.loads(json.dumps(FOUND.to_json()))
 
 
 @pytest.mark.parametrize("found", [(), (FOUND,)])
 def test_the_exit_code_says_whether_the_result_can_be_trusted(tmp_path, monkeypatch, armsight, found):
-    monkeypatch.setattr(demo, "run_demo", lambda given, progress: RunSummary({}, 1.0, None, {}, health=found))
+    report = replace(report_of(broken_off(health=found), None), values={"wall_s": 1.0})
+    monkeypatch.setattr(demo, "run_demo", lambda given, progress: report)
     said = armsight("demo", "--quick", "-o", tmp_path / "demo")
     assert said.code == (3 if found else 0)
     assert ("do not trust this result: rig: a camera is rotated" in said.err) is bool(found)
@@ -110,9 +102,8 @@ def test_the_exit_code_says_whether_the_result_can_be_trusted(tmp_path, monkeypa
 
 
 def test_the_report_begins_with_what_must_not_be_trusted():
-    summary = RunSummary({"arm": "six_r"}, 1.0, None, {}, health=(FOUND,))
-    page = _page(RunReport(summary, None, None, None, None, None, ["a note"]), {})
-    assert 0 < page.index("Do not trust this result") < page.index("a camera is rotated") < page.index("a note")
+    page = report_of(broken_off(health=(FOUND,)), None).page({})
+    assert 0 < page.index("Do not trust this result") < page.index("a camera is rotated")
 
 
 def shots(count):
@@ -137,7 +128,7 @@ def test_an_interrupt_while_shots_are_written_leaves_none_by_half(tmp_path, monk
         (folder / "left000000.png").write_bytes(b"half")
         return SimpleNamespace(directory=folder, interrupted=True, stopped="interrupted")
 
-    monkeypatch.setattr(run_files, "record", interrupted)
+    monkeypatch.setattr(run_folder, "record", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_shots(tmp_path / "shots", shots(1))
     assert list(tmp_path.iterdir()) == []
@@ -152,13 +143,13 @@ def test_an_interrupt_while_writing_waits_until_what_was_measured_is_there(tmp_p
 
     monkeypatch.setattr(run_folder, "write_columns", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        write_run(finished(), tmp_path)
-    assert {"joints.csv", "joints.parquet", "poses.csv", "summary.json"} == {path.name for path in tmp_path.iterdir()}
+        finished(tmp_path)
+    assert {"joints.csv", "poses.csv", "summary.json"} == {path.name for path in tmp_path.iterdir()}
 
 
 def test_the_message_about_what_ended_a_run_names_the_folder(tmp_path):
     with pytest.raises(ArmsightError) as caught:
-        finish(finished(ended_by=DeviceError("the board is gone")), tmp_path)
+        finished(tmp_path, ended_by=DeviceError("the board is gone"))
     assert str(caught.value) == f"the board is gone; the arm was stopped; what was measured until then is in {tmp_path}"
 
 

@@ -13,11 +13,11 @@ from test_run_mcap import BODY, measured, write
 from armsight.app.export.tables import tables_of
 from armsight.app.replay.recorded import read_run
 from armsight.app.replay.tables import LIVE_COLUMNS
-from armsight.app.stream.datum import JointsDatum, ShotDatum
 from armsight.app.stream.mcap_file import METADATA
 from armsight.app.stream.ros import TO_ROS
 from armsight.app.stream.websocket import TOPICS
 from armsight.data import JointStates, Missed, Shot
+from armsight.loop.running.data import JointsDatum, ShotDatum
 from armsight.vision.pose.shot_pose import CSV_COLUMNS, SHUTTER_COLUMNS
 from armsight.vision.sources.bag import Bag
 

@@ -18,12 +18,13 @@ pytest.importorskip("foxglove_schemas_protobuf")
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from armsight.app.stream.datum import EventDatum, JointsDatum, NoteDatum, Published, ShotDatum, json_text, quaternion
+from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.mcap_file import LazyMcap, McapBeside, McapSink, arm_of, properties
 from armsight.data import Body, Dropped, JointStates, Missed, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3, quaternion_wxyz
+from armsight.loop.running.data import EventDatum, JointsDatum, NoteDatum, ShotDatum, quaternion
 from armsight.robot.arm_file import open_arm
 from armsight.vision.detections import SeenShot
 from armsight.vision.pose.measure import measure_seen
@@ -195,7 +196,7 @@ KILLED = """
 import sys, time
 from pathlib import Path
 from test_run_mcap import published
-from armsight.app.stream.datum import NoteDatum
+from armsight.loop.running.data import NoteDatum
 from armsight.app.stream.mcap_file import McapBeside, McapSink
 sink = McapSink(Path(sys.argv[1]), published())
 sink.start()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from armsight.app.stream.datum import NoteDatum, Published, ShotDatum
+from armsight.app.stream.datum import Published
 from armsight.app.stream.igtl import crc64, message, position_body, status_body, transform_body
 from armsight.app.stream.network import open_json_tcp
 from armsight.app.stream.streams import open_streams
@@ -18,6 +18,7 @@ from armsight.data import Missed, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
+from armsight.loop.running.data import NoteDatum, ShotDatum
 
 pytestmark = pytest.mark.real_time  # readers have threads of their own, and zenoh gives a connection a second
 SHOT = ShotDatum(Shot("s0", None, None, 2.5), Missed("too dark"), 2.52)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from armsight.app.check.evaluate import evaluate
 from armsight.app.check.run_folder import WINDOW_S, JointTrack, Noise, attained_in, joint_track, noise_of, segments_of
-from armsight.app.run.record import read_track
+from armsight.app.run.tracks import read_track
 from armsight.app.show.encode import json_of
 from armsight.data import Array, Record
 from armsight.errors import InputError

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from armsight.app.check.rows import SAME_M, Attained, Reversal, Row, first_few, natural
-from armsight.app.run.record import ToolTrack, read_track
+from armsight.app.run.tracks import ToolTrack, read_track
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import read_toml

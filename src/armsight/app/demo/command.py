@@ -79,7 +79,7 @@ def command(
     """Calibrate, measure the moving arm, compare the tracks, and close the loop, in a simulated workcell.
 
     Simulated dynamics, rendered cameras, and the real ARM firmware under emulation; needs no hardware. DIR receives the
-    run: report.html, summary.json, every track as CSV and Parquet (docs/howto/run.md).
+    run: report.html, summary.json, every track as CSV (docs/howto/run.md).
     """
     emulator = board.removeprefix("emulated:")
     if emulator == board:
@@ -91,7 +91,7 @@ def command(
 
     from armsight.app.demo.demo import Demo, run_demo
     from armsight.app.progress import steps
-    from armsight.app.run.summary import show_summary
+    from armsight.app.run.report import show
     from armsight.robot.arm_file import open_arm
 
     gc.freeze()  # what was imported stays: no collection has to look at it
@@ -99,8 +99,8 @@ def command(
     demo = Demo(output, arm, cameras, seed, emulator, layout, model, quick, nominal, nominal_arm, follow_rig, sync_led)
     try:
         with steps() as progress:
-            summary = run_demo(demo, progress=progress)
+            report = run_demo(demo, progress=progress)
     except KeyboardInterrupt:
         click.echo(f"the arm was stopped; what was measured until then is in {output}", err=True)
         raise
-    show_summary(summary, output, as_json=as_json)
+    show(report, output, as_json=as_json)

@@ -1,49 +1,50 @@
 """The demo: the experiment of ``armsight run`` in the simulated workcell, evaluated against the truth.
 
-In: a :class:`Demo`. Out: a run's folder with report, and its summary. The workcell simulates the arm's dynamics, renders
-the cameras' images, and runs the board's firmware under emulation; the cameras are calibrated first.
+In: a :class:`Demo`. Out: a run's folder, and its report. The workcell simulates the arm's dynamics, renders the cameras'
+images, and runs the board's firmware under emulation; the cameras are calibrated first.
 """
 
 from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from armsight.app.demo.studies import rate_study, vision_studies
-from armsight.app.run.calibrate import calibrated, handeye_poses
-from armsight.app.run.experiment import Progress, RunResult, run_experiment
-from armsight.app.run.folder import Finished, finish, make_room, open_folder
+from armsight.app.demo.studies import rate_study, true_track, vision_studies
+from armsight.app.run.devices import setup_of
+from armsight.app.run.experiment import RunResult, run_experiment
+from armsight.app.run.folder import finish, make_room, open_folder
 from armsight.app.run.metrics import Study
-from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK, MotionPlan, read_motions
-from armsight.app.run.setup import setup_of
-from armsight.app.run.summary import RunSummary
+from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK, read_motions
+from armsight.app.show.report import Report
 from armsight.app.stream.datum import Published
 from armsight.app.stream.mcap_file import LazyMcap, properties
 from armsight.data import Array, Shot
 from armsight.errors import ArmsightError
 from armsight.files import write_text
-from armsight.geometry.pose import inverse
+from armsight.loop.running.calibrate import Progress, handeye_poses
 from armsight.processes import Process, caller
 from armsight.robot.arm_file import open_arm
 from armsight.robot.kinematics.arm import Arm
 from armsight.sim.workcell.cameras import camera_name, open_cameras
 from armsight.sim.workcell.controlled import CONTROLLED
 from armsight.sim.workcell.workcell import DEFAULT_ARM, Workcell
+from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.result import Calibration
+from armsight.vision.image import grey
+from armsight.vision.markers.board import open_board
 
 #: Pairs of the calibration target, hand-eye poses, shots for each value of a study: by default, and with --quick.
 _AMOUNTS = {False: (40, 30, 8), True: (30, 15, 0)}
 _MOTIONS = {False: DEFAULT_MOTION, True: QUICK}
-#: What the second process imports first: it evaluates lens models, and draws figures.
-_SECOND = ("armsight.vision.calibrate.boards", "armsight.app.run.report", "matplotlib.figure")
 #: Cameras of an arm with our firmware, and of one that keeps its own controller and is slower.
 _CAMERAS, _SLOW_CAMERAS = "1280x720@60", "1280x720@30"
 #: Rests of an arm with its own controller, s: from a command to its state it takes a tenth of a second and more.
@@ -54,42 +55,26 @@ _LINE, _RADIUS = 0.7, 0.1
 
 @dataclass(frozen=True)
 class Demo:
-    """The options of a demo.
+    """The options of a demo."""
 
-    Attributes:
-        folder: the folder of the run.
-        arm: the simulated arm: nominal, used, worn, or a TOML file.
-        cameras: as the workcell names them, such as 1280x720@60 or webcam-good-light; None for what suits the arm.
-        seed: of everything that is random.
-        emulator: what runs the firmware: unicorn, qemu or host.
-        layout: of the cameras: parallel or verging.
-        model: the arm that is simulated, by its name: six_r, another of six joints, so101 or ar4.
-        quick: fewer calibration shots and motions, and no studies.
-        nominal_arm: the arm model that the estimators and the controller have; by default the table the arm was built to.
-        nominal_arm_name: its name in the summary; by default the arm's own.
-        follow_rig: whether a rig that moved is put right.
-        sync_led: whether an LED on the board's clock is in view.
-    """
-
-    folder: Path
-    arm: str = "worn"
+    folder: Path  #: the folder of the run
+    arm: str = "worn"  #: the simulated arm: nominal, used, worn, or a TOML file
+    #: as the workcell names them, such as 1280x720@60 or webcam-good-light; None for what suits the arm.
     cameras: str | None = None
-    seed: int = 0
-    emulator: str = "unicorn"
-    layout: str = "parallel"
-    model: str = DEFAULT_ARM
-    quick: bool = False
+    seed: int = 0  #: of everything that is random
+    emulator: str = "unicorn"  #: what runs the firmware: unicorn, qemu or host
+    layout: str = "parallel"  #: of the cameras: parallel or verging
+    model: str = DEFAULT_ARM  #: the arm that is simulated, by its name: six_r, another of six joints, so101 or ar4
+    quick: bool = False  #: fewer calibration shots and motions, and no studies
+    #: the arm model that the estimators and the controller have; by default the table the arm was built to.
     nominal_arm: Arm | None = None
-    nominal_arm_name: str | None = None
-    follow_rig: bool = False
-    sync_led: bool = False
+    nominal_arm_name: str | None = None  #: its name in the summary; by default the arm's own
+    follow_rig: bool = False  #: whether a rig that moved is put right
+    sync_led: bool = False  #: whether an LED on the board's clock is in view
 
 
-def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummary:
-    """Run the experiment in a workcell, and write its folder.
-
-    Returns:
-        The summary; its ``to_json`` is what summary.json holds.
+def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> Report:
+    """Run the experiment in a workcell, and write its folder; the report's JSON is what summary.json holds.
 
     Raises:
         ArmsightError: an unknown name, a folder that cannot be written to, or the run failed; what was measured is in the
@@ -97,30 +82,33 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
     """
     began = time.perf_counter()
     pairs, handeyes, study_shots = _AMOUNTS[demo.quick]
-    open_folder(demo.folder)
+    folder = demo.folder
+    open_folder(folder)
     progress("building the workcell")
     cameras = demo.cameras or (_SLOW_CAMERAS if demo.model in CONTROLLED else _CAMERAS)
-    with _workcell(demo, cameras) as workcell, contextlib.ExitStack() as ended:
-        motion = _motion_text(demo, workcell)
-        make_room(demo.folder)
-        write_text(demo.folder / "motion.toml", motion)
-        plan = read_motions(workcell.model, demo.folder / "motion.toml")
+    with _workcell(demo, cameras) as workcell:
+        own = demo.model != DEFAULT_ARM
+        motion = _MOTIONS[demo.quick].read_text(encoding="utf-8")
+        if own:
+            motion = motion_text(workcell.model, workcell.poses, quick=demo.quick, slow=workcell.link is None)
+        make_room(folder)
+        write_text(folder / "motion.toml", motion)
+        plan = read_motions(workcell.model, folder / "motion.toml")
         progress("rendering the calibration target")
         shots = _ahead(workcell.chessboard_shots(pairs))
         first = next(shots)  # begun before, the second process would take a core from those that render it
-        second = ended.enter_context(contextlib.closing(Process(caller, *_SECOND)))
-        calibration = calibrated(workcell.chessboard_spec, chain([first], shots), progress, second)
-        calibration.rig.save(demo.folder / "rig.json")
-        write_text(demo.folder / "body.toml", workcell.body_text)
-        poses = np.vstack([workcell.model.home, workcell.poses])
-        targets = handeye_poses(workcell.model, poses, handeyes, demo.seed)
+        with contextlib.closing(Process(caller, "armsight.vision.calibrate.boards")) as second:
+            rig = _calibrated(workcell.chessboard_spec, chain([first], shots), progress, second).rig
+        rig.save(folder / "rig.json")
+        write_text(folder / "body.toml", workcell.body_text)
+        targets = handeye_poses(workcell.model, np.vstack([workcell.model.home, workcell.poses]), handeyes, demo.seed)
         setup = setup_of(workcell)
-        texts = properties(calibration.rig, workcell.body_text, setup.arm, command="demo")
-        published = Published(calibration.rig, setup.target.body, setup.arm, texts)
-        with contextlib.closing(LazyMcap(demo.folder, published, progress, process=True)) as file:
-            outcome = run_experiment(
+        texts = properties(rig, workcell.body_text, setup.arm, command="demo")
+        published = Published(rig, setup.target.body, setup.arm, texts)
+        with contextlib.closing(LazyMcap(folder, published, progress, process=True)) as file:
+            result = run_experiment(
                 setup,
-                calibration.rig,
+                rig,
                 plan,
                 targets,
                 progress=progress,
@@ -131,14 +119,14 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
         workcell.source.close()  # its processes hold 300 MB
         studies: list[Study] = []
         try:
-            if demo.model == DEFAULT_ARM:
-                studies = _studies(demo, cameras, workcell, calibration, outcome, plan, study_shots, progress)
+            if not own:
+                studies = _studies(demo, cameras, workcell, result, study_shots, progress)
         except (ArmsightError, KeyboardInterrupt) as error:  # the run itself is complete, and is written
-            outcome.interrupted = isinstance(error, KeyboardInterrupt)
-            outcome.ended_by = error if isinstance(error, ArmsightError) else None
+            result.ended(error)
         workcell.forget_room()  # drawing takes as much
         progress("plotting")
-        of_run = {
+        result.began = began
+        result.properties = {
             "seed": demo.seed,
             "arm": demo.arm,
             "nominal_arm": demo.nominal_arm_name or workcell.model.name,
@@ -146,13 +134,10 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> RunSummar
             "board": workcell.board.welcome.board,
             "emulator": demo.emulator if workcell.link is not None else "own controller",
         }
-        truth = _truth(workcell, outcome)
+        truth = None if result.handeye is None else true_track(workcell, result.handeye.mounting)
         with ThreadPoolExecutor(1) as beside:
-            overview = beside.submit(workcell.picture)
-            finished = Finished(
-                workcell.model, calibration.rig, outcome, plan, truth, of_run, began, studies, overview.result, second
-            )
-            return finish(finished, demo.folder)
+            aside = beside.submit(workcell.picture).result
+            return finish(result, folder, truth=truth, studies=studies, workcell=aside)
 
 
 def _ahead(shots: Iterator[Shot]) -> Iterator[Shot]:
@@ -165,21 +150,26 @@ def _ahead(shots: Iterator[Shot]) -> Iterator[Shot]:
             shot = begun.result()
 
 
-def _motion_text(demo: Demo, workcell: Workcell) -> str:
-    """Return the motions of a demo as a motion file: poses, a line, a circle; another arm's are of the workcell's poses."""
-    if demo.model == DEFAULT_ARM:
-        return _MOTIONS[demo.quick].read_text(encoding="utf-8")
-    return motion_text(workcell.model, workcell.poses, quick=demo.quick, slow=workcell.link is None)
+def _calibrated(
+    target_spec: str, shots: Iterable[Shot], progress: Progress, second: Callable[..., Any] | None = None
+) -> Calibration:
+    """Calibrate a rig from shots of a flat calibration target, such as chessboard:9x6:25mm; ``second`` calls beside."""
+    board = open_board(target_spec)
+    pairs, sizes = list[Pair](), ((0, 0), (0, 0))
+    for shot in shots:
+        assert shot.left is not None
+        assert shot.right is not None
+        left, right = grey(shot.left), grey(shot.right)
+        sizes = ((left.shape[1], left.shape[0]), (right.shape[1], right.shape[0]))
+        pairs.append(Pair(shot.name, board.detect(left), board.detect(right)))
+        progress(f"detecting the calibration target: {len(pairs)} pairs")
+    return calibrate_boards(board, pairs, sizes, progress=progress, second=second)
 
 
 def motion_text(model: Arm, poses: Array, *, quick: bool, slow: bool) -> str:
-    """Return motions of an arm before the workcell's cameras as a motion file: poses, a line, a circle.
+    """Return motions of an arm before the workcell's cameras as a motion file: poses (5, n), rad, a line, a circle.
 
-    Args:
-        model: the arm.
-        poses: (5, n) joint angles of the poses, rad.
-        quick: one pose alone.
-        slow: whether its controller takes long to come to rest.
+    ``quick``: one pose alone; ``slow``: its controller takes long to come to rest.
     """
     rest = f"rest_s = {_REST_S}\n" if slow else ""
     first, second = (model.forward(q)[:3, 3] for q in poses[:2])
@@ -223,19 +213,6 @@ def _workcell(demo: Demo, cameras: str, like: Workcell | None = None) -> Workcel
     )
 
 
-def _truth(workcell: Workcell, outcome: RunResult) -> tuple[Array, Array] | None:
-    """Return the true times (N,), s, and poses (N, 4, 4) of the tool in the base that the hand-eye calibration defined.
-
-    The true poses are those of the body in the true cameras' frame. The base and tool frames are those of the hand-eye
-    calibration, as the geometry of an arm with errors defines none.
-    """
-    if outcome.handeye is None:
-        return None
-    truth, mounting = workcell.truth, outcome.handeye.mounting
-    T_left_body = inverse(truth.T_base_rig) @ truth.T_base_tool @ truth.T_tool_body
-    return truth.t_s, mounting.T_base_rig @ T_left_body @ inverse(mounting.T_tool_body)
-
-
 def cameras_at(cameras: str, rate_hz: float) -> str:
     """Return the name of the same cameras at another rate, Hz."""
     (width, height), (name, _) = open_cameras(cameras)[0].image_size_px, camera_name(cameras)
@@ -243,17 +220,10 @@ def cameras_at(cameras: str, rate_hz: float) -> str:
 
 
 def _studies(
-    demo: Demo,
-    cameras: str,
-    workcell: Workcell,
-    calibration: Calibration,
-    outcome: RunResult,
-    plan: MotionPlan,
-    shots: int,
-    progress: Progress,
+    demo: Demo, cameras: str, workcell: Workcell, result: RunResult, shots: int, progress: Progress
 ) -> list[Study]:
     """Return the studies; none with --quick or after a run that ended early."""
-    if not shots or outcome.closed_s is None or outcome.ended_by is not None or outcome.interrupted:
+    if not shots or result.closed_s is None or result.ended_text is not None:
         return []
 
     def at_rate(rate_hz: float) -> Workcell:
@@ -263,7 +233,7 @@ def _studies(
     with contextlib.closing(Process(caller, "armsight.app.demo.studies")) as other, ThreadPoolExecutor(1) as beside:
         of_vision = beside.submit(other, partial(vision_studies, seed=demo.seed, shots=shots))
         try:
-            of_rate = rate_study(at_rate, setup_of, calibration.rig, outcome, plan, progress)
+            of_rate = rate_study(at_rate, result, progress)
             progress("studies of vision")
             return [*of_vision.result(), of_rate]
         finally:  # after an interrupt nobody waits for what it computes

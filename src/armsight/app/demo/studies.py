@@ -15,17 +15,17 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import chdtri
 
-from armsight.app.run.controllers import closed_on, drive
-from armsight.app.run.experiment import Progress, RunResult, prior_of, timing
-from armsight.app.run.loop import Loop
+from armsight.app.run.devices import setup_of
+from armsight.app.run.experiment import RunResult, closed_on, drive, prior_of, timing
 from armsight.app.run.metrics import Study, track_metrics
-from armsight.app.run.motion_file import MotionPlan
-from armsight.app.run.record import Log, RunData, assembled
-from armsight.app.run.setup import Setup
+from armsight.app.run.tracks import Tracks
 from armsight.data import Array, PoseEstimate, Record, Shot
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.loop.estimators import KalmanEstimator
+from armsight.loop.estimators import KalmanEstimator, Mounting
+from armsight.loop.running.calibrate import Progress
+from armsight.loop.running.log import Log
+from armsight.loop.running.loop import Loop
 from armsight.loop.servo import PoseServo
 from armsight.sim.example_rig import board_poses, example_rig
 from armsight.sim.render.background import plain
@@ -66,13 +66,7 @@ class _Conditions:
 
 
 def vision_studies(*, seed: int, shots: int, progress: Callable[[str], None] = lambda line: None) -> list[Study]:
-    """Make the five studies of vision.
-
-    Args:
-        seed: of poses and noise.
-        shots: number of shots rendered for each value.
-        progress: called with a line about what is being done.
-    """
+    """Make the five studies of vision, with so many shots rendered for each value."""
 
     def changed(name: str, unit: str, values: Sequence[float], errors: Callable[[float], _Errors]) -> Study:
         progress(f"study: error against {name}")
@@ -206,37 +200,22 @@ def _calibration_study(seed: int, shots: int, progress: Callable[[str], None]) -
     # The errors of the shots of one calibration are correlated: the number of calibrations counts.
     freedom = 3.0 * _REPEATS
     wide = study.position_rms_m * np.sqrt(freedom / chdtri(freedom, [[0.025], [0.975]]))
-    return Study(
-        study.name, study.unit, study.values, study.position_rms_m, wide[0], wide[1], study.predicted_m, study.missed
-    )
+    return replace(study, low_m=wide[0], high_m=wide[1])
 
 
 RATES_HZ = (4.0, 15.0, 30.0, 60.0, 120.0)
 
 
-def rate_study(
-    open_workcell: Callable[[float], Workcell],
-    setup_of: Callable[[Workcell], Setup],
-    rig: StereoRig,
-    outcome: RunResult,
-    plan: MotionPlan,
-    progress: Progress,
-) -> Study:
-    """Make the last motions of a plan, up to its circle, with the loop closed at several rates of the cameras.
+def rate_study(open_workcell: Callable[[float], Workcell], result: RunResult, progress: Progress) -> Study:
+    """Make the last motions of a run, up to its circle, with the loop closed at several rates of the cameras.
 
-    Args:
-        open_workcell: opens a workcell with cameras of a rate, Hz; all else as in the run.
-        setup_of: makes a setup of it.
-        rig: the calibrated cameras.
-        outcome: of the run; its hand-eye calibration and delay are used.
-        plan: the motions of the run.
-        progress: called with a line about what is being done.
+    ``open_workcell`` opens a workcell with cameras of a rate, Hz; all else as in the run.
     """
 
     def at(rate: float) -> tuple[float, float, int]:
         progress(f"study: vision at {rate:g} Hz in the loop")
         with open_workcell(rate) as workcell:
-            return _circle_errors(_circle(workcell, setup_of(workcell), rig, outcome, plan))
+            return _circle(workcell, result)
 
     with ThreadPoolExecutor(2) as both:  # the longest first
         rows = list(both.map(at, RATES_HZ[::-1]))[::-1]
@@ -255,35 +234,38 @@ def rate_study(
     )
 
 
-def _circle(workcell: Workcell, setup: Setup, rig: StereoRig, outcome: RunResult, plan: MotionPlan) -> RunData:
-    """Move to the circle and along it, without a rest; return the tracks."""
-    assert outcome.handeye is not None
+def _circle(workcell: Workcell, result: RunResult) -> tuple[float, float, int]:
+    """Move to the circle and along it, without a rest.
+
+    Returns:
+        The RMS error of the fused estimate on the circle, m, the claimed one, m, and the number of readings.
+    """
+    assert result.handeye is not None
+    setup, mounting, plan = setup_of(workcell), result.handeye.mounting, result.plan
     setup.board.enable()
-    log = Log()
-    loop = Loop.open(
-        setup,
-        Follower(rig, setup.target, setup.sync_s),
-        log,
-        KalmanEstimator(setup.arm, prior=prior_of(setup.board), delay=outcome.delay, learns_delay=False),
-    )
-    loop.mounting, loop.delay_s, loop.shutters = outcome.handeye.mounting, outcome.delay.delay_s, outcome.shutters
-    servo = PoseServo(setup.arm, timing(setup, outcome.delay))
+    follower, log = Follower(result.rig, setup.target, setup.sync_s), Log()
+    estimator = KalmanEstimator(setup.arm, prior=prior_of(setup.board), delay=result.delay, learns_delay=False)
+    loop = Loop.open(setup, follower, log, estimator)
+    loop.mounting, loop.delay_s, loop.shutters = mounting, result.delay.delay_s, result.shutters
+    servo = PoseServo(setup.arm, timing(setup, result.delay))
     kinds = [motion.kind for motion in plan.motions]
-    first = max(kinds.index("line") - 1, 0)  # the motion to its start
-    last = kinds.index("circle") + 1
+    first, last = max(kinds.index("line") - 1, 0), kinds.index("circle") + 1  # from the motion to the line's start
     part = replace(plan, motions=tuple(replace(motion, rest_s=0.0) for motion in plan.motions[first:last]))
-    drive(loop, part, closed_on(servo, lambda: loop.health, setup.gravity), closed=True, progress=lambda line: None)
+    drive(loop, part, closed_on(servo, lambda: loop.health, setup.gravity), closed=True)
     loop.close_record()
-    truth, mounting = workcell.truth, outcome.handeye.mounting
-    T_left_body = inverse(truth.T_base_rig) @ truth.T_base_tool @ truth.T_tool_body
-    Ts = mounting.T_base_rig @ T_left_body @ inverse(mounting.T_tool_body)
-    return assembled(log, setup.arm, mounting, outcome.delay, (truth.t_s, Ts))
-
-
-def _circle_errors(run: RunData) -> tuple[float, float, int]:
-    """Return the RMS error of the fused estimate on the circle, m, the claimed one, m, and the number of readings."""
+    run = Tracks(log, setup.arm, mounting, result.delay, true_track(workcell, mounting)).between()
     assert run.truth is not None
     rows = (run.fused.motion == "circle") & (run.fused.phase == "closed_loop")
     found = track_metrics(run.fused[rows], run.truth)
-    assert found.claimed is not None
-    return found.position_rms_m, found.claimed.position_sigma_rms_m, int(rows.sum())
+    assert found.position_sigma_rms_m is not None
+    return found.position_rms_m, found.position_sigma_rms_m, int(rows.sum())
+
+
+def true_track(workcell: Workcell, mounting: Mounting) -> tuple[Array, Array]:
+    """Return the true times (N,), s, and poses (N, 4, 4) of the tool in the base that the hand-eye calibration defined.
+
+    The true poses are those of the body in the true cameras' frame: the geometry of an arm with errors defines no base.
+    """
+    truth = workcell.truth
+    T_left_body = inverse(truth.T_base_rig) @ truth.T_base_tool @ truth.T_tool_body
+    return truth.t_s, mounting.T_base_rig @ T_left_body @ inverse(mounting.T_tool_body)

@@ -5,11 +5,15 @@ from __future__ import annotations
 import csv
 import io
 from pathlib import Path
+from typing import Any
 
-from armsight.app.replay.recorded import JointsDatum, RecordedRun, ShotDatum
-from armsight.app.run.record import require_pyarrow
+from armsight.app.replay.recorded import RecordedRun
+from armsight.app.replay.tables import Cell, Table, live_table
+from armsight.app.run.tracks import NAMES, require_pyarrow
 from armsight.errors import InputError
 from armsight.files import replacing, write_text
+from armsight.loop.running.data import JointsDatum, ShotDatum
+from armsight.vision.pose.shot_pose import UPPER
 
 #: A column of a datum -> its key, and the names of its parts; a key without parts is one column.
 _SHOT: tuple[tuple[str, tuple[str, ...]], ...] = (
@@ -33,21 +37,21 @@ _MATRICES = (
     ("covariance_precision", "cov_precision"),
     ("covariance_calibration", "cov_calibration"),
 )
-_UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
-_LIVE = ("t_s", "status", "vision_age_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
-Cell = str | float | int | None
-Table = tuple[list[str], list[list[Cell]]]
 
 
 def tables_of(run: RecordedRun) -> dict[str, Table]:
     """Return the tables of a run by name: poses, live, joints; those without rows are left out."""
-    found: dict[str, Table] = {"poses": _poses(run), "live": _live(run), "joints": _joints(run)}
+    found: dict[str, Table] = {
+        "poses": _poses(run),
+        "live": live_table(each.content for each in run.of(JointsDatum)),
+        "joints": _joints(run),
+    }
     return {name: table for name, table in found.items() if table[1]}
 
 
 def _poses(run: RecordedRun) -> Table:
     header = [part for key, parts in _SHOT for part in (parts or (key,))]
-    header += [f"{short}_{i}{j}" for _, short in _MATRICES for i, j in _UPPER]
+    header += [f"{short}_{i}{j}" for _, short in _MATRICES for i, j in UPPER]
     rows: list[list[Cell]] = []
     for each in run.of(ShotDatum):
         row: list[Cell] = []
@@ -56,21 +60,7 @@ def _poses(run: RecordedRun) -> Table:
             row += [value] if not parts else ([None] * len(parts) if value is None else value)
         for key, _ in _MATRICES:
             matrix = each.content.get(key)
-            row += [None if matrix is None else matrix[i][j] for i, j in _UPPER]
-        rows.append(row)
-    return header, rows
-
-
-def _live(run: RecordedRun) -> Table:
-    header = [*_LIVE, *(f"cov_{i}{j}" for i, j in _UPPER)]
-    rows: list[list[Cell]] = []
-    for each in run.of(JointsDatum):
-        content = each.content
-        if "tool_position_m" not in content:
-            continue
-        cov = content["tool_covariance"]
-        row: list[Cell] = [content["t_s"][-1], content["status"], content["vision_age_s"]]
-        row += [*content["tool_position_m"], *content["tool_quaternion_wxyz"], *(cov[i][j] for i, j in _UPPER)]
+            row += [None if matrix is None else matrix[i][j] for i, j in UPPER]
         rows.append(row)
     return header, rows
 
@@ -99,15 +89,20 @@ def write_csv(run: RecordedRun, folder: Path) -> list[Path]:
 
 
 def write_parquet(run: RecordedRun, folder: Path) -> list[Path]:
-    """Write a Parquet file a table; return the files."""
+    """Write a Parquet file a table, and one of each track whose CSV lies beside run.mcap; return the files."""
     require_pyarrow()
     import pyarrow as pa
     from pyarrow import parquet
+    from pyarrow.csv import read_csv
 
-    files = []
+    files, found = [], dict[str, Any]()
     for name, (header, rows) in _some(run, tables_of(run)).items():
         columns = list(zip(*rows, strict=True))
-        table = pa.table({key: pa.array(column) for key, column in zip(header, columns, strict=True)})
+        found[name] = pa.table({key: pa.array(column) for key, column in zip(header, columns, strict=True)})
+    for track in (run.path.with_name(f"{name}.csv") for name in NAMES):
+        if track.is_file() and track.stem not in found:
+            found[track.stem] = read_csv(track)
+    for name, table in found.items():
         files.append(_file(folder, f"{name}.parquet"))
         with replacing(files[-1], "wb") as file:
             parquet.write_table(table, file)

@@ -25,7 +25,7 @@ from armsight.app.live.measuring import MeasureStep
 from armsight.app.live.records import asked
 from armsight.app.live.step import SIM, PageStep, Shared, unused, why
 from armsight.app.run.angles import LoggedAngles, read_angles
-from armsight.app.run.calibrate import VisitedPose, handeye_poses
+from armsight.app.run.devices import require_joints, setup_of
 from armsight.app.run.experiment import (
     RunResult,
     passed,
@@ -35,17 +35,18 @@ from armsight.app.run.experiment import (
     run_visits,
     start_rad,
 )
-from armsight.app.run.folder import Finished, finish, run_in
-from armsight.app.run.loop import Loop
+from armsight.app.run.folder import finish, run_in
 from armsight.app.run.motion_file import MotionPlan, read_motions
-from armsight.app.run.record import require_pyarrow
-from armsight.app.run.setup import HostClock, Setup, require_joints, setup_of
+from armsight.app.run.tracks import require_pyarrow
 from armsight.app.show.plotting import require_matplotlib
 from armsight.data import Array, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import read_text
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators import Mounting
+from armsight.loop.running.calibrate import VisitedPose, handeye_poses
+from armsight.loop.running.loop import Loop
+from armsight.loop.running.setup import HostClock, Setup
 from armsight.robot.arm_file import open_arm
 from armsight.robot.board_registry import emulator_name, is_real, open_motion_board, slowed
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Fault
@@ -390,14 +391,12 @@ class ArmStep(PageStep[ArmState]):
         """Run the experiment, and write its folder in another thread."""
         handeye, follow, folder = self.handeye.run, self.shared.options.follow_rig, unused(self.folder / "run")
         self._chart.clear()
-        finished: Finished | None = None
 
         def work(setup: Setup, rig: StereoRig, plan: MotionPlan, targets: Array) -> RunResult:
-            nonlocal finished
             if follow:
                 require_followed(rig, Path(self._measuring.rig_path or "rig.json"))
             texts = (read_text(self.shared.motion), read_text(str(self._measuring.target_spec)))
-            finished = run_in(
+            return run_in(
                 folder,
                 setup,
                 rig,
@@ -412,18 +411,17 @@ class ArmStep(PageStep[ArmState]):
                 handeye=handeye,
                 follow_rig=follow,
             )
-            return finished.outcome
 
         outcome = self._moving("the run has ended early: {}; what was measured is being written", work)
-        if outcome is not None and finished is not None:
+        if outcome is not None:
             self.show(results=self._results(outcome), folder=str(folder))
-            self.later(str(folder), self._write, finished, folder)
+            self.later(str(folder), self._write, outcome, folder)
 
-    def _write(self, finished: Finished, folder: Path) -> None:
-        summary = finish(finished, folder)
+    def _write(self, outcome: RunResult, folder: Path) -> None:
+        finish(outcome, folder)
         self.say("good", f"the run is written to {folder}: report.html, summary.json")
-        if summary.health:
-            self.say("error", f"do not trust this run: {summary.health[0].line()}")
+        if outcome.health:
+            self.say("error", f"do not trust this run: {outcome.health[0].line()}")
 
     def _visit(self) -> None:
         """Visit the poses of the guided hand-eye calibration."""
@@ -515,9 +513,9 @@ class ArmStep(PageStep[ArmState]):
             raise DeviceError(f"the arm is held: {reason}")
         if len(loop.log.joints):
             self._q = loop.log.joints[-1].q[-1]
-        if len(loop.log.poses) == self._seen:
+        if loop.log.shots == self._seen:
             return
-        self._seen = len(loop.log.poses)
+        self._seen = loop.log.shots
         name, _, result = loop.log.poses[-1]
         newest = self.shared.capture.newest
         if newest is not None and newest.shot.name == name:

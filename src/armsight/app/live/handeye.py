@@ -1,8 +1,8 @@
 """The guided hand-eye calibration: which pose of the arm to take next, and how good the calibration is, in mm.
 
 In: poses of the arm at rest, taken by a person or by the arm itself. Out: a :class:`HandEyeState` at any time, and a
-:class:`~armsight.app.run.calibrate.HandEyeRun`, which the loop uses and ``handeye/`` of the session holds. The next pose
-is the one of the candidates after which the predicted error is least: the RMS distance by which the covariance of the
+:class:`~armsight.loop.running.calibrate.HandEyeRun`, which the loop uses and ``handeye/`` of the session holds. The next
+pose is the one of the candidates after which the predicted error is least: the RMS distance by which the covariance of the
 calibration moves a measured position in the arm's base (as :mod:`~armsight.app.live.guide` does for the cameras).
 """
 
@@ -15,11 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from armsight.app.live.step import Guided, GuidedState, Shared
-from armsight.app.run.calibrate import HandEyeRun, VisitedPose, handeye_of, handeye_poses, visit
-from armsight.app.run.controllers import Planned
 from armsight.app.run.folder import write_handeye
-from armsight.app.run.loop import Loop
-from armsight.app.run.record import RunSegment
 from armsight.data import Array, Missed
 from armsight.errors import ArmsightError, CalibrationError, InputError
 from armsight.files import write_text
@@ -27,6 +23,9 @@ from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.poses import Poses
 from armsight.loop.identify.read import read_poses
+from armsight.loop.running.calibrate import HandEyeRun, VisitedPose, handeye_of, handeye_poses, visit
+from armsight.loop.running.log import RunSegment
+from armsight.loop.running.loop import Loop
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import Trajectory, point_to_point
 from armsight.vision.rig import StereoRig
@@ -267,27 +266,26 @@ def visit_poses(loop: Loop, guide: HandEyeGuide, start: Array, progress: Callabl
 
     ``start``: (n,) joint angles at which it stands, rad; ``progress`` is called with a line about what is being done.
     """
-    q, setup = start, loop.setup
+    q = start
     for number in range(1, MOST_POSES + 1):
         goal = guide.next_q
         if goal is None:
             break
         progress(f"hand-eye: pose {number}")
-        found = visit(loop, setup.arm, q, goal, setup.gravity, f"hand-eye {number}")
+        found = visit(loop, q, goal, f"hand-eye {number}")
         q = goal
         if isinstance(found, Missed):
             guide.miss(goal, found.reason)
         else:
             guide.add(found)
         loop.compute(guide.fit)
-    go(loop, point_to_point(setup.arm, q, start), progress)
+    go(loop, point_to_point(loop.setup.arm, q, start), progress)
 
 
 def go(loop: Loop, way: Trajectory, progress: Callable[[str], None]) -> None:
     """Move an arm to the start of its motions."""
     progress("to the start")
-    segment = RunSegment("calibration", "to the start", "joints", False, trajectory=way)
-    loop.run(Planned(way, loop.t_s, loop.setup.gravity), way.duration_s + 0.3, segment, watch=False)
+    loop.go(way, 0.3, RunSegment("calibration", "to the start", "joints"), watch=False)
 
 
 def likely_joint_errors(arm: Arm, q: Array, T_base_tool: Array) -> Array:

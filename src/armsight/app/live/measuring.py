@@ -19,7 +19,7 @@ import numpy as np
 from armsight.app.live.capture import LiveShot
 from armsight.app.live.records import Drawn, asked, dots, polyline
 from armsight.app.live.step import PageStep, Shared
-from armsight.app.stream.datum import Published, ShotDatum
+from armsight.app.stream.datum import Published
 from armsight.app.stream.mcap_file import LazyMcap, properties
 from armsight.app.stream.streams import open_streams
 from armsight.data import Array, Body, Missed, PoseEstimate, Shot
@@ -28,6 +28,7 @@ from armsight.geometry.pose import adjoint, inverse, transform
 from armsight.geometry.rotation import euler_zyx, skew
 from armsight.loop.handeye.pivot import MIN_POSES, Pivot, calibrate_pivot
 from armsight.loop.health import HealthMonitor
+from armsight.loop.running.data import ShotDatum
 from armsight.vision.follow.follower import follows, measurer
 from armsight.vision.markers.calibrated_board import is_print
 from armsight.vision.markers.marker import Target

@@ -45,9 +45,9 @@ from armsight.app.live.capture import LiveShot
 from armsight.app.live.records import command_of, json_text
 from armsight.app.live.session import LiveSession
 from armsight.app.live.step import why
-from armsight.app.run.loop import SWITCH_S
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import read_bytes
+from armsight.loop.running.loop import SWITCH_S
 from armsight.vision.image import grey
 
 if TYPE_CHECKING:

@@ -18,13 +18,13 @@ from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, Measure
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.progress import bar
 from armsight.app.show.messages import colour, weak
-from armsight.app.stream.datum import NoteDatum, Published, ShotDatum
-from armsight.app.stream.sink import Fanout, Publisher
+from armsight.app.stream.datum import Published
 from armsight.data import Body, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines, unseen_lines
 from armsight.loop.health.update import contradiction
+from armsight.loop.running.data import Fanout, NoteDatum, Publisher, ShotDatum
 from armsight.vision.follow.follower import measurer
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_fixed

@@ -52,9 +52,8 @@ def command(
     FILE[,left=TOPIC,right=TOPIC], with images or tags of two cameras; its camera_info is the rig where they are of a stereo
     pair. Without changes the answers of a run's estimators are the same to the last digit, and the command says so.
     """
-    from armsight.app.replay.compare import compare
     from armsight.app.replay.open import Request, replay
-    from armsight.app.replay.tables import LIVE, POSES, write_tables
+    from armsight.app.replay.tables import LIVE, POSES, compare, write_tables
     from armsight.files import check_folder
 
     if output is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from armsight.app.replay.recorded import RecordedRun, read_run, run_file
@@ -31,33 +31,19 @@ from armsight.vision.sources.folder import INDEX
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be replayed, as the command line names it; None is what was recorded.
+    """What is to be replayed, as the command line names it; None is what was recorded."""
 
-    Attributes:
-        recording: RUN or BAG.
-        rig: rig file.
-        target: spec of a board, or body file.
-        arm: arm model.
-        estimator: a name of ESTIMATORS.
-        rate: seconds of the recording a second; 0 as fast as possible.
-        streams: what to publish to.
-    """
-
-    recording: str
-    rig: str | None = None
-    target: str | None = None
-    arm: str | None = None
-    estimator: str = "kalman"
-    rate: float = 0.0
-    streams: tuple[str, ...] = ()
+    recording: str  #: RUN or BAG
+    rig: str | None = None  #: rig file
+    target: str | None = None  #: spec of a board, or body file
+    arm: str | None = None  #: arm model
+    estimator: str = "kalman"  #: a name of ESTIMATORS
+    rate: float = 0.0  #: seconds of the recording a second; 0 as fast as possible
+    streams: tuple[str, ...] = ()  #: what to publish to
 
 
 def replay(request: Request, say: Callable[[str], None]) -> Replayed:
-    """Replay a recording.
-
-    Args:
-        request: what is to be replayed.
-        say: is given notes, a line each.
+    """Replay a recording; ``say`` is given notes, a line each.
 
     Raises:
         InputError: not a recording, or it does not hold what the request needs.
@@ -163,4 +149,4 @@ def _with_joints(replayed: Replayed, bag: Bag, say: Callable[[str], None]) -> Re
         return replayed
     for note in joints.notes:
         say(f"note: {note}")
-    return Replayed(replayed.poses, replayed.live, joints, replayed.differences)
+    return replace(replayed, joints=joints)

@@ -9,35 +9,28 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.stream.datum import EventDatum, JointsDatum, ShotDatum
 from armsight.app.stream.mcap_file import RUN_MCAP, TOPICS
-from armsight.data import Correspondences, JointStates, Missed, Points, PoseEstimate
+from armsight.data import JointStates, Missed, PoseEstimate
 from armsight.errors import InputError
+from armsight.loop.running.data import NO_POINTS, EventDatum, JointsDatum
 from armsight.vision.sources.bag import Bag
 from armsight.vision.sources.bag.camera_info import METADATA
 
 _KINDS = {topic: kind for kind, topic in TOPICS.items()}
-_NOTHING = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
 
 
 @dataclass(frozen=True)
 class RecordedDatum:
-    """A datum as it stands in the file.
+    """A datum as it stands in the file."""
 
-    Attributes:
-        kind: ShotDatum, JointsDatum or EventDatum: what was published.
-        content: its JSON; docs/reference/data.md describes the keys.
-    """
-
-    kind: type
-    content: dict[str, Any]
+    kind: type  #: ShotDatum, JointsDatum or EventDatum: what was published
+    content: dict[str, Any]  #: its JSON; docs/reference/data.md describes the keys
 
     @property
     def result(self) -> PoseEstimate | Missed:
         """What was measured in a shot, with all digits; the points are not recorded."""
         if self.content["status"] != "ok":
             return Missed(str(self.content["reason"]))
-        points = Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 0)), _NOTHING)
         return PoseEstimate(
             np.array(self.content["T_left_body"]),
             np.array(self.content["covariance_body"]),
@@ -45,7 +38,7 @@ class RecordedDatum:
             float("nan" if self.content["residual_rms_m"] is None else self.content["residual_rms_m"]),
             float(self.content["reprojection_rms_px"]),
             float(self.content["misfit"]),
-            points,
+            NO_POINTS,
         )
 
     @property
@@ -57,19 +50,12 @@ class RecordedDatum:
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """A run.mcap.
+    """A run.mcap."""
 
-    Attributes:
-        path: of the file.
-        properties: its metadata: versions, rig file, body file, arm.
-        data: in the order they were published.
-        notes: what could not be read.
-    """
-
-    path: Path
-    properties: dict[str, str]
-    data: tuple[RecordedDatum, ...]
-    notes: tuple[str, ...] = field(default=())
+    path: Path  #: of the file
+    properties: dict[str, str]  #: its metadata: versions, rig file, body file, arm
+    data: tuple[RecordedDatum, ...]  #: in the order they were published
+    notes: tuple[str, ...] = field(default=())  #: what could not be read
 
     def of(self, kind: type) -> Iterator[RecordedDatum]:
         """Yield the data of one kind."""
@@ -105,6 +91,3 @@ def read_run(path: Path) -> RecordedRun | None:
             raise InputError(f"{path}: a datum on {message.topic} is no JSON object")
         data.append(RecordedDatum(_KINDS[message.topic], content))
     return RecordedRun(path, bag.metadata[METADATA], tuple(data), tuple(bag.notes))
-
-
-__all__ = ["EventDatum", "JointsDatum", "RecordedDatum", "RecordedRun", "ShotDatum", "read_run", "run_file"]

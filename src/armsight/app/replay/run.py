@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from armsight.app.replay.recorded import EventDatum, JointsDatum, RecordedDatum, RecordedRun, ShotDatum
-from armsight.app.stream.datum import quaternion
-from armsight.app.stream.sink import Publisher
-from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Shot
+from armsight.app.replay.recorded import RecordedDatum, RecordedRun
+from armsight.data import Body, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.loop.estimators import (
     ESTIMATORS,
@@ -30,67 +28,34 @@ from armsight.loop.estimators import (
     Prior,
     Remembered,
 )
+from armsight.loop.running.data import EventDatum, JointsDatum, Publisher, ShotDatum
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.detections import SeenShot
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.markers.marker import Target
 from armsight.vision.pose.measure import measure, measure_seen
-from armsight.vision.pose.shot_pose import ShotPose, left_axes, shot_pose
+from armsight.vision.pose.shot_pose import ShotPose, shot_pose
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import Source
 from armsight.vision.sources.bag.states import JointStream
 
-
-@dataclass(frozen=True)
-class LiveRow:
-    """The estimate after one batch of readings.
-
-    Attributes:
-        t_s: time of the newest reading, s.
-        position_m: (3,) of the tool in the base.
-        quaternion_wxyz: (4,) of the tool.
-        cov: (6, 6) along the axes of the base.
-        vision_age_s: time since the newest measurement used, s; infinite before the first.
-    """
-
-    t_s: float
-    position_m: Array
-    quaternion_wxyz: Array
-    cov: Array
-    vision_age_s: float
+_Seen = TypeVar("_Seen", Shot, SeenShot)
 
 
 @dataclass(frozen=True)
 class Replayed:
-    """What came out.
+    """What came out."""
 
-    Attributes:
-        poses: one a shot.
-        live: one a batch of readings; none without an estimator.
-        joints: the joint readings that a bag holds; None without.
-        differences: largest absolute difference of the estimates to those recorded, by name; none where not comparable.
-    """
-
-    poses: tuple[ShotPose, ...]
-    live: tuple[LiveRow, ...] = ()
-    joints: JointStream | None = None
+    body: Body  #: what was measured
+    poses: tuple[ShotPose, ...]  #: one a shot
+    live: tuple[JointsDatum, ...] = ()  #: readings and estimate, one a batch; none without an estimator
+    joints: JointStream | None = None  #: the joint readings that a bag holds; None without
+    #: largest absolute difference of the estimates to those recorded, by name; none where not comparable.
     differences: dict[str, float] | None = None
 
 
-def live_row(estimate: ArmEstimate) -> LiveRow:
-    """Return an estimate as a row."""
-    T = estimate.T_base_tool
-    return LiveRow(
-        estimate.t_s, T[:3, 3], np.array(quaternion(T[:3, :3])), left_axes(T, estimate.cov), estimate.vision_age_s
-    )
-
-
 class Pace:
-    """Waits so that recorded times pass at a rate.
-
-    Args:
-        rate: seconds of the recording a second; 0 does not wait.
-    """
+    """Waits so that recorded times pass at a rate, in seconds of the recording a second; at 0 it does not."""
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
@@ -109,43 +74,32 @@ class Pace:
 def replay_run(
     recorded: RecordedRun, arm: Arm, body: Body, *, estimator: str, pace: Pace, publisher: Publisher, changed: bool
 ) -> Replayed:
-    """Run the estimators of a run again.
+    """Run the estimators of a run again, with an arm and a body; the publisher is given what comes out.
 
-    Args:
-        recorded: the run.
-        arm: the nominal arm.
-        body: what was measured.
-        estimator: a name of ESTIMATORS.
-        pace: of the replay.
-        publisher: is given what comes out.
-        changed: whether arm or estimator are others: the estimates are then not compared with the recorded ones.
+    ``changed``: whether arm or estimator are others, whose estimates are not compared with the recorded ones.
 
     Raises:
-        InputError: arm or estimator are others, and the rig was put right during the run.
+        InputError: they are, and the rig was put right during the run.
     """
     state = _RunAgain(arm, estimator, changed)
-    poses: list[ShotPose] = []
-    rows: list[LiveRow] = []
-    before: list[RecordedDatum] = []
+    poses, live, before = list[ShotPose](), list[JointsDatum](), list[RecordedDatum]()
     for each in recorded.data:
         if each.kind is EventDatum:
             state.event(each.content)
         elif each.kind is JointsDatum:
             states = each.states
             pace.wait(float(states.t_s[-1]))
-            estimate = state.joints(states)
-            if estimate is not None:
-                rows.append(live_row(estimate))
+            if (estimate := state.joints(states)) is not None:
+                live.append(JointsDatum(states, estimate.T_base_tool, estimate.cov, estimate.vision_age_s))
                 before.append(each)
-                publisher.put(JointsDatum(states, estimate.T_base_tool, estimate.cov, estimate.vision_age_s))
+                publisher.put(live[-1])
         else:
-            result, t_s = each.result, each.content["t_s"]
+            result, t_s, name = each.result, each.content["t_s"], str(each.content["shot"])
             outcome = state.vision(result, t_s, each.content)
-            poses.append(shot_pose(str(each.content["shot"]), t_s, body, result))
-            shot = Shot(str(each.content["shot"]), None, None, t_s)
+            poses.append(shot_pose(name, t_s, body, result))
+            shot = Shot(name, None, None, t_s)
             publisher.put(ShotDatum(shot, result, each.content["arrival_s"], each.content["sigma_t_s"], outcome))
-    differences = None if changed else _differences(before, rows)
-    return Replayed(tuple(poses), tuple(rows), None, differences)
+    return Replayed(body, tuple(poses), tuple(live), None, None if changed else _differences(before, live, body))
 
 
 class _RunAgain:
@@ -222,53 +176,42 @@ def _with_pose(pose: PoseEstimate, row: dict[str, Any]) -> PoseEstimate:
     return replace(pose, T_left_body=T, cov=cov, cov_noise=noise)
 
 
-def _differences(before: list[RecordedDatum], rows: list[LiveRow]) -> dict[str, float]:
+def _differences(before: list[RecordedDatum], live: list[JointsDatum], body: Body) -> dict[str, float]:
     """Return the largest absolute differences of estimates to the recorded ones, by name with unit."""
-    found = {"position_m": 0.0, "quaternion": 0.0, "covariance": 0.0}
-    for was, row in zip(before, rows, strict=True):
-        content = was.content
-        for name, key, value in (
-            ("position_m", "tool_position_m", row.position_m),
-            ("quaternion", "tool_quaternion_wxyz", row.quaternion_wxyz),
-            ("covariance", "tool_covariance", row.cov),
-        ):
-            found[name] = max(found[name], float(np.abs(np.array(content[key]) - value).max()))
+    keys = {"position_m": "tool_position_m", "quaternion": "tool_quaternion_wxyz", "covariance": "tool_covariance"}
+    found = dict.fromkeys(keys, 0.0)
+    for was, now in zip(before, (datum.to_json(body) for datum in live), strict=True):
+        for name, key in keys.items():
+            found[name] = max(found[name], float(np.abs(np.subtract(was.content[key], now[key])).max()))
     return found
 
 
 def replay_source(rig: StereoRig, target: Target, source: Source, *, pace: Pace, publisher: Publisher) -> Replayed:
     """Measure the images of a recording again."""
     measured = Follower(rig, target).measure if follows(target) else lambda shot: measure(rig, target, shot)
-
-    def results() -> Iterator[tuple[Shot, PoseEstimate | Missed]]:
-        with contextlib.closing(source):
-            while (shot := source.read()) is not None:
-                pace.wait(shot.t_s)
-                yield shot, measured(shot)
-
-    return _shots(results(), target.body, publisher)
+    with contextlib.closing(source):
+        return _shots(((shot, shot) for shot in iter(source.read, None)), measured, target.body, pace, publisher)
 
 
 def replay_tags(rig: StereoRig, body: Body, shots: Iterable[SeenShot], *, pace: Pace, publisher: Publisher) -> Replayed:
     """Measure the recorded tags again."""
-
-    def results() -> Iterator[tuple[Shot, PoseEstimate | Missed]]:
-        for shot in shots:
-            pace.wait(shot.t_s)
-            yield Shot(shot.name, None, None, shot.t_s), measure_seen(rig, body, shot)
-
-    return _shots(results(), body, publisher)
+    seen = ((Shot(shot.name, None, None, shot.t_s), shot) for shot in shots)
+    return _shots(seen, lambda shot: measure_seen(rig, body, shot), body, pace, publisher)
 
 
-def _shots(results: Iterable[tuple[Shot, PoseEstimate | Missed]], body: Body, publisher: Publisher) -> Replayed:
+def _shots(
+    shots: Iterable[tuple[Shot, _Seen]],
+    measured: Callable[[_Seen], PoseEstimate | Missed],
+    body: Body,
+    pace: Pace,
+    publisher: Publisher,
+) -> Replayed:
     poses = []
-    for shot, result in results:
+    for shot, seen in shots:
+        pace.wait(shot.t_s)
+        result = measured(seen)
         poses.append(shot_pose(shot.name, shot.t_s, body, result))
         publisher.put(ShotDatum(shot, result))
     if not poses:
         raise InputError("the recording ended without a single shot")
-    return Replayed(tuple(poses))
-
-
-#: Called with a line about what is done.
-Say = Callable[[str], None]
+    return Replayed(body, tuple(poses))

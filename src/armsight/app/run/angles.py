@@ -25,21 +25,13 @@ MOST_GAP_S = 0.25
 
 @dataclass(frozen=True, eq=False)
 class LoggedAngles(Record):
-    """The rows of a file.
+    """The rows of a file."""
 
-    Attributes:
-        path: of the file, for errors.
-        q: (N, n) joint angles, rad.
-        shots: names of the shots the rows belong to; None where no column has them.
-        t_s: (N,) times of the rows, s, rising; None where no column has them.
-        unused: the columns that were not read.
-    """
-
-    path: Path
-    q: Array
-    shots: tuple[str, ...] | None
-    t_s: Array | None
-    unused: tuple[str, ...] = ()
+    path: Path  #: of the file, for errors
+    q: Array  #: (N, n) joint angles, rad
+    shots: tuple[str, ...] | None  #: names of the shots the rows belong to; None where no column has them
+    t_s: Array | None  #: (N,) times of the rows, s, rising; None where no column has them
+    unused: tuple[str, ...] = ()  #: the columns that were not read
 
     def at(self, names: Sequence[str], times_s: Sequence[float | None]) -> list[Array | None]:
         """Return the joint angles (n,), rad, at each shot; None at a shot that no row belongs to.

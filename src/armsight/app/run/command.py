@@ -16,7 +16,6 @@ from armsight.files import read_text
 
 if TYPE_CHECKING:
     from armsight.app.run.motion_file import MotionPlan
-    from armsight.data import Array
     from armsight.robot.kinematics.arm import Arm
 
 _HANDEYE_POSES = 30
@@ -142,15 +141,13 @@ def command(
         )
         return
 
-    import numpy as np
-
     from armsight.app.progress import steps
-    from armsight.app.run.calibrate import handeye_poses
+    from armsight.app.run.devices import Devices, open_devices, planned_for
     from armsight.app.run.experiment import require_followed, require_start
     from armsight.app.run.folder import finish, open_folder, run_in
     from armsight.app.run.motion_file import DEFAULT_MOTION
-    from armsight.app.run.setup import Devices, open_devices, planned_for
-    from armsight.app.run.summary import show_summary
+    from armsight.app.run.report import show
+    from armsight.loop.running.calibrate import handeye_poses
     from armsight.robot.arm_file import open_arm
     from armsight.vision.follow.follower import follows
     from armsight.vision.markers.targets import open_fixed, open_target
@@ -168,8 +165,7 @@ def command(
         )
     motion = DEFAULT_MOTION if motion is None else motion
     motions = _motions(arm, arm_spec, motion)
-    ends: list[Array] = [motions.start, *(m.trajectory.at(m.trajectory.duration_s).q for m in motions.motions)]
-    targets = handeye_poses(arm, np.array(ends), _HANDEYE_POSES, 0)
+    targets = handeye_poses(arm, motions.ends, _HANDEYE_POSES, 0)
     files = {"motion.toml": read_text(motion), "body.toml": read_text(target_spec)}
     open_folder(output)
     devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms, calibration, sync_led)
@@ -181,7 +177,7 @@ def command(
                 setup = replace(setup, fixed=fixed_targets)
                 require_start(setup, motions, targets)
                 begun = True
-                finished = run_in(
+                result = run_in(
                     output,
                     setup,
                     rig,
@@ -196,12 +192,12 @@ def command(
                     follow_rig=follow_rig,
                 )
                 progress("writing and plotting")
-                summary = finish(finished, output)
+                report = finish(result, output)
     except KeyboardInterrupt:
         if begun:  # said once the progress is off the terminal
             click.echo(f"the arm was stopped; what was measured until then is in {output}", err=True)
         raise
-    show_summary(summary, output, as_json=as_json)
+    show(report, output, as_json=as_json)
 
 
 def _run_logged(

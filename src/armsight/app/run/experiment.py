@@ -1,40 +1,39 @@
 """The experiment: hand-eye calibration, camera delay, the motions in open loop, the motions with the loop closed.
 
-In: a :class:`~armsight.app.run.setup.Setup` (the workcell or real devices), a calibrated rig and a motion plan. Out: a
+In: a :class:`~armsight.loop.running.setup.Setup` (the workcell or real devices), a calibrated rig and a motion plan. Out: a
 :class:`RunResult`. After a device failure or an interrupt it has everything measured until then; the arm is stopped first.
-
-Before an arm moves, :func:`require_start` checks its joint angles and limits, and :func:`enable` switches
-the drives on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from armsight.app.interrupts import uninterrupted
-from armsight.app.run.calibrate import HandEyeRun, find_delay, find_mounting
-from armsight.app.run.controllers import Planned, closed_on, drive, planned
-from armsight.app.run.loop import PERIOD_S, Loop, steady
 from armsight.app.run.motion_file import MotionPlan
-from armsight.app.run.record import Log, RunSegment
-from armsight.app.run.setup import Setup
-from armsight.app.stream.datum import EventDatum, estimator_event
-from armsight.app.stream.sink import Fanout, Publisher
-from armsight.data import Array, Body, Missed, PoseEstimate, Shot
+from armsight.data import Array, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, Prior
-from armsight.loop.health import HealthFinding
+from armsight.loop.health import HealthFinding, HealthMonitor
 from armsight.loop.health.change import Change
 from armsight.loop.health.follow import RigFollower
+from armsight.loop.running.calibrate import HandEyeRun, Progress, find_delay, find_mounting
+from armsight.loop.running.controllers import PERIOD_S, Closed, Controller, Planned
+from armsight.loop.running.data import EventDatum, Fanout, Publisher, estimator_event
+from armsight.loop.running.log import Log, RunSegment
+from armsight.loop.running.loop import Loop, steady
+from armsight.loop.running.setup import Setup
 from armsight.loop.servo import JointLoops, LoopTiming, PoseServo
 from armsight.loop.sync_led import SyncLedWatch, led_findings
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Command, Fault
 from armsight.robot.boards.contract import Abilities, MotionBoard
-from armsight.robot.trajectories import Trajectory, point_to_point
+from armsight.robot.trajectories import Tabled, Trajectory, point_to_point
 from armsight.vision.follow.follower import Follower
 from armsight.vision.rig import Shutters, StereoRig
 
@@ -45,6 +44,20 @@ _START_RAD, _START_ALONE_RAD = float(np.radians(2.0)), float(np.radians(5.0))
 _SLOWS_S = 3.0
 _STEP_S = 0.05
 _CHECKED = 200  # joint angles along a motion that are checked
+#: Delay of the cameras and its sigma before it is measured, s.
+_UNKNOWN_DELAY = Delay(0.02, 0.02)
+#: Number of shots that are kept as images: a recording to try the stages on.
+KEPT_SHOTS = 12
+#: Links of an arm at rest creep within their backlash, which the potentiometers do not measure: by half of a gap of 0.2
+#: degree within seconds.
+PRIOR = Prior(creep_rad=float(np.deg2rad(0.05)))
+#: Time from an image's arrival to its command, s: computing time, and the mean wait for the next iteration.
+_OWN_S = 0.002 + PERIOD_S / 2
+_STALE_S = 0.05
+#: Longest rest in open loop, s, beyond what the board lags: there is no correction that has to settle.
+OPEN_REST_S = 0.5
+#: Makes a controller from a trajectory, the time at which it begins, board's clock, s, and how long the arm then rests, s.
+Control = Callable[[Trajectory, float, float], Controller]
 
 
 def enable(board: MotionBoard) -> None:
@@ -76,12 +89,7 @@ def start_rad(abilities: Abilities) -> float:
 
 
 def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
-    """Check that the arm is where the motion starts, and that the board allows all joint angles of the run.
-
-    Args:
-        setup: the arm and its board.
-        plan: the motions.
-        targets: (N, n) further joint angles of the run, rad.
+    """Check that the arm is where the motion starts, and that the board allows all joint angles, ``targets`` (N, n) too.
 
     Raises:
         ArmsightError: a joint is elsewhere, or out of the board's limits; the message has its angle and the allowed one.
@@ -128,60 +136,38 @@ def require_range(setup: Setup, q: Array) -> None:
         )
 
 
-Progress = Callable[[str], None]
-#: Delay of the cameras and its sigma before it is measured, s.
-_UNKNOWN_DELAY = Delay(0.02, 0.02)
-#: Number of shots that are kept as images: a recording to try the stages on.
-KEPT_SHOTS = 12
-#: Links of an arm at rest creep within their backlash, which the potentiometers do not measure: by half of a gap of 0.2
-#: degree within seconds.
-PRIOR = Prior(creep_rad=float(np.deg2rad(0.05)))
-#: Time from an image's arrival to its command, s: computing time, and the mean wait for the next iteration.
-_OWN_S = 0.002 + PERIOD_S / 2
-_STALE_S = 0.05
-
-
 @dataclass
 class RunResult:
-    """What a run measured.
+    """What a run was of, and what it measured."""
 
-    Attributes:
-        body: the body on the tool.
-        log: everything that was measured and commanded.
-        handeye: the hand-eye calibration; None before it was made.
-        delay: delay of the cameras' time stamps.
-        shutters: when the cameras expose, given or found by the sweep; None where they do at one time.
-        open_s: begin and end of the pass with potentiometers alone, board's clock, s; None before.
-        closed_s: begin and end of the pass with the loop closed.
-        covered_s: begin and end of the time the body was hidden on purpose; None where it was not.
-        kept: the first shots of the motions.
-        picture: the first shot in motion in which the body was found, and its pose.
-        health: why the result must not be trusted; empty where nothing says so.
-        changes: what explains a motion of the rig or the body; empty where none was found.
-        fixed_unseen: names of the fixed bodies that were seen too rarely to be watched.
-        not_corrected: why what was found of a rig that is followed was not put right; None where nothing was left.
-        led: what followed the cameras' clock by the sync LED; None without one.
-        ended_by: the error that ended the run early; None where there was none.
-        interrupted: whether the keyboard ended the run.
-    """
-
-    body: Body
-    log: Log = field(default_factory=Log)
-    handeye: HandEyeRun | None = None
-    delay: Delay = _UNKNOWN_DELAY
+    setup: Setup  #: the devices
+    rig: StereoRig  #: the calibrated cameras
+    plan: MotionPlan  #: the motions
+    #: what the run was of, as summary.json names it: arm, board, seed, cameras.
+    properties: Mapping[str, Any] = field(default_factory=dict)
+    began: float = field(default_factory=time.perf_counter)  #: when it began, s
+    log: Log = field(default_factory=Log)  #: everything that was measured and commanded
+    handeye: HandEyeRun | None = None  #: the hand-eye calibration; None before it was made
+    delay: Delay = _UNKNOWN_DELAY  #: delay of the cameras' time stamps
+    #: when the cameras expose, given or found by the sweep; None where they do at one time.
     shutters: Shutters | None = None
+    #: begin and end of the pass with potentiometers alone, board's clock, s; None before.
     open_s: tuple[float, float] | None = None
-    closed_s: tuple[float, float] | None = None
+    closed_s: tuple[float, float] | None = None  #: begin and end of the pass with the loop closed
+    #: begin and end of the time the body was hidden on purpose; None where it was not.
     covered_s: tuple[float, float] | None = None
-    kept: list[Shot] = field(default_factory=list)
-    picture: tuple[Shot, PoseEstimate] | None = None
-    health: tuple[HealthFinding, ...] = ()
-    changes: tuple[Change, ...] = ()
-    fixed_unseen: tuple[str, ...] = ()
+    kept: list[Shot] = field(default_factory=list)  #: the first shots of the motions
+    picture: tuple[Shot, PoseEstimate] | None = (
+        None  #: the first shot in motion in which the body was found, and its pose
+    )
+    health: tuple[HealthFinding, ...] = ()  #: why the result must not be trusted; empty where nothing says so
+    changes: tuple[Change, ...] = ()  #: what explains a motion of the rig or the body; empty where none was found
+    fixed_unseen: tuple[str, ...] = ()  #: names of the fixed bodies that were seen too rarely to be watched
+    #: why what was found of a rig that is followed was not put right; None where nothing was left.
     not_corrected: str | None = None
-    led: SyncLedWatch | None = None
-    ended_by: ArmsightError | None = None
-    interrupted: bool = False
+    led: SyncLedWatch | None = None  #: what followed the cameras' clock by the sync LED; None without one
+    ended_by: ArmsightError | None = None  #: the error that ended the run early; None where there was none
+    interrupted: bool = False  #: whether the keyboard ended the run
 
     @property
     def delay_found(self) -> bool:
@@ -192,6 +178,11 @@ class RunResult:
     def ended_text(self) -> str | None:
         """What ended the run early, as text; None where it ran to its end."""
         return "interrupted" if self.interrupted else None if self.ended_by is None else str(self.ended_by)
+
+    def ended(self, error: BaseException) -> None:
+        """Note what ended the run early."""
+        self.interrupted = isinstance(error, KeyboardInterrupt)
+        self.ended_by = error if isinstance(error, ArmsightError) else None
 
 
 def run_experiment(
@@ -226,16 +217,14 @@ def run_experiment(
     Returns:
         All that was measured, also where something ended the run early.
     """
-    outcome, given = RunResult(setup.target.body, handeye=handeye), publisher or Fanout()
+    result = RunResult(setup, rig, plan, handeye=handeye)
 
     def work(loop: Loop) -> None:
         loop.rig_follower = RigFollower(rig, setup.target.body) if follow_rig else None
-        _prepare(loop, setup, plan, targets, outcome, progress)
-        _passes(loop, setup, plan, outcome, progress, cover, close_loop)
+        _prepare(loop, result, targets, progress)
+        _passes(loop, result, progress, cover, close_loop)
 
-    with steady(in_time=setup.clock is not None):
-        _run(setup, rig, plan, outcome, progress, begun, given, work)
-    return outcome
+    return _run(result, progress, begun, publisher or Fanout(), work)
 
 
 def run_visits(
@@ -248,83 +237,68 @@ def run_visits(
     begun: Callable[[Loop], None] = lambda loop: None,
     look: bool = True,
 ) -> RunResult:
-    """Move the arm by ``work`` alone, which is given the loop; all else as :func:`run_experiment`.
+    """Move the arm from a plan's start by ``work`` alone, which is given the loop; else as :func:`run_experiment`.
 
-    Args:
-        setup: the devices.
-        rig: the calibrated cameras.
-        plan: the arm stands at its start.
-        work: moves the arm.
-        progress: called with a line about what is being done.
-        begun: called with the loop before the drives are switched on.
-        look: whether the body must be seen before.
-
-    Returns:
-        What was measured, also where something ended it early.
+    ``look``: whether the body must be seen before.
     """
-    outcome = RunResult(setup.target.body)
-    with steady(in_time=setup.clock is not None):
-        _run(setup, rig, plan, outcome, progress, begun, Fanout(), work, look=look)
-    return outcome
+    return _run(RunResult(setup, rig, plan), progress, begun, Fanout(), work, look=look)
 
 
 def _run(
-    setup: Setup,
-    rig: StereoRig,
-    plan: MotionPlan,
-    outcome: RunResult,
+    result: RunResult,
     progress: Progress,
     begun: Callable[[Loop], None],
     publisher: Publisher,
     work: Callable[[Loop], None],
     *,
     look: bool = True,
-) -> None:
-    """Switch the drives on, look, and do the work; what ends it early is stored in the outcome, and the arm is stopped."""
+) -> RunResult:
+    """Switch the drives on, look, and do the work; what ends it early is stored in the result, and the arm is stopped."""
     loop: Loop | None = None
-    try:
-        progress("preparing to follow the body")
-        follower = Follower(rig, setup.target, setup.sync_s)
-        if setup.clock is not None:
-            setup.board.receive(_STALE_S)  # what arrived in the port's buffer meanwhile
-        first = KalmanEstimator(setup.arm, prior=prior_of(setup.board), delay=_UNKNOWN_DELAY)
-        publisher.put(EventDatum(0.0, estimator_event(first, anew=False)))
-        loop = Loop.open(setup, follower, outcome.log, first, publisher)
-        begun(loop)
-        enable(setup.board)
-        if look:
-            _require_seen(loop, setup, plan)
-        work(loop)
-    except (ArmsightError, KeyboardInterrupt) as error:
-        outcome.interrupted = isinstance(error, KeyboardInterrupt)
-        outcome.ended_by = error if isinstance(error, ArmsightError) else None
-    finally:  # after any exception, a programming error too: the arm stops
-        if loop is not None:
-            with uninterrupted() as again:  # a second Ctrl-C must not keep the arm from stopping
-                _stopped(loop)
-                loop.close_record()
-                outcome.health, outcome.changes = loop.health.findings(), loop.health.every_change
-                outcome.not_corrected = None if loop.rig_follower is None else loop.rig_follower.rejected
-                if loop.led is not None:
-                    outcome.led, outcome.health = loop.led, (*outcome.health, *led_findings(loop.led))
-                outcome.fixed_unseen = loop.health.fixed_never_seen
-            outcome.interrupted = outcome.interrupted or bool(again)
+    setup = result.setup
+    with steady(in_time=setup.clock is not None):
+        try:
+            progress("preparing to follow the body")
+            follower = Follower(result.rig, setup.target, setup.sync_s)
+            if setup.clock is not None:
+                setup.board.receive(_STALE_S)  # what arrived in the port's buffer meanwhile
+            first = KalmanEstimator(setup.arm, prior=prior_of(setup.board), delay=_UNKNOWN_DELAY)
+            publisher.put(EventDatum(0.0, estimator_event(first, anew=False)))
+            loop = Loop.open(setup, follower, result.log, first, publisher)
+            begun(loop)
+            enable(setup.board)
+            if look:
+                _require_seen(loop, result.plan)
+            work(loop)
+        except (ArmsightError, KeyboardInterrupt) as error:
+            result.ended(error)
+        finally:  # after any exception, a programming error too: the arm stops
+            if loop is not None:
+                _close(loop, result)
+    return result
 
 
-def _stopped(loop: Loop) -> None:
-    """Bring the arm to rest; an error is ignored, as the one that ended the run is reported."""
-    try:
-        loop.stop()
-    except ArmsightError:
-        return  # the board is gone: it reacts to the silence itself, and holds or releases the arm
+def _close(loop: Loop, result: RunResult) -> None:
+    """Stop the arm, and take what the loop found into the result."""
+    with uninterrupted() as again:  # a second Ctrl-C must not keep the arm from stopping
+        with contextlib.suppress(ArmsightError):  # the board is gone: it reacts to the silence itself
+            loop.stop()
+        loop.close_record()
+        result.health, result.changes = loop.health.findings(), loop.health.every_change
+        result.not_corrected = None if loop.rig_follower is None else loop.rig_follower.rejected
+        if loop.led is not None:
+            result.led, result.health = loop.led, (*result.health, *led_findings(loop.led))
+        result.fixed_unseen = loop.health.fixed_never_seen
+    result.interrupted = result.interrupted or bool(again)
 
 
-def _require_seen(loop: Loop, setup: Setup, plan: MotionPlan) -> None:
+def _require_seen(loop: Loop, plan: MotionPlan) -> None:
     """Raise an ArmsightError if the body is not in view at the start."""
+    setup = loop.setup
     here = plan.start if setup.clock is None else loop.log.joints[-1].q[-1]  # a real arm is only near the start
     there = point_to_point(setup.arm, np.clip(here, setup.arm.q_min, setup.arm.q_max), plan.start)
     look_s = there.duration_s + max(0.3, 3.0 / setup.rate_hz)
-    loop.run_until_seen(Planned(there, loop.t_s, setup.gravity), look_s, RunSegment("calibration", "", "", False))
+    loop.run_until_seen(Planned(there, loop.t_s, setup.gravity), look_s, RunSegment())
     results = [result for _, _, result in loop.log.poses]
     if any(isinstance(result, PoseEstimate) for result in results):
         return
@@ -337,80 +311,105 @@ def _require_seen(loop: Loop, setup: Setup, plan: MotionPlan) -> None:
     )
 
 
-def _prepare(
-    loop: Loop, setup: Setup, plan: MotionPlan, targets: Array, outcome: RunResult, progress: Progress
-) -> None:
+def _prepare(loop: Loop, result: RunResult, targets: Array, progress: Progress) -> None:
     """Calibrate hand and eye, and measure the delay of the images; the arm ends at the plan's start."""
-    arm, gravity = setup.arm, setup.gravity
-    stands = plan.start
+    setup, plan, stands = loop.setup, result.plan, result.plan.start
     if loop.led is not None:
         progress("looking for the sync LED")
         loop.find_led()
-    if outcome.handeye is None:
-        outcome.handeye = find_mounting(loop, arm, plan.start, targets, gravity, progress)
+    if result.handeye is None:
+        result.handeye = find_mounting(loop, plan.start, targets, progress)
         stands = targets[-1]
-    loop.mounting = outcome.handeye.mounting
+    loop.mounting = result.handeye.mounting
     progress("measuring the delay of the images: a sweep of the joints")
     middle = plan.motions[0].trajectory.at(plan.motions[0].trajectory.duration_s).q
-    outcome.delay = find_delay(loop, arm, stands, middle, gravity)
-    outcome.shutters = loop.shutters
-    back = point_to_point(arm, middle, plan.start)
-    there = RunSegment("calibration", "to the start", "joints", False, trajectory=back)
-    loop.begin(KalmanEstimator(arm, prior=prior_of(setup.board), delay=outcome.delay, learns_delay=False))
-    loop.run(Planned(back, loop.t_s, gravity), back.duration_s + 0.5, there)
+    result.delay = find_delay(loop, stands, middle)
+    result.shutters = loop.shutters
+    loop.begin(KalmanEstimator(setup.arm, prior=prior_of(setup.board), delay=result.delay, learns_delay=False))
+    loop.go(point_to_point(setup.arm, middle, plan.start), 0.5, RunSegment("calibration", "to the start", "joints"))
 
 
 def _passes(
     loop: Loop,
-    setup: Setup,
-    plan: MotionPlan,
-    outcome: RunResult,
+    result: RunResult,
     progress: Progress,
     cover: Callable[[float, float], None] | None,
     close_loop: bool,
 ) -> None:
     """Make the motions with potentiometers alone, and then with the loop closed."""
+    setup, plan = loop.setup, result.plan
 
-    def started(motion: str, kind: str, duration_s: float) -> None:
-        if cover is not None and kind == "circle" and outcome.covered_s is None:
+    def started(kind: str, duration_s: float) -> None:
+        if cover is not None and kind == "circle" and result.covered_s is None:
             begin = loop.t_s + 0.4 * duration_s
-            outcome.covered_s = (begin, begin + 0.5)
-            cover(*outcome.covered_s)
+            result.covered_s = (begin, begin + 0.5)
+            cover(*result.covered_s)
 
-    def seen(shot: Shot, result: PoseEstimate | Missed) -> None:
-        outcome.kept.append(shot)
-        if isinstance(result, PoseEstimate) and outcome.picture is None:
-            outcome.picture = (shot, result)
-        if len(outcome.kept) >= KEPT_SHOTS:
-            loop.on_shot = lambda shot, result: None
+    def seen(shot: Shot, found: PoseEstimate | Missed) -> None:
+        result.kept.append(shot)
+        if isinstance(found, PoseEstimate) and result.picture is None:
+            result.picture = (shot, found)
+        if len(result.kept) >= KEPT_SHOTS:
+            loop.on_shot = lambda shot, found: None
 
     loop.on_shot = seen
     begin = loop.t_s
-    outcome.open_s = (begin, begin)
+    result.open_s = (begin, begin)
     try:
-        drive(loop, plan, planned(setup.gravity), closed=False, progress=progress, started=started)
+        alone: Control = lambda way, start_s, rest_s: Planned(way, start_s, setup.gravity)  # noqa: E731
+        drive(loop, plan, alone, closed=False, progress=progress, started=started)
     finally:
-        outcome.open_s = (begin, loop.t_s)
+        result.open_s = (begin, loop.t_s)
     if not close_loop:
         return
-    _to_start(loop, setup, plan)
-    servo = PoseServo(setup.arm, timing(setup, outcome.delay), joint_loops(setup))
+    _to_start(loop, plan)
+    servo = PoseServo(setup.arm, timing(setup, result.delay), joint_loops(setup))
     begin = loop.t_s
     try:
         drive(loop, plan, closed_on(servo, lambda: loop.health, setup.gravity), closed=True, progress=progress)
     finally:
-        outcome.closed_s = (begin, loop.t_s)
+        result.closed_s = (begin, loop.t_s)
 
 
-def _to_start(loop: Loop, setup: Setup, plan: MotionPlan) -> None:
+def drive(
+    loop: Loop,
+    plan: MotionPlan,
+    control: Control,
+    *,
+    closed: bool,
+    progress: Progress = lambda line: None,
+    started: Callable[[str, float], None] = lambda kind, duration_s: None,
+) -> None:
+    """Make all motions of a plan, with its rests; the arm stands at its start.
+
+    ``control`` makes the controller of each motion, closed on vision or not; ``started`` is called with kind and duration,
+    s, of each as it begins.
+
+    Raises:
+        DeviceError: the board or a camera failed.
+    """
+    phase, open_s = "closed_loop" if closed else "open_loop", OPEN_REST_S + 2.0 * loop.setup.board.abilities.latency_s
+    for motion in plan.motions:
+        progress(f"{'loop closed on vision' if closed else 'joint sensors alone'}: {motion.name}")
+        controller = control(Tabled(motion.trajectory), loop.t_s, motion.rest_s)
+        segment = RunSegment(phase, motion.name, motion.kind, closed, trajectory=motion.trajectory)
+        started(motion.kind, motion.trajectory.duration_s)
+        loop.run(controller, motion.trajectory.duration_s, segment)
+        loop.run(controller, motion.rest_s if closed else min(motion.rest_s, open_s), replace(segment, phase="rest"))
+
+
+def closed_on(servo: PoseServo, health: Callable[[], HealthMonitor], gravity: Callable[[Array], Array]) -> Control:
+    """Return the control that follows the plan with the loop closed on vision, as far as that may be relied on."""
+    return lambda trajectory, start_s, rest_s: Closed(servo, health, trajectory, start_s, gravity, rest_s)
+
+
+def _to_start(loop: Loop, plan: MotionPlan) -> None:
     """Move the arm from the end of the motions to their start, if these differ."""
     last = plan.motions[-1].trajectory
     end = last.at(last.duration_s).q
-    if np.allclose(end, plan.start, rtol=0.0, atol=1e-6):
-        return
-    back = point_to_point(setup.arm, end, plan.start)
-    there = RunSegment("calibration", "back to the start", "joints", False, trajectory=back)
-    loop.run(Planned(back, loop.t_s + PERIOD_S, setup.gravity), back.duration_s + 0.5, there)
+    if not np.allclose(end, plan.start, rtol=0.0, atol=1e-6):
+        back = point_to_point(loop.setup.arm, end, plan.start)
+        loop.go(back, 0.5, RunSegment("calibration", "back to the start", "joints"), late_s=PERIOD_S)
 
 
 def prior_of(board: MotionBoard) -> Prior:

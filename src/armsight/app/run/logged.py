@@ -11,14 +11,13 @@ import csv
 import io
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from armsight.app.run.angles import LoggedAngles
-from armsight.app.run.calibrate import HandEyeRun
 from armsight.app.run.folder import write_handeye
 from armsight.app.show.page import PAGE
 from armsight.app.show.plotting import BLUE, new_figure
@@ -26,10 +25,10 @@ from armsight.app.show.report import Lines, Report, figures
 from armsight.data import Array, Missed, PoseEstimate, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse
-from armsight.loop.estimators import Mounting
 from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, calibrate_handeye, require_known
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.misread import check_plausible, without_tool
+from armsight.loop.running.calibrate import HandEyeRun
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.markers.marker import Target
 from armsight.vision.pose.measure import measure
@@ -48,23 +47,15 @@ _MOVED_RAD = float(np.radians(0.5))
 
 @dataclass(frozen=True, eq=False)
 class LoggedRun(Record):
-    """The result.
+    """The result."""
 
-    Attributes:
-        run: the hand-eye calibration and its poses.
-        names: (N,) shots of its poses.
-        shots: how many shots there were.
-        unpaired: shots that no row of angles belongs to.
-        shift: 1 where the angles of the row before fit the shots better than their own, -1 those of the row behind, else 0.
-        implausible: why these angles cannot be this arm's; None where they can.
-    """
-
-    run: HandEyeRun
-    names: tuple[str, ...]
-    shots: int
-    unpaired: tuple[str, ...]
+    run: HandEyeRun  #: the hand-eye calibration and its poses
+    names: tuple[str, ...]  #: (N,) shots of its poses
+    shots: int  #: how many shots there were
+    unpaired: tuple[str, ...]  #: shots that no row of angles belongs to
+    #: 1 where the angles of the row before fit the shots better than their own, -1 those of the row behind, else 0.
     shift: int
-    implausible: str | None
+    implausible: str | None  #: why these angles cannot be this arm's; None where they can
 
     @property
     def error_mm(self) -> Array:
@@ -129,8 +120,7 @@ def run_logged(
     found = _required(arm, q, Ts, covs, centre)
     steps = np.diff(q, axis=0, prepend=q[:1])
     approach = np.sign(np.where(np.abs(steps) > _MOVED_RAD, steps, 0.0))
-    mounting = replace(Mounting.of(found, arm), cov=np.zeros((12, 12)))
-    run = HandEyeRun(mounting, found, q, Ts, covs, approach, missed)
+    run = HandEyeRun.of(arm, found, q, Ts, covs, approach, missed)
     progress("hand-eye: are rows and shots shifted, are the angles this arm's?")
     shift = _shift(arm, q, Ts, covs, centre, found.held_out.rms()[0])
     implausible = None if shift else _implausible(arm, q[found.used], Ts[found.used])

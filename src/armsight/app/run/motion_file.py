@@ -44,40 +44,29 @@ _OLD_KEYS = {"roll_pitch_yaw_deg": "euler_zyx_deg", "turn_deg": "rotation_deg"}
 
 @dataclass(frozen=True, eq=False)
 class PlannedMotion(Record):
-    """One motion of a run.
+    """One motion of a run."""
 
-    Attributes:
-        name: its name, unique in the run.
-        kind: joints, home, line or circle.
-        trajectory: joint angles over time.
-        rest_s: how long the arm rests at its end, s.
-    """
-
-    name: str
-    kind: str
-    trajectory: Trajectory
-    rest_s: float
+    name: str  #: its name, unique in the run
+    kind: str  #: joints, home, line or circle
+    trajectory: Trajectory  #: joint angles over time
+    rest_s: float  #: how long the arm rests at its end, s
 
 
 @dataclass(frozen=True, eq=False)
 class MotionPlan(Record):
-    """The motions of a run.
+    """The motions of a run."""
 
-    Attributes:
-        start: (n,) joint angles before the first, rad.
-        motions: one after the other, each from where the one before ends.
-    """
+    start: Array  #: (n,) joint angles before the first, rad
+    motions: tuple[PlannedMotion, ...]  #: one after the other, each from where the one before ends
 
-    start: Array
-    motions: tuple[PlannedMotion, ...]
+    @property
+    def ends(self) -> Array:
+        """(N, n) joint angles of the start and at the end of each motion, rad."""
+        return np.array([self.start, *(m.trajectory.at(m.trajectory.duration_s).q for m in self.motions)])
 
 
 def read_motions(arm: Arm, path: str | Path = DEFAULT_MOTION) -> MotionPlan:
-    """Read a motion file and plan all of it.
-
-    Args:
-        arm: the nominal arm.
-        path: the file.
+    """Read a motion file and plan all of it for a nominal arm.
 
     Raises:
         InputError: the file cannot be read, a key or a number is not allowed, or a motion cannot be made; the message

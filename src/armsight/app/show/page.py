@@ -95,17 +95,37 @@ def folded(summary: str, body: str) -> str:
     return f"<details><summary>{text(summary)}</summary>\n{body}</details>\n" if body else ""
 
 
-def picture(data: bytes, description: str, *, kind: str = "png", attributes: str = "") -> str:
+def picture(data: bytes, description: str, *, zoom: bool = False) -> str:
     """Return an HTML image that holds its own data.
 
     Args:
-        data: the file's bytes.
+        data: the file's bytes, PNG or SVG.
         description: for who cannot see it; plain text.
-        kind: png or svg+xml.
-        attributes: further HTML attributes, such as a style.
+        zoom: whether the mouse wheel enlarges it, by :data:`ZOOM`.
     """
+    kind = "png" if data.startswith(b"\x89PNG") else "svg+xml"
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
-    return f'<img src="{source}" alt="{text(description)}"{attributes and " " + attributes}>'
+    image = f'<img src="{source}" alt="{text(description)}"{_ZOOMED if zoom else ""}>'
+    return f'<div class="zoom" style="overflow:hidden;cursor:grab;touch-action:none">{image}</div>' if zoom else image
+
+
+#: Script of a page: the wheel zooms about the pointer, dragging moves, a double click shows the whole again.
+ZOOM = """
+for (const box of document.querySelectorAll(".zoom")) {
+  const img = box.firstElementChild; let k = 1, x = 0, y = 0, from = null;
+  const show = () => { img.style.transform = `translate(${x}px,${y}px) scale(${k})`; };
+  box.addEventListener("wheel", e => { e.preventDefault();
+    const r = box.getBoundingClientRect(), px = e.clientX - r.left, py = e.clientY - r.top;
+    const n = Math.min(40, Math.max(1, k * Math.exp(-e.deltaY / 400)));
+    x = n > 1 ? px - (px - x) * n / k : 0; y = n > 1 ? py - (py - y) * n / k : 0; k = n; show(); }, {passive: false});
+  box.addEventListener("pointerdown", e => { from = [e.clientX - x, e.clientY - y]; box.setPointerCapture(e.pointerId); });
+  box.addEventListener("pointermove", e => {
+    if (from && k > 1) { x = e.clientX - from[0]; y = e.clientY - from[1]; show(); } });
+  box.addEventListener("pointerup", () => { from = null; });
+  box.addEventListener("dblclick", () => { k = 1; x = y = 0; show(); });
+}
+"""
+_ZOOMED = ' style="transform-origin:0 0" draggable="false"'
 
 
 def html_page(title: str, heading: str, sub: str, sections: Mapping[str, tuple[str, str]], script: str = "") -> str:

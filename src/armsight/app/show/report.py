@@ -16,12 +16,14 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
+import numpy as np
 
 from armsight.app.show import page
 from armsight.app.show.encode import json_of
 from armsight.app.show.messages import UNTRUSTED, Level, Note, weak
-from armsight.app.show.plotting import drawing, png, require_matplotlib
+from armsight.app.show.plotting import drawing, png, require_matplotlib, svg
 from armsight.app.show.table import TextTable, html_table, plain_text
+from armsight.data import Image
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,17 +65,19 @@ class Plot:
 
     Attributes:
         name: of its file, without the prefix.
-        draw: plots it; None where there is nothing to plot.
-        caption: HTML.
+        draw: plots it, or returns an image (H, W, 3) BGR; None where there is nothing to plot.
+        caption: HTML; empty: it is a file alone.
         description: for who cannot see it.
         folded: whether it stands beneath its description until a reader asks for it.
+        zoom: on the page it stays sharp and the mouse wheel enlarges it.
     """
 
     name: str
-    draw: Callable[[], Figure | None]
+    draw: Callable[[], Figure | Image | None]
     caption: str
     description: str
     folded: bool = False
+    zoom: bool = False
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,7 @@ class Report:
         sections: by their anchors, in order.
         notes: remarks.
         values: what programs read besides the facts.
-        prefix: of the figures' files.
+        prefix: of the figures' files; may be empty.
     """
 
     name: str
@@ -174,7 +178,8 @@ class Report:
             for anchor, body in bodies.items()
             if body
         }
-        return page.html_page(f"armsight: {self.name}", self.heading, self.sub, shown)
+        zooms = any(isinstance(block, Plot) and block.zoom for block in self.blocks)
+        return page.html_page(f"armsight: {self.name}", self.heading, self.sub, shown, page.ZOOM if zooms else "")
 
     def write(self, folder: Path, files: Mapping[str, str | bytes] = MappingProxyType({})) -> Path:
         """Draw the figures, and write page, figures and further files into a folder.
@@ -190,14 +195,21 @@ class Report:
         Raises:
             InputError: matplotlib is missing, or a file cannot be written; then none of the new ones is left.
         """
-        plots = {f"{self.prefix}-{block.name}.png": block for block in self.blocks if isinstance(block, Plot)}
+        plots = {
+            f"{self.prefix}-{block.name}.png".lstrip("-"): block for block in self.blocks if isinstance(block, Plot)
+        }
         if plots:
             require_matplotlib()
         folder, images, pictures = page.writable_folder(folder, "no report"), dict[str, bytes](), dict[str, bytes]()
         with drawing() if plots else contextlib.nullcontext():
             for file, plot in plots.items():
-                if (figure := plot.draw()) is not None:
-                    images[plot.name] = pictures[file] = png(figure)
+                if isinstance(drawn := plot.draw(), np.ndarray):
+                    import cv2
+
+                    images[plot.name] = pictures[file] = cv2.imencode(".png", drawn)[1].tobytes()
+                elif drawn is not None:
+                    pictures[file] = png(drawn)
+                    images[plot.name] = svg(drawn) if plot.zoom and plot.caption else pictures[file]
         beside = {name: data.encode() if isinstance(data, str) else data for name, data in files.items()}
         page.put_files(folder, {**pictures, **beside, page.PAGE: self.page(images).encode()})
         for file in plots.keys() - pictures.keys():
@@ -263,9 +275,9 @@ def _html(block: Block, images: Mapping[str, bytes]) -> str:
             return html
         case TextTable():
             return html_table(block)
-        case Plot(name, _, caption, description, folded) if name in images:
+        case Plot(name, _, caption, description, folded, zoom) if caption and name in images:
             said = caption if caption.startswith("<p") else f"<p>{caption}</p>"
-            shown = page.picture(images[name], description)
+            shown = page.picture(images[name], description, zoom=zoom)
             figure = f"<figure>{shown}<figcaption>{said}</figcaption></figure>\n"
             return page.folded(description, figure) if folded else figure
         case Fact(sentence) if sentence:

@@ -12,9 +12,10 @@ from typing import Any, TypeAlias
 import cv2
 import numpy as np
 
-from armsight.app.stream.datum import EventDatum, JointsDatum, NoteDatum, Published, ShotDatum, quaternion
+from armsight.app.stream.datum import Published
 from armsight.data import SIDES, Array, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
+from armsight.loop.running.data import EventDatum, JointsDatum, NoteDatum, ShotDatum, quaternion
 from armsight.vision.pose.shot_pose import left_axes
 from armsight.vision.rigfiles.rigfile import rectification
 

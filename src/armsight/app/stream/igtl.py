@@ -16,9 +16,10 @@ from functools import cache
 
 import numpy as np
 
-from armsight.app.stream.datum import Datum, JointsDatum, NoteDatum, Published, ShotDatum, quaternion
+from armsight.app.stream.datum import Published
 from armsight.app.stream.network import TcpSink, host_and_port, listening
 from armsight.data import Array, Missed, PoseEstimate
+from armsight.loop.running.data import Datum, JointsDatum, NoteDatum, ShotDatum, quaternion
 
 _HEADER = struct.Struct(">H12s20sQQQ")
 _VERSION = 1

@@ -21,12 +21,13 @@ from typing import IO, Any
 import numpy as np
 
 from armsight import __version__
-from armsight.app.stream.datum import Datum, EventDatum, JointsDatum, NoteDatum, Published, ShotDatum, json_text
+from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.foxglove import LookedAt, Messages, nanoseconds, require_foxglove
 from armsight.app.stream.mcap_writer import McapWriter
 from armsight.app.stream.sink import Sink
 from armsight.data import Shot
 from armsight.errors import InputError
+from armsight.loop.running.data import Datum, EventDatum, JointsDatum, NoteDatum, ShotDatum
 from armsight.processes import Process
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.rig import StereoRig

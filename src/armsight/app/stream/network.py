@@ -13,9 +13,10 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-from armsight.app.stream.datum import Datum, EventDatum, JointsDatum, NoteDatum, Published, ShotDatum, json_text
+from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.sink import Sink
 from armsight.errors import InputError
+from armsight.loop.running.data import Datum, EventDatum, JointsDatum, NoteDatum, ShotDatum
 
 #: Lines that may wait for one reader.
 _WAITING = 256

@@ -9,10 +9,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable
-from typing import Protocol
 
-from armsight.app.stream.datum import Datum
+from armsight.loop.running.data import Datum
 
 #: How often ``tick`` is called at least, s.
 TICK_S = 0.25
@@ -20,26 +18,6 @@ TICK_S = 0.25
 _BEHIND = 0.25
 #: How long :meth:`Sink.close` waits for the thread, s, where nothing else is said.
 _CLOSE_S = 10.0
-
-
-class Publisher(Protocol):
-    """Takes data and returns at once."""
-
-    def put(self, datum: Datum) -> None:
-        """Take a datum."""
-        ...
-
-    def pause(self) -> None:
-        """Leave the interpreter to the caller until :meth:`resume`: begin to publish no other datum. Returns at once."""
-        ...
-
-    def resume(self) -> None:
-        """Publish again."""
-        ...
-
-    def close(self) -> None:
-        """Publish what was taken, and end."""
-        ...
 
 
 class Sink:
@@ -145,30 +123,3 @@ class Sink:
 
     def finish(self) -> None:
         """Release what was opened."""
-
-
-class Fanout:
-    """Publishes to several sinks; with none it does nothing."""
-
-    def __init__(self, sinks: Iterable[Publisher] = ()) -> None:
-        self.sinks = tuple(sinks)
-
-    def put(self, datum: Datum) -> None:
-        """Hand a datum to every sink."""
-        for sink in self.sinks:
-            sink.put(datum)
-
-    def pause(self) -> None:
-        """Pause every sink."""
-        for sink in self.sinks:
-            sink.pause()
-
-    def resume(self) -> None:
-        """Resume every sink."""
-        for sink in self.sinks:
-            sink.resume()
-
-    def close(self) -> None:
-        """Close every sink."""
-        for sink in self.sinks:
-            sink.close()

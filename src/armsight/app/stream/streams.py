@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from armsight.app.stream.datum import Datum, Published
+from armsight.app.stream.datum import Published
 from armsight.app.stream.igtl import open_igtl
 from armsight.app.stream.network import open_json_tcp, open_json_udp
 from armsight.app.stream.sink import Sink
 from armsight.app.stream.websocket import open_foxglove
 from armsight.app.stream.zenoh import open_ros2
 from armsight.errors import InputError
+from armsight.loop.running.data import Datum
 
 #: Kind -> what opens the rest of the text; another kind is one line here.
 STREAMS: dict[str, Callable[[str, Published], Sink]] = {

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from armsight.app.stream.datum import Datum, EventDatum, NoteDatum, Published, json_text
+from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove
 from armsight.app.stream.mcap_file import TOPICS
 from armsight.app.stream.network import host_and_port
 from armsight.app.stream.sink import Sink
 from armsight.errors import InputError
+from armsight.loop.running.data import Datum, EventDatum, NoteDatum
 
 
 class FoxgloveSink(Sink):

@@ -18,13 +18,14 @@ import struct
 from itertools import count
 from typing import Any
 
-from armsight.app.stream.datum import Datum, EventDatum, NoteDatum, Published, json_text
+from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove
 from armsight.app.stream.mcap_file import TOPICS
 from armsight.app.stream.network import host_and_port
 from armsight.app.stream.ros import TO_ROS, ros_name
 from armsight.app.stream.sink import Sink
 from armsight.errors import InputError
+from armsight.loop.running.data import Datum, EventDatum, NoteDatum
 
 _NODE = "armsight"
 #: Reliable, volatile, keep last 10: what differs from the defaults of rmw_zenoh is written.

@@ -1,11 +1,10 @@
-"""The control loop of a run: receive joint readings, measure the newest shot, estimate, command; and record all of it.
+"""The control loop: receive joint readings, measure the newest shot, estimate, command; and log all of it.
 
-In: a :class:`~armsight.app.run.setup.Setup` and controllers. Out: a :class:`~armsight.app.run.record.Log`.
+In: a :class:`~armsight.loop.running.setup.Setup` and controllers. Out: a :class:`~armsight.loop.running.log.Log`.
 
-Simulation and hardware have one interface: a :class:`~armsight.robot.boards.board.Board`, in whose ``receive`` time
-passes, and a function that returns the newest shot. Time is the board's. On hardware time passes by itself, and a board
-that receives nothing for 100 ms stops its arm: so long computations (:func:`beside`) and the detection in images
-(:class:`Watch`) run in threads, and the loop continues meanwhile.
+Simulation and hardware have one interface: a board in whose ``receive`` time passes, and a function that returns the newest
+shot. Time is the board's. On hardware it passes by itself, and a board that receives nothing for 100 ms stops its arm: long
+computations (:func:`beside`) and the detection in images (:class:`Watch`) run in threads, and the loop continues meanwhile.
 """
 
 from __future__ import annotations
@@ -18,32 +17,35 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
-from armsight.app.run.record import Log, RunSegment, Skew, ToolTrack
-from armsight.app.run.setup import Setup
-from armsight.app.stream.datum import (
+from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
+from armsight.errors import ArmsightError, DeviceError
+from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.estimators import KalmanEstimator, Mounting
+from armsight.loop.estimators.smoothing import Interval
+from armsight.loop.frame_clock import FrameClock
+from armsight.loop.health import HealthMonitor
+from armsight.loop.health.follow import RigCorrection, RigFollower, remeasured
+from armsight.loop.running.controllers import PERIOD_S, Controller, Planned, Still
+from armsight.loop.running.data import (
     EventDatum,
+    Fanout,
     JointsDatum,
+    Publisher,
     ShotDatum,
     estimator_event,
     mounting_event,
     remeasured_event,
     restored_event,
 )
-from armsight.app.stream.sink import Fanout, Publisher
-from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
-from armsight.errors import ArmsightError, DeviceError
-from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.estimators import Estimator, KalmanEstimator, Mounting
-from armsight.loop.estimators.smoothing import Interval
-from armsight.loop.frame_clock import FrameClock
-from armsight.loop.health import HealthMonitor
-from armsight.loop.health.follow import RigCorrection, RigFollower, remeasured
+from armsight.loop.running.log import NEWEST_SHOTS, Log, RunSegment, Skew
+from armsight.loop.running.setup import Setup
 from armsight.loop.sync_led import SyncLedWatch
 from armsight.robot.boards.codes import BoardState
+from armsight.robot.trajectories import Trajectory
 from armsight.vision.follow.follower import Follower, measurer
 from armsight.vision.markers.calibrated_board import is_print
 from armsight.vision.pose.shutter import Motion, TimedShot, measure_with_motion
@@ -55,37 +57,11 @@ SWITCH_S = 2e-4
 _Result = TypeVar("_Result")
 
 
-class Still:
-    """A controller that repeats one command.
-
-    Args:
-        held: the command.
-    """
-
-    def __init__(self, held: JointCommand) -> None:
-        self._held = held
-
-    def prepare(self, t_s: float) -> None:
-        """Do nothing: the command is fixed."""
-
-    def command(self, estimator: Estimator) -> tuple[JointCommand, str]:
-        """Return the command, and "planned" as its basis."""
-        return self._held, "planned"
-
-
 def beside(work: Callable[[], _Result], meanwhile: Callable[[Callable[[], bool]], None]) -> _Result:
-    """Run a long computation in a thread, and something else in this thread until it is done.
+    """Return the result of a long computation in a thread; run something else in this thread until it is done.
 
-    Args:
-        work: the computation.
-        meanwhile: runs in this thread; it is called with a function that returns whether the work is done, and returns
-            once it is.
-
-    Returns:
-        The result of the work.
-
-    Raises:
-        Exception: what either of them raises. Where ``meanwhile`` or the keyboard raised it, the work is not waited for.
+    ``meanwhile`` is called with a function that returns whether the work is done, and returns once it is. What either of
+    them raises is raised; where ``meanwhile`` or the keyboard raised it, the work is not waited for.
     """
     pool = ThreadPoolExecutor(1)
     try:
@@ -96,20 +72,10 @@ def beside(work: Callable[[], _Result], meanwhile: Callable[[Callable[[], bool]]
         pool.shutdown(wait=False)
 
 
-def _lean(result: PoseEstimate | Missed) -> PoseEstimate | Missed:
-    """Return a result without what a wrong calibration does to its points: a run of an hour keeps 200,000 of them."""
-    if isinstance(result, Missed):
-        return result
-    points = replace(result.points, calibration=np.zeros((len(result.points.ids), 3, 0)))
-    return replace(result, points=points)
-
-
 class Watch:
     """Measures shots in a thread: a search of the whole image takes longer than the loop may pause.
 
-    Args:
-        measure: returns the pose of the body in a shot.
-        patience_s: how long :meth:`take` waits for a result, s; a later result is returned in the next iteration.
+    :meth:`take` waits ``patience_s`` for a result, s; a later one is returned in the next iteration.
     """
 
     def __init__(self, measure: Callable[[Shot], PoseEstimate | Missed], patience_s: float) -> None:
@@ -143,15 +109,11 @@ class Watch:
 
 @contextlib.contextmanager
 def steady(*, in_time: bool) -> Iterator[None]:
-    """Configure the interpreter for a control loop within the block; both settings are restored afterwards.
+    """Configure the interpreter for a control loop within the block.
 
-    Python's cyclic garbage collector is off within the block. A full collection visits every object of the process (the
-    modules that a run imports make more than a hundred thousand) and takes 0.1 s or more, at an arbitrary time; a board
-    that receives no command for 100 ms stops its arm. The loop does without it because its records form no reference
-    cycles: reference counting frees them at once.
-
-    Args:
-        in_time: whether time passes by itself; then threads alternate more often (``SWITCH_S``), at some cost.
+    The cyclic garbage collector is off: a full collection visits every object of the process and takes 0.1 s or more, and a
+    board that receives no command for 100 ms stops its arm. The loop's records form no reference cycles. Where time passes
+    by itself (``in_time``), threads alternate more often (``SWITCH_S``), at some cost.
     """
     before, collects = sys.getswitchinterval(), gc.isenabled()
     gc.disable()
@@ -165,8 +127,6 @@ def steady(*, in_time: bool) -> Iterator[None]:
             gc.enable()
 
 
-#: Period of the loop and so of the commands, s.
-PERIOD_S = 0.004
 #: Without a shot for so long the cameras have stalled, s.
 STALLED_S = 0.5
 #: Upper bound of the time to search an image for the body, on a computer under load, s.
@@ -179,66 +139,38 @@ SIMULATED_SEARCH_S = 0.06
 RECORD_LAG_S = 0.6
 _RECORD_EVERY_S = 0.02  # interval of the fused track that is noted at once: cheaper than every iteration
 _WRITE_EVERY_S = 0.1  # interval that is computed at once, after a command was sent: cheaper still
-#: The motion of the body about an exposure is a cubic through the live estimates so near to it, s, which are among the
-#: newest so many. Their errors are correlated for longer than that: the scatter about the cubic shows this share of them.
-_MOTION_S, _MOTION_NEWEST, _SCATTER_SHARE = 0.03, 100, 0.25
+#: The motion of the body about an exposure is a cubic through the newest live estimates so near to it, s. Their errors are
+#: correlated for longer than that: the scatter about the cubic shows this share of them.
+_MOTION_S, _SCATTER_SHARE = 0.03, 0.25
 #: Searches for the sync LED before it is given up, two steps each, and the longest time for them, s.
 _LED_TRIES, _LED_S = 4, 60.0
 _STOP_S = 0.3  # in which an interrupted motion comes to rest
 _FIXED_EVERY_S = 0.2  # in which fixed bodies are measured
-#: Where a rig is followed: how often it is looked whether it can be put right, s, and in so many of the newest shots.
-_RIG_EVERY_S, _RIG_SHOTS = 0.25, 2000
+#: Where a rig is followed: how often it is looked whether it can be put right, s.
+_RIG_EVERY_S = 0.25
 _LEAST_WAIT_S = 0.001  # for the board, even when the loop is late: a lost board is detected by a timeout
-
-
-class Controller(Protocol):
-    """Computes the next joint command, in two steps, so that little is left to do after an image was measured."""
-
-    def prepare(self, t_s: float) -> None:
-        """Compute what the command at time ``t_s`` (board's clock, s) needs and no image changes."""
-        ...
-
-    def command(self, estimator: Estimator) -> tuple[JointCommand, str]:
-        """Return the command that was prepared, and its basis: planned, vision, bridged."""
-        ...
 
 
 class Loop:
     """Runs controllers on a board, with cameras.
 
-    The constructor receives nothing; :meth:`open` returns a loop that has its first reading.
-
-    Args:
-        setup: the board, the cameras.
-        follower: measures the body.
-        log: all that is measured and commanded is appended to it.
-        estimator: estimates the pose of the tool.
-
-    Attributes:
-        mounting: poses of cameras and body on the arm; None before they are known: then the estimator has the joints alone.
-        delay_s: delay of the images, s; None before it was measured.
-        shutters: when the cameras expose, where they do not at one time: from the rig file, or found by the sweep. Once the
-            delay is known, detections are moved to one time by the motion of the arm.
-        health: watches whether the calibrations still hold.
-        rig_follower: decides when the rig can be put right; None where it is not followed.
-        led: follows the cameras' clock by the sync LED; None without one.
-        on_shot: called with each shot that was measured and its result, after the command that follows from it was sent.
-        on_period: called in every period before its command; what it raises ends the motion.
-        segment: the entry of the log of what is running, with its begin; None before the first.
-        t_s: time of the newest reading, board's clock, s.
-        publisher: is given every batch of readings, and every shot after the command that follows from it was sent.
+    The constructor receives nothing; :meth:`open` returns a loop that has its first reading. It takes a setup, what
+    measures the body, the log to append to, and what estimates the pose of the tool.
     """
 
     def __init__(self, setup: Setup, follower: Follower, log: Log, estimator: KalmanEstimator) -> None:
         self.board, self.setup, self.follower = setup.board, setup, follower
         self.estimator, self.log = estimator, log
+        #: poses of cameras and body on the arm; None: the estimator has the joints alone
         self.mounting: Mounting | None = None
-        self.delay_s: float | None = None
-        self.shutters: Shutters | None = follower.rig.shutters
+        self.delay_s: float | None = None  #: delay of the images, s; None before it was measured
+        self.shutters: Shutters | None = follower.rig.shutters  #: when the cameras expose, where not at one time
+        #: called with each shot and its result, after the command that follows from it was sent
         self.on_shot: Callable[[Shot, PoseEstimate | Missed], None] = lambda shot, result: None
+        #: called in every period before its command; what it raises ends the motion
         self.on_period: Callable[[], None] = lambda: None
-        self.segment: RunSegment | None = None
-        self.t_s = 0.0
+        self.segment: RunSegment | None = None  #: what is running, with its begin; None before the first
+        self.t_s = 0.0  #: time of the newest reading, board's clock, s
         self.publisher: Publisher = Fanout()
         self._datum: ShotDatum | None = None
         self._known: Mounting | None = None  # the mounting that was published
@@ -246,7 +178,7 @@ class Loop:
         self._stamp_s: float | None = None  # of the shot that is measured, as it was stamped
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s, printed=is_print(setup.target))
         self._frames = self.health.stamps = FrameClock()
-        self.rig_follower: RigFollower | None = None
+        self.rig_follower: RigFollower | None = None  #: decides when the rig can be put right; None: it is not followed
         self._rig_work: Future[RigCorrection | None] | None = None
         self._rig_s = -np.inf
         self._skew = Skew(follower.rig, setup.sync_s)
@@ -259,10 +191,10 @@ class Loop:
         self._fixed_work: Future[None] | None = None
         self._fixed_s = -np.inf
         # Of the fused track: the time up to which its intervals are noted, the time up to which it is computed, the noted
-        # intervals that are not computed yet, and the first batch of readings that is not noted completely.
+        # intervals that are not computed yet, and the times of the readings that are not all noted.
         self._noted_s = self._written_s = -np.inf
         self._noted: list[Interval] = []
-        self._first = 0
+        self._read = deque[Array]()
         self._watch = Watch(self._measured, PERIOD_S)
         # Of a lost body in the shot that is measured: its predicted pose and its velocity.
         self._expected: Array | None = None
@@ -305,24 +237,18 @@ class Loop:
         learn(self.log.joints[len(received) :])  # what arrived meanwhile
         self._write()
         self.estimator = estimator  # its memory covers what is not recorded yet
+        self.log.settle()
         self.health.follow(estimator, self.setup.arm, mounting.T_base_rig[:3, 2])
 
     def compute(self, work: Callable[[], _Result]) -> _Result:
-        """Run a long computation; on hardware the loop continues meanwhile and holds the arm.
+        """Return the result of a long computation, which uses nothing that the loop changes.
 
-        Args:
-            work: the computation; it uses nothing that the loop changes.
-
-        Returns:
-            Its result.
-
-        Raises:
-            DeviceError: the board failed meanwhile; and what the work raises.
+        On hardware the loop continues meanwhile and holds the arm: a DeviceError is raised where the board fails.
         """
         if self.setup.clock is None:
             return work()
-        held, calm = Still(self._at_rest(PERIOD_S)), RunSegment("calibration", "", "", False)
-        return beside(work, lambda done: self._iterate(held, done, calm, watch=False))
+        held = Still(self._at_rest(PERIOD_S))
+        return beside(work, lambda done: self._iterate(held, done, RunSegment(), watch=False))
 
     def pass_time(self, wait_s: float) -> None:
         """Let time pass, receive the joint readings, and update the estimator with them."""
@@ -332,27 +258,23 @@ class Loop:
         self.t_s = float(states.t_s[-1])
         if self.setup.clock is not None:
             self.setup.clock.heard(self.t_s)
-        self.log.joints.append(states)
+        self.log.read(states)
+        self._read.append(states.t_s)
         self.estimator.joints(states)
         estimate = self.estimator.estimate()
-        self.log.live.append(estimate)
+        self.log.estimated(estimate)
         self.publisher.put(JointsDatum(states, estimate.T_base_tool, estimate.cov, estimate.vision_age_s))
-        self._record()
-
-    def _record(self) -> None:
-        """Note the fused track RECORD_LAG_S behind the present: with pose measurements on both sides of a time."""
         if self.t_s - RECORD_LAG_S - self._noted_s >= _RECORD_EVERY_S:
-            self._note(self.t_s - RECORD_LAG_S)
+            self._note(self.t_s - RECORD_LAG_S)  # with pose measurements on both sides of a time
 
     def _note(self, upto_s: float) -> None:
         """Note the intervals of the fused track up to a time, board's clock, s."""
-        joints, parts = self.log.joints, list[Array]()
-        for k in range(self._first, len(joints)):
-            if joints[k].t_s[0] > upto_s:
+        parts = list[Array]()
+        while self._read and self._read[0][0] <= upto_s:
+            parts.append(self._read[0])
+            if self._read[0][-1] > upto_s:
                 break
-            parts.append(joints[k].t_s)
-            if joints[k].t_s[-1] <= upto_s:
-                self._first = k + 1
+            self._read.popleft()
         t_s = np.concatenate([*parts, np.zeros(0)])
         t_s = t_s[(t_s > self._noted_s) & (t_s <= upto_s)]
         if len(t_s):
@@ -362,9 +284,7 @@ class Loop:
     def _write(self) -> None:
         """Compute the fused poses at the readings that are noted, and record them."""
         if self._noted:
-            track = self.estimator.blended(self._noted)
-            none = np.full(len(track), "")
-            self.log.fused.append(ToolTrack(track.t_s, track.Ts_base_tool, none, none, track.covs))
+            self.log.smoothed(self.estimator.blended(self._noted))
             self._noted, self._written_s = [], self._noted_s
 
     def close_record(self) -> None:
@@ -373,11 +293,7 @@ class Loop:
         self._write()
 
     def look(self) -> tuple[Shot, float, PoseEstimate | Missed] | None:
-        """Measure the newest shot, if there is one.
-
-        Returns:
-            The shot, when its measurement began (host's clock, s), and the result.
-        """
+        """Measure the newest shot; return it, when its measurement began, host's clock, s, and the result, if any."""
         measured = self._in_lock_step() if self.setup.clock is None else self._watch.take(self._newest)
         if measured is not None or self._watch.busy or self._search is not None:
             self._shot_s = self.t_s
@@ -397,9 +313,9 @@ class Loop:
                 measurement = plain if suspected is None else replace(plain, cov_common=plain.cov_common + suspected)
                 outcome = self.estimator.vision(measurement)
                 T_base_rig, T_base_tool = self.mounting.T_base_rig, measurement.T_base_tool
-                self.log.outcomes.append(outcome)
+                self.log.outcomes[outcome] += 1
         stamped_s = np.nan if shot.t_s is None else shot.t_s - self.estimator.clock_offset_s(shot.t_s)
-        self.log.poses.append((shot.name, stamped_s, _lean(result)))
+        self.log.seen(shot.name, stamped_s, result)
         self._datum = ShotDatum(
             shot,
             result,
@@ -425,7 +341,7 @@ class Loop:
         if self.mounting is None or self.delay_s is None:
             return None
         exposed_s = t_s - self.delay_s - self.estimator.clock_offset_s(t_s)
-        near = [live for live in self.log.live[-_MOTION_NEWEST:] if abs(live.t_s - exposed_s) <= _MOTION_S]
+        near = [live for live in self.log.live if abs(live.t_s - exposed_s) <= _MOTION_S]
         if len(near) < 8:
             return None
         tau = np.array([live.t_s for live in near]) - exposed_s
@@ -487,12 +403,12 @@ class Loop:
         return shot
 
     def run(self, controller: Controller, duration_s: float, segment: RunSegment, *, watch: bool = True) -> None:
-        """Let a controller command the joints for some time.
+        """Let a controller command the joints for some time, s; the segment is logged with its times.
 
         Args:
             controller: computes the commands.
             duration_s: how long, s.
-            segment: the entry of the log; its times are filled in.
+            segment: the entry of the log.
             watch: whether shots are measured.
 
         Raises:
@@ -502,13 +418,20 @@ class Loop:
         begin_s = self.t_s
         self._iterate(controller, lambda: self.t_s - begin_s >= duration_s - 1e-9, segment, watch=watch)
 
+    def go(
+        self, way: Trajectory, rest_s: float, segment: RunSegment, *, late_s: float = 0.0, watch: bool = True
+    ) -> None:
+        """Do as :meth:`run` with a trajectory as planned, which begins so late, s, and a rest at its end, s."""
+        controller = Planned(way, self.t_s + late_s, self.setup.gravity)
+        self.run(controller, way.duration_s + rest_s, replace(segment, trajectory=way), watch=watch)
+
     def run_until_seen(self, controller: Controller, duration_s: float, segment: RunSegment) -> None:
         """Do as :meth:`run`, and continue (at most ``SEARCH_S``) until a first shot has been measured."""
-        begin_s, before = self.t_s, len(self.log.poses)
+        begin_s, before = self.t_s, self.log.shots
 
         def over() -> bool:
             late_s = self.t_s - begin_s - duration_s + 1e-9
-            return late_s >= 0.0 and (len(self.log.poses) > before or late_s >= SEARCH_S)
+            return late_s >= 0.0 and (self.log.shots > before or late_s >= SEARCH_S)
 
         self._iterate(controller, over, segment, watch=True)
 
@@ -532,9 +455,7 @@ class Loop:
                 command, mode = controller.command(self.estimator)
                 self.board.send(command)
                 sent_s = time.perf_counter()
-                self.log.commanded_s.append(self.t_s)
-                self.log.command = command
-                self.log.modes.append(mode)
+                self.log.commanded(self.t_s, command, mode)
                 self._publish()
                 self.publisher.resume()
                 if measured is not None:
@@ -542,6 +463,7 @@ class Loop:
                     if self.mounting is not None:  # before, no command depended on images
                         times_s = self.log.latency_s if self.follower.way == "followed" else self.log.search_s
                         times_s.append(sent_s - began)
+                    self.log.write()
                     self.on_shot(shot, result)
                     self._look_at_fixed(shot)
                     self._look_at_led(shot)
@@ -600,7 +522,7 @@ class Loop:
     def _newest_poses(self) -> list[tuple[float, PoseEstimate]]:
         """Return time and pose of the newest shots, measured with the rig as it is."""
         since_s = max((each.at_s for each in self.log.corrections if each.update is not None), default=-np.inf)
-        newest = self.log.poses[-_RIG_SHOTS:]
+        newest = self.log.poses[-NEWEST_SHOTS:]
         return [(t_s, pose) for _, t_s, pose in newest if isinstance(pose, PoseEstimate) and t_s >= since_s]
 
     def _put_right(self, correction: RigCorrection) -> None:
@@ -673,7 +595,7 @@ class Loop:
         def over() -> bool:
             return bool(led.estimates) or led.tried >= _LED_TRIES or self.t_s - begin_s > _LED_S
 
-        self._iterate(Still(self._at_rest(PERIOD_S)), over, RunSegment("calibration", "", "", False), watch=True)
+        self._iterate(Still(self._at_rest(PERIOD_S)), over, RunSegment(), watch=True)
         if not led.estimates:
             reason = led.reason or f"no image in {_LED_S:g} s shows it"
             raise ArmsightError(

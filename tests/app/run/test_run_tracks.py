@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from armsight.app.run.record import Log, RunSegment, ToolTrack, assembled, errors
+from armsight.app.run.tracks import Tracks, errors
 from armsight.data import JointStates, PoseEstimate
 from armsight.geometry.pose import exp_se3
 from armsight.loop.estimators import Delay, Mounting
+from armsight.loop.running.data import NO_POINTS
+from armsight.loop.running.log import Log, RunSegment
 from armsight.robot.arm_file import open_arm
 
 ARM = open_arm("six_r")
@@ -27,13 +29,12 @@ def assemble(rng, delay, jitter_s, off_s, exposed=EXPOSED):
     Ts = swinging(exposed) @ exp_se3(SIGMA * rng.normal(size=(len(exposed), 6)))
     cov = np.diag(SIGMA**2)
     t_s = np.arange(0.0, exposed[-1] + 0.5, 1e-3)
-    log = Log(
-        joints=[JointStates(t_s, np.tile(ARM.home, (len(t_s), 1)))],
-        fused=[ToolTrack(t_s[:1], np.eye(4)[None], np.full(1, ""), np.full(1, ""), cov[None])],
-        poses=[(str(n), stamps[n], PoseEstimate(Ts[n], cov, cov, 0.0, 0.0, 1.0, None)) for n in range(len(exposed))],
-        segments=[RunSegment("open_loop", "swing", "joints", False)],
-    )
-    run = assembled(log, ARM, Mounting(np.eye(4), np.eye(4), np.zeros((12, 12))), delay, (t_s, swinging(t_s)))
+    log = Log(segments=[RunSegment("open_loop", "swing", "joints")])
+    log.read(JointStates(t_s, np.tile(ARM.home, (len(t_s), 1))))
+    for n in range(len(exposed)):
+        log.seen(str(n), stamps[n], PoseEstimate(Ts[n], cov, cov, 0.0, 0.0, 1.0, NO_POINTS))
+    mounting = Mounting(np.eye(4), np.eye(4), np.zeros((12, 12)))
+    run = Tracks(log, ARM, mounting, delay, (t_s, swinging(t_s))).between()
     return run.vision, run.truth
 
 

@@ -5,9 +5,9 @@ import threading
 import numpy as np
 import pytest
 
-from armsight.app.run.setup import DRIFT, HostClock, LiveShots
 from armsight.data import Shot
 from armsight.errors import DeviceError
+from armsight.loop.running.setup import DRIFT, HostClock, LiveShots
 
 OFFSET_S = 12345.678
 

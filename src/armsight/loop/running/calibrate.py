@@ -1,21 +1,16 @@
-"""The calibrations of a run: the cameras, the hand-eye poses of cameras and body, and the delay of the images.
+"""What a loop finds by moving the arm: the poses of cameras and body on it, the delay of the images, and the shutters.
 
-In: shots of a calibration target, or a :class:`~armsight.app.run.loop.Loop` that moves the arm. Out: a Calibration, a
-:class:`HandEyeRun`, a Delay. The demo calibrates its cameras as well; on real devices ``armsight calibrate`` did so.
+In: a :class:`~armsight.loop.running.loop.Loop`. Out: a :class:`HandEyeRun`, a Delay.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from armsight.app.run.controllers import Planned, Sweep
-from armsight.app.run.loop import Loop
-from armsight.app.run.record import RunSegment
-from armsight.data import Array, JointStates, Missed, PoseEstimate, Record, Shot
+from armsight.data import Array, JointStates, Missed, PoseEstimate, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.geometry.rotation import exp_so3
@@ -23,13 +18,12 @@ from armsight.loop.delay import MIN_MEASUREMENTS, estimate_delay
 from armsight.loop.estimators import Delay, Mounting, Prior
 from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, calibrate_handeye, require_known
 from armsight.loop.identify.misread import require_fitting
+from armsight.loop.running.controllers import Planned, Sweep
+from armsight.loop.running.log import RunSegment, Seen
+from armsight.loop.running.loop import Loop
 from armsight.loop.sync_led import with_led
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import point_to_point
-from armsight.vision.calibrate.boards import Pair, calibrate_boards
-from armsight.vision.calibrate.result import Calibration
-from armsight.vision.image import grey
-from armsight.vision.markers.board import open_board
 from armsight.vision.pose.shutter import TimedShot, estimate_shutters, measure_moving
 from armsight.vision.rig import Shutters
 
@@ -47,34 +41,10 @@ _SAMPLES = 50  # candidates for each pose
 _NEAR = np.radians(70.0)  # a joint that rotated further has changed to another configuration of the arm
 
 
-def calibrated(
-    target_spec: str, shots: Iterable[Shot], progress: Progress, second: Callable[..., Any] | None = None
-) -> Calibration:
-    """Calibrate a rig from shots of a flat calibration target, such as chessboard:9x6:25mm; ``second`` calls beside."""
-    board = open_board(target_spec)
-    pairs, sizes = [], None
-    for shot in shots:
-        assert shot.left is not None
-        assert shot.right is not None
-        left, right = grey(shot.left), grey(shot.right)
-        sizes = ((left.shape[1], left.shape[0]), (right.shape[1], right.shape[0]))
-        pairs.append(Pair(shot.name, board.detect(left), board.detect(right)))
-        progress(f"detecting the calibration target: {len(pairs)} pairs")
-    if sizes is None:
-        raise CalibrationError("no shot of the calibration target")
-    return calibrate_boards(board, pairs, sizes, progress=progress, second=second)
-
-
 def handeye_poses(arm: Arm, around: Array, count: int, seed: int) -> Array:
-    """Sample joint angles (count, n), rad, that show the body from many sides, near given ones at which it is in view.
+    """Sample joint angles (count, n), rad, that show the body from many sides, near given ones (M, n) that have it in view.
 
     They are in the order of a short way: from the first of ``around`` always on to the nearest.
-
-    Args:
-        arm: the nominal arm.
-        around: (M, n) joint angles at which the body is in view, rad.
-        count: how many.
-        seed: of the samples.
 
     Raises:
         InputError: the arm reaches too few such poses.
@@ -105,44 +75,35 @@ def handeye_poses(arm: Arm, around: Array, count: int, seed: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class HandEyeRun(Record):
-    """The result of the hand-eye motions.
+    """The result of the hand-eye motions."""
 
-    Attributes:
-        mounting: poses of cameras and body on the arm. They define the base and the tool frame of the run: the geometry of
-            a real arm defines its base only to within its own errors. So their covariance is zero here; how well the arm
-            agrees with them is in ``found``.
-        found: the hand-eye calibration.
-        q: (N, n) potentiometer readings at rest at each pose that was used, rad.
-        Ts_left_body: (N, 4, 4) measured poses of the body in the left camera's frame.
-        covs: (N, 6, 6) their covariances, right tangents [m; rad].
-        approach: (N, n) direction each joint came from: 1 with rising angle, -1 with falling angle, 0 unmoved.
-        missed: poses at which the body was not measured, and why.
-    """
-
+    #: poses of cameras and body on the arm. They define the base and the tool frame of the run: the geometry of a real arm
+    #: defines its base only to within its own errors. So their covariance is zero here; how well the arm agrees with them
+    #: is in ``found``.
     mounting: Mounting
-    found: HandEye
-    q: Array
-    Ts_left_body: Array
-    covs: Array
-    approach: Array
-    missed: tuple[str, ...]
+    found: HandEye  #: the hand-eye calibration
+    q: Array  #: (N, n) potentiometer readings at rest at each pose that was used, rad
+    Ts_left_body: Array  #: (N, 4, 4) measured poses of the body in the left camera's frame
+    covs: Array  #: (N, 6, 6) their covariances, right tangents [m; rad]
+    approach: Array  #: (N, n) direction each joint came from: 1 with rising angle, -1 with falling angle, 0 unmoved
+    missed: tuple[str, ...]  #: poses at which the body was not measured, and why
+
+    @classmethod
+    def of(
+        cls, arm: Arm, found: HandEye, q: Array, Ts: Array, covs: Array, approach: Array, missed: tuple[str, ...]
+    ) -> HandEyeRun:
+        """Return the result of a calibration; the arguments are the attributes."""
+        return cls(replace(Mounting.of(found, arm), cov=np.zeros((12, 12))), found, q, Ts, covs, approach, missed)
 
 
 @dataclass(frozen=True, eq=False)
 class VisitedPose(Record):
-    """A pose of an arm at rest.
+    """A pose of an arm at rest."""
 
-    Attributes:
-        q: (n,) potentiometer readings, rad.
-        T_left_body: (4, 4) measured pose of the body in the left camera's frame.
-        cov: (6, 6) its covariance, right tangent [m; rad].
-        approach: (n,) direction each joint came from: 1 with rising angle, -1 with falling angle, 0 unmoved.
-    """
-
-    q: Array
-    T_left_body: Array
-    cov: Array
-    approach: Array
+    q: Array  #: (n,) potentiometer readings, rad
+    T_left_body: Array  #: (4, 4) measured pose of the body in the left camera's frame
+    cov: Array  #: (6, 6) its covariance, right tangent [m; rad]
+    approach: Array  #: (n,) direction each joint came from: 1 with rising angle, -1 with falling angle, 0 unmoved
 
     @classmethod
     def of(cls, q: Array, seen: Sequence[PoseEstimate], moved: Array) -> VisitedPose:
@@ -153,18 +114,8 @@ class VisitedPose(Record):
         return cls(q, mean_pose(np.array([r.T_left_body for r in seen])), cov, approach)
 
 
-def find_mounting(
-    loop: Loop, arm: Arm, q_start: Array, targets: Array, gravity: Callable[[Array], Array], progress: Progress
-) -> HandEyeRun:
-    """Visit poses, measure the body at rest, and calibrate hand and eye.
-
-    Args:
-        loop: runs the motions.
-        arm: the nominal arm.
-        q_start: (n,) joint angles at which the arm stands, rad.
-        targets: (N, n) joint angles to visit, rad.
-        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
-        progress: called with a line about what is being done.
+def find_mounting(loop: Loop, q_start: Array, targets: Array, progress: Progress) -> HandEyeRun:
+    """Visit joint angles (N, n), rad, from where the arm stands (n,), measure the body at rest, calibrate hand and eye.
 
     Raises:
         CalibrationError: too few poses were seen.
@@ -177,7 +128,7 @@ def find_mounting(
     for n, q_to in enumerate(targets):
         progress(f"hand-eye: pose {n + 1} of {len(targets)}")
         before = len(loop.log.poses)
-        found = visit(loop, arm, q_from, q_to, gravity, f"hand-eye {n + 1}")
+        found = visit(loop, q_from, q_to, f"hand-eye {n + 1}")
         if isinstance(found, Missed):
             missed.append(found.reason)
         else:
@@ -192,56 +143,37 @@ def find_mounting(
     progress("hand-eye: calibrating")
     if loop.put_cameras_right():
         visited = [_again(each, loop.log.poses[part]) for each, part in zip(visited, rows, strict=True)]
-    return loop.compute(lambda: handeye_of(arm, visited, tuple(missed)))
+    return loop.compute(lambda: handeye_of(loop.setup.arm, visited, tuple(missed)))
 
 
-def _again(visited: VisitedPose, shots: Sequence[tuple[str, float, PoseEstimate | Missed]]) -> VisitedPose:
+def _again(visited: VisitedPose, shots: Sequence[Seen]) -> VisitedPose:
     """Return a pose of an arm with the shots of it that were measured anew."""
     seen = [pose for _, _, pose in shots if isinstance(pose, PoseEstimate)]
     return VisitedPose.of(visited.q, seen, visited.approach) if seen else visited
 
 
-def visit(
-    loop: Loop, arm: Arm, q_from: Array, q_to: Array, gravity: Callable[[Array], Array], name: str
-) -> VisitedPose | Missed:
-    """Move to a pose, and measure the body at rest.
-
-    Args:
-        loop: runs the motion.
-        arm: the nominal arm.
-        q_from: (n,) joint angles at which the arm stands, rad.
-        q_to: (n,) joint angles to go to, rad.
-        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
-        name: of the pose, in the log.
+def visit(loop: Loop, q_from: Array, q_to: Array, name: str) -> VisitedPose | Missed:
+    """Move from joint angles (n,), rad, to others, and measure the body at rest; ``name`` is the pose's in the log.
 
     Raises:
         DeviceError: the board or a camera failed.
     """
-    way = point_to_point(arm, q_from, q_to)
-    segment = RunSegment("calibration", name, "joints", False, trajectory=way)
-    settle_s = SETTLE_S + 2.0 * loop.setup.board.abilities.latency_s
-    loop.run(Planned(way, loop.t_s, gravity), way.duration_s + settle_s, segment, watch=False)
-    poses_before = len(loop.log.poses)
-    joints_before = len(loop.log.joints)
-    stands = Planned(way, loop.t_s - way.duration_s, gravity)
-    look_s = max(LOOK_S, 3.0 / loop.setup.rate_hz)
-    loop.run_until_seen(stands, look_s, RunSegment("calibration", "", "", False))
-    results = [result for _, _, result in loop.log.poses[poses_before:]]
+    way, log, setup = point_to_point(loop.setup.arm, q_from, q_to), loop.log, loop.setup
+    settle_s = SETTLE_S + 2.0 * setup.board.abilities.latency_s
+    loop.go(way, settle_s, RunSegment("calibration", name, "joints"), watch=False)
+    shots, batches = len(log.poses), len(log.joints)
+    stands = Planned(way, loop.t_s - way.duration_s, setup.gravity)
+    loop.run_until_seen(stands, max(LOOK_S, 3.0 / setup.rate_hz), RunSegment())
+    results = [result for _, _, result in log.poses[shots:]]
     good = [r for r in results if isinstance(r, PoseEstimate)]
     if not good:
         return Missed(f"{name}: " + (str(getattr(results[-1], "reason", "")) if results else "no shot came"))
-    q = np.concatenate([s.q for s in loop.log.joints[joints_before:]]).mean(axis=0)
+    q = np.concatenate([s.q for s in log.joints[batches:]]).mean(axis=0)
     return VisitedPose.of(q, good, q_to - q_from)
 
 
 def handeye_of(arm: Arm, visited: Sequence[VisitedPose], missed: tuple[str, ...], quick: bool = False) -> HandEyeRun:
-    """Calibrate hand and eye.
-
-    Args:
-        arm: the nominal arm.
-        visited: four poses at least.
-        missed: poses at which the body was not measured, and why.
-        quick: as in :func:`~armsight.loop.handeye.handeye.calibrate_handeye`.
+    """Calibrate hand and eye of a nominal arm from four poses at least; ``missed``: where the body was not, and why.
 
     Raises:
         CalibrationError: the motions leave a direction open, or the arm's table is grossly wrong.
@@ -251,36 +183,28 @@ def handeye_of(arm: Arm, visited: Sequence[VisitedPose], missed: tuple[str, ...]
     require_fitting(arm, q, Ts_left_body)
     found = calibrate_handeye(arm.forward(q) @ inverse(arm.T_flange_tool), Ts_left_body, cov, quick=quick)
     require_known(found, TRUSTED_M, TRUSTED_RAD)
-    mounting = replace(Mounting.of(found, arm), cov=np.zeros((12, 12)))
-    return HandEyeRun(mounting, found, q, Ts_left_body, cov, np.array([each.approach for each in visited]), missed)
+    return HandEyeRun.of(arm, found, q, Ts_left_body, cov, np.array([each.approach for each in visited]), missed)
 
 
-def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: Callable[[Array], Array]) -> Delay:
-    """Sweep the joints back and forth about a pose; estimate the delay of the cameras' time stamps, and their shutters.
+def find_delay(loop: Loop, q_start: Array, q_middle: Array) -> Delay:
+    """Sweep the joints about a pose (n,), rad, where the arm then stands; estimate the images' delay and the shutters.
 
-    Args:
-        loop: runs the motions; its mounting is known, its shutters and its delay are set.
-        arm: the nominal arm.
-        q_start: (n,) joint angles at which the arm stands, rad.
-        q_middle: (n,) joint angles about which to sweep, rad; the arm stands there afterwards.
-        gravity: returns the duty (n,) that compensates the gravity torque at joint angles (n,), rad.
+    The loop's mounting is known; its shutters and its delay are set.
 
     Raises:
         CalibrationError: the sweep does not determine the delay.
         DeviceError: the board or a camera failed.
     """
+    arm, log = loop.setup.arm, loop.log
     way = point_to_point(arm, q_start, q_middle)
-    there = RunSegment("calibration", "sweep's start", "joints", False, trajectory=way)
-    loop.run(Planned(way, loop.t_s, gravity), way.duration_s + DELAY_REST_S, there, watch=False)
+    loop.go(way, DELAY_REST_S, RunSegment("calibration", "sweep's start", "joints"), watch=False)
     sweep = Sweep(arm, q_middle, duration_s=max(SWEEP_S, SWEEP_SHOTS / loop.setup.rate_hz))
-    poses_before = len(loop.log.poses)
-    controller = Planned(sweep, loop.t_s, gravity)
-    loop.run(controller, sweep.duration_s, RunSegment("calibration", "sweep", "joints", False, trajectory=sweep))
-    shots = [(t, p) for _, t, p in loop.log.poses[poses_before:] if isinstance(p, PoseEstimate)]
-    loop.run(controller, DELAY_REST_S, RunSegment("calibration", "", "", False), watch=False)
-    states = JointStates(
-        np.concatenate([s.t_s for s in loop.log.joints]), np.concatenate([s.q for s in loop.log.joints])
-    )
+    before = len(log.poses)
+    controller = Planned(sweep, loop.t_s, loop.setup.gravity)
+    loop.run(controller, sweep.duration_s, RunSegment("calibration", "sweep", "joints", trajectory=sweep))
+    shots = [(t, p) for _, t, p in log.poses[before:] if isinstance(p, PoseEstimate)]
+    loop.run(controller, DELAY_REST_S, RunSegment(), watch=False)
+    states = JointStates(np.concatenate([s.t_s for s in log.joints]), np.concatenate([s.q for s in log.joints]))
     newest = states.t_s > states.t_s[-1] - sweep.duration_s - 2 * DELAY_REST_S
     swept = JointStates(states.t_s[newest], states.q[newest])
     if len(shots) < MIN_MEASUREMENTS:
@@ -313,15 +237,7 @@ def find_delay(loop: Loop, arm: Arm, q_start: Array, q_middle: Array, gravity: C
 def _at_one_time(
     loop: Loop, shots: list[tuple[float, PoseEstimate]]
 ) -> tuple[Shutters | None, list[tuple[float, PoseEstimate]]]:
-    """Return when the cameras expose, and the poses of a sweep with what they saw moved to one time.
-
-    Args:
-        loop: its shutters are taken where they are known; else they are found, if the sweep shows any.
-        shots: time, s, and pose of each shot of the sweep.
-
-    Returns:
-        None and the poses as they are where the cameras expose at one time.
-    """
+    """Return when the cameras expose, as known or as the sweep shows, and its poses moved to one time by it."""
     rig, body = loop.follower.rig, loop.setup.target.body
     timed = [TimedShot(t, pose.points.seen, pose.T_left_body) for t, pose in shots]
     shutters = loop.shutters or _visible(estimate_shutters(rig, body, timed, readout=True))

@@ -8,25 +8,24 @@ from types import SimpleNamespace
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "loop" / "health"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "health"))
 
 import faults
 from arm_rig import ARM, MIDDLE
 
 from armsight.app.replay.recorded import RecordedDatum, RecordedRun
 from armsight.app.replay.run import Pace, replay_run
-from armsight.app.run.calibrate import find_delay
-from armsight.app.run.controllers import Planned
 from armsight.app.run.experiment import PRIOR
-from armsight.app.run.loop import Loop
-from armsight.app.run.record import Log, RunSegment
-from armsight.app.run.setup import Setup
-from armsight.app.stream.datum import EventDatum, estimator_event, json_text
-from armsight.app.stream.sink import Fanout
+from armsight.app.stream.datum import json_text
 from armsight.data import JointStates, Shot
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.loop.estimators import Delay, KalmanEstimator, Mounting
 from armsight.loop.health.follow import RigFollower
+from armsight.loop.running.calibrate import find_delay
+from armsight.loop.running.data import EventDatum, Fanout, estimator_event
+from armsight.loop.running.log import Log, RunSegment
+from armsight.loop.running.loop import Loop
+from armsight.loop.running.setup import Setup
 from armsight.loop.sync_led import led_findings, light
 from armsight.robot.boards.codes import BoardState
 from armsight.robot.boards.contract import Abilities
@@ -122,8 +121,7 @@ def moves(loop, seconds, seed=3):
     while loop.t_s - begin_s < seconds:
         to = MIDDLE + np.radians(15.0) * rng.uniform(-1, 1, 6)
         way, at = point_to_point(ARM, at, to), to
-        segment = RunSegment("open_loop", "", "", False)
-        loop.run(Planned(way, loop.t_s, lambda q: np.zeros(6)), way.duration_s + 0.3, segment)
+        loop.go(way, 0.3, RunSegment("open_loop"))
 
 
 def test_a_camera_that_rotates_is_put_right_in_the_loop_and_replay_agrees():
@@ -143,20 +141,10 @@ def test_a_camera_that_rotates_is_put_right_in_the_loop_and_replay_agrees():
     assert ("rig", correction.at_s) in [(each.cause, each.corrected_s) for each in found]
     off = inverse(loop.estimator.estimate().T_base_tool) @ board.tool(board.t_s)
     assert np.linalg.norm(off[:3, 3]) < 5e-4
-    recorded = RecordedRun(
-        Path("run.mcap"),
-        {},
-        tuple(
-            RecordedDatum(
-                type(each),
-                json.loads(json_text(each.content if isinstance(each, EventDatum) else each.to_json(faults.BODY))),
-            )
-            for each in data
-        ),
-    )
-    again = replay_run(
-        recorded, ARM, faults.BODY, estimator="kalman", pace=Pace(0.0), publisher=Fanout(), changed=False
-    )
+    texts = [json_text(each.content if isinstance(each, EventDatum) else each.to_json(faults.BODY)) for each in data]
+    recorded = tuple(RecordedDatum(type(each), json.loads(text)) for each, text in zip(data, texts, strict=True))
+    run = RecordedRun(Path("run.mcap"), {}, recorded)
+    again = replay_run(run, ARM, faults.BODY, estimator="kalman", pace=Pace(0.0), publisher=Fanout(), changed=False)
     assert again.differences == {"position_m": 0.0, "quaternion": 0.0, "covariance": 0.0}
 
 
@@ -175,7 +163,7 @@ def test_the_sync_led_gives_the_delay_in_the_loop_and_a_sweep_that_differs_is_sa
     loop.log.command = SimpleNamespace(q_ref=MIDDLE, gravity_duty=np.zeros(6))
     loop.find_led()
     loop.mounting = MOUNTING
-    delay = find_delay(loop, ARM, MIDDLE, MIDDLE, lambda q: np.zeros(6))
+    delay = find_delay(loop, MIDDLE, MIDDLE)
     assert abs(delay.delay_s - (DELAY_S - 4e-4)) < 4 * delay.sigma_s < 1e-3
     assert delay.sigma_s > 1e-4  # the age of a reading is known no better
     (found,) = led_findings(loop.led)

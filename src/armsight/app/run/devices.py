@@ -1,0 +1,133 @@
+"""The devices that the command line names, opened as a loop takes them: real ones, or the workcell instead of them."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from armsight.errors import InputError
+from armsight.loop.running.setup import HostClock, LiveShots, Setup
+from armsight.robot.board_registry import EMULATED, emulator_name, open_motion_board, slowed
+from armsight.robot.boards.board import Board
+from armsight.robot.boards.contract import MotionBoard
+from armsight.robot.kinematics.arm import Arm
+from armsight.vision.markers.targets import Composite
+from armsight.vision.sources import open_source
+
+if TYPE_CHECKING:
+    from armsight.sim.workcell.workcell import Workcell
+
+_SIM = "sim:"
+#: The workcell's arm and cameras where ``sim:`` names none: those of ``armsight demo``.
+_SIM_ARM, _SIM_CAMERAS = "worn", "1280x720@60"
+
+
+def setup_of(workcell: Workcell) -> Setup:
+    """Return the setup of a workcell: the interface that real devices have as well."""
+    timing = workcell.timing
+    sync_s = float(np.hypot(timing.sync_s / np.sqrt(3), timing.skew_s))
+    return Setup(
+        workcell.model,
+        workcell.board,
+        workcell.poll,
+        workcell.target,
+        workcell.gravity_duty,
+        timing.rate_hz,
+        sync_s,
+        sync_led_bit_s=sync_led_bit_s(workcell.board, "the workcell") if workcell.source.shows_led else None,
+    )
+
+
+def sync_led_bit_s(board: MotionBoard, name: str) -> float:
+    """Return how long each bit of the code lasts that a board's sync LED blinks, s; ``name``: what the user calls it.
+
+    Raises:
+        InputError: it has no LED.
+    """
+    if not isinstance(board, Board):
+        raise InputError(f"--sync-led: {name} keeps its own controller, which drives no LED on its clock")
+    config = board.configuration()
+    if not config["sync_led_pin"]:
+        raise InputError(
+            f"--sync-led: {name} drives no LED: choose its pin with armsight board config set arm.sync_led_pin=PB13,"
+            " and start the board anew"
+        )
+    return int(config["sync_led_ticks"]) / board.welcome.ticks_per_s
+
+
+@dataclass(frozen=True)
+class Devices:
+    """The devices as the command line names them."""
+
+    source: str  #: the cameras, such as usb:0,1; or sim:
+    board: str  #: the controller board, such as serial:/dev/ttyACM0; or emulated:
+    arm: Arm  #: the nominal arm
+    target: Composite  #: the body on the tool
+    rate_hz: float  #: rate of the cameras, Hz
+    sync_s: float  #: standard deviation of the time between the two exposures of a shot, s
+    calibration: Path | None = None  #: LeRobot's calibration file of a servo bus; None without
+    sync_led: bool = False  #: whether an LED on the board's clock is in view
+
+
+def require_joints(board: MotionBoard, name: str, arm: Arm) -> None:
+    """Raise an InputError if a board drives another number of joints than the arm has."""
+    if board.abilities.joints != len(arm.a):
+        raise InputError(
+            f"--board {name} has {board.abilities.joints} joints, --arm {arm.name} {len(arm.a)}: give the arm that is at"
+            " the board (armsight arm list)"
+        )
+
+
+def planned_for(arm: Arm, board: str) -> Arm:
+    """Return an arm whose motions its board of this name follows; in the workcell it stands where the cameras see it."""
+    if not board.startswith(EMULATED):
+        return slowed(arm, board)
+    from armsight.sim.workcell.controlled import CONTROLLED, standing
+
+    own = CONTROLLED.get(arm.name)
+    return standing(arm) if own is None else slowed(standing(arm), own.board)
+
+
+@contextlib.contextmanager
+def open_devices(devices: Devices) -> Iterator[Setup]:
+    """Open the devices, or the workcell instead of them, and close them at the end of the block."""
+    source, board = devices.source, devices.board
+    if source.startswith(_SIM) != board.startswith(EMULATED):
+        raise InputError(
+            f"--source {source} --board {board}: {_SIM} and {EMULATED} are one workcell and go together; real ones are "
+            "usb:0,1 and serial:/dev/ttyACM0, feetech:PORT or ar4:PORT"
+        )
+    with contextlib.ExitStack() as stack:
+        if source.startswith(_SIM):
+            from armsight.sim.workcell.workcell import Workcell
+
+            emulator = "unicorn" if board == EMULATED else emulator_name(board)
+            cameras = source.removeprefix(_SIM) or _SIM_CAMERAS
+            led = devices.sync_led
+            workcell = stack.enter_context(
+                Workcell.open(arm=_SIM_ARM, cameras=cameras, emulator=emulator, model=devices.arm, sync_led=led)
+            )
+            yield replace(setup_of(workcell), target=devices.target)
+            return
+        opened = stack.enter_context(open_motion_board(board, calibration=devices.calibration))
+        require_joints(opened, board, devices.arm)
+        bit_s = sync_led_bit_s(opened, f"--board {board}") if devices.sync_led else None
+        shots = LiveShots(open_source(source))
+        stack.callback(shots.close)
+        shots.start()
+        yield Setup(
+            devices.arm,
+            opened,
+            shots.poll,
+            devices.target,
+            np.zeros_like,
+            devices.rate_hz,
+            devices.sync_s,
+            HostClock(),
+            sync_led_bit_s=bit_s,
+        )
