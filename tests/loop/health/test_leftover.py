@@ -7,8 +7,7 @@ from faults import watched_body
 from armsight.estimate.change import Sums
 from armsight.loop.health.passing import Leftover
 
-OTHERS, LENS, ROWS = 9, 20, 400
-EVERY = np.eye(OTHERS)
+OTHERS, LENS, ROWS, EVERY = 9, 20, 400, np.eye(9)
 
 
 def sums_of(rng, tau_px, noise, change, count=12):
