@@ -5,7 +5,7 @@ and the pixel's width are both integrated exactly: across an edge a pixel is a b
 shadows, and the shorter one adds to the blur. There are two versions: from tables, and in single precision without
 tables or branches, so that a loop over pixels fills the processor's vectors (SIMD).
 
-The normal equations of a least-squares fit are assembled, Cholesky-factored, solved and inverted.
+Small normal equations of a least-squares fit are Cholesky-factored, solved and inverted.
 """
 
 from __future__ import annotations
@@ -120,22 +120,6 @@ def products(n: int, rows: Floats, sums: Array) -> None:
             sums[i + 1, j], sums[i + 1, j + 1], sums[i + 1, j + 2], sums[i + 1, j + 3] = t0, t1, t2, t3
 
 
-@kernel(fastmath=True)
-def normal_equations(n: int, J: Array, r: Array, A: Array, g: Array) -> None:
-    """Fill A = J J^T and g = J r."""
-    for i in range(len(J)):
-        for j in range(i + 1):
-            s = 0.0
-            for m in range(n):
-                s += J[i, m] * J[j, m]
-            A[i, j] = s
-            A[j, i] = s
-        s = 0.0
-        for m in range(n):
-            s += J[i, m] * r[m]
-        g[i] = s
-
-
 @kernel
 def factor(A: Array, damping: float, L: Array) -> bool:
     """Cholesky-factor A, as far as L reaches, its diagonal raised by ``damping``; False if it is not positive definite.
@@ -181,25 +165,3 @@ def invert(L: Array, inverse: Array) -> None:
         unit[i] = 1.0
         solve(L, unit, x)
         inverse[i] = x
-
-
-@kernel(fastmath=True)
-def edge_noise(n: int, J: Array, r: Array, inverse: Array, first: int, second: int) -> float:
-    """Estimate the variance of the noise from the residuals r (n,) of the pixels that determine two parameters (position).
-
-    The mean squared residual, each divided by 1 - leverage and weighted by its pixel's information about the two
-    parameters: flat areas, saturated ones above all, must not count for the edges. No image is known better than its
-    quantisation.
-    """
-    leverage = np.zeros(n)
-    for i in range(len(J)):
-        for j in range(i + 1):
-            share = inverse[i, i] if i == j else 2.0 * inverse[i, j]
-            for m in range(n):
-                leverage[m] += share * J[i, m] * J[j, m]
-    weight, power = 0.0, 0.0
-    for m in range(n):
-        w = J[first, m] ** 2 + J[second, m] ** 2
-        weight += w * (1.0 - leverage[m])
-        power += w * r[m] ** 2
-    return float(max(power / weight, 1.0 / 12.0))

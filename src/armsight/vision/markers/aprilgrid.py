@@ -81,7 +81,7 @@ class AprilGrid(Record, CalibrationBoard):
         others: set[int] = set()
         border = BORDERS[0]
         for border in BORDERS:
-            seen = find_squares(image, FAMILY, border)
+            seen = find_squares(image, FAMILY, border, self.codes[1])
             found = [(identity - self.first, corners) for identity, corners in seen if identity in self.codes[1]]
             others |= {identity for identity, _ in seen if identity not in self.codes[1]}
             if found:

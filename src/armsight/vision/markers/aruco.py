@@ -1,8 +1,10 @@
 """Square code markers of every family OpenCV knows, found roughly: identities and corners to a pixel or so.
 
-OpenCV finds quadrilaterals and reads their cells by a threshold. Blur and sharpening mix neighbouring cells of small
-markers, and some are not read. In families of 6x6 cells and more, those quadrilaterals are compared with all codes, each
-blurred: the nearest code is taken where the next one explains the image much worse.
+A quick search (:mod:`~armsight.vision.markers.quads`) reads plain ones. Where it leaves dark regions that may be
+markers, and not all that are wanted were read, OpenCV finds quadrilaterals in several windows and reads their cells by a
+threshold. Blur and sharpening mix neighbouring cells of small markers, and some are not read. In families of 6x6 cells
+and more, those quadrilaterals are compared with all codes, each blurred: the nearest code is taken where the next one
+explains the image much worse.
 
 AprilTag families carry their own names (``tag36h11``) and are then upright as the AprilTag project prints them; markers
 of OpenCV's names (``DICT_APRILTAG_36h11``, ``DICT_4X4_50``) are upright as OpenCV prints them. The two conventions
@@ -12,7 +14,7 @@ print the same AprilTag upside down to each other, so the name of the family sta
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -23,13 +25,14 @@ from numpy.typing import NDArray
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.vision.markers.apriltag3 import LAYOUTS, codes, read_tag
+from armsight.vision.markers.quads import SIDE_MIN_PX, outlines, read_codes
 
 #: AprilTag's families -> OpenCV's dictionaries, in which they stand upside down.
 APRILTAGS = {f"tag{kind}": f"DICT_APRILTAG_{kind}" for kind in ("16h5", "25h9", "36h10", "36h11")}
 #: Every family; OpenCV lists some of its dictionaries twice, as 36h11 and 36H11.
 FAMILIES = (*APRILTAGS, *sorted(n for n in dir(cv2.aruco) if n.startswith("DICT_") and not re.search("[0-9]H[0-9]", n)))
-#: A marker smaller than this cannot be read: eight cells across need more than a pixel each.
-SIDE_MIN_PX = 10.0
+#: Most quadrilaterals of an image; share of the cells that a family's distance lets correct which is used, as OpenCV's.
+_MOST, _CORRECTED = 1024, 0.6
 
 
 def family_name(text: str) -> str:
@@ -79,6 +82,28 @@ def _detector(family: str, perimeter_share: float, border: int) -> cv2.aruco.Aru
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
     parameters.markerBorderBits = border
     return cv2.aruco.ArucoDetector(_dictionary(family), parameters)
+
+
+@lru_cache(maxsize=16)
+def _codes(family: str, border: int) -> NDArray[np.uint64]:
+    """Return a family's codes (M, 4) in four rotations, row by row, the first cell in the highest bit."""
+    whole = np.array([cells(family, k, border)[border:-border, border:-border] > 0 for k in range(family_size(family))])
+    bits = np.uint64(1) << np.arange(whole[0].size - 1, -1, -1, dtype=np.uint64)
+    turned = [np.rot90(whole, r, axes=(1, 2)).reshape(len(whole), -1) @ bits for r in range(4)]
+    return np.ascontiguousarray(np.transpose(turned))
+
+
+def _read_quickly(image: NDArray[np.uint8], family: str, border: int) -> tuple[list[tuple[int, Array]], bool]:
+    """Return the markers that the quick search reads, upright, and whether the image may show others."""
+    height, width = image.shape
+    image, dictionary = np.ascontiguousarray(image), _dictionary(family)
+    dark, steps = np.zeros((height + 2, width + 2), np.uint8), np.empty((2, 3 * (height + width)), np.int32)
+    quads, found = np.empty((_MOST, 4, 2)), np.empty(_MOST, np.int64)
+    count, regions = outlines(image, dark, steps, quads)
+    size, allowed = dictionary.markerSize + 2 * border, int(_CORRECTED * dictionary.maxCorrectionBits)
+    read_codes(image, quads[:count], _codes(family, border), size, border, allowed, found)
+    read = [(int(code) // 4, np.roll(quads[k], code % 4, axis=0)) for k, code in enumerate(found[:count]) if code >= 0]
+    return read, regions > len(read)
 
 
 def detect_markers(
@@ -210,13 +235,16 @@ def _without_repeats(corners: Array, identities: NDArray[Any]) -> list[int]:
     return sorted(kept)
 
 
-def find_squares(image: NDArray[np.uint8], family: str, border: int = 1) -> list[tuple[int, Array]]:
+def find_squares(
+    image: NDArray[np.uint8], family: str, border: int = 1, wanted: Collection[int] | None = None
+) -> list[tuple[int, Array]]:
     """Find the markers of a family, upright by the convention of the family's name.
 
     Args:
         image: (H, W) grey image.
         family: a name of FAMILIES or of LAYOUTS.
         border: width of the markers' dark border, cells.
+        wanted: identities that are looked for: when the quick search reads all of them it is enough; all by default.
 
     Returns:
         Identity and rough corners (4, 2), raw pixels, of each marker seen: upper left, upper right, lower right, lower
@@ -224,12 +252,20 @@ def find_squares(image: NDArray[np.uint8], family: str, border: int = 1) -> list
     """
     if family in LAYOUTS:
         return _find_apriltag3(image, family)
+    read, others = _read_quickly(image, family, border)
+    if not others or (wanted is not None and set(wanted) <= {identity for identity, _ in read}):
+        return read
     rot90 = 2 if family in APRILTAGS else 0
     corners, identities = detect_markers(image, family, border)
-    return [
+    read += [
         (int(identity), np.roll(found.reshape(4, 2).astype(np.float64), -rot90, axis=0))
         for identity, found in zip(identities[:, 0], corners, strict=True)
     ]
+    return (
+        [read[k] for k in _without_repeats(np.array([c for _, c in read]), np.array([i for i, _ in read]))]
+        if read
+        else []
+    )
 
 
 def _find_apriltag3(image: NDArray[np.uint8], family: str) -> list[tuple[int, Array]]:

@@ -266,7 +266,7 @@ def rough_noise(n: int, w: Work) -> float:
 def edge_noise(n: int, w: Work, L: Array, middle: Array, cov: Array, noise: Array, gain: Array) -> float:
     """Return the variance of the residuals and fill cov (2, 2), the covariance of the corner; derivatives are overwritten.
 
-    The noise is that of the pixels that determine the corner, as in ``normal.edge_noise``. Leverage is the squared
+    The noise is that of the pixels that determine the corner, as in ``square.py``. Leverage is the squared
     length of L^-1 times a pixel's derivatives, so its weighted sum needs only the weighted products of the derivatives.
 
     An X corner has a point symmetry: what a camera's processing does to both sides alike (the halo of sharpening, a tone

@@ -11,40 +11,47 @@ accurate than from their outline. The homography is corrected by a displacement 
 its affine and perspective parts are free, the others model the bow that lens distortion gives to lines, which is small
 (prior). c models print that bleeds and the camera's gamma, which make all dark cells look smaller or larger and would
 move an outline's corners inward or outward. Method: Levenberg-Marquardt; the covariance is that of the linearised fit
-with the noise that its own residuals show. The compiled image model and its fit come first, their use on an image after
-them.
+with the noise that its own residuals show. Pixels are processed in blocks that stay in the processor's cache.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
-from armsight.geometry.matrix import dot
+from armsight.geometry.matrix import dot, product, solved
 from armsight.kernels import kernel
-from armsight.vision.normal import edge, edge_noise, factor, invert, normal_equations, solve
+from armsight.vision.markers.quads import square_to_quad
+from armsight.vision.normal import edge, factor, invert, solve
 
 FIELD = 12  # coefficients of the quadratic field over the marker
 PARAMETERS = FIELD + 6  # ..., squared blur, b, c, a, k (2)
-_STEPS, _STOP, _STALL, _LAMBDA = 40, 0.05, 0.05, 1e-2  # as in corner.py
+_STEPS, _STALL, _LAMBDA = 40, 0.05, 1e-2  # as in corner.py
+#: A step is the last when it lowers the cost by less than so many times one pixel's noise; in the first fit by so many.
+_STOP, _STOP_FIRST = 0.5, 20.0  # the step is taken: what is left is a hundredth of it
 _BLUR2_MIN = 0.03  # px^2, as in corner.py
+_BLOCK = 128  # pixels
 
 
-@kernel("f8, f8, f8[:, ::1]")
-def field(x: float, y: float, phi: Array) -> None:
-    """Fill the displacement basis phi (12, 2) at the marker's coordinates x, y in -1..1."""
-    phi[:, :] = 0.0
-    phi[0, 0], phi[1, 0], phi[2, 0] = 1.0, x, y
-    phi[3, 1], phi[4, 1], phi[5, 1] = 1.0, x, y
-    phi[6, 0], phi[6, 1] = x * x, x * y  # perspective
-    phi[7, 0], phi[7, 1] = x * y, y * y
-    phi[8, 0], phi[9, 1] = y * y, x * x  # bow
-    phi[10, 0], phi[10, 1] = x * x, -x * y
-    phi[11, 0], phi[11, 1] = x * y, -y * y
+@kernel(fastmath=True, forceinline=True)
+def _displaced(q: Array, x: float, y: float) -> tuple[float, float]:
+    """Return where the field moves the marker's coordinates x, y in -1..1: affine, perspective (6, 7), bow (8 to 11)."""
+    xx, xy, yy = x * x, x * y, y * y
+    u = x + q[0] + q[1] * x + q[2] * y + (q[6] + q[10]) * xx + (q[7] + q[11]) * xy + q[8] * yy
+    v = y + q[3] + q[4] * x + q[5] * y + (q[6] - q[10]) * xy + (q[7] - q[11]) * yy + q[9] * xx
+    return u, v
+
+
+@kernel(fastmath=True, forceinline=True)
+def _by_field(x: float, y: float, a: float, b: float, out: Array) -> None:
+    """Fill the derivatives (12,) by the field at x, y of a times the displacement along x plus b times that along y."""
+    ax, ay, bx, by = a * x, a * y, b * x, b * y
+    out[0], out[1], out[2], out[3], out[4], out[5] = a, ax, ay, b, bx, by
+    out[6], out[7], out[8], out[9] = (ax + by) * x, (ax + by) * y, ay * y, bx * x
+    out[10], out[11] = (ax - by) * x, (ax - by) * y
 
 
 @kernel(fastmath=True)
@@ -79,17 +86,17 @@ def _skewed(
     """
     rho = px[7]
     kx, ky = px[3] * spread, px[4] * spread
-    gain = 0.0
+    gain, step_x, step_y = 0.0, 2.0 * kx / cells, 2.0 * ky / cells
+    first_x, first_y = (u + 1.0) * kx - (cx + 1) * step_x, (v + 1.0) * ky - (cy + 1) * step_y
     slopes[:] = 0.0
-    for j in range(3):
-        zy = (v + 1.0 - 2.0 * (cy + 1 + j) / cells) * ky
-        if abs(zy) > 4.0:
-            continue
-        for i in range(3):
-            zx = (u + 1.0 - 2.0 * (cx + 1 + i) / cells) * kx
-            row, col = cy + 3 + j, cx + 3 + i
+    for j in range(max(int(np.ceil((first_y - 4.0) / step_y)), 0), min(int(np.floor((first_y + 4.0) / step_y)), 2) + 1):
+        zy, row = first_y - j * step_y, cy + 3 + j
+        for i in range(
+            max(int(np.ceil((first_x - 4.0) / step_x)), 0), min(int(np.floor((first_x + 4.0) / step_x)), 2) + 1
+        ):
+            zx, col = first_x - i * step_x, cx + 3 + i
             step = grid[row, col] - grid[row, col - 1] - grid[row - 1, col] + grid[row - 1, col - 1]
-            if step == 0.0 or abs(zx) > 4.0:
+            if step == 0.0:
                 continue
             ff = step * (0.5 / np.pi) * np.exp(-0.5 * (zx * zx + zy * zy))
             wx, wy = zx * zx - 1.0, zy * zy - 1.0
@@ -104,30 +111,26 @@ def _skewed(
 
 
 @kernel(fastmath=True)
-def _evaluate(n: int, px: Array, grid: Array, prior: Array, q: Array, J: Array, r: Array) -> float:
-    """Fill residuals r and derivatives J (18, n) of pixels px (8, n) at parameters q (18,); return the cost.
+def _fill(first: int, n: int, px: Array, grid: Array, q: Array, J: Array) -> None:
+    """Fill derivatives and residuals J (19, _BLOCK) of n pixels from the first at parameters q (18,); zeros after them.
 
-    px: grey, marker coordinates x, y, per axis the length of a unit in pixels and the pixel's width, and the cosine
+    px: (N, 8) grey, marker coordinates x, y, per axis the length of a unit in pixels and the pixel's width, and the cosine
     between the axes' gradients. grid: (N + 4, N + 4), the cells as -1 and 1 with two rings of white around.
     """
     cells = len(grid) - 4
-    phi, wx, wy, extra = np.empty((FIELD, 2)), np.empty((3, 4)), np.empty((3, 4)), np.empty(3)
+    wx, wy, extra = np.empty((3, 4)), np.empty((3, 4)), np.empty(3)
     b, c, a = q[FIELD + 1], q[FIELD + 2], q[FIELD + 3]
-    cost = 0.0
-    for i in range(FIELD + 3):
-        cost += (q[i] - prior[i, 0]) ** 2 * prior[i, 1]
+    spread = 1.0 / np.sqrt(q[FIELD] + 1.0 / 12.0)
+    J[:, n:] = 0.0
     for i in range(n):
-        x, y = px[1, i], px[2, i]
-        field(x, y, phi)
-        u, v = x, y
-        for j in range(FIELD):
-            u += q[j] * phi[j, 0]
-            v += q[j] * phi[j, 1]
-        blur_x = np.sqrt(q[FIELD] + (1.0 - px[5, i] ** 2) / 12.0)
-        blur_y = np.sqrt(q[FIELD] + (1.0 - px[6, i] ** 2) / 12.0)
-        cx = _shares(u, cells, px[3, i], px[5, i], blur_x, wx)
-        cy = _shares(v, cells, px[4, i], px[6, i], blur_y, wy)
-        M, mx, my, ms = 0.0, 0.0, 0.0, 0.0
+        p = px[first + i]
+        x, y = p[1], p[2]
+        u, v = _displaced(q, x, y)
+        blur_x = np.sqrt(q[FIELD] + (1.0 - p[5] ** 2) / 12.0)
+        blur_y = np.sqrt(q[FIELD] + (1.0 - p[6] ** 2) / 12.0)
+        cx = _shares(u, cells, p[3], p[5], blur_x, wx)
+        cy = _shares(v, cells, p[4], p[6], blur_y, wy)
+        M, mx, my, sx, sy = 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(4):
             w, d, s = 0.0, 0.0, 0.0
             for m in range(4):
@@ -138,86 +141,150 @@ def _evaluate(n: int, px: Array, grid: Array, prior: Array, q: Array, J: Array, 
             M += wy[0, k] * w
             mx += wy[0, k] * d
             my += wy[1, k] * w
-            ms += 0.5 * (wy[0, k] * s / blur_x + wy[2, k] * w / blur_y)
-        spread = 1.0 / np.sqrt(q[FIELD] + 1.0 / 12.0)
-        skew = _skewed(u, v, cells, px[:, i], spread, grid, cx, cy, extra)
-        M += skew
+            sx += wy[0, k] * s
+            sy += wy[2, k] * w
+        M += _skewed(u, v, cells, p, spread, grid, cx, cy, extra)
         mx += extra[0]
         my += extra[1]
-        ms += extra[2]
+        ms = 0.5 * (sx / blur_x + sy / blur_y) + extra[2]
         light = 1.0 + q[FIELD + 4] * x + q[FIELD + 5] * y
         level = a + b * M + c * (1.0 - M * M)
         slope = (b - 2.0 * c * M) * light
-        for j in range(FIELD):
-            J[j, i] = slope * (mx * phi[j, 0] + my * phi[j, 1])
+        _by_field(x, y, slope * mx, slope * my, J[:FIELD, i])
         J[FIELD, i] = slope * ms
         J[FIELD + 1, i] = light * M
         J[FIELD + 2, i] = light * (1.0 - M * M)
         J[FIELD + 3, i] = light
         J[FIELD + 4, i] = level * x
         J[FIELD + 5, i] = level * y
-        r[i] = px[0, i] - light * level
-        cost += r[i] * r[i]
+        J[PARAMETERS, i] = p[0] - light * level
+
+
+@kernel(fastmath=True)
+def _assemble(n: int, px: Array, grid: Array, prior: Array, q: Array, J: Array, A: Array) -> float:
+    """Fill the normal equations at q, A (19, 19), the last row their right side; return the cost.
+
+    A blur that is at its lower bound is held.
+    """
+    A[:, :] = 0.0
+    for block in range((n + _BLOCK - 1) // _BLOCK):
+        here = J[block]
+        _fill(block * _BLOCK, min(_BLOCK, n - block * _BLOCK), px, grid, q, here)
+        for i in range(PARAMETERS + 1):
+            for j in range(i + 1):
+                s = 0.0
+                for m in range(_BLOCK):
+                    s += here[i, m] * here[j, m]
+                A[i, j] += s
+    cost, g = A[PARAMETERS, PARAMETERS], A[PARAMETERS]
+    for i in range(FIELD + 3):
+        A[i, i] += prior[i, 1]
+        g[i] += prior[i, 1] * (prior[i, 0] - q[i])
+        cost += (q[i] - prior[i, 0]) ** 2 * prior[i, 1]
+    if q[FIELD] < 1.001 * _BLUR2_MIN and g[FIELD] < 0.0:
+        A[FIELD, FIELD] *= 1e9
+        g[FIELD] = 0.0
     return float(cost)
 
 
 @kernel
-def _assemble(n: int, q: Array, prior: Array, J: Array, r: Array, A: Array, g: Array) -> None:
-    """Fill the normal equations with the prior, and hold a blur that is at its lower bound."""
-    normal_equations(n, J, r, A, g)
-    for i in range(FIELD + 3):
-        A[i, i] += prior[i, 1]
-        g[i] += prior[i, 1] * (prior[i, 0] - q[i])
-    if q[FIELD] < 1.001 * _BLUR2_MIN and g[FIELD] < 0.0:
-        A[FIELD, FIELD] *= 1e9
-        g[FIELD] = 0.0
+def _minimise(n: int, px: Array, grid: Array, prior: Array, stop: float, q: Array, J: Array, inverse: Array) -> bool:
+    """Minimise from q by Levenberg-Marquardt; whether it settles.
 
-
-@kernel("i8, f8[::1, :], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1]")
-def fit_pattern(n: int, px: Array, grid: Array, prior: Array, q: Array, inverse: Array, J: Array, r: Array) -> float:
-    """Minimise from q by Levenberg-Marquardt; return the noise variance, -1 if unsettled.
-
-    ``inverse`` (18, 18), J (18, n) and r (n,), derivatives and residuals, are filled.
+    Args:
+        n: number of pixels.
+        px: as in ``_fill``.
+        grid: as in ``_fill``.
+        prior: (15, 2) mean and weight of the parameters' priors.
+        stop: a step is the last when it lowers the cost by less than so many times one pixel's noise.
+        q: (18,) start, and solution.
+        J: (blocks, 19, _BLOCK) filled with derivatives and residuals.
+        inverse: (18, 18) filled with that of the normal matrix.
     """
-    A, L = np.empty((PARAMETERS, PARAMETERS)), np.zeros((PARAMETERS, PARAMETERS))
-    g, step, trial = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty(PARAMETERS)
-    cost, damping = _evaluate(n, px, grid, prior, q, J, r), _LAMBDA
-    _assemble(n, q, prior, J, r, A, g)
+    A, T = np.empty((PARAMETERS + 1, PARAMETERS + 1)), np.empty((PARAMETERS + 1, PARAMETERS + 1))
+    L, step, trial = np.zeros((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS), np.empty(PARAMETERS)
+    cost, damping, current = _assemble(n, px, grid, prior, q, J, A), _LAMBDA, True
     for _ in range(_STEPS):
         if not factor(A, damping, L):
-            return -1.0
+            return False
+        g = A[PARAMETERS, :PARAMETERS]
         solve(L, g, step)
         gain = dot(step, g)
-        done = damping <= 1.0 and gain < _STOP * cost / n
         trial[:] = q + step
         trial[FIELD] = max(trial[FIELD], _BLUR2_MIN)
-        new = _evaluate(n, px, grid, prior, trial, J, r)
-        done |= max(gain, abs(new - cost)) < _STALL * cost / n
+        if current and damping <= 1.0 and gain < stop * cost / n:  # derivatives stay what they are
+            step[:], q[:] = trial - q, trial
+            for here in J:
+                for i in range(PARAMETERS):
+                    for m in range(_BLOCK):
+                        here[PARAMETERS, m] -= step[i] * here[i, m]
+            return _inverted(A, L, inverse)
+        new = _assemble(n, px, grid, prior, trial, J, T)
+        done = max(gain, abs(new - cost)) < _STALL * cost / n
         if new > cost and not done:
-            damping = max(damping * 10.0, 1e-4)
+            damping, current = max(damping * 10.0, 1e-4), False
             if damping > 1e8:
-                return -1.0
+                return False
             continue
         if cost - new > 0.5 * gain:
             damping = max(damping * 0.1, 1e-9)
         elif cost - new < 0.2 * gain:
             damping = max(damping * 3.0, 1e-2)
         q[:] = trial
-        cost = new
-        _assemble(n, q, prior, J, r, A, g)
+        A[:, :], cost, current = T, new, True
         if done:
-            if not factor(A, 0.0, L):
-                return -1.0
-            invert(L, inverse)
-            return edge_noise(n, J, r, inverse, 0, 3)
-    return -1.0
+            return _inverted(A, L, inverse)
+    return False
+
+
+@kernel
+def _inverted(A: Array, L: Array, inverse: Array) -> bool:
+    """Fill the inverse (18, 18) of a normal matrix, L (18, 18) with its factor; whether there is one."""
+    if not factor(A, 0.0, L):
+        return False
+    invert(L, inverse)
+    return True
+
+
+@kernel(fastmath=True)
+def _noise(n: int, inverse: Array, by_middle: Array, J: Array, left: Array) -> float:
+    """Return the variance of the noise, and fill ``left`` (n + 1, 4): 1, the residual, and by how much it moves the middle.
+
+    The mean squared residual of the pixels that determine the position, each divided by 1 - leverage and weighted by its
+    pixel's information about it: flat areas, saturated ones above all, must not count for the edges. No image is known
+    better than its quantisation. by_middle: (2, FIELD) derivatives of the middle.
+    """
+    gains, leverage = product(by_middle, inverse[:FIELD]), np.empty(_BLOCK)
+    weight, power = 0.0, 0.0
+    for block in range((n + _BLOCK - 1) // _BLOCK):
+        first, here = block * _BLOCK, J[block]
+        count = min(_BLOCK, n - first)
+        leverage[:] = 0.0
+        for i in range(PARAMETERS):
+            for j in range(i + 1):
+                share = inverse[i, i] if i == j else 2.0 * inverse[i, j]
+                for m in range(_BLOCK):
+                    leverage[m] += share * here[i, m] * here[j, m]
+        for m in range(count):
+            w = here[0, m] ** 2 + here[3, m] ** 2
+            weight += w * (1.0 - leverage[m])
+            power += w * here[PARAMETERS, m] ** 2
+            p = left[first + m]
+            p[0], p[1], p[2], p[3] = 1.0, here[PARAMETERS, m], 0.0, 0.0
+            for i in range(PARAMETERS):
+                p[2] += gains[0, i] * here[i, m]
+                p[3] += gains[1, i] * here[i, m]
+    left[n] = 0.0
+    return float(max(power / weight, 1.0 / 12.0))
 
 
 #: How far the window extends beyond the outline, in cells, and its distance, px, from the end of the white around a
 #: marker, which is one cell wide by the families' definitions.
 MARGIN_CELLS, MARGIN_GAP_PX = (0.2, 0.6), 1.5
 #: More pixels than this are thinned evenly, in the first fit, which only finds the position, and in the last.
-PIXELS_FIRST, PIXELS_LAST = 500, 3000
+PIXELS_FIRST, PIXELS_LAST = 300, 3000
+#: An edge is seen so many sigmas of its blur away, and px more; share of the pixels further away that is used.
+_NEAR_SIGMAS, _NEAR_PX, _FLAT = 3.0, 0.5, 0.25
 #: Blur at the start of the first fit, cells, so that corners that are off by most of a cell still converge.
 START_BLUR_CELLS = 0.4
 #: A corner that ends further than this many cells from where it was found belongs to something else.
@@ -236,7 +303,238 @@ _BOW_PER_PX = 1e-4
 _BLEED_SHARE = 0.3  # c as a share of b, about
 _PRIOR_NOISE = 2.0  # grey levels of noise that the priors on bow and c are weighted against
 
-_CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+#: Neighbours of pixels, px, between which noise is looked at.
+_NEIGHBOURS = 4
+#: Why a marker is not fitted; the index is what :func:`fit_marker` returns.
+PROBLEMS = (
+    None,
+    "too small or too near the image border",
+    "no convergence",
+    "the pattern does not fit",
+    "its corners are not where they were found",
+)
+
+
+@kernel
+def _edge_near(grid: Array, x: float, y: float, near_x: float, near_y: float) -> bool:
+    """Whether the cells about a point of a marker, so far along its axes, have two colours."""
+    half = 0.5 * (len(grid) - 4)
+    left, right = int((x - near_x + 1.0) * half + 2.0), int((x + near_x + 1.0) * half + 2.0)
+    top, bottom = int((y - near_y + 1.0) * half + 2.0), int((y + near_y + 1.0) * half + 2.0)
+    left, top = max(left, 0), max(top, 0)
+    for j in range(top, min(bottom + 1, len(grid))):
+        for i in range(left, min(right + 1, len(grid))):
+            if grid[j, i] != grid[top, left]:
+                return True
+    return False
+
+
+@kernel
+def _gather(
+    image: NDArray[np.uint8], corners: Array, inverse: Array, grid: Array, whole: bool, most: int, near: float, px: Array,
+    at: Ids,
+) -> int:  # fmt: skip
+    """Collect up to ``most`` pixels of a marker and its margin, px (N, 8) as in ``_fill``; return their number.
+
+    Those from which no edge of a cell is near are thinned: they say nothing of where the marker is.
+
+    Args:
+        image: (H, W) grey.
+        corners: (4, 2) of the marker.
+        inverse: (3, 3) homography from the image to the marker, its scale positive before the horizon.
+        grid: its cells, as in ``_fill``.
+        whole: whether pixels beyond the corners count.
+        most: pixels.
+        near: how far an edge is seen, px.
+        px: filled.
+        at: (N, 2) filled with their columns and rows.
+    """
+    area, size_of = 0.0, np.array([image.shape[1], image.shape[0]])
+    for k in range(4):
+        i = (k + 1) % 4
+        area += 0.5 * (corners[k, 0] * corners[i, 1] - corners[k, 1] * corners[i, 0])
+    size = len(grid) - 4
+    cell = np.sqrt(abs(area)) / size
+    reach = 1.0 + 2.0 * min(max(1.0 - MARGIN_GAP_PX / max(cell, 1e-9), MARGIN_CELLS[0]), MARGIN_CELLS[1]) / size
+    low, high, back = np.full(2, np.inf), np.full(2, -np.inf), solved(inverse, np.eye(3))
+    for k in range(4):
+        x, y = (reach if k in (1, 2) else -reach), (reach if k > 1 else -reach)
+        w = back[2, 0] * x + back[2, 1] * y + back[2, 2]
+        for m in range(2):
+            end = (back[m, 0] * x + back[m, 1] * y + back[m, 2]) / w
+            if not abs(end) < 1e6:
+                return 0
+            low[m], high[m] = min(low[m], end), max(high[m], end)
+    for m in range(2):
+        low[m], high[m] = max(np.floor(low[m]), 0.0), min(np.ceil(high[m]), size_of[m] - 1.0)
+    n, share, due = 0, min(1.0, most / max(reach * reach * abs(area), 1.0)), 1.0
+    for v in range(int(low[1]), int(high[1]) + 1):
+        for u in range(int(low[0]), int(high[0]) + 1):
+            w = inverse[2, 0] * u + inverse[2, 1] * v + inverse[2, 2]
+            x = (inverse[0, 0] * u + inverse[0, 1] * v + inverse[0, 2]) / w
+            y = (inverse[1, 0] * u + inverse[1, 1] * v + inverse[1, 2]) / w
+            if not (w > 0.0 and abs(x) <= reach and abs(y) <= reach) or (not whole and abs(x) > 1.0 and abs(y) > 1.0):
+                continue
+            a, b = (inverse[0, 0] - x * inverse[2, 0]) / w, (inverse[0, 1] - x * inverse[2, 1]) / w
+            c, d = (inverse[1, 0] - y * inverse[2, 0]) / w, (inverse[1, 1] - y * inverse[2, 1]) / w
+            steep_x, steep_y = np.sqrt(a * a + b * b), np.sqrt(c * c + d * d)
+            due += share if _edge_near(grid, x, y, near * steep_x, near * steep_y) else _FLAT * share
+            if due < 1.0 or n == len(px):
+                continue
+            due -= 1.0
+            px[n, 0], px[n, 1], px[n, 2], px[n, 3], px[n, 4] = image[v, u], x, y, 1.0 / steep_x, 1.0 / steep_y
+            px[n, 5], px[n, 6] = max(abs(a), abs(b)) / steep_x, max(abs(c), abs(d)) / steep_y
+            px[n, 7] = (a * c + b * d) / (steep_x * steep_y)
+            at[n, 0], at[n, 1] = u, v
+            n += 1
+    return n
+
+
+@kernel
+def _corners(q: Array, H: Array, uv: Array, by_field: Array) -> None:
+    """Fill the corners uv (4, 2) and their derivatives by_field (8, FIELD); H: marker to image."""
+    for k in range(4):
+        x, y = (1.0 if k in (1, 2) else -1.0), (1.0 if k > 1 else -1.0)
+        s, t = x, y
+        for _ in range(10):  # the point that the field maps onto the corner; the field is small, so this converges
+            u, v = _displaced(q, s, t)
+            s, t = s + x - u, t + y - v
+        w = H[2, 0] * s + H[2, 1] * t + H[2, 2]
+        for m in range(2):
+            uv[k, m] = (H[m, 0] * s + H[m, 1] * t + H[m, 2]) / w
+            a, b = (uv[k, m] * H[2, 0] - H[m, 0]) / w, (uv[k, m] * H[2, 1] - H[m, 1]) / w
+            _by_field(s, t, a, b, by_field[2 * k + m])
+
+
+@kernel(fastmath=True)
+def _correlated(n: int, at: Ids, left: Array) -> float:
+    """Return by how much the variance of a fit's result grows because the noise of neighbouring pixels is correlated.
+
+    Args:
+        n: number of pixels.
+        at: (N, 2) their columns and rows.
+        left: (N + 1, 4) one, the residuals, and derivatives of two results by the pixels' grey levels; zeros.
+
+    Returns:
+        The mean over the results, one at least. The noise's autocovariance is that of the residuals, over up to four
+        pixels.
+    """
+    x0, y0, x1, y1 = at[0, 0], at[0, 1], at[0, 0], at[n - 1, 1]
+    for i in range(n):
+        x0, x1 = min(x0, at[i, 0]), max(x1, at[i, 0])
+    width = 2 * _NEIGHBOURS + 1
+    index, sums = (
+        np.full((y1 - y0 + 1 + _NEIGHBOURS, x1 - x0 + width), n, np.int32),
+        np.zeros((_NEIGHBOURS + 1, width, 4)),
+    )
+    for i in range(n):
+        index[at[i, 1] - y0, at[i, 0] - x0 + _NEIGHBOURS] = i
+    for i in range(n):
+        x, y, here = at[i, 0] - x0, at[i, 1] - y0, left[i]
+        for dy in range(_NEIGHBOURS + 1):
+            for dx in range(width):
+                there = left[index[y + dy, x + dx]]
+                for k in range(4):
+                    sums[dy, dx, k] += here[k] * there[k]
+    total, none = 0.0, sums[0, _NEIGHBOURS]
+    for dy in range(_NEIGHBOURS + 1):
+        for dx in range(width):
+            s = sums[dy, dx]
+            if (dy > 0 or dx >= _NEIGHBOURS) and s[0] > 0.0:  # the others are these mirrored
+                rho = s[1] / s[0] / max(none[1] / none[0], 1e-12)
+                total += (1.0 if dy == 0 and dx == _NEIGHBOURS else 2.0) * rho * 0.5 * (s[2] / none[2] + s[3] / none[3])
+    return float(max(1.0, total))
+
+
+@kernel
+def _fit_from(
+    image: NDArray[np.uint8], corners: Array, grid: Array, whole: bool, most: int, q: Array, px: Array, at: Ids, uv: Array,
+    cov: Array,
+) -> int:  # fmt: skip
+    """Fit one marker's field over the homography of given corners, starting at parameters q; return the problem."""
+    H, inverse = np.empty((3, 3)), np.empty((PARAMETERS, PARAMETERS))
+    square_to_quad(corners, H)
+    back = solved(H, np.eye(3))
+    back /= back[2, 0] * corners[:, 0].mean() + back[2, 1] * corners[:, 1].mean() + back[2, 2]
+    n = _gather(
+        image, corners, back, grid, whole, most, _NEAR_SIGMAS * np.sqrt(q[FIELD] + 1.0 / 12.0) + _NEAR_PX, px, at
+    )
+    if n < 3 * PARAMETERS:
+        return 1
+    if q[FIELD + 1] == 0.0:
+        levels = np.sort(px[:n, 0])
+        low, high = levels[n // 20], levels[n - 1 - n // 20]
+        q[FIELD + 1], q[FIELD + 3] = 0.5 * (high - low), 0.5 * (high + low)
+    side = 0.0
+    for k in range(4):
+        side += 0.25 * np.hypot(corners[k, 0] - corners[k - 1, 0], corners[k, 1] - corners[k - 1, 1])
+    prior, J = np.zeros((FIELD + 3, 2)), np.empty(((n + _BLOCK - 1) // _BLOCK, PARAMETERS + 1, _BLOCK))
+    prior[8:FIELD, 1] = (_PRIOR_NOISE * 0.5 / (_BOW_PER_PX * side)) ** 2
+    prior[FIELD, 0], prior[FIELD, 1] = _BLUR2_PRIOR[0], _BLUR2_PRIOR[1] ** -2.0
+    prior[FIELD + 2, 1] = (_PRIOR_NOISE / (_BLEED_SHARE * max(q[FIELD + 1], 1.0))) ** 2
+    if not _minimise(n, px, grid, prior, _STOP if most == PIXELS_LAST else _STOP_FIRST, q, J, inverse):
+        return 2
+    by_field, by_middle, left = np.empty((8, FIELD)), np.zeros((2, FIELD)), np.empty((n + 1, 4))
+    _corners(q, H, uv, by_field)
+    for k in range(8):
+        by_middle[k % 2] += 0.25 * by_field[k]
+    variance = _noise(n, inverse, by_middle, J, left)
+    if not np.sqrt(variance) <= MISFIT_MAX * q[FIELD + 1]:
+        return 3
+    if most < PIXELS_LAST:
+        return 0
+    of_field = variance * inverse[:FIELD, :FIELD]
+    all_corners, middle = (
+        product(product(by_field, of_field), by_field.T),
+        product(product(by_middle, of_field), by_middle.T),
+    )
+    # The corners of one fit have errors in common. Whoever takes them as independent finds the middle as it is then.
+    total = 0.0
+    for k in range(8):
+        total += 0.25 * all_corners[k, k]
+    grown = max(1.0, 4.0 * (middle[0, 0] + middle[1, 1]) / total) * _correlated(n, at, left)
+    for k in range(4):
+        for i in range(2):
+            for j in range(2):
+                cov[k, i, j] = grown * all_corners[2 * k + i, 2 * k + j]
+    return 0
+
+
+@kernel("const u1[:, ::1], const f8[:, ::1], const f8[:, ::1], b1, f8[:, ::1], f8[:, :, ::1]")
+def fit_marker(image: NDArray[np.uint8], corners: Array, grid: Array, whole: bool, uv: Array, cov: Array) -> int:
+    """Fit one marker.
+
+    Args:
+        image: (H, W) grey.
+        corners: (4, 2) rough corners, px.
+        grid: (N + 4, N + 4) its cells as -1 and 1, and two rings around.
+        whole: whether the colour beyond the corners is known.
+        uv: (4, 2) filled with the corners.
+        cov: (4, 2, 2) filled with their covariances, px^2.
+
+    Returns:
+        An index into PROBLEMS.
+    """
+    px, at, here = np.empty((PIXELS_LAST, 8)), np.empty((PIXELS_LAST, 2), np.int64), corners.copy()
+    cell = 0.0
+    for k in range(4):
+        cell += 0.25 * np.hypot(corners[k, 0] - corners[k - 1, 0], corners[k, 1] - corners[k - 1, 1]) / (len(grid) - 4)
+    q, pixels = np.zeros(PARAMETERS), PIXELS_FIRST
+    q[FIELD] = max(1.0, START_BLUR_CELLS * cell) ** 2
+    for _ in range(_ROUNDS):
+        problem = _fit_from(image, here, grid, whole, pixels, q, px, at, uv, cov)
+        if problem != 0:
+            return problem
+        off, moved = 0.0, 0.0
+        for k in range(4):
+            off = max(off, np.hypot(uv[k, 0] - corners[k, 0], uv[k, 1] - corners[k, 1]))
+            moved = max(moved, np.hypot(uv[k, 0] - here[k, 0], uv[k, 1] - here[k, 1]))
+        if not off <= max(MOVED_MAX_CELLS * cell, 1.0):
+            return 4
+        if moved < max(SETTLED_CELLS * cell, SETTLED_PX) and pixels == PIXELS_LAST:
+            return 0
+        here[:], q[:8], pixels = uv, 0.0, PIXELS_LAST  # the homography takes over what is affine or perspective
+    return 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,133 +566,8 @@ def fit_square(
     Returns:
         The fitted corners, or why they cannot be fitted.
     """
-    cell = float(np.mean(np.linalg.norm(np.diff(corners, axis=0, append=corners[:1]), axis=1))) / len(cells)
-    here, blur, pixels = corners, START_BLUR_CELLS * cell, PIXELS_FIRST
-    for _ in range(_ROUNDS):
-        fit = _fit_from(image, here, cells, diagonal, max(1.0, blur), pixels)
-        if fit.problem is not None:
-            return fit
-        moved = np.linalg.norm(fit.uv - here, axis=1).max()
-        if not np.linalg.norm(fit.uv - corners, axis=1).max() <= max(MOVED_MAX_CELLS * cell, 1.0):
-            return _bad(corners, "its corners are not where they were found")
-        if moved < max(SETTLED_CELLS * cell, SETTLED_PX) and pixels == PIXELS_LAST:
-            return fit
-        here, blur, pixels = np.array(fit.uv), 1.0, PIXELS_LAST
-    return _bad(corners, "no convergence")
-
-
-def _fit_from(
-    image: NDArray[np.uint8], corners: Array, cells: NDArray[np.int8], diagonal: int | None, blur: float, pixels: int
-) -> SquareFit:
-    """Fit one marker's field over the homography of given corners, starting at a blur in px."""
-    size = len(cells)
-    H: Array = cv2.getPerspectiveTransform(corners.astype(np.float32), _CORNERS.astype(np.float32)).astype(np.float64)
-    gathered = _gather(image, corners, H, size, diagonal is not None, pixels)
-    if gathered is None or gathered[0].shape[1] < 3 * PARAMETERS:
-        return _bad(corners, "too small or too near the image border")
-    px, at = gathered
-    low, high = np.percentile(px[0], (5, 95))
-    q, prior, inverse = np.zeros(PARAMETERS), np.zeros((FIELD + 3, 2)), np.empty((PARAMETERS, PARAMETERS))
-    q[FIELD], q[FIELD + 1], q[FIELD + 3] = blur * blur, 0.5 * (high - low), 0.5 * (high + low)
-    side = float(np.mean(np.linalg.norm(np.diff(corners, axis=0, append=corners[:1]), axis=1)))
-    prior[8:FIELD, 1] = (_PRIOR_NOISE * 0.5 / (_BOW_PER_PX * side)) ** 2
-    prior[FIELD] = _BLUR2_PRIOR[0], _BLUR2_PRIOR[1] ** -2
-    prior[FIELD + 2, 1] = (_PRIOR_NOISE / (_BLEED_SHARE * max(q[FIELD + 1], 1.0))) ** 2
     grid = np.pad(cells.astype(np.float64), 2, constant_values=1.0)
     grid[np.ix_((0, 1, -2, -1), (0, 1, -2, -1))] = 1.0 if diagonal is None else diagonal
-    J, r = np.empty((PARAMETERS, px.shape[1])), np.empty(px.shape[1])
-    variance = fit_pattern(px.shape[1], px, grid, prior, q, inverse, J, r)
-    if variance < 0.0:
-        return _bad(corners, "no convergence")
-    if not np.sqrt(variance) <= MISFIT_MAX * q[FIELD + 1]:
-        return _bad(corners, "the pattern does not fit")
-    uv, by_field = _corners(q, np.asarray(np.linalg.inv(H), np.float64))
-    cov_field = variance * inverse[:FIELD, :FIELD]
-    cov, middle = by_field @ cov_field @ by_field.transpose(0, 2, 1), by_field.mean(axis=0)
-    # The corners of one fit have errors in common. Whoever takes them as independent finds the middle as it is then.
-    together = 4.0 * np.trace(middle @ cov_field @ middle.T) / np.trace(cov.mean(axis=0))
-    cov *= max(1.0, float(together)) * correlated(at, r, middle @ inverse[:FIELD] @ J)
-    return SquareFit(uv, cov, None)
-
-
-#: Neighbours of pixels, px, between which noise is looked at.
-_NEIGHBOURS = 4
-
-
-def correlated(at: Ids, residuals: Array, gains: Array) -> float:
-    """Return by how much the variance of a fit's result grows because the noise of neighbouring pixels is correlated.
-
-    Args:
-        at: (N, 2) columns and rows of the pixels.
-        residuals: (N,) of the fit.
-        gains: (K, N) derivative of K results by the pixels' grey levels.
-
-    Returns:
-        The mean over the results, one at least. The noise's autocovariance is that of the residuals, over up to four
-        pixels; gains and residuals are correlated by FFT.
-    """
-    x, y = at.T - at.min(axis=0)[:, None]
-    shape = (int(y.max()) + 1 + _NEIGHBOURS, int(x.max()) + 1 + _NEIGHBOURS)
-
-    def lags(values: Array) -> Array:
-        """Return the autocorrelation of values (N,) on the pixels up to a few pixels."""
-        plane = np.zeros(shape)
-        plane[y, x] = values
-        power = np.abs(np.fft.rfft2(plane)) ** 2
-        near = np.arange(-_NEIGHBOURS, _NEIGHBOURS + 1)
-        return np.asarray(np.fft.irfft2(power, shape)[np.ix_(near, near)])
-
-    pairs = lags(np.ones(len(residuals)))
-    rho = np.where(pairs > 0.5, lags(residuals) / np.maximum(pairs, 0.5), 0.0)
-    rho /= max(float(rho[_NEIGHBOURS, _NEIGHBOURS]), 1e-12)
-    factors = [float((rho * by).sum() / by[_NEIGHBOURS, _NEIGHBOURS]) for by in map(lags, gains)]
-    return max(1.0, float(np.mean(factors)))
-
-
-def _bad(corners: Array, problem: str) -> SquareFit:
-    """Return a fit that failed."""
-    return SquareFit(corners, np.zeros((4, 2, 2)), problem)
-
-
-def _gather(
-    image: NDArray[np.uint8], corners: Array, H: Array, size: int, whole: bool, pixels: int
-) -> tuple[Array, Ids] | None:
-    """Collect the pixels of a marker and its margin, (8, n) as in ``fit_pattern``, and their columns and rows (n, 2)."""
-    cell = float(np.sqrt(abs(cv2.contourArea(corners.astype(np.float32))))) / size
-    margin = np.clip(1.0 - MARGIN_GAP_PX / max(cell, 1e-9), *MARGIN_CELLS)
-    reach = 1.0 + 2.0 * float(margin) / size
-    quad = cv2.perspectiveTransform((reach * _CORNERS)[None], np.linalg.inv(H))[0]
-    low = np.maximum(np.floor(quad.min(axis=0)), 0).astype(int)
-    high = np.minimum(np.ceil(quad.max(axis=0)), np.array(image.shape[::-1]) - 1).astype(int)
-    if not (np.isfinite(quad).all() and (high > low).all()):
-        return None
-    v, u = np.mgrid[low[1] : high[1] + 1, low[0] : high[0] + 1].reshape(2, -1)
-    p = H / (H[2] @ [*corners.mean(axis=0), 1.0]) @ np.stack([u, v, np.ones(len(u))])  # positive before the horizon
-    xy = p[:2] / p[2]
-    beyond = (np.abs(xy) > 1.0).all(axis=0)  # beyond the marker's corners
-    inside = (p[2] > 0) & (np.abs(xy) <= reach).all(axis=0) & (whole | ~beyond)
-    chosen = np.flatnonzero(inside)
-    if len(chosen) > pixels:
-        chosen = chosen[np.linspace(0, len(chosen) - 1, pixels).astype(int)]
-    slope = H[:2, None, :2] - xy[:, chosen][:, :, None] * H[2, :2]
-    slope /= (H[2] @ [*corners.mean(axis=0), 1.0]) * p[2, chosen][None, :, None]
-    steep = np.linalg.norm(slope, axis=2)
-    width = np.abs(slope).max(axis=2) / steep
-    cosine = (slope[0] * slope[1]).sum(axis=1) / steep.prod(axis=0)
-    px = np.concatenate([image[v[chosen], u[chosen]][None], xy[:, chosen], 1.0 / steep, width, cosine[None]])
-    return px, np.column_stack([u[chosen], v[chosen]])
-
-
-def _corners(q: Array, H: Array) -> tuple[Array, Array]:
-    """Return the corners (4, 2) and their derivatives (4, 2, FIELD) by the field; H: marker to image."""
-    phi = np.empty((FIELD, 2))
-    uv, by_field = np.empty((4, 2)), np.empty((4, 2, FIELD))
-    for i, corner in enumerate(_CORNERS):
-        at = corner.copy()
-        for _ in range(10):  # the point that the field maps onto the corner; the field is small, so this converges
-            field(at[0], at[1], phi)
-            at = corner - q[:FIELD] @ phi
-        x, y, w = H @ np.array([at[0], at[1], 1.0])
-        uv[i] = x / w, y / w
-        by_field[i] = (H[:2, :2] - uv[i][:, None] * H[2, :2]) / w @ -phi.T
-    return uv, by_field
+    uv, cov, rough = np.zeros((4, 2)), np.zeros((4, 2, 2)), np.ascontiguousarray(corners, np.float64)
+    problem = fit_marker(np.ascontiguousarray(image), rough, grid, diagonal is not None, uv, cov)
+    return SquareFit(uv, cov, PROBLEMS[problem])
