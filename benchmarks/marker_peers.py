@@ -30,11 +30,13 @@ def squares(rng: np.random.Generator, radius: float, count: int = TARGETS) -> np
     return np.array(out)
 
 
-def tag_picture(rng: np.random.Generator, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def tag_picture(
+    rng: np.random.Generator, radius: float, count: int = TARGETS
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return an image of tags, their centres (N, 2) and corners (N, 4, 2)."""
     known = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     light = np.full((HEIGHT, WIDTH), BRIGHT)
-    maps = squares(rng, radius)
+    maps = squares(rng, radius, count)
     for A in maps:
         bits = cv2.aruco.generateImageMarker(known, int(rng.integers(0, 587)), 8, borderBits=1) > 127
         edges = np.linspace(-1, 1, 9)
@@ -45,6 +47,7 @@ def tag_picture(rng: np.random.Generator, radius: float) -> tuple[np.ndarray, np
                 cell = np.array([[x[0], y[0], 1], [x[1], y[0], 1], [x[1], y[1], 1], [x[0], y[1], 1]])
                 add_region(light, polygon_border(cell @ A.T, BLUR), BLUR, DARK - BRIGHT)
     square = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], float)
+    maps = np.reshape(maps, (-1, 2, 3))
     return exposed(light, NOISE, 0.0, rng), maps[:, :, 2], square @ maps.transpose(0, 2, 1)
 
 

@@ -12,12 +12,14 @@ import numpy as np
 
 from armsight.data import Body, Detections, Missed
 from armsight.geometry.pose import inverse, log_se3, pose
+from armsight.vision.markers.aruco import find_squares
+from armsight.vision.markers.tag import Tag, TagTarget
 from armsight.vision.pose.measure import measure_detections
 from armsight.vision.rig import StereoRig
 from disc_images import disc_picture
 from disc_surround import TEXTURES
 from marker_follow import Following
-from marker_peers import moments
+from marker_peers import FAMILY, aruco, moments, nearest, rms, tag_picture
 from marker_plate import LENS, parallel_rig, poses, project, shot, views
 from marker_report import Report, disc_target, last_level_cache_bytes, read_us, ring, timed
 
@@ -217,8 +219,44 @@ def textured(seed: int, report: Report, count: int = 4, rounds: int = 7) -> None
         report.metric(f"16 discs, {label}: over contours", over, "<= 1.0", form=".2f", good=over <= 1)
 
 
+def tags(seed: int, report: Report, count: int = 8, rounds: int = 7) -> None:
+    """Find and fit AprilTags, and OpenCV's with corners refined, interleaved: least and median of the CPU time."""
+    rng, peer = np.random.default_rng(seed), aruco(0.3)
+    for label, shape, many, most in (
+        ("4 tags of 60 px, 1280x720", (720, 1280), 4, 2.0),
+        ("4 tags of 60 px, 640x480", (480, 640), 4, 2.0),
+        ("16 tags of 60 px, 1280x720", (720, 1280), 16, 2.0),
+        ("no tag, 1280x720", (720, 1280), 0, 1.3),
+    ):
+        ms, corners = [], ([], [])
+        while len(ms) < count * rounds:
+            image, _, truth = tag_picture(rng, 30.0, many)
+            inside = np.all((truth.min(axis=1) > 20) & (truth.max(axis=1) < np.array(shape[::-1]) - 20), axis=1)
+            if many and inside.sum() < min(many, 2):
+                continue
+            image = np.ascontiguousarray(image[: shape[0], : shape[1]])
+            ids = [i for i, _ in find_squares(image, FAMILY)] or [0]
+            target = TagTarget("b", tuple(Tag(f"T{i}", FAMILY, i, 0.04, np.eye(4)) for i in sorted(set(ids))))
+            for _ in range(rounds):
+                began = time.process_time_ns()
+                own = target.detect(image)
+                middle = time.process_time_ns()
+                theirs = peer(image)
+                ms.append((1e-6 * (middle - began), 1e-6 * (time.process_time_ns() - middle)))
+            for kept, uv in zip(corners, (own.uv, theirs.reshape(-1, 2)), strict=True):
+                kept.append(nearest(uv, truth.reshape(-1, 2))[0])
+        each = np.reshape(ms, (count, rounds, 2))
+        least, median = np.median(each.min(axis=1), axis=0), np.median(each, axis=(0, 1))
+        px = [rms(np.concatenate(e)) for e in corners]
+        for name, k in (("armsight", 0), ("OpenCV", 1)):
+            report.say(f"  {label}, {name}: least {least[k]:.2f}, median {median[k]:.2f} ms, {px[k]:.4f} px")
+        over = least[0] / least[1]
+        report.metric(f"{label}: over OpenCV", over, f"<= {most}", form=".2f", good=over <= most)
+
+
 def metric(seed: int, report: Report) -> None:
     whole_image(seed, report)
+    tags(seed, report)
     textured(seed, report)
     few_points(seed, report)
     pairs(seed, report)

@@ -9,6 +9,7 @@ from supersampled import expose, paint, picture, project, view
 
 from armsight.geometry.pose import pose
 from armsight.vision.image import grey, read_image
+from armsight.vision.markers import aruco
 from armsight.vision.markers.aruco import APRILTAGS, FAMILIES, cells, family_name, family_size, find_squares
 from armsight.vision.markers.square import fit_square
 from armsight.vision.markers.tag import Tag, TagTarget
@@ -150,6 +151,23 @@ def test_a_body_is_found_with_its_points_in_order():
     assert np.abs(found.uv - truth).max() < 0.06
     other_order = plate(11, 30).detect(expose(painted, 130, 2, np.random.default_rng(5)))
     assert np.abs(other_order.uv - truth[[8, 9, 10, 11, 0, 1, 2, 3]]).max() < 0.06
+
+
+def test_plain_tags_are_read_quickly_and_only_what_is_left_is_searched_again(monkeypatch):
+    painted, truth = seen(30, 2, 11)
+    image, slow = expose(painted, 130, 2, np.random.default_rng(5)), []
+    monkeypatch.setattr(aruco, "detect_markers", lambda *_: slow.append(1) or ((), np.zeros((0, 1), np.int32)))
+    found = dict(find_squares(image, "tag36h11", wanted=[30, 11]))
+    assert sorted(found) == [2, 11, 30]
+    assert np.abs(np.concatenate([found[k] for k in (30, 2, 11)]) - truth).max() < 0.5
+    assert find_squares(np.full((90, 120), 128, np.uint8), "tag36h11") == []
+    assert not slow
+    low, high = truth[4:8].min(axis=0).astype(int), truth[4:8].max(axis=0).astype(int)
+    image[low[1] + 14 : high[1] - 14, low[0] + 14 : high[0] - 14] = 120  # the code is hidden, not the outline
+    assert sorted(dict(find_squares(image, "tag36h11", wanted=[30, 11]))) == [11, 30]
+    assert not slow
+    find_squares(image, "tag36h11", wanted=[30, 2])
+    assert slow
 
 
 def test_a_tag_seen_twice_is_left_out_and_nothing_found_says_so():
