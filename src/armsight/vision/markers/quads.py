@@ -96,7 +96,7 @@ def _threshold(image: Grey, dark: Grey) -> NDArray[np.bool_]:
         edges = False
         for i in range(columns):
             bottom, top = np.int64(low[j + 1, i + 1]), np.int64(high[j + 1, i + 1])
-            edge = top - bottom >= least
+            edge = bool(top - bottom >= least)
             edges |= edge
             level[_TILE * i : _TILE * i + _TILE] = np.uint8((top + bottom + 1) // 2) if edge else np.uint8(0)
         if not edges:
