@@ -1,19 +1,21 @@
 """Rotations: vectors, matrices, quaternions (wxyz) and Euler angles about z, y, x.
 
-Rotation matrices go in and out; scipy's Rotation does the conversions it has. Formulas: Sola, "A micro Lie theory",
-2018; Euler angles: equations 18.15 and 18.16 of "Application of Stereo Vision and ARM Processor for Motion Control".
+Rotation matrices go in and out. Formulas: Sola, "A micro Lie theory", 2018; quaternions of matrices: Shepperd, J. Guidance
+and Control 1(3), 1978; Euler angles: equations 18.15 and 18.16 of "Application of Stereo Vision and ARM Processor for
+Motion Control".
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
 #: Below this cos(pitch) only roll -+ yaw is determined (Euler angles are singular at +-90 degrees).
 SINGULAR_COS_PITCH = 1e-7
+#: Sine of half an angle below which it is that angle, to the last digit; half, double: nothing.
+_SMALL = 1e-9
 
 
 def skew(v: Array) -> Array:
@@ -34,14 +36,17 @@ def skew(v: Array) -> Array:
 
 def exp_so3(phi: Array) -> Array:
     """Convert rotation vectors (..., 3), rad, into rotation matrices (..., 3, 3)."""
-    flat = Rotation.from_rotvec(phi.reshape(-1, 3)).as_matrix()
-    return np.asarray(flat.reshape((*phi.shape, 3)))
+    half = np.linalg.norm(phi, axis=-1, keepdims=True) / 2
+    return from_quaternion_wxyz(np.concatenate([np.cos(half), phi / 2 * np.sinc(half / np.pi)], axis=-1))
 
 
 def log_so3(R: Array) -> Array:
     """Convert rotation matrices (..., 3, 3) into rotation vectors (..., 3), rad, of length at most pi."""
-    flat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()
-    return np.asarray(flat.reshape(R.shape[:-1]))
+    q = quaternion_wxyz(R)
+    v = q[..., 1:]
+    sine = np.linalg.norm(v, axis=-1, keepdims=True)
+    small = sine < _SMALL
+    return v * np.where(small, 2.0, 2 * np.arctan2(sine, q[..., :1]) / np.where(small, 1.0, sine))
 
 
 def nearest_rotation(M: Array, *, mirrored: bool = False) -> Array:
@@ -57,13 +62,25 @@ def nearest_rotation(M: Array, *, mirrored: bool = False) -> Array:
 
 
 def quaternion_wxyz(R: Array) -> Array:
-    """Convert a rotation matrix (3, 3) into a unit quaternion (4,), w x y z, with w >= 0."""
-    return np.asarray(np.roll(Rotation.from_matrix(R).as_quat(canonical=True), 1))
+    """Convert rotation matrices (..., 3, 3) into unit quaternions (..., 4), w x y z, with w >= 0."""
+    R = np.asarray(R)
+    x, y, z = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    by_w, by_x = R - np.swapaxes(R, -1, -2), R + np.swapaxes(R, -1, -2)
+    a, b, c = by_w[..., 2, 1], by_w[..., 0, 2], by_w[..., 1, 0]  # 4 w times x, y, z
+    d, e, f = by_x[..., 0, 1], by_x[..., 0, 2], by_x[..., 1, 2]  # 4 times xy, xz, yz
+    rows = np.array(
+        [[1 + x + y + z, a, b, c], [a, 1 + x - y - z, d, e], [b, d, 1 - x + y - z, f], [c, e, f, 1 - x - y + z]]
+    )
+    best = np.argmax(rows[range(4), range(4)], axis=0)  # of the four squares, so that nothing small is divided by
+    q = np.take_along_axis(np.moveaxis(rows, (0, 1), (-2, -1)), best[..., None, None], axis=-2)[..., 0, :]
+    return np.asarray(q * (np.copysign(1.0, q[..., :1]) / np.linalg.norm(q, axis=-1, keepdims=True)))
 
 
 def from_quaternion_wxyz(q: Array) -> Array:
-    """Convert a quaternion (4,), w x y z, of any length but zero, into a rotation matrix (3, 3)."""
-    return np.asarray(Rotation.from_quat(np.roll(q, -1)).as_matrix())
+    """Convert quaternions (..., 4), w x y z, of any length but zero, into rotation matrices (..., 3, 3)."""
+    q = np.asarray(q) / np.linalg.norm(q, axis=-1, keepdims=True)
+    S = skew(q[..., 1:])
+    return np.asarray(np.eye(3) + 2 * (q[..., :1, None] * S + S @ S))
 
 
 def from_euler_zyx(roll: float, pitch: float, yaw: float) -> Array:
@@ -71,7 +88,14 @@ def from_euler_zyx(roll: float, pitch: float, yaw: float) -> Array:
 
     Roll is about z and yaw about x, as in the source; ROS's roll is about x.
     """
-    return np.asarray(Rotation.from_euler("ZYX", [roll, pitch, yaw]).as_matrix())
+    (sz, sy, sx), (cz, cy, cx) = np.sin([roll, pitch, yaw]), np.cos([roll, pitch, yaw])
+    return np.array(
+        [
+            [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
+            [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx],
+            [-sy, cy * sx, cy * cx],
+        ]
+    )
 
 
 def euler_zyx(R: Array) -> tuple[Array, bool]:

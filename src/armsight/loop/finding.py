@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import Any, Literal
 
-from scipy.special import chdtri, fdtri
+from armsight.estimate.chance import chi_square_limit
 
 #: rig: one camera against the other; body: the body, or what looks the same; fixed: the rig against the arm's base;
 #: time: shots that are not of one time; lens: what the model of the cameras cannot express; joint: a potentiometer that
@@ -106,6 +106,8 @@ def alarm_limit(freedom: int, tests_per_s: float, hypotheses: int = 1, estimated
     """
     chance = FALSE_ALARMS_PER_MINUTE / (60.0 * tests_per_s * hypotheses)
     if estimated is None:
-        return float(chdtri(freedom, chance))
+        return chi_square_limit(freedom, chance)
+    from scipy.special import fdtri  # not above: SciPy takes longer than a pair of images
+
     # The reciprocal of F, since chance is far below what 1 resolves.
     return freedom / float(fdtri(estimated, freedom, chance))

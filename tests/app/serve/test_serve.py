@@ -185,7 +185,7 @@ def test_the_examples_are_what_is_served(rendered, tmp_path):
         .replace("body.toml", str(rendered.plate))
     )
     found = read_config(write(tmp_path / "serve.toml", text))
-    assert (found.command, found.http, found.log) == ("measure", "127.0.0.1:9110", "armsight.log")
+    assert (found.command, found.http, found.log) == ("measure", "127.0.0.1:9110", "serve.log")
     unit = configparser.ConfigParser()
     unit.read(here / "armsight.service")
     assert unit["Service"]["ExecStart"].split()[1:] == ["serve", "/etc/armsight/serve.toml"]

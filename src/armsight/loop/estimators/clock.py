@@ -17,9 +17,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import chdtri
 
 from armsight.data import Array
+from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.matrix import product, solved
 from armsight.kernels import kernel
 from armsight.loop.estimators.estimator import ClockEffect, Innovation, Outcome
@@ -36,7 +36,7 @@ _LEAST_S, _CERTAIN, _STAYS_S, _CERTAIN_SIGMAS = 5e-4, 30.0, 0.5, 3.0
 #: From this chi-square on an offset is said to who watches the innovations: below, it is noise.
 _SAID = 14.0
 #: A measurement that an offset leaves less likely than this says nothing of it: something else is wrong.
-_GATE = float(chdtri(6, 1e-3))
+_GATE = chi_square_limit(6, 1e-3)
 #: Residuals are compared over about this time, s. Beyond so many sigmas the offset changes by other than its rate: it is
 #: taken to walk by that much from then on, less and less with this time constant, s. Residuals that determine an offset no
 #: better than so, s, do not say that it changed: the arm hardly moves, and what the model lacks would be taken for it.

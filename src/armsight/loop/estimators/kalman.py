@@ -18,9 +18,9 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from armsight.data import Array, JointStates
+from armsight.estimate.chance import chi_square_limit
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import Prior
 from armsight.loop.estimators.clock import ClockFollower
@@ -51,7 +51,7 @@ FURTHEST = 8.0
 HISTORY_S = 1.0
 #: Most measurements newer than the readings that are kept waiting.
 MAX_WAITING = 16
-_GATE = float(chdtri(6, CHANCE))
+_GATE = chi_square_limit(6, CHANCE)
 
 
 class Remembered(NamedTuple):

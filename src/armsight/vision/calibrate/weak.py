@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander2d
-from scipy.special import chdtri
 
 from armsight.data import Array
 from armsight.errors import CalibrationError
+from armsight.estimate.chance import chi_square_limit
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.calibrate.result import Calibration
 
@@ -166,7 +166,7 @@ def _by_position(calibration: Calibration) -> float | None:
         basis = np.stack([fields[:, i, k] for i, k in powers], axis=1)
         explained += float(((basis @ np.linalg.lstsq(basis, residuals[rows])[0]) ** 2).sum())
     whole = float((residuals**2).sum())
-    by_chance = float(chdtri(4 * len(powers), _FIELD_CHANCE)) / residuals.size
+    by_chance = chi_square_limit(4 * len(powers), _FIELD_CHANCE) / residuals.size
     return float(np.sqrt(explained / len(residuals))) if explained > max(_FIELD_SHARE, by_chance) * whole else None
 
 

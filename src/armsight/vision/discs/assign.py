@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
-from scipy.special import chdtri
 
 from armsight.data import SIDES, Array, Correspondences, Discs, Dropped, Ids, Missed, Record
+from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import exp_se3
 from armsight.vision.discs.bias import Expected, expect, visible
 from armsight.vision.discs.pairing import DiscView
@@ -23,7 +22,7 @@ from armsight.vision.rig import StereoRig
 
 #: A detection beyond this quantile of the chi-square distribution of its distance is not of this disc.
 GATE_QUANTILE = 1.0 - 1e-5
-_GATE_ONE, _GATE_BOTH = (float(chdtri(n, 1 - GATE_QUANTILE)) for n in (2, 4))
+_GATE_ONE, _GATE_BOTH = (chi_square_limit(n, 1 - GATE_QUANTILE) for n in (2, 4))
 _NONE = np.zeros(0, np.int64)
 #: Rows of the left and of the right camera's discs that may be one disc of the body.
 Claim = tuple[Ids, Ids]
@@ -154,7 +153,8 @@ def _improved(view: DiscView, expected: Expected, T: Array, cov: Array, unique: 
         gap.append((view.discs[side].uv[rows] - expected.uv[m, side]).ravel())
         noises += list(view.covariances(expected, m, side, rows))
     by_pose = np.concatenate(J)
-    S = by_pose @ cov @ by_pose.T + block_diag(*noises)
+    S, rows = by_pose @ cov @ by_pose.T, np.arange(len(by_pose)).reshape(-1, 2)
+    S[rows[:, :, None], rows[:, None, :]] += noises
     gain = np.linalg.solve(S, by_pose @ cov).T
     return T @ exp_se3(gain @ np.concatenate(gap)), cov - gain @ by_pose @ cov
 

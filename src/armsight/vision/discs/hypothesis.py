@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import chdtri
 
 from armsight.data import Array, Correspondences, Ids, Record
+from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import exp_se3, transform
 from armsight.vision.discs.assign import correspondences, settle
 from armsight.vision.discs.bias import LEAST_FACING, Expected, expect, visible
@@ -112,7 +112,7 @@ def hypothesis(view: DiscView, pairs: Pairs, T_left_body: Array, rows: Ids) -> H
 @lru_cache(maxsize=256)
 def _limit(freedom: int) -> float:
     """Chi-square above which a fit is rejected."""
-    return float(chdtri(freedom, 1 - FIT_QUANTILE))
+    return chi_square_limit(freedom, 1 - FIT_QUANTILE)
 
 
 def _fit(view: DiscView, T: Array, rows: Ids) -> _Fit | None:

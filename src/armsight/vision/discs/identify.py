@@ -18,7 +18,6 @@ from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from armsight.data import SIDES, Array, Correspondences, Discs, Ids, Missed, Record
 from armsight.kernels import kernel
@@ -92,6 +91,8 @@ def _most(support: Ids) -> Ids:
 
 def _edges(view: DiscView, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
     """Return nodes (V, 2) of pair and disc, the first and second node (E,) of every edge, and its chi-square (E,)."""
+    from scipy.spatial import cKDTree  # not above: SciPy takes longer than a pair of images
+
     points, tolerance = view.target.body.points, view.made_sigma_m
     sides = np.linalg.norm(points[:, None] - points[None], axis=2)
     pair, disc = np.nonzero(pairs.fits)

@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from armsight.data import Array, Discs, Ids, Record
 from armsight.geometry.pose import inverse, transform
@@ -115,6 +114,8 @@ class DiscView(Record):
 
 def _radius_once(discs: Discs) -> Array:
     """Return (N,) longer half axes, NaN where one as large lies within half of it: the same disc detected again."""
+    from scipy.spatial import cKDTree  # not above: SciPy takes longer than a pair of images
+
     radius = discs.radius_px
     if len(radius) < 2:
         return radius

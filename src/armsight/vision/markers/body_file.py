@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from armsight.data import Array, Body, Record
 from armsight.errors import InputError
@@ -218,6 +217,8 @@ def check_discs(markers: Sequence[Marker], radii_m: Sequence[float]) -> None:
         InputError: a radius or a distance that suggests a wrong unit, or two discs at one position; the message names
             file and entry.
     """
+    from scipy.spatial import cKDTree  # not above: SciPy takes longer than a pair of images
+
     positions = np.array([marker.position for marker in markers])
     away = np.linalg.norm(positions - positions[0], axis=1)
     for marker, radius, distance in zip(markers, radii_m, away, strict=True):

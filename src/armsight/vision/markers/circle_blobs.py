@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from armsight.data import Array, Record
 from armsight.kernels import kernel
@@ -184,6 +183,8 @@ def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Room]:
 
 def _without_repeats(theta: Array, contrast: Array) -> Blobs:
     """Drop outlines of one disc that the next larger copies gave again; the one of the sharpest copy stays."""
+    from scipy.spatial import KDTree  # not above: SciPy takes longer than a pair of images
+
     radius = (theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2) ** -0.25
     keep = np.ones(len(theta), bool)
     if len(theta) > 1:

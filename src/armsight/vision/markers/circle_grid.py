@@ -16,7 +16,6 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from armsight.data import Array, Ids, Record
 from armsight.vision.markers.circle_blobs import Blobs
@@ -99,6 +98,8 @@ def _unevenness(blobs: Blobs, cells: dict[Cell, int]) -> float:
 
 def _neighbours(blobs: Blobs) -> list[Ids]:
     """Return for every outline the nearest ones of its size and contrast."""
+    from scipy.spatial import KDTree  # not above: SciPy takes longer than a pair of images
+
     uv, size = blobs.theta[:, :2], np.log(blobs.radius_px)
     span, out = 0.5 * np.log(_ALIKE), [np.zeros(0, np.int64)] * len(uv)
     for band in np.arange(size.min(), size.max() + span, span):
@@ -156,6 +157,8 @@ def _sides(blobs: Blobs, i: int, js: Ids) -> tuple[int, int] | None:
 
 def _spread(blobs: Blobs, seed: int, sides: tuple[int, int]) -> dict[Cell, int]:
     """Grow a lattice from an outline and two of its neighbours: cell -> outline."""
+    from scipy.spatial import KDTree  # not above: SciPy takes longer than a pair of images
+
     uv = blobs.theta[:, :2]
     tree = KDTree(uv)
     cells = {(0, 0): seed, (1, 0): sides[0], (0, 1): sides[1]}

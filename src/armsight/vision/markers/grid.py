@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from armsight.data import Array, Ids
 from armsight.kernels import kernel
@@ -24,6 +23,8 @@ def rotations(points: Array) -> tuple[tuple[int, Ids], ...]:
         Pairs of the multiple of 90 degrees (1, 2, 3) and the permutation (M,): point i moves to where point perm[i]
         was.
     """
+    from scipy.spatial import KDTree  # not above: SciPy takes longer than a pair of images
+
     p = points[:, :2] - 0.5 * (points[:, :2].min(axis=0) + points[:, :2].max(axis=0))
     tree = KDTree(p)
     tolerance = 0.1 * float(np.asarray(tree.query(p, k=2)[0])[:, 1].min())

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import pdist
 
 from armsight.data import Body, Detections, Record
 from armsight.errors import InputError
@@ -135,6 +134,8 @@ def open_fixed(specs: Sequence[str], target: str) -> tuple[Target, ...]:
 
 def _alike(target: Target, other: Target) -> str:
     """Return why one of two targets may be taken for the other; empty where neither can."""
+    from scipy.spatial.distance import pdist  # not above: SciPy takes longer than a pair of images
+
     if both := _codes(target) & _codes(other):
         return "both have the marker {} {}".format(*min(both))
     apart, beside = (np.sort(pdist(each.body.points)) for each in (target, other))

@@ -18,9 +18,9 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from armsight.data import SIDES, Array, Body, Dropped, Missed, Points, PoseEstimate
+from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
@@ -145,13 +145,13 @@ def _scale(rig: StereoRig, p_body: Array, points: Points, T_left_body: Array) ->
 @lru_cache(maxsize=256)
 def misfit_limit(freedom: int) -> float:
     """Sum of squares beyond which residuals are a misfit, not chance."""
-    return float(chdtri(freedom, 1 - _MISFIT_QUANTILE)) if freedom > 0 else np.inf
+    return chi_square_limit(freedom, 1 - _MISFIT_QUANTILE) if freedom > 0 else np.inf
 
 
 #: A detection whose whitened squared distance from a robust fit is beyond this quantile of the chi-square distribution
 #: is an outlier.
 OUTLIER_QUANTILE = 1.0 - 1e-5
-_LIMIT, _MEDIAN = float(chdtri(2, 1 - OUTLIER_QUANTILE)), float(chdtri(2, 0.5))
+_LIMIT, _MEDIAN = chi_square_limit(2, 1 - OUTLIER_QUANTILE), chi_square_limit(2, 0.5)
 #: A shot in which less than this share of the detections agrees with one pose is missed.
 _AGREEING = 0.5
 #: With this many matched points the rigid fit alone is a safe start; with fewer, its mirror image is tried too, and where
