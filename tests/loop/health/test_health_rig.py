@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from faults import BODY, SIGMAS, SYNC_S, TRUE, ended, ripple, watched_body
 from numpy.polynomial.chebyshev import chebval
-from scipy.linalg import block_diag
 
 from armsight.estimate.change import Hypotheses, changed, explained
 from armsight.geometry.pose import inverse, log_se3
@@ -123,18 +122,24 @@ def test_images_that_do_not_belong_together_in_one_shot_are_no_moved_camera():
 
 def test_the_estimate_is_what_dense_least_squares_gives():
     """The sums before and after with everything eliminated, against one dense fit of all parameters with their priors."""
-    model, sums = ShotModel(replace(TRUE, cov=np.diag(SIGMAS**2), sigma_px=0.0), BODY, 0.0), []
-    for rotated in (None, np.radians([0.02, 0.05, 0.0])):
+    rig = replace(TRUE, cov=np.diag(SIGMAS**2), sigma_px=0.0)
+    model, sums = ShotModel(rig, BODY, 0.0), []
+    for rotated in (np.zeros(3), np.radians([0.02, 0.05, 0.0])):
         shots = [estimate for *_, estimate, _ in watched_body(7, rotated=rotated, seconds=1.5)][::10]
         sums.append(model.information(shots)[0])
-    L, F = model.prior, Table.of(model, BODY, printed=False).F[:, :7]
-    found = changed(sums[1], sums[0], L, F)
+    before, after = sums
+    L, table = model.prior, Table.of(model, BODY, printed=False)
+    F = table.F[:, :7]
+    found = changed(after, before, L, F)
     L = L + 1e-9 * np.eye(model.size)  # the skew's prior is none
-    G = np.hstack([np.eye(model.size), F])
-    H = G.T @ sums[1].H @ G + block_diag(sums[0].H + np.linalg.inv(L @ L.T), np.eye(7))
-    expected = np.linalg.solve(H, G.T @ sums[1].b + np.append(sums[0].b, np.zeros(7)))[model.size :]
-    size = explained(found, Hypotheses(np.arange(7)[None], np.ones(1)), 1.0).size[0]
-    assert size == pytest.approx(expected, rel=1e-3, abs=1e-6)
+    G, prior = np.hstack([np.eye(model.size), F]), np.linalg.inv(L @ L.T)
+    zero = np.zeros((model.size, 7))
+    H = G.T @ after.H @ G + np.block([[before.H + prior, zero], [zero.T, np.eye(7)]])
+    both = np.linalg.solve(H, G.T @ after.b + np.append(before.b, np.zeros(7)))
+    expected = both[model.size :]
+    assert np.linalg.solve(found.H + np.eye(7), found.b) == pytest.approx(expected, rel=1e-3, abs=1e-6)
+    rows = Hypotheses(np.arange(7)[None], np.ones(1))
+    assert explained(found, rows, 1.0).size[0] == pytest.approx(expected, rel=1e-3, abs=1e-6)
 
 
 def test_the_compiled_rows_of_a_shot_are_those_of_a_dense_elimination():
@@ -143,7 +148,8 @@ def test_the_compiled_rows_of_a_shot_are_those_of_a_dense_elimination():
     (_, t, _, before, _), (_, now_s, _, estimate, _) = list(islice(watched_body(9), 0, 6, 5))
     watch = ShotModel(rig, replace(BODY, points=np.asfortranarray(BODY.points)), sync_s := 2e-3)
     watch.passed(before.T_left_body, t)
-    velocity, found = watch._velocity(estimate.T_left_body, now_s), watch.residuals(estimate, now_s)
+    velocity = watch._velocity(estimate.T_left_body, now_s)
+    found = watch.residuals(estimate, now_s)
     seen, points = PixelObservations.of(estimate.points.seen, rig.sigma_px), BODY.points
     fit = fit_pose(rig.cameras, rig.T_left_right, points, seen, estimate.T_left_body, robust=False, steps=0)
     W, A, B = whitened(rig.cameras, rig.T_left_right, points, seen, estimate.T_left_body)

@@ -7,7 +7,8 @@ from faults import watched_body
 from armsight.estimate.change import Sums
 from armsight.loop.health.passing import Leftover
 
-OTHERS, LENS, ROWS, EVERY = 9, 20, 400, np.eye(9)
+OTHERS, LENS, ROWS = 9, 20, 400
+EVERY = np.eye(OTHERS)
 
 
 def sums_of(rng, tau_px, noise, change, count=12):

@@ -149,8 +149,7 @@ class Found(NamedTuple):
         kinds: of them, and of a point its row among the points (else 0).
         value: (D,) of all directions, m, rad, shares, s.
         cov: (D, D) its covariance.
-        begin_s: when the first test after the beginning began, s.
-        since_s: since when, s: of cameras since the test before, which may be of both times.
+        begin_s: since when, s.
         alike: what explains nearly as much as the first: kind and row of a point.
         evidence: twice the log-evidence of the first.
         lasting: whether it had to be seen in two tests.
@@ -160,7 +159,6 @@ class Found(NamedTuple):
     value: Array
     cov: Array
     begin_s: float
-    since_s: float
     alike: tuple[tuple[Kind, int], ...]
     evidence: float
     lasting: bool
@@ -247,8 +245,7 @@ def _time(found: Found, table: Table, points: Sequence[int]) -> HealthFinding:
 
 def _focals(found: Found, table: Table, points: Sequence[int]) -> HealthFinding:
     share, sigma = (100.0 * each for each in _sized(found, FOCAL + 1))
-    longer = "longer" if share > 0 else "shorter"
-    what = f"the focal lengths of both cameras are {abs(share):.3f} % {longer} than calibrated"
+    what = f"the focal lengths of both cameras are {abs(share):.3f} % {'longer' if share > 0 else 'shorter'} than calibrated"
     advice = "fasten focus and zoom of both lenses, let the cameras warm up, and calibrate the rig again"
     return HealthFinding("lens", what, None, abs(share), sigma, "%", advice)
 
@@ -276,7 +273,7 @@ def _strained(found: Found, table: Table, points: Sequence[int]) -> HealthFindin
     n = len(table.names)
     value, basis = table.smooth @ found.value[-27:], table.smooth[:, :9]
     cov = table.smooth @ found.cov[-27:, -27:] @ table.smooth.T
-    rigid = (np.linalg.pinv(basis, rcond=1e-9) @ value).reshape(3, 3)
+    rigid = np.linalg.lstsq(basis, value, rcond=1e-9)[0].reshape(3, 3)
     spin = (basis @ (0.5 * (rigid - rigid.T)).ravel()).reshape(-1, 3)
     shifts = value.reshape(n, 3) - spin
     shifts -= shifts.mean(axis=0)
@@ -345,9 +342,6 @@ def lens_finding(size_px: tuple[float, float], needed: Sequence[Any], cost_m: fl
 
 def of_one_pose(found: HealthFinding) -> HealthFinding:
     """Return a finding that rests on one pose, with what looks the same."""
-    same = (
-        "or the two images do not belong together (another pair's, or the body moved between them); one pose leaves both "
-        "open"
-    )
+    same = "or the two images do not belong together (another pair's, or the body moved between them); one pose leaves both open"
     advice = f"measure more poses; if all say so, {found.advice}"
     return replace(found, what=f"{found.what}; {same}", advice=advice, alternatives=("time",))

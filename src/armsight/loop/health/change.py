@@ -261,11 +261,6 @@ _OTHER: dict[Kind, str] = {
 }
 
 
-def squared_sigmas(values: Array, cov: Array) -> float:
-    """Return the chi-square of values (D,) against zero, of covariance (D, D)."""
-    return float(values @ np.linalg.solve(cov, values))
-
-
 def along_axis(motion: Array, cov: Array, axis: Array) -> bool:
     """Return whether a motion is one along an axis alone, within its sigma.
 
@@ -280,7 +275,7 @@ def along_axis(motion: Array, cov: Array, axis: Array) -> bool:
     across = np.zeros((5, 6))
     across[:2, :3], across[2:, 3:] = np.linalg.svd(axis[None])[2][1:], np.eye(3)
     off, along = across @ motion, float(axis @ motion[:3])
-    chi_square = squared_sigmas(off, across @ cov @ across.T)
+    chi_square = float(off @ np.linalg.solve(across @ cov @ across.T, off))
     return chi_square < _ALONG and along**2 > 4.0 * float(axis @ cov[:3, :3] @ axis)
 
 

@@ -22,7 +22,7 @@ from scipy.special import chdtri
 from armsight.data import Array, PoseEstimate
 from armsight.geometry.pose import adjoint, inverse, log_se3
 from armsight.loop.finding import FALSE_ALARMS_PER_MINUTE, HealthFinding
-from armsight.loop.health.change import FOCAL, along_axis, squared_sigmas
+from armsight.loop.health.change import FOCAL, along_axis
 
 #: Poses of a mean.
 _SHOTS = 5
@@ -70,7 +70,7 @@ class _Landmark:
         if self.newest is None:
             return False
         xi, cov, _ = self.newest
-        return self.shift_m > _LEAST_M and squared_sigmas(xi, cov) > _limit(6)
+        return self.shift_m > _LEAST_M and float(xi @ np.linalg.solve(cov, xi)) > _limit(6)
 
 
 def _limit(freedom: int) -> float:
@@ -195,7 +195,7 @@ def _agreed(last: tuple[Array, Array] | None, now: tuple[Array, Array] | None) -
     if last is None or now is None:
         return None
     apart = now[0] - last[0]
-    return now if squared_sigmas(apart, now[1] + last[1]) < _limit(6) else None
+    return now if float(apart @ np.linalg.solve(now[1] + last[1], apart)) < _limit(6) else None
 
 
 def _cameras(common: tuple[Array, Array], marks: Sequence[_Landmark]) -> HealthFinding:

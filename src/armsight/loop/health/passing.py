@@ -322,9 +322,7 @@ class Passing:
             size = math.hypot(mean, spread)
             sigma = size / math.sqrt(2.0 * len(shares))
             what = f"the focal length of one camera changes against that of the other by {size:.3f} % (RMS), within seconds"
-            advice = (
-                "switch autofocus and image stabilisation off, fasten focus and zoom of both lenses, calibrate again"
-            )
+            advice = "switch autofocus and image stabilisation off, fasten focus and zoom of both lenses, calibrate the rig again"
         return HealthFinding("lens", what, since_s if timed else None, size, sigma, "%", advice, ("rig",))
 
 

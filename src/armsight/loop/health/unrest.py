@@ -55,10 +55,10 @@ class Unrest:
         kept = np.eye(len(t_s)) - Q @ Q.T
         left, noise = kept @ values, np.einsum("nk,kij->nij", kept**2, excess * covs)
         # A shot says of a variance as much as the square of its information.
-        sizes = np.trace(np.linalg.inv(covs.mean(axis=0)) @ noise, axis1=1, axis2=2)
+        sizes = np.trace(np.linalg.solve(covs.mean(axis=0), noise), axis1=1, axis2=2)
         shares = 1.0 / sizes**2
         sums = (left.T * shares) @ left, np.einsum("n,nij->ij", shares, noise), shares.sum(), np.square(shares).sum()
-        self._windows.append((float(np.trace(np.linalg.inv(sums[1]) @ sums[0])), len(t_s), *sums))
+        self._windows.append((float(np.trace(np.linalg.solve(sums[1], sums[0]))), len(t_s), *sums))
         self.cov = np.zeros_like(self.cov)
         if len(self._windows) < _FEWEST:
             return
@@ -66,8 +66,7 @@ class Unrest:
         _, counts, seen, expected, once, twice = (sum(part) for part in zip(*usual, strict=True))
         freedom = float(once**2 / twice) * (1.0 - _TERMS * len(usual) / counts)
         L = np.linalg.cholesky(expected / once)
-        white = np.linalg.inv(L)
-        inner = white @ (seen / once) @ white.T
+        inner = np.linalg.solve(L, np.linalg.solve(L, seen / once).T)
         values, vectors = np.linalg.eigh((inner + inner.T) / 2.0)
         certain = chdtrc(freedom, freedom * values) * len(values) < FALSE_ALARMS_PER_MINUTE / 60.0
         axes = L @ vectors

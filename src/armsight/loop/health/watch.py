@@ -467,17 +467,11 @@ class CameraWatch:
         if shown is not None and self._alarms <= _FRESH:
             shown = self._dated(shown) or shown
         elif shown is not None and before is not None:
-            shown = shown._replace(
-                begin_s=before.begin_s, since_s=before.since_s
-            )  # though the tests of that time are no longer kept
+            shown = shown._replace(begin_s=before.begin_s)  # though the tests of that time are no longer kept
         again = before is not None and shown is not None and before.kinds[0] == shown.kinds[0]
         self._suspect = shown
         self.found = shown if shown is not None and (not shown.lasting or again or (ends and n == 1)) else None
         self._said = self.found or self._said
-        self._suspect_mixture(weighed)
-
-    def _suspect_mixture(self, weighed: Sequence[_Weighed]) -> None:
-        """Widen poses by the hypotheses of the beginning at which they are most probable, if they are."""
         mixtures = [self._mixture(each) for each in weighed]
         best = max(range(len(mixtures)), key=lambda k: mixtures[k][0])
         evidence, moment = mixtures[best]
@@ -516,16 +510,22 @@ class CameraWatch:
 
     def _shown(self, weighed: _Weighed) -> Found | None:
         """Return what the tests from one on show for certain; None where that is nothing."""
+        tests = list(self._tests)[weighed.begin :]
         # A smooth deformation, which has many numbers, is ahead where it is distinguished from all others.
         ranked = sorted(
             self._said_best(weighed.changes), key=lambda each: (_ALIKE if each[2].kind == "smooth" else 0.0) - each[0]
         )
         most, chi_square, cause, k = ranked[0]
         rows = cause.hypotheses.rows[k]
-        least = self._limits[weighed.begin > 0].get(len(rows), np.inf)
-        if most < _CERTAIN if cause.kind == "smooth" else chi_square < least:
+        if cause.kind == "smooth":
+            if most < _CERTAIN:
+                return None
+        elif chi_square < self._limits[weighed.begin > 0][len(rows)]:
             return None
-        if cause.lasting and not self._lasts(weighed, cause, rows):
+        views = [view for each in tests for view in each.views]
+        if cause.lasting and (len(views) < _LEAST_POSES or not _differ(np.array(views))):
+            return None
+        if cause.kind == "point" and not self._steady(weighed, rows):
             return None
         kinds, columns = [(cause.kind, k if cause.kind == "point" else 0)], rows
         # The velocity by which times show is off by a share, which looks like other causes.
@@ -537,16 +537,8 @@ class CameraWatch:
             return None
         if cause.kind == "point" and np.linalg.norm(value[rows]) < _LEAST_M:
             return None
-        since_s = self._tests[weighed.begin if cause.lasting else max(weighed.begin - 1, 0)].sums.begin_s
         alike = [(each.kind, n if each.kind == "point" else 0) for log, _, each, n in ranked[1:] if log > most - _ALIKE]
-        return Found(tuple(kinds), value, cov, weighed.sums.begin_s, since_s, tuple(alike), 2.0 * most, cause.lasting)
-
-    def _lasts(self, weighed: _Weighed, cause: Cause, rows: Ids) -> bool:
-        """Return whether a cause was seen from directions that differ, and a point in most of the shots."""
-        views = [view for each in list(self._tests)[weighed.begin :] for view in each.views]
-        if len(views) < _LEAST_POSES or not _differ(np.array(views)):
-            return False
-        return cause.kind != "point" or self._steady(weighed, rows)
+        return Found(tuple(kinds), value, cov, weighed.sums.begin_s, tuple(alike), 2.0 * most, cause.lasting)
 
     def _values(self, weighed: _Weighed, columns: Ids, cause: Cause, k: int) -> tuple[Array, Array]:
         """Return the sizes (D,) of directions that changed together, and their covariance (D, D)."""
@@ -612,7 +604,7 @@ class CameraWatch:
         newest = self._directions(self._tests[-1].sums)
 
         def one(sums: Sums) -> tuple[Array, Array]:
-            cov = np.asarray(np.linalg.inv(sums.H[np.ix_(columns, columns)] + np.eye(len(columns))), float)
+            cov: Array = np.linalg.inv(sums.H[np.ix_(columns, columns)] + np.eye(len(columns)))
             return cov @ sums.b[columns], cov
 
         (d, cov), (now, cov_now) = one(weighed.sums), one(newest)
@@ -717,7 +709,7 @@ class CameraWatch:
         """
         if self.found is None or not self._timed or self.lens is not None or self.found.kinds != (("rig", 0),):
             return None
-        return None if self.only_newest() else self.found.since_s
+        return None if self.only_newest() else self.found.begin_s
 
     def only_newest(self) -> bool:
         """Return whether only the newest test shows a change: cameras may have moved within it, so the next one decides."""
@@ -734,7 +726,7 @@ class CameraWatch:
         """Return what changed and stays."""
         said, lens = self._said, self.lens
         if said is not None and (lens is None or (said.lasting and said.evidence > lens.chi_square)):
-            said_of = self._of(said, said.since_s if self._timed else None)
+            said_of = self._of(said, said.begin_s if self._timed else None)
             several = self._poses > 1 or (self._timed and self._count > 1)
             return (*(said_of if several else map(of_one_pose, said_of)), *self._nods())
         if lens is not None:
@@ -777,7 +769,7 @@ class CameraWatch:
         weighed = _Weighed(0, one, max(one.square / max(one.freedom, 1.0), 1.0), ())
         value, cov = self._values(weighed, cause.hypotheses.rows[k], cause, k)
         alike = ((second.kind, 0),) if other > most - _ALIKE else ()
-        change = Found(((cause.kind, 0),), value, cov, 0.0, 0.0, alike, most, False)
+        change = Found(((cause.kind, 0),), value, cov, 0.0, alike, most, False)
         found = replace(findings(change, self._table, None, lambda rows: 0.0)[0], cost_mm=None)
         rig = self.rig.perturbed(free_directions(self.rig) @ value[:5])
         body = replace(self._body, points=(1.0 + value[5]) * self._body.points)
