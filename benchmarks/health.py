@@ -224,7 +224,8 @@ def body_run(case: Case, seed: int) -> dict:
     begin_s = case.options.get("at_s", 0.0)
     for monitor, t_s, T, measured, given in faults.watched_body(seed, seconds=BODY_S, **case.options):
         rig = monitor._rig
-        found = rig.found is not None or rig.lens is not None or rig.passing.now or rig.unrest.cov.any()
+        found = rig.alarm or rig.lens is not None or rig._shape.found is not None or rig.passing.now
+        found = found or rig._unrest.cov.any()
         if np.isnan(named_s) and found:
             named_s = t_s
         error, sigma = (inverse(T) @ measured.T_left_body)[:3, 3], np.sqrt(np.trace(measured.cov[:3, :3]))

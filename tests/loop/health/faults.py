@@ -16,7 +16,7 @@ from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health import HealthMonitor
 from armsight.loop.health.change import widened
 from armsight.loop.health.follow import RigFollower
-from armsight.loop.health.shots import ShotModel
+from armsight.loop.health.rig import RigWatch
 from armsight.loop.servo import LoopTiming, PoseServo
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.example_rig import example_rig
@@ -72,7 +72,7 @@ def calibrated_with(lens, rng):
     """
     free = replace(TRUE, cov=np.diag((300 * SIGMAS) ** 2), sigma_px=0.1)
     for _ in range(3):
-        watch, seen = ShotModel(free, BODY, 0.0), []
+        watch, seen = RigWatch(free, BODY, 0.0), []
         for _ in range(40):
             T = pose(exp_so3(rng.uniform(-0.6, 0.6, 3)), np.array([0.1, 0, 0.9]) + rng.uniform(-0.25, 0.25, 3))
             uv = both_pixels(TRUE, BODY.points @ T[:3, :3].T + T[:3, 3])

@@ -8,12 +8,9 @@ import pytest
 from faults import BODY, SIGMAS, SYNC_S, TRUE, ended, ripple, watched_body
 from numpy.polynomial.chebyshev import chebval
 
-from armsight.estimate.change import Hypotheses, changed, explained
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.health import HealthMonitor, Trust
-from armsight.loop.health.causes import Table
-from armsight.loop.health.shots import ShotModel
-from armsight.loop.health.watch import CameraWatch
+from armsight.loop.health.rig import RigWatch
 from armsight.vision.pose.posefit import PixelObservations, fit_pose, whitened
 
 
@@ -67,7 +64,7 @@ def test_to_ask_often_changes_nothing():
     for k, (asked, *_) in enumerate(watched_body(8, rotated=np.radians([0.02, 0.0, 0.0]), seconds=2.9)):
         if k % 20 == 0:
             asked.findings()
-    assert pytest.approx(silent._rig._whole.M, rel=1e-12) == asked._rig._whole.M
+    assert pytest.approx(silent._rig._window.H, rel=1e-12) == asked._rig._window.H
     assert asked.findings() == silent.findings() == asked.findings()
 
 
@@ -105,7 +102,7 @@ def test_images_that_do_not_belong_together_in_one_shot_are_no_moved_camera():
     )
 
     def findings(estimates, period_s):
-        watch = CameraWatch(rig, BODY, SYNC_S)
+        watch = RigWatch(rig, BODY, SYNC_S)
         for k, estimate in enumerate(estimates):
             watch.take(estimate, None if period_s is None else k * period_s)
         return [(found.cause, found.alternatives) for found in watch.findings()]
@@ -121,35 +118,31 @@ def test_images_that_do_not_belong_together_in_one_shot_are_no_moved_camera():
 
 
 def test_the_estimate_is_what_dense_least_squares_gives():
-    """The sums before and after with everything eliminated, against one dense fit of all parameters with their priors."""
+    """The sums with everything eliminated, against one dense fit of all parameters with their priors."""
+    rows = [
+        (t, estimate) for _, t, _, estimate, _ in watched_body(7, rotated=np.radians([0.02, 0.05, 0.0]), seconds=0.9)
+    ][::10]
     rig = replace(TRUE, cov=np.diag(SIGMAS**2), sigma_px=0.0)
-    model, sums = ShotModel(rig, BODY, 0.0), []
-    for rotated in (np.zeros(3), np.radians([0.02, 0.05, 0.0])):
-        shots = [estimate for *_, estimate, _ in watched_body(7, rotated=rotated, seconds=1.5)][::10]
-        sums.append(model.information(shots)[0])
-    before, after = sums
-    L, table = model.prior, Table.of(model, BODY, printed=False)
-    F = table.F[:, :7]
-    found = changed(after, before, L, F)
-    L = L + 1e-9 * np.eye(model.size)  # the skew's prior is none
-    G, prior = np.hstack([np.eye(model.size), F]), np.linalg.inv(L @ L.T)
-    zero = np.zeros((model.size, 7))
-    H = G.T @ after.H @ G + np.block([[before.H + prior, zero], [zero.T, np.eye(7)]])
-    both = np.linalg.solve(H, G.T @ after.b + np.append(before.b, np.zeros(7)))
-    expected = both[model.size :]
-    assert np.linalg.solve(found.H + np.eye(7), found.b) == pytest.approx(expected, rel=1e-3, abs=1e-6)
-    rows = Hypotheses(np.arange(7)[None], np.ones(1))
-    assert explained(found, rows, 1.0).size[0] == pytest.approx(expected, rel=1e-3, abs=1e-6)
+    watch = RigWatch(rig, BODY, 0.0)
+    for t, estimate in rows:
+        watch.take(estimate, t)
+    sums, size = watch._summed(watch._stays).of(watch._size), watch._size
+    found, L, F = watch._estimated(watch._in_priors(sums)), watch.prior, watch._by_fault
+    wide = np.diag(np.array([0.1, 0.1, 1, 1, 1, 1, 0.1]) ** 2.0)
+    L = L + 1e-9 * np.eye(size)  # the skew's prior is none
+    prior = np.linalg.inv(np.block([[L @ L.T, np.zeros((size, 7))], [np.zeros((7, size)), wide]]))
+    G = np.hstack([np.eye(size), F])
+    both = np.linalg.solve(G.T @ sums.H @ G + prior, G.T @ sums.b)
+    assert found.f == pytest.approx(both[size:], rel=1e-3, abs=1e-6)
 
 
 def test_the_compiled_rows_of_a_shot_are_those_of_a_dense_elimination():
     """Pose and own skew as parameters of the normal equations, the skew with its prior; polynomials by numpy."""
     rig = replace(TRUE, cov=np.diag(SIGMAS**2), sigma_px=0.02)
     (_, t, _, before, _), (_, now_s, _, estimate, _) = list(islice(watched_body(9), 0, 6, 5))
-    watch = ShotModel(rig, replace(BODY, points=np.asfortranarray(BODY.points)), sync_s := 2e-3)
-    watch.passed(before.T_left_body, t)
-    velocity = watch._velocity(estimate.T_left_body, now_s)
-    found = watch.residuals(estimate, now_s)
+    watch = RigWatch(rig, replace(BODY, points=np.asfortranarray(BODY.points)), sync_s := 2e-3)
+    watch.take(before, t)
+    found, velocity = watch._residuals(estimate, now_s), watch._velocity(estimate.T_left_body, now_s)
     seen, points = PixelObservations.of(estimate.points.seen, rig.sigma_px), BODY.points
     fit = fit_pose(rig.cameras, rig.T_left_right, points, seen, estimate.T_left_body, robust=False, steps=0)
     W, A, B = whitened(rig.cameras, rig.T_left_right, points, seen, estimate.T_left_body)
@@ -157,14 +150,14 @@ def test_the_compiled_rows_of_a_shot_are_those_of_a_dense_elimination():
     dense[:, 0] = (W @ fit.residuals_px[:, :, None]).ravel()
     dense[:, 1 : 1 + P] = B
     dense[:, 1 + P] = np.einsum("nij,nj->ni", A[:, :3].reshape(-1, 2, 3), points[seen.point]).ravel()
-    dense[:, watch.size] = A @ velocity * np.repeat(seen.camera, 2)
+    dense[:, watch._size] = A @ velocity * np.repeat(seen.camera, 2)
     for k, (side, point) in enumerate(zip(seen.camera, seen.point, strict=True)):
         dense[2 * k : 2 * k + 2, 2 + P + 3 * point :][:, :3] = A[2 * k : 2 * k + 2, :3]
         x, y = 2.0 * (seen.uv[k] + 0.5) / rig.cameras[side].image_size_px - 1.0
         each = [chebval(x, np.eye(5)[i]) * chebval(y, np.eye(5)[j]) for i in range(5) for j in range(5 - i)]
         for axis in range(2):
-            dense[2 * k : 2 * k + 2, watch.size + 1 + 15 * (2 * side + axis) :][:, :15] = np.outer(W[k, :, axis], each)
-    first = np.column_stack([A, sync_s * dense[:, watch.size]])
+            dense[2 * k : 2 * k + 2, watch._size + 1 + 15 * (2 * side + axis) :][:, :15] = np.outer(W[k, :, axis], each)
+    first = np.column_stack([A, sync_s * dense[:, watch._size]])
     prior = np.diag([0.0] * 6 + [1.0])
     cross = first.T @ dense
     expected = dense.T @ dense - cross.T @ np.linalg.solve(first.T @ first + prior, cross)

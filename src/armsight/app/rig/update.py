@@ -19,8 +19,8 @@ from armsight.app.show.table import TextTable
 from armsight.data import Missed
 from armsight.errors import InputError
 from armsight.files import read_json
+from armsight.loop.health.rig import TEST_S
 from armsight.loop.health.update import DEPTHS_M, LEAST_STAYS, RigUpdate, updated_rig
-from armsight.loop.health.watch import TEST_S
 from armsight.vision.detections import SeenShot, detection_times, read_detections
 from armsight.vision.markers.targets import open_body
 from armsight.vision.rig import StereoRig

@@ -23,9 +23,8 @@ from armsight.loop.estimators import Mounting
 from armsight.loop.finding import Cause
 from armsight.loop.health.base_motion import BaseMotion, KeptMeasurement, Moved
 from armsight.loop.health.change import Change
-from armsight.loop.health.shots import differ
+from armsight.loop.health.rig import TEST_S, RigWatch, differ
 from armsight.loop.health.update import LEAST_STAYS, RigUpdate, updated_rig
-from armsight.loop.health.watch import TEST_S, CameraWatch
 from armsight.vision.detections import SeenShot
 from armsight.vision.match import gate
 from armsight.vision.pose.locate import locate
@@ -210,7 +209,7 @@ class RigFollower:
         return one
 
     def _of_watch(
-        self, watch: CameraWatch, poses: Sequence[tuple[float, PoseEstimate]], at_s: float
+        self, watch: RigWatch, poses: Sequence[tuple[float, PoseEstimate]], at_s: float
     ) -> RigCorrection | None:
         """Return the cameras put right, where nothing else is found to have changed."""
         since_s = watch.moved_since_s()

@@ -20,7 +20,7 @@ from armsight.loop.health.fixed import FixedWatch, ShakeWatch
 from armsight.loop.health.follow import RigCorrection
 from armsight.loop.health.host import HostWatch
 from armsight.loop.health.landmarks import LandmarkWatch
-from armsight.loop.health.watch import TEST_S, CameraWatch
+from armsight.loop.health.rig import TEST_S, RigWatch
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.rig import StereoRig
 
@@ -49,7 +49,7 @@ class HealthMonitor:
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
         self._body, self._sync_s, self._printed = body, sync_s, printed
-        self._rig = CameraWatch(rig, body, sync_s, printed=printed) if rig.cov.any() else None
+        self._rig = RigWatch(rig, body, sync_s, printed=printed) if rig.cov.any() else None
         self._host = HostWatch()
         self.stamps: FrameClock | None = None
         self._landmarks: LandmarkWatch | None = None
@@ -174,7 +174,7 @@ class HealthMonitor:
         """Whether what an estimator makes of the poses is watched."""
         return self._fixed is not None
 
-    def cameras_moved(self) -> CameraWatch | None:
+    def cameras_moved(self) -> RigWatch | None:
         """Return a copy of the watch of the cameras that found a change, for another thread; None where it found none."""
         if self._rig is None or not self._rig.wrong_at_rest:
             return None
@@ -261,7 +261,7 @@ class HealthMonitor:
 
     def _watch_cameras(self, rig: StereoRig) -> None:
         """Begin the tests of cameras, as they are now, anew."""
-        self._rig = CameraWatch(rig, self._body, self._sync_s, printed=self._printed)
+        self._rig = RigWatch(rig, self._body, self._sync_s, printed=self._printed)
         self._suspected, self._cameras_s = None, np.inf
 
     @property

@@ -31,34 +31,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.estimate.change import Sums, changed, eliminated, evidence_of_width
 from armsight.loop.finding import HealthFinding
-from armsight.loop.health.shots import UNKNOWN_SHARE, ExposedShot
+from armsight.loop.health.shape import ResidualSums, eliminated
 
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
 _APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
 #: Standard deviations that are tried of what is anew in each shot: rotations about an axis, rad, a focal length's share.
 #: Half: a nod of 0.1 deg counts for less against times, double: one of 0.3 deg counts, too, in which poses are not linear.
 _NOD_RAD = tuple(1e-5 * 2.0**k for k in range(9))
+#: The velocity of measured poses is off by this share of the speed in any direction; half: rig and body are blamed for what
+#: is left of late images, double: less of them is seen.
+_UNKNOWN_SHARE = 0.2
+#: The body's motion at a shot is that of so many newest ones, if these are of so short a time, s.
+TRACK, _LONGEST_S = 5, 1.0
 #: Log-evidence by which a hypothesis must be ahead of all others to be taken; half: chance takes one of 100 tests for it.
 _AHEAD = math.log(1e4)
 #: Hypotheses whose log-evidence is nearer than this are not distinguished: 12 of chi-square.
 _ALIKE = 6.0
 #: Times are another in each shot where their own part is this share of what all have in common at the least.
 _CONSTANT = 0.4
-#: A focal length changed once where the mean of its tests is so many times what they scatter; half: slow breathing is taken
-#: for that, double: noise is taken for breathing.
-_STEADY = 3.0
 #: Tests that must show something before it is said: one in which a camera moved is of both times, and looks alike.
 _LEAST = 2
 #: Of the columns of a shot those of times: of the right camera, of the rows of the right and of the left one; acceleration.
 _TIMES = [0, 7, 8, 9]
+#: An acceleration moves the body like so many seconds of it, where times are of a second.
+_BENT_S = 0.1
+#: Standard deviation of the focal length of a test, as a share: so wide that it decides nothing beside the column's own.
+_FOCAL = 0.05
 #: Standard deviations of coefficients that are tried, px; 0 is none.
 _TAU_PX = np.array([0.0, *(1e-3 * 2.0**k for k in range(7))])
 #: Before anything is seen none is so much more probable than any other; half: fine noise counts as it, double: what some
@@ -68,6 +74,68 @@ _NONE = 30.0
 _ODD = 0.02
 #: So many residuals of unit variance are assumed before those of a test; half: tests of few poses scatter more.
 _USUAL = 30.0
+
+
+def velocity(before: Array, after: Array, seconds: float) -> Array:
+    """Return the velocity (6,) in the body's axes, 1/s, that takes a pose (4, 4) to another, by a small angle."""
+    R = before[:3, :3].T @ after[:3, :3]
+    rotation = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    shift = after[:3, :3].T @ (after[:3, 3] - before[:3, 3])
+    return np.asarray(np.concatenate([shift, rotation]) / seconds)
+
+
+class ExposedShot(NamedTuple):
+    """By how much the times of exposure move the residuals of a shot.
+
+    Attributes:
+        A: (n, 6) derivative of the residuals by the pose, in standard deviations; rows u, v of the left image and of the
+            right one, point by point.
+        roll: (n,) the row of the image, from -1 at its top to 1.
+        track: times, s, and poses T_left_body (4, 4) of the newest shots up to this one.
+    """
+
+    A: Array
+    roll: Array
+    track: tuple[tuple[float, Array], ...]
+
+    def of(self, rows: NDArray[np.bool_]) -> ExposedShot:
+        """Return that of some rows."""
+        return self._replace(A=self.A[rows], roll=self.roll[rows])
+
+    def motion(self) -> tuple[Array, Array]:
+        """Return velocity and acceleration (6,) of the body in its axes, 1/s and 1/s^2; zero where they are unknown.
+
+        They are those of each second shot: what a shot has of its own and the next one not leaves them right.
+        """
+        if len(self.track) < TRACK:
+            return np.zeros(6), np.zeros(6)
+        (first_s, first), (middle_s, middle), (last_s, last) = self.track[0], self.track[TRACK // 2], self.track[-1]
+        if not first_s < middle_s < last_s < first_s + _LONGEST_S:
+            return np.zeros(6), np.zeros(6)
+        early, late = velocity(first, middle, middle_s - first_s), velocity(middle, last, last_s - middle_s)
+        return 1.5 * late - 0.5 * early, (late - early) * 2.0 / (last_s - first_s)
+
+    def moved(self) -> Array:
+        """Return what (n, 10) moves the residuals.
+
+        1 s later in the right image, other motions there (6), 1 s at the edge of the right and of the left one; and what
+        the first lacks of a body that accelerates.
+        """
+        right = np.arange(len(self.A)) % 4 >= 2
+        by_right, (along, acceleration) = self.A * right[:, None], self.motion()
+        speeds = np.repeat(np.linalg.norm(along.reshape(2, 3), axis=1) / math.sqrt(3.0), 3)
+        rolled = self.roll * (self.A @ along)
+        skew, bent = by_right @ along, _BENT_S * (by_right @ acceleration)
+        return np.column_stack([skew, _UNKNOWN_SHARE * speeds * by_right, rolled * right, rolled * ~right, bent])
+
+    def without_pose(self) -> Array:
+        """Return the same (n, 10) with the pose eliminated."""
+        Q, moved = np.linalg.qr(self.A)[0], self.moved()
+        return np.asarray(moved - Q @ (Q.T @ moved))
+
+    def response(self) -> Array:
+        """Return what (6, 10) these do to the pose."""
+        return np.asarray(np.linalg.lstsq(self.A, self.moved(), rcond=None)[0])
 
 
 @dataclass(frozen=True)
@@ -141,7 +209,7 @@ def _apart(apart_s: float, W: Array, b: Array, weights: Array) -> Apart:
     return Apart(apart_s, rms_s, gained, occam, shared_s, information)
 
 
-def eliminate(found: Apart, shots: Sequence[tuple[Array, Array, float]], sums: Sums) -> None:
+def eliminate(found: Apart, shots: Sequence[tuple[Array, Array, float]], sums: ResidualSums) -> None:
     """Take what times of exposure explain out of sums.
 
     Args:
@@ -175,9 +243,7 @@ class Passing:
     focal: tuple[float, tuple[float, ...]] = (math.inf, ())
     apart_s: float = 0.0
     focal_share: float = 0.0
-    unsure: tuple[str, ...] = ()
-    _wide: float = 1.0  # width of its prior, and its sigma
-    _sigma: float = 0.0
+    unsure: tuple[str, ...] = field(default=())
 
     @property
     def now(self) -> bool:
@@ -186,54 +252,56 @@ class Passing:
 
     def decide(
         self,
-        test: Sums,
-        evidence: Callable[[Sums, float], tuple[float, float]],
-        focal: tuple[int, float],
+        every: ResidualSums,
+        evidence: Callable[[ResidualSums, float], tuple[float, float]],
+        size: int,
         found: Apart | None,
-        rest: Sums | None,
-        field: Callable[[float], float],
+        sums: ResidualSums | None,
     ) -> Literal["time", "lens"] | None:
         """Decide what explains a test best, and return it: None where it is something that stays.
 
         Args:
-            test: sums of the directions of what may have changed, in units of their priors.
+            every: the sums of the test: parameters, seven numbers, candidates, the first of which is a focal length.
             evidence: returns the log-evidence of what stays, and of the focal length, of sums and a variance of the noise.
-            focal: which of the directions is the focal length, and the width of its prior.
+            size: K, how many parameters there are.
             found: times of exposure that explain it.
-            rest: the sums with these eliminated.
-            field: returns the log-evidence of what the camera models cannot express.
+            sums: those with these eliminated.
         """
         # What the test before showed goes on, more likely than that it ended and something else began.
         by_lens, by_apart = (-_AHEAD if shown else 0.0 for shown in (self.focal_share, self.apart_s))
         self.apart_s = self.focal_share = 0.0
-        by_time = 0.0 if rest is None else test.square - rest.square
-        left = test.square - max(float(test.b @ np.linalg.solve(test.H + np.eye(len(test.b)), test.b)), by_time)
-        excess = max(left / max(test.freedom, 1.0), 1.0)
-        stays, lens = evidence(test, excess)
-        stays = max(stays, field(excess))
+        cost = float(eliminated(every.M[: 1 + size, : 1 + size], slice(1, 1 + size))[0, 0])
+        M = eliminated(every.M, slice(1, 1 + size))
+        all_explain = (
+            cost - float(M[0, 0]) + float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0]))
+        )
+        by_time, left = 0.0, cost - all_explain
+        if found is not None and sums is not None:
+            by_time = cost - float(eliminated(sums.M[: 1 + size, : 1 + size], slice(1, 1 + size))[0, 0])
+            left = min(left, cost - by_time)
+        excess = max(left / max(every.freedom, 1.0), 1.0)
+        stays, lens = evidence(every, excess)
         time = alone = -math.inf
-        if found is not None and rest is not None:  # what stays may have happened besides
+        if found is not None and sums is not None:  # what stays may have happened besides
             alone = 0.5 * (by_time / excess - found.occam)
-            time = alone + max(evidence(rest, excess)[0], 0.0)
+            time = alone + max(evidence(sums, excess)[0], 0.0)
+        first = max(time, lens)
         self.unsure = tuple(
             cause
             for cause, each in (("time", alone), ("lens", lens))
             if each > max(stays - _ALIKE, _AHEAD) and each <= stays
         )
-        # A focal length is one of what stays, too: it need not be ahead of itself; nor times that all shots have in common.
-        least = by_apart or (0.0 if found is not None and found.apart_s == 0.0 else _AHEAD)
-        ahead = time < stays + least if time >= lens else lens < stays + by_lens - 1e-9
-        if max(time, lens) < _AHEAD or ahead:
+        # A focal length is one of what stays, too: it need not be ahead of itself.
+        if first < _AHEAD or (time < stays + (by_apart or _AHEAD) if time >= lens else lens < stays + by_lens - 1e-9):
             return None
         if time >= lens:
             assert found is not None
             self.apart_s = math.hypot(found.apart_s, float(np.linalg.norm(found.shared_s[:3])))
-            self.apart = min(self.apart[0], test.begin_s), (*self.apart[1], found)
+            self.apart = min(self.apart[0], every.begin_s), (*self.apart[1], found)
             return "time"
-        row, self._wide = focal
-        self.focal_share = self._wide * float(test.b[row] / (test.H[row, row] + 1.0))
-        self._sigma = self._wide / math.sqrt(test.H[row, row] + 1.0)
-        self.focal = min(self.focal[0], test.begin_s), (*self.focal[1], self.focal_share)
+        M = eliminated(every.M, slice(1, 1 + size))
+        self.focal_share = _FOCAL * float(M[0, 8] / (M[8, 8] + 1.0))
+        self.focal = min(self.focal[0], every.begin_s), (*self.focal[1], self.focal_share)
         return "lens"
 
     def added(self, exposed: ExposedShot, by_focal: Array) -> Array:
@@ -241,7 +309,7 @@ class Passing:
 
         Args:
             exposed: its shot.
-            by_focal: (6,) its response to a focal length, in units of its prior.
+            by_focal: (6,) its response to a focal length, in units of ``_FOCAL``.
         """
         added = np.zeros((6, 6))
         if self.apart_s:
@@ -249,7 +317,7 @@ class Passing:
             added += by @ by.T
         if self.focal_share:
             spread = math.sqrt(float(np.mean(np.square(self.focal[1]))))
-            added += (spread / self._wide) ** 2 * np.outer(by_focal, by_focal)
+            added += (spread / _FOCAL) ** 2 * np.outer(by_focal, by_focal)
         return added
 
     def among(self, stays: tuple[HealthFinding, ...], *, timed: bool) -> tuple[HealthFinding, ...]:
@@ -259,10 +327,10 @@ class Passing:
             unsure = [each for each in ("time", "lens") if each in self.unsure]
             return tuple(_besides(each, unsure) if each.cause in ("rig", "body") else each for each in stays)
         found = self._time_finding(timed=timed) if times >= focals else self._lens_finding(timed=timed)
-        # What is left of it looks like what stays: that cannot be excluded, but what was found before.
+        if focals > times:  # one that stays is sized better
+            found = next((each for each in stays if each.cause == "lens"), found)
+        # What is left of it looks like what stays: that cannot be excluded.
         before = [each for each in stays if found.since_s and each.since_s and each.since_s < found.since_s - 1.0]
-        if any(each.cause == found.cause for each in before):
-            found, before = replace(found, since_s=min(each.since_s for each in before if each.since_s)), []
         others = [each.cause for each in stays if each not in before]
         return (*before, _besides(found, [*others, *(("lens",) if 0 < focals <= times else ())]))
 
@@ -277,7 +345,7 @@ class Passing:
         # What the velocity lacks is lacking in all shots alike.
         size, sigma = (
             1e3 * float(mean_s[k]),
-            1e3 * math.hypot(float(sigmas_s[k]), 0.5 * UNKNOWN_SHARE * float(mean_s[k])),
+            1e3 * math.hypot(float(sigmas_s[k]), 0.5 * _UNKNOWN_SHARE * float(mean_s[k])),
         )
         if own_s > _CONSTANT * abs(mean_s[k]):
             size = 1e3 * math.sqrt(float(np.mean([each.rms_s**2 for each in tests])))
@@ -309,21 +377,18 @@ class Passing:
     def _lens_finding(self, *, timed: bool) -> HealthFinding:
         """Return the finding of a focal length that changes."""
         since_s, shares = self.focal
-        mean, spread = 100.0 * float(np.mean(shares)), 100.0 * float(np.std(shares))
-        if abs(mean) > _STEADY * spread:
-            size, sigma = abs(mean), max(100.0 * self._sigma, spread / math.sqrt(len(shares)))
-            longer, shorter = ("left", "right") if mean > 0 else ("right", "left")
-            what = (
-                f"the focal length of the {longer} camera is {size:.3f} % longer against that of the {shorter} one than "
-                "calibrated; which of the two changed cannot be distinguished"
-            )
-            advice = "fasten focus and zoom of both lenses, let the cameras warm up, and calibrate the rig again"
-        else:
-            size = math.hypot(mean, spread)
-            sigma = size / math.sqrt(2.0 * len(shares))
-            what = f"the focal length of one camera changes against that of the other by {size:.3f} % (RMS), within seconds"
-            advice = "switch autofocus and image stabilisation off, fasten focus and zoom of both lenses, calibrate the rig again"
-        return HealthFinding("lens", what, since_s if timed else None, size, sigma, "%", advice, ("rig",))
+        size = 100.0 * math.sqrt(float(np.mean(np.square(shares))))
+        what = f"the focal length of one camera changes against that of the other by {size:.3f} % (RMS), within seconds"
+        return HealthFinding(
+            "lens",
+            what,
+            since_s if timed else None,
+            size,
+            size / math.sqrt(2.0 * len(shares)),
+            "%",
+            "switch autofocus and image stabilisation off, fasten focus and zoom of both lenses, calibrate the rig again",
+            ("rig",),
+        )
 
 
 def _besides(found: HealthFinding, causes: Sequence[str]) -> HealthFinding:
@@ -335,69 +400,54 @@ def _besides(found: HealthFinding, causes: Sequence[str]) -> HealthFinding:
 class Leftover:
     """What images leave beyond their noise, of all tests so far.
 
-    Args:
-        wide: (K, P) square root of the covariance of the parameters once everything may have changed.
-        L: (K, Q) that of their own error.
-        F: (K, D) directions of what is as in the test before, for the evidence.
-
     Attributes:
         tau_px: standard deviation of a polynomial's coefficient in a test, px.
     """
 
-    def __init__(self, wide: Array, L: Array, F: Array) -> None:
+    def __init__(self) -> None:
         self._evidence = np.log([_NONE, *np.ones(len(_TAU_PX) - 1)])
-        self._wide, self._L, self._F = wide, L, F
-        self.tau_px, self._before = 0.0, (np.zeros(F.shape[1]), np.eye(F.shape[1]))
+        self.tau_px, self._before = 0.0, (np.zeros(7), np.eye(7))
 
-    def seen(self, sums: Sums, share: float) -> tuple[float, Array]:
+    def seen(self, sums: ResidualSums, lens: int, points: int, seven: slice, share: float) -> tuple[float, Array]:
         """Return of a test the variance of its noise, kappa, and the log-evidence of each tau that is tried.
 
         Args:
-            sums: of the parameters and of the coefficients, px, which stand last.
+            sums: of all that may have changed, in units of its priors, and of the coefficients, px, which stand last.
+            lens: how many coefficients there are.
+            points: how many numbers before them are of single points: these are as before for the evidence.
+            seven: which of the sums are the seven numbers: for the evidence they are those of the test before.
             share: of the shots those that differ from each other.
         """
-        K, P = self._wide.shape
-        lens, most = len(sums.b) - K, float(_TAU_PX[-1])
-        H = self._wide.T @ sums.H[:K, :K] @ self._wide
-        M = coefficients(sums, self._wide)
+        first = len(sums.M) - lens
+        H, most = sums.H[: first - 1, : first - 1], float(_TAU_PX[-1])
+        M = eliminated(sums.M, slice(1, first))
         G, b = most**2 * M[1:, 1:] + np.eye(lens), most * M[1:, 0]
-        explained = float(np.trace(np.linalg.solve(H + np.eye(P), H))) + lens - float(np.trace(np.linalg.inv(G)))
+        explained = float(np.trace(np.linalg.solve(H + np.eye(len(H)), H))) + lens - float(np.trace(np.linalg.inv(G)))
         left = float(M[0, 0]) - float(b @ np.linalg.solve(G, b))
         noise = max((_USUAL + left) / (_USUAL + max(sums.freedom - share * explained, 0.0)), 1.0)
-        mean, root = self._before
-        M = coefficients(sums.over(noise), np.hstack([self._L, self._F @ root]), self._F @ mean)
-        return noise, evidence_of_width(M[1:, 1:], M[1:, 0], _TAU_PX)
+        rows = np.delete(np.arange(len(sums.M)), slice(first - points, first))
+        as_before = np.eye(len(rows))
+        as_before[seven, 0], as_before[seven, seven] = self._before
+        M = eliminated(as_before.T @ sums.M[np.ix_(rows, rows)] @ as_before / noise, slice(1, first - points))
+        values, V = np.linalg.eigh(M[1:, 1:])
+        variances = np.square(_TAU_PX)[:, None]
+        ratio = 1.0 + variances * np.maximum(values, 0.0)
+        return noise, 0.5 * (variances * np.square(V.T @ M[1:, 0]) / ratio - np.log(ratio)).sum(axis=1)
 
-    def passed(self, test: Sums) -> None:
-        """Take the sums of the newest test, of the parameters: what it says of the directions."""
-        one = changed(test, Sums.empty(len(test.b)), self._L, self._F)
-        cov = np.linalg.inv(one.H + np.eye(len(one.b)))
-        self._before = cov @ one.b, np.linalg.cholesky(cov)
+    def passed(self, test: ResidualSums) -> None:
+        """Take the sums of the newest test, of the parameters and the seven numbers: what it says of these."""
+        M = eliminated(test.M, slice(1, len(test.M) - 7))
+        cov = np.linalg.inv(M[1:, 1:] + np.eye(7))
+        self._before = -cov @ M[1:, 0], np.linalg.cholesky(cov)
 
     def take(self, evidence: Array) -> None:
         """Count a test's log-evidence."""
         self._evidence = self._evidence + np.logaddexp(evidence - evidence.max(), math.log(_ODD))
         self.tau_px = float(_TAU_PX[int(np.argmax(self._evidence))])
 
-    def without(self, sums: Sums, noise: float) -> Sums:
+    def without(self, sums: ResidualSums, lens: int, noise: float) -> ResidualSums:
         """Return sums without the coefficients, which are eliminated, and over the variance of the noise."""
-        first, variance = 1 + len(self._wide), self.tau_px**2 / noise
+        first, variance = len(sums.M) - lens, self.tau_px**2 / noise
         found, across = sums.of(first - 1), sums.M[first:, :first]
-        inner = variance * sums.M[first:, first:] + np.eye(len(across))
-        return Sums(found.M - variance * across.T @ np.linalg.solve(inner, across), sums.freedom, sums.begin_s).over(
-            noise
-        )
-
-
-def coefficients(sums: Sums, root: Array, mean: Array | None = None) -> Array:
-    """Return sums of the coefficients that stand last (1 + M, 1 + M), the first parameters eliminated.
-
-    Their covariance has a square root (K, P), and they are about a mean (K,).
-    """
-    K, P = root.shape
-    by = np.zeros((len(sums.M), 1 + P + len(sums.M) - 1 - K))
-    by[0, 0], by[1 : 1 + K, 1 : 1 + P] = 1.0, root
-    by[1 + K :, 1 + P :] = np.eye(len(sums.M) - 1 - K)
-    if mean is not None:
-        by[1 : 1 + K, 0] = -mean
-    return eliminated(by.T @ sums.M @ by, slice(1, 1 + P))
+        found.M -= variance * across.T @ np.linalg.solve(variance * sums.M[first:, first:] + np.eye(lens), across)
+        return found.over(noise)

@@ -1,7 +1,7 @@
 """The relative pose of the cameras estimated again from a body in view, where the cameras moved after their calibration.
 
 In: a calibrated rig, a body, and detections of it. Out: the rig with what these say of it, with its covariance; or why
-they say too little. Model and sums are those of :mod:`armsight.loop.health.shots`. All parameters of the rig are estimated,
+they say too little. Model and sums are those of :mod:`armsight.loop.health.rig`. All parameters of the rig are estimated,
 with the calibration as their prior; the prior of the right camera's pose is dropped, except for the length of the
 baseline: the shots cannot distinguish it from the size of the body.
 
@@ -23,11 +23,10 @@ from typing import Any
 import numpy as np
 
 from armsight.data import Array, Body, Correspondences, Missed, PoseEstimate, Record
-from armsight.estimate.change import Sums
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.finding import HealthFinding
-from armsight.loop.health.shots import ShotModel, free_directions
-from armsight.loop.health.watch import CameraWatch
+from armsight.loop.health.rig import RigWatch, free_directions
+from armsight.loop.health.shape import ResidualSums
 from armsight.vision.detections import SeenShot
 from armsight.vision.match import epipolar_distances, gate
 from armsight.vision.pose.locate import locate
@@ -135,7 +134,7 @@ def updated_rig(
         if not found:
             reason = next((each.reason for each in measured if isinstance(each, Missed)), "no shot")
             return Missed(f"the body is measured in no shot: {reason}")
-        watch = ShotModel(replace(new, cov=prior, sigma_px=noise_px), body, 0.0)
+        watch = RigWatch(replace(new, cov=prior, sigma_px=noise_px), body, 0.0)
         sums, stays = watch.information(found)
         if stays < LEAST_STAYS:
             return Missed(
@@ -152,7 +151,7 @@ def updated_rig(
         so_far[:count] = _difference(rig, new)
         whole = L @ np.linalg.solve(L.T @ sums.H @ L + np.eye(len(L)), L.T)
         step = whole @ (sums.b + sums.H @ so_far)
-        noise_px *= float(np.sqrt(sums.left(step - so_far) / max(sums.freedom, 1.0)))
+        noise_px *= float(np.sqrt(_left(sums, step - so_far) / max(sums.freedom, 1.0)))
         new, cov = rig.perturbed(step[:count]), whole[:count, :count]
     new = replace(new, cov=(cov + cov.T) / 2)
     some = shots[:: -(-len(shots) // _SIZED)]
@@ -169,7 +168,7 @@ def contradiction(rig: StereoRig, body: Body, missed: Sequence[PoseEstimate], sh
         missed: poses of shots that contradict it, measured with a wide gate.
         shots: how many do, and how many show the body.
     """
-    moved, resized, found = CameraWatch(rig, body, 0.0).explained(missed)
+    moved, resized, found = RigWatch(rig, body, 0.0).explained(missed)
     seen = [each.points.seen for each in missed]
     again = [locate(moved, resized, triangulate(moved, resized, gate(moved, resized, each))) for each in seen]
     right = sum(isinstance(each, PoseEstimate) for each in again)
@@ -215,11 +214,11 @@ class _Change(Record):
         new: StereoRig,
         body: Body,
         before: Sequence[SeenShot],
-        after: tuple[ShotModel, Sums],
+        after: tuple[RigWatch, ResidualSums],
         noise_px: float,
     ) -> _Change:
         """Estimate the change from shots before it, and the sums of those after it, which are about a rig ``new``."""
-        watch, later = ShotModel(replace(rig, sigma_px=noise_px), body, 0.0), after[1]
+        watch, later = RigWatch(replace(rig, sigma_px=noise_px), body, 0.0), after[1]
         measured = [measure_seen(rig, body, shot) for shot in before]
         sooner, _ = watch.information([each for each in measured if isinstance(each, PoseEstimate)])
         count, size = rig.parameter_count, len(later.b)
@@ -233,9 +232,14 @@ class _Change(Record):
         cov = M @ np.linalg.solve(M.T @ H @ M + np.eye(size + 5), M.T)
         found = cov @ np.concatenate([sooner.b + b, F.T @ b])
         x, f = found[:size], found[size:]
-        left = sooner.left(x) + later.left(x + F @ (f - so_far))
+        left = _left(sooner, x) + _left(later, x + F @ (f - so_far))
         noise = float(np.sqrt(left / max(sooner.freedom + later.freedom, 1.0)))
         return cls(f, (cov[size:, size:] + cov[size:, size:].T) / 2, noise)
+
+
+def _left(sums: ResidualSums, x: Array) -> float:
+    """Return the sum of squares that parameters (K,) leave."""
+    return max(sums.square - 2.0 * float(x @ sums.b) + float(x @ sums.H @ x), 0.0)
 
 
 def _position_sigma(rig: StereoRig, body: Body, shots: Sequence[SeenShot]) -> float:

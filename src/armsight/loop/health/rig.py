@@ -1,0 +1,1200 @@
+"""Cameras that moved, expose late or have another lens than their model, a body of another size: found in residuals.
+
+In: measured poses with the detections they came from. Out: an estimate of seven numbers that a calibration fixes: the five
+degrees of freedom of the right camera's pose in the left one that do not change the scale (rotation, and translation across
+the baseline), the scale of body over baseline, and the skew: by how much the right camera exposes later than is known.
+Model of a shot's residuals, in standard deviations:
+
+    r = A dT + B x + S e + D f + n,    x ~ N(0, rig.cov),  e ~ N(0, tolerance),  n ~ N(0, s^2)
+
+with dT the pose, which is eliminated shot by shot; x the calibration's own error and e the shape of the body, which all
+shots share; f the seven numbers, zero while all is well. The information of the shots is summed, weighted down with age; f
+is estimated with x and e eliminated (generalised least squares); chi-square of f against zero is the test. The part of r
+that needs no body is the epipolar distance; the rest says what the body's known shape does. Size of body and length of
+baseline have the same effect: which of them is wrong cannot be distinguished. The skew shows in the detections of the right
+camera by the body's motion between the shots; each shot has a skew of its own besides, of a known standard deviation.
+
+What the camera model lacks (a lens whose distortion it cannot express, a sensor that is tilted) displaces whatever appears
+at the same position in an image by the same: r = ... + L beta, with L polynomials of the position, of which each camera has
+its own. It is reported where beta explains more than any change of the seven numbers at any time does.
+
+A camera that nods or a lens that breathes averages out in the sums: what single shots say of its rotation and of a focal
+length is compared within each second, and what it varies beyond the noise is a covariance of its own (``fixed``). Images
+that were seen before, to the bit, say nothing new. What images leave in all that is near each other, for a second, is in
+the noise of each test, as large as the rig itself shows it (:class:`~armsight.loop.health.passing.Leftover`).
+
+What changes and does not stay is a hypothesis of each single test (:mod:`~armsight.loop.health.passing`): each shot's own
+times of exposure, a focal length. Where its evidence is the largest the test is counted with that eliminated, so that
+cameras are not blamed for it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.special import chdtri
+
+from armsight.data import Array, Body, Ids, PoseEstimate, Record
+from armsight.geometry.matrix import product, solved
+from armsight.geometry.pose import adjoint, inverse, log_se3, pose
+from armsight.kernels import kernel
+from armsight.loop.finding import COSTS_M, LEVER_M, HealthFinding, alarm_limit
+from armsight.loop.health.fixed import Unrest
+from armsight.loop.health.passing import (
+    TRACK,
+    Apart,
+    ExposedShot,
+    Leftover,
+    Passing,
+    apart,
+    eliminate,
+    nodding,
+    velocity,
+)
+from armsight.loop.health.shape import FURTHEST_M, SMOOTH, ResidualSums, ShapeWatch, eliminated, total
+from armsight.vision.camera import pair_arguments
+from armsight.vision.pose.posefit import differentiate
+from armsight.vision.rig import StereoRig
+
+Part = Literal["rig", "body", "time"]
+
+#: Tolerance of a body that was built and measured with care: of each point, m, and of its scale.
+SHAPE_M, SCALE = 5e-5, 3e-4
+#: Points of a body that are used, at most: those of a large board would cost more than they say.
+MOST_POINTS = 24
+#: Shots that differ less than this share their errors (where a point is within its pixels, how it is lit) and count as one:
+#: translation over distance, and rotation, rad.
+_SAME = 0.01
+_SAME_COSINE = float(np.cos(_SAME))
+#: While nothing is suspected, shots closer in time than this are left out, s, and those that hardly differ from the newest:
+#: they would cost time and add little.
+_LEAST_S, _LIKE_S = 0.025, 0.1
+#: One of so many shots, those that fit worst, is no usual one.
+_ODD = 4
+#: A point that a pose was measured without is another thing also where its two detections disagree by more than chance
+#: explains once in so many shots.
+_PAIRED = float(chdtri(1, 1e-4))
+#: Fewer points than this say nothing of these numbers; shots further apart in time than this give no speed, s.
+_LEAST_POINTS, _APART_S = 4, 0.5
+#: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
+TEST_S, TEST_SHOTS, FORGET_TESTS = 1.0, 60, 30.0
+#: Residuals are not linear in the size of a body that is off by more than this share of it.
+_LINEAR = 0.005
+#: In so many tests after an alarm what was before the change is dropped; it began at most so many tests before the alarm.
+_FRESH, _BEFORE = 6, 3
+#: Tests that are kept, to find since when.
+_KEPT = 600
+#: A prior so wide that it decides nothing: m, rad, scale, s.
+_WIDE = np.array([0.1, 0.1, 1.0, 1.0, 1.0, 1.0, 0.1])
+#: A change matters that moves a pose by so many of its claimed sigmas, in any direction.
+_MATTERS = 2.0
+#: A part of the seven counts as necessary beyond this chance.
+_NECESSARY = 1e-4
+_ROTATIONS, _SCALED, _SKEWED = slice(2, 5), 5, 6
+#: Shots whose detections are remembered, to know the same images again; half: a shorter loop of images counts as new.
+_IMAGES = 4096
+#: What may be wrong, and its part of the seven numbers.
+_PARTS: dict[Part, slice] = {"rig": slice(0, 5), "body": slice(5, 6), "time": slice(6, 7)}
+#: Chi-square of an alarm: of all seven numbers, and of each part alone, which share the probability of a false one.
+_ALARM, _ALARMS = (
+    alarm_limit(len(_WIDE), 1.0 / TEST_S, 4),
+    {part: alarm_limit(rows.stop - rows.start, 1.0 / TEST_S, 4) for part, rows in _PARTS.items()},
+)
+#: A change matters or not at so many of the newest poses: a skew does so in motion alone.
+_POSES = 60
+#: Chi-square from which on a change that matters widens the poses: chance exceeds it in one of fifty tests.
+_SUSPECTED = float(chdtri(len(_WIDE), 0.02))
+#: The polynomials of the position in an image are all products of x and y up to this degree; their count.
+_DEGREE = 4
+_POLYNOMIALS = (_DEGREE + 1) * (_DEGREE + 2) // 2
+#: Numbers of what the camera models lack: of two cameras, along u and v; their prior is 1 px wide.
+_LENS = 4 * _POLYNOMIALS
+#: Standard deviations of its prior that are tried: the one of the largest evidence is taken (MacKay, 1992).
+_LENS_SCALES_PX = tuple(2.0**k for k in range(-6, 2))
+#: It is tested in every so many tests, from so many poses that differ; its chi-square of an alarm.
+_LENS_TESTS, _LENS_POSES = 4, 8
+#: It is named where it explains so much more than a change of the seven numbers, as a share of what that explains.
+_LENS_SHARE = 0.5
+_LENS_ALARM = alarm_limit(_LENS, 1.0 / (TEST_S * _LENS_TESTS))
+
+
+@dataclass(frozen=True, eq=False)
+class RigChange(Record):
+    """An estimate of the seven numbers.
+
+    Attributes:
+        f: (7,) translation of the right camera across the baseline (2), m, its rotation about its own axes (3), rad, both
+            as tangents of T_left_right on the right; size of the body over that of its file, less 1; by how much the right
+            camera exposes later than is known, s.
+        cov: (7, 7) its covariance.
+        chi_square: of all against zero.
+        alone: the same of each part alone, with the others right.
+        without: the same of the others.
+        gained: sum of squares that the seven explain.
+        left: sum of squares that nothing explains.
+    """
+
+    f: Array
+    cov: Array
+    chi_square: float
+    alone: dict[Part, float]
+    without: dict[Part, float]
+    gained: float
+    left: float
+
+
+@dataclass(frozen=True, eq=False)
+class LensError(Record):
+    """What the camera models lack.
+
+    Attributes:
+        beta: (M,) coefficients of its polynomials, px.
+        cov: (M, M) their covariance.
+        size_px: RMS of the residuals that it explains, px, and its standard deviation.
+        chi_square: by how much it explains more than a change of the seven numbers does.
+        needed: which of these are needed besides.
+    """
+
+    beta: Array
+    cov: Array
+    size_px: tuple[float, float]
+    chi_square: float
+    needed: tuple[Part, ...]
+
+
+class _ShotResiduals(NamedTuple):
+    """What a shot says, its pose eliminated, of K parameters and M coefficients of what the camera models lack.
+
+    Attributes:
+        t_s: its time.
+        rows: (n, 1 + K + M) residuals and their derivatives, in standard deviations.
+        response: (6, K + M) of its pose to these.
+        every: as ``rows``, with points that do not fit, which may be displaced.
+        response_with_all: (6, K + M) of a pose measured with these.
+        exposed: by how much the times of the exposures would move each row of ``rows``, and of ``every``.
+    """
+
+    t_s: float
+    rows: Array
+    response: Array
+    every: Array
+    response_with_all: Array
+    exposed: tuple[ExposedShot, ExposedShot]
+
+
+class _Newest(NamedTuple):
+    """The newest test.
+
+    Attributes:
+        whole: sums of all that may have changed, of the points that fit.
+        every: the same of every point.
+        noise: variance of the noise.
+        evidence: log-evidence of what the lenses leave.
+        test: sums of the parameters and the seven numbers, the lenses' coefficients eliminated.
+        own: times of exposure that explain it; None without.
+    """
+
+    whole: ResidualSums
+    every: ResidualSums
+    noise: float
+    evidence: Array
+    test: ResidualSums
+    own: Apart | None
+
+
+class RigWatch:
+    """Watches the calibrated pose of the cameras and the size and shape of the body.
+
+    Args:
+        rig: the calibrated pair; without a covariance nothing can be tested.
+        body: the body that is measured.
+        sync_s: standard deviation of the time between the two exposures of a shot, s.
+        printed: whether the body is a print whose shape a calibration found: its points are not tested.
+
+    Attributes:
+        rig: the pair.
+        prior: (K, K) square root of the covariance of all parameters: the rig's, scale and points of the body, skew. The
+            skew's is zero: what is not known of it is one of the seven numbers.
+        suspected: the change that the newest test found, where it matters and is more likely than not; it widens poses.
+        alarm: whether the newest test found one that is certain.
+        alarmed: whether any did.
+        lens: what the camera models lack, where that is certain and matters.
+        noise: (6, 6) what of the covariance that the newest shot was given differs from shot to shot.
+        passing: what changed from shot to shot, or from test to test.
+    """
+
+    def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
+        self.rig, self._body, self._sync_s = rig, body, sync_s
+        self._points = np.unique(np.linspace(0, len(body.points) - 1, MOST_POINTS).astype(int))
+        count, shape = rig.parameter_count, 3 * len(self._points)
+        self._size = count + 1 + shape + 1
+        self.prior = np.zeros((self._size, self._size))
+        values, vectors = np.linalg.eigh(rig.cov)
+        self.prior[:count, :count] = vectors * np.sqrt(np.maximum(values, 0.0))
+        rest = np.arange(count, self._size - 1)
+        self.prior[rest, rest] = np.append(SCALE, np.full(shape, SHAPE_M))
+        self._by_fault = _fault_directions(rig, self._size)
+        names = tuple(body.point_names[k] for k in self._points)
+        many = len(body.points) > MOST_POINTS
+        points = np.asarray(body.points, float)[self._points]
+        self._focal = _focal_changes(rig, self._size)
+        self._shape = ShapeWatch(
+            self._size, self._focal, count + 1, points, names, TEST_S, rigid=printed or many, strained=not printed
+        )
+        # (K, K + 7 + C) what the parameters, the seven numbers and the candidates of the shape change of the parameters, in
+        # units of their priors: a test has sums of these.
+        self._scaled = np.hstack([self.prior, self._by_fault * _WIDE, self._shape.by_wide])
+        # The same with the coefficients of what the camera models lack, px.
+        self._with_lens = block_diag(self._scaled, np.eye(_LENS))
+        # What moves to and fro of the parameters: the right camera's rotation (3), rad, a focal length against the other;
+        # and what a focal length does of the right camera alone, and of the left one.
+        last, (apart_f, both_f) = rig.parameter_count, self._focal.T
+        self._to_and_fro = np.column_stack([np.eye(self._size)[:, last - 3 : last], apart_f])
+        self._alone = np.column_stack([apart_f - 0.5 * both_f, apart_f + 0.5 * both_f])
+        self._shots = 0
+        self._row_of = np.full(len(body.points), -1)
+        self._row_of[self._points] = np.arange(len(self._points))
+        self._last = (-np.inf, np.eye(4))
+        self._track: deque[tuple[float, Array]] = deque(maxlen=TRACK)
+        self._used_s = np.full(len(self._points), -np.inf)  # when a pose was measured with each point
+        self.passing = Passing()
+        self._taken_s = -np.inf
+        self._began: Array | None = None
+        # The response of the newest poses to everything, and the covariances of these poses.
+        self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
+        self._full = self._size + _LENS
+        # What the kernels take of the cameras, and half of the size of their images, px.
+        counts = np.array([camera.distortion.size for camera in rig.cameras])
+        self._pair = (*pair_arguments(rig.cameras), counts, inverse(rig.T_left_right))
+        self._p_body = np.array(body.points, float, order="C")
+        self._half_px = np.array([camera.image_size_px for camera in rig.cameras]) / 2.0
+        self._focal_px = np.array([camera.intrinsics[:2] for camera in rig.cameras])
+        # Shots of the running test, in stays; sums since the beginning are for what the camera models lack.
+        self._stays: list[list[_ShotResiduals]] = []
+        self._window = ResidualSums(self._size + len(_WIDE), 0.0)
+        self._whole, self._leftover = ResidualSums(self._with_lens.shape[1], 0.0), Leftover()
+        self._counted: list[Array] = []  # log-evidences of the newest tests, which the former is given later
+        self.lens: LensError | None = None
+        self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
+        self._plain: deque[ResidualSums] = deque(maxlen=_KEPT)  # the same with what images leave beyond noise
+        self._timed = False
+        self._doubted: ResidualSums | None = None  # what the alarm of the test before would have rested on
+        self._poses = 0  # that differ
+        self.alarm = self.alarmed = False
+        self._alarms = 0  # in a row
+        self.suspected: RigChange | None = None
+        self.noise, self._unrest = np.zeros((6, 6)), Unrest(4)
+        self._images: dict[bytes, None] = {}  # detections of shots that were summed, the newest last
+
+    def take(self, estimate: PoseEstimate, t_s: float | None) -> Array:
+        """Take a measured pose.
+
+        Args:
+            estimate: the pose.
+            t_s: time of its shot, s; None where it has none.
+
+        Returns:
+            (6, 6) what the suspected errors add to the pose's covariance; zero while nothing is suspected.
+        """
+        now_s, self._timed = (float(self._shots), False) if t_s is None else (t_s, True)
+        self._shots += 1
+        is_new = self._is_new(estimate)
+        self._track.append((now_s, estimate.T_left_body))
+        if self._redundant(estimate.T_left_body, now_s):
+            self._last = (now_s, estimate.T_left_body)
+            return np.zeros((6, 6))
+        self._taken_s = now_s
+        found = self._residuals(estimate, now_s)
+        self._last = (now_s, estimate.T_left_body)
+        if found is None:
+            return np.zeros((6, 6))
+        self._effects.append((found.response, estimate.cov))
+        if is_new:
+            self._sum(found, estimate)
+        self.noise = self._nodding(found.response, estimate.T_left_body)
+        added = self._added(found) + self.noise
+        if added.any():  # of a body that is far off more than what is linear
+            off = log_se3(inverse(estimate.T_left_body) @ self._linear_about(estimate)[1])
+            added += np.outer(off, off)
+        return added
+
+    def _is_new(self, estimate: PoseEstimate) -> bool:
+        """Return whether a shot's detections differ from those of the shots before: the same images say nothing new."""
+        seen = estimate.points.seen.uv.tobytes()
+        known = seen in self._images
+        self._images[seen] = None
+        if len(self._images) > _IMAGES:
+            del self._images[next(iter(self._images))]
+        return not known
+
+    def _nodding(self, response: Array, T: Array) -> Array:
+        """Return the covariance (6, 6) that a camera which nods or a lens that breathes adds to a pose (4, 4).
+
+        Either camera may be the one; by a rotation of the left one, in whose frame poses are, the body moves as well.
+        """
+        by_rotation = response[:, : self._size] @ self._to_and_fro[:, :3]
+        by_focal = response[:, : self._size] @ self._alone
+        by_right = np.column_stack([by_rotation, by_focal[:, 0]])
+        by_rotation = by_rotation + adjoint(inverse(T))[:, 3:] @ self.rig.T_left_right[:3, :3]
+        by_left, cov = np.column_stack([by_rotation, by_focal[:, 1]]), self._unrest.cov
+        return np.asarray(0.5 * (by_right @ cov @ by_right.T + by_left @ cov @ by_left.T))
+
+    def _moving(self, rows: Array) -> Array:
+        """Return the derivatives (n, 4) of a shot's rows by what moves to and fro."""
+        return np.asarray(rows[:, 1 : 1 + self._size] @ self._to_and_fro)
+
+    def _take_unrest(self, stays: Sequence[Sequence[_ShotResiduals]]) -> None:
+        """Compare what the shots of a test say of the right camera's rotation and a focal length."""
+        shots = [shot for stay in stays for shot in stay]
+        J, r = [self._moving(each.rows) for each in shots], [each.rows[:, 0] for each in shots]
+        H, b = np.array([each.T @ each for each in J]), np.array([j.T @ e for j, e in zip(J, r, strict=True)])
+        cov = np.linalg.inv(H)
+        d = np.einsum("nij,nj->ni", cov, b)
+        freedom = sum(map(len, r)) - 10.0 * len(shots)
+        excess = (sum(float(e @ e) for e in r) - float(np.vdot(b, d))) / max(freedom, 1.0)
+        rested = not self._unrest.cov.any()
+        self._unrest.take(np.array([each.t_s for each in shots]), d, cov, max(excess, 1.0))
+        if rested and self._unrest.cov.any():  # sums so far do not have it in their noise
+            self._window.scale(0.0)
+            self._history.clear()
+            self._plain.clear()
+            self._alarms, self.alarm, self.alarmed, self.suspected = 0, False, False, None
+
+    def _unrest_weighed(self, rows: Array, other: Array | None = None) -> Array:
+        """Return rows of a shot, or others (n, K) of it, with what moves to and fro in their noise.
+
+        That is (I + J V J^T)^-1/2 times them.
+        """
+        given = rows if other is None else other
+        if not self._unrest.cov.any():
+            return given
+        values, vectors = np.linalg.eigh(self._unrest.cov)
+        J = self._moving(rows) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        squares, axes = np.linalg.eigh(J.T @ J)
+        squares = np.maximum(squares, 1e-12)
+        J = J @ axes
+        return np.asarray(given - J @ (((1.0 - 1.0 / np.sqrt(1.0 + squares)) / squares)[:, None] * (J.T @ given)))
+
+    def _weighed_parts(
+        self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool
+    ) -> list[tuple[Array, Array, float]]:
+        """Return of each shot its rows, what the times of its exposures do to them (n, 10), and its weight."""
+        parts = list[tuple[Array, Array, float]]()
+        for stay in stays:
+            for shot in stay:
+                rows, moved = shot.every if every else shot.rows, shot.exposed[every].without_pose()
+                parts.append((self._unrest_weighed(rows), self._unrest_weighed(rows, moved), 1.0 / len(stay)))
+        return parts
+
+    def _added(self, found: _ShotResiduals) -> Array:
+        """Return what the suspected errors add to the covariance (6, 6) of a pose."""
+        by_parameter, by_lens = found.response[:, : self._size], found.response[:, self._size :]
+        added, shape, known = self._shape.added(by_parameter), self._shape.found, 0
+        if self.passing.now:
+            added = added + self.passing.added(found.exposed[0], by_parameter @ self._shape.by_wide[:, 0])
+        if self.suspected is not None and (shape is None or shape.seven_needed):
+            known = len(_WIDE)
+        if self.lens is not None:
+            known = known if self.lens.needed else 0
+            shift = by_lens @ self.lens.beta
+            added += np.outer(shift, shift) + by_lens @ self.lens.cov @ by_lens.T
+        elif (doubt := self._shape.doubt) is not None:
+            effect = by_parameter @ self._scaled[:, self._size + known :]
+            added += effect @ doubt[known:, known:] @ effect.T
+        if known and self.suspected is not None:
+            by_fault = by_parameter @ self._by_fault
+            shift = by_fault @ self.suspected.f
+            added += np.outer(shift, shift) + by_fault @ self.suspected.cov @ by_fault.T
+        return added
+
+    def _redundant(self, T: Array, now_s: float) -> bool:
+        """Return whether a shot adds too little to what was taken just before it."""
+        passed_s = now_s - self._taken_s
+        if (
+            self.suspected is not None
+            or self.lens is not None
+            or self._shape.found is not None
+            or self._shape.doubt is not None
+            or self._unrest.cov.any()
+            or self.passing.now
+            or not self._timed
+            or not 0.0 <= passed_s < _LIKE_S
+        ):
+            return False
+        return passed_s < _LEAST_S or (self._began is not None and not differ(self._began, T))
+
+    def information(self, estimates: Sequence[PoseEstimate]) -> tuple[ResidualSums, int]:
+        """Return the sums of measured poses, and how many of these differ: consecutive ones that are alike count as one."""
+        sums, stays = ResidualSums(self._size, 0.0), list[list[_ShotResiduals]]()
+        count, began = 0, None
+        for k, estimate in enumerate(estimates):
+            found = self._residuals(estimate, float(k))
+            if found is None:
+                continue
+            if began is None or differ(began, estimate.T_left_body):
+                began = estimate.T_left_body
+                sums.add(self._summed(stays).of(self._size), 1.0)
+                stays = [[]]
+                count += 1
+            stays[-1].append(found)
+        sums.add(self._summed(stays).of(self._size), 1.0)
+        return sums, count
+
+    def explained(self, estimates: Sequence[PoseEstimate]) -> tuple[StereoRig, Body, HealthFinding]:
+        """Return the rig and the body with the change that poses show, which are known to be wrong, and what it is."""
+        sums, self._poses = self.information(estimates)
+        change = self._estimated(self._in_priors(sums))
+        more = {part: change.chi_square - change.without[part] for part in ("rig", "body")}
+        part: Part = max(("rig", "body"), key=lambda each: (more[each], change.alone[each]))
+        sure = more[part] > chdtri(_PARTS[part].stop - _PARTS[part].start, _NECESSARY)
+        found = _FINDINGS[part](change, None, not sure)
+        rig = self.rig.perturbed(free_directions(self.rig) @ change.f[_PARTS["rig"]])
+        body = replace(self._body, points=(1.0 + change.f[_SCALED]) * self._body.points)
+        return rig, body, found if self._poses > 1 else _of_one_pose(found)
+
+    def _residuals(self, estimate: PoseEstimate, now_s: float) -> _ShotResiduals | None:
+        """Return what one shot says; None where too few of its points were measured."""
+        seen = estimate.points.seen
+        good = np.zeros(len(self._p_body), bool)
+        good[estimate.points.ids] = True
+        rows = np.flatnonzero(seen.paired & (self._row_of >= 0)[seen.ids])
+        ids = seen.ids[rows]
+        fits = good[ids]
+        if np.count_nonzero(fits) < _LEAST_POINTS:
+            return None
+        A, whole = np.empty((4 * len(ids), 6)), np.zeros((4 * len(ids), 1 + self._full))
+        size, T = self._linear_about(estimate)
+        uv = np.ascontiguousarray(seen.uv[rows])
+        noise_px2 = _differentiate(
+            *self._pair, self._half_px, size * self._p_body, self._row_of, np.asarray(ids, np.int64),
+            uv, np.ascontiguousarray(seen.cov_uv[rows]),
+            max(self.rig.sigma_px, 1e-6), np.array(T, order="C"),
+            self._velocity(estimate.T_left_body, now_s), A, whole,
+        )  # fmt: skip
+        if not np.isfinite(noise_px2):
+            return None
+        if size != 1.0:  # the residuals of a body as its file says, were they linear
+            by_size = 1 + self.rig.parameter_count
+            whole[:, by_size] /= size
+            whole[:, 0] += (size - 1.0) * whole[:, by_size]
+        self._noise_px = float(np.sqrt(noise_px2))
+        self._used_s[self._row_of[ids[fits]]] = now_s
+        roll = (uv[:, :, 1] / self._half_px[:, 1] - 1.0).repeat(2)
+        exposed = ExposedShot(A, roll, tuple(self._track))
+        if fits.all():
+            response = self._eliminated(A, whole)
+            return _ShotResiduals(now_s, whole, response, whole, response, (exposed, exposed))
+        kept, every = np.repeat(fits, 4), np.repeat(fits | self._displaced(A, whole[:, 0]), 4)
+        found, with_all = whole[kept], whole[every]
+        response, response_with_all = self._eliminated(A[kept], found), self._eliminated(A[every], with_all)
+        both = exposed.of(kept), exposed.of(every)
+        return _ShotResiduals(now_s, found, response, with_all, response_with_all, both)
+
+    def _linear_about(self, estimate: PoseEstimate) -> tuple[float, Array]:
+        """Return the size of the body over that of its file, and the pose (4, 4), about which residuals are linear.
+
+        Those of the file and of the estimate, unless the triangulated points are of another size (Umeyama, 1991).
+        """
+        p_body, p_left = self._p_body[estimate.points.ids], estimate.points.p_left
+        middle_body, middle_left = p_body.mean(axis=0), p_left.mean(axis=0)
+        from_body, from_left = p_body - middle_body, p_left - middle_left
+        size = float(np.sqrt(np.vdot(from_left, from_left) / np.vdot(from_body, from_body)))
+        if abs(size - 1.0) <= _LINEAR:
+            return 1.0, estimate.T_left_body
+        U, _, Vt = np.linalg.svd(from_left.T @ from_body)
+        R = (U * [1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
+        return size, pose(R, middle_left - size * (R @ middle_body))
+
+    def _eliminated(self, A: Array, rows: Array) -> Array:
+        """Eliminate the pose and the shot's own skew from rows (n, 1 + K + M); return the pose's response (6, K + M)."""
+        response = np.empty((6, rows.shape[1]))
+        _eliminate(A, rows, self._size, self._sync_s, response)
+        return response[:, 1:]
+
+    @staticmethod
+    def _displaced(A: Array, residuals: Array) -> NDArray[np.bool_]:
+        """Return (N,) whether a point may be the body's, displaced on it: what its four residuals say of the pose (4 N, 6).
+
+        Not one that is too far off, nor one of which the two cameras see different things.
+        """
+        J, r = A[:, :3].reshape(-1, 4, 3), residuals.reshape(-1, 4)
+        H, b = np.einsum("nki,nkj->nij", J, J), np.einsum("nki,nk->ni", J, r)
+        d = np.linalg.solve(H, b[..., None])[..., 0]
+        left = np.einsum("ni,ni->n", r, r) - np.einsum("ni,ni->n", b, d)
+        return np.asarray((left < _PAIRED) & (np.linalg.norm(d, axis=1) < FURTHEST_M))
+
+    def _velocity(self, T: Array, now_s: float) -> Array:
+        """Return the velocity (6,) of the body between the shot before and this one, 1/s; zero where it is unknown."""
+        before_s, before = self._last
+        if not self._timed or not 0.0 < now_s - before_s < _APART_S:
+            return np.zeros(6)
+        return velocity(before, T, now_s - before_s)
+
+    def _sum(self, shot: _ShotResiduals, estimate: PoseEstimate) -> None:
+        """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
+        T = estimate.T_left_body
+        moved = self._began is None or differ(self._began, T)
+        size = 1 + self._size
+        self._shape.take(shot.every[:, :size], T, shot.response_with_all[:, : self._size], estimate.cov, moved)
+        if moved or not self._stays:
+            self._stays.append([])
+            self._began = T
+        self._stays[-1].append(shot)
+        if shot.t_s - self._stays[0][0].t_s >= (TEST_S if self._timed else TEST_SHOTS):
+            self._decide()
+
+    def _summed(
+        self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool = False, own: Apart | None = None
+    ) -> ResidualSums:
+        """Return the sums of stays, of each the mean of its shots.
+
+        Args:
+            stays: they.
+            every: with points that do not fit.
+            own: times of exposure that are eliminated.
+        """
+        sums = ResidualSums(self._full, stays[0][0].t_s if stays else 0.0)
+        for alone in (True, False):  # those of one shot are summed at once
+            shots = [
+                (self._unrest_weighed(each.every if every else each.rows), len(stay))
+                for stay in stays
+                for each in stay
+                if (len(stay) == 1) is alone
+            ]
+            if shots:
+                rows = [each if alone else each / np.sqrt(count) for each, count in shots]
+                sums.take(np.concatenate(rows), sum((len(each) - 6.0) / count for each, count in shots))
+        if own is not None:
+            eliminate(own, self._weighed_parts(stays, every=every), sums)
+        return sums
+
+    def _in_units(
+        self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool = False, own: Apart | None = None
+    ) -> ResidualSums:
+        """Return the same sums of all that may have changed, in units of its priors, and of the lenses' coefficients."""
+        return self._summed(stays, every=every, own=own).by(self._with_lens)
+
+    def _decide(self, *, ends: bool = False) -> None:
+        """Test for a change with the newest sums; weigh the older ones down."""
+        stays, self._stays = self._stays, []
+        if not stays:
+            return
+        self._poses += len(stays)
+        newest, change = self._tested(stays)
+        self._leftover.passed(newest.test)
+        # A point that is displaced looks like it, for some tests before it is found.
+        self._counted = [*self._counted, newest.evidence] if self._shape.found is None else []
+        if len(self._counted) > _BEFORE:
+            self._leftover.take(self._counted.pop(0))
+        nodded = stays if self._timed and newest.own is None else []
+        self._test_shape(stays, newest, ends=ends)
+        alarm, doubted = self._is_alarm(change), self._doubted
+        self._doubted = None
+        moments = [] if newest.own is not None else [stay[0] for stay in stays if len(stay) == 1]
+        if alarm and moments and not self._alarms and self._poses > 1:
+            newest, change, alarm = self._less_worst(moments, newest, change, doubted)
+        self._keep(newest, change, alarm)
+        if nodded:
+            self._take_unrest(nodded)
+        due = 0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0
+        if due and 0 < len(self._history) < _KEPT and self._poses >= _LENS_POSES:
+            self.lens = self._lens()
+
+    def _keep(self, newest: _Newest, change: RigChange, alarm: bool) -> None:
+        """Keep the newest test, and what it says of the rig."""
+        if len(self._history) < _KEPT:
+            self._whole.add(newest.whole.over(newest.noise), 1.0)
+        self._plain.append(newest.whole.of(len(newest.test.b)).over(newest.noise))
+        self._history.append(newest.test)
+        self._alarms = self._alarms + 1 if alarm else 0
+        if 0 < self._alarms <= _FRESH:
+            change = self._begun(change)
+        matters = alarm or (change.chi_square > _SUSPECTED and self._matters(change, slice(None)))
+        self.suspected = change if matters else None
+        self.alarm, self.alarmed = alarm, self.alarmed or alarm
+
+    def _tested(self, stays: Sequence[Sequence[_ShotResiduals]]) -> tuple[_Newest, RigChange]:
+        """Return the newest test and the change by the window with it; what a passing cause explains is taken off."""
+        whole, every = self._sums_of(stays, None)
+        newest = self._without_lens(stays, whole, every, whole, None)
+        self._window.scale(float(np.exp(-1.0 / FORGET_TESTS)))
+        self._window.add(newest.test, 1.0)
+        change = self._estimated(self._window)
+        if not self.passing.now and change.chi_square <= _SUSPECTED:
+            return newest, change
+        passes, own = self._passes(stays, every.of(len(every.b) - _LENS))
+        if passes is None:
+            return newest, change
+        self._window.add(newest.test, -1.0)
+        if passes == "time":
+            whole, every = self._sums_of(stays, own)
+        rest = whole.without(self._size + len(_WIDE)) if passes == "lens" else whole
+        newest = self._without_lens(stays, whole, every, rest, own if passes == "time" else None)
+        self._window.add(newest.test, 1.0)
+        return newest, self._estimated(self._window)
+
+    def _sums_of(
+        self, stays: Sequence[Sequence[_ShotResiduals]], own: Apart | None
+    ) -> tuple[ResidualSums, ResidualSums]:
+        """Return the sums of the points that fit, and of every point."""
+        whole = self._in_units(stays, own=own)
+        if all(each.every is each.rows for stay in stays for each in stay):
+            return whole, whole
+        return whole, self._in_units(stays, every=True, own=own)
+
+    def _without_lens(
+        self,
+        stays: Sequence[Sequence[_ShotResiduals]],
+        whole: ResidualSums,
+        every: ResidualSums,
+        rest: ResidualSums,
+        own: Apart | None,
+    ) -> _Newest:
+        """Return the test of what is to be explained, ``rest``, with the lenses' coefficients eliminated."""
+        share, seven = len(stays) / sum(map(len, stays)), slice(1 + self._size, 1 + self._size + len(_WIDE))
+        noise, evidence = self._leftover.seen(rest, _LENS, 3 * len(self._points), seven, share)
+        test = self._leftover.without(rest, _LENS, noise).of(len(self._window.b))
+        return _Newest(whole, every, noise, evidence, test, own)
+
+    def _test_shape(self, stays: Sequence[Sequence[_ShotResiduals]], newest: _Newest, *, ends: bool) -> None:
+        """Test for displaced points, with all shots and without those that fit worst."""
+        odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
+        every = newest.every
+        usual = every.less(self._in_units(odd, every=True, own=newest.own)) if odd else every
+        self._shape.decide(*(self._leftover.without(each, _LENS, newest.noise) for each in (every, usual)), ends=ends)
+
+    def _less_worst(
+        self, moments: list[_ShotResiduals], newest: _Newest, change: RigChange, doubted: ResidualSums | None
+    ) -> tuple[_Newest, RigChange, bool]:
+        """Return the newest test, the change, and whether it is one, without images that alone say so.
+
+        Images that do not belong together are no moved camera; newer shots that agree with them are.
+        """
+        rest = newest.whole.less(self._worst(moments))
+        left_out = newest.test.less(self._leftover.without(rest, _LENS, newest.noise).of(len(newest.test.b)))
+        without = self._window.less(left_out)
+        estimated = self._estimated(without)
+        if self._is_alarm(estimated):
+            return newest, change, True
+        if doubted is not None:
+            self._window.add(doubted, 1.0)
+            return newest, change, True
+        self._window, self._doubted = without, left_out
+        return newest._replace(whole=rest, test=newest.test.less(left_out)), estimated, False
+
+    def _is_alarm(self, change: RigChange) -> bool:
+        """Return whether a change is certain, beyond the sigmas of poses, and displaces them by what matters."""
+        every = slice(None)
+        costs = self._cost_m(self._of_part(change, every)) > COSTS_M
+        return _certain(change) and costs and self._matters(change, every)
+
+    def _passes(
+        self, stays: Sequence[Sequence[_ShotResiduals]], every: ResidualSums
+    ) -> tuple[Literal["time", "lens"] | None, Apart | None]:
+        """Return what passing cause explains a test of some sums best, and its times of exposure."""
+        found: Apart | None = None
+        if self._timed:
+            parts = self._weighed_parts(stays, every=False)
+            found = apart([(rows[:, 0], moved, weight) for rows, moved, weight in parts])
+            nods = nodding([(rows[:, 0], self._moving(rows), weight) for rows, _, weight in parts])
+            if found is not None and nods > found.gained - found.occam:
+                found = None
+        sums = None if found is None else self._in_units(stays, own=found).of(len(every.b))
+        return self.passing.decide(every, self._shape.evidence, self._size, found, sums), found
+
+    def _in_priors(self, sums: ResidualSums) -> ResidualSums:
+        """Return sums of the parameters and the seven numbers, in units of their priors, from those of the parameters."""
+        return sums.by(self._scaled[:, : self._size + len(_WIDE)])
+
+    def _worst(self, moments: list[_ShotResiduals]) -> ResidualSums:
+        """Return the sums of the moments that fit worst: of one, or where shots have no times of a tenth of them."""
+        count = 1 if self._timed else max(1, len(moments) // 10)
+        worst = sorted(moments, key=lambda each: float(each.rows[:, 0] @ each.rows[:, 0]) - len(each.rows))[-count:]
+        return self._in_units([[each] for each in worst])
+
+    def _lens(self) -> LensError | None:
+        """Return what the camera models lack; None where a change of the seven explains as much, or it hardly matters."""
+        K, sums, faults = self._size, self._whole, len(_WIDE)
+        every = np.arange(K + faults + _LENS)
+        changed, lens = every[K : K + faults], every[K + faults :]
+        rows = np.append(every[: K + faults], len(sums.b) - _LENS + np.arange(_LENS))
+        H, b = sums.H[np.ix_(rows, rows)] + np.eye(len(rows)), sums.b[rows]
+
+        def gained(*without: Ids) -> float:
+            rows = np.setdiff1d(every, np.concatenate([*without, np.zeros(0, int)]))
+            return float(b[rows] @ cho_solve(cho_factor(H[np.ix_(rows, rows)]), b[rows]))
+
+        most, by_lens = gained(), gained(changed)
+        excess = max((sums.square - most) / max(sums.freedom, 1.0), 1.0)
+        if by_lens - gained(lens) < _LENS_ALARM * excess:
+            return None
+        more = (self._split(list(self._plain))[2] - (sums.square - by_lens)) / excess  # than a change at any time
+        # A lens that lacks a little is not to blame where the cameras moved: then they explain most.
+        moved = gained(lens) - gained(changed, lens)
+        if more < max(_LENS_ALARM, _LENS_SHARE * moved / excess):
+            return None
+        needed = tuple(
+            part
+            for part, rows in _PARTS.items()
+            if (most - gained(changed[rows])) / excess > chdtri(rows.stop - rows.start, _NECESSARY)
+        )
+        explained = (by_lens - gained(changed, lens)) / excess
+        size = self._noise_px * float(np.sqrt(2.0 * excess * explained / max(sums.freedom, 1.0)))
+        sigma = size * float(np.sqrt(_LENS / 2.0 + explained)) / explained
+        beta, cov = max((self._of_lens(sums, scale, excess) for scale in _LENS_SCALES_PX), key=lambda each: each[2])[:2]
+        found = LensError(beta, cov, (size, sigma), more, needed)
+        responses, covs = map(np.array, zip(*self._effects, strict=True))
+        shifts = responses[:, :, K:] @ beta
+        squares = np.einsum("ni,ni->n", shifts, np.linalg.solve(covs, shifts[..., None])[..., 0])
+        return found if self.alarm or float(np.max(squares)) > _MATTERS**2 else None
+
+    def _of_lens(self, sums: ResidualSums, scale_px: float, excess: float) -> tuple[Array, Array, float]:
+        """Return the coefficients (M,), px, with a prior of some size, their covariance (M, M), and its log-evidence."""
+        rows = np.append(np.arange(self._size), len(sums.b) - _LENS + np.arange(_LENS))
+        scales = np.append(np.ones(self._size), np.full(_LENS, scale_px))
+        inner = cho_factor(sums.H[np.ix_(rows, rows)] * np.outer(scales, scales) / excess + np.eye(len(rows)))
+        b = scales * sums.b[rows] / excess
+        found = cho_solve(inner, b)
+        evidence = 0.5 * float(b @ found) - float(np.log(np.diag(inner[0])).sum())
+        cov = scale_px**2 * cho_solve(inner, np.eye(len(rows)))[-_LENS:, -_LENS:]
+        return scale_px * found[-_LENS:], cov, evidence
+
+    def _begun(self, change: RigChange) -> RigChange:
+        """Return the change estimated from its beginning on; drop what was before."""
+        count = self._alarms + _BEFORE
+        if len(self._history) <= count:
+            return change
+        self._window, change, _ = self._split(list(self._history)[-count:])
+        return change
+
+    @property
+    def wrong_at_rest(self) -> bool:
+        """Whether what is suspected makes poses wrong also where nothing moves."""
+        parts = [] if self.suspected is None else self._to_blame(self.suspected)
+        shape = self._shape.found
+        if shape is not None and (points := [each for each in shape.chosen if each >= 0]):
+            moved = bool((self._used_s[points] > self._last[0] - TEST_S).any())  # else poses are of the other points
+        else:
+            moved = shape is not None
+        return moved or (self.alarm and not set(parts) <= {"time"})
+
+    def _cost_m(self, by: Array) -> float:
+        """Return by how much a change of the parameters (K + M,) displaces one of the newest poses at most, m."""
+        shifts = np.array([response for response, _ in self._effects]) @ by
+        return float(np.max(np.linalg.norm(shifts[:, :3], axis=1) + LEVER_M * np.linalg.norm(shifts[:, 3:], axis=1)))
+
+    def _of_part(self, change: RigChange, part: slice) -> Array:
+        """Return the change of the parameters (K + M,) that a part of the seven numbers makes."""
+        return np.append(self._by_fault[:, part] @ change.f[part], np.zeros(_LENS))
+
+    def _matters(self, change: RigChange, part: slice) -> bool:
+        """Return whether a part of the seven numbers moves one of the newest poses by so many of its sigmas."""
+        responses, cov = map(np.array, zip(*self._effects, strict=True))
+        shift = responses[:, :, : self._size] @ (self._by_fault[:, part] @ change.f[part])
+        squares = np.einsum("ni,ni->n", shift, np.linalg.solve(cov, shift[..., None])[..., 0])
+        return float(np.max(squares)) > _MATTERS**2
+
+    def _estimated(self, sums: ResidualSums) -> RigChange:
+        """Return the seven numbers from sums of the parameters and them, everything else eliminated."""
+        M = eliminated(sums.M, slice(1, 1 + self._size))
+        S, s, square = np.asarray(M[1:, 1:] + np.eye(len(_WIDE)), float), M[1:, 0], float(M[0, 0])
+        f = np.linalg.solve(S, s)
+        # What the model leaves unexplained widens the noise (Birge ratio); it never narrows it.
+        excess = max((square - float(s @ f)) / max(sums.freedom, 1.0), 1.0)
+
+        def explained(rows: Ids) -> float:
+            return float(s[rows] @ np.linalg.solve(S[np.ix_(rows, rows)], s[rows])) / excess
+
+        every = np.arange(len(_WIDE))
+        alone = {part: explained(every[rows]) for part, rows in _PARTS.items()}
+        without = {part: explained(np.delete(every, rows)) for part, rows in _PARTS.items()}
+        cov = excess * np.linalg.inv(S) * np.outer(_WIDE, _WIDE)
+        gained = float(s @ f)
+        return RigChange(_WIDE * f, cov, gained / excess, alone, without, gained, square - gained)
+
+    def _since(self) -> tuple[float, RigChange]:
+        """Return since when there is a change, on the clock of the shots, and the change estimated from then on.
+
+        It is the beginning that leaves least unexplained: with the seven numbers zero before it, and estimated after it.
+        """
+        sums, change, _ = self._split(list(self._history))
+        return sums.begin_s, change
+
+    def _split(self, tests: Sequence[ResidualSums]) -> tuple[ResidualSums, RigChange, float]:
+        """Return the sums of the tests after the beginning of a change, the change that they show, and what is left.
+
+        The test before its beginning may be of both times: it is left out, and counts as noise.
+        """
+        size = len(self._window.b)
+        after, before = ResidualSums(size, 0.0), total(tests)  # less the test in which it began
+        least, best = np.inf, len(tests) - 1
+        for k in reversed(range(len(tests))):
+            after.add(tests[k], 1.0)
+            before.add(tests[k], -1.0)
+            mixed = tests[k - 1] if k else ResidualSums(size, tests[0].begin_s)
+            before.add(mixed, -1.0)
+            (_, left), (gained, none) = self._gained(after), self._gained(before)
+            before.add(mixed, 1.0)
+            left += none + gained + mixed.freedom
+            if left < least:
+                least, best = left, k
+        found = ResidualSums(size, tests[max(best - 1, 0)].begin_s)
+        for test in reversed(tests[best:]):
+            found.add(test, 1.0)
+        return found, self._estimated(found), float(least)
+
+    def _gained(self, sums: ResidualSums) -> tuple[float, float]:
+        """Return what the seven numbers explain of a sum of squares, and what nothing does."""
+        M = eliminated(sums.M, slice(1, 1 + self._size))
+        gained = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(_WIDE)), M[1:, 0]))
+        return gained, float(M[0, 0]) - gained
+
+    def findings(self) -> tuple[HealthFinding, ...]:
+        """Return what was found so far, the shots of the running test included: nothing where no test gave an alarm."""
+        return self.passing.among(self._stays_changed(), timed=self._timed)
+
+    def _stays_changed(self) -> tuple[HealthFinding, ...]:
+        """Return what changed and stays."""
+        ended = self._ended()
+        shape, lens = ended._shape.said, ended.lens
+        by_shape = 0.0 if shape is None else ended._cost_m(np.append(ended._shape.change(shape), np.zeros(_LENS)))
+        if shape is not None and shape.chosen == (SMOOTH,) and by_shape < COSTS_M:
+            shape = None  # a print as good as any: poses have it in their sigma
+        if shape is not None and (lens is None or shape.chi_square > lens.chi_square):
+            found = ended._shape.finding(shape, shape.begin_s if self._timed else None)
+            found = replace(found, cost_mm=1e3 * by_shape)
+            return (found, *(ended._changed() if ended.alarmed and shape.seven_needed else ()))
+        if lens is not None:
+            cost_m = ended._cost_m(np.append(np.zeros(self._size), lens.beta))
+            return (_lens_finding(lens, cost_m),) if cost_m > COSTS_M else ()
+        return (*(ended._changed() if ended.alarmed else ()), *ended._nods())
+
+    def _nods(self) -> tuple[HealthFinding, ...]:
+        """Return the finding of a camera that nods or a lens that breathes, where that displaces poses by what matters."""
+        cov, newest = self._unrest.cov, list(self._effects)[-1:]
+        if not cov.any() or not newest:
+            return ()
+        covs = self._nodding(newest[0][0], self._last[1])
+        cost_m = float(np.sqrt(np.trace(covs[:3, :3]))) + LEVER_M * float(np.sqrt(np.trace(covs[3:, 3:])))
+        if cost_m < COSTS_M:
+            return ()
+        # The one that displaces points in the images by more.
+        seen = np.diag(cov) * np.array([1.0, 1.0, 0.0, np.square(self._half_px / self._focal_px).sum(axis=1).mean()])
+        return (_breathing_finding(cov, cost_m) if seen[3] > seen[:3].sum() else _nod_finding(cov[:3, :3], cost_m),)
+
+    def _changed(self) -> tuple[HealthFinding, ...]:
+        """Return what the newest test found of the seven numbers."""
+        began_s, change = self._since()
+        since_s = began_s if self._timed else None
+        parts = self._to_blame(change)
+        found = (
+            replace(
+                _FINDINGS[part](change, since_s, len(parts) == 1 and not self._needed(change, part)),
+                cost_mm=1e3 * self._cost_m(self._of_part(change, _PARTS[part])),
+            )
+            for part in parts
+        )
+        several = self._poses > 1 or (self._timed and self._shots > 1)
+        return tuple(found) if several else tuple(map(_of_one_pose, found))
+
+    @property
+    def _shaped(self) -> bool:
+        """Whether displaced points or focal lengths explain what the seven numbers would."""
+        return self._shape.found is not None and not self._shape.found.seven_needed
+
+    def copied(self) -> RigWatch:
+        """Return a copy that says what was found so far; this one goes on."""
+        copied = copy(self)
+        copied._history, copied._plain, copied._shape = self._history.copy(), self._plain.copy(), self._shape.copied()
+        copied._stays, copied.passing = [stay.copy() for stay in self._stays], copy(self.passing)
+        copied._unrest = self._unrest.copied()
+        return copied
+
+    def _ended(self) -> RigWatch:
+        """Return a copy whose running test was made; this one goes on with it."""
+        ended = self.copied()
+        ended._window, ended._whole = self._window.of(len(self._window.b)), self._whole.of(len(self._whole.b))
+        ended._leftover = copy(self._leftover)
+        ended._decide(ends=True)
+        return ended
+
+    def moved_since_s(self) -> float | None:
+        """Return since when the cameras alone are found to have moved, s.
+
+        None where nothing or more was found, or only the newest test shows it.
+        """
+        if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None or self._shaped:
+            return None
+        since_s, change = self._since()
+        return None if self._in_newest(since_s) or self._to_blame(change) != ["rig"] else since_s
+
+    def only_newest(self) -> bool:
+        """Return whether only the newest test shows a change: cameras may have moved within it, so the next one decides."""
+        return self._in_newest(self._since()[0])
+
+    def _in_newest(self, since_s: float) -> bool:
+        return len(self._history) > 1 and since_s >= self._history[-2].begin_s
+
+    def _needed(self, change: RigChange, part: Part) -> bool:
+        """Return whether the other parts do not explain what was found."""
+        rows = _PARTS[part]
+        more = change.chi_square - change.without[part]
+        return more > chdtri(rows.stop - rows.start, _NECESSARY) and self._matters(change, rows)
+
+    def _to_blame(self, change: RigChange) -> list[Part]:
+        """Return the parts that are needed to explain a change; where none is, the one that explains most alone."""
+        if self.lens is not None:
+            return list(self.lens.needed)
+        return [part for part in _PARTS if self._needed(change, part)] or [max(_PARTS, key=change.alone.__getitem__)]
+
+
+def _misfit(stay: Sequence[_ShotResiduals]) -> float:
+    """Return by how much the squared residuals of a stay exceed their number, mean of its shots."""
+    return sum(float(each.every[:, 0] @ each.every[:, 0]) - len(each.every) for each in stay) / len(stay)
+
+
+@kernel
+def _polynomials(x: float, y: float, values: Array) -> None:
+    """Fill values (P,) of the products of Chebyshev polynomials of a position in an image with edges at -1 and 1."""
+    T = np.empty((2, _DEGREE + 1))
+    T[:, 0], T[0, 1], T[1, 1] = 1.0, min(max(x, -1.0), 1.0), min(max(y, -1.0), 1.0)
+    for i in range(2, _DEGREE + 1):
+        for axis in range(2):
+            T[axis, i] = 2.0 * T[axis, 1] * T[axis, i - 1] - T[axis, i - 2]
+    n = 0
+    for i in range(_DEGREE + 1):
+        for k in range(_DEGREE + 1 - i):
+            values[n] = T[0, i] * T[1, k]
+            n += 1
+
+
+@kernel(
+    "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], const f8[:, ::1], i8[::1], const i8[::1], "
+    "const f8[:, :, ::1], const f8[:, :, :, ::1], f8, f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1]"
+)
+def _differentiate(
+    fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, half_px: Array, points: Array,
+    row_of: Ids, ids: Ids, uv: Array, cov: Array, sigma_px: float, T: Array, velocity: Array, A: Array, rows: Array,
+) -> float:  # fmt: skip
+    """Fill the derivatives A (4 N, 6) by the pose, and rows (4 N, 1 + K + M), of N points in both images; they hold zeros.
+
+    Return the mean variance of a coordinate, px^2; NaN where a point is behind a camera.
+    """
+    n, P = 2 * len(ids), 14 + counts[0] + counts[1]
+    p, side, seen, covs = np.empty((n, 3)), np.empty(n, np.int64), np.empty((n, 2)), np.empty((n, 2, 2))
+    variance = 0.0
+    for i in range(n):
+        side[i] = i % 2
+        p[i], seen[i], covs[i] = points[ids[i // 2]], uv[i // 2, i % 2], cov[i // 2, i % 2]
+        for axis in range(2):
+            covs[i, axis, axis] += sigma_px * sigma_px
+            variance += covs[i, axis, axis] / (2.0 * n)
+    W, left, B, values = np.zeros((n, 2, 2)), np.empty((n, 2)), np.zeros((2 * n, P)), np.empty(_POLYNOMIALS)
+    if not differentiate(fisheye, k, d, counts, T_right_left, p, side, seen, covs, T, W, left, A, B):
+        return np.nan
+    lens = rows.shape[1] - _LENS
+    for i in range(n):
+        c, first = side[i], 2 + P + 3 * row_of[ids[i // 2]]
+        _polynomials((seen[i, 0] + 0.5) / half_px[c, 0] - 1.0, (seen[i, 1] + 0.5) / half_px[c, 1] - 1.0, values)
+        for axis in range(2):
+            row, J = rows[2 * i + axis], A[2 * i + axis]
+            row[0] = W[i, axis, 0] * left[i, 0] + W[i, axis, 1] * left[i, 1]
+            row[1 : 1 + P] = B[2 * i + axis]
+            for j in range(3):
+                row[1 + P] += J[j] * p[i, j]
+                row[first + j] = J[j]
+            if c == 1:  # what the body's motion of a second does to the right image: one of a later exposure
+                for j in range(6):
+                    row[lens - 1] += J[j] * velocity[j]
+            for along in range(2):
+                begin = lens + (2 * c + along) * _POLYNOMIALS
+                for j in range(_POLYNOMIALS):
+                    row[begin + j] = W[i, axis, along] * values[j]
+    return variance
+
+
+@kernel("f8[:, ::1], f8[:, ::1], i8, f8, f8[:, ::1]")
+def _eliminate(A: Array, rows: Array, skew: int, sync_s: float, response: Array) -> None:
+    """Eliminate the pose, of derivatives A (n, 6), and the shot's own skew from rows (n, K); fill its response (6, K).
+
+    The skew, of column ``skew`` and standard deviation ``sync_s``, s, is eliminated by a symmetric factor of what Sherman
+    and Morrison give: (1 - g u u^T)^2 = 1 - u u^T / (1 / sync_s^2 + u^T u).
+    """
+    gain = solved(product(A.T, A), product(A.T, rows))
+    for i in range(len(rows)):
+        for j in range(6):
+            for c in range(rows.shape[1]):
+                rows[i, c] -= A[i, j] * gain[j, c]
+    response[:, :] = -gain
+    u, square = rows[:, skew].copy(), 0.0
+    for i in range(len(u)):
+        square += u[i] * u[i]
+    share = sync_s * sync_s / (1.0 + sync_s * sync_s * square)
+    along = np.zeros(rows.shape[1])
+    for i in range(len(u)):
+        for c in range(len(along)):
+            along[c] += u[i] * rows[i, c]
+    along *= share / (1.0 + np.sqrt(1.0 - share * square))
+    for i in range(len(u)):
+        for c in range(len(along)):
+            rows[i, c] -= u[i] * along[c]
+
+
+def _certain(change: RigChange) -> bool:
+    """Return whether chance explains neither all seven numbers nor one of their parts."""
+    return change.chi_square > _ALARM or any(change.alone[part] > limit for part, limit in _ALARMS.items())
+
+
+def free_directions(rig: StereoRig) -> Array:
+    """Return (P, 5) of a rig's parameters: translation of the right camera across the baseline (2), its rotation (3)."""
+    free, begin = np.zeros((rig.parameter_count, 5)), rig.parameter_count - 6
+    baseline = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3]
+    free[begin : begin + 3, :2] = np.linalg.svd(baseline[None])[2][1:].T
+    free[begin + 3 :, 2:] = np.eye(3)
+    return free
+
+
+def _fault_directions(rig: StereoRig, size: int) -> Array:
+    """Return (size, 7) what a unit of each of the seven numbers changes of the parameters."""
+    by_fault = np.zeros((size, len(_WIDE)))
+    by_fault[: rig.parameter_count, :5] = free_directions(rig)
+    by_fault[rig.parameter_count, _SCALED] = by_fault[-1, _SKEWED] = 1.0
+    return by_fault
+
+
+def _focal_changes(rig: StereoRig, size: int) -> Array:
+    """Return (size, 2) what relative changes of the focal lengths change: against each other by half each, and of both."""
+    changes, right = np.zeros((size, 2)), rig.left.parameters.size
+    changes[:2], changes[right : right + 2] = rig.left.intrinsics[:2, None], rig.right.intrinsics[:2, None]
+    return changes * [0.5, 1.0] * np.where(np.arange(size) < right, 1.0, [[-1.0], [1.0]]).T
+
+
+def differ(T: Array, other: Array) -> bool:
+    """Return whether two poses (4, 4) are so far apart that their errors count as independent."""
+    by = T[:3, 3] - other[:3, 3]
+    cosine = (float(np.vdot(T[:3, :3], other[:3, :3])) - 1.0) / 2.0
+    return float(by @ by) > (_SAME * float(T[2, 3])) ** 2 or cosine < _SAME_COSINE
+
+
+def _rig_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:
+    """Return the finding of cameras that moved against each other."""
+    rotation = change.f[_ROTATIONS]
+    size = float(np.linalg.norm(rotation))
+    along = rotation / size if size > 0.0 else np.zeros(3)
+    sigma = float(np.sqrt(along @ change.cov[_ROTATIONS, _ROTATIONS] @ along))
+    unsure = "; a body of another size cannot be excluded" if alone else ""
+    moved_mm = 1e3 * float(np.linalg.norm(change.f[:2]))
+    return HealthFinding(
+        "rig",
+        f"the right camera is rotated by {np.degrees(size):.3f} deg and shifted by {moved_mm:.2f} mm against the left one, "
+        f"compared with the calibration{unsure}",
+        since_s,
+        float(np.degrees(size)),
+        float(np.degrees(sigma)),
+        "deg",
+        "fasten the cameras and calibrate the rig again",
+    )
+
+
+def _scale_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:
+    """Return the finding of a body of another size, or a baseline of another length."""
+    size, sigma = 100.0 * float(change.f[_SCALED]), 100.0 * float(np.sqrt(change.cov[_SCALED, _SCALED]))
+    unsure = "; a rotation of one camera cannot be excluded" if alone else ""
+    return HealthFinding(
+        "body",
+        f"the body looks {abs(size):.2f} % {'larger' if size > 0 else 'smaller'} than its file says: the body file or the "
+        f"baseline of the rig is wrong, and the two cannot be distinguished{unsure}",
+        since_s,
+        size,
+        sigma,
+        "%",
+        "measure the distances on the body with calipers; if they agree with its file, calibrate the rig again",
+    )
+
+
+def _skew_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:
+    """Return the finding of cameras that do not expose when they are said to."""
+    size, sigma = 1e3 * float(change.f[_SKEWED]), 1e3 * float(np.sqrt(change.cov[_SKEWED, _SKEWED]))
+    unsure = "; a rotation of one camera cannot be excluded" if alone else ""
+    return HealthFinding(
+        "time",
+        f"the right camera exposes {abs(size):.2f} ms {'later' if size > 0 else 'earlier'} than is known, against the left "
+        f"one{unsure}",
+        since_s,
+        size,
+        sigma,
+        "ms",
+        "trigger both cameras together; in a recording --skew find moves the detections to one time",
+    )
+
+
+def _nod_finding(cov: Array, cost_m: float) -> HealthFinding:
+    """Return the finding of a camera that nods, of the covariance (3, 3) of its rotation, rad."""
+    size = float(np.degrees(np.sqrt(np.trace(cov))))
+    return HealthFinding(
+        "rig",
+        f"a camera nods: within a second the right one rotates by {size:.3f} deg (RMS) to and fro against the left one; "
+        "which of the two moves cannot be distinguished",
+        None,
+        size,
+        float(np.degrees(np.sqrt(np.linalg.eigvalsh(cov)[-1]))) * 0.1,
+        "deg",
+        "fasten the cameras on one stiff bar, away from what vibrates; poses have this in their sigma",
+        cost_mm=1e3 * cost_m,
+    )
+
+
+def _breathing_finding(cov: Array, cost_m: float) -> HealthFinding:
+    """Return the finding of a lens that breathes, of the covariance (4, 4) of rotation and focal length."""
+    size = 100.0 * float(np.sqrt(cov[3, 3]))
+    return HealthFinding(
+        "lens",
+        f"a lens breathes: within a second the focal length of one camera changes by {size:.3f} % (RMS) to and fro against "
+        "that of the other; which of the two cannot be distinguished",
+        None,
+        size,
+        0.1 * size,
+        "%",
+        "switch autofocus and image stabilisation off, fasten focus and zoom; poses have this in their sigma",
+        ("rig",),
+        cost_mm=1e3 * cost_m,
+    )
+
+
+def _lens_finding(lens: LensError, cost_m: float) -> HealthFinding:
+    """Return the finding of camera models that lack something."""
+    size, sigma = lens.size_px
+    besides = "; a change of the cameras, the body or their times cannot be excluded" if lens.needed else ""
+    return HealthFinding(
+        "lens",
+        f"residuals of {size:.3f} px RMS depend on the position in the images alone, which the model of the cameras cannot "
+        f"express{besides}",
+        None,
+        size,
+        sigma,
+        "px",
+        "calibrate again with a richer lens model and with targets over the whole of both images; look for a lens that is "
+        "loose or behind a window",
+        lens.needed,
+        cost_mm=1e3 * cost_m,
+    )
+
+
+def _of_one_pose(found: HealthFinding) -> HealthFinding:
+    """Return a finding that rests on one pose, with what looks the same."""
+    same = (
+        "or the two images do not belong together (another pair's, or the body moved between them); one pose leaves both "
+        "open"
+    )
+    advice = f"measure more poses; if all say so, {found.advice}"
+    return replace(found, what=f"{found.what}; {same}", advice=advice, alternatives=("time",))
+
+
+_FINDINGS = {"rig": _rig_finding, "body": _scale_finding, "time": _skew_finding}

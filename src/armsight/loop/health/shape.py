@@ -1,0 +1,809 @@
+"""Points of the body that are not where its file says, and focal lengths that changed: found in what seven numbers leave.
+
+In: the sums of the shots' residuals as in :mod:`~armsight.loop.health.rig`, those of points included that a pose was
+measured without because they did not fit. Out: which points moved on the body, by how much, or by how much the focal length
+of one camera changed against that of the other.
+
+Score test (Rao, 1948): with everything else estimated, the seven numbers among it, a displacement d of a point k explains
+r^T S^-1 r of the sum of squares, with
+
+    S = J^T H J - A^T C^-1 A + I / w^2,    A = M^T H J,    C = M^T H M + I,    r = J^T b - A^T C^-1 M^T b
+
+where H and b are the sums, J selects the point, and M has the standard deviations of everything else as its columns. The
+point that explains most is taken, then the next one besides it, while one explains more than chance: a body that is bent.
+
+What the sums from before a change say of everything else (M) is added to those from after it: a body may be off by its
+tolerance, but by the same all the time, so a point that moves is found where it moved by less than that.
+
+What may have changed and is not distinguished yet widens the poses: of each hypothesis (the seven numbers, focal lengths,
+a point, all points a little) the evidence against none (MacKay, 1992), of the newest test and of some newest ones together.
+Where the hypotheses together are more probable than that nothing changed, the second moment of their mixture is what poses
+may be off by. Shots that fit worst, a quarter of them, do not count: what changed shows in all that follow, an edge before
+the body in few. Chance exceeds an evidence of 1 / p in p of the tests at most (Markov), whatever the hypotheses.
+
+Only what lasts is reported. A reflection, or another light of the scene that is taken for a disc, stays in the scene or in
+the image while the body rotates. So a point counts only if the median of what single shots say agrees with what all say
+together, seen from directions that differ.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from armsight.data import Array, Ids, Record
+from armsight.loop.finding import HealthFinding, alarm_limit
+
+#: A displacement may be so large, m: what is further off is another thing. So much may a focal length change, as a share.
+FURTHEST_M, _FOCAL = 5e-3, 0.05
+#: Less than this is not reported, m and as a share: paint and glue are not more exact.
+_LEAST_M, _LEAST_FOCAL = 1e-4, 4e-4
+#: Single shots agree with all together if the median of their share of the displacement is between these.
+_AGREE = (0.5, 2.0)
+#: So many of the newest shots are asked, at the least so many; all together are of so many poses that differ at the least.
+_ASKED, _LEAST_SHOTS, _LEAST_POSES = 30, 8, 6
+#: The directions from which the body was seen must differ from their mean by so much, rad.
+_VIEWS_RAD = 0.05
+#: Tests that are kept; in so many after an alarm it is dated anew.
+_KEPT, _FRESH = 30, 6
+#: A displacement matters that moves a pose by so many of its claimed sigmas, of so many newest poses.
+_MATTERS, _POSES = 2.0, 60
+#: Explanations whose chi-squares differ by less are not distinguished; one is needed besides another beyond this chance.
+_ALIKE, _NECESSARY = 12.0, 1e-4
+_BESIDES = float(chdtri(3, _NECESSARY))
+#: Probability, before a test, that it is the first one after any change; that a body is strained or bent as a print is.
+_RARE, _PRINTED = 1e-4, 0.1
+#: A smooth deformation is said from this log-evidence on; chance exceeds it in one of a thousand bodies at most (Markov),
+#: as a body's shape is the same in all tests. Half: one of thirty, double: a shear of 0.3 % widens poses without a word.
+_CERTAIN = float(np.log(1e3))
+#: Strain, shear and what bending adds at the body's edge, as a share of its radius: widths of their priors; half: an
+#: elongation of 0.3 % is found later, double: one of 0.1 % is.
+_STRAINS = (1e-3, 4e-3)
+#: So many newest tests, together, may be those after a change, or all; all points may be displaced by about so much, m.
+_AFTER, _BENT_M = (1, 2, 4, 8, 16), (2e-4, 1e-3)
+#: Tests that are not kept are forgotten with this time constant, in tests.
+_SETTLED = 30.0
+#: The seven numbers are expected to change by such shares of their priors, which are wide.
+_SEVEN_SCALES = (1.0, 0.03, 0.003)
+#: The newest test agrees with all together unless chance explains their difference more rarely than this.
+_UNLIKE = 0.01
+
+
+class ResidualSums:
+    """What whitened residuals say of K parameters: sums over their rows, degrees of freedom, and when they began.
+
+    Attributes:
+        M: (1 + K, 1 + K) sum of the outer products of rows [residual; derivatives].
+        freedom: degrees of freedom.
+        begin_s: when the first shot was, s.
+    """
+
+    def __init__(self, size: int, begin_s: float) -> None:
+        self.M, self.freedom, self.begin_s = np.zeros((1 + size, 1 + size)), 0.0, begin_s
+
+    @property
+    def H(self) -> Array:
+        """(K, K) information."""
+        return self.M[1:, 1:]
+
+    @property
+    def b(self) -> Array:
+        """(K,) right side."""
+        return self.M[1:, 0]
+
+    @property
+    def square(self) -> float:
+        """Sum of squares of the residuals."""
+        return float(self.M[0, 0])
+
+    def add(self, other: ResidualSums, weight: float) -> None:
+        """Add another's."""
+        self.M += other.M if weight == 1.0 else weight * other.M
+        self.freedom += weight * other.freedom
+
+    def take(self, rows: Array, freedom: float) -> None:
+        """Add rows (N, 1 + K)."""
+        self.M += rows.T @ rows
+        self.freedom += freedom
+
+    def scale(self, weight: float) -> None:
+        """Weigh down what there is."""
+        self.M *= weight
+        self.freedom *= weight
+
+    def besides(self, before: ResidualSums, size: int) -> ResidualSums:
+        """Return these with what sums from before say of the first parameters, the others being zero then."""
+        found = ResidualSums(len(self.b), self.begin_s)
+        found.M, found.freedom = self.M.copy(), self.freedom + before.freedom
+        found.M[: 1 + size, : 1 + size] += before.M[: 1 + size, : 1 + size]
+        return found
+
+    def of(self, size: int) -> ResidualSums:
+        """Return those of the first parameters alone."""
+        found = ResidualSums(size, self.begin_s)
+        found.M, found.freedom = self.M[: 1 + size, : 1 + size].copy(), self.freedom
+        return found
+
+    def by(self, T: Array) -> ResidualSums:
+        """Return those of P other parameters, of which these K are T (K, P) times."""
+        found = ResidualSums(T.shape[1], self.begin_s)
+        found.M[0, 0], found.M[0, 1:], found.freedom = self.square, self.b @ T, self.freedom
+        found.M[1:, 0], found.M[1:, 1:] = found.M[0, 1:], T.T @ self.H @ T
+        return found
+
+    def over(self, variance: float) -> ResidualSums:
+        """Return these of residuals whose noise has a variance."""
+        found = self.of(len(self.b))
+        found.M /= variance
+        return found
+
+    def without(self, row: int) -> ResidualSums:
+        """Return these with a parameter eliminated, which has a prior of variance 1; its row is of no use."""
+        rest, column = self.of(len(self.b)), self.M[1 + row]
+        rest.M -= np.outer(column, column) / (1.0 + column[1 + row])
+        return rest
+
+    def less(self, other: ResidualSums) -> ResidualSums:
+        """Return these sums without another's."""
+        rest = ResidualSums(len(self.b), self.begin_s)
+        rest.add(self, 1.0)
+        rest.add(other, -1.0)
+        return rest
+
+
+def eliminated(M: Array, rows: slice) -> Array:
+    """Return sums M (N, N) with parameters eliminated, of which each has a prior of variance 1."""
+    across = np.delete(M[rows], rows, axis=1)
+    kept = np.delete(np.delete(M, rows, axis=0), rows, axis=1)
+    return np.asarray(kept - across.T @ np.linalg.solve(M[rows, rows] + np.eye(len(across)), across))
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeError(Record):
+    """Points that are displaced on the body, or focal lengths that changed.
+
+    Attributes:
+        chosen: what is wrong: rows of the tested points, in the order of what they explain, or FOCAL alone.
+        value: (C,) of all candidates, m for each coordinate of a point, as a share for the focal lengths. Of one point
+            that is displaced the others are zero; of a bent body they are as uncertain as the displacements are large.
+        cov: (C, C) its covariance.
+        chi_square: by how much the first explains more than a change of the seven numbers does.
+        seven: by how much the seven numbers explain more than they all do.
+        alike: what explains nearly as much as the first.
+        begin_s: since when, s.
+    """
+
+    chosen: tuple[int, ...]
+    value: Array
+    cov: Array
+    chi_square: float
+    seven: float
+    alike: tuple[int, ...]
+    begin_s: float
+
+    @property
+    def seven_needed(self) -> bool:
+        """Whether a change of the seven numbers is needed besides."""
+        return bool(self.seven > chdtri(7, _NECESSARY))
+
+    def is_of(self, other: ShapeError | None) -> bool:
+        """Whether both name the same candidate first."""
+        return other is not None and self.chosen[0] == other.chosen[0]
+
+
+#: Stand for the focal lengths and for a smooth deformation among the rows of the points.
+FOCAL, SMOOTH = -1, -2
+#: Rows of the seven numbers once the parameters are eliminated.
+_SEVEN = slice(1, 8)
+
+
+class _ShapeSums(NamedTuple):
+    """Sums with everything but the candidates eliminated: G (C, C), r (C,), and the sum of squares and freedom."""
+
+    G: Array
+    r: Array
+    square: float
+    freedom: float
+
+    def gain(self, columns: Ids) -> float:
+        """Return what candidates explain of the sum of squares."""
+        r = self.r[columns]
+        return float(r @ np.linalg.solve(self.G[np.ix_(columns, columns)], r))
+
+    def gains(self, points: Sequence[int]) -> Array:
+        """Return what each of some points (P,) explains alone, as :meth:`gain` does."""
+        rows = 2 + 3 * np.array(points, int)[:, None] + np.arange(3)
+        r = self.r[rows]
+        solved = np.linalg.solve(self.G[rows[:, :, None], rows[:, None, :]], r[..., None])[..., 0]
+        return np.asarray(np.einsum("pi,pi->p", r, solved))
+
+    def excess(self, gain: float) -> float:
+        """Return by how much the variance of what is left exceeds the noise (Birge ratio), 1 at the least."""
+        return max((self.square - gain) / max(self.freedom, 1.0), 1.0)
+
+
+class _Reduced(NamedTuple):
+    """What sums say of the candidates: with the seven numbers eliminated, and with these zero."""
+
+    whole: _ShapeSums
+    without: _ShapeSums
+
+
+class _Hypotheses(NamedTuple):
+    """Hypotheses of D numbers each.
+
+    Rows (N, D) of seven numbers, candidates and smooth deformations, by how much of their priors (N,), and the probability
+    of all of them before anything is seen.
+    """
+
+    rows: Ids
+    scales: Array
+    chance: float = _RARE
+
+
+#: One focal length that changed against the other, by little or much.
+_FOCAL_ALONE = _Hypotheses(np.array([[7], [7], [7]]), np.array([1.0, 0.1, 0.01]))
+
+
+class _Explained(NamedTuple):
+    """Log-evidence (N,) of hypotheses against none, the sizes (N, D) of what changed, and their covariances (N, D, D)."""
+
+    evidence: Array
+    size: Array
+    cov: Array
+
+
+class _ShapeTest(NamedTuple):
+    """The sums of one test, of its usual shots, what all say alone, and the directions from which it saw the body."""
+
+    sums: ResidualSums
+    usual: ResidualSums
+    alone: _Reduced
+    views: list[Array]
+
+
+class ShapeWatch:
+    """Watches the shape of the body, and the focal lengths of the cameras against each other.
+
+    Args:
+        size: K, of the parameters.
+        focal: (K, 2) what relative changes of the focal lengths change of these: of the left one by a half and of the right
+            one by minus a half, and of both.
+        first: row of the first parameter of the points.
+        points: (N, 3) those that have parameters, m.
+        names: of them.
+        test_s: how often it is tested, s.
+        rigid: whether single points are not tested.
+        strained: whether the body may be elongated, sheared or bent: not a print whose shape a calibration found.
+
+    Attributes:
+        by_wide: (K, C) what the standard deviations of the candidates' priors change of the parameters.
+        doubt: (7 + C, 7 + C) second moment of the seven numbers and the candidates, in units of their priors, by all that
+            may have changed; None where that is improbable, or known.
+        found: what the newest test found for certain.
+        said: what was found last.
+    """
+
+    def __init__(
+        self,
+        size: int,
+        focal: Array,
+        first: int,
+        points: Array,
+        names: tuple[str, ...],
+        test_s: float,
+        *,
+        rigid: bool,
+        strained: bool,
+    ) -> None:
+        K, n = size, len(names)
+        self._size, self._first, self._names = K, first, names
+        # (K, 2 + 3 N) what a unit of each candidate changes of the parameters: of the focal lengths against each other,
+        # of both together, of each coordinate of each point.
+        self._by_candidate = np.zeros((K, 2 + 3 * n))
+        self._by_candidate[:, :2] = focal
+        self._by_candidate[first : first + 3 * n, 2:] = np.eye(3 * n)
+        self._wide = np.append([_FOCAL, _FOCAL], np.full(3 * n, FURTHEST_M))
+        self.by_wide = self._by_candidate * self._wide
+        self._candidates = () if rigid else tuple(range(n))
+        # What smooth deformations add to sums of the residual, the seven numbers and the candidates; in m of the latter.
+        self._smooth = _smooth(points)
+        self._with_smooth = np.hstack([np.eye(10 + 3 * n), np.vstack([np.zeros((10, 27)), self._smooth / FURTHEST_M])])
+        self._hypotheses = _hypotheses(len(self._candidates), 3 * n, strained=strained)
+        self._limit_focal, self._limit = (alarm_limit(size, 1.0 / test_s, 2 * (n + 1)) for size in (1, 3))
+        self._view: Array | None = None  # the newest direction that differs from the one before
+        self._views: list[Array] = []  # of the running test
+        self._history: deque[_ShapeTest] = deque(maxlen=_KEPT)
+        every = 1 + K + 7 + 2 + 3 * n
+        # Of older tests, of all shots and of the usual ones; of those before what is suspected to have changed.
+        self._settled = ResidualSums(every - 1, 0.0), ResidualSums(every - 1, 0.0)
+        # Of both, what was settled and the tests before each one that is kept, all of them last.
+        self._running: tuple[list[ResidualSums], list[ResidualSums]] = [], []
+        self._shots: deque[Array] = deque(maxlen=_ASKED)  # rows, as they were taken
+        # The response of the newest poses to the parameters, and the covariances of these poses.
+        self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
+        self._changed_s: float | None = None  # since when something may have changed
+        self._alarms = 0  # in a row
+        self._suspect: ShapeError | None = None
+        self.doubt: Array | None = None
+        self.found: ShapeError | None = None
+        self.said: ShapeError | None = None
+
+    def take(self, rows: Array, T: Array, response: Array, cov: Array, moved: bool) -> None:
+        """Take a shot.
+
+        Args:
+            rows: (n, 1 + K) its residuals and their derivatives, all points included, its pose eliminated.
+            T: (4, 4) pose T_left_body.
+            response: (6, K) of a pose measured with all points to the parameters.
+            cov: (6, 6) covariance of the pose.
+            moved: whether its pose differs from the one before; single shots are asked only then.
+        """
+        self._effects.append((response, cov))
+        if not moved:
+            return
+        self._shots.append(rows)
+        view = T[:3, :3].T @ T[:3, 3]
+        view /= np.sqrt(view @ view)
+        if self._view is None or np.linalg.norm(view - self._view) > _VIEWS_RAD / _LEAST_POSES:  # else it rests
+            self._views.append(view)
+            self._view = view
+
+    def decide(self, sums: ResidualSums, usual: ResidualSums, *, ends: bool) -> None:
+        """Test once more; the first test is enough by itself only where it ends all.
+
+        Args:
+            sums: since the last test: of the K parameters, the seven numbers and the candidates, in units of their priors.
+            usual: the same without the shots that fit worst.
+            ends: whether it ends all.
+        """
+        # The test before the first one after a change is of both times.
+        if len(self._history) == _KEPT and (self._changed_s is None or self._history[1].sums.begin_s < self._changed_s):
+            oldest = self._history[0]
+            self._settled = _settled(self._settled[0], oldest.sums), _settled(self._settled[1], oldest.usual)
+        self._history.append(_ShapeTest(sums, usual, self._reduced(sums), self._views))
+        self._views = []
+        tests, before = list(self._history), self._suspect
+        self._running = (
+            _running(self._settled[0], [each.sums for each in tests]),
+            _running(self._settled[1], [each.usual for each in tests]),
+        )
+        self._suspect = self._suspected(tests, before)
+        self._alarms = 0 if self._suspect is None else self._alarms + 1
+        # What a change leaves in the test in which it began may look like a displaced point, once.
+        again = before is not None and before.is_of(self._suspect)
+        self.found = self._suspect if again or (ends and len(tests) == 1) else None
+        self.said = self.found or self.said
+        doubted_s, self.doubt = self._doubted()
+        if self.found is not None:
+            self._changed_s = self.found.begin_s
+        elif self.doubt is None:
+            self._changed_s = None
+        elif self._changed_s is None:
+            self._changed_s = doubted_s
+
+    def _suspected(self, tests: list[_ShapeTest], before: ShapeError | None) -> ShapeError | None:
+        """Return what the tests show now, since when; ``before`` is what they showed last time."""
+        if before is None:
+            counts = (1, len(tests)) if self.doubt is None else (*self._counts(), 1)
+            shown = next(filter(None, (self._shown(len(tests) - count) for count in counts)), None)
+        else:
+            later = sum(each.sums.begin_s >= before.begin_s for each in tests)
+            shown = self._shown(len(tests) - max(later, 1))
+        if shown is not None and self._alarms < _FRESH:
+            return self._dated()
+        if shown is not None and before is not None and before.is_of(shown):
+            return replace(shown, begin_s=before.begin_s)  # though the tests of that time are no longer kept
+        return shown
+
+    def _counts(self) -> tuple[int, ...]:
+        """Return how many newest tests may be those after a change."""
+        tests = len(self._history)
+        return (*(count for count in _AFTER if count < tests), tests)
+
+    def _since(self, begin: int, *, usual: bool = False) -> ResidualSums:
+        """Return the sums of the tests from one on, with what those before it say of what does not change.
+
+        The test before may be of both times: it is left out.
+        """
+        running = self._running[usual]
+        after = running[-1].less(running[begin])
+        after.begin_s = self._history[begin].sums.begin_s
+        return after.besides(running[max(begin - 1, 0)], self._size)
+
+    def _doubted(self) -> tuple[float, Array | None]:
+        """Return since when something may have changed, s, and its second moment (7 + C, 7 + C).
+
+        None where nothing did, more probably.
+        """
+        tests = len(self._history)
+        if self.found is None:
+            sums = [self._since(tests - count, usual=True) for count in self._counts()]
+            mixtures = [self._mixture(each, self._hypotheses) for each in sums]
+            best = max(range(len(sums)), key=lambda n: mixtures[n][0])
+            evidence, moment = mixtures[best]
+            return sums[best].begin_s, moment if evidence > np.log(2.0) else None
+        if self.found.chosen != (FOCAL,):
+            return self.found.begin_s, None
+        # Cameras that moved cannot be excluded.
+        later = sum(each.usual.begin_s >= self.found.begin_s for each in self._history)
+        sums_since = self._since(tests - max(later, 1), usual=True)
+        return self.found.begin_s, self._mixture(sums_since, self._hypotheses[:1])[1]
+
+    def evidence(self, sums: ResidualSums, excess: float) -> tuple[float, float]:
+        """Return the log-evidence of the best hypothesis of what changed and stays in sums of one test, against none.
+
+        And that of one focal length that changed, with a noise whose variance is so many times larger.
+        """
+        M = self._with_smooth.T @ eliminated(sums.M, slice(1, 1 + self._size)) @ self._with_smooth
+        every = [_explained(M, each, excess).evidence for each in (*self._hypotheses, _FOCAL_ALONE)]
+        return max(float(each.max()) for each in every[:-1]), float(every[-1].max())
+
+    def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypotheses]) -> tuple[float, Array]:
+        """Return the log-evidence that anything changed before the tests of sums, and the second moment of what did.
+
+        Nothing is one of the hypotheses, and its evidence is 1.
+        """
+        M, excess = self._whole(sums)
+        every = self._with_smooth[1:, 1:]
+        moment = np.zeros((every.shape[1], every.shape[1]))
+        if M is None:
+            return 0.0, every @ moment @ every.T
+        explained = [_explained(M, each, excess) for each in hypotheses]
+        shares = zip(hypotheses, explained, strict=True)
+        logs = [np.log(each.chance / len(each.scales)) + found.evidence for each, found in shares]
+        evidence = float(np.logaddexp.reduce(np.concatenate([*logs, [0.0]])))
+        for (rows, _, _), log, each in zip(hypotheses, logs, explained, strict=True):
+            moments = each.size[:, :, None] * each.size[:, None, :] + each.cov
+            np.add.at(moment, (rows[:, :, None], rows[:, None, :]), np.exp(log - evidence)[:, None, None] * moments)
+        return evidence, every @ moment @ every.T
+
+    def _whole(self, sums: ResidualSums) -> tuple[Array | None, float]:
+        """Return sums of everything that may have changed, smooth deformations included, and the Birge ratio they leave.
+
+        None where all together explain too little to matter.
+        """
+        M = eliminated(sums.M, slice(1, 1 + self._size))
+        gain = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0]))
+        if gain < 2.0:
+            return None, 1.0
+        excess = max((float(M[0, 0]) - gain) / max(sums.freedom, 1.0), 1.0)  # what all together do not explain is noise
+        return self._with_smooth.T @ M @ self._with_smooth, excess
+
+    def _shown(self, begin: int) -> ShapeError | None:
+        """Return what the tests from one on show for certain; None where that is nothing."""
+        tests = list(self._history)[begin:]
+        views = [view for each in tests for view in each.views]
+        if len(views) < _LEAST_POSES or not _differ(np.array(views)):
+            return None
+        sums, newest = self._since(begin), tests[-1].alone
+        found = self._reduced(sums)
+        error = self._focal_alone(found, sums.begin_s)
+        if error is not None and _one_is_enough(newest):
+            return error
+        return self._deformed(sums) or self._displaced(found, newest.whole, sums.begin_s)
+
+    def _deformed(self, sums: ResidualSums) -> ShapeError | None:
+        """Return a smooth deformation of the body that tests show for certain, beside any change of the seven numbers.
+
+        And better than a single point does.
+        """
+        M, excess = self._whole(sums)
+        smooth = [each for each in self._hypotheses if each.chance == _PRINTED]
+        if M is None or not smooth:
+            return None
+        besides = eliminated(M, _SEVEN)
+        points = [each for each in self._hypotheses[1:] if each.chance != _PRINTED]
+        most, other = (
+            [float(_explained(besides, each._replace(rows=each.rows - 7), excess).evidence.max()) for each in some]
+            for some in (smooth, points)
+        )
+        if max(most) < max(_CERTAIN, max(other) + _ALIKE / 2.0):
+            return None
+        hypothesis = smooth[int(np.argmax(most))]
+        found = _explained(M, hypothesis, excess)
+        row = int(found.evidence.argmax())
+        columns = self._with_smooth[8:, 1:][:, hypothesis.rows[row]] * self._wide[:, None]
+        value, cov = columns @ found.size[row], columns @ found.cov[row] @ columns.T
+        if not self._matters(value):
+            return None
+        return ShapeError((SMOOTH,), value, cov, 2.0 * max(most), 0.0, (), sums.begin_s)
+
+    def _displaced(self, found: _Reduced, newest: _ShapeSums, begin_s: float) -> ShapeError | None:
+        """Return the points that are displaced by what all tests together say, and the newest; None where none is."""
+        whole = found.whole
+        if not self._candidates or not (whole.gains(self._candidates) > self._limit).any():
+            return None
+        steady = [each for each in self._candidates if self._steady(whole, newest, each)]
+        chosen = list[int]()
+        scores = dict[int, float]()
+        most = max(1, len(self._names) // 2)
+        while len(chosen) < most and (left := [each for each in steady if each not in chosen]):
+            now = whole.gain(_columns(chosen)) if chosen else 0.0
+            gains = {each: whole.gain(_columns([*chosen, each])) for each in left}
+            best = max(gains, key=gains.__getitem__)
+            excess = whole.excess(gains[best])
+            if (gains[best] - now) / excess <= (_BESIDES if chosen else self._limit):
+                break
+            scores = scores or {each: gain / excess for each, gain in gains.items()}
+            chosen.append(best)
+        return self._error(found, tuple(chosen), scores, begin_s) if chosen else None
+
+    def _focal_alone(self, found: _Reduced, begin_s: float) -> ShapeError | None:
+        """Return the focal lengths' change where that one number explains as much as the seven do; else None."""
+        columns, without = _columns([FOCAL]), found.without
+        gain = without.gain(columns)
+        excess = without.excess(gain)
+        if gain / excess < self._limit_focal or not _one_is_enough(found):
+            return None
+        value, cov = self._values(without, columns, 0.0)
+        if abs(value[0]) < _LEAST_FOCAL:
+            return None
+        cov[1, 1] = (value[0] / 2.0) ** 2 / excess  # one of the two may have changed alone
+        return ShapeError((FOCAL,), value, excess * cov, gain / excess, 0.0, (), begin_s)
+
+    def _error(
+        self, found: _Reduced, chosen: tuple[int, ...], scores: dict[int, float], begin_s: float
+    ) -> ShapeError | None:
+        """Return the record of what was chosen; None where it is too small to matter."""
+        (whole, without), columns = found, _columns(chosen)
+        gain = whole.gain(columns)
+        excess = whole.excess(gain)
+        value, cov = self._values(whole, columns, 0.0)
+        if len(chosen) > 1:
+            value, cov = self._values(whole, columns, float(np.sqrt(np.mean(value[columns] ** 2))))
+        if np.linalg.norm(value[_columns(chosen[:1])]) < _LEAST_M or not self._matters(value):
+            return None
+        seven = (without.square - without.gain(columns) - (whole.square - gain)) / excess
+        best = chosen[0]
+        alike = tuple(each for each, score in scores.items() if each != best and score > scores[best] - _ALIKE)
+        return ShapeError(chosen, value, excess * cov, scores[best], seven, alike, begin_s)
+
+    def _values(self, whole: _ShapeSums, columns: Ids, others_m: float) -> tuple[Array, Array]:
+        """Return the displacements (C,) of columns, and of all other points if these have a prior, and cov (C, C)."""
+        wide = self._wide.copy()
+        free = columns if others_m == 0.0 else np.arange(2, len(wide))
+        wide[np.setdiff1d(free, columns)] = others_m
+        G = whole.G - np.eye(len(wide))
+        narrow = wide / self._wide
+        G, r = G * np.outer(narrow, narrow) + np.eye(len(wide)), whole.r * narrow
+        value, cov = np.zeros(len(wide)), np.zeros((len(wide), len(wide)))
+        inverse = np.linalg.inv(G[np.ix_(free, free)])
+        value[free] = wide[free] * (inverse @ r[free])
+        cov[np.ix_(free, free)] = inverse * np.outer(wide[free], wide[free])
+        return value, cov
+
+    def _reduced(self, sums: ResidualSums) -> _Reduced:
+        """Eliminate the parameters from sums, and the seven numbers."""
+        without = eliminated(sums.M, slice(1, 1 + self._size))
+        whole, candidates = eliminated(without, _SEVEN), np.delete(np.arange(len(without)), _SEVEN)
+        return _Reduced(*(_of_candidates(M, sums.freedom) for M in (whole, without[np.ix_(candidates, candidates)])))
+
+    def _steady(self, whole: _ShapeSums, newest: _ShapeSums, which: int) -> bool:
+        """Return whether the newest test, and the median of single shots, agree on a point with all tests together."""
+        columns = _columns([which])
+        (d, cov), (now, cov_now) = (self._values(each, columns, 0.0) for each in (whole, newest))
+        d, off = d[columns], (now - d)[columns]
+        each = (cov + cov_now)[np.ix_(columns, columns)]
+        if float(off @ np.linalg.solve(each, off)) > newest.excess(newest.gain(columns)) * chdtri(len(off), _UNLIKE):
+            return False
+        first = 1 + self._first + 3 * which
+        if len(self._shots) < _LEAST_SHOTS:
+            return False
+        begins = np.cumsum([0, *map(len, self._shots)])[:-1]
+        rows = np.concatenate(self._shots)
+        along = rows[:, first : first + 3] @ d
+        squares, right = (np.add.reduceat(along * other, begins) for other in (along, rows[:, 0]))
+        shares = right[squares > 0.0] / squares[squares > 0.0]
+        return len(shares) >= _LEAST_SHOTS and bool(_AGREE[0] < np.median(shares) < _AGREE[1])
+
+    def _matters(self, value: Array) -> bool:
+        """Return whether a displacement moves a new pose by so many of its sigmas, were it measured with that point."""
+        responses, covs = map(np.array, zip(*self._effects, strict=True))
+        shift = responses @ (self._by_candidate @ value)
+        squares = np.einsum("ni,ni->n", shift, np.linalg.solve(covs, shift[..., None])[..., 0])
+        return float(np.max(squares)) > _MATTERS**2
+
+    def _dated(self) -> ShapeError | None:
+        """Return what is shown from the beginning on that leaves least unexplained, whichever points moved then.
+
+        The test before its beginning may be of both times: it is left out, and counts as noise.
+        """
+        lefts, free = list[float](), np.concatenate([[0, 1], *(_columns([each]) for each in self._candidates)])
+        for k in range(len(self._history)):
+            whole = self._reduced(self._since(k)).whole
+            mixed = self._history[k - 1].sums.freedom if k else 0.0
+            lefts.append(whole.square - whole.gain(free) + mixed)
+        return self._shown(int(np.argmin(lefts)))
+
+    def added(self, response: Array) -> Array:
+        """Return the covariance (6, 6) of what was found, of a pose with a response (6, K) to the parameters."""
+        found = self.found
+        if found is None:
+            return np.zeros((6, 6))
+        effect = response @ self._by_candidate
+        shift = effect @ found.value
+        return np.asarray(np.outer(shift, shift) + effect @ found.cov @ effect.T)
+
+    def change(self, error: ShapeError) -> Array:
+        """Return the change of the parameters (K,) that was found."""
+        return np.asarray(self._by_candidate @ error.value)
+
+    def copied(self) -> ShapeWatch:
+        """Return a copy that says what was found so far; this one goes on."""
+        other = copy(self)
+        other._history, other._shots, other._effects = self._history.copy(), self._shots.copy(), self._effects.copy()
+        other._views = self._views.copy()
+        return other
+
+    def finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
+        """Return the finding of what was found."""
+        if error.chosen[0] == SMOOTH:
+            return self._smooth_finding(error, since_s)
+        return _focal_finding(error, since_s) if error.chosen[0] == FOCAL else self._points_finding(error, since_s)
+
+    def _smooth_finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
+        """Return the finding of a body that is strained or bent: how far a point is displaced at most, motions apart."""
+        basis, value = self._smooth[:, :9], error.value[2:]
+        rigid = np.linalg.lstsq(basis, value, rcond=1e-9)[0].reshape(3, 3)
+        spin = (basis @ (0.5 * (rigid - rigid.T)).ravel()).reshape(-1, 3)
+        shifts = value.reshape(-1, 3) - spin
+        shifts -= shifts.mean(axis=0)
+        sizes = np.linalg.norm(shifts, axis=1)
+        k = int(sizes.argmax())
+        along = np.zeros(len(error.value))
+        along[2 + 3 * k : 5 + 3 * k] = shifts[k] / sizes[k]
+        strain = 50.0 * float(np.ptp(np.linalg.eigvalsh(rigid + rigid.T)))
+        return HealthFinding(
+            "body",
+            f"the body is elongated, sheared or bent against its file: its lengths differ by {strain:.2f} % from one "
+            f"direction to another, {self._names[k]} is displaced by {1e3 * sizes[k]:.2f} mm",
+            since_s,
+            1e3 * float(sizes[k]),
+            1e3 * float(np.sqrt(along @ error.cov @ along)),
+            "mm",
+            "measure the body along two directions and both diagonals with calipers, or take its shape from images "
+            "(armsight body); printers are off along one axis",
+        )
+
+    def _points_finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
+        """Return the finding of points that are displaced."""
+        points = [(each, _columns([each])) for each in error.chosen]
+        largest = max((rows for _, rows in points), key=lambda rows: float(np.linalg.norm(error.value[rows])))
+        size = float(np.linalg.norm(error.value[largest]))
+        along = error.value[largest] / size
+        sigma = float(np.sqrt(along @ error.cov[np.ix_(largest, largest)] @ along))
+        names = ", ".join(
+            f"{self._names[each]} by {1e3 * np.linalg.norm(error.value[rows]):.2f} mm" for each, rows in points
+        )
+        others = [self._names[each] for each in error.alike]
+        unsure = f"; it may be {' or '.join(others)} instead" if others and len(points) == 1 else ""
+        what = (
+            f"the body is bent, or points of it moved: against the others {names} are not where its file says"
+            if len(points) > 1
+            else f"{self._names[error.chosen[0]]} is displaced by {1e3 * size:.2f} mm on the body against its file: it "
+            f"moved, or is partly covered{unsure}"
+        )
+        return HealthFinding(
+            "body",
+            what,
+            since_s,
+            1e3 * size,
+            1e3 * sigma,
+            "mm",
+            "look at these points; clean or fasten them, and measure the body again (armsight body)",
+        )
+
+
+def _of_candidates(M: Array, freedom: float) -> _ShapeSums:
+    """Return sums M (1 + C, 1 + C) with the candidates' priors."""
+    return _ShapeSums(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0], float(M[0, 0]), freedom)
+
+
+def _smooth(points: Array) -> Array:
+    """Return (3 N, 27) smooth deformations of points (N, 3), m: strains (9: by coordinate, direction) and bends (18).
+
+    The former are motions of rows of a matrix that multiplies the points, the latter products of two coordinates; each is
+    a share of the body's radius at a point so far out.
+    """
+    from_middle = points - points.mean(axis=0)
+    radius = float(np.linalg.norm(from_middle, axis=1).max())
+    u = from_middle / radius
+    i, k = np.triu_indices(3)
+    bends = u[:, i] * u[:, k]
+    by = np.hstack([u, bends - bends.mean(axis=0)])
+    return np.asarray(radius * np.einsum("nk,ij->nikj", by, np.eye(3)).reshape(3 * len(points), -1))
+
+
+def _hypotheses(points: int, smooth: int, *, strained: bool) -> tuple[_Hypotheses, ...]:
+    """Return what may have changed: the seven numbers, one focal length, both alike, a point, all points a little.
+
+    And smooth deformations, whose rows stand after those of all points (``smooth`` of them).
+    """
+    every, first = 9 + np.arange(3 * points), 9 + smooth
+    strains, bends = (
+        _Hypotheses(np.tile(first + np.arange(count), (len(_STRAINS), 1)), np.array(_STRAINS), _PRINTED)
+        for count in (9, 27)
+    )
+    seven = _Hypotheses(np.tile(np.arange(7), (len(_SEVEN_SCALES), 1)), np.array(_SEVEN_SCALES))
+    alone = (seven, _Hypotheses(np.array([[7], [8]]), np.ones(2)), *((strains, bends) if strained else ()))
+    if not points:
+        return alone
+    single = _Hypotheses(every.reshape(points, 3), np.ones(points))
+    return (*alone, single, _Hypotheses(np.tile(every, (len(_BENT_M), 1)), np.array(_BENT_M) / FURTHEST_M))
+
+
+def _explained(M: Array, hypotheses: _Hypotheses, excess: float) -> _Explained:
+    """Return what hypotheses say of sums M (1 + K, 1 + K), of a noise whose variance is so many times larger."""
+    rows, scales = 1 + hypotheses.rows, hypotheses.scales[:, None]
+    variances = scales[..., None] ** 2
+    G = M[rows[:, :, None], rows[:, None, :]] * (variances / excess) + np.eye(rows.shape[1])
+    r, inverse = M[rows, 0] * (scales / excess), np.linalg.inv(G)
+    d = np.einsum("nij,nj->ni", inverse, r)
+    evidence = 0.5 * np.einsum("ni,ni->n", r, d) - 0.5 * np.linalg.slogdet(G)[1]
+    return _Explained(evidence, scales * d, variances * inverse)
+
+
+def _columns(chosen: Sequence[int]) -> Ids:
+    """Return the columns of candidates."""
+    return np.concatenate([[0] if each == FOCAL else np.arange(2 + 3 * each, 5 + 3 * each) for each in chosen])
+
+
+def _one_is_enough(found: _Reduced) -> bool:
+    """Return whether the change of one focal length explains about as much as the seven numbers do."""
+    whole, without = found
+    gain, seven = without.gain(_columns([FOCAL])), without.square - whole.square
+    return gain >= seven - _ALIKE * without.excess(max(gain, seven))
+
+
+def total(tests: Sequence[ResidualSums]) -> ResidualSums:
+    """Return the sums of tests."""
+    found = tests[0].of(len(tests[0].b))
+    for each in tests[1:]:
+        found.add(each, 1.0)
+    return found
+
+
+def _settled(sums: ResidualSums, test: ResidualSums) -> ResidualSums:
+    """Return sums of older tests with one more."""
+    found = total([sums])
+    found.scale(float(np.exp(-1.0 / _SETTLED)))
+    found.add(test, 1.0)
+    return found
+
+
+def _running(settled: ResidualSums, tests: Sequence[ResidualSums]) -> list[ResidualSums]:
+    """Return the sums before each of some tests, and those of all."""
+    found = [settled]
+    for each in tests:
+        found.append(total([found[-1], each]))
+    return found
+
+
+def _differ(views: Array) -> bool:
+    """Return whether directions (N, 3) differ enough from their mean."""
+    mean = views.mean(axis=0)
+    return bool(np.min(views @ mean) < np.cos(_VIEWS_RAD) * np.linalg.norm(mean))
+
+
+def _focal_finding(error: ShapeError, since_s: float | None) -> HealthFinding:
+    """Return the finding of a focal length that changed."""
+    share, sigma = 100.0 * float(error.value[0]), 100.0 * float(np.sqrt(error.cov[0, 0]))
+    longer, shorter = ("left", "right") if share > 0 else ("right", "left")
+    return HealthFinding(
+        "lens",
+        f"the focal length of the {longer} camera is {abs(share):.3f} % longer against that of the {shorter} one than "
+        "calibrated; which of the two changed cannot be distinguished",
+        since_s,
+        abs(share),
+        sigma,
+        "%",
+        "fasten focus and zoom of both lenses, let the cameras warm up, and calibrate the rig again",
+        ("rig",),
+    )
