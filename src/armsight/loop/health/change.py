@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.special import chdtri
 
 from armsight.data import Array, Record
+from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import adjoint, inverse
 from armsight.loop.estimators import PoseMeasurement
 from armsight.loop.estimators.armerror import ErrorLayout
@@ -31,7 +31,7 @@ MARGIN = 1.4
 _OTHERWISE = 0.08
 #: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone: beyond it by chance once in
 #: a hundred.
-_ALONG = float(chdtri(5, 0.01))
+_ALONG = chi_square_limit(5, 0.01)
 #: What the pair alone cannot distinguish from that.
 FOCAL = "; both focal lengths that changed alike look the same to the pair"
 

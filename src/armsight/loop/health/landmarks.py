@@ -17,9 +17,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import chdtri
 
 from armsight.data import Array, PoseEstimate
+from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import adjoint, inverse, log_se3
 from armsight.loop.finding import FALSE_ALARMS_PER_MINUTE, HealthFinding
 from armsight.loop.health.change import FOCAL, along_axis
@@ -75,7 +75,7 @@ class _Landmark:
 
 def _limit(freedom: int) -> float:
     """Return the chi-square of an alarm of some degrees of freedom: a mean is tested some times a second."""
-    return float(chdtri(freedom, FALSE_ALARMS_PER_MINUTE / 360.0))
+    return chi_square_limit(freedom, FALSE_ALARMS_PER_MINUTE / 360.0)
 
 
 #: So many means of all bodies together for each of them are waited for those of a body that is not seen any more.

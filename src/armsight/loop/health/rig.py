@@ -39,9 +39,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
-from scipy.special import chdtri
 
 from armsight.data import Array, Body, Ids, PoseEstimate, Record
+from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import adjoint, inverse, log_se3, pose
 from armsight.kernels import kernel
@@ -80,7 +80,7 @@ _LEAST_S, _LIKE_S = 0.025, 0.1
 _ODD = 4
 #: A point that a pose was measured without is another thing also where its two detections disagree by more than chance
 #: explains once in so many shots.
-_PAIRED = float(chdtri(1, 1e-4))
+_PAIRED = chi_square_limit(1, 1e-4)
 #: Fewer points than this say nothing of these numbers; shots further apart in time than this give no speed, s.
 _LEAST_POINTS, _APART_S = 4, 0.5
 #: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
@@ -110,7 +110,7 @@ _ALARM, _ALARMS = (
 #: A change matters or not at so many of the newest poses: a skew does so in motion alone.
 _POSES = 60
 #: Chi-square from which on a change that matters widens the poses: chance exceeds it in one of fifty tests.
-_SUSPECTED = float(chdtri(len(_WIDE), 0.02))
+_SUSPECTED = chi_square_limit(len(_WIDE), 0.02)
 #: The polynomials of the position in an image are all products of x and y up to this degree; their count.
 _DEGREE = 4
 _POLYNOMIALS = (_DEGREE + 1) * (_DEGREE + 2) // 2
@@ -453,7 +453,7 @@ class RigWatch:
         change = self._estimated(self._in_priors(sums))
         more = {part: change.chi_square - change.without[part] for part in ("rig", "body")}
         part: Part = max(("rig", "body"), key=lambda each: (more[each], change.alone[each]))
-        sure = more[part] > chdtri(_PARTS[part].stop - _PARTS[part].start, _NECESSARY)
+        sure = more[part] > chi_square_limit(_PARTS[part].stop - _PARTS[part].start, _NECESSARY)
         found = _FINDINGS[part](change, None, not sure)
         rig = self.rig.perturbed(free_directions(self.rig) @ change.f[_PARTS["rig"]])
         body = replace(self._body, points=(1.0 + change.f[_SCALED]) * self._body.points)
@@ -743,7 +743,7 @@ class RigWatch:
         needed = tuple(
             part
             for part, rows in _PARTS.items()
-            if (most - gained(changed[rows])) / excess > chdtri(rows.stop - rows.start, _NECESSARY)
+            if (most - gained(changed[rows])) / excess > chi_square_limit(rows.stop - rows.start, _NECESSARY)
         )
         explained = (by_lens - gained(changed, lens)) / excess
         size = self._noise_px * float(np.sqrt(2.0 * excess * explained / max(sums.freedom, 1.0)))
@@ -946,7 +946,7 @@ class RigWatch:
         """Return whether the other parts do not explain what was found."""
         rows = _PARTS[part]
         more = change.chi_square - change.without[part]
-        return more > chdtri(rows.stop - rows.start, _NECESSARY) and self._matters(change, rows)
+        return more > chi_square_limit(rows.stop - rows.start, _NECESSARY) and self._matters(change, rows)
 
     def _to_blame(self, change: RigChange) -> list[Part]:
         """Return the parts that are needed to explain a change; where none is, the one that explains most alone."""

@@ -35,9 +35,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from armsight.data import Array, Ids, Record
+from armsight.estimate.chance import chi_square_limit
 from armsight.loop.finding import HealthFinding, alarm_limit
 
 #: A displacement may be so large, m: what is further off is another thing. So much may a focal length change, as a share.
@@ -56,7 +56,7 @@ _KEPT, _FRESH = 30, 6
 _MATTERS, _POSES = 2.0, 60
 #: Explanations whose chi-squares differ by less are not distinguished; one is needed besides another beyond this chance.
 _ALIKE, _NECESSARY = 12.0, 1e-4
-_BESIDES = float(chdtri(3, _NECESSARY))
+_BESIDES = chi_square_limit(3, _NECESSARY)
 #: Probability, before a test, that it is the first one after any change; that a body is strained or bent as a print is.
 _RARE, _PRINTED = 1e-4, 0.1
 #: A smooth deformation is said from this log-evidence on; chance exceeds it in one of a thousand bodies at most (Markov),
@@ -190,7 +190,7 @@ class ShapeError(Record):
     @property
     def seven_needed(self) -> bool:
         """Whether a change of the seven numbers is needed besides."""
-        return bool(self.seven > chdtri(7, _NECESSARY))
+        return bool(self.seven > chi_square_limit(7, _NECESSARY))
 
     def is_of(self, other: ShapeError | None) -> bool:
         """Whether both name the same candidate first."""
@@ -591,7 +591,9 @@ class ShapeWatch:
         (d, cov), (now, cov_now) = (self._values(each, columns, 0.0) for each in (whole, newest))
         d, off = d[columns], (now - d)[columns]
         each = (cov + cov_now)[np.ix_(columns, columns)]
-        if float(off @ np.linalg.solve(each, off)) > newest.excess(newest.gain(columns)) * chdtri(len(off), _UNLIKE):
+        if float(off @ np.linalg.solve(each, off)) > newest.excess(newest.gain(columns)) * chi_square_limit(
+            len(off), _UNLIKE
+        ):
             return False
         first = 1 + self._first + 3 * which
         if len(self._shots) < _LEAST_SHOTS:
