@@ -14,7 +14,7 @@ MAY_IMPORT = {
     "kernels": set(),
     "firmware": set(),
     "tables": {"geometry"},
-    "vision": {"geometry", "kernels", "tables"},
+    "vision": {"estimate", "geometry", "kernels", "tables"},
     "robot": {"geometry", "kernels", "firmware", "tables"},
     "sim": {"geometry", "kernels", "tables", "vision", "robot"},
     "estimate": {"geometry"},

@@ -70,7 +70,7 @@ def test_a_pose_prints_mm_degrees_and_sigma():
     found = estimate(pose(from_euler_zyx(0.1, 0.0, 0.0), np.array([0.1, -0.25, 0.8])), 1e-8 * np.eye(6))
     assert repr(found) == (
         "PoseEstimate(x 100.000 +- 0.100, y -250.000 +- 0.100, z 800.000 +- 0.100 mm; "
-        "rz 5.7296 +- 0.0057, ry -0.0000 +- 0.0057, rx 0.0000 +- 0.0057 deg; 4 points)"
+        "rz 5.7296 +- 0.0057, ry 0.0000 +- 0.0057, rx 0.0000 +- 0.0057 deg; 4 points)"
     )
     assert "<td>-250.000 +- 0.100</td><td>mm</td>" in found._repr_html_()
     assert found.to_dict()["position_mm"] == pytest.approx([100.0, -250.0, 800.0])

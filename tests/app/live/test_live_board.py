@@ -10,7 +10,7 @@ from armsight.app.live import arm
 from armsight.app.live.arm import ArmStep
 from armsight.app.live.board import StoppableBoard
 from armsight.app.live.step import SessionOptions, Shared
-from armsight.data import JointStates, Missed
+from armsight.data import JointStates
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.codes import BoardState, Command
 from armsight.robot.boards.contract import Abilities
@@ -187,10 +187,11 @@ def test_what_is_shown_waits_for_the_command_of_a_shot(tmp_path, monkeypatch):
     step = arm_step(tmp_path, None)
     step.between_shots()  # nothing moves: at once
     step.shared.capture = SimpleNamespace(newest=None)
-    loop = SimpleNamespace(log=SimpleNamespace(joints=[], poses=[]), mounting=None)
+    loop = SimpleNamespace(log=SimpleNamespace(joints=[], poses=[], shots=0), mounting=None)
     step._begun(loop)
     step.between_shots()  # it watches no shot yet: at once
     loop.log.poses.append(("0", 0.0, Missed("not seen")))
+    loop.log.shots = 1
     loop.on_period()
     shown = threading.Event()
     thread = threading.Thread(target=lambda: (step.between_shots(), shown.set()))
@@ -198,6 +199,6 @@ def test_what_is_shown_waits_for_the_command_of_a_shot(tmp_path, monkeypatch):
     loop.on_period()  # no shot was answered
     assert not shown.wait(0.05)
     while not shown.wait(0.01):
-        loop.log.poses.append(("1", 0.0, Missed("not seen")))
+        loop.log.shots = 2
         loop.on_period()
     thread.join()

@@ -157,16 +157,16 @@ def test_plain_tags_are_read_quickly_and_only_what_is_left_is_searched_again(mon
     painted, truth = seen(30, 2, 11)
     image, slow = expose(painted, 130, 2, np.random.default_rng(5)), []
     monkeypatch.setattr(aruco, "detect_markers", lambda *_: slow.append(1) or ((), np.zeros((0, 1), np.int32)))
-    found = dict(find_squares(image, "tag36h11", wanted=[30, 11]))
+    found = dict(find_squares(image, "tag36h11", requested=[30, 11]))
     assert sorted(found) == [2, 11, 30]
     assert np.abs(np.concatenate([found[k] for k in (30, 2, 11)]) - truth).max() < 0.5
     assert find_squares(np.full((90, 120), 128, np.uint8), "tag36h11") == []
     assert not slow
     low, high = truth[4:8].min(axis=0).astype(int), truth[4:8].max(axis=0).astype(int)
     image[low[1] + 14 : high[1] - 14, low[0] + 14 : high[0] - 14] = 120  # the code is hidden, not the outline
-    assert sorted(dict(find_squares(image, "tag36h11", wanted=[30, 11]))) == [11, 30]
+    assert sorted(dict(find_squares(image, "tag36h11", requested=[30, 11]))) == [11, 30]
     assert not slow
-    find_squares(image, "tag36h11", wanted=[30, 2])
+    find_squares(image, "tag36h11", requested=[30, 2])
     assert slow
 
 

@@ -13,11 +13,10 @@ import click
 @click.argument("config", metavar="CONFIG.toml", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print each event as one JSON object.")
 def command(config: Path, as_json: bool) -> None:
-    """Keep `armsight measure` or `armsight run` going for days.
+    """Keep `armsight measure` going for days.
 
-    CONFIG.toml has the options of the command by their long names, and how it is served (docs/howto/serve.md). A camera or
-    a board that is lost is tried again until it is back; each loss is said once. /healthz and /metrics show the state.
-    Ctrl-C and SIGTERM stop it: the arm is held and all files are whole.
+    CONFIG.toml has the options of `armsight measure` by their long names, and how it is served (docs/howto/serve.md). A
+    camera that is lost is tried again until it is back; each loss is said once. /healthz and /metrics show the state.
     """
     from armsight.app.serve.config import read_config
     from armsight.app.serve.service import Service

@@ -1,4 +1,4 @@
-"""The file of ``armsight serve``: a table of the command with its options by their long names, and a table ``serve``."""
+"""The file of ``armsight serve``: a table ``measure`` of options by their long names, and a table ``serve``."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ import click
 from armsight.errors import InputError
 from armsight.files import read_toml
 
-#: Commands that can be kept going.
-COMMANDS = ("measure", "run")
 #: Keys of the table ``serve`` that are texts, and numbers.
 _TEXTS, _NUMBERS = ("http", "log"), ("log_mb", "log_files", "stale_s", "retry_s")
 #: Options that the service itself needs, or that would let memory grow.
@@ -31,10 +29,8 @@ class ServeConfig:
     """What is kept going, and how.
 
     Attributes:
-        command: the command.
-        arguments: of the command.
+        arguments: of `armsight measure`.
         folder: where relative paths begin: that of the file.
-        output: folder of a run's folders, one each start; None for ``measure``.
         http: where /healthz and /metrics are, ``host:port``; empty for nowhere.
         log: file of the log, empty for stderr.
         log_mb: size at which it is begun anew, MB.
@@ -43,10 +39,8 @@ class ServeConfig:
         retry_s: longest time between two tries, s.
     """
 
-    command: str
     arguments: tuple[str, ...]
     folder: Path
-    output: Path | None = None
     http: str = "127.0.0.1:9110"
     log: str = ""
     log_mb: float = 10.0
@@ -62,25 +56,25 @@ def read_config(path: Path) -> ServeConfig:
         InputError: it cannot be read, has an unknown key, or an option that its command rejects.
     """
     document = read_toml(path)
-    chosen = [name for name in COMMANDS if name in document]
-    if unknown := sorted(document.keys() - {*COMMANDS, "serve"}):
-        raise InputError(f"{path}: unknown table [{unknown[0]}]; known are [measure] or [run], and [serve]")
-    if len(chosen) != 1 or not isinstance(document[chosen[0]], dict):
+    if "run" in document:
+        raise InputError(f"{path}: [run] is not served: an arm must not begin to move again by itself after a loss")
+    if unknown := sorted(document.keys() - {"measure", "serve"}):
+        raise InputError(f"{path}: unknown table [{unknown[0]}]; known are [measure] and [serve]")
+    given = document.get("measure")
+    if not isinstance(given, dict):
         raise InputError(
-            f"{path}: expected one table [measure] or [run], with the command's options by their long names"
+            f"{path}: expected a table [measure], with the options of `armsight measure` by their long names"
         )
-    name, given = chosen[0], dict(document[chosen[0]])
     service = _service(path, document.get("serve", {}))
     folder = path.expanduser().resolve().parent
-    output = Path(str(given.pop("output", "runs"))) if name == "run" else None
-    command: click.Command = importlib.import_module(f"armsight.app.{name}.command").command
-    arguments = _arguments(path, name, command, given)
+    command: click.Command = importlib.import_module("armsight.app.measure.command").command
+    arguments = _arguments(path, command, given)
     try:
-        command.make_context(name, list(arguments)).close()
+        command.make_context("measure", list(arguments)).close()
     except click.UsageError as error:
-        raise InputError(f"{path}: [{name}]: {error.format_message()}") from None
+        raise InputError(f"{path}: [measure]: {error.format_message()}") from None
     _check(folder, given)
-    return ServeConfig(name, arguments, folder, output, **service)
+    return ServeConfig(arguments, folder, **service)
 
 
 def _service(path: Path, given: Any) -> dict[str, Any]:  # noqa: ANN401 - whatever TOML holds
@@ -95,25 +89,27 @@ def _service(path: Path, given: Any) -> dict[str, Any]:  # noqa: ANN401 - whatev
             raise InputError(f"{path}: [serve] {key} is {value!r}: expected a text")
         if key in _NUMBERS and (isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e6):
             raise InputError(f"{path}: [serve] {key} is {value!r}: expected a number above 0")
+        if key == "log_files" and value != int(value):
+            raise InputError(f"{path}: [serve] log_files is {value!r}: expected a whole number above 0")
         found[key] = int(value) if key == "log_files" else value
     return found
 
 
-def _arguments(path: Path, name: str, command: click.Command, given: dict[str, Any]) -> tuple[str, ...]:
+def _arguments(path: Path, command: click.Command, given: dict[str, Any]) -> tuple[str, ...]:
     """Return a table's keys and values as arguments of the command."""
     known = {_key(each): each for each in command.params}
     out: list[str] = []
     for key, value in given.items():
         if key in _OWN:
-            raise InputError(f"{path}: [{name}] {key}: not for a service: {_OWN[key]}")
+            raise InputError(f"{path}: [measure] {key}: not for a service: {_OWN[key]}")
         if key not in known:
             raise InputError(
-                f"{path}: [{name}] has an unknown key {key!r}{_near(key, [k for k in known if k not in _OWN])}"
+                f"{path}: [measure] has an unknown key {key!r}{_near(key, [k for k in known if k not in _OWN])}"
             )
         option = known[key]
         values = value if isinstance(value, list) else [value]
         if not all(isinstance(each, str | int | float) for each in values) or (len(values) > 1 and not option.multiple):
-            raise InputError(f"{path}: [{name}] {key} is {value!r}: expected one text, number or true")
+            raise InputError(f"{path}: [measure] {key} is {value!r}: expected one text, number or true")
         for each in values:
             if isinstance(option, click.Argument):
                 out.insert(0, str(each))

@@ -15,7 +15,7 @@ METRICS = {
     "up": ("gauge", "1 while shots arrive"),
     "shots_total": ("counter", "shots since the service began"),
     "missed_total": ("counter", "shots in which the target was not measured"),
-    "losses_total": ("counter", "times that a camera, a board or the process was lost"),
+    "losses_total": ("counter", "times that the cameras or the process were lost"),
     "shot_age_seconds": ("gauge", "time since the newest shot"),
     "latency_seconds": ("gauge", "time from the newest exposure to its pose"),
     "sigma_metres": ("gauge", "standard deviation of the newest position, root sum of squares of its axes"),

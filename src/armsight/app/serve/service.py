@@ -21,6 +21,7 @@ from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import Any
 
+from armsight.app.interrupts import uninterrupted
 from armsight.app.serve.config import ServeConfig
 from armsight.app.serve.page import StatePage
 from armsight.errors import InputError
@@ -28,7 +29,7 @@ from armsight.errors import InputError
 #: s; a child without a shot for so long after its start is started again; half: a slow computer never begins, double: a
 #: driver that hangs at the start is noticed later.
 _BEGIN_S = 60.0
-#: s; a child has so long to hold the arm and to write its files; half: a slow disk loses a file, double: a child that hangs
+#: s; a child has so long to write its files; half: a slow disk loses a file, double: a child that hangs
 #: delays the end.
 _END_S = 10.0
 #: s, between two looks at the child; half: nothing, double: a camera is back later.
@@ -37,6 +38,8 @@ _LOOK_S = 0.2
 _PAUSE_S = 0.5
 
 
+#: Lines of the child that are remembered; half, double: so much memory.
+_LINES = 1000
 #: What is started; the command and its options follow.
 _ARMSIGHT = (sys.executable, "-P", "-m", "armsight")
 #: Lines of the child that only say that it goes on.
@@ -44,7 +47,7 @@ _PROGRESS = re.compile(r"[a-z ]+: \d+( of \d+)?$")
 
 
 class Service:
-    """Keeps one command going.
+    """Keeps `armsight measure` going.
 
     Args:
         config: what, and how.
@@ -67,8 +70,8 @@ class Service:
         """Keep the command going until it ends by itself; return its exit code, 0 or 3.
 
         Raises:
-            InputError: something listens at the address of the pages.
-            KeyboardInterrupt: Ctrl-C or SIGTERM; the child has ended and its arm is held.
+            InputError: something listens at the address of the pages, or the first start ended without a shot.
+            KeyboardInterrupt: Ctrl-C or SIGTERM; the child has ended.
         """
         page = None if not self._config.http else StatePage(self._config.http, self.state, self.values)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
@@ -81,10 +84,12 @@ class Service:
                 while True:
                     code = self._one(heard)
                     if code is not None and code in (0, 3):
-                        self._event("ended", f"armsight {self._config.command} has ended", code=code)
+                        self._event("ended", "armsight measure has ended", code=code)
                         return code
+                    if code == 2 and not self._counts["shots_total"]:
+                        raise InputError(self._last_line or "armsight measure ended without a shot")
                     pause = _PAUSE_S if self._lost_since is None else min(2 * pause, self._config.retry_s)
-                    self._lost(self._last_line or f"armsight {self._config.command} ended with {code}")
+                    self._lost(self._last_line or f"armsight measure ended with {code}")
                     time.sleep(pause)
             except KeyboardInterrupt:
                 self._event("stopped", "stopped")
@@ -120,24 +125,25 @@ class Service:
     def _one(self, heard: socket.socket) -> int | None:
         """Start the child and listen to it until it ends or falls silent; return its exit code, None where it was ended."""
         arguments = [*self._config.arguments, f"--stream=json+udp:127.0.0.1:{heard.getsockname()[1]}"]
-        if self._config.output is not None:
-            name = datetime.now(UTC).strftime("%Y-%m-%dT%H-%M-%S")
-            arguments.append(f"--output={self._config.output / name}")
         self._tries, self._last_line = self._tries + 1, ""
-        self._child = subprocess.Popen(
-            [*_ARMSIGHT, self._config.command, *arguments],
-            cwd=self._config.folder,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-        )
-        listener = threading.Thread(target=self._listen, args=(self._child,), daemon=True)
-        listener.start()
+        listener: threading.Thread | None = None
         try:
+            self._child = subprocess.Popen(
+                [*_ARMSIGHT, "measure", *arguments],
+                cwd=self._config.folder,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                start_new_session=True,  # a terminal's Ctrl-C reaches it once, from here
+            )
+            listener = threading.Thread(target=self._listen, args=(self._child,), daemon=True)
+            listener.start()
             code = self._heard(heard, self._child)
         finally:
-            self._end()
-            listener.join()
+            with uninterrupted():
+                self._end()
+            if listener is not None:
+                listener.join()
         if code is None:
             self._last_line = f"no shot for {self._config.stale_s:.0f} s"
         return code
@@ -162,17 +168,21 @@ class Service:
                 self._take(heard.recv(65536))
 
     def _take(self, datagram: bytes) -> None:
-        """Take one published datum."""
-        datum = json.loads(datagram)
-        if datum.get("kind") != "shot":
+        """Take one published datum; what is none, from whoever sends to the port, is passed over."""
+        try:
+            datum = json.loads(datagram)
+            if datum["kind"] != "shot":
+                return
+            ok, age_s = datum["status"] == "ok", datum["age_s"]
+            values = {} if age_s is None else {"latency_seconds": float(age_s)}
+            if ok:
+                values["sigma_metres"] = math.sqrt(sum(float(datum["covariance"][i][i]) for i in range(3)))
+        except (ValueError, KeyError, TypeError, IndexError):
             return
         self._newest = time.monotonic()
         self._counts["shots_total"] += 1
-        self._counts["missed_total"] += datum["status"] != "ok"
-        if datum.get("age_s") is not None:
-            self._values["latency_seconds"] = datum["age_s"]
-        if datum["status"] == "ok":
-            self._values["sigma_metres"] = math.sqrt(sum(datum["covariance"][i][i] for i in range(3)))
+        self._counts["missed_total"] += not ok
+        self._values |= values
         if self._lost_since is not None:
             gone_s = self._newest - self._lost_since
             text = f"back after {gone_s:.1f} s (tries: {self._tries})"
@@ -204,11 +214,13 @@ class Service:
         """Take a line of the child."""
         self._last_line = line.removeprefix("armsight: error: ") or self._last_line
         if not _PROGRESS.match(line) and (self._lost_since is None or line not in self._said):
+            if len(self._said) > _LINES:
+                self._said.clear()
             self._said.add(line)
-            self._log.info("%s: %s", self._config.command, line)
+            self._log.info("measure: %s", line)
 
     def _end(self) -> None:
-        """End the child as Ctrl-C does, so that its arm is held and its files are whole; kill it where it does not."""
+        """End the child as Ctrl-C does, so that its files are whole; kill it where it does not."""
         child = self._child
         if child is None or child.poll() is not None:
             return

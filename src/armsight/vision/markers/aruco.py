@@ -1,7 +1,7 @@
 """Square code markers of every family OpenCV knows, found roughly: identities and corners to a pixel or so.
 
 A quick search (:mod:`~armsight.vision.markers.quads`) reads plain ones. Where it leaves dark regions that may be
-markers, and not all that are wanted were read, OpenCV finds quadrilaterals in several windows and reads their cells by a
+markers, and not all that are requested were read, OpenCV finds quadrilaterals in several windows and reads their cells by a
 threshold. Blur and sharpening mix neighbouring cells of small markers, and some are not read. In families of 6x6 cells
 and more, those quadrilaterals are compared with all codes, each blurred: the nearest code is taken where the next one
 explains the image much worse.
@@ -89,8 +89,8 @@ def _codes(family: str, border: int) -> NDArray[np.uint64]:
     """Return a family's codes (M, 4) in four rotations, row by row, the first cell in the highest bit."""
     whole = np.array([cells(family, k, border)[border:-border, border:-border] > 0 for k in range(family_size(family))])
     bits = np.uint64(1) << np.arange(whole[0].size - 1, -1, -1, dtype=np.uint64)
-    turned = [np.rot90(whole, r, axes=(1, 2)).reshape(len(whole), -1) @ bits for r in range(4)]
-    return np.ascontiguousarray(np.transpose(turned))
+    rotated = [np.rot90(whole, r, axes=(1, 2)).reshape(len(whole), -1) @ bits for r in range(4)]
+    return np.ascontiguousarray(np.transpose(rotated))
 
 
 def _read_quickly(image: NDArray[np.uint8], family: str, border: int) -> tuple[list[tuple[int, Array]], bool]:
@@ -236,7 +236,7 @@ def _without_repeats(corners: Array, identities: NDArray[Any]) -> list[int]:
 
 
 def find_squares(
-    image: NDArray[np.uint8], family: str, border: int = 1, wanted: Collection[int] | None = None
+    image: NDArray[np.uint8], family: str, border: int = 1, requested: Collection[int] | None = None
 ) -> list[tuple[int, Array]]:
     """Find the markers of a family, upright by the convention of the family's name.
 
@@ -244,7 +244,7 @@ def find_squares(
         image: (H, W) grey image.
         family: a name of FAMILIES or of LAYOUTS.
         border: width of the markers' dark border, cells.
-        wanted: identities that are looked for: when the quick search reads all of them it is enough; all by default.
+        requested: identities that are looked for: when the quick search reads all of them it is enough; all by default.
 
     Returns:
         Identity and rough corners (4, 2), raw pixels, of each marker seen: upper left, upper right, lower right, lower
@@ -253,7 +253,7 @@ def find_squares(
     if family in LAYOUTS:
         return _find_apriltag3(image, family)
     read, others = _read_quickly(image, family, border)
-    if not others or (wanted is not None and set(wanted) <= {identity for identity, _ in read}):
+    if not others or (requested is not None and set(requested) <= {identity for identity, _ in read}):
         return read
     rot90 = 2 if family in APRILTAGS else 0
     corners, identities = detect_markers(image, family, border)

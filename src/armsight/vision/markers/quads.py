@@ -197,9 +197,9 @@ def _line(n: int, at: NDArray[np.int32], first: int, last: int, line: Array) -> 
 
 
 @kernel
-def _quad(n: int, at: NDArray[np.int32], area: float, quad: Array) -> bool:
-    """Find the corners (4, 2), clockwise as seen, of a border (n points, area in px^2); whether it is a quadrilateral."""
-    p, ends, lines, marks = np.zeros(2), np.empty((4, 2)), np.empty((4, 3)), np.zeros(5, np.int64)
+def _marks(n: int, at: NDArray[np.int32], ends: Array, marks: NDArray[np.int64]) -> bool:
+    """Find where a border bends most: steps (5,), the first once more, and points (4, 2); return whether they follow."""
+    p = np.zeros(2)
     for i in range(n):
         p[0] += at[0, i] / n
         p[1] += at[1, i] / n
@@ -229,10 +229,17 @@ def _quad(n: int, at: NDArray[np.int32], area: float, quad: Array) -> bool:
         marks[3] += n
     if marks[0] > marks[1]:
         marks[0] -= n
-    if not (marks[0] < marks[1] < marks[2] < marks[3] < marks[0] + n):
+    marks[4] = marks[0] + n
+    return bool(marks[0] < marks[1] < marks[2] < marks[3] < marks[4])
+
+
+@kernel
+def _quad(n: int, at: NDArray[np.int32], area: float, quad: Array) -> bool:
+    """Find the corners (4, 2), clockwise as seen, of a border (n points, area in px^2); whether it is a quadrilateral."""
+    ends, lines, marks = np.empty((4, 2)), np.empty((4, 3)), np.zeros(5, np.int64)
+    if not _marks(n, at, ends, marks):
         return False
     shift = n if marks[0] < 0 else 0
-    marks[4] = marks[0] + n
     for k in range(4):
         if not _line(n, at, marks[k] + shift, marks[k + 1] + shift, lines[k]):
             return False
@@ -246,15 +253,15 @@ def _quad(n: int, at: NDArray[np.int32], area: float, quad: Array) -> bool:
         side = np.hypot(ends[(k + 1) % 4, 0] - ends[k, 0], ends[(k + 1) % 4, 1] - ends[k, 1])
         if not np.hypot(quad[k, 0] - ends[k, 0], quad[k, 1] - ends[k, 1]) < 6.0 + 0.25 * side:
             return False
-    covered, turns = 0.0, 0
+    covered, right = 0.0, 0
     for k in range(4):
         i, j = (k + 1) % 4, (k + 2) % 4
         covered += 0.5 * (quad[k, 0] * quad[i, 1] - quad[k, 1] * quad[i, 0])
         cross = (quad[i, 0] - quad[k, 0]) * (quad[j, 1] - quad[i, 1])
-        turns += cross > (quad[i, 1] - quad[k, 1]) * (quad[j, 0] - quad[i, 0])
+        right += cross > (quad[i, 1] - quad[k, 1]) * (quad[j, 0] - quad[i, 0])
     for k in range(4):
         quad[k, 0], quad[k, 1] = 0.5 * quad[k, 0] - 1.5, 0.5 * quad[k, 1] - 1.5
-    return turns == 4 and 0.75 < 0.25 * covered / area < 1.33
+    return right == 4 and 0.75 < 0.25 * covered / area < 1.33
 
 
 @kernel("const u1[:, ::1], u1[:, ::1], i4[:, ::1], f8[:, :, ::1]")
@@ -313,8 +320,8 @@ def square_to_quad(quad: Array, H: Array) -> None:
 def _cells_seen(image: Grey, quad: Array, spread: float, seen: Array) -> None:
     """Sample the cells of a marker with corners ``quad`` (4, 2), px, and a ring around it.
 
-    seen (N + 2, N + 2) is filled with the mean of three by three places, so many cells apart, in each of the N cells and of
-    the ring.
+    seen (N + 2, N + 2) is filled with the mean of three by three samples, ``spread`` cells apart, in each cell and of the
+    ring.
     """
     height, width = image.shape
     H, count = np.empty((3, 3)), len(seen)
@@ -357,7 +364,7 @@ def _plane(seen: Array, first: int, last: int, plane: Array) -> None:
 _RING_STEP = 10.0  # half: noise is read; double: faint markers are missed
 #: Share of the cells of the border that may be on the wrong side.
 _BORDER_WRONG = 0.25
-#: Half way between two places of a cell that are sampled: neighbours blur into its edges.
+#: Half way between two samples of a cell that are sampled: neighbours blur into its edges.
 _SPREAD = 0.22
 _NONE, _ONE = np.uint64(0), np.uint64(1)
 

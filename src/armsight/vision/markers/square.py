@@ -492,11 +492,11 @@ def _fit_from(
     total = 0.0
     for k in range(8):
         total += 0.25 * all_corners[k, k]
-    grown = max(1.0, 4.0 * (middle[0, 0] + middle[1, 1]) / total) * _correlated(n, at, left)
+    wider = max(1.0, 4.0 * (middle[0, 0] + middle[1, 1]) / total) * _correlated(n, at, left)
     for k in range(4):
         for i in range(2):
             for j in range(2):
-                cov[k, i, j] = grown * all_corners[2 * k + i, 2 * k + j]
+                cov[k, i, j] = wider * all_corners[2 * k + i, 2 * k + j]
     return 0
 
 

@@ -90,7 +90,7 @@ class TagTarget(Record, Target):
         """Find the body in one grey image; a marker that is detected twice is left out: one of them is foreign."""
         ids, uv, cov, problems = [], [], [], []
         for family in sorted({tag.family for tag in self.tags}):
-            found = find_squares(image, family, wanted=[tag.identity for tag in self.tags if tag.family == family])
+            found = find_squares(image, family, requested=[tag.identity for tag in self.tags if tag.family == family])
             seen = Counter(identity for identity, _ in found)
             corners = dict(found)
             for row, tag in enumerate(self.tags):
