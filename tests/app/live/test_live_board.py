@@ -10,7 +10,7 @@ from armsight.app.live import arm
 from armsight.app.live.arm import ArmStep
 from armsight.app.live.board import StoppableBoard
 from armsight.app.live.step import SessionOptions, Shared
-from armsight.data import JointStates
+from armsight.data import JointStates, Missed
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.codes import BoardState, Command
 from armsight.robot.boards.contract import Abilities
