@@ -64,9 +64,10 @@ $(VENV)/.armsight: pyproject.toml setup.py $(shell find firmware -type f)
 # that came with the environment is older, and would be found first.
 $(VENV)/.build: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
+	rm -rf $(VENV)/build  # else pip would find the setuptools there, and remove that
+	$(BIN)/python -m pip uninstall --quiet --yes setuptools
 	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --upgrade --target $(VENV)/build \
 		$$($(BIN)/python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['build-system']['requires'])")
-	$(BIN)/python -m pip uninstall --quiet --yes setuptools
 	$(BIN)/python -c "import site; print('$(abspath $(VENV)/build)', file=open(site.getsitepackages()[0] + '/build.pth', 'w'))"
 	touch $@
 
