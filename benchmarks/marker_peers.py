@@ -101,6 +101,7 @@ def aruco(window_cells: float) -> Callable:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     parameters.relativeCornerRefinmentWinSize = window_cells
+    parameters.cornerRefinementWinSize = 10  # else it cuts a wide window to 5 px
     finder = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), parameters)
     return lambda image: np.array(finder.detectMarkers(image)[0]).reshape(-1, 4, 2)
 

@@ -221,7 +221,7 @@ def textured(seed: int, report: Report, count: int = 4, rounds: int = 7) -> None
 
 def tags(seed: int, report: Report, count: int = 8, rounds: int = 7) -> None:
     """Find and fit AprilTags, and OpenCV's with corners refined, interleaved: least and median of the CPU time."""
-    rng, peer = np.random.default_rng(seed), aruco(0.3)
+    rng, peer = np.random.default_rng(seed), aruco(1.0)  # the window at which its corners are best
     for label, shape, many, most in (
         ("4 tags of 60 px, 1280x720", (720, 1280), 4, 2.0),
         ("4 tags of 60 px, 640x480", (480, 640), 4, 2.0),
