@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
-from armsight.loop.handeye.handeye import calibrate_poses
+from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, calibrate_poses, known_where_seen, require_known
 from armsight.loop.handeye.poses import Poses
 from armsight.loop.handeye.sources import pose_kernel
 from armsight.robot.arm_file import open_arm
@@ -275,6 +275,21 @@ def test_translations_alone_are_rejected():
     xi = np.concatenate([np.random.default_rng(0).uniform(-0.3, 0.3, (20, 3)), np.zeros((20, 3))], axis=1)
     with pytest.raises(CalibrationError, match=r"hardly rotates .* open in every direction"):
         calibrate_poses(rotated(xi, noise=1e-3))
+
+
+def test_how_far_away_the_rig_stands_does_not_leave_a_mounting_open():
+    poses, _, _, _ = made(5, n=15, camera=(1e-4, 2e-4, 2e-4), links=(2e-3, 8e-3), spread=0.35)
+    sigmas_m = []
+    for metres in (0.0, 8.0):
+        away = exp_se3(np.array([0.0, 0.0, metres, 0.0, 0.0, 0.0]))
+        seen = replace(poses, B=away @ poses.B)
+        found = calibrate_poses(seen)
+        require_known(found, seen.B, TRUSTED_M, TRUSTED_RAD)
+        covs = known_where_seen(found, seen.B)["base-rig"][1], found.cov
+        sigmas_m.append([np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1]) for cov in covs])
+    (near, _), (far, at_the_lens) = sigmas_m
+    assert far == pytest.approx(near, rel=0.1)  # vision's errors depend on the distance, by less
+    assert at_the_lens > TRUSTED_M
 
 
 def test_a_pose_kernel_is_a_covariance():

@@ -15,7 +15,7 @@ from armsight.app.show.report import Block, Fact, Grade, Lines, Report, Section,
 from armsight.app.show.table import TextTable
 from armsight.data import Array, Record
 from armsight.geometry.pose import inverse, log_se3, mean_pose, transform
-from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye
+from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, known_where_seen
 from armsight.loop.handeye.recording import PairedPoses
 from armsight.loop.handeye.sources import OF_THE_ARM
 from armsight.loop.identify.plan import MountingPlan, worst_sigmas
@@ -264,12 +264,14 @@ def _untrusted(run: HandEyeAnswer) -> list[str]:
     median = float(np.nanmedian(found.held_out.position_m))
     if median > TRUSTED_M:
         why.append(f"half of the poses left out are off by more than {1e3 * median:.0f} mm: check one row by hand")
-    for name, cov in zip(names(run), (found.cov[6:, 6:], found.cov[:6, :6]), strict=True):
+    seen = known_where_seen(found, run.recording.poses.B)
+    for name, (_, cov) in zip(names(run), seen.values(), strict=True):
         far_m, far_rad = (float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in (cov[:3, :3], cov[3:, 3:]))
         if far_m > TRUSTED_M or far_rad > TRUSTED_RAD:
             why.append(
-                f"{name} is known to {1e3 * far_m:.0f} mm and {np.degrees(far_rad):.1f} deg only along its worst axes "
-                "(sigma): rotate the flange further, about axes that are not parallel, and take more poses"
+                f"{name} is known, where the body was seen, to {1e3 * far_m:.0f} mm and {np.degrees(far_rad):.1f} deg "
+                "only along its worst axes (sigma): rotate the flange further, about axes that are not parallel, and "
+                "take more poses"
             )
     return why
 

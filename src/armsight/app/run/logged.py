@@ -125,7 +125,7 @@ def run_logged(
     shift = _shift(arm, q, Ts, covs, centre, found.held_out.rms()[0])
     implausible = None if shift else _implausible(arm, q[found.used], Ts[found.used])
     if not shift and implausible is None:
-        require_known(found, TRUSTED_M, TRUSTED_RAD)
+        require_known(found, Ts, TRUSTED_M, TRUSTED_RAD)
     return LoggedRun(run, tuple(name for name, _, _ in good), len(names), unpaired, shift, implausible)
 
 

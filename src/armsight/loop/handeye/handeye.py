@@ -508,17 +508,27 @@ def require_rotations(poses: Poses, e: Array) -> None:
         )
 
 
-def require_known(found: HandEye, most_m: float, most_rad: float) -> None:
-    """Reject a result one of whose directions is known worse than by these sigmas, m and rad.
+def known_where_seen(found: HandEye, Ts_rig_body: Array) -> dict[str, tuple[Array, Array]]:
+    """Return what the flange carries and what stands still, by name: transform (4, 4), and covariance (6, 6) where used.
+
+    The rig's is that of a point at the middle of the places where the body was seen, Ts_rig_body (N, 4, 4): the rig is used
+    there alone, and errors of an arm move the lens, a metre away, by more.
+    """
+    held, still = ("flange-rig", "base-body") if found.eye == "in_hand" else ("flange-body", "base-rig")
+    to_body = np.eye(6)
+    to_body[:3, 3:] = -skew(found.scale * Ts_rig_body[:, :3, 3].mean(axis=0))
+    covs = {name: found.cov[rows, rows] for name, rows in ((held, slice(6, 12)), (still, slice(0, 6)))}
+    covs = {name: to_body @ cov @ to_body.T if "rig" in name else cov for name, cov in covs.items()}
+    return {held: (found.T_flange_held, covs[held]), still: (found.T_base_still, covs[still])}
+
+
+def require_known(found: HandEye, Ts_rig_body: Array, most_m: float, most_rad: float) -> None:
+    """Reject a result one of whose directions is known worse, where the body was seen, than by these sigmas, m and rad.
 
     Raises:
         CalibrationError: the open direction, by name.
     """
-    held, still = ("flange-rig", "base-body") if found.eye == "in_hand" else ("flange-body", "base-rig")
-    for name, T, block in (
-        (held, found.T_flange_held, found.cov[6:, 6:]),
-        (still, found.T_base_still, found.cov[:6, :6]),
-    ):
+    for name, (T, block) in known_where_seen(found, Ts_rig_body).items():
         for kind, part, most, unit, times in (
             ("translation", block[:3, :3], most_m, "mm", 1e3),
             ("rotation", block[3:, 3:], most_rad, "deg", np.degrees(1.0)),
@@ -656,7 +666,7 @@ def _weighed(
         common=moved.common,
         common_m=_common_m(whole.poses, moved),
     )
-    require_known(found, OPEN_M, OPEN_RAD)
+    require_known(found, whole.poses.B, OPEN_M, OPEN_RAD)
     return found
 
 

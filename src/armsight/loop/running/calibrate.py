@@ -182,7 +182,7 @@ def handeye_of(arm: Arm, visited: Sequence[VisitedPose], missed: tuple[str, ...]
     Ts_left_body, cov = np.array([each.T_left_body for each in visited]), np.array([each.cov for each in visited])
     require_fitting(arm, q, Ts_left_body)
     found = calibrate_handeye(arm.forward(q) @ inverse(arm.T_flange_tool), Ts_left_body, cov, quick=quick)
-    require_known(found, TRUSTED_M, TRUSTED_RAD)
+    require_known(found, Ts_left_body, TRUSTED_M, TRUSTED_RAD)
     return HandEyeRun.of(arm, found, q, Ts_left_body, cov, np.array([each.approach for each in visited]), missed)
 
 
