@@ -681,4 +681,6 @@ def test_a_mounting_that_is_hardly_known_is_answered_and_not_to_be_trusted(armsi
     said = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand", "--json")
     assert said.code == 3
     assert 0.02 < said.lines[0]["worst_sigma_m"] < 0.5
-    assert re.match(r"T_flange_rig is known, where the body was seen, to \d+ mm and \d\.\d deg only", said.lines[0]["untrusted"][0])
+    assert re.match(
+        r"T_flange_rig is known, where the body was seen, to \d+ mm and \d\.\d deg only", said.lines[0]["untrusted"][0]
+    )

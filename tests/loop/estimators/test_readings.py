@@ -31,7 +31,7 @@ def test_parabolas_pass_unharmed_with_their_slope():
 def test_the_variance_left_is_what_is_left(back_s, speed):
     rng = np.random.default_rng(1)
     off, said = [], []
-    for _ in range(300):
+    for _ in range(150):
         readings, t = filled(lambda t: speed * t, 0.4, SIGMA, SIGMA * rng.normal(size=(400, 6)))
         at = t[-1] - back_s
         out = readings.at(np.array([at]))
@@ -40,10 +40,10 @@ def test_the_variance_left_is_what_is_left(back_s, speed):
     off, said = np.array(off), np.array(said)
     # A joint that stands is averaged but for noise that looks like motion: less than 1% by three sigma of two tests.
     still = said < 2 / (STILL_SPAN_S * 1000)
-    assert still.mean() == 0 if speed else still.mean() > 0.99 - 3 * np.sqrt(0.01 / 1800)
+    assert still.mean() == 0 if speed else still.mean() > 0.99 - 3 * np.sqrt(0.01 / 900)
     counted = still if speed == 0 else ~still
-    # The variance of 1800 samples is within 5 sqrt(2 / 1800) of itself.
-    assert np.var(off[counted]) == pytest.approx(SIGMA**2 * said[counted].mean(), rel=5 * np.sqrt(2 / 1800))
+    # The variance of 900 samples is within 5 sqrt(2 / 900) of itself.
+    assert np.var(off[counted]) == pytest.approx(SIGMA**2 * said[counted].mean(), rel=5 * np.sqrt(2 / 900))
     # The end of a parabola through N has 9/N, its middle 9/(4N) (to 1/N^2); a mean of M has 1/M.
     assert said.max() < (9.5 if back_s < SPAN_S / 2 else 2.5) / (SPAN_S * 1000)
     assert said[still] == pytest.approx(1 / (STILL_SPAN_S * 1000), rel=0.02)

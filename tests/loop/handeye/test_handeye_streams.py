@@ -120,7 +120,7 @@ def recorded(data_dir, archive, end):
 
 def test_a_simulated_arms_one_clock_has_no_offset_and_its_own_motion_gives_back_a_known_mounting(data_dir):
     hand = PoseStream.of(*recorded(data_dir, "robot_arm_w_color_camera_sim", "sim_hand.csv"), "hand")
-    t, T = (each[::2] for each in recorded(data_dir, "robot_arm_w_color_camera_sim", "sim_camera.csv"))
+    t, T = (each[::4] for each in recorded(data_dir, "robot_arm_w_color_camera_sim", "sim_camera.csv"))
     found = calibrate_streams(hand, PoseStream.of(t, inverse(T), "eye"), eye="in_hand")
     assert abs(found.offset_s) < 3 * np.hypot(found.sigma_offset_s, 1e-3)  # stamps are those of steps of 1 ms
     A, good = hand.at(t - OFFSET_S)  # what an eye of a known mounting, whose clock is behind, would have seen

@@ -77,7 +77,7 @@ def mean_width(sigma, n):
     return 2 * t.ppf(0.975, n - 1) * sigma / np.sqrt(n)
 
 
-@pytest.mark.parametrize("shape", [(1.0, 1.0, 1.0), (1.0, 0.5, 0.2), (1.0, 0.05, 0.05)])
+@pytest.mark.parametrize("shape", [(1.0, 1.0, 1.0), (1.0, 0.05, 0.05)])
 @pytest.mark.parametrize(("n", "noise"), [(10, 0.5), (30, 0.0), (30, 0.5)])
 def test_the_instruments_noise_is_taken_off_and_the_interval_holds(shape, n, noise):
     arm = np.diag(np.square(shape))

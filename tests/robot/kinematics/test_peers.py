@@ -31,13 +31,13 @@ def test_pinocchio_has_the_same_pose_jacobian_and_rate(arm):
 def test_no_solution_is_missed_that_eaik_finds(arm):
     peer = peers.Eaik(arm)
     missed = found = ours = 0
-    for q in draw(4, 1500):
+    for q in draw(4, 500):
         T = arm.forward(q)
         theirs, answer = peer.inverse(T), arm.inverse(T)
         missed += len(peers.unmatched(arm, T, theirs, answer))
         found, ours = found + len(theirs), ours + len(answer)
     assert missed == 0
-    assert ours >= found > 6000
+    assert ours >= found > 2000
 
 
 @models

@@ -1,5 +1,7 @@
 """The renderer against brute force, closed forms and OpenCV."""
 
+import itertools
+
 import numpy as np
 import pytest
 from render_oracle import brute, displacement_px
@@ -70,8 +72,7 @@ def test_chessboard_corners_are_where_brute_force_puts_them(model):
         assert difference < LEVEL
 
 
-@pytest.mark.parametrize("model", DISTORTIONS)
-@pytest.mark.parametrize("radius_m", [0.002, 0.005])
+@pytest.mark.parametrize(("model", "radius_m"), list(zip(DISTORTIONS, itertools.cycle([0.002, 0.005]))))
 def test_discs_are_where_brute_force_puts_them(model, radius_m):
     rng = np.random.default_rng(2)
     cam, pattern = camera(model), plate(0.05, 0.05, 0.1, [(0.001, 0.002, radius_m, 0.9)])

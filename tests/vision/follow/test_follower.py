@@ -205,7 +205,7 @@ def test_covariance_is_honest():
     """NEES of followed poses against truth, the rig exactly known, over fresh noise."""
     rig = hd_rig(known=True)
     rng, squares = np.random.default_rng(6), []
-    for _ in range(6):
+    for _ in range(4):
         T = someplace(rng, z=(0.7, 1.0), tilt=0.5)
         light = light_of(rig, PLATE, T)
         follower = Follower(rig, BODY)
@@ -215,8 +215,8 @@ def test_covariance_is_honest():
             xi = log_se3(inverse(result.T_left_body) @ T)
             squares.append(xi @ np.linalg.solve(result.cov, xi))
         assert follower.way == "followed"
-    # Mean of 150 chi-squares of 6 degrees: 6 +- sqrt(12 / 150) = 0.28; its own search aside all are followed.
-    assert abs(np.mean(squares) - 6) < 4 * 0.28
+    # Mean of 100 chi-squares of 6 degrees: 6 +- sqrt(12 / 100) = 0.35; its own search aside all are followed.
+    assert abs(np.mean(squares) - 6) < 4 * 0.35
 
 
 def test_what_can_be_followed():
