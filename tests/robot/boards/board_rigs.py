@@ -5,12 +5,16 @@ import os
 import pty
 import select
 import threading
+import time
 import tty
+
+import pytest
 
 from armsight.data import JointCommand
 from armsight.errors import DeviceError
 from armsight.firmware import dialect
 from armsight.robot.board_registry import configured, open_emulator
+from armsight.robot.boards import serial
 from armsight.robot.boards.board_file import configuration_text
 from armsight.robot.boards.configuration import CONFIG, CONFIG_VERSION
 from armsight.robot.boards.emulated import EmulatedLink
@@ -102,38 +106,51 @@ class Speaker:
         return self.say("config_part", offset, CONFIG.itemsize, len(data), list(data.ljust(200, b"\0")))
 
 
-class PtyBoard:
-    """The host build behind a pseudo-terminal, as a real board behind its USB cable; it runs as fast as it is let.
+class PtyCable:
+    """A link behind a pseudo-terminal, as a real board behind its USB cable; :attr:`port` is its name.
 
-    Every poll of the far side lets one tick pass for a millisecond of real time, at most; nothing is asserted on times.
+    Every poll of the far side lets one tick pass, not faster than real time and on a busy computer slower. The host's
+    waits for the port count these ticks: what a test sees does not depend on how the computer shares its time.
     """
 
-    def __init__(self, *, fresh=False, plant=None):
-        self.plant = JointPlant() if plant is None else plant
-        self.link = EmulatedLink(open_emulator("host"), self.plant)
-        if not fresh:
-            configured(self.link)
-        self.master, slave = pty.openpty()
-        tty.setraw(slave)
+    def __init__(self, link):
+        self.link, self.lock, self._ticks, self._unread = link, threading.Lock(), 0, bytearray()
+        self.master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
         os.set_blocking(self.master, False)
-        self.port = os.ttyname(slave)
-        self._slave = slave
+        self.port = os.ttyname(self._slave)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
+        self._patch = pytest.MonkeyPatch()
+        self._patch.setattr(serial, "time", self)
+
+    def monotonic(self):
+        """Return the time that the port's waits count, s."""
+        return 1e-3 * self._ticks if self._thread.is_alive() else time.monotonic()
+
+    def sleep(self, _):
+        """Nap until the next look at the time."""
+        time.sleep(0.0005)
 
     def _run(self):
-        unread = bytearray()
         while not self._stop.wait(0.0005):
             ready, _, _ = select.select([self.master], [], [], 0)
             try:
-                if ready:
-                    self.link.write(os.read(self.master, 4096))
-                unread += self.link.read(0.001)
-                with contextlib.suppress(BlockingIOError):  # nobody reads: the board goes on
-                    del unread[: os.write(self.master, unread)]
+                with self.lock:
+                    if ready:
+                        self.link.write(os.read(self.master, 4096))
+                    self.link.step(1)
+                    self._unread += self.link.read(0.0)
+                    self._ticks += 1
+                self._say()
             except (OSError, DeviceError):
                 return
+
+    def _say(self):
+        """Give what the port takes; the rest waits."""
+        with contextlib.suppress(BlockingIOError):
+            del self._unread[: os.write(self.master, self._unread)]
 
     def pull(self):
         """Pull the cable: the port is gone, the board runs on by hand (``link.step``)."""
@@ -143,5 +160,17 @@ class PtyBoard:
         os.close(self.master)
 
     def close(self):
+        self._patch.undo()
         if not self._stop.is_set():
             self.pull()
+
+
+class PtyBoard(PtyCable):
+    """The host build behind a pseudo-terminal."""
+
+    def __init__(self, *, fresh=False, plant=None):
+        self.plant = JointPlant() if plant is None else plant
+        link = EmulatedLink(open_emulator("host"), self.plant)
+        if not fresh:
+            configured(link)
+        super().__init__(link)
