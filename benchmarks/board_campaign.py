@@ -1,6 +1,6 @@
 """Figure 1: every class of board_arms.py and board_motors.py, named by the right part or not; one row a class.
 
-    python benchmarks/board_campaign.py 100 --seed 9902      rounds of 40 cases each
+    python benchmarks/board_campaign.py 100 --seed 9902      rounds of 42 cases each
 
 ``right``: the first code is the broken part's, and its alone; ``both``: it is latched beside another one that cannot be
 distinguished from it; ``silent``: no fault. Healthy classes begin with H: there no fault is right.
@@ -92,6 +92,10 @@ def main():
                 label = f"{hurt.__name__}{' moving' if moving else ''}"
                 case = (library, next(seeds), table, label, hurt)
                 table.run(label, part, board_motors.broken, *case, moving=moving)
+        for moving in (True, False):
+            label = f"stuck{' moving' if moving else ''}, no figures"
+            case = (library, next(seeds), table, label, board_motors.stuck)
+            table.run(label, Fault.BRIDGE, board_motors.broken, *case, moving=moving, unknown=True)
         for brake in (board_motors.BRAKE_N_M, 0.0):
             for ms in (0, 20):
                 label = f"stuck, stop after {ms} ms{', brake' if brake else ''}"

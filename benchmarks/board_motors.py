@@ -129,16 +129,26 @@ def until_moving(arm, joint):
         arm.swing(4)
 
 
-def broken(library, seed, table, kind, hurt, *, moving, load=0.6, brake=0.0, stop_ms=None):
+def forget_motors(arm):
+    """Let the board have no figures of the motors, so that the reading alone is left to watch them by."""
+    for joint in arm.core.config.joint:
+        joint.motor.resistance_ohm = 0.0
+    arm.core.crc, arm.core.crc_at, arm.core.crc_known = 0xFFFFFFFF, 0, 0
+
+
+def broken(library, seed, table, kind, hurt, *, moving, load=0.6, brake=0.0, stop_ms=None, unknown=False):
     """Break a joint's electrics and look at it tick by tick; stop_ms: the emergency stop comes so much later."""
     arm = drawn_arm(library, seed, load, brake=brake)
+    if unknown:
+        forget_motors(arm)
     arm.enable()
     joint = int(arm.rng.integers(6))
     arm.rest(400)
     until_moving(arm, joint)
     if not moving:
         arm.rest(600)
-    label = f"{kind}{' moving' if moving else ''}{' unloaded' if load < 0.1 else ''}{' brake' if brake else ''}"
+    options = {" moving": moving, " unloaded": load < 0.1, " brake": brake, " unknown": unknown}
+    label = kind + "".join(name for name, holds in options.items() if holds)
     if arm.first[0] is not None:
         table.add("before the fault", arm)
         return
@@ -213,6 +223,15 @@ def classes():
     for hurt in (stuck, offset, gain, sign, weak, shorted):
         for moving in (True, False):
             yield f"{hurt.__name__} {moving}", lambda *a, h=hurt, m=moving: broken(*a, h.__name__, h, moving=m)
+    for moving in (True, False):
+        yield f"unknown {moving}", lambda *a, m=moving: broken(*a, "stuck", stuck, moving=m, unknown=True)
+    for ms in (0, 20):
+        yield (
+            f"unknown stop {ms}",
+            lambda *a, t=ms: broken(
+                *a, f"stuck stop after {t} ms", stuck, moving=True, brake=BRAKE_N_M, stop_ms=t, unknown=True
+            ),
+        )
     yield "stuck unloaded", lambda *a: broken(*a, "stuck", stuck, moving=True, load=0.02)
     for hurt in (stuck, sound):
         for brake in (BRAKE_N_M, 0.0):

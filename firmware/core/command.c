@@ -4,6 +4,7 @@
 #include "governor.h"
 #include "motor.h"
 #include "number.h"
+#include "observer.h"
 #include "pid.h"
 #include "pot.h"
 #include "safety.h"
@@ -22,6 +23,8 @@ static void start_joint(joint_state *joint, const joint_config *config, uint32_t
     const float ka_mv = config->gains.ka_s2_per_rad * (float)nominal_mv; /* J R / K by 1000 */
     joint->motor.swift_per_a = ka_mv > 0.0f ? config->motor.resistance_ohm / ka_mv : 0.0f;
     joint->released = 0u;
+    observer_move(&joint->observer, angle_rad);
+    joint->observer.speed_rad_s = speed_rad_s;
     joint->zero.ticks = 0u;
     joint->suspect = FAULT_NONE;
     pot_watch(&joint->pot, angle_rad);
@@ -138,10 +141,11 @@ static uint32_t check_move(const core_state *core, const move_command *move)
 static void move_joint(joint_state *joint, const joint_config *config, const move_command *move, uint32_t i)
 {
     const float limit_rad_s = config->speed_limit_rad_s;
-    const float to_rad = number_clamp(move->position_rad[i], joint->low_rad, joint->high_rad);
+    float to_rad = move->position_rad[i];
     float to_rad_s = number_bound(move->speed_rad_s[i], limit_rad_s);
     uint32_t held_back = to_rad_s != move->speed_rad_s[i] ? LIMITED_SPEED : 0u;
-    if (to_rad != move->position_rad[i]) {
+    if (!number_within(to_rad, joint->low_rad, joint->high_rad)) {
+        to_rad = number_clamp(to_rad, joint->low_rad, joint->high_rad);
         held_back |= LIMITED_SOFT;
         to_rad_s = 0.0f; /* it ends at the limit, so it ends at rest */
     }

@@ -6,6 +6,7 @@
 #include "governor.h"
 #include "motor.h"
 #include "number.h"
+#include "observer.h"
 #include "pid.h"
 #include "pot.h"
 #include "safety.h"
@@ -46,9 +47,20 @@ static void measure(core_state *core, joint_state *joint, const joint_config *co
     }
     if (!known || fault != FAULT_NONE) {
         pid_reset(&joint->pid, joint->pot.angle_rad); /* a new position is no speed */
+        observer_move(&joint->observer, joint->pot.angle_rad);
     } else {
         pid_measure(&joint->pid, &config->gains, joint->pot.angle_rad);
     }
+}
+
+/* Watch a joint without its motor. */
+static void observe(const core_state *core, joint_state *joint, const joint_config *config, float angle_rad)
+{
+    joint->motor.last_rad = angle_rad;
+    joint->motor.driven_ticks++;
+    joint->motor.trust = 1.0f; /* no witness, no trust to earn */
+    const float supply_duty = 1000.0f * core->supply_v / (float)core->config.supply_nominal_mv;
+    observer_measure(&joint->observer, &config->gains, joint->motor.duty * supply_duty, angle_rad);
 }
 
 /* Bring a reference that has nearly come to rest to it: the path ends where it is. */
@@ -229,7 +241,11 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
             if ((weak || joint->over_a > 0.0f) && joint->motor.duty != 0.0f) { /* what it does not put out is not known */
                 motor_limit(&joint->motor);
             }
-            motor_measure(&joint->motor, &config->motor, core->supply_v, joint->current_a, angle_rad);
+            if (config->motor.resistance_ohm > 0.0f) {
+                motor_measure(&joint->motor, &config->motor, core->supply_v, joint->current_a, angle_rad);
+            } else {
+                observe(core, joint, config, angle_rad);
+            }
         } else {
             motor_sleep(&joint->zero, joint->current_a);
         }

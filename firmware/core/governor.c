@@ -61,8 +61,9 @@ uint32_t governor_step(governor_state *reference, const setpoint_state *path, fl
     reference->speed_rad_s = number_bound(before_rad_s + next_rad_s2 * TICK_S, fastest);
     reference->acceleration_rad_s2 = (reference->speed_rad_s - before_rad_s) * (float)TICKS_PER_S;
     const float reached_rad = before_rad + 0.5f * TICK_S * (before_rad_s + reference->speed_rad_s);
-    reference->position_rad = number_clamp(reached_rad, low_rad, high_rad);
-    if (reference->position_rad != reached_rad) {
+    reference->position_rad = reached_rad;
+    if (!number_within(reached_rad, low_rad, high_rad)) {
+        reference->position_rad = number_clamp(reached_rad, low_rad, high_rad);
         reference->speed_rad_s = 0.0f;
         reference->acceleration_rad_s2 = 0.0f;
         limited |= LIMITED_SOFT;

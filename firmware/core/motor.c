@@ -420,10 +420,9 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     const float moved_rad = angle_rad - motor->last_rad;
     motor->last_rad = angle_rad;
     motor->driven_ticks++;
-    if (config->resistance_ohm <= 0.0f || motor->driven_ticks <= SETTLE_TICKS) {
+    if (motor->driven_ticks <= SETTLE_TICKS) {
         motor->window_rad = motor->part_rad = angle_rad;
         motor->ohm = motor->resistance_scale * config->resistance_ohm;
-        motor->trust = config->resistance_ohm <= 0.0f ? 1.0f : motor->trust; /* no witness, no trust to earn */
         return;
     }
     const float voltage_v = motor->duty * supply_v;

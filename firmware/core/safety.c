@@ -4,6 +4,7 @@
 #include "governor.h"
 #include "motor.h"
 #include "number.h"
+#include "observer.h"
 #include "pid.h"
 #include "pot.h"
 #include "setpoint.h"
@@ -15,10 +16,6 @@
 #define OVERCURRENT_TICKS 20u /* in a row above the limit; half: a reversal trips it, double: windings heat for longer */
 #define STOP_TICKS 300u /* after which an emergency stop ends with sleeping drives, braked by shorted windings until then; half:
                            a fast joint coasts, double: a bridge that conducts by itself drives on for longer */
-#define FREE_TICKS 33u    /* in which shorted windings brake any joint; half: heavy joints sleep, double: a bridge drives on longer */
-#define FREE_BRAKED 0.9f  /* of its speed then, at most; half: heavy joints sleep, nearer 1: a bridge drives on longer */
-#define FREE_SLOW 0.25f   /* of the speed limit: what was slower when it was let go of may sink up to its limit; half: slow
-                             joints that sink sleep, double: a bridge drives up to the limit */
 #define NAME_EARLY_TICKS 64u /* after which a weak motor may show: its joint is taken back; half: noise names,
                                 double: it sinks for longer */
 #define NAME_TICKS 160u /* after which a joint let go of has shown which fault it has; half: more are named wrongly, double: the
@@ -321,18 +318,15 @@ void safety_limit_blindly(core_state *core)
     }
 }
 
-/* Return whether a joint without a motor that is watched goes on although shorted windings brake it: as fast as when it was
- * let go of, or, where it was slow, faster than its limit. */
-static bool runs_on(joint_state *joint, const joint_config *config)
+/* Return whether a joint whose motor is not watched is driven by its bridge, which does not follow its duty. */
+static bool runs_on(const core_state *core, joint_state *joint, const joint_config *config, bool off)
 {
-    const float speed_rad_s = number_size(joint->pid.speed_rad_s);
-    if (joint->free_ticks == 0u) {
-        joint->free_rad_s = speed_rad_s;
+    if (config->motor.resistance_ohm > 0.0f || config->transmission.twist_rad_per_a > 0.0f) {
+        return false; /* the motor shows it; and a spring drives a joint, too */
     }
-    const bool moved = joint->free_rad_s > FREE_SLOW * config->speed_limit_rad_s;
-    const float most_rad_s = moved ? FREE_BRAKED * joint->free_rad_s : config->speed_limit_rad_s;
-    joint->free_ticks = speed_rad_s > most_rad_s ? number_add(joint->free_ticks, WATCH_TICKS) : 1u;
-    return config->motor.resistance_ohm <= 0.0f && joint->free_ticks >= FREE_TICKS;
+    const float supply_duty = 1000.0f * core->supply_v / (float)core->config.supply_nominal_mv;
+    const float fast = number_size(joint->pid.speed_rad_s) / config->speed_limit_rad_s;
+    return observer_is_driven(&joint->observer, supply_duty, fast, off);
 }
 
 /* Give a suspected fault its name; where parts cannot be distinguished, those of all. */
@@ -395,13 +389,12 @@ static void watch_joint(core_state *core, joint_state *joint, const joint_config
     if (joint->released != 0u || joint->motor.doubted != 0u) {
         name_suspect(core, joint, config, i);
     }
-    if (joint->released != 0u) {
-        if (runs_on(joint, config)) {
-            blame(core, joint, FAULT_BRIDGE, i);
-        }
+    if (runs_on(core, joint, config, joint->released != 0u)) {
+        blame(core, joint, FAULT_BRIDGE, i);
+    }
+    if (joint->released != 0u || !safety_drives_on(core)) {
         return;
     }
-    joint->free_ticks = 0u;
     const float off_rad = number_size(joint->pid.error_rad);
     if (joint->motor.doubted == 0u) {
         watch_motor(core, joint, config, i);
@@ -446,7 +439,8 @@ void safety_watch_rest(core_state *core)
     for (uint32_t i = core->tick % WATCH_TICKS; i < core->config.joint_count; i += WATCH_TICKS) {
         joint_state *joint = &core->joint[i];
         const joint_config *config = &core->config.joint[i];
-        if (motor_disobeys(&joint->motor, &config->motor, core->supply_v, 0.0f) || runs_on(joint, config)) {
+        if (motor_disobeys(&joint->motor, &config->motor, core->supply_v, 0.0f) ||
+            runs_on(core, joint, config, true)) {
             blame(core, joint, FAULT_BRIDGE, i);
         }
     }

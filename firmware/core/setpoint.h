@@ -70,11 +70,10 @@ bool setpoint_slow(setpoint_state *setpoint, float deceleration_rad_s2);
 /* Hold the present reference within [low_rad, high_rad], at rest where it would leave. Returns whether it would. */
 inline bool setpoint_clamp(setpoint_state *setpoint, float low_rad, float high_rad)
 {
-    const float held_rad = number_clamp(setpoint->position_rad, low_rad, high_rad);
-    if (held_rad == setpoint->position_rad) {
+    if (number_within(setpoint->position_rad, low_rad, high_rad)) {
         return false;
     }
-    setpoint->position_rad = held_rad;
+    setpoint->position_rad = number_clamp(setpoint->position_rad, low_rad, high_rad);
     setpoint->speed_rad_s = 0.0f;
     return true;
 }

@@ -480,6 +480,18 @@ typedef struct zero_state {
     uint32_t ticks; /* since then */
 } zero_state;
 
+/* What is remembered of a joint whose motor is not watched: an observer by duty and reading. */
+typedef struct observer_state {
+    float position_rad; /* where it is, */
+    float speed_rad_s;  /* how fast, */
+    float load_duty;    /* and what of the duty its load takes */
+    float usual_duty;   /* the same of late */
+    float inertia;      /* learnt: over the configuration's */
+    float pull_duty;    /* what of the duty accelerates it under its usual load, as late as load_duty is */
+    float agreed_rad;   /* the way on which it answered to its duty, since the board is on */
+    float driven_rad;   /* where it was when something else than its duty began to drive it */
+} observer_state;
+
 /* What is remembered of one joint. */
 typedef struct joint_state {
     pid_state pid;
@@ -489,8 +501,6 @@ typedef struct joint_state {
     uint32_t released;       /* not 0: a fault took it out of the drive, its windings are shorted */
     uint32_t suspect;        /* the fault by which motor and reading disagreed, until it has its name */
     uint32_t suspect_ticks;  /* since then */
-    float free_rad_s;        /* its speed when it was left to shorted windings, */
-    uint32_t free_ticks;     /* and since when it goes on, 0 while it is driven */
     float gravity_duty;      /* in use; it follows gravity_asked */
     float gravity_asked;
     float stop_rad_s2;       /* deceleration on the way to a stop along the path */
@@ -507,6 +517,7 @@ typedef struct joint_state {
     uint32_t limited;        /* LIMITED_... of this tick */
     encoder_state encoder;
     zero_state zero;
+    observer_state observer;
     motor_state motor;
 } joint_state;
 

@@ -133,19 +133,45 @@ def test_a_current_that_flows_asleep_is_its_sensors_error(motors, library):
     assert arm.first == (Fault.CURRENT_SENSOR, 4)
 
 
-@pytest.mark.parametrize("share", [-0.6, 0.6])
-def test_a_bridge_of_a_joint_without_motor_figures_is_put_to_sleep(motors, library, share):
-    """No current is compared with its voltage there: what shorted windings do not brake is driven on."""
-    arm = motors.drawn_arm(library, 812, load=0.2)
-    for joint in arm.core.config.joint:
-        joint.motor.resistance_ohm = 0.0
-    arm.core.crc, arm.core.crc_at, arm.core.crc_known = 0xFFFFFFFF, 0, 0
+def unwatched(motors, library, seed, *, brake=0.0):
+    """An arm of which the board has no motor figures, in motion."""
+    arm = motors.drawn_arm(library, seed, load=0.4, brake=brake)
+    motors.forget_motors(arm)
     arm.enable()
     motors.until_moving(arm, 2)
-    arm.plant.stuck[2] = share
-    arm.swing(600, stop_at_fault=False)
-    assert arm.first == (Fault.BRIDGE, 2)
-    assert asleep(arm)
+    assert arm.first == (None, None)
+    return arm
+
+
+@pytest.mark.parametrize("share", [-1.0, -0.6, 0.6, 1.0])
+def test_a_bridge_of_a_joint_without_motor_figures_sleeps_within_60_ms_or_below_its_limit(motors, library, share):
+    """No current is compared with its voltage there: what does not answer to its duty as before is driven on."""
+    for seed in SEEDS:
+        arm = unwatched(motors, library, seed)
+        arm.plant.stuck[2], fastest = share, 0.0
+        for tick in range(0, 600, 4):
+            if asleep(arm):
+                break
+            if tick >= 60:
+                fastest = max(fastest, abs(arm.plant.qd[2]) / arm.core.config.joint[2].speed_limit_rad_s)
+            arm.swing(4, stop_at_fault=False)
+        assert asleep(arm)
+        assert fastest < motors.SPEED
+        assert arm.first == (Fault.BRIDGE, 2)
+
+
+def test_a_sound_joint_without_motor_figures_may_be_stopped_and_pushed_and_have_a_payload(motors, library):
+    for seed in SEEDS:
+        arm = unwatched(motors, library, seed, brake=motors.BRAKE_N_M * (seed % 2))
+        arm.plant._model[2] *= 1.8
+        arm.swing(1500)
+        arm.plant.hand_n_m[2] = 2.0
+        arm.swing(100)
+        arm.plant.hand_n_m[2] = 0.0
+        arm.swing(1000)
+        arm.inputs.stop_pressed = 1
+        arm.tick(600)
+        assert arm.first == (None, None)
 
 
 def test_a_gain_and_a_worn_winding_that_cannot_be_distinguished_are_both_named_and_the_joint_held(motors, library):

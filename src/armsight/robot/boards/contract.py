@@ -171,10 +171,10 @@ class PolledBoard:
         none = (Limited(0),) * self.abilities.joints
         return JointReport(self._t_s, speed_rad_s, self._goal, self._goal_speed, duty, none, temperature_c)
 
-    def _take_goal(
+    def _checked_goal(
         self, command: JointCommand, who: str, names: Sequence[str] | None = None, margin_rad: float = 1e-8
-    ) -> Array:
-        """Make a command's angles (n,), rad, the goal, where they are near, and within the limits but for a margin.
+    ) -> tuple[Array, Array]:
+        """Return a command's angles (n,), rad, and speeds, rad/s: near, and within the limits but for a margin.
 
         Raises:
             InputError: another number of joints, one that is not finite, outside the limits, or far away.
@@ -195,8 +195,7 @@ class PolledBoard:
             at, goal, step = np.degrees([here[k], q_ref[k], MOST_STEP_RAD])
             far = f"{step:.0f} at most: send goals step by step"
             raise InputError(f"{of[k]} is at {at:.1f} deg and is to go to {goal:.1f} at once; {far}")
-        self._goal, self._goal_speed = q_ref, np.asarray(command.qd_ref, float)
-        return q_ref
+        return q_ref, np.asarray(command.qd_ref, float)
 
     def _count(self) -> int:
         self._sent += 1

@@ -118,6 +118,20 @@ def test_torque_goes_on_where_the_arm_is_and_off_at_once(folded):
     assert board.status.state is BoardState.ENABLED
 
 
+def test_a_goal_that_was_not_sent_is_not_reported(folded, monkeypatch):
+    board, _ = folded
+    q = board.receive(0.1).q[-1]
+    goto(board, q, 0.1)
+
+    def gone(*_):
+        raise DeviceError("the bus is gone")
+
+    monkeypatch.setattr(board.bus, "write_all", gone)
+    with pytest.raises(DeviceError, match="the bus is gone"):
+        board.send(JointCommand(q + 0.05, REST, REST, 0.005))
+    assert board.joints.reference_rad == pytest.approx(q)
+
+
 def test_an_alarm_is_named_with_its_joint(folded):
     board, device = folded
     answer = device._answer

@@ -154,7 +154,7 @@ class Ar4Board(PolledBoard):
             DeviceError: the port is gone.
         """
         self._require_homed()
-        self._take_goal(command, f"the AR4 {self.model.name}")
+        self._goal, self._goal_speed = self._checked_goal(command, f"the AR4 {self.model.name}")
         if self._now() - self._written_s >= 1 / RATE_HZ:
             self._write_goal()
         return self._count()

@@ -148,8 +148,9 @@ class FeetechBoard(PolledBoard):
             DeviceError: the bus is gone.
         """
         # The margin is what rounds to a count that is allowed.
-        q_ref = self._take_goal(command, "its servo", self.calibration.names, margin_rad=RAD_PER_COUNT / 2)
-        self._write_goals(self.calibration.counts(q_ref))
+        goal = self._checked_goal(command, "its servo", self.calibration.names, margin_rad=RAD_PER_COUNT / 2)
+        self._write_goals(self.calibration.counts(goal[0]))
+        self._goal, self._goal_speed = goal
         return self._count()
 
     def command(self, command: Command) -> int:
