@@ -1,17 +1,16 @@
 """The result of a calibration as a Report: its table, its JSON, and a page with its assessment and its figures.
 
-In order: the tables; the sections of the page, from the assessment to the parameters; the report. A figure's caption
-explains what one should see, and what would be bad.
+In order: the tables; the figures with their captions, which explain what one should see, and what would be bad; the report.
 """
 
 from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -40,10 +39,9 @@ from armsight.app.show.messages import weak
 from armsight.app.show.page import PAGE, bullets, table, text
 from armsight.app.show.report import Block, Html, Plot, Report, Section, Text, assessment
 from armsight.app.show.table import TextTable, plain_text
-from armsight.data import Array
 from armsight.geometry.pose import exp_se3
 from armsight.geometry.rotation import log_so3
-from armsight.vision.calibrate.result import Calibration, HeldOutErrors
+from armsight.vision.calibrate.result import Calibration
 from armsight.vision.calibrate.screen import merged_notes
 from armsight.vision.calibrate.weak import COVERAGE_GRID, contradicted
 from armsight.vision.rig import StereoRig
@@ -53,6 +51,10 @@ if TYPE_CHECKING:
 
 _STEP_RAD = 1e-6
 _ROUNDING = 1e-12
+#: Why the reprojection RMS may be far below the epipolar RMS of the same fit.
+MOTION_FITTED = (
+    "The reprojection follows the board, which moved between the two exposures of a pair; the epipolar RMS does not."
+)
 
 
 def headline_table(calibration: Calibration) -> str:
@@ -67,73 +69,60 @@ def headline_table(calibration: Calibration) -> str:
         )
         for row in graded_metrics(calibration)
     ]
-    fit = f"{calibration.reprojection_rms_px:.3g} px"
     meaning = "Error of the fitted model at the points it was fitted to. It does not predict errors in millimetres."
-    if calibration.motion is not None:
-        meaning += f" {MOTION_FITTED}"
-    rows.append(("reprojection RMS", "–", fit, "", meaning))
-    head = ("", f"held out, {calibration.heldout.folds} folds", "fit", "", "meaning")
-    return table(head, rows, "headline")
-
-
-#: Why the reprojection RMS may be far below the epipolar RMS of the same fit.
-MOTION_FITTED = (
-    "The reprojection follows the board, which moved between the two exposures of a pair; the epipolar RMS does not."
-)
+    meaning += "" if calibration.motion is None else f" {MOTION_FITTED}"
+    rows.append(("reprojection RMS", "–", f"{calibration.reprojection_rms_px:.3g} px", "", meaning))
+    return table(("", f"held out, {calibration.heldout.folds} folds", "fit", "", "meaning"), rows, "headline")
 
 
 def models_table(calibration: Calibration) -> str:
     """Return the distortion models that were tried, with their held-out errors."""
-
-    def row(name: str, h: HeldOutErrors) -> tuple[str, ...]:
-        chosen = "<b>chosen</b>" if name == calibration.rig.left.model else ""
+    rows = []
+    for name, h in calibration.models.items():
         values = (f"{h.epipolar_rms_px:.4f}", f"{1e3 * h.rigid_rms_m:.4f}", f"{100 * h.scale_error:+.3f}")
-        return (text(name), *values, f"{h.normalised_rms:.2f}", chosen)
-
+        chosen = "<b>chosen</b>" if name == calibration.rig.left.model else ""
+        rows.append((text(name), *values, f"{h.normalised_rms:.2f}", chosen))
     head = ("model", "epipolar RMS, px", "rigid RMS, mm", "scale error, %", "residual / sigma", "")
-    return table(head, [row(name, h) for name, h in calibration.models.items()], "numbers")
+    return table(head, rows, "numbers")
 
 
-def _with_sigma(value: float, sigma: float, unit: str = "") -> str:
+def _with_sigma(value: float, sigma: float) -> str:
     """Return a value to the digits its sigma allows, with the sigma; "given" where it was not estimated."""
     if not sigma > _ROUNDING * max(abs(value), 1.0):
-        return f"{value:.6g}{unit} <i>given</i>"
+        return f"{value:.6g} <i>given</i>"
     digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 9))
-    return f"{value:.{digits}f} ± {sigma:.{digits}f}{unit}"
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
 
 
 def cameras_table(rig: StereoRig) -> str:
     """Return intrinsics and distortion of both cameras with their sigmas."""
     sigma, n_left = np.sqrt(np.diag(rig.cov)), rig.left.parameters.size
-    cells: dict[str, list[str]] = {}
-    for k, (name, value) in enumerate(
-        zip(rig.parameter_names, np.r_[rig.left.parameters, rig.right.parameters], strict=False)
-    ):
+    rows = {
+        "image, px": ["{} x {}".format(*camera.image_size_px) for camera in rig.cameras],
+        "distortion model": [text(camera.model) for camera in rig.cameras],
+    }
+    values = np.r_[rig.left.parameters, rig.right.parameters]
+    for k, (name, value) in enumerate(zip(rig.parameter_names, values, strict=False)):
         label = name.split(".", 1)[1].replace("_px", ", px")
-        cells.setdefault(label, ["–", "–"])[k >= n_left] = _with_sigma(float(value), float(sigma[k]))
-    rows = [("image, px", *("{} x {}".format(*camera.image_size_px) for camera in rig.cameras))]
-    rows.append(("distortion model", *(text(camera.model) for camera in rig.cameras)))
-    return table(("", "left", "right"), [*rows, *((name, *both) for name, both in cells.items())], "numbers")
+        rows.setdefault(label, ["–", "–"])[k >= n_left] = _with_sigma(float(value), float(sigma[k]))
+    return table(("", "left", "right"), [(name, *both) for name, both in rows.items()], "numbers")
 
 
 def pose_table(rig: StereoRig) -> str:
     """Return the pose of the right camera in the left one's frame, mm and degrees, with sigmas."""
     cov, T = rig.cov[-6:, -6:], rig.T_left_right
-    rotation, J = log_so3(T[:3, :3]), np.empty((3, 6))
-    for k, axis in enumerate(np.eye(6)):
-        ends = [log_so3((T @ exp_se3(h * axis))[:3, :3]) for h in (_STEP_RAD, -_STEP_RAD)]
-        J[:, k] = (ends[0] - ends[1]) / (2 * _STEP_RAD)
+    ends = [
+        [log_so3((T @ exp_se3(h * axis))[:3, :3]) for axis in np.eye(6)] for h in (_STEP_RAD, -_STEP_RAD)
+    ]  # by finite differences
+    J = (np.array(ends[0]) - ends[1]).T / (2 * _STEP_RAD)
     cov_t = T[:3, :3] @ cov[:3, :3] @ T[:3, :3].T  # the tangent's translation is along the right camera's axes
+    toward, rotation = T[:3, 3] / max(rig.baseline_m, 1e-12), np.degrees(log_so3(T[:3, :3]))
     sigma_mm, sigma_deg = 1e3 * np.sqrt(np.diag(cov_t)), np.degrees(np.sqrt(np.diag(J @ cov @ J.T)))
-    toward = T[:3, 3] / max(rig.baseline_m, 1e-12)
-    rows = [("baseline, mm", _with_sigma(1e3 * rig.baseline_m, 1e3 * float(np.sqrt(toward @ cov_t @ toward))))]
-    rows += [
-        (f"{axis}, mm", _with_sigma(1e3 * value, s)) for axis, value, s in zip("XYZ", T[:3, 3], sigma_mm, strict=True)
-    ]
-    rows.append(("angle between the optical axes, degrees", f"{rig.convergence_deg:.3f}"))
-    rows += [
-        (f"rotation vector {axis}, degrees", _with_sigma(float(np.degrees(value)), s))
-        for axis, value, s in zip("XYZ", rotation, sigma_deg, strict=True)
+    rows = [
+        ("baseline, mm", _with_sigma(1e3 * rig.baseline_m, 1e3 * float(np.sqrt(toward @ cov_t @ toward)))),
+        *((f"{axis}, mm", _with_sigma(1e3 * T[k, 3], sigma_mm[k])) for k, axis in enumerate("XYZ")),
+        ("angle between the optical axes, degrees", f"{rig.convergence_deg:.3f}"),
+        *((f"rotation vector {axis}, degrees", _with_sigma(rotation[k], sigma_deg[k])) for k, axis in enumerate("XYZ")),
     ]
     return table(("T_left_right", "value ± one sigma"), rows, "numbers")
 
@@ -141,8 +130,7 @@ def pose_table(rig: StereoRig) -> str:
 def sigma_table(calibration: Calibration) -> str:
     """Return the predicted sigmas at the nearest, the middle and the farthest target."""
     middle = target_points(calibration).mean(axis=1)
-    order = np.argsort(middle[:, 2])
-    chosen: Array = middle[order[[0, len(order) // 2, -1]]]
+    chosen = middle[np.argsort(middle[:, 2])[[0, len(middle) // 2, -1]]]
     depth, lateral = predicted_sigmas(calibration.rig, chosen, corner_variance_px2(calibration))
     rows, what = [], target(calibration)
     for k, name in enumerate(("nearest", "middle", "farthest")):
@@ -152,185 +140,213 @@ def sigma_table(calibration: Calibration) -> str:
     return table(head, rows, "numbers")
 
 
-def provenance_table(provenance: Mapping[str, Any]) -> str:
-    """Return how a rig was made, as its file records it."""
-    rows = [
-        (text(key), text(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)))
-        for key, value in provenance.items()
-    ]
-    return table(("", ""), rows, "provenance") if rows else "<p>Nothing is recorded.</p>"
+class Captioned(NamedTuple):
+    """A figure of the page; its texts are templates of what :func:`_words` has."""
+
+    title: str  #: of its section
+    draw: Callable[[Calibration], Figure | None]  #: plots it, or returns None where there is nothing to plot
+    description: str  #: for who cannot see it
+    see: str  #: what it shows
+    bad: str  #: what would be bad
+    opening: str = "You should see"
 
 
-#: Name -> the function that plots it (None where there is nothing to plot), and its description for who cannot see it.
-FIGURES: dict[str, tuple[Callable[[Calibration], Figure | None], str]] = {
-    "coverage": (coverage_figure, "Maps of both images: how many points were seen in which part"),
-    "residuals": (residuals_figure, "Residual vectors over both images, every point and averaged by region"),
-    "pairs": (pairs_figure, "Bars: held-out epipolar and rigid error of every pair"),
-    "volume": (volume_figure, "Maps of the predicted depth and lateral sigma over a slice of the volume"),
-    "target": (target_figure, "Map of the target's deviation from its drawing"),
+FIGURES = {
+    "coverage": Captioned(
+        "Coverage of the images",
+        coverage_figure,
+        "Maps of both images: how many points were seen in which part",
+        "points of the {what} (dots) in nearly all cells of both images, up to their corners. Colour: their number. The "
+        f"percentages are counted in {COVERAGE_GRID} x {COVERAGE_GRID} cells, larger than those of the map.",
+        "hatched cells where you want to measure: no point was seen there, so the lens model is extrapolated. Take more "
+        "pairs with the {what} there. (The dark rim around the image of a fisheye lens stays empty.)",
+    ),
+    "residuals": Captioned(
+        "Residuals of the fit",
+        residuals_figure,
+        "Residual vectors over both images, every point and averaged by region",
+        "above, short arrows in all directions, alike in both images, as random noise is: one sigma of a point along u or "
+        "v is {sigma[0]:.3g} px left and {sigma[1]:.3g} px right. Below, tiny arrows without a pattern. Note the scale "
+        "over each panel.",
+        "neighbours that point the same way, or a vortex or a star below: the lens differs from its model there, or the "
+        f"{{what}} from its drawing. Red arrows are more than {STANDS_OUT:g} times their own uncertainty. "
+        "Longer arrows in one image than in the other: that camera is out of focus, moves, or has too little light.",
+    ),
+    "pairs": Captioned(
+        "Held-out errors by pair",
+        pairs_figure,
+        "Bars: held-out epipolar and rigid error of every pair",
+        "bars of similar length, all blue.{few}{rejected}",
+        f"orange bars, more than {OUTSTANDING:g} times the median. A pair that stands out in the epipolar error moved "
+        "between the two images or was taken at two moments; one that stands out in the rigid error only was blurred, "
+        "far away or bent. Look at its images and take it again. Each pair was measured with a rig fitted without it.",
+    ),
+    "volume": Captioned(
+        "Predicted uncertainty of a measurement",
+        volume_figure,
+        "Maps of the predicted depth and lateral sigma over a slice of the volume",
+        "one sigma of a triangulated point, in a slice through the middle of the {what}'s positions (dots): of 100 "
+        "measurements of a point, 95 have an error of less than two sigma. Depth is along the line of sight, and its sigma "
+        "grows with the square of the distance; lateral is across it, in the worse direction. The axes are the left "
+        "camera's.",
+        "a calibration's share above that of the pixel noise where you measure: more and better pairs help there, while "
+        "a longer baseline, more pixels or nearer cameras help against the pixel noise. Beyond the dots the calibration "
+        "is extrapolated.",
+        "It shows",
+    ),
+    "target": Captioned(
+        "Shape of the target",
+        target_figure,
+        "Map of the target's deviation from its drawing",
+        "the deviation of the target from its drawing, {deviation_mm:.2g} mm RMS: a few hundredths of a "
+        "millimetre for a target on glass or aluminium, tenths for paper on card. It was estimated together with the "
+        "cameras, so that it does not distort their parameters.",
+        "a millimetre or more: a loose or bowed sheet, which also bends from pair to pair. Glue it to something stiff. "
+        "(The cameras cannot measure the size of the whole target; it is the one you gave.)",
+        "It shows",
+    ),
 }
 
 
-def _figure(calibration: Calibration, name: str, see: str, bad: str, opening: str = "You should see") -> Plot:
-    """Return a figure with its caption: what one should see, and what would be bad."""
-    draw, description = FIGURES[name]
-    caption = f"<p><b>{opening}</b> {see}</p><p><b>Bad would be</b> {bad}</p>"
-    return Plot(name, partial(draw, calibration), caption, description)
+def _words(calibration: Calibration) -> dict[str, object]:
+    """Return what captions say of a calibration."""
+    pairs = len(calibration.errors.pair)
+    return {
+        "what": target(calibration),
+        "sigma": np.sqrt(corner_variance_px2(calibration)),
+        "deviation_mm": 1e3 * calibration.deviation_m,
+        "few": f" Of {pairs} pairs the {MOST_BARS} with the largest rigid error are shown."
+        if pairs > MOST_BARS
+        else "",
+        "rejected": " Pairs that were not used are named below them." if calibration.rejected else "",
+    }
 
 
-def result(calibration: Calibration) -> list[Block]:
+def _result(calibration: Calibration) -> str:
     """Return the assessment, the held-out metrics, what is weak, and which pairs were rejected or used in part."""
-    found = assess(calibration)
-    parts = [assessment([found.headline], found.meaning, found.grade)]
-    parts.append(headline_table(calibration))
-    parts.append(
-        "<p>Rely on the held-out column: a fit adapts to the pairs it is made from, the more so the fewer they are. The "
-        "held-out metrics come from pairs that were not fitted, measured as later measurements are.</p>\n"
-    )
-    parts.append("<h3>Weak points, and what to do</h3>\n")
-    weak = advice(calibration)
-    parts.append(bullets(weak) if weak else "<p>None.</p>\n")
-    used, pairs_found = len(calibration.pairs), calibration.pairs_found
-    parts.append("<h3>Pairs that were not used</h3>\n")
+    found, used = assess(calibration), len(calibration.pairs)
+    weak_points = bullets(advice(calibration)) or "<p>None.</p>\n"
+    rejected = f"<p>None: all {used} pairs were used.</p>\n"
     if calibration.rejected:
         reasons: dict[str, list[str]] = {}
         for pair in calibration.rejected:
             reasons.setdefault(pair.reason, []).append(pair.pair)
         rows = [(", ".join(text(name) for name in names), text(reason)) for reason, names in reasons.items()]
-        parts.append(f"<p>{used} of {pairs_found} pairs were used.</p>\n" + table(("pair", "reason"), rows, "prose"))
-    else:
-        parts.append(f"<p>None: all {used} pairs were used.</p>\n")
-    if calibration.notes:
-        parts.append("<h3>Corrected, or used in part</h3>\n" + bullets(calibration.notes))
-    return [Html("".join(parts))]
-
-
-def coverage(calibration: Calibration) -> list[Block]:
-    """Return the coverage maps."""
-    what = target(calibration)
-    see = (
-        f"points of the {what} (dots) in nearly all cells of both images, up to their corners. Colour: their number. The "
-        f"percentages are counted in {COVERAGE_GRID} x {COVERAGE_GRID} cells, larger than those of the map."
+        counted = f"<p>{used} of {calibration.pairs_found} pairs were used.</p>\n"
+        rejected = counted + table(("pair", "reason"), rows, "prose")
+    return (
+        assessment([found.headline], found.meaning, found.grade)
+        + headline_table(calibration)
+        + "<p>Rely on the held-out column: a fit adapts to the pairs it is made from, the more so the fewer they are. The "
+        "held-out metrics come from pairs that were not fitted, measured as later measurements are.</p>\n"
+        f"<h3>Weak points, and what to do</h3>\n{weak_points}"
+        f"<h3>Pairs that were not used</h3>\n{rejected}"
+        + ("<h3>Corrected, or used in part</h3>\n" + bullets(calibration.notes) if calibration.notes else "")
     )
-    bad = (
-        "hatched cells where you want to measure: no point was seen there, so the lens model is extrapolated. Take more "
-        f"pairs with the {what} there. (The dark rim around the image of a fisheye lens stays empty.)"
+
+
+def _volume(calibration: Calibration) -> str:
+    """Return what stands beneath the map of the volume."""
+    unknown = "<p><b>The uncertainty of this calibration is unknown; its share is missing here.</b></p>\n"
+    return (
+        f"{sigma_table(calibration)}<p>The calibration's share is common to all points and all shots: averaging does not "
+        "reduce it, but it largely cancels between positions close to each other. The noise is that of a typical point of "
+        f"these images. The slice extends {100 * BEYOND:.0f}% beyond the nearest and the farthest point. An error in the "
+        f"size given for the {target(calibration)} adds to these errors.</p>\n"
+        f"{'' if calibration.rig.cov.any() else unknown}"
     )
-    return [_figure(calibration, "coverage", see, bad)]
 
 
-def residuals(calibration: Calibration) -> list[Block]:
-    """Return the residual vectors."""
-    sigma = np.sqrt(corner_variance_px2(calibration))
-    see = (
-        "above, short arrows in all directions, alike in both images, as random noise is: one sigma of a point along u or "
-        f"v is {sigma[0]:.3g} px left and {sigma[1]:.3g} px right. Below, tiny arrows without a pattern. Note the scale "
-        "over each panel."
-    )
-    bad = (
-        "neighbours that point the same way, or a vortex or a star below: the lens differs from its model there, or the "
-        f"{target(calibration)} from its drawing. Red arrows are more than {STANDS_OUT:g} times their own uncertainty. "
-        "Longer arrows in one image than in the other: that camera is out of focus, moves, or has too little light."
-    )
-    return [_figure(calibration, "residuals", see, bad)]
-
-
-def pairs(calibration: Calibration) -> list[Block]:
-    """Return the held-out errors by pair."""
-    see = "bars of similar length, all blue."
-    shown = len(calibration.errors.pair)
-    if shown > MOST_BARS:
-        see += f" Of {shown} pairs the {MOST_BARS} with the largest rigid error are shown."
-    see += " Pairs that were not used are named below them." if calibration.rejected else ""
-    bad = (
-        f"orange bars, more than {OUTSTANDING:g} times the median. A pair that stands out in the epipolar error moved "
-        "between the two images or was taken at two moments; one that stands out in the rigid error only was blurred, "
-        "far away or bent. Look at its images and take it again. Each pair was measured with a rig fitted without it."
-    )
-    return [_figure(calibration, "pairs", see, bad)]
-
-
-def volume(calibration: Calibration) -> list[Block]:
-    """Return the predicted sigma over the volume, and where the board was."""
-    what = target(calibration)
-    see = (
-        f"one sigma of a triangulated point, in a slice through the middle of the {what}'s positions (dots): of 100 "
-        "measurements of a point, 95 have an error of less than two sigma. Depth is along the line of sight, and its sigma "
-        "grows with the square of the distance; lateral is across it, in the worse direction. The axes are the left "
-        "camera's."
-    )
-    bad = (
-        "a calibration's share above that of the pixel noise where you measure: more and better pairs help there, while "
-        "a longer baseline, more pixels or nearer cameras help against the pixel noise. Beyond the dots the calibration "
-        "is extrapolated."
-    )
-    known = (
-        "<p>The calibration's share is common to all points and all shots: averaging does not reduce it, but it largely "
-        "cancels between positions close to each other. The noise is that of a typical point of these images. The slice "
-        f"extends {100 * BEYOND:.0f}% beyond the nearest and the farthest point. An error in the size given for the {what} "
-        "adds to these errors.</p>\n"
-    )
-    if not calibration.rig.cov.any():
-        known += "<p><b>The uncertainty of this calibration is unknown; its share is missing here.</b></p>\n"
-    return [_figure(calibration, "volume", see, bad, "It shows"), Html(sigma_table(calibration) + known)]
-
-
-def target_shape(calibration: Calibration) -> list[Block]:
-    """Return the deviation of the target from its drawing, where it was estimated."""
-    see = (
-        f"the deviation of the target from its drawing, {1e3 * calibration.deviation_m:.2g} mm RMS: a few hundredths of a "
-        "millimetre for a target on glass or aluminium, tenths for paper on card. It was estimated together with the "
-        "cameras, so that it does not distort their parameters."
-    )
-    bad = (
-        "a millimetre or more: a loose or bowed sheet, which also bends from pair to pair. Glue it to something stiff. "
-        "(The cameras cannot measure the size of the whole target; it is the one you gave.)"
-    )
-    return [_figure(calibration, "target", see, bad, "It shows")]
-
-
-def numbers(calibration: Calibration) -> list[Block]:
+def _parameters(calibration: Calibration) -> str:
     """Return the parameters with their sigmas and the distortion models tried."""
     rig = calibration.rig
-    parts = [
-        cameras_table(rig),
-        pose_table(rig),
-        "<p>± is one sigma. T_left_right is the pose of the right camera in the left camera's frame: X right, Y down, Z "
-        "forward. Parameters are correlated, so a single sigma may be large while a measured point is well known; the "
-        f"rig file holds the whole covariance. Noise of a point beyond its detection's own: {rig.sigma_px:.3g} px.</p>\n",
+    tried = (
+        f"<h3>Distortion models tried</h3>\n{models_table(calibration)}<p>Evaluated on held-out pairs alone; of models "
+        "that are about as good, the simplest is chosen.</p>\n"
+    )
+    return (
+        f"{cameras_table(rig)}{pose_table(rig)}<p>± is one sigma. T_left_right is the pose of the right camera in the left "
+        "camera's frame: X right, Y down, Z forward. Parameters are correlated, so a single sigma may be large while a "
+        "measured point is well known; the rig file holds the whole covariance. Noise of a point beyond its detection's "
+        f"own: {rig.sigma_px:.3g} px.</p>\n{tried if calibration.models else ''}"
+    )
+
+
+def _provenance(rig: StereoRig) -> str:
+    """Return how a rig was made, as its file records it."""
+    rows = [
+        (text(key), text(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)))
+        for key, value in rig.provenance.items()
     ]
-    if calibration.models:
-        parts.append("<h3>Distortion models tried</h3>\n" + models_table(calibration))
-        parts.append(
-            "<p>Evaluated on held-out pairs alone; of models that are about as good, the simplest is chosen.</p>\n"
-        )
-    return [Html("".join(parts))]
+    return table(("", ""), rows, "provenance") if rows else "<p>Nothing is recorded.</p>"
 
 
-def provenance(calibration: Calibration) -> list[Block]:
-    """Return how the rig was made."""
-    return [Html(provenance_table(calibration.rig.provenance))]
+def _printed(calibration: Calibration, output: Path, board_file: Path | None, page: Path | None) -> str:
+    """Return what is printed: the held-out errors first, then those of the fit, then what is weak."""
+    c, h, poor = calibration, calibration.heldout, _poor(calibration)
+    rows = (
+        ("epipolar RMS", f"{h.epipolar_rms_px:.3f} px"),
+        ("rigid RMS (shape of the target)", f"{1e3 * h.rigid_rms_m:.3f} mm"),
+        ("scale error", f"{100 * h.scale_error:+.3f} %"),
+        ("residual over predicted sigma", f"{h.normalised_rms:.2f}"),
+    )
+    title = f"Held-out errors: {h.folds} folds, each measured with the fit to the others"
+    use = "" if contradicted(c) else f"; to measure it: armsight measure {output} --target {board_file}"
+    fit_px = f"{c.epipolar_rms_px:.3f} px" if np.isfinite(c.epipolar_rms_px) else "unknown"
+    fitted = "" if c.motion is None else f" ({MOTION_FITTED[0].lower()}{MOTION_FITTED[1:].rstrip('.')})"
+    lines = [
+        plain_text(TextTable(title, ("", ""), rows)),
+        f"fit: epipolar {fit_px}, reprojection {c.reprojection_rms_px:.3f} px RMS{fitted}; "
+        f"{len(c.pairs)} of {c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px",
+        f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg; the body differs from its "
+        f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
+        *([] if c.disc_radius_m is None else [f"radius of the board's discs: {1e3 * c.disc_radius_m:.3f} mm"]),
+    ]
+    for reason, group in itertools.groupby(c.rejected, key=lambda r: r.reason):  # neighbours share a line
+        first, *more = (r.pair for r in group)
+        pairs = f"{1 + len(more)} pairs {first} to {more[-1]}" if more else f"pair {first}"
+        lines.append(f"rejected {pairs}: {reason}")
+    lines += [f"note: {note}" for note in merged_notes(c.notes)]
+    lines += map(weak, [*c.weaknesses, *([f"do not rely on this calibration yet: {', '.join(poor)}"] if poor else [])])
+    lines.append(f"rig written to {output}" + ("" if page is None else f", report to {page}"))
+    lines += [] if board_file is None else [f"board as found written to {board_file}{use}"]
+    return "\n".join(lines)
 
 
-#: Anchor -> title, and what stands there, in the page's order.
-SECTIONS: dict[str, tuple[str, Callable[[Calibration], list[Block]]]] = {
-    "result": ("Assessment", result),
-    "coverage": ("Coverage of the images", coverage),
-    "residuals": ("Residuals of the fit", residuals),
-    "pairs": ("Held-out errors by pair", pairs),
-    "volume": ("Predicted uncertainty of a measurement", volume),
-    "target": ("Shape of the target", target_shape),
-    "parameters": ("Parameters of the cameras", numbers),
-    "provenance": ("Provenance", provenance),
-}
+def _poor(calibration: Calibration) -> list[str]:
+    """Return the metrics for which the calibration must not be relied on yet, with their values."""
+    return [f"{row.name} {row.heldout}" for row in graded_metrics(calibration) if row.grade == "poor"]
 
 
-def _values(
+#: Names of all files that a report may have.
+REPORT_FILES = (PAGE, *(f"report-{name}.png" for name in FIGURES))
+
+
+def calibration_report(
     calibration: Calibration, output: Path, board_file: Path | None, report: Path | None, seconds: float
-) -> dict[str, Any]:
-    """Return the object that ``--json`` prints."""
-    c = calibration
-    return {
+) -> Report:
+    """Return what a calibration says.
+
+    Args:
+        calibration: what is reported on.
+        output: the rig's file.
+        board_file: the board's; None where there is none.
+        report: the report's folder; None where none is asked for.
+        seconds: how long it took.
+    """
+    c, words, page = calibration, _words(calibration), None if report is None else report / PAGE
+    left, right = ("{} x {}".format(*camera.image_size_px) for camera in c.rig.cameras)
+    size = f"{left} px" if left == right else f"{left} px left, {right} px right"
+    used = f"{len(c.pairs)} of {c.pairs_found} pairs of images used"
+    sections: dict[str, Section] = {"result": ("Assessment", [Html(_result(c))])}
+    for name, (title, draw, description, see, bad, opening) in FIGURES.items():
+        caption = f"<p><b>{opening}</b> {see}</p><p><b>Bad would be</b> {bad}</p>".format(**words)
+        shown: list[Block] = [Plot(name, partial(draw, c), caption, description)]
+        sections[name] = title, [*shown, Html(_volume(c))] if name == "volume" else shown
+    sections["parameters"] = "Parameters of the cameras", [Html(_parameters(c))]
+    sections["provenance"] = "Provenance", [Html(_provenance(c.rig))]
+    sections["printed"] = "", [Text(_printed(c, output, board_file, page))]
+    values = {
         "pairs_found": c.pairs_found,
         "pairs_used": len(c.pairs),
         "rejected": c.rejected,
@@ -350,78 +366,8 @@ def _values(
         "shutters": None if c.rig.shutters is None else c.rig.shutters.to_json(),
         "rig": output,
         "board": board_file,
-        "report": None if report is None else report / PAGE,
+        "report": page,
         "seconds": seconds,
     }
-
-
-def _poor(calibration: Calibration) -> list[str]:
-    """Return the metrics for which the calibration must not be relied on yet, with their values."""
-    return [f"{row.name} {row.heldout}" for row in graded_metrics(calibration) if row.grade == "poor"]
-
-
-def _rejected_lines(calibration: Calibration) -> list[str]:
-    """Return a line for each pair that was rejected; neighbours rejected for one reason share a line."""
-    lines = []
-    for reason, group in itertools.groupby(calibration.rejected, key=lambda r: r.reason):
-        first, *more = (r.pair for r in group)
-        pairs = f"{1 + len(more)} pairs {first} to {more[-1]}" if more else f"pair {first}"
-        lines.append(f"rejected {pairs}: {reason}")
-    return lines
-
-
-def _printed(calibration: Calibration, output: Path, board_file: Path | None, report: Path | None) -> Text:
-    """Return what is printed: the held-out errors first, then those of the fit, then what is weak."""
-    c, h = calibration, calibration.heldout
-    rows = (
-        ("epipolar RMS", f"{h.epipolar_rms_px:.3f} px"),
-        ("rigid RMS (shape of the target)", f"{1e3 * h.rigid_rms_m:.3f} mm"),
-        ("scale error", f"{100 * h.scale_error:+.3f} %"),
-        ("residual over predicted sigma", f"{h.normalised_rms:.2f}"),
-    )
-    title = f"Held-out errors: {h.folds} folds, each measured with the fit to the others"
-    poor = _poor(c)
-    use = "" if contradicted(c) else f"; to measure it: armsight measure {output} --target {board_file}"
-    fit_px = f"{c.epipolar_rms_px:.3f} px" if np.isfinite(c.epipolar_rms_px) else "unknown"
-    fitted = "" if c.motion is None else f" ({MOTION_FITTED[0].lower()}{MOTION_FITTED[1:].rstrip('.')})"
-    lines = [
-        plain_text(TextTable(title, ("", ""), rows)),
-        f"fit: epipolar {fit_px}, reprojection {c.reprojection_rms_px:.3f} px RMS{fitted}; "
-        f"{len(c.pairs)} of {c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px",
-        f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg; the body differs from its "
-        f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
-        *([] if c.disc_radius_m is None else [f"radius of the board's discs: {1e3 * c.disc_radius_m:.3f} mm"]),
-        *_rejected_lines(c),
-        *(f"note: {note}" for note in merged_notes(c.notes)),
-        *(weak(weakness) for weakness in c.weaknesses),
-        *([weak(f"do not rely on this calibration yet: {', '.join(poor)}")] if poor else []),
-        f"rig written to {output}" + (f", report to {report / PAGE}" if report is not None else ""),
-        *([] if board_file is None else [f"board as found written to {board_file}{use}"]),
-    ]
-    return Text("\n".join(lines))
-
-
-#: Names of all files that a report may have.
-REPORT_FILES = (PAGE, *(f"report-{name}.png" for name in FIGURES))
-
-
-def calibration_report(
-    calibration: Calibration, output: Path, board_file: Path | None, report: Path | None, seconds: float
-) -> Report:
-    """Return what a calibration says.
-
-    Args:
-        calibration: what is reported on.
-        output: the rig's file.
-        board_file: the board's; None where there is none.
-        report: the report's folder; None where none is asked for.
-        seconds: how long it took.
-    """
-    left, right = ("{} x {}".format(*camera.image_size_px) for camera in calibration.rig.cameras)
-    size = f"{left} px" if left == right else f"{left} px left, {right} px right"
-    used = f"{len(calibration.pairs)} of {calibration.pairs_found} pairs of images used"
-    what = f"{calibration.body.name} · {used} · {size} · baseline {1e3 * calibration.rig.baseline_m:.1f} mm"
-    sections: dict[str, Section] = {name: (title, make(calibration)) for name, (title, make) in SECTIONS.items()}
-    sections["printed"] = ("", [_printed(calibration, output, board_file, report)])
-    values = _values(calibration, output, board_file, report, seconds)
+    what = f"{c.body.name} · {used} · {size} · baseline {1e3 * c.rig.baseline_m:.1f} mm"
     return Report("calibration report", "Calibration of two cameras", what, "", sections, values=values)

@@ -13,9 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from armsight.app.calibrate.command import CalibrateOptions
 from armsight.app.progress import bar, steps
 from armsight.data import SIDES, Detections, Shot
 from armsight.errors import CalibrationError, InputError
+from armsight.vision.calibrate import MODELS
 from armsight.vision.calibrate.boards import Pair, calibrate_boards, calibrate_recording
 from armsight.vision.calibrate.bodies import calibrate_bodies
 from armsight.vision.calibrate.result import Calibration
@@ -37,15 +39,125 @@ _VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 _LEAST_CODES = 4
 
 Grey = NDArray[np.uint8]
-Sizes = tuple[tuple[int, int], tuple[int, int]]
+
+
+class GivenDetections:
+    """Detections of a known body, to calibrate from; the body's points are estimated into a file that is named."""
+
+    board_file: Path | None = None
+
+    def __init__(self, options: CalibrateOptions) -> None:
+        """Hold the files, which are read later."""
+        detections, cameras, body = options.detections, options.cameras, options.body
+        assert detections is not None and cameras is not None and body is not None  # noqa: PT018 - the command's check
+        self._options, self.files = options, (detections, cameras, body)
+        self.named = {"detections": str(detections), "cameras": str(cameras), "body": str(body)}
+
+    def calibrated(self) -> Calibration:
+        """Read the files, and calibrate."""
+        detections, cameras, body = self.files
+        known, pair, refine = load_body_csv(body), read_cameras(cameras), self._options.refine_body is not None
+        with steps() as progress:
+            shots, folds = read_detections(detections, known), self._options.folds
+            return calibrate_bodies(known, shots, pair, refine_body=refine, folds=folds, progress=progress)
+
+    def save(self, calibration: Calibration) -> None:
+        """Write what was found besides the rig."""
+        if self._options.refine_body is not None:
+            save_body_csv(calibration.body, self._options.refine_body)
+
+    def close(self) -> None:
+        """Close nothing."""
+
+
+class GivenImages:
+    """Images of a board, to calibrate from; the board's shape as it is found goes into ``board_file``."""
+
+    def __init__(self, options: CalibrateOptions) -> None:
+        """Open a source, or the images that two globs match, and find those of one camera alone.
+
+        Raises:
+            InputError: there is no such source, a live one, or nothing matches.
+        """
+        self.named: dict[str, str] = {}
+        self._options, self._spec, globs = options, str(options.target), (str(options.left), str(options.right))
+        if (spec := options.source) is None:
+            opened = PairsSource.open(*globs)
+            video = next((file for file in opened.files if file.suffix.lower() in _VIDEOS), None)
+            if video is not None:
+                raise InputError(f"{video}: is a video: give both as --source video:LEFT,RIGHT")
+            self._source: Source = opened
+            self.named |= zip(SIDES, globs, strict=True)
+        elif spec.startswith(("usb:", "url:")):
+            raise InputError(
+                f"{spec}: is live: `armsight record {spec} -o DIR` stores a recording, and --source DIR takes it"
+            )
+        else:
+            self._source, self.named["source"] = open_source(spec), spec
+        self.board_file = options.output.parent / f"{options.output.stem}.board.toml"
+        self.named |= {"target": self._spec, "board": self.board_file.name}
+        alone = (options.left_intrinsics, options.right_intrinsics)
+        self.named |= {f"{side}_intrinsics": each for side, each in zip(SIDES, alone, strict=True) if each is not None}
+        self._alone = [(side, file) for side, pattern in enumerate(alone) for file in _files_of(pattern)]
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All images that are files."""
+        stored = self._source.files if isinstance(self._source, StoredSource) else ()
+        return (*stored, *(file for _, file in self._alone))
+
+    def calibrated(self) -> Calibration:
+        """Detect the board in all images, and calibrate; where shots have times it may move, and the skew is found."""
+        source, target = self._source, open_board(self._spec)
+        pairs, times, singles = list[Pair](), list[float | None](), list[Pair]()
+        sizes, unseen = None, _Unseen(target)
+        with bar("detecting the target", None if source.count is None else source.count + len(self._alone)) as advance:
+            for shot, files in _shots(source):
+                if shot.left is None or shot.right is None:
+                    nothing = Detections.none(shot.problem or "no image")
+                    unread = (nothing, replace(nothing, problem=None))  # the problem names the file of one side
+                    left, right = unread[::-1] if (shot.problem or "").startswith(f"{files[1]}:") else unread
+                    pairs.append(Pair(shot.name, left, right))
+                else:
+                    images = grey(shot.left), grey(shot.right)
+                    sizes = _one_size(sizes, images, files)
+                    pairs.append(Pair(shot.name, target.detect(images[0]), target.detect(images[1])))
+                    unseen.keep(images, pairs[-1])
+                times.append(shot.t_s)
+                advance()
+            for side, path in self._alone if sizes is not None else ():
+                singles.append(_single(path, target, side, sizes[side] if sizes is not None else (0, 0)))
+                advance()
+        if sizes is None:
+            why = f"none of {len(pairs)} pairs can be read; {pairs[0].name}: {pairs[0].left.problem}" if pairs else ""
+            raise InputError(why or "the recording has no shots")
+        model = self._options.lens_model
+        how: Any = {"models": MODELS if model is None else (model,), "flat": self._options.flat_target}
+        how |= {"folds": self._options.folds, "singles": singles}
+        with steps() as progress, unseen.explained(source):
+            known = [(pair, t) for pair, t in zip(pairs, times, strict=True) if t is not None]
+            if not known:
+                return calibrate_boards(target, pairs, sizes, progress=progress, **how)
+            timed, t_s = zip(*known, strict=True)
+            found = calibrate_recording(target, timed, np.array(t_s), sizes, progress=progress, **how)
+            return replace(found, notes=(*notes_of(source), *found.notes))
+
+    def save(self, calibration: Calibration) -> None:
+        """Write the board as it was found."""
+        radius_m, spec = calibration.disc_radius_m, self._spec
+        if radius_m is not None and "radius=" not in spec:
+            spec += f":radius={1e3 * radius_m:.6g}mm"
+        save_board_file(self.board_file, spec, calibration.body.points)
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()
 
 
 def _files_of(pattern: str | None) -> list[Path]:
     """Return the images that a glob matches, sorted; none without one."""
-    if pattern is None:
-        return []
-    files = sorted(image_files(pattern), key=natural_key)
-    if not files:
+    files = [] if pattern is None else sorted(image_files(pattern), key=natural_key)
+    if pattern is not None and not files:
         raise InputError(no_files(pattern))
     return files
 
@@ -64,175 +176,11 @@ def _single(path: Path, target: CalibrationBoard, side: int, size: tuple[int, in
             f"{path}: is {width}x{height}, and the {SIDES[side]} images in the pairs {size[0]}x{size[1]}: take both with "
             "the same field of view, and so the same ratio of width to height"
         )
-    found = target.detect(image)
-    found = replace(
-        found,
-        uv=(found.uv + 0.5) * scale - 0.5,
-        cov_uv=found.cov_uv * scale**2,
-        shape=found.shape * scale**2,
-        common=found.common * [scale, scale, 1.0],
-    )
+    found, square = target.detect(image), scale**2
+    uv, common = (found.uv + 0.5) * scale - 0.5, found.common * [scale, scale, 1.0]
+    found = replace(found, uv=uv, cov_uv=found.cov_uv * square, shape=found.shape * square, common=common)
     nothing = Detections.none(f"{path.name} is of the {SIDES[side]} camera alone")
     return Pair(str(path), *((found, nothing) if side == 0 else (nothing, found)))
-
-
-def _open_stored(spec: str) -> Source:
-    """Open a folder or a recording.
-
-    Raises:
-        InputError: live cameras, or no such source.
-    """
-    if spec.startswith(("usb:", "url:")):
-        raise InputError(
-            f"{spec}: is live: `armsight record {spec} -o DIR` stores a recording, and --source DIR takes it"
-        )
-    return open_source(spec)
-
-
-class GivenDetections:
-    """Detections of a known body, to calibrate from; the body's points are estimated into a file that is named."""
-
-    board_file: Path | None = None
-
-    def __init__(self, detections: Path, cameras: Path, body: Path, refined: Path | None) -> None:
-        """Hold the files, which are read later."""
-        self.files, self._refined = (detections, cameras, body), refined
-        self.named = {"detections": str(detections), "cameras": str(cameras), "body": str(body)}
-
-    def calibrated(self, folds: int) -> Calibration:
-        """Read the files, and calibrate."""
-        detections, cameras, body = self.files
-        known, pair, refine = load_body_csv(body), read_cameras(cameras), self._refined is not None
-        with steps() as progress:
-            shots = read_detections(detections, known)
-            return calibrate_bodies(known, shots, pair, refine_body=refine, folds=folds, progress=progress)
-
-    def save(self, calibration: Calibration) -> None:
-        """Write what was found besides the rig."""
-        if self._refined is not None:
-            save_body_csv(calibration.body, self._refined)
-
-    def close(self) -> None:
-        """Close nothing."""
-
-
-class GivenImages:
-    """Images of a board, to calibrate from; the board's shape as it is found goes into ``board_file``."""
-
-    def __init__(
-        self,
-        images: str | tuple[str, str],
-        alone: tuple[str | None, str | None],
-        spec: str,
-        models: tuple[str, ...],
-        flat: bool,
-        board_file: Path,
-    ) -> None:
-        """Open a source, or the images that two globs match, and find those of one camera alone.
-
-        Raises:
-            InputError: there is no such source, or nothing matches.
-        """
-        if isinstance(images, str):
-            self._source, self.named = _open_stored(images), {"source": images}
-        else:
-            opened = PairsSource.open(*images)
-            video = next((file for file in opened.files if file.suffix.lower() in _VIDEOS), None)
-            if video is not None:
-                raise InputError(f"{video}: is a video: give both as --source video:LEFT,RIGHT")
-            self._source, self.named = opened, dict(zip(SIDES, images, strict=True))
-        self.named |= {"target": spec, "board": board_file.name}
-        self.named |= {f"{side}_intrinsics": each for side, each in zip(SIDES, alone, strict=True) if each is not None}
-        self._alone = (_files_of(alone[0]), _files_of(alone[1]))
-        self._spec, self._models, self._flat, self.board_file = spec, models, flat, board_file
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """All images that are files."""
-        stored = self._source.files if isinstance(self._source, StoredSource) else ()
-        return (*stored, *self._alone[0], *self._alone[1])
-
-    def calibrated(self, folds: int) -> Calibration:
-        """Detect the board in all images, and calibrate."""
-        return _calibrate_images(self._source, self._alone, self._spec, self._models, flat=self._flat, folds=folds)
-
-    def save(self, calibration: Calibration) -> None:
-        """Write the board as it was found."""
-        radius_m = calibration.disc_radius_m
-        known = radius_m is None or "radius=" in self._spec
-        spec = self._spec if known else f"{self._spec}:radius={1e3 * float(radius_m or 0.0):.6g}mm"
-        save_board_file(self.board_file, spec, calibration.body.points)
-
-    def close(self) -> None:
-        """Close the source."""
-        self._source.close()
-
-
-def _calibrate_images(
-    source: Source, alone: tuple[list[Path], list[Path]], spec: str, models: tuple[str, ...], *, flat: bool, folds: int
-) -> Calibration:
-    """Detect a board, given by its spec, in every shot, and in images of one camera alone, and calibrate.
-
-    Where shots have times, the board may move, and the skew of the cameras is found.
-    """
-    target = open_board(spec)
-    pairs: list[Pair] = []
-    times: list[float | None] = []
-    singles: list[Pair] = []
-    sizes: Sizes | None = None
-    unseen = _Unseen(target)
-    total = None if source.count is None else source.count + sum(map(len, alone))
-    with bar("detecting the target", total) as advance:
-        for shot, files in _shots(source):
-            if shot.left is None or shot.right is None:
-                nothing = Detections.none(shot.problem or "no image")
-                unread = (nothing, replace(nothing, problem=None))  # the problem names the file of one side
-                left, right = unread[::-1] if (shot.problem or "").startswith(f"{files[1]}:") else unread
-                pairs.append(Pair(shot.name, left, right))
-            else:
-                now = tuple((image.shape[1], image.shape[0]) for image in (shot.left, shot.right))
-                sizes = _same(sizes, (now[0], now[1]), *files)
-                images = grey(shot.left), grey(shot.right)
-                _differ(*images, *files)
-                pairs.append(Pair(shot.name, target.detect(images[0]), target.detect(images[1])))
-                unseen.keep(images, pairs[-1])
-            times.append(shot.t_s)
-            advance()
-        for side, paths in enumerate(alone if sizes is not None else ()):
-            for path in paths:
-                singles.append(_single(path, target, side, sizes[side] if sizes is not None else (0, 0)))
-                advance()
-    if sizes is None:
-        if not pairs:
-            raise InputError("the recording has no shots")
-        raise InputError(f"none of {len(pairs)} pairs can be read; {pairs[0].name}: {pairs[0].left.problem}")
-    with steps() as progress, unseen.explained(source):
-        known = [(pair, t) for pair, t in zip(pairs, times, strict=True) if t is not None]
-        if not known:
-            return calibrate_boards(
-                target, pairs, sizes, models=models, flat=flat, folds=folds, singles=singles, progress=progress
-            )
-        t_s = np.array([t for _, t in known])
-        calibration = calibrate_recording(
-            target,
-            [pair for pair, _ in known],
-            t_s,
-            sizes,
-            models=models,
-            flat=flat,
-            folds=folds,
-            singles=singles,
-            progress=progress,
-        )
-        return replace(calibration, notes=(*notes_of(source), *calibration.notes))
-
-
-def _differ(left: Grey, right: Grey, left_name: Path | str, right_name: Path | str) -> None:
-    """Raise an InputError if both grey images of a pair are the same one."""
-    if one_image(left, right):
-        raise InputError(
-            f"{left_name}, {right_name}: the left and the right image are the same: give the images of two cameras"
-        )
 
 
 class _Unseen:
@@ -298,15 +246,22 @@ def _shots(source: Source) -> Iterator[tuple[Shot, tuple[Path | str, Path | str]
         yield next_one, (f"shot {next_one.name}", f"shot {next_one.name}")
 
 
-def _same(sizes: Sizes | None, now: Sizes, left: Path | str, right: Path | str) -> Sizes:
-    """Return the sizes of the images; raise an InputError if they differ from those before."""
-    for side, path in enumerate((left, right)):
+def _one_size(
+    sizes: tuple[tuple[int, int], ...] | None, images: tuple[Grey, Grey], files: tuple[Path | str, Path | str]
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the sizes of a pair's images; an InputError if they differ from those before, or both images are one."""
+    now = tuple((image.shape[1], image.shape[0]) for image in images)
+    for side, path in enumerate(files):
         if sizes is not None and sizes[side] != now[side]:
             (w, h), (w0, h0) = now[side], sizes[side]
             raise InputError(
                 f"{path}: is {w}x{h}, the {SIDES[side]} images before it are {w0}x{h0}: a calibration needs one size"
             )
-    return now
+    if one_image(*images):
+        raise InputError(
+            f"{files[0]}, {files[1]}: the left and the right image are the same: give the images of two cameras"
+        )
+    return now[0], now[1]
 
 
 def provenance(given: dict[str, str], calibration: Calibration) -> dict[str, Any]:
