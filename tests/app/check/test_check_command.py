@@ -7,8 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from armsight.app.check.limits import check_limits
-from armsight.app.check.result import MetricLine
+from armsight.app.check.result import MetricLine, check_limits
 from armsight.app.run.motion_file import read_motions
 from armsight.geometry.pose import pose
 from armsight.loop.iso9283.statistic import Metric

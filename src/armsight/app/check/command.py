@@ -12,7 +12,7 @@ from armsight.app.check import CYCLES
 from armsight.errors import InputError
 from armsight.files import check_folder, check_writable, write_text
 
-_KINDS = (".toml", ".csv")
+_PATH = click.Path(path_type=Path)
 
 
 class _Context(click.Context):
@@ -54,15 +54,9 @@ def command() -> None:
 
 
 @command.command("evaluate", cls=_Evaluate)
-@click.argument("data", metavar="RUN|POSES.csv", type=click.Path(path_type=Path))
+@click.argument("data", metavar="RUN|POSES.csv", type=_PATH)
 @click.option("--closed", is_flag=True, help="Of a run: evaluate the motions with the loop closed on vision.")
-@click.option(
-    "-o",
-    "--output",
-    metavar="DIR",
-    type=click.Path(path_type=Path),
-    help="Folder for report.html, check.json, figures.",
-)
+@click.option("-o", "--output", metavar="DIR", type=_PATH, help="Folder for report.html, check.json, figures.")
 @click.option(
     "--columns", metavar="NAME=COLUMN,...", help="Names of columns in your CSV, such as x_m=X,command_x_m=X0."
 )
@@ -84,9 +78,8 @@ def evaluated(
     armsight check plan --help.
     """
     from armsight.app.check.evaluate import evaluate, read_check
-    from armsight.app.check.limits import check_limits, read_limits
     from armsight.app.check.report import REPORT_FILES, check_report
-    from armsight.app.check.result import metric_lines
+    from armsight.app.check.result import check_limits, metric_lines, read_limits
     from armsight.app.check.rows import rows_csv
     from armsight.app.check.run_folder import is_run
     from armsight.app.show.page import PAGE
@@ -134,17 +127,10 @@ def evaluated(
     "--speed", type=click.FloatRange(1.0, 1e4), default=100.0, show_default=True, help="Speed on paths, mm/s."
 )
 @click.option(
-    "--visible-in",
-    metavar="RUN",
-    type=click.Path(path_type=Path),
-    help="An earlier run; both of its cameras must see the whole test.",
+    "--visible-in", metavar="RUN", type=_PATH, help="An earlier run; both of its cameras must see the whole test."
 )
 @click.option(
-    "-o",
-    "--output",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="check.toml for armsight run --motion; .csv: the poses alone.",
+    "-o", "--output", metavar="FILE", type=_PATH, help="check.toml for armsight run --motion; .csv: the poses alone."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 def plan(
@@ -163,7 +149,7 @@ def plan(
     """
     if output is not None:
         check_writable(output, apart_from=(arm_name, visible_in))
-        if output.suffix not in _KINDS or (output.suffix == ".csv" and name in ("line", "circle")):
+        if output.suffix not in (".toml", ".csv") or (output.suffix == ".csv" and name in ("line", "circle")):
             raise InputError(f"{output}: a plan is written as .toml, motions to run, or, of poses, as .csv")
 
     import numpy as np

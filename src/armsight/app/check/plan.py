@@ -5,10 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,35 +34,25 @@ RADIUS = 0.4
 #: Where on the circle the motion starts, and by how much more than a whole revolution it is run, deg: neither the start nor
 #: the end is evaluated.
 START_DEG, OVER_DEG = 15.0, 60.0
-#: Points of the body stay this far from the images' edges, px.
-_MARGIN_PX = 20.0
-#: Points of a path that are looked at for limits and visibility.
-_LOOKED = 200
+#: Points of the body stay this far from the images' edges, px; points of a path are looked at for limits and visibility.
+_MARGIN_PX, _LOOKED = 20.0, 200
 Allowed = Callable[[Array], NDArray[np.bool_]]
 
 
 class PlannedTest(NamedTuple):
-    """A test that was planned.
+    """A test that was planned."""
 
-    Attributes:
-        name: poses, wide, line or circle.
-        cycles: how many times.
-        plan: its poses and cube.
-        motions: the motion file.
-    """
-
-    name: str
-    cycles: int
-    plan: CheckPlan
-    motions: str
+    name: str  #: poses, wide, line or circle
+    cycles: int  #: how many times
+    plan: CheckPlan  #: its poses and cube
+    motions: str  #: the motion file
 
     @property
     def notes(self) -> list[str]:
         """What fewer cycles than the standard's leave out of the evaluation."""
-        required = REQUIRED_CYCLES.get(self.name, 1)
+        required, poses = REQUIRED_CYCLES.get(self.name, 1), self.name == "poses"
         if self.cycles >= required:
             return []
-        poses = self.name == "poses"
         if self.cycles < MIN_POSES:
             what = "pose attained" if poses else "path followed"
             lost = f"`armsight check` leaves out every {what} fewer than {MIN_POSES} times: there will be no accuracy, "
@@ -90,12 +80,11 @@ def plan_test(
         InputError: no cube is within reach, or the run's files cannot be used.
     """
     allowed = everywhere if visible_in is None else seen_by(visible_in)
-    paths = {"line": partial(_line, arm), "circle": partial(_circle, arm)}
-    done = paths.get(name)
+    path = {"line": _line, "circle": _circle}.get(name)
     too_fast: list[CheckPlan] = []  # cubes whose poses would do, but not the path
 
     def feasible(plan: CheckPlan) -> bool:
-        good = done is None or _goes(arm, partial(done, plan, speed_m_s), allowed)
+        good = path is None or _goes(arm, partial(path, arm, plan, speed_m_s), allowed)
         too_fast.extend([] if good else [plan])
         return good
 
@@ -104,27 +93,21 @@ def plan_test(
     except InputError as error:
         raise InputError(f"{error}{', or a lower --speed' if too_fast else ''}") from None
     times = CYCLES[name] if cycles is None else cycles
-    texts = {"line": _line_text, "circle": _circle_text}
 
     def motions(cycles: int) -> str:
-        return texts[name](arm, plan, cycles, speed_m_s) if name in texts else _poses_text(plan, cycles)
+        # Where there are cycles, the first pose comes from the last, as every other does.
+        poses = [("joints", at, {"q_deg": np.degrees(q)}) for at, q in zip(plan.names, plan.q, strict=True)]
+        last = (f"to {plan.names[-1]}", plan.q[-1]) if cycles > 1 else None
+        begin, each = (last, poses) if path is None else path(arm, plan, speed_m_s)[1:]
+        first = "" if begin is None else _motion("joints", begin[0], {"q_deg": np.degrees(begin[1])})
+        numbered = [(kind, f"{at} cycle {n}", keys) for n in range(1, cycles + 1) for kind, at, keys in each]
+        return first + "".join(_motion(*motion) for motion in numbered)
 
     with tempfile.TemporaryDirectory() as folder:  # it is planned as it will be; after two cycles all come again
         write_text(Path(folder) / "motion.toml", motions(min(times, 2)))
         read_motions(arm, Path(folder) / "motion.toml")
     head = f"# armsight check plan: {name}, {times} cycles, arm {arm.name}. Keys: docs/howto/motions.md.\n"
     return PlannedTest(name, times, plan, head + motions(times))
-
-
-def _goes(arm: Arm, path: Callable[[], Trajectory], allowed: Allowed) -> bool:
-    """Return whether the arm can follow a path, clear of its limits and, all along it, where it may be."""
-    try:
-        way = path()
-    except InputError:
-        return False
-    q = way.at(np.linspace(0.0, way.duration_s, _LOOKED)).q
-    inside = np.all((q > arm.q_min + CLEAR_RAD) & (q < arm.q_max - CLEAR_RAD))
-    return bool(inside and allowed(arm.forward(q)).all())
 
 
 def seen_by(run: Path) -> Allowed:
@@ -138,89 +121,72 @@ def seen_by(run: Path) -> Allowed:
         raise InputError(f"{file}: {error}" if str(file) not in str(error) else str(error)) from None
     except (ValueError, KeyError, TypeError):
         raise InputError(f"{file}: not a run's hand-eye calibration: T_base_rig and T_tool_body are needed") from None
-    T_rig_base = inverse(T_base_rig)
-    T_right_left = inverse(rig.T_left_right)
+    T_rig_base, T_right_left = inverse(T_base_rig), inverse(rig.T_left_right)
 
     def seen(Ts: Array) -> NDArray[np.bool_]:
-        p_left = np.array([transform(T_rig_base @ T @ T_tool_body, body) for T in Ts])
+        p_left = transform((T_rig_base @ Ts @ T_tool_body)[:, None], body)
         good = np.ones(len(Ts), bool)
-        for camera, p in ((rig.left, p_left), (rig.right, transform(T_right_left, p_left.reshape(-1, 3)))):
+        for camera, p in ((rig.left, p_left), (rig.right, transform(T_right_left, p_left))):
             uv = camera.project(p.reshape(-1, 3)).reshape(len(Ts), -1, 2)
             with np.errstate(invalid="ignore"):
                 inside = (uv > _MARGIN_PX) & (uv < np.array(camera.image_size_px) - _MARGIN_PX)
-            good &= inside.all(axis=(1, 2)) & (p.reshape(len(Ts), -1, 3)[..., 2] > 0).all(axis=1)
+            good &= inside.all(axis=(1, 2)) & (p[..., 2] > 0).all(axis=1)
         return good
 
     return seen
 
 
-def _line(arm: Arm, plan: CheckPlan, speed_m_s: float) -> Trajectory:
-    """Return the line across the cube, P2 to P4."""
-    length = float(np.linalg.norm((plan.Ts_base_tool[3] - plan.Ts_base_tool[1])[:3, 3]))
-    return line(arm, plan.q[1], plan.Ts_base_tool[3], duration_s=length / speed_m_s)
+class _Path(NamedTuple):
+    """A path in a cube."""
+
+    way: Trajectory
+    begin: tuple[str, Array]  #: name of the motion to where it begins, and joint angles (n,), rad
+    motions: list[tuple[str, str, dict[str, Any]]]  #: kinds, names and keys of a cycle's motions
 
 
-def _round(plan: CheckPlan, speed_m_s: float) -> tuple[Array, Array, float, float]:
-    """Return where the circle begins (3,), its axis (3,), its angle, deg, and its duration, s."""
-    axes = plane_axes(np.array([1.0, 0.0, -1.0]) / np.sqrt(2))  # the plane of the five poses
-    a, radius = np.radians(START_DEG), RADIUS * plan.side_m
-    angle = 360.0 + OVER_DEG
+def _goes(arm: Arm, path: Callable[[], _Path], allowed: Allowed) -> bool:
+    """Return whether the arm can follow a path, clear of its limits and, all along it, where it may be."""
+    try:
+        way = path().way
+    except InputError:
+        return False
+    q = way.at(np.linspace(0.0, way.duration_s, _LOOKED)).q
+    inside = np.all((q > arm.q_min + CLEAR_RAD) & (q < arm.q_max - CLEAR_RAD))
+    return bool(inside and allowed(arm.forward(q)).all())
+
+
+def _line(arm: Arm, plan: CheckPlan, speed_m_s: float) -> _Path:
+    """Return the line across the cube, P2 to P4, and back."""
+    Ts = plan.Ts_base_tool
+    way = line(arm, plan.q[1], Ts[3], duration_s=float(np.linalg.norm((Ts[3] - Ts[1])[:3, 3])) / speed_m_s)
+    goals = {"P2 to P4": 1e3 * Ts[3, :3, 3], "P4 to P2": 1e3 * Ts[1, :3, 3]}
+    keys = [("line", name, {"to_mm": p, "duration_s": way.duration_s}) for name, p in goals.items()]
+    return _Path(way, ("to P2", plan.q[1]), keys)
+
+
+def _circle(arm: Arm, plan: CheckPlan, speed_m_s: float) -> _Path:
+    """Return the circle about P1 in the plane of the five poses, counter-clockwise, and clockwise."""
+    axes, radius = plane_axes(np.array([1.0, 0.0, -1.0]) / np.sqrt(2)), RADIUS * plan.side_m
+    a, angle, axis = np.radians(START_DEG), 360.0 + OVER_DEG, np.cross(*axes)
     start = plan.centre + radius * np.array([np.cos(a), np.sin(a)]) @ axes
-    return start, np.cross(*axes), angle, float(np.radians(angle)) * radius / speed_m_s
-
-
-def _circle(arm: Arm, plan: CheckPlan, speed_m_s: float) -> Trajectory:
-    """Return the circle about P1, counter-clockwise."""
-    start, axis, angle, duration_s = _round(plan, speed_m_s)
-    return circle(arm, _start(arm, plan, start), plan.centre, axis, np.radians(angle), duration_s=duration_s)
-
-
-def _start(arm: Arm, plan: CheckPlan, p_base: Array) -> Array:
-    """Return joint angles (n,), rad, at a position (3,), base, m, in the configuration of the poses."""
-    found = arm.inverse(pose(plan.Ts_base_tool[0][:3, :3], p_base), near=plan.q[0]).best
-    if found is None:
+    # In the configuration of the poses.
+    q = arm.inverse(pose(plan.Ts_base_tool[0][:3, :3], start), near=plan.q[0]).best
+    if q is None:
         raise InputError("the circle is out of reach")
-    return found
+    duration_s = float(np.radians(angle)) * radius / speed_m_s
+    way = circle(arm, q, plan.centre, axis, np.radians(angle), duration_s=duration_s)
+    keys = {"center_mm": 1e3 * plan.centre, "axis": axis}
+    ways = {"counter-clockwise": angle, "clockwise": -angle}
+    motions = [("circle", name, {**keys, "angle_deg": at, "duration_s": duration_s}) for name, at in ways.items()]
+    return _Path(way, ("to the circle", q), motions)
 
 
-def _numbers(values: Array) -> str:
-    """Return numbers (N,) as a motion file has them."""
-    return "[" + ", ".join(f"{v:.6f}" for v in values) + "]"
-
-
-def _joints(name: str, q: Array) -> str:
-    """Return a motion to joint angles (n,), rad."""
-    return f'\n[[motion]]\nkind = "joints"\nname = "{name}"\nq_deg = {_numbers(np.degrees(q))}\n'
-
-
-def _poses_text(plan: CheckPlan, cycles: int) -> str:
-    """Return the motions from pose to pose; where there are cycles, the first comes from the last, as every other does."""
-    text = _joints(f"to {plan.names[-1]}", plan.q[-1]) if cycles > 1 else ""
-    for cycle in range(1, cycles + 1):
-        for name, q in zip(plan.names, plan.q, strict=True):
-            text += _joints(f"{name} cycle {cycle}", q)
-    return text
-
-
-def _line_text(arm: Arm, plan: CheckPlan, cycles: int, speed_m_s: float) -> str:
-    duration = _line(arm, plan, speed_m_s).duration_s
-    text = _joints("to P2", plan.q[1])
-    for cycle in range(1, cycles + 1):
-        for way, goal in (("P2 to P4", 3), ("P4 to P2", 1)):
-            to_mm = 1e3 * plan.Ts_base_tool[goal][:3, 3]
-            text += f'\n[[motion]]\nkind = "line"\nname = "{way} cycle {cycle}"\nto_mm = {_numbers(to_mm)}\n'
-            text += f"duration_s = {duration:.4f}\n"
-    return text
-
-
-def _circle_text(arm: Arm, plan: CheckPlan, cycles: int, speed_m_s: float) -> str:
-    start, axis, angle, duration = _round(plan, speed_m_s)
-    text = _joints("to the circle", _start(arm, plan, start))
-    for cycle in range(1, cycles + 1):
-        for way, sign in (("counter-clockwise", 1), ("clockwise", -1)):
-            text += f'\n[[motion]]\nkind = "circle"\nname = "{way} cycle {cycle}"\n'
-            text += f"center_mm = {_numbers(1e3 * plan.centre)}\naxis = {_numbers(axis)}\n"
-            text += f"angle_deg = {sign * angle:.1f}\nduration_s = {duration:.4f}\n"
+def _motion(kind: str, name: str, keys: Mapping[str, Any]) -> str:
+    """Return a motion as a motion file has it."""
+    text = f'\n[[motion]]\nkind = "{kind}"\nname = "{name}"\n'
+    for key, value in keys.items():
+        number = f"{value:.{1 if key == 'angle_deg' else 4}f}" if np.ndim(value) == 0 else ""
+        text += f"{key} = {number or '[' + ', '.join(f'{v:.6f}' for v in value) + ']'}\n"
     return text
 
 

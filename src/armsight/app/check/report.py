@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from armsight.app.check.limits import LimitResult, all_compared
-from armsight.app.check.result import MEANINGS, CheckResult, direction, metric_lines
+from armsight.app.check.result import MEANINGS, CheckResult, LimitResult, all_compared, direction, metric_lines
 from armsight.app.check.rows import Row
 from armsight.app.show.messages import Note
 from armsight.app.show.page import PAGE, bullets
@@ -25,9 +24,14 @@ from armsight.loop.iso9283.paths import square_to
 from armsight.loop.iso9283.statistic import Metric
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.projections.polar import PolarAxes
+
+
+#: This many poses are shown with their scatter.
+_MOST = 6
+_VIEWS = ((0, 1, "from above"), (0, 2, "from the side"))
+_GRID: dict[str, Any] = {"color": "#e4e7eb", "lw": 0.8, "zorder": 0}
 
 
 def metric_text(metric: Metric) -> str:
@@ -42,9 +46,13 @@ def metric_text(metric: Metric) -> str:
     return f"{clean:.3f} mm, {low:.3f} to {high:.3f} ({raw:.3f} as measured)"
 
 
-#: This many poses are shown with their scatter.
-_MOST = 6
-_VIEWS = ((0, 1, "from above"), (0, 2, "from the side"))
+def _at(rows: Sequence[Row]) -> tuple[Array, Array]:
+    """Return the attained and the commanded positions (N, 3) of rows, m."""
+    return np.array([row.T[:3, 3] for row in rows]), np.array([row.T_command[:3, 3] for row in rows])
+
+
+def _of_pose(rows: Sequence[Row], name: str) -> list[Row]:
+    return [row for row in rows if row.test == "pose" and row.pose == name]
 
 
 def scatter_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
@@ -54,85 +62,59 @@ def scatter_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
     names = list(result.poses)[:_MOST]
     if not names:
         return None
-    figure = new_figure(4.6)
+    figure, reach, a = new_figure(4.6), 0.0, np.linspace(0, 2 * np.pi, 120)
     panels = figure.subplots(2, len(names), squeeze=False, sharex=True, sharey=True)
-    reach = 0.0
     for column, name in enumerate(names):
-        p = _positions(rows, name)
-        off, middle = p - p.mean(axis=0), result.poses[name]
-        RP = middle.RP_m.clean
-        reach = max(reach, 1.15 * float(np.abs(off).max()), 1.1 * (RP or 0.0))
+        p, metrics = _at(_of_pose(rows, name))[0], result.poses[name]
+        off, RP = 1e3 * (p - p.mean(axis=0)), metrics.RP_m.clean
+        radius = 1e3 * (RP if RP is not None else metrics.RP_m.high or 0.0)
+        reach = max(reach, 1.15 * float(np.abs(off).max()), 1.1e3 * (RP or 0.0))
         for row, (i, j, view) in enumerate(_VIEWS):
             ax = panels[row, column]
-            dots = ax.scatter(
-                1e3 * off[:, i], 1e3 * off[:, j], c=np.arange(len(off)) + 1, cmap="viridis", s=13, zorder=3
-            )
-            ax.axhline(0, color="#e4e7eb", lw=0.8, zorder=0)
-            ax.axvline(0, color="#e4e7eb", lw=0.8, zorder=0)
-            _ring(ax, 1e3 * (RP if RP is not None else (middle.RP_m.high or 0.0)), dotted=RP is None)
-            ax.set_aspect("equal")
-            if row == 0:
-                ax.set_title(f"{name}: command is\n{1e3 * middle.AP_m.raw:.2f} mm off")
-            if row == 1:
-                ax.set_xlabel("x, mm")
-            if column == 0:
-                ax.set_ylabel(f"{'xyz'[j]}, mm ({view})")
-    panels[0, 0].set_xlim(-1e3 * reach, 1e3 * reach)
-    panels[0, 0].set_ylim(-1e3 * reach, 1e3 * reach)
+            dots = ax.scatter(off[:, i], off[:, j], c=np.arange(len(off)) + 1, cmap="viridis", s=13, zorder=3)
+            ax.axhline(0, **_GRID)
+            ax.axvline(0, **_GRID)
+            ax.plot(radius * np.cos(a), radius * np.sin(a), color=ORANGE, lw=1.2, ls=":" if RP is None else "-")
+            ax.set(aspect="equal", xlabel="x, mm" if row else "")
+            ax.set_title("" if row else f"{name}: command is\n{1e3 * metrics.AP_m.raw:.2f} mm off")
+            ax.set_ylabel("" if column else f"{'xyz'[j]}, mm ({view})")
+    panels[0, 0].set(xlim=(-reach, reach), ylim=(-reach, reach))
     bar = figure.colorbar(dots, ax=panels, label="cycle", shrink=0.7)
     bar.locator = MaxNLocator(integer=True)
     bar.update_ticks()
     return figure
 
 
-def _ring(ax: Axes, radius: float, *, dotted: bool) -> None:
-    a = np.linspace(0, 2 * np.pi, 120)
-    ax.plot(radius * np.cos(a), radius * np.sin(a), color=ORANGE, lw=1.2, ls=":" if dotted else "-")
-
-
-def _positions(rows: Sequence[Row], name: str) -> Array:
-    return np.array([row.T[:3, 3] for row in rows if row.test == "pose" and row.pose == name])
-
-
 def anywhere_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
     """Plot the error over the workspace."""
     if result.anywhere is None:
         return None
-    chosen = [row for row in rows if row.test == "pose"]
-    at = np.array([row.T_command[:3, 3] for row in chosen])
-    error = 1e3 * np.linalg.norm([(row.T - row.T_command)[:3, 3] for row in chosen], axis=1)
-    figure = new_figure(3.6)
+    p, at = _at([row for row in rows if row.test == "pose"])
+    error, figure = 1e3 * np.linalg.norm(p - at, axis=1), new_figure(3.6)
     panels = figure.subplots(1, 3, width_ratios=(1, 1, 1))
     for ax, (i, j, view) in zip(panels, _VIEWS, strict=False):
         dots = ax.scatter(at[:, i], at[:, j], c=error, s=26, cmap="viridis", vmin=0)
         ax.set_aspect("equal", adjustable="datalim")
-        ax.set_title(view)
-        ax.set_xlabel(f"{'xyz'[i]}, m")
-        ax.set_ylabel(f"{'xyz'[j]}, m")
+        ax.set(title=view, xlabel=f"{'xyz'[i]}, m", ylabel=f"{'xyz'[j]}, m")
     figure.colorbar(dots, ax=list(panels[:2]), label="error, mm", shrink=0.8)
     panels[2].hist(error, bins=15, color=BLUE)
     panels[2].set_xlim(left=0)
-    panels[2].set_title("poses")
-    panels[2].set_xlabel("error, mm")
+    panels[2].set(title="poses", xlabel="error, mm")
     return figure
 
 
 def drift_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
     """Plot the attained positions of the first pose over time, and the drift of their mean."""
-    if result.drift is None:
+    if (d := result.drift) is None:
         return None
-    d = result.drift
-    chosen = [row for row in rows if row.test == "pose" and row.pose == d.pose and row.t_s is not None]
-    t = np.array([row.t_s for row in chosen], float)
-    p = np.array([row.T[:3, 3] for row in chosen])
-    figure = new_figure(3.2)
+    chosen = [row for row in _of_pose(rows, d.pose) if row.t_s is not None]
+    t, p, figure = np.array([row.t_s for row in chosen], float), _at(chosen)[0], new_figure(3.2)
     ax = figure.subplots()
     for i, colour in enumerate((RED, "#2f7d4f", BLUE)):
         ax.plot(t - t.min(), 1e3 * (p - p.mean(axis=0))[:, i], ".-", lw=0.7, ms=4, color=colour, label="xyz"[i])
     ax.plot(d.t_s - t.min(), 1e3 * d.dAP_m, "s-", color=INK, ms=5, label="dAP")
-    ax.axhline(0, color="#e4e7eb", lw=0.8, zorder=0)
-    ax.set_xlabel("s")
-    ax.set_ylabel(f"{d.pose} about its mean, mm")
+    ax.axhline(0, **_GRID)
+    ax.set(xlabel="s", ylabel=f"{d.pose} about its mean, mm")
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4)
     return figure
 
@@ -143,19 +125,16 @@ def paths_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
         return None
     figure = new_figure(3.2)
     ax = figure.subplots()
-    for (name, p), colour in zip(result.paths.items(), (BLUE, ORANGE, MUTED, RED) * len(result.paths), strict=False):
-        off_m = p.off_m
-        share = 100 * (np.arange(len(off_m)) + 1) / (len(off_m) + 1)
-        ax.plot(share, 1e3 * off_m, color=colour, label=name)
-        cycles = {row.cycle for row in rows if row.test == "path" and (row.approach or "path") == name}
-        for cycle in sorted(cycles):
-            chosen = [r for r in rows if r.test == "path" and (r.approach or "path") == name and r.cycle == cycle]
-            off = np.array([(row.T - row.T_command)[:3, 3] for row in chosen])
-            off = (square_to(np.array([row.T_command[:3, 3] for row in chosen])) @ off[..., None])[..., 0]
+    for (name, path), colour in zip(result.paths.items(), (BLUE, ORANGE, MUTED, RED) * len(result.paths), strict=False):
+        share = 100 * (np.arange(len(path.off_m)) + 1) / (len(path.off_m) + 1)
+        ax.plot(share, 1e3 * path.off_m, color=colour, label=name)
+        chosen = [row for row in rows if row.test == "path" and (row.approach or "path") == name]
+        for cycle in sorted({row.cycle for row in chosen}):
+            p, p_ref = _at([row for row in chosen if row.cycle == cycle])
+            off = (square_to(p_ref) @ (p - p_ref)[..., None])[..., 0]
             ax.plot(share, 1e3 * np.linalg.norm(off, axis=1), color=colour, lw=0.5, alpha=0.5)
     ax.set_ylim(bottom=0)
-    ax.set_xlabel("of the way, %")
-    ax.set_ylabel("distance from the path, mm\n(thick: of the mean path)")
+    ax.set(xlabel="of the way, %", ylabel="distance from the path, mm\n(thick: of the mean path)")
     ax.legend()
     return figure
 
@@ -164,24 +143,21 @@ def circle_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
     """Plot the circle, its deviations enlarged, both ways, with the backlash that its quadrants show."""
     if result.circle is None:
         return None
-    c = result.circle.metrics
-    angle = np.radians(np.append(c.angle_deg, c.angle_deg[0]))
-    radii = 1e3 * c.radii_m
+    c, figure = result.circle.metrics, new_figure(6.4)
+    angle, radii = np.radians(np.append(c.angle_deg, c.angle_deg[0])), 1e3 * c.radii_m
     span = max(float(np.abs(radii).max()), 1e-6)
-    figure = new_figure(6.4)
+    step = nice(span / 1.5)
     ax = cast("PolarAxes", figure.subplots(subplot_kw={"projection": "polar"}))
-    for way, name, colour in ((0, "counter-clockwise", BLUE), (1, "clockwise", ORANGE)):
-        ax.plot(angle, np.append(radii[way], radii[way][0]), color=colour, lw=1.4, label=name)
+    for r, name, colour in zip(radii, ("counter-clockwise", "clockwise"), (BLUE, ORANGE), strict=True):
+        ax.plot(angle, np.append(r, r[0]), color=colour, lw=1.4, label=name)
     ax.plot(np.linspace(0, 2 * np.pi, 200), np.zeros(200), color=MUTED, lw=0.9, ls="--", label="fitted circle")
     ax.set_ylim(-3 * span, 1.6 * span)
-    step = nice(span / 1.5)
     ax.set_yticks([-step, 0, step], ["", "", ""])
     ax.set_thetagrids([0, 90, 180, 270], [f"{a} deg" for a in (0, 90, 180, 270)])
+    style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8}
     for k in range(4):
         jumps = " / ".join(f"{1e3 * s[k]:+.3f}" for s in c.steps_m)
-        ax.annotate(
-            f"jump, mm\n{jumps}", (np.radians(90 * k), -1.5 * span), ha="center", va="center", color=INK, fontsize=8
-        )
+        ax.annotate(f"jump, mm\n{jumps}", (np.radians(90 * k), -1.5 * span), color=INK, **style)
     shown: list[float] = []
     for reversal in result.circle.reversals:
         if any(abs((reversal.angle_deg - other + 180) % 360 - 180) < 5 for other in shown):
@@ -189,8 +165,7 @@ def circle_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
         shown.append(reversal.angle_deg)
         at = np.radians(reversal.angle_deg)
         ax.plot([at, at], [-0.2 * span, 1.1 * span], color=RED, lw=0.8, ls=":")
-        label = "J" + ",".join(map(str, reversal.joints))
-        ax.annotate(label, (at, 1.3 * span), ha="center", va="center", color=RED, fontsize=8)
+        ax.annotate("J" + ",".join(map(str, reversal.joints)), (at, 1.3 * span), color=RED, **style)
     first, second = (direction(axis) for axis in result.circle.axes)
     ax.set_title(
         f"radius {1e3 * c.radius_m:.1f} mm, grey rings {step:g} mm off; 0 deg is along {first}, 90 deg along {second}"

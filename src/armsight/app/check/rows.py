@@ -38,61 +38,35 @@ _COLUMNS = (*_TEXTS, *_NUMBERS)
 
 @dataclass(frozen=True, eq=False)
 class Row(Record):
-    """One attained pose.
+    """One attained pose."""
 
-    Attributes:
-        test: pose, path or circle.
-        pose: its name; on a path the number of the path point, on a circle the angle, deg.
-        cycle: which repetition.
-        approach: where the arm came from; of a path its name; on a circle 1 counter-clockwise, -1 clockwise.
-        t_s: when, s; None where that is not known.
-        T: (4, 4) attained, base.
-        T_command: (4, 4) commanded.
-        cov: (3, 3) covariance of the position by the instrument, base's axes, m^2: what differs from row to row.
-        cov_common: (3, 3) that of the instrument's constant error.
-        measured_rotation: whether the attained rotation is known.
-        commanded_rotation: whether the commanded rotation is known.
-    """
-
-    test: str
-    pose: str
-    cycle: str
-    approach: str
-    t_s: float | None
-    T: Array
-    T_command: Array
-    cov: Array
-    cov_common: Array
-    measured_rotation: bool = True
-    commanded_rotation: bool = True
+    test: str  #: pose, path or circle
+    pose: str  #: its name; on a path the number of the path point, on a circle the angle, deg
+    cycle: str  #: which repetition
+    approach: str  #: where the arm came from; of a path its name; on a circle 1 counter-clockwise, -1 clockwise
+    t_s: float | None  #: when, s; None where that is not known
+    T: Array  #: (4, 4) attained, base
+    T_command: Array  #: (4, 4) commanded
+    cov: Array  #: (3, 3) covariance of the position by the instrument, base's axes, m^2: what differs from row to row
+    cov_common: Array  #: (3, 3) that of the instrument's constant error
+    measured_rotation: bool = True  #: whether the attained rotation is known
+    commanded_rotation: bool = True  #: whether the commanded rotation is known
 
 
 class Reversal(NamedTuple):
-    """Joints reverse on the circle.
+    """Joints reverse on the circle."""
 
-    Attributes:
-        joints: their numbers, from 1.
-        way: 1 counter-clockwise, -1 clockwise.
-        p: (3,) where the tool is commanded then, base, m.
-    """
-
-    joints: tuple[int, ...]
-    way: float
-    p: Array
+    joints: tuple[int, ...]  #: their numbers, from 1
+    way: float  #: 1 counter-clockwise, -1 clockwise
+    p: Array  #: (3,) where the tool is commanded then, base, m
 
 
 class Attained(NamedTuple):
-    """What a test attained.
+    """What a test attained."""
 
-    Attributes:
-        rows: all that is evaluated.
-        notes: what was left out, as text.
-        reversals: where joints reverse on the circle, as far as that is known.
-    """
-
-    rows: list[Row]
-    notes: list[str]
-    reversals: list[Reversal]
+    rows: list[Row]  #: all that is evaluated
+    notes: list[str]  #: what was left out, as text
+    reversals: list[Reversal]  #: where joints reverse on the circle, as far as that is known
 
 
 def read_rows(file: Path, columns: str | None = None) -> list[Row]:
@@ -152,48 +126,33 @@ def _require_sense(file: Path, rows: list[Row]) -> None:
 
 
 def _row(where: str, entries: dict[str, str], numbers: dict[str, float]) -> Row:
+    """Return a row; raise an InputError where it lacks a value, or one cannot be."""
     test = entries["test"] or "pose"
     if test not in TESTS:
         raise InputError(f"{where}: test is {test!r}; known are {', '.join(TESTS)}")
-    _require_whole(where, entries, numbers)
-    covs = [np.diag([numbers.get(name, 0.0) ** 2 for name in names]) for names in (_SIGMA, _COMMON)]
-    return Row(
-        test,
-        entries["pose"],
-        entries["cycle"],
-        entries["approach"],
-        numbers.get("t_s"),
-        _pose(where, numbers, ""),
-        _pose(where, numbers, "command_"),
-        covs[0],
-        covs[1],
-        _QUATERNION[0] in numbers,
-        _COMMAND[3] in numbers,
-    )
-
-
-def _require_whole(where: str, entries: dict[str, str], numbers: dict[str, float]) -> None:
-    """Raise InputError where a row lacks a value, or a standard deviation is none."""
     if not entries["pose"]:
         raise InputError(f"{where}: pose is empty; it needs a name")
-    for name in NEEDED[1:]:
-        if name not in numbers:
-            raise InputError(f"{where}: {name} is empty")
+    if empty := [name for name in NEEDED[1:] if name not in numbers]:
+        raise InputError(f"{where}: {empty[0]} is empty")
     for part in _TOGETHER:
         lost = [name for name in part if name not in numbers]
         if 0 < len(lost) < len(part):
             raise InputError(f"{where}: {lost[0]} is missing, though others of {', '.join(part)} are there")
-    for name in (*_SIGMA, *_COMMON):
-        if numbers.get(name, 0.0) < 0.0:
-            raise InputError(f"{where}: {name} is {numbers[name]:g}; a standard deviation is never below zero")
-
-
-def _pose(where: str, numbers: dict[str, float], prefix: str) -> Array:
-    """Return a pose (4, 4); without a rotation it has that of the base."""
-    q = np.array([numbers.get(prefix + name, float(name == "qw")) for name in _QUATERNION])
-    if not 0.999 < np.linalg.norm(q) < 1.001:
-        raise InputError(f"{where}: quaternion {prefix}qw .. {prefix}qz has length {np.linalg.norm(q):.4g}, not 1")
-    return pose(from_quaternion_wxyz(q / np.linalg.norm(q)), np.array([numbers[prefix + name] for name in _POSITION]))
+    sigmas = {name: numbers.get(name, 0.0) for name in (*_SIGMA, *_COMMON)}
+    if below := [name for name, sigma in sigmas.items() if sigma < 0.0]:
+        raise InputError(f"{where}: {below[0]} is {sigmas[below[0]]:g}; a standard deviation is never below zero")
+    Ts = []
+    for prefix in ("", "command_"):
+        q = np.array([numbers.get(prefix + name, float(name == "qw")) for name in _QUATERNION])  # else that of the base
+        if not 0.999 < (length := np.linalg.norm(q)) < 1.001:
+            raise InputError(f"{where}: quaternion {prefix}qw .. {prefix}qz has length {length:.4g}, not 1")
+        p = np.array([numbers[prefix + name] for name in _POSITION])
+        Ts.append(pose(from_quaternion_wxyz(q / length), p))
+    covs = [np.diag([sigmas[name] ** 2 for name in names]) for names in (_SIGMA, _COMMON)]
+    name, cycle, approach = (entries[key] for key in _TEXTS[1:])
+    known, known_ref = _QUATERNION[0] in numbers, _COMMAND[3] in numbers
+    t_s = numbers.get("t_s")
+    return Row(test, name, cycle, approach, t_s, Ts[0], Ts[1], covs[0], covs[1], known, known_ref)
 
 
 def natural(name: str) -> list[tuple[int, str]]:
@@ -214,14 +173,9 @@ def rows_csv(rows: list[Row]) -> str:
     writer.writerow(_COLUMNS)
     for row in rows:
         entries = [row.test, row.pose, row.cycle, row.approach, "" if row.t_s is None else f"{row.t_s:.6f}"]
+        numbers: list[float | None] = []
         for T, known in ((row.T, row.measured_rotation), (row.T_command, row.commanded_rotation)):
-            entries += _decimals(T[:3, 3])
-            entries += _decimals(quaternion_wxyz(T[:3, :3])) if known else [""] * len(_QUATERNION)
-        for cov in (row.cov, row.cov_common):
-            entries += _decimals(np.sqrt(np.diag(cov)))
-        writer.writerow(entries)
+            numbers += [*T[:3, 3], *(quaternion_wxyz(T[:3, :3]) if known else [None] * len(_QUATERNION))]
+        numbers += [*np.sqrt(np.diag(row.cov)), *np.sqrt(np.diag(row.cov_common))]
+        writer.writerow(entries + ["" if number is None else f"{number:.9f}" for number in numbers])
     return out.getvalue()
-
-
-def _decimals(numbers: Array) -> list[str]:
-    return [f"{number:.9f}" for number in numbers]

@@ -8,8 +8,6 @@ for the evaluation. The run is cut into segments: its motions, and the rest at t
 - A line or circle belongs with those along the same commanded path; of a circle, both directions are needed.
 - The instrument's noise is half the mean square of the steps from one shot of a rest to the next: slower motion of the arm
   is not in it, faster motion is, so it is an upper estimate. What vision.csv claims beyond it is common to all shots.
-
-From top to bottom: reading and segments, noise, rests, paths, circle, joint reversals.
 """
 
 from __future__ import annotations
@@ -36,14 +34,10 @@ from armsight.tables.columns import Columns
 
 #: A rest is evaluated over its last part, this long, s: longer averages more shots, and more of the settling.
 WINDOW_S = 0.3
-#: A rest is evaluated that was seen in this many shots.
-_REST_SHOTS = 3
+#: A rest, and a path, is evaluated that was seen in this many shots; a path at so many path points.
+_REST_SHOTS, _PATH_SHOTS, _PATH_POINTS = 3, 10, 40
 #: Paths whose first, middle and last positions are this near to each other are one path, m.
 _SAME_M = 1e-4
-#: Path points at which a path is evaluated.
-_PATH_POINTS = 40
-#: A path is evaluated that was seen in this many shots.
-_PATH_SHOTS = 10
 #: A circle is whole from this angle on, rad.
 _WHOLE_RAD = 2 * np.pi * 0.999
 #: Between two shots further apart than this many path points the path was not seen: the cycle is left out.
@@ -58,41 +52,41 @@ _NEAR = 0.015
 _AWAY_RAD = float(np.radians(0.3))
 #: Columns of joints.csv in version 1 of a run's folder -> their present names; both are read.
 _VERSION_1 = {f"q{joint}_wanted_rad": f"q{joint}_ref_rad" for joint in range(1, MOST_JOINTS + 1)}
-_SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
 
 
 @dataclass(frozen=True)
 class PathSegment:
-    """A motion, or the rest at its end.
+    """A motion, or the rest at its end."""
 
-    Attributes:
-        name: of the motion.
-        kind: joints, home, line, circle; rest.
-        reference: commanded poses of the tool.
-        seen: poses of the tool that vision measured.
-        sigma: (N, 3) what vision claims, m.
-    """
+    name: str  #: of the motion
+    kind: str  #: joints, home, line, circle; rest
+    reference: ToolTrack  #: commanded poses of the tool
+    seen: ToolTrack  #: poses of the tool that vision measured
+    sigma: Array  #: (N, 3) what vision claims, m
 
-    name: str
-    kind: str
-    reference: ToolTrack
-    seen: ToolTrack
-    sigma: Array
+    @property
+    def p_ref(self) -> Array:
+        """(M, 3) commanded positions of the tool, m."""
+        return self.reference.Ts_base_tool[:, :3, 3]
+
+    @property
+    def called(self) -> str:
+        """The name of the motion without its cycle."""
+        return re.sub(r" cycle \d+$", "", self.name)
+
+    def at_rest(self) -> tuple[Array, Array]:
+        """Return poses (n, 4, 4) and sigmas (n, 3) of the shots at the end of a rest."""
+        rows = self.seen.t_s > self.reference.t_s[-1] - WINDOW_S
+        return self.seen.Ts_base_tool[rows], self.sigma[rows]
 
 
 @dataclass(frozen=True)
 class Noise:
-    """The instrument.
+    """The instrument."""
 
-    Attributes:
-        own: (3, 3) covariance of one shot of an arm at rest, base's axes, m^2.
-        common: (3, 3) that of the error that all shots share.
-        claimed: (3,) variances that vision claims at rest, all in.
-    """
-
-    own: Array
-    common: Array
-    claimed: Array
+    own: Array  #: (3, 3) covariance of one shot of an arm at rest, base's axes, m^2
+    common: Array  #: (3, 3) that of the error that all shots share
+    claimed: Array  #: (3,) variances that vision claims at rest, all in
 
     def moving(self, segment: PathSegment) -> Array:
         """Return the covariance (3, 3) of one shot in a motion: vision claims more there, as the cameras expose apart."""
@@ -101,17 +95,11 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class JointTrack(Record):
-    """Readings and commands of the joints.
+    """Readings and commands of the joints."""
 
-    Attributes:
-        t_s: (N,) board's clock, s.
-        q: (N, n) readings, rad; NaN where the file has commands alone.
-        q_ref: (N, n) commands, rad.
-    """
-
-    t_s: Array
-    q: Array
-    q_ref: Array
+    t_s: Array  #: (N,) board's clock, s
+    q: Array  #: (N, n) readings, rad; NaN where the file has commands alone
+    q_ref: Array  #: (N, n) commands, rad
 
     def sides(self, t_s: float) -> Array:
         """Return how each joint came to its command at a time, s (n,): 1 with rising angle, -1 with falling, 0 unmoved."""
@@ -161,7 +149,7 @@ def attained_in(folder: Path, *, closed: bool) -> Attained:
         which = "with the loop closed" if closed else "with the joint sensors alone"
         raise InputError(f"{folder}: the run has no motions {which}; run.log says how far it came")
     noise = noise_of(segments)
-    paths, run, circle, notes = path_rows(segments, noise)
+    paths, run, circle, notes = _paths(segments, noise)
     track = joint_track(folder) if (folder / "joints.csv").is_file() else None
     rows, more = _rests(segments, run, noise, track)
     return Attained(rows + paths, more + notes, [] if track is None else reversals_of(track, circle))
@@ -184,15 +172,19 @@ def segments_of(folder: Path, closed: bool) -> list[PathSegment]:
     Raises:
         InputError: no run's folder, or a file of it cannot be read.
     """
-    file = _reference_file(folder)
-    for name in (file.name, "vision.csv", "motion.toml"):
+    file, motions = _reference_file(folder), folder / "motion.toml"
+    for name in (file.name, "vision.csv", motions.name):
         if not (folder / name).is_file():
             if (folder / "summary.json").is_file():
                 raise InputError(f"{folder}: {name} is missing: the run ended before its motions; run it to the end")
             raise InputError(f"{folder}: is no run, {name} is missing: give a folder of armsight run or demo, or a CSV")
     reference, _ = read_track(file, ())
-    seen, sigma = read_track(folder / "vision.csv", _SIGMAS)
-    kinds = _kinds(folder / "motion.toml")
+    seen, sigma = read_track(folder / "vision.csv", ("sigma_x_m", "sigma_y_m", "sigma_z_m"))
+    try:
+        entries: Any = read_toml(motions).get("motion", [])
+        kinds = {str(e.get("name", f"{e['kind']} {n}")): str(e["kind"]) for n, e in enumerate(entries, start=1)}
+    except (AttributeError, KeyError, TypeError):
+        raise InputError(f"{motions}: not a motion file (docs/howto/motions.md)") from None
     named = np.char.add(np.char.add(reference.phase, "/"), reference.motion)
     ends = [0, *(np.flatnonzero(named[1:] != named[:-1]) + 1).tolist(), len(named)]
     found, now = [], "calibration"
@@ -208,53 +200,27 @@ def segments_of(folder: Path, closed: bool) -> list[PathSegment]:
     return found
 
 
-def _kinds(file: Path) -> dict[str, str]:
-    """Return the kind of every motion of a motion file by its name."""
-    try:
-        entries: Any = read_toml(file).get("motion", [])
-        return {str(e.get("name", f"{e['kind']} {n}")): str(e["kind"]) for n, e in enumerate(entries, start=1)}
-    except (AttributeError, KeyError, TypeError):
-        raise InputError(f"{file}: not a motion file (docs/howto/motions.md)") from None
-
-
-def plain(name: str) -> str:
-    """Return the name of a motion without its cycle."""
-    return re.sub(r" cycle \d+$", "", name)
-
-
 def noise_of(segments: list[PathSegment]) -> Noise:
     """Return the instrument's noise as the rests show it."""
-    steps, sigmas = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for segment in segments:
-        if segment.kind == "rest":
-            Ts, sigma = at_rest(segment)
-            steps.append(np.diff(Ts[:, :3, 3], axis=0))
-            sigmas.append(sigma)
-    d, sigma = np.concatenate(steps), np.concatenate(sigmas)
+    rests = [segment.at_rest() for segment in segments if segment.kind == "rest"]
+    d = np.concatenate([np.zeros((0, 3)), *(np.diff(Ts[:, :3, 3], axis=0) for Ts, _ in rests)])
     if len(d) < MIN_POSES:
         raise InputError("the arm was hardly seen at rest: rests of half a second in view of both cameras are needed")
-    own = d.T @ d / (2 * len(d))
-    claimed = (sigma**2).mean(axis=0)
+    own, claimed = d.T @ d / (2 * len(d)), (np.concatenate([sigma for _, sigma in rests]) ** 2).mean(axis=0)
     return Noise(own, np.diag(np.maximum(claimed - np.diag(own), 0.0)), claimed)
-
-
-def at_rest(segment: PathSegment) -> tuple[Array, Array]:
-    """Return poses (n, 4, 4) and sigmas (n, 3) of the shots at the end of a rest."""
-    rows = segment.seen.t_s > segment.reference.t_s[-1] - WINDOW_S
-    return segment.seen.Ts_base_tool[rows], segment.sigma[rows]
 
 
 def _rests(
     segments: list[PathSegment], run: set[str], noise: Noise, track: JointTrack | None
 ) -> tuple[list[Row], list[str]]:
     """Return a row for every rest at a pose, but those at the ends of paths that are evaluated, and what was left out."""
-    names = _pose_names(segments, run)
+    names = _pose_names([s for s in segments if s.kind == "rest" and s.name not in run])
     visits: dict[tuple[str, str], list[Row]] = {}
     times: Counter[str] = Counter()
     before, here, unseen = "the start", "the start", 0
     for segment in segments:
         if segment.kind != "rest":
-            before, here = here, plain(segment.name)
+            before, here = here, segment.called
             continue
         T, t_s = segment.reference.Ts_base_tool[-1], float(segment.reference.t_s[-1])
         name = next((n for at, n in names if np.abs(at - T).max() < SAME_M), None)
@@ -266,36 +232,30 @@ def _rests(
         if track is not None and t_s >= track.t_s[0]:
             came = "sides " + "".join("-0+"[int(side) + 1] for side in track.sides(t_s))
         times[name] += 1
-        Ts, _ = at_rest(segment)
+        Ts, _ = segment.at_rest()
+        unseen += len(Ts) < _REST_SHOTS
         if len(Ts) >= _REST_SHOTS:
             seen = Row("pose", name, str(times[name]), came, t_s, mean_pose(Ts), T, noise.own / len(Ts), noise.common)
             visits.setdefault((name, came), []).append(seen)
-        unseen += len(Ts) < _REST_SHOTS
+    attained = Counter(name for (name, _), group in visits.items() for _ in group)
+    often = any(len(group) >= MIN_POSES for group in visits.values())
+    rare = {at: len(rows) for at, rows in visits.items() if often and len(rows) < MIN_POSES <= attained[at[0]]}
+    rows = [row for at, group in visits.items() if at not in rare for row in group]
+    said = [f"left out: {name} approached from {came}, too seldom ({n})" for (name, came), n in rare.items()]
     notes = [f"{unseen} rests were not seen, and are left out"] if unseen else []
-    often = any(len(came) >= MIN_POSES for came in visits.values())
-    attained: Counter[str] = Counter()
-    for (name, _), group in visits.items():
-        attained[name] += len(group)
-    rows, rare = [], []
-    for (name, came), group in visits.items():
-        if often and len(group) < MIN_POSES <= attained[name]:
-            rare.append(f"left out: {name} approached from {came}, too seldom ({len(group)})")
-        else:
-            rows += group
-    notes += first_few(rare, "approaches, too seldom")
+    notes += first_few(said, "approaches, too seldom")
     return sorted(rows, key=lambda row: (natural(row.pose), row.t_s)), notes
 
 
-def _pose_names(segments: list[PathSegment], run: set[str]) -> list[tuple[Array, str]]:
+def _pose_names(rests: list[PathSegment]) -> list[tuple[Array, str]]:
     """Return every pose at which the arm rested, (4, 4), with a name of its own: that by which it was commanded most."""
     found: list[tuple[Array, Counter[str]]] = []
-    for segment in segments:
-        if segment.kind == "rest" and segment.name not in run:
-            T = segment.reference.Ts_base_tool[-1]
-            called = next((each for at, each in found if np.abs(at - T).max() < SAME_M), None)
-            if called is None:
-                found.append((T, called := Counter()))
-            called[plain(segment.name).removeprefix("to ")] += 1
+    for rest in rests:
+        T = rest.reference.Ts_base_tool[-1]
+        called = next((each for at, each in found if np.abs(at - T).max() < SAME_M), None)
+        if called is None:
+            found.append((T, called := Counter()))
+        called[rest.called.removeprefix("to ")] += 1
     names: dict[str, Array] = {}
     for T, called in found:
         name = called.most_common(1)[0][0]
@@ -303,140 +263,95 @@ def _pose_names(segments: list[PathSegment], run: set[str]) -> list[tuple[Array,
     return [(T, name) for name, T in names.items()]
 
 
-def path_rows(segments: list[PathSegment], noise: Noise) -> tuple[list[Row], set[str], list[PathSegment], list[str]]:
-    """Return the rows of a run's paths and of its circle.
-
-    Args:
-        segments: of the run.
-        noise: the instrument.
-
-    Returns:
-        The rows; the names of the motions that they are of; one segment of the circle in each direction; notes on what was
-        left out.
-    """
-    paths = [s for s in segments if s.kind in ("line", "circle")]
-    seen = [s for s in paths if len(s.seen) >= _PATH_SHOTS]
-    notes = [
-        f"left out: {s.name}, seen in {len(s.seen)} shots; {_PATH_SHOTS} are needed"
-        for s in paths
-        if len(s.seen) < _PATH_SHOTS
-    ]
-    groups = _grouped(seen)
+def _paths(segments: list[PathSegment], noise: Noise) -> tuple[list[Row], set[str], list[PathSegment], list[str]]:
+    """Return the rows of paths and circle, the names of their motions, a segment of the circle each way, and notes."""
+    groups, notes = list[list[PathSegment]](), list[str]()
+    for segment in segments:
+        if segment.kind not in ("line", "circle"):
+            continue
+        if len(segment.seen) < _PATH_SHOTS:
+            notes.append(f"left out: {segment.name}, seen in {len(segment.seen)} shots; {_PATH_SHOTS} are needed")
+            continue
+        ends = _ends(segment)
+        same = (g for g in groups if g[0].kind == segment.kind and np.abs(_ends(g[0]) - ends).max() < _SAME_M)
+        if (found := next(same, None)) is None:
+            groups.append(found := [])
+        found.append(segment)
     circle, others = _both_ways(groups)
-    notes += others
-    rows: list[Row] = []
-    run: set[str] = {s.name for group in circle for s in group}
+    rows, notes = list[Row](), notes + others
+    run = {segment.name for group in circle for segment in group}
     names: list[str] = []
     for group in groups:
         if group[0].name in run:
             continue
-        names.append(short if (short := plain(group[0].name)) not in names else group[0].name)
-        cycles, unseen = _path(names[-1], group, noise)
-        notes += unseen
+        names.append(group[0].called if group[0].called not in names else group[0].name)
+        cycles = _path(names[-1], group, noise, notes)
         if len(cycles) < MIN_POSES:
             notes.append(f"left out: {names[-1]}, followed too seldom ({len(cycles)})")
             continue
         rows += [row for cycle in cycles for row in cycle]
-        run |= {s.name for s in group}
+        run |= {segment.name for segment in group}
     return rows + [row for group in circle for row in _circle(group, noise)], run, [g[0] for g in circle], notes
-
-
-def _grouped(paths: list[PathSegment]) -> list[list[PathSegment]]:
-    """Group segments that have the same commanded path."""
-    groups: list[list[PathSegment]] = []
-    for segment in paths:
-        same = (g for g in groups if g[0].kind == segment.kind and np.abs(_ends(g[0]) - _ends(segment)).max() < _SAME_M)
-        found = next(same, None)
-        if found is None:
-            groups.append([segment])
-        else:
-            found.append(segment)
-    return groups
 
 
 def _ends(segment: PathSegment) -> Array:
     """Return the first, a middle and the last commanded position (3, 3)."""
-    p = segment.reference.Ts_base_tool[:, :3, 3]
-    return p[[0, len(p) // 3, -1]]
+    return segment.p_ref[[0, len(segment.p_ref) // 3, -1]]
 
 
-def _path(name: str, group: list[PathSegment], noise: Noise) -> tuple[list[list[Row]], list[str]]:
-    """Return a path's rows, cycle by cycle, and what is left out: the cycles of which a part was not seen.
+def _path(name: str, group: list[PathSegment], noise: Noise, notes: list[str]) -> list[list[Row]]:
+    """Return a path's rows, cycle by cycle, and note the cycles of which a part was not seen.
 
     There is a row for every path point of the command: where the attained path crosses the plane square to it.
     """
-    p = group[0].reference.Ts_base_tool[:, :3, 3]
-    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+    p = group[0].p_ref
+    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])  # arc lengths, m
     keep = np.concatenate([[True], np.diff(gone) > 0])
     p, gone, since = p[keep], gone[keep], group[0].reference.t_s[keep] - group[0].reference.t_s[0]
     points = np.linspace(0.0, gone[-1], _PATH_POINTS + 2)[1:-1]
-    cycles, notes = [], []
+
+    def on(s: Array) -> Array:
+        return np.stack([np.interp(s, gone, p[:, i]) for i in range(3)], axis=1)
+
+    cycles, commanded, widest = [], on(points), _GAP * float(points[1] - points[0])
     for cycle, segment in enumerate(group, start=1):
-        s = np.interp(segment.seen.t_s - segment.reference.t_s[0], since, gone)
-        s, off = _off(p, gone, segment.seen.Ts_base_tool[:, :3, 3], s)
-        if unseen := _unseen(s, points):
-            notes.append(f"left out: {segment.name}, {unseen}")
+        was, s = (
+            segment.seen.Ts_base_tool[:, :3, 3],
+            np.interp(segment.seen.t_s - segment.reference.t_s[0], since, gone),
+        )
+        for _ in range(4):  # to the foot of the perpendicular: the time of the shot has no effect
+            ahead = on(s + _AHEAD_M) - on(s - _AHEAD_M)
+            ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-12)[:, None]
+            s = np.clip(s + ((was - on(s)) * ahead).sum(axis=1), 0.0, gone[-1])
+        s, first = np.unique(s, return_index=True)
+        off = was[first] - on(s)
+        if len(s) < 2 or s[0] > points[0] or s[-1] < points[-1]:
+            notes.append(f"left out: {segment.name}, not seen from its first path point to its last")
+            continue
+        if (gap := float(np.diff(s).max())) > widest:
+            most = f"{1e3 * widest:.1f} mm are the most: slower, or in view"
+            notes.append(f"left out: {segment.name}, not seen over {1e3 * gap:.1f} mm; {most}")
             continue
         at = np.clip(np.searchsorted(s, points), 1, len(s) - 1)
         share = (points - s[at - 1]) / (s[at] - s[at - 1])
-        between = off[at - 1] + share[:, None] * (off[at] - off[at - 1])
-        factor, own = (1 - share) ** 2 + share**2, noise.moving(segment)
-        rows = []
-        for k, p_base in enumerate(_on(p, gone, points)):
-            T, T_command = pose(np.eye(3), p_base + between[k]), pose(np.eye(3), p_base)
-            rows.append(Row("path", str(k + 1), str(cycle), name, None, T, T_command, factor[k] * own, noise.common))
+        attained = commanded + off[at - 1] + share[:, None] * (off[at] - off[at - 1])
+        covs = ((1 - share) ** 2 + share**2)[:, None, None] * noise.moving(segment)
+        rows = [
+            Row("path", str(k + 1), str(cycle), name, None, pose(np.eye(3), a), pose(np.eye(3), c), cov, noise.common)
+            for k, (a, c, cov) in enumerate(zip(attained, commanded, covs, strict=True))
+        ]
         cycles.append(rows)
-    return cycles, notes
-
-
-def _unseen(s: Array, points: Array) -> str:
-    """Say which part of a path was not seen; an empty string where all of it was.
-
-    Args:
-        s: (N,) arc lengths at which the path was seen, m, rising.
-        points: (S,) arc lengths of the path points, m.
-    """
-    step = float(points[1] - points[0])
-    if len(s) < 2 or s[0] > points[0] or s[-1] < points[-1]:
-        return "not seen from its first path point to its last"
-    widest = float(np.diff(s).max())
-    if widest > _GAP * step:
-        return f"not seen over {1e3 * widest:.1f} mm; {1e3 * _GAP * step:.1f} mm are the most: slower, or in view"
-    return ""
-
-
-def _on(p: Array, gone: Array, s: Array) -> Array:
-    """Return positions (N, 3) on a path p (M, 3), of arc lengths gone (M,), at arc lengths s (N,), m."""
-    return np.stack([np.interp(s, gone, p[:, i]) for i in range(3)], axis=1)
-
-
-def _off(p: Array, gone: Array, was: Array, s: Array) -> tuple[Array, Array]:
-    """Project attained positions onto a path.
-
-    Args:
-        p: (M, 3) the commanded path, m.
-        gone: (M,) its arc lengths, m.
-        was: (N, 3) attained positions, m.
-        s: (N,) first guesses of their arc lengths, m.
-
-    Returns:
-        Arc lengths (N,), rising, and offsets from the path (N, 3), m.
-    """
-    for _ in range(4):  # to the foot of the perpendicular: the time of the shot has no effect
-        ahead = _on(p, gone, s + _AHEAD_M) - _on(p, gone, s - _AHEAD_M)
-        ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-12)[:, None]
-        s = np.clip(s + ((was - _on(p, gone, s)) * ahead).sum(axis=1), 0.0, gone[-1])
-    s, first = np.unique(s, return_index=True)
-    return s, was[first] - _on(p, gone, s)
+    return cycles
 
 
 def _both_ways(groups: list[list[PathSegment]]) -> tuple[list[list[PathSegment]], list[str]]:
     """Return the two groups of the first circle that is run all around both ways; what is said of further ones."""
-    whole = [g for g in groups if g[0].kind == "circle" and abs(_angle_of(g[0])[-1]) >= _WHOLE_RAD]
+    rounds = [(group, *_round(group[0])) for group in groups if group[0].kind == "circle"]
+    whole = [(group, shape, angle[-1]) for group, shape, angle in rounds if abs(angle[-1]) >= _WHOLE_RAD]
     pairs = [
         (a, b)
-        for a, b in combinations(whole, 2)
-        if _angle_of(a[0])[-1] * _angle_of(b[0])[-1] < 0 and np.abs(_round(a[0]) - _round(b[0])).max() < _SAME_M
+        for (a, shape, angle), (b, other, back) in combinations(whole, 2)
+        if angle * back < 0 and np.abs(shape - other).max() < _SAME_M
     ]
     if not pairs:
         return [], []
@@ -446,83 +361,54 @@ def _both_ways(groups: list[list[PathSegment]]) -> tuple[list[list[PathSegment]]
     return circle, [note + ", ".join(sorted(others))] if others else []
 
 
-def _round(segment: PathSegment) -> Array:
-    """Return what distinguishes one whole circle from another (10,), m: centre, radius, plane axes times radius."""
-    p = segment.reference.Ts_base_tool[:, :3, 3]
+def _round(segment: PathSegment) -> tuple[Array, Array]:
+    """Return a circle's shape (10,), m: centre, radius, axes times radius; and its angle from the start (N,), rad."""
+    p = segment.p_ref
     centre = (p.max(axis=0) + p.min(axis=0)) / 2
-    radius = np.linalg.norm(p - centre, axis=1).mean()
-    return np.concatenate([centre, [radius], radius * _axes(p).ravel()])
-
-
-def _axes(p: Array) -> Array:
-    """Return the axes (2, 3) of the plane of positions (N, 3)."""
-    return plane_axes(np.linalg.svd(p - p.mean(axis=0), full_matrices=False)[2][2])
-
-
-def _angle_of(segment: PathSegment) -> Array:
-    """Return the commanded angle of a circle since its start (N,), rad, counter-clockwise."""
-    p = segment.reference.Ts_base_tool[:, :3, 3]
-    flat = (p - (p.max(axis=0) + p.min(axis=0)) / 2) @ _axes(p).T
+    axes = plane_axes(np.linalg.svd(p - p.mean(axis=0), full_matrices=False)[2][2])
+    radius, flat = np.linalg.norm(p - centre, axis=1).mean(), (p - centre) @ axes.T
     angle = np.unwrap(np.arctan2(flat[:, 1], flat[:, 0]))
-    return np.asarray(angle - angle[0])
+    return np.concatenate([centre, [radius], radius * axes.ravel()]), angle - angle[0]
 
 
 def _circle(group: list[PathSegment], noise: Noise) -> list[Row]:
     """Return a circle's rows: the middle revolution of each cycle, without its start and end."""
     rows = []
     for cycle, segment in enumerate(group, start=1):
-        angle = _angle_of(segment)
+        _, angle = _round(segment)
         there = np.interp(segment.seen.t_s, segment.reference.t_s, angle)
-        way, own = "1" if angle[-1] > 0 else "-1", noise.moving(segment)
-        for k in np.flatnonzero(np.abs(there - angle[-1] / 2) <= np.pi):
-            T = segment.reference.at(segment.seen.t_s[k : k + 1])[0]
-            t_s = float(segment.seen.t_s[k])
-            attained = segment.seen.Ts_base_tool[k]
-            rows.append(
-                Row("circle", f"{np.degrees(there[k]):.2f}", str(cycle), way, t_s, attained, T, own, noise.common)
-            )
+        way, own, common = "1" if angle[-1] > 0 else "-1", noise.moving(segment), noise.common
+        middle = np.flatnonzero(np.abs(there - angle[-1] / 2) <= np.pi)
+        for k, T_ref in zip(middle, segment.reference.at(segment.seen.t_s[middle]), strict=True):
+            T, t_s, at = segment.seen.Ts_base_tool[k], float(segment.seen.t_s[k]), f"{np.degrees(there[k]):.2f}"
+            rows.append(Row("circle", at, str(cycle), way, t_s, T, T_ref, own, common))
     return rows
 
 
 def reversals_of(track: JointTrack, circle: list[PathSegment]) -> list[Reversal]:
-    """Return where joints were commanded to reverse on a circle.
+    """Return where joints were commanded to reverse on a circle; those that reverse at about the same time are one.
 
     Args:
         track: commands of the joints.
         circle: the circle, one cycle of each direction.
     """
-    values = np.column_stack([track.t_s, track.q_ref])
     reversals = []
     for segment in circle:
-        angle = _angle_of(segment)
-        rows = values[(values[:, 0] > segment.reference.t_s[0]) & (values[:, 0] < segment.reference.t_s[-1])]
-        for t_s, reversed_joints in _together(rows):
-            here = float(np.interp(t_s, segment.reference.t_s, angle)) - angle[-1] / 2
-            if abs(here) <= np.pi:
-                reversals.append(
-                    Reversal(
-                        reversed_joints, float(np.sign(angle[-1])), segment.reference.at(np.array([t_s]))[0, :3, 3]
-                    )
-                )
+        reference, (_, angle) = segment.reference, _round(segment)
+        rows = (track.t_s > reference.t_s[0]) & (track.t_s < reference.t_s[-1])
+        t, q_ref = track.t_s[rows], track.q_ref[rows]
+        each = sorted((t_s, k) for k in range(q_ref.shape[1]) for t_s in _reversal_times(t, q_ref[:, k]))
+        together: list[tuple[float, tuple[int, ...]]] = []
+        for t_s, joint in each:
+            if together and t_s - together[-1][0] < _NEAR * float(np.ptp(t)):
+                together[-1] = (together[-1][0], (*together[-1][1], joint + 1))
+            else:
+                together.append((t_s, (joint + 1,)))
+        for t_s, joints in together:
+            if abs(float(np.interp(t_s, reference.t_s, angle)) - angle[-1] / 2) <= np.pi:
+                p = reference.at(np.array([t_s]))[0, :3, 3]
+                reversals.append(Reversal(joints, float(np.sign(angle[-1])), p))
     return reversals
-
-
-def _together(rows: Array) -> list[tuple[float, tuple[int, ...]]]:
-    """Return (time, joints) of every reversal, s; joints that reverse at about the same time are one.
-
-    ``rows``: (N, n + 1) times, s, and commanded joint angles, rad.
-    """
-    each = sorted(
-        (t_s, joint) for joint in range(1, rows.shape[1]) for t_s in _reversal_times(rows[:, 0], rows[:, joint])
-    )
-    near = _NEAR * float(np.ptp(rows[:, 0])) if len(rows) else 0.0
-    found: list[tuple[float, tuple[int, ...]]] = []
-    for t_s, joint in each:
-        if found and t_s - found[-1][0] < near:
-            found[-1] = (found[-1][0], (*found[-1][1], joint))
-        else:
-            found.append((t_s, (joint,)))
-    return found
 
 
 def _reversal_times(t_s: Array, q: Array) -> list[float]:
