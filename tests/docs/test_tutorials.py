@@ -1,6 +1,7 @@
 """The tutorials' commands run in the order in which their pages have them, and make the pictures that they show."""
 
 import contextlib
+import json
 import re
 import shlex
 import sys
@@ -9,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from armsight.app.run import command as run_command
+from armsight.app.run import motion_file
+from armsight.loop.running import calibrate as run_calibrate
 from cli_runs import run
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -41,13 +44,28 @@ def test_every_tutorial_is_run():
     assert listed == {path.stem for path in (DOCS / "tutorials").glob("*.md")} - {"index"}
 
 
+def assert_run_as_devices_are(folder, demo):
+    """Hold a run on the workcell, which is named as devices are, to what is known of devices."""
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["ended_by"] is None
+    assert summary["camera_delay_s"]["value"] == pytest.approx(13e-3, abs=1e-3)
+    assert not (folder / "truth.csv").exists()
+    assert (folder / "report.html").exists()
+    assert (folder / "body.toml").read_text() == (demo / "body.toml").read_text()
+    assert "as planned" in (folder / "run.log").read_text()
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_the_commands_run_and_make_the_pictures(runner, page, monkeypatch):
     monkeypatch.setattr(run_tutorials, "execute", execute)
     monkeypatch.setattr(run_command, "_HANDEYE_POSES", 12)  # 30 take two thirds of a run
+    monkeypatch.setattr(motion_file, "_REST_S", 0.8)
+    monkeypatch.setattr(run_calibrate, "SWEEP_S", 2.0)
     run = [command for block in blocks(page) if block.how != "no" for command in block.commands]
     assert any(command.startswith("armsight ") for command in run)
     folder = runner.run(page)
+    if page == "tutorials/iso9283_test":
+        assert_run_as_devices_are(folder / "run", runner.folder / "shared" / "demo")
     for short, file in pictures(page):
         assert short == folder.name
         assert (folder / file).stat().st_size > 5000, file  # an empty plot of this size would be smaller

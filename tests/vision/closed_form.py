@@ -16,15 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from armsight.data import Array, Record, Side
-from armsight.errors import InputError
-from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import euler_zyx, from_euler_zyx
 from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 
-#: Below this sine of the angle between x_b and z_b, P1, P2 and P3 lie on one line and fix no orientation.
-COLLINEAR_SINE = 1e-6
 #: Beyond this angle, rad, x_b and z_b count as not square: P3 is not equally far from P1 and P2.
 SQUARE_RAD = 1e-9
 
@@ -57,13 +53,6 @@ class VergingRig:
     Z01: float = 0.0
     Z02: float = 0.0
 
-    def __post_init__(self) -> None:
-        """Check the focal lengths and the angles."""
-        if not (self.F1 > 0 and self.F2 > 0):
-            raise InputError(f"focal lengths must be positive lengths in metres, got {self.F1} and {self.F2}")
-        if not (abs(self.beta1) < np.pi / 2 and abs(self.beta2) < np.pi / 2):
-            raise InputError(f"a camera is rotated by less than 90 degrees (in rad), got {self.beta1} and {self.beta2}")
-
     @staticmethod
     def symmetric(F: float, B: float, beta: float = 0.0) -> VergingRig:
         """Return two equal cameras a baseline ``B`` apart (18.9), rotated inward by ``beta`` each; 0 is parallel."""
@@ -77,7 +66,7 @@ def rotation(beta: float) -> Array:
 
 
 def triangulate_verging(rig: VergingRig, u1: ArrayLike, v1: ArrayLike, u2: ArrayLike) -> Array:
-    """Return points (N, 3), m, seen by two verging cameras (18.7, 18.8); NaN where the rays are parallel.
+    """Return points (N, 3), m, seen by two verging cameras (18.7, 18.8).
 
     The two rays meet in the X-Z plane, and Y comes from camera 1 alone: v2 would be redundant.
     """
@@ -89,20 +78,18 @@ def triangulate_verging(rig: VergingRig, u1: ArrayLike, v1: ArrayLike, u2: Array
     n1 = u1 * c1 - F1 * s1  # 18.8
     n2 = u2 * c2 + F2 * s2  # 18.8
     across = m1 * n2 - m2 * n1
-    across = np.where(across == 0.0, np.nan, across)
     Z = (
         m1 * m2 * (X01 + X02) + m1 * F2 * u2 - m2 * F1 * u1 + m1 * n2 * Z02 - m2 * n1 * Z01
     ) / across  # 18.7, corrected
-    X = (u1 * F1 - m1 * X01 - n1 * (Z - Z01)) / np.where(m1 == 0.0, np.nan, m1)  # 18.7
+    X = (u1 * F1 - m1 * X01 - n1 * (Z - Z01)) / m1  # 18.7
     Y = v1 - Y01 - v1 / F1 * ((X + X01) * s1 + (Z - Z01) * c1)  # 18.7, corrected: (X + X01)
     return np.stack([X, Y, Z], axis=-1)
 
 
 def triangulate_parallel(F: float, B: float, u1: ArrayLike, v1: ArrayLike, u2: ArrayLike) -> Array:
-    """Return points (N, 3), m, of two equal parallel cameras (18.10), origin half-way; NaN where there is no disparity."""
+    """Return points (N, 3), m, of two equal parallel cameras (18.10), origin half-way."""
     u1, v1, u2 = (np.atleast_1d(np.asarray(a, dtype=np.float64)) for a in (u1, v1, u2))
-    disparity = np.where(u1 == u2, np.nan, u1 - u2)
-    Z = F - B * F / disparity  # 18.10, corrected: u1 - u2
+    Z = F - B * F / (u1 - u2)  # 18.10, corrected: u1 - u2
     X = (F - Z) * u1 / F - B / 2  # 18.10
     Y = (F - Z) * v1 / F  # 18.10
     return np.stack([X, Y, Z], axis=-1)
@@ -171,16 +158,13 @@ def orientation(P1: ArrayLike, P2: ArrayLike, P3: ArrayLike) -> Orientation:
     perpendicular; x_b, the measured line, is then kept and z_b rotated within the plane of the three points: it runs
     from P3 to the nearest point of the line P1 P2 instead of its middle.
     """
-    p1, p2, p3 = checked(P1, (3,), "P1"), checked(P2, (3,), "P2"), checked(P3, (3,), "P3")
-    x_b = _direction(p2 - p1, "P1 and P2 coincide: they fix no x axis")  # 18.11 to 18.14
-    z_b = _direction(
-        (p1 + p2) / 2 - p3, "P3 lies in the middle between P1 and P2: they fix no z axis"
-    )  # 18.11 to 18.14
+    p1, p2, p3 = (np.asarray(P, dtype=np.float64) for P in (P1, P2, P3))
+    x_b = (p2 - p1) / np.linalg.norm(p2 - p1)  # 18.11 to 18.14
+    z_b = (p1 + p2) / 2 - p3  # 18.11 to 18.14
+    z_b /= np.linalg.norm(z_b)
     cosine = float(x_b @ z_b)
     square = z_b - cosine * x_b
     sine = float(np.linalg.norm(square))
-    if sine < COLLINEAR_SINE:
-        raise InputError("P1, P2 and P3 lie on one line: the rotation about that line is not determined")
     z_b = square / sine
     y_b = np.cross(z_b, x_b)  # 18.11 to 18.14
     R = np.stack([x_b, y_b, z_b], axis=1)  # 18.11 to 18.14
@@ -194,11 +178,3 @@ def rotation_from_angles(phi: float, theta: float, psi: float) -> Array:
     The source names phi roll, theta pitch and psi yaw; ROS's roll is the angle about x.
     """
     return from_euler_zyx(phi, theta, psi)  # 18.15; row 1, column 3 is C_phi S_theta C_psi + S_phi S_psi
-
-
-def _direction(v: Array, problem: str) -> Array:
-    """Return a unit vector, or the problem where there is none."""
-    norm = np.linalg.norm(v)
-    if not norm > 0:
-        raise InputError(problem)
-    return np.asarray(v / norm)

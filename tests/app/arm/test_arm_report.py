@@ -169,7 +169,7 @@ def test_mistakes_are_one_line(armsight, run, tmp_path):
     assert not (tmp_path / "plan.toml").exists()
 
 
-@pytest.mark.parametrize("joints", [4, 7])
+@pytest.mark.parametrize("joints", [4, 5, 6, 7])
 def test_every_joint_of_any_arm_has_its_figure(joints, report, tmp_path):
     several = replace(
         report,
@@ -177,9 +177,10 @@ def test_every_joint_of_any_arm_has_its_figure(joints, report, tmp_path):
         lever=np.tile(report.lever, 2)[:, :joints],
         lag=np.tile(report.lag, 2)[:, :joints],
     )
-    write_report(arm_report.arm_report(several, {}), several, tmp_path)
-    assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
     assert len(arm_report._figure(several, "joints").axes) == joints
+    if joints == 7:
+        write_report(arm_report.arm_report(several, {}), several, tmp_path)
+        assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_what_was_found_is_printed_and_stored_though_it_cannot_be_drawn(run, report, tmp_path, monkeypatch, capsys):

@@ -292,11 +292,7 @@ def test_a_video_is_named_with_what_to_do(armsight, tmp_path):
     assert_rejected(said, "left.mp4", "is a video", "--source video:LEFT,RIGHT")
 
 
-@pytest.mark.parametrize(
-    "spec",
-    ["chessboard", "chessboard:9x6", "chessboard:9x6:25", "chessboard:9:25mm", "chessboard:0x6:25mm", "quilt:9x6:25mm",
-     "chessboard:9x6:-25mm", "chessboard:9x6:nanmm", "", "charuco:9x6:25mm:30mm:DICT_4X4_50"],
-)  # fmt: skip
+@pytest.mark.parametrize("spec", ["chessboard:9x6:25", ""])
 def test_a_bad_board_spec(few, armsight, tmp_path, spec):
     assert_rejected(armsight("calibrate", *images(few), "--target", spec, "-o", tmp_path / "rig.json"))
 

@@ -4,6 +4,7 @@ import csv
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -116,6 +117,7 @@ def broken(tmp_path, monkeypatch, mend):
         def open(cls, **options):
             workcell = super().open(**options | {"processes": False})
             mend(workcell)
+            monkeypatch.setattr(demo, "_calibrated", lambda *given: SimpleNamespace(rig=workcell.truth.rig))
             return workcell
 
     class Here:

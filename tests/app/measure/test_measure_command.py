@@ -1,6 +1,5 @@
 import csv
 import json
-import math
 import os
 import shutil
 import subprocess
@@ -212,9 +211,10 @@ def test_a_shot_that_cannot_be_read_is_missed_and_the_rest_measured(start, arm, 
         assert [row["status"] for row in csv.DictReader(file)] == ["ok", "missed", "ok"]
 
 
-def test_nothing_in_view_is_an_error_after_its_lines(start, rendered, armsight):
-    two = [f"{rendered.folder}/board/{side}00[01].png" for side in ("left", "right")]
-    said = armsight(*start, "--left", two[0], "--right", two[1])
+def test_nothing_in_view_is_an_error_after_its_lines(start, tmp_path, armsight):
+    for name in ("left0", "left1", "right0", "right1"):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((360, 640), 90, np.uint8))
+    said = armsight(*start, *images(tmp_path))
     assert said.code == 2
     assert len(said.out.splitlines()) == 2
     assert all(": missed: " in line for line in said.out.splitlines())
@@ -285,36 +285,10 @@ def test_shots_given_no_way_or_two(start, armsight, options):
     assert_rejected(armsight(*start, *options), "give the shots one way")
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("", "not JSON"),
-        ("{", "not JSON"),
-        ("[1, 2]", "not a rig file"),
-        ('{"format": "other"}', "not a rig file"),
-        ('{"format": "armsight-rig", "version": 1}', "has no 'left'"),
-        (b"\xff\xfe\x00", "not a text file"),
-    ],
-)
-def test_a_damaged_rig(rendered, arm, tmp_path, armsight, text, said):
-    path = tmp_path / "rig.json"
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    assert_rejected(armsight("measure", path, "--target", rendered.plate, *images(arm)), path, said)
-
-
-def test_half_a_rig_and_a_newer_one_and_one_with_nan(rendered, arm, tmp_path, armsight):
+def test_half_a_rig(rendered, arm, tmp_path, armsight):
     path, text = tmp_path / "rig.json", rendered.rig.read_text()
     path.write_text(text[: len(text) // 2])
     assert_rejected(armsight("measure", path, "--target", rendered.plate, *images(arm)), path, "not JSON")
-    document = json.loads(text)
-    path.write_text(json.dumps({**document, "version": 99}))
-    assert_rejected(
-        armsight("measure", path, "--target", rendered.plate, *images(arm)), path, "version 99", "update armsight"
-    )
-    path.write_text(json.dumps({**document, "sigma_px": math.nan}))
-    assert_rejected(armsight("measure", path, "--target", rendered.plate, *images(arm)), path)
-    path.unlink()
-    assert_rejected(armsight("measure", path, "--target", rendered.plate, *images(arm)), path, "no such file")
 
 
 @pytest.mark.parametrize("target", ["", "plate", "nowhere.toml", "nowhere.csv", "chessboard:9x6", "tag:1:2"])
@@ -417,13 +391,7 @@ def test_a_board_of_which_detections_are_given_is_known_to_be_a_print(rendered, 
 @pytest.mark.parametrize(
     ("file", "old", "new", "said"),
     [
-        ("d.csv", "3,left,T0.0,", "3,left,T0.0,nan,1\n3,left,T0.0,", "line 2: u_px is nan"),
-        ("d.csv", "u_px", "u", "no column u_px"),
-        ("d.csv", "3,left,T0.0", "3,middle,T0.0", "line 2: camera 'middle'"),
         ("d.csv", "3,left,T0.0", "3,left,T9.9", "line 2: unknown marker 'T9.9'"),
-        ("plate.csv", "T0.0,", "T0.0,nan,0,0\nT8,", "line 2"),
-        ("plate.csv", "T0.0,-", "T0.0,about ", "line 2"),
-        ("plate.csv", "T0.1,", "T0.0,", "line 3"),
         ("plate.csv", "x_m", "left_m", "line 1"),
     ],
 )
@@ -434,12 +402,6 @@ def test_a_wrong_line_in_a_table(rendered, seen, armsight, file, old, new, said)
     result = armsight(*by_detections(rendered, seen), "-o", seen / "poses.csv")
     assert_rejected(result, seen / file, said)
     assert not (seen / "poses.csv").exists()
-
-
-@pytest.mark.parametrize("text", ["", "shot,camera,marker,u_px,v_px\n"])
-def test_empty_tables(rendered, seen, armsight, text):
-    (seen / "d.csv").write_text(text)
-    assert_rejected(armsight(*by_detections(rendered, seen)), seen / "d.csv")
 
 
 def test_a_bowed_board_is_measured_as_its_calibration_found_it(data_dir, armsight, tmp_path):

@@ -1,4 +1,4 @@
-"""``armsight run`` typed wrong, and on the workcell."""
+"""``armsight run`` typed wrong, and interrupted on the workcell. The whole of it there: docs/test_tutorials.py."""
 
 import json
 import os
@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from armsight.app.progress import steps
-from armsight.app.run import command
-from armsight.loop.running import calibrate as run_calibrate
 from armsight.sim.workcell.workcell import Workcell
 from cli_runs import assert_rejected
 
@@ -36,21 +34,6 @@ def files(tmp_path_factory, host_firmware):
 def arguments(files, output, *more, source="sim:640x360@12", board="emulated:host", rig="rig.json", target="body.toml"):
     named = ("--rig", files / rig, "--target", files / target, "--motion", files / "motion.toml")
     return ("run", "--source", source, "--board", board, *named, "-o", output, *more)
-
-
-def test_the_workcell_by_name_is_run_as_devices_are(armsight, files, tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "_HANDEYE_POSES", 12)
-    monkeypatch.setattr(run_calibrate, "SWEEP_S", 2.0)
-    said = armsight(*arguments(files, tmp_path / "run", "--open-loop", "--json"))
-    assert said.code == 0, said.err
-    assert said.err == ""
-    (summary,) = said.lines
-    assert summary["ended_by"] is None
-    assert summary["camera_delay_s"]["value"] == pytest.approx(13e-3, abs=1e-3)
-    assert not (tmp_path / "run" / "truth.csv").exists()  # no more is known than of devices
-    assert (tmp_path / "run" / "report.html").exists()
-    assert (tmp_path / "run" / "body.toml").read_text() == (files / "body.toml").read_text()
-    assert "as planned" in (tmp_path / "run" / "run.log").read_text()
 
 
 @pytest.mark.parametrize(

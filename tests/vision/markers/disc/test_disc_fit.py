@@ -253,7 +253,7 @@ def test_what_is_no_disc_is_rejected_with_its_reason():
     ring = share([outline(c, 14, 14, 0)], 0.8, np.zeros(2), size) - share([outline(c, 7, 7, 0)], 0.8, np.zeros(2), size)
     shapes = {
         "square": share([square(c, 10, 0.3)], 0.8, np.zeros(2), size),
-        "merged": share(two, 0.8, np.zeros(2), size),
+        "merged": np.minimum(share(two, 0.8, np.zeros(2), size), 1.0),
         "cut": share([cut], 0.8, np.zeros(2), size),
         "bar": share([c + np.array([[21, 4], [21, -4], [-21, -4], [-21, 4]])], 0.8, np.zeros(2), size),
         "ring": ring,
