@@ -34,37 +34,35 @@ def small(xi):
     return expm(np.array([[0, -c, b, x], [c, 0, -a, y], [-b, a, 0, z], [0, 0, 0, 0.0]]))
 
 
-def link_motion(i, theta):
-    """Row i of the table, (N, 4, 4), at (N,) angles."""
-    c, s, z = np.cos(theta), np.sin(theta), np.zeros(len(theta))
-    ca, sa = np.cos(ARM.alpha[i]), np.sin(ARM.alpha[i])
-    rows = [
-        [c, -s * ca, s * sa, ARM.a[i] * c],
-        [s, c * ca, -c * sa, ARM.a[i] * s],
-        [z, z + sa, z + ca, z + ARM.d[i]],
-        [z, z, z, z + 1],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
+def link_motions(theta):
+    """The six rows of the table, (6, N, 4, 4), at angles (N, 6)."""
+    c, s = np.cos(theta).T, np.sin(theta).T
+    a, d, ca, sa = (each[:, None] for each in (ARM.a, ARM.d, np.cos(ARM.alpha), np.sin(ARM.alpha)))
+    T = np.zeros((*c.shape, 4, 4))
+    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2], T[..., 0, 3] = c, -s * ca, s * sa, a * c
+    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2], T[..., 1, 3] = s, c * ca, -c * sa, a * s
+    T[..., 2, 1], T[..., 2, 2], T[..., 2, 3], T[..., 3, 3] = sa, ca, d, 1.0
+    return T
 
 
 def product(q, smalls):
     """The tool's poses (N, 4, 4) at true joint angles (N, 6), with a small motion of each of seven frames."""
     T = np.broadcast_to(smalls[0], (len(q), 4, 4))
-    for i in range(6):
-        T = T @ link_motion(i, ARM.direction[i] * q[:, i] + ARM.offset[i]) @ smalls[i + 1]
+    for moved, fixed in zip(link_motions(ARM.direction * q + ARM.offset), smalls[1:], strict=True):
+        T = T @ moved @ fixed
     return T
 
 
 def loads(q):
     """Gravity torques (N, 6) of unit loads: the mean of the frames beyond each joint, seen from it."""
     frames = [np.broadcast_to(np.eye(4), (len(q), 4, 4))]
-    for i in range(6):
-        frames.append(frames[-1] @ link_motion(i, q[:, i]))
+    for moved in link_motions(q):
+        frames.append(frames[-1] @ moved)
     at = np.array([T[:, :3, 3] for T in frames])
     out = np.empty((len(q), 6))
     for i in range(6):
-        lever = at[i + 1 :].mean(axis=0) - at[i]
-        out[:, i] = np.einsum("nk,nk->n", frames[i][:, :3, 2], np.cross(lever, [0, 0, -1.0]))
+        (x, y, _), axis = (at[i + 1 :].mean(axis=0) - at[i]).T, frames[i][:, :3, 2]
+        out[:, i] = axis[:, 1] * x - axis[:, 0] * y  # axis . (lever x (0, 0, -1))
     return out
 
 
@@ -89,7 +87,7 @@ class TrueArm:
             self.held, self.last = shaft[0].copy(), shaft[0]
         beyond = np.empty_like(shaft)
         for n, q in enumerate(shaft):
-            self.held = np.clip(self.held, q - half, q + half)
+            self.held = np.minimum(np.maximum(self.held, q - half), q + half)
             beyond[n] = self.held - q
         travel = self.travelled + np.cumsum(np.abs(np.diff(shaft, axis=0, prepend=self.last[None])), axis=0)
         self.travelled, self.last = travel[-1], shaft[-1]

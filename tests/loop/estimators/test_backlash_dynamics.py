@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from arm_rig import ARM, MIDDLE, TICK_S, TrueArm, distance_mm, legs, link_motion, rms, run, states
+from arm_rig import ARM, MIDDLE, TICK_S, TrueArm, distance_mm, legs, link_motions, rms, run, states
 
 from armsight.loop.estimators import Delay, KalmanEstimator, Prior
 from armsight.loop.estimators import backlash_dynamics as floating
@@ -18,7 +18,7 @@ def positions(points, q):
     for i in range(6):
         c, s = np.cos(q[i]), np.sin(q[i])
         frames.append(T @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, ARM.d[i]], [0, 0, 0, 1.0]]))
-        T = T @ link_motion(i, q[i : i + 1])[0]
+        T = T @ link_motions(q[None])[i, 0]
     return np.array([(frames[int(p[0])] @ np.append(p[2:], 1.0))[:3] for p in points])
 
 
