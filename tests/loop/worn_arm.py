@@ -40,13 +40,11 @@ class Worn:
         """Gravity torque about every joint, N m, in the sense of its angle."""
         out = np.zeros_like(q)
         for n, angles in enumerate(q):
-            T = self.nominal.links(angles)
-            for i in range(q.shape[1]):
-                z, at = T[i, :3, 2], T[i, :3, 3]
-                force = np.array([0, 0, -GRAVITY])
-                out[n, i] = sum(
-                    m * z @ np.cross(T[j + 1, :3, 3] - at, force) for j, m in enumerate(MASS_KG[: q.shape[1]]) if j >= i
-                )
+            T = self.nominal.links(angles)[: len(angles) + 1]
+            z, at = T[:-1, :3, 2], T[:, :3, 3]
+            lever = at[None, 1:] - at[:-1, None]  # from joint i to the end of link j
+            each = GRAVITY * (z[:, None, 1] * lever[..., 0] - z[:, None, 0] * lever[..., 1])  # z . (lever x (0, 0, -g))
+            out[n] = np.triu(MASS_KG[: len(angles)] * each).sum(axis=1)
         return out
 
     def T_rig_body(self, q, approach):

@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 SAMPLES = 32
 #: Each step of the iteration takes three quarters of the error away at the very least, mostly nine tenths.
 STEPS = 16
+STILL = 1e-12  # a step shorter than this is the last
 
 
 def rays(camera, uv):
@@ -22,8 +23,10 @@ def rays(camera, uv):
         r = np.hypot(u, v)
         theta = r.copy()
         for _ in range(STEPS):
-            t2 = theta * theta
+            t2, last = theta * theta, theta
             theta = r / (1 + t2 * (d[0] + t2 * (d[1] + t2 * (d[2] + t2 * d[3]))))
+            if np.abs(theta - last).max() < STILL:
+                break
         s = np.sin(theta) / np.maximum(r, 1e-12)
         return np.stack([s * u, s * v, np.cos(theta)], axis=1)
     x, y = u.copy(), v.copy()
@@ -31,10 +34,13 @@ def rays(camera, uv):
     for _ in range(STEPS if d.any() else 0):
         r2 = x * x + y * y
         radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        last = x
         x, y = (
             (u - 2 * p1 * x * y - p2 * (r2 + 2 * x * x)) / radial,
             (v - p1 * (r2 + 2 * y * y) - 2 * p2 * x * y) / radial,
         )
+        if np.abs(x - last).max() < STILL:
+            break
     return np.stack([x, y, np.ones_like(x)], axis=1)
 
 
