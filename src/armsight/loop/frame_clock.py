@@ -142,7 +142,7 @@ class FrameClock:
         now_s = self._shifted(stamp_s) - ahead_s
         self.rate = (1.0 + self.rate) * (1.0 - drift) - 1.0
         self._shift_s, self._origin_s = now_s - stamp_s, stamp_s
-        self.stepped = self.stepped or (self._soonest[0][0], 0.0)
+        self.stepped = self.stepped or (float(t_s[-3 if sure else 0]), 0.0)
         self._late.clear()
         self._soonest.clear()
         self._newest_s = -math.inf

@@ -221,6 +221,8 @@ class Moved:
         if self.late is not None:
             late_s = self.late(t_s - AT_S) if t_s >= AT_S else 0.0
             sane_s = self.monitor.stamps.time(t_s + late_s, self.estimator.span_s[1])
+            if self.monitor.stamps_ran:
+                self.monitor.stamps_right()
             if sane_s is None:
                 return None
             measurement = replace(measurement, t_s=sane_s)

@@ -41,3 +41,13 @@ def test_a_camera_that_rotated_is_not_taken_for_time():
     assert (only.cause, only.alternatives) == ("rig", ())
     assert only.size == pytest.approx(0.05, abs=4 * only.sigma)
     assert nees < 12.0
+
+
+def test_a_moved_camera_is_taken_back_once_a_lens_that_breathes_explains_all_tests_better():
+    alarmed = False
+    for monitor, *_ in faults.watched_body(
+        9301, at_s=5.0, seconds=20.0, focal=lambda t: (0.0, 1.5e-3 * np.sin(2 * np.pi * t / 6.0))
+    ):
+        alarmed = alarmed or monitor._rig.alarm
+    assert alarmed
+    assert [each.cause for each in monitor.findings()] == ["lens"]

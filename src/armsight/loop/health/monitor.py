@@ -52,6 +52,7 @@ class HealthMonitor:
         self._rig = RigWatch(rig, body, sync_s, printed=printed) if rig.cov.any() else None
         self._host = HostWatch()
         self.stamps: FrameClock | None = None
+        self._stamps_right = False
         self._landmarks: LandmarkWatch | None = None
         self._fixed: FixedWatch | None = None
         self._closure: ClosureWatch | None = None
@@ -216,6 +217,23 @@ class HealthMonitor:
         self._kept += (*(replace(each, corrected_s=at_s) for each in right), *self._left(correction))
         self._past += tuple(replace(each, until_s=at_s) for each in self.changes)
         self._renew(correction)
+        return self._go_back(since_s)
+
+    @property
+    def stamps_ran(self) -> bool:
+        """Whether stamps were found to have run fast, and what the estimator took of them is not yet taken back."""
+        return self.stamps is not None and self.stamps.rate != 0.0 and not self._stamps_right
+
+    def stamps_right(self) -> Remembered | None:
+        """Go back to before stamps ran fast: what they displaced is taken back; return what the estimator knew then."""
+        assert self.stamps is not None
+        assert self.stamps.stepped is not None
+        self._stamps_right = True
+        self.work()
+        return self._go_back(self.stamps.stepped[0])
+
+    def _go_back(self, since_s: float) -> Remembered | None:
+        """Go on with what the estimator knew before a time, s, and begin its tests anew; return it."""
         self._doubted_s = -np.inf
         if self._estimator is None or self._arm is None:
             return None

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.loop.finding import HealthFinding
-from armsight.loop.health.shape import ResidualSums, eliminated
+from armsight.loop.health.shape import ResidualSums, eliminated, total
 
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
 _APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
@@ -53,6 +53,9 @@ _UNKNOWN_SHARE = 0.2
 TRACK, _LONGEST_S = 5, 1.0
 #: Log-evidence by which a hypothesis must be ahead of all others to be taken; half: chance takes one of 100 tests for it.
 _AHEAD = math.log(1e4)
+#: And by this share of the log-evidence of what stays: its residuals are linear, and those of the test in which it began
+#: are of both times. Half: a camera that rotates by 0.2 deg is a lens that breathes, double: slow breathing is a rotation.
+_MODELLED = 0.05
 #: Hypotheses whose log-evidence is nearer than this are not distinguished: 12 of chi-square.
 _ALIKE = 6.0
 #: Times are another in each shot where their own part is this share of what all have in common at the least.
@@ -64,7 +67,11 @@ _TIMES = [0, 7, 8, 9]
 #: An acceleration moves the body like so many seconds of it, where times are of a second.
 _BENT_S = 0.1
 #: Standard deviation of the focal length of a test, as a share: so wide that it decides nothing beside the column's own.
-_FOCAL = 0.05
+#: It stands so many rows after the parameters; against what stays its variance is this share of that.
+_FOCAL, _FOCAL_ROW, _FOCAL_VARIANCE = 0.05, 7, 0.01
+#: So many newest doubtful tests are explained together; half: slow breathing is taken for a change that stays, double: more
+#: time and memory.
+TOGETHER = 12
 #: Standard deviations of coefficients that are tried, px; 0 is none.
 _TAU_PX = np.array([0.0, *(1e-3 * 2.0**k for k in range(7))])
 #: Before anything is seen none is so much more probable than any other; half: fine noise counts as it, double: what some
@@ -74,6 +81,12 @@ _NONE = 30.0
 _ODD = 0.02
 #: So many residuals of unit variance are assumed before those of a test; half: tests of few poses scatter more.
 _USUAL = 30.0
+
+
+Passes = Literal["time", "lens"]
+_PASSES: tuple[Passes, ...] = ("time", "lens")
+#: Returns the log-evidence of what stays, of sums and a variance of the noise, and whether with a skew; 0 of nothing.
+Staying = Callable[[ResidualSums, float, bool], float]
 
 
 def velocity(before: Array, after: Array, seconds: float) -> Array:
@@ -167,16 +180,15 @@ def _normal(shots: Sequence[tuple[Array, Array, float]]) -> tuple[Array, Array, 
     return W, b, weights
 
 
-def apart(shots: Sequence[tuple[Array, Array, float]]) -> Apart | None:
-    """Return the times of exposure that explain residuals (n,) of shots best; None where none do.
+def apart(shots: Sequence[tuple[Array, Array, float]]) -> Apart:
+    """Return the times of exposure that explain residuals (n,) of shots best.
 
     Args:
         shots: residuals, what times of exposure do to them (n, 10), and weights.
     """
     W, b, weights = _normal(shots)
     found = [_apart(each, W, b, weights) for each in _APART_S]
-    best = max(found, key=lambda each: each.gained - each.occam)
-    return best if best.gained > best.occam else None
+    return max(found, key=lambda each: each.gained - each.occam)
 
 
 def nodding(shots: Sequence[tuple[Array, Array, float]]) -> float:
@@ -209,8 +221,8 @@ def _apart(apart_s: float, W: Array, b: Array, weights: Array) -> Apart:
     return Apart(apart_s, rms_s, gained, occam, shared_s, information)
 
 
-def eliminate(found: Apart, shots: Sequence[tuple[Array, Array, float]], sums: ResidualSums) -> None:
-    """Take what times of exposure explain out of sums.
+def eliminate(found: Apart, shots: Sequence[tuple[Array, Array, float]], sums: ResidualSums) -> Array:
+    """Take what times of exposure explain out of sums; return the right sides (4, 1 + K) of the times that all shots share.
 
     Args:
         found: they.
@@ -225,6 +237,139 @@ def eliminate(found: Apart, shots: Sequence[tuple[Array, Array, float]], sums: R
         sums.M -= weight * found.apart_s**2 * (G.T @ left)
         sums.freedom -= weight * (len(K) - float(np.trace(np.linalg.inv(K))))
     sums.M -= shared.T @ np.linalg.solve(found.information, shared)
+    return shared
+
+
+class _Rest(NamedTuple):
+    """A test's sums with what passes eliminated, what that explains of the sum of squares, and by chance.
+
+    The latter is twice a logarithm, and does not count times that all shots share.
+    """
+
+    sums: ResidualSums
+    gained: float
+    occam: float
+
+    def shows(self, excess: float) -> bool:
+        """Return whether it explains more than chance, of a noise whose variance is so many times larger."""
+        return self.gained / excess > self.occam
+
+
+class Times(NamedTuple):
+    """Times of exposure of a test, the right sides (4, 1 + K) of those that all shots share, and its sums without them."""
+
+    found: Apart
+    shared: Array
+    rest: ResidualSums
+
+
+@dataclass(frozen=True)
+class _Doubtful:
+    """A test that something other than chance explains.
+
+    Attributes:
+        every: its sums.
+        rests: these with what passes eliminated.
+        times: of exposure; None where those are not known.
+        focal_share: the focal length's change in it, as a share, everything else right.
+        counted: what passes, as it was counted last; None where that is what stays.
+    """
+
+    every: ResidualSums
+    rests: dict[Passes, _Rest]
+    times: Times | None
+    focal_share: float
+    counted: Passes | None = None
+
+    @classmethod
+    def of(cls, every: ResidualSums, size: int, times: Times | None) -> _Doubtful:
+        """Return a test; ``size``: how many parameters there are, which are eliminated."""
+        M, row, cost = eliminated(every.M, slice(1, 1 + size)), 1 + _FOCAL_ROW, _left(every, size)
+        focal = every.without(size + _FOCAL_ROW, _FOCAL_VARIANCE)
+        occam = math.log1p(_FOCAL_VARIANCE * float(M[row, row]))
+        rests: dict[Passes, _Rest] = {"lens": _Rest(focal, cost - _left(focal, size), occam)}
+        if times is not None:
+            occam = times.found.occam - _occam(times.found.information)
+            rests["time"] = _Rest(times.rest, cost - _left(times.rest, size), occam)
+        return cls(every, rests, times, _FOCAL * float(M[0, row] / (M[row, row] + 1.0)))
+
+    def shows(self, cause: Passes | None, excess: float) -> bool:
+        """Return whether a cause explains more than chance, of a noise whose variance is so many times larger."""
+        return cause in self.rests and self.rests[cause].shows(excess)
+
+
+def _occam(information: Array) -> float:
+    """Return twice the logarithm of what chance explains with times that shots share, of information (4, 4)."""
+    return float(np.linalg.slogdet(_SHARED_S**2 * information)[1])
+
+
+def _without(tests: Sequence[_Doubtful], cause: Passes, excess: float) -> tuple[ResidualSums, float]:
+    """Return the sums of tests with a cause eliminated, and twice the logarithm of what chance explains with it.
+
+    A focal length is another in each test, the times that shots share are the same in all: what differs, shots have of
+    their own.
+    """
+    some = [each.shows(cause, excess) for each in tests]
+    sums = total([each.rests[cause].sums if shows else each.every for each, shows in zip(tests, some, strict=True)])
+    occam = sum(each.rests[cause].occam for each, shows in zip(tests, some, strict=True) if shows)
+    times = [each.times for each, shows in zip(tests, some, strict=True) if shows and each.times is not None]
+    if cause == "lens" or not times:
+        return sums, occam
+    for each in times:
+        sums.M += each.shared.T @ np.linalg.solve(each.found.information, each.shared)
+    prior = np.eye(len(_TIMES)) / _SHARED_S**2
+    information = prior + np.sum([each.found.information - prior for each in times], axis=0)
+    shared = np.sum([each.shared for each in times], axis=0)
+    sums.M -= shared.T @ np.linalg.solve(information, shared)
+    return sums, occam + _occam(information)
+
+
+class _Weighed(NamedTuple):
+    """What doubtful tests say, all together.
+
+    Attributes:
+        excess: the variance of their noise, over what is expected.
+        stays: log-evidence of what stays.
+        explained: of each cause that passes, its log-evidence alone.
+        ahead: by how much it explains more than what stays does, which may have happened besides.
+    """
+
+    excess: float
+    stays: float
+    explained: dict[Passes, float]
+    ahead: dict[Passes, float]
+
+    @classmethod
+    def of(cls, tests: Sequence[_Doubtful], stays: Staying, size: int) -> _Weighed:
+        """Weigh tests; ``size``: how many parameters there are."""
+        none = total([each.every for each in tests])
+        lefts = [_left(each, len(each.b)) for each in (none, *(_without(tests, cause, 1.0)[0] for cause in _PASSES))]
+        excess, of_none = max(min(lefts) / max(none.freedom, 1.0), 1.0), _left(none, size)
+        explained, ahead = dict[Passes, float](), dict[Passes, float]()
+        for cause in _PASSES:
+            sums, occam = _without(tests, cause, excess)
+            explained[cause] = 0.5 * ((of_none - _left(sums, size)) / excess - occam)
+            skewed = cause != "time"  # cameras that are apart by the same time always are no rival of times
+            ahead[cause] = explained[cause] + stays(sums, excess, skewed) - stays(none, excess, skewed)
+        return cls(excess, stays(none, excess, True), explained, ahead)
+
+    def best(self, shown: Passes | None, *, one: bool) -> Passes | None:
+        """Return what passes that explains most; None where it is what stays.
+
+        Args:
+            shown: what the test before showed: it goes on, more likely than that it ended and something else began.
+            one: whether it is one test. A focal length is one of what stays, too: then it need not be ahead of itself, but
+                explain all alone.
+        """
+        best = max(_PASSES, key=self.ahead.__getitem__)
+        goes_on = shown == best or (best == "lens" and one and self.explained[best] > self.stays)
+        least = -_AHEAD if goes_on else _AHEAD + _MODELLED * self.stays
+        return best if self.explained[best] > _AHEAD and self.ahead[best] > least else None
+
+
+def _left(sums: ResidualSums, size: int) -> float:
+    """Return the sum of squares that the first parameters leave."""
+    return float(eliminated(sums.M[: 1 + size, : 1 + size], slice(1, 1 + size))[0, 0])
 
 
 @dataclass
@@ -232,18 +377,20 @@ class Passing:
     """What was found that changes and does not stay; one of a watch.
 
     Attributes:
-        apart: of the tests in which the exposures were apart, since when, s.
-        focal: the changes of one focal length against the other of the tests in which that explained most, since when, s.
+        apart: of the tests in which the exposures were apart, when each began, s, and how.
+        focal: of those in which one focal length against the other explained most, when each began, s, and its change.
         apart_s: standard deviation of the times in the newest test, those that its shots share included, s.
         focal_share: the focal length's change in it.
         unsure: causes that explained the newest doubtful test nearly as well as what was taken.
     """
 
-    apart: tuple[float, tuple[Apart, ...]] = (math.inf, ())
-    focal: tuple[float, tuple[float, ...]] = (math.inf, ())
+    apart: tuple[tuple[float, Apart], ...] = ()
+    focal: tuple[tuple[float, float], ...] = ()
     apart_s: float = 0.0
     focal_share: float = 0.0
-    unsure: tuple[str, ...] = field(default=())
+    unsure: tuple[str, ...] = ()
+    _doubtful: list[_Doubtful] = field(default_factory=list)
+    _counted: Passes | None = None
 
     @property
     def now(self) -> bool:
@@ -251,58 +398,50 @@ class Passing:
         return self.apart_s > 0.0 or self.focal_share != 0.0
 
     def decide(
-        self,
-        every: ResidualSums,
-        evidence: Callable[[ResidualSums, float], tuple[float, float]],
-        size: int,
-        found: Apart | None,
-        sums: ResidualSums | None,
-    ) -> Literal["time", "lens"] | None:
-        """Decide what explains a test best, and return it: None where it is something that stays.
+        self, every: ResidualSums, stays: Staying, size: int, times: Times | None
+    ) -> tuple[Passes | None, tuple[float, ...]]:
+        """Decide what explains the doubtful tests best, all together: what stays has one value in them, what passes many.
+
+        What was decided of earlier ones of them is taken back where another cause explains all of them better.
 
         Args:
-            every: the sums of the test: parameters, seven numbers, candidates, the first of which is a focal length.
-            evidence: returns the log-evidence of what stays, and of the focal length, of sums and a variance of the noise.
+            every: the sums of the newest: parameters, seven numbers, candidates, the first of which is a focal length.
+            stays: see :data:`Staying`.
             size: K, how many parameters there are.
-            found: times of exposure that explain it.
-            sums: those with these eliminated.
+            times: of exposure that explain it; None without.
+
+        Returns:
+            What explains the newest test, None where it is something that stays; and when those tests began, s, that were
+            counted for something else, and are taken back.
         """
-        # What the test before showed goes on, more likely than that it ended and something else began.
-        by_lens, by_apart = (-_AHEAD if shown else 0.0 for shown in (self.focal_share, self.apart_s))
-        self.apart_s = self.focal_share = 0.0
-        cost = float(eliminated(every.M[: 1 + size, : 1 + size], slice(1, 1 + size))[0, 0])
-        M = eliminated(every.M, slice(1, 1 + size))
-        all_explain = (
-            cost - float(M[0, 0]) + float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0]))
+        tests = [*self._doubtful[1 - TOGETHER :], _Doubtful.of(every, size, times)]
+        weighed = _Weighed.of(tests, stays, size)
+        cause = self._counted = weighed.best(self._counted, one=len(tests) == 1)
+        near = (each for each, log in weighed.explained.items() if log > max(_AHEAD, weighed.stays - _ALIKE))
+        self.unsure = tuple(near) if cause is None else ()
+        self._doubtful = [replace(each, counted=cause if each.shows(cause, weighed.excess) else None) for each in tests]
+        self._list(self._doubtful)
+        changed = (
+            now.every.begin_s
+            for before, now in zip(tests[:-1], self._doubtful, strict=False)
+            if now.counted not in (None, before.counted)
         )
-        by_time, left = 0.0, cost - all_explain
-        if found is not None and sums is not None:
-            by_time = cost - float(eliminated(sums.M[: 1 + size, : 1 + size], slice(1, 1 + size))[0, 0])
-            left = min(left, cost - by_time)
-        excess = max(left / max(every.freedom, 1.0), 1.0)
-        stays, lens = evidence(every, excess)
-        time = alone = -math.inf
-        if found is not None and sums is not None:  # what stays may have happened besides
-            alone = 0.5 * (by_time / excess - found.occam)
-            time = alone + max(evidence(sums, excess)[0], 0.0)
-        first = max(time, lens)
-        self.unsure = tuple(
-            cause
-            for cause, each in (("time", alone), ("lens", lens))
-            if each > max(stays - _ALIKE, _AHEAD) and each <= stays
-        )
-        # A focal length is one of what stays, too: it need not be ahead of itself.
-        if first < _AHEAD or (time < stays + (by_apart or _AHEAD) if time >= lens else lens < stays + by_lens - 1e-9):
-            return None
-        if time >= lens:
-            assert found is not None
-            self.apart_s = math.hypot(found.apart_s, float(np.linalg.norm(found.shared_s[:3])))
-            self.apart = min(self.apart[0], every.begin_s), (*self.apart[1], found)
-            return "time"
-        M = eliminated(every.M, slice(1, 1 + size))
-        self.focal_share = _FOCAL * float(M[0, 8] / (M[8, 8] + 1.0))
-        self.focal = min(self.focal[0], every.begin_s), (*self.focal[1], self.focal_share)
-        return "lens"
+        return self._doubtful[-1].counted, tuple(changed)
+
+    def _list(self, tests: Sequence[_Doubtful]) -> None:
+        """Take over what the doubtful tests show now; those that are no more among them stay as they were."""
+        first_s = tests[0].every.begin_s
+        apart = [*(each for each in self.apart if each[0] < first_s)]
+        focal = [*(each for each in self.focal if each[0] < first_s)]
+        for each in tests:
+            if each.counted == "time" and each.times is not None:
+                apart.append((each.every.begin_s, each.times.found))
+            elif each.counted == "lens":
+                focal.append((each.every.begin_s, each.focal_share))
+        self.apart, self.focal, newest = tuple(apart), tuple(focal), tests[-1]
+        found = newest.times.found if newest.counted == "time" and newest.times is not None else None
+        self.apart_s = 0.0 if found is None else math.hypot(found.apart_s, float(np.linalg.norm(found.shared_s[:3])))
+        self.focal_share = newest.focal_share if newest.counted == "lens" else 0.0
 
     def added(self, exposed: ExposedShot, by_focal: Array) -> Array:
         """Return the covariance (6, 6) of a pose by what is passing now.
@@ -316,27 +455,30 @@ class Passing:
             by = self.apart_s * exposed.response()
             added += by @ by.T
         if self.focal_share:
-            spread = math.sqrt(float(np.mean(np.square(self.focal[1]))))
+            spread = math.sqrt(float(np.mean(np.square([share for _, share in self.focal]))))
             added += (spread / _FOCAL) ** 2 * np.outer(by_focal, by_focal)
         return added
 
     def among(self, stays: tuple[HealthFinding, ...], *, timed: bool) -> tuple[HealthFinding, ...]:
         """Return what was found, with findings of what stays: of one cause once; what explains it as well is named."""
-        times, focals = len(self.apart[1]), len(self.focal[1])
+        times, focals = len(self.apart), len(self.focal)
         if max(times, focals) < _LEAST:
-            unsure = [each for each in ("time", "lens") if each in self.unsure]
-            return tuple(_besides(each, unsure) if each.cause in ("rig", "body") else each for each in stays)
+            return tuple(_besides(each, self.unsure) if each.cause in ("rig", "body") else each for each in stays)
         found = self._time_finding(timed=timed) if times >= focals else self._lens_finding(timed=timed)
-        if focals > times:  # one that stays is sized better
-            found = next((each for each in stays if each.cause == "lens"), found)
-        # What is left of it looks like what stays: that cannot be excluded.
-        before = [each for each in stays if found.since_s and each.since_s and each.since_s < found.since_s - 1.0]
-        others = [each.cause for each in stays if each not in before]
-        return (*before, _besides(found, [*others, *(("lens",) if 0 < focals <= times else ())]))
+        same = [each for each in stays if each.cause == found.cause]
+        if found.cause == "lens":  # one that stays is sized better
+            found = next(iter(same), found)
+        begins = [each.since_s for each in (found, *same) if each.since_s is not None]
+        since_s = min(begins, default=0.0)
+        # What is left of it looks like what stays: that cannot be excluded, but what was found before.
+        others = [each for each in stays if each not in same]
+        before = [each for each in others if begins and each.since_s is not None and each.since_s < since_s - 1.0]
+        causes = [*(each.cause for each in others if each not in before), *(("lens",) if focals else ())]
+        return (*before, _besides(replace(found, since_s=since_s if begins else None), causes))
 
     def _time_finding(self, *, timed: bool) -> HealthFinding:
         """Return the finding of exposures that are apart."""
-        since_s, tests = self.apart
+        since_s, tests = self.apart[0][0], [each for _, each in self.apart]
         information = np.sum([each.information for each in tests], axis=0)
         mean_s = np.linalg.solve(information, np.sum([each.information @ each.shared_s for each in tests], axis=0))
         sigmas_s = np.sqrt(np.diag(np.linalg.inv(information)))
@@ -376,7 +518,7 @@ class Passing:
 
     def _lens_finding(self, *, timed: bool) -> HealthFinding:
         """Return the finding of a focal length that changes."""
-        since_s, shares = self.focal
+        since_s, shares = self.focal[0][0], [share for _, share in self.focal]
         size = 100.0 * math.sqrt(float(np.mean(np.square(shares))))
         what = f"the focal length of one camera changes against that of the other by {size:.3f} % (RMS), within seconds"
         return HealthFinding(

@@ -48,11 +48,13 @@ from armsight.kernels import kernel
 from armsight.loop.finding import COSTS_M, LEVER_M, HealthFinding, alarm_limit
 from armsight.loop.health.fixed import Unrest
 from armsight.loop.health.passing import (
+    TOGETHER,
     TRACK,
     Apart,
     ExposedShot,
     Leftover,
     Passing,
+    Times,
     apart,
     eliminate,
     nodding,
@@ -280,6 +282,7 @@ class RigWatch:
         self._stays: list[list[_ShotResiduals]] = []
         self._window = ResidualSums(self._size + len(_WIDE), 0.0)
         self._whole, self._leftover = ResidualSums(self._with_lens.shape[1], 0.0), Leftover()
+        self._wholes: deque[ResidualSums] = deque(maxlen=TOGETHER)  # of the newest tests
         self._counted: list[Array] = []  # log-evidences of the newest tests, which the former is given later
         self.lens: LensError | None = None
         self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
@@ -339,6 +342,8 @@ class RigWatch:
 
         Either camera may be the one; by a rotation of the left one, in whose frame poses are, the body moves as well.
         """
+        if not self._unrest.cov.any():
+            return np.zeros((6, 6))
         by_rotation = response[:, : self._size] @ self._to_and_fro[:, :3]
         by_focal = response[:, : self._size] @ self._alone
         by_right = np.column_stack([by_rotation, by_focal[:, 0]])
@@ -610,7 +615,8 @@ class RigWatch:
     def _keep(self, newest: _Newest, change: RigChange, alarm: bool) -> None:
         """Keep the newest test, and what it says of the rig."""
         if len(self._history) < _KEPT:
-            self._whole.add(newest.whole.over(newest.noise), 1.0)
+            self._wholes.append(newest.whole.over(newest.noise))
+            self._whole.add(self._wholes[-1], 1.0)
         self._plain.append(newest.whole.of(len(newest.test.b)).over(newest.noise))
         self._history.append(newest.test)
         self._alarms = self._alarms + 1 if alarm else 0
@@ -629,14 +635,13 @@ class RigWatch:
         change = self._estimated(self._window)
         if not self.passing.now and change.chi_square <= _SUSPECTED:
             return newest, change
-        passes, own = self._passes(stays, every.of(len(every.b) - _LENS))
-        if passes is None:
-            return newest, change
         self._window.add(newest.test, -1.0)
+        passes, own = self._passes(stays, every)
         if passes == "time":
             whole, every = self._sums_of(stays, own)
-        rest = whole.without(self._size + len(_WIDE)) if passes == "lens" else whole
-        newest = self._without_lens(stays, whole, every, rest, own if passes == "time" else None)
+        if passes is not None:
+            rest = whole.without(self._size + len(_WIDE)) if passes == "lens" else whole
+            newest = self._without_lens(stays, whole, every, rest, own if passes == "time" else None)
         self._window.add(newest.test, 1.0)
         return newest, self._estimated(self._window)
 
@@ -704,10 +709,44 @@ class RigWatch:
             parts = self._weighed_parts(stays, every=False)
             found = apart([(rows[:, 0], moved, weight) for rows, moved, weight in parts])
             nods = nodding([(rows[:, 0], self._moving(rows), weight) for rows, _, weight in parts])
-            if found is not None and nods > found.gained - found.occam:
+            if found.apart_s > 0.0 and nods > found.gained - found.occam:
                 found = None
-        sums = None if found is None else self._in_units(stays, own=found).of(len(every.b))
-        return self.passing.decide(every, self._shape.evidence, self._size, found, sums), found
+        times = None
+        if found is not None:
+            sums = self._summed(stays)
+            shared = eliminate(found, parts, sums)
+            shared = np.hstack([shared[:, :1], shared[:, 1:] @ self._with_lens])
+            times = Times(found, shared, sums.by(self._with_lens))
+        cause, taken_back = self.passing.decide(every, self._staying, self._size, times)
+        if taken_back:
+            self._take_back(taken_back)
+        return cause, found
+
+    def _staying(self, sums: ResidualSums, excess: float, skewed: bool) -> float:
+        """Return the log-evidence of what stays: cameras, body, or what the camera models lack; 0 where nothing does."""
+        M = np.delete(np.delete(sums.M, rows := slice(1 + self._size, len(sums.M) - _LENS), axis=0), rows, axis=1)
+        M = eliminated(M, slice(1, 1 + self._size)) / excess
+        values, V = np.linalg.eigh(M[1:, 1:])
+        variances = np.square(_LENS_SCALES_PX)[:, None]
+        ratio = 1.0 + variances * np.maximum(values, 0.0)
+        lens = 0.5 * (variances * np.square(V.T @ M[1:, 0]) / ratio - np.log(ratio)).sum(axis=1)
+        return max(self._shape.evidence(sums.of(len(sums.b) - _LENS), excess, skewed), float(lens.max()))
+
+    def _take_back(self, begins: Sequence[float]) -> None:
+        """Take back what was found since tests, by when they began, s, which something explains that passes."""
+        self._history, self._plain = (
+            deque((each for each in tests if each.begin_s not in begins), _KEPT)
+            for tests in (self._history, self._plain)
+        )
+        self._window.scale(0.0)
+        for age, test in enumerate(reversed(self._history)):
+            self._window.add(test, float(np.exp(-age / FORGET_TESTS)))
+        for each in [each for each in self._wholes if each.begin_s in begins]:
+            self._whole.add(each, -1.0)
+            self._wholes.remove(each)
+        self._shape.forget(begins)
+        self._alarms, self.alarm, self.alarmed = 0, False, False
+        self.suspected = self._doubted = self.lens = None
 
     def _in_priors(self, sums: ResidualSums) -> ResidualSums:
         """Return sums of the parameters and the seven numbers, in units of their priors, from those of the parameters."""
@@ -914,7 +953,7 @@ class RigWatch:
         copied = copy(self)
         copied._history, copied._plain, copied._shape = self._history.copy(), self._plain.copy(), self._shape.copied()
         copied._stays, copied.passing = [stay.copy() for stay in self._stays], copy(self.passing)
-        copied._unrest = self._unrest.copied()
+        copied._unrest, copied._wholes = self._unrest.copied(), self._wholes.copy()
         return copied
 
     def _ended(self) -> RigWatch:

@@ -143,10 +143,10 @@ class ResidualSums:
         found.M /= variance
         return found
 
-    def without(self, row: int) -> ResidualSums:
-        """Return these with a parameter eliminated, which has a prior of variance 1; its row is of no use."""
+    def without(self, row: int, variance: float = 1.0) -> ResidualSums:
+        """Return these with a parameter eliminated, which has a prior of a variance; its row is of no use."""
         rest, column = self.of(len(self.b)), self.M[1 + row]
-        rest.M -= np.outer(column, column) / (1.0 + column[1 + row])
+        rest.M -= np.outer(column, column) * (variance / (1.0 + variance * column[1 + row]))
         return rest
 
     def less(self, other: ResidualSums) -> ResidualSums:
@@ -247,10 +247,6 @@ class _Hypotheses(NamedTuple):
     chance: float = _RARE
 
 
-#: One focal length that changed against the other, by little or much.
-_FOCAL_ALONE = _Hypotheses(np.array([[7], [7], [7]]), np.array([1.0, 0.1, 0.01]))
-
-
 class _Explained(NamedTuple):
     """Log-evidence (N,) of hypotheses against none, the sizes (N, D) of what changed, and their covariances (N, D, D)."""
 
@@ -260,11 +256,10 @@ class _Explained(NamedTuple):
 
 
 class _ShapeTest(NamedTuple):
-    """The sums of one test, of its usual shots, what all say alone, and the directions from which it saw the body."""
+    """The sums of one test, of its usual shots, and the directions from which it saw the body."""
 
     sums: ResidualSums
     usual: ResidualSums
-    alone: _Reduced
     views: list[Array]
 
 
@@ -323,8 +318,8 @@ class ShapeWatch:
         every = 1 + K + 7 + 2 + 3 * n
         # Of older tests, of all shots and of the usual ones; of those before what is suspected to have changed.
         self._settled = ResidualSums(every - 1, 0.0), ResidualSums(every - 1, 0.0)
-        # Of both, what was settled and the tests before each one that is kept, all of them last.
-        self._running: tuple[list[ResidualSums], list[ResidualSums]] = [], []
+        self._all = ResidualSums(every - 1, 0.0), ResidualSums(every - 1, 0.0)  # of both, with the tests that are kept
+        self._tests = 0
         self._shots: deque[Array] = deque(maxlen=_ASKED)  # rows, as they were taken
         # The response of the newest poses to the parameters, and the covariances of these poses.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
@@ -363,36 +358,48 @@ class ShapeWatch:
             usual: the same without the shots that fit worst.
             ends: whether it ends all.
         """
-        # The test before the first one after a change is of both times.
-        if len(self._history) == _KEPT and (self._changed_s is None or self._history[1].sums.begin_s < self._changed_s):
-            oldest = self._history[0]
-            self._settled = _settled(self._settled[0], oldest.sums), _settled(self._settled[1], oldest.usual)
-        self._history.append(_ShapeTest(sums, usual, self._reduced(sums), self._views))
+        self._keep(_ShapeTest(sums, usual, self._views))
         self._views = []
         tests, before = list(self._history), self._suspect
-        self._running = (
-            _running(self._settled[0], [each.sums for each in tests]),
-            _running(self._settled[1], [each.usual for each in tests]),
-        )
-        self._suspect = self._suspected(tests, before)
+        doubted_s, self.doubt = self._doubted(every=ends or self.doubt is not None)
+        # What is not doubtful is not certain.
+        self._suspect = None if before is None and self.doubt is None else self._suspected(tests, before)
         self._alarms = 0 if self._suspect is None else self._alarms + 1
         # What a change leaves in the test in which it began may look like a displaced point, once.
         again = before is not None and before.is_of(self._suspect)
         self.found = self._suspect if again or (ends and len(tests) == 1) else None
         self.said = self.found or self.said
-        doubted_s, self.doubt = self._doubted()
         if self.found is not None:
+            _, self.doubt = self._doubted(every=True)
             self._changed_s = self.found.begin_s
         elif self.doubt is None:
             self._changed_s = None
         elif self._changed_s is None:
             self._changed_s = doubted_s
 
+    def _keep(self, newest: _ShapeTest) -> None:
+        """Keep a test; the oldest one settles, but where it is of the time after a change.
+
+        The test before the first one after a change is of both times.
+        """
+        if len(self._history) == _KEPT and (self._changed_s is None or self._history[1].sums.begin_s < self._changed_s):
+            oldest, keep = self._history[0], float(np.exp(-1.0 / _SETTLED))
+            for settled, every, test in zip(self._settled, self._all, (oldest.sums, oldest.usual), strict=True):
+                every.add(settled, keep - 1.0)
+                settled.scale(keep)
+                settled.add(test, 1.0)
+        elif len(self._history) == _KEPT:
+            for every, test in zip(self._all, (self._history[0].sums, self._history[0].usual), strict=True):
+                every.add(test, -1.0)
+        self._history.append(newest)
+        self._tests += 1
+        for every, test in zip(self._all, (newest.sums, newest.usual), strict=True):
+            every.add(test, 1.0)
+
     def _suspected(self, tests: list[_ShapeTest], before: ShapeError | None) -> ShapeError | None:
         """Return what the tests show now, since when; ``before`` is what they showed last time."""
         if before is None:
-            counts = (1, len(tests)) if self.doubt is None else (*self._counts(), 1)
-            shown = next(filter(None, (self._shown(len(tests) - count) for count in counts)), None)
+            shown = next(filter(None, (self._shown(len(tests) - count) for count in self._counts(every=True))), None)
         else:
             later = sum(each.sums.begin_s >= before.begin_s for each in tests)
             shown = self._shown(len(tests) - max(later, 1))
@@ -402,29 +409,35 @@ class ShapeWatch:
             return replace(shown, begin_s=before.begin_s)  # though the tests of that time are no longer kept
         return shown
 
-    def _counts(self) -> tuple[int, ...]:
-        """Return how many newest tests may be those after a change."""
+    def _counts(self, *, every: bool) -> tuple[int, ...]:
+        """Return how many newest tests may be those after a change.
+
+        Unless ``every``, those that begin with this test anew: as many windows as tests are looked at twice.
+        """
         tests = len(self._history)
-        return (*(count for count in _AFTER if count < tests), tests)
+        counts = (*(count for count in _AFTER if count < tests), tests)
+        return tuple(count for count in counts if every or self._tests % min(count, _AFTER[2]) == 0)
 
     def _since(self, begin: int, *, usual: bool = False) -> ResidualSums:
         """Return the sums of the tests from one on, with what those before it say of what does not change.
 
         The test before may be of both times: it is left out.
         """
-        running = self._running[usual]
-        after = running[-1].less(running[begin])
-        after.begin_s = self._history[begin].sums.begin_s
-        return after.besides(running[max(begin - 1, 0)], self._size)
+        tests = [each.usual if usual else each.sums for each in self._history]
+        after = total(tests[begin:])
+        before = self._all[usual].less(after)
+        if begin:
+            before.add(tests[begin - 1], -1.0)
+        return after.besides(before, self._size)
 
-    def _doubted(self) -> tuple[float, Array | None]:
+    def _doubted(self, *, every: bool) -> tuple[float, Array | None]:
         """Return since when something may have changed, s, and its second moment (7 + C, 7 + C).
 
         None where nothing did, more probably.
         """
         tests = len(self._history)
         if self.found is None:
-            sums = [self._since(tests - count, usual=True) for count in self._counts()]
+            sums = [self._since(tests - count, usual=True) for count in self._counts(every=every)]
             mixtures = [self._mixture(each, self._hypotheses) for each in sums]
             best = max(range(len(sums)), key=lambda n: mixtures[n][0])
             evidence, moment = mixtures[best]
@@ -436,14 +449,27 @@ class ShapeWatch:
         sums_since = self._since(tests - max(later, 1), usual=True)
         return self.found.begin_s, self._mixture(sums_since, self._hypotheses[:1])[1]
 
-    def evidence(self, sums: ResidualSums, excess: float) -> tuple[float, float]:
-        """Return the log-evidence of the best hypothesis of what changed and stays in sums of one test, against none.
+    def evidence(self, sums: ResidualSums, excess: float, skewed: bool) -> float:
+        """Return the log-evidence of the best hypothesis of what changed and stays, against none: 0 where none does.
 
-        And that of one focal length that changed, with a noise whose variance is so many times larger.
+        Of sums whose noise has a variance so many times larger; ``skewed``: with a skew among the seven numbers.
         """
         M = self._with_smooth.T @ eliminated(sums.M, slice(1, 1 + self._size)) @ self._with_smooth
-        every = [_explained(M, each, excess).evidence for each in (*self._hypotheses, _FOCAL_ALONE)]
-        return max(float(each.max()) for each in every[:-1]), float(every[-1].max())
+        seven, *rest = self._hypotheses
+        some = seven if skewed else seven._replace(rows=seven.rows[:, :-1])
+        return max(0.0, *(float(_explained(M, each, excess).evidence.max()) for each in (some, *rest)))
+
+    def forget(self, begins: Sequence[float]) -> None:
+        """Forget tests, by when they began, s, and what was found since the first: another cause explains them."""
+        self._history = deque((each for each in self._history if each.sums.begin_s not in begins), _KEPT)
+        self._all = (
+            total([self._settled[0], *(each.sums for each in self._history)]),
+            total([self._settled[1], *(each.usual for each in self._history)]),
+        )
+        if self.said is not None and self.said.begin_s >= min(begins):
+            self.said = None
+        self.found = self.doubt = self._suspect = self._changed_s = None
+        self._alarms = 0
 
     def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypotheses]) -> tuple[float, Array]:
         """Return the log-evidence that anything changed before the tests of sums, and the second moment of what did.
@@ -482,12 +508,12 @@ class ShapeWatch:
         views = [view for each in tests for view in each.views]
         if len(views) < _LEAST_POSES or not _differ(np.array(views)):
             return None
-        sums, newest = self._since(begin), tests[-1].alone
+        sums = self._since(begin)
         found = self._reduced(sums)
         error = self._focal_alone(found, sums.begin_s)
-        if error is not None and _one_is_enough(newest):
+        if error is not None and _one_is_enough(self._reduced(tests[-1].sums)):
             return error
-        return self._deformed(sums) or self._displaced(found, newest.whole, sums.begin_s)
+        return self._deformed(sums) or self._displaced(found, sums.begin_s)
 
     def _deformed(self, sums: ResidualSums) -> ShapeError | None:
         """Return a smooth deformation of the body that tests show for certain, beside any change of the seven numbers.
@@ -515,11 +541,12 @@ class ShapeWatch:
             return None
         return ShapeError((SMOOTH,), value, cov, 2.0 * max(most), 0.0, (), sums.begin_s)
 
-    def _displaced(self, found: _Reduced, newest: _ShapeSums, begin_s: float) -> ShapeError | None:
+    def _displaced(self, found: _Reduced, begin_s: float) -> ShapeError | None:
         """Return the points that are displaced by what all tests together say, and the newest; None where none is."""
         whole = found.whole
         if not self._candidates or not (whole.gains(self._candidates) > self._limit).any():
             return None
+        newest = self._reduced(self._history[-1].sums).whole
         steady = [each for each in self._candidates if self._steady(whole, newest, each)]
         chosen = list[int]()
         scores = dict[int, float]()
@@ -642,6 +669,8 @@ class ShapeWatch:
         other = copy(self)
         other._history, other._shots, other._effects = self._history.copy(), self._shots.copy(), self._effects.copy()
         other._views = self._views.copy()
+        other._settled = total(self._settled[:1]), total(self._settled[1:])
+        other._all = total(self._all[:1]), total(self._all[1:])
         return other
 
     def finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
@@ -769,22 +798,6 @@ def total(tests: Sequence[ResidualSums]) -> ResidualSums:
     found = tests[0].of(len(tests[0].b))
     for each in tests[1:]:
         found.add(each, 1.0)
-    return found
-
-
-def _settled(sums: ResidualSums, test: ResidualSums) -> ResidualSums:
-    """Return sums of older tests with one more."""
-    found = total([sums])
-    found.scale(float(np.exp(-1.0 / _SETTLED)))
-    found.add(test, 1.0)
-    return found
-
-
-def _running(settled: ResidualSums, tests: Sequence[ResidualSums]) -> list[ResidualSums]:
-    """Return the sums before each of some tests, and those of all."""
-    found = [settled]
-    for each in tests:
-        found.append(total([found[-1], each]))
     return found
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from armsight.data import Array, JointCommand, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError
 from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.estimators import KalmanEstimator, Mounting
+from armsight.loop.estimators import KalmanEstimator, Mounting, Remembered
 from armsight.loop.estimators.smoothing import Interval
 from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health import HealthMonitor
@@ -393,6 +393,9 @@ class Loop:
         if shot is not None and shot.t_s is not None:
             self._stamp_s, self._shot_s = shot.t_s, self.t_s
             sane_s = self._frames.time(shot.t_s, self.t_s)
+            if self.health.stamps_ran:
+                self.close_record()
+                self._restored(self.health.stamps_right())
             if sane_s is None:
                 return None
             shot = replace(shot, t_s=sane_s)
@@ -532,12 +535,16 @@ class Loop:
         self.mounting = correction.mounting(self.mounting)
         if correction.update is not None:
             self._recalibrate(correction.update.rig)
-        if (state := self.health.put_right(correction)) is not None:
-            self.publisher.put(EventDatum(self.t_s, restored_event(state)))
+        self._restored(self.health.put_right(correction))
         if self.rig_follower is not None:
             self.rig_follower.put_right(correction)
         self.log.corrections.append(correction)
         self.log.mountings.append((self.t_s, self.mounting))
+
+    def _restored(self, state: Remembered | None) -> None:
+        """Publish what the estimator goes on from, if it was brought back to that."""
+        if state is not None:
+            self.publisher.put(EventDatum(self.t_s, restored_event(state)))
 
     def _recalibrate(self, rig: StereoRig) -> None:
         """Measure with another calibration of the cameras from now on."""
