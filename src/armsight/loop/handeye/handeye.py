@@ -511,8 +511,8 @@ def require_rotations(poses: Poses, e: Array) -> None:
 def known_where_seen(found: HandEye, Ts_rig_body: Array) -> dict[str, tuple[Array, Array]]:
     """Return what the flange carries and what stands still, by name: transform (4, 4), and covariance (6, 6) where used.
 
-    The rig's is that of a point at the mean of the positions of the body that were seen, Ts_rig_body (N, 4, 4): the rig is used
-    there alone, and errors of an arm move the lens, a metre away, by more.
+    The rig's is that of a point at the mean of the positions of the body that were seen, Ts_rig_body (N, 4, 4): the rig is
+    used there alone, and errors of an arm move the lens, a metre away, by more.
     """
     held, still = ("flange-rig", "base-body") if found.eye == "in_hand" else ("flange-body", "base-rig")
     to_body = np.eye(6)
