@@ -20,6 +20,7 @@ from armsight.data import Array, Record
 from armsight.kernels import kernel
 from armsight.vision.markers.disc.common import FIELDS, SHARED, common, correct
 from armsight.vision.markers.disc.fit import (
+    NOT_UNIFORM,
     PARAMETERS,
     REASONS,
     SURROUND,
@@ -115,7 +116,7 @@ def _outlines(
     n, _ = search(image, words, noise_of(image), bright, dark, starts, codes, signs, room)
     across, good = np.empty(_RAYS), 0
     for i in range(n):
-        if codes[i] != 0:
+        if codes[i] not in (0, NOT_UNIFORM):
             continue
         found, _ = _rim_contrast(image, starts[i], signs[i], across)
         if found > 0.0:

@@ -27,6 +27,10 @@ MOST_REPORTED = 100
 _MOST_CANDIDATES, _NEVER = fit.MOST_DISCS, 99
 #: Most outlines in a smaller copy; one this large, as a share of the longest half chord in the image, is looked at.
 _MOST_LARGER, _LARGE = 512, 0.8
+#: Code -> place among the reported.
+_ORDER = np.array(
+    [fit.LOOK_ALIKES.index(c) if c in fit.LOOK_ALIKES else _NEVER for c in range(1 + max(fit.REASONS))], np.uint8
+)
 _KEPT = threading.local()
 
 
@@ -157,6 +161,7 @@ def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Array, 
 
 def _rejected(theta: Array, codes: NDArray[np.int64]) -> tuple[Rejected, ...]:
     """Report what is not a disc and why: candidates with a closed rim, most disc-like first; without one, the others."""
-    order = np.array([fit.LOOK_ALIKES.index(c) if c in fit.LOOK_ALIKES else _NEVER for c in codes.tolist()])
+    order = _ORDER[codes]
     reported = np.argsort(order, kind="stable")[: min(MOST_REPORTED, max(int((order < _NEVER).sum()), 1))]
-    return tuple(Rejected((float(theta[i, 0]), float(theta[i, 1])), fit.REASONS[int(codes[i])]) for i in reported)
+    rows = zip(theta[reported, :2].tolist(), codes[reported].tolist(), strict=True)
+    return tuple(Rejected((u, v), fit.REASONS[code]) for (u, v), code in rows)

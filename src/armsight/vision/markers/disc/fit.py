@@ -731,7 +731,7 @@ REASONS = {
     10: "its surround is not uniform: text, a ring, a square of a board",
     11: "a duplicate of another disc",
 }
-FOUND_TWICE = 11
+NOT_UNIFORM, FOUND_TWICE = 10, 11
 #: Reasons of candidates that have a closed rim, those that look most like a disc first.
 LOOK_ALIKES = (5, 8, 1, 10, 3, 4, 6)
 _MOST_BLUR = 0.8  # of the smaller half axis
@@ -802,9 +802,9 @@ def minimise(
     """
     flat, H = work.sectors[0], work.H
     weighed = not weigh
-    for round_ in range(_STEPS):
+    for _ in range(_STEPS):
         shift, square = _step(n, theta, x0, y0, slope, texture, work)
-        if shift < 0.0 or (round_ > 1 and _LEAST_SNR * square > n * theta[6] * theta[6]):
+        if shift < 0.0 or _LEAST_SNR * square > n * theta[6] * theta[6]:
             return -1.0, 0.0
         if shift < _WEIGH_PX and not weighed:
             weighed = True
@@ -848,7 +848,8 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if n < 4 * UNKNOWNS:
         return 7
     x0, y0 = np.rint(theta[0]), np.rint(theta[1])
-    if _step(sample, theta, x0, y0, SURROUND, 0.0, work)[0] < 0.0:
+    shift, square = _step(sample, theta, x0, y0, SURROUND, 0.0, work)
+    if shift < 0.0 or _LEAST_SNR * square > sample * theta[6] * theta[6]:
         return 2
     square, texture = minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, 0.0, work)
     if square < 0.0:
@@ -867,7 +868,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
         return 6
     excess = np.sqrt(max(variance - noise_sigma * noise_sigma, 0.0)) / abs(theta[6])
     if excess > _MOST_RESIDUAL:
-        return 10
+        return NOT_UNIFORM
     rim(n, theta, x0, y0, work, sectors)
     off, chance, count = off_ellipse(variance, work)
     allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor) + _RIM_TEXTURE * theta[5] * excess
@@ -890,7 +891,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
         work.shown[12] = texture_factor(n, theta[5], texture, work)
         variance *= work.shown[12]
         if variance * (cov[0, 0] + cov[1, 1]) > 2.0 * _MOST_SIGMA_PX * _MOST_SIGMA_PX:
-            return 10
+            return NOT_UNIFORM
     levelled(theta, variance, work)
     for a in range(2):
         for b in range(2):
