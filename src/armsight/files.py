@@ -387,6 +387,15 @@ def check_writable(path: str | Path, *, apart_from: Iterable[str | Path | None] 
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 
 
+def unused(path: Path) -> Path:
+    """Return the first of NAME, NAME-2, NAME-3 ... that is not there yet."""
+    found, number = path, 1
+    while found.exists():
+        number += 1
+        found = path.with_name(f"{path.name}-{number}")
+    return found
+
+
 def check_suffix(path: str | Path, suffix: str, what: str) -> None:
     """Check that a file to be is named as what it will hold.
 

@@ -41,6 +41,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "dense": "Find a disparity for every pixel of a pair, or evaluate the methods on scenes with a truth.",
     },
     "Operate an arm": {
+        "setup": "Walk through ARM's page, from the cameras to the corrected arm; setup.json remembers how far it came.",
         "arm": "Print an arm's table and kinematics: mm and degrees here, m and rad in --json.",
         "board": "Build and flash the arm's firmware, watch a board, tune its gains, test it.",
         "run": "Run the experiment on a real arm: hand-eye calibration, the motions, the loop closed on vision.",
@@ -114,33 +115,32 @@ def main() -> None:
     """Run the command line and exit: 0 done, 2 a mistake in the input (one line on stderr), 130 Ctrl-C or SIGTERM."""
     terminate_as_interrupt()
     print_notes()
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run a command and return its exit code; what is wrong is said on stderr."""
     try:
-        code = group.main(prog_name="armsight", standalone_mode=False, color=colour())
+        code = group.main(arguments, prog_name="armsight", standalone_mode=False, color=colour())
         if sys.stdout is not None:
             sys.stdout.flush()
-        sys.exit(code if isinstance(code, int) else 0)
-    except click.exceptions.Abort:
+        return code if isinstance(code, int) else 0
+    except (click.exceptions.Abort, KeyboardInterrupt):
         click.echo("armsight: interrupted", err=True)
-        sys.exit(130)
+        return 130
     except click.exceptions.NoArgsIsHelpError as error:  # a group by itself: its help
         error.show()
-        sys.exit(2)
     except click.ClickException as error:
         print_error(_usage_text(error))
-        sys.exit(2)
     except ArmsightError as error:
         print_error(str(error))
-        sys.exit(2)
-    except KeyboardInterrupt:
-        click.echo("armsight: interrupted", err=True)
-        sys.exit(130)
     except BrokenPipeError:
         _silence_stdout()
-        sys.exit(0)
+        return 0
     except OSError as error:  # errors of files and devices are ArmsightErrors: only the output is left
         _silence_stdout()
         print_error(f"{error.filename or 'the output'}: cannot be written: {error.strerror or error}")
-        sys.exit(2)
+    return 2
 
 
 def _usage_text(error: click.ClickException) -> str:

@@ -23,9 +23,10 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import read_text, write_text
+from armsight.files import read_text, read_toml, write_text
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import log_so3
+from armsight.robot.arm_file import file_transform
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.urdf.read import ChainLink, arm_rows, check_same, rotation_of
 from armsight.robot.urdf.write import roll_pitch_yaw
@@ -219,6 +220,12 @@ def _frames(arm: Arm, nominal: Arm) -> list[Array]:
         x /= np.linalg.norm(x)
         out.append(pose(np.stack([x, np.cross(z, x), z], axis=1), origin))
     return out
+
+
+def with_tool_of(arm: Arm, path: str | Path, nominal: Arm) -> Arm:
+    """Return the arm of a corrected.toml, whose tool is the measured body, with the nominal arm's tool on its flange."""
+    T_flange_body = file_transform(path, read_toml(path), "T_flange_body")
+    return replace(arm, T_flange_tool=arm.T_flange_tool @ inverse(T_flange_body) @ nominal.T_flange_tool)
 
 
 def difference(first: Arm, second: Arm) -> Difference:

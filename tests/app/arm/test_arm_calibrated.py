@@ -2,11 +2,13 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from armsight.geometry.rotation import quaternion_wxyz
 from armsight.robot.calibration_file import calibration_text, read_calibration
 from armsight.robot.models import MODELS
 from armsight.robot.urdf.read import read_urdf
@@ -63,3 +65,26 @@ def test_the_controllers_own_file_of_a_real_ur3(armsight, tmp_path):
     said = armsight("arm", "calibrated", "ur3", tmp_path / "cut.conf")
     assert "holds delta_theta, delta_a, delta_x" in said.err
     assert "expected delta_d = [6 numbers]" in said.err
+
+
+def test_the_body_on_the_flange_of_a_corrected_arm_does_not_count(armsight, tmp_path):
+    """The tool of corrected.toml is the measured body, far from the flange and rotated: the arm is 0.4 mm off, not 200."""
+    limits = ("q_min_rad", "q_max_rad", "qd_max_rad_s", "qdd_max_rad_s2", "qddd_max_rad_s3", "home_rad")
+    ours = {key: getattr(LONGER, re.sub("_rad.*", "", key)) for key in limits}
+    ours |= {"offset_rad": LONGER.offset, "d_m": LONGER.d, "a_m": LONGER.a, "alpha_rad": LONGER.alpha}
+    rows = "".join(
+        f'[[joint]]\nname = "j{i}"\ndirection = {int(LONGER.direction[i])}\nbeta_rad = 0.0\n'
+        + "".join(f"{key} = {float(value[i])!r}\n" for key, value in ours.items())
+        for i in range(6)
+    )
+    w, x, y, z = map(float, quaternion_wxyz(LONGER.T_base_0[:3, :3]))
+    at = ", ".join(repr(float(each)) for each in LONGER.T_base_0[:3, 3])
+    (tmp_path / "corrected.toml").write_text(
+        'name = "ur5e"\nconvention = "standard"\nidentified = true\nversion = 3\n'
+        f"T_base_0 = {{ position_m = [{at}], quaternion_wxyz = [{w}, {x}, {y}, {z}] }}\n"
+        "T_flange_body = { position_m = [0.1, 0.15, -0.1], quaternion_wxyz = [0.0, 0.6, 0.8, 0.0] }\n" + rows
+    )
+    said = armsight("arm", "calibrated", "ur5e", tmp_path / "corrected.toml", "--json")
+    assert said.code == 0, said.err
+    assert said.lines[0]["tool_apart_mean_m"] == pytest.approx(4e-4, abs=1e-9)
+    assert said.lines[0]["tool_rotated_max_rad"] == pytest.approx(0.0, abs=1e-6)

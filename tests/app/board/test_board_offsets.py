@@ -92,7 +92,7 @@ def test_it_asks_first(armsight, arm, tmp_path, monkeypatch):
     assert not (tmp_path / "old.json").exists()
 
 
-def test_mistakes_are_one_line_and_nothing_is_written(armsight, arm, tmp_path):
+def test_mistakes_are_one_line_and_nothing_is_written(armsight, arm, tmp_path, monkeypatch):
     device, name = arm
     options, keep = ("--board", name, "--yes"), tmp_path / "old.json"
     assert_rejected(armsight("board", "offsets", *options, "--further", "1,2"), "5 corrections are needed")
@@ -115,6 +115,14 @@ def test_mistakes_are_one_line_and_nothing_is_written(armsight, arm, tmp_path):
         "the torque of shoulder_lift (id 2) is on",
     )
     assert registers(device) == [0] * 6
+    device.servos.switch(1, True)
+    questions = []
+    monkeypatch.setattr("click.confirm", lambda text, abort, err: questions.append(text))
+    said = armsight("board", "offsets", "--board", name, "--further", FURTHER, "--keep", tmp_path / "new.json")
+    assert said.code == 0, said.err
+    assert ["the drives are on" in text for text in questions] == [True, False]
+    assert registers(device) != [0] * 6
+    device.servos.switch(1, True)
     said = armsight("board", "release", "--board", name)
     assert said.out == "DISABLED\n", said.err
     assert not device.servos.on.any()

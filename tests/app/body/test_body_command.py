@@ -504,3 +504,24 @@ def test_split_is_offered_where_a_drawing_is_too_large_and_changes_none_that_fit
     assert armsight("body", "draw", PLATE, "-o", tmp_path / "c.pdf", "--split").code == 0
     assert (tmp_path / "b.pdf").read_bytes() == (tmp_path / "c.pdf").read_bytes()
     assert_rejected(armsight("body", "draw", "dartboard:3:4", "-o", tmp_path / "d.pdf"), "unknown board", "chessboard:")
+
+
+def test_a_board_and_a_body_are_one_print(armsight, tmp_path):
+    said = armsight("body", "draw", "chessboard:9x6:20mm", PLATE, "-o", tmp_path / "print.svg", "--json")
+    assert said.code == 0, said.err
+    assert [page["markers"][0] for page in answer(said)["pages"]] == ["chessboard:9x6:20mm", "A"]
+    assert len(answer(said)["files"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("spec", "fits"),
+    [
+        ("chessboard:9x6:25mm", "chessboard:9x6:22mm"),
+        ("charuco:11x8:30mm:22mm:DICT_5X5_100", "charuco:11x8:20mm:14.7mm:DICT_5X5_100"),
+        ("circles:11x9:30mm", "circles:11x9:18mm"),
+    ],
+)
+def test_a_board_that_is_too_large_gets_the_largest_that_fits(armsight, tmp_path, spec, fits):
+    out = tmp_path / "board.pdf"
+    assert_rejected(armsight("body", "draw", spec, "-o", out), f"take {fits}, the largest that fits")
+    assert armsight("body", "draw", fits, "-o", out).code == 0

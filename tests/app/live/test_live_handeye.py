@@ -1,13 +1,19 @@
 """The guided hand-eye calibration: each pose it chooses lowers the error, and it says when to stop."""
 
+import json
 import os
 import shutil
+import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from armsight.app.live import handeye
+from armsight.app.live.calibration import CalibrationStep
+from armsight.app.live.guide import CalibrationAim
 from armsight.app.live.handeye import LEAST_POSES, MOST_POSES, HandEyeGuide, likely_joint_errors
+from armsight.app.live.records import command_of
 from armsight.app.live.session import LiveSession
 from armsight.app.live.step import SessionOptions, Shared
 from armsight.errors import InputError
@@ -112,3 +118,54 @@ def test_a_singular_arm_does_not_explain_a_millimetre_by_degrees():
     bent = q + np.radians([5, -20, 30, 10, 20, 5])
     errors = np.radians([0.2, -0.1, 0.3, 0.1, -0.2, 0.1])
     assert likely_joint_errors(arm, bent, arm.forward(bent + errors)) == pytest.approx(errors, abs=1e-3)
+
+
+def test_the_rig_of_an_earlier_session_is_offered_and_can_be_put_aside(tmp_path):
+    stored = tmp_path / "rig.json"
+    replace(example_rig(), provenance={"heldout_rigid_rms_m": 2.4e-5}).save(stored)
+    os.utime(stored, ((now := time.time()), now - 24 * 3600))
+    when = time.strftime("%H:%M", time.localtime(now - 24 * 3600))
+
+    def offered(command):
+        session = LiveSession(SessionOptions(tmp_path, "usb:0,1"))
+        try:
+            before = session.sections()["overview"]
+            session.execute(command_of(json.dumps({"command": command})))
+            return before.offer, session.sections()["overview"], session.measuring.rig
+        finally:
+            session.close()
+
+    offer, after, rig = offered("KeepRig")
+    assert offer == f"rig of yesterday {when}, 0.024 mm"
+    assert (after.offer, after.step) == ("", "measure")
+    assert rig is not None
+    offer, after, rig = offered("BeginAnew")
+    assert offer
+    assert (after.offer, after.step, rig) == ("", "cameras", None)
+    assert not stored.exists()
+    assert len(list(tmp_path.glob("rig-*.json"))) == 1
+    assert "is kept as" in (tmp_path / "session.log").read_text().splitlines()[-1]
+
+
+def test_a_calibration_that_is_good_enough_ends_once_by_itself(tmp_path, monkeypatch):
+    said, finished = [], []
+    shared = Shared(SessionOptions(tmp_path), tmp_path, lambda level, text: said.append(text))
+    step = CalibrationStep(shared, "chessboard:9x6:25mm", CalibrationAim(2e-4, 0.8))
+    monkeypatch.setattr(step, "finish_calibration", lambda: (finished.append(1), step.show(running=False)))
+    good = False
+    monkeypatch.setattr(step, "fit", lambda: step.show(good=good))
+    try:
+        step.start()
+        step._fit()
+        assert step.shown.running
+        good = True
+        step._fit()
+        assert (len(finished), said) == (1, ["good enough for 0.2 mm: finished; Continue takes more shots"])
+        step.start()  # a person goes on
+        step._fit()
+        assert step.shown.running
+        step.set_aim(0.1, 0.8)
+        step._fit()
+        assert len(finished) == 2
+    finally:
+        step.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -183,7 +184,7 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
     """
     from armsight.app.arm import description
     from armsight.robot.arm_file import open_arm
-    from armsight.robot.calibration_file import difference, read_calibration, write_calibration
+    from armsight.robot.calibration_file import difference, read_calibration, with_tool_of, write_calibration
     from armsight.robot.urdf.write import write_urdf
 
     if output is not None:
@@ -192,6 +193,8 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
         _check_written(output, arm_name, file)
     nominal = open_arm(arm_name)
     arm = read_calibration(file, nominal) if file.lower().endswith((".yaml", ".yml", ".conf")) else open_arm(file)
+    if arm.source.startswith("identified:"):
+        arm = replace(with_tool_of(arm, file, nominal), name=f"the corrected {arm.name}")
     if output is not None and output.exists():
         _keep(output, yes)
     if output is not None and output.suffix == ".yaml":

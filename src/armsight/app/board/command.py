@@ -5,10 +5,11 @@ In: the name of a board, emulated or at a port. Out: JSON objects in SI units, t
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -441,7 +442,7 @@ def offsets(
 
     feetech:PORT: the homing offsets of the servos (register 31); LeRobot's calibration, where given, gets the same. A board
     with armsight's firmware: the tables of its potentiometers. --ar4-offsets: a file of ar4_ros_driver. The drives must be
-    off (`armsight board release`). A servo's offset is -2047 to 2047 counts; what looks like a mistake, such as
+    off: it asks before it switches them off. A servo's offset is -2047 to 2047 counts; what looks like a mistake, such as
     more than a tooth of the horn (14.4 degrees), is not written with --yes.
     """
     from armsight.app.board import offsets as kept
@@ -475,6 +476,8 @@ def offsets(
     elif name.startswith("feetech:"):
         with _open_any(name, baud, calibration) as board:
             assert isinstance(board, FeetechBoard)
+            if given and not yes:
+                kept.offer_release(board)
             offer(kept.servo_zeros(board, angles, restore, calibration))
     else:
         with _open(name, baud) as own:
@@ -490,6 +493,14 @@ def emulate(arm: str, seconds: float | None, as_json: bool) -> None:
 
     so101 is a servo bus with backlash and droop, for feetech:PORT; ar4 a Teensy with backlash and a homing that is off.
     """
+    with emulated_arm(arm) as board:
+        _show(as_json, {"board": board}, board)
+        threading.Event().wait(seconds)
+
+
+@contextlib.contextmanager
+def emulated_arm(arm: str) -> Iterator[str]:
+    """Emulate an SO-101 or an AR4 at a port; yields the board's name."""
     from armsight.robot.boards.ar4 import board as ar4
     from armsight.robot.boards.feetech import bus as feetech
     from armsight.sim.boards.ar4 import Ar4Teensy
@@ -498,9 +509,7 @@ def emulate(arm: str, seconds: float | None, as_json: bool) -> None:
 
     servos = arm == "so101"
     with serve(So101Bus.made() if servos else Ar4Teensy(), feetech.BAUD if servos else ar4.BAUD) as port:
-        board = f"{'feetech' if servos else 'ar4'}:{port.name}"
-        _show(as_json, {"board": board}, board)
-        threading.Event().wait(seconds)
+        yield f"{'feetech' if servos else 'ar4'}:{port.name}"
 
 
 @command.group()

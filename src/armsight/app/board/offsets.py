@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import click
 import numpy as np
 
 from armsight.data import Array
@@ -24,6 +25,7 @@ from armsight.files import check_outputs, check_writable, read_json, read_text, 
 from armsight.robot.boards.ar4.models import SENSE
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.board_file import configuration_text, read_configuration
+from armsight.robot.boards.codes import Command
 from armsight.robot.boards.configuration import JOINTS, Configuration, check_configuration
 from armsight.robot.boards.feetech.board import FeetechBoard
 from armsight.robot.boards.feetech.calibration import read_calibration, write_offsets
@@ -33,7 +35,7 @@ from armsight.robot.boards.feetech.offsets import (
     require_released,
     write_changes,
 )
-from armsight.robot.boards.feetech.registers import MOST_OFFSET, RAD_PER_COUNT
+from armsight.robot.boards.feetech.registers import MOST_OFFSET, RAD_PER_COUNT, TORQUE
 from armsight.robot.kinematics.arm import Arm
 
 #: Zeros of joints that home, or have a potentiometer, are off by a few degrees; more looks like a mistake, degrees.
@@ -131,6 +133,13 @@ def pot_zeros(board: Board, further_rad: Array | None, restore: Path | None) -> 
         board.store(config)
 
     return _of_angles(changes, restore is not None, write)
+
+
+def offer_release(board: FeetechBoard) -> None:
+    """Switch the drives off after asking, if a torque is on."""
+    if any(board.bus.read(id, TORQUE) for id in board.calibration.ids):
+        click.confirm("the drives are on, and off the arm sinks: is it supported?", abort=True, err=True)
+        board.confirm(board.command(Command.DISABLE))
 
 
 def servo_zeros(

@@ -59,7 +59,7 @@ def check(path: str, rig_path: str | None, distances: tuple[float, ...], as_json
 
 
 @command.command()
-@click.argument("path", metavar="BODY.toml|BOARD")
+@click.argument("paths", nargs=-1, required=True, metavar="BODY.toml|BOARD...")
 @click.option("-o", "--output", required=True, metavar="OUT", help="The drawing: .pdf, .svg or .png.")
 @click.option("--paper", default="a4", show_default=True, type=click.Choice(list(PAPERS), case_sensitive=False))
 @click.option("--split", is_flag=True, help="Split a drawing larger than the paper into several overlapping sheets.")
@@ -71,25 +71,28 @@ def check(path: str, rig_path: str | None, distances: tuple[float, ...], as_json
     help="Resolution of a .png, pixels per inch.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def draw(path: str, output: str, paper: str, split: bool, dpi: int, as_json: bool) -> None:
-    """Draw a body's markers, or a calibration board, to scale: print at 100%, measure the bar, glue.
+def draw(paths: tuple[str, ...], output: str, paper: str, split: bool, dpi: int, as_json: bool) -> None:
+    """Draw bodies' markers and calibration boards to scale: print at 100%, measure the bar, glue.
 
-    BOARD is a spec such as chessboard:9x6:25mm. One page for each plane of a body; .svg and .png have a file for each page
-    and sheet.
+    BOARD is a spec such as chessboard:9x6:20mm. One page for each board and each plane of a body; .svg and .png have a file
+    for each page and sheet.
     """
-    check_writable(output, apart_from=(path,))
+    check_writable(output, apart_from=paths)
 
     from armsight.app.body.draw import draw_body
 
-    drawing = draw_body(path, output, paper=paper.lower(), dpi=dpi, split=split)
+    drawing = draw_body(paths, output, paper=paper.lower(), dpi=dpi, split=split)
     for note in drawing.notes:
         click.echo(f"note: {note}", err=True)
     if as_json:
         pages = [
-            {"normal": page.normal.tolist(), "markers": [name or path for name in page.names]} for page in drawing.pages
+            {"normal": page.normal.tolist(), "markers": [name or path for name in page.names]}
+            for page, path in zip(drawing.pages, drawing.of, strict=True)
         ]
-        click.echo(json.dumps({"body": path, "files": drawing.files, "paper": paper.lower(), "pages": pages}))
+        click.echo(
+            json.dumps({"body": " ".join(paths), "files": drawing.files, "paper": paper.lower(), "pages": pages})
+        )
         return
-    for number, page in enumerate(drawing.pages, start=1):
+    for number, (page, path) in enumerate(zip(drawing.pages, drawing.of, strict=True), start=1):
         click.echo(f"page {number}: {', '.join(name or path for name in page.names)}")
     click.echo(f"written to {', '.join(drawing.files)}; print at 100%, not fitted to the page, and measure the bar")

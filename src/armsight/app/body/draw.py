@@ -13,7 +13,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import importlib.util
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -291,11 +292,13 @@ class Drawing(Record):
     Attributes:
         files: the files written.
         pages: what is on each page.
+        of: the body or board of each page.
         notes: what should be said about it.
     """
 
     files: tuple[str, ...]
     pages: tuple[Page, ...]
+    of: tuple[str, ...]
     notes: tuple[str, ...]
 
 
@@ -324,12 +327,12 @@ def is_board_spec(path: str | Path) -> bool:
 
 
 def draw_body(
-    path: str | Path, output: str | Path, *, paper: str = "a4", dpi: int = 600, split: bool = False
+    paths: Sequence[str | Path], output: str | Path, *, paper: str = "a4", dpi: int = 600, split: bool = False
 ) -> Drawing:
-    """Draw a body's markers, or a board, to scale.
+    """Draw bodies' markers and boards to scale.
 
     Args:
-        path: the TOML body file, or a board's spec such as ``chessboard:9x6:25mm``.
+        paths: TOML body files, and boards' specs such as ``chessboard:9x6:20mm``.
         output: .pdf (a page for each plane), .svg or .png (a file for each, numbered from the second on).
         paper: a key of PAPERS; rotated where that fits better.
         dpi: pixels an inch of a .png.
@@ -344,30 +347,41 @@ def draw_body(
         raise InputError(f"{output}: a drawing is a {', '.join(_SAVERS)} file, by its suffix")
     if importlib.util.find_spec("matplotlib") is None:
         raise InputError('drawing a body needs matplotlib, which is not installed: pip install "armsight[report]"')
-    planes: tuple[Page, ...]
-    if is_board_spec(path):
-        name, planes, notes = str(path), (_board_page(str(path)),), list[str]()
-        foot = "drawn by armsight body draw"
-    else:
-        layout = read_layout(path)
-        name, (planes, notes) = layout.name, pages(path, layout)
-        foot = f"{plain(Path(path).name)}   sha256 {hashlib.sha256(read_bytes(path)).hexdigest()[:16]}"
-    sizes = [_paper(path, page, paper, split) for page in planes]
+    planes, of, heads, notes = list[Page](), list[str](), list[tuple[str, str]](), list[str]()
+    for path in paths:
+        its_own, head, foot = _pages_of(path, notes)
+        many = len(its_own) > 1
+        heads += [(head + (f", plane {k} of {len(its_own)}" if many else ""), foot) for k in range(1, len(its_own) + 1)]
+        planes, of = [*planes, *its_own], [*of, *([str(path)] * len(its_own))]
+    sizes = [_paper(path, page, paper, split) for path, page in zip(of, planes, strict=True)]
     parts = [_sheets(size, PAPERS[paper]) if split and paper != "fit" else [] for size in sizes]
     if suffix == ".png":
         _check_pixels(output, [each[0].paper if each else size for each, size in zip(parts, sizes, strict=True)], dpi)
     with drawing():
         figures = []
-        for number, (page, size, sheets) in enumerate(zip(planes, sizes, parts, strict=True), start=1):
-            head = plain(name) + (f", plane {number} of {len(planes)}" if len(planes) > 1 else "")
-            figures += [_figure(page, size, head, foot, sheet) for sheet in (*sheets,) or (None,)]
+        for number, (page, size, sheets, texts) in enumerate(zip(planes, sizes, parts, heads, strict=True), start=1):
+            figures += [_figure(page, size, *texts, sheet) for sheet in (*sheets,) or (None,)]
             if sheets:
                 notes.append(
                     f"page {number} is split over {len(sheets)} sheets that overlap by {_OVERLAP:g} mm: cut each along the "
                     "marks in its margins and join them edge to edge"
                 )
         files = _SAVERS[suffix](figures, Path(output), dpi)
-    return Drawing(tuple(str(file) for file in files), planes, tuple(notes))
+    return Drawing(tuple(str(file) for file in files), tuple(planes), tuple(of), tuple(notes))
+
+
+def _pages_of(path: str | Path, notes: list[str]) -> tuple[tuple[Page, ...], str, str]:
+    """Return the pages of a body or a board, their head and foot; what is odd about them is added to ``notes``."""
+    if is_board_spec(path):
+        return (_board_page(str(path)),), plain(str(path)), "drawn by armsight body draw"
+    layout = read_layout(path)
+    planes, odd = pages(path, layout)
+    notes += odd
+    return (
+        planes,
+        plain(layout.name),
+        f"{plain(Path(path).name)}   sha256 {hashlib.sha256(read_bytes(path)).hexdigest()[:16]}",
+    )
 
 
 def _board_page(spec: str) -> Page:
@@ -424,9 +438,7 @@ def _content(page: Page) -> Array:
 
 def _paper(path: str | Path, page: Page, paper: str, split: bool) -> tuple[float, float]:
     """Return the width and height of the paper, upright or rotated, mm; of the drawing where it is to be split."""
-    low, high = _content(page)
-    needed = high - low + [2 * _EDGE, 2 * _EDGE + _FOOT]
-    needed[0] = max(needed[0], _FOOT_WIDTH + 2 * _EDGE)
+    needed = _needed(page)
     if paper == "fit":
         return float(np.ceil(needed[0])), float(np.ceil(needed[1]))
     larger = [name for name, size in PAPERS.items() if name != "fit" and _rotated(size, needed) is not None]
@@ -435,6 +447,8 @@ def _paper(path: str | Path, page: Page, paper: str, split: bool) -> tuple[float
         return float(np.ceil(needed[0])), float(np.ceil(needed[1]))
     if size is None:
         hint = f"--paper {larger[0]}, or " if larger else ""
+        if smaller := next((each for each in _smaller(str(path)) if _fits(each, paper)), ""):
+            hint = f"{smaller}, the largest that fits, or {hint}"
         what = f"the plane of {', '.join(page.names[:3])}" if any(page.names) else "the board"
         raise InputError(
             f"{path}: {what} needs {needed[0]:.0f} x {needed[1]:.0f} mm of paper, and "
@@ -442,6 +456,28 @@ def _paper(path: str | Path, page: Page, paper: str, split: bool) -> tuple[float
             "--split for several sheets to join"
         )
     return size
+
+
+def _needed(page: Page) -> Array:
+    """Return the width and height that a page needs (2,), mm."""
+    low, high = _content(page)
+    needed = high - low + [2 * _EDGE, 2 * _EDGE + _FOOT]
+    needed[0] = max(needed[0], _FOOT_WIDTH + 2 * _EDGE)
+    return np.asarray(needed)
+
+
+def _smaller(spec: str) -> Iterator[str]:
+    """Yield a board's spec with its first length in whole millimetres less and less, the others in proportion."""
+    lengths = [float(each) for each in re.findall(r"(?<=[:=])(\d+(?:\.\d+)?)mm", spec)]
+    for first in range(int(np.ceil(lengths[0])) - 1 if lengths and is_board_spec(spec) else 0, 0, -1):
+        shrunk = [f"{round(each * first / lengths[0], 1):g}mm" for each in lengths]
+        parts = re.split(r"(?<=[:=])\d+(?:\.\d+)?mm", spec)
+        yield "".join(part + length for part, length in zip(parts, [*shrunk, ""], strict=True))
+
+
+def _fits(spec: str, paper: str) -> bool:
+    """Whether a board fits a paper."""
+    return _rotated(PAPERS[paper], _needed(_board_page(spec))) is not None
 
 
 def _rotated(size: tuple[float, float], needed: Array) -> tuple[float, float] | None:

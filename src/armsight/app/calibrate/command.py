@@ -11,7 +11,7 @@ import click
 
 from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import InputError
-from armsight.files import check_folder, check_outputs
+from armsight.files import check_folder, check_outputs, check_writable
 from armsight.vision.calibrate import FOLDS, MODELS
 
 _FILE = click.Path(path_type=Path)
@@ -43,7 +43,9 @@ class CalibrateOptions:
 @click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
 @click.option("--right", metavar="GLOB", help="Right images, matched to the left ones by sorted name.")
 @click.option(
-    "--source", metavar="SOURCE", help="Instead: a folder or a recording; with times, the skew of the cameras is found."
+    "--source",
+    metavar="SOURCE",
+    help="Instead: usb:0,1, recorded first, or a recording; finds the skew.",
 )
 @click.option("--left-intrinsics", metavar="GLOB", help="More images of the target, by the left camera alone.")
 @click.option("--right-intrinsics", metavar="GLOB", help="The same by the right camera.")
@@ -87,7 +89,11 @@ def command(**given: object) -> int:
     from armsight.app.calibrate.run import GivenDetections, GivenImages, provenance
     from armsight.app.show.plotting import require_matplotlib
     from armsight.vision.calibrate.weak import contradicted, require_order
+    from armsight.vision.markers.board import open_board
 
+    if o.target is not None:
+        open_board(o.target)  # before a person shows it to cameras
+        check_writable(o.output)
     with contextlib.closing(GivenImages(o) if o.target is not None else GivenDetections(o)) as opened:
         outputs = (o.output, o.refine_body, opened.board_file)
         check_outputs(outputs, opened.files)

@@ -9,14 +9,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import click
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.calibrate.command import CalibrateOptions
 from armsight.app.progress import bar, steps
+from armsight.app.record.recording import record
 from armsight.data import SIDES, Detections, Shot
 from armsight.errors import CalibrationError, InputError
+from armsight.files import unused
 from armsight.vision.calibrate import MODELS
 from armsight.vision.calibrate.boards import Pair, calibrate_boards, calibrate_recording
 from armsight.vision.calibrate.bodies import calibrate_bodies
@@ -31,12 +34,17 @@ from armsight.vision.markers.body_file import load_body_csv, save_body_csv
 from armsight.vision.markers.calibrated_board import save_board_file
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.rig import CONTRADICTED
-from armsight.vision.sources import PairsSource, Source, notes_of, open_source
+from armsight.vision.sources import LIVE, PairsSource, Source, notes_of, open_source
 from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files
 
 _VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 #: Fewest markers of a family by which it is named as the one in view; in families of few cells less are chance.
 _LEAST_CODES = 4
+
+#: A person has so long to show the board to live cameras, s; half: too few poses, double: an arm that grows tired.
+_RECORDED_S = 60.0
+#: The simulated workcell as cameras, and how often its person shows the board.
+_SIM, _SIM_CAMERAS, _SIM_SHOTS = "sim:", "1280x720@60", 24
 
 Grey = NDArray[np.uint8]
 
@@ -70,6 +78,45 @@ class GivenDetections:
         """Close nothing."""
 
 
+def _open(spec: str, folder: Path) -> Source:
+    """Open a folder or a recording; what cameras see is stored in a new folder first, so that it is there afterwards.
+
+    Raises:
+        InputError: no such source, or nothing can be stored.
+    """
+    if not spec.startswith((*LIVE, _SIM)):
+        return open_source(spec)
+    stored = unused(folder)
+    click.echo(f"recording for {_RECORDED_S:g} s into {stored}: move the target; Ctrl-C ends it earlier", err=True)
+    opened = _SimulatedBoard(spec) if spec.startswith(_SIM) else open_source(spec)
+    with contextlib.closing(opened) as live, bar("recording shots", live.count) as advance:
+        done = record(live, stored, seconds=_RECORDED_S, on_shot=lambda _: advance())
+    if (done.stopped and not done.interrupted) or not done.shots:
+        raise InputError(f"{spec}: {done.stopped or 'no shot came'}; {done.shots} shots are in {stored}")
+    return open_source(str(stored))
+
+
+class _SimulatedBoard(Source):
+    """What the workcell's cameras see of the chessboard that a person shows them."""
+
+    count: int | None = _SIM_SHOTS
+
+    def __init__(self, spec: str) -> None:
+        from armsight.sim.workcell.workcell import Workcell
+
+        self._workcell = Workcell.open(cameras=spec.removeprefix(_SIM) or _SIM_CAMERAS)
+        self._shots = self._workcell.chessboard_shots(_SIM_SHOTS)
+
+    def read(self) -> Shot | None:
+        """Return the next shot; the workcell's time stands still, so it has none."""
+        shot = next(self._shots, None)
+        return None if shot is None else replace(shot, t_s=None)
+
+    def close(self) -> None:
+        """End the workcell."""
+        self._workcell.close()
+
+
 class GivenImages:
     """Images of a board, to calibrate from; the board's shape as it is found goes into ``board_file``."""
 
@@ -77,7 +124,7 @@ class GivenImages:
         """Open a source, or the images that two globs match, and find those of one camera alone.
 
         Raises:
-            InputError: there is no such source, a live one, or nothing matches.
+            InputError: there is no such source, or nothing matches.
         """
         self.named: dict[str, str] = {}
         self._options, self._spec, globs = options, str(options.target), (str(options.left), str(options.right))
@@ -88,12 +135,8 @@ class GivenImages:
                 raise InputError(f"{video}: is a video: give both as --source video:LEFT,RIGHT")
             self._source: Source = opened
             self.named |= zip(SIDES, globs, strict=True)
-        elif spec.startswith(("usb:", "url:")):
-            raise InputError(
-                f"{spec}: is live: `armsight record {spec} -o DIR` stores a recording, and --source DIR takes it"
-            )
         else:
-            self._source, self.named["source"] = open_source(spec), spec
+            self._source, self.named["source"] = _open(spec, options.output.with_suffix(".board")), spec
         self.board_file = options.output.parent / f"{options.output.stem}.board.toml"
         self.named |= {"target": self._spec, "board": self.board_file.name}
         alone = (options.left_intrinsics, options.right_intrinsics)

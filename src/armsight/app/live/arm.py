@@ -23,7 +23,7 @@ from armsight.app.live.handeye import HandEyeGuide, HandEyeState, go, likely_joi
 from armsight.app.live.identification import IdentifyState, IdentifyStep
 from armsight.app.live.measuring import MeasureStep
 from armsight.app.live.records import asked
-from armsight.app.live.step import SIM, PageStep, Shared, unused, why
+from armsight.app.live.step import SIM, PageStep, Shared, why
 from armsight.app.run.angles import LoggedAngles, read_angles
 from armsight.app.run.devices import require_joints, setup_of
 from armsight.app.run.experiment import (
@@ -41,7 +41,7 @@ from armsight.app.run.tracks import require_pyarrow
 from armsight.app.show.plotting import require_matplotlib
 from armsight.data import Array, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
-from armsight.files import read_text
+from armsight.files import read_text, unused
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators import Mounting
 from armsight.loop.running.calibrate import VisitedPose, handeye_poses

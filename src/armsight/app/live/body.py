@@ -40,7 +40,7 @@ class _Drawn(PageStep[S]):
 
     def _draw(self, target: str, path: Path, paper: str) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        for note in draw_body(target, path, paper=paper, split=True).notes:
+        for note in draw_body([target], path, paper=paper, split=True).notes:
             self.say("hint", note)
         self.say("good", f"drawn to {path}: print at 100%, and measure the bar")
         self.show(drawing=str(path))

@@ -23,10 +23,11 @@ from armsight.app.live.capture import LiveShot
 from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, NextPose, guessed_camera, guessed_rig
 from armsight.app.live.quality import SHARP_PX, edge_spread_px
 from armsight.app.live.records import Drawn, asked, dots, polyline
-from armsight.app.live.step import Guided, GuidedState, Shared, unused
+from armsight.app.live.step import Guided, GuidedState, Shared
 from armsight.app.record.recording import ShotFolder
 from armsight.data import Array, Detections, Shot
 from armsight.errors import ArmsightError, CalibrationError, InputError
+from armsight.files import unused
 from armsight.geometry.pose import inverse, transform
 from armsight.vision.calibrate import MODELS
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
@@ -146,7 +147,7 @@ class CalibrationStep(Guided[CalibrationState]):
         self._next: NextPose | None = None
         self._recent: deque[tuple[float, Pair]] = deque(maxlen=12)  # when, s, and the board in both views
         self._writer: ShotFolder | None = None
-        self._forced = self._must_move = False
+        self._forced = self._must_move = self._ended = False  # _ended: it was good enough, once
         self._first = 0  # number of the pose before the first fit
         self._thorough_s = self._rest_s = 0.0  # last thorough search; since when the board has not moved on
 
@@ -180,7 +181,7 @@ class CalibrationStep(Guided[CalibrationState]):
         if not (0.0 < error_mm < 1e3 and 0.05 <= distance_m <= 20.0):
             raise InputError("the aim must be an error above 0 mm, and a distance from 0.05 to 20 m")
         with self.lock:
-            self.aim = CalibrationAim(1e-3 * error_mm, distance_m)
+            self.aim, self._ended = CalibrationAim(1e-3 * error_mm, distance_m), False
             if self._result is not None:
                 self._learned(self._result)
 
@@ -347,6 +348,16 @@ class CalibrationStep(Guided[CalibrationState]):
         result = calibrate_boards(self.board, pairs, sizes, **how)
         require_order(result)
         return result, {pair.name for pair in pairs}
+
+    def _fit(self) -> None:
+        """Fit; a calibration that is good enough for the first time ends by itself."""
+        super()._fit()
+        with self.lock:
+            shown = self.shown
+            if shown.good and shown.running and shown.fitting is None and not self._ended:
+                self._ended = True
+                self.say("good", f"good enough for {1e3 * self.aim.error_m:g} mm: finished; Continue takes more shots")
+                self.finish_calibration()
 
     def fit(self) -> None:
         """Fit the shots so far, if there are enough, and choose the next pose."""

@@ -11,10 +11,11 @@ from pathlib import Path
 
 from armsight.app.identify.report import identify_report, write_results
 from armsight.app.identify.run import run_identify
-from armsight.app.live.step import PageStep, unused
+from armsight.app.live.step import PageStep
 from armsight.app.show.plotting import require_matplotlib
 from armsight.app.show.report import Report
 from armsight.errors import InputError
+from armsight.files import unused
 from armsight.loop.identify.read import read_poses
 from armsight.robot.arm_file import open_arm
 

@@ -224,8 +224,8 @@ class MeasureStep(PageStep[MeasureState]):
         """Whether the body that is measured can be followed from shot to shot."""
         return self._body is not None and follows(self._body.target)
 
-    def use_rig(self, rig: StereoRig, path: Path) -> None:
-        """Measure with a rig from now on."""
+    def use_rig(self, rig: StereoRig | None, path: Path | None) -> None:
+        """Measure with a rig from now on; with none nothing is measured."""
         with self.lock:
             self.rig, self.rig_path = rig, path
             self._prepare()

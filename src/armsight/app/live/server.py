@@ -43,7 +43,7 @@ import cv2
 
 from armsight.app.live.capture import LiveShot
 from armsight.app.live.records import command_of, json_text
-from armsight.app.live.session import LiveSession
+from armsight.app.live.session import LOG, LiveSession
 from armsight.app.live.step import why
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import read_bytes
@@ -68,8 +68,8 @@ _CSP = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src blob: data:; "
     "connect-src 'self'{sockets}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-#: Drawings in the folder of the session that a page can open.
-DRAWINGS = ("/board.pdf", "/body.pdf")
+#: Files in the folder of the session that a page can open, and their types.
+FILES = {"/board.pdf": "application/pdf", "/body.pdf": "application/pdf", f"/{LOG}": "text/plain; charset=utf-8"}
 
 
 @dataclass
@@ -195,12 +195,12 @@ class LiveServer:
             rejected = HTTPStatus.FORBIDDEN, "only pages of this server may connect\n"
         elif url.path == "/":
             return self._html(connection, host)
-        elif url.path in DRAWINGS:  # to be printed from the computer that shows the page
+        elif url.path in FILES:  # drawings are printed from the computer that shows the page
             try:
-                pdf = read_bytes(self.session.folder / url.path.removeprefix("/"))
-                return _answer(connection, pdf, {"Content-Type": "application/pdf"})
+                data = read_bytes(self.session.folder / url.path.removeprefix("/"))
+                return _answer(connection, data, {"Content-Type": FILES[url.path]})
             except InputError:
-                rejected = HTTPStatus.NOT_FOUND, "it is not drawn yet\n"
+                rejected = HTTPStatus.NOT_FOUND, "it is not there yet\n"
         return connection.respond(*(rejected or (HTTPStatus.NOT_FOUND, "there is only /\n")))
 
     def _named(self, host: str) -> bool:

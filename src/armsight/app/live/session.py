@@ -7,10 +7,12 @@ for another, and none of them for whoever shows the state.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections import deque
 from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from pathlib import Path
 
 from armsight.app.live.arm import ArmStep, StopAnswer
@@ -25,7 +27,7 @@ from armsight.app.live.step import SIM, SessionOptions, Shared, why
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK
 from armsight.app.show.messages import Level, Note
 from armsight.errors import InputError
-from armsight.files import check_folder, write_text
+from armsight.files import check_folder, unused, write_text
 from armsight.robot.arm_file import open_arm
 from armsight.robot.board_registry import EMULATED, slowed
 from armsight.sim.workcell.workcell import CHESSBOARD
@@ -33,8 +35,10 @@ from armsight.vision.rig import StereoRig
 
 #: The workcell's cameras where ``sim:`` names none, and its arm.
 _SIM_CAMERAS, _SIM_ARM, _EMULATOR = "1280x720@15", "worn", "unicorn"
-_DEFAULT_BOARD = "chessboard:9x6:25mm"
+_DEFAULT_BOARD = "chessboard:9x6:20mm"
 _EVENTS = 200
+#: All that was said, in the folder of the session.
+LOG = "session.log"
 _BEHIND = 1.5  # intervals between shots that a pose may take
 
 
@@ -61,6 +65,7 @@ class Overview:
     folder: str
     moving: bool  # the arm moves by this session
     held: str = ""  # why the arm was held, until it is moved again
+    offer: str = ""  # the rig that was there, until a person has said whether to use it
 
 
 class LiveSession:
@@ -86,7 +91,7 @@ class LiveSession:
         self.board = BoardStep(shared, spec, self._calibrated)
         self.body = BodyStep(shared, self.measuring)
         self.arm = ArmStep(shared, self.measuring, slowed(model, shared.options.board or ""))
-        self._step = "cameras"
+        self._step, self._offer = "cameras", ""
         self.cameras.show(left_known=simulated)
         self._closing = threading.Event()
         self._eye = threading.Thread(target=self._see, name="eye", daemon=True)
@@ -115,12 +120,31 @@ class LiveSession:
         elif stored.exists():
             try:
                 self._use_rig(stored)
+                self._offer = _offer(stored)
                 self.say("good", f"the rig stored in {stored} is used; calibrate again where the cameras moved")
                 self.arm.handeye.recall(stored)
             except InputError as error:
                 self.say("warn", f"the stored rig is not used: {error}")
         if target is not None:
             self.body.use_body(target)
+
+    @asked("")
+    def keep_rig(self) -> None:
+        """Go on with the rig that was in the folder."""
+        self._offer = ""
+
+    @asked("", rest=True)
+    def begin_anew(self) -> None:
+        """Put the rig that was in the folder aside, and begin with the cameras."""
+        stored = self.folder / "rig.json"
+        aside = unused(stored.with_name(f"rig-{time.strftime('%Y%m%d-%H%M%S')}.json"))
+        try:
+            stored.rename(aside)
+        except OSError as error:
+            raise InputError(f"{stored} cannot be put aside: {error.strerror}") from None
+        self.measuring.use_rig(None, None)
+        self._step, self._offer = "cameras", ""
+        self.say("good", f"the rig is kept as {aside}")
 
     def _use_rig(self, path: Path) -> None:
         """Begin with measuring by a calibrated rig."""
@@ -164,6 +188,10 @@ class LiveSession:
         with self._lock:
             self._number += 1
             self._events.append(Event(self._number, time.strftime("%H:%M:%S"), level, text))
+            with contextlib.suppress(OSError):  # a full disk ends no session
+                self.folder.mkdir(parents=True, exist_ok=True)
+                with (self.folder / LOG).open("a", encoding="utf-8") as log:
+                    log.write(f"{time.strftime('%Y-%m-%dT%H:%M:%S')} {level}: {text}\n")
 
     def events(self, after: int = 0) -> tuple[Event, ...]:
         """Return the events after a number."""
@@ -233,7 +261,7 @@ class LiveSession:
         """Return the state, section by section: records of this package."""
         measure = self.measuring.state
         return {
-            "overview": Overview(self._step, STEPS, str(self.folder), self.arm.busy, self.arm.held),
+            "overview": Overview(self._step, STEPS, str(self.folder), self.arm.busy, self.arm.held, self._offer),
             "cameras": self.cameras.state,
             "board": self.board.state,
             "calibrate": self.calibration.state,
@@ -261,3 +289,12 @@ class LiveSession:
             command = f"armsight check {run}; armsight rig update {run} -o rig2.json"
         slowest_ms, found = 1e3 * self.capture.slowest_s, measure.health
         return HealthState(latency, of, measure.measured, measure.missed, found, slowest_ms, tuple(notes), command)
+
+
+def _offer(stored: Path) -> str:
+    """Return of when a rig is and how good, as it is offered: rig of yesterday 21:33, 0.024 mm."""
+    made, now = datetime.fromtimestamp(stored.stat().st_mtime), datetime.now()
+    days = {now.date(): "today", now.date() - timedelta(days=1): "yesterday"}
+    heldout_m = StereoRig.load_trusted(stored).provenance.get("heldout_rigid_rms_m")
+    error = f", {1e3 * heldout_m:.3f} mm" if isinstance(heldout_m, float) else ""
+    return f"rig of {days.get(made.date(), made.date().isoformat())} {made:%H:%M}{error}"

@@ -148,12 +148,3 @@ class Guided(PageStep[G]):
 def why(error: Exception) -> str:
     """Return what went wrong: the message of an error of ours, of another one its kind too."""
     return str(error) if isinstance(error, ArmsightError) else f"{type(error).__name__}: {error}"
-
-
-def unused(path: Path) -> Path:
-    """Return the first of NAME, NAME-2, NAME-3 ... that is not there yet."""
-    found, number = path, 1
-    while found.exists():
-        number += 1
-        found = path.with_name(f"{path.name}-{number}")
-    return found

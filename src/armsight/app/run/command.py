@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,13 +13,14 @@ import click
 from armsight.app.arm_option import arm_option
 from armsight.app.show.messages import UNTRUSTED, require
 from armsight.errors import InputError
-from armsight.files import read_text
+from armsight.files import read_text, write_text
 
 if TYPE_CHECKING:
-    from armsight.app.run.motion_file import MotionPlan
     from armsight.robot.kinematics.arm import Arm
 
 _HANDEYE_POSES = 30
+#: Of motions that are planned here: cycles, and the speed on lines, m/s, which five poses do not use.
+_CYCLES, _SPEED_M_S = 3, 0.1
 _POSES = "poses:"
 
 
@@ -60,8 +62,8 @@ _POSES = "poses:"
 @click.option(
     "--motion",
     type=click.Path(path_type=Path),
-    help="The motions (TOML, docs/howto/run.md). Without: five poses, a line and a circle, made for six_r; "
-    "other arms need theirs (armsight check plan).",
+    help="The motions (TOML, docs/howto/run.md). Without: of six_r five poses, a line and a circle, of others five poses "
+    "three times in the largest cube within reach (armsight check plan).",
 )
 @click.option(
     "--rate",
@@ -145,7 +147,7 @@ def command(
     from armsight.app.run.devices import Devices, open_devices, planned_for
     from armsight.app.run.experiment import require_followed, require_start
     from armsight.app.run.folder import finish, open_folder, run_in
-    from armsight.app.run.motion_file import DEFAULT_MOTION
+    from armsight.app.run.motion_file import read_motions
     from armsight.app.run.report import show
     from armsight.loop.running.calibrate import handeye_poses
     from armsight.robot.arm_file import open_arm
@@ -163,10 +165,13 @@ def command(
         raise InputError(
             f"{target_spec}: {target.body.name} cannot be followed: a body of three discs or more is needed"
         )
-    motion = DEFAULT_MOTION if motion is None else motion
-    motions = _motions(arm, arm_spec, motion)
+    text = read_text(motion) if motion is not None else _motion_text(arm, simulated=source_spec.startswith("sim:"))
+    with tempfile.TemporaryDirectory() as name:
+        if motion is None:
+            write_text(motion := Path(name) / "motion.toml", text)
+        motions = read_motions(arm, motion)
     targets = handeye_poses(arm, motions.ends, _HANDEYE_POSES, 0)
-    files = {"motion.toml": read_text(motion), "body.toml": read_text(target_spec)}
+    files = {"motion.toml": text, "body.toml": read_text(target_spec)}
     open_folder(output)
     devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms, calibration, sync_led)
     begun = False
@@ -235,17 +240,20 @@ def _run_logged(
         click.get_current_context().exit(UNTRUSTED)
 
 
-def _motions(arm: Arm, arm_spec: str, path: Path) -> MotionPlan:
-    """Plan the motions; where an arm cannot make the built-in ones, say which option gives others."""
-    from armsight.app.run.motion_file import DEFAULT_MOTION, read_motions
+def _motion_text(arm: Arm, *, simulated: bool) -> str:
+    """Return the motions of an arm where nobody gives a file: kept ones, before simulated cameras, or planned."""
+    import numpy as np
 
-    try:
-        return read_motions(arm, path)
-    except InputError as error:
-        if path != DEFAULT_MOTION:
-            raise
-        reason = str(error).removeprefix(f"{path}: ")
-        raise InputError(
-            f"--arm {arm_spec}: the built-in motion is made for six_r ({reason}); give this arm's own with --motion FILE "
-            "(docs/howto/run.md), or plan one: armsight check plan"
-        ) from None
+    from armsight.app.check.plan import plan_test
+    from armsight.app.run.motion_file import motion_of
+
+    if (kept := motion_of(arm.name, simulated=simulated)) is not None:
+        return read_text(kept)
+    if simulated:
+        from armsight.sim.workcell.workcell import workcell_poses
+
+        motion = '[[motion]]\nkind = "joints"\nname = "P{} cycle {}"\nq_deg = {}\n'
+        poses = np.degrees(workcell_poses(arm, default=False)).round(2).tolist()
+        there = [motion.format(n, cycle, q) for cycle in range(1, _CYCLES + 1) for n, q in enumerate(poses, start=1)]
+        return "\n".join([f"start_deg = {np.degrees(arm.home).round(4).tolist()}", *there])
+    return plan_test(arm, "poses", _CYCLES, None, _SPEED_M_S, None).motions

@@ -24,7 +24,7 @@ from armsight.robot.trajectories.line import LinePath
 from armsight.robot.trajectories.resolved_rate import resolved_rate
 
 #: Five poses and home again, a straight line, a circle.
-DEFAULT_MOTION = Path(__file__).with_name("default_motion.toml")
+_DEFAULT_ARM, DEFAULT_MOTION = "six_r", Path(__file__).with_name("default_motion.toml")
 #: One pose, a line, a circle.
 QUICK = Path(__file__).with_name("quick_motion.toml")
 _REST_S = 2.0
@@ -40,6 +40,12 @@ _KINDS: dict[str, tuple[dict[str, int], tuple[str, ...]]] = {
 _COMMON = {"kind": 0, "name": 0, "duration_s": 1, "rest_s": 1}
 #: Older name of a key -> its name.
 _OLD_KEYS = {"roll_pitch_yaw_deg": "euler_zyx_deg", "turn_deg": "rotation_deg"}
+
+
+def motion_of(arm: str, *, simulated: bool) -> Path | None:
+    """Return the file of an arm's own motions, or None; of all but the default arm simulated cameras see other poses."""
+    path = DEFAULT_MOTION if arm == _DEFAULT_ARM else DEFAULT_MOTION.with_name(f"{arm}_motion.toml")
+    return path if path.exists() and (not simulated or arm == _DEFAULT_ARM) else None
 
 
 @dataclass(frozen=True, eq=False)

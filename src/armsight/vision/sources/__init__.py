@@ -46,6 +46,10 @@ SOURCES: dict[str, Callable[[str], Source]] = {
 }
 
 
+#: Kinds that are cameras.
+LIVE = ("usb:", "url:")
+
+
 def check_source(spec: str) -> None:
     """Reject a text that can never be a source; what it names may come later.
 

@@ -1,0 +1,58 @@
+"""``armsight setup``: the page of an arm, walked through in the terminal."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from armsight.errors import InputError
+
+
+@click.command("setup")
+@click.argument("arm")
+@click.option(
+    "--source", metavar="SOURCE", help="The cameras, such as usb:0,1, without looking for them; sim: for a try."
+)
+@click.option("--board", metavar="PORT", help="The arm's port, such as /dev/ttyACM0; emulated: with sim:.")
+@click.option("--from", "begin", type=click.IntRange(1), metavar="N", help="Do it again from this step on.")
+@click.option("--json", "as_json", is_flag=True, help="Print how far it came as one JSON object.")
+def command(arm: str, source: str | None, board: str | None, begin: int | None, as_json: bool) -> None:
+    """SetupWalk through ARM's page, from the cameras to the corrected arm; setup.json remembers how far it came.
+
+    Each command is shown before it runs; they are those of docs/arms/. The port is found by unplugging, the cameras by
+    covering them. Ctrl-C keeps what was done: the same command goes on there.
+    """
+    from armsight.app.setup.steps import ARMS, CAMERAS, PORT
+    from armsight.app.setup.walk import INTERRUPTED, SetupWalk, simulated
+
+    if arm not in ARMS:
+        raise InputError(
+            f"{arm}: no arm with a page; there are {', '.join(ARMS)}. Another arm: docs/arms/another_arm.md"
+        )
+    simulate = (source or "").startswith("sim:")
+    if simulate != ((board or "").startswith("emulated:")):
+        raise InputError("--source sim: and --board emulated: go together: both are simulated")
+    steps = ARMS[arm]
+    if begin is not None and begin > len(steps):
+        raise InputError(f"--from {begin}: {arm} has {len(steps)} steps")
+    if simulate and not any(step.command.startswith("run ") for step in steps):
+        raise InputError(f"{arm}: its own controller moves it, which is not simulated; so101, ar4 and six_r are")
+    walk = SetupWalk.open(arm, begin)
+    if not simulate:
+        walk.words |= {word: given for word, given in ((CAMERAS, source), (PORT, board)) if given is not None}
+    result: dict[str, Any] = {"arm": arm, "folder": str(Path.cwd()), "steps": []}
+    code = INTERRUPTED
+    stdout = contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext()  # what commands print
+    with stdout, simulated(walk, source or "") if simulate else contextlib.nullcontext():
+        try:
+            code = walk.go(lambda line: click.echo(line, err=True), result)
+        except (KeyboardInterrupt, click.Abort):
+            click.echo(f"\nwhat is done is kept: armsight setup {arm} goes on there", err=True)
+    if as_json:
+        click.echo(json.dumps(result))
+    click.get_current_context().exit(code)

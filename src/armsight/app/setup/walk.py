@@ -1,0 +1,153 @@
+"""One step after the other: what this computer calls things goes into the commands, and what is done into a file."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shlex
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import click
+
+from armsight.app.main import run
+from armsight.app.setup import finding
+from armsight.app.setup.steps import ARMS, CAMERAS, PORT, SetupStep
+from armsight.errors import InputError
+from armsight.files import read_json, write_text
+
+FILE = Path("setup.json")
+INTERRUPTED = 130
+
+
+@dataclass
+class SetupWalk:
+    """An arm's steps on this computer.
+
+    Attributes:
+        arm: its name.
+        words: what the page says -> what is so here.
+        done: commands of the page -> done, or left out.
+        simulated: how the board is called where nobody is at the terminal; empty with a person.
+    """
+
+    arm: str
+    words: dict[str, str] = field(default_factory=dict)
+    done: dict[str, str] = field(default_factory=dict)
+    simulated: str = ""
+
+    @classmethod
+    def open(cls, arm: str, begin: int | None) -> SetupWalk:
+        """Return the walk that the folder remembers, or a new one; ``begin``: from which step, from 1.
+
+        Raises:
+            InputError: the folder is another arm's, or its file is none of ours.
+        """
+        kept = cls(arm)
+        if FILE.exists():
+            try:
+                found = read_json(FILE)
+                kept = cls(str(found["arm"]), dict(found["words"]), dict(found["done"]))
+            except (TypeError, KeyError, ValueError):
+                raise InputError(f"{FILE}: not written by `armsight setup`: move it away") from None
+        if kept.arm != arm:
+            raise InputError(f"{FILE}: this folder is of {kept.arm}: take another folder for {arm}")
+        again = [step.command for step in ARMS[arm][begin - 1 :]] if begin is not None else []
+        kept.done = {command: state for command, state in kept.done.items() if command not in again}
+        return kept
+
+    def typed(self, step: SetupStep) -> str:
+        """Return the command of a step as it is typed here."""
+        command = step.command
+        if self.simulated:
+            kind = next((each for each in finding.KINDS if f"{each}{PORT}" in command), "")
+            command = command.replace(f"{kind}{PORT}", "emulated:" if command.startswith("run ") else self.simulated)
+        for old, new in self.words.items():
+            command = command.replace(old, new)
+        return " ".join(filter(None, (command, step.simulated if self.simulated else "")))
+
+    def find(self, step: SetupStep, say: Callable[[str], None]) -> bool:
+        """Find what a step needs of this computer and its person; whether the step can be done."""
+        if CAMERAS in step.command and CAMERAS not in self.words:
+            self.words[CAMERAS] = finding.find_left_and_right(lambda text: _asked(f"{text}, then press Enter"))
+            say(f"cameras: {self.words[CAMERAS]}")
+        if PORT in step.command and PORT not in self.words and not self.simulated:
+            port = finding.find_port(say)
+            kind = next(each for each in finding.KINDS if f"{each}{PORT}" in step.command)
+            finding.check_arm(f"{kind}{port}")
+            self.words[PORT] = port
+            say(f"port: {port}")
+        if step.given and step.given not in self.words and not set(dict(step.without)) & set(self.words):
+            file = "" if self.simulated else _asked(f"your file {step.given} (Enter: there is none)")
+            if file and not Path(file).expanduser().exists():
+                raise InputError(f"{file}: no such file")
+            self.words |= {step.given: file} if file else dict(step.without)
+        return not step.given or step.given in self.words or step.given not in self.typed(step)
+
+    def go(self, say: Callable[[str], None], result: dict[str, Any]) -> int:
+        """Do what is left; return the exit code of the step that did not go well, or 0.
+
+        Args:
+            say: shows a line to the person.
+            result: gets the state of each step.
+        """
+        steps = ARMS[self.arm]
+        for number, step in enumerate(steps, start=1):
+            row: dict[str, Any] = {
+                "command": f"armsight {self.typed(step)}",
+                "state": self.done.get(step.command, "open"),
+            }
+            result["steps"].append(row)
+            if step.command in self.done:
+                say(f"{number} of {len(steps)} {row['state']}: {row['command']}")
+                continue
+            say(f"\n{number} of {len(steps)}: {step.say}")
+            possible = self.find(step, say)
+            row["command"] = f"armsight {self.typed(step)}"
+            self.keep()
+            say(f"$ {row['command']}" if possible else "left out: there is no such file")
+            answer = "" if self.simulated or not possible else _asked("Enter runs it, s leaves it out, q ends here")
+            if answer.lower().startswith("q"):
+                return 0
+            row["state"] = "left out"
+            if possible and not answer.lower().startswith("s"):
+                code = run(shlex.split(self.typed(step)))
+                if code and not (step.endless and code == INTERRUPTED):
+                    row |= {"state": "failed", "exit_code": code}
+                    if not step.needed and code != INTERRUPTED:
+                        continue
+                    say(f"step {number} ended with {code}; armsight setup {self.arm} goes on here")
+                    return code
+                row["state"] = "done"
+            self.done[step.command] = row["state"]
+            self.keep()
+        say(f"\nall {len(steps)} steps are done; --from N does them again from the N-th")
+        return 0
+
+    def keep(self) -> None:
+        """Write how far it is; a simulated port is another one next time."""
+        words = {} if self.simulated else self.words
+        write_text(FILE, json.dumps({"arm": self.arm, "words": words, "done": self.done}, indent=1) + "\n")
+
+
+def _asked(question: str) -> str:
+    """Ask a person for a line."""
+    return str(click.prompt(question, default="", show_default=False, err=True)).strip()
+
+
+@contextlib.contextmanager
+def simulated(walk: SetupWalk, cameras: str) -> Iterator[None]:
+    """Let a walk go through on the emulated arm before simulated cameras, with nobody at the terminal."""
+    from armsight.app.board.command import emulated_arm
+    from armsight.app.setup.steps import BOARD, PLATE
+    from armsight.sim.workcell.body import body_text
+    from armsight.sim.workcell.workcell import CHESSBOARD
+
+    write_text("body.toml", body_text())
+    walk.words |= {CAMERAS: cameras, BOARD: CHESSBOARD, PLATE: "body.toml"}
+    with contextlib.ExitStack() as stack:
+        own = walk.arm == "six_r"
+        walk.simulated = "emulated:unicorn" if own else stack.enter_context(emulated_arm(walk.arm))
+        yield
