@@ -244,22 +244,6 @@ def test_planned_poses_are_near_those_taken_with_the_target_in_view_and_say_why(
     assert (middle < was.max(axis=0) + 0.03).all()
 
 
-def test_rows_shuffled_by_name_change_nothing(armsight, tmp_path):
-    _, A, B = motion()
-    names = [f"pose{k}" for k in range(14)]
-    order = np.random.default_rng(3).permutation(14)
-    head = "name,x_m,y_m,z_m,qw,qx,qy,qz"
-
-    def rows(Ts, order):
-        return [(names[k], *Ts[k, :3, 3], *quaternions(Ts[k : k + 1])[0]) for k in order]
-
-    seen = named(tmp_path / "seen.csv", head, rows(B, range(14)))
-    one, _ = found(armsight, named(tmp_path / "a.csv", head, rows(A, range(14))), seen)
-    other, _ = found(armsight, named(tmp_path / "b.csv", head, rows(A, order)), seen)
-    assert one["T_flange_rig"] == other["T_flange_rig"]
-    assert one["cov_m_rad"] == other["cov_m_rad"]
-
-
 def test_streams_with_an_unknown_clock_offset(armsight, tmp_path):
     t_hand, t_eye = np.arange(0, 8, 0.02), np.arange(0.5, 7.5, 0.05)
 
