@@ -735,7 +735,8 @@ NOT_UNIFORM, FOUND_TWICE = 10, 11
 #: Reasons of candidates that have a closed rim, those that look most like a disc first.
 LOOK_ALIKES = (5, 8, 1, 10, 3, 4, 6)
 _MOST_BLUR = 0.8  # of the smaller half axis
-_LEAST_RATIO = 0.22
+#: Smaller half axis over the larger one, at least.
+LEAST_RATIO = 0.22
 #: How far the sixteenths of the rim may deviate from the ellipse beyond noise, RMS: px, share of the size, and share of
 #: the blur for each share of the contrast that residuals have beyond noise (a textured surround moves the rim).
 _RIM_PX, _RIM_SHARE, _RIM_TEXTURE = 0.05, 0.005, 1.5
@@ -753,7 +754,7 @@ _LEAST_SNR = 3.0
 @kernel
 def narrow(m11: float, m12: float, m22: float) -> bool:
     """Whether a matrix M, while it is fitted, is that of no ellipse, or its determinant is half the narrowest disc's."""
-    return bool(not m11 * m22 - m12 * m12 > 0.5 * (_LEAST_RATIO * (m11 + m22)) ** 2)
+    return bool(not m11 * m22 - m12 * m12 > 0.5 * (LEAST_RATIO * (m11 + m22)) ** 2)
 
 
 @kernel
@@ -862,7 +863,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     minor, major = 1.0 / np.sqrt(half + root), 1.0 / np.sqrt(max(half - root, 1e-12))
     if theta[5] > _MOST_BLUR * minor:
         return 3
-    if minor < _LEAST_RATIO * major:
+    if minor < LEAST_RATIO * major:
         return 4
     if not abs(theta[6]) > _LEAST_SNR * np.sqrt(variance):
         return 6
