@@ -27,7 +27,7 @@ MOST_REPORTED = 100
 _MOST_CANDIDATES, _NEVER = fit.MOST_DISCS, 99
 #: Most outlines in a smaller copy; one this large, as a share of the longest half chord in the image, is looked at.
 _MOST_LARGER, _LARGE = 512, 0.8
-#: Code -> place among the reported.
+#: Code -> rank among the reported.
 _ORDER = np.array(
     [fit.LOOK_ALIKES.index(c) if c in fit.LOOK_ALIKES else _NEVER for c in range(1 + max(fit.REASONS))], np.uint8
 )

@@ -193,7 +193,7 @@ def _ellipse(radii: Array, room: Room) -> tuple[float, float, float]:
 
 @kernel
 def _uneven(image: Grey, theta: Array) -> float:
-    """Return the standard deviation of the contrast across an ellipse's rim, at sixteen places, over its mean."""
+    """Return the standard deviation of the contrast across an ellipse's rim, in sixteen directions, over its mean."""
     height, width = image.shape
     u0, v0, m11, m12, m22 = theta[0], theta[1], theta[2], theta[3], theta[4]
     minor = 1.0 / np.sqrt(0.5 * (m11 + m22) + np.sqrt(0.25 * (m11 - m22) ** 2 + m12 * m12))
