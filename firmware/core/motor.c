@@ -59,6 +59,7 @@
 #define DISOBEY_OFF_RAD 0.02f /* and so far it is from where it is to be; half: lagging joints are suspected, double: a
                                  bridge shows later */
 #define FOLLOWS 0.7f            /* of the answer of the configured resistance; half: weak motors look like bridges, double: a bridge shows late */
+#define FOLLOWS_SAMPLES 8u /* after a step the answer is that since; half: what was before hides a bridge, double: weak motors look like one */
 #define STUCK_SUPPLY 0.2f /* of the supply: less a stuck bridge hardly moves; half: uncertain windings look like
                              bridges, double: bridges at 0.3 are not seen */
 #define STEP_RAD_S 0.05f /* a change of the motor's speed in a tick, beyond noise and torque, that is none; half: noise
@@ -509,6 +510,7 @@ enum { READ, VOLTAGE, CURRENT, TIME, BETWEEN };
 typedef float combination[COLUMNS]; /* of the columns */
 
 static const combination reading = {1.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+static const combination voltage = {0.0f, 1.0f, 0.0f, 0.0f, 0.0f};
 static const combination motors = {0.0f, 1.0f, -1.0f, 0.0f, 0.0f};
 static const combination gap = {1.0f, -1.0f, 1.0f, 0.0f, 0.0f};
 static const combination winding = {0.0f, 0.0f, 1.0f, 0.0f, 0.0f};
@@ -616,19 +618,22 @@ uint32_t motor_names(const motor_state *motor, const motor_config *config, uint3
     const float by_share = left_by(s, reading, motors, &share) + noise;
     const float by_drift = left_by(s, gap, passing, &drift) + noise;
     const float least = by_share < by_drift ? by_share : by_drift;
+    const bool agreed = motor->trust == 1.0f;
+    const float by_lag = left_by_lag(s, &rate) + noise;
+    if (by_lag < LAG_SHARE * least && rate > 0.0f) { /* a slip ends late, too */
+        return FAULT_BIT(FAULT_POT_LAG) | (agreed && share > 0.0f && share < 1.0f ? FAULT_BIT(FAULT_POT_SLIP) : 0u);
+    }
     if (by_share < by_drift && share < -0.3f) {
         return FAULT_BIT(FAULT_POT_INVERTED);
     }
-    if (left_by_lag(s, &rate) + noise < LAG_SHARE * least && rate > 0.0f) {
-        return FAULT_BIT(FAULT_POT_LAG);
-    }
-    const bool agreed = motor->trust == 1.0f;
     const bool drifts = number_size(drift) * (float)count > 4.0f * NAME_NOISE_RAD;
     const uint32_t drifting = FAULT_BIT(drifts ? FAULT_POT_DRIFT : suspect);
+    /* A constant that was learnt down to its bound is none: they may never have agreed. */
     const uint32_t sharing = FAULT_BIT(share < 0.15f  ? FAULT_POT_FROZEN
                                        : !agreed      ? FAULT_POT_SCALE
                                        : share < 1.0f ? FAULT_POT_SLIP
-                                                      : FAULT_MOTOR);
+                                                      : FAULT_MOTOR) |
+                             (share > 1.0f && motor->constant_scale <= CONSTANT_LOW ? FAULT_BIT(FAULT_POT_SCALE) : 0u);
     return (by_drift < SAME_SHARE * by_share ? 0u : sharing) |
            (by_share < (agreed ? SAME_SHARE : 1.0f / SAME_SHARE) * by_drift ? 0u : drifting);
 }
@@ -698,7 +703,7 @@ void motor_weakens(motor_state *motor, const motor_config *config, motor_sums *s
     float constant;
     const float noise = (float)count * NAME_NOISE_RAD * NAME_NOISE_RAD;
     const float way = product(s, reading, reading);
-    const float left = left_by(s, (const combination){0.0f, 1.0f, 0.0f, 0.0f, 0.0f}, reading, &constant) + noise;
+    const float left = left_by(s, voltage, reading, &constant) + noise;
     if (way > motor->way_seen) {
         motor->way_seen = way;
         motor->constant_seen = constant;
@@ -706,11 +711,17 @@ void motor_weakens(motor_state *motor, const motor_config *config, motor_sums *s
     }
 }
 
+/* Return whether the current follows the duty from tick to tick, as through a sound bridge; in the last 64 ms. */
+static bool follows(const motor_state *motor, const motor_config *config)
+{
+    return motor->damping_share == 0.0f && config->resistance_ohm * motor->dither_va > FOLLOWS * motor->dither_vv;
+}
+
 bool motor_is_stuck(const motor_state *motor, const motor_config *config, float supply_v, motor_sums *s)
 {
     const uint32_t since = (motor->driven_ticks - motor->step_ticks) / SAMPLE_TICKS;
     const uint32_t count = fewer(fewer(motor->sampled, NAME_SAMPLES), since);
-    if (!motor_stepped(motor) || count < 4u) {
+    if (!motor_stepped(motor) || count < 4u || (count >= FOLLOWS_SAMPLES && follows(motor, config))) {
         return false;
     }
     sums_of(motor, config, count, s);
@@ -719,8 +730,11 @@ bool motor_is_stuck(const motor_state *motor, const motor_config *config, float 
     const float stuck = left_by(s, at_terminals, passing, &by_time) + noise;
     const float offset = left_by(s, gap, passing, &unused) + noise;
     const float gain = left_by(s, gap, winding, &unused) + noise;
+    const float weak = left_by(s, gap, reading, &unused) + noise; /* its voltage may stay, too */
+    const float electric = offset < gain ? offset : gain;
+    const float sound = electric < weak ? electric : weak;
     const float by_v = by_time * config->constant_v_s / (TICK_S * (float)SAMPLE_TICKS);
-    return stuck < STUCK_SHARE * (offset < gain ? offset : gain) && number_size(by_v) > STUCK_SUPPLY * supply_v;
+    return stuck < STUCK_SHARE * sound && number_size(by_v) > STUCK_SUPPLY * supply_v;
 }
 
 bool motor_disobeys(const motor_state *motor, const motor_config *config, float supply_v, float error_rad)
@@ -742,11 +756,10 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
     const float ir_v = motor->resistance_scale * config->resistance_ohm * amperes * per_tick;
     const float emf_v = config->constant_v_s * way_rad * (float)TICKS_PER_S * per_tick;
     const float terminal_v = ir_v + emf_v;
-    const float follows_v = config->resistance_ohm * motor->dither_va; /* a bridge that follows lets the current follow the duty: */
-    const bool follows = !off && motor->damping_share == 0.0f && follows_v > FOLLOWS * motor->dither_vv; /* then resistance or constant may be half of the learnt */
-    const float unsure_v = follows ? 0.5f * (number_size(ir_v) + number_size(emf_v)) : 0.0f;
+    /* The resistance or constant of a motor whose bridge follows may be half of the learnt. */
+    const float unsure_v = !off && follows(motor, config) ? 0.5f * (number_size(ir_v) + number_size(emf_v)) : 0.0f;
     if (number_size(terminal_v - applied_v * per_tick) < STUCK_SUPPLY * supply_v + unsure_v ||
-        (motor->damping_share == 0.0f && follows_v < -ANSWER_NONE * motor->dither_vv)) {
+        (motor->damping_share == 0.0f && config->resistance_ohm * motor->dither_va < -ANSWER_NONE * motor->dither_vv)) {
         return false;
     }
     if (off) { /* the current drives it on, or would if nothing held it: shorted windings brake */

@@ -329,6 +329,9 @@ static bool runs_on(const core_state *core, joint_state *joint, const joint_conf
     return observer_is_driven(&joint->observer, supply_duty, fast, off);
 }
 
+/* Return whether the reading holds a joint with one of these faults: a weak motor, or a reading that goes too far. */
+static bool may_hold(uint32_t parts) { return (parts & ~FAULT_BIT(FAULT_POT_SCALE)) == FAULT_BIT(FAULT_MOTOR); }
+
 /* Give a suspected fault its name; where parts cannot be distinguished, those of all. */
 static void name(core_state *core, joint_state *joint, const joint_config *config, uint32_t parts, uint32_t i)
 {
@@ -336,7 +339,7 @@ static void name(core_state *core, joint_state *joint, const joint_config *confi
     while ((parts & FAULT_BIT(fault)) == 0u) {
         fault++;
     }
-    if (fault == FAULT_MOTOR) {
+    if (may_hold(parts)) {
         doubt_motor(joint, config);
     }
     rename_fault(core, i, joint->suspect, fault);
@@ -350,8 +353,9 @@ static void name(core_state *core, joint_state *joint, const joint_config *confi
 static void name_suspect(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
     motor_state *motor = &joint->motor;
+    const bool stepped = motor_stepped(motor);
     if (motor_is_stuck(motor, &config->motor, core->supply_v, &core->sums) ||
-        (motor_stepped(motor) && motor_disobeys(motor, &config->motor, core->supply_v, joint->pid.error_rad))) {
+        (stepped && motor->trust == 1.0f && motor_disobeys(motor, &config->motor, core->supply_v, joint->pid.error_rad))) {
         blame(core, joint, FAULT_BRIDGE, i);
         return;
     }
@@ -364,7 +368,7 @@ static void name_suspect(core_state *core, joint_state *joint, const joint_confi
     /* What a load takes shows at rest. */
     const bool shows = motor->doubted == 0u || joint->reference.speed_rad_s == 0.0f;
     joint->suspect_ticks = in_a_row(joint->suspect_ticks, shows);
-    if (motor->doubted == 0u && (motor_stepped(motor) || motor_answers_otherwise(motor, &config->motor))) {
+    if (motor->doubted == 0u && (stepped || motor_answers_otherwise(motor, &config->motor))) {
         doubt_motor(joint, config);
         rename_fault(core, i, joint->suspect, FAULT_CURRENT_SENSOR);
         joint->suspect = FAULT_CURRENT_SENSOR;
@@ -375,7 +379,7 @@ static void name_suspect(core_state *core, joint_state *joint, const joint_confi
     const bool due = joint->suspect_ticks >= NAME_TICKS;
     if (motor->doubted == 0u) {
         const uint32_t parts = motor_names(motor, &config->motor, joint->suspect, &core->sums);
-        if (due || parts == FAULT_BIT(FAULT_MOTOR)) { /* a joint with a weak motor falls meanwhile */
+        if (due || may_hold(parts)) { /* a joint with a weak motor falls meanwhile */
             name(core, joint, config, parts, i);
         }
     } else if (due) {
