@@ -407,6 +407,10 @@ static void watch_joint(core_state *core, joint_state *joint, const joint_config
     if (motor_swings(&joint->motor, joint->pid.speed_rad_s, joint->reference.speed_rad_s, config->speed_limit_rad_s)) {
         safety_raise(core, FAULT_OSCILLATION, i);
         take_back_gains(core, joint, i);
+        if (joint->motor.doubted == 0u && motor_answers_otherwise(&joint->motor, &config->motor)) { /* it swings for that */
+            doubt_motor(joint, config);
+            blame(core, joint, FAULT_CURRENT_SENSOR, i);
+        }
     }
     watch_load(core, joint, config, i, off_rad);
     if (pot_is_inverted(&joint->pot, &config->pot, joint->pid.error_rad, joint->pid.duty)) {

@@ -122,6 +122,21 @@ def test_a_weak_motor_is_named_and_its_joint_held(motors, library):
     assert abs(arm.plant.link[joint] - arm.out[0]["reference_rad"][joint]) < 0.1
 
 
+@pytest.mark.parametrize(("seed", "joint", "share"), [(71003159, 0, 0.57), (71004323, 0, 0.65), (73001419, 2, 0.67)])
+def test_a_weak_motor_at_its_duty_limit_is_no_bridge(motors, library, seed, joint, share):
+    """Its voltage stays as a stuck bridge's does, but its current follows the duty."""
+    arm = motors.drawn_arm(library, seed)
+    arm.enable()
+    assert int(arm.rng.integers(6)) == joint
+    arm.rest(400)
+    motors.until_moving(arm, joint)
+    arm.plant._model[1, joint] *= share
+    arm.swing(1500, stop_at_fault=False)
+    assert arm.first[0] in (Fault.MOTOR, Fault.POT_SCALE)  # both where they cannot be told apart
+    assert int(arm.out[0]["joint_faults"][joint]) & 1  # MOTOR, 32, has bit 0
+    assert arm.out[0]["drives_on"]
+
+
 def test_a_current_that_flows_asleep_is_its_sensors_error(motors, library):
     arm = at_rest(motors, library, 801)
     arm.plant.blocked[:] = True
@@ -172,6 +187,21 @@ def test_a_sound_joint_without_motor_figures_may_be_stopped_and_pushed_and_have_
         arm.inputs.stop_pressed = 1
         arm.tick(600)
         assert arm.first == (None, None)
+
+
+def test_a_joint_that_swings_as_its_winding_is_shorted_is_named_for_that(motors, library):
+    """Half of the resistance makes twice the loop's gain."""
+    arm = motors.drawn_arm(library, 75000460)
+    arm.enable()
+    joint = int(arm.rng.integers(6))
+    arm.rest(400)
+    motors.until_moving(arm, joint)
+    arm.rest(600)
+    motors.shorted(arm, joint)
+    arm.rest_on(1200)
+    arm.tick(200)
+    assert arm.first[1] == joint
+    assert arm.first[0] in (Fault.MOTOR, Fault.CURRENT_SENSOR)  # OSCILLATION once
 
 
 def test_a_gain_and_a_worn_winding_that_cannot_be_distinguished_are_both_named_and_the_joint_held(motors, library):

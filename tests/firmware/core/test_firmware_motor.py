@@ -173,6 +173,31 @@ def test_a_drift_is_distinguished_from_a_slip_once_the_joint_was_let_go_of(arms,
         assert arm.out[0]["joint_faults"][joint] == arm.out[0]["faults"] == 1 << code
 
 
+class Kept:
+    """Keeps the arm of a case, once its fault has its name."""
+
+    def __init__(self, arms, library, seed, kind, size):
+        self.named_ticks = arms.NAMED_TICKS
+        arms.broken(library, seed, self, kind, size)
+
+    def add(self, kind, arm, *_):
+        arm.tick(self.named_ticks)
+        self.arm = arm
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "code", "seed"),
+    [
+        (PotFault.LAG, 0.17605843552036962, Fault.POT_LAG, 71000512),  # called POT_INVERTED once
+        (PotFault.SCALED, 1.6231190434530514, Fault.POT_SCALE, 72002273),  # MOTOR alone
+        (PotFault.SCALED, 2.3936734940067215, Fault.POT_SCALE, 72004601),
+    ],
+)
+def test_what_cannot_be_told_apart_has_both_names(arms, library, kind, size, code, seed):
+    arm = Kept(arms, library, seed, kind, size).arm
+    assert int(arm.out[0]["joint_faults"][arm.first[1]]) >> code & 1
+
+
 @pytest.mark.parametrize("rows", [{}, {"drum_rad": 0.05}, {"stiffness_n_m": 60.0, "pose_share": 0.1, "drum_rad": 0.03}])
 def test_the_arm_that_runs_in_c_is_the_plant_of_sim(arms, library, rows):
     between = arms.plain_transmission(damping_n_m_s=0.1, back_share=0.8, drum_per_rev=3.0, **rows)
