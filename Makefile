@@ -51,9 +51,9 @@ docs: $(VENV)/.armsight-test  ## the site, into docs/_build/html; runs the tutor
 
 # Fewer repetitions than a script makes alone: docs/measured.md names the command of each table.
 SCRIPTS := calibration.py "markers.py --fixed-only" "kinematics.py 100000" motions.py "board.py 1000" dense.py identify.py \
-	"experiment.py 3 quick" "health.py --seeds 2100:2102" speed.py
+	"experiment.py 3 quick" "health.py --seeds 2100:2102" speed.py "digits.py ratio"
 
-bench: $(VENV)/.armsight-test  ## every figure, peers beside; real recordings are looked for at ARMSIGHT_DATA
+bench: $(VENV)/.armsight-test  ## every figure, peers beside, ends with 1 where a ratio of times is worse than the last release's; real recordings are looked for at ARMSIGHT_DATA
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[bench]"
 	cd benchmarks && for each in $(SCRIPTS); do echo "== $$each"; ../$(BIN)/python $$each || exit 1; done
 

@@ -4,6 +4,7 @@ python experiment.py            ten seeds, worn arm, the ARM binary under Unicor
 python experiment.py 3          three of them
 python experiment.py 3 quick    the quick demo of them
 python experiment.py 3 busy     beside two processes that take a core each
+python experiment.py 1 quick processor    times from image to command of the processor: other programs do not count
 """
 
 import subprocess
@@ -13,10 +14,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 
 from armsight.app.demo.demo import Demo, run_demo
+from armsight.loop.running import loop
 
 #: Metric -> where it stands in the summary, its factor and unit, and what it must be at most (None: reported only).
 METRICS = {
@@ -73,8 +77,21 @@ def run(seed: int, quick: bool, found: dict[str, list[float]]) -> None:
     print(f"seed {seed}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
 
 
-def main(seeds: int, quick: bool, others: int) -> None:
+def reading_ms() -> float:
+    """Return what reading two HD images takes of the processor, ms."""
+    images, times = np.random.default_rng(0).integers(0, 255, (2, 720, 1280), np.uint8), []
+    for _ in range(200):
+        began = time.thread_time()
+        for image in images:
+            cv2.sumElems(image)
+        times.append(time.thread_time() - began)
+    return 1e3 * min(times)
+
+
+def main(seeds: int, quick: bool, others: int, processor: bool) -> None:
     """Run and print."""
+    if processor:  # a simulation computes everything in one thread
+        loop.time = SimpleNamespace(perf_counter=time.thread_time, monotonic=time.monotonic)
     found: dict[str, list[float]] = {
         name: [] for name in (*METRICS, "vision, RMS over sigma", "rest, times smaller", "path, times smaller")
     }
@@ -89,7 +106,11 @@ def main(seeds: int, quick: bool, others: int) -> None:
         unit, most = metrics[name][3:] if name in metrics else ("", None)
         bar = "" if most is None else f"{most:g} {unit}: {sum(v <= most for v in values)} of {len(values)}"
         print(f"{name:34s} {np.median(values):8.3f} {min(values):8.3f} {max(values):8.3f}  {bar}")
+    if processor:
+        ratio = float(np.median(found["image to command, p50"])) / reading_ms()
+        print(f"image to command, p50, over reading both images: {ratio:.1f}")
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10, "quick" in sys.argv, 2 if "busy" in sys.argv else 0)
+    others = 2 if "busy" in sys.argv else 0
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10, "quick" in sys.argv, others, "processor" in sys.argv)

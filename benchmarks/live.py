@@ -146,13 +146,13 @@ def loop(blocks: int) -> None:
         if with_page:
             page = subprocess.Popen([sys.executable, "-c", _PAGE, f"127.0.0.1:{server.port}"])
             until(lambda: server._clients)
-        while (running := session.arm._loop) is None or not running.log.latency_s:
+        while (running := session.arm._loop) is None or not len(running.log.latency_s):
             if not session.arm.busy:
                 session.execute(records.GoToStart() if session.arm.state.away else records.RunMotions())
             time.sleep(0.2)
         log, seen = running.log, len(running.log.latency_s)
         until(lambda log=log, seen=seen: len(log.latency_s) >= seen + 60 or session.arm._loop is None, 300.0)
-        times[with_page] += list(log.latency_s[seen:])
+        times[with_page] += list(log.latency_s.array(1)[seen:, 0])
         if page is not None:
             page.terminate()
             page.wait()
@@ -241,13 +241,13 @@ def attacked(count: int) -> None:
             here = Path(__file__).parent
             attacker = subprocess.Popen([sys.executable, "-c", script], cwd=here) if under else None
             while attacker is None or attacker.poll() is None:
-                while (running := session.arm._loop) is None or not running.log.latency_s:
+                while (running := session.arm._loop) is None or not len(running.log.latency_s):
                     if not session.arm.busy:
                         session.execute(records.GoToStart() if session.arm.state.away else records.RunMotions())
                     time.sleep(0.2)
                 log, seen = running.log, len(running.log.latency_s)
                 until(lambda log=log, seen=seen: len(log.latency_s) >= seen + 40 or session.arm._loop is None, 300.0)
-                times[under] += list(log.latency_s[seen:])
+                times[under] += list(log.latency_s.array(1)[seen:, 0])
                 most_mb = max(most_mb, resident_mb())
                 if attacker is None and len(times[False]) >= len(times[True]):
                     break

@@ -2,6 +2,7 @@
 
     python benchmarks/speed.py            all but the demo
     python benchmarks/speed.py --demo     and the demo: --quick, then whole
+    python benchmarks/speed.py start      one pair beside a script of OpenCV alone
 
 Times of discs: ``markers.py 2``; from image to command: ``experiment.py``; of identification: ``identify.py --speed``.
 Every command runs in a process of its own, as a user types it; the median of several. ``import cv2`` runs beside it: what a
@@ -64,8 +65,8 @@ def helps() -> None:
     report(f"-h of {len(times)} commands, the slowest ({slowest})", times[slowest], 0.15)
 
 
-def first_measurement(folder: Path) -> None:
-    """Time one pair of a board, cold and warm, beside importing OpenCV."""
+def first_measurement(folder: Path, *, alone: bool) -> None:
+    """Time one pair of a board, cold and warm, beside importing OpenCV; ``alone``: beside OpenCV's script alone."""
     pairs = DATA / "stereo" / "opencv-480p"
     rig, target = str(folder / "rig.json"), ("--target", "chessboard:9x6:25mm")
     many = ("--left", str(pairs / "left*.jpg"), "--right", str(pairs / "right*.jpg"))
@@ -73,7 +74,8 @@ def first_measurement(folder: Path) -> None:
     seconds(ARMSIGHT, "calibrate", *many, *target, "-o", rig)
     measure = (ARMSIGHT, "measure", rig, *target, *one)
     opencv = (sys.executable, "-c", "import cv2")
-    for name, prepare, repeats in (("cold", forget_pages, 1), ("warm", lambda: None, REPEATS)):
+    starts = () if alone else (("cold", forget_pages, 1), ("warm", lambda: None, REPEATS))
+    for name, prepare, repeats in starts:
         times = []
         for command in (opencv, measure):
             prepare()
@@ -136,9 +138,12 @@ def main() -> None:
     )
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
+        if "start" in sys.argv:
+            first_measurement(folder, alone=True)
+            return
         helps()
         if DATA.is_dir():
-            first_measurement(folder)
+            first_measurement(folder, alone=False)
             calibration(folder)
         else:
             print(f"no real recordings at {DATA}: set ARMSIGHT_DATA to their folder")

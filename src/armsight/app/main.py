@@ -6,7 +6,7 @@ is one line on stderr and exit code 2; a result that must not be trusted is exit
 
 from __future__ import annotations
 
-import difflib
+import gc
 import importlib
 import os
 import re
@@ -113,6 +113,7 @@ def group() -> None:
 
 def main() -> None:
     """Run the command line and exit: 0 done, 2 a mistake in the input (one line on stderr), 130 Ctrl-C or SIGTERM."""
+    gc.set_threshold(100_000)  # what is imported stays: collections that look at it again and again take 20 ms
     terminate_as_interrupt()
     print_notes()
     sys.exit(run(sys.argv[1:]))
@@ -164,6 +165,8 @@ def _usage_text(error: click.ClickException) -> str:
 def _meant(name: str, context: click.Context) -> str:
     """Return what was likely meant by a word that is no command: a near one, or a file, which follows an option."""
     known = context.command.list_commands(context) if isinstance(context.command, click.Group) else []
+    import difflib
+
     if near := difflib.get_close_matches(name, known, 1):
         return f": did you mean {near[0]}?"
     options = [option.opts[0] for option in context.command.params if isinstance(option.type, click.Path)]
@@ -184,6 +187,8 @@ def _meant_option(name: str, context: click.Context) -> str:
             return f": {given} is given without an option"
     known = [o for p in context.command.params if isinstance(p, click.Option) for o in p.opts if o.startswith("--")]
     also = [other for other in _ALSO.get(name, ()) if other in known]
+    import difflib
+
     alike = difflib.get_close_matches(name.lstrip("-"), [each.lstrip("-") for each in known], 1)
     near = [*also, *(f"--{each}" for each in alike)]
     return f": did you mean {near[0]}?" if near else ""

@@ -16,7 +16,6 @@ oracle of what was compiled.
 from __future__ import annotations
 
 import functools
-import hashlib
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -83,6 +82,8 @@ def _check_not_stale(sources: Iterable[tuple[str, str]]) -> None:
 
 def source_digest(path: Path) -> str:
     """Return a digest of a source file's text."""
+    import hashlib  # not above: an installed package needs none
+
     return hashlib.sha256(path.read_bytes().replace(b"\r\n", b"\n")).hexdigest()[:16]
 
 

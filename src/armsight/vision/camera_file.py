@@ -21,7 +21,6 @@ import numpy as np
 from armsight.data import SIDES, Array
 from armsight.errors import InputError
 from armsight.geometry.check import checked
-from armsight.tables.document import read_document
 from armsight.vision.camera import Camera
 
 #: Names of a camera's parts in the files of the field's programs, without capitals and marks.
@@ -317,6 +316,8 @@ def read_cameras(path: str | Path) -> tuple[Camera, Camera]:
     Raises:
         InputError: missing, or not two cameras; the message names the file and the entry.
     """
+    from armsight.tables.document import read_document  # not above: YAML takes as long to import as a pair of images
+
     document = read_document(path)
     if not all(isinstance(document.get(side), dict) for side in SIDES):
         raise InputError(
@@ -334,6 +335,8 @@ def read_camera(path: str | Path) -> Camera:
     Raises:
         InputError: missing, of two cameras, or none.
     """
+    from armsight.tables.document import read_document  # not above: YAML takes as long to import as a pair of images
+
     document = read_document(path)
     inner = [value for value in document.values() if is_camera(value)]
     if not is_camera(document) and len(inner) == 1:

@@ -19,6 +19,9 @@ class Source(Protocol):
     ``len(source)``, and ``with``, which closes it.
     """
 
+    #: whether it is a recording whose shots have times
+    timed: bool = False
+
     @property
     def count(self) -> int | None:
         """How many shots there are in all; None where that is not known, as of live cameras."""

@@ -181,7 +181,8 @@ def test_the_quaternion_is_that_of_scipy(angle):
 
 
 def test_infinity_becomes_null():
-    assert json_text({"a": [1.5, float("inf")], "b": {"c": float("nan")}}) == b'{"a": [1.5, null], "b": {"c": null}}'
+    text = json_text({"a": [1.5, float("inf")], "b": {"c": float("nan")}})
+    assert json.loads(text) == {"a": [1.5, None], "b": {"c": None}}
 
 
 def test_the_arm_comes_back_with_all_digits():

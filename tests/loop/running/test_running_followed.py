@@ -1,10 +1,11 @@
 """The control loop with a rig that is followed, and with a sync LED: an arm that goes where it is sent."""
 
+import gc
 import json
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import BuiltinFunctionType, FunctionType, MethodDescriptorType, ModuleType, SimpleNamespace
 
 import numpy as np
 
@@ -20,7 +21,9 @@ from armsight.app.stream.datum import json_text
 from armsight.data import JointStates, Shot
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.loop.estimators import Delay, KalmanEstimator, Mounting
+from armsight.loop.health import base_motion, closure, fixed, monitor, rig, shape
 from armsight.loop.health.follow import RigFollower
+from armsight.loop.running import log
 from armsight.loop.running.calibrate import find_delay
 from armsight.loop.running.data import EventDatum, Fanout, estimator_event
 from armsight.loop.running.log import Log, RunSegment
@@ -170,3 +173,46 @@ def test_the_sync_led_gives_the_delay_in_the_loop_and_a_sweep_that_differs_is_sa
     assert found.cause == "time"
     assert abs(found.size - (0.4 - 4.0)) < 4 * found.sigma
     assert "a sweep of the arm finds the images 3." in found.what
+
+
+def held(loop):
+    """Bytes of all that lives as long as a loop: of its log, its watches, its estimator; devices are not its own."""
+    seen = {id(each) for each in (loop.board, loop.setup, loop.follower, loop.publisher)}
+    todo, total = [vars(loop)], 0
+    while todo:
+        each = todo.pop()
+        code = ModuleType, FunctionType, BuiltinFunctionType, MethodDescriptorType, type
+        if id(each) not in seen and not isinstance(each, code):
+            seen.add(id(each))
+            total += sys.getsizeof(each)
+            todo += gc.get_referents(each)
+            todo += [each.base] if isinstance(each, np.ndarray) else []
+    return total
+
+
+def test_what_a_loop_holds_does_not_grow_with_its_shots(monkeypatch):
+    """With bounds so small that a third of the shots fill them."""
+    small = {
+        log: {"NEWEST_SHOTS": 20, "_MOST_SHOTS": 10, "_BLOCK": 512, "_NEWEST_LIVE": 20},
+        closure: {"_MOST_KEPT": 14},
+        fixed: {"MOST": 6, "_NEWEST": 4},
+        rig: {"_MOST_KEPT": 6, "_IMAGES": 30, "_POSES": 10},
+        shape: {"_KEPT": 4, "_ASKED": 8, "_POSES": 10},
+        monitor: {"_ALL_S": 2.0, "_RATIO": 2.0},
+        base_motion: {"_KEPT": 20},
+    }
+    for module, bounds in small.items():
+        for name, value in bounds.items():
+            monkeypatch.setattr(module, name, value)
+    board = Obedient()
+    loop, data = opened(board, lambda t_s: (np.zeros(3), np.zeros(6)), rate_hz=10.0)
+    loop.mounting, loop.delay_s = MOUNTING, DELAY_S
+    moves(loop, 0.5)
+    loop.begin(KalmanEstimator(ARM, prior=PRIOR, delay=Delay(DELAY_S, 1e-4), learns_delay=False))
+    sizes = []
+    for _ in range(3):
+        del board.ticks[:-500], board.commands[:-5], data[:], loop.log.segments[:]
+        moves(loop, 12.0)
+        sizes.append(held(loop))
+    assert loop.log.shots > 350
+    assert sizes[2] < 1.1 * sizes[0], sizes  # what the estimator knew each second alone was a third more

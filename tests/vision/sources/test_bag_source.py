@@ -17,9 +17,9 @@ from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.rigfiles.rigfile import rectification
-from armsight.vision.sources import notes_of, open_source
+from armsight.vision.sources import notes_of, open_rig, open_source
 from armsight.vision.sources.bag import Bag
-from armsight.vision.sources.bag.camera_info import bag_rig, open_rig
+from armsight.vision.sources.bag.camera_info import bag_rig
 from armsight.vision.sources.bag.images import decoded_image
 from armsight.vision.sources.bag.pairing import pair, stamps_of
 from armsight.vision.sources.bag.states import read_joints, read_track

@@ -25,7 +25,7 @@ from armsight.errors import InputError
 from armsight.files import check_folder, parsed_json, read_bytes, read_text, replacing, write_text
 from armsight.robot.arm_file import open_arm
 from armsight.vision.markers.targets import open_body, open_target
-from armsight.vision.sources.bag.camera_info import open_rig
+from armsight.vision.sources import open_rig
 
 #: Files of a batch.
 SHOTS, RECORDINGS, ABOUT, PARTS = "shots.parquet", "recordings.parquet", "batch.json", "parts"

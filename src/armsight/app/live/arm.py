@@ -45,6 +45,7 @@ from armsight.files import read_text, unused
 from armsight.geometry.pose import inverse
 from armsight.loop.estimators import Mounting
 from armsight.loop.running.calibrate import VisitedPose, handeye_poses
+from armsight.loop.running.log import NEWEST_SHOTS
 from armsight.loop.running.loop import Loop
 from armsight.loop.running.setup import HostClock, Setup
 from armsight.robot.arm_file import open_arm
@@ -563,7 +564,7 @@ class ArmStep(PageStep[ArmState]):
                     f"{name}: {rms:.2f} mm RMS from the reference, as the loop estimates at {len(errors)} shots"
                 )
         if len(outcome.log.latency_s):
-            p50, p99 = 1e3 * np.percentile(outcome.log.latency_s, (50, 99))
+            p50, p99 = 1e3 * np.percentile(outcome.log.latency_s.array(1), (50, 99))
             lines.append(f"image to command: p50 {p50:.1f} ms, p99 {p99:.1f} ms")
         return tuple(lines)
 
@@ -571,9 +572,9 @@ class ArmStep(PageStep[ArmState]):
     def latency_s(self) -> tuple[float, float] | None:
         """p50 and p99 from an image to its command in the loop that runs, s; None where none does."""
         loop = self._loop
-        if loop is None or not loop.log.latency_s:
+        if loop is None or not len(loop.log.latency_s):
             return None
-        p50, p99 = np.percentile(list(loop.log.latency_s), (50, 99))
+        p50, p99 = np.percentile(loop.log.latency_s.array(1)[-NEWEST_SHOTS:], (50, 99))
         return float(p50), float(p99)
 
     def now(self) -> ArmState:

@@ -29,6 +29,7 @@ from armsight.geometry.rotation import euler_zyx, skew
 from armsight.loop.handeye.pivot import MIN_POSES, Pivot, calibrate_pivot
 from armsight.loop.health import HealthMonitor
 from armsight.loop.running.data import ShotDatum
+from armsight.loop.running.log import count
 from armsight.vision.follow.follower import follows, measurer
 from armsight.vision.markers.calibrated_board import is_print
 from armsight.vision.markers.marker import Target
@@ -293,7 +294,7 @@ class MeasureStep(PageStep[MeasureState]):
                 if self._pivot_poses is not None:
                     self._pivot_poses.append(result.T_left_body)
             else:
-                self._missed[result.reason] += 1
+                count(self._missed, result.reason)
             self._times.append(now)
             self._latency.append(1e3 * (now - live.arrived_s))
             self._body.newest = live, result

@@ -23,7 +23,6 @@ from armsight.data import Body, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines, unseen_lines
-from armsight.loop.health.update import contradiction
 from armsight.loop.running.data import Fanout, NoteDatum, Publisher, ShotDatum
 from armsight.vision.follow.follower import measurer
 from armsight.vision.markers.marker import Target
@@ -31,7 +30,7 @@ from armsight.vision.markers.targets import open_fixed
 from armsight.vision.match import gate
 from armsight.vision.pose.shot_pose import ANGLES, ShotPose, csv_text, shot_pose
 from armsight.vision.rig import StereoRig
-from armsight.vision.sources.bag.camera_info import open_rig
+from armsight.vision.sources import open_rig
 
 #: Standard deviation of the time between the two exposures of a shot, s: of cameras that nothing synchronises to better.
 _SYNC_S = 1e-3
@@ -250,6 +249,8 @@ class _Contradicting:
 
     def _explained(self, count: int) -> HealthFinding:
         """Return what explains that so many shots contradict the rig."""
+        from armsight.loop.health.update import contradiction
+
         return contradiction(self._rig, self._body, self._found, (count, count + self._measured))
 
 

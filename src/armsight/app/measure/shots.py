@@ -33,11 +33,7 @@ from armsight.vision.pose.shot_pose import ShotPose
 from armsight.vision.pose.shutter import LOOSE_PX
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.sources import PairsSource, Source, notes_of, open_source
-from armsight.vision.sources.bag import BagSource
-from armsight.vision.sources.bag.tags import read_tags
-from armsight.vision.sources.lerobot import LeRobotSource
 from armsight.vision.sources.pairs import StoredSource
-from armsight.vision.sources.video import VideoSource
 
 #: So many shots that fit badly are named.
 NAMED = 3
@@ -174,7 +170,7 @@ class ImageShots:
         say(self._said)
         if self._options.output is not None and isinstance(source, StoredSource):
             check_writable(self._options.output, apart_from=source.files)
-        timed = _timed(source)
+        timed = source.timed
         self.recorded = timed or isinstance(source, StoredSource)
         if requested is not None and not timed:
             raise InputError("--skew and --readout need a recording with times: they show the motion of the body")
@@ -204,7 +200,7 @@ class ImageShots:
         """Say what only the images showed."""
         source, target = self._source, self._target
         say(note for note in notes_of(source) if note not in self._said)
-        if self._options.as_json and isinstance(source, VideoSource) and (odd := source.odd_frames):
+        if self._options.as_json and (odd := getattr(source, "odd_frames", None)):
             click.echo(json.dumps({"odd_frames": odd}))
         say(reversed_notes(target, records))
         rank = {name: k for k, name in enumerate(self.body.point_names)}
@@ -246,6 +242,8 @@ def _detected(detections: Path, target: str) -> tuple[Body, list[SeenShot], bool
     body, printed = (opened, False) if isinstance(opened, Body) else (opened.body, is_print(opened))
     if not str(detections).startswith("bag:"):
         return body, read_detections(detections, body), printed
+    from armsight.vision.sources.bag.tags import read_tags
+
     shots, notes = read_tags(str(detections), opened)
     say(notes)
     return body, shots, printed
@@ -255,13 +253,6 @@ def say(notes: Iterable[str]) -> None:
     """Print notes on stderr."""
     for note in notes:
         click.echo(f"note: {note}", err=True)
-
-
-def _timed(source: Source) -> bool:
-    """Whether a source is a recording whose shots have times."""
-    if isinstance(source, StoredSource):
-        return any(pair.t_s is not None for pair in source.pairs)
-    return isinstance(source, VideoSource | BagSource | LeRobotSource)
 
 
 def _noted(rig: StereoRig, body: Body, results: Iterator[Result], skewed: list[HealthFinding]) -> Iterator[Result]:

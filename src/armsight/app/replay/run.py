@@ -19,11 +19,11 @@ from armsight.app.replay.recorded import RecordedDatum, RecordedRun
 from armsight.data import Body, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.loop.estimators import (
-    ESTIMATORS,
     ArmEstimate,
     Delay,
     Estimator,
     KalmanEstimator,
+    LatestEstimator,
     Mounting,
     Prior,
     Remembered,
@@ -40,6 +40,8 @@ from armsight.vision.sources import Source
 from armsight.vision.sources.bag.states import JointStream
 
 _Seen = TypeVar("_Seen", Shot, SeenShot)
+#: Every estimator; each takes the arm, and by name ``prior`` and ``delay``.
+ESTIMATORS: dict[str, Callable[..., Estimator]] = {"kalman": KalmanEstimator, "latest": LatestEstimator}
 
 
 @dataclass(frozen=True)

@@ -179,14 +179,14 @@ def _measured(result: RunResult, values: dict[str, Any], led: Any, studies: Sequ
     log, lines = result.log, list[str]()
     assert result.handeye is not None
     if len(log.latency_s):
-        t = spread(np.array(log.latency_s))
+        t = spread(log.latency_s.array(1))
         values["latency_s"] = vars(t)
         lines.append(
             f"image to command: p50 {1e3 * t.p50:.2f} ms, p99 {1e3 * t.p99:.2f} ms, p99.9 {1e3 * t.p999:.2f} ms, "
             f"longest {1e3 * t.max:.1f} ms while the body is followed"
         )
     if len(log.search_s):
-        t = spread(np.array(log.search_s))
+        t = spread(log.search_s.array(1))
         values["search_s"] = vars(t)
         lines.append(
             f"search of the body: median {1e3 * t.p50:.0f} ms, longest {1e3 * t.max:.0f} ms; commands continue meanwhile"
@@ -340,7 +340,7 @@ def _figures(
         "path": partial(figures.path_figure, run),
         "errors": partial(figures.errors_figure, run),
         "loop": partial(figures.loop_figure, passes),
-        "latency": partial(figures.latency_figure, np.array(result.log.latency_s)),
+        "latency": partial(figures.latency_figure, result.log.latency_s.array(1)[:, 0]),
         "studies": partial(figures.studies_figure, studies),
         "overview": partial(figures.overview_figure, picture, alone, passes),
     }

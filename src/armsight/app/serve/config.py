@@ -134,7 +134,7 @@ def _near(key: str, known: list[str]) -> str:
 def _check(folder: Path, given: dict[str, Any]) -> None:
     """Open rig and target once: a mistake in them ends the service before it begins."""
     from armsight.vision.markers.targets import open_target
-    from armsight.vision.sources.bag.camera_info import open_rig
+    from armsight.vision.sources import open_rig
 
     target = folder / str(given["target"])
     open_rig(folder / str(given["rig"]))

@@ -11,25 +11,26 @@ backlash, and ``smoothing`` computes a track in retrospect. Equations: docs/conc
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import importlib
+from typing import TYPE_CHECKING, Any
 
-from armsight.loop.estimators.armerror import Prior
-from armsight.loop.estimators.estimator import (
-    ArmEstimate,
-    Delay,
-    Estimator,
-    Innovation,
-    Learned,
-    Outcome,
-    PoseMeasurement,
-    Track,
-)
-from armsight.loop.estimators.kalman import KalmanEstimator, Remembered
-from armsight.loop.estimators.latest import LatestEstimator
-from armsight.loop.estimators.mounting import Mounting
+if TYPE_CHECKING:
+    from armsight.loop.estimators.armerror import Prior
+    from armsight.loop.estimators.estimator import (
+        ArmEstimate,
+        Delay,
+        Estimator,
+        Innovation,
+        Learned,
+        Outcome,
+        PoseMeasurement,
+        Track,
+    )
+    from armsight.loop.estimators.kalman import KalmanEstimator, Remembered
+    from armsight.loop.estimators.latest import LatestEstimator
+    from armsight.loop.estimators.mounting import Mounting
 
 __all__ = [
-    "ESTIMATORS",
     "ArmEstimate",
     "Delay",
     "Estimator",
@@ -44,6 +45,18 @@ __all__ = [
     "Remembered",
     "Track",
 ]
+#: Name -> its module, where that is not ``estimator``; each is imported on first use: who measures images has no filter.
+_HOME = {
+    "Prior": "armerror",
+    "KalmanEstimator": "kalman",
+    "Remembered": "kalman",
+    "LatestEstimator": "latest",
+    "Mounting": "mounting",
+}
 
-#: Every estimator; each takes the arm, and by name ``prior`` and ``delay``.
-ESTIMATORS: dict[str, Callable[..., Estimator]] = {"kalman": KalmanEstimator, "latest": LatestEstimator}
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401 - a module's names are of any type
+    """Import a name on its first use (PEP 562)."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOME.get(name, 'estimator')}"), name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,8 +16,10 @@ from armsight.geometry.matrix import product
 from armsight.geometry.pose import adjoint, inverse
 from armsight.kernels import kernel
 from armsight.loop.estimators.estimator import PoseMeasurement
-from armsight.loop.handeye.handeye import HandEye
 from armsight.robot.kinematics.arm import Arm
+
+if TYPE_CHECKING:
+    from armsight.loop.handeye.handeye import HandEye
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from armsight.data import Array, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import adjoint, inverse
-from armsight.loop.estimators import PoseMeasurement
-from armsight.loop.estimators.armerror import ErrorLayout
 from armsight.loop.finding import LEVER_M, Cause, HealthFinding
+
+if TYPE_CHECKING:
+    from armsight.loop.estimators import PoseMeasurement
+    from armsight.loop.estimators.armerror import ErrorLayout
 
 #: Hypotheses whose scores differ by less than this from the best cannot be distinguished from it.
 ALIKE = 12.0

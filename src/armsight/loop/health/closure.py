@@ -24,7 +24,6 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from armsight.data import Array
 from armsight.loop.estimators import Innovation, Outcome
@@ -43,7 +42,7 @@ _LEAST_BLOCKS, _AGAIN, _MOST_BLOCKS = 12, 4, 64
 _BEGINS = 12
 #: Blocks that are kept: then the older half is merged in pairs, and so on. half: an old beginning is known half as closely,
 #: double: 6 MB more.
-_MOST_KEPT = 600
+_MOST_KEPT = 160
 #: Errors of a block before any is seen (m, rad), and how many blocks that counts.
 _BLOCK_SIGMA, _BLOCKS = np.repeat([1.2e-4, np.radians(0.012)], 3), 8.0
 #: Priors so wide that they decide nothing: of a motion (m, rad), of a time, s, and of an angle, rad.
@@ -357,7 +356,7 @@ class ClosureWatch:
 
     def _finest_of(self, between: Array, hypotheses: Sequence[Suspect]) -> list[_Tested]:
         """Return hypotheses, each at the best of some beginnings, the block into which the change fell left out."""
-        solved = solve_triangular(np.linalg.cholesky(self._N), self._b, lower=True, check_finite=False)
+        solved = np.linalg.solve(np.linalg.cholesky(self._N), self._b)
         with_all = self._square - float(solved @ solved)
         tested = [self._tested(np.array([k]), hypotheses, (k - 1, with_all)) for k in between]
         return [max(each, key=lambda one: one.above) for each in zip(*tested, strict=True)]
@@ -402,7 +401,7 @@ class ClosureWatch:
         L = np.linalg.cholesky(N)
         steps, step_C, step_b, ramps, ramp_C, ramp_b = self._sums.since(begins, t[begins - 1], t[-1])
         whole = np.moveaxis(np.concatenate([steps, ramps], axis=2), 1, 0).reshape(self._parts.rest, -1)
-        solved = solve_triangular(L, np.column_stack([whole, b]), lower=True, check_finite=False)
+        solved = np.linalg.solve(L, np.column_stack([whole, b]))
         b, white = solved[:, -1], np.moveaxis(solved[:, :-1].reshape(self._parts.rest, len(begins), -1), 1, 0)
         # What the model leaves beyond the blocks' errors widens them.
         left = square - float(b @ b)

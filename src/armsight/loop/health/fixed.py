@@ -29,10 +29,9 @@ from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.special import chdtrc
 
 from armsight.data import Array, Ids
+from armsight.estimate.chance import chi_square_chance
 from armsight.loop.estimators import Innovation, Outcome
 from armsight.loop.estimators.armerror import layout
 from armsight.loop.finding import COSTS_M, FALSE_ALARMS_PER_MINUTE, LEVER_M, HealthFinding, alarm_limit
@@ -163,7 +162,7 @@ class FixedWatch:
             U[:, : at.start] *= keeps[:, None]
             L[at, : at.start], A[at], Q[at] = H[k] @ U[:, : at.start], H[k] * kept, H[k][:, self._ramp_rows] * ramps
             U[:, at] = gains[k]
-        AQ = solve_triangular(L, np.column_stack([A, Q]), lower=True, unit_diagonal=True, check_finite=False)
+        AQ = np.linalg.solve(L, np.column_stack([A, Q]))
         G = (AQ[:, : self._size].astype(np.float32) @ self._F.reshape(self._size, -1)).reshape(n, -1, self._columns)
         G[:, :, steps:] += AQ[:, None, self._size :]
         left = (U.astype(np.float32) @ G.reshape(n, -1)).reshape(self._F.shape)
@@ -302,7 +301,8 @@ class Unrest:
         L = np.linalg.cholesky(expected / once)
         inner = np.linalg.solve(L, np.linalg.solve(L, seen / once).T)
         values, vectors = np.linalg.eigh((inner + inner.T) / 2.0)
-        certain = chdtrc(freedom, freedom * values) * len(values) < FALSE_ALARMS_PER_MINUTE / 60.0
+        chances = np.array([chi_square_chance(freedom, freedom * value) for value in values])
+        certain = chances * len(values) < FALSE_ALARMS_PER_MINUTE / 60.0
         axes = L @ vectors
         self.cov = (axes * np.where(certain, values - 1.0, 0.0)) @ axes.T
 

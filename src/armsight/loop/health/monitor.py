@@ -2,32 +2,37 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from armsight.data import Array, Body, PoseEstimate
-from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, PoseMeasurement, Remembered
-from armsight.loop.estimators.clock import ClockFollower
+from armsight.loop.estimators import Outcome
 from armsight.loop.finding import HealthFinding, Trust
 from armsight.loop.frame_clock import FrameClock
-from armsight.loop.health.base_motion import BaseMotion, KeptMeasurement, Measurements
 from armsight.loop.health.change import Change, doubtful, finding, happened_besides, suspected
-from armsight.loop.health.closure import ClosureWatch
 from armsight.loop.health.fixed import FixedWatch, ShakeWatch
-from armsight.loop.health.follow import RigCorrection
 from armsight.loop.health.host import HostWatch
 from armsight.loop.health.landmarks import LandmarkWatch
 from armsight.loop.health.rig import TEST_S, RigWatch
-from armsight.robot.kinematics.arm import Arm
 from armsight.vision.rig import StereoRig
+
+if TYPE_CHECKING:
+    from armsight.loop.estimators import Innovation, KalmanEstimator, PoseMeasurement, Remembered
+    from armsight.loop.estimators.clock import ClockFollower
+    from armsight.loop.health.base_motion import BaseMotion, KeptMeasurement, Measurements
+    from armsight.loop.health.closure import ClosureWatch
+    from armsight.loop.health.follow import RigCorrection
+    from armsight.robot.kinematics.arm import Arm
 
 #: So long after measurements contradicted what was learned the cause is open, s: the tests need some shots to find it.
 DOUBT_S = 2.0
-#: What the estimator knows is kept every so often, s, and so many times: to go on from there once something was put right.
-_KEEP_S, _KEPT = 1.0, 600
+#: What the estimator knows is kept every so often, s, to go on from there once something was put right: all of the newest
+#: seconds, and of what is older each time whose age is by this factor less than that of the one before. half of what the
+#: factor exceeds 1 by: 5 MB more, double: what was learned just before an old change is lost.
+_KEEP_S, _ALL_S, _RATIO = 1.0, 20.0, 1.2
 #: A change is dated to about so much, s.
 _DATED_S = 0.7
 #: A rate of a clock is said beyond so many sigmas.
@@ -67,8 +72,8 @@ class HealthMonitor:
         self._arm: Arm | None = None
         self._axis: Array | None = None  # optical axis of the left camera (3,), in the base's frame
         self._cameras_s = np.inf  # since when the cameras are found to have moved, s
-        self._known: deque[tuple[float, Remembered]] = deque(maxlen=_KEPT)
-        self._measurements = Measurements()
+        self._known: list[tuple[float, Remembered]] = []
+        self._measurements: Measurements | None = None
         # What was found before a correction: what it put right, and what else.
         self._kept: tuple[HealthFinding, ...] = ()
         self._past: tuple[Change, ...] = ()
@@ -88,8 +93,8 @@ class HealthMonitor:
         self._poses.clear()
         due = not self._known or self._newest_s - self._known[-1][0] >= _KEEP_S
         if self._estimator is not None and due and self.trust is not Trust.NONE:
-            self._known.append((self._newest_s, self._estimator.remembered()))
-        if self._fixed is not None and self._closure is not None:
+            self._known = [*_thinned(self._known, self._newest_s), (self._newest_s, self._estimator.remembered())]
+        if self._fixed is not None and self._closure is not None and self._measurements is not None:
             for innovation in self._innovations:
                 self._fixed.take(innovation)
                 self._closure.take(innovation)
@@ -150,6 +155,8 @@ class HealthMonitor:
             arm: the arm.
             axis: (3,) optical axis of the left camera, unit vector in the base's frame; None where that is not known.
         """
+        from armsight.loop.health.base_motion import Measurements  # not above: what measures a pair needs no filter
+
         self._estimator, self._arm, self._axis = estimator, arm, axis
         self._known.clear()
         self._measurements = Measurements()
@@ -158,6 +165,8 @@ class HealthMonitor:
 
     def _begin(self, estimator: KalmanEstimator, arm: Arm) -> None:
         """Begin the tests of what an estimator makes of the poses."""
+        from armsight.loop.health.closure import ClosureWatch
+
         self._fixed = FixedWatch(arm.joints)
         self._closure = ClosureWatch(estimator.sigmas, arm.joints)
         self._innovations, self._clock, self._names = [], estimator.clock, arm.joint_names
@@ -237,7 +246,7 @@ class HealthMonitor:
         self._doubted_s = -np.inf
         if self._estimator is None or self._arm is None:
             return None
-        self._known = deque([each for each in self._known if each[0] < since_s - _DATED_S], _KEPT)
+        self._known = [each for each in self._known if each[0] < since_s - _DATED_S]
         before = self._known[-1][1] if self._known else self._estimator.nothing_known()
         self._estimator.restore(before)
         self._begin(self._estimator, self._arm)
@@ -285,10 +294,12 @@ class HealthMonitor:
     @property
     def measurements(self) -> tuple[KeptMeasurement, ...]:
         """Some of the newest measurements that the estimator used."""
-        return self._measurements.newest()
+        return () if self._measurements is None else self._measurements.newest()
 
     def base_motion(self, begin_s: float, *, slow: bool) -> BaseMotion:
         """Return what estimates a motion of the rig that began at a time, s, and goes on where it is slow."""
+        from armsight.loop.health.base_motion import BaseMotion
+
         assert self._estimator is not None
         nothing = -np.inf, self._estimator.nothing_known()
         known = next((each for each in reversed(self._known) if each[0] < begin_s - _DATED_S), nothing)
@@ -395,6 +406,15 @@ class HealthMonitor:
         again = {_subject(each) for each in now}
         kept = (each for each in self._kept if each.corrected_s is not None or _subject(each) not in again)
         return (*kept, *now)
+
+
+def _thinned(known: Sequence[tuple[float, Remembered]], now_s: float) -> list[tuple[float, Remembered]]:
+    """Return what was known at some times, rising, the closer to each other the newer they are."""
+    kept: list[tuple[float, Remembered]] = []
+    for each in known:
+        if not kept or now_s - each[0] <= _ALL_S or now_s - kept[-1][0] >= _RATIO * (now_s - each[0]):
+            kept.append(each)
+    return kept
 
 
 def _clock_findings(clock: ClockFollower, t_s: float) -> tuple[HealthFinding, ...]:

@@ -72,6 +72,9 @@ _FOCAL, _FOCAL_ROW, _FOCAL_VARIANCE = 0.05, 7, 0.01
 #: So many newest doubtful tests are explained together; half: slow breathing is taken for a change that stays, double: more
 #: time and memory.
 TOGETHER = 12
+#: Newest tests in which something passed that are listed, to size it; half: hours of it are sized a little worse, double:
+#: 0.3 MB more.
+_LISTED = 300
 #: Standard deviations of coefficients that are tried, px; 0 is none.
 _TAU_PX = np.array([0.0, *(1e-3 * 2.0**k for k in range(7))])
 #: Before anything is seen none is so much more probable than any other; half: fine noise counts as it, double: what some
@@ -438,7 +441,9 @@ class Passing:
                 apart.append((each.every.begin_s, each.times.found))
             elif each.counted == "lens":
                 focal.append((each.every.begin_s, each.focal_share))
-        self.apart, self.focal, newest = tuple(apart), tuple(focal), tests[-1]
+        # Of those of hours the first says since when.
+        self.apart, self.focal = (*apart[:1], *apart[1:][-_LISTED:]), (*focal[:1], *focal[1:][-_LISTED:])
+        newest = tests[-1]
         found = newest.times.found if newest.counted == "time" and newest.times is not None else None
         self.apart_s = 0.0 if found is None else math.hypot(found.apart_s, float(np.linalg.norm(found.shared_s[:3])))
         self.focal_share = newest.focal_share if newest.counted == "lens" else 0.0

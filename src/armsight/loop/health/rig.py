@@ -38,7 +38,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from armsight.data import Array, Body, Ids, PoseEstimate, Record
 from armsight.estimate.chance import chi_square_limit
@@ -91,8 +90,9 @@ TEST_S, TEST_SHOTS, FORGET_TESTS = 1.0, 60, 30.0
 _LINEAR = 0.005
 #: In so many tests after an alarm what was before the change is dropped; it began at most so many tests before the alarm.
 _FRESH, _BEFORE = 6, 3
-#: Tests that are kept, to find since when.
-_KEPT = 600
+#: Tests that are kept, to find since when: then the older half is merged in pairs, and so on. half: an old beginning is
+#: known half as closely, double: 4 MB more. So many first ones say what the lenses lack.
+_MOST_KEPT, _LENS_KEPT = 64, 600
 #: A prior so wide that it decides nothing: m, rad, scale, s.
 _WIDE = np.array([0.1, 0.1, 1.0, 1.0, 1.0, 1.0, 0.1])
 #: A change matters that moves a pose by so many of its claimed sigmas, in any direction.
@@ -254,7 +254,9 @@ class RigWatch:
         # units of their priors: a test has sums of these.
         self._scaled = np.hstack([self.prior, self._by_fault * _WIDE, self._shape.by_wide])
         # The same with the coefficients of what the camera models lack, px.
-        self._with_lens = block_diag(self._scaled, np.eye(_LENS))
+        self._with_lens = np.zeros((self._size + _LENS, self._scaled.shape[1] + _LENS))
+        self._with_lens[: self._size, :-_LENS] = self._scaled
+        self._with_lens[self._size :, -_LENS:] = np.eye(_LENS)
         # What moves to and fro of the parameters: the right camera's rotation (3), rad, a focal length against the other;
         # and what a focal length does of the right camera alone, and of the left one.
         last, (apart_f, both_f) = rig.parameter_count, self._focal.T
@@ -285,8 +287,8 @@ class RigWatch:
         self._wholes: deque[ResidualSums] = deque(maxlen=TOGETHER)  # of the newest tests
         self._counted: list[Array] = []  # log-evidences of the newest tests, which the former is given later
         self.lens: LensError | None = None
-        self._history: deque[ResidualSums] = deque(maxlen=_KEPT)
-        self._plain: deque[ResidualSums] = deque(maxlen=_KEPT)  # the same with what images leave beyond noise
+        self._tests, self._history = 0, list[ResidualSums]()
+        self._plain = list[ResidualSums]()  # the same with what images leave beyond noise
         self._timed = False
         self._doubted: ResidualSums | None = None  # what the alarm of the test before would have rested on
         self._poses = 0  # that differ
@@ -608,13 +610,16 @@ class RigWatch:
         self._keep(newest, change, alarm)
         if nodded:
             self._take_unrest(nodded)
-        due = 0 < self._alarms <= _FRESH or len(self._history) % _LENS_TESTS == 0
-        if due and 0 < len(self._history) < _KEPT and self._poses >= _LENS_POSES:
+        due = 0 < self._alarms <= _FRESH or self._tests % _LENS_TESTS == 0
+        if due and self._tests < _LENS_KEPT and self._poses >= _LENS_POSES:
             self.lens = self._lens()
+        if len(self._history) >= _MOST_KEPT:
+            self._merge()
 
     def _keep(self, newest: _Newest, change: RigChange, alarm: bool) -> None:
         """Keep the newest test, and what it says of the rig."""
-        if len(self._history) < _KEPT:
+        self._tests += 1
+        if self._tests <= _LENS_KEPT:
             self._wholes.append(newest.whole.over(newest.noise))
             self._whole.add(self._wholes[-1], 1.0)
         self._plain.append(newest.whole.of(len(newest.test.b)).over(newest.noise))
@@ -625,6 +630,15 @@ class RigWatch:
         matters = alarm or (change.chi_square > _SUSPECTED and self._matters(change, slice(None)))
         self.suspected = change if matters else None
         self.alarm, self.alarmed = alarm, self.alarmed or alarm
+
+    def _merge(self) -> None:
+        """Merge the older half of the tests in pairs, but for those about the beginning of a change."""
+        begin_s = self._since()[0] if self.alarmed else np.inf
+        begun = sum(each.begin_s < begin_s for each in self._history)
+        for k in reversed(range(0, len(self._history) // 2, 2)):
+            if not k - 2 <= begun <= k + 3:
+                for tests in (self._history, self._plain):
+                    tests[k : k + 2] = [total(tests[k : k + 2])]
 
     def _tested(self, stays: Sequence[Sequence[_ShotResiduals]]) -> tuple[_Newest, RigChange]:
         """Return the newest test and the change by the window with it; what a passing cause explains is taken off."""
@@ -734,12 +748,14 @@ class RigWatch:
 
     def _take_back(self, begins: Sequence[float]) -> None:
         """Take back what was found since tests, by when they began, s, which something explains that passes."""
+        before = len(self._history)
         self._history, self._plain = (
-            deque((each for each in tests if each.begin_s not in begins), _KEPT)
-            for tests in (self._history, self._plain)
+            [each for each in tests if each.begin_s not in begins] for tests in (self._history, self._plain)
         )
+        self._tests -= before - len(self._history)
         self._window.scale(0.0)
-        for age, test in enumerate(reversed(self._history)):
+        for test in self._history:
+            age = (self._history[-1].begin_s - test.begin_s) / (TEST_S if self._timed else TEST_SHOTS)
             self._window.add(test, float(np.exp(-age / FORGET_TESTS)))
         for each in [each for each in self._wholes if each.begin_s in begins]:
             self._whole.add(each, -1.0)
@@ -768,13 +784,13 @@ class RigWatch:
 
         def gained(*without: Ids) -> float:
             rows = np.setdiff1d(every, np.concatenate([*without, np.zeros(0, int)]))
-            return float(b[rows] @ cho_solve(cho_factor(H[np.ix_(rows, rows)]), b[rows]))
+            return float(b[rows] @ np.linalg.solve(H[np.ix_(rows, rows)], b[rows]))
 
         most, by_lens = gained(), gained(changed)
         excess = max((sums.square - most) / max(sums.freedom, 1.0), 1.0)
         if by_lens - gained(lens) < _LENS_ALARM * excess:
             return None
-        more = (self._split(list(self._plain))[2] - (sums.square - by_lens)) / excess  # than a change at any time
+        more = (self._split(self._plain)[2] - (sums.square - by_lens)) / excess  # than a change at any time
         # A lens that lacks a little is not to blame where the cameras moved: then they explain most.
         moved = gained(lens) - gained(changed, lens)
         if more < max(_LENS_ALARM, _LENS_SHARE * moved / excess):
@@ -798,11 +814,11 @@ class RigWatch:
         """Return the coefficients (M,), px, with a prior of some size, their covariance (M, M), and its log-evidence."""
         rows = np.append(np.arange(self._size), len(sums.b) - _LENS + np.arange(_LENS))
         scales = np.append(np.ones(self._size), np.full(_LENS, scale_px))
-        inner = cho_factor(sums.H[np.ix_(rows, rows)] * np.outer(scales, scales) / excess + np.eye(len(rows)))
-        b = scales * sums.b[rows] / excess
-        found = cho_solve(inner, b)
-        evidence = 0.5 * float(b @ found) - float(np.log(np.diag(inner[0])).sum())
-        cov = scale_px**2 * cho_solve(inner, np.eye(len(rows)))[-_LENS:, -_LENS:]
+        inner = sums.H[np.ix_(rows, rows)] * np.outer(scales, scales) / excess + np.eye(len(rows))
+        b, spread = scales * sums.b[rows] / excess, np.asarray(np.linalg.inv(inner), float)
+        found = spread @ b
+        evidence = 0.5 * float(b @ found - np.linalg.slogdet(inner)[1])
+        cov = scale_px**2 * spread[-_LENS:, -_LENS:]
         return scale_px * found[-_LENS:], cov, evidence
 
     def _begun(self, change: RigChange) -> RigChange:
@@ -810,7 +826,7 @@ class RigWatch:
         count = self._alarms + _BEFORE
         if len(self._history) <= count:
             return change
-        self._window, change, _ = self._split(list(self._history)[-count:])
+        self._window, change, _ = self._split(self._history[-count:])
         return change
 
     @property
@@ -863,7 +879,7 @@ class RigWatch:
 
         It is the beginning that leaves least unexplained: with the seven numbers zero before it, and estimated after it.
         """
-        sums, change, _ = self._split(list(self._history))
+        sums, change, _ = self._split(self._history)
         return sums.begin_s, change
 
     def _split(self, tests: Sequence[ResidualSums]) -> tuple[ResidualSums, RigChange, float]:

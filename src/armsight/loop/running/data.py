@@ -9,13 +9,15 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partialmethod
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from armsight.data import Array, Body, Correspondences, JointStates, Missed, Points, PoseEstimate, Record, Shot
-from armsight.loop.estimators import KalmanEstimator, Mounting, Remembered
 from armsight.vision.pose.shot_pose import left_axes, shot_pose
+
+if TYPE_CHECKING:
+    from armsight.loop.estimators import KalmanEstimator, Mounting, Remembered
 
 #: The points of a pose that was recorded without them.
 NO_POINTS = Points(

@@ -10,7 +10,6 @@ from __future__ import annotations
 import pickle
 import tempfile
 import weakref
-from array import array
 from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -37,6 +36,7 @@ _MOST_SHOTS, _DIFFERENT = (
     400,
     0.01,
 )  # detections kept, and by how much their poses differ, m, rad; half: more of the same
+_REASONS = 200  # reasons that are counted, as some have figures; half: rare ones are named less, double: nothing
 
 
 def _unnamed(owner: object, buffering: int = -1) -> IO[bytes]:
@@ -44,6 +44,16 @@ def _unnamed(owner: object, buffering: int = -1) -> IO[bytes]:
     file = tempfile.TemporaryFile(buffering=buffering)  # noqa: SIM115 - as long as its owner
     weakref.finalize(owner, file.close)
     return file
+
+
+def count(reasons: Counter[str], reason: str) -> None:
+    """Count a reason; where there are too many different ones the rarer half becomes one."""
+    reasons[reason] += 1
+    if len(reasons) > _REASONS:
+        total, kept = reasons.total(), dict(reasons.most_common(_REASONS // 2))
+        reasons.clear()
+        reasons.update(kept)
+        reasons["other reasons"] += total - sum(kept.values())
 
 
 class Rows:
@@ -54,6 +64,10 @@ class Rows:
         self._block: list[Array] = []
         self._held = self._written = 0
 
+    def __len__(self) -> int:
+        """Return how many rows there are."""
+        return self._written + sum(map(len, self._block))
+
     def append(self, *columns: Array | float) -> None:
         """Append a row: its numbers, in this order."""
         self.extend(np.concatenate([np.ravel(each) for each in columns])[None])
@@ -61,7 +75,7 @@ class Rows:
     def extend(self, rows: Array) -> None:
         """Append rows (N, w)."""
         self._block.append(rows)
-        self._held += rows.size
+        self._held += rows.size + 16  # an array takes 128 bytes by itself
         if self._held >= _BLOCK:
             self._write()
 
@@ -158,9 +172,9 @@ class Log:
     command: JointCommand | None = None  #: the newest command; None before the first
     commanded_s: tuple[float, float] = (np.inf, 0.0)  #: its time, s, and the longest time between two commands, s
     #: computing time from an image in which the body was followed to the command that depends on it, s.
-    latency_s: array[float] = field(default_factory=lambda: array("d"))
+    latency_s: Rows = field(default_factory=Rows)
     #: the same of images in which the body was searched; commands continued meanwhile.
-    search_s: array[float] = field(default_factory=lambda: array("d"))
+    search_s: Rows = field(default_factory=Rows)
     segments: list[RunSegment] = field(default_factory=list)  #: motions and rests with their times
     corrections: list[RigCorrection] = field(default_factory=list)  #: what was put right of the rig, in order of time
     #: from when on which mounting was used, s, where there was more than one: those after a correction.
@@ -221,7 +235,7 @@ class Log:
         """Count and keep a shot that stays as it is."""
         name, t_s, result = seen
         if isinstance(result, Missed):
-            self.missed[result.reason] += 1
+            count(self.missed, result.reason)
         else:
             self.misfit_max = max(self.misfit_max, result.misfit)
             self.measured.append(t_s, result.T_left_body, result.cov, result.cov_noise)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import SIDES, Array, Correspondences, Discs, Ids, Missed, Record
+from armsight.geometry.near import pairs_within
 from armsight.kernels import kernel
 from armsight.vision.discs.hypothesis import Hypothesis, hypothesis
 from armsight.vision.discs.pairing import MOST_PAIRS, DiscView, Pairs, pair, wrong_size
@@ -91,8 +92,6 @@ def _most(support: Ids) -> Ids:
 
 def _edges(view: DiscView, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
     """Return nodes (V, 2) of pair and disc, the first and second node (E,) of every edge, and its chi-square (E,)."""
-    from scipy.spatial import cKDTree  # not above: SciPy takes longer than a pair of images
-
     points, tolerance = view.target.body.points, view.made_sigma_m
     sides = np.linalg.norm(points[:, None] - points[None], axis=2)
     pair, disc = np.nonzero(pairs.fits)
@@ -103,11 +102,10 @@ def _edges(view: DiscView, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
         return nodes, pair, pair, np.zeros(0)
     # No two discs lie farther apart than this, the least certain pairs included.
     sigma = np.sqrt(np.linalg.eigvalsh(pairs.cov)[:, -1].max() * 2)
-    tree = cKDTree(pairs.p_left)
-    reach = sides.max() + DISTANCE_SIGMAS * (sigma + tolerance)
-    if tree.count_neighbors(tree, reach) > 2 * MOST_EDGES:
+    near = pairs_within(pairs.p_left, sides.max() + DISTANCE_SIGMAS * (sigma + tolerance), MOST_EDGES + 1)
+    if len(near) > MOST_EDGES:
         return None
-    i, j = tree.query_pairs(reach, output_type="ndarray").T
+    i, j = near.T
     apart = (pairs.left[i] != pairs.left[j]) & (pairs.right[i] != pairs.right[j])
     i, j = i[apart], j[apart]
     along = pairs.p_left[i] - pairs.p_left[j]

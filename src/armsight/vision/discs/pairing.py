@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Discs, Ids, Record
+from armsight.geometry.near import pairs_within
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
 from armsight.kernels import kernel, kernel_types
@@ -114,12 +115,10 @@ class DiscView(Record):
 
 def _radius_once(discs: Discs) -> Array:
     """Return (N,) longer half axes, NaN where one as large lies within half of it: the same disc detected again."""
-    from scipy.spatial import cKDTree  # not above: SciPy takes longer than a pair of images
-
     radius = discs.radius_px
     if len(radius) < 2:
         return radius
-    one, again = cKDTree(discs.uv).query_pairs(radius.max() / 2, output_type="ndarray").T
+    one, again = pairs_within(discs.uv, radius.max() / 2).T
     near = np.linalg.norm(discs.uv[one] - discs.uv[again], axis=1) < radius[one] / 2
     same = near & (np.abs(radius[one] - radius[again]) < SIZE_TOLERANCE * radius[one])
     radius[again[same & (discs.bright[one] == discs.bright[again])]] = np.nan

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from armsight.errors import InputError
 from armsight.geometry.check import checked
-from armsight.tables.document import read_document
 from armsight.vision.camera_file import described, stranger
 from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.charuco import Charuco
@@ -44,6 +43,8 @@ def kalibr_spec(path: str) -> str:
     Raises:
         InputError: missing, no target file, or one whose squares are no squares; the message names file and key.
     """
+    from armsight.tables.document import read_document  # not above: YAML takes as long to import as a pair of images
+
     document = read_document(path)
     kind = document.get("target_type")
     if kind not in _TARGETS:

@@ -22,6 +22,7 @@ from armsight.data import Array, Body, Record
 from armsight.errors import InputError
 from armsight.files import read_table, read_toml, write_text
 from armsight.geometry.check import checked
+from armsight.geometry.near import pairs_within
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_euler_zyx, from_quaternion_wxyz
 from armsight.tables.lengths import BODY, check_length
@@ -217,8 +218,6 @@ def check_discs(markers: Sequence[Marker], radii_m: Sequence[float]) -> None:
         InputError: a radius or a distance that suggests a wrong unit, or two discs at one position; the message names
             file and entry.
     """
-    from scipy.spatial import cKDTree  # not above: SciPy takes longer than a pair of images
-
     positions = np.array([marker.position for marker in markers])
     away = np.linalg.norm(positions - positions[0], axis=1)
     for marker, radius, distance in zip(markers, radii_m, away, strict=True):
@@ -229,7 +228,7 @@ def check_discs(markers: Sequence[Marker], radii_m: Sequence[float]) -> None:
                 f"lies {distance:g} m from {markers[0].name}, and a body with discs is {DISC_BODY_MAX_M:g} m across at "
                 "most; is position_mm in mm?"
             )
-    for i, j in sorted(cKDTree(positions).query_pairs(max(radii_m))):
+    for i, j in sorted(map(tuple, pairs_within(positions, max(radii_m)).tolist())):
         gap, larger = float(np.linalg.norm(positions[i] - positions[j])), max(radii_m[i], radii_m[j])
         if gap < larger and not _back_to_back(markers[i], markers[j]):
             where = "at the same position as" if gap < 1e-6 else f"{1e3 * gap:.3g} mm from"

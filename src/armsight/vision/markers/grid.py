@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Ids
+from armsight.geometry.near import nearest
 from armsight.kernels import kernel
 
 
@@ -23,17 +24,15 @@ def rotations(points: Array) -> tuple[tuple[int, Ids], ...]:
         Pairs of the multiple of 90 degrees (1, 2, 3) and the permutation (M,): point i moves to where point perm[i]
         was.
     """
-    from scipy.spatial import KDTree  # not above: SciPy takes longer than a pair of images
-
     p = points[:, :2] - 0.5 * (points[:, :2].min(axis=0) + points[:, :2].max(axis=0))
-    tree = KDTree(p)
-    tolerance = 0.1 * float(np.asarray(tree.query(p, k=2)[0])[:, 1].min())
-    found, rotated = [], p
+    rows, squares = np.empty(len(p), np.int64), np.empty(len(p))
+    nearest(p, p, False, rows, squares)
+    found, rotated, most = [], p, 0.01 * squares.min()  # a tenth of the least distance, squared
     for rot90 in (1, 2, 3):
         rotated = rotated @ np.array([[0.0, 1.0], [-1.0, 0.0]])
-        distance, nearest = tree.query(rotated)
-        if np.max(distance) < tolerance:
-            found.append((rot90, np.asarray(nearest, dtype=np.int64)))
+        nearest(p, rotated, True, rows, squares)
+        if squares.max() < most:
+            found.append((rot90, rows.copy()))
     return tuple(found)
 
 

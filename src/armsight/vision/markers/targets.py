@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Body, Detections, Record
+from armsight.data import Array, Body, Detections, Record
 from armsight.errors import InputError
 from armsight.files import read_toml
 from armsight.vision.markers.aprilgrid import AprilGrid
@@ -134,11 +134,9 @@ def open_fixed(specs: Sequence[str], target: str) -> tuple[Target, ...]:
 
 def _alike(target: Target, other: Target) -> str:
     """Return why one of two targets may be taken for the other; empty where neither can."""
-    from scipy.spatial.distance import pdist  # not above: SciPy takes longer than a pair of images
-
     if both := _codes(target) & _codes(other):
         return "both have the marker {} {}".format(*min(both))
-    apart, beside = (np.sort(pdist(each.body.points)) for each in (target, other))
+    apart, beside = (_distances(each.body.points) for each in (target, other))
     kinds = {type(each.drawing if isinstance(each, EstimatedBoard) else each) for each in (target, other)}
     coded = _codes(target) or _codes(other)
     same = (
@@ -164,6 +162,11 @@ def _codes(target: Target) -> set[tuple[str, int]]:
         family, ids = board_codes(target)
         return {(family, k) for k in ids}
     return set()
+
+
+def _distances(points: Array) -> Array:
+    """Return the distances between points (N, 3), each pair's twice, sorted."""
+    return np.sort(np.concatenate([np.linalg.norm(points - each, axis=1) for each in points]))
 
 
 def _is_board_file(path: str) -> bool:

@@ -13,6 +13,7 @@ Every shot's own parameters are eliminated (Schur complement; Triggs et al., "Bu
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -227,6 +228,7 @@ _UNDAMPED = 1e-6
 _LEAST_BENT = 1e-2
 
 
+@functools.cache
 def _robust_excess() -> float:
     """Return how many times the inverse of the reweighted information exceeds a robust fit's covariance, without outliers.
 
@@ -237,9 +239,6 @@ def _robust_excess() -> float:
     half_d2, density = np.polynomial.laguerre.laggauss(40)
     w = 1.0 / (1.0 + 2 * half_d2 / CAUCHY_SCALE**2)
     return float((density @ w**2) ** 2 / ((density @ (half_d2 * w**2)) * (density @ w)))
-
-
-_ROBUST_EXCESS = _robust_excess()
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,7 +362,7 @@ def _covariance(normal: Arrow, prior: Array, robust: bool) -> Array:
     """(q, q) covariance of the free shared parameters, given their prior information (q,)."""
     S = normal.schur()
     if robust:
-        S = _ROBUST_EXCESS * (S - np.diag(prior)) + np.diag(prior)
+        S = _robust_excess() * (S - np.diag(prior)) + np.diag(prior)
     d = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
     return np.asarray(d[:, None] * np.linalg.pinv(d[:, None] * S * d, rcond=1e-14, hermitian=True) * d)
 

@@ -12,37 +12,48 @@ The contract is in ``vision/source.py``; :func:`open_source` opens a spec.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from armsight.errors import InputError
+from armsight.vision.rig import StereoRig
 from armsight.vision.source import Source
-from armsight.vision.sources.bag import open_bag_source
-from armsight.vision.sources.bag.reader import SUFFIXES
 from armsight.vision.sources.folder import FolderSource
-from armsight.vision.sources.lerobot import open_lerobot
 from armsight.vision.sources.pairs import PairsSource
-from armsight.vision.sources.usb import open_usb
-from armsight.vision.sources.video import open_video
 
-__all__ = ["SOURCES", "FolderSource", "PairsSource", "Source", "check_source", "lent", "notes_of", "open_source"]
+__all__ = [
+    "SOURCES",
+    "FolderSource",
+    "PairsSource",
+    "Source",
+    "check_source",
+    "lent",
+    "notes_of",
+    "open_rig",
+    "open_source",
+]
 
 
-def _open_url(rest: str) -> Source:
-    from armsight.vision.sources.url import open_url  # not above: with it come http and TLS
+def _later(module: str, name: str) -> Callable[[str], Source]:
+    """Return a function of a module beside, which is imported when it is called: with them come http, SQLite, Parquet."""
 
-    return open_url(rest)
+    def opened(rest: str) -> Source:
+        source: Source = getattr(importlib.import_module(f"{__name__}.{module}"), name)(rest)
+        return source
+
+    return opened
 
 
 #: Kind -> what opens the rest of the text; another kind of source is one line here.
 SOURCES: dict[str, Callable[[str], Source]] = {
     "folder": FolderSource.open,
-    "video": open_video,
-    "url": _open_url,
-    "usb": open_usb,
-    "bag": open_bag_source,
-    "lerobot": open_lerobot,
+    "video": _later("video", "open_video"),
+    "url": _later("url", "open_url"),
+    "usb": _later("usb", "open_usb"),
+    "bag": _later("bag", "open_bag_source"),
+    "lerobot": _later("lerobot", "open_lerobot"),
 }
 
 
@@ -63,6 +74,8 @@ def check_source(spec: str) -> None:
         if "://" in spec or spec.startswith("/dev/video"):
             hint = f" ({'url' if '://' in spec else 'usb'}:LEFT,RIGHT?)"
         elif os.path.isfile(os.path.expanduser(spec)):
+            from armsight.vision.sources.bag.reader import SUFFIXES
+
             hint = f" ({'bag' if spec.endswith(SUFFIXES) else 'video'}:{spec}?)"
         raise InputError(f"{spec}: not a source{hint}: known are {known}, or the path of a folder")
 
@@ -81,6 +94,23 @@ def open_source(spec: str | Path) -> Source:
     check_source(spec := str(spec))
     kind, colon, rest = spec.partition(":")
     return SOURCES[kind](rest) if colon and kind in SOURCES else FolderSource.open(spec)
+
+
+def open_rig(spec: str | Path) -> StereoRig:
+    """Read a rig: a rig file, or ``bag:FILE`` for the camera_info of a recording.
+
+    Raises:
+        InputError: it is not there, damaged, or the recording holds no stereo pair.
+    """
+    text = str(spec)
+    if not text.startswith("bag:"):
+        return StereoRig.load_trusted(spec)
+    from armsight.vision.sources.bag.camera_info import bag_rig
+    from armsight.vision.sources.bag.images import parsed
+    from armsight.vision.sources.bag.reader import Bag
+
+    path, named = parsed(text.removeprefix("bag:"))
+    return bag_rig(Bag(path), named)
 
 
 @contextlib.contextmanager

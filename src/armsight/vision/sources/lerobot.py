@@ -200,6 +200,8 @@ class LeRobotSource(Source):
         notes: what was left out: episodes without a video.
     """
 
+    timed = True
+
     def __init__(self, dataset: LeRobotDataset, keys: tuple[str, str], episode: int | None) -> None:
         table = dataset.table(["timestamp", "episode_index", "frame_index"])
         columns = (np.array(table[key]).reshape(-1) for key in ("timestamp", "episode_index", "frame_index"))

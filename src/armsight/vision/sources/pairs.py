@@ -77,6 +77,7 @@ class StoredSource(Source):
 
     def __init__(self, pairs: Sequence[StoredPair]) -> None:
         self.pairs = tuple(pairs)
+        self.timed = any(pair.t_s is not None for pair in self.pairs)
         self._rest = iter(self.pairs)
 
     @property

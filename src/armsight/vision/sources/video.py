@@ -59,6 +59,7 @@ class VideoSource(Source):
     """Two video files, or one side-by-side file."""
 
     count: int | None = None  # what a container promises is an estimate
+    timed = True
 
     def __init__(self, files: Sequence[_File]) -> None:
         self._files = list(files)

@@ -14,7 +14,7 @@ from armsight.tables.document import Foreign
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import ImportOptions
 from armsight.vision.rigfiles.ros import rig_of
-from armsight.vision.sources.bag.images import IMAGES, parsed, two_topics
+from armsight.vision.sources.bag.images import IMAGES, two_topics
 from armsight.vision.sources.bag.reader import Bag, Decoded
 
 #: Types of messages that hold a camera's calibration.
@@ -23,19 +23,6 @@ INFOS = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
 METADATA, RIG = "armsight", "rig.json"
 #: Names of models -> ROS's: Foxglove calls the equidistant one by its authors.
 _MODELS = {"": "plumb_bob", "kannala_brandt": "equidistant"}
-
-
-def open_rig(spec: str | Path) -> StereoRig:
-    """Read a rig: a rig file, or ``bag:FILE`` for the camera_info of a recording.
-
-    Raises:
-        InputError: it is not there, damaged, or the recording holds no stereo pair.
-    """
-    text = str(spec)
-    if not text.startswith("bag:"):
-        return StereoRig.load_trusted(spec)
-    path, named = parsed(text.removeprefix("bag:"))
-    return bag_rig(Bag(path), named)
 
 
 def bag_rig(bag: Bag, named: dict[str, str] | None = None) -> StereoRig:

@@ -73,6 +73,7 @@ _S_NS = 1e9
 #: Messages that wait until they are due, MB; half: a recording far from the order of time is read more often; double: twice
 #: the memory.
 _HELD_MB = 128
+_SAMPLED = 61  # of so many bytes one distinguishes messages of a stamp; half: 20 us an image more, double: less
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,8 @@ class BagSource(Source):
         notes: what was left out, or is odd, a line each.
         topics: of the left and of the right images.
     """
+
+    timed = True
 
     def __init__(self, bag: Bag, topics: tuple[str, str], pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> None:
         self.topics, self.notes = topics, (*bag.notes, *pairing.notes)
@@ -230,7 +233,7 @@ def stamps_of_topics(bag: Bag, topics: tuple[str, str]) -> tuple[Stamps, Stamps]
         header, arrival, contents = found[message.topic]
         header.append(message.stamp_ns())
         arrival.append(message.arrival_ns)
-        contents.append(hash(message.data))
+        contents.append(hash(message.data[::_SAMPLED]))
     if any(header and max(header) <= 0 for header, _, _ in found.values()):  # both cameras by one clock
         found = {topic: ([0] * len(arrival), arrival, contents) for topic, (_, arrival, contents) in found.items()}
     left, right = (stamps_of(topic, *found[topic]) for topic in topics)

@@ -287,6 +287,7 @@ class _McapFiles:
         except ImportError:
             raise InputError(f"{path}: MCAP is read with mcap, which is not installed: {_INSTALL}") from None
         self._path, self._files, self._notes, self._metadata = path, files, notes, metadata
+        self._chunks = dict[Path, int]()  # of each file so many are whole
 
     def topics(self) -> list[Topic]:
         counts: dict[tuple[str, str], int] = {}
@@ -312,6 +313,7 @@ class _McapFiles:
         schemas: dict[int, _McapRecord] = {0: None}
         channels: dict[int, _McapRecord] = {}
         decoders: dict[int, Callable[[bytes], Decoded]] = {}
+        chunks = 0
 
         def found(record: _McapRecord) -> _McapRecord:
             if isinstance(record, records.Schema):
@@ -333,14 +335,17 @@ class _McapFiles:
                         if (one := found(record)) is not None:
                             yield one
                         continue
+                    if not note and chunks == self._chunks[file]:
+                        return
                     if record.compression not in _COMPRESSIONS:
                         raise InputError(
                             f"{self._path}: its chunks are compressed with {record.compression!r}; lz4 and zstd are read: "
                             f"mcap compress --compression zstd {file} -o OUT.mcap"
                         )
-                    for inner in breakup_chunk(_decompressed(record), validate_crc=True):
+                    for inner in breakup_chunk(_decompressed(record), validate_crc=note):  # once
                         if (one := found(inner)) is not None:
                             yield one
+                    chunks += 1
         except InputError:
             raise
         except OSError as error:
@@ -349,6 +354,9 @@ class _McapFiles:
             if note:
                 text = " ".join(str(error).split()) or type(error).__name__
                 self._notes.append(f"{file}: cut short or damaged ({text}): what was before is read")
+        finally:
+            if note:
+                self._chunks[file] = chunks
 
     def _decoder(
         self,
