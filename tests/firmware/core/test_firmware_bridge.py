@@ -132,7 +132,7 @@ def test_a_weak_motor_at_its_duty_limit_is_no_bridge(motors, library, seed, join
     motors.until_moving(arm, joint)
     arm.plant._model[1, joint] *= share
     arm.swing(1500, stop_at_fault=False)
-    assert arm.first[0] in (Fault.MOTOR, Fault.POT_SCALE)  # both where they cannot be told apart
+    assert arm.first[0] in (Fault.MOTOR, Fault.POT_SCALE)  # both where they cannot be distinguished
     assert int(arm.out[0]["joint_faults"][joint]) & 1  # MOTOR, 32, has bit 0
     assert arm.out[0]["drives_on"]
 

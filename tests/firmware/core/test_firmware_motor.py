@@ -193,7 +193,7 @@ class Kept:
         (PotFault.SCALED, 2.3936734940067215, Fault.POT_SCALE, 72004601),
     ],
 )
-def test_what_cannot_be_told_apart_has_both_names(arms, library, kind, size, code, seed):
+def test_what_cannot_be_distinguished_has_both_names(arms, library, kind, size, code, seed):
     arm = Kept(arms, library, seed, kind, size).arm
     assert int(arm.out[0]["joint_faults"][arm.first[1]]) >> code & 1
 
