@@ -476,7 +476,7 @@ def offsets(
     elif name.startswith("feetech:"):
         with _open_any(name, baud, calibration) as board:
             assert isinstance(board, FeetechBoard)
-            kept.offer_release(board, asked=bool(given) and not yes)
+            kept.offer_release(board, changes=bool(given), yes=yes)
             offer(kept.servo_zeros(board, angles, restore, calibration))
     else:
         with _open(name, baud) as own:

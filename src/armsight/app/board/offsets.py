@@ -135,9 +135,9 @@ def pot_zeros(board: Board, further_rad: Array | None, restore: Path | None) -> 
     return _of_angles(changes, restore is not None, write)
 
 
-def offer_release(board: FeetechBoard, *, asked: bool) -> None:
-    """Switch the drives off after asking, if a torque is on and there is somebody to ask."""
-    if asked and any(board.bus.read(id, TORQUE) for id in board.calibration.ids):
+def offer_release(board: FeetechBoard, *, changes: bool, yes: bool) -> None:
+    """Switch the drives off after asking, if a torque is on where zeros change; with ``yes`` nobody can be asked."""
+    if changes and not yes and any(board.bus.read(id, TORQUE) for id in board.calibration.ids):
         click.confirm("the drives are on, and off the arm sinks: is it supported?", abort=True, err=True)
         board.confirm(board.command(Command.DISABLE))
 
