@@ -1,5 +1,6 @@
 """A camera's clock that drifts against that of the joints: followed, named, and nothing else is blamed."""
 
+import faults
 import numpy as np
 import pytest
 from faults import AT_S, watched_arm
@@ -50,3 +51,15 @@ def test_an_earlier_state_is_gone_back_to_with_the_clock_of_that_time(drifting):
     estimator.restore(estimator.nothing_known())
     assert estimator.clock_offset_s(17.0) == offset_s
     assert np.count_nonzero(estimator.clock._V) == 1
+
+
+def test_stamps_that_run_fast_leave_no_error_in_what_was_learned(monkeypatch):
+    monkeypatch.setattr(faults, "AT_S", 10.0)
+    fast = watched_arm(63, seconds=20.0, late=lambda t_s: 0.01 * t_s)
+    (found,) = fast.monitor.findings()
+    assert (found.cause, found.unit) == ("time", "%")
+    track = fast.tracked
+    rows = np.flatnonzero(track.t_s > 14.0)[::20]
+    off = np.linalg.inv(track.Ts_base_tool[rows]) @ fast.Ts_true[rows]
+    shift, cov = off[:, :3, 3], track.covs[rows, :3, :3]
+    assert np.mean(np.einsum("ni,nij,nj->n", shift, np.linalg.inv(cov), shift)) < 6.0

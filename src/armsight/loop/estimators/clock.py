@@ -89,6 +89,11 @@ class ClockFollower:
         self._V[forgotten] = 0.0
         self._certain_s = np.inf
 
+    def jumped(self, t_s: float, sigma_s: float) -> None:
+        """Correct stamps from a time, s, on: they were put right, to a standard deviation, s."""
+        self._M[0, 0] += sigma_s**2
+        self.since_s = t_s
+
     def offset_s(self, t_s: float) -> float:
         """Return by how much later than its delay says a stamp is about a time, s, as far as that is corrected."""
         if self.since_s is None:
