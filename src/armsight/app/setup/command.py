@@ -22,7 +22,7 @@ from armsight.errors import InputError
 @click.option("--from", "begin", type=click.IntRange(1), metavar="N", help="Do it again from this step on.")
 @click.option("--json", "as_json", is_flag=True, help="Print how far it came as one JSON object.")
 def command(arm: str, source: str | None, board: str | None, begin: int | None, as_json: bool) -> None:
-    """SetupWalk through ARM's page, from the cameras to the corrected arm; setup.json remembers how far it came.
+    """Walk through ARM's page, from the cameras to the corrected arm; setup.json remembers how far it came.
 
     Each command is shown before it runs; they are those of docs/arms/. The port is found by unplugging, the cameras by
     covering them. Ctrl-C keeps what was done: the same command goes on there.

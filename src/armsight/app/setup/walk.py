@@ -147,6 +147,7 @@ def simulated(walk: SetupWalk, cameras: str) -> Iterator[None]:
 
     write_text("body.toml", body_text())
     walk.words |= {CAMERAS: cameras, BOARD: CHESSBOARD, PLATE: "body.toml"}
+    walk.words |= {old: new for step in ARMS[walk.arm] for old, new in step.without}  # nobody has files of their own
     with contextlib.ExitStack() as stack:
         own = walk.arm == "six_r"
         walk.simulated = "emulated:unicorn" if own else stack.enter_context(emulated_arm(walk.arm))
