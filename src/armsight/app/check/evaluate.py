@@ -74,21 +74,15 @@ def evaluate(attained: Attained) -> CheckResult:
     """
     by_test = {test: [row for row in attained.rows if row.test == test] for test in TESTS}
     rows, few = by_test["pose"], iso9283.MIN_POSES
+    seldom, workspace = "", None
+    often, said = _often(rows)
     counts = Counter(row.pose for row in rows)
-    seldom, often, said = "", dict[str, list[Row]](), list[str]()
-    if rows and max(counts.values()) < few and len(counts) < _WIDE:
+    if rows and not often and len(counts) < _WIDE:
         seldom = (
             f"{len(counts)} poses, none attained {few} times and more (the most: {max(counts.values())}), so there is no "
             f"repeatability: 30 times are the standard's, or {_WIDE} poses and more once (armsight check plan)"
         )
-    elif rows:
-        groups = _groups(rows, lambda row: row.pose)
-        often = {name: groups[name] for name in sorted(groups, key=natural) if counts[name] >= few}
-        rare = [f"left out: {name}, attained too seldom ({counts[name]})" for name in groups if name not in often]
-        said = first_few(rare, "poses, attained too seldom") if often else []
-        said += [note for group in often.values() for note in _outliers(group)]
-    workspace = None
-    if rows and not often and not seldom:
+    elif rows and not often:
         p, p_ref, cov, common = _stacked(rows)
         workspace = WorkspaceResult(len(rows), *iso9283.anywhere(p - p_ref, cov, common))
     paths = _groups(by_test["path"], lambda row: row.approach or "path")
@@ -100,6 +94,15 @@ def evaluate(attained: Attained) -> CheckResult:
     notes += [f"left out: all poses, as none was attained {few} times"] if seldom else []
     ways = _several_ways(often)
     return CheckResult(poses, ways, workspace, _distance(often), _drift(often), followed, circle, notes)
+
+
+def _often(rows: list[Row]) -> tuple[dict[str, list[Row]], list[str]]:
+    """Return the rows of each pose that was attained often enough, and what is said of the others and of outliers."""
+    groups = _groups(rows, lambda row: row.pose)
+    often = {name: groups[name] for name in sorted(groups, key=natural) if len(groups[name]) >= iso9283.MIN_POSES}
+    rare = [f"left out: {name}, attained too seldom ({len(groups[name])})" for name in groups if name not in often]
+    said = first_few(rare, "poses, attained too seldom") if often else []
+    return often, said + [note for group in often.values() for note in _outliers(group)]
 
 
 class _Stacked(NamedTuple):

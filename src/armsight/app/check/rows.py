@@ -141,18 +141,20 @@ def _row(where: str, entries: dict[str, str], numbers: dict[str, float]) -> Row:
     sigmas = {name: numbers.get(name, 0.0) for name in (*_SIGMA, *_COMMON)}
     if below := [name for name, sigma in sigmas.items() if sigma < 0.0]:
         raise InputError(f"{where}: {below[0]} is {sigmas[below[0]]:g}; a standard deviation is never below zero")
-    Ts = []
-    for prefix in ("", "command_"):
-        q = np.array([numbers.get(prefix + name, float(name == "qw")) for name in _QUATERNION])  # else that of the base
-        if not 0.999 < (length := np.linalg.norm(q)) < 1.001:
-            raise InputError(f"{where}: quaternion {prefix}qw .. {prefix}qz has length {length:.4g}, not 1")
-        p = np.array([numbers[prefix + name] for name in _POSITION])
-        Ts.append(pose(from_quaternion_wxyz(q / length), p))
+    Ts = [_pose(where, numbers, prefix) for prefix in ("", "command_")]
     covs = [np.diag([sigmas[name] ** 2 for name in names]) for names in (_SIGMA, _COMMON)]
     name, cycle, approach = (entries[key] for key in _TEXTS[1:])
     known, known_ref = _QUATERNION[0] in numbers, _COMMAND[3] in numbers
     t_s = numbers.get("t_s")
     return Row(test, name, cycle, approach, t_s, Ts[0], Ts[1], covs[0], covs[1], known, known_ref)
+
+
+def _pose(where: str, numbers: dict[str, float], prefix: str) -> Array:
+    """Return a pose (4, 4); without a rotation it has that of the base."""
+    q = np.array([numbers.get(prefix + name, float(name == "qw")) for name in _QUATERNION])
+    if not 0.999 < (length := np.linalg.norm(q)) < 1.001:
+        raise InputError(f"{where}: quaternion {prefix}qw .. {prefix}qz has length {length:.4g}, not 1")
+    return pose(from_quaternion_wxyz(q / length), np.array([numbers[prefix + name] for name in _POSITION]))
 
 
 def natural(name: str) -> list[tuple[int, str]]:
