@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.body.check import SEPARATED_SIGMAS, sigma_px
-from armsight.app.body.finding import Assessment, Prediction, ambiguity_text
+from armsight.app.body.check import Assessment, Prediction, ambiguity_text, sigma_px
 from armsight.app.show.report import Block, Fact, Report
 from armsight.app.show.table import TextTable
 from armsight.vision.markers.body_layout import Layout
@@ -129,7 +128,7 @@ def _ambiguities(layout: Layout, assessment: Assessment) -> list[dict[str, Any]]
             "from_behind": one.behind,
             "settled_by_normals": one.by_side,
             "separation_sigmas": one.separation_sigmas,
-            "distinguishable": not bool((one.separation_sigmas < SEPARATED_SIGMAS).any()),
+            "distinguishable": not len(one.unsettled),
         }
         for one in assessment.ambiguities
     ]
