@@ -130,31 +130,23 @@ def _of_files(path: Path, side: str, whose: str | None) -> Cells:
 
 def _of_file(path: Path, side: str, whose: str | None) -> Cells:
     """Return what one file holds, its names as they stand there."""
-    if path.suffix.lower() in PACKED or is_packed(path):
-        return _of_records(path, "", side, whose)
-    text = read_text(path, TABLE_MB).removeprefix("\ufeff")
-    if points := program_rows(path, text):
+    packed = path.suffix.lower() in PACKED or is_packed(path)
+    text = "" if packed else read_text(path, TABLE_MB).removeprefix("\ufeff")
+    if not packed and (points := program_rows(path, text)):
         return Cells(points.head, _even(path, points.rows, len(points.head)), points.rotation, points.notes)
     written = [(line, row.strip()) for line, row in enumerate(text.splitlines(), 1)]
     written = [(line, row) for line, row in written if row and not row.startswith("#")]
     if written and _LIST.fullmatch(written[0][1]):
-        cells = _without_names(path, _lists(path, written))
-        return cells._replace(listed=True)
-    if is_document(path, text):
-        return _of_records(path, text, side, whose)
+        return _without_names(path, _lists(path, written))._replace(listed=True)
+    if packed or is_document(path, text):
+        head, records = document_rows(path, text, side, whose)
+        return Cells(head, [(k, [record.get(name, "") for name in head]) for k, record in enumerate(records, 1)])
     if written and _NO_TABLE.match(written[0][1]):
         raise InputError(
             f"{path}: {written[0][1][:40]!r} begins no table: write one pose a line, a matrix of 16 numbers or columns "
             "such as x_mm,y_mm,z_mm,qw,qx,qy,qz"
         )
     return _delimited(path, text, written)
-
-
-def _of_records(path: Path, text: str, side: str, whose: str | None) -> Cells:
-    """Return what a document holds."""
-    head, records = document_rows(path, text, side, whose)
-    rows = [(k, [record.get(name, "") for name in head]) for k, record in enumerate(records, 1)]
-    return Cells(head, rows)
 
 
 def _delimited(path: Path, text: str, written: list[tuple[int, str]]) -> Cells:
@@ -216,11 +208,8 @@ def _without_names(path: Path, rows: Rows) -> Cells:
     if len(rows[0][1]) == 4:
         rows = _matrices(path, _even(path, rows, 4))
     count = len(rows[0][1])
-    head = _FORMS.get(count) or [f"_{k}" for k in range(count)]
-    rows = _even(path, rows, count)
-    if count == 16:
-        return _row_major(path, Cells(head, rows))
-    return Cells(head, rows)
+    cells = Cells(_FORMS.get(count) or [f"_{k}" for k in range(count)], _even(path, rows, count))
+    return _row_major(path, cells) if count == 16 else cells
 
 
 def _is_last(cells: list[str]) -> bool | None:

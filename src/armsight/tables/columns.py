@@ -66,8 +66,8 @@ def understood(
     """
     bare = [name.strip().strip('"').strip().lower().replace("°", "deg") for name in head]
     bare = [re.sub(r"\s*[\[(](mm|m|deg|rad|s)[\])]$", r"_\1", name) for name in bare]
-    ours = _of_ros(bare, joint_names, unit or "m")
-    out = [one if one in COLUMNS else name.strip().strip('"').strip() for one, name in zip(ours, head, strict=True)]
+    ours = zip(_of_ros(bare, joint_names, unit or "m"), head, strict=True)
+    out = [one if one in COLUMNS else name.strip().strip('"').strip() for one, name in ours]
     theirs, said = _of_a_maker(bare, out, unit or "mm")
     out = [theirs.get(k, name) for k, name in enumerate(out)]
     if len(set(out)) < len(out):
@@ -134,12 +134,10 @@ def degree_columns(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
         InputError: other joints than these, or no value beyond 100: both are possible.
     """
     head = [cell.strip() for cell in rows[0]] if rows else []
-    theirs = [
-        name for name in head if name.endswith(_LEROBOT_POSITION) and name != _LEROBOT_GRIPPER + _LEROBOT_POSITION
-    ]
-    if not {f"{name}{_LEROBOT_POSITION}" for name in LEROBOT} & set(theirs) or {"q1_deg", "q1_rad"} & set(head):
+    known, gripper = [f"{name}{_LEROBOT_POSITION}" for name in LEROBOT], _LEROBOT_GRIPPER + _LEROBOT_POSITION
+    theirs = [name for name in head if name.endswith(_LEROBOT_POSITION) and name != gripper]
+    if not set(known) & set(theirs) or {"q1_deg", "q1_rad"} & set(head):
         return rows
-    known = [name + _LEROBOT_POSITION for name in LEROBOT]
     if sorted(theirs) != sorted(known):
         raise InputError(
             f"{path}: line 1: LeRobot's columns {', '.join(theirs)}; read are those of one SO-100 or SO-101, "
@@ -244,12 +242,10 @@ class Columns:
         """Return what may be wrong with the columns of joints."""
         if len(names) == count + 1:
             return "; is the last one a gripper? remove its column"
-        gone = next(
-            (f"q{k}" for k in range(1, count + 1) if not any(name.startswith(f"q{k}_") for name in names)), None
-        )
         unknown = next((name for name in self.at if name and name not in COLUMNS), None)
         if unknown is None:
-            return "" if gone is None else f"; column {gone}{names[0][2:]} is missing"
+            gone = {f"q{k}" for k in range(1, count + 1)} - {name[:2] for name in names}
+            return f"; column {min(gone)}{names[0][2:]} is missing" if gone else ""
         known = [*self.links, *(f"{name}_joint" for name in self.links), *COLUMNS]
         near = get_close_matches(unknown, known, 1)
         return f"; column {unknown!r} is not known" + (f": is it {near[0]}?" if near else "")
@@ -288,29 +284,29 @@ class Columns:
             R = self.numbers([f"r{i}{j}" for i in "123" for j in "123"]).reshape(-1, 3, 3)
             return self._checked(R), np.zeros((len(R), 0)), "", np.zeros((len(R), 0))
         if "qw" in self.at:
-            written = self.numbers(["qw", "qx", "qy", "qz"])
-            found, convention = written, "wxyz"
+            found = written = self.numbers(["qw", "qx", "qy", "qz"])
+            convention = "wxyz"
         elif "n4" in self.at:
-            if rotation not in ("wxyz", "xyzw"):
-                raise InputError(
-                    f"{self.path}: which of the four numbers of a quaternion is w? give --rotation wxyz or --rotation xyzw"
-                )
-            written = self.numbers(["n1", "n2", "n3", "n4"])
-            self._require_in_order(written)
-            found, convention = written, rotation
+            found, convention = self._quaternions(rotation)
+            written = found
         else:
             found, convention, written = self._angles(rotation)
         return self._checked(rotations_by(found, convention, self.path)), found, convention, written
 
-    def _require_in_order(self, quaternions: Array) -> None:
-        """Raise an InputError where the four numbers of a quaternion stand before the position: their length is 1 there."""
-        first = self.numbers([*"xyz", "n1"])
-        off, other = (float(np.abs(np.linalg.norm(four, axis=1) - 1).max()) for four in (quaternions, first))
+    def _quaternions(self, rotation: str | None) -> tuple[Array, str]:
+        """Return four numbers (N, 4) without names, and their convention; reject those that stand before the position."""
+        if rotation not in ("wxyz", "xyzw"):
+            raise InputError(
+                f"{self.path}: which of the four numbers of a quaternion is w? give --rotation wxyz or --rotation xyzw"
+            )
+        last, first = self.numbers(["n1", "n2", "n3", "n4"]), self.numbers([*"xyz", "n1"])
+        off, other = (float(np.abs(np.linalg.norm(four, axis=1) - 1).max()) for four in (last, first))
         if off > QUATERNION_OFF > other:
             raise InputError(
                 f"{self.path}: the last four numbers are no quaternions, the first four are: the rotation comes before the "
                 "position: name the columns in their order, --columns qx,qy,qz,qw,x,y,z or qw,qx,qy,qz,x,y,z"
             )
+        return last, rotation
 
     def _angles(self, rotation: str | None) -> tuple[Array, str, Array]:
         """Return three numbers of a rotation (N, 3), degrees, their convention, and them as written."""

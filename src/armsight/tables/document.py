@@ -90,9 +90,9 @@ def documents_in(data: bytes, path: str | Path) -> list[Foreign]:
     """Return the documents that a file's bytes hold, one at least; errors as :func:`read_document`."""
     if data[:2] == b"\x1f\x8b":
         data = _unpacked(data, path)
-    found = _binary(data, path)
-    if found is not None:
-        return [found]
+    if data[:4] == b"PK\x03\x04" or data[:6] == b"\x93NUMPY":
+        return [_numpy(data, path)]
+    _refuse(data, path)
     try:
         text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except UnicodeDecodeError:
@@ -150,10 +150,8 @@ def _unpacked(data: bytes, path: str | Path) -> bytes:
     return out
 
 
-def _binary(data: bytes, path: str | Path) -> dict[str, Foreign] | None:
-    """Return what a file of numpy holds, None where it is none."""
-    if data[:4] == b"PK\x03\x04" or data[:6] == b"\x93NUMPY":
-        return _numpy(data, path)
+def _refuse(data: bytes, path: str | Path) -> None:
+    """Raise an InputError for a file of a kind that is known and not read."""
     if data[:6] == b"MATLAB" or data[:4] == b"\x89HDF":
         raise InputError(
             f"{path}: a MATLAB file, which is not read: in MATLAB, writelines(jsonencode(load('{Path(path).name}')), "
@@ -163,7 +161,6 @@ def _binary(data: bytes, path: str | Path) -> dict[str, Foreign] | None:
         raise InputError(f"{path}: an archive (tar): unpack it and give the files in it")
     if re.match(rb"\x80[\x02-\x05]", data):
         raise InputError(f"{path}: a Python pickle, which may run programs and is not read: {_SAVE}")
-    return None
 
 
 def _numpy(data: bytes, path: str | Path) -> dict[str, Foreign]:
@@ -280,26 +277,23 @@ class _Yaml:
 
     def _value(self, event: _Event, depth: int) -> Foreign:
         """Return the value that begins with an event."""
-        before, self._count = self._count, self._count + 1
-        self._check_bounds(event, depth)
-        if isinstance(event, yaml.AliasEvent):
-            if event.anchor not in self._anchors:
-                _reject(event, f"no anchor &{event.anchor} before it")
-            value, held = self._anchors[event.anchor]
-            self._count += held
-            self._check_bounds(event, depth)
-        elif isinstance(event, yaml.ScalarEvent):
+        before, alias = self._count, isinstance(event, yaml.AliasEvent)
+        if alias and event.anchor not in self._anchors:
+            _reject(event, f"no anchor &{event.anchor} before it")
+        value, held = self._anchors[event.anchor] if alias else (None, 0)
+        self._count += 1 + held
+        if self._count > _MOST_VALUES or depth > _MOST_DEPTH:
+            _reject(event, f"over {_MOST_VALUES} values, or nested over {_MOST_DEPTH} deep: is it the right file?")
+        if alias:
+            return value
+        if isinstance(event, yaml.ScalarEvent):
             value = self._scalar(event)
         else:
             self._check_tag(event)
             value = self._sequence(depth) if isinstance(event, yaml.SequenceStartEvent) else self._mapping(depth)
-        if event.anchor and not isinstance(event, yaml.AliasEvent):
+        if event.anchor:
             self._anchors[event.anchor] = value, self._count - before
         return value
-
-    def _check_bounds(self, event: _Event, depth: int) -> None:
-        if self._count > _MOST_VALUES or depth > _MOST_DEPTH:
-            _reject(event, f"over {_MOST_VALUES} values, or nested over {_MOST_DEPTH} deep: is it the right file?")
 
     def _sequence(self, depth: int) -> list[Foreign]:
         values = []
@@ -391,11 +385,9 @@ def _xml(data: bytes, path: str | Path) -> Foreign:
 
 def _node(element: ElementTree.Element) -> Foreign:
     """Return the value of an element of OpenCV's XML."""
-    children = list(element)
-    if children:
-        if all(child.tag == "_" for child in children):
-            return [_node(child) for child in children]
-        return {child.tag: _node(child) for child in children}
+    if children := list(element):
+        listed = all(child.tag == "_" for child in children)
+        return [*map(_node, children)] if listed else {child.tag: _node(child) for child in children}
     words = (element.text or "").split()
     if element.tag == "dt" or not words:
         return " ".join(words)
@@ -407,5 +399,4 @@ def _node(element: ElementTree.Element) -> Foreign:
 
 def _or_number(text: str) -> Foreign:
     """Return a number where a text is one."""
-    found = number(text)
-    return text.strip() if found is None else found
+    return text.strip() if (found := number(text)) is None else found

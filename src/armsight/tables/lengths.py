@@ -61,7 +61,8 @@ def check_length(length_m: float, unit_m: float, usual: Usual, advice: str = "--
     if usual.least_m <= length_m <= usual.most_m:
         return
     unit = fitting_unit(length_m, unit_m, usual)
-    found = f"{usual.what} {metric(length_m)}, with the file's lengths in {_unit_name(unit_m)}"
+    name = next((name for name, other_m in UNITS_M.items() if other_m == unit_m), f"units of {unit_m:g} m")
+    found = f"{usual.what} {metric(length_m)}, with the file's lengths in {name}"
     expected = f"expected {metric(usual.least_m)} to {metric(usual.most_m)}"
     if unit is None:
         raise InputError(f"{found}; {expected}: is the file damaged, or its unit another one?")
@@ -75,8 +76,3 @@ def check_length(length_m: float, unit_m: float, usual: Usual, advice: str = "--
 def metric(length_m: float) -> str:
     """Return a length for people: mm below a metre, else m."""
     return f"{1e3 * length_m:.4g} mm" if length_m < 1 else f"{length_m:.4g} m"
-
-
-def _unit_name(unit_m: float) -> str:
-    """Return the name of a unit, or its length."""
-    return next((name for name, other_m in UNITS_M.items() if other_m == unit_m), f"units of {unit_m:g} m")

@@ -103,7 +103,8 @@ def _records(path: Path, document: Any, side: str, whose: str | None) -> list[Re
         if groups:
             poses = [key for key, one in groups.items() if not _is_joints(one)]
             record = dict(groups[_chosen(path, poses or list(groups), side, whose)])
-            record |= next((one for one in groups.values() if poses and len(groups) > 1 and _with_unit(one)), {})
+            joints = (one for one in groups.values() if poses and _is_joints(one, r"q\d_(deg|rad)"))
+            record |= next(joints, {})
             records.append({**record, **({} if name is None else {"name": name}), **_beside(item)})
     if not records:
         raise InputError(
@@ -152,11 +153,9 @@ def _array(node: object) -> np.ndarray[Any, np.dtype[np.float64]] | None:
 
 def _items(node: Any) -> list[tuple[Any, str | None]]:  # noqa: ANN401
     """Return the records of a document, each with its name where it has one."""
-    array = _array(node)
-    if array is not None:
-        if array.ndim < 2 or array.shape in ((4, 4), (3, 4)):
-            return [(array.tolist(), None)]
-        return [(one.tolist(), None) for one in array]
+    if (array := _array(node)) is not None:
+        whole = array.ndim < 2 or array.shape in ((4, 4), (3, 4))
+        return [(one.tolist(), None) for one in ([array] if whole else array)]
     if isinstance(node, list):
         found: list[tuple[Any, str | None]] = [(one, None) for one in node if isinstance(one, Mapping | list)]
         return found if len(found) != 1 else _items(found[0][0])
@@ -224,13 +223,10 @@ def _positions_beside_rotations(node: Mapping[str, Any]) -> dict[str, Record]:
     return {whose: found for whose, found in halves.items() if len(found) > 4}
 
 
-def _is_joints(record: Record) -> bool:
-    return not {key.partition("_")[0] for key in record} & {*_XYZ, *"XYZ"}
-
-
-def _with_unit(record: Record) -> bool:
-    """Return whether a record is of joints whose unit is known."""
-    return _is_joints(record) and all(re.fullmatch(r"q\d_(deg|rad)", key) for key in record)
+def _is_joints(record: Record, unit: str = "") -> bool:
+    """Return whether a record is of joints, in units that match a pattern."""
+    known = all(re.fullmatch(unit, key) for key in record) if unit else True
+    return known and not {key.partition("_")[0] for key in record} & {*_XYZ, *"XYZ"}
 
 
 def _of_numbers(array: np.ndarray[Any, np.dtype[np.float64]], name: str) -> Record | None:
@@ -252,36 +248,26 @@ def _of_numbers(array: np.ndarray[Any, np.dtype[np.float64]], name: str) -> Reco
 
 def _half(key: str, node: Any, half: re.Match[str]) -> Record:  # noqa: ANN401
     """Return the numbers of a position or a rotation by their names; {} where they are none."""
+    position = half["position"] is not None
     if isinstance(node, Mapping):
         numbers = _numbers(node)
-        before = {
-            frozenset(_XYZ): "" if half["position"] else "r",
-            frozenset("wxyz"): None if half["position"] else "q",
-        }
-        prefix = before.get(frozenset(numbers))
-        return {} if prefix is None else {f"{prefix}{k}": one for k, one in numbers.items()}
+        prefix = {frozenset(_XYZ): "" if position else "r", frozenset("wxyz"): None if position else "q"}
+        before = prefix.get(frozenset(numbers))
+        return {} if before is None else {f"{before}{k}": one for k, one in numbers.items()}
     array = _array(node)
     if array is None:
         return {}
-    cells = [repr(float(one)) for one in array.ravel()]
     unit = found[0] if (found := _UNIT.search(key)) else ""
-    if half["position"]:
-        return dict(zip((f"{axis}{unit}" for axis in "xyz"), cells, strict=True)) if array.shape == (3,) else {}
-    return _rotation_cells(key, array.shape, cells, unit)
-
-
-def _rotation_cells(key: str, shape: tuple[int, ...], cells: list[str], unit: str) -> Record:
-    """Return the numbers of a rotation, of an array of some shape, by their names; {} where they are none."""
-    if shape in ((3, 3), (9,)):
-        return dict(zip(_ROTATION, cells, strict=True))
-    if shape == (4,):
+    vector = not position and any(word in key.lower() for word in ("rvec", "rotvec", "axis"))
+    names = [f"{'' if position else 'r'}{axis}{unit or ('_rad' if vector else '')}" for axis in "xyz"]
+    if array.shape == (4,):
         order = next((order for order in ("xyzw", "wxyz") if order in key.lower()), None)
-        return dict(zip([f"q{k}" for k in order] if order else ["n1", "n2", "n3", "n4"], cells, strict=True))
-    if shape != (3,):
+        names = [f"q{k}" for k in order] if order else ["n1", "n2", "n3", "n4"]
+    elif array.shape in ((3, 3), (9,)):
+        names = _ROTATION
+    if array.size != len(names) or array.ndim > 2 or (position and array.size != 3):
         return {}
-    vector = any(word in key.lower() for word in ("rvec", "rotvec", "axis"))
-    unit = unit or ("_rad" if vector else "")
-    return dict(zip((f"r{axis}{unit}" for axis in "xyz"), cells, strict=True))
+    return dict(zip(names, (repr(float(one)) for one in array.ravel()), strict=True))
 
 
 def _beside(item: Any) -> Record:  # noqa: ANN401

@@ -211,7 +211,7 @@ def _positions(table: Columns, unit: str | None, detect: bool, side: str) -> tup
         if not detect:
             raise InputError(
                 f"{table.path}: positions of up to {far:.0f} m: are they millimetres? name the columns x_mm y_mm z_mm, or "
-                f"give {'' if suffix else '--units mm, or '}--detect-units{_or_units(far)}{_or_angles(table, far, side)}"
+                f"give {'' if suffix else '--units mm, or '}--detect-units{_or_else(table, far, side)}"
             )
         return 1e-3 * p, 1e-3, (f"{table.path}: positions read as millimetres: as metres they would reach {far:.0f} m",)
     if unit_m == 1e-3 and far < NEAR_M:
@@ -220,11 +220,8 @@ def _positions(table: Columns, unit: str | None, detect: bool, side: str) -> tup
                 f"{table.path}: positions of at most {1e3 * far:.2g} mm: are they metres? name the columns x_m y_m z_m, or "
                 f"give {'' if suffix else '--units m, or '}--detect-units"
             )
-        return (
-            p,
-            1.0,
-            (f"{table.path}: positions read as metres: as millimetres they would stay within {1e3 * far:.2g} mm",),
-        )
+        within = f"as millimetres they would stay within {1e3 * far:.2g} mm"
+        return p, 1.0, (f"{table.path}: positions read as metres: {within}",)
     return unit_m * p, unit_m, ()
 
 
@@ -243,18 +240,13 @@ def _suffix(table: Columns) -> str:
     )
 
 
-def _or_units(far: float) -> str:
-    """Return the other units in which lengths that are too large for metres are an arm's reach."""
+def _or_else(table: Columns, far: float, side: str) -> str:
+    """Return what else lengths that are too large for metres may be: of another unit, or the angles of six numbers."""
     others = [name for name in ("cm", "in") if far * UNITS_M[name] <= REACH_M < far]
-    return f"; or in {' or '.join(others)}? write those in m or mm" if others else ""
-
-
-def _or_angles(table: Columns, far: float, side: str) -> str:
-    """Return that the first three of six numbers may be angles, where they are no more than degrees, the others lengths."""
+    said = f"; or in {' or '.join(others)}? write those in m or mm" if others else ""
     if "n1" not in table.at or "n4" in table.at or far > MOST_DEG:
-        return ""
-    others = np.linalg.norm(table.numbers(["n1", "n2", "n3"]), axis=1)
-    if not NEAR_M < others.max() < FAR_M:
-        return ""
-    option = "--columns rx,ry,rz,x,y,z" if side == "robot" else "--columns seen:rx,ry,rz,x,y,z"
-    return f"; or are they degrees, and the rotation comes before the position? then {option}"
+        return said
+    if not NEAR_M < np.linalg.norm(table.numbers(["n1", "n2", "n3"]), axis=1).max() < FAR_M:
+        return said
+    option = f"--columns {'' if side == 'robot' else 'seen:'}rx,ry,rz,x,y,z"
+    return f"{said}; or are they degrees, and the rotation comes before the position? then {option}"

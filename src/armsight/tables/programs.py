@@ -1,18 +1,9 @@
 """Poses and joints in the languages of robots' controllers.
 
 In: the text of a program or of its data. Out: names of columns and rows, mm and degrees as the maker writes them. A table
-of patterns, one a maker; each says in which unit and convention its numbers are, by its maker's manual:
-
-- Universal Robots ``p[x, y, z, rx, ry, rz]``: m and rad, a rotation vector.
-- KUKA ``{X 1,Y 2,Z 3,A 4,B 5,C 6}`` (.dat, .src): mm, deg, about z, y' and x''; axes ``{A1 1,..,A6 6}``.
-- ABB ``[[x,y,z],[q1,q2,q3,q4],..]`` (RAPID): mm, a quaternion w first; ``jointtarget``.
-- FANUC ``P[1]{.. X = 1 mm, .. R = 6 deg}`` (.LS), Yaskawa ``C00000=x,..`` (.JBI, ///RECTAN), DENSO ``P(x, .., rz, fig)``,
-  xArm ``set_position(x=.., yaw=..)``: mm, deg, about the fixed x, y and z.
-- Staubli ``<Value x= .. rz= />`` (.dtx), Mecademic ``MovePose(..)``: mm, deg, about x, y' and z''.
-- Epson ``XY(x, y, z, u, v, w)`` and .pts: mm, deg, U, V, W about the fixed z, y and x; Mitsubishi ``P1=(x,..,c)(7,0)``,
-  Techman ``PTP("CPP",x,..,rz,..)``: mm, deg, about the fixed x, y and z.
-- Doosan ``posx(x, y, z, a, b, c)``, Kawasaki ``.TRANS`` and ``TRANS(x,y,z,o,a,t)``: mm, deg, about z, y' and z''; given on
-  as a quaternion.
+of patterns, one a maker; each says in which unit and convention its numbers are, by its maker's manual. Two have a reader
+of their own: Universal Robots ``p[x, y, z, rx, ry, rz]``, m and rad, a rotation vector; and KUKA ``{X 1,Y 2,Z 3,A 4,B 5,C
+6}`` (.dat, .src), mm, deg, about z, y' and x'', axes ``{A1 1,..,A6 6}``. Angles about z, y' and z'' become quaternions.
 """
 
 from __future__ import annotations
@@ -27,118 +18,117 @@ from scipy.spatial.transform import Rotation
 from armsight.errors import InputError
 from armsight.tables.number import NUMBER
 
-_N = NUMBER
-_SIX = rf"\s*({_N})" + rf"\s*,\s*({_N})" * 5
-_SIX_JOINTS = rf"\s*({_N}(?:\s*,\s*{_N}){{5}})"
-_JOINTS = rf"\s*({_N}(?:\s*,\s*{_N}){{3,6}})"
-_MM = ("x_mm", "y_mm", "z_mm")
-_ANGLES = ("rx_deg", "ry_deg", "rz_deg")
+_MM, _ANGLES, _QUATERNION = ("x_mm", "y_mm", "z_mm"), ("rx_deg", "ry_deg", "rz_deg"), ("qw", "qx", "qy", "qz")
 _ROTATED, _FIXED = "XYZ", "xyz"
-#: Kawasaki: between two numbers; Epson: the names before the second number and on.
-_OR_BLANK = r"(?:[ \t]*,[ \t]*|[ \t]+)"
-_SPEL = "".join(rf"(?:\s*,\s*|\s*r{name}\s*=\s*)({_N})" for name in "YZUVW")
+#: What stands for a part in the patterns below: a number, a captured one, a comma, six numbers between commas, joints as
+#: one group (six, or four to seven); Kawasaki's comma; the names before Epson's second number and on.
+_PARTS = {
+    "<epson>": "".join(rf"(?:<,>|\s*r{name}\s*=\s*)<n>" for name in "YZUVW"),
+    "<6>": r"\s*<n>" + r"<,><n>" * 5,
+    "<joints6>": r"\s*(<N>(?:<,><N>){5})",
+    "<joints>": r"\s*(<N>(?:<,><N>){3,6})",
+    "<or blank>": r"(?:[ \t]*,[ \t]*|[ \t]+)",
+    "<n>": "(<N>)",
+    "<,>": r"\s*,\s*",
+    "<N>": NUMBER,
+}
+
+
+def _pattern(text: str) -> str:
+    """Return a pattern with its parts."""
+    for part, pattern in _PARTS.items():
+        text = text.replace(part, pattern)
+    return text
 
 
 class Program(NamedTuple):
-    """A maker's way to write poses."""
+    """A maker's way to write poses, mm and degrees."""
 
     maker: str  #: its name
-    mark: str | None  #: what shows that a text is of this maker; None: the patterns
-    pose: str  #: a pattern with its numbers as groups, in the order of ``names``
-    names: tuple[str, ...]  #: of the numbers of a pose; () where the pattern names them itself
     rotation: str  #: the convention of its angles; "" for quaternions
+    mark: str  #: what shows that a text is of this maker
+    pose: str  #: a pattern with its numbers as groups, in the order of ``names``
     joints: str | None = None  #: a pattern of joints, degrees, one group with commas, or named groups
+    names: tuple[str, ...] = (*_MM, *_ANGLES)  #: of the numbers of a pose
     beside: str | None = None  #: a pattern of lines that hold such numbers, but no pose to read: tools, frames
 
 
 PROGRAMS = (
-    Program(
+    Program(  # RAPID: [[x,y,z],[q1,q2,q3,q4],..], w first; jointtarget
         "ABB",
-        r"\brobtarget\b|\bjointtarget\b|\bMove[LJ]\b|^\s*MODULE\b|^\s*\[\s*\[[^\[\]]*\]\s*,\s*\[[^\[\]]*\]\s*,\s*\[",
-        rf"\[\s*\[\s*({_N})\s*,\s*({_N})\s*,\s*({_N})\s*\]\s*,\s*\[\s*({_N})\s*,\s*({_N})\s*,\s*({_N})\s*,\s*({_N})\s*\]\s*,\s*\[",
-        (*_MM, "qw", "qx", "qy", "qz"),
         "",
-        rf"\[\s*\[{_JOINTS}\s*\]\s*,\s*\[",
+        r"\brobtarget\b|\bjointtarget\b|\bMove[LJ]\b|^\s*MODULE\b|^\s*\[\s*\[[^\[\]]*\]\s*,\s*\[[^\[\]]*\]\s*,\s*\[",
+        r"\[\s*\[\s*<n><,><n><,><n>\s*\]<,>\[\s*<n><,><n><,><n><,><n>\s*\]<,>\[",
+        r"\[\s*\[<joints>\s*\]<,>\[",
+        (*_MM, *_QUATERNION),
         r"\b(?:tooldata|wobjdata|loaddata|speeddata|zonedata)\b",
     ),
-    Program(
+    Program(  # .LS: P[1]{.. X = 1 mm, .. R = 6 deg}
         "FANUC",
-        r"^\s*P\[\d+.*\]\s*\{",
-        r"P\[\d+[^\]]*\]\s*\{[^}]*?\bX\s*=\s*({n})\s*mm\s*,\s*Y\s*=\s*({n})\s*mm\s*,\s*Z\s*=\s*({n})\s*mm\s*,\s*"
-        r"W\s*=\s*({n})\s*deg\s*,\s*P\s*=\s*({n})\s*deg\s*,\s*R\s*=\s*({n})\s*deg".replace("{n}", _N),
-        (*_MM, *_ANGLES),
         _FIXED,
+        r"^\s*P\[\d+.*\]\s*\{",
+        r"P\[\d+[^\]]*\]\s*\{[^}]*?\bX\s*=\s*<n>\s*mm<,>Y\s*=\s*<n>\s*mm<,>Z\s*=\s*<n>\s*mm<,>"
+        r"W\s*=\s*<n>\s*deg<,>P\s*=\s*<n>\s*deg<,>R\s*=\s*<n>\s*deg",
         r"P\[\d+[^\]]*\]\s*\{[^}]*?"
-        + r"\s*deg\s*,\s*".join(rf"\bJ{k}\s*=\s*(?P<J{k}>{_N})" for k in range(1, 7))
+        + r"\s*deg<,>".join(rf"\bJ{k}\s*=\s*(?P<J{k}><N>)" for k in range(1, 7))
         + r"\s*deg",
     ),
-    Program("Yaskawa", r"^///(?:POSTYPE|RECTAN|PULSE)\b", rf"^[BC]?[CP]X?\d+\s*={_SIX}\s*$", (*_MM, *_ANGLES), _FIXED),
-    Program("Staubli", r"<Data\b[^>]*\btype=\"(?:pointRx|point|jointRx|joint|trsf)\"", "", (*_MM, *_ANGLES), _ROTATED),
-    Program(
-        "Doosan",
-        r"\bpos[xj]\s*\(",
-        rf"\bposx\s*\(\s*\[?{_SIX}",
-        (*_MM, *_ANGLES),
-        "ZYZ",
-        rf"\bposj\s*\(\s*\[?{_JOINTS}",
-    ),
+    # .JBI, ///RECTAN: C00000=x,..
+    Program("Yaskawa", _FIXED, r"^///(?:POSTYPE|RECTAN|PULSE)\b", r"^[BC]?[CP]X?\d+\s*=<6>\s*$"),
+    # .dtx: <Value x= .. rz= />
+    Program("Staubli", _ROTATED, r"<Data\b[^>]*\btype=\"(?:pointRx|point|jointRx|joint|trsf)\"", ""),
+    Program("Doosan", "ZYZ", r"\bpos[xj]\s*\(", r"\bposx\s*\(\s*\[?<6>", r"\bposj\s*\(\s*\[?<joints>"),
     Program(
         "Mecademic",
-        r"\b(?:Move|Set)\w+\s*\(",
-        rf"\b(?:MovePose|MoveLin|MoveLinRelWrf|MoveJump)\s*\({_SIX}\s*\)",
-        (*_MM, *_ANGLES),
         _ROTATED,
-        rf"\bMoveJoints\s*\({_JOINTS}\s*\)",
-        r"\bSet[TW]rf\b",
+        r"\b(?:Move|Set)\w+\s*\(",
+        r"\b(?:MovePose|MoveLin|MoveLinRelWrf|MoveJump)\s*\(<6>\s*\)",
+        r"\bMoveJoints\s*\(<joints>\s*\)",
+        beside=r"\bSet[TW]rf\b",
     ),
-    Program(
+    Program(  # P(x, .., rz, fig)
         "DENSO",
+        _FIXED,
         r"(?:^|[^\w])P\d*\s*=?\s*P?\s*\(",
-        rf"(?:^|[^\w])P\s*\({_SIX}(?:\s*,\s*[-+\d]+)?\s*\)",
-        (*_MM, *_ANGLES),
-        _FIXED,
-        rf"(?:^|[^\w])J\s*\({_JOINTS}\s*\)",
+        r"(?:^|[^\w])P\s*\(<6>(?:\s*,\s*[-+\d]+)?\s*\)",
+        r"(?:^|[^\w])J\s*\(<joints>\s*\)",
     ),
-    Program(
+    Program(  # .TRANS, and TRANS(x,y,z,o,a,t)
         "Kawasaki",
-        r"^\s*\.(?:TRANS|JOINTS)\b|\bTRANS\s*\(",
-        rf"(?:^[ \t]*[A-Za-z]\w*(?:\[\d+\])?[ \t]+|\bTRANS\s*\(\s*)({_N})" + rf"{_OR_BLANK}({_N})" * 5,
-        (*_MM, *_ANGLES),
         "ZYZ",
-        rf"^[ \t]*#[A-Za-z]\w*(?:\[\d+\])?[ \t]+({_N}(?:{_OR_BLANK}{_N}){{5,6}})",
+        r"^\s*\.(?:TRANS|JOINTS)\b|\bTRANS\s*\(",
+        r"(?:^[ \t]*[A-Za-z]\w*(?:\[\d+\])?[ \t]+|\bTRANS\s*\(\s*)<n>" + "<or blank><n>" * 5,
+        r"^[ \t]*#[A-Za-z]\w*(?:\[\d+\])?[ \t]+(<N>(?:<or blank><N>){5,6})",
     ),
-    Program(
+    Program(  # P1=(x,..,c)(7,0)
         "Mitsubishi",
+        _FIXED,
         r"^\s*(?:\d+\s+)?[PJ]\w*\s*=\s*\(",
-        rf"^\s*(?:\d+\s+)?P\w*\s*=\s*\({_SIX}(?:\s*,\s*{_N}){{0,2}}\s*\)\s*\(\s*\d+\s*,\s*-?\d+\s*\)",
-        (*_MM, *_ANGLES),
-        _FIXED,
-        rf"^\s*(?:\d+\s+)?J\w*\s*=\s*\({_SIX_JOINTS}(?:\s*,\s*{_N}){{0,2}}\s*\)",
+        r"^\s*(?:\d+\s+)?P\w*\s*=\s*\(<6>(?:<,><N>){0,2}\s*\)\s*\(\s*\d+\s*,\s*-?\d+\s*\)",
+        r"^\s*(?:\d+\s+)?J\w*\s*=\s*\(<joints6>(?:<,><N>){0,2}\s*\)",
     ),
-    Program(
+    Program(  # XY(x, y, z, u, v, w), and .pts: U, V, W about the fixed z, y and x
         "Epson",
+        _FIXED,
         r"\bXY\s*\(|^\s*rX\s*=|\b(?:JA|AglToPls)\s*\(",
-        rf"(?:\bXY\s*\(\s*|\brX\s*=\s*)({_N}){_SPEL}",
+        r"(?:\bXY\s*\(\s*|\brX\s*=\s*)<n><epson>",
+        r"\b(?:JA|AglToPls)\s*\(<joints6>\s*\)",
         (*_MM, *_ANGLES[::-1]),
-        _FIXED,
-        rf"\b(?:JA|AglToPls)\s*\({_SIX_JOINTS}\s*\)",
     ),
-    Program(
+    Program(  # PTP("CPP",x,..,rz,..)
         "Techman",
+        _FIXED,
         r"\b(?:PTP|Line)\s*\(\s*\"(?:CPP|CAP|CAR|JPP)\"",
-        rf"\b(?:PTP|Line)\s*\(\s*\"C(?:PP|AP|AR)\"\s*,\s*\{{?{_SIX}",
-        (*_MM, *_ANGLES),
-        _FIXED,
-        rf"\bPTP\s*\(\s*\"JPP\"\s*,\s*\{{?{_SIX_JOINTS}",
+        r"\b(?:PTP|Line)\s*\(\s*\"C(?:PP|AP|AR)\"\s*,\s*\{?<6>",
+        r"\bPTP\s*\(\s*\"JPP\"\s*,\s*\{?<joints6>",
     ),
-    Program(
+    Program(  # set_position(x=.., yaw=..)
         "xArm",
-        r"\bset_(?:position|servo_angle)\s*\(",
-        r"\bset_position\s*\((?:\s*\*?\[\s*)?(?:x\s*=)?\s*({n})\s*,\s*(?:y\s*=)?\s*({n})\s*,\s*(?:z\s*=)?\s*({n})\s*,\s*"
-        r"(?:roll\s*=)?\s*({n})\s*,\s*(?:pitch\s*=)?\s*({n})\s*,\s*(?:yaw\s*=)?\s*({n})".replace("{n}", _N),
-        (*_MM, *_ANGLES),
         _FIXED,
-        rf"\bset_servo_angle\s*\([^\[]*\[{_JOINTS}\s*\]",
+        r"\bset_(?:position|servo_angle)\s*\(",
+        r"\bset_position\s*\((?:\s*\*?\[\s*)?"
+        + "<,>".join(rf"(?:{name}\s*=)?\s*<n>" for name in ("x", "y", "z", "roll", "pitch", "yaw")),
+        r"\bset_servo_angle\s*\([^\[]*\[<joints>\s*\]",
     ),
 )
 _UR = re.compile(r"\bp\[([^\[\]]*,[^\[\]]*)\]")
@@ -176,7 +166,7 @@ def program_rows(path: Path, text: str) -> ProgramPoints | None:
     if any(_points_in(row) for _, row in written):
         return _points_of_krl(path, written)
     for program in PROGRAMS:
-        if re.search(program.mark or program.pose, text, re.MULTILINE) and (found := _points(path, text, program)):
+        if re.search(program.mark, text, re.MULTILINE) and (found := _points(path, text, program)):
             return found
     return None
 
@@ -190,55 +180,41 @@ def _points(path: Path, text: str, program: Program) -> ProgramPoints | None:
     if program.maker == "Yaskawa":
         kept, left_out = _rectangular(path, kept)
         notes += left_out
-    poses = list(re.finditer(program.pose, kept, re.MULTILINE))
-    joints = [] if program.joints is None else list(re.finditer(program.joints, kept, re.MULTILINE))
+    poses, joints = (
+        [] if each is None else list(re.finditer(_pattern(each), kept, re.MULTILINE))
+        for each in (program.pose, program.joints)
+    )
     joints = [one for one in joints if not any(one.start() == pose.start() for pose in poses)]
     if poses and joints:
-        kinds = [
-            f"{len(found)} {what} (line {_line(text, found[0])})"
-            for found, what in ((poses, "poses"), (joints, "joints"))
-        ]
-        raise InputError(f"{path}: {program.maker}'s program holds {' and '.join(kinds)}: keep one kind in a file")
-    if program.maker == "FANUC":
-        _require_one_frame(path, kept)
+        raise InputError(
+            f"{path}: {program.maker}'s program holds {len(poses)} poses (line {_line(text, poses[0])}) and {len(joints)} "
+            f"joints (line {_line(text, joints[0])}): keep one kind in a file"
+        )
+    frames = dict.fromkeys(re.findall(r"\bUF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)", kept))
+    if program.maker == "FANUC" and len(frames) > 1:  # their poses do not belong together
+        named = ", ".join(f"UF {uf}, UT {ut}" for uf, ut in frames)
+        raise InputError(f"{path}: its points are of several frames or tools ({named}): keep those of one in a file")
     if joints:
         cells = [re.split(r"[\s,]+", one[1].strip()) if one.re.groups == 1 else list(one.groups()) for one in joints]
         head = [f"q{k}_deg" for k in range(1, len(cells[0]) + 1)]
         rows = [(_line(text, one), [cell.strip() for cell in row]) for one, row in zip(joints, cells, strict=True)]
         return ProgramPoints(head, rows, None, notes)
-    return _poses_of(path, program, [(_line(text, one), list(one.groups())) for one in poses], notes)
-
-
-def _poses_of(
-    path: Path, program: Program, rows: list[tuple[int, list[str]]], notes: tuple[str, ...]
-) -> ProgramPoints | None:
-    """Return the poses of a program, by their lines; None where there are none."""
+    rows = [(_line(text, one), list(one.groups())) for one in poses]
     if not rows:
         return None
     how = f"degrees, {program.rotation}" if program.rotation else "quaternions"
     said = f"{path}: {len(rows)} points read as {program.maker}'s: mm, {how}"
     if program.rotation == "ZYZ":  # not among the conventions of three axes
         angles = np.array([row[3:] for _, row in rows], float)
-        x, y, z, w = Rotation.from_euler("ZYZ", angles, degrees=True).as_quat().T
-        rows = [
-            (line, [*row[:3], *map(repr, map(float, quaternion))])
-            for (line, row), quaternion in zip(rows, np.stack([w, x, y, z], axis=1), strict=True)
-        ]
-        return ProgramPoints([*_MM, "qw", "qx", "qy", "qz"], rows, None, (*notes, said))
+        quaternions = Rotation.from_euler("ZYZ", angles, degrees=True).as_quat()[:, [3, 0, 1, 2]].tolist()
+        rows = [(line, [*row[:3], *map(repr, q)]) for (line, row), q in zip(rows, quaternions, strict=True)]
+        return ProgramPoints([*_MM, *_QUATERNION], rows, None, (*notes, said))
     return ProgramPoints(list(program.names), rows, program.rotation or None, (*notes, said))
 
 
 def _line(text: str, found: re.Match[str]) -> int:
     """Return the line that a match begins in."""
     return text.count("\n", 0, found.start() + len(found[0]) - len(found[0].lstrip())) + 1
-
-
-def _require_one_frame(path: Path, text: str) -> None:
-    """Raise an InputError where points of FANUC's are of several tools or frames: their poses do not belong together."""
-    frames = dict.fromkeys(re.findall(r"\bUF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)", text))
-    if len(frames) > 1:
-        named = ", ".join(f"UF {uf}, UT {ut}" for uf, ut in frames)
-        raise InputError(f"{path}: its points are of several frames or tools ({named}): keep those of one in a file")
 
 
 def _rectangular(path: Path, text: str) -> tuple[str, tuple[str, ...]]:
