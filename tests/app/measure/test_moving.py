@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from armsight.app.measure import run as measure_run
+from armsight.app.measure.run import MeasureRun
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import example_rig
@@ -112,7 +112,7 @@ def test_images_without_times_are_rejected(late, armsight):
 
 
 def test_a_rig_file_that_the_shots_have_nothing_for_is_said(tmp_path, capsys):
-    shots = SimpleNamespace(noise=None, skewed=[])
-    assert not measure_run._keep_noise(example_rig((640, 360)), shots, [], tmp_path / "rig.json")
+    shots, options = SimpleNamespace(noise=None, skewed=[]), SimpleNamespace(save_rig=tmp_path / "rig.json")
+    assert not MeasureRun(options, example_rig((640, 360)), shots, None, None).keep_noise()
     assert "rig.json was not written: too few shots" in capsys.readouterr().err
     assert not (tmp_path / "rig.json").exists()

@@ -25,36 +25,26 @@ _GREEN, _PURPLE, _LOST = "#3f8f5f", "#7b52ab", "#f6dcdc"
 TIME, SHOT = "time since the first shot, s", "shot"
 #: How a shot was found -> its colour in the band, the usual ones first.
 _WAYS = {"followed": _GREEN, "measured": BLUE, "searched": ORANGE, "lost": RED, "missed": RED}
-_STRIPS = 9
-_DOTS_UP_TO = 80  # shots that can be distinguished as dots
-_THIN_FROM = 1000  # from this many shots on lines are thinner
-_LOG_FROM = 20.0  # sigmas that differ by a larger factor are plotted on a logarithmic scale
-_GAP_STEPS = 3.0  # an interval between shots that is longer, in median steps, is a gap
+#: Strips; so many shots can be distinguished as dots; from so many on lines are thinner.
+_STRIPS, _DOTS_UP_TO, _THIN_FROM = 9, 80, 1000
+#: Sigmas that differ by a larger factor are plotted on a logarithmic scale; a longer interval, in median steps, is a gap.
+_LOG_FROM, _GAP_STEPS = 20.0, 3.0
+#: Where a legend stands.
+_PLACE: dict[str, Any] = {"borderaxespad": 0.0, "handlelength": 1.2}
 
 
 @dataclass(frozen=True, eq=False)
 class ChartData(Record):
-    """N shots as they are plotted; NaN where one was missed.
+    """N shots as they are plotted; NaN where one was missed."""
 
-    Attributes:
-        along: (N,) time since the first shot, s, or the number of the shot.
-        label: of that axis.
-        way: how each was found: a key of the band's colours.
-        jumped: (N,) whether the pose jumped.
-        pose: (N, 6) x, y, z, mm; angles about z, y, x, degrees, without steps of 360 degrees.
-        pose_sigma: (N, 6) one sigma of these.
-        rotation_sigma: (N, 3) one sigma of the rotation about the left camera's axes, degrees.
-        rms_px: (N,) reprojection RMS, px.
-    """
-
-    along: Array
-    label: str
-    way: tuple[str, ...]
-    jumped: NDArray[np.bool_]
-    pose: Array
-    pose_sigma: Array
-    rotation_sigma: Array
-    rms_px: Array
+    along: Array  #: (N,) time since the first shot, s, or the number of the shot
+    label: str  #: of that axis
+    way: tuple[str, ...]  #: how each was found: a key of the band's colours
+    jumped: NDArray[np.bool_]  #: (N,) whether the pose jumped
+    pose: Array  #: (N, 6) x, y, z, mm; angles about z, y, x, degrees, without steps of 360 degrees
+    pose_sigma: Array  #: (N, 6) one sigma of these
+    rotation_sigma: Array  #: (N, 3) one sigma of the rotation about the left camera's axes, degrees
+    rms_px: Array  #: (N,) reprojection RMS, px
 
 
 def chart_data(poses: Sequence[ShotPose]) -> ChartData:
@@ -96,8 +86,8 @@ def _figure(run: ChartData) -> Figure:
     top = figure.add_subplot(grid[0])
     strips = [figure.add_subplot(grid[1 + k], sharex=top) for k in range(_STRIPS)]
     _band(top, run)
-    for k, (name, unit) in enumerate([*((n, "mm") for n in "xyz"), *((n, "deg") for n in ANGLES)]):
-        _strip(strips[k], run, run.pose[:, k], run.pose_sigma[:, k], f"{name}\n{unit}")
+    for k, name in enumerate([*(f"{n}\nmm" for n in "xyz"), *(f"{n}\ndeg" for n in ANGLES)]):
+        _strip(strips[k], run, run.pose[:, k], run.pose_sigma[:, k], name)
     _sigmas(strips[6], run, run.pose_sigma[:, :3], "sigma of\nposition\nmm")
     _sigmas(strips[7], run, run.rotation_sigma, "sigma of\nrotation\ndeg")
     _line(strips[8], run, run.rms_px, INK)
@@ -155,9 +145,8 @@ def _band(axes: Axes, run: ChartData) -> None:
     from matplotlib.patches import Patch
 
     counts = Counter(run.way)
-    intervals = list(_intervals(run))
     for way, count in counts.most_common():
-        bars = [(begin, end - begin) for begin, end, w in intervals if w == way]
+        bars = [(begin, end - begin) for begin, end, w in _intervals(run) if w == way]
         rare = 0.8 if count < len(run.way) / 2 else 0.0
         axes.broken_barh(bars, (0.0, 1.0), facecolor=_WAYS[way], edgecolor=_WAYS[way], linewidth=rare, clip_on=False)
     handles: list[Any] = [
@@ -167,8 +156,8 @@ def _band(axes: Axes, run: ChartData) -> None:
         style: Any = {"marker": "v", "color": _PURPLE, "linestyle": "none", "clip_on": False}
         axes.plot(run.along[run.jumped], np.full(int(run.jumped.sum()), 1.25), **style)
         handles.append(Line2D([], [], label=f"{run.jumped.sum()} jumped", **style))
-    position: Any = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.15), "borderaxespad": 0.0, "handlelength": 1.2}
-    axes.legend(handles=handles, ncols=len(handles), title=f"shots: {len(run.way)}", alignment="left", **position)
+    said: Any = {"title": f"shots: {len(run.way)}", "alignment": "left", "ncols": len(handles)}
+    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.15), **said, **_PLACE)
     axes.set_ylim(0.0, 1.0)
     low, high = _edges(run.along)
     axes.set_xlim(float(low[0]), float(high[-1]))
@@ -217,6 +206,5 @@ def _sigmas(axes: Axes, run: ChartData, sigma: Array, name: str) -> None:
         axes.set_yscale("log")
     else:
         _from_zero(axes, good)
-    position: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.96), "borderaxespad": 0.0, "handlelength": 1.2}
-    axes.legend(ncols=3, fontsize=7.0, columnspacing=1.2, **position)
+    axes.legend(ncols=3, fontsize=7.0, columnspacing=1.2, loc="lower right", bbox_to_anchor=(1.0, 0.96), **_PLACE)
     axes.set_ylabel(name)

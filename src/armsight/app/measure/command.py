@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import click
@@ -9,9 +11,36 @@ import click
 from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import InputError
 
+_PATH = click.Path(path_type=Path)
+
+
+@dataclass(frozen=True)
+class MeasureOptions:
+    """The options of ``armsight measure``, by their names; what each means is in its help."""
+
+    rig: Path
+    target: str
+    left: str | None
+    right: str | None
+    source: str | None
+    detections: Path | None
+    fixed: Sequence[str]
+    skew: str | None
+    readout: str | None
+    save_rig: Path | None
+    output: Path | None
+    stream: Sequence[str]
+    view_dir: Path | None
+    as_json: bool
+
+    @property
+    def globs(self) -> tuple[str | None, str | None]:
+        """The left and the right images."""
+        return self.left, self.right
+
 
 @click.command("measure")
-@click.argument("rig", metavar="RIG.json", type=click.Path(path_type=Path))
+@click.argument("rig", metavar="RIG.json", type=_PATH)
 @click.option(
     "--target",
     required=True,
@@ -22,10 +51,7 @@ from armsight.errors import InputError
 @click.option("--right", metavar="GLOB", help="Right images.")
 @click.option("--source", metavar="SOURCE", help="A folder, video, stream or pair of cameras (see armsight record -h).")
 @click.option(
-    "--detections",
-    metavar="D.csv",
-    type=click.Path(path_type=Path),
-    help="Detections instead of images; bag:FILE for tags in a bag.",
+    "--detections", metavar="D.csv", type=_PATH, help="Detections instead of images; bag:FILE for tags in a bag."
 )
 @click.option(
     "--fixed",
@@ -42,34 +68,19 @@ from armsight.errors import InputError
 @click.option(
     "--save-rig",
     metavar="RIG2.json",
-    type=click.Path(path_type=Path),
+    type=_PATH,
     help="Write the rig with the skew and readout found, and the noise of a moved body's discs.",
 )
-@click.option("-o", "--output", metavar="POSES.csv", type=click.Path(path_type=Path), help="Write the poses as CSV.")
+@click.option("-o", "--output", metavar="POSES.csv", type=_PATH, help="Write the poses as CSV.")
 @click.option(
     "--stream",
     multiple=True,
     metavar="STREAM",
     help="Publish each pose: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT, igtl:PORT or ros2:PORT; may be repeated.",
 )
-@click.option("--view", "view_dir", metavar="DIR", type=click.Path(path_type=Path), help="Write annotated pictures.")
+@click.option("--view", "view_dir", metavar="DIR", type=_PATH, help="Write annotated pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
-def command(
-    rig: Path,
-    target: str,
-    left: str | None,
-    right: str | None,
-    source: str | None,
-    detections: Path | None,
-    fixed: tuple[str, ...],
-    skew: str | None,
-    readout: str | None,
-    save_rig: Path | None,
-    output: Path | None,
-    stream: tuple[str, ...],
-    view_dir: Path | None,
-    as_json: bool,
-) -> None:
+def command(**given: object) -> None:
     """Measure the pose of a target in the left camera's frame, with its uncertainty.
 
     Give the images as --left and --right, as --source, or what was detected in them as --detections. RIG.json may also be
@@ -81,30 +92,12 @@ def command(
     With --skew or --readout, or where the rig file has them, a moving body's detections are moved to the time of the shot
     by its own motion, which the recording's other shots show.
     """
-    given = [left is not None or right is not None, source is not None, detections is not None]
-    if sum(given) != 1 or (left is None) != (right is None):
+    options = MeasureOptions(**given)  # type: ignore[arg-type]
+    ways = [options.globs.count(None) < 2, options.source is not None, options.detections is not None]
+    if sum(ways) != 1 or options.globs.count(None) == 1:
         raise InputError("give the shots one way: --left and --right, or --source, or --detections")
 
     from armsight.app.measure.run import measure_shots
-    from armsight.app.measure.shots import MeasureOptions
 
-    health = measure_shots(
-        MeasureOptions(
-            rig,
-            target,
-            left,
-            right,
-            source,
-            detections,
-            fixed,
-            skew,
-            readout,
-            save_rig,
-            output,
-            stream,
-            view_dir,
-            as_json,
-        )
-    )
-    if any(each.forbids for each in health):
+    if any(each.forbids for each in measure_shots(options)):
         click.get_current_context().exit(UNTRUSTED)

@@ -84,20 +84,16 @@ def moved_results(
             "these shots have no times, so nothing is known of the body's motion between two exposures: record them with "
             "`armsight record`, or give a video"
         )
-    rows = [k for k, (_, result) in enumerate(first) if isinstance(result, PoseEstimate)]
-    shots = [_timed(*first[k]) for k in rows]
+    shots = _timed(first)
     shutters = requested if isinstance(requested, Shutters) else _shutters(rig, body, shots, requested)
-    results: list[tuple[PoseEstimate | Missed, bool]] = [(result, False) for _, result in first]
-    for k, moved in zip(rows, measure_moving(rig, body, shots, shutters), strict=True):
-        results[k] = moved
-    return results, shutters
+    moved = iter(measure_moving(rig, body, shots, shutters))
+    return [next(moved) if isinstance(result, PoseEstimate) else (result, False) for _, result in first], shutters
 
 
-def _timed(t_s: float | None, result: PoseEstimate | Missed) -> TimedShot:
-    """Return a measured shot with a time."""
-    assert t_s is not None
-    assert isinstance(result, PoseEstimate)
-    return TimedShot(t_s, result.points.seen, result.T_left_body)
+def _timed(first: Sequence[tuple[float | None, PoseEstimate | Missed]]) -> list[TimedShot]:
+    """Return the measured shots that have a time."""
+    measured = [(t_s, r) for t_s, r in first if t_s is not None and isinstance(r, PoseEstimate)]
+    return [TimedShot(t_s, r.points.seen, r.T_left_body) for t_s, r in measured]
 
 
 def _shutters(rig: StereoRig, body: Body, shots: Sequence[TimedShot], requested: Requested) -> Shutters:
@@ -115,17 +111,16 @@ def skew_finding(
     rig: StereoRig, body: Body, first: Sequence[tuple[float | None, PoseEstimate | Missed]]
 ) -> HealthFinding | None:
     """Return what is wrong where shots that were measured as simultaneous show that they are not, or None."""
-    measured = [(t, r) for t, r in first if t is not None and isinstance(r, PoseEstimate)]
-    times = [t for t, _ in measured]
-    if any(b <= a for a, b in itertools.pairwise(times)):
+    shots = _timed(first)
+    if any(b.t_s <= a.t_s for a, b in itertools.pairwise(shots)):
         return None
-    found = estimate_shutters(rig, body, [_timed(*each) for each in measured]) if measured else Missed("")
+    found = estimate_shutters(rig, body, shots) if shots else Missed("")
     if not isinstance(found, Shutters) or abs(found.skew_s) <= max(_NOTED_SIGMAS * found.sigmas[0], _NOTED_S):
         return None
     return HealthFinding(
         "time",
         f"the cameras do not expose at one time: {found}",
-        times[0],
+        shots[0].t_s,
         1e3 * found.skew_s,
         1e3 * float(found.sigmas[0]),
         "ms",

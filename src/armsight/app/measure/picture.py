@@ -14,45 +14,66 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.show.plotting import nice, plain
-from armsight.data import SIDES, Array, Body, Dropped, Image, PoseEstimate, Record
-from armsight.geometry.pose import inverse, transform
+from armsight.data import SIDES, Array, Body, Image, PoseEstimate, Record
+from armsight.geometry.pose import transform
 from armsight.vision.discs.bias import expect
 from armsight.vision.image import grey
 from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.pose.shot_pose import ANGLES, ShotPose
 from armsight.vision.rig import StereoRig
 
+Canvas = NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+PAPER: Colour = (255, 255, 255)
+INK: Colour = (41, 32, 26)
+MUTED: Colour = (124, 110, 97)
+RED: Colour = (40, 40, 200)
+BLANK = 200  # grey value where there is no image
+LINE = 24  # height of a line of text, px
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_SHIFT, _FAR = 4, 1e5  # OpenCV takes coordinates in sixteenths of a pixel; points further away, px, are not drawn
+_SPELT = str.maketrans({"±": "+-", "…": "...", "°": " deg", "σ": "sigma", "µ": "u", "×": "x"})
+
+
+#: What is printed behind the angles at their singularity.
+SINGULAR = " (ry is +-90: only rz and rx together are determined)"
+#: Width of a picture, height of its two images at the most, side of an enlarged detail: px.
+WIDTH, _TALLEST, _TILE, _GAP = 1640, 760, 264, 12
+_HALF = (WIDTH - 3 * _GAP) // 2
+_PER_ROW = (WIDTH - _GAP) // (2 * _TILE + _GAP)
+_MIDDLE = np.full(2, (_TILE - 1) / 2)
+#: Up to this many points are all shown enlarged; of more only the worst few.
+_ALL, _WORST = 12, 6
+#: Enlargement of a detail; less where its disc would not fit; of a residual at the most; arms of a cross in an image, px.
+_ZOOM, _MOST, _CROSS_PX = 8.0, 1e5, 3.0
+#: Length of the longest residual, px of the picture: in an enlarged detail, where sigma counts as well, and in the images.
+_REACH, _LONGEST = 0.42 * _TILE, 40.0
+_RIM, _CROSS, _ARROW, _SIGMA = (255, 200, 40), (70, 220, 70), (30, 110, 255), (235, 70, 225)
+_PALE = (160, 160, 255)
+
 
 @dataclass(frozen=True, eq=False)
 class Marks(Record):
-    """The N points of a body in a measured shot; camera 0 is left, 1 right. NaN where there is none.
+    """The N points of a body in a measured shot; camera 0 is left, 1 right. NaN where there is none."""
 
-    Attributes:
-        names: names of the points.
-        at: (N, 2, 2) projection of a point, or of the centre of a disc's ellipse, at the measured pose, raw px; NaN where
-            it was not detected and faces away from the camera.
-        shape: (N, 2, 3) S11, S12, S22 of a disc's ellipse at the measured pose, px^2.
-        found: (N, 2, 2) detected position, raw px; of a disc the centre of its ellipse.
-        cov: (N, 2, 2, 2) its covariance, px^2.
-        dropped: (N, 2) whether the detection was dropped.
-        reasons: why; empty where neither was.
-        others: what else was dropped, and why.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  #: names of the points
+    #: (N, 2, 2) projection of a point, or of the centre of a disc's ellipse, at the measured pose, raw px; NaN where it was
+    #: not detected and faces away from the camera.
     at: Array
-    shape: Array
-    found: Array
-    cov: Array
-    dropped: NDArray[np.bool_]
-    reasons: tuple[str, ...]
-    others: tuple[str, ...]
+    shape: Array  #: (N, 2, 3) S11, S12, S22 of a disc's ellipse at the measured pose, px^2
+    found: Array  #: (N, 2, 2) detected position, raw px; of a disc the centre of its ellipse
+    cov: Array  #: (N, 2, 2, 2) its covariance, px^2
+    dropped: NDArray[np.bool_]  #: (N, 2) whether the detection was dropped
+    reasons: tuple[str, ...]  #: why; empty where neither was
+    others: tuple[str, ...]  #: what else was dropped, and why
 
     @property
     def residual(self) -> Array:
@@ -82,50 +103,25 @@ def marks_of(rig: StereoRig, body: Body, discs: DiscTarget | None, estimate: Pos
         discs: the body's plain discs, None where it has none.
         estimate: the measured pose.
     """
-    at, shape, bias, away = _expected(rig, body, discs, estimate.T_left_body)
-    seen = estimate.points.seen
-    found, cov = np.full_like(at, np.nan), np.zeros((len(at), 2, 2, 2))
-    found[seen.ids] = seen.uv + np.nan_to_num(bias[seen.ids])
-    cov[seen.ids] = seen.cov_uv + rig.sigma_px**2 * np.eye(2)
-    hidden = away & ~np.isfinite(found[..., 0])
-    at[hidden], shape[hidden] = np.nan, np.nan
-    reasons, others = _reasons(body, estimate.dropped)
-    rows = range(len(at))
-    dropped = np.array([_sides(reasons.get(i, [])) for i in rows], bool)
-    return Marks(
-        body.point_names, at, shape, found, cov, dropped, tuple(_together(reasons.get(i, [])) for i in rows), others
-    )
-
-
-def _expected(
-    rig: StereoRig, body: Body, discs: DiscTarget | None, T: Array
-) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Return the projections (M, 2, 2) of all points, px, ellipses (M, 2, 3), biases (M, 2, 2), px, and facing (M, 2).
-
-    The last is True for discs that face away from the camera.
-    """
-    p_left, count = transform(T, body.points), len(body.points)
-    p_right = transform(inverse(rig.T_left_right), p_left)
-    at = np.stack([camera.project(p) for camera, p in zip(rig.cameras, (p_left, p_right), strict=True)], axis=1)
+    T, count, seen = estimate.T_left_body, len(body.points), estimate.points.seen
+    at = np.stack(rig.project(transform(T, body.points)), axis=1)
     shape, bias, away = np.full((count, 2, 3), np.nan), np.zeros((count, 2, 2)), np.zeros((count, 2), bool)
     if discs is not None:
         first, expected = count - len(discs.radii_m), expect(rig, discs, T)
         at[first:] = np.where(np.isfinite(expected.uv), expected.uv, at[first:])
         shape[first:], bias[first:], away[first:] = expected.shape, expected.bias, expected.facing <= 0.0
-    return at, shape, bias, away
-
-
-def _reasons(body: Body, dropped: tuple[Dropped, ...]) -> tuple[dict[int, list[str]], tuple[str, ...]]:
-    """Return the reasons of dropped points by their row, and texts on what is not a point of the body."""
-    row = {name: i for i, name in enumerate(body.point_names)}
-    found: dict[int, list[str]] = {}
-    others = []
-    for drop in dropped:
-        if drop.point in row:
-            found.setdefault(row[drop.point], []).append(drop.reason)
-        else:
-            others.append(f"{drop.point}: {drop.reason}")
-    return {i: list(dict.fromkeys(reasons)) for i, reasons in found.items()}, tuple(others)
+    found, cov = np.full_like(at, np.nan), np.zeros((count, 2, 2, 2))
+    found[seen.ids] = seen.uv + np.nan_to_num(bias[seen.ids])
+    cov[seen.ids] = seen.cov_uv + rig.sigma_px**2 * np.eye(2)
+    hidden = away & ~np.isfinite(found[..., 0])
+    at[hidden], shape[hidden] = np.nan, np.nan
+    reasons = {name: dict[str, None]() for name in body.point_names}
+    for drop in estimate.dropped:
+        reasons.get(drop.point, {})[drop.reason] = None
+    others = tuple(f"{drop.point}: {drop.reason}" for drop in estimate.dropped if drop.point not in reasons)
+    dropped = np.array([_sides(list(each)) for each in reasons.values()], bool)
+    why = tuple(_together(list(each)) for each in reasons.values())
+    return Marks(body.point_names, at, shape, found, cov, dropped, why, others)
 
 
 def _sides(reasons: list[str]) -> list[bool]:
@@ -136,27 +132,9 @@ def _sides(reasons: list[str]) -> list[bool]:
 
 def _together(reasons: list[str]) -> str:
     """Join reasons; ``left: why; right: why`` becomes ``both: why``."""
-    left, right = (f"{side}: " for side in SIDES)
-    if len(reasons) == 2 and reasons[0].startswith(left) and reasons[1].startswith(right):
-        first, second = reasons[0].removeprefix(left), reasons[1].removeprefix(right)
-        if first == second:
-            return f"both: {first}"
-    return "; ".join(reasons)
-
-
-Canvas = NDArray[np.uint8]
-Colour = tuple[int, int, int]
-
-PAPER: Colour = (255, 255, 255)
-INK: Colour = (41, 32, 26)
-MUTED: Colour = (124, 110, 97)
-RED: Colour = (40, 40, 200)
-BLANK = 200  # grey value where there is no image
-LINE = 24  # height of a line of text, px
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
-_SHIFT = 4  # OpenCV takes coordinates in sixteenths of a pixel
-_FAR = 1e5  # px: points further away are not drawn
-_SPELT = str.maketrans({"±": "+-", "…": "...", "°": " deg", "σ": "sigma", "µ": "u", "×": "x"})
+    whys = [reason.removeprefix(f"{side}: ") for side, reason in zip(SIDES, reasons, strict=False)]
+    same = len(reasons) == 2 and whys[0] == whys[1] and [f"{side}: {whys[0]}" for side in SIDES] == reasons
+    return f"both: {whys[0]}" if same else "; ".join(reasons)
 
 
 def ascii_text(text: str) -> str:
@@ -211,8 +189,7 @@ def paper(height: int, width: int) -> Canvas:
 
 def beside(parts: Sequence[Canvas], width: int, gap: int) -> Canvas:
     """Put canvases beside one another on white, with gaps before and between them."""
-    canvas = paper(max(part.shape[0] for part in parts), width)
-    x = gap
+    canvas, x = paper(max(part.shape[0] for part in parts), width), gap
     for part in parts:
         canvas[: part.shape[0], x : x + part.shape[1]] = part
         x += part.shape[1] + gap
@@ -234,50 +211,33 @@ def outline(canvas: Canvas, points: Array, colour: Colour, width: int = 1) -> No
         cv2.polylines(canvas, [fixed], True, colour, width, cv2.LINE_AA, _SHIFT)
 
 
-def segment(canvas: Canvas, a: Array, b: Array, colour: Colour, width: int = 1) -> None:
-    """Draw a line between two positions (2,), px."""
-    outline(canvas, np.array([a, b]), colour, width)
-
-
-def cross(canvas: Canvas, at: Array, size: float, colour: Colour) -> None:
-    """Draw an upright cross with arms of ``size`` px."""
-    for arm in (np.array([size, 0.0]), np.array([0.0, size])):
-        segment(canvas, at - arm, at + arm, colour)
-
-
 def arrow(canvas: Canvas, a: Array, b: Array, colour: Colour, width: int = 1) -> None:
     """Draw an arrow from a to b (2,), px, its head never longer than itself."""
-    segment(canvas, a, b, colour, width)
+    outline(canvas, np.array([a, b]), colour, width)
     length = float(np.linalg.norm(b - a))
     if length > 1.0:
         along = (b - a) / length * min(9.0, 0.5 * length)
         for side in (1, -1):
-            segment(canvas, b, b - along + side * 0.45 * np.array([-along[1], along[0]]), colour, width)
+            wing = b - along + side * 0.45 * np.array([-along[1], along[0]])
+            outline(canvas, np.array([b, wing]), colour, width)
 
 
 def header(shot: ShotPose) -> list[str]:
     """Return the lines above a shot's picture, mm and degrees, one sigma after each +-."""
-    first = [f"shot {shot.shot}"]
-    if shot.t_s is not None:
-        first.append(f"t {shot.t_s:.3f} s")
-    if shot.way is not None:
-        first.append(shot.way if shot.took_ms is None else f"{shot.way}, {shot.took_ms:.1f} ms")
-    if shot.jump:
-        first.append(shot.jump)
+    took = f"{shot.way}, {shot.took_ms:.1f} ms" if shot.way is not None and shot.took_ms is not None else shot.way
+    at = None if shot.t_s is None else f"t {shot.t_s:.3f} s"
+    first = ", ".join(each for each in (f"shot {shot.shot}", at, took, shot.jump) if each)
     if not shot.ok:
-        return [", ".join(first)]
+        return [first]
     position = _pairs(("x", "y", "z"), 1e3 * shot.position_m, 1e3 * np.sqrt(np.diag(shot.cov)[:3]))
-    rotation = _pairs(ANGLES, shot.euler_zyx_deg, shot.angle_sigmas_deg)
-    count, dropped = len(shot.points_m), len(shot.dropped)
+    rotation, dropped = _pairs(ANGLES, shot.euler_zyx_deg, shot.angle_sigmas_deg), len(shot.dropped)
     _, precision, calibration = (1e3 * sigma for sigma in shot.position_sigmas_m)
-    fit = (
-        f"precision {precision:.3f} mm, calibration {calibration:.3f} mm; "
-        f"reprojection {shot.reprojection_rms_px:.3f} px RMS, misfit {shot.misfit:.1f}, {count} points"
-    )
     return [
-        ", ".join(first),
+        first,
         f"{position} mm; {rotation} deg{SINGULAR if shot.pitch_singular else ''}",
-        fit + (f", {dropped} dropped" if dropped else ""),
+        f"precision {precision:.3f} mm, calibration {calibration:.3f} mm; "
+        f"reprojection {shot.reprojection_rms_px:.3f} px RMS, misfit {shot.misfit:.1f}, {len(shot.points_m)} points"
+        f"{f', {dropped} dropped' if dropped else ''}",
     ]
 
 
@@ -287,24 +247,6 @@ def _pairs(names: tuple[str, ...], values: Array, sigmas: Array) -> str:
         f"{name} {value:.3f}" + (f" +- {sigma:.3f}" if np.isfinite(sigma) else "")
         for name, value, sigma in zip(names, values, sigmas, strict=True)
     )
-
-
-#: What is printed behind the angles at their singularity.
-SINGULAR = " (ry is +-90: only rz and rx together are determined)"
-#: Width of a picture, height of its two images at the most, side of an enlarged detail: px.
-WIDTH, _TALLEST, _TILE, _GAP = 1640, 760, 264, 12
-_HALF = (WIDTH - 3 * _GAP) // 2
-_PER_ROW = (WIDTH - _GAP) // (2 * _TILE + _GAP)
-_MIDDLE = np.full(2, (_TILE - 1) / 2)
-#: Up to this many points are all shown enlarged; of more only the worst few.
-_ALL, _WORST = 12, 6
-#: Enlargement of a detail; less where its disc would not fit.
-_ZOOM = 8.0
-#: Length of the longest residual, px of the picture: in an enlarged detail, where sigma counts as well, and in the images.
-_REACH, _LONGEST = 0.42 * _TILE, 40.0
-_MOST = 1e5
-_RIM, _CROSS, _ARROW, _SIGMA = (255, 200, 40), (70, 220, 70), (30, 110, 255), (235, 70, 225)
-_PALE = (160, 160, 255)
 
 
 def draw_shot(
@@ -341,6 +283,20 @@ def draw_shot(
     return np.vstack([paper(_GAP, WIDTH), *(canvas for part in parts for canvas in (part, paper(_GAP, WIDTH)))])
 
 
+def _point(
+    canvas: Canvas, marks: Marks, which: tuple[int, int], at: Array, scale: float, factor: float, arm: float
+) -> None:
+    """Draw a point and side at a position (2,), px, where there is one: its rim, a cross with such arms, its residual."""
+    bad, residual = marks.dropped[which], marks.residual[which]
+    outline(canvas, ellipse(marks.shape[which]) * scale + at, RED if bad else _RIM)
+    enlarged = arm > _CROSS_PX
+    if enlarged and np.isfinite(residual).all():
+        outline(canvas, ellipse(marks.cov[which].ravel()[[0, 1, 3]]) * factor + at, _SIGMA)
+    for ends in (np.array([[-arm, 0.0], [arm, 0.0]]), np.array([[0.0, -arm], [0.0, arm]])):
+        outline(canvas, at + scale * residual + ends, RED if bad and not enlarged else _CROSS)
+    arrow(canvas, at, at + factor * residual, RED if bad else _ARROW, 2 if enlarged else 1)
+
+
 class _Panel:
     """One camera's image in the picture."""
 
@@ -350,21 +306,16 @@ class _Panel:
         width, height = size if self.image is None else (self.image.shape[1], self.image.shape[0])
         self.scale = min(_HALF / width, _TALLEST / height)
         shown = (max(round(width * self.scale), 1), max(round(height * self.scale), 1))
-        how = cv2.INTER_AREA if self.scale < 1 else cv2.INTER_LINEAR
-        blank: Canvas = np.full((shown[1], shown[0], 3), BLANK, np.uint8)
-        self.canvas: Canvas = (
-            blank if self.image is None else np.asarray(cv2.resize(self.image, shown, interpolation=how), np.uint8)
-        )
+        self.canvas: Canvas = np.full((shown[1], shown[0], 3), BLANK, np.uint8)
+        if self.image is not None:
+            how = cv2.INTER_AREA if self.scale < 1 else cv2.INTER_LINEAR
+            self.canvas = np.asarray(cv2.resize(self.image, shown, interpolation=how), np.uint8)
 
     def draw(self, marks: Marks, side: int, named: list[int], factor: float) -> None:
         """Draw every point, its residual ``factor`` times as long, and the names of some."""
         positions = (marks.at[:, side] + 0.5) * self.scale - 0.5
         for i, at in enumerate(positions):
-            bad = marks.dropped[i, side]
-            outline(self.canvas, ellipse(marks.shape[i, side]) * self.scale + at, RED if bad else _RIM)
-            if np.isfinite(marks.found[i, side]).all():
-                cross(self.canvas, at + self.scale * marks.residual[i, side], 3.0, RED if bad else _CROSS)
-            arrow(self.canvas, at, at + factor * marks.residual[i, side], RED if bad else _ARROW)
+            _point(self.canvas, marks, (i, side), at, self.scale, factor, _CROSS_PX)
         good = np.asarray((np.abs(np.nan_to_num(positions, nan=np.inf)) < 2 * WIDTH).all(axis=1))
         middle = positions[good].mean(axis=0) if good.any() else np.zeros(2)
         for i in (i for i in named if good[i]):
@@ -387,11 +338,8 @@ class _Panel:
             return np.full((_TILE, _TILE, 3), BLANK, np.uint8)
         to_image = np.column_stack([np.eye(2) / zoom, centre - _MIDDLE / zoom])
         how = (cv2.INTER_NEAREST if zoom > 1 else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP
-        edge = (BLANK, BLANK, BLANK)
-        tile = cv2.warpAffine(
-            self.image, to_image, (_TILE, _TILE), flags=how, borderMode=cv2.BORDER_CONSTANT, borderValue=edge
-        )
-        return np.asarray(tile, np.uint8)
+        beyond: Any = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (BLANK, BLANK, BLANK)}
+        return np.asarray(cv2.warpAffine(self.image, to_image, (_TILE, _TILE), flags=how, **beyond), np.uint8)
 
 
 def _factor(lengths: Array, reach: float) -> float:
@@ -406,8 +354,7 @@ def _details(marks: Marks, shown: list[int], panels: list[_Panel], in_images: fl
         return []
     wide = float(np.sqrt(np.nan_to_num(marks.shape[shown][..., [0, 2]]).max()))
     zoom = min(_ZOOM, _TILE / (2.6 * wide)) if wide > 0 else _ZOOM
-    used = ~marks.dropped[shown]
-    sigma = np.sqrt(np.linalg.eigvalsh(marks.cov[shown])[..., 1])
+    used, sigma = ~marks.dropped[shown], np.sqrt(np.linalg.eigvalsh(marks.cov[shown])[..., 1])
     lengths = np.maximum(np.nan_to_num(np.linalg.norm(marks.residual[shown], axis=2)), 1.2 * sigma)
     factor = _factor(lengths[used] if used.any() else lengths, _REACH)
     blocks = [_block(marks, i, panels, zoom, factor) for i in shown]
@@ -417,38 +364,31 @@ def _details(marks: Marks, shown: list[int], panels: list[_Panel], in_images: fl
 
 def _block(marks: Marks, i: int, panels: list[_Panel], zoom: float, factor: float) -> Canvas:
     """Return one point enlarged, left and right: its name and residuals above, why it was dropped below."""
-    tiles, name = [], plain(marks.names[i], 40)
+    tiles, name, caption = [], plain(marks.names[i], 40), paper(2 * LINE, 2 * _TILE)
     for side, panel in enumerate(panels):
-        tile, residual, bad = panel.detail(marks.at[i, side], zoom), marks.residual[i, side], marks.dropped[i, side]
-        outline(tile, ellipse(marks.shape[i, side]) * zoom + _MIDDLE, RED if bad else _RIM)
-        if np.isfinite(residual).all():
-            outline(tile, ellipse(marks.cov[i, side].ravel()[[0, 1, 3]]) * factor + _MIDDLE, _SIGMA)
-            cross(tile, _MIDDLE + zoom * residual, 9.0, _CROSS)
-            arrow(tile, _MIDDLE, _MIDDLE + factor * residual, RED if bad else _ARROW, 2)
+        tile, bad = panel.detail(marks.at[i, side], zoom), marks.dropped[i, side]
+        _point(tile, marks, (i, side), _MIDDLE, zoom, factor, 3 * _CROSS_PX)
         cv2.rectangle(tile, (0, 0), (_TILE - 1, _TILE - 1), RED if bad else MUTED, 1)
         tiles.append(tile)
-    caption = paper(2 * LINE, 2 * _TILE)
-    lost = [side for side, bad in zip(SIDES, marks.dropped[i], strict=True) if bad]
-    if lost:
+        length = float(np.linalg.norm(marks.residual[i, side]))
+        value = f"residual {length:.3f} px" if np.isfinite(length) else "not used" if bad else "not detected"
+        write(caption, f"{SIDES[side]}: {value}", (2 + side * _TILE, LINE + 17), MUTED, 0.5)
+    if lost := [side for side, bad in zip(SIDES, marks.dropped[i], strict=True) if bad]:
         name += ", dropped" if len(lost) == 2 else f", dropped in the {lost[0]} image"
     write(caption, name, (2, 17), RED if lost else INK, 0.6)
-    for side, length in enumerate(np.linalg.norm(marks.residual[i], axis=1)):
-        unseen = "not used" if marks.dropped[i, side] else "not detected"
-        value = f"residual {length:.3f} px" if np.isfinite(length) else unseen
-        write(caption, f"{SIDES[side]}: {value}", (2 + side * _TILE, LINE + 17), MUTED, 0.5)
     reason = wrapped(marks.reasons[i], 0.5, 2 * _TILE - 4)[:2] if marks.reasons[i] else []
     return np.vstack([caption, np.hstack(tiles), paragraph(reason, RED, 0.5, 2 * _TILE, 2)])
 
 
 def _legend(marks: Marks, zoom: float, factor: float, in_images: float) -> Canvas:
     """Return the legend, with a bar for the length of the enlarged vectors."""
-    discs = bool(np.isfinite(marks.shape).any())
-    detected = (
-        "detected centre of its ellipse (the position used plus the perspective bias)" if discs else "detected position"
+    discs, centre = (
+        bool(np.isfinite(marks.shape).any()),
+        "centre of its ellipse (the position used plus the perspective bias)",
     )
     entries: list[tuple[Colour, str]] = [
         *([(_RIM, "predicted rim of a disc at the measured pose")] if discs else []),
-        (_CROSS, detected),
+        (_CROSS, f"detected {centre if discs else 'position'}"),
         (_ARROW, f"residual, from the pose's projection to the detection, {factor:g}x; in the images {in_images:g}x"),
         (_SIGMA, f"1 sigma of the detection, {factor:g}x"),
         *([(RED, "dropped")] if marks.dropped.any() else []),
@@ -463,7 +403,7 @@ def _legend(marks: Marks, zoom: float, factor: float, in_images: float) -> Canva
         x += width + 54
     y += LINE
     bar = nice(0.6 * _TILE / factor)
-    segment(canvas, np.array([_GAP, y - 5.0]), np.array([_GAP + bar * factor, y - 5.0]), INK, 2)
+    outline(canvas, np.array([[_GAP, y - 5.0], [_GAP + bar * factor, y - 5.0]]), INK, 2)
     text = f"{bar:g} px of residual and sigma; details enlarged {zoom:.3g}x"
     write(canvas, text, (round(_GAP + bar * factor) + 10, y), INK, 0.5)
     return canvas[: y + 7]
@@ -471,18 +411,13 @@ def _legend(marks: Marks, zoom: float, factor: float, in_images: float) -> Canva
 
 def _unshown(marks: Marks, shown: list[int]) -> list[Canvas]:
     """Return a text on what is not shown enlarged."""
-    count, lines = len(marks.names), []
-    if len(shown) < count:
-        lines.append(f"enlarged: the worst {len(shown)} of {count} points, dropped ones first")
-    unseen = [marks.names[i] for i in np.flatnonzero(~marks.seen.any(axis=1) & ~marks.dropped.any(axis=1))]
-    if unseen:
-        more = f" and {len(unseen) - 20} more" if len(unseen) > 20 else ""
-        lines.append(f"seen by neither camera: {', '.join(unseen[:20])}{more}")
-    rest = [
-        f"{marks.names[i]} ({marks.reasons[i]})" for i in np.flatnonzero(marks.dropped.any(axis=1)) if i not in shown
-    ]
-    rest += marks.others
-    if rest:
-        more = f" and {len(rest) - 8} more" if len(rest) > 8 else ""
-        lines.append(f"also dropped: {', '.join(rest[:8])}{more}")
+    dropped, lines = marks.dropped.any(axis=1), list[str]()
+    if len(shown) < len(marks.names):
+        lines.append(f"enlarged: the worst {len(shown)} of {len(marks.names)} points, dropped ones first")
+    unseen = [marks.names[i] for i in np.flatnonzero(~marks.seen.any(axis=1) & ~dropped)]
+    rest = [f"{marks.names[i]} ({marks.reasons[i]})" for i in np.flatnonzero(dropped) if i not in shown]
+    for what, names, most in (("seen by neither camera", unseen, 20), ("also dropped", [*rest, *marks.others], 8)):
+        if names:
+            more = f" and {len(names) - most} more" if len(names) > most else ""
+            lines.append(f"{what}: {', '.join(names[:most])}{more}")
     return [paragraph(lines, MUTED, 0.5, WIDTH, _GAP)] if lines else []

@@ -6,15 +6,16 @@ import contextlib
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import click
 import numpy as np
 
+from armsight.app.measure.command import MeasureOptions
 from armsight.app.measure.moving import Requested, requested_shutters
 from armsight.app.measure.picture import SINGULAR
-from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, MeasureOptions, Result, open_shots
+from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, Result, named, open_shots
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.progress import bar
 from armsight.app.show.messages import colour, weak
@@ -44,6 +45,14 @@ _LIVE_S = 10.0
 _KEPT = 10_000
 #: s, between two looks at the health of live cameras; half: nothing, double: a warning comes later.
 _HEALTH_S = 1.0
+#: Columns of the table for people, their widths and digits; the shot's name is before them.
+_TABLE = (
+    *((f"{axis} mm", 9, 3) if k == 0 else ("±", 6, 3) for axis in "xyz" for k in (0, 1)),
+    *((f"{angle} deg", 9, 3) for angle in ANGLES),
+    ("±", 6, 3),
+    ("prec.", 7, 3),
+    ("pts", 4, 0),
+)
 
 
 def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
@@ -62,61 +71,35 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
     folder = _checked_outputs(options)
     if not rig.cov.any():
         click.echo(f"note: {options.rig} has no covariance: every ± is the share of the pixel noise alone", err=True)
-    records, past = list[ShotPose](), _Past(options.output is None and options.view_dir is None)
     started = time.perf_counter()
     with contextlib.ExitStack() as stack:
         shots = stack.enter_context(contextlib.closing(open_shots(options, rig, requested, folder is not None)))
         view = None if folder is None else PictureFolder(folder, rig, shots.body, shots.discs, shots.total)
+        run = MeasureRun(options, rig, shots, view, HealthMonitor(rig, shots.body, _SYNC_S, printed=shots.printed))
         # What was measured is written whatever ends the run; where one of the two cannot be written the other is.
         if view is not None:
-            stack.callback(view.finish, records)
-        if options.output is not None:
-            stack.callback(_write, options.output, records)
-        monitor = HealthMonitor(rig, shots.body, _SYNC_S, printed=shots.printed)
+            stack.callback(view.finish, run.records)
+        stack.callback(run.write)
         publisher = stack.enter_context(contextlib.closing(_streams(options.stream, rig, shots.body)))
         missed = _Contradicting(rig, shots.body, shots.again)
-        results = _watched(rig, fixed, missed.keeping(shots.results), monitor)
         try:
-            _run(results, shots, records, past, options.as_json, view, monitor, publisher)
+            run.measure(_watched(rig, fixed, missed.keeping(shots.results), run.monitor), publisher)
         except KeyboardInterrupt:
-            kept = f", kept in {options.output}" if options.output is not None and records else ""
-            click.echo(f"armsight: stopped after {past.shots + len(records)} shots{kept}", err=True)
+            kept = f", kept in {options.output}" if options.output is not None and run.records else ""
+            click.echo(f"armsight: stopped after {run.past + len(run.records)} shots{kept}", err=True)
             raise
-        shots.finish(records)
+        shots.finish(run.records)
         contradicted = missed.finding()
-        if records and not any(record.ok for record in records):
-            raise ArmsightError(_nothing_measured(records, shots.mistake(), contradicted, options.output))
-    board_file = _board_file(options.rig, rig, options.target)
-    _close(records, past, time.perf_counter() - started, options.output, view, board_file)
-    saved = _keep_noise(rig, shots, records, options.save_rig)
-    health = _concluded(monitor, shots, contradicted)
+        if run.records and not any(record.ok for record in run.records):
+            raise ArmsightError(run.nothing_measured(contradicted))
+    click.echo(run.summary(time.perf_counter() - started), err=True)
+    saved = run.keep_noise()
+    health = run.concluded(contradicted)
     if options.as_json and health:
         click.echo(json.dumps({"health": [found.to_json() for found in health]}))
     if not saved and not health:
         click.get_current_context().exit(1)
     return health
-
-
-@dataclass
-class _Past:
-    """Shots of days, of which no file needs all: counted and forgotten.
-
-    Attributes:
-        forgets: whether any are.
-        shots: forgotten.
-        good: those of them that were measured.
-    """
-
-    forgets: bool
-    shots: int = 0
-    good: int = 0
-
-    def thin(self, records: list[ShotPose]) -> None:
-        """Forget the older half once there are many."""
-        if self.forgets and len(records) >= 2 * _KEPT:
-            self.shots += _KEPT
-            self.good += sum(record.ok for record in records[:_KEPT])
-            del records[:_KEPT]
 
 
 def _checked_outputs(options: MeasureOptions) -> Path | None:
@@ -132,65 +115,172 @@ def _checked_outputs(options: MeasureOptions) -> Path | None:
 
 def _check_detections(options: MeasureOptions, requested: Requested | None) -> None:
     """Reject options that need images where only detections are given."""
-    if options.detections is None:
-        return
-    if requested is not None:
-        raise InputError("--skew and --readout need images with times: detections have none")
-    if options.fixed:
-        raise InputError("--fixed needs images: --detections has the markers of the target alone")
-    if options.save_rig is not None:
-        raise InputError("--save-rig writes what images show of the cameras: --detections has none")
+    for given, why in (
+        (requested is not None, "--skew and --readout need images with times: detections have none"),
+        (bool(options.fixed), "--fixed needs images: --detections has the markers of the target alone"),
+        (options.save_rig is not None, "--save-rig writes what images show of the cameras: --detections has none"),
+    ):
+        if options.detections is not None and given:
+            raise InputError(why)
 
 
-def _concluded(
-    monitor: HealthMonitor, shots: DetectedShots | ImageShots, contradicted: HealthFinding | None
-) -> tuple[HealthFinding, ...]:
-    """Say and return why the poses must not be trusted: findings of the run, and what all its shots show better."""
-    health = tuple(
-        replace(each, advice=_RECORDED) if each.cause == "host" and shots.recorded else each
-        for each in monitor.findings()
-    )
-    for line in unseen_lines(monitor.fixed_never_seen):
-        click.echo(f"note: {line}", err=True)
-    if contradicted is not None:
-        health = (contradicted, *(each for each in health if each.cause not in ("rig", "body", "lens")))
-    if shots.skewed and any(each.cause in ("rig", "time") for each in health):
-        # Of a moving body a skew looks like cameras that moved against each other; all shots together size it best.
-        health = (*shots.skewed, *(each for each in health if each.cause not in ("rig", "time")))
-    else:  # a skew that changes no pose by more than its sigma
-        for late in shots.skewed:
-            click.echo(f"note: {late.what}; {late.advice}", err=True)
-    for line in health_lines(health):
-        click.echo(weak(line), err=True, color=colour())
-    return health
+@dataclass
+class MeasureRun:
+    """A run: what it has measured so far, and what is said of it."""
 
+    options: MeasureOptions
+    rig: StereoRig
+    shots: DetectedShots | ImageShots
+    view: PictureFolder | None
+    monitor: HealthMonitor
+    records: list[ShotPose] = field(default_factory=list)
+    past: int = 0  #: shots of days, of which no file needs all: counted and forgotten
+    past_good: int = 0  #: those of them that were measured
 
-def _keep_noise(
-    rig: StereoRig, shots: DetectedShots | ImageShots, records: list[ShotPose], save_rig: Path | None
-) -> bool:
-    """Say how noisy the cameras' discs were, and write the rig with that and with the shutters that were found.
+    def measure(self, results: Iterator[Result], publisher: Publisher) -> None:
+        """Measure every shot, print its line, keep its record and draw it; of live cameras also warn at once."""
+        warned, looked_s, width, headed = set[str](), 0.0, 0, False
+        with bar("measuring", self.shots.total) as advance:
+            for shot, measured, followed, shutters in results:
+                result = self.monitor.measured(measured, shot.t_s) if isinstance(measured, PoseEstimate) else measured
+                record = replace(shot_pose(shot.name, shot.t_s, self.shots.body, result), shutters=shutters)
+                if followed is not None:
+                    record = replace(record, way=followed.way, jump=followed.jump, took_ms=followed.took_ms)
+                self._keep(record)
+                now = time.monotonic()  # the time by the clock of live cameras; a recording has none
+                arrival_s = now if shot.t_s is not None and 0.0 <= now - shot.t_s < _LIVE_S else None
+                publisher.put(ShotDatum(shot, result, arrival_s))
+                if arrival_s is not None and arrival_s - looked_s > _HEALTH_S:
+                    looked_s = arrival_s
+                    for found in self.monitor.findings():
+                        if found.cause not in warned:
+                            warned.add(found.cause)
+                            _warn(found.line())
+                            publisher.put(NoteDatum(arrival_s, found.line(), "warning"))
+                if self.options.as_json:
+                    click.echo(json.dumps(record.to_json()))
+                else:
+                    width = width or max(4, len(record.shot))
+                    if record.ok and not headed:
+                        headed = True
+                        click.echo(f"{'shot':<{width}}" + "".join(f"{name:>{wide}}" for name, wide, _ in _TABLE))
+                    click.echo(_line(record, width))
+                if self.view is not None:
+                    self.view.add(shot, result, record)
+                advance()
 
-    Returns False where a rig was to be written and the shots showed nothing to write. Of shots that show a skew the
-    residuals are those of the motion, not of the discs.
-    """
-    found = None if shots.noise is None or shots.skewed else shots.noise.found()
-    moved = next((record.shutters for record in records if record.shutters is not None), None)
-    if found is not None:
-        left, right = found
-        kept = "" if save_rig is not None or rig.disc_noise is not None else "; --save-rig keeps it for single shots"
-        click.echo(
-            f"note: discs' centres vary {left} (left) and {right} (right) times as much as single images say{kept}",
-            err=True,
-        )
-    if save_rig is None:
+    def _keep(self, record: ShotPose) -> None:
+        """Keep a record; once there are many that no file needs, forget the older half."""
+        self.records.append(record)
+        if self.options.output is None and self.view is None and len(self.records) >= 2 * _KEPT:
+            self.past += _KEPT
+            self.past_good += sum(record.ok for record in self.records[:_KEPT])
+            del self.records[:_KEPT]
+
+    def write(self) -> None:
+        """Write the poses, where there are any and a file is named."""
+        if self.records and self.options.output is not None:
+            write_text(self.options.output, csv_text(self.records))
+
+    def nothing_measured(self, contradicted: HealthFinding | None) -> str:
+        """Return why no shot could be measured: what was done to the images, or the first reason and what explains it."""
+        records, mistake = self.records, self.shots.mistake()
+        why = mistake or f"{records[0].shot}: {records[0].reason}"
+        if contradicted is not None and contradicted.cause == "rig" and not mistake:
+            why += f"; {contradicted.what}; {contradicted.advice}"
+        written = "" if self.options.output is None else f" (the reason of each is in {self.options.output})"
+        return f"none of {len(records)} shots could be measured: {why}{written}"
+
+    def summary(self, seconds: float) -> str:
+        """Return what was measured and missed; raise an ArmsightError where there was nothing to measure."""
+        if not self.records:
+            raise ArmsightError("the source ended without a single shot")
+        good = [r for r in self.records if r.ok]
+        total, measured, output = self.past + len(self.records), self.past_good + len(good), self.options.output
+        missed = f", {total - measured} missed (their lines have the reasons)" if total > measured else ""
+        said = [f"measured {measured} of {total} shots in {seconds:.1f} s{missed}"]
+        said.append(self._ways())
+        if jumps := [r.shot for r in self.records if r.jump]:
+            said.append(f"jumped in {named(jumps, 5)}")
+        if few := [r.shot for r in good if _contradicts(r.dropped, len(r.points_m))]:
+            said.append(
+                f"in {named(few)} most points contradict each other: do not use it; the body moved between the two "
+                "exposures, or the images do not belong together"
+            )
+        if odd := [r.shot for r in good if r.misfit > 1]:
+            which = f" ({', '.join(odd)})" if len(odd) <= NAMED else ""
+            worse = f"{len(odd)} fit the body worse than the noise allows{which}"
+            said.append(f"{worse} (misfit in their lines; their sigma includes it)")
+            # The board as the rig's calibration found it, where it is measured by its drawing.
+            given, board = self.rig.provenance.get("target"), self.rig.provenance.get("board")
+            if given == self.options.target and isinstance(board, str) and (self.options.rig.parent / board).exists():
+                board_file = self.options.rig.parent / board
+                said.append(f"the rig's calibration found the shape of this board: measure with --target {board_file}")
+        said.append(self.view.summary() if self.view is not None else "")
+        said.append(f"written to {output}" if output is not None else "")
+        return "; ".join(filter(None, said))
+
+    def _ways(self) -> str:
+        """Return how often a followed body was found which way, and how long that took."""
+        took: dict[str, list[float]] = {}
+        for record in self.records:
+            if record.way is not None and record.took_ms is not None:
+                took.setdefault(record.way, []).append(record.took_ms)
+        often = sorted(took.items(), key=lambda item: -len(item[1]))
+        return ", ".join(f"{len(times)} {way} ({np.median(times):.1f} ms each)" for way, times in often)
+
+    def keep_noise(self) -> bool:
+        """Say how noisy the cameras' discs were, and write the rig with that and with the shutters that were found.
+
+        Returns False where a rig was to be written and the shots showed nothing to write. Of shots that show a skew the
+        residuals are those of the motion, not of the discs.
+        """
+        rig, shots, save_rig = self.rig, self.shots, self.options.save_rig
+        found = None if shots.noise is None or shots.skewed else shots.noise.found()
+        moved = next((record.shutters for record in self.records if record.shutters is not None), None)
+        if found is not None:
+            left, right = found
+            kept = (
+                "" if save_rig is not None or rig.disc_noise is not None else "; --save-rig keeps it for single shots"
+            )
+            click.echo(
+                f"note: discs' centres vary {left} (left) and {right} (right) times as much as single images say{kept}",
+                err=True,
+            )
+        if save_rig is not None and found is None and moved is None:
+            few = "too few shots, or the body moved too little, to know the discs' noise"
+            why = "the shots show a skew, which hides the discs' noise: give --skew find" if shots.skewed else few
+            _warn(f"{save_rig} was not written: {why}")
+            return False
+        if save_rig is not None:
+            replace(rig, shutters=moved or rig.shutters, disc_noise=found or rig.disc_noise).save(save_rig)
         return True
-    if found is None and moved is None:
-        few = "too few shots, or the body moved too little, to know the discs' noise"
-        why = "the shots show a skew, which hides the discs' noise: give --skew find" if shots.skewed else few
-        click.echo(weak(f"{save_rig} was not written: {why}"), err=True, color=colour())
-        return False
-    replace(rig, shutters=moved or rig.shutters, disc_noise=found or rig.disc_noise).save(save_rig)
-    return True
+
+    def concluded(self, contradicted: HealthFinding | None) -> tuple[HealthFinding, ...]:
+        """Say and return why the poses must not be trusted: findings of the run, and what all its shots show better."""
+        shots = self.shots
+        health = tuple(
+            replace(each, advice=_RECORDED) if each.cause == "host" and shots.recorded else each
+            for each in self.monitor.findings()
+        )
+        for line in unseen_lines(self.monitor.fixed_never_seen):
+            click.echo(f"note: {line}", err=True)
+        if contradicted is not None:
+            health = (contradicted, *(each for each in health if each.cause not in ("rig", "body", "lens")))
+        if shots.skewed and any(each.cause in ("rig", "time") for each in health):
+            # Of a moving body a skew looks like cameras that moved against each other; all shots together size it best.
+            health = (*shots.skewed, *(each for each in health if each.cause not in ("rig", "time")))
+        else:  # a skew that changes no pose by more than its sigma
+            for late in shots.skewed:
+                click.echo(f"note: {late.what}; {late.advice}", err=True)
+        for line in health_lines(health):
+            _warn(line)
+        return health
+
+
+def _warn(line: str) -> None:
+    """Print what is weak."""
+    click.echo(weak(line), err=True, color=colour())
 
 
 def _contradicts(dropped: Sequence[Dropped], used: int) -> bool:
@@ -218,20 +308,20 @@ class _Contradicting:
                 self._missed += 1
                 if self._tried < _AGAIN:
                     self._tried += 1
-                    if isinstance(wide := self._again(self._wide, shot), PoseEstimate) and self._apart(wide):
-                        self._found.append(wide)
+                    if isinstance(wide := self._again(self._wide, shot), PoseEstimate):
+                        seen = wide.points.seen
+                        # Rays that miss each other by more than the rig allows: a body of another size does not do that.
+                        if gate(self._rig, self._body, seen).paired.sum() < seen.paired.sum():
+                            self._found.append(wide)
             yield result
-
-    def _apart(self, found: PoseEstimate) -> bool:
-        """Whether rays of a shot miss each other by more than the rig allows; a body of another size does not do that."""
-        seen = found.points.seen
-        return bool(gate(self._rig, self._body, seen).paired.sum() < seen.paired.sum())
 
     def finding(self) -> HealthFinding | None:
         """Return what explains them, where they are more than those that were measured; None elsewhere."""
         count = round(len(self._found) / max(self._tried, 1) * self._missed)
         if self._found and count > self._measured:
-            return self._explained(count)
+            from armsight.loop.health.update import contradiction
+
+            return contradiction(self._rig, self._body, self._found, (count, count + self._measured))
         if self._few <= self._measured:
             return None
         return HealthFinding(
@@ -246,12 +336,6 @@ class _Contradicting:
             "look at the pairs of images; calibrate the rig again with images as they are now",
             ("lens", "time"),
         )
-
-    def _explained(self, count: int) -> HealthFinding:
-        """Return what explains that so many shots contradict the rig."""
-        from armsight.loop.health.update import contradiction
-
-        return contradiction(self._rig, self._body, self._found, (count, count + self._measured))
 
 
 def _watched(
@@ -277,75 +361,6 @@ def _streams(specs: Sequence[str], rig: StereoRig, body: Body) -> Publisher:
     return open_streams(specs, Published(rig, body), lambda line: click.echo(line, err=True))
 
 
-def _arrival_s(shot: Shot) -> float | None:
-    """Return the time by the clock of live cameras, s; None where the shot is of a recording."""
-    now = time.monotonic()
-    return now if shot.t_s is not None and 0.0 <= now - shot.t_s < _LIVE_S else None
-
-
-def _run(
-    results: Iterator[Result],
-    shots: DetectedShots | ImageShots,
-    records: list[ShotPose],
-    past: _Past,
-    as_json: bool,
-    view: PictureFolder | None,
-    monitor: HealthMonitor,
-    publisher: Publisher,
-) -> None:
-    """Measure every shot, print its line, keep its record and draw it; of live cameras also warn at once."""
-    warned, looked_s, width, headed = set[str](), 0.0, 0, False
-    with bar("measuring", shots.total) as advance:
-        for shot, measured, followed, shutters in results:
-            result = monitor.measured(measured, shot.t_s) if isinstance(measured, PoseEstimate) else measured
-            record = replace(shot_pose(shot.name, shot.t_s, shots.body, result), shutters=shutters)
-            if followed is not None:
-                record = replace(record, way=followed.way, jump=followed.jump, took_ms=followed.took_ms)
-            records.append(record)
-            past.thin(records)
-            arrival_s = _arrival_s(shot)
-            publisher.put(ShotDatum(shot, result, arrival_s))
-            if arrival_s is not None and arrival_s - looked_s > _HEALTH_S:
-                looked_s = arrival_s
-                for found in monitor.findings():
-                    if found.cause not in warned:
-                        warned.add(found.cause)
-                        click.echo(weak(found.line()), err=True, color=colour())
-                        publisher.put(NoteDatum(arrival_s, found.line(), "warning"))
-            if as_json:
-                click.echo(json.dumps(record.to_json()))
-            else:
-                width = width or max(4, len(record.shot))
-                if record.ok and not headed:
-                    headed = True
-                    click.echo(_head(width))
-                click.echo(_line(record, width))
-            if view is not None:
-                view.add(shot, result, record)
-            advance()
-
-
-def _write(output: Path, records: list[ShotPose]) -> None:
-    """Write the poses, where there are any."""
-    if records:
-        write_text(output, csv_text(records))
-
-
-#: Columns of the table for people, their widths and digits; the shot's name is before them.
-_TABLE = (
-    *((f"{axis} mm", 9, 3) if k == 0 else ("±", 6, 3) for axis in "xyz" for k in (0, 1)),
-    *((f"{angle} deg", 9, 3) for angle in ANGLES),
-    ("±", 6, 3),
-    ("prec.", 7, 3),
-    ("pts", 4, 0),
-)
-
-
-def _head(width: int) -> str:
-    """Return the names of the columns: each ± is one sigma of what is before it, prec. what differs from shot to shot."""
-    return f"{'shot':<{width}}" + "".join(f"{name:>{wide}}" for name, wide, _ in _TABLE)
-
-
 def _line(record: ShotPose, width: int) -> str:
     """Return one shot as a row of the table for people: mm and degrees, one sigma; what is unusual comes last."""
     if not record.ok:
@@ -368,74 +383,3 @@ def _line(record: ShotPose, width: int) -> str:
         SINGULAR.strip(", ") if record.pitch_singular else "",
     )
     return f"{record.shot:<{width}}{row}  {', '.join(filter(None, notes))}".rstrip()
-
-
-def _board_file(path: Path, rig: StereoRig, target: str) -> Path | None:
-    """Return the file of the board as the rig's calibration found it, where that board is measured by its drawing."""
-    name = rig.provenance.get("board")
-    if rig.provenance.get("target") != target or not isinstance(name, str):
-        return None
-    beside = path.parent / name
-    return beside if beside.exists() else None
-
-
-def _nothing_measured(
-    records: list[ShotPose], mistake: str, contradicted: HealthFinding | None, output: Path | None
-) -> str:
-    """Return why no shot could be measured: what was done to the images, or the first reason and what explains it."""
-    why = mistake or f"{records[0].shot}: {records[0].reason}"
-    if contradicted is not None and contradicted.cause == "rig" and not mistake:
-        why += f"; {contradicted.what}; {contradicted.advice}"
-    written = "" if output is None else f" (the reason of each is in {output})"
-    return f"none of {len(records)} shots could be measured: {why}{written}"
-
-
-def _close(
-    records: list[ShotPose],
-    past: _Past,
-    seconds: float,
-    output: Path | None,
-    view: PictureFolder | None,
-    board_file: Path | None,
-) -> None:
-    """Print on stderr what was measured and missed; raise an error if nothing was measured."""
-    if not records:
-        raise ArmsightError("the source ended without a single shot")
-    good = [r for r in records if r.ok]
-    missed = past.shots - past.good + len(records) - len(good)
-    said = [
-        f"measured {past.good + len(good)} of {past.shots + len(records)} shots in {seconds:.1f} s"
-        + (f", {missed} missed (their lines have the reasons)" if missed else ""),
-        _ways(records),
-    ]
-    if jumps := [r.shot for r in records if r.jump]:
-        said.append(f"jumped in {_some(jumps, 5)}")
-    if few := [r.shot for r in good if _contradicts(r.dropped, len(r.points_m))]:
-        said.append(
-            f"in {_some(few, NAMED)} most points contradict each other: do not use it; the body moved between the two "
-            "exposures, or the images do not belong together"
-        )
-    if odd := [r.shot for r in good if r.misfit > 1]:
-        which = f" ({', '.join(odd)})" if len(odd) <= NAMED else ""
-        worse = f"{len(odd)} fit the body worse than the noise allows{which}"
-        said.append(f"{worse} (misfit in their lines; their sigma includes it)")
-        if board_file is not None:
-            said.append(f"the rig's calibration found the shape of this board: measure with --target {board_file}")
-    said.append(view.summary() if view is not None else "")
-    said.append(f"written to {output}" if output is not None else "")
-    click.echo("; ".join(filter(None, said)), err=True)
-
-
-def _ways(records: list[ShotPose]) -> str:
-    """Return how often a followed body was found which way, and how long that took."""
-    took: dict[str, list[float]] = {}
-    for record in records:
-        if record.way is not None and record.took_ms is not None:
-            took.setdefault(record.way, []).append(record.took_ms)
-    often = sorted(took.items(), key=lambda item: -len(item[1]))
-    return ", ".join(f"{len(times)} {way} ({np.median(times):.1f} ms each)" for way, times in often)
-
-
-def _some(names: list[str], most: int) -> str:
-    """Return names as text, at most so many."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -15,6 +15,7 @@ from pathlib import Path
 import click
 import numpy as np
 
+from armsight.app.measure.command import MeasureOptions
 from armsight.app.measure.moving import NOTED_SHOTS, Requested, moved_results, skew_finding
 from armsight.data import SIDES, Body, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
@@ -42,49 +43,6 @@ _ROTATED_SPARE_DEG = 35.0
 
 
 @dataclass(frozen=True)
-class MeasureOptions:
-    """What ``armsight measure`` is given.
-
-    Attributes:
-        rig: the rig's file.
-        target: a board's spec or a body's file.
-        left: glob of the left images; with ``right``.
-        right: glob of the right images.
-        source: a source's spec, where the images are not given by globs.
-        detections: a file of detections, where there are no images.
-        fixed: bodies in view that do not move.
-        skew: time by which the right camera is later, with its unit, or ``find``.
-        readout: time from the first row to the last, with its unit, or ``find``.
-        save_rig: file for the rig with the skew and readout that were found or given.
-        output: CSV file of the poses.
-        stream: what to publish each pose to.
-        view_dir: folder for pictures.
-        as_json: whether each line is a JSON object.
-    """
-
-    rig: Path
-    target: str
-    left: str | None
-    right: str | None
-    source: str | None
-    detections: Path | None
-    fixed: Sequence[str]
-    skew: str | None
-    readout: str | None
-    save_rig: Path | None
-    output: Path | None
-    stream: Sequence[str]
-    view_dir: Path | None
-    as_json: bool
-
-    def open_source(self) -> Source:
-        """Open the images that are named."""
-        if self.left is not None and self.right is not None:
-            return PairsSource.open(self.left, self.right)
-        return open_source(str(self.source))
-
-
-@dataclass(frozen=True)
 class Followed:
     """How the follower found the body in a shot, what it noticed about a jump, and how long it took, ms."""
 
@@ -106,8 +64,7 @@ class DetectedShots:
     def __init__(self, options: MeasureOptions, rig: StereoRig) -> None:
         """Read them."""
         self.body, shots, self.printed = _detected(Path(str(options.detections)), options.target)
-        self._by_name = {shot.name: shot for shot in shots}
-        self.total = len(shots)
+        self._by_name, self.total = {shot.name: shot for shot in shots}, len(shots)
         self.skewed: list[HealthFinding] = []
         self.results: Iterator[Result] = (
             (Shot(s.name, None, None, s.t_s), measure_seen(rig, self.body, s), None, None) for s in shots
@@ -144,47 +101,89 @@ class ImageShots:
         self, options: MeasureOptions, rig: StereoRig, requested: Requested | Shutters | None, draws: bool
     ) -> None:
         """Open target and source, say what is known of them; ``draws``: whether the images are drawn afterwards."""
-        self._options, self._rig = options, rig
-        self._target = target = open_target(options.target)
-        self.body, self.discs, self.printed = target.body, target.discs, is_print(target)
-        self.noise = None if self.discs is None else DiscNoise(rig, target)
+        self._options, self._rig, self._target = options, rig, open_target(options.target)
+        self.body, self.discs, self.printed = self._target.body, self._target.discs, is_print(self._target)
+        self.noise = None if self.discs is None else DiscNoise(rig, self._target)
         if self.noise is None and options.save_rig is not None and requested is None:
             raise InputError(
                 "--save-rig writes skew, readout and the noise of discs: give --skew find, or a body of discs"
             )
         self.skewed: list[HealthFinding] = []
-        self._first: list[Shot] = []
+        self._missed: Shot | None = None  # the first with both images
         self._again: Source | None = None
-        self._source = options.open_source()
+        self._source = source = self._open()
         try:
-            self.results = _keeping(self._results(requested, draws), self._first, self.noise)
+            self._said = notes_of(source)
+            say(self._said)
+            if options.output is not None and isinstance(source, StoredSource):
+                check_writable(options.output, apart_from=source.files)
+            self._timed = source.timed
+            self.recorded = self._timed or isinstance(source, StoredSource)
+            if requested is not None and not self._timed:
+                raise InputError("--skew and --readout need a recording with times: they show the motion of the body")
+            if requested is None and rig.shutters is not None and not self._timed:
+                click.echo(f"note: {options.rig} has {rig.shutters}, not used: no recording with times", err=True)
+            self._requested = rig.shutters if requested is None and self._timed else requested
+            self._again = self._open() if self._requested is not None and draws else None
         except BaseException:
             self.close()
             raise
-        self.total = self._source.count
+        self.total, self.results = source.count, self._results()
 
-    def _results(self, requested: Requested | Shutters | None, draws: bool) -> Iterator[Result]:
-        """Return what measures shot after shot, by the shutters that are requested or stand in the rig's file."""
-        source, rig, path = self._source, self._rig, self._options.rig
-        self._said = notes_of(source)
-        say(self._said)
-        if self._options.output is not None and isinstance(source, StoredSource):
-            check_writable(self._options.output, apart_from=source.files)
-        timed = source.timed
-        self.recorded = timed or isinstance(source, StoredSource)
-        if requested is not None and not timed:
-            raise InputError("--skew and --readout need a recording with times: they show the motion of the body")
-        if requested is None and rig.shutters is not None:
-            if timed:
-                requested = rig.shutters
-            else:
-                click.echo(f"note: {path} has {rig.shutters}, not used: no recording with times", err=True)
-        shots = _shots(source, rig, path)
-        if requested is not None:
-            self._again = self._options.open_source() if draws else None
-            return _moved(rig, self._target, shots, requested, self._again)
-        results = _measured(rig, self._target, shots)
-        return _noted(rig, self.body, results, self.skewed) if timed else results
+    def _open(self) -> Source:
+        """Open the images that are named."""
+        left, right = self._options.globs
+        return (
+            open_source(str(self._options.source)) if left is None or right is None else PairsSource.open(left, right)
+        )
+
+    def _results(self) -> Iterator[Result]:
+        """Measure shot after shot, by the shutters that are requested or stand in the rig's file."""
+        first: list[tuple[float | None, PoseEstimate | Missed]] = []  # of cameras that are taken for simultaneous
+        for result in self._measured(self._rig) if self._requested is None else self._moved(self._requested):
+            shot, found = result[:2]
+            if self.noise is not None and isinstance(found, PoseEstimate):
+                self.noise.add(found)
+            if isinstance(found, Missed) and shot.left is not None and shot.right is not None:
+                self._missed = self._missed or shot
+            if self._requested is None and self._timed and len(first) < NOTED_SHOTS:
+                first.append((shot.t_s, found))
+            yield result
+        if (skewed := skew_finding(self._rig, self.body, first) if first else None) is not None:
+            self.skewed.append(skewed)
+
+    def _measured(self, rig: StereoRig) -> Iterator[Result]:
+        """Measure shot after shot; a body of discs is followed from one to the next."""
+        follower = Follower(rig, self._target) if follows(self._target) else None
+        for shot in self._shots():
+            if follower is None:
+                yield shot, measure(rig, self._target, shot), None, None
+                continue
+            begun = time.perf_counter()
+            found = follower.measure(shot)
+            yield shot, found, Followed(follower.way, follower.jump, 1e3 * (time.perf_counter() - begun)), None
+
+    def _moved(self, requested: Requested | Shutters) -> Iterator[Result]:
+        """Measure all shots, then move their detections to one time and measure again."""
+        wide = self._measured(replace(self._rig, sigma_px=max(self._rig.sigma_px, LOOSE_PX)))
+        first = [(replace(shot, left=None, right=None), found, followed) for shot, found, followed, _ in wide]
+        timed = [(shot.t_s, found) for shot, found, _ in first]
+        moved, shutters = moved_results(self._rig, self.body, timed, requested)
+        click.echo(f"note: {shutters}", err=True)
+        for (shot, _, followed), (found, is_moved) in zip(first, moved, strict=True):
+            drawn = self._again.read() if self._again is not None else None
+            yield drawn or shot, found, followed, shutters if is_moved else None
+
+    def _shots(self) -> Iterator[Shot]:
+        """Yield the source's shots; the first image that can be read must have the rig's size."""
+        checked = False
+        while (shot := self._source.read()) is not None:
+            if not checked and shot.left is not None and shot.right is not None:
+                checked = True
+                for side, camera, image in zip(SIDES, self._rig.cameras, (shot.left, shot.right), strict=True):
+                    if (problem := size_problem(camera.image_size_px, image, side)) is not None:
+                        raise InputError(f"{self._options.rig}: shot {shot.name}: {problem}")
+            yield shot
 
     def again(self, rig: StereoRig, shot: Shot) -> PoseEstimate | Missed:
         """Measure a shot with another rig."""
@@ -208,8 +207,22 @@ class ImageShots:
         say(unseen_row(target, [np.array(ids, np.int64) for ids in of_shots]))
 
     def mistake(self) -> str:
-        """Return what was done to the images where a missed shot can be measured once it is undone; empty otherwise."""
-        return _mistaken(self._rig, self._target, self._first)
+        """Return what was done to the images where a missed shot can be measured once it is undone; empty otherwise.
+
+        Rotated images of two parallel cameras nearly fit the rig exchanged, and the other way round: the better fit
+        decides.
+        """
+        if (shot := self._missed) is None or shot.left is None or shot.right is None:
+            return ""
+        if one_image(shot.left, shot.right):
+            return "the left and the right image are the same: give the images of two cameras"
+        fits = {}
+        for what, images in _undone(shot.left, shot.right).items():
+            left, right = map(np.ascontiguousarray, images)
+            found = measure(self._rig, self._target, replace(shot, left=left, right=right))
+            if isinstance(found, PoseEstimate) and len(found.points.ids) > len(found.dropped):
+                fits[-len(found.points.ids), found.reprojection_rms_px] = what
+        return fits[min(fits)] if fits else ""
 
 
 def open_shots(
@@ -223,17 +236,6 @@ def open_shots(
     if options.detections is not None:
         return DetectedShots(options, rig)
     return ImageShots(options, rig, requested, draws)
-
-
-def _keeping(results: Iterator[Result], first: list[Shot], noise: DiscNoise | None) -> Iterator[Result]:
-    """Yield the results; keep the first shot that was missed although both images are there, and what shows the noise."""
-    for result in results:
-        shot = result[0]
-        if noise is not None and isinstance(result[1], PoseEstimate):
-            noise.add(result[1])
-        if not first and isinstance(result[1], Missed) and shot.left is not None and shot.right is not None:
-            first.append(shot)
-        yield result
 
 
 def _detected(detections: Path, target: str) -> tuple[Body, list[SeenShot], bool]:
@@ -255,53 +257,9 @@ def say(notes: Iterable[str]) -> None:
         click.echo(f"note: {note}", err=True)
 
 
-def _noted(rig: StereoRig, body: Body, results: Iterator[Result], skewed: list[HealthFinding]) -> Iterator[Result]:
-    """Yield the results, and add to ``skewed`` at the end where they show that the cameras do not expose at one time."""
-    first: list[tuple[float | None, PoseEstimate | Missed]] = []
-    for result in results:
-        if len(first) < NOTED_SHOTS:
-            first.append((result[0].t_s, result[1]))
-        yield result
-    found = skew_finding(rig, body, first)
-    if found is not None:
-        skewed.append(found)
-
-
-def _moved(
-    rig: StereoRig, target: Target, shots: Iterator[Shot], requested: Requested | Shutters, again: Source | None
-) -> Iterator[Result]:
-    """Measure all shots, then move their detections to one time and measure again; ``again`` has the images to draw."""
-    measured = _measured(replace(rig, sigma_px=max(rig.sigma_px, LOOSE_PX)), target, shots)
-    first = [(replace(shot, left=None, right=None), result, followed) for shot, result, followed, _ in measured]
-    moved, shutters = moved_results(rig, target.body, [(shot.t_s, result) for shot, result, _ in first], requested)
-    click.echo(f"note: {shutters}", err=True)
-    for (shot, _, followed), (result, is_moved) in zip(first, moved, strict=True):
-        drawn = again.read() if again is not None else None
-        yield drawn or shot, result, followed, shutters if is_moved else None
-
-
-def _shots(source: Source, rig: StereoRig, path: Path) -> Iterator[Shot]:
-    """Yield a source's shots; the first image that can be read must have the rig's size."""
-    checked = False
-    while (shot := source.read()) is not None:
-        if not checked and shot.left is not None and shot.right is not None:
-            checked = True
-            for side, camera, image in zip(SIDES, rig.cameras, (shot.left, shot.right), strict=True):
-                if (problem := size_problem(camera.image_size_px, image, side)) is not None:
-                    raise InputError(f"{path}: shot {shot.name}: {problem}")
-        yield shot
-
-
-def _measured(rig: StereoRig, target: Target, shots: Iterator[Shot]) -> Iterator[Result]:
-    """Measure shot after shot; a body of discs is followed from one to the next."""
-    if not follows(target):
-        yield from ((shot, measure(rig, target, shot), None, None) for shot in shots)
-        return
-    follower = Follower(rig, target)
-    for shot in shots:
-        begun = time.perf_counter()
-        result = follower.measure(shot)
-        yield shot, result, Followed(follower.way, follower.jump, 1e3 * (time.perf_counter() - begun)), None
+def named(names: Sequence[str], most: int = NAMED) -> str:
+    """Return names as text, at most so many."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 #: What a camera's driver may have done to its images -> how it is undone.
@@ -321,15 +279,11 @@ def _undone(left: Image, right: Image) -> dict[str, tuple[Image, Image]]:
             np.iinfo(right.dtype).max - right,
         ),
     }
+    said = "the {} are {} against those of the calibration; the cameras must deliver both alike"
     for what, undo in _FLIPS.items():
-        sides = {
-            "images": (undo(left), undo(right)),
-            "left images": (undo(left), right),
-            "right images": (left, undo(right)),
-        }
-        for which, images in sides.items():
-            said = f"the {which} are {what} against those of the calibration; the cameras must deliver both alike"
-            undone[said] = images
+        undone[said.format("images", what)] = undo(left), undo(right)
+        undone[said.format("left images", what)] = undo(left), right
+        undone[said.format("right images", what)] = left, undo(right)
     return undone
 
 
@@ -344,30 +298,8 @@ def reversed_notes(target: Target, records: list[ShotPose]) -> list[str]:
     names = [record.shot for record, angle in zip(measured[1:], angles, strict=True) if angle > least]
     if not names:
         return []
-    shown = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
     return [
-        f"{shown}: rotated by {least + _ROTATED_SPARE_DEG:.0f} degrees or so against the shot before; this board looks the "
-        "same then, and its origin is the corner most to the upper left in the image: codes, rings, or one even and one "
-        "odd count of a chessboard distinguish its ends"
+        f"{named(names)}: rotated by {least + _ROTATED_SPARE_DEG:.0f} degrees or so against the shot before; this board "
+        "looks the same then, and its origin is the corner most to the upper left in the image: codes, rings, or one even "
+        "and one odd count of a chessboard distinguish its ends"
     ]
-
-
-def _mistaken(rig: StereoRig, target: Target, shots: list[Shot]) -> str:
-    """Return what was done to the images where a missed shot can be measured once it is undone; empty otherwise.
-
-    Rotated images of two parallel cameras nearly fit the rig exchanged, and the other way round: the better fit decides.
-    """
-    for shot in shots:
-        assert shot.left is not None
-        assert shot.right is not None
-        if one_image(shot.left, shot.right):
-            return "the left and the right image are the same: give the images of two cameras"
-        fits = {}
-        for what, images in _undone(shot.left, shot.right).items():
-            left, right = map(np.ascontiguousarray, images)
-            found = measure(rig, target, replace(shot, left=left, right=right))
-            if isinstance(found, PoseEstimate) and len(found.points.ids) > len(found.dropped):
-                fits[-len(found.points.ids), found.reprojection_rms_px] = what
-        if fits:
-            return fits[min(fits)]
-    return ""

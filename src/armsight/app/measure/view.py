@@ -84,7 +84,8 @@ class PictureFolder:
         """
         if self._earlier is None:
             self._earlier = {path.name for path in self.folder.glob(f"{PREFIX}*.png")}
-        number, odd = self._shots, _is_odd(record)
+        number = self._shots
+        odd = not record.ok or record.way == "searched" or bool(record.jump)
         step = _step(number, EACH_UP_TO) if self._every is None else self._every
         chosen = number % step == 0 or (odd and self._odd % _step(self._odd, ODD_UP_TO) == 0)
         self._shots += 1
@@ -135,11 +136,6 @@ class PictureFolder:
         with replacing(self.folder / name, "wb") as file:
             file.write(data)
         self._written.add(name)
-
-
-def _is_odd(record: ShotPose) -> bool:
-    """Return whether a shot is unusual: missed, searched for in the whole image, or with a jump."""
-    return not record.ok or record.way == "searched" or bool(record.jump)
 
 
 def _step(number: int, most: int) -> int:
