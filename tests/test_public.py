@@ -26,8 +26,12 @@ from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.geometry.rotation import euler_zyx, from_euler_zyx
 from armsight.sim.example_rig import BOARD, demo_recording
 from armsight.vision.pose.shot_pose import CSV_COLUMNS, ShotPoses
+from armsight.vision.source import Source
 from made_once import made_once
 from strategies import ordinary_rig
+
+#: What a pose measured alone and a row of a table have alike.
+SHARED = ("T_left_body", "position_mm", "sigma_mm", "angles_deg", "sigma_deg", "cov_left", "quaternion_wxyz")
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +90,8 @@ def test_a_hand_eye_calibration_prints_its_error_and_sigma():
     B = inverse(Z) @ A @ X @ exp_se3(rng.multivariate_normal(np.zeros(6), cov, 12))
     text = repr(armsight.handeye(A, B, np.tile(cov, (12, 1, 1)), quick=True))
     assert text.startswith("HandEye(to_hand, 12 of 12 poses; held out ")
+    with pytest.raises(ArmsightError, match=r"Ts_base_flange is a str; expected poses .*read_pose_table"):
+        armsight.handeye("robot.csv", B)
     still = np.array(re.findall(r"(-?[\d.]+) \+- ([\d.]+)", text), float)[:3]
     assert (np.abs(still[:, 0] - 1e3 * Z[:3, 3]) < 4 * still[:, 1] + 0.005).all()
 
@@ -94,13 +100,17 @@ def test_a_source_is_iterated_counted_and_indexed(boards):
     with open_source(boards / "board") as source:
         assert len(source) == 12
         assert source[3].name == "003"
-        assert [shot.name for shot in source] == [f"{k:03d}" for k in range(12)]
-        assert list(source) == []
+        for _ in range(2):  # each time from the first
+            assert [shot.name for shot in source] == [f"{k:03d}" for k in range(12)]
         assert source
         assert [shot.name for shot in source[2:8:3]] == ["002", "005"]
         assert repr(source) == "FolderSource(12 shots)"
-        with pytest.raises(ArmsightError, match="no shot left"):
-            measure_all(ordinary_rig(), BOARD, source)
+        with pytest.raises(IndexError, match="shot 12 of 12"):
+            source[12]
+        figure = source[0].plot()
+        assert [ax.get_title() for ax in figure.axes] == ["left", "right"]
+        with pytest.raises(ArmsightError, match="no such folder"):
+            open_source(boards / "none")
 
 
 def test_pictures_to_a_rig_to_a_table(boards):
@@ -117,14 +127,20 @@ def test_pictures_to_a_rig_to_a_table(boards):
     assert pyarrow.table(table).column("z_m").to_pylist() == columns["z_m"].tolist()
     table.write_csv(boards / "poses.csv")
     assert (boards / "poses.csv").read_text().splitlines()[0] == ",".join(CSV_COLUMNS)
+    again = armsight.read_pose_table(boards / "poses.csv")
+    np.testing.assert_allclose(again.Ts, [each.T_left_body for each in table], atol=1e-9)
+    assert table.to_pandas()["x_m"].tolist() == columns["x_m"].tolist()
     one = measure(rig, open_target(BOARD), open_source(str(boards / "board"))[0])
     np.testing.assert_allclose(one.position_mm, 1e3 * np.array([columns[f"{axis}_m"][0] for axis in "xyz"]), atol=1e-9)
-    x, _, z = table.plot()
+    for name in SHARED:
+        np.testing.assert_allclose(getattr(one, name), getattr(table[0], name), rtol=1e-9, atol=1e-15, err_msg=name)
+    x, rz, _, _, z, _ = table.plot().axes
+    np.testing.assert_allclose(rz.lines[0].get_ydata(), columns["euler_z_deg"], atol=1e-9)
     np.testing.assert_allclose(x.lines[0].get_ydata(), 1e3 * columns["x_m"], atol=1e-9)
     low, high = z.collections[0].get_paths()[0].get_extents().intervaly  # the band has two sigmas to either side
     wide = 2e3 * columns["sigma_z_m"]
     assert (low, high) == pytest.approx(((1e3 * columns["z_m"] - wide).min(), (1e3 * columns["z_m"] + wide).max()))
-    mm, _ = found.plot()
+    mm, _ = found.plot().axes
     assert [bar.get_height() for bar in mm.patches] == pytest.approx((1e3 * found.errors.rigid_m).tolist())
 
 
@@ -134,8 +150,10 @@ def test_a_plot_without_matplotlib_says_what_to_install(monkeypatch):
         ShotPoses(()).plot()
 
 
-class Lost:
+class Lost(Source):
     """The least that a source is; it is not closed by whom it is lent to."""
+
+    count = None
 
     def __init__(self, shots):
         self.count, self.rest, self.closed = len(shots), list(shots), False
@@ -152,6 +170,12 @@ def test_a_missed_shot_stays_in_the_table():
     table = measure_all(ordinary_rig(), BOARD, source)
     assert (table[0].reason, len(table), source.closed) == ("lost", 1, False)
     assert np.isnan(table.columns()["x_m"][0])
+    assert np.isnan(table[0].position_mm).all()
+    assert repr(table) == "ShotPoses(0 of 1 shots measured; missed 1 times: lost)"
+    with pytest.raises(ArmsightError, match="nothing to draw: ShotPoses"):
+        table.plot()
+    with pytest.raises(ArmsightError, match="no shot left"):
+        measure_all(ordinary_rig(), BOARD, source)
     with pytest.raises(ArmsightError, match="no pair of images: shot a: lost"):
         calibrate(BOARD, Lost([Shot("a", None, None, None, "lost")]))
 
@@ -172,7 +196,11 @@ def test_a_missed_shot_stays_in_the_table():
 )
 def test_wrong_arguments_are_named(call):
     given = {"rig": ordinary_rig(), "target": open_target(BOARD), "shot": Shot("a", None, None, None, "lost")}
-    assert measure(**given) == Missed("lost")
+    missed = measure(**given)
+    assert missed == Missed("lost")
+    assert not missed
+    with pytest.raises(AttributeError, match="position_mm: nothing was measured: lost"):
+        missed.position_mm  # noqa: B018
     names = {"measure": measure, "measure_all": measure_all, "calibrate": calibrate, "source": Lost([given["shot"]])}
     with pytest.raises(ArmsightError, match=r"^\w+\([a-z, ]+\): (rig|target|board|shot|source) is a \w+; expected \w+"):
         eval(call, names | given)

@@ -8,9 +8,11 @@
     table = measure_all(rig, target, open_source("recording")).columns()   # for pandas, polars
 
 To open: ``open_source`` images or cameras, ``open_board`` a board, ``open_target`` and ``open_body`` what is measured,
-``StereoRig.load`` a rig, ``open_arm`` an arm, ``read_poses`` a table of its poses, ``open_corrected`` an identified arm.
+``StereoRig.load`` a rig, ``open_arm`` an arm, ``open_corrected`` an identified one; ``read_poses`` joint angles with
+what was measured there, ``read_pose_table`` poses alone, those of ``write_csv`` too.
 To compute: ``calibrate``, ``calibrate_boards``, ``calibrate_bodies`` the pair of cameras; ``measure``, ``measure_all``,
-``Follower`` the pose of a body; ``handeye`` where rig and body are on the arm; ``identify`` what the arm really is.
+``Follower`` the pose of a body; ``handeye`` where rig and body are on the arm; ``identify`` what the arm really is,
+``validate`` how far off it is on other poses.
 To exchange: ``as_transform`` reads a transform of pinocchio, SciPy, spatialmath or ROS, ``ros_fields`` writes ROS' fields.
 Records: ``Shot``, ``Body``, ``PoseEstimate`` or ``Missed``, ``Pair``, ``Camera``, ``StereoRig``, ``Arm``, ``Corrected``.
 Wrong input raises ``ArmsightError``, with what was found, what was expected and what to do.
@@ -36,8 +38,10 @@ if TYPE_CHECKING:
     from armsight.loop.identify.corrected import Corrected, open_corrected
     from armsight.loop.identify.identify import identify
     from armsight.loop.identify.read import read_poses
+    from armsight.loop.identify.validate import validate
     from armsight.robot.arm_file import open_arm
     from armsight.robot.kinematics.arm import Arm
+    from armsight.tables.poses import read_pose_table
     from armsight.vision.calibrate.boards import Pair, calibrate_boards
     from armsight.vision.calibrate.bodies import calibrate_bodies
     from armsight.vision.calibrate.images import calibrate
@@ -81,8 +85,10 @@ __all__ = [
     "open_corrected",
     "open_source",
     "open_target",
+    "read_pose_table",
     "read_poses",
     "ros_fields",
+    "validate",
 ]
 
 _HOME = {
@@ -99,6 +105,8 @@ _HOME = {
     **dict.fromkeys(("Corrected", "open_corrected"), "armsight.loop.identify.corrected"),
     "identify": "armsight.loop.identify.identify",
     "read_poses": "armsight.loop.identify.read",
+    "read_pose_table": "armsight.tables.poses",
+    "validate": "armsight.loop.identify.validate",
     "open_arm": "armsight.robot.arm_file",
     "open_board": "armsight.vision.markers.board",
     **dict.fromkeys(("open_body", "open_target"), "armsight.vision.markers.targets"),

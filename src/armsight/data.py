@@ -93,6 +93,23 @@ class Shot(Record):
         """Return the image of one side."""
         return self.left if side == "left" else self.right
 
+    def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
+        """Draw both images side by side; return matplotlib's figure.
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
+        from armsight.plots import new_figure
+
+        figure, axes = new_figure(1, 2)
+        for side, ax in zip(SIDES, axes, strict=True):
+            image = self.image(side)
+            if image is not None:
+                ax.imshow(image if image.ndim == 2 else image[..., ::-1], cmap="gray")
+            ax.set(title=side if image is not None else f"{side}: {self.problem}", xticks=[], yticks=[])
+        figure.suptitle(self.name)
+        return figure
+
 
 @dataclass(frozen=True, eq=False)
 class Body(Record):
@@ -244,19 +261,60 @@ class Points(Record):
 
 @dataclass(frozen=True)
 class Missed:
-    """An expected miss: no measurement in this shot, and why."""
+    """An expected miss: no measurement in this shot, and why. It is false: ``if pose := measure(...)``."""
 
     reason: str
 
+    def __bool__(self) -> bool:
+        """Return False: nothing was measured."""
+        return False
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - it never returns
+        """Raise an AttributeError with the reason; it names what a pose would have."""
+        raise AttributeError(f"{name}: nothing was measured: {self.__dict__.get('reason')}")
+
+
+class SeenPose(Record):
+    """What people read of a pose in the left camera's frame: mm, degrees, and one sigma of each, along its axes."""
+
+    T_left_body: Array
+    cov_left: Any  # a field, or a property of ``cov``
+
+    @property
+    def position_mm(self) -> Array:
+        """(3,) x, y, z of the body's origin in the left camera's frame, mm."""
+        return np.asarray(1e3 * self.T_left_body[:3, 3])
+
+    @property
+    def sigma_mm(self) -> Array:
+        """(3,) one sigma of ``position_mm``, mm."""
+        return np.asarray(1e3 * np.sqrt(np.diag(self.cov_left[:3, :3])))
+
+    @property
+    def angles_deg(self) -> Array:
+        """(3,) rz, ry, rx, degrees: the body's rotation is R_z R_y R_x, about the left camera's axes."""
+        from armsight.geometry.rotation import (
+            euler_zyx,  # not above: it takes compiled kernels, which records do without
+        )
+
+        return np.degrees(euler_zyx(self.T_left_body[:3, :3])[0])
+
+    @property
+    def sigma_deg(self) -> Array:
+        """(3,) one sigma of ``angles_deg``, degrees; NaN where ry is +-90 and only rz and rx together are determined."""
+        from armsight.geometry.rotation import euler_zyx_sigmas
+
+        return np.degrees(euler_zyx_sigmas(self.T_left_body[:3, :3], self.cov_left[3:, 3:]))
+
 
 @dataclass(frozen=True, eq=False)
-class PoseEstimate(Record):
+class PoseEstimate(SeenPose):
     """Where a body is.
 
     Attributes:
         T_left_body: (4, 4) pose of the body in the left camera's frame.
-        cov: (6, 6) covariance of the tangent [translation m; rotation rad], perturbation on the right; pixel noise
-            and the rig's calibration together.
+        cov: (6, 6) covariance of the tangent [translation m; rotation rad] along the body's axes, perturbation on the
+            right; pixel noise and the rig's calibration together. ``cov_left`` is the same along the left camera's axes.
         cov_noise: (6, 6) the same from the pixel noise alone.
         residual_rms_m: RMS distance of the triangulated points from the fitted body.
         reprojection_rms_px: RMS distance of the detections from the fitted body's projections.
@@ -276,33 +334,18 @@ class PoseEstimate(Record):
     dropped: tuple[Dropped, ...] = ()
 
     @property
-    def position_mm(self) -> Array:
-        """(3,) x, y, z of the body's origin in the left camera's frame, mm."""
-        return 1e3 * self.T_left_body[:3, 3]
+    def cov_left(self) -> Array:
+        """(6, 6) covariance [m; rad] along the left camera's axes, rotations about the body's origin."""
+        from armsight.geometry.pose import left_axes
+
+        return left_axes(self.T_left_body, self.cov)
 
     @property
-    def sigma_mm(self) -> Array:
-        """(3,) one sigma of ``position_mm``, mm."""
-        return np.asarray(1e3 * np.sqrt(np.diag(self._of_left(self.cov[:3, :3]))))
+    def quaternion_wxyz(self) -> Array:
+        """(4,) orientation of the body."""
+        from armsight.geometry.rotation import quaternion_wxyz
 
-    @property
-    def angles_deg(self) -> Array:
-        """(3,) rz, ry, rx, degrees: the body's rotation is R_z R_y R_x, about the left camera's axes."""
-        from armsight.geometry.rotation import euler_zyx  # not above: it takes SciPy, which records do without
-
-        return np.degrees(euler_zyx(self.T_left_body[:3, :3])[0])
-
-    @property
-    def sigma_deg(self) -> Array:
-        """(3,) one sigma of ``angles_deg``, degrees; NaN where ry is +-90 and only rz and rx together are determined."""
-        from armsight.geometry.rotation import euler_zyx_sigmas
-
-        return np.degrees(euler_zyx_sigmas(self.T_left_body[:3, :3], self._of_left(self.cov[3:, 3:])))
-
-    def _of_left(self, cov: Array) -> Array:
-        """Return a covariance (3, 3) along the body's axes as one along the left camera's."""
-        R = self.T_left_body[:3, :3]
-        return np.asarray(R @ cov @ R.T)
+        return quaternion_wxyz(self.T_left_body[:3, :3])
 
     def to_dict(self) -> dict[str, Any]:
         """Return what people read, as lists and numbers: mm, degrees, and one sigma of each."""

@@ -21,3 +21,9 @@ class DeviceError(ArmsightError):
 
 class CalibrationError(ArmsightError):
     """The recordings do not determine what was asked for."""
+
+
+def require(call: str, name: str, value: object, fits: bool, expected: str) -> None:
+    """Raise the InputError of an argument of a wrong type, which names what opens a right one."""
+    if not fits:
+        raise InputError(f"{call}: {name} is a {type(value).__name__}; expected {expected}")

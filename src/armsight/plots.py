@@ -1,4 +1,4 @@
-"""Axes for the ``plot`` of results, where matplotlib is installed."""
+"""A figure for the ``plot`` of results, where matplotlib is installed."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 from armsight.errors import InputError
 
 
-def new_axes(rows: int, **options: Any) -> Any:  # noqa: ANN401 - matplotlib is no dependency
-    """Return axes one below the other that share their x, of a new figure.
+def new_figure(rows: int, columns: int, **options: Any) -> Any:  # noqa: ANN401 - matplotlib is no dependency
+    """Return a new figure and its axes (rows, columns), without dimensions of one.
 
     Raises:
         InputError: matplotlib is not installed.
@@ -17,4 +17,4 @@ def new_axes(rows: int, **options: Any) -> Any:  # noqa: ANN401 - matplotlib is 
         import matplotlib.pyplot as plt
     except ImportError:
         raise InputError('plot needs matplotlib, which is not installed: pip install "armsight[report]"') from None
-    return plt.subplots(rows, 1, sharex=True, layout="constrained", **options)[1]
+    return plt.subplots(rows, columns, layout="constrained", **options)

@@ -28,6 +28,7 @@ def forms():
         "pinocchio": pinocchio.SE3(T),
         "SciPy": RigidTransform.from_matrix(T),
         "spatialmath": SimpleNamespace(A=T),
+        "a measured pose": SimpleNamespace(T_left_body=T),
         "Transform": message(fields),
         "TransformStamped": message({"header": {}, "child_frame_id": "tool", "transform": fields}),
         "Pose": message(as_pose),
@@ -38,6 +39,7 @@ def forms():
 @pytest.mark.parametrize("name", forms())
 def test_transforms_of_others_are_read(name):
     np.testing.assert_allclose(as_transform(forms()[name]), T, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(as_transform(message(ros_fields(forms()[name]))), T, rtol=0, atol=1e-15)
 
 
 def test_ros_has_the_quaternion_as_x_y_z_w():

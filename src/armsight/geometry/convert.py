@@ -21,8 +21,9 @@ def as_transform(given: object) -> Array:
     """Return the (4, 4) transform, m, that an object of another library holds.
 
     Args:
-        given: a 4x4 matrix; pinocchio's, SciPy's (RigidTransform) or spatialmath's transform; a ROS Pose, Transform, or a
-            message that holds one (``pose``, ``transform``, also with covariance), whose quaternions are x y z w.
+        given: a 4x4 matrix; a pose that was measured; pinocchio's, SciPy's (RigidTransform) or spatialmath's transform; a
+            ROS Pose, Transform, or a message that holds one (``pose``, ``transform``, also with covariance), whose
+            quaternions are x y z w.
 
     Raises:
         InputError: it is none of these, or no rigid transform.
@@ -39,9 +40,9 @@ def as_transform(given: object) -> Array:
 
 def _matrix(given: Any) -> Array:  # noqa: ANN401 - any library's object
     """Return the matrix of a transform of another library."""
-    for name in ("transform", "pose"):  # what ROS wraps
-        if hasattr(given, name):
-            return _matrix(getattr(given, name))
+    for name in ("T_left_body", "transform", "pose"):  # a pose, and what ROS wraps
+        if (inner := getattr(given, name, None)) is not None:
+            return _matrix(inner)
     for moves, rotates in (("translation", "rotation"), ("position", "orientation")):
         t: Any = getattr(given, moves, None)
         q: Any = getattr(given, rotates, None)
@@ -64,8 +65,16 @@ def _matrix(given: Any) -> Array:  # noqa: ANN401 - any library's object
     return T
 
 
-def ros_fields(T: Array) -> dict[str, dict[str, float]]:
-    """Return ``translation`` and ``rotation`` of a ROS Transform as plain numbers, m and quaternion x y z w."""
-    w, x, y, z = quaternion_wxyz(np.asarray(T)[:3, :3]).tolist()
-    tx, ty, tz = np.asarray(T)[:3, 3].tolist()
+def ros_fields(given: object) -> dict[str, dict[str, float]]:
+    """Return ``translation`` and ``rotation`` of a ROS Transform as plain numbers, m and quaternion x y z w.
+
+    Args:
+        given: what :func:`as_transform` takes.
+
+    Raises:
+        InputError: it is no rigid transform.
+    """
+    T = as_transform(given)
+    w, x, y, z = quaternion_wxyz(T[:3, :3]).tolist()
+    tx, ty, tz = T[:3, 3].tolist()
     return {"translation": {"x": tx, "y": ty, "z": tz}, "rotation": {"x": x, "y": y, "z": z, "w": w}}

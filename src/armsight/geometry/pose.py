@@ -94,3 +94,10 @@ def log_se3(T: Array) -> Array:
 def mean_pose(Ts: Array) -> Array:
     """Return the mean (4, 4) of transforms (N, 4, 4): mean translation, chordal mean rotation."""
     return pose(nearest_rotation(Ts[:, :3, :3].sum(axis=0)), Ts[:, :3, 3].mean(axis=0))
+
+
+def left_axes(T_left_body: Array, cov: Array) -> Array:
+    """Return the covariance (6, 6) of the right tangent of a pose as one along the left camera's axes."""
+    R = T_left_body[:3, :3]
+    blocks = cov.reshape(2, 3, 2, 3).swapaxes(1, 2)
+    return np.asarray((R @ blocks @ R.T).swapaxes(1, 2).reshape(6, 6))

@@ -75,7 +75,7 @@ class PoseTable(Record):
 
 
 def read_pose_table(
-    path: Path,
+    path: str | Path,
     *,
     rotation: str | None = None,
     unit: str | None = None,
@@ -100,6 +100,7 @@ def read_pose_table(
     Raises:
         InputError: the file, the line and what was expected.
     """
+    path = Path(path)
     table, rotation, notes, missed = _table(path, rotation, unit, columns, arm, side)
     names = table.joint_names(*((len(arm.joint_names), arm.name) if arm is not None else (None, "")))
     q = table.joints(names) if names else None

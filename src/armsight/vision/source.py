@@ -40,7 +40,7 @@ class Source(Protocol):
         ...
 
     def __iter__(self) -> Iterator[Shot]:
-        """Read the shots that are left, one after another: none, where all were read."""
+        """Read the shots that are left, one after another; a folder of images begins anew each time."""
         while (shot := self.read()) is not None:
             yield shot
 

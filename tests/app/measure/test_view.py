@@ -168,7 +168,7 @@ def test_the_header_says_what_was_measured_and_how_it_was_found():
     record = record_of(result, way="followed", jump="jumped 40 mm", took_ms=2.34)
     first, second, third = header(record)
     assert first == "shot 007, t 0.250 s, followed, 2.3 ms, jumped 40 mm"
-    x, sigma = 1e3 * record.position_m[0], 1e3 * np.sqrt(record.cov[0, 0])
+    x, sigma = 1e3 * record.position_m[0], 1e3 * np.sqrt(record.cov_left[0, 0])
     assert second.startswith(f"x {x:.3f} +- {sigma:.3f}, y ")
     assert " mm; rz " in second
     assert second.endswith(" deg")
@@ -182,7 +182,7 @@ def test_the_sigmas_of_the_angles_are_those_of_random_rotations():
     _, result = located()
     record = record_of(result)
     rng, count = np.random.default_rng(1), 4000
-    rotations = rng.multivariate_normal(np.zeros(3), record.cov[3:, 3:], count)
+    rotations = rng.multivariate_normal(np.zeros(3), record.cov_left[3:, 3:], count)
     R = result.T_left_body[:3, :3]
     angles = np.degrees([euler_zyx(exp_so3(w) @ R)[0] for w in rotations])
     # A sample's standard deviation has a relative error of 1/sqrt(2 n): four of them.

@@ -15,7 +15,7 @@ from armsight.loop.identify.backlash import joint_backlashes
 from armsight.loop.identify.corrected import Corrected, table_text
 from armsight.loop.identify.fit import fit, prior_sigma, with_joint_noise
 from armsight.loop.identify.identify import contributions, identify
-from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.measured import Measured, Read
 from armsight.loop.identify.model import FRICTION_M, Model
 from armsight.loop.identify.observable import observed
 from armsight.loop.identify.placement import with_placement
@@ -369,10 +369,29 @@ def test_another_arm_is_reported(scene):
         identify(open_arm("ur10"), measured)
 
 
+def test_wrong_arguments_are_named_and_what_was_read_is_taken(scene):
+    w, measured, found, _ = scene
+    for call, words in (
+        (lambda: identify("ur10", measured), r'arm is a str; expected open_arm\("ur10"\)'),
+        (lambda: identify(w.nominal, "poses.csv"), r'poses is a str; expected read_poses\("poses.csv"\)'),
+        (lambda: validate(w.nominal, measured), "identified is a Arm"),
+    ):
+        with pytest.raises(InputError, match=words):
+            call()
+    read = Read(measured, np.arange(len(measured)), ())
+    assert repr(read) == f"Read({len(measured)} full poses of 6 joints; notes=())"
+    assert repr(validate(found, read)) == repr(validate(found, measured))
+    assert repr(validate(found, read)).startswith(f"Validation({len(measured)} poses: 0.")
+
+
 def test_a_prior_of_zero_keeps_a_parameter_and_an_unknown_name_is_rejected(scene):
     w, measured, _, _ = scene
     found = identify(w.nominal, measured, priors={"a2": 0.0, "wave": 0.0})
-    assert found.value("a2")[0] == w.nominal.a[1]
+    assert found.value("a2") == (w.nominal.a[1], pytest.approx(np.nan, nan_ok=True))
+    table = found.columns()
+    assert np.isnan(table["sigma"]).tolist() == (~found.solution.free).tolist()
+    with pytest.raises(InputError, match="has no parameter alpha9; it has "):
+        found.value("alpha9")
     assert "prior of zero" in found.reasons["wave1_sin1"]
     with pytest.raises(InputError, match="'a9'"):
         identify(w.nominal, measured, priors={"a9": 1.0})

@@ -40,6 +40,7 @@ from armsight.app.stream.streams import open_streams
 from armsight.data import Array, Image, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder, replacing, write_text
+from armsight.geometry.pose import left_axes
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.estimators import Mounting
 from armsight.loop.health import health_lines
@@ -48,7 +49,7 @@ from armsight.loop.running.data import Fanout
 from armsight.loop.running.setup import Setup
 from armsight.vision.detections import detections_text
 from armsight.vision.image import grey
-from armsight.vision.pose.shot_pose import CSV_COLUMNS, UPPER, left_axes, rows_of, shot_pose
+from armsight.vision.pose.shot_pose import CSV_COLUMNS, UPPER, rows_of, shot_pose
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import Source
 

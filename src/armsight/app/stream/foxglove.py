@@ -15,8 +15,8 @@ import numpy as np
 from armsight.app.stream.datum import Published
 from armsight.data import SIDES, Array, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
+from armsight.geometry.pose import left_axes
 from armsight.loop.running.data import EventDatum, JointsDatum, NoteDatum, ShotDatum, quaternion
-from armsight.vision.pose.shot_pose import left_axes
 from armsight.vision.rigfiles.rigfile import rectification
 
 #: A protobuf message.

@@ -18,7 +18,7 @@ The rows are put into an order of their own first (by time, else by content), so
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri, expit, fdtri
 
 from armsight.data import Array, Record
-from armsight.errors import CalibrationError, InputError
+from armsight.errors import CalibrationError, InputError, require
 from armsight.estimate.linear import Linear
 from armsight.estimate.solve import Solved, covariances, left_out, log_density, solve
 from armsight.estimate.variance import SPEAKS, integrate, most_probable, posterior, scores
@@ -57,6 +57,7 @@ from armsight.loop.handeye.sources import (
     over_poses,
     over_time,
 )
+from armsight.tables.poses import PoseTable
 
 #: Poses that the fit comes from at most, and the variances, evenly spread; half: less is known, double: twice the time.
 MAX_FIT, MAX_VARIANCE = 1000, 120
@@ -105,7 +106,7 @@ def _transform_of(eye: Eye, name: str, field_name: str, what: str) -> property:
 
 @dataclass(frozen=True, eq=False)
 class HandEye(Record):
-    """A hand-eye calibration."""
+    """A hand-eye calibration: two constant transforms, their covariance, and the error on poses left out of the fit."""
 
     eye: Eye  #: "to_hand": the rig stands still and the flange carries the body; "in_hand": the other way round
     T_base_still: Array  #: (4, 4) what stands still, in the base: the rig, or in_hand the body
@@ -143,8 +144,8 @@ class HandEye(Record):
             both = zip(1e3 * T[:3, 3], 1e3 * np.sqrt(np.diag(R @ cov @ R.T)), strict=True)
             shown.append(f"{name} at {', '.join(f'{x:.2f} +- {sigma:.2f}' for x, sigma in both)} mm")
         return (
-            f"HandEye({self.eye}, {int(self.used.sum())} of {len(self.used)} poses; held out {1e3 * position_m:.3f} mm, "
-            f"{np.degrees(angle_rad):.3f} deg; {'; '.join(shown)})"
+            f"HandEye({self.eye}, {int(self.used.sum())} of {len(self.used)} poses; held out {1e3 * position_m:.3f} mm "
+            f"RMS, {np.degrees(angle_rad):.3f} deg; {'; '.join(shown)})"
         )
 
     T_base_rig = _transform_of("to_hand", "T_base_rig", "T_base_still", "the rig in the base")
@@ -281,8 +282,8 @@ class _Problem(Record):
 
 
 def calibrate_handeye(
-    Ts_base_flange: ArrayLike,
-    Ts_rig_body: ArrayLike,
+    Ts_base_flange: ArrayLike | PoseTable,
+    Ts_rig_body: ArrayLike | PoseTable,
     covs: ArrayLike | None = None,
     *,
     eye: Eye = "to_hand",
@@ -293,8 +294,9 @@ def calibrate_handeye(
     """Calibrate the two constant transforms of rig, body and arm.
 
     Args:
-        Ts_base_flange: (N, 4, 4) the flange in the base, from the joints, m; it must rotate about two axes at least.
-        Ts_rig_body: (N, 4, 4) the body in the rig at the same instants, m (``PoseEstimate.T_left_body``).
+        Ts_base_flange: (N, 4, 4) the flange in the base, from the joints, m, or what ``read_pose_table`` returns; it must
+            rotate about two axes at least.
+        Ts_rig_body: the same of the body in the rig at the same instants, m (``T_left_body`` of what was measured).
         covs: (N, 6, 6) covariance of the latter, right tangent (``PoseEstimate.cov``); None: not known.
         eye: "to_hand" where the rig stands still and the arm carries the body, "in_hand" where the arm carries the rig.
         centre: (3,) the middle of the body's points, body frame, m: errors of vision rotate the body about it.
@@ -306,7 +308,13 @@ def calibrate_handeye(
         InputError: wrong shapes, NaN, no rigid motions, fewer than 4 poses.
         CalibrationError: the motions leave a direction open.
     """
-    poses = checked_poses(Ts_base_flange, Ts_rig_body, covs, eye, np.zeros(3) if centre is None else centre)
+    A, B = (getattr(each, "Ts", each) for each in (Ts_base_flange, Ts_rig_body))
+    for name, each in (("Ts_base_flange", A), ("Ts_rig_body", B)):
+        fits = isinstance(each, np.ndarray | Sequence) and not isinstance(each, str)
+        require(
+            "handeye(Ts_base_flange, Ts_rig_body)", name, each, fits, 'poses (N, 4, 4): read_pose_table("robot.csv")'
+        )
+    poses = checked_poses(A, B, covs, eye, np.zeros(3) if centre is None else centre)
     return calibrate_poses(poses, quick=quick, progress=progress)
 
 

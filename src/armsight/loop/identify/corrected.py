@@ -256,7 +256,7 @@ def zeros_text(found: Identified) -> str:
     offsets = (model.table(found.solution.x) - model.table(model.nominal()))[:, chain.OFFSET] * model.arm.direction
     for i, (name, zero) in enumerate(zip(model.arm.joint_names, offsets.tolist(), strict=True)):
         lines += ["", "[[joint]]", *_toml({"name": name, "zero_rad": zero}), f"zero_deg = {np.degrees(zero):.5f}"]
-        row = {"sigma_zero_rad": found.value(f"offset{i + 1}")[1]} | _seen(model, i)
+        row = {"sigma_zero_rad": float(np.nan_to_num(found.value(f"offset{i + 1}")[1]))} | _seen(model, i)
         for f in model.features:
             if f.joint == i and f.kind in SENSOR and (value := found.value(f.name)[0]) != 0.0:
                 row["gain" if f.kind == "gain" else f"{f.name.split('_')[1]}_rad"] = value

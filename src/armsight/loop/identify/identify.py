@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
-from armsight.errors import CalibrationError, InputError
+from armsight.errors import CalibrationError, InputError, require
 from armsight.loop.identify.fit import Mask, Solution, covariance, fit, joint_noise, prior_sigma, with_joint_noise
-from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.measured import Measured, Read, measured_of
 from armsight.loop.identify.misread import check_plausible, without_tool
 from armsight.loop.identify.model import PLENTY, SENSOR, Model
 from armsight.loop.identify.observable import Observed, observed
@@ -34,7 +34,7 @@ _TABLE = ("offset", "d", "a", "alpha", "beta")
 
 @dataclass(frozen=True, eq=False)
 class Identified(Record):
-    """An identified arm."""
+    """An identified arm: every number of its table, base and tool, and the error sources that lower the held-out error."""
 
     model: Model  #: the nominal arm with every parameter
     nominal: Array  #: (P,) base and tool fitted, the rest nominal
@@ -68,9 +68,22 @@ class Identified(Record):
         return np.asarray(np.flatnonzero(~self.solution.used), np.int64)
 
     def value(self, name: str) -> tuple[float, float]:
-        """Return value and sigma of a parameter."""
+        """Return value and sigma of a parameter, m or rad; sigma is NaN where it was not fitted and stays nominal.
+
+        Raises:
+            InputError: the arm has no such parameter.
+        """
+        if name not in self.model.names:
+            raise InputError(f"{self.model.arm.name} has no parameter {name}; it has {', '.join(self.model.names)}")
         k = self.model.names.index(name)
-        return float(self.solution.x[k]), float(np.sqrt(self.cov[k, k]))
+        return float(self.solution.x[k]), float(np.sqrt(self.cov[k, k])) if self.solution.free[k] else np.nan
+
+    def columns(self) -> dict[str, Array | list[str]]:
+        """Return a table of all parameters, m or rad; sigma is NaN where one was not fitted, and ``reason`` says why."""
+        names = list(self.model.names)
+        values, sigmas = np.array([self.value(name) for name in names]).T
+        reasons = [self.reasons.get(name, "") for name in names]
+        return {"name": names, "value": values, "nominal": self.model.nominal(), "sigma": sigmas, "reason": reasons}
 
     def correlation(self, rows: NDArray[np.int64]) -> Array:
         """Return the correlations (R, R) of fitted parameters: how badly these poses distinguish them.
@@ -93,7 +106,7 @@ class Identified(Record):
 
 def identify(
     arm: Arm,
-    measured: Measured,
+    measured: Measured | Read,
     *,
     priors: Mapping[str, float] | None = None,
     progress: Callable[[str], None] = lambda line: None,
@@ -102,14 +115,20 @@ def identify(
 
     Args:
         arm: the nominal arm; where base and tool are is found from the data.
-        measured: joint angles, and where the tool was measured.
+        measured: joint angles, and where the tool was measured, as ``read_poses`` returns them.
         priors: sigma by name of a parameter or a kind, instead of ``fit.SIGMA``; 0 keeps one at its nominal value.
         progress: called with the name of each step as it begins.
+
+    Returns:
+        Every number with its sigma: ``columns()`` is a table for pandas, ``validate`` says how far off it is on other
+        poses, ``Corrected.of`` makes an arm of it that computes and is saved.
 
     Raises:
         InputError: too few poses, or data that cannot be of this arm; the message says what would make them fit.
         CalibrationError: poses so alike that not even base and tool are observable.
     """
+    require("identify(arm, poses)", "arm", arm, isinstance(arm, Arm), 'open_arm("ur10")')
+    measured = measured_of("identify(arm, poses)", measured)
     model, x, prior, seen = _begun(arm, measured, priors, progress)
     progress("base and tool")
     placement = _of(model, PLACEMENT) & seen.free

@@ -7,6 +7,7 @@ tracked, or one body's full pose.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from armsight.data import Array, Record
-from armsight.errors import InputError
+from armsight.errors import InputError, require
 from armsight.geometry.check import checked
 
 Rows = NDArray[np.bool_] | NDArray[np.int64]
@@ -90,3 +91,27 @@ def visits(q: Array) -> NDArray[np.int64]:
     graph = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(q), len(q)))
     _, first, which = np.unique(connected_components(graph, directed=False)[1], return_index=True, return_inverse=True)
     return np.asarray(np.argsort(np.argsort(first))[which], np.int64)
+
+
+class Read(NamedTuple):
+    """The contents of a file."""
+
+    measured: Measured  #: its good rows
+    lines: Array  #: (N,) the line of the file that each row comes from
+    notes: tuple[str, ...]  #: what was left out, and why, as text
+
+    def __repr__(self) -> str:
+        """Return how many poses of how many joints there are, and the notes."""
+        seen = "points" if self.measured.R_rig_body is None else "full poses"
+        return f"Read({len(self.measured)} {seen} of {self.measured.q.shape[1]} joints; notes={self.notes!r})"
+
+
+def measured_of(call: str, poses: Measured | Read) -> Measured:
+    """Return the poses of what was read.
+
+    Raises:
+        InputError: it is neither.
+    """
+    poses = poses.measured if isinstance(poses, Read) else poses
+    require(call, "poses", poses, isinstance(poses, Measured), 'read_poses("poses.csv")')
+    return poses

@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop.handeye.recording import matched_rows
-from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.measured import Measured, Read
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS
 from armsight.tables.cells import Cells, Rows, read_cells, read_columns
@@ -43,14 +42,6 @@ COLUMNS = (
 REST_RAD, REST_S = 3e-3, 0.2
 
 
-class Read(NamedTuple):
-    """The contents of a file."""
-
-    measured: Measured  #: its good rows
-    lines: Array  #: (N,) the line of the file that each row comes from
-    notes: tuple[str, ...]  #: what was left out, and why, as text
-
-
 def read_poses(
     path: str | Path, *, rotation: str | None = None, columns: str | None = None, arm: ArmJoints | None = None
 ) -> Read:
@@ -58,7 +49,8 @@ def read_poses(
 
     Args:
         path: the file.
-        rotation: the convention of rx_deg, ry_deg, rz_deg, one of ROTATIONS; None: they are not used.
+        rotation: the convention of rx_deg, ry_deg, rz_deg, such as "zyx"; None: they are not used; a wrong one: the error
+            lists all.
         columns: what the file calls its columns, NAME=THEIRS,... with names of COLUMNS, or the names of all in order.
         arm: whose joints they are, where that is known.
 

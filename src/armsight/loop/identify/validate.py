@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from armsight.data import Array
-from armsight.errors import InputError
+from armsight.errors import InputError, require
 from armsight.estimate.solve import covariances
 from armsight.loop.identify.fit import fit, linear_of, variances_of, with_joint_noise
 from armsight.loop.identify.identify import Identified
-from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.measured import Measured, Read, measured_of
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.selection import PLACEMENT
@@ -49,6 +49,14 @@ class Validation(NamedTuple):
     placement_refitted: bool  #: whether base and tool were fitted to these very poses
     residual_over_predicted: float  #: RMS residual over the predicted sigma; 1 where the sigmas are honest
 
+    def __repr__(self) -> str:
+        """Return the mean errors of both arms, mm, and whether the sigmas are honest."""
+        mean, nominal = (1e3 * float(each.position_m.mean()) for each in (self.identified, self.nominal))
+        return (
+            f"Validation({len(self.identified.position_m)} poses: {mean:.3f} mm mean, nominal arm {nominal:.3f} mm; "
+            f"residual over sigma {self.residual_over_predicted:.2f})"
+        )
+
 
 def errors(model: Model, x: Array, measured: Measured) -> Errors:
     """Return the errors of a parameter vector on poses."""
@@ -58,16 +66,19 @@ def errors(model: Model, x: Array, measured: Measured) -> Errors:
     return Errors(np.linalg.norm(e[:, None, :3], axis=2), np.linalg.norm(e[:, 3:], axis=1))
 
 
-def validate(found: Identified, measured: Measured) -> Validation:
+def validate(found: Identified, measured: Measured | Read) -> Validation:
     """Evaluate an identified arm on poses that it was not fitted to.
 
     Args:
         found: the identified arm.
-        measured: the poses; points or full poses as it was identified with.
+        measured: other poses, as ``read_poses`` returns them; points or full poses as it was identified with.
 
     Raises:
         InputError: another number of points, or points instead of poses.
     """
+    call = "validate(identified, poses)"
+    require(call, "identified", found, isinstance(found, Identified), "what identify(arm, poses) returns")
+    measured = measured_of(call, measured)
     require_alike(measured, found.model.points, found.model.full)
 
     def of(model: Model, nominal: Array, x: Array, refitted: bool) -> Validation:

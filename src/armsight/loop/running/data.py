@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from armsight.data import Array, Body, Correspondences, JointStates, Missed, Points, PoseEstimate, Record, Shot
-from armsight.vision.pose.shot_pose import left_axes, shot_pose
+from armsight.geometry.pose import left_axes
+from armsight.vision.pose.shot_pose import shot_pose
 
 if TYPE_CHECKING:
     from armsight.loop.estimators import KalmanEstimator, Mounting, Remembered

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from armsight.data import Array, Body, Record
+from armsight.plots import new_figure
 from armsight.vision.calibrate.motion import ExposureMotion
-from armsight.vision.plots import new_axes
 from armsight.vision.pose.bundle import BundleSolution, Observations
 from armsight.vision.rig import StereoRig
 
@@ -123,17 +123,17 @@ class Calibration(Record):
         )
 
     def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
-        """Draw the errors of every pair when it was left out of the fit, mm and px; return both axes.
+        """Draw the errors of every pair when it was left out of the fit, mm and px; return matplotlib's figure.
 
         Raises:
             InputError: matplotlib is not installed.
         """
-        axes = new_axes(2)
+        figure, axes = new_figure(2, 1, sharex=True)
         axes[0].bar(self.errors.pair, 1e3 * self.errors.rigid_m)
         axes[1].bar(self.errors.pair, self.errors.epipolar_px)
         axes[0].set(ylabel="board's points, mm RMS", title="errors of pairs left out of the fit")
         axes[1].set(ylabel="epipolar, px RMS", xlabel="pair")
-        return axes
+        return figure
 
     @property
     def reprojection_rms_px(self) -> float:

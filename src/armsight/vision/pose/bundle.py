@@ -1,14 +1,10 @@
 """Joint bundle adjustment of two cameras, their relative pose, the body's shape and its pose in every shot.
 
 Observations and a start go in, a maximum-likelihood state with the full covariance of the shared parameters comes out.
-Levenberg-Marquardt on the arrow-shaped normal equations (:mod:`~armsight.vision.pose.bundle`). Robust by iteratively
-reweighted least squares with the Cauchy loss on each detection's whitened distance. Where the cameras are not
+Levenberg-Marquardt; each shot's own parameters are eliminated from the arrow-shaped normal equations (Schur complement;
+Triggs et al., "Bundle adjustment: a modern synthesis", 2000), so the cost grows linearly with the shots. Robust by
+iteratively reweighted least squares with the Cauchy loss on each detection's whitened distance. Where the cameras are not
 synchronised, the body may move between the two exposures of a shot: six more parameters of that shot, held by a prior.
-
-Arrow-shaped normal equations: parameters that all shots share, and a few of every shot's own.
-
-Every shot's own parameters are eliminated (Schur complement; Triggs et al., "Bundle adjustment: a modern synthesis",
-2000), so the cost grows linearly with the shots.
 """
 
 from __future__ import annotations
@@ -31,55 +27,100 @@ from armsight.vision.pose.projection import (
     predict,
 )
 
+#: Detections of one camera and shot whose products are added together; half: a quarter slower, double: nothing.
+_TOGETHER = 4
+
 
 @kernel(nogil=True)
-def _add(a: float, u: Array, b: float, v: Array, out: Array) -> None:
-    """Add a u + b v to out, as far as it goes."""
-    for j in range(out.size):
-        out[j] += a * u[j] + b * v[j]
+def _add(U: Array, i: int, first: int, out: Array) -> None:
+    """Add the products of column i of eight rows U (8, n) with all columns from ``first`` on to out (n,)."""
+    a, b, c, d, e, f, g, h = U[0], U[1], U[2], U[3], U[4], U[5], U[6], U[7]
+    ai, bi, ci, di, ei, fi, gi, hi = a[i], b[i], c[i], d[i], e[i], f[i], g[i], h[i]
+    for j in range(first, out.size):
+        out[j] += (ai * a[j] + bi * b[j] + ci * c[j] + di * d[j]) + (ei * e[j] + fi * f[j] + gi * g[j] + hi * h[j])
+
+
+@kernel(nogil=True)
+def _weights(w: Array, white: Array, c2: float, bends: bool, out: Array) -> float:
+    """Write a detection's weights with the loss's into out (2, 2); return by what its whitened residual is multiplied."""
+    square = white[0] ** 2 + white[1] ** 2
+    root, bent = 1.0 / np.sqrt(1.0 + square / c2), 1.0
+    if bends:
+        bent = np.sqrt(max((c2 - square) / (c2 + square), _LEAST_BENT))
+    less = (1.0 - bent) / max(square, 1e-300)
+    for c in range(2):
+        along = less * (white[0] * w[0, c] + white[1] * w[1, c])
+        out[0, c], out[1, c] = root * (w[0, c] - along * white[0]), root * (w[1, c] - along * white[1])
+    return root / bent
 
 
 @kernel(
-    "const f8[:, :, ::1], const f8[:, :, ::1], const f8[:, ::1], (const i8[::1], const i8[::1], const i8[::1]), "
-    "(f8[:, :, :, ::1], f8[:, :, :, ::1], f8[:, :, :, ::1])",
+    "const f8[:, :, ::1], const f8[:, :, ::1], const f8[:, ::1], (f8, b1), "
+    "(const i8[::1], const i8[::1], const i8[::1]), (f8[:, :, :, ::1], f8[:, :, :, ::1], f8[:, :, :, ::1])",
     nogil=True,
 )
-def _accumulate(J: Array, W: Array, r: Array, rows: tuple[Ids, Ids, Ids], sums: tuple[Array, Array, Array]) -> None:
+def _accumulate(
+    J: Array,
+    W: Array,
+    white: Array,
+    loss: tuple[float, bool],
+    rows: tuple[Ids, Ids, Ids],
+    sums: tuple[Array, Array, Array],
+) -> None:
     """Add the products of every detection's weighted derivatives, the residual being one more column.
+
+    With the loss's own curvature along each residual (Triggs et al., 2000, section 4.3), which is smaller than the weight
+    and below zero beyond the loss's scale, where it is held positive.
 
     Args:
         J: (N, 2, m) derivatives, those by the point last.
-        W: (N, 2, 2) weights.
-        r: (N, 2) weighted residuals.
+        W: (N, 2, 2) whiteners.
+        white: (N, 2) whitened residuals.
+        loss: square of the Cauchy loss's scale; whether its curvature is taken.
         rows: camera, point and shot of each, (N,).
-        sums: of each shot and camera (S, 2, m - 2, m - 2) without the point, upper triangles; of each point and camera, its
-            three derivatives by all (M, 2, 3, m + 1), residual before point; of each shot its own k by each point
-            (S, M, k, 3).
+        sums: of each shot and camera (S, 2, m - 3, n) without the point, right of the diagonal, n at least m - 2; of each
+            point and camera, its three derivatives by all (M, 2, 3, m + 1), residual before point; of each shot its own k
+            by each point (S, M, k, 3).
     """
     shots, points, cross = sums
-    m, k = J.shape[2] - 3, cross.shape[2]
-    u, v = np.empty(m + 4), np.empty(m + 4)
-    for row in range(J.shape[0]):
-        side, p, s = rows[0][row], rows[1][row], rows[2][row]
-        w = W[row]
-        for c in range(m + 3):
-            at = c if c < m else c + 1
-            u[at], v[at] = (
-                w[0, 0] * J[row, 0, c] + w[0, 1] * J[row, 1, c],
-                w[1, 0] * J[row, 0, c] + w[1, 1] * J[row, 1, c],
-            )
-        u[m], v[m] = r[row, 0], r[row, 1]
-        for i in range(m):
-            _add(u[i], u[i:], v[i], v[i:], shots[s, side, i, i:])
-        for i in range(m + 1, m + 4):
-            _add(u[i], u, v[i], v, points[p, side, i - m - 1])
-        for i in range(k):
-            _add(u[m - k + i], u[m + 1 :], v[m - k + i], v[m + 1 :], cross[s, p, i])
+    m, k, n = J.shape[2] - 3, cross.shape[2], shots.shape[3]
+    U, weights = np.zeros((2 * _TOGETHER, max(n, m + 4))), np.empty((2, 2))
+    for side in range(2):
+        filled, last = 0, -1
+        for row in range(J.shape[0] + 1):
+            ends = row == J.shape[0]
+            if not ends and rows[0][row] != side:
+                continue
+            if filled and (ends or filled == 2 * _TOGETHER or rows[2][row] != last):
+                U[filled:] = 0.0
+                for i in range(m):
+                    _add(U[:, :n], i, i // 4 * 4, shots[last, side, i])
+                filled = 0
+            if ends:
+                break
+            p, last = rows[1][row], rows[2][row]
+            factor = _weights(W[row], white[row], loss[0], loss[1], weights)
+            u, v, by_u, by_v = U[filled], U[filled + 1], J[row, 0], J[row, 1]
+            filled += 2
+            for c in range(m):
+                u[c] = weights[0, 0] * by_u[c] + weights[0, 1] * by_v[c]
+                v[c] = weights[1, 0] * by_u[c] + weights[1, 1] * by_v[c]
+            u[m], v[m] = factor * white[row, 0], factor * white[row, 1]
+            for c in range(m, m + 3):
+                u[c + 1] = weights[0, 0] * by_u[c] + weights[0, 1] * by_v[c]
+                v[c + 1] = weights[1, 0] * by_u[c] + weights[1, 1] * by_v[c]
+            for i in range(3):
+                out, ui, vi = points[p, side, i], u[m + 1 + i], v[m + 1 + i]
+                for c in range(m + 4):
+                    out[c] += ui * u[c] + vi * v[c]
+            for i in range(k):
+                for c in range(3):
+                    cross[last, p, i, c] += u[m - k + i] * u[m + 1 + c] + v[m - k + i] * v[m + 1 + c]
 
 
 def _whole(upper: Array) -> Array:
-    """Return symmetric matrices (..., K, K) of their upper triangles, zero below."""
-    return upper + np.triu(upper, 1).swapaxes(-1, -2)
+    """Return symmetric matrices (..., K, K) of their upper triangles."""
+    return np.asarray(np.triu(upper) + np.triu(upper, 1).swapaxes(-1, -2))
 
 
 def _flat(blocks: Array) -> Array:
@@ -111,51 +152,6 @@ class Arrow(Record):
     g_shared: Array
     g_shots: Array
     cost: float
-
-    @staticmethod
-    def of(
-        J: Array, W: Array, r: Array, observations: Observations, sizes: tuple[int, int], modes: Array, cost: float
-    ) -> Arrow:
-        """Assemble from what each detection depends on; the shape's modes come last, once a point.
-
-        Args:
-            J: (N, 2, ...) as :func:`~armsight.vision.pose.projection.derivatives` returns it.
-            W: (N, 2, 2) weights: whiteners, times the roots of robust weights.
-            r: (N, 2) weighted residuals.
-            observations: of which camera, point and shot they are.
-            sizes: parameters of the left and of the right camera.
-            modes: (K, M, 3) the shape's modes.
-            cost: what is minimised.
-        """
-        count, M, n, m = observations.shot_count, modes.shape[1], sum(sizes), J.shape[2] - 3
-        own = max(sizes) + 6  # first column of the shot's own
-        shots, points = np.zeros((count, 2, m + 1, m + 1)), np.zeros((M, 2, 3, m + 4))
-        by_point = np.zeros((count, M, m - own, 3))
-        rows = observations.camera, observations.point, observations.shot
-        _accumulate(J, W, r, rows, (shots, points, by_point))
-        H, g, H_points = np.zeros((n + 6, n + 6)), np.zeros(n + 6), np.zeros((3 * M, n + 6))
-        cross = np.zeros((count, m - own, n + 6))
-        for side, start in enumerate((0, sizes[0])):
-            ours = np.concatenate([np.arange(sizes[side]), np.arange(own - 6, own)])
-            there = np.concatenate([np.arange(start, start + sizes[side]), np.arange(n, n + 6)])
-            G = shots[:, side].sum(axis=0)
-            H[np.ix_(there, there)] += G[np.ix_(ours, ours)]
-            g[there] += G[ours, m]
-            cross[:, :, there] += shots[:, side, ours, own:m].transpose(0, 2, 1)
-            H_points[:, there] += points[:, side].reshape(3 * M, -1)[:, ours]
-        flat, each = modes.reshape(len(modes), 3 * M).T, points.sum(axis=1)
-        by_shape = H_points.T @ flat
-        H_shape = flat.T @ (each[:, :, m + 1 :] @ flat.reshape(M, 3, -1)).reshape(3 * M, -1)
-        cross_shape = by_point.transpose(0, 2, 1, 3).reshape(count, m - own, 3 * M) @ flat
-        H_shots = shots[:, :, own:m, own:].sum(axis=1)
-        return Arrow(
-            np.block([[_whole(H), by_shape], [by_shape.T, H_shape]]),
-            np.concatenate([cross, cross_shape], axis=2),
-            _whole(H_shots[:, :, :-1]),
-            np.concatenate([g, each[:, :, m].ravel() @ flat]),
-            H_shots[:, :, -1],
-            cost,
-        )
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Solve for the shared step (Q,) and the shots' steps (S, K) with Marquardt's damping."""
@@ -224,6 +220,8 @@ _RELATIVE_DECREASE = 1e-7
 DAMPING, NEAR = 1e-4, 1e-9
 #: Damping up to which a step is the Newton step: what it promises is what is left. Half and double change nothing.
 _UNDAMPED = 1e-6
+#: Square of the loss's scale without a loss: larger than that of any residual; half and double change nothing.
+_NO_LOSS = 1e300
 #: Least curvature of the loss along an outlier's residual, as a share of its weight; half and double: a step more or less.
 _LEAST_BENT = 1e-2
 
@@ -268,8 +266,11 @@ class BundleSolution(Record):
 
 def whiteners(observations: Observations, sigma_px: float) -> Array:
     """(N, 2, 2) matrices W with W^T W the inverse of the detections' covariance, sigma_px included."""
-    cov = observations.cov_uv + sigma_px**2 * np.eye(2)
-    return np.linalg.inv(np.linalg.cholesky(cov))
+    cov = observations.cov_uv
+    a, b, c = cov[:, 0, 0] + sigma_px**2, cov[:, 0, 1], cov[:, 1, 1] + sigma_px**2
+    W, last = np.zeros_like(cov), 1.0 / np.sqrt(c - b**2 / a)
+    W[:, 0, 0], W[:, 1, 0], W[:, 1, 1] = 1.0 / np.sqrt(a), -last * b / a, last
+    return W
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,6 +294,9 @@ class _Near(Record):
     cost: float
 
 
+_Loss = tuple[float, bool]  # square of the Cauchy loss's scale; whether its curvature is taken
+
+
 def _near(model: BundleModel, state: BundleState, observations: Observations, W: Array, robust: bool) -> _Near:
     """Project and differentiate at a state."""
     uv, J = derivatives(model, state, observations)
@@ -308,46 +312,39 @@ def _near(model: BundleModel, state: BundleState, observations: Observations, W:
 
 
 def _normal(
-    model: BundleModel, near: _Near, observations: Observations, W: Array, free: NDArray[np.bool_], robust: bool
+    model: BundleModel, near: _Near, observations: Observations, W: Array, free: NDArray[np.bool_], loss: _Loss
 ) -> Arrow:
-    """Assemble the normal equations of reweighted least squares."""
-    root = (1.0 / np.sqrt(1.0 + near.squares / CAUCHY_SCALE**2) if robust else np.ones(len(W)))[:, None]
-    return _assembled(model, near, observations, root[..., None] * W, root * near.white, free)
-
-
-def _newton(
-    model: BundleModel, near: _Near, observations: Observations, W: Array, free: NDArray[np.bool_], robust: bool
-) -> Arrow:
-    """Assemble the same with the loss's own curvature along each residual (Triggs et al., 2000, section 4.3).
-
-    It is smaller than the weight, and below zero beyond the loss's scale, where it is held positive.
-    """
-    if not robust:
-        return _normal(model, near, observations, W, free, robust)
-    c2 = CAUCHY_SCALE**2
-    root = 1.0 / np.sqrt(1.0 + near.squares / c2)
-    bent = np.sqrt(np.maximum((c2 - near.squares) / (c2 + near.squares), _LEAST_BENT))
-    along = near.white / np.sqrt(np.maximum(near.squares, 1e-300))[:, None]
-    bend = np.eye(2) - (1 - bent)[:, None, None] * along[:, :, None] * along[:, None, :]
-    weights, r = root[:, None, None] * (bend @ W), (root / bent)[:, None] * near.white
-    return _assembled(model, near, observations, weights, r, free)
-
-
-def _assembled(
-    model: BundleModel, near: _Near, observations: Observations, weights: Array, r: Array, free: NDArray[np.bool_]
-) -> Arrow:
-    """Assemble normal equations of weighted derivatives and residuals r (N, 2), with the priors of shape and motion."""
-    state, prior = near.state, _prior(model, len(free))
-    sizes = (state.cameras[0].parameters.size, state.cameras[1].parameters.size)
-    arrow = Arrow.of(near.J, weights, r, observations, sizes, model.modes, near.cost)
-    H_shots, g_shots = np.array(arrow.H_shots), np.array(arrow.g_shots)
+    """Assemble the normal equations with the priors of shape and motion; the shape's modes come last, once a point."""
+    state, modes, J = near.state, model.modes, near.J
+    sizes = [camera.parameters.size for camera in state.cameras]
+    count, M, n, m = observations.shot_count, modes.shape[1], sum(sizes), J.shape[2] - 3
+    own = max(sizes) + 6  # first column of the shot's own
+    shots, points = np.zeros((count, 2, m, (m + 4) // 4 * 4)), np.zeros((M, 2, 3, m + 4))
+    by_point = np.zeros((count, M, m - own, 3))
+    rows = observations.camera, observations.point, observations.shot
+    _accumulate(J, W, near.white, loss, rows, (shots, points, by_point))
+    H, g, H_points = np.zeros((n + 6, n + 6)), np.zeros(n + 6), np.zeros((3 * M, n + 6))
+    cross = np.zeros((count, m - own, n + 6))
+    for side, start in enumerate((0, sizes[0])):
+        ours = np.concatenate([np.arange(sizes[side]), np.arange(own - 6, own)])
+        there = np.concatenate([np.arange(start, start + sizes[side]), np.arange(n, n + 6)])
+        G = shots[:, side].sum(axis=0)
+        H[np.ix_(there, there)] += G[np.ix_(ours, ours)]
+        g[there] += G[ours, m]
+        cross[:, :, there] += shots[:, side, ours, own:m].transpose(0, 2, 1)
+        H_points[:, there] += points[:, side].reshape(3 * M, -1)[:, ours]
+    flat, each = modes.reshape(len(modes), 3 * M).T, points.sum(axis=1)
+    by_shape = H_points.T @ flat
+    H_shape = flat.T @ (each[:, :, m + 1 :] @ flat.reshape(M, 3, -1)).reshape(3 * M, -1)
+    cross_shape = by_point.transpose(0, 2, 1, 3).reshape(count, m - own, 3 * M) @ flat
+    H_shots, g_shots = _whole(shots[:, :, own:, own:m].sum(axis=1)), shots[:, :, own:, m].sum(axis=1)
     if len(state.motions):
         still = model.motion_sigmas**-2.0
         H_shots[:, 6:, 6:] += still[:, :, None] * np.eye(6)
         g_shots[:, 6:] -= still * state.motions
-    H_shared, g_shared = arrow.H_shared + np.diag(prior), np.array(arrow.g_shared)
-    g_shared[len(free) - len(state.shape) :] -= state.shape / model.shape_sigma_m**2
-    H_cross = arrow.H_cross
+    H_shared = np.block([[_whole(H), by_shape], [by_shape.T, H_shape]]) + np.diag(_prior(model, len(free)))
+    g_shared = np.concatenate([g, each[:, :, m].ravel() @ flat - state.shape / model.shape_sigma_m**2])
+    H_cross = np.concatenate([cross, cross_shape], axis=2)
     if not free.all():
         H_shared, H_cross, g_shared = H_shared[np.ix_(free, free)], H_cross[:, :, free], g_shared[free]
     return Arrow(H_shared, H_cross, H_shots, g_shared, g_shots, near.cost)
@@ -407,13 +404,12 @@ def minimise(
     empty = np.flatnonzero(np.bincount(observations.shot, minlength=observations.shot_count) == 0)
     if len(empty):
         raise CalibrationError(f"shot {empty[0]} of {observations.shot_count} in the adjustment has no detections")
-    W = whiteners(observations, sigma_px)
+    W, c2 = whiteners(observations, sigma_px), CAUCHY_SCALE**2 if robust else _NO_LOSS
     free = free_parameters(model, start) if free is None else free
     now, steps, converged = _near(model, _with_motions(model, start), observations, W, robust), 0, False
     if not np.isfinite(now.cost):
         raise CalibrationError("the start of the adjustment puts a detected point behind its camera")
-    assemble = _newton if damping <= _UNDAMPED else _normal
-    normal = assemble(model, now, observations, W, free, robust)
+    normal = _normal(model, now, observations, W, free, (c2, damping <= _UNDAMPED))
     while steps < max_steps and not converged:
         steps += 1
         step, shots = normal.step(damping)
@@ -427,12 +423,12 @@ def minimise(
         if there is not None and there.cost <= now.cost:
             converged = now.cost - there.cost <= least_decrease * there.cost
             now, damping = there, max(damping / 10, 1e-12)
-            assemble = _newton if damping <= _UNDAMPED else _normal
-            normal = normal if converged else assemble(model, now, observations, W, free, robust)
+            if not converged:
+                normal = _normal(model, now, observations, W, free, (c2, damping <= _UNDAMPED))
         else:
             damping *= 10
             converged = damping >= 1e12  # not even the smallest step lowers the cost
-    normal = _normal(model, now, observations, W, free, robust)
+    normal = _normal(model, now, observations, W, free, (c2, False))
     cov = np.zeros((len(free), len(free)))
     if free.any():
         cov[np.ix_(free, free)] = _covariance(normal, _prior(model, len(free))[free], robust)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import SIDES, Body, Correspondences, Detections, Image, Missed, PoseEstimate, Shot
-from armsight.errors import InputError
+from armsight.errors import require
 from armsight.geometry.pose import inverse
 from armsight.vision.detections import SeenShot
 from armsight.vision.discs.bias import apparent_radii
@@ -78,8 +78,7 @@ def require_arguments(call: str, **given: object) -> None:
     """Raise an InputError that names the argument of a wrong type, and what opens a right one."""
     for name, value in given.items():
         fits, opener = _ARGUMENTS[name]
-        if not fits(value):
-            raise InputError(f"{call}: {name} is a {type(value).__name__}; expected {opener}")
+        require(call, name, value, fits(value), opener)
 
 
 def _measured(

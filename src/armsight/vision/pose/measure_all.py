@@ -45,11 +45,9 @@ def measure_all(
     poses = list[ShotPose]()
     with lent(source) as shots:
         require_arguments("measure_all(rig, target, source)", rig=rig, target=target, source=shots)
-        for shot in iter(shots.read, None):
+        for shot in shots:
             poses.append(shot_pose(shot.name, shot.t_s, target.body, measure(rig, target, shot)))
             progress(len(poses), shots.count)
     if not poses:
-        raise InputError(
-            "measure_all(rig, target, source): the source has no shot left: open it again, or take source[:]"
-        )
+        raise InputError("measure_all(rig, target, source): the source has no shot left: open it again")
     return ShotPoses(tuple(poses))

@@ -16,6 +16,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,10 +24,12 @@ from typing import Any
 
 import numpy as np
 
-from armsight.data import Array, Body, Dropped, Missed, PoseEstimate, Record
+from armsight.data import Array, Body, Dropped, Missed, PoseEstimate, SeenPose
+from armsight.errors import InputError
 from armsight.files import write_text
-from armsight.geometry.rotation import euler_zyx, euler_zyx_sigmas, from_euler_zyx, quaternion_wxyz
-from armsight.vision.plots import new_axes
+from armsight.geometry.pose import left_axes, pose
+from armsight.geometry.rotation import euler_zyx, from_quaternion_wxyz, quaternion_wxyz
+from armsight.plots import new_figure
 from armsight.vision.rig import Shutters
 
 #: Elements of a 6x6 covariance that are written.
@@ -56,7 +59,7 @@ SHUTTER_COLUMNS = ("skew_s", "readout_s", "sigma_skew_s", "sigma_readout_s")
 
 
 @dataclass(frozen=True, eq=False)
-class ShotPose(Record):
+class ShotPose(SeenPose):
     """What was measured in one shot; the values after ``reason`` hold only where ``reason`` is None.
 
     Attributes:
@@ -67,8 +70,8 @@ class ShotPose(Record):
         quaternion_wxyz: (4,) orientation of the body.
         euler_zyx_deg: (3,) the same as angles about z, y, x, degrees.
         pitch_singular: whether the angle about y is +-90 degrees: then only those about z and x together are determined.
-        cov: (6, 6) covariance [m; rad] along the left camera's axes.
-        cov_precision: (6, 6) the share of ``cov`` that differs from shot to shot; the rest is the calibration's.
+        cov_left: (6, 6) covariance [m; rad] along the left camera's axes.
+        cov_precision: (6, 6) the share of ``cov_left`` that differs from shot to shot; the rest is the calibration's.
         cov_body: (6, 6) covariance [m; rad] along the body's axes.
         residual_rms_m: RMS distance of the points from the body's, m; None where it is not known.
         reprojection_rms_px: RMS reprojection error, px.
@@ -89,7 +92,7 @@ class ShotPose(Record):
     quaternion_wxyz: Array = field(default_factory=lambda: np.full(4, np.nan))
     euler_zyx_deg: Array = field(default_factory=lambda: np.full(3, np.nan))
     pitch_singular: bool = False
-    cov: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
+    cov_left: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
     cov_precision: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
     cov_body: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
     residual_rms_m: float | None = None
@@ -103,19 +106,24 @@ class ShotPose(Record):
     shutters: Shutters | None = None
 
     @property
+    def T_left_body(self) -> Array:  # type: ignore[override]
+        """(4, 4) pose of the body in the left camera's frame; NaN where none was measured."""
+        return pose(from_quaternion_wxyz(self.quaternion_wxyz), self.position_m)
+
+    @property
     def ok(self) -> bool:
         """Whether a pose was measured."""
         return self.reason is None
 
     @property
     def cov_calibration(self) -> Array:
-        """(6, 6) the share of ``cov`` that is common to all shots of the rig."""
-        return self.cov - self.cov_precision
+        """(6, 6) the share of ``cov_left`` that is common to all shots of the rig."""
+        return self.cov_left - self.cov_precision
 
     @property
     def position_sigmas_m(self) -> tuple[float, float, float]:
         """Sigmas of the position in space (roots of the traces), m: in all, precision, calibration."""
-        traces = (float(np.trace(cov[:3, :3])) for cov in (self.cov, self.cov_precision, self.cov_calibration))
+        traces = (float(np.trace(cov[:3, :3])) for cov in (self.cov_left, self.cov_precision, self.cov_calibration))
         total, precision, calibration = (math.sqrt(max(trace, 0.0)) for trace in traces)
         return total, precision, calibration
 
@@ -124,7 +132,7 @@ class ShotPose(Record):
         """(3,) one sigma of ``euler_zyx_deg``, degrees; NaN at the singularity."""
         if self.pitch_singular:
             return np.full(3, np.nan)
-        return np.degrees(euler_zyx_sigmas(from_euler_zyx(*np.radians(self.euler_zyx_deg)), self.cov[3:, 3:]))
+        return self.sigma_deg
 
     @property
     def status(self) -> str:
@@ -140,7 +148,7 @@ class ShotPose(Record):
                 "quaternion_wxyz": self.quaternion_wxyz.tolist(),
                 "euler_zyx_deg": self.euler_zyx_deg.tolist(),
                 "pitch_singular": self.pitch_singular,
-                "covariance": self.cov.tolist(),
+                "covariance": self.cov_left.tolist(),
                 "covariance_precision": self.cov_precision.tolist(),
                 "covariance_calibration": self.cov_calibration.tolist(),
                 "covariance_body": self.cov_body.tolist(),
@@ -190,13 +198,6 @@ def shot_pose(name: str, t_s: float | None, body: Body, result: PoseEstimate | M
     )
 
 
-def left_axes(T_left_body: Array, cov: Array) -> Array:
-    """Return the covariance (6, 6) of the right tangent of a pose as one along the left camera's axes."""
-    R = T_left_body[:3, :3]
-    blocks = cov.reshape(2, 3, 2, 3).swapaxes(1, 2)
-    return np.asarray((R @ blocks @ R.T).swapaxes(1, 2).reshape(6, 6))
-
-
 def rows_of(poses: Sequence[ShotPose]) -> tuple[tuple[str, ...], list[list[Any]]]:
     """Return the columns of a table of shots and its rows; None where a shot has no value.
 
@@ -208,9 +209,9 @@ def rows_of(poses: Sequence[ShotPose]) -> tuple[tuple[str, ...], list[list[Any]]
         row: list[Any] = [p.shot, p.status, p.reason, p.t_s]
         if p.ok:
             row += [*p.position_m.tolist(), *p.quaternion_wxyz.tolist(), *p.euler_zyx_deg.tolist()]
-            row += np.sqrt(np.diag(p.cov)).tolist()
+            row += np.sqrt(np.diag(p.cov_left)).tolist()
             row += [p.residual_rms_m, p.reprojection_rms_px, p.misfit, len(p.points_m), len(p.dropped)]
-            row += [float(p.cov[i, j]) for i, j in UPPER]
+            row += [float(p.cov_left[i, j]) for i, j in UPPER]
             for share in (p.cov_precision, p.cov_calibration):
                 row += np.sqrt(np.maximum(np.diag(share), 0.0)).tolist()
         if p.shutters is not None:
@@ -276,28 +277,42 @@ class ShotPoses:
 
         return pyarrow.table(self.columns()).__arrow_c_stream__(requested_schema)
 
+    def to_pandas(self) -> Any:  # noqa: ANN401 - pandas is no dependency
+        """Return pandas' DataFrame of the columns."""
+        import pandas as pd
+
+        return pd.DataFrame(self.columns())
+
     def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
-        """Draw the position over time or shots, mm, with two sigmas; return the three axes.
+        """Draw position, mm, and angles, degrees, over time or shots, with two sigmas; return matplotlib's figure.
 
         Raises:
-            InputError: matplotlib is not installed.
+            InputError: matplotlib is not installed, or no shot was measured.
         """
-        axes = new_axes(3)
-        timed = all(pose.t_s is not None for pose in self.poses)
-        at = [pose.t_s if timed else k for k, pose in enumerate(self.poses) if pose.ok]
-        good = [pose for pose in self.poses if pose.ok]
-        for k, (ax, name) in enumerate(zip(axes, "xyz", strict=True)):
-            centre = np.array([1e3 * pose.position_m[k] for pose in good])
-            wide = np.array([2e3 * np.sqrt(pose.cov[k, k]) for pose in good])
-            ax.fill_between(at, centre - wide, centre + wide, alpha=0.3, linewidth=0)
-            ax.plot(at, centre, ".-", markersize=3)
-            ax.set_ylabel(f"{name}, mm")
-        axes[-1].set_xlabel("time, s" if timed else "shot")
-        axes[0].set_title(f"{len(good)} of {len(self)} shots measured; band: two sigmas", fontsize="medium")
-        return axes
+        figure, axes = new_figure(3, 2, sharex=True)
+        good = [each for each in self.poses if each.ok]
+        if not good:
+            raise InputError(f"nothing to draw: {self!r}")
+        timed = all(each.t_s is not None for each in self.poses)
+        at = [each.t_s if timed else k for k, each in enumerate(self.poses) if each.ok]
+        for column, values, sigmas, names in (
+            (0, [each.position_mm for each in good], [each.sigma_mm for each in good], ("x, mm", "y, mm", "z, mm")),
+            (1, [each.angles_deg for each in good], [each.sigma_deg for each in good], [f"{a}, deg" for a in ANGLES]),
+        ):
+            for ax, centre, sigma, name in zip(
+                axes[:, column], np.transpose(values), np.transpose(sigmas), names, strict=True
+            ):
+                ax.fill_between(at, centre - 2 * sigma, centre + 2 * sigma, alpha=0.3, linewidth=0)
+                ax.plot(at, centre, ".-", markersize=3)
+                ax.set_ylabel(name)
+            axes[-1, column].set_xlabel("time, s" if timed else "shot")
+        figure.suptitle(f"{len(good)} of {len(self)} shots measured; band: two sigmas", fontsize="medium")
+        return figure
 
     def __repr__(self) -> str:
         """Return how many shots were measured, and the sigma of a position in the middle, mm."""
-        good = [1e3 * pose.position_sigmas_m[0] for pose in self.poses if pose.ok]
+        good = [1e3 * each.position_sigmas_m[0] for each in self.poses if each.ok]
         sigma = f", sigma {np.median(good):.3f} mm (median)" if good else ""
-        return f"ShotPoses({len(good)} of {len(self)} shots measured{sigma})"
+        reasons = Counter(each.reason for each in self.poses if not each.ok).most_common(1)
+        missed = "".join(f"; missed {count} times: {reason}" for reason, count in reasons)
+        return f"ShotPoses({len(good)} of {len(self)} shots measured{sigma}{missed})"

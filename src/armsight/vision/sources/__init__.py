@@ -77,6 +77,8 @@ def check_source(spec: str) -> None:
             from armsight.vision.sources.bag.reader import SUFFIXES
 
             hint = f" ({'bag' if spec.endswith(SUFFIXES) else 'video'}:{spec}?)"
+        elif os.sep in spec:
+            hint = ": there is no such folder"
         raise InputError(f"{spec}: not a source{hint}: known are {known}, or the path of a folder")
 
 
@@ -85,7 +87,8 @@ def open_source(spec: str | Path) -> Source:
 
     Args:
         spec: ``folder:DIR`` or the path of a folder, ``video:LEFT,RIGHT`` or ``video:SIDE_BY_SIDE``, ``bag:FILE``,
-            ``url:URL_LEFT,URL_RIGHT``, ``usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms]``; docs/howto/sources.md.
+            ``lerobot:DIR``, ``url:URL_LEFT,URL_RIGHT``, ``usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms]``. Without
+            cameras: ``armsight.sim.example_rig.demo_recording`` writes a small recording with its rig and target.
 
     Raises:
         InputError: an unknown kind, or what is named is not there or not usable.

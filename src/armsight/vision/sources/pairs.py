@@ -11,7 +11,7 @@ import glob
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
@@ -96,7 +96,15 @@ class StoredSource(Source):
     def __getitem__(self, row: slice) -> StoredSource: ...
     def __getitem__(self, row: int | slice) -> Shot | StoredSource:
         """Load a shot by its row in the recording, or return a source of some of them; what is read next here stays."""
-        return StoredSource(self.pairs[row]) if isinstance(row, slice) else self.pairs[row].load()
+        if isinstance(row, slice):
+            return StoredSource(self.pairs[row])
+        if not -len(self) <= row < len(self):
+            raise IndexError(f"shot {row} of {len(self)}: rows begin at 0")
+        return self.pairs[row].load()
+
+    def __iter__(self) -> Iterator[Shot]:
+        """Load all shots, each time from the first; ``read`` goes on where it was."""
+        return (pair.load() for pair in self.pairs)
 
     def read(self) -> Shot | None:
         """Return the next shot, or None at the end."""
@@ -104,7 +112,7 @@ class StoredSource(Source):
         return None if pair is None else pair.load()
 
     def close(self) -> None:
-        """Hand out no more shots."""
+        """Let ``read`` return no more shots; no file is open."""
         self._rest = iter(())
 
 
