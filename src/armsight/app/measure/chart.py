@@ -55,7 +55,7 @@ def chart_data(poses: Sequence[ShotPose]) -> ChartData:
     pose, sigma, rotation, rms = (np.full((count, width), np.nan) for width in (6, 6, 3, 1))
     for n, p in enumerate(poses):
         if p.ok:
-            each = np.sqrt(np.diag(p.cov))
+            each = np.sqrt(np.diag(p.cov_left))
             pose[n] = [*(1e3 * p.position_m), *p.euler_zyx_deg]
             sigma[n] = [*(1e3 * each[:3]), *p.angle_sigmas_deg]
             rotation[n], rms[n] = np.degrees(each[3:]), p.reprojection_rms_px

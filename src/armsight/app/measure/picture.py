@@ -229,7 +229,7 @@ def header(shot: ShotPose) -> list[str]:
     first = ", ".join(each for each in (f"shot {shot.shot}", at, took, shot.jump) if each)
     if not shot.ok:
         return [first]
-    position = _pairs(("x", "y", "z"), 1e3 * shot.position_m, 1e3 * np.sqrt(np.diag(shot.cov)[:3]))
+    position = _pairs(("x", "y", "z"), 1e3 * shot.position_m, 1e3 * np.sqrt(np.diag(shot.cov_left)[:3]))
     rotation, dropped = _pairs(ANGLES, shot.euler_zyx_deg, shot.angle_sigmas_deg), len(shot.dropped)
     _, precision, calibration = (1e3 * sigma for sigma in shot.position_sigmas_m)
     return [

@@ -365,7 +365,7 @@ def _line(record: ShotPose, width: int) -> str:
     """Return one shot as a row of the table for people: mm and degrees, one sigma; what is unusual comes last."""
     if not record.ok:
         return f"{record.shot}: missed: {record.reason}"
-    sigma = np.sqrt(np.diag(record.cov))
+    sigma = np.sqrt(np.diag(record.cov_left))
     each = [1e3 * v for pair in zip(record.position_m, sigma[:3], strict=True) for v in pair]
     values = [
         *each,

@@ -308,7 +308,7 @@ def calibrate_handeye(
         InputError: wrong shapes, NaN, no rigid motions, fewer than 4 poses.
         CalibrationError: the motions leave a direction open.
     """
-    A, B = (getattr(each, "Ts", each) for each in (Ts_base_flange, Ts_rig_body))
+    A, B = (each.Ts if isinstance(each, PoseTable) else each for each in (Ts_base_flange, Ts_rig_body))
     for name, each in (("Ts_base_flange", A), ("Ts_rig_body", B)):
         fits = isinstance(each, np.ndarray | Sequence) and not isinstance(each, str)
         require(

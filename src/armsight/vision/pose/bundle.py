@@ -51,7 +51,7 @@ def _weights(w: Array, white: Array, c2: float, bends: bool, out: Array) -> floa
     for c in range(2):
         along = less * (white[0] * w[0, c] + white[1] * w[1, c])
         out[0, c], out[1, c] = root * (w[0, c] - along * white[0]), root * (w[1, c] - along * white[1])
-    return root / bent
+    return float(root / bent)
 
 
 @kernel(

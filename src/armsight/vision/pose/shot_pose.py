@@ -14,6 +14,7 @@ way round, as roll (about x), pitch, yaw (about z).
 from __future__ import annotations
 
 import csv
+import importlib
 import io
 import math
 from collections import Counter
@@ -279,9 +280,7 @@ class ShotPoses:
 
     def to_pandas(self) -> Any:  # noqa: ANN401 - pandas is no dependency
         """Return pandas' DataFrame of the columns."""
-        import pandas as pd
-
-        return pd.DataFrame(self.columns())
+        return importlib.import_module("pandas").DataFrame(self.columns())
 
     def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
         """Draw position, mm, and angles, degrees, over time or shots, with two sigmas; return matplotlib's figure.
