@@ -22,7 +22,13 @@ MAY_IMPORT = {
     "app": {"geometry", "kernels", "firmware", "tables", "vision", "robot", "sim", "loop"},
 }
 #: The ground: what each of these modules may import of armsight.
-GROUND = {"data": {"errors", "geometry"}, "errors": set(), "files": {"errors"}, "processes": {"errors"}}
+GROUND = {
+    "data": {"errors", "geometry", "plots"},
+    "errors": set(),
+    "files": {"errors"},
+    "plots": {"errors"},
+    "processes": {"errors"},
+}
 #: What lies outside that geometry may use.
 GEOMETRY_USES = {"numpy", "scipy"}
 

@@ -76,7 +76,7 @@ def _held_out(axes: Axes) -> None:
                     (0.12 + 0.15 * column, 0.75 - 0.13 * row), 0.13, 0.1, fc=RED if left else PALE, ec=INK, lw=0.8
                 )
             )
-    _words(axes, 0.5, 0.12, "blue: fit; red: judged")
+    _words(axes, 0.5, 0.12, "blue: fit; red: evaluated")
 
 
 def _sigma(axes: Axes) -> None:
@@ -125,7 +125,7 @@ def _backlash(axes: Axes) -> None:
         axes.add_patch(Polygon([[x, 0.2], [x + 0.16, 0.2], [x + 0.12, 0.6], [x + 0.04, 0.6]], fc=color, ec=INK))
     axes.add_patch(Polygon([[0.41, 0.85], [0.57, 0.85], [0.53, 0.4], [0.45, 0.4]], fc="white", ec=INK))
     _arrow(axes, (0.52, 0.5), (0.66, 0.5), both=True)
-    _words(axes, 0.5, 0.1, "play between teeth", RED)
+    _words(axes, 0.5, 0.1, "free travel of the teeth", RED)
 
 
 def _droop(axes: Axes) -> None:

@@ -2,12 +2,15 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from armsight.app.board.offsets import further_of, pot_changes
 from armsight.errors import DeviceError, InputError
+from armsight.loop.identify.corrected import Corrected, table_text
+from armsight.loop.identify.model import Model
 from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.feetech import bus as feetech
@@ -189,15 +192,20 @@ def test_where_one_servo_fails_the_others_get_their_old_offsets_back():
     assert registers(device) == [0] * 6
 
 
-def test_an_identified_arm_gives_the_correction():
+def test_an_identified_arm_gives_the_correction(tmp_path):
+    """Its axes 2 and 3 are not quite parallel: as an arm without beta its joint 2 would be 20 degrees and more further."""
     nominal, further = open_arm("six_r"), np.radians([0.5, -0.4, 0.0, 0.2, 0.1, -1.0])
-    from dataclasses import replace
-
-    # theta = direction q + offset: a joint that is further by e than it reports has direction e more in its offset.
-    identified = replace(nominal, offset=nominal.offset + nominal.direction * further)
-    assert further_of(identified, nominal) == pytest.approx(further)
+    model = Model(nominal, 1, True, (), np.eye(3), np.eye(3), np.array([0.0, 0.0, 1.0]))
+    x = model.nominal()
+    table = x[model.table_at : model.sources_at].reshape(6, 5)  # a view
+    table[:, 0] += nominal.direction * further  # theta = direction q + offset
+    table[1] += [0.0, 0.0, 0.0, 3e-4, -2e-4]
+    path = tmp_path / "corrected.toml"
+    path.write_text(table_text(Corrected(model, x, np.zeros(len(x)))))
+    assert further_of(str(path), nominal) == pytest.approx(further)
+    assert further_of("six_r", nominal) == pytest.approx(np.zeros(6))
     with pytest.raises(InputError, match="are different arms"):
-        further_of(replace(nominal, direction=-nominal.direction), nominal)
+        further_of(str(path), replace(nominal, direction=-nominal.direction))
 
 
 AR4 = """# measured in May

@@ -166,7 +166,7 @@ def test_the_simulated_arm_is_calibrated_and_corrected(armsight, typed, monkeypa
 
     def carried_out(arguments):
         if arguments[0] == "run":
-            Path("run").symlink_to(quick_demo)
+            Path("run").symlink_to(quick_demo / "demo")
         long = arguments[0] in ("run", "check") or arguments[1] == "bringup"
         return parsed(arguments) if long else run(arguments)
 

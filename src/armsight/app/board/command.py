@@ -454,7 +454,7 @@ def offsets(
         raise InputError("give one of --identified ARM with --arm ARM, --further DEG,... and --restore FILE")
     angles = None if further is None else kept.parsed_degrees(further)
     if identified is not None and nominal is not None:
-        angles = kept.further_of(open_arm(identified), open_arm(nominal))
+        angles = kept.further_of(identified, open_arm(nominal))
 
     def offer(zeros: Zeros) -> None:
         """Show the zeros, and write them where others are given, after asking."""

@@ -21,7 +21,9 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import check_outputs, check_writable, read_json, read_text, write_text
+from armsight.files import check_outputs, check_writable, read_json, read_text, read_toml, write_text
+from armsight.loop.identify.corrected import open_corrected
+from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.ar4.models import SENSE
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.board_file import configuration_text, read_configuration
@@ -44,15 +46,22 @@ USUAL_CHANGE_DEG = 10.0
 _AR4_LINE = re.compile(r"(?m)^(?P<head>joint_(?P<joint>[1-6])[ \t]*:[ \t]*)(?P<value>[+-]?\d+(?:\.\d*)?)")
 
 
-def further_of(identified: Arm, nominal: Arm) -> Array:
+def further_of(identified: str, nominal: Arm) -> Array:
     """Return by how much each joint really is further than it reports (n,), rad: the offsets that were identified.
 
+    Those of a corrected.toml stand beside the angles beta of parallel axes: as an arm without them, it would have others.
+
     Raises:
-        InputError: the two are different arms.
+        InputError: a file is wrong, or the two are different arms.
     """
-    if len(identified.a) != len(nominal.a) or not np.array_equal(identified.direction, nominal.direction):
-        raise InputError(f"{identified.name} and {nominal.name} are different arms: other joints, or other directions")
-    further = (identified.offset - nominal.offset) * nominal.direction
+    if Path(identified).is_file() and "identified" in read_toml(Path(identified)):
+        found = open_corrected(identified)
+        arm, zeros = found.model.arm, found.zeros_rad()
+    else:
+        arm, zeros = open_arm(identified), None
+    if len(arm.a) != len(nominal.a) or not np.array_equal(arm.direction, nominal.direction):
+        raise InputError(f"{arm.name} and {nominal.name} are different arms: other joints, or other directions")
+    further = (arm.offset - nominal.offset) * nominal.direction if zeros is None else zeros
     return np.asarray((further + np.pi) % (2 * np.pi) - np.pi)
 
 

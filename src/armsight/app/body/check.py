@@ -38,7 +38,7 @@ _WELL_FACING = 0.7
 #: A wrong assignment is separated from the right one where it misses by this many standard deviations: the odds of a
 #: million that identification asks for take five, chance may favour the wrong one by three.
 SEPARATED_SIGMAS = 8.0
-#: More discs than these are not searched for ambiguities, not with one of them hidden, and none is moved to a better place.
+#: More discs than these are not searched for ambiguities, not with one of them hidden, and none is moved elsewhere.
 SEARCHED, SEARCHED_HIDDEN, SEARCHED_MOVES = 25, 10, 6
 #: Symmetries that are examined, the closest first.
 _LOOKED_INTO = 60

@@ -344,11 +344,11 @@ def _sheets(size: tuple[float, float], paper: tuple[float, float]) -> list[_Shee
     form = min(counts, key=lambda each: int(counts[each].prod()))
     (columns, rows), (wide, tall) = counts[form].tolist(), steps[form]
     cuts = np.arange(1, columns) * wide + _OVERLAP / 2, np.arange(1, rows) * tall + _OVERLAP / 2
-    places = [(row, column) for row in range(rows) for column in range(columns)]
+    parts = [(row, column) for row in range(rows) for column in range(columns)]
     label = "sheet {} of {}: row {}, column {}"
     return [
-        _Sheet(form, (column * wide, row * tall), cuts, label.format(n, len(places), row + 1, column + 1))
-        for n, (row, column) in enumerate(places, 1)
+        _Sheet(form, (column * wide, row * tall), cuts, label.format(n, len(parts), row + 1, column + 1))
+        for n, (row, column) in enumerate(parts, 1)
     ]
 
 
@@ -460,8 +460,8 @@ def _joints(axes: Axes, sheet: _Sheet) -> None:
     """Draw in a sheet's margins where it is cut, and which one it is."""
     width, height = sheet.paper
     for i, size, across in ((0, width, height), (1, height, width)):
-        places = _EDGE + sheet.cuts[i] - sheet.low[i]
-        for at in places[(places > _EDGE) & (places < size - _EDGE)]:
+        cuts = _EDGE + sheet.cuts[i] - sheet.low[i]
+        for at in cuts[(cuts > _EDGE) & (cuts < size - _EDGE)]:
             for ends in (_MARK, (across - _MARK[1], across - _MARK[0])):
                 line = ((at, at), ends) if i == 0 else (ends, (at, at))
                 axes.plot(*line, color="black", lw=0.4, solid_capstyle="butt")

@@ -30,7 +30,7 @@ _STRIPS, _DOTS_UP_TO, _THIN_FROM = 9, 80, 1000
 #: Sigmas that differ by a larger factor are plotted on a logarithmic scale; a longer interval, in median steps, is a gap.
 _LOG_FROM, _GAP_STEPS = 20.0, 3.0
 #: Where a legend stands.
-_PLACE: dict[str, Any] = {"borderaxespad": 0.0, "handlelength": 1.2}
+_LEGEND: dict[str, Any] = {"borderaxespad": 0.0, "handlelength": 1.2}
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ def _band(axes: Axes, run: ChartData) -> None:
         axes.plot(run.along[run.jumped], np.full(int(run.jumped.sum()), 1.25), **style)
         handles.append(Line2D([], [], label=f"{run.jumped.sum()} jumped", **style))
     said: Any = {"title": f"shots: {len(run.way)}", "alignment": "left", "ncols": len(handles)}
-    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.15), **said, **_PLACE)
+    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.15), **said, **_LEGEND)
     axes.set_ylim(0.0, 1.0)
     low, high = _edges(run.along)
     axes.set_xlim(float(low[0]), float(high[-1]))
@@ -206,5 +206,5 @@ def _sigmas(axes: Axes, run: ChartData, sigma: Array, name: str) -> None:
         axes.set_yscale("log")
     else:
         _from_zero(axes, good)
-    axes.legend(ncols=3, fontsize=7.0, columnspacing=1.2, loc="lower right", bbox_to_anchor=(1.0, 0.96), **_PLACE)
+    axes.legend(ncols=3, fontsize=7.0, columnspacing=1.2, loc="lower right", bbox_to_anchor=(1.0, 0.96), **_LEGEND)
     axes.set_ylabel(name)

@@ -51,6 +51,11 @@ class Corrected(Record):
         """Return what was identified, ready for use."""
         return Corrected(found.model, found.solution.x, np.sqrt(np.diag(found.cov)))
 
+    def zeros_rad(self) -> Array:
+        """Return by how much each joint is further than it reads at zero (n,), rad, beside the nominal table."""
+        model = self.model
+        return np.asarray((model.table(self.x) - model.table(model.nominal()))[:, chain.OFFSET] * model.arm.direction)
+
     def joint_corrections(self, q: Array, approach: Array | None = None) -> Array:
         """Return what the error sources add to readings q (N, n), (N, n), rad: curves, backlash and compliance.
 
@@ -253,8 +258,8 @@ def zeros_text(found: Identified) -> str:
         "# zero: to be added to every node of the joint's potentiometer table. Backlash and compliance stay uncorrected.",
         "# It holds for readings from seen_min_rad to seen_max_rad, and says nothing of others.",
     ]
-    offsets = (model.table(found.solution.x) - model.table(model.nominal()))[:, chain.OFFSET] * model.arm.direction
-    for i, (name, zero) in enumerate(zip(model.arm.joint_names, offsets.tolist(), strict=True)):
+    zeros = Corrected.of(found).zeros_rad().tolist()
+    for i, (name, zero) in enumerate(zip(model.arm.joint_names, zeros, strict=True)):
         lines += ["", "[[joint]]", *_toml({"name": name, "zero_rad": zero}), f"zero_deg = {np.degrees(zero):.5f}"]
         row = {"sigma_zero_rad": float(np.nan_to_num(found.value(f"offset{i + 1}")[1]))} | _seen(model, i)
         for f in model.features:
