@@ -27,17 +27,12 @@ from armsight.vision.pose.projection import (
     predict,
 )
 
-#: Detections of one camera and shot whose products are added together; half: a quarter slower, double: nothing.
-_TOGETHER = 4
-
 
 @kernel(nogil=True)
-def _add(U: Array, i: int, first: int, out: Array) -> None:
-    """Add the products of column i of eight rows U (8, n) with all columns from ``first`` on to out (n,)."""
-    a, b, c, d, e, f, g, h = U[0], U[1], U[2], U[3], U[4], U[5], U[6], U[7]
-    ai, bi, ci, di, ei, fi, gi, hi = a[i], b[i], c[i], d[i], e[i], f[i], g[i], h[i]
-    for j in range(first, out.size):
-        out[j] += (ai * a[j] + bi * b[j] + ci * c[j] + di * d[j]) + (ei * e[j] + fi * f[j] + gi * g[j] + hi * h[j])
+def _add(a: float, u: Array, b: float, v: Array, out: Array) -> None:
+    """Add a u + b v to out, as far as it goes."""
+    for j in range(out.size):
+        out[j] += a * u[j] + b * v[j]
 
 
 @kernel(nogil=True)
@@ -78,44 +73,27 @@ def _accumulate(
         white: (N, 2) whitened residuals.
         loss: square of the Cauchy loss's scale; whether its curvature is taken.
         rows: camera, point and shot of each, (N,).
-        sums: of each shot and camera (S, 2, m - 3, n) without the point, right of the diagonal, n at least m - 2; of each
-            point and camera, its three derivatives by all (M, 2, 3, m + 1), residual before point; of each shot its own k
-            by each point (S, M, k, 3).
+        sums: of each shot and camera (S, 2, m - 3, m - 2) without the point, upper triangles; of each point and camera, its
+            three derivatives by all (M, 2, 3, m + 1), residual before point; of each shot its own k by each point
+            (S, M, k, 3).
     """
     shots, points, cross = sums
-    m, k, n = J.shape[2] - 3, cross.shape[2], shots.shape[3]
-    U, weights = np.zeros((2 * _TOGETHER, max(n, m + 4))), np.empty((2, 2))
-    for side in range(2):
-        filled, last = 0, -1
-        for row in range(J.shape[0] + 1):
-            ends = row == J.shape[0]
-            if not ends and rows[0][row] != side:
-                continue
-            if filled and (ends or filled == 2 * _TOGETHER or rows[2][row] != last):
-                U[filled:] = 0.0
-                for i in range(m):
-                    _add(U[:, :n], i, i // 4 * 4, shots[last, side, i])
-                filled = 0
-            if ends:
-                break
-            p, last = rows[1][row], rows[2][row]
-            factor = _weights(W[row], white[row], loss[0], loss[1], weights)
-            u, v, by_u, by_v = U[filled], U[filled + 1], J[row, 0], J[row, 1]
-            filled += 2
-            for c in range(m):
-                u[c] = weights[0, 0] * by_u[c] + weights[0, 1] * by_v[c]
-                v[c] = weights[1, 0] * by_u[c] + weights[1, 1] * by_v[c]
-            u[m], v[m] = factor * white[row, 0], factor * white[row, 1]
-            for c in range(m, m + 3):
-                u[c + 1] = weights[0, 0] * by_u[c] + weights[0, 1] * by_v[c]
-                v[c + 1] = weights[1, 0] * by_u[c] + weights[1, 1] * by_v[c]
-            for i in range(3):
-                out, ui, vi = points[p, side, i], u[m + 1 + i], v[m + 1 + i]
-                for c in range(m + 4):
-                    out[c] += ui * u[c] + vi * v[c]
-            for i in range(k):
-                for c in range(3):
-                    cross[last, p, i, c] += u[m - k + i] * u[m + 1 + c] + v[m - k + i] * v[m + 1 + c]
+    m, k = J.shape[2] - 3, cross.shape[2]
+    u, v, weights = np.empty(m + 4), np.empty(m + 4), np.empty((2, 2))
+    for row in range(J.shape[0]):
+        side, p, s = rows[0][row], rows[1][row], rows[2][row]
+        factor = _weights(W[row], white[row], loss[0], loss[1], weights)
+        for c in range(m + 3):
+            at = c if c < m else c + 1
+            u[at] = weights[0, 0] * J[row, 0, c] + weights[0, 1] * J[row, 1, c]
+            v[at] = weights[1, 0] * J[row, 0, c] + weights[1, 1] * J[row, 1, c]
+        u[m], v[m] = factor * white[row, 0], factor * white[row, 1]
+        for i in range(m):
+            _add(u[i], u[i:], v[i], v[i:], shots[s, side, i, i:])
+        for i in range(m + 1, m + 4):
+            _add(u[i], u, v[i], v, points[p, side, i - m - 1])
+        for i in range(k):
+            _add(u[m - k + i], u[m + 1 :], v[m - k + i], v[m + 1 :], cross[s, p, i])
 
 
 def _whole(upper: Array) -> Array:
@@ -319,7 +297,7 @@ def _normal(
     sizes = [camera.parameters.size for camera in state.cameras]
     count, M, n, m = observations.shot_count, modes.shape[1], sum(sizes), J.shape[2] - 3
     own = max(sizes) + 6  # first column of the shot's own
-    shots, points = np.zeros((count, 2, m, (m + 4) // 4 * 4)), np.zeros((M, 2, 3, m + 4))
+    shots, points = np.zeros((count, 2, m, m + 1)), np.zeros((M, 2, 3, m + 4))
     by_point = np.zeros((count, M, m - own, 3))
     rows = observations.camera, observations.point, observations.shot
     _accumulate(J, W, near.white, loss, rows, (shots, points, by_point))
