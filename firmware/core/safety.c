@@ -326,7 +326,9 @@ static bool runs_on(const core_state *core, joint_state *joint, const joint_conf
     }
     const float supply_duty = 1000.0f * core->supply_v / (float)core->config.supply_nominal_mv;
     const float fast = number_size(joint->pid.speed_rad_s) / config->speed_limit_rad_s;
-    return observer_is_driven(&joint->observer, supply_duty, fast, off);
+    const bool driven = observer_is_driven(&joint->observer, supply_duty, fast, off);
+    const bool powered = core->supply_v >= 0.001f * (float)core->config.supply_min_mv;
+    return driven && powered; /* without a supply a load or a hand moves it */
 }
 
 /* Return whether the reading holds a joint with one of these faults: a weak motor, or a reading that goes too far. */

@@ -174,16 +174,3 @@ def test_the_suffix_of_an_arms_files_is_checked(here, armsight):
 def test_millimetres_taken_for_metres_are_reported(here, armsight):
     said = armsight("dense", "rig.json", "left1.png", "right1.png", "--near", "300", "-o", "out")
     assert_rejected(said, "--near 300", "--near 0.3", "metres")
-
-
-def test_a_built_in_motion_that_an_arm_cannot_make_is_reported_by_its_option(here, armsight):
-    marker = (
-        '[[markers]]\nname = "{}"\nposition_mm = [{}, {}, 0.0]\nnormal = [0, 0, -1]\ndisc = {{ radius_mm = 8.0 }}\n'
-    )
-    discs = (("a", 0.0, 0.0), ("b", 40.0, 0.0), ("c", 5.0, 25.0))
-    (here / "body.toml").write_text('name = "plate"\n' + "".join(marker.format(*one) for one in discs))
-    devices = ("--source", "sim:", "--board", "emulated:", "--rig", "rig.json", "--target", "body.toml")
-    said = armsight("run", *devices, "--arm", "ur10")
-    assert_rejected(said, "--arm ur10", "--motion FILE")
-    assert "site-packages" not in said.err
-    assert ".toml:" not in said.err

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from arm_rig import ARM, MIDDLE, TICK_S, Workcell, distance_mm, mounts, rms, worn
 
+from armsight.app.replay.run import ESTIMATORS
 from armsight.data import JointCommand
 from armsight.errors import InputError
-from armsight.loop.estimators import ESTIMATORS, ArmEstimate, Delay, Mounting
+from armsight.loop.estimators import ArmEstimate, Delay, Mounting
 from armsight.loop.health import Trust
 from armsight.loop.servo import (
     MAX_CORRECTION_RAD,

@@ -509,7 +509,7 @@ def test_split_is_offered_where_a_drawing_is_too_large_and_changes_none_that_fit
 def test_a_board_and_a_body_are_one_print(armsight, tmp_path):
     said = armsight("body", "draw", "chessboard:9x6:20mm", PLATE, "-o", tmp_path / "print.svg", "--json")
     assert said.code == 0, said.err
-    assert [page["markers"][0] for page in answer(said)["pages"]] == ["chessboard:9x6:20mm", "A"]
+    assert [page["markers"][0] for page in answer(said)["pages"]] == ["chessboard:9x6:20mm", "P1"]
     assert len(answer(said)["files"]) == 2
 
 

@@ -265,7 +265,7 @@ def shots(angles_deg, times):
         ShotPose(str(n), t, "gone")
         if angle is None
         else ShotPose(
-            str(n), t, None, position, euler_zyx_deg=np.array([angle, 10.0, 0.0]), cov=cov, reprojection_rms_px=0.1
+            str(n), t, None, position, euler_zyx_deg=np.array([angle, 10.0, 0.0]), cov_left=cov, reprojection_rms_px=0.1
         )
         for n, (angle, t) in enumerate(zip(angles_deg, times, strict=True))
     ]
@@ -304,7 +304,7 @@ def test_intervals_end_where_the_way_changes_and_at_gaps_in_time():
         shots([None] * 5, [1.0, 2.0, 3.0, 4.0, 5.0]),
         shots([1.0, None] * 40, [None] * 80),
         [replace(r, pitch_singular=True, way="searched", jump="jumped") for r in shots([1.0, 2.0], [1.0, 2.0])],
-        [replace(r, cov=np.zeros((6, 6))) for r in shots([1.0, 2.0], [1.0, 2.0])],
+        [replace(r, cov_left=np.zeros((6, 6))) for r in shots([1.0, 2.0], [1.0, 2.0])],
     ],
     ids=["one", "one missed", "all missed", "every other", "singular", "certain"],
 )

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from arm_rig import ARM, MIDDLE, MOUNT, SHOT, TICK_S, measured, mounts, off, seen, small, states
 
+from armsight.app.replay.run import ESTIMATORS
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse
-from armsight.loop.estimators import ESTIMATORS, Delay, Mounting, Outcome, PoseMeasurement
+from armsight.loop.estimators import Delay, Mounting, Outcome, PoseMeasurement
 
 EXACT = Delay(0.0, 1e-6)
 

@@ -274,6 +274,11 @@ class ArmStep(PageStep[ArmState]):
             self.handeye.begin(q[None], None, self._measuring.rig)
         self.handeye.fit_soon()
 
+    def forget_rig(self) -> None:
+        """Forget what was found with a rig that is put aside: the hand-eye calibration, its poses and the mounting."""
+        self.handeye.clear()
+        self._mounting = None
+
     @asked("arm", rest=True)
     def clear_hand_eye(self) -> None:
         """Forget the hand-eye calibration and its poses."""

@@ -143,6 +143,7 @@ class LiveSession:
         except OSError as error:
             raise InputError(f"{stored} cannot be put aside: {error.strerror}") from None
         self.measuring.use_rig(None, None)
+        self.arm.forget_rig()
         self._step, self._offer = "cameras", ""
         self.say("good", f"the rig is kept as {aside}")
 

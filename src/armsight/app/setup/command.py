@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ def command(arm: str, source: str | None, board: str | None, begin: int | None, 
     Each command is shown before it runs; they are those of docs/arms/. The port is found by unplugging, the cameras by
     covering them. Ctrl-C keeps what was done: the same command goes on there.
     """
+    from armsight.app.setup.finding import KINDS
     from armsight.app.setup.steps import ARMS, CAMERAS, PORT
     from armsight.app.setup.walk import INTERRUPTED, SetupWalk, simulated
 
@@ -42,9 +44,12 @@ def command(arm: str, source: str | None, board: str | None, begin: int | None, 
         raise InputError(f"--from {begin}: {arm} has {len(steps)} steps")
     if simulate and not any(step.command.startswith("run ") for step in steps):
         raise InputError(f"{arm}: its own controller moves it, which is not simulated; so101, ar4 and six_r are")
-    walk = SetupWalk.open(arm, begin)
+    walk = SetupWalk.open(arm, begin, simulate)
     if not simulate:
-        walk.words |= {word: given for word, given in ((CAMERAS, source), (PORT, board)) if given is not None}
+        port = board.removeprefix(next((kind for kind in KINDS if board.startswith(kind)), "")) if board else None
+        walk.words |= {
+            word: shlex.quote(given) for word, given in ((CAMERAS, source), (PORT, port)) if given is not None
+        }
     result: dict[str, Any] = {"arm": arm, "folder": str(Path.cwd()), "steps": []}
     code = INTERRUPTED
     stdout = contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext()  # what commands print

@@ -28,10 +28,11 @@ def find_port(say: Callable[[str], None], ports: Callable[[], Sequence[str]] = l
     """Return the port that goes and comes back with the arm's cable."""
     while True:
         there = set(ports())
-        if there:
+        unplugged = bool(there)
+        if unplugged:
             say("Unplug the arm's USB cable.")
             there = _other(there, ports, gone=True)
-        say("Plug the arm's USB cable in again." if there is not None else "Plug in the arm's USB cable.")
+        say("Plug the arm's USB cable in again." if unplugged else "Plug in the arm's USB cable.")
         came = _other(there, ports, gone=False) - there
         if len(came) == 1:
             return came.pop()

@@ -39,21 +39,24 @@ class SetupWalk:
     simulated: str = ""
 
     @classmethod
-    def open(cls, arm: str, begin: int | None) -> SetupWalk:
+    def open(cls, arm: str, begin: int | None, simulated: bool = False) -> SetupWalk:
         """Return the walk that the folder remembers, or a new one; ``begin``: from which step, from 1.
 
         Raises:
-            InputError: the folder is another arm's, or its file is none of ours.
+            InputError: the folder is another arm's, or of a simulated walk and this is none, or its file is none of ours.
         """
-        kept = cls(arm)
+        kept, was = cls(arm), simulated
         if FILE.exists():
             try:
                 found = read_json(FILE)
                 kept = cls(str(found["arm"]), dict(found["words"]), dict(found["done"]))
+                was = bool(found.get("simulated", False))
             except (TypeError, KeyError, ValueError):
                 raise InputError(f"{FILE}: not written by `armsight setup`: move it away") from None
         if kept.arm != arm:
             raise InputError(f"{FILE}: this folder is of {kept.arm}: take another folder for {arm}")
+        if was != simulated:
+            raise InputError(f"{FILE}: this folder is of a {'simulated' if was else 'real'} arm: take another folder")
         again = [step.command for step in ARMS[arm][begin - 1 :]] if begin is not None else []
         kept.done = {command: state for command, state in kept.done.items() if command not in again}
         return kept
@@ -81,9 +84,10 @@ class SetupWalk:
             say(f"port: {port}")
         if step.given and step.given not in self.words and not set(dict(step.without)) & set(self.words):
             file = "" if self.simulated else _asked(f"your file {step.given} (Enter: there is none)")
-            if file and not Path(file).expanduser().exists():
+            path = Path(file).expanduser()
+            if file and not path.exists():
                 raise InputError(f"{file}: no such file")
-            self.words |= {step.given: file} if file else dict(step.without)
+            self.words |= {step.given: shlex.quote(str(path))} if file else dict(step.without)
         return not step.given or step.given in self.words or step.given not in self.typed(step)
 
     def go(self, say: Callable[[str], None], result: dict[str, Any]) -> int:
@@ -123,13 +127,16 @@ class SetupWalk:
                 row["state"] = "done"
             self.done[step.command] = row["state"]
             self.keep()
-        say(f"\nall {len(steps)} steps are done; --from N does them again from the N-th")
+        failed = sum(row["state"] == "failed" for row in result["steps"])
+        well = f"all {len(steps)} steps are done" if not failed else f"{failed} of {len(steps)} steps failed"
+        say(f"\n{well}; --from N does them again from the N-th")
         return 0
 
     def keep(self) -> None:
         """Write how far it is; a simulated port is another one next time."""
         words = {} if self.simulated else self.words
-        write_text(FILE, json.dumps({"arm": self.arm, "words": words, "done": self.done}, indent=1) + "\n")
+        state = {"arm": self.arm, "simulated": bool(self.simulated), "words": words, "done": self.done}
+        write_text(FILE, json.dumps(state, indent=1) + "\n")
 
 
 def _asked(question: str) -> str:
@@ -145,7 +152,9 @@ def simulated(walk: SetupWalk, cameras: str) -> Iterator[None]:
     from armsight.sim.workcell.body import body_text
     from armsight.sim.workcell.workcell import CHESSBOARD
 
-    write_text("body.toml", body_text())
+    if (body := Path("body.toml")).exists() and body.read_text(encoding="utf-8") != body_text():
+        raise InputError(f"{body}: is of another arm: a simulated walk takes a folder of its own")
+    write_text(body, body_text())
     walk.words |= {CAMERAS: cameras, BOARD: CHESSBOARD, PLATE: "body.toml"}
     walk.words |= {old: new for step in ARMS[walk.arm] for old, new in step.without}  # nobody has files of their own
     with contextlib.ExitStack() as stack:

@@ -18,8 +18,9 @@ The rows are put into an order of their own first (by time, else by content), so
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -310,7 +311,7 @@ def calibrate_handeye(
     """
     A, B = (each.Ts if isinstance(each, PoseTable) else each for each in (Ts_base_flange, Ts_rig_body))
     for name, each in (("Ts_base_flange", A), ("Ts_rig_body", B)):
-        fits = isinstance(each, np.ndarray | Sequence) and not isinstance(each, str)
+        fits = not isinstance(each, str | Path)
         require(
             "handeye(Ts_base_flange, Ts_rig_body)", name, each, fits, 'poses (N, 4, 4): read_pose_table("robot.csv")'
         )

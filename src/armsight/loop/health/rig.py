@@ -93,6 +93,9 @@ _FRESH, _BEFORE = 6, 3
 #: Tests that are kept, to find since when: then the older half is merged in pairs, and so on. half: an old beginning is
 #: known half as closely, double: 4 MB more. So many first ones say what the lenses lack.
 _MOST_KEPT, _LENS_KEPT = 64, 600
+#: Most of what all tests hold that merged ones may, as a change may begin in the midst of them, which are then left out;
+#: half: 16 more are kept, double: a quarter of what the rig showed may be left out.
+_BLOCK_SHARE = 0.125
 #: A prior so wide that it decides nothing: m, rad, scale, s.
 _WIDE = np.array([0.1, 0.1, 1.0, 1.0, 1.0, 1.0, 0.1])
 #: A change matters that moves a pose by so many of its claimed sigmas, in any direction.
@@ -635,8 +638,9 @@ class RigWatch:
         """Merge the older half of the tests in pairs, but for those about the beginning of a change."""
         begin_s = self._since()[0] if self.alarmed else np.inf
         begun = sum(each.begin_s < begin_s for each in self._history)
+        most = _BLOCK_SHARE * sum(each.freedom for each in self._history)
         for k in reversed(range(0, len(self._history) // 2, 2)):
-            if not k - 2 <= begun <= k + 3:
+            if not k - 2 <= begun <= k + 3 and sum(each.freedom for each in self._history[k : k + 2]) <= most:
                 for tests in (self._history, self._plain):
                     tests[k : k + 2] = [total(tests[k : k + 2])]
 
@@ -748,11 +752,9 @@ class RigWatch:
 
     def _take_back(self, begins: Sequence[float]) -> None:
         """Take back what was found since tests, by when they began, s, which something explains that passes."""
-        before = len(self._history)
         self._history, self._plain = (
             [each for each in tests if each.begin_s not in begins] for tests in (self._history, self._plain)
         )
-        self._tests -= before - len(self._history)
         self._window.scale(0.0)
         for test in self._history:
             age = (self._history[-1].begin_s - test.begin_s) / (TEST_S if self._timed else TEST_SHOTS)
@@ -913,23 +915,23 @@ class RigWatch:
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far, the shots of the running test included: nothing where no test gave an alarm."""
-        return self.passing.among(self._stays_changed(), timed=self._timed)
+        ended = self._ended()
+        return ended.passing.among(ended._stays_changed(), timed=self._timed)
 
     def _stays_changed(self) -> tuple[HealthFinding, ...]:
-        """Return what changed and stays."""
-        ended = self._ended()
-        shape, lens = ended._shape.said, ended.lens
-        by_shape = 0.0 if shape is None else ended._cost_m(np.append(ended._shape.change(shape), np.zeros(_LENS)))
+        """Return what changed and stays, where the running test has ended."""
+        shape, lens = self._shape.said, self.lens
+        by_shape = 0.0 if shape is None else self._cost_m(np.append(self._shape.change(shape), np.zeros(_LENS)))
         if shape is not None and shape.chosen == (SMOOTH,) and by_shape < COSTS_M:
             shape = None  # a print as good as any: poses have it in their sigma
         if shape is not None and (lens is None or shape.chi_square > lens.chi_square):
-            found = ended._shape.finding(shape, shape.begin_s if self._timed else None)
+            found = self._shape.finding(shape, shape.begin_s if self._timed else None)
             found = replace(found, cost_mm=1e3 * by_shape)
-            return (found, *(ended._changed() if ended.alarmed and shape.seven_needed else ()))
+            return (found, *(self._changed() if self.alarmed and shape.seven_needed else ()))
         if lens is not None:
-            cost_m = ended._cost_m(np.append(np.zeros(self._size), lens.beta))
+            cost_m = self._cost_m(np.append(np.zeros(self._size), lens.beta))
             return (_lens_finding(lens, cost_m),) if cost_m > COSTS_M else ()
-        return (*(ended._changed() if ended.alarmed else ()), *ended._nods())
+        return (*(self._changed() if self.alarmed else ()), *self._nods())
 
     def _nods(self) -> tuple[HealthFinding, ...]:
         """Return the finding of a camera that nods or a lens that breathes, where that displaces poses by what matters."""

@@ -77,9 +77,8 @@ def check_source(spec: str) -> None:
             from armsight.vision.sources.bag.reader import SUFFIXES
 
             hint = f" ({'bag' if spec.endswith(SUFFIXES) else 'video'}:{spec}?)"
-        elif os.sep in spec:
-            hint = ": there is no such folder"
-        raise InputError(f"{spec}: not a source{hint}: known are {known}, or the path of a folder")
+        gone = ", and there is no such folder" if os.sep in spec and not hint else ""
+        raise InputError(f"{spec}: not a source{hint}: known are {known}, or the path of a folder{gone}")
 
 
 def open_source(spec: str | Path) -> Source:
