@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -28,9 +27,8 @@ def command(arm: str, source: str | None, board: str | None, begin: int | None, 
     Each command is shown before it runs; they are those of docs/arms/. The port is found by unplugging, the cameras by
     covering them. Ctrl-C keeps what was done: the same command goes on there.
     """
-    from armsight.app.setup.finding import KINDS
-    from armsight.app.setup.steps import ARMS, CAMERAS, PORT
-    from armsight.app.setup.walk import INTERRUPTED, SetupWalk, simulated
+    from armsight.app.setup.steps import ARMS
+    from armsight.app.setup.walk import INTERRUPTED, SetupWalk, simulated, words_of
 
     if arm not in ARMS:
         raise InputError(
@@ -46,10 +44,7 @@ def command(arm: str, source: str | None, board: str | None, begin: int | None, 
         raise InputError(f"{arm}: its own controller moves it, which is not simulated; so101, ar4 and six_r are")
     walk = SetupWalk.open(arm, begin, simulate)
     if not simulate:
-        port = board.removeprefix(next((kind for kind in KINDS if board.startswith(kind)), "")) if board else None
-        walk.words |= {
-            word: shlex.quote(given) for word, given in ((CAMERAS, source), (PORT, port)) if given is not None
-        }
+        walk.words |= words_of(source, board)
     result: dict[str, Any] = {"arm": arm, "folder": str(Path.cwd()), "steps": []}
     code = INTERRUPTED
     stdout = contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext()  # what commands print

@@ -139,6 +139,13 @@ class SetupWalk:
         write_text(FILE, json.dumps(state, indent=1) + "\n")
 
 
+def words_of(cameras: str | None, board: str | None) -> dict[str, str]:
+    """Return what the pages' words are here, as given: cameras, and a board's port, with or without its kind before it."""
+    kind = next((kind for kind in finding.KINDS if (board or "").startswith(kind)), "")
+    given = {CAMERAS: cameras, PORT: board and board.removeprefix(kind)}
+    return {word: shlex.quote(here) for word, here in given.items() if here is not None}
+
+
 def _asked(question: str) -> str:
     """Ask a person for a line."""
     return str(click.prompt(question, default="", show_default=False, err=True)).strip()

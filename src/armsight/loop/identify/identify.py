@@ -59,7 +59,7 @@ class Identified(Record):
         used, free = self.solution.used, self.solution.free
         return (
             f"Identified({self.model.arm.name}, {int(free.sum())} of {len(free)} numbers fitted, {int(used.sum())} of "
-            f"{len(used)} poses used; value(NAME) and sigma, NAME out of model.names)"
+            f"{len(used)} poses used; columns() lists them, validate() evaluates them on others)"
         )
 
     @property
