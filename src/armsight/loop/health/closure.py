@@ -41,7 +41,7 @@ _LEAST_BLOCKS, _AGAIN, _MOST_BLOCKS = 12, 4, 64
 #: Beginnings that are tried; the newer, the closer.
 _BEGINS = 12
 #: Blocks that are kept: then the older half is merged in pairs, and so on. half: an old beginning is known half as closely,
-#: double: 6 MB more.
+#: double: 2 MB more.
 _MOST_KEPT = 160
 #: Errors of a block before any is seen (m, rad), and how many blocks that counts.
 _BLOCK_SIGMA, _BLOCKS = np.repeat([1.2e-4, np.radians(0.012)], 3), 8.0
