@@ -58,7 +58,6 @@ def serving(tmp_path, monkeypatch):
     return serve
 
 
-@pytest.mark.real_time
 def test_each_loss_is_said_once_and_the_return_with_its_tries(serving):
     gone = "0 camera gone"
     code, events, log, served = serving(

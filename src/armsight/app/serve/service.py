@@ -58,7 +58,7 @@ class Service:
         self._config, self._report = config, report
         self._log = _logger(config)
         self._child: subprocess.Popen[bytes] | None = None
-        self._said: set[str] = set()  # by the child, during one loss
+        self._lines, self._said = set[str](), set[str]()  # of this child, and of all during one loss
         self._last_line = ""
         self._began = self._newest = time.monotonic()
         self._lost_since: float | None = None
@@ -125,7 +125,7 @@ class Service:
     def _one(self, heard: socket.socket) -> int | None:
         """Start the child and listen to it until it ends or falls silent; return its exit code, None where it was ended."""
         arguments = [*self._config.arguments, f"--stream=json+udp:127.0.0.1:{heard.getsockname()[1]}"]
-        self._tries, self._last_line = self._tries + 1, ""
+        self._tries, self._last_line, self._lines = self._tries + 1, "", set()
         listener: threading.Thread | None = None
         try:
             self._child = subprocess.Popen(
@@ -192,12 +192,11 @@ class Service:
         if self._why:
             self._began, self._lost_since, self._why = self._newest, None, ""
             self._tries = 0
-            self._said.clear()
 
     def _lost(self, why: str) -> None:
         """Say that the child was lost: once, and again where another reason shows."""
         if self._lost_since is None:
-            self._lost_since = time.monotonic()
+            self._lost_since, self._said = time.monotonic(), self._lines
             self._counts["losses_total"] += 1
         if why != self._why:
             self._why = why
@@ -213,11 +212,14 @@ class Service:
     def _hear(self, line: str) -> None:
         """Take a line of the child."""
         self._last_line = line.removeprefix("armsight: error: ") or self._last_line
-        if not _PROGRESS.match(line) and (self._lost_since is None or line not in self._said):
-            if len(self._said) > _LINES:
-                self._said.clear()
-            self._said.add(line)
+        if _PROGRESS.match(line):
+            return
+        if self._lost_since is None or line not in self._said:
             self._log.info("measure: %s", line)
+        for lines in (self._lines, self._said):
+            if len(lines) > _LINES:
+                lines.clear()
+            lines.add(line)
 
     def _end(self) -> None:
         """End the child as Ctrl-C does, so that its files are whole; kill it where it does not."""
