@@ -94,7 +94,7 @@ _FRESH, _BEFORE = 6, 3
 #: known half as closely, double: 4 MB more. So many first ones say what the lenses lack.
 _MOST_KEPT, _LENS_KEPT = 64, 600
 #: Most of what all tests hold that merged ones may, as a change may begin in the midst of them, which are then left out;
-#: half: 16 more are kept, double: a quarter of what the rig showed may be left out.
+#: half: they are merged somewhat more often, double: a quarter of what the rig showed may be left out.
 _BLOCK_SHARE = 0.125
 #: A prior so wide that it decides nothing: m, rad, scale, s.
 _WIDE = np.array([0.1, 0.1, 1.0, 1.0, 1.0, 1.0, 0.1])
