@@ -1,0 +1,208 @@
+"""Calibrate a reference: all its parameters and its delay, from readings while the tool's motion is known.
+
+In: readings, and where the tool was and how it moved (by vision or by an arm). Out: the reference with its parameters and
+their covariance, how large its noise is beside what was said, which readings are blunders, and the error of readings that
+the fit has not seen: blocks of time, each left out in turn. Gauss-Newton on ``estimate``'s one solver.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.estimate.linear import Linear
+from armsight.estimate.solve import Solved, by_chance, left_out, solve
+from armsight.estimate.variance import restricted
+from armsight.loop.references.reference import Reading, Reference, ToolMotion
+
+R = TypeVar("R", bound=Reference)
+
+#: A reading less likely than this among the others is a blunder; half, double: one in a million more or fewer.
+CHANCE = 1e-6
+#: Gauss-Newton steps at most, and halvings of one that does not lower the cost; half: far starts do not arrive.
+STEPS, HALVINGS = 30, 8
+#: A step that lowers the cost by less than this has arrived; half, double: nothing.
+ARRIVED = 1e-6
+#: Rounds of blunders and variances; half: a few blunders stay in, double: nothing.
+ROUNDS = 4
+#: Blocks of time that are left out in turn.
+BLOCKS = 8
+#: A parameter that the readings left at more than this share of its sigma before is open; half: known ones are called open.
+OPEN = 0.9
+#: The noise of a channel may be this many times less, or more, than was said.
+LEAST, MOST = 1e-3, 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceCalibration(Record, Generic[R]):
+    """A calibrated reference, and how far to believe it.
+
+    Attributes:
+        reference: with its parameters, their covariance, its delay and that's sigma.
+        noise: channel -> how many times larger its noise is than its readings say.
+        used: (N,) whether a reading was used; the others are blunders.
+        left_out: (N, m) error of the readings predicted by fits to the other blocks, measured minus predicted.
+        squares: (N,) their squared Mahalanobis distance over m: 1 on average where the covariance is honest.
+        open: parameters that the readings do not determine.
+    """
+
+    reference: R
+    noise: dict[str, float]
+    used: NDArray[np.bool_]
+    left_out: Array
+    squares: Array
+    open: tuple[str, ...]
+
+
+def calibrate(
+    reference: R, readings: Sequence[Reading], motion: Callable[[float], ToolMotion], *, fit_delay: bool = False
+) -> ReferenceCalibration[R]:
+    """Fit all parameters of a reference.
+
+    Args:
+        reference: where to begin; its ``cov`` says how far its parameters may be off (the variances count).
+        readings: in order of time. Those that share one error (samples of one rest) should be one reading, their mean.
+        motion: returns the tool's motion at a time, s.
+        fit_delay: whether the delay is fitted too, from ``sigma_delay_s`` on; the motions then must not all be rests.
+
+    Raises:
+        InputError: fewer numbers than parameters.
+    """
+    fit = _SensorFit(reference, readings, motion, fit_delay)
+    numbers = sum(len(reading.z) for reading in readings)
+    if numbers <= fit.unknowns:
+        raise InputError(f"{reference.name}: {numbers} numbers were read, {fit.unknowns} parameters need more of them")
+    used, variances = np.ones(len(readings), np.bool_), np.ones(len(fit.names))
+    at, linear = fit.begin, fit.linear(fit.begin)
+    for _ in range(ROUNDS):
+        at, linear = fit.solved(at, linear, variances, used)
+        before, factors = used, _factors(linear, variances)
+        used = _plausible(linear, factors, fit.channel)
+        variances = restricted(linear.rows(np.flatnonzero(used)), factors, LEAST, MOST)
+        if (used == before).all():
+            break
+    at, linear = fit.solved(at, linear, variances, used)
+    s = solve(linear.rows(np.flatnonzero(used)), variances)
+    cov = s.root[: fit.unknowns] @ s.root[: fit.unknowns].T
+    errors, squares = _held_out(linear, variances, used)
+    sigma, names = np.sqrt(np.diag(cov)), (*reference.parameters, "delay_s")
+    unknown = tuple(name for name, a, b in zip(names, sigma, fit.sigma, strict=False) if a > OPEN * b)
+    noise = {name: float(np.sqrt(v)) for name, v in zip(fit.names, variances, strict=True)}
+    return ReferenceCalibration(fit.reference(at, cov), noise, used, errors, squares, unknown)
+
+
+class _SensorFit(Generic[R]):
+    """Residuals of readings, predicted minus measured, near a step from where the fit began."""
+
+    def __init__(
+        self, reference: R, readings: Sequence[Reading], motion: Callable[[float], ToolMotion], fit_delay: bool
+    ) -> None:
+        self._first, self._readings, self._motion, self._delays = reference, readings, motion, fit_delay
+        self.channel = np.array([reading.channel for reading in readings])
+        self.names = [reference.channels[k] for k in np.unique(self.channel)]
+        self.sigma = np.sqrt(np.diag(reference.cov))
+        if fit_delay:
+            self.sigma = np.append(self.sigma, reference.sigma_delay_s)
+        self.unknowns, self.begin = len(self.sigma), (reference, np.zeros(len(self.sigma)))
+        noise = np.linalg.cholesky(np.array([reading.cov for reading in readings]))
+        self._own = {
+            name: noise * (self.channel == k)[:, None, None]
+            for k, name in zip(np.unique(self.channel), self.names, strict=True)
+        }
+
+    def reference(self, at: tuple[R, Array], cov: Array) -> R:
+        """Return the reference of a state with the covariance (Q, Q) of its unknowns."""
+        P = len(self._first.cov)
+        late = float(np.sqrt(cov[P, P])) if self._delays else self._first.sigma_delay_s
+        return replace(at[0], cov=cov[:P, :P], sigma_delay_s=late)
+
+    def moved(self, at: tuple[R, Array], step: Array) -> tuple[R, Array]:
+        """Return a state moved by a step (Q,)."""
+        reference, total = at
+        P = len(self._first.cov)
+        late = reference.delay_s + (float(step[P]) if self._delays else 0.0)
+        return replace(reference.moved(step[:P]), delay_s=late), total + step
+
+    def linear(self, at: tuple[R, Array]) -> Linear:
+        """Return the residuals near a state."""
+        reference, total = at
+        e, J, given = [], [], []
+        for reading in self._readings:
+            motion = self._motion(reading.t_s - reference.delay_s)
+            expected = reference.expected(motion, reading.channel)
+            by = expected.by_parameters
+            e.append(expected.z - reading.z)
+            J.append(np.column_stack([by, -expected.rate(motion)]) if self._delays else by)
+            given.append(expected.by_tool @ motion.cov @ expected.by_tool.T)
+        return Linear(np.array(e), np.array(J), np.array(given), self._own, {}, self.sigma**-2.0, total)
+
+    def solved(
+        self, at: tuple[R, Array], linear: Linear, variances: Array, used: NDArray[np.bool_]
+    ) -> tuple[tuple[R, Array], Linear]:
+        """Return the best state for the variances (K,) and the readings that are used (N,), and the residuals there."""
+        rows = np.flatnonzero(used)
+        s = solve(linear.rows(rows), variances)
+        for _ in range(STEPS):
+            step, cost = s.x[: self.unknowns], _cost(linear.rows(rows), s)
+            for _ in range(HALVINGS):
+                near = self.moved(at, step)
+                tried = self.linear(near)
+                if _cost(tried.rows(rows), s) < cost:
+                    break
+                step = step / 2
+            else:
+                return at, linear
+            gained = cost - _cost(tried.rows(rows), s)
+            at, linear, s = near, tried, solve(tried.rows(rows), variances)
+            if gained < ARRIVED * cost:
+                break
+        return at, linear
+
+
+def _cost(linear: Linear, s: Solved) -> float:
+    """Return the weighted squares of residuals, and of how far the unknowns are from where their priors have them."""
+    return float(np.einsum("ni,nij,nj->", linear.e, s.W, linear.e) + (linear.known * linear.at**2).sum())
+
+
+def _factors(linear: Linear, variances: Array) -> Array:
+    """Return variances (K,) to begin at that a few blunders cannot raise: from the medians of the squares left out."""
+    from scipy.special import chdtri
+
+    errors, covs = left_out(solve(linear, variances))
+    squares = np.einsum("ni,ni->n", errors, np.linalg.solve(covs, errors[..., None])[..., 0])
+    median = chdtri(errors.shape[1], 0.5)
+    mine = [np.abs(M).sum(axis=(1, 2)) > 0.0 for M in linear.own.values()]
+    each = [v * np.median(squares[rows]) / median for v, rows in zip(variances, mine, strict=True)]
+    return np.asarray(np.clip(each, LEAST**2, MOST**2))
+
+
+def _plausible(linear: Linear, variances: Array, channel: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which readings (N,) chance explains, among those of their channel."""
+    errors, covs = left_out(solve(linear, variances))
+    squares = np.einsum("ni,ni->n", errors, np.linalg.solve(covs, errors[..., None])[..., 0])
+    out = np.ones(len(squares), np.bool_)
+    for k in np.unique(channel):
+        out[channel == k] = by_chance(squares[channel == k], errors.shape[1], CHANCE)
+    return out
+
+
+def _held_out(linear: Linear, variances: Array, used: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return errors (N, m) and squares (N,) of each reading under the fit to the other blocks of time."""
+    count, m = linear.e.shape
+    errors, squares = np.empty((count, m)), np.empty(count)
+    for block in np.array_split(np.arange(count), min(BLOCKS, count)):
+        others = np.setdiff1d(np.flatnonzero(used), block)
+        s, out = solve(linear.rows(others), variances), linear.rows(block)
+        own = np.linalg.inv(solve(out, variances).W)
+        error = -(out.e + out.J @ s.x[: out.J.shape[2]])
+        JR = out.J @ s.root[: out.J.shape[2]]
+        cov = own + JR @ np.swapaxes(JR, 1, 2)
+        errors[block] = error
+        squares[block] = np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[..., None])[..., 0]) / m
+    return errors, squares
