@@ -89,7 +89,7 @@ def test_the_model_is_chosen_on_held_out_error(model, focal_px, tried):
     true, board, Ts = rig_and_board(model, focal_px, 14)
     c = calibrate_boards(board, board_pairs(true, board.body.points, Ts, sigma=0.05), SIZES, models=tried, folds=2)
     assert c.rig.left.model == c.rig.right.model == model
-    assert set(c.models) == set(tried)
+    assert set(c.models) == {tried[0], model}  # others cannot be worth it: their first step promises too little
     assert c.heldout == c.models[model]
     error = rig_error(c.rig, true)
     assert (np.abs(error) < 4.5 * np.sqrt(np.diag(c.rig.cov))).all()

@@ -57,7 +57,7 @@ from armsight.vision.discs.bias import apparent_radii
 from armsight.vision.markers.circles import unseen_row
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.match import join, renamed
-from armsight.vision.pose.bundle import NEAR, BundleModel, BundleSolution, BundleState, Observations, minimise
+from armsight.vision.pose.bundle import NEAR, BundleModel, BundleSolution, BundleState, Observations, minimise, promised
 from armsight.vision.pose.pnp import body_poses
 from armsight.vision.pose.projection import of_middles, smooth
 from armsight.vision.pose.shutter import TimedShot, aligned, at_one_time, estimate_shutters
@@ -80,7 +80,8 @@ BOARD_DEGREE = 4
 BOARD_SIGMA_SHARE, BOARD_SIGMA_LEAST_M = 1e-3, 1e-7
 #: Rounds in which noise and tolerances settle; motion, which competes with them, takes longer.
 _NOISE_ROUNDS, _MOTION_ROUNDS = 4, 8
-#: A start that leaves more than this, px RMS, may have names of a symmetric board that contradict each other.
+#: A start that leaves more than this, px RMS, is no minimum to draw conclusions from: names of a symmetric board may
+#: contradict each other, the lens may be another.
 _MISNAMED_PX = 2.0
 #: Rounds of the discs' radius and the poses; a radius given may differ by this factor from what the images show: print and
 #: lens widen or narrow what is dark.
@@ -171,6 +172,29 @@ def _freed(model: BundleModel, solution: BundleSolution) -> float:
     return freed + float(modes - variance[len(variance) - modes :].sum() / model.shape_sigma_m**2)
 
 
+def _padded(cameras: tuple[Camera, Camera], distortion: str) -> tuple[Camera, Camera]:
+    """Return cameras with another number of distortion coefficients, those that are new zero."""
+    count = DISTORTION_MODELS[distortion]
+    left, right = (
+        Camera(c.image_size_px, distortion, c.intrinsics, np.append(c.distortion, np.zeros(count))[:count])
+        for c in cameras
+    )
+    return left, right
+
+
+def _may_gain(model: BundleModel, solution: BundleSolution, observations: Observations, distortion: str) -> bool:
+    """Return whether another lens may lower the error of an adjustment by its WORTH.
+
+    A larger model lowers held-out errors by less than the fit's, and that by no more than its first step promises. What a
+    fisheye lens does otherwise than a plain one, the largest plain one would take up in part.
+    """
+    if solution.state.cameras[0].model == "fisheye":
+        return True
+    wider = _padded(solution.state.cameras, "brown8" if distortion == "fisheye" else distortion)
+    share = promised(model, replace(solution.state, cameras=wider), observations, solution.sigma_px)
+    return not share < 1 - (1 - WORTH[distortion]) ** 2  # of squares; NaN may
+
+
 Progress = Callable[[str], None]
 #: Calls a function with arguments in another process, and returns what it returns.
 Second = Callable[..., Any]
@@ -220,9 +244,16 @@ class LensModelSearch(Record):
     progress: Callable[[str], None]
 
     def best(self, models: tuple[str, ...], second: Second | None = None) -> tuple[Trial, dict[str, HeldOutErrors]]:
-        """Return the first model that no later one beats by more than WORTH, and the held-out errors of all."""
-        found = self._trials(models, second)
-        trials = {name: trial for name in models if (trial := found[name]) is not None}
+        """Return the first model that no later one beats by more than WORTH, and the held-out errors of those tried.
+
+        After the first, only those that may be worth it are tried.
+        """
+        self.progress(f"evaluating distortion model {models[0]} on held-out pairs")
+        first = self.trial(models[0])
+        seen = self.screened.observations
+        later = tuple(m for m in models[1:] if first is None or _may_gain(first.model, first.solution, seen, m))
+        found = {models[0]: first, **self._trials(later, second)}
+        trials = {name: trial for name in models if (trial := found.get(name)) is not None}
         if not trials:
             raise CalibrationError("no distortion model could be adjusted to the detections")
         reference = next(iter(trials.values())).heldout
@@ -287,13 +318,7 @@ class LensModelSearch(Record):
             if left is not None and right is not None:
                 return replace(state, cameras=(left, right))
             return replace(start_board(self.model.points, self.sizes, seen, distortion).state, shape=state.shape)
-        cameras = []
-        for camera in state.cameras:
-            d = np.zeros(DISTORTION_MODELS[distortion])
-            n = min(len(d), camera.distortion.size)
-            d[:n] = camera.distortion[:n]
-            cameras.append(Camera(camera.image_size_px, distortion, camera.intrinsics, d))
-        return replace(state, cameras=(cameras[0], cameras[1]))
+        return replace(state, cameras=_padded(state.cameras, distortion))
 
     def _adjusted(self, state: BundleState) -> tuple[BundleModel, ExposureMotion | None, BundleSolution]:
         """Adjust with the noise of the residuals and the estimated tolerances of the board and of its motion."""
@@ -567,7 +592,8 @@ def _start(
         found: list[BundleSolution] = []
         for family in families:
             found.append(start_board(points, sizes, observations, family))
-            if fits(found[-1]):
+            near = residual_rms_px(found[-1]) < _MISNAMED_PX and family != "fisheye"
+            if fits(found[-1]) or (near and not _may_gain(rigid_board(points), found[-1], observations, "fisheye")):
                 break
         return min(found, key=lambda s: s.cost)
 

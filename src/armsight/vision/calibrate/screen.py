@@ -31,6 +31,8 @@ LOST_SHARE = 0.25
 #: Fewest corners, seen by both cameras, that make a pair useful.
 LEAST_CORNERS = 6
 _ROUNDS = 6
+#: A step that lowers the cost by less than this share is a round's last; half and double: no detection changes sides.
+_ROUGHLY = 1e-4
 #: As many pairs of which corners were dropped have a line of their own.
 _NAMED = 3
 _DROPPED = "dropped as gross errors"
@@ -110,7 +112,10 @@ def screen(
     for k in range(_ROUNDS):
         rows = good & np.isin(observations.shot, kept)
         now = _renumbered(observations, rows, kept)
-        solution = minimise(_of_shots(model, kept), state, now, sigma, damping=NEAR if k else DAMPING)
+        damping = NEAR if k else DAMPING
+        solution = minimise(
+            _of_shots(model, kept), state, now, sigma, damping=damping, least_decrease=_ROUGHLY, covariance=False
+        )
         new_sigma = robust_sigma(solution)
         distance = np.full(len(good), np.nan)
         distance[rows] = _whitened(solution, now)

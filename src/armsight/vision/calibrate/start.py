@@ -19,8 +19,9 @@ from armsight.vision.pose.pnp import MIN_POINTS, body_poses
 #: Focal lengths tried, in units of the image's longer side: fields of view from 115 to 11 degrees.
 _FOCAL_LADDER = np.geomspace(0.32, 5.0, 18)
 _STARTS_KEPT = 3
-#: Number of views, spread over all, from which the first focal lengths are estimated.
-_FOCAL_VIEWS = 12
+#: Views, spread over all, from which the first focal lengths are estimated: a few choose a third of the ladder, more
+#: choose from that. Half: a blurred or frontal view may choose a wrong minimum, double: slower.
+_FEW_VIEWS, _FOCAL_VIEWS = 4, 12
 #: Corners that all fit so well, px RMS, leave no doubt about the minimum: wrong ones are off by whole pixels. So does a
 #: lens that imitates another one, to begin with.
 _FITS_PX, _IMITATES_PX = 0.1, 1.0
@@ -51,17 +52,20 @@ def _focal_candidates(
     points: Array, size: tuple[int, int], observations: Observations, side: int, model: str
 ) -> list[float]:
     """Return the focal lengths, px, under which one camera's views fit best, best first."""
-    views = [rows for rows in _views(observations, side) if len(rows) >= MIN_POINTS]
-    views = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, min(len(views), _FOCAL_VIEWS)).astype(int))]
-    scores = []
-    for focal in _FOCAL_LADDER * max(size):
-        camera = pinhole(size, focal, model)
-        errors = []
-        for rows in views:
-            candidates = body_poses(points[observations.point[rows]], camera, observations.uv[rows])
-            errors.append(candidates[0][1] if candidates else max(size))
-        scores.append((float(np.mean(np.square(errors))) if errors else np.inf, focal))
-    return [focal for _, focal in sorted(scores)[:_STARTS_KEPT]]
+    every = [rows for rows in _views(observations, side) if len(rows) >= MIN_POINTS]
+    focals = list(_FOCAL_LADDER * max(size))
+    for count, kept in ((_FEW_VIEWS, len(focals) // 3), (_FOCAL_VIEWS, _STARTS_KEPT)):
+        views = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, min(len(every), count)).astype(int))]
+        scores = []
+        for focal in focals:
+            camera = pinhole(size, focal, model)
+            errors = []
+            for rows in views:
+                candidates = body_poses(points[observations.point[rows]], camera, observations.uv[rows])
+                errors.append(candidates[0][1] if candidates else max(size))
+            scores.append((float(np.mean(np.square(errors))) if errors else np.inf, focal))
+        focals = [focal for _, focal in sorted(scores)[:kept]]
+    return focals
 
 
 def _apart(a: Array, b: Array, scale_m: float = 1.0) -> Array:
@@ -264,8 +268,8 @@ def _staged(model: BundleModel, state: BundleState, observations: Observations) 
     focal[[0, 1, sizes[0], sizes[0] + 1]] = True
     focal[-6:] = True
     try:
-        first = minimise(model, state, observations, 5.0, free=focal, max_steps=15)
-        second = minimise(model, first.state, observations, 3.0, max_steps=15)
-        return minimise(model, second.state, observations, 1.0, max_steps=25)
+        first = minimise(model, state, observations, 5.0, free=focal, max_steps=15, covariance=False)
+        second = minimise(model, first.state, observations, 3.0, max_steps=15, covariance=False)
+        return minimise(model, second.state, observations, 1.0, max_steps=25, covariance=False)
     except (CalibrationError, np.linalg.LinAlgError):
         return None

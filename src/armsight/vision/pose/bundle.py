@@ -184,6 +184,7 @@ __all__ = [
     "minimise",
     "moved",
     "predict",
+    "promised",
     "whiteners",
 ]
 
@@ -225,7 +226,7 @@ class BundleSolution(Record):
         state: the estimate.
         residuals_px: (N, 2) detection minus projection.
         sigma_px: standard deviation of a detection beyond its image covariance, px.
-        cov_shared: (Q, Q) covariance of all shared parameters; zero rows for what was held fixed.
+        cov_shared: (Q, Q) covariance of all shared parameters, zero rows for what was held fixed, or (0, 0).
         cost: robust cost.
         steps: iterations used.
         converged: whether it is a minimum; False where the last step that was allowed still lowered the cost.
@@ -359,6 +360,7 @@ def minimise(
     max_steps: int = _MAX_STEPS,
     least_decrease: float = _RELATIVE_DECREASE,
     damping: float = DAMPING,
+    covariance: bool = True,
 ) -> BundleSolution:
     """Find the minimum next to ``start`` for a given noise.
 
@@ -372,6 +374,7 @@ def minimise(
         max_steps: iterations at the most.
         least_decrease: a step that lowers the cost by less than this share of it is the last.
         damping: Marquardt's damping to begin with, NEAR where the start is a neighbouring problem's minimum.
+        covariance: whether it is needed; without, ``cov_shared`` and ``cov_motions`` are empty.
 
     Returns:
         The minimum with its covariance.
@@ -406,14 +409,27 @@ def minimise(
         else:
             damping *= 10
             converged = damping >= 1e12  # not even the smallest step lowers the cost
+    cov, cov_motions = np.zeros((0, 0)), np.zeros((0, 6, 6))
+    if not covariance:
+        return BundleSolution(now.state, now.residuals_px, sigma_px, cov, now.cost, steps, converged, cov_motions)
     normal = _normal(model, now, observations, W, free, (c2, False))
     cov = np.zeros((len(free), len(free)))
     if free.any():
         cov[np.ix_(free, free)] = _covariance(normal, _prior(model, len(free))[free], robust)
-    cov_motions = np.zeros((0, 6, 6))
     if len(now.state.motions):
         cov_motions = normal.cov_shots(cov[np.ix_(free, free)])[:, 6:, 6:]
     return BundleSolution(now.state, now.residuals_px, sigma_px, cov, now.cost, steps, converged, cov_motions)
+
+
+def promised(model: BundleModel, state: BundleState, observations: Observations, sigma_px: float) -> float:
+    """Return the share of the robust cost that a Newton step from a state would remove, a score test (Rao, 1948).
+
+    At the minimum of a smaller model this bounds what a larger one with the same start can gain, without adjusting it.
+    """
+    W = whiteners(observations, sigma_px)
+    near, free = _near(model, state, observations, W, robust=True), free_parameters(model, state)
+    normal = _normal(model, near, observations, W, free, (CAUCHY_SCALE**2, True))
+    return normal.promises(*normal.step(NEAR)) / near.cost
 
 
 def _with_motions(model: BundleModel, state: BundleState) -> BundleState:
