@@ -84,5 +84,5 @@ def test_blunders_are_named_and_not_used():
 
 
 def test_too_few_readings_are_rejected():
-    with pytest.raises(InputError, match="wire: 6 numbers were read, 6 parameters need more of them"):
-        calibrate(FIRST, readings(0, count=6)[0], motion, fit_delay=True)
+    with pytest.raises(InputError, match="wire: 5 numbers were read, 5 parameters need more of them"):
+        calibrate(FIRST, readings(0, count=5)[0], motion, fit_delay=True)

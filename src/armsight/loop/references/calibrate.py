@@ -75,11 +75,11 @@ def calibrate(
         InputError: fewer numbers than parameters.
     """
     fit = _SensorFit(reference, readings, motion, fit_delay)
-    numbers = sum(len(reading.z) for reading in readings)
-    if numbers <= fit.unknowns:
-        raise InputError(f"{reference.name}: {numbers} numbers were read, {fit.unknowns} parameters need more of them")
-    used, variances = np.ones(len(readings), np.bool_), np.ones(len(fit.names))
     at, linear = fit.begin, fit.linear(fit.begin)
+    numbers, seen = linear.e.size, int((linear.J != 0.0).any(axis=(0, 1)).sum())
+    if numbers <= seen:
+        raise InputError(f"{reference.name}: {numbers} numbers were read, {seen} parameters need more of them")
+    used, variances = np.ones(len(readings), np.bool_), np.ones(len(fit.names))
     for _ in range(ROUNDS):
         at, linear = fit.solved(at, linear, variances, used)
         before, factors = used, _factors(linear, variances)
