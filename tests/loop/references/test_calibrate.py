@@ -1,40 +1,17 @@
 """Calibration of a reference, on a small member of the family whose truth is known: a wire from an anchor to the tool."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from wire import Wire
 
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3
 from armsight.loop.references.calibrate import calibrate
-from armsight.loop.references.reference import ExpectedReading, Reading, Reference, ToolMotion
+from armsight.loop.references.reference import Reading, ToolMotion
 
 SIGMA_M = 1e-3
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Wire(Reference):
-    """The length of a wire to the tool's origin, and an offset; a last parameter that does nothing."""
-
-    values: np.ndarray
-
-    @property
-    def channels(self):
-        return ("length",)
-
-    @property
-    def parameters(self):
-        return dict(zip(("x_m", "y_m", "z_m", "offset_m", "idle"), self.values, strict=True))
-
-    def expected(self, motion, channel):
-        way = motion.T_base_tool[:3, 3] - self.values[:3]
-        u = way / np.linalg.norm(way)
-        by_tool = np.concatenate([u @ motion.T_base_tool[:3, :3], np.zeros(3)])[None]
-        return ExpectedReading(np.array([np.linalg.norm(way) + self.values[3]]), by_tool, np.array([[*-u, 1.0, 0.0]]))
-
-    def moved(self, step):
-        return replace(self, values=self.values + step)
 
 
 TRUE = Wire(name="wire", cov=np.eye(5), values=np.array([0.9, -0.2, 0.1, 0.05, 0.0]), delay_s=0.02)

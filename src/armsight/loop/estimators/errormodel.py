@@ -8,6 +8,7 @@ covariances. All of it is compiled: a command waits for it. Equations: docs/conc
 from __future__ import annotations
 
 import math
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,8 @@ from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import Prior, layout, pose_and_derivative, tangent
 from armsight.loop.estimators.estimator import PoseMeasurement
 from armsight.loop.estimators.readings import Smoothed
+from armsight.loop.references.reference import Reading, Reference
+from armsight.loop.references.update import Considered
 from armsight.robot.kinematics.arm import Arm
 
 #: After so long a joint has crept wherever it could, s.
@@ -40,13 +43,28 @@ NOTHING = 1e-40
 OPEN_M, OPEN_RAD = 10e-3, np.deg2rad(1.0)
 _MIN_SHARE = 1e-9  # of a share
 _NOWHERE, _NONE = np.eye(4), np.zeros((6, 6))  # where nothing was measured: a pose, and a covariance
+#: Name under which what all measurements of vision share is considered, along the base's axes; and nothing considered.
+VISION, NONE_CONSIDERED = "", MappingProxyType[str, Array]({})
+
+
+class Taken(NamedTuple):
+    """A reading of a reference beside vision."""
+
+    reference: Reference
+    reading: Reading
+
+    @property
+    def t_s(self) -> float:
+        """Time of the reading, s, the delay removed."""
+        return self.reading.t_s - self.reference.delay_s
 
 
 class ErrorState(NamedTuple):
     """The filter right after a pose measurement, or before the first.
 
     ``x`` (size,) and ``P`` (size, size): the arm's error and its covariance; ``t_s``: when that was; ``joints``: how the
-    readings smoothed them then, N = 1; ``pose_measurement``: what went in last.
+    readings smoothed them then, N = 1; ``pose_measurement``: what went in last of vision. Where a reading of a reference
+    went in last: ``taken``, that, and ``vision_s``, when vision's was; ``considered``: see :mod:`..references.update`.
     """
 
     t_s: float
@@ -54,6 +72,19 @@ class ErrorState(NamedTuple):
     P: Array
     joints: Smoothed
     pose_measurement: PoseMeasurement | None
+    taken: Taken | None = None
+    vision_s: float | None = None
+    considered: Considered = NONE_CONSIDERED
+
+    @property
+    def measurement(self) -> PoseMeasurement | Taken | None:
+        """What went in last."""
+        return self.pose_measurement if self.taken is None else self.taken
+
+    @property
+    def seen_s(self) -> float:
+        """When vision's newest measurement was, s."""
+        return self.t_s if self.vision_s is None else self.vision_s
 
 
 class Propagation(NamedTuple):
@@ -190,6 +221,10 @@ class ErrorModel:
         Ts, covs, own = np.empty((count, 4, 4)), np.empty((count, 6, 6)), np.empty((count, 6, 6))
         common = (_NOWHERE, _NONE) if measured is None else (measured.T_base_tool, measured.cov_common)
         _tracked(self._table, state.x, state.P, *step, joints.q, joints.unseen, *common, Ts, covs, own)
+        if VISION in state.considered:
+            _, Hs = self.poses(state.x * step.kept, joints.q, joints.unseen)
+            across = (Hs * step.kept[:, None]) @ state.considered[VISION] @ np.swapaxes(tool_axes(Ts), 1, 2)
+            covs += across + np.swapaxes(across, 1, 2)
         return Ts, covs, own
 
     def imagined(
@@ -585,6 +620,13 @@ def chi_square(S: Array, z: Array) -> float:
         y[i] /= L[i, i]
         total += y[i] * y[i]
     return total
+
+
+def tool_axes(Ts: Array) -> Array:
+    """Return the maps (..., 6, 6) from [translation; rotation] along the base's axes to the tangents of poses."""
+    out = np.zeros((*Ts.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = np.swapaxes(Ts[..., :3, :3], -1, -2)
+    return out
 
 
 def shared(pose_measurement: PoseMeasurement | None, Ts: Array) -> Array:

@@ -73,6 +73,9 @@ class Outcome(Enum):
 class Innovation(Record):
     """What a filter did with a pose measurement: what a monitor of its consistency needs.
 
+    Of a reading of a reference beside vision (:meth:`KalmanEstimator.take`) z has its m numbers in place of 6, measured
+    minus predicted, and ``T_base_tool`` is the predicted pose.
+
     Attributes:
         t_s: time of the measurement, s, the delay removed.
         T_base_tool: (4, 4) the measured pose of the tool, m.

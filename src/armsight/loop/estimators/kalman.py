@@ -21,22 +21,30 @@ import numpy as np
 
 from armsight.data import Array, JointStates
 from armsight.estimate.chance import chi_square_limit
+from armsight.geometry.pose import left_axes
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import Prior
 from armsight.loop.estimators.clock import ClockFollower
 from armsight.loop.estimators.errormodel import (
     LEARNING,
+    NONE_CONSIDERED,
+    VISION,
     ErrorModel,
     ErrorState,
     Predicted,
     Propagation,
+    Taken,
     chi_square,
     opened,
     smoothed_anew,
+    tool_axes,
 )
 from armsight.loop.estimators.estimator import ArmEstimate, Delay, Innovation, Learned, Outcome, PoseMeasurement, Track
+from armsight.loop.estimators.parabola import SPAN_S
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
 from armsight.loop.estimators.smoothing import Interval, blended, by_state, intervals
+from armsight.loop.references.reference import Reading, Reference, ToolMotion
+from armsight.loop.references.update import Considered, Shares, gained, passed
 from armsight.robot.kinematics.arm import Arm
 
 #: A measurement less likely than this is an outlier.
@@ -52,6 +60,13 @@ HISTORY_S = 1.0
 #: Most measurements newer than the readings that are kept waiting.
 MAX_WAITING = 16
 _GATE = chi_square_limit(6, CHANCE)
+#: The tool's acceleration is the difference of its twists so long before and after, s; half: noisier, double: bends cut.
+APART_S = 0.01
+
+
+def _carried(considered: Considered, step: Propagation) -> dict[str, Array]:
+    """Return how the state's error hangs on parameters that are considered after motion."""
+    return {name: C * step.kept[0][:, None] for name, C in considered.items()}
 
 
 class Remembered(NamedTuple):
@@ -79,6 +94,7 @@ class KalmanEstimator:
     Attributes:
         clock: follows the camera's clock; None where the delay is learned.
         on_innovation: called with what became of each pose measurement that came in order of time.
+        on_reading: the same of readings of references, with the reference's name; their innovations have m numbers.
     """
 
     def __init__(self, arm: Arm, *, prior: Prior | None = None, delay: Delay, learns_delay: bool = True) -> None:
@@ -99,9 +115,10 @@ class KalmanEstimator:
         self._furthest = np.where(self._opened > 0.0, furthest, np.inf)
         self._states = [ErrorState(-np.inf, np.zeros(at.size), np.diag(self._model.sigmas**2), nowhere, None)]
         self.on_innovation: Callable[[Innovation], None] | None = None
+        self.on_reading: Callable[[str, Innovation], None] | None = None
         self.clock = None if learns_delay else ClockFollower(at.size, at.delay, delay.sigma_s)
         self._reference: Array | None = None
-        self._waiting: list[PoseMeasurement] = []
+        self._waiting: list[PoseMeasurement | Taken] = []
         self._outliers: list[Array] = []
         self._backlash_set = True  # whether the readings have the newest estimate of the backlash
         # At the newest reading, until something is heard: the state, the joints and what came of the state, and the tool.
@@ -168,13 +185,14 @@ class KalmanEstimator:
         (x, P), newest = self.known_again(state), self._states[-1]
         if self.clock is not None:
             self.clock.restore(state.clock, self._forgets)
-        self._states, self._outliers, self._newest, self._here = [newest._replace(x=x, P=P)], [], None, None
+        self._states = [newest._replace(x=x, P=P, taken=None, considered=NONE_CONSIDERED)]
+        self._outliers, self._newest, self._here = [], None, None
         self._waiting, self._backlash_set = [], False
 
     def as_before(self, state: Remembered) -> KalmanEstimator:
         """Return an estimator at the newest reading that knows what this one knew of the arm earlier; it takes nothing."""
         other = copy(self)
-        other.clock = other.on_innovation = None
+        other.clock = other.on_innovation = other.on_reading = None
         other.restore(state)
         return other
 
@@ -187,42 +205,56 @@ class KalmanEstimator:
         self._readings.add(states)
         if self._waiting:
             waiting, self._waiting = self._waiting, []
-            for pose_measurement in waiting:
-                self.vision(pose_measurement)
+            for measurement in waiting:
+                self._hear(measurement)
 
     def vision(self, pose_measurement: PoseMeasurement) -> Outcome:
         """Take a pose measurement, in any order of time; return what became of it."""
+        return self._hear(pose_measurement)
+
+    def take(self, reference: Reference, reading: Reading) -> Outcome:
+        """Take a reading of a reference beside vision, in any order of time; return what became of it.
+
+        The reference's parameters and delay are considered by their covariance, not estimated. An outlier is never used,
+        however often it comes back: which of reference and vision is wrong is not the filter's to say.
+        """
+        return self._hear(Taken(reference, reading))
+
+    def _hear(self, measurement: PoseMeasurement | Taken) -> Outcome:
+        """Use a measurement in its place among those before, and use those after it again."""
         self._newest = self._here = None
         oldest, newest = self.span_s
         row = len(self._states)
-        while row > 1 and self._after(self._states[row - 1], pose_measurement):
+        while row > 1 and self._after(self._states[row - 1], measurement):
             row -= 1
         before = self._states[row - 1]
-        seen_s = self._seen_s(pose_measurement, before)
+        seen_s = self._seen_s(measurement, before)
         if seen_s > newest:
-            self._waiting = [*self._waiting, pose_measurement][-MAX_WAITING:]
+            self._waiting = [*self._waiting, measurement][-MAX_WAITING:]
             return Outcome.WAITING
-        if seen_s < oldest or (
-            row == 1 and before.pose_measurement is not None and self._after(before, pose_measurement)
-        ):
+        if seen_s < oldest or (row == 1 and before.measurement is not None and self._after(before, measurement)):
             return Outcome.TOO_LATE
         later = self._states[row:]
-        after, outcome = self._take(before, pose_measurement, None if later else self._report)
+        after, outcome = self._used(before, measurement, report=not later)
         if after is None:
             return outcome
         self._states[row:] = [after]
         for state in later:
-            again, _ = (
-                self._take(self._states[-1], state.pose_measurement)
-                if state.pose_measurement is not None
-                else (None, outcome)
-            )
+            again, _ = (None, outcome) if state.measurement is None else self._used(self._states[-1], state.measurement)
             if again is not None:
                 self._states.append(again)
         self._backlash_set = False
         while len(self._states) > 2 and self._states[1].t_s < self._states[-1].t_s - HISTORY_S:
             del self._states[0]
         return outcome
+
+    def _used(
+        self, before: ErrorState, measurement: PoseMeasurement | Taken, *, report: bool = False
+    ) -> tuple[ErrorState | None, Outcome]:
+        """Return the state after a measurement, None where it is an outlier."""
+        if isinstance(measurement, Taken):
+            return self._take_reading(before, measurement, report=report)
+        return self._take(before, measurement, self._report if report else None)
 
     def estimate(self, t_s: float | None = None) -> ArmEstimate:
         """Return the pose of the tool at a time, by default that of the newest reading."""
@@ -232,7 +264,7 @@ class KalmanEstimator:
             state, joints, step = self._now()
             (T,), (cov,), (own,) = self._model.tracked(state, step, joints)
             t_s = self.span_s[1]
-            self._newest = ArmEstimate(t_s, T, cov, own, joints.q[0], joints.qd[0], t_s - state.t_s)
+            self._newest = ArmEstimate(t_s, T, cov, own, joints.q[0], joints.qd[0], t_s - state.seen_s)
         return self._newest
 
     def _now(self) -> tuple[ErrorState, Smoothed, Propagation]:
@@ -303,13 +335,17 @@ class KalmanEstimator:
         known = 1 - np.diag(self._widths @ state.P @ self._widths.T) / (self._widths @ self._model.sigmas**2)
         return np.asarray(known * (self._widths @ state.x) + (1 - known) * GAP_RAD)
 
-    @staticmethod
-    def _after(state: ErrorState, pose_measurement: PoseMeasurement) -> bool:
+    def _after(self, state: ErrorState, measurement: PoseMeasurement | Taken) -> bool:
         """Return whether a state has used a measurement newer than this one."""
-        return state.pose_measurement is not None and state.pose_measurement.t_s > pose_measurement.t_s
+        used = state.measurement
+        if isinstance(used, Taken) or isinstance(measurement, Taken):  # their stamps are of several clocks
+            return used is not None and state.t_s > self._seen_s(measurement, state)
+        return used is not None and used.t_s > measurement.t_s
 
-    def _seen_s(self, pose_measurement: PoseMeasurement, state: ErrorState) -> float:
+    def _seen_s(self, pose_measurement: PoseMeasurement | Taken, state: ErrorState) -> float:
         """Return the time of a measurement, s, by a state's estimate of the delay."""
+        if isinstance(pose_measurement, Taken):
+            return pose_measurement.t_s
         return pose_measurement.t_s - self._delay_s(pose_measurement.t_s - self._delay.delay_s, state.x)
 
     def clock_offset_s(self, t_s: float) -> float:
@@ -359,7 +395,70 @@ class KalmanEstimator:
                 x = x + change
                 by_delay = P[:, self._at.delay] / P[self._at.delay, self._at.delay]
                 P += (self.clock.sigma_s**2 - P[self._at.delay, self._at.delay]) * np.outer(by_delay, by_delay)
-        return ErrorState(t_s, x, P, joints, pose_measurement), outcome
+        considered = passed(_carried(before.considered, step), K, at.H) if before.considered else NONE_CONSIDERED
+        return ErrorState(t_s, x, P, joints, pose_measurement, considered=considered), outcome
+
+    def _take_reading(self, before: ErrorState, taken: Taken, *, report: bool) -> tuple[ErrorState | None, Outcome]:
+        """Return the state after a reading of a reference, None where it is an outlier; report it."""
+        (reference, reading), t_s = taken, max(taken.t_s, before.t_s)
+        before, joints = self._anew(before, np.array([t_s]))
+        step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
+        kept, added = step.kept[0], step.added[0]
+        x, P = before.x * kept, before.P * np.outer(kept, kept) + np.diag(added)
+        (T,), (by_state,) = self._model.poses(x, joints.q, joints.unseen)
+        motion, cov_twist, cov_acceleration = self._motion(x, T, by_state, joints, t_s, reference.inertial)
+        expected = reference.expected(motion, reading.channel)
+        z, H, R = reading.z - expected.z, expected.by_tool @ by_state, np.array(reading.cov)
+        if expected.by_twist is not None:
+            R += expected.by_twist @ cov_twist @ expected.by_twist.T
+        if expected.by_acceleration is not None:
+            R += expected.by_acceleration @ cov_acceleration @ expected.by_acceleration.T
+        by = np.column_stack([expected.by_parameters, -expected.rate(motion)])
+        cov = np.zeros((by.shape[1], by.shape[1]))
+        cov[:-1, :-1], cov[-1, -1] = reference.cov, reference.sigma_delay_s**2
+        shares = {reference.name: Shares(by, cov)}
+        if before.pose_measurement is not None:
+            common = left_axes(before.pose_measurement.T_base_tool, before.pose_measurement.cov_common)
+            shares[VISION] = Shares(expected.by_tool @ tool_axes(T), common)
+        fixed = [] if self._learns_delay else [self._at.delay]
+        got = gained(P, z, H, R, shares, _carried(before.considered, step), fixed)
+        outcome = Outcome.USED if got.square < chi_square_limit(len(z), CHANCE) else Outcome.OUTLIER
+        x = x + got.gain @ z
+        if not (np.abs(x) < self._furthest).all():  # NaN neither
+            outcome = Outcome.OUTLIER
+        if report and self.on_reading is not None:
+            gain = got.gain if outcome is Outcome.USED else np.zeros_like(got.gain)
+            self.on_reading(reference.name, Innovation(t_s, T, z, got.S, H, kept, gain, outcome, None, None, added, R))
+        if outcome is Outcome.OUTLIER:
+            return None, outcome
+        used = before.pose_measurement, taken, before.seen_s, got.considered
+        return ErrorState(t_s, x, got.P, joints, *used), outcome
+
+    def _motion(
+        self, x: Array, T: Array, by_state: Array, joints: Smoothed, t_s: float, inertial: bool
+    ) -> tuple[ToolMotion, Array, Array]:
+        """Return how the tool moves by a state, and what the readings' noise makes of its twist and acceleration (6, 6).
+
+        The acceleration is the difference of the twists a little before and after; zero for references that do not ask.
+        """
+        by_speed = by_state[:, self._at.zeros] * self._arm.direction
+        # The variance that a parabola leaves of its slope at its end is 192/(9 SPAN^2) of that of its value.
+        moves = (
+            np.where(joints.qd[0] == 0.0, 0.0, joints.variance[0] * 192 / 9) * (self._prior.reading_rad / SPAN_S) ** 2
+        )
+        cov_twist = by_speed * moves @ by_speed.T
+        motion = ToolMotion(T, by_speed @ joints.qd[0])
+        if not inertial:
+            return motion, cov_twist, np.zeros((6, 6))
+        oldest, newest = self.span_s
+        ends = np.clip([t_s - APART_S, t_s + APART_S], oldest, newest)
+        if ends[1] <= ends[0]:
+            return motion, cov_twist, np.zeros((6, 6))
+        near = self._readings.at(ends)
+        _, Hs = self._model.poses(x, near.q, near.unseen)
+        twists = ((Hs[:, :, self._at.zeros] * self._arm.direction) @ near.qd[..., None])[..., 0]
+        acceleration = (twists[1] - twists[0]) / (ends[1] - ends[0])
+        return motion._replace(acceleration=acceleration), cov_twist, cov_twist * 2 / (ends[1] - ends[0]) ** 2
 
     def _said(
         self,

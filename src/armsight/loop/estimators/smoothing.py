@@ -93,7 +93,7 @@ def anew(readings: Readings, states: list[ErrorState]) -> list[ErrorState]:
 
 def by_state(model: ErrorModel, state: ErrorState, t_s: Array, joints: Smoothed, step: Propagation) -> Track:
     """Return the poses of the tool at times (N,), s, by one state, propagated."""
-    return Track(t_s, *model.tracked(state, step, joints), joints.q, joints.qd, t_s - state.t_s)
+    return Track(t_s, *model.tracked(state, step, joints), joints.q, joints.qd, t_s - state.seen_s)
 
 
 def _alone(model: ErrorModel, readings: Readings, part: Interval) -> Track:
@@ -134,7 +134,8 @@ def _between(model: ErrorModel, readings: Readings, parts: list[Interval]) -> Tr
         own[some] = (first + share[some, None, None] * (last - first)) @ transposed[some]
         common[some] = shared(None if part.after is None else part.after.pose_measurement, Ts[some])
     own += (Hs * bridge[:, None, :]) @ transposed
-    return Track(t_s, Ts, own + common, own, joints.q, joints.qd, t_s - before.t_s[rows])
+    seen_s = np.array([part.before.seen_s for part in parts])[rows]
+    return Track(t_s, Ts, own + common, own, joints.q, joints.qd, t_s - seen_s)
 
 
 class _Ends(NamedTuple):

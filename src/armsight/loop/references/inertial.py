@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -81,6 +81,7 @@ class Inertial(Reference):
         values: (35,) lever (again, m), biases (3 rad/s, 3 m/s2), M_a (6), M_g (9), G (9, rad/s per m/s2), tilt (2, rad).
     """
 
+    inertial: ClassVar[bool] = True
     T_tool_sensor: Array
     values: Array
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -87,8 +87,10 @@ class Reference(Record, ABC):
         cov: (P, P) covariance of its parameters' tangent: before a calibration, how far each may be off.
         delay_s: how late its stamps are: the reading is of ``t_s - delay_s``.
         sigma_delay_s: standard deviation of that, s.
+        inertial: whether it feels the tool's acceleration; of the class.
     """
 
+    inertial: ClassVar[bool] = False
     name: str
     cov: Array
     delay_s: float = 0.0
