@@ -16,7 +16,7 @@ RATES = np.array([1.1, 1.7, 2.3, 0.9, 1.3, 1.9])
 
 
 def pose(t_s):
-    """A path that turns by 1 rad and moves by 0.2 m about every axis."""
+    """A path that rotates by 1 rad and moves by 0.2 m about every axis."""
     return exp_se3(np.array([0.2, 0.2, 0.2, 1.0, 1.0, 1.0]) * np.sin(RATES * t_s + np.arange(6)))
 
 
@@ -57,8 +57,8 @@ def test_every_derivative_is_that_of_finite_differences(channel):
         "by_parameters": lambda e: (sensor.moved(e), at),
     }
     for name, change in by.items():
-        wanted = differences(change, 38 if name == "by_parameters" else 6)
-        np.testing.assert_allclose(getattr(got, name), wanted, atol=1e-6, err_msg=name)
+        numeric = differences(change, 38 if name == "by_parameters" else 6)
+        np.testing.assert_allclose(getattr(got, name), numeric, atol=1e-6, err_msg=name)
 
 
 def test_it_reads_what_a_point_of_the_path_feels():
@@ -90,9 +90,9 @@ def test_mounting_biases_scales_and_delay_are_found_from_a_sweep():
         given, first = sweep(true, seed), Inertial.of("imu")
         got = calibrate(first.begun(given, motion), given, motion, fit_delay=True)
         miss = np.append(true.values - got.reference.values, true.delay_s - got.reference.delay_s)
-        turned = log_se3(inverse(got.reference.T_tool_sensor) @ true.T_tool_sensor)[3:]
+        rotated = log_se3(inverse(got.reference.T_tool_sensor) @ true.T_tool_sensor)[3:]
         sigma = np.sqrt(np.append(np.diag(got.reference.cov), got.reference.sigma_delay_s**2))
-        off.append(np.append(turned, miss) / sigma)
+        off.append(np.append(rotated, miss) / sigma)
         squares.append(got.squares.mean())
     assert 0.6 < np.mean(np.square(off)) < 1.5  # 117 numbers
     assert 0.85 < np.mean(squares) < 1.15

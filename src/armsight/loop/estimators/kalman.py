@@ -221,7 +221,7 @@ class KalmanEstimator:
         return self._hear(Taken(reference, reading))
 
     def _hear(self, measurement: PoseMeasurement | Taken) -> Outcome:
-        """Use a measurement in its place among those before, and use those after it again."""
+        """Use a measurement after those before it in time, and use those after it again."""
         self._newest = self._here = None
         oldest, newest = self.span_s
         row = len(self._states)

@@ -50,7 +50,7 @@ class InertialClass(NamedTuple):
     Attributes:
         gyro_noise: rad/s/sqrt(Hz).
         noise: of the accelerometer, m/s2/sqrt(Hz).
-        gyro_bias: at turn-on, rad/s.
+        gyro_bias: at power-on, rad/s.
         bias: of the accelerometer, m/s2.
         scale: of both, relative; misalignments likewise, rad.
         g_sensitivity: rad/s per m/s2.
@@ -156,18 +156,18 @@ class Inertial(Reference):
             by[_UPPER[0], np.arange(_M_A.start, _M_A.stop)] = f[_UPPER[1]]
             by[:, _BIAS] = np.eye(3)
             return ExpectedReading(M @ f + self._part(_BIAS), M @ by_tool, by, M @ by_twist, M @ by_acceleration)
-        G, turned = self._part(_G).reshape(3, 3), R @ w
+        G, rates = self._part(_G).reshape(3, 3), R @ w
         by = G @ by
-        by[:, _ROTATION] += M @ skew(turned)
-        by[:, _M_G], by[:, _G] = np.kron(np.eye(3), turned), np.kron(np.eye(3), f)
+        by[:, _ROTATION] += M @ skew(rates)
+        by[:, _M_G], by[:, _G] = np.kron(np.eye(3), rates), np.kron(np.eye(3), f)
         by[:, _GYRO_BIAS], by_rate = np.eye(3), G @ by_twist
         by_rate[:, 3:] += M @ R
         return ExpectedReading(
-            M @ turned + G @ f + self._part(_GYRO_BIAS), G @ by_tool, by, by_rate, G @ by_acceleration
+            M @ rates + G @ f + self._part(_GYRO_BIAS), G @ by_tool, by, by_rate, G @ by_acceleration
         )
 
     def moved(self, step: Array) -> Inertial:
-        """Return it with a mounting turned on the right by ``step[:3]``, the other parameters added."""
+        """Return it with a mounting rotated on the right by ``step[:3]``, the other parameters added."""
         values = self.values + step[_LEVER.start :]
         T = self.T_tool_sensor @ exp_se3(np.append(np.zeros(3), step[_ROTATION]))
         T[:3, 3] = values[:3]
@@ -197,7 +197,7 @@ class Inertial(Reference):
             self._reject(A, name, channel)
         if not found:
             raise InputError(
-                f"{self.name}: the tool was not turned enough to see how the sensor is mounted: give it attitudes about "
+                f"{self.name}: the tool was not rotated enough to see how the sensor is mounted: give it attitudes about "
                 "two axes that differ by 60 degrees and more"
             )
         R = nearest_rotation(found[-1][0])
