@@ -418,3 +418,13 @@ def test_figures_that_look_like_contradictions_are_explained(data_dir, armsight,
     assert f"{share} of the left image never saw the board" in page
     assert "The percentages are counted in 8 x 8 cells, larger than those of the map." in page
     assert "The reprojection follows the board, which moved" in page
+
+
+def test_nothing_is_recorded_for_options_that_do_not_work(armsight, tmp_path):
+    (tmp_path / "report").write_text("a file of mine")
+    given = ("calibrate", "--source", "sim:", *CHESS, "-o", tmp_path / "rig.json")
+    for wrong in (("--report", tmp_path / "report"), ("--left-intrinsics", tmp_path / "none*.png")):
+        said = armsight(*given, *wrong)
+        assert_rejected(said, str(wrong[1]))
+        assert "recording" not in said.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report"]

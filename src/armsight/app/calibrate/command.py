@@ -91,16 +91,20 @@ def command(**given: object) -> int:
     from armsight.vision.calibrate.weak import contradicted, require_order
     from armsight.vision.markers.board import open_board
 
-    if o.target is not None:
-        open_board(o.target)  # before a person shows it to cameras
+    def check_report(*apart: Path | None) -> None:
+        if o.report is not None:
+            check_folder(o.report, holding=REPORT_FILES, apart_from=apart, problem="no report can be written here")
+
+    if o.report is not None:
+        require_matplotlib()
+    if o.target is not None:  # before a person shows it to cameras
+        open_board(o.target)
         check_writable(o.output)
+        check_report(o.output)
     with contextlib.closing(GivenImages(o) if o.target is not None else GivenDetections(o)) as opened:
         outputs = (o.output, o.refine_body, opened.board_file)
         check_outputs(outputs, opened.files)
-        if o.report is not None:
-            require_matplotlib()
-            apart = (*outputs, *opened.files)
-            check_folder(o.report, holding=REPORT_FILES, apart_from=apart, problem="no report can be written here")
+        check_report(*outputs, *opened.files)
         started = time.perf_counter()
         calibration = opened.calibrated()
     require_order(calibration)

@@ -128,6 +128,8 @@ class GivenImages:
         """
         self.named: dict[str, str] = {}
         self._options, self._spec, globs = options, str(options.target), (str(options.left), str(options.right))
+        alone = (options.left_intrinsics, options.right_intrinsics)
+        self._alone = [(side, file) for side, pattern in enumerate(alone) for file in _files_of(pattern)]
         if (spec := options.source) is None:
             opened = PairsSource.open(*globs)
             video = next((file for file in opened.files if file.suffix.lower() in _VIDEOS), None)
@@ -139,9 +141,7 @@ class GivenImages:
             self._source, self.named["source"] = _open(spec, options.output.with_suffix(".board")), spec
         self.board_file = options.output.parent / f"{options.output.stem}.board.toml"
         self.named |= {"target": self._spec, "board": self.board_file.name}
-        alone = (options.left_intrinsics, options.right_intrinsics)
         self.named |= {f"{side}_intrinsics": each for side, each in zip(SIDES, alone, strict=True) if each is not None}
-        self._alone = [(side, file) for side, pattern in enumerate(alone) for file in _files_of(pattern)]
 
     @property
     def files(self) -> tuple[Path, ...]:
