@@ -3,27 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from worn_arm import distance_m, poses, worn
+from worn_arm import distance_m, poses, truth_of, worn
 
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.plan import free_of_collision, plan_joints
 
 POSES, UNSEEN, FIRST = 60, 200, 15
-
-
-def truth_of(w) -> dict[str, float]:
-    out = {}
-    for i in range(6):
-        n = i + 1
-        out |= {
-            f"a{n}": w.true.a[i],
-            f"d{n}": w.true.d[i],
-            f"alpha{n}": w.true.alpha[i],
-            f"offset{n}": w.true.offset[i],
-        }
-        out |= {f"backlash{n}": w.backlash[i], f"gain{n}": w.gain[i]}
-    return out
 
 
 def worn_arms(report, seeds: int) -> None:

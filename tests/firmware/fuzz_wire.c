@@ -205,15 +205,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 }
 
 #ifdef SHAKE
-static uint32_t word = 2463534242u;
-
-static uint32_t draw(void)
-{
-    word ^= word << 13;
-    word ^= word >> 17;
-    word ^= word << 5;
-    return word;
-}
+#include "draw.h"
 
 int main(int count, char **arguments)
 {

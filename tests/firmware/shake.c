@@ -5,17 +5,8 @@
 
 #include "config.h"
 #include "core.h"
+#include "draw.h"
 #include "number.h"
-
-static uint32_t word = 2463534242u;
-
-static uint32_t draw(void)
-{
-    word ^= word << 13;
-    word ^= word >> 17;
-    word ^= word << 5;
-    return word;
-}
 
 static void fill(void *bytes, size_t length)
 {

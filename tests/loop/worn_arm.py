@@ -103,3 +103,10 @@ def poses(arm, n, rng, half=0.9):
 def distance_m(model, x, truth, q, approach):
     """How far off the model says the body is, in the rig."""
     return np.linalg.norm((model.T_rig_base(x) @ model.tool_in_base(x, q, approach) - truth)[:, :3, 3], axis=1)
+
+
+def truth_of(w):
+    """The true value of each parameter that a worn arm has, by its name."""
+    each = {"a": w.true.a, "d": w.true.d, "alpha": w.true.alpha, "offset": w.true.offset}
+    each |= {"backlash": w.backlash, "gain": w.gain}
+    return {f"{kind}{i + 1}": values[i] for i in range(6) for kind, values in each.items()}

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from worn_arm import distance_m, poses, worn
+from worn_arm import distance_m, poses, truth_of, worn
 
 from armsight.errors import CalibrationError, InputError
 from armsight.estimate.select import Folds
@@ -38,20 +38,6 @@ def scene():
     w, rng = worn(1), np.random.default_rng(101)
     measured = w.seen(*poses(w.nominal, 60, rng), rng)
     return w, measured, identify(w.nominal, measured), rng
-
-
-def truth_of(w):
-    out = {}
-    for i in range(6):
-        n = i + 1
-        out |= {
-            f"a{n}": w.true.a[i],
-            f"d{n}": w.true.d[i],
-            f"alpha{n}": w.true.alpha[i],
-            f"offset{n}": w.true.offset[i],
-        }
-        out |= {f"backlash{n}": w.backlash[i], f"gain{n}": w.gain[i]}
-    return out
 
 
 def test_a_worn_arm_is_found_out(scene):

@@ -76,12 +76,12 @@ def _upper_ends(cost: Callable[[Array], float], best: Array) -> Array:
     """Return the logs of the factors at the upper end of what the evidence allows, each with the others at their best."""
     out, allowed = best.copy(), cost(best) + FALLEN
     for k in range(len(best)):
-        for log in np.arange(np.log(MAX_FACTOR), max(best[k], np.log(MIN_FACTOR)), -0.2):
+        for log in np.arange(np.log(MAX_FACTOR), max(best[k], np.log(MIN_FACTOR)), -0.2)[::-1]:
             tried = best.copy()
             tried[k] = log
-            if cost(tried) <= allowed:
-                out[k] = log
+            if cost(tried) > allowed:
                 break
+            out[k] = log
         out[k] = max(out[k], best[k] + np.log(WIDER))
     return out
 
