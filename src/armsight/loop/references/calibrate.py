@@ -7,9 +7,10 @@ the fit has not seen: blocks of time, each left out in turn. Gauss-Newton on ``e
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,49 @@ OPEN = 0.9
 LEAST, MOST = 1e-3, 1e3
 
 
+class Carrier(ABC):
+    """What carries the tool, with errors of its own that the readings show too: an arm.
+
+    Attributes:
+        sigma: (K,) how far each error may be.
+    """
+
+    sigma: Array
+
+    @abstractmethod
+    def at(self, t_s: float) -> tuple[ToolMotion, Array]:
+        """Return the tool's motion at a time, s, and the derivative (6, K) of its pose by the errors."""
+
+    @abstractmethod
+    def moved(self, step: Array) -> Self:
+        """Return it with errors moved by a step (K,)."""
+
+
+class Known(Carrier):
+    """A motion that is known, but for the covariance of its poses."""
+
+    sigma = np.zeros(0)
+
+    def __init__(self, motion: Callable[[float], ToolMotion]) -> None:
+        self._motion = motion
+
+    def at(self, t_s: float) -> tuple[ToolMotion, Array]:
+        """Return the motion, and no errors."""
+        return self._motion(t_s), np.zeros((6, 0))
+
+    def moved(self, step: Array) -> Self:
+        """Return itself."""
+        return self
+
+
+class _State(NamedTuple, Generic[R]):
+    """Where a fit is: reference and carrier, and the step (Q,) of all unknowns from where it began."""
+
+    reference: R
+    carrier: Carrier
+    total: Array
+
+
 @dataclass(frozen=True, eq=False)
 class ReferenceCalibration(Record, Generic[R]):
     """A calibrated reference, and how far to believe it.
@@ -50,6 +94,8 @@ class ReferenceCalibration(Record, Generic[R]):
         left_out: (N, m) error of the readings predicted by fits to the other blocks, measured minus predicted.
         squares: (N,) their squared Mahalanobis distance over m: 1 on average where the covariance is honest.
         open: parameters that the readings do not determine.
+        carrier: with its errors.
+        cov_carrier: (K, K) their covariance.
     """
 
     reference: R
@@ -58,23 +104,29 @@ class ReferenceCalibration(Record, Generic[R]):
     left_out: Array
     squares: Array
     open: tuple[str, ...]
+    carrier: Carrier
+    cov_carrier: Array
 
 
 def calibrate(
-    reference: R, readings: Sequence[Reading], motion: Callable[[float], ToolMotion], *, fit_delay: bool = False
+    reference: R,
+    readings: Sequence[Reading],
+    motion: Callable[[float], ToolMotion] | Carrier,
+    *,
+    fit_delay: bool = False,
 ) -> ReferenceCalibration[R]:
     """Fit all parameters of a reference.
 
     Args:
         reference: where to begin; its ``cov`` says how far its parameters may be off (the variances count).
         readings: in order of time. Those that share one error (samples of one rest) should be one reading, their mean.
-        motion: returns the tool's motion at a time, s.
+        motion: returns the tool's motion at a time, s; or what carries the tool, whose errors then are fitted too.
         fit_delay: whether the delay is fitted too, from ``sigma_delay_s`` on; the motions then must not all be rests.
 
     Raises:
         InputError: fewer numbers than parameters.
     """
-    fit = _SensorFit(reference, readings, motion, fit_delay)
+    fit = _SensorFit(reference, readings, motion if isinstance(motion, Carrier) else Known(motion), fit_delay)
     at, linear = fit.begin, fit.linear(fit.begin)
     numbers, seen = linear.e.size, int((linear.J != 0.0).any(axis=(0, 1)).sum())
     if numbers <= seen:
@@ -91,60 +143,60 @@ def calibrate(
     s = solve(linear.rows(np.flatnonzero(used)), variances)
     cov = s.root[: fit.unknowns] @ s.root[: fit.unknowns].T
     errors, squares = _held_out(linear, variances, used)
-    sigma, names = np.sqrt(np.diag(cov)), (*reference.parameters, "delay_s")
+    sigma, names = np.sqrt(np.diag(cov)), (*reference.parameters, *(["delay_s"] if fit_delay else []))
     unknown = tuple(name for name, a, b in zip(names, sigma, fit.sigma, strict=False) if a > OPEN * b)
     noise = {name: float(np.sqrt(v)) for name, v in zip(fit.names, variances, strict=True)}
-    return ReferenceCalibration(fit.reference(at, cov), noise, used, errors, squares, unknown)
+    beside = slice(fit.unknowns - len(at.carrier.sigma), None)
+    found = fit.reference(at, cov), noise, used, errors, squares, unknown
+    return ReferenceCalibration(*found, at.carrier, cov[beside, beside])
 
 
 class _SensorFit(Generic[R]):
     """Residuals of readings, predicted minus measured, near a step from where the fit began."""
 
-    def __init__(
-        self, reference: R, readings: Sequence[Reading], motion: Callable[[float], ToolMotion], fit_delay: bool
-    ) -> None:
-        self._first, self._readings, self._motion, self._delays = reference, readings, motion, fit_delay
+    def __init__(self, reference: R, readings: Sequence[Reading], carrier: Carrier, fit_delay: bool) -> None:
+        self._first, self._readings, self._delays = reference, readings, fit_delay
         self.channel = np.array([reading.channel for reading in readings])
         self.names = [reference.channels[k] for k in np.unique(self.channel)]
         self.sigma = np.sqrt(np.diag(reference.cov))
         if fit_delay:
             self.sigma = np.append(self.sigma, reference.sigma_delay_s)
-        self.unknowns, self.begin = len(self.sigma), (reference, np.zeros(len(self.sigma)))
+        self.sigma = np.append(self.sigma, carrier.sigma)
+        self.unknowns, self.begin = len(self.sigma), _State(reference, carrier, np.zeros(len(self.sigma)))
         noise = np.linalg.cholesky(np.array([reading.cov for reading in readings]))
         self._own = {
             name: noise * (self.channel == k)[:, None, None]
             for k, name in zip(np.unique(self.channel), self.names, strict=True)
         }
 
-    def reference(self, at: tuple[R, Array], cov: Array) -> R:
+    def reference(self, at: _State[R], cov: Array) -> R:
         """Return the reference of a state with the covariance (Q, Q) of its unknowns."""
         P = len(self._first.cov)
         late = float(np.sqrt(cov[P, P])) if self._delays else self._first.sigma_delay_s
-        return replace(at[0], cov=cov[:P, :P], sigma_delay_s=late)
+        return replace(at.reference, cov=cov[:P, :P], sigma_delay_s=late)
 
-    def moved(self, at: tuple[R, Array], step: Array) -> tuple[R, Array]:
+    def moved(self, at: _State[R], step: Array) -> _State[R]:
         """Return a state moved by a step (Q,)."""
-        reference, total = at
         P = len(self._first.cov)
-        late = reference.delay_s + (float(step[P]) if self._delays else 0.0)
-        return replace(reference.moved(step[:P]), delay_s=late), total + step
+        late = at.reference.delay_s + (float(step[P]) if self._delays else 0.0)
+        carrier = at.carrier.moved(step[len(step) - len(at.carrier.sigma) :])
+        return _State(replace(at.reference.moved(step[:P]), delay_s=late), carrier, at.total + step)
 
-    def linear(self, at: tuple[R, Array]) -> Linear:
+    def linear(self, at: _State[R]) -> Linear:
         """Return the residuals near a state."""
-        reference, total = at
         e, J, given = [], [], []
         for reading in self._readings:
-            motion = self._motion(reading.t_s - reference.delay_s)
-            expected = reference.expected(motion, reading.channel)
-            by = expected.by_parameters
+            motion, errors = at.carrier.at(reading.t_s - at.reference.delay_s)
+            expected = at.reference.expected(motion, reading.channel)
+            delay = [-expected.rate(motion)] if self._delays else []
             e.append(expected.z - reading.z)
-            J.append(np.column_stack([by, -expected.rate(motion)]) if self._delays else by)
+            J.append(np.column_stack([expected.by_parameters, *delay, expected.by_tool @ errors]))
             given.append(expected.by_tool @ motion.cov @ expected.by_tool.T)
-        return Linear(np.array(e), np.array(J), np.array(given), self._own, {}, self.sigma**-2.0, total)
+        return Linear(np.array(e), np.array(J), np.array(given), self._own, {}, self.sigma**-2.0, at.total)
 
     def solved(
-        self, at: tuple[R, Array], linear: Linear, variances: Array, used: NDArray[np.bool_]
-    ) -> tuple[tuple[R, Array], Linear]:
+        self, at: _State[R], linear: Linear, variances: Array, used: NDArray[np.bool_]
+    ) -> tuple[_State[R], Linear]:
         """Return the best state for the variances (K,) and the readings that are used (N,), and the residuals there."""
         rows = np.flatnonzero(used)
         s = solve(linear.rows(rows), variances)
