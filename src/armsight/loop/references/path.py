@@ -39,6 +39,12 @@ class PosePath:
             raise InputError(f"{len(t_s)} poses were given; {LEAST} at least are needed, at times that rise")
         self._t, self._Ts, self._cov = t_s, Ts_base_tool, np.zeros((6, 6)) if cov is None else cov
 
+    def covers(self, t_s: float, apart_s: float) -> bool:
+        """Return whether there are poses around a time and so long before and after it."""
+        low, high = np.searchsorted(self._t, [t_s - apart_s, t_s + apart_s])
+        inside = self._t[0] <= t_s - apart_s and t_s + apart_s <= self._t[-1]
+        return bool(inside and np.diff(self._t[max(low - 1, 0) : high + 1]).max(initial=0.0) <= GAP_S)
+
     def __call__(self, t_s: float) -> ToolMotion:
         """Return the motion at a time, s.
 

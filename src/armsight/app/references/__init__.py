@@ -1,0 +1,1 @@
+"""``armsight references``: sensors beside vision, checked and calibrated from their files."""

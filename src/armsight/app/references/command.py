@@ -1,0 +1,248 @@
+"""``armsight references``: check the recordings of sensors beside vision, and calibrate them against the tool's poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from armsight.app.show.report import Report
+    from armsight.loop.references.calibrate import ReferenceCalibration
+    from armsight.loop.references.file import Entry
+    from armsight.loop.references.inertial import Inertial
+
+#: A noise so many times that of its class is said.
+NOISY = 3.0
+#: The rate may differ by this share from what the file says.
+RATE = 0.05
+#: Gravity at rest may be off by this share.
+UNIT = 0.2
+#: Readings are averaged over so long for a calibration, s.
+AVERAGED_S = 0.05
+
+
+@click.group("references")
+def command() -> None:
+    """Check and calibrate sensors beside vision: inertial units, named in a file references.toml."""
+
+
+@command.command()
+@click.argument("path", metavar="REFERENCES.toml", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def check(path: Path, as_json: bool) -> None:
+    """Say what the recordings of references are like: rate, gaps, clock, noise at rest beside that of their class."""
+    from armsight.loop.references.file import read_references
+
+    raise SystemExit(_checked(read_references(path)).echo(as_json=as_json))
+
+
+@command.command()
+@click.argument("path", metavar="REFERENCES.toml", type=click.Path(path_type=Path))
+@click.option("--poses", required=True, metavar="POSES.csv", help="Poses of the tool in the base, with times t_s.")
+@click.option("-o", "--output", metavar="OUT.toml", type=click.Path(path_type=Path), help="Where to write the result.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def calibrate(path: Path, poses: str, output: Path | None, as_json: bool) -> None:
+    """Find mounting, biases, scales and delay from one sweep with poses by vision or by the arm."""
+    from armsight.files import check_writable, write_text
+    from armsight.loop.references.file import read_references, written
+
+    if output is not None:
+        check_writable(output, apart_from=(path, poses))
+    report, entries = _calibrated(read_references(path), Path(poses))
+    if output is not None:
+        write_text(output, "\n".join(written(entry, output.parent) for entry in entries))
+    raise SystemExit(report.echo(as_json=as_json, written=None if output is None else str(output)))
+
+
+def _recording(entry: Entry) -> tuple[Path, Any, Any]:
+    """Return the file of a reference, its times (N,) and its values (N, 6)."""
+    from armsight.errors import InputError
+    from armsight.loop.references.file import read_recording
+
+    if entry.source is None:
+        raise InputError(f'[{entry.reference.name}]: no source; name its recording: source = "imu.csv"')
+    return entry.source, *read_recording(entry.source)
+
+
+def _checked(entries: list[Entry]) -> Report:
+    """Return what the recordings are like."""
+    from armsight.app.show.messages import Note
+    from armsight.app.show.report import Fact, Report
+
+    notes, facts, found = list[Note](), list[Fact](), list[dict[str, Any]]()
+    for entry in entries:
+        values, lines, weak = _check(entry)
+        found.append(values)
+        notes += [Note("weak", text) for text in weak]
+        facts += [Fact(line) for line in lines]
+    name = "references check"
+    sections = {"references": ("References", facts)}
+    return Report(name, "References", "", "", sections, notes, {"references": found})
+
+
+def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
+    """Return values, lines and warnings of one recording."""
+    import numpy as np
+
+    from armsight.errors import InputError
+    from armsight.loop.references.inertial import INERTIAL_CLASSES
+    from armsight.loop.references.reference import STANDARD_GRAVITY_M_S2
+    from armsight.loop.references.stream import allan, check_stream, coefficients
+
+    source, t_s, z = _recording(entry)
+    name, stream = entry.reference.name, check_stream(t_s, z, str(source))
+    values: dict[str, Any] = {
+        "name": name,
+        "readings": len(t_s),
+        "rate_hz": stream.rate_hz,
+        "jitter_s": stream.jitter_s,
+        "gaps": stream.gaps,
+        "longest_gap_s": stream.longest_gap_s,
+        "doubled": stream.doubled,
+        "frozen_s": stream.frozen_s,
+        "saturated": [("gyro" if k < 3 else "accelerometer") + f"_{'xyz'[k % 3]}" for k in stream.saturated],
+    }
+    lines = [
+        f"{name}: {len(t_s)} readings, {stream.rate_hz:.4g} Hz, jitter {1e3 * stream.jitter_s:.2g} ms, "
+        f"{stream.gaps} gaps, the longest {1e3 * stream.longest_gap_s:.0f} ms"
+    ]
+    weak = []
+    if entry.rate_hz is not None and abs(stream.rate_hz / entry.rate_hz - 1) > RATE:
+        weak.append(f"{name}: the rate is {stream.rate_hz:.4g} Hz, not {entry.rate_hz:g} as the file says")
+    if stream.doubled > RATE:
+        weak.append(f"{name}: {100 * stream.doubled:.0f} % of the readings repeat the one before: it is read too often")
+    if stream.frozen_s:
+        weak.append(f"{name}: no value changes for {stream.frozen_s:.2f} s")
+    weak += [f"{name}: {axis} stands at the end of its range: that is too small" for axis in values["saturated"]]
+    rest = z[stream.rest]
+    values["rest_s"] = len(rest) / stream.rate_hz
+    if not len(rest):
+        weak.append(f"{name}: no rest of a second was found, so its noise is unknown")
+        return values, lines, weak
+    force = float(np.linalg.norm(rest[:, 3:].mean(axis=0)))
+    if abs(force - 1.0) < UNIT:
+        raise InputError(f"{source}: the accelerometer reads {force:.3g} at rest, as if in g; give m/s2")
+    if abs(force / STANDARD_GRAVITY_M_S2 - 1.0) > UNIT:
+        weak.append(f"{name}: gravity is {force:.3g} m/s2 at rest")
+    values["gravity_m_s2"] = force
+    tau, variance, freedom = allan(rest, 1.0 / stream.rate_hz)
+    c = INERTIAL_CLASSES[entry.sensor_class]
+    for sensor, rows, usual, unit in (
+        ("gyro", slice(0, 3), c.gyro_noise, "rad/s"),
+        ("accelerometer", slice(3, 6), c.noise, "m/s2"),
+    ):
+        each = [coefficients(tau, column, freedom) for column in variance[:, rows].T]
+        values[sensor] = {key: [one[key] for one in each] for key in each[0]}
+        density = float(np.sqrt(np.mean(np.square(values[sensor]["random_walk"]))))
+        ratio = density / usual
+        values[sensor]["noise_over_class"] = ratio
+        lines.append(
+            f"{name}: {sensor} noise {density:.3g} {unit}/sqrt(Hz) at rest for {values['rest_s']:.1f} s, {ratio:.2g} times "
+            f"that of {entry.sensor_class}"
+        )
+        if ratio > NOISY:
+            weak.append(
+                f"{name}: {sensor} is {ratio:.2g} times as noisy as {entry.sensor_class}: motors near, or its unit"
+            )
+    return values, lines, weak
+
+
+def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]:
+    """Return the report, and the references as calibrated."""
+    from dataclasses import replace
+
+    from armsight.app.show.messages import Note
+    from armsight.app.show.report import Fact, Report
+    from armsight.app.show.table import TextTable
+    from armsight.errors import InputError
+    from armsight.loop.references.calibrate import calibrate as fit
+    from armsight.loop.references.path import PosePath
+    from armsight.tables.poses import read_pose_table
+
+    table = read_pose_table(poses)
+    if table.t_s is None:
+        raise InputError(f"{poses}: line 1: a column t_s is needed")
+    path = PosePath(table.t_s, table.Ts)
+    found, blocks, done = list[dict[str, Any]](), list[Fact | TextTable](), list["Entry"]()
+    notes = [Note("note", text) for text in table.notes]
+    for entry in entries:
+        readings = _averaged(entry, path)
+        click.echo(f"{entry.reference.name}: fitting its parameters to {len(readings)} readings", err=True)
+        began = entry.reference if entry.calibrated else entry.reference.begun(readings, path)
+        result = fit(began, readings, path, fit_delay=True)
+        done.append(replace(entry, reference=result.reference, calibrated=True))
+        values, parts = _said(result)
+        found.append(values)
+        blocks += parts
+    sections = {"references": ("References", blocks)}
+    return Report("references calibrate", "References", "", "", sections, notes, {"references": found}), done
+
+
+def _averaged(entry: Entry, path: Any) -> list[Any]:  # noqa: ANN401 - imported late
+    """Return readings of both channels, means of a short time each, with the covariance that their spread gives."""
+    import numpy as np
+
+    from armsight.errors import InputError
+    from armsight.loop.references.reference import Reading
+    from armsight.loop.references.stream import check_stream
+
+    source, t_s, z = _recording(entry)
+    size = max(round(AVERAGED_S * check_stream(t_s, z, str(source)).rate_hz), 1)
+    count = len(t_s) // size
+    times = t_s[: count * size].reshape(count, size).mean(axis=1)
+    means = z[: count * size].reshape(count, size, 2, 3).mean(axis=1)
+    within = np.flatnonzero(
+        [path.covers(t - entry.reference.delay_s, 5 * entry.reference.sigma_delay_s) for t in times]
+    )
+    if len(within) < 20:
+        raise InputError(
+            f"{source}: {len(within)} times of {AVERAGED_S:g} s lie within the poses; do both have one clock?"
+        )
+    # Of neighbouring means what is not a line in time is noise; its median is that of rests, too, where there are any.
+    bend = means[2:] - 2 * means[1:-1] + means[:-2]
+    noise = np.maximum(np.median(np.abs(bend), axis=0) / (0.6745 * np.sqrt(6.0)), 1e-6)
+    return [
+        Reading(float(times[k]), channel, means[k, channel], np.diag(noise[channel] ** 2))
+        for k in within
+        for channel in (0, 1)
+    ]
+
+
+def _said(result: ReferenceCalibration[Inertial]) -> tuple[dict[str, Any], list[Any]]:
+    """Return the values of a calibration, and what is shown of it."""
+    import numpy as np
+
+    from armsight.app.show.report import Fact
+    from armsight.app.show.table import TextTable
+
+    sensor, sigmas = result.reference, np.sqrt(np.diag(result.reference.cov))
+    named = dict(zip(sensor.parameters, sigmas.tolist(), strict=True))
+    errors = {
+        name: float(np.sqrt(np.mean(result.left_out[k::2][result.used[k::2]] ** 2)))
+        for k, name in enumerate(sensor.channels)
+    }
+    values = {
+        "name": sensor.name,
+        "parameters": sensor.parameters,
+        "sigma": named,
+        "delay_s": sensor.delay_s,
+        "sigma_delay_s": sensor.sigma_delay_s,
+        "open": list(result.open),
+        "noise_factor": result.noise,
+        "left_out_rms": errors,
+        "left_out_over_sigma": float(np.sqrt(np.mean(result.squares[result.used]))),
+        "outliers": int((~result.used).sum()),
+    }
+    rows = tuple(
+        (name, "open" if name in result.open else f"{value:.5g}", f"{named[name]:.2g}")
+        for name, value in (*sensor.parameters.items(),)
+    )
+    delay = ("delay_s", f"{sensor.delay_s:.5g}", f"{sensor.sigma_delay_s:.2g}")
+    sentence = (
+        f"{sensor.name}: readings of times left out are wrong by {errors['gyro']:.3g} rad/s and "
+        f"{errors['accelerometer']:.3g} m/s2 RMS, {values['left_out_over_sigma']:.2f} sigma; "
+        f"{values['outliers']} of {len(result.used)} are outliers"
+    )
+    return values, [Fact(sentence), TextTable(sensor.name, ("parameter", "value", "sigma"), (*rows, delay))]

@@ -1,0 +1,123 @@
+"""``armsight references``: what recordings of an inertial unit are like, and its calibration from a sweep."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armsight.geometry.pose import exp_se3, inverse, log_se3
+from armsight.geometry.rotation import quaternion_wxyz
+from armsight.loop.references.file import INERTIAL_COLUMNS
+from armsight.loop.references.inertial import Inertial
+from armsight.loop.references.path import PosePath
+from cli_runs import hold_keys, run, said_of
+
+HEAD = ["t_s", *INERTIAL_COLUMNS]
+RATES = np.array([1.1, 1.7, 2.3, 0.9, 1.3, 1.9])
+
+
+def pose(t_s):
+    return exp_se3(np.array([0.2, 0.2, 0.2, 1.0, 1.0, 1.0]) * np.sin(RATES * t_s + np.arange(6)))
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory):
+    """A folder with the poses of a sweep of 7 s, a recording of a sensor on it, and then 3 s at rest."""
+    folder, rng = tmp_path_factory.mktemp("references"), np.random.default_rng(2)
+    at = np.arange(0.0, 8.0, 1 / 40)
+    Ts = np.array([pose(t) for t in at])
+    path = PosePath(at, Ts)
+    first = Inertial.of("imu")
+    true = replace(first.moved(rng.normal(size=38) * np.sqrt(np.diag(first.cov)) * 0.2), delay_s=0.015)
+    rows = []
+    for t in np.arange(0.1, 7.0, 0.02):
+        m = path(t - true.delay_s)
+        rows.append([t, *true.expected(m, 0).z, *true.expected(m, 1).z])
+    rest = true.expected(path(7.0)._replace(twist=np.zeros(6), acceleration=np.zeros(6)), 1).z
+    rows += [[t, *true.expected(path(7.0)._replace(twist=np.zeros(6)), 0).z, *rest] for t in np.arange(9.0, 12.0, 0.02)]
+    values = np.array(rows)
+    values[:, 1:4] += rng.normal(0.0, 1e-3, (len(rows), 3))
+    values[:, 4:] += rng.normal(0.0, 0.02, (len(rows), 3))
+    write(folder / "imu.csv", values)
+    quaternions = quaternion_wxyz(Ts[:, :3, :3])
+    np.savetxt(
+        folder / "poses.csv", np.column_stack([at, Ts[:, :3, 3], quaternions]), "%.9f", ",",
+        header="t_s,x_m,y_m,z_m,qw,qx,qy,qz", comments="",
+    )  # fmt: skip
+    (folder / "references.toml").write_text('[imu]\nkind = "inertial"\nsource = "imu.csv"\nrate_hz = 50.0\n')
+    return folder, true, values
+
+
+def write(path, values):
+    np.savetxt(path, values, "%.9f", ",", header=",".join(HEAD), comments="")
+
+
+def test_check_says_rate_gap_and_noise_beside_that_of_the_class(sweep, capsys):
+    folder, _, values = sweep
+    said = said_of(capsys, "references", "check", folder / "references.toml", "--json")
+    hold_keys(["references", "check"], said.out)
+    (found,) = said.lines[0]["references"]
+    assert found["rate_hz"] == pytest.approx(50.0)
+    assert (found["readings"], found["gaps"], found["saturated"]) == (len(values), 1, [])
+    assert found["rest_s"] == pytest.approx(3.0, abs=0.5)
+    # 0.02 m/s2 at 50 Hz is 0.0028 m/s2/sqrt(Hz); 0.0039 is usual.
+    assert found["accelerometer"]["noise_over_class"] == pytest.approx(0.72, rel=0.25)
+
+
+def test_json_lines_are_read_as_csv_is_and_oddities_are_said(sweep, capsys, tmp_path):
+    _, _, values = sweep
+    odd = np.repeat(values[::2], 2, axis=0)
+    lines = (json.dumps(dict(zip(HEAD, map(float, row), strict=True))) for row in odd)
+    (tmp_path / "imu.jsonl").write_text("\n".join(lines))
+    (tmp_path / "r.toml").write_text('[a]\nkind = "inertial"\nsource = "imu.jsonl"\nrate_hz = 100.0\n')
+    said = said_of(capsys, "references", "check", tmp_path / "r.toml")
+    assert said.code == 0
+    assert "weak: a: the rate is 25 Hz, not 100 as the file says" in said.out
+    assert "a: 50 % of the readings repeat the one before: it is read too often" in said.out
+
+
+def test_calibrate_finds_the_sensor_and_writes_what_check_reads(sweep, capsys, tmp_path):
+    folder, true, _ = sweep
+    out = tmp_path / "calibrated.toml"
+    given = "references", "calibrate", folder / "references.toml", "--poses", folder / "poses.csv", "-o", out, "--json"
+    said = said_of(capsys, *given)
+    assert said.code == 0, said.err
+    hold_keys(["references", "calibrate"], said.out)
+    (found,) = said.lines[0]["references"]
+    assert found["delay_s"] == pytest.approx(0.015, abs=5e-4)
+    at, sigma = (np.array(list(found[key].values())) for key in ("parameters", "sigma"))
+    miss = at[3:] - np.array(list(true.parameters.values()))[3:]
+    assert np.sqrt(np.mean((miss / sigma[3:]) ** 2)) < 2.0
+    assert found["left_out_over_sigma"] == pytest.approx(1.0, abs=0.2)
+    assert run("references", "check", out) == 0
+    from armsight.loop.references.file import read_references
+
+    (entry,) = read_references(out)
+    apart = log_se3(inverse(entry.reference.T_tool_sensor) @ true.T_tool_sensor)
+    assert np.degrees(np.linalg.norm(apart[3:])) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("toml", "change", "said"),
+    [
+        ("[imu]\nkind = 'compass'", None, r"\[imu\]: kind is 'compass'; known is inertial"),
+        ("[imu]\nkind = 'inertial'\nrate = 3", None, r"\[imu\]: unknown key 'rate'; known are kind, source"),
+        ("[imu]\nkind = 'inertial'\nclass = 'best'", None, "no class of inertial units 'best'; there are icm-42688"),
+        ("[imu]\nkind = 'inertial'\nrate_hz = 0", None, "rate_hz is 0; expected more"),
+        ("[imu]\nkind = 'inertial'", None, r"\[imu\]: no source; name its recording"),
+        ("kind = 'inertial'", None, "expected a table a reference"),
+        (None, lambda v: v / [1, 1, 1, 1, 9.80665, 9.80665, 9.80665], "reads .* at rest, as if in g; give m/s2"),
+        (None, lambda v: v[::-1], "the clock runs backwards by .* at reading 2"),
+    ],
+)
+def test_bad_input_is_one_line(sweep, capsys, tmp_path, toml, change, said):
+    _, _, values = sweep
+    write(tmp_path / "imu.csv", values if change is None else change(values))
+    (tmp_path / "r.toml").write_text(toml or '[imu]\nkind = "inertial"\nsource = "imu.csv"\n')
+    got = said_of(capsys, "references", "check", tmp_path / "r.toml")
+    assert got.code == 2
+    assert len(got.err.splitlines()) == 1
+
+    assert re.search(said, got.err), got.err
