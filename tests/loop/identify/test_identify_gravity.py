@@ -7,7 +7,7 @@ import pytest
 from worn_arm import poses, worn
 
 from armsight.errors import InputError
-from armsight.loop.references.arm_errors import gravity_shows, parallel
+from armsight.loop.identify.gravity import gravity_shows, parallel
 from armsight.loop.references.inertial import ACCELEROMETER, GYRO, Inertial
 from armsight.loop.references.reference import Reading, ToolMotion
 from armsight.robot.models import MODELS
