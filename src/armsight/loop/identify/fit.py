@@ -203,6 +203,8 @@ def _newton(
 
 def _robust_noise(e: Array) -> tuple[float, float]:
     """Return sigmas along one axis from median residuals."""
+    if e.shape[1] == 1:
+        return max(float(np.median(np.abs(e)) / np.sqrt(chdtri(1, 0.5))), MIN_NOISE), MIN_NOISE
     middle = np.sqrt(chdtri(3, 0.5))
     positions = e[:, :3] if e.shape[1] == 6 else e.reshape(-1, 3)
     angle = float(np.median(np.linalg.norm(e[:, 3:], axis=1)) / middle) if e.shape[1] == 6 else 0.0

@@ -167,7 +167,10 @@ def _begun(
         raise CalibrationError("the poses are too alike: no joint moves; move every joint by 20 degrees and more")
     arm = without_tool(arm)
     progress("is this the arm")
-    check_plausible(arm, measured)
+    if measured.length_m is None:
+        check_plausible(arm, measured)
+    else:  # a sphere has no directions: the rig's axes are the base's
+        priors = {**dict.fromkeys(("base_rx", "base_ry", "base_rz"), 0.0), **(priors or {})}
     sides = measured.approach is not None and bool(measured.approach.any())
     model, x = with_placement(Model.of(arm, measured, backlash=sides), measured)
     still = np.ptp(measured.q, axis=0) < ALIKE  # the curve of a joint that does not move is its zero

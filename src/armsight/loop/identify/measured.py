@@ -1,7 +1,8 @@
 """The input of an identification: joint angles, and where an instrument measured the tool.
 
 The instrument's frame is called rig whatever it is (a stereo rig, a laser tracker). Either K points of the tool were
-tracked, or one body's full pose.
+tracked, or one body's full pose, or how far one point is from a fixed anchor (a draw-wire's length), which then is
+the rig's origin.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ class Measured(Record):
     #: (N, 3) rx, ry, rz as in the file, degrees, where the rotations came as angles; None else
     angles_deg: Array | None = None
     rotation: str = ""  #: the convention that these were read in, one of ROTATIONS; "" else
+    #: (N,) distance of the one point from the rig's origin, m, where only that was measured; ``p_rig`` is then unused
+    length_m: Array | None = None
 
     def __post_init__(self) -> None:
         """Check shapes.
@@ -52,6 +55,10 @@ class Measured(Record):
             checked(self.R_rig_body, (n, 3, 3), "R_rig_body")
             if k != 1:
                 raise InputError(f"with full poses p_rig holds one point a row, the body's origin; got {k}")
+        if self.length_m is not None:
+            checked(self.length_m, (n,), "length_m")
+            if k != 1 or self.R_rig_body is not None:
+                raise InputError(f"a length is of one point without a pose; p_rig has {k} points")
         if self.cov is not None:
             checked(self.cov, (n, self.size, self.size), "cov")
         if self.approach is not None:
@@ -70,13 +77,13 @@ class Measured(Record):
     @property
     def size(self) -> int:
         """M, how many numbers were measured at each pose."""
-        return 6 if self.R_rig_body is not None else 3 * self.points
+        return 1 if self.length_m is not None else 6 if self.R_rig_body is not None else 3 * self.points
 
     def rows(self, rows: Rows) -> Measured:
         """Return a part of the poses."""
-        own = (self.R_rig_body, self.cov, self.approach, self.angles_deg)
-        R, cov, approach, angles = (None if a is None else a[rows] for a in own)
-        return Measured(self.q[rows], self.p_rig[rows], R, cov, approach, angles, self.rotation)
+        own = (self.R_rig_body, self.cov, self.approach, self.angles_deg, self.length_m)
+        R, cov, approach, angles, length = (None if a is None else a[rows] for a in own)
+        return Measured(self.q[rows], self.p_rig[rows], R, cov, approach, angles, self.rotation, length)
 
 
 SAME_RAD = 5e-3  # poses whose joints all read within this, rad, of each other's are one pose, visited again

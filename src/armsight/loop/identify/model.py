@@ -372,7 +372,10 @@ class Model(Record):
     def residuals(self, x: Array, measured: Measured, phi: Array, m: TableMotion | None = None) -> Array:
         """Return predicted minus measured, (N, M); see :class:`Measured` for its axes. ``m``: the motion, where known."""
         m, t = self.motion(x, measured.q, phi) if m is None else m, self.tool_points(x)
-        off = m.o[:, None] + (m.R @ t.T).swapaxes(1, 2) - measured.p_rig
+        p = m.o[:, None] + (m.R @ t.T).swapaxes(1, 2)
+        if measured.length_m is not None:
+            return np.asarray(np.linalg.norm(p[:, 0], axis=1) - measured.length_m)[:, None]
+        off = p - measured.p_rig
         if measured.R_rig_body is None:
             return np.asarray(off.reshape(len(off), -1))
         back = measured.R_rig_body.swapaxes(1, 2)
@@ -384,7 +387,7 @@ class Model(Record):
         m = self.motion(x, measured.q, phi)
         e = self.residuals(x, measured, phi, m)
         t, n, at = self.tool_points(x), len(measured), self.table_at
-        J = np.zeros((n, measured.size, len(self.parameters)))
+        J = np.zeros((n, 3 * self.points + 3 * self.full, len(self.parameters)))
         for k in range(self.points):
             rows, p = slice(3 * k, 3 * k + 3), m.o + m.R @ t[k]
             J[:, rows, 0:3] = np.eye(3)
@@ -397,6 +400,9 @@ class Model(Record):
                 J[:, rows, self.sources_at :] = self._by_source(table[:, OFFSET], phi)
         if measured.R_rig_body is not None:
             self._rotation_rows(m, x, measured, phi, e, J)
+        if measured.length_m is not None:
+            p = m.o + m.R @ t[0]
+            J = (p / np.linalg.norm(p, axis=1)[:, None])[:, None] @ J
         return e, J
 
     def _rotation_rows(self, m: TableMotion, x: Array, measured: Measured, phi: Array, e: Array, J: Array) -> None:

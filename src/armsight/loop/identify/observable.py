@@ -157,7 +157,8 @@ def _ties_anywhere(
     m = model.motion(x, q, model.feature_values(q, approach))
     p = m.o[:, None] + (m.R @ model.tool_points(x).T).swapaxes(1, 2)
     R = m.R @ model.T_6_body(x)[:3, :3] if measured.R_rig_body is not None else None
-    probes = Measured(q, p, R, None, approach)
+    length = None if measured.length_m is None else np.linalg.norm(p[:, 0], axis=1)
+    probes = Measured(q, p, R, None, approach, length_m=length)
     _, ties, _ = _gram_schmidt(
         _triangle(model, x, probes, prior, (noise[0] + 1e-4, noise[1] + 1e-4)), preference, prior
     )

@@ -2,7 +2,8 @@
 
 Points: with M = R^T and c unknown, M p_i + c = o_i + R_i t is linear in M (nine numbers, not yet a rotation), c and the
 point t in frame 6; M contains the scale, too. The rotation that fits best is then found among all of them. Full poses:
-A_i X = Z B_i, solved by :func:`~armsight.loop.handeye.poses.starts`.
+A_i X = Z B_i, solved by :func:`~armsight.loop.handeye.poses.starts`. Lengths: the anchor by linear trilateration of the
+flange, and its mirror image about the flange's best plane, which fits nearly as well where the flange moves in one.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ def with_placement(model: Model, measured: Measured) -> tuple[Model, Array]:
         T = inverse(Z)
         model, t = replace(model, R_start=T[:3, :3], R_tool=X[:3, :3]), X[None, :3, 3]
         x[:3] = T[:3, 3]
+    elif measured.length_m is not None:
+        x[:3], t = -_anchors(m.o, measured.length_m)[0], np.zeros((1, 3))
     else:
         M, c, t, _ = rigid_placement(m.R, m.o, measured.p_rig)
         R = M.T
@@ -46,6 +49,25 @@ def with_placement(model: Model, measured: Measured) -> tuple[Model, Array]:
         x[:3] = -R @ c
     x[model.tool_at : model.tool_at + t.size] = t.ravel()
     return model, x
+
+
+def _anchors(p: Array, length: Array) -> Array:
+    """Return the anchor (2, 3) that points p (N, 3) have distances (N,) from, by median residuals, and its mirror image."""
+    centre = p.mean(axis=0)
+    _, _, axes = np.linalg.svd(p - centre, full_matrices=False)
+    A, squares = np.column_stack([-2 * (p - centre), np.ones(len(p))]), length**2 - ((p - centre) ** 2).sum(axis=1)
+    keep = np.ones(len(p), bool)
+    for _ in range(_ROUNDS):
+        a = np.linalg.lstsq(A[keep], squares[keep], rcond=None)[0][:3]
+        off = np.abs(np.linalg.norm(p - centre - a, axis=1) - length)
+        keep = off <= 2 * np.median(off)
+    both = np.array([a, a - 2 * (a @ axes[2]) * axes[2]])
+    off = np.median(np.abs(np.linalg.norm(p - centre - both[:, None], axis=2) - length), axis=1)
+    return np.asarray(centre + both[np.argsort(off)])
+
+
+#: Rounds of trilateration, each by the lengths that fit better than twice the median before; half: blunders pull longer.
+_ROUNDS = 6
 
 
 def linear_placement(R: Array, o: Array, p_rig: Array) -> tuple[Array, Array, Array]:

@@ -1,0 +1,52 @@
+"""An arm identified by one draw-wire: the anchor, blunders that agree with each other, and joints without rounding."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armsight.data import Array
+from armsight.loop.identify.lengths import identify_wire, unrounded
+from armsight.robot.arm_file import open_arm
+
+ROWS, NOISE_M, STEP_RAD, STEP_M = 90, 2e-4, np.deg2rad(0.1), 1e-4
+ANCHOR, TOOL = np.array([0.25, -0.5, -0.05]), np.array([0.01, 0.02, 0.07])
+HOOKED, LOST = np.arange(20, 28), np.arange(60, 68)
+
+
+def _recording(seed: int) -> tuple[Array, Array, Array, Array]:
+    """Return true joints, joints as printed, lengths and the controller's positions."""
+    rng = np.random.default_rng(seed)
+    arm = open_arm("irb120")
+    q = rng.uniform(*np.deg2rad([[-70, -20, -50, -40, 30, -80], [-10, 50, 10, -5, 80, -40]]), (ROWS, 6))
+    T = arm.forward(q)
+    p = T[:, :3, 3] + T[:, :3, :3] @ TOOL
+    length = np.linalg.norm(p - ANCHOR, axis=1) + NOISE_M * rng.standard_normal(ROWS)
+    length[HOOKED] += 4e-3 + 5e-4 * rng.standard_normal(len(HOOKED))  # longer, and not by a constant
+    printed = np.round(q / STEP_RAD) * STEP_RAD
+    printed[LOST, 5] *= -1
+    return q, printed, length, np.round(T[:, :3, 3] / STEP_M) * STEP_M
+
+
+def test_the_anchor_is_found_and_blunders_are_named() -> None:
+    _, printed, length, p = _recording(3)
+    p[10, 2] += 0.099
+    found = identify_wire(open_arm("irb120"), printed, length, p)
+    named = {text: set(rows) for rows, text in found.blunders}
+    assert {10} == set().union(*(rows for text, rows in named.items() if "contradicts" in text))
+    assert set(LOST) == set().union(*(rows for text, rows in named.items() if "sign of joint 6" in text))
+    assert set(HOOKED) == set().union(*(rows for text, rows in named.items() if "too long" in text))
+    sigma = np.sqrt(np.diag(found.identified.cov))[:3]
+    assert (np.abs(found.anchor - ANCHOR) < 4 * sigma).all()
+    assert (sigma < 0.03).all()
+
+
+def test_a_position_says_what_rounding_took_away() -> None:
+    q, printed, _, p = _recording(4)
+    printed[LOST, 5] *= -1
+    sigma = STEP_RAD / np.sqrt(12)
+    better, agree = unrounded(open_arm("irb120"), printed, p, sigma, STEP_M / np.sqrt(12))
+    assert agree.all()
+    T, T_true = open_arm("irb120").forward(better), open_arm("irb120").forward(q)
+    apart = np.linalg.norm(T[:, :3, 3] - T_true[:, :3, 3], axis=1)
+    assert apart.max() < STEP_M  # rounding alone moves it by 0.3 mm
+    assert np.abs(better - printed).max() < 3 * sigma
