@@ -151,3 +151,16 @@ def test_gravity_at_rest_shows_what_vision_does_not_see_yet():
     assert np.linalg.norm(e) < 4 * 0.04
     assert np.sort(sigma_deg)[0] < 0.1
     assert np.abs(np.degrees(off(ARM.forward(MIDDLE), T)[3:])).max() > 0.2
+
+
+def test_a_delay_that_is_not_to_be_learned_stays():
+    _, q, _, looks, lengths = world(6, seconds=1.5, blind_s=1.4)
+    estimator = KalmanEstimator(ARM, delay=Delay(0.0, 1e-3), learns_delay=False)
+    estimator.joints(states(np.arange(len(q)) * TICK_S, q))
+    for m in looks:
+        estimator.vision(m)
+    before = estimator.learned().delay
+    for wire, reading in lengths[-40:]:
+        assert estimator.take(wire, reading) is Outcome.USED
+    assert estimator.learned().delay == before
+    assert (np.linalg.eigvalsh(estimator.estimate().cov) > 0.0).all()

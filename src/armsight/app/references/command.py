@@ -19,6 +19,8 @@ NOISY = 3.0
 RATE = 0.05
 #: Gravity at rest may be off by this share.
 UNIT = 0.2
+#: A rest is so long at least, s.
+REST_S = 0.5
 #: Readings are averaged over so long for a calibration, s.
 AVERAGED_S = 0.05
 
@@ -54,6 +56,75 @@ def calibrate(path: Path, poses: str, output: Path | None, as_json: bool) -> Non
     if output is not None:
         write_text(output, "\n".join(written(entry, output.parent) for entry in entries))
     raise SystemExit(report.echo(as_json=as_json, written=None if output is None else str(output)))
+
+
+@command.command()
+@click.argument("path", metavar="REFERENCES.toml", type=click.Path(path_type=Path))
+@click.option("--model", required=True, metavar="ARM", help="The arm: a name of armsight arm list, or a file.")
+@click.option("--joints", required=True, metavar="JOINTS.csv", help="Joint angles of 8 rests or more, with times t_s.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def gravity(path: Path, model: str, joints: str, as_json: bool) -> None:
+    """Find the base's tilt and the joint zeros that gravity shows at rests; the others are named as open."""
+    from armsight.loop.references.file import read_references
+
+    raise SystemExit(_gravity(read_references(path)[0], model, Path(joints)).echo(as_json=as_json))
+
+
+def _gravity(entry: Entry, model: str, joints: Path) -> Report:
+    """Return what gravity shows of an arm that carries the first reference."""
+    import numpy as np
+
+    from armsight.app.show.report import Report
+    from armsight.app.show.table import TextTable
+    from armsight.errors import InputError
+    from armsight.loop.identify.gravity import gravity_shows
+    from armsight.loop.references.inertial import ACCELEROMETER
+    from armsight.loop.references.reference import Reading, ToolMotion
+    from armsight.robot.arm_file import open_arm
+    from armsight.tables.poses import read_pose_table
+
+    arm = open_arm(model)
+    table = read_pose_table(joints, arm=arm, only_joints=True)
+    if table.t_s is None or table.q is None:
+        raise InputError(f"{joints}: line 1: a column t_s is needed")
+    source, t_s, z = _recording(entry)
+    readings = []
+    for rest, at in enumerate(table.t_s - entry.reference.delay_s):
+        rows = np.flatnonzero(np.abs(t_s - at) <= REST_S / 2)
+        if len(rows) < 8:
+            raise InputError(
+                f"{source}: {len(rows)} readings within {REST_S / 2:g} s of the rest at {at:.3f} s; do both have one clock?"
+            )
+        parts = [z[part, 3:].mean(axis=0) for part in np.array_split(rows, 4)]
+        noise = np.maximum(np.var(parts, axis=0, ddof=1) / 4, 1e-6)
+        readings.append(Reading(float(rest), ACCELEROMETER, np.mean(parts, axis=0), np.diag(np.full(3, noise.mean()))))
+    sensor, poses = entry.reference, arm.forward(table.q)
+    if not entry.calibrated:
+        sensor = sensor.begun(readings, lambda rest: ToolMotion(poses[int(rest)]))
+    shown, found = gravity_shows(arm, sensor, table.q, readings)
+    values = {
+        "name": sensor.name,
+        "rests": len(readings),
+        "outliers": int((~found.used).sum()),
+        "found": [
+            {
+                "name": each.name,
+                "joints": list(each.joints),
+                "value_rad": each.value,
+                "sigma_rad": each.sigma,
+                "open": each.open,
+            }
+            for each in shown
+        ],
+    }
+    cells = tuple(
+        (each.name, "open" if each.open else f"{np.degrees(each.value):.3f}", f"{np.degrees(each.sigma):.3f}")
+        for each in shown
+    )
+    blocks = [
+        TextTable(f"{sensor.name}: {len(readings)} rests, {values['outliers']} outliers", ("", "deg", "sigma"), cells)
+    ]
+    return Report("references gravity", "Gravity", "", "", {"gravity": ("Gravity", blocks)}, (), values)
 
 
 def _recording(entry: Entry) -> tuple[Path, Any, Any]:

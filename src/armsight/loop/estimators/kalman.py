@@ -404,7 +404,8 @@ class KalmanEstimator:
         before, joints = self._anew(before, np.array([t_s]))
         step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
         kept, added = step.kept[0], step.added[0]
-        x, P = before.x * kept, before.P * np.outer(kept, kept) + np.diag(added)
+        x, P = before.x * kept, before.P * np.outer(kept, kept)
+        P[np.diag_indices(len(P))] += added
         (T,), (by_state,) = self._model.poses(x, joints.q, joints.unseen)
         motion, cov_twist, cov_acceleration = self._motion(x, T, by_state, joints, t_s, reference.inertial)
         expected = reference.expected(motion, reading.channel)

@@ -38,7 +38,7 @@ class ArmRests(Carrier):
     """
 
     def __init__(self, arm: Arm, prior: Prior, q: Array) -> None:
-        self._model, self._q = ErrorModel(arm, prior, 0.0), np.ascontiguousarray(q)
+        self._model, self._q = ErrorModel(arm, prior, 0.0), np.array(q)
         at = self._at = self._model.layout
         free = np.ones(at.size, np.bool_)
         free[:5] = free[at.linearity - 6 : at.linearity] = False  # base and tool frames are where they are: a gauge

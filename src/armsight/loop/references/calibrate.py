@@ -143,6 +143,7 @@ def calibrate(
     s = solve(linear.rows(np.flatnonzero(used)), variances)
     cov = s.root[: fit.unknowns] @ s.root[: fit.unknowns].T
     errors, squares = _held_out(linear, variances, used)
+    cov *= max(1.0, float(squares[used].mean()))  # what lasts, such as a bias that warms up, shows in times left out
     sigma, names = np.sqrt(np.diag(cov)), (*reference.parameters, *(["delay_s"] if fit_delay else []))
     unknown = tuple(name for name, a, b in zip(names, sigma, fit.sigma, strict=False) if a > OPEN * b)
     noise = {name: float(np.sqrt(v)) for name, v in zip(fit.names, variances, strict=True)}

@@ -61,7 +61,9 @@ def gained(
     S = HP @ H.T + R + sum(one.by @ (C[name].T @ H.T + one.cov @ one.by.T) for name, one in shares.items())
     K = np.asarray(np.linalg.solve(S, HP).T, np.float64)
     K[fixed] = 0.0
-    after = P + K @ S @ K.T - K @ HP - (K @ HP).T  # Joseph's: right also where rows are fixed
+    after = P - K @ HP
+    after[fixed] = after[:, fixed].T  # a fixed row is as it was but for its part with the others
+    after = (after + after.T) / 2
     considered = passed(before, K, H)
     for name, one in shares.items():
         considered[name] = C[name] - K @ (H @ C[name] + one.by @ one.cov)
