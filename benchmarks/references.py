@@ -1,0 +1,194 @@
+"""References beside vision: what they are worth, in the simulated workcell and on public recordings.
+
+python references.py hidden [N]     body hidden for 0.5, 2, 5 s on the circle, N worn arms (10), joints alone: a minute each
+python references.py tilt [N]       base's tilt and the zeros that gravity shows, N simulated worn arms (40): a minute
+python references.py gravity        direction of gravity at rest, arm-imu, each rest left out of the fit: two minutes
+
+Public recordings lie where ARMSIGHT_DATA points.
+"""
+
+import os
+import sys
+import tempfile
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.app.demo import demo
+from armsight.app.run.experiment import run_experiment
+from armsight.app.run.metrics import track_metrics
+from armsight.app.run.tracks import Tracks
+from armsight.geometry.rotation import from_quaternion_wxyz
+from armsight.loop.identify.gravity import gravity_shows
+from armsight.loop.references.calibrate import calibrate
+from armsight.loop.references.inertial import ACCELEROMETER, GYRO, Inertial
+from armsight.loop.references.path import PosePath
+from armsight.loop.references.reference import STANDARD_GRAVITY_M_S2, Reading, ToolMotion
+from armsight.sim.workcell.workcell import Workcell
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "loop"))
+from worn_arm import poses, worn
+
+#: How long the body is hidden, s, and the circle, from 0, on which that begins.
+HIDDEN = ((0.5, 0), (2.0, 1), (5.0, 2))
+CIRCLE_S, REST_S = 3.2, 0.5
+DATA = Path(os.environ.get("ARMSIGHT_DATA", Path(__file__).resolve().parents[1] / "../shared/data"))
+#: What a calibration left of the sensor: rotation, bias, M_a; the tilt is not known.
+LEFT = np.full(38, 1e-9)
+LEFT[:3], LEFT[9:12], LEFT[12:18], LEFT[36:] = np.radians(0.05), 0.01, 5e-4, np.radians(5.0)
+RESTS = 120
+
+
+def circles(path: Path) -> Path:
+    """Write the quick demo's motions with its circle made four times, and return the file."""
+    text = demo._MOTIONS[True].read_text(encoding="utf-8")
+    begin = text.index('[[motion]]\nkind = "circle"')
+    again = "".join(text[begin:].replace('"circle"\nc', f'"circle {k}"\nc') for k in range(2, 5))
+    path.write_text(text + "\n" + again, encoding="utf-8")
+    return path
+
+
+def hidden_run(seed: int, folder: Path) -> dict[str, tuple[float, float]]:
+    """Run a worn arm; return RMS and largest error, mm, of the estimates while the body was hidden."""
+    found: dict[str, tuple[float, float]] = {}
+    spans: list[tuple[float, float]] = []
+
+    def cover(self: Workcell, begin_s: float, end_s: float) -> None:
+        for length, circle in HIDDEN:
+            start = begin_s + circle * (CIRCLE_S + REST_S)
+            spans.append((start, start + length))
+            self.source.cover(start, start + length)
+
+    def finish(result: Any, folder: Path, *, truth: Any = None, **_: Any) -> None:
+        tracks = Tracks(result.log, result.setup.arm, result.handeye.mounting, result.delay, truth, result.changes)
+        part = tracks.between(*result.open_s)
+        for name in ("fused", "live"):
+            track = getattr(part, name)
+            for (begin, end), (length, _) in zip(spans, HIDDEN, strict=True):
+                rows = (track.t_s > begin - 0.01) & (track.t_s < end + 0.05)
+                metrics = track_metrics(track[rows], part.truth)
+                found[f"{name} {length:g} s"] = 1e3 * metrics.position_rms_m, 1e3 * metrics.position_max_m
+
+    demo._MOTIONS = {**demo._MOTIONS, True: circles(folder / "circles.toml")}
+    Workcell.cover = cover  # type: ignore[method-assign]
+    demo.finish = finish
+    demo.run_experiment = lambda *given, **named: run_experiment(*given, **named, close_loop=False)
+    demo.run_demo(demo.Demo(folder / "run", seed=seed, quick=True))
+    return found
+
+
+def hidden(count: int) -> None:
+    """Print the errors while the body was hidden."""
+    motions, found = dict(demo._MOTIONS), list[dict[str, tuple[float, float]]]()
+    for seed in range(count):
+        demo._MOTIONS = motions
+        with tempfile.TemporaryDirectory() as folder:
+            found.append(hidden_run(seed, Path(folder)))
+        print(f"seed {seed}: {found[-1]}", file=sys.stderr, flush=True)
+    for name in found[0]:
+        values = np.array([each[name] for each in found])
+        print(
+            f"{name:12s} RMS {np.sqrt(np.mean(values[:, 0] ** 2)):.3f} mm (worst arm {values[:, 0].max():.3f}), "
+            f"largest: median {np.median(values[:, 1]):.3f}, worst {values[:, 1].max():.3f} mm"
+        )
+
+
+def tilt(count: int) -> None:
+    """Print errors and sigmas of what gravity shows of worn arms; the sensor warms up, is bent and rounded."""
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    for seed in range(3000, 3000 + count):
+        arm, rng = worn(seed), np.random.default_rng(seed)
+        q, approach = poses(arm.nominal, RESTS, rng, 2.5)
+        said = replace(Inertial.of("imu"), cov=np.diag(LEFT**2), sigma_delay_s=0.0)
+        true = said.moved(rng.normal(size=38) * np.append(LEFT[:-2], np.radians([0.5, 0.5])))
+        readings = []
+        for k, T in enumerate(arm.true.forward(arm.joints(q, approach))):
+            z = true.expected(ToolMotion(T), ACCELEROMETER).z
+            z = z * (1 + 2e-5 * z) + 0.004 * (k / RESTS - 0.5) * np.array([1, -1, 0.5]) + rng.normal(0.0, 0.003, 3)
+            readings.append(Reading(float(k), ACCELEROMETER, np.round(z / 0.0024) * 0.0024, 0.004**2 * np.eye(3)))
+        beyond = arm.joints(q, approach) - q + 0.5 * arm.backlash * approach
+        zeros = (arm.true.offset - arm.nominal.offset) * arm.nominal.direction + beyond.mean(axis=0)
+        shown, _ = gravity_shows(arm.nominal, said, q, readings)
+        truth = [*true.values[-2:], *(zeros[np.array(each.joints) - 1].sum() for each in shown[2:])]
+        for each, value in zip(shown, truth, strict=True):
+            rows.setdefault(each.name, []).append((each.value - value, each.sigma, each.open))
+    for name, found in rows.items():
+        e, sigma, unseen = np.array(found, float).T
+        inside = 100 * np.mean(np.abs(e) < 1.96 * sigma)
+        rms, said_deg = np.degrees(np.sqrt(np.mean(e**2))), np.degrees(sigma.mean())
+        print(
+            f"{name:20s} RMS {rms:.3f} deg, sigma {said_deg:.3f}, in 95 %: {inside:.0f} %, open {100 * unseen.mean():.0f} %"
+        )
+
+
+def arm_imu(folder: Path) -> tuple[np.ndarray, np.ndarray, PosePath]:
+    """Return times (N,), readings (N, 6) in SI units, and the arm's poses of a recording of the set arm-imu.
+
+    The sensor's samples came late and in bursts: their time is a line through the times of arrival. The arm's quaternions
+    are those of the base in the tool.
+    """
+    from scipy.io import loadmat
+
+    m = loadmat(folder / "MPU9150.mat")
+    z = np.hstack([np.radians(m["SENSgyro"].T), STANDARD_GRAVITY_M_S2 * m["SENSacc"].T])
+    arrived, count = m["MATLABtime"][0], len(z)
+    index = np.arange(count)
+    late = index > count // 4
+    line = np.polyfit(index[late], arrived[late], 1)
+    near = late & (np.abs(arrived - np.polyval(line, index)) < 0.05)
+    t = np.polyval(np.polyfit(index[near], arrived[near], 1), index)
+    token = m["TokenPosition"][0].astype(int) - 1
+    at = m["ABBtime"][0][: len(token)]
+    keep = (token >= 0) & (token < count) & np.append(True, np.diff(at) > 0.005)
+    Ts = np.tile(np.eye(4), (int(keep.sum()), 1, 1))
+    Ts[:, :3, :3] = np.swapaxes(from_quaternion_wxyz(m["ABBquaternion"].T[token[keep]]), 1, 2)
+    position = m["ABBposition"].T
+    Ts[:, :3, 3] = 1e-3 * (position[token[keep]] if len(position) == count else position[: len(token)][keep])
+    good = np.isfinite(z).all(axis=1)
+    return t[good], z[good], PosePath(at[keep], Ts)
+
+
+def gravity() -> None:
+    """Print the angle between gravity by the sensor and by the arm at each rest, that rest left out of the fit."""
+    found = []
+    for folder in sorted((DATA / "references" / "arm-imu").glob("*/Sequencia*")):
+        t, z, path = arm_imu(folder)
+        motion = cache(path)
+        inside = [k for k, at in enumerate(t) if path.covers(float(at), 0.3)]
+        t, z = t[inside], z[inside]
+        still = np.array([np.abs(motion(float(at)).twist).max() < 2e-3 for at in t])
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]]))).reshape(-1, 2)
+        rests = [np.arange(a + 15, b - 5) for a, b in edges if b - a > 40]  # without what swings after a motion
+        moving = [np.arange(a, a + 20) for a in range(0, len(t) - 20, 20) if not still[a : a + 20].any()]
+        for left in rests:
+            readings = [
+                Reading(float(t[rows].mean()), ACCELEROMETER, z[rows, 3:].mean(axis=0), 0.01**2 * np.eye(3))
+                for rows in rests
+                if rows is not left
+            ]
+            for rows in moving:
+                at, mean = float(t[rows].mean()), z[rows].mean(axis=0)
+                readings.append(Reading(at, GYRO, mean[:3], 0.03**2 * np.eye(3)))
+                readings.append(Reading(at, ACCELEROMETER, mean[3:], 0.15**2 * np.eye(3)))
+            readings.sort(key=lambda reading: reading.t_s)
+            first = replace(Inertial.of("imu"), sigma_delay_s=0.0)
+            sensor = calibrate(first.begun(readings, motion), readings, motion).reference
+            there = motion(float(t[left].mean()))
+            e = sensor.expected(there, ACCELEROMETER)
+            off, *_ = np.linalg.lstsq(e.by_tool[:, 3:], z[left, 3:].mean(axis=0) - e.z, rcond=1e-6)
+            found.append(float(np.degrees(np.linalg.norm(off))))
+            print(f"{folder.parent.name}/{folder.name} at {t[left].mean():.1f} s: {found[-1]:.3f} deg", flush=True)
+    print(f"{len(found)} rests: median {np.median(found):.3f} deg, 90 % {np.quantile(found, 0.9):.3f} deg")
+
+
+if __name__ == "__main__":
+    what, count = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else None
+    if what == "hidden":
+        hidden(count or 10)
+    elif what == "tilt":
+        tilt(count or 40)
+    else:
+        gravity()
