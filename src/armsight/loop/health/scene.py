@@ -1,0 +1,375 @@
+"""The background of both images: whether a camera still stands where it stood, without any marker.
+
+In: shots. Out: findings. Conspicuous, stable spots of each background are learned from the mean of the first images:
+corners (Shi and Tomasi, CVPR 1994), weighted by the spectral residual of the image (Hou and Zhang, "Saliency detection: a
+spectral residual approach", CVPR 2007), without what changes meanwhile. Each later image says by how much each spot is
+displaced from its first place (Lucas and Kanade, with brightness and contrast of its own: a lamp is no motion), and a
+robust fit to all spots of one camera by how much that turned. What an arm or people hide does not look like its spot any
+more; what else moves is outvoted. A spot's depth, from the other camera, distinguishes a shift from a rotation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from armsight.data import Array, Image, Shot
+from armsight.geometry.pose import inverse, transform
+from armsight.geometry.rotation import skew
+from armsight.loop.finding import HealthFinding, alarm_limit
+from armsight.vision.camera import Camera
+from armsight.vision.image import grey
+from armsight.vision.rig import StereoRig
+from armsight.vision.triangulate import midpoints
+
+#: How often the background is looked at, s; half: twice the time, double: a turn is named later.
+EVERY_S = 0.2
+#: Images whose mean the spots are learned from; half: a noisier reference, double: learned after 4 s.
+_LEARNED = 10
+#: Cells of an image, at most one spot each; half: half as accurate, double: twice the time.
+_CELLS = (10, 8)
+#: Half the side of a spot's patch, px; half: fewer patterns are unmistakable, double: more of them are hidden now and then.
+_HALF = 8
+#: A spot is stable where the noise of one image displaces it by less, px; half: plain walls have none, double: noise has.
+_STABLE_PX = 0.1
+#: What changes by more than so many times the usual noise while spots are learned is no background.
+_CHANGES = 3.0
+#: Steps of Lucas and Kanade; a spot further than this from its place, px, is not followed: half a patch.
+_STEPS, _FAR_PX = 4, 4.0
+#: A patch that leaves this share of its contrast unexplained is hidden; half: noise hides them, double: people do not.
+_HIDDEN = 0.4
+#: Fewest spots that say something, and the share of those seen that must agree; half: two chairs are a room.
+_LEAST, _MAJORITY = 10, 0.5
+#: Residuals beyond so many sigmas do not agree; rounds in which that settles.
+_AGREES, _ROUNDS = 4.0, 8
+#: A camera turned by less is not said, standard deviation, rad: mounts breathe and images are compressed. Half: what
+#: processing leaves is said, double: half a millimetre is not.
+_FLOOR_RAD = np.radians(0.001)
+#: Depths from this, m, on are tried for a spot, and patches of both cameras that correlate less are different ones.
+_NEAREST_M, _ALIKE = 0.25, 0.8
+#: A shift and a rotation are distinguished where their chi-squares differ by this.
+_DISTINCT = 9.0
+#: Looks in a row that must agree.
+_AGAIN = 2
+_LIMIT = alarm_limit(3, 1.0 / EVERY_S, 2)
+_SPOT = np.stack(np.meshgrid(*2 * [np.arange(-_HALF, _HALF + 1.0)]), axis=-1).reshape(-1, 2).astype(np.float32)
+
+
+class CameraMotion(NamedTuple):
+    """How a camera moved since its spots were learned.
+
+    Attributes:
+        rotation: (3,) of the camera about its own axes, rad, if it turned alone; covariance (3, 3).
+        shift: (3,) of the camera, m, if it moved alone; covariance (3, 3); None where too few depths are known.
+        favours: by how much the chi-square of a shift is larger than that of a rotation; 0 without a shift.
+        seen: how many spots agree.
+    """
+
+    rotation: tuple[Array, Array]
+    shift: tuple[Array, Array] | None
+    favours: float
+    seen: int
+
+    @property
+    def chi_square(self) -> float:
+        """Of no rotation, a mount's own breathing included."""
+        turned, cov = self.rotation
+        return float(turned @ np.linalg.solve(cov, turned))
+
+
+class _Spots:
+    """The spots of one camera: learned from images, then followed.
+
+    Attributes:
+        uv: (K, 2) where they are, raw pixels.
+        depth_m: (K,) along the optical axis; NaN where it is not known.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera, self._first = camera, list[NDArray[np.float32]]()
+        self.uv, self.depth_m = np.zeros((0, 2)), np.zeros(0)
+
+    def learned(self, image: NDArray[np.float32]) -> bool:
+        """Take an image to learn from; return whether it is the last one."""
+        self._first.append(image)
+        if len(self._first) < _LEARNED:
+            return False
+        mean, noise = np.mean(self._first, axis=0), np.std(self._first, axis=0, ddof=1)
+        self._choose(mean, noise)
+        self._template = self._patches(mean, self.uv)
+        dx, dy = cv2.Scharr(mean, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(mean, cv2.CV_32F, 0, 1) / 32
+        ones = np.ones_like(self._template)
+        A = np.stack([self._patches(dx, self.uv), self._patches(dy, self.uv), self._template, ones], axis=2)
+        self._by = np.linalg.pinv(A.astype(float))
+        self._cov = np.linalg.inv(np.swapaxes(A, 1, 2).astype(float) @ A)[:, :2, :2]
+        self._contrast = self._template.std(axis=1)
+        # Neighbouring pixels of compressed and interpolated images err alike: how much more spots scatter than it seems.
+        tried = [self.displaced(each) for each in self._first]
+        scatter = np.array([np.where(seen[:, None], d, np.nan) for d, _, seen in tried])
+        said = np.median([np.trace(cov, axis1=1, axis2=2) for _, cov, _ in tried], axis=0)
+        always = np.isfinite(scatter).all(axis=(0, 2))
+        ratio = scatter[:, always].var(axis=0, ddof=1).sum(axis=1) / said[always]
+        self._cov = self._cov * max(float(np.median(ratio)) if always.any() else 1.0, 1.0)
+        self._first.clear()
+        return True
+
+    def _choose(self, mean: NDArray[np.float32], noise: NDArray[np.float32]) -> None:
+        """Choose the most conspicuous stable spot of each cell."""
+        side = 2 * _HALF + 1
+        usual = max(float(np.median(noise)), 0.3)
+        steady = cv2.blur((noise < _CHANGES * usual).astype(np.float32), (side, side)) > 0.95
+        strength = cv2.cornerMinEigenVal(mean, side, 3) * 4 * side**2  # Sobel, blurred: of sums of squared derivatives
+        good = (usual / np.sqrt(np.maximum(strength, 1e-9)) < _STABLE_PX) & steady
+        rank = np.where(good, np.sqrt(strength) * _saliency(mean), 0.0)
+        edge = _HALF + int(_FAR_PX) + 2
+        rank[:edge], rank[-edge:], rank[:, :edge], rank[:, -edge:] = 0, 0, 0, 0
+        chosen = []
+        for v in np.array_split(np.arange(mean.shape[0]), _CELLS[1]):
+            for u in np.array_split(np.arange(mean.shape[1]), _CELLS[0]):
+                cell = rank[v[0] : v[-1] + 1, u[0] : u[-1] + 1]
+                row, column = np.unravel_index(int(cell.argmax()), cell.shape)
+                if cell[row, column] > 0:
+                    chosen.append((u[0] + column, v[0] + row))
+        self.uv = np.array(chosen, float).reshape(-1, 2)
+        self.depth_m = np.full(len(chosen), np.nan)
+
+    @staticmethod
+    def _patches(image: NDArray[np.float32], uv: Array) -> NDArray[np.float32]:
+        """Return the patches (K, P) about pixels (K, 2); OpenCV's cubic interpolation would displace them by a hundredth."""
+        at = (uv[:, None] + _SPOT).astype(np.float32)
+        return np.asarray(cv2.remap(image, at, None, cv2.INTER_LINEAR))
+
+    def displaced(self, image: NDArray[np.float32]) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Return by how much each spot is displaced (K, 2), px, the covariance (K, 2, 2), and whether it is seen (K,)."""
+        d = np.zeros_like(self.uv)
+        patches = self._template
+        for _ in range(_STEPS):
+            patches = self._patches(image, self.uv + d)
+            step = (self._by @ (patches - self._template)[..., None].astype(float))[:, :2, 0]
+            d = np.clip(d - step, -2 * _FAR_PX, 2 * _FAR_PX)
+        centred = patches - patches.mean(axis=1, keepdims=True)
+        fixed = self._template - self._template.mean(axis=1, keepdims=True)
+        share = (centred * fixed).sum(axis=1) / np.maximum((fixed**2).sum(axis=1), 1e-9)
+        left = (centred - share[:, None] * fixed).std(axis=1)
+        seen = (left < _HIDDEN * np.abs(share) * self._contrast) & (share > 0) & (np.abs(d) < _FAR_PX).all(axis=1)
+        cov = self._cov * (left / np.maximum(share, 1e-3))[:, None, None] ** 2
+        return d, cov, seen
+
+    def moved(self, image: NDArray[np.float32]) -> CameraMotion | None:
+        """Return how the camera moved; None where too few spots are seen."""
+        d, cov, seen = self.displaced(image)
+        if seen.sum() < _LEAST:
+            return None
+        d, cov = d[seen], cov[seen] + 1e-8 * np.eye(2)
+        rays = self._camera.unproject(self.uv[seen])
+        _, J, _ = self._camera.project_jacobians(rays)
+        focal = self.uv[seen] - self._camera.intrinsics[2:4]  # a lens that breathes moves spots to and from the middle
+        turning = np.concatenate([J @ skew(rays), focal[..., None]], axis=2)
+        found = _fitted(turning, d, cov)
+        if found is None:
+            return None
+        x, C, squares, good = found
+        rotation = x[:3], C[:3, :3] + _FLOOR_RAD**2 * np.eye(3)
+        depth = self.depth_m[seen] / rays[:, 2]
+        known = np.isfinite(depth) & good
+        if known.sum() < _LEAST:
+            return CameraMotion(rotation, None, 0.0, int(good.sum()))
+        shifting = np.concatenate([-J / depth[:, None, None], focal[..., None]], axis=2)
+        rows = np.flatnonzero(known)
+        moved, turned = (_fitted(A[rows], d[rows], cov[rows], robust=False) for A in (shifting, turning))
+        if moved is None or turned is None:
+            return CameraMotion(rotation, None, 0.0, int(good.sum()))
+        floor = (_FLOOR_RAD * float(np.median(self.depth_m[seen][rows]))) ** 2 * np.eye(3)
+        scale = max(min(moved[2].mean(), turned[2].mean()) / 2, 1.0)
+        favours = float(moved[2].sum() - turned[2].sum()) / scale
+        return CameraMotion(rotation, (moved[0][:3], moved[1][:3, :3] + floor), favours, int(good.sum()))
+
+
+def _saliency(image: NDArray[np.float32]) -> Array:
+    """Return how conspicuous each pixel (H, W) is, 1 on average."""
+    small = cv2.resize(image, (64, 48), interpolation=cv2.INTER_AREA)
+    F = np.fft.fft2(small)
+    log = np.log(np.abs(F) + 1e-9).astype(np.float32)
+    residual = np.exp(log - cv2.blur(log, (3, 3), borderType=cv2.BORDER_WRAP) + 1j * np.angle(F))
+    map_ = cv2.GaussianBlur((np.abs(np.fft.ifft2(residual)) ** 2).astype(np.float32), (0, 0), 2.5)
+    return np.asarray(cv2.resize(map_ / map_.mean(), image.shape[::-1]))
+
+
+def _fitted(A: Array, d: Array, cov: Array, *, robust: bool = True) -> tuple[Array, Array, Array, NDArray[np.bool_]] | None:
+    """Fit displacements d (K, 2) by A (K, 2, P), by least trimmed then weighted squares.
+
+    Returns:
+        The fit (P,), its covariance, scaled by what the residuals scatter, all squared distances (K,), and which spots agree
+        (K,); None where no majority does.
+    """
+    half = np.linalg.inv(np.linalg.cholesky(cov))
+    white, e = half @ A, (half @ d[..., None])[..., 0]
+    good = np.ones(len(d), np.bool_)
+    weights, x = np.ones(len(d)), np.zeros(A.shape[2])
+    for _ in range(_ROUNDS if robust else 1):
+        H = np.einsum("kip,k,kiq->pq", white, weights, white)
+        x = np.linalg.lstsq(H, np.einsum("kip,k,ki->p", white, weights, e), rcond=1e-12)[0]
+        squares = ((e - white @ x) ** 2).sum(axis=1)
+        scale = max(float(np.median(squares)) / 1.3863, 1.0)
+        weights = 1.0 / (1.0 + squares / scale) if robust else weights
+        good = squares < _AGREES**2 * scale
+    if good.sum() < max(_LEAST, _MAJORITY * len(d)):
+        return None
+    rows = np.flatnonzero(good)
+    H = np.einsum("kip,kiq->pq", white[rows], white[rows])
+    x = np.linalg.lstsq(H, np.einsum("kip,ki->p", white[rows], e[rows]), rcond=1e-12)[0]
+    squares = ((e - white @ x) ** 2).sum(axis=1)
+    excess = max(float(squares[rows].sum()) / max(2 * len(rows) - len(x), 1), 1.0)
+    return x, excess * np.linalg.pinv(H), squares, good
+
+
+class SceneWatch:
+    """Watches the background of a pair of cameras.
+
+    Args:
+        rig: the calibrated pair.
+    """
+
+    def __init__(self, rig: StereoRig) -> None:
+        self._rig = rig
+        self._spots = tuple(_Spots(camera) for camera in rig.cameras)
+        self._learning, self._last_s = True, -np.inf
+        self._alarms, self._since = [0, 0], list[float | None]([None, None])
+        self._found: tuple[HealthFinding, ...] = ()
+
+    @property
+    def spots(self) -> tuple[int, int]:
+        """How many spots of each camera are watched; 0 before they were learned."""
+        left, right = self._spots
+        return len(left.uv), len(right.uv)
+
+    def due(self, t_s: float) -> bool:
+        """Return whether the next look is due at a time, s."""
+        return t_s - self._last_s >= EVERY_S
+
+    def take(self, shot: Shot, t_s: float, p_left: Array | None = None) -> None:
+        """Look at a shot, in order of time, s; the cost of a finding is that at a point (3,), m, left camera."""
+        self._last_s = t_s
+        if shot.left is None or shot.right is None:
+            return
+        images = tuple(_float(image) for image in (shot.left, shot.right))
+        if self._learning:
+            ready = [spots.learned(image) for spots, image in zip(self._spots, images, strict=True)]
+            self._learning = not all(ready)
+            if not self._learning:
+                self._find_depths(images)
+            return
+        motions = [spots.moved(image) for spots, image in zip(self._spots, images, strict=True)]
+        for side, motion in enumerate(motions):
+            alarm = motion is not None and motion.chi_square > _LIMIT
+            if motion is not None:
+                self._since[side] = (t_s if self._alarms[side] == 0 else self._since[side]) if alarm else None
+                self._alarms[side] = self._alarms[side] + 1 if alarm else 0
+        certain = [count >= _AGAIN for count in self._alarms]
+        if any(certain):
+            at = np.array([0.0, 0.0, 1.0]) if p_left is None else p_left
+            self._found = self._said(motions, certain, at)
+
+    def findings(self) -> tuple[HealthFinding, ...]:
+        """Return what was found so far; nothing while all is well."""
+        return self._found
+
+    def _find_depths(self, images: Sequence[NDArray[np.float32]]) -> None:
+        """Find the depth of each spot: the distance along its ray at which the other camera sees the same patch."""
+        for side, spots in enumerate(self._spots):
+            if not len(spots.uv):
+                continue
+            other = self._rig.cameras[1 - side]
+            T = inverse(self._rig.T_left_right) if side == 0 else self._rig.T_left_right
+            pixels = float(other.intrinsics[0]) * self._rig.baseline_m / _NEAREST_M  # of the nearest depth's disparity
+            near = np.linspace(0.0, 1.0 / _NEAREST_M, max(int(pixels / 1.5), 2))[1:]
+            rays = self._rig.cameras[side].unproject(spots.uv)
+            p = transform(T, (rays[:, None] / rays[:, None, 2:] / near[:, None]).reshape(-1, 3))
+            uv = other.project(p).reshape(len(rays), len(near), 2)
+            mine = spots._patches(images[side], spots.uv)
+            mine = _unit(mine)
+            for k, row in enumerate(uv):
+                inside = np.isfinite(row).all(axis=1)
+                alike = np.full(len(row), -1.0)
+                alike[inside] = _unit(spots._patches(images[1 - side], row[inside])) @ mine[k]
+                best = int(alike.argmax())
+                apart = np.abs(np.arange(len(row)) - best) > 4
+                if alike[best] > _ALIKE and (alike[apart] < alike[best] - 0.1).all():
+                    spots.depth_m[k] = 1.0 / near[best]
+
+    def _said(
+        self, motions: Sequence[CameraMotion | None], certain: Sequence[bool], p_left: Array
+    ) -> tuple[HealthFinding, ...]:
+        """Return the finding of cameras that moved."""
+        names = ("left", "right")
+        moved = [(side, motion) for side, motion in enumerate(motions) if certain[side] and motion is not None]
+        if not moved:
+            return self._found
+        side, motion = max(moved, key=lambda each: each[1].chi_square)
+        shifted = motion.shift is not None and motion.favours < -_DISTINCT
+        unsure = motion.shift is not None and abs(motion.favours) <= _DISTINCT
+        x, cov = motion.shift if shifted and motion.shift is not None else motion.rotation
+        size = float(np.linalg.norm(x))
+        sigma = float(np.sqrt(x @ cov @ x)) / size
+        scale, unit, verb = (1e3, "mm", "moved by") if shifted else (float(np.degrees(1.0)), "deg", "turned by")
+        or_shift = ""
+        if unsure and motion.shift is not None:
+            or_shift = f", or was moved by {1e3 * np.linalg.norm(motion.shift[0]):.2f} mm: the two cannot be distinguished"
+        both = len(moved) == 2 and self._alike(*(motion for _, motion in moved))
+        who = f"the {names[side]} camera {verb} {scale * size:.3f} {unit}{or_shift}"
+        if both:
+            who = f"both cameras moved together: {who}"
+        elif len(moved) == 2:
+            who = f"both cameras moved, not together: {who}"
+        elif motions[1 - side] is not None:
+            who += f", the {names[1 - side]} one did not"
+        what = f"{who}, as {motion.seen} spots of the background show"
+        begins = [since for _, since in ((s, self._since[s]) for s, _ in moved) if since is not None]
+        return (
+            HealthFinding(
+                "fixed" if both else "rig",
+                what,
+                min(begins, default=None),
+                scale * size,
+                scale * sigma,
+                unit,
+                "fasten the cameras and calibrate the rig again" if not both else "fasten the rig, and run again",
+                (),
+                None,
+                1e3 * self._cost_m(dict(moved), p_left, together=both),
+            ),
+        )
+
+    def _alike(self, left: CameraMotion, right: CameraMotion) -> bool:
+        """Return whether both cameras turned as one."""
+        R = self._rig.T_left_right[:3, :3]
+        apart = left.rotation[0] - R @ right.rotation[0]
+        cov = left.rotation[1] + R @ right.rotation[1] @ R.T
+        return float(apart @ np.linalg.solve(cov, apart)) < _LIMIT
+
+    def _cost_m(self, moved: dict[int, CameraMotion], p_left: Array, *, together: bool) -> float:
+        """Return by how much a measured point (3,) is displaced by rotations of the cameras, m."""
+        if together:
+            return float(np.linalg.norm(np.cross(moved[0].rotation[0], p_left)))
+        uv = []
+        for side, camera in enumerate(self._rig.cameras):
+            p = p_left if side == 0 else transform(inverse(self._rig.T_left_right), p_left)
+            turned = moved[side].rotation[0] if side in moved else np.zeros(3)
+            uv.append(camera.project((p - np.cross(turned, p))[None]))
+        (found,) = midpoints(self._rig, *uv)
+        return float(np.linalg.norm(found - p_left))
+
+
+def _float(image: Image) -> NDArray[np.float32]:
+    """Return an image in grey, smoothed as much as a patch is interpolated."""
+    return np.asarray(cv2.GaussianBlur(grey(image), (0, 0), 0.7).astype(np.float32))
+
+
+def _unit(patches: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return patches (K, P) of mean zero and length one."""
+    centred = patches - patches.mean(axis=1, keepdims=True)
+    return np.asarray(centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-9))
