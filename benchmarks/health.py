@@ -6,7 +6,8 @@ python health.py --seeds 2100:2105       of these seeds alone
 python health.py bump slip               of the cases alone whose names contain one of these words
 python health.py --results rows.jsonl    each run is a line there; those that stand in it are not made again
 python health.py rendered knock          one rendered run of a fault in the workcell (worn arm), about two minutes; with
-                                         "fixed" two fixed bodies are in view (run --fixed) while the rig is bumped by 2 mm
+                                         "fixed" two fixed bodies are in view (run --fixed) while the rig is bumped by 2 mm;
+                                         with "rotation" the right camera rotates by 0.02 deg
 
 python health.py follow                  a rig that is followed (run --follow-rig): when it is put right, what that leaves
 python health.py cost                    computing time of the tests a shot, at 60 Hz, and of falling back, a command (set
@@ -23,6 +24,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from sys import path
@@ -504,6 +506,24 @@ def with_plates(case: str) -> tuple[Target, ...]:
     return tuple(target for target, _ in plates)
 
 
+def rotated_camera(rotation_deg: float) -> None:
+    """Rotate the right camera of the workcell about its y axis in mid-run."""
+    image, begun, after = _OneCamera.__call__, WorkcellSource.__init__, {}
+
+    def seen(camera, exposed):
+        if camera._side == 1 and exposed.number >= 0 and exposed.t_s >= KNOCK_S and "right" not in after:
+            after["right"] = camera._camera = copy(camera._camera)
+            xi = np.array([0.0, 0.0, 0.0, 0.0, rotation_deg * DEG, 0.0])
+            camera._camera.T_base_camera, camera._camera._seen_room = camera._camera.T_base_camera @ exp_se3(xi), None
+            camera._T_this_left = inverse(exp_se3(xi)) @ camera._T_this_left
+        return image(camera, exposed)
+
+    def here(source, *given, processes=False, **options):
+        begun(source, *given, processes=False, **options)
+
+    _OneCamera.__call__, WorkcellSource.__init__ = seen, here
+
+
 def rendered(case: str) -> None:
     """Run the quick demo with a fault and print what it says."""
     run, carry = demo.run_experiment, Mounting.pose_measurement
@@ -526,6 +546,8 @@ def rendered(case: str) -> None:
             measured = replace(measured, T_left_body=inverse(exp_se3(motion)) @ measured.T_left_body)
         return carry(mounting, measured, t_s)
 
+    if case == "rotation":
+        rotated_camera(0.02)
     demo.run_experiment, Mounting.pose_measurement = faulty, moved
     try:
         with tempfile.TemporaryDirectory() as folder:

@@ -30,7 +30,7 @@ class Room:
             shift = self.rng.uniform(-0.5, 0.5, 2) * (z < 2.5)
             T = pose(exp_so3(self.rng.normal(0, 0.15, 3)), np.array([*shift, z]))
             image = draw((1600, 1200), self.rng) if texture else np.full((1200, 1600), 0.4, np.float32)
-            smooth = cv2.GaussianBlur(255 * image, (0, 0), 1.5)  # what no pixel resolves would be seen at wrong places
+            smooth = cv2.GaussianBlur(255 * image, (0, 0), 1.5)  # what no pixel resolves would be seen elsewhere
             self.planes.append((T, size, smooth))
         self.walkers = self.rng.uniform(0.2, 0.8, (3, 2))
         self._still = {}
@@ -65,8 +65,8 @@ class Room:
         return self._still[key]
 
     def shot(self, k, left=STILL, right=STILL, *, lamp=0.0, sun=None, people=False, noise=2.0, quality=None):
-        """Shot k; ``lamp`` adds that share of light from one side, ``sun`` is where a shadow's soft edge is, as a share of the
-        width, ``people`` walk by and a screen changes."""
+        """Shot k; ``lamp`` adds that share of light from one side, ``sun`` is a shadow's soft edge, a share of the width;
+        ``people`` walk by and a screen changes."""
         images = []
         for side, xi in enumerate((left, right)):
             image = self.clean(side, xi)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from armsight.data import Array, Body, PoseEstimate
+from armsight.data import Array, Body, PoseEstimate, Shot
 from armsight.loop.estimators import Outcome
 from armsight.loop.finding import HealthFinding, Trust
 from armsight.loop.frame_clock import FrameClock
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from armsight.loop.health.base_motion import BaseMotion, KeptMeasurement, Measurements
     from armsight.loop.health.closure import ClosureWatch
     from armsight.loop.health.follow import RigCorrection
+    from armsight.loop.health.scene import SceneWatch
     from armsight.robot.kinematics.arm import Arm
 
 #: So long after measurements contradicted what was learned the cause is open, s: the tests need some shots to find it.
@@ -61,6 +62,9 @@ class HealthMonitor:
     def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
         self._body, self._sync_s, self._printed = body, sync_s, printed
         self._rig = RigWatch(rig, body, sync_s, printed=printed) if rig.cov.any() else None
+        self._cameras = rig
+        self._scene: SceneWatch | None = None
+        self._p_left: Array | None = None  # where the body was seen last (3,), m
         self._host = HostWatch()
         self.stamps: FrameClock | None = None
         self._stamps_right = False
@@ -129,6 +133,7 @@ class HealthMonitor:
 
     def _take(self, pose: PoseEstimate, t_s: float | None) -> None:
         """Test a measured pose."""
+        self._p_left = pose.T_left_body[:3, 3]
         if t_s is not None:
             self._host.take(pose, t_s)
         if self._rig is not None:
@@ -147,6 +152,14 @@ class HealthMonitor:
         """Take the measured pose of the fixed body of a row, in order of time, s (None: the shots have no times)."""
         assert self._landmarks is not None
         self._landmarks.take(row, pose, t_s)
+
+    def scene_seen(self, shot: Shot, t_s: float) -> None:
+        """Look at the background of a shot, in order of time, s."""
+        from armsight.loop.health.scene import SceneWatch  # not above: what measures a pair does not look at it
+
+        if shot.left is not None:
+            self._scene = self._scene or SceneWatch(self._cameras)
+            self._scene.take(shot, t_s, self._p_left)
 
     @property
     def fixed_never_seen(self) -> tuple[str, ...]:
@@ -296,12 +309,13 @@ class HealthMonitor:
         """Begin the tests of cameras and bodies anew."""
         if correction.update is not None:
             self._watch_cameras(correction.update.rig)
+        self._scene = None
         if self._landmarks is not None:
             self._landmarks = LandmarkWatch(self._fixed_names)
 
     def _watch_cameras(self, rig: StereoRig) -> None:
         """Begin the tests of cameras, as they are now, anew."""
-        self._rig = RigWatch(rig, self._body, self._sync_s, printed=self._printed)
+        self._rig, self._cameras = RigWatch(rig, self._body, self._sync_s, printed=self._printed), rig
         self._suspected, self._cameras_s = None, np.inf
 
     @property
@@ -416,9 +430,22 @@ class HealthMonitor:
             *late,
             *self._host.findings(),
         )
+        now = _with_scene(now, () if self._scene is None else self._scene.findings())
         again = {_subject(each) for each in now}
         kept = (each for each in self._kept if each.corrected_s is not None or _subject(each) not in again)
         return (*kept, *now)
+
+
+def _with_scene(found: tuple[HealthFinding, ...], scene: tuple[HealthFinding, ...]) -> tuple[HealthFinding, ...]:
+    """Return findings with what the background shows: in the same finding where body or arm say it, too."""
+    for seen in scene:
+        same = next((each for each in found if seen.cause in (each.cause, *each.alternatives)), None)
+        if same is None:
+            found = (*found, seen)
+        else:
+            both = replace(same, what=f"{same.what}; the background says: {seen.what}")
+            found = tuple(both if each is same else each for each in found)
+    return found
 
 
 def _thinned(known: Sequence[tuple[float, Remembered]], now_s: float) -> list[tuple[float, Remembered]]:

@@ -3,8 +3,8 @@
 In: shots. Out: findings. Conspicuous, stable spots of each background are learned from the mean of the first images:
 corners (Shi and Tomasi, CVPR 1994), weighted by the spectral residual of the image (Hou and Zhang, "Saliency detection: a
 spectral residual approach", CVPR 2007), without what changes meanwhile. Each later image says by how much each spot is
-displaced from its first place (Lucas and Kanade, with brightness and contrast of its own: a lamp is no motion), and a
-robust fit to all spots of one camera by how much that turned. What an arm or people hide does not look like its spot any
+displaced from where it was first (Lucas and Kanade, with brightness and contrast of its own: a lamp is no motion), and a
+robust fit to all spots of one camera by how much that rotated. What an arm or people hide does not look like its spot any
 more; what else moves is outvoted. A spot's depth, from the other camera, distinguishes a shift from a rotation.
 """
 
@@ -26,9 +26,10 @@ from armsight.vision.image import grey
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import midpoints
 
-#: How often the background is looked at, s; half: twice the time, double: a turn is named later.
-EVERY_S = 0.2
-#: Images whose mean the spots are learned from; half: a noisier reference, double: learned after 4 s.
+Grey = NDArray[np.float32]
+#: Looks a second, for the rate of false alarms; half, double: nothing that shows.
+_LOOKS_HZ = 5.0
+#: Images whose mean the spots are learned from, and then their noise; half: a noisier reference, double: after 8 s.
 _LEARNED = 10
 #: Cells of an image, at most one spot each; half: half as accurate, double: twice the time.
 _CELLS = (10, 8)
@@ -38,7 +39,7 @@ _HALF = 8
 _STABLE_PX = 0.1
 #: What changes by more than so many times the usual noise while spots are learned is no background.
 _CHANGES = 3.0
-#: Steps of Lucas and Kanade; a spot further than this from its place, px, is not followed: half a patch.
+#: Steps of Lucas and Kanade; a spot further than this from where it was, px, is not followed: half a patch.
 _STEPS, _FAR_PX = 4, 4.0
 #: A patch that leaves this share of its contrast unexplained is hidden; half: noise hides them, double: people do not.
 _HIDDEN = 0.4
@@ -46,7 +47,7 @@ _HIDDEN = 0.4
 _LEAST, _MAJORITY = 10, 0.5
 #: Residuals beyond so many sigmas do not agree; rounds in which that settles.
 _AGREES, _ROUNDS = 4.0, 8
-#: A camera turned by less is not said, standard deviation, rad: mounts breathe and images are compressed. Half: what
+#: A camera rotated by less is not said, standard deviation, rad: mounts breathe and images are compressed. Half: what
 #: processing leaves is said, double: half a millimetre is not.
 _FLOOR_RAD = np.radians(0.001)
 #: Depths from this, m, on are tried for a spot, and patches of both cameras that correlate less are different ones.
@@ -55,7 +56,7 @@ _NEAREST_M, _ALIKE = 0.25, 0.8
 _DISTINCT = 9.0
 #: Looks in a row that must agree.
 _AGAIN = 2
-_LIMIT = alarm_limit(3, 1.0 / EVERY_S, 2)
+_LIMIT = alarm_limit(3, _LOOKS_HZ, 2)
 _SPOT = np.stack(np.meshgrid(*2 * [np.arange(-_HALF, _HALF + 1.0)]), axis=-1).reshape(-1, 2).astype(np.float32)
 
 
@@ -63,7 +64,7 @@ class CameraMotion(NamedTuple):
     """How a camera moved since its spots were learned.
 
     Attributes:
-        rotation: (3,) of the camera about its own axes, rad, if it turned alone; covariance (3, 3).
+        rotation: (3,) of the camera about its own axes, rad, if it rotated alone; covariance (3, 3).
         shift: (3,) of the camera, m, if it moved alone; covariance (3, 3); None where too few depths are known.
         favours: by how much the chi-square of a shift is larger than that of a rotation; 0 without a shift.
         seen: how many spots agree.
@@ -77,8 +78,8 @@ class CameraMotion(NamedTuple):
     @property
     def chi_square(self) -> float:
         """Of no rotation, a mount's own breathing included."""
-        turned, cov = self.rotation
-        return float(turned @ np.linalg.solve(cov, turned))
+        rotated, cov = self.rotation
+        return float(rotated @ np.linalg.solve(cov, rotated))
 
 
 class _Spots:
@@ -90,39 +91,45 @@ class _Spots:
     """
 
     def __init__(self, camera: Camera) -> None:
-        self._camera, self._first = camera, list[NDArray[np.float32]]()
+        self._camera, self._looks, self._tried = camera, 0, list[tuple[Array, Array, NDArray[np.bool_]]]()
+        self._sum = self._squares = np.zeros(camera.image_size_px[::-1], np.float32)
         self.uv, self.depth_m = np.zeros((0, 2)), np.zeros(0)
+        self._cov: Array = np.zeros((0, 2, 2))  # of a displacement, by noise of one grey level
 
-    def learned(self, image: NDArray[np.float32]) -> bool:
-        """Take an image to learn from; return whether it is the last one."""
-        self._first.append(image)
-        if len(self._first) < _LEARNED:
+    def learned(self, image: Grey) -> bool:
+        """Take an image to learn from; return whether it is the last one: the mean of some, then how others scatter."""
+        self._looks += 1
+        if self._looks <= _LEARNED:
+            self._sum, self._squares = self._sum + image, self._squares + image * image
+            if self._looks == _LEARNED:
+                self._choose()
             return False
-        mean, noise = np.mean(self._first, axis=0), np.std(self._first, axis=0, ddof=1)
-        self._choose(mean, noise)
-        self._template = self._patches(mean, self.uv)
-        dx, dy = cv2.Scharr(mean, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(mean, cv2.CV_32F, 0, 1) / 32
-        ones = np.ones_like(self._template)
-        A = np.stack([self._patches(dx, self.uv), self._patches(dy, self.uv), self._template, ones], axis=2)
-        self._by = np.linalg.pinv(A.astype(float))
-        self._cov = np.linalg.inv(np.swapaxes(A, 1, 2).astype(float) @ A)[:, :2, :2]
-        self._contrast = self._template.std(axis=1)
-        # Neighbouring pixels of compressed and interpolated images err alike: how much more spots scatter than it seems.
-        tried = [self.displaced(each) for each in self._first]
-        scatter = np.array([np.where(seen[:, None], d, np.nan) for d, _, seen in tried])
-        said = np.median([np.trace(cov, axis1=1, axis2=2) for _, cov, _ in tried], axis=0)
-        always = np.isfinite(scatter).all(axis=(0, 2))
-        ratio = scatter[:, always].var(axis=0, ddof=1).sum(axis=1) / said[always]
-        self._cov = self._cov * max(float(np.median(ratio)) if always.any() else 1.0, 1.0)
-        self._first.clear()
+        if self.followed:
+            self._tried.append(self.displaced(image))
+        if self._looks < 2 * _LEARNED:
+            return False
+        if self.followed:  # neighbouring pixels of compressed and interpolated images err alike
+            scatter = np.array([np.where(seen[:, None], d, np.nan) for d, _, seen in self._tried])
+            said = np.median([np.trace(cov, axis1=1, axis2=2) for _, cov, _ in self._tried], axis=0)
+            always = np.isfinite(scatter).all(axis=(0, 2))
+            ratio = scatter[:, always].var(axis=0, ddof=1).sum(axis=1) / said[always]
+            self._cov = self._cov * max(float(np.median(ratio)) if always.any() else 1.0, 1.0)
+        self._tried.clear()
         return True
 
-    def _choose(self, mean: NDArray[np.float32], noise: NDArray[np.float32]) -> None:
-        """Choose the most conspicuous stable spot of each cell."""
-        side = 2 * _HALF + 1
+    @property
+    def followed(self) -> bool:
+        """Whether there are spots enough."""
+        return len(self.uv) >= _LEAST
+
+    def _choose(self) -> None:
+        """Choose the most conspicuous stable spot of each cell, and keep how it looks."""
+        mean, side = np.asarray(self._sum / _LEARNED, np.float32), 2 * _HALF + 1
+        noise = np.sqrt(np.maximum(self._squares / _LEARNED - mean * mean, 0.0))
+        self._sum = self._squares = np.zeros((0, 0), np.float32)
         usual = max(float(np.median(noise)), 0.3)
         steady = cv2.blur((noise < _CHANGES * usual).astype(np.float32), (side, side)) > 0.95
-        strength = cv2.cornerMinEigenVal(mean, side, 3) * 4 * side**2  # Sobel, blurred: of sums of squared derivatives
+        strength = cv2.cornerMinEigenVal(mean, side, ksize=3) * side**2 / 4  # of the sums of squared derivatives
         good = (usual / np.sqrt(np.maximum(strength, 1e-9)) < _STABLE_PX) & steady
         rank = np.where(good, np.sqrt(strength) * _saliency(mean), 0.0)
         edge = _HALF + int(_FAR_PX) + 2
@@ -136,14 +143,27 @@ class _Spots:
                     chosen.append((u[0] + column, v[0] + row))
         self.uv = np.array(chosen, float).reshape(-1, 2)
         self.depth_m = np.full(len(chosen), np.nan)
+        if not self.followed:
+            return
+        self._template = self._patches(mean, self.uv)
+        slopes = (cv2.Scharr(mean, cv2.CV_32F, *each, scale=1 / 32) for each in ((1, 0), (0, 1)))
+        rows = [
+            *(self._patches(np.asarray(each, np.float32), self.uv) for each in slopes),
+            self._template,
+            np.ones_like(self._template),
+        ]
+        A = np.stack(rows, axis=2).astype(float)
+        self._by = np.linalg.pinv(A)
+        self._cov = np.linalg.inv(np.swapaxes(A, 1, 2) @ A)[:, :2, :2]
+        self._contrast = self._template.std(axis=1)
 
     @staticmethod
-    def _patches(image: NDArray[np.float32], uv: Array) -> NDArray[np.float32]:
-        """Return the patches (K, P) about pixels (K, 2); OpenCV's cubic interpolation would displace them by a hundredth."""
+    def _patches(image: Grey, uv: Array) -> Grey:
+        """Return the patches (K, P) about pixels (K, 2); OpenCV's cubic interpolation would displace them."""
         at = (uv[:, None] + _SPOT).astype(np.float32)
-        return np.asarray(cv2.remap(image, at, None, cv2.INTER_LINEAR))
+        return np.asarray(cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR))
 
-    def displaced(self, image: NDArray[np.float32]) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def displaced(self, image: Grey) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Return by how much each spot is displaced (K, 2), px, the covariance (K, 2, 2), and whether it is seen (K,)."""
         d = np.zeros_like(self.uv)
         patches = self._template
@@ -159,8 +179,10 @@ class _Spots:
         cov = self._cov * (left / np.maximum(share, 1e-3))[:, None, None] ** 2
         return d, cov, seen
 
-    def moved(self, image: NDArray[np.float32]) -> CameraMotion | None:
+    def moved(self, image: Grey) -> CameraMotion | None:
         """Return how the camera moved; None where too few spots are seen."""
+        if not self.followed:
+            return None
         d, cov, seen = self.displaced(image)
         if seen.sum() < _LEAST:
             return None
@@ -168,11 +190,11 @@ class _Spots:
         rays = self._camera.unproject(self.uv[seen])
         _, J, _ = self._camera.project_jacobians(rays)
         focal = self.uv[seen] - self._camera.intrinsics[2:4]  # a lens that breathes moves spots to and from the middle
-        turning = np.concatenate([J @ skew(rays), focal[..., None]], axis=2)
-        found = _fitted(turning, d, cov)
+        rotating = np.concatenate([J @ skew(rays), focal[..., None]], axis=2)
+        found = _fitted(rotating, d, cov)
         if found is None:
             return None
-        x, C, squares, good = found
+        x, C, _, good = found
         rotation = x[:3], C[:3, :3] + _FLOOR_RAD**2 * np.eye(3)
         depth = self.depth_m[seen] / rays[:, 2]
         known = np.isfinite(depth) & good
@@ -180,16 +202,16 @@ class _Spots:
             return CameraMotion(rotation, None, 0.0, int(good.sum()))
         shifting = np.concatenate([-J / depth[:, None, None], focal[..., None]], axis=2)
         rows = np.flatnonzero(known)
-        moved, turned = (_fitted(A[rows], d[rows], cov[rows], robust=False) for A in (shifting, turning))
-        if moved is None or turned is None:
+        moved, rotated = (_fitted(A[rows], d[rows], cov[rows], robust=False) for A in (shifting, rotating))
+        if moved is None or rotated is None:
             return CameraMotion(rotation, None, 0.0, int(good.sum()))
         floor = (_FLOOR_RAD * float(np.median(self.depth_m[seen][rows]))) ** 2 * np.eye(3)
-        scale = max(min(moved[2].mean(), turned[2].mean()) / 2, 1.0)
-        favours = float(moved[2].sum() - turned[2].sum()) / scale
+        scale = max(min(moved[2].mean(), rotated[2].mean()) / 2, 1.0)
+        favours = float(moved[2].sum() - rotated[2].sum()) / scale
         return CameraMotion(rotation, (moved[0][:3], moved[1][:3, :3] + floor), favours, int(good.sum()))
 
 
-def _saliency(image: NDArray[np.float32]) -> Array:
+def _saliency(image: Grey) -> Array:
     """Return how conspicuous each pixel (H, W) is, 1 on average."""
     small = cv2.resize(image, (64, 48), interpolation=cv2.INTER_AREA)
     F = np.fft.fft2(small)
@@ -199,12 +221,14 @@ def _saliency(image: NDArray[np.float32]) -> Array:
     return np.asarray(cv2.resize(map_ / map_.mean(), image.shape[::-1]))
 
 
-def _fitted(A: Array, d: Array, cov: Array, *, robust: bool = True) -> tuple[Array, Array, Array, NDArray[np.bool_]] | None:
+def _fitted(
+    A: Array, d: Array, cov: Array, *, robust: bool = True
+) -> tuple[Array, Array, Array, NDArray[np.bool_]] | None:
     """Fit displacements d (K, 2) by A (K, 2, P), by least trimmed then weighted squares.
 
     Returns:
-        The fit (P,), its covariance, scaled by what the residuals scatter, all squared distances (K,), and which spots agree
-        (K,); None where no majority does.
+        The fit (P,), its covariance by what the residuals scatter, all squared distances (K,), and which spots agree (K,);
+        None where no majority does.
     """
     half = np.linalg.inv(np.linalg.cholesky(cov))
     white, e = half @ A, (half @ d[..., None])[..., 0]
@@ -237,7 +261,7 @@ class SceneWatch:
     def __init__(self, rig: StereoRig) -> None:
         self._rig = rig
         self._spots = tuple(_Spots(camera) for camera in rig.cameras)
-        self._learning, self._last_s = True, -np.inf
+        self._learning = True
         self._alarms, self._since = [0, 0], list[float | None]([None, None])
         self._found: tuple[HealthFinding, ...] = ()
 
@@ -247,16 +271,13 @@ class SceneWatch:
         left, right = self._spots
         return len(left.uv), len(right.uv)
 
-    def due(self, t_s: float) -> bool:
-        """Return whether the next look is due at a time, s."""
-        return t_s - self._last_s >= EVERY_S
-
     def take(self, shot: Shot, t_s: float, p_left: Array | None = None) -> None:
         """Look at a shot, in order of time, s; the cost of a finding is that at a point (3,), m, left camera."""
-        self._last_s = t_s
         if shot.left is None or shot.right is None:
             return
         images = tuple(_float(image) for image in (shot.left, shot.right))
+        if any(i.shape[::-1] != c.image_size_px for i, c in zip(images, self._rig.cameras, strict=True)):
+            return
         if self._learning:
             ready = [spots.learned(image) for spots, image in zip(self._spots, images, strict=True)]
             self._learning = not all(ready)
@@ -278,10 +299,10 @@ class SceneWatch:
         """Return what was found so far; nothing while all is well."""
         return self._found
 
-    def _find_depths(self, images: Sequence[NDArray[np.float32]]) -> None:
+    def _find_depths(self, images: Sequence[Grey]) -> None:
         """Find the depth of each spot: the distance along its ray at which the other camera sees the same patch."""
         for side, spots in enumerate(self._spots):
-            if not len(spots.uv):
+            if not spots.followed:
                 continue
             other = self._rig.cameras[1 - side]
             T = inverse(self._rig.T_left_right) if side == 0 else self._rig.T_left_right
@@ -315,10 +336,12 @@ class SceneWatch:
         x, cov = motion.shift if shifted and motion.shift is not None else motion.rotation
         size = float(np.linalg.norm(x))
         sigma = float(np.sqrt(x @ cov @ x)) / size
-        scale, unit, verb = (1e3, "mm", "moved by") if shifted else (float(np.degrees(1.0)), "deg", "turned by")
+        scale, unit, verb = (1e3, "mm", "moved by") if shifted else (float(np.degrees(1.0)), "deg", "rotated by")
         or_shift = ""
         if unsure and motion.shift is not None:
-            or_shift = f", or was moved by {1e3 * np.linalg.norm(motion.shift[0]):.2f} mm: the two cannot be distinguished"
+            or_shift = (
+                f", or was moved by {1e3 * np.linalg.norm(motion.shift[0]):.2f} mm: the two cannot be distinguished"
+            )
         both = len(moved) == 2 and self._alike(*(motion for _, motion in moved))
         who = f"the {names[side]} camera {verb} {scale * size:.3f} {unit}{or_shift}"
         if both:
@@ -345,7 +368,7 @@ class SceneWatch:
         )
 
     def _alike(self, left: CameraMotion, right: CameraMotion) -> bool:
-        """Return whether both cameras turned as one."""
+        """Return whether both cameras rotated as one."""
         R = self._rig.T_left_right[:3, :3]
         apart = left.rotation[0] - R @ right.rotation[0]
         cov = left.rotation[1] + R @ right.rotation[1] @ R.T
@@ -358,18 +381,18 @@ class SceneWatch:
         uv = []
         for side, camera in enumerate(self._rig.cameras):
             p = p_left if side == 0 else transform(inverse(self._rig.T_left_right), p_left)
-            turned = moved[side].rotation[0] if side in moved else np.zeros(3)
-            uv.append(camera.project((p - np.cross(turned, p))[None]))
+            rotated = moved[side].rotation[0] if side in moved else np.zeros(3)
+            uv.append(camera.project((p - np.cross(rotated, p))[None]))
         (found,) = midpoints(self._rig, *uv)
         return float(np.linalg.norm(found - p_left))
 
 
-def _float(image: Image) -> NDArray[np.float32]:
+def _float(image: Image) -> Grey:
     """Return an image in grey, smoothed as much as a patch is interpolated."""
     return np.asarray(cv2.GaussianBlur(grey(image), (0, 0), 0.7).astype(np.float32))
 
 
-def _unit(patches: NDArray[np.float32]) -> NDArray[np.float32]:
+def _unit(patches: Grey) -> Grey:
     """Return patches (K, P) of mean zero and length one."""
     centred = patches - patches.mean(axis=1, keepdims=True)
     return np.asarray(centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-9))

@@ -145,7 +145,7 @@ _MOTION_S, _SCATTER_SHARE = 0.03, 0.25
 #: Searches for the sync LED before it is given up, two steps each, and the longest time for them, s.
 _LED_TRIES, _LED_S = 4, 60.0
 _STOP_S = 0.3  # in which an interrupted motion comes to rest
-_FIXED_EVERY_S = 0.2  # in which fixed bodies are measured
+_FIXED_EVERY_S = 0.2  # in which fixed bodies are measured, and the background is looked at
 #: Where a rig is followed: how often it is looked whether it can be put right, s.
 _RIG_EVERY_S = 0.25
 _LEAST_WAIT_S = 0.001  # for the board, even when the loop is late: a lost board is detected by a timeout
@@ -479,16 +479,17 @@ class Loop:
             self.log.segments.append(replace(segment, begin_s=begin_s, end_s=self.t_s))
 
     def _look_at_fixed(self, shot: Shot) -> None:
-        """Measure the fixed bodies in a shot, if it is time; on hardware in a thread."""
-        if not self._measure_fixed or self.t_s - self._fixed_s < _FIXED_EVERY_S:
+        """Look at the background and measure the fixed bodies in a shot, if it is time; on hardware in a thread."""
+        if self.t_s - self._fixed_s < _FIXED_EVERY_S:
             return
         if self._fixed_work is not None:
             if not self._fixed_work.done():
                 return
             self._fixed_work.result()
-        self._fixed_s = self.t_s
+        self._fixed_s = now_s = self.t_s
 
         def look() -> None:
+            self.health.scene_seen(shot, now_s)
             for row, measure in enumerate(self._measure_fixed):
                 if isinstance(measured := measure(shot), PoseEstimate):
                     self.health.fixed_measured(row, measured, shot.t_s)
