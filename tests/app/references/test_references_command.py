@@ -108,6 +108,7 @@ def test_calibrate_finds_the_sensor_and_writes_what_check_reads(sweep, capsys, t
         ("[imu]\nkind = 'inertial'\nrate = 3", None, r"\[imu\]: unknown key 'rate'; known are kind, source"),
         ("[imu]\nkind = 'inertial'\nclass = 'best'", None, "no class of inertial units 'best'; there are icm-42688"),
         ("[imu]\nkind = 'inertial'\nrate_hz = 0", None, "rate_hz is 0; expected more"),
+        ("[imu]\nkind = 'inertial'\nsource = 3", None, "source is 3; expected a text"),
         ("[imu]\nkind = 'inertial'", None, r"\[imu\]: no source; name its recording"),
         ("kind = 'inertial'", None, "expected a table a reference"),
         (None, lambda v: v / [1, 1, 1, 1, 9.80665, 9.80665, 9.80665], "reads .* at rest, as if in g; give m/s2"),

@@ -8,6 +8,7 @@ from arm_rig import ARM, MIDDLE, TICK_S, legs, measured, mounts, off, sampled, s
 from scipy.stats import chi2
 from wire import Wire
 
+from armsight.errors import InputError
 from armsight.loop.estimators import Delay, KalmanEstimator, Outcome, Prior
 from armsight.loop.references.inertial import ACCELEROMETER, Inertial
 from armsight.loop.references.reference import Reading, ToolMotion
@@ -127,6 +128,8 @@ def test_an_outlier_is_never_used_and_is_reported():
     assert heard[0][1].z.shape == (1,)
     assert heard[0][1].z[0] == pytest.approx(0.1, abs=0.01)
     assert estimator.take(wire, reading) is Outcome.USED
+    with pytest.raises(InputError, match="wire 0: channel 1 of 1: length"):
+        estimator.take(lengths[0][0], replace(reading, channel=1))
 
 
 def test_gravity_at_rest_shows_what_vision_does_not_see_yet():

@@ -44,7 +44,7 @@ OPEN_M, OPEN_RAD = 10e-3, np.deg2rad(1.0)
 _MIN_SHARE = 1e-9  # of a share
 _NOWHERE, _NONE = np.eye(4), np.zeros((6, 6))  # where nothing was measured: a pose, and a covariance
 #: Name under which what all measurements of vision share is considered, along the base's axes; and nothing considered.
-VISION, NONE_CONSIDERED = "", MappingProxyType[str, Array]({})
+VISION, NONE_CONSIDERED = "\0vision", MappingProxyType[str, Array]({})
 
 
 class Taken(NamedTuple):

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from armsight.data import Array, JointStates
+from armsight.errors import InputError
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import left_axes
 from armsight.loop.estimators import armerror
@@ -217,7 +218,14 @@ class KalmanEstimator:
 
         The reference's parameters and delay are considered by their covariance, not estimated. An outlier is never used,
         however often it comes back: which of reference and vision is wrong is not the filter's to say.
+
+        Raises:
+            InputError: the reference has no such channel.
         """
+        if not 0 <= reading.channel < len(reference.channels):
+            raise InputError(
+                f"{reference.name}: channel {reading.channel} of {len(reference.channels)}: {', '.join(reference.channels)}"
+            )
         return self._hear(Taken(reference, reading))
 
     def _hear(self, measurement: PoseMeasurement | Taken) -> Outcome:

@@ -84,7 +84,10 @@ def _entry(path: Path, name: str, table: dict[str, Any]) -> Entry:
             raise InputError(f"{where}: {key} is {value!r}; expected a number")
         if value < 0.0 or (key == "rate_hz" and value == 0.0):
             raise InputError(f"{where}: {key} is {value:g}; expected more")
-    kind = str(table.get("class", "mpu-6050"))
+    for key in ("source", "class"):
+        if not isinstance(table.get(key, ""), str):
+            raise InputError(f"{where}: {key} is {table[key]!r}; expected a text")
+    kind = table.get("class", "mpu-6050")
     sensor = Inertial.of(name, kind)
     late = table.get("delay_s", 0.0), table.get("sigma_delay_s", sensor.sigma_delay_s)
     sensor = replace(sensor, delay_s=float(late[0]), sigma_delay_s=float(late[1]))
