@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Image, Shot
+from armsight.data import SIDES, Array, Image, Shot
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
 from armsight.loop.finding import HealthFinding, alarm_limit
@@ -80,6 +80,17 @@ class CameraMotion(NamedTuple):
         """Of no rotation, a mount's own breathing included."""
         rotated, cov = self.rotation
         return float(rotated @ np.linalg.solve(cov, rotated))
+
+    def sized(self) -> tuple[float, float, str, str]:
+        """Return size, sigma, unit and words of what explains it: a shift where that does clearly, else a rotation."""
+        size, sigma = _size(*self.rotation, float(np.degrees(1.0)))
+        how = f"rotated by {size:.3f} deg"
+        if self.shift is not None and self.favours <= _DISTINCT:
+            shift_mm, sigma_mm = _size(*self.shift, 1e3)
+            if self.favours < -_DISTINCT:
+                return shift_mm, sigma_mm, "mm", f"moved by {shift_mm:.2f} mm"
+            how += f", or moved by {shift_mm:.2f} mm: the two cannot be distinguished"
+        return size, sigma, "deg", how
 
 
 class _Spots:
@@ -211,6 +222,12 @@ class _Spots:
         return CameraMotion(rotation, (moved[0][:3], moved[1][:3, :3] + floor), favours, int(good.sum()))
 
 
+def _size(x: Array, cov: Array, unit: float) -> tuple[float, float]:
+    """Return the length of a vector (3,) and its standard deviation, in a unit."""
+    size = float(np.linalg.norm(x))
+    return unit * size, unit * float(np.sqrt(x @ cov @ x)) / max(size, 1e-12)
+
+
 def _saliency(image: Grey) -> Array:
     """Return how conspicuous each pixel (H, W) is, 1 on average."""
     small = cv2.resize(image, (64, 48), interpolation=cv2.INTER_AREA)
@@ -326,44 +343,27 @@ class SceneWatch:
         self, motions: Sequence[CameraMotion | None], certain: Sequence[bool], p_left: Array
     ) -> tuple[HealthFinding, ...]:
         """Return the finding of cameras that moved."""
-        names = ("left", "right")
-        moved = [(side, motion) for side, motion in enumerate(motions) if certain[side] and motion is not None]
+        moved = {side: motion for side, motion in enumerate(motions) if certain[side] and motion is not None}
         if not moved:
             return self._found
-        side, motion = max(moved, key=lambda each: each[1].chi_square)
-        shifted = motion.shift is not None and motion.favours < -_DISTINCT
-        unsure = motion.shift is not None and abs(motion.favours) <= _DISTINCT
-        x, cov = motion.shift if shifted and motion.shift is not None else motion.rotation
-        size = float(np.linalg.norm(x))
-        sigma = float(np.sqrt(x @ cov @ x)) / size
-        scale, unit, verb = (1e3, "mm", "moved by") if shifted else (float(np.degrees(1.0)), "deg", "rotated by")
-        or_shift = ""
-        if unsure and motion.shift is not None:
-            or_shift = (
-                f", or was moved by {1e3 * np.linalg.norm(motion.shift[0]):.2f} mm: the two cannot be distinguished"
-            )
-        both = len(moved) == 2 and self._alike(*(motion for _, motion in moved))
-        who = f"the {names[side]} camera {verb} {scale * size:.3f} {unit}{or_shift}"
-        if both:
-            who = f"both cameras moved together: {who}"
-        elif len(moved) == 2:
-            who = f"both cameras moved, not together: {who}"
+        side = max(moved, key=lambda each: moved[each].chi_square)
+        together = len(moved) == 2 and self._alike(moved[0], moved[1])
+        size, sigma, unit, how = moved[side].sized()
+        who = f"the {SIDES[side]} camera {how}"
+        if len(moved) == 2:
+            who = f"both cameras moved{'' if together else ', not'} together: {who}"
         elif motions[1 - side] is not None:
-            who += f", the {names[1 - side]} one did not"
-        what = f"{who}, as {motion.seen} spots of the background show"
-        begins = [since for _, since in ((s, self._since[s]) for s, _ in moved) if since is not None]
+            who += f", the {SIDES[1 - side]} one did not"
         return (
             HealthFinding(
-                "fixed" if both else "rig",
-                what,
-                min(begins, default=None),
-                scale * size,
-                scale * sigma,
+                "fixed" if together else "rig",
+                f"{who}, as {moved[side].seen} spots of the background show",
+                min((since for each in moved if (since := self._since[each]) is not None), default=None),
+                size,
+                sigma,
                 unit,
-                "fasten the cameras and calibrate the rig again" if not both else "fasten the rig, and run again",
-                (),
-                None,
-                1e3 * self._cost_m(dict(moved), p_left, together=both),
+                "fasten the rig, and run again" if together else "fasten the cameras and calibrate the rig again",
+                cost_mm=1e3 * self._cost_m(moved, p_left, together=together),
             ),
         )
 
