@@ -26,6 +26,7 @@ FILE_WRITERS = {
     "arm calibrated": ("six_r", "arm.toml"),
     "arm plan": ("six_r", "--around", "run"),
     "rig update": (".",),
+    "references calibrate": ("arm.toml", "--poses", "poses.csv"),
 }
 FOLDER_WRITERS = {
     "calibrate --report": (*FILE_WRITERS["calibrate"], "-o", "new.json"),
