@@ -4,6 +4,7 @@ A shot is the ray of each pixel cut with each plane, the nearest one seen; then 
 """
 
 from dataclasses import replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from armsight.sim.example_rig import example_rig
 from armsight.sim.render.background import cluttered, textured
 
 RATE_HZ = 5.0
+FINE = 3  # rays a pixel along each side
 STILL = np.zeros(6)
 
 
@@ -35,16 +37,20 @@ class Room:
         self.walkers = self.rng.uniform(0.2, 0.8, (3, 2))
         self._still = {}
 
+    @cached_property
+    def _rays(self):
+        """The rays of both cameras' pixels, FINE along each side of one."""
+        width, height = self.rig.left.image_size_px
+        v, u = np.mgrid[: FINE * height, : FINE * width] / FINE - 0.5 + 0.5 / FINE
+        return [camera.unproject(np.stack([u.ravel(), v.ravel()], axis=1)) for camera in self.rig.cameras]
+
     def clean(self, side, xi):
         """The image of a camera that moved by a right tangent of its own pose."""
         key = side, tuple(xi)
         if key not in self._still:
             T = (np.eye(4), self.rig.T_left_right)[side] @ exp_se3(np.asarray(xi, float))
-            camera = self.rig.cameras[side]
-            width, height = camera.image_size_px
-            fine = 3  # rays a pixel along each side
-            v, u = np.mgrid[: fine * height, : fine * width] / fine - 0.5 + 0.5 / fine
-            rays = camera.unproject(np.stack([u.ravel(), v.ravel()], axis=1))
+            width, height = self.rig.cameras[side].image_size_px
+            rays = self._rays[side]
             depth, out = np.full(len(rays), np.inf), np.full(len(rays), 90.0)
             for T_left_plane, size, image in self.planes:
                 W = inverse(T_left_plane) @ T
@@ -56,10 +62,10 @@ class Room:
                 inside = (np.abs(xy - np.array([w / 2, h / 2])) < np.array([w / 2 - 2, h / 2 - 2])).all(axis=1)
                 hit = (t > 0) & (t < depth) & inside
                 depth[hit] = t[hit]
-                x, y = (xy[:, i].reshape(-1, fine * width) for i in (0, 1))
+                x, y = (xy[:, i].reshape(-1, FINE * width) for i in (0, 1))
                 seen = cv2.remap(image, x, y, cv2.INTER_CUBIC)
                 out[hit] = seen.ravel()[hit]
-            big = out.reshape(fine * height, fine * width).astype(np.float32)
+            big = out.reshape(FINE * height, FINE * width).astype(np.float32)
             image = cv2.resize(big, (width, height), interpolation=cv2.INTER_AREA)
             self._still[key] = cv2.GaussianBlur(image, (0, 0), 0.8)
         return self._still[key]

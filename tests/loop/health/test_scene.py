@@ -22,7 +22,7 @@ def watched(room, *, left=STILL, right=STILL, looks=6, after=None, **light):
 
 @pytest.fixture(scope="module")
 def room():
-    return Room(11)
+    return Room(11, scale=0.4)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -60,15 +60,15 @@ def test_both_cameras_on_one_stand_that_rotates_are_the_rig(room):
 
 
 def test_people_a_lamp_and_a_wandering_shadow_are_no_motion(room):
-    assert not watched(room, people=True, quality=80, after={"lamp": 0.4}, looks=20).findings()
+    assert not watched(room, people=True, quality=80, after={"lamp": 0.4}, looks=12).findings()
     watch = SceneWatch(room.rig)
-    for k in range(45):
+    for k in range(40):
         watch.take(room.shot(k, sun=0.2 + 0.01 * k, people=True), k / RATE_HZ)
     assert not watch.findings()
 
 
 def test_a_room_without_texture_says_nothing(room):
-    bare = Room(11, texture=False)
+    bare = Room(11, scale=0.4, texture=False)
     watch = watched(bare, right=np.array([0.0, 0.0, 0.0, 0.0, 0.1 * DEG, 0.0]))
     assert max(watch.spots) < 10
     assert not watch.findings()
