@@ -1,6 +1,7 @@
 """The public names: what completion shows, what a result prints, and the whole way from pictures to a table."""
 
 import inspect
+import json
 import pydoc
 import re
 import sys
@@ -92,8 +93,44 @@ def test_a_hand_eye_calibration_prints_its_error_and_sigma():
     assert text.startswith("HandEye(to_hand, 12 of 12 poses; held out ")
     with pytest.raises(ArmsightError, match=r"Ts_base_flange is a str; expected poses .*read_pose_table"):
         armsight.handeye("robot.csv", B)
+    with pytest.raises(ArmsightError, match="are the same numbers"):
+        armsight.handeye(A, A.copy())
     still = np.array(re.findall(r"(-?[\d.]+) \+- ([\d.]+)", text), float)[:3]
     assert (np.abs(still[:, 0] - 1e3 * Z[:3, 3]) < 4 * still[:, 1] + 0.005).all()
+
+
+def test_one_decisive_pose_is_said_and_a_calibration_is_saved_and_drawn(tmp_path):
+    """All poses but the fifth rotate about one axis alone: without it the translation along that axis is open."""
+    rng = np.random.default_rng(4)
+    turns = np.zeros((9, 6))
+    turns[:, :3], turns[:, 5] = rng.normal(size=(9, 3)) * 0.2, rng.normal(size=9)
+    turns[4, 3] = 0.8
+    A, cov = exp_se3(turns), np.diag([1e-4, 1e-4, 3e-4, 1e-3, 1e-3, 1e-3]) ** 2
+    B = A @ exp_se3(np.array([0.01, 0.02, 0.1, 0.1, 0.5, -0.3])) @ exp_se3(rng.multivariate_normal(np.zeros(6), cov, 9))
+    found = armsight.handeye(A, B, np.tile(cov, (9, 1, 1)), quick=True)
+    assert int(np.argmax(found.leverage)) == 4
+    assert "one pose decides: without pose 4 a direction is" in repr(found)
+    found.save(tmp_path / "handeye.json")
+    kept = json.loads((tmp_path / "handeye.json").read_text())
+    assert kept == found.to_dict()
+    np.testing.assert_array_equal(kept["T_flange_body"], found.T_flange_body)
+    assert len(found.plot().axes[0].patches) == 9
+
+
+def test_errors_name_arguments_and_not_options(tmp_path):
+    """A table of joints is no table of what cameras saw; a folder is no board."""
+    path = tmp_path / "joints.csv"
+    path.write_text("q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n1,2,3,4,5,6\n")
+    with pytest.raises(ArmsightError, match="give arm, a name"):
+        armsight.read_pose_table(path)
+    with pytest.raises(ArmsightError, match="no poses that cameras saw"):
+        armsight.read_pose_table(path, arm=armsight.open_arm("six_r"), side="seen")
+    (tmp_path / "poses.csv").write_text("0.1,0.2,0.3,1,0,0,0\n")
+    with pytest.raises(ArmsightError, match=r"give rotation=wxyz or rotation=xyzw") as raised:
+        armsight.read_pose_table(tmp_path / "poses.csv")
+    assert "--" not in str(raised.value)
+    with pytest.raises(ArmsightError, match=r"board is the folder .*: are the two exchanged"):
+        calibrate(str(tmp_path), BOARD)
 
 
 def test_a_source_is_iterated_counted_and_indexed(boards):

@@ -25,8 +25,12 @@ frozen records in :mod:`armsight.data`:
 
 from __future__ import annotations
 
+import functools
 import importlib
 import os
+import re
+import types
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -125,7 +129,35 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 - a module's names are of any
         return importlib.import_module("importlib.metadata").version("armsight")
     if name not in _HOME:
         raise AttributeError(f"module 'armsight' has no attribute {name!r}; public are {', '.join(__all__)}")
-    return getattr(importlib.import_module(_HOME[name]), _THERE.get(name, name))
+    found = getattr(importlib.import_module(_HOME[name]), _THERE.get(name, name))
+    if isinstance(found, types.FunctionType):
+        found = globals()[name] = _in_python(found)
+    return found
+
+
+#: Option of the command line in a message -> the argument that a Python caller gives instead, where the names differ.
+_ARGUMENTS = {"model": "arm", "units": "unit", "seen-units": "unit", "seen-rotation": "rotation"}
+
+
+def _in_python(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a public function whose errors name arguments where the command line's name options."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> Any:  # noqa: ANN401 - of any public function
+        try:
+            return function(*args, **options)
+        except _root() as error:
+            said = lambda m: f"{_ARGUMENTS.get(m[1], m[1].replace('-', '_'))}{'=' if m[2] else ''}"  # noqa: E731
+            error.args = (
+                re.sub(r"(?<![\w-])--([a-z][a-z-]*)( (?=[A-Za-z]+[:=]|wxyz|xyzw|rotvec|m\b|mm\b))?", said, str(error)),
+            )
+            raise
+
+    return call
+
+
+def _root() -> type[Exception]:
+    return importlib.import_module("armsight.errors").ArmsightError  # type: ignore[no-any-return]
 
 
 def __dir__() -> list[str]:

@@ -118,6 +118,10 @@ def read_pose_table(
         Ts = pose(R, p)
     elif arm is None:
         raise InputError(f"{path}: joint angles need the arm: give --model, a name (armsight arm list) or a .urdf file")
+    elif side == "seen":
+        raise InputError(
+            f"{path}: holds joint angles alone, no poses that cameras saw: x_m y_m z_m or x_mm y_mm z_mm are needed"
+        )
     else:
         Ts, of_joints = np.asarray(arm.forward(q)), True
     t_s, row_names, lines = table.times(), table.names(), np.array([line for line, _ in table.rows])

@@ -26,6 +26,7 @@ from armsight.app.calibrate.figures import (
 from armsight.app.calibrate.report import FIGURES, calibration_report, pose_table
 from armsight.app.show import page
 from armsight.app.show.plotting import drawing, nice, plain, png
+from armsight.app.show.report import figure_files
 from armsight.data import Body, Detections
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose, transform
@@ -96,7 +97,8 @@ def written(calibration, tmp_path_factory):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Spare the rendering where a test is not about the pictures."""
-    monkeypatch.setattr("armsight.app.show.report.png", lambda figure: b"png")
+    for made in ("png", "svg", "data_csv"):
+        monkeypatch.setattr(f"armsight.app.show.report.{made}", lambda figure, made=made: made.encode())
 
 
 class Page:
@@ -161,9 +163,7 @@ def test_nothing_from_outside_gets_into_the_page_as_html(written):
 
 
 def test_every_figure_is_in_the_page_and_beside_it_and_not_blank(written):
-    assert sorted(path.name for path in written.iterdir()) == sorted(
-        ["report.html", *(f"report-{name}.png" for name in FIGURES)]
-    )
+    assert sorted(path.name for path in written.iterdir()) == sorted(["report.html", *figure_files("report", FIGURES)])
     embedded = [base64.b64decode(v.split(",")[1]) for _, key, v in page_of(written).attributes if key == "src"]
     assert embedded == [(written / f"report-{name}.png").read_bytes() for name in FIGURES]
     for data in embedded:

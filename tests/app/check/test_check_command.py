@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 
+from armsight.app.check.report import assess
 from armsight.app.check.result import MetricLine, check_limits
 from armsight.app.run.motion_file import read_motions
 from armsight.geometry.pose import pose
@@ -400,3 +401,26 @@ def test_help_shows_both_usages(capsys):
     lines = said(capsys, "--help").out.splitlines()
     assert lines[:2] == ["Usage: armsight check [OPTIONS] RUN|POSES.csv", "       armsight check plan [OPTIONS]"]
     assert said(capsys, "plan", "--help").out.startswith("Usage: armsight check plan [OPTIONS]\n")
+
+
+def test_the_first_sentence_says_how_good_and_what_to_do():
+    def metric(clean, low, high):
+        return Metric(clean or high, clean, low, high, None if low is None else 1e-5)
+
+    sure, hidden, alone = metric(1e-3, 9e-4, 1.1e-3), metric(None, 0.0, 2e-4), Metric(1e-3, None, None, None, None)
+    lines = [MetricLine("AP", "P1", sure), MetricLine("RP", "P1", metric(1e-4, 9e-5, 1.1e-4))]
+    grade, said = assess(lines, [])
+    assert (grade, said[:43]) == ("good", "Well resolved: AP is 1.00 mm and RP is 0.10")
+    assert "armsight identify" in said
+    assert assess([lines[0], MetricLine("RP", "P1", sure)], [])[1].endswith("--limit holds the arm to a figure.")
+    assert assess([lines[0], MetricLine("RP", "P1", hidden)], [])[0] == "fair"
+    assert "RP is 0.20 mm" in assess([lines[0], MetricLine("RP", "P1", hidden)], [])[1]
+    assert assess([MetricLine("AP", "P1", alone)], [])[1].startswith("Usable with care")
+    for limit, expected, words in (
+        (0.9, "poor", "AP of P1 is 1.00 mm, limit 0.9"),
+        (1.05, "fair", "more cycles"),
+        (2, "good", "Within"),
+    ):
+        outcomes = check_limits(lines, {"AP": limit * 1e-3})
+        grade, said = assess(lines, [each for each in outcomes if each is not None])
+        assert (grade, words in said) == (expected, True), said

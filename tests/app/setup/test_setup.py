@@ -11,7 +11,7 @@ import pytest
 from armsight.app.main import group, run
 from armsight.app.setup import finding, walk
 from armsight.app.setup.finding import check_arm, find_left_and_right, find_port
-from armsight.app.setup.steps import ARMS
+from armsight.app.setup.steps import ARMS, PLATE
 from armsight.robot.boards.ar4 import board as ar4
 from armsight.sim.boards.ar4 import Ar4Teensy
 from armsight.sim.boards.device import serve
@@ -122,6 +122,18 @@ def test_it_goes_on_where_it_was(armsight, typed, person):
     came.clear()
     said = armsight("setup", "six_r", "--from", "6")
     assert [c.split()[0] for c in came] == ["identify", "board"]
+
+
+def test_a_recording_that_ctrl_c_ends_is_done_and_the_plate_is_at_hand(armsight, typed, person, folder):
+    _, codes = typed
+    codes["record"] = 130
+    said = armsight("setup", "ur5e", "--source", "usb:3,1", "--json")
+    assert said.code == 0
+    assert [row["state"] for row in said.lines[0]["steps"]].count("failed") == 0
+    assert not (folder / "examples").exists()  # nothing of these steps needs the plate
+    walk.FILE.unlink()
+    assert "written: examples/arm_plate.toml" in armsight("setup", "so101", "--source", "usb:3,1", "--board", "x").err
+    assert (folder / PLATE).read_bytes() == (DOCS.parents[1] / PLATE).read_bytes()
 
 
 def test_a_check_that_says_no_holds_nothing_up(armsight, typed, person):

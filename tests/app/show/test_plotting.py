@@ -1,11 +1,12 @@
 """A figure that is laid out once looks as matplotlib renders it."""
 
+import csv
 import io
 
 import cv2
 import numpy as np
 
-from armsight.app.show.plotting import DPI, drawing, new_figure, png, svg
+from armsight.app.show.plotting import DPI, data_csv, drawing, new_figure, png, svg
 
 
 def figure():
@@ -39,3 +40,33 @@ def test_a_figure_has_the_pixels_and_the_lines_that_matplotlib_gives_it():
         assert svg(ours) == lines
     decoded = [cv2.imdecode(np.frombuffer(each, np.uint8), cv2.IMREAD_UNCHANGED) for each in (data, expected)]
     np.testing.assert_array_equal(*decoded)
+
+
+def test_the_data_of_a_figure_are_its_points_bars_arrows_and_cells():
+    with drawing():
+        made = new_figure(3.0)
+        ax, other = made.subplots(1, 2)
+        ax.plot([1.0, 2.0], [3.0, np.nan], label="a line")
+        ax.axhline(7.0)  # lies at no data
+        ax.scatter([4.0, 5.0], [6.0, 7.0], c=[8.0, 9.0])
+        ax.quiver([1.0], [2.0], [3.0], [4.0])
+        ax.set(title="of a test", xlabel="along, s", ylabel="across, mm")
+        other.bar([1, 3], [2.0, 5.0], width=0.5)
+        made.colorbar(other.imshow([[1.0, 2.0], [3.0, 4.0]], extent=(0, 4, 0, 2), aspect="auto"))
+        head, *rows = csv.reader(io.StringIO(data_csv(made).decode()))
+    cells = [dict(zip(head, row, strict=True)) for row in rows]
+    points = [tuple(row[name] for name in ("panel", "series", "x", "y", "value", "u", "v")) for row in cells]
+    assert points == [
+        ("1", "a line", "1", "3", "", "", ""),
+        ("1", "a line", "2", "", "", "", ""),
+        ("1", "", "4", "6", "8", "", ""),
+        ("1", "", "5", "7", "9", "", ""),
+        ("1", "", "1", "2", "", "3", "4"),
+        ("2", "", "1", "2", "", "", ""),
+        ("2", "", "3", "5", "", "", ""),
+        *(
+            ("2", "", x, y, v, "", "")
+            for x, y, v in (("1", "1.5", "1"), ("3", "1.5", "2"), ("1", "0.5", "3"), ("3", "0.5", "4"))
+        ),
+    ]
+    assert (cells[0]["title"], cells[0]["x axis"], cells[0]["y axis"]) == ("of a test", "along, s", "across, mm")

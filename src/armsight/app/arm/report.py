@@ -12,12 +12,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import click
 import numpy as np
 
 from armsight.app.arm.evaluate import SURE, VERSION, ArmReport, JointFigures
 from armsight.app.show.page import PAGE, writable_folder
 from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, arrows, drawing, new_figure, panels
-from armsight.app.show.report import Lines, Plot, Report, Section
+from armsight.app.show.report import Grade, Lines, Plot, Report, Section
 from armsight.app.show.table import TextTable
 from armsight.errors import InputError
 from armsight.files import read_json, write_text
@@ -195,7 +196,23 @@ def arm_report(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> Repor
         "notes": ("Notes", [Lines(remarks(report))]),
         "plots": ("Figures", plots),
     }
-    return Report(report.arm, heading, sub, "", sections, values=report.to_json())
+    return Report(report.arm, heading, sub, "", sections, values=report.to_json(), assessed=assess(report))
+
+
+def assess(report: ArmReport) -> tuple[Grade, str]:
+    """Return the grade of a report, and in one sentence how far the arm is off and which remedy to begin with."""
+    off, most = report.accuracy_mm
+    said = f"the arm is off by {off:.2f} mm RMS, {most:.2f} at most"
+    if report.health:
+        return "poor", f"Do not use this report: {report.health[0]}; mend that, and record the run again."
+    known = [part for part in report.parts.values() if part.determined and part.remedy and part.without_mm < off]
+    if not known:
+        return "fair", f"Usable with care: {said}, and no remedy here would lower that for certain; record more poses."
+    best = min(known, key=lambda part: part.without_mm)
+    after = f"begin with this remedy, which alone leaves {best.without_mm:.2f} mm: {best.remedy}"
+    if 2 * best.without_mm > off:
+        return "fair", f"Usable: {said}, and no remedy alone halves it; {after}."
+    return "good", f"Good: {said}, and most of that is explained; {after}."
 
 
 def write_report(report: Report, found: ArmReport, folder: Path) -> None:
@@ -214,7 +231,9 @@ def _text_page(report: Report) -> Figure:
     """Return a page of text for the PDF."""
     figure = new_figure(_PAGE)
     figure.set_layout_engine(None)
-    lines = "\n".join(textwrap.fill(line, 150, subsequent_indent="  ") for line in report.text().split("\n"))
+    lines = "\n".join(
+        textwrap.fill(line, 150, subsequent_indent="  ") for line in click.unstyle(report.text()).split("\n")
+    )
     figure.text(0.04, 0.97, report.heading, fontsize=16, va="top", weight="bold")
     figure.text(0.04, 0.945, report.sub, fontsize=9, va="top", color=MUTED)
     figure.text(0.04, 0.915, lines, fontsize=7, va="top", family="monospace", linespacing=1.35)

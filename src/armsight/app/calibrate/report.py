@@ -37,7 +37,7 @@ from armsight.app.calibrate.figures import (
 )
 from armsight.app.show.messages import weak
 from armsight.app.show.page import PAGE, bullets, table, text
-from armsight.app.show.report import Block, Html, Plot, Report, Section, Text, assessment
+from armsight.app.show.report import Block, Html, Plot, Report, Section, Text, figure_files
 from armsight.app.show.table import TextTable, plain_text
 from armsight.geometry.pose import exp_se3
 from armsight.geometry.rotation import log_so3
@@ -224,7 +224,7 @@ def _words(calibration: Calibration) -> dict[str, object]:
 
 def _result(calibration: Calibration) -> str:
     """Return the assessment, the held-out metrics, what is weak, and which pairs were rejected or used in part."""
-    found, used = assess(calibration), len(calibration.pairs)
+    used = len(calibration.pairs)
     weak_points = bullets(advice(calibration)) or "<p>None.</p>\n"
     rejected = f"<p>None: all {used} pairs were used.</p>\n"
     if calibration.rejected:
@@ -235,8 +235,7 @@ def _result(calibration: Calibration) -> str:
         counted = f"<p>{used} of {calibration.pairs_found} pairs were used.</p>\n"
         rejected = counted + table(("pair", "reason"), rows, "prose")
     return (
-        assessment([found.headline], found.meaning, found.grade)
-        + headline_table(calibration)
+        headline_table(calibration)
         + "<p>Rely on the held-out column: a fit adapts to the pairs it is made from, the more so the fewer they are. The "
         "held-out metrics come from pairs that were not fitted, measured as later measurements are.</p>\n"
         f"<h3>Weak points, and what to do</h3>\n{weak_points}"
@@ -319,7 +318,7 @@ def _poor(calibration: Calibration) -> list[str]:
 
 
 #: Names of all files that a report may have.
-REPORT_FILES = (PAGE, *(f"report-{name}.png" for name in FIGURES))
+REPORT_FILES = (PAGE, *figure_files("report", FIGURES))
 
 
 def calibration_report(
@@ -335,6 +334,7 @@ def calibration_report(
         seconds: how long it took.
     """
     c, words, page = calibration, _words(calibration), None if report is None else report / PAGE
+    found = assess(c)
     left, right = ("{} x {}".format(*camera.image_size_px) for camera in c.rig.cameras)
     size = f"{left} px" if left == right else f"{left} px left, {right} px right"
     used = f"{len(c.pairs)} of {c.pairs_found} pairs of images used"
@@ -352,7 +352,7 @@ def calibration_report(
         "rejected": c.rejected,
         "notes": c.notes,
         "weaknesses": c.weaknesses,
-        "grade": assess(c).grade,
+        "grade": found.grade,
         "poor": _poor(c),
         "fit": {"epipolar_rms_px": c.epipolar_rms_px, "reprojection_rms_px": c.reprojection_rms_px},
         "heldout": c.heldout,
@@ -370,4 +370,12 @@ def calibration_report(
         "seconds": seconds,
     }
     what = f"{c.body.name} · {used} · {size} · baseline {1e3 * c.rig.baseline_m:.1f} mm"
-    return Report("calibration report", "Calibration of two cameras", what, "", sections, values=values)
+    return Report(
+        "calibration report",
+        "Calibration of two cameras",
+        what,
+        found.meaning,
+        sections,
+        values=values,
+        assessed=(found.grade, found.headline),
+    )

@@ -102,7 +102,7 @@ def evaluated(
     report = check_report(result, attained.rows, data, outcomes)
     if output is not None:
         report.write(output, {"check.json": report.json_text(), "check.csv": rows_csv(list(attained.rows))})
-    files = "report.html with its figures as PNG, check.json, check.csv"
+    files = "report.html with its figures as PNG, SVG and CSV, check.json, check.csv"
     report.echo(as_json=as_json, written=None if output is None else f"{output}/{files}")
     return 1 if any(each is not None and not each.passed for each in outcomes) else 0
 

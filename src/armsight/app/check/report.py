@@ -1,7 +1,7 @@
 """The metrics of a test as text, as figures and as one HTML page that holds everything it shows.
 
 In: the metrics (``result``) and the rows that they are made of. Out: text in mm for the terminal; a folder of report.html,
-its figures as PNG, check.json and check.csv.
+its figures as PNG, SVG and CSV, check.json and check.csv.
 """
 
 from __future__ import annotations
@@ -12,12 +12,21 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from armsight.app.check.result import MEANINGS, CheckResult, LimitResult, all_compared, direction, metric_lines
+from armsight.app.check.result import (
+    MEANINGS,
+    CheckResult,
+    LimitResult,
+    MetricLine,
+    all_compared,
+    direction,
+    metric_lines,
+    value_m,
+)
 from armsight.app.check.rows import Row
 from armsight.app.show.messages import Note
 from armsight.app.show.page import PAGE, bullets
 from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, new_figure, nice
-from armsight.app.show.report import Block, Html, Report, Text, figures
+from armsight.app.show.report import Block, Grade, Html, Report, Text, figure_files, figures
 from armsight.app.show.table import TextTable, html_table
 from armsight.data import Array
 from armsight.loop.iso9283.paths import square_to
@@ -63,6 +72,7 @@ def scatter_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
     if not names:
         return None
     figure, reach, a = new_figure(4.6), 0.0, np.linspace(0, 2 * np.pi, 120)
+    figure.set_layout_engine("compressed")  # few poses stand side by side, not in the corners
     panels = figure.subplots(2, len(names), squeeze=False, sharex=True, sharey=True)
     for column, name in enumerate(names):
         p, metrics = _at(_of_pose(rows, name))[0], result.poses[name]
@@ -203,7 +213,7 @@ FIGURES: dict[str, tuple[Callable[[CheckResult, Sequence[Row]], Figure | None], 
 }
 
 #: Names of all files that a report may have.
-REPORT_FILES = (PAGE, "check.json", "check.csv", *(f"check-{name}.png" for name in FIGURES))
+REPORT_FILES = (PAGE, "check.json", "check.csv", *figure_files("check", FIGURES))
 
 
 def check_report(
@@ -257,7 +267,53 @@ def check_report(
         [Note("note", each) for each in result.notes],
         result.values(),
         prefix="check",
+        assessed=assess(listed, [each for each in outcomes if each is not None]),
     )
+
+
+#: What a test says first of an arm: how far from the command, and how far from its own mean.
+_ACCURACY, _REPEATABILITY = (
+    ("AP", "mean error", "AT", "AD", "circularity"),
+    ("RP", "largest error", "RT", "RD", "hysteresis"),
+)
+_SYSTEMATIC = 3.0  # accuracy over repeatability; half: identify is named though it gains little, double: rarely named
+
+
+def assess(lines: Sequence[MetricLine], outcomes: Sequence[LimitResult]) -> tuple[Grade, str]:
+    """Return the grade of a test, and in one sentence what it found and what to do next.
+
+    Args:
+        lines: all metrics.
+        outcomes: of those with a limit.
+    """
+    worst = {name: max(each) for name in MEANINGS if (each := [value_m(m) for n, _, m in lines if n == name])}
+    first = [next((name for name in names if name in worst), "") for names in (_ACCURACY, _REPEATABILITY)]
+    said = " and ".join(f"{name} is {1e3 * worst[name]:.2f} mm" for name in first if name) + " at worst"
+    if failed := [each for each in outcomes if not each.passed]:
+        e, more = max(failed, key=lambda each: each.value_m / each.limit_m), len(failed) - 1
+        others = f", and {more} more above theirs" if more else ""
+        return "poor", (
+            f"Above its limits: {e.metric} of {e.of} is {1e3 * e.value_m:.2f} mm, limit {1e3 * e.limit_m:g}{others}; "
+            "armsight identify corrects what is the same each time."
+        )
+    if unsure := [each for each in outcomes if each.certain is False]:
+        return "fair", (
+            f"Within its limits, but {unsure[0].metric} of {unsure[0].of} by less than its 95 % interval: repeat the test "
+            "with more cycles."
+        )
+    shown = [m for name, _, m in lines if name in first]
+    if any(m.low is None for m in shown):
+        return "fair", f"Usable with care: {said}, the instrument's noise in it; give sigmas to know how sure that is."
+    if any(m.clean is None for m in shown):
+        return "fair", f"Usable as bounds: {said}, partly below the instrument's noise; more cycles lower the bounds."
+    if outcomes:
+        return "good", f"Within its limits: {said}; repeat the test when the arm has changed."
+    apart, own = (worst[name] if name else np.inf for name in first)
+    systematic = apart > _SYSTEMATIC * own and first[0] != "mean error"
+    after = (
+        "armsight identify corrects what is the same each time" if systematic else "--limit holds the arm to a figure"
+    )
+    return "good", f"Well resolved: {said}; {after}."
 
 
 def _mm(value: float | None) -> str:

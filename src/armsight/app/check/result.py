@@ -220,14 +220,19 @@ def check_limits(lines: Sequence[MetricLine], limits: Mapping[str, float]) -> li
     return [_compared(line, limits[line.name]) if line.name in limits else None for line in lines]
 
 
+def value_m(metric: Metric) -> float:
+    """Return the size of a metric, m: where it is not resolved the bound, where that is not known as measured."""
+    bound = metric.raw if metric.low is None or metric.high is None else max(abs(metric.low), abs(metric.high))
+    return abs(bound if metric.clean is None else metric.clean)
+
+
 def _compared(line: MetricLine, limit_m: float) -> LimitResult:
     """Compare one metric with its limit."""
-    m, certain, known = line.metric, None, line.metric.raw
+    m, certain = line.metric, None
     if m.low is not None and m.high is not None:
-        known = max(abs(m.low), abs(m.high))
         smallest = 0.0 if m.low <= 0 <= m.high else min(abs(m.low), abs(m.high))
-        certain = known <= limit_m or smallest > limit_m
-    value = abs(known if m.clean is None else m.clean)
+        certain = max(abs(m.low), abs(m.high)) <= limit_m or smallest > limit_m
+    value = value_m(m)
     return LimitResult(line.name, line.what, limit_m, value, value <= limit_m, certain)
 
 

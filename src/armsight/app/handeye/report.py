@@ -51,7 +51,6 @@ def names(run: HandEyeAnswer) -> tuple[str, str]:
 def handeye_report(run: HandEyeAnswer) -> Report:
     """Return what a calibration says."""
     found, names_ = run.found, run.recording.names
-    held, still = names(run)
     position, angle = found.held_out.rms()
     headline = (
         f"poses left out: {1e3 * position:.2f} mm, {np.degrees(angle):.3f} deg RMS; {int(found.used.sum())} of "
@@ -61,20 +60,10 @@ def handeye_report(run: HandEyeAnswer) -> Report:
     worst = out[np.argsort(-found.distance[out])]
     blunders = [f"{names_[k]}: {np.sqrt(found.distance[k]):.0f} sigma from the others" for k in worst]
     why = _untrusted(run)
+    decided = [Note("weak", said.removeprefix("; "))] if (said := found.decided_by(names_)) else []
     values = {
-        "eye": found.eye,
+        **found.to_dict(),
         "untrusted": why,
-        held: found.T_flange_held,
-        still: found.T_base_still,
-        "cov_m_rad": found.cov,
-        "cov_order": [f"{still}: right tangent, translation then rotation", f"{held}: the same"],
-        "held_out_rms_m": position,
-        "held_out_rms_rad": angle,
-        "held_out_mean_m": found.held_out.mean()[0],
-        "held_out_nominal_rms_m": found.held_out_nominal.rms()[0],
-        "held_out_nominal_mean_m": found.held_out_nominal.mean()[0],
-        "held_out_geometry_rms_m": None if found.held_out_geometry is None else found.held_out_geometry.rms()[0],
-        "held_out_geometry_mean_m": None if found.held_out_geometry is None else found.held_out_geometry.mean()[0],
         "noise": {
             "structure": found.structure,
             "arm_off_probability": found.arm_off,
@@ -110,7 +99,7 @@ def handeye_report(run: HandEyeAnswer) -> Report:
         f"{run.recording.robot.path.name} · {len(found.used)} poses · eye {found.eye.replace('_', ' ')}",
         headline,
         sections,
-        [*(Note("untrusted", each) for each in why), *(Note("note", each) for each in run.recording.notes)],
+        [*(Note("untrusted", each) for each in why), *(Note("note", each) for each in run.recording.notes), *decided],
         values,
         assessed=assess(run, why),
     )

@@ -22,8 +22,7 @@ from armsight.data import Array
 from armsight.files import write_text
 from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
 from armsight.loop.identify.corrected import Corrected, zeros_text
-from armsight.loop.identify.identify import contributions
-from armsight.loop.identify.model import Parameter
+from armsight.loop.identify.identify import contributions, value_text
 from armsight.loop.identify.selection import PLACEMENT
 
 if TYPE_CHECKING:
@@ -60,7 +59,7 @@ def map_figure(run: Identification) -> Figure:
             size = float(np.clip(2000 / len(x), 7, 25))  # few poses must not be lost on the page
             style: dict[str, Any] = {"cmap": "viridis", "vmin": 0, "vmax": top, "linewidths": 0}
             plotted = ax.scatter(x[rising], y[rising], c=error[rising], s=size, **style)
-            ax.set_aspect("equal", adjustable="box")
+            ax.set_aspect("equal", adjustable="datalim")
             ax.set_xlabel(f"{across}, m")
             ax.set_ylabel(f"{up}, m")
             # No longer title: where a view is narrow it would run into the scale.
@@ -332,16 +331,6 @@ def headline(run: Identification) -> str:
         line += f", {np.degrees(after['mean_rad']):.3f} deg mean ({np.degrees(before['mean_rad']):.3f})"
     no_better = "; no better than the nominal arm: keep that one, or take more poses"
     return f"{line}, on {run.how}{no_better if after['mean_m'] >= before['mean_m'] else ''}"
-
-
-def value_text(p: Parameter, value: float) -> str:
-    """Return a value in mm, deg, deg/m or %."""
-    shown = {
-        "m": f"{1e3 * value:.3f} mm",
-        "rad": f"{np.degrees(value):.4f} deg",
-        "rad/m": f"{np.degrees(value):.4f} deg/m",
-    }
-    return shown.get(p.unit, f"{100 * value:.4f} %")
 
 
 def _in_short(backlashes: Sequence[JointBacklash], pairs: int) -> str:

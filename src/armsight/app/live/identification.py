@@ -54,7 +54,10 @@ class IdentifyStep(PageStep[IdentifyState]):
             write_results(run, report, out)
         finally:
             self.show(working=None)
-        lines = (*(f"note: {note}" for note in run.notes), *report.text().splitlines()[1:])
+        lines = (
+            *(f"note: {note}" for note in run.notes),
+            *(line for line in report.text().splitlines() if line != report.headline),
+        )
         self.show(headline=report.headline, lines=lines, corrected=str(out / "corrected.toml"))
         self.later("the report was not drawn", self._draw, report, out)  # what was found is shown before
 

@@ -30,7 +30,7 @@ from armsight.app.run.metrics import (
 from armsight.app.run.tracks import Part, Tracks
 from armsight.app.show.messages import UNTRUSTED, Level, Note, colour, weak
 from armsight.app.show.page import PAGE
-from armsight.app.show.report import Block, Fact, Lines, Plot, Report, Section, Text
+from armsight.app.show.report import Block, Fact, Grade, Lines, Plot, Report, Section, Text
 from armsight.app.show.table import TextTable
 from armsight.data import Image
 from armsight.loop.health import health_lines, unseen_lines
@@ -109,6 +109,7 @@ def report_of(
     values: dict[str, Any] = {"version": 2}  # 1 named the reference track and the reference angles differently
     tables, lines = list[TextTable | None](), list[str]()
     sections: Mapping[str, Section] = {}
+    passes = None
     if tracks is not None:
         passes = _passes(result, tracks)
         before = None if result.open_s is None else tracks.between(*result.open_s)
@@ -148,7 +149,47 @@ def report_of(
         else ""
     )
     sub = f"{result.properties.get('arm', '')}{seed}"
-    return Report("run", "A run of the arm, measured", sub, "", sections, _said(result), prefix="")
+    return Report(
+        "run",
+        "A run of the arm, measured",
+        sub,
+        "",
+        sections,
+        _said(result),
+        prefix="",
+        assessed=assess(result, passes),
+    )
+
+
+_FEW = 0.8  # of the shots in view; half: misses are hardly noticed, 1: one missed shot is said
+
+
+def assess(result: RunResult, passes: tuple[PassErrors, PassErrors] | None) -> tuple[Grade, str]:
+    """Return the grade of a run, and in one sentence how good it is and what to do next; ``passes``: open and closed."""
+    wrong = [each for each in result.health if each.forbids]
+    if wrong:
+        return "poor", f"Do not use this run: {wrong[0].line()}; mend that, and run it again."
+    if result.ended_text is not None or result.handeye is None:
+        why = result.ended_text or "no hand-eye calibration"
+        return "poor", f"Ended early ({why}): what was measured until then is kept; run it again."
+    counts = result.log.counts()
+    share = counts["measured"] / max(counts["measured"] + counts["missed"] + counts["rejected"], 1)
+    said, gained = f"the hand-eye calibration is off by {1e3 * result.handeye.found.held_out.rms()[0]:.2f} mm", True
+    for what, key in (("follows its path", "path_m"), ("rests", "rest_m")):
+        alone, closed = (None, None) if passes is None else (getattr(each, key) for each in passes)
+        if alone is not None and closed is not None:
+            gained = closed < alone
+            said = f"with the loop closed the tool {what} {1e3 * closed:.2f} mm off, without {1e3 * alone:.2f}"
+    if result.health or share < _FEW:
+        why = (
+            result.health[0].line()
+            if result.health
+            else f"only {100 * share:.0f} % of the shots were measured: see run.log"
+        )
+        return "fair", f"Usable with care: {said}; {why}."
+    if not gained:
+        return "fair", f"Usable, but vision gained nothing: {said}; armsight check shows where."
+    return "good", f"Good: {said}; armsight arm report shows what the arm's error is made of."
 
 
 def _said(result: RunResult) -> list[Note]:

@@ -18,7 +18,7 @@ class SetupStep:
         given: a file of the user's own that it takes; where there is none, see ``without``.
         without: what the words of ``given`` and all that hangs on it become: old text -> new text in all commands; empty
             where the step is left out.
-        endless: it goes on until Ctrl-C.
+        endless: Ctrl-C ends it as it should end, and it is done.
         needed: whether what follows needs it.
         simulated: options that let it go through where nobody is at the terminal.
     """
@@ -35,7 +35,9 @@ class SetupStep:
 PLATE, BOARD = "examples/arm_plate.toml", "chessboard:9x6:20mm"
 _CHARUCO = "charuco:7x6:20mm:15mm:DICT_4X4_50"
 _SHOW = "Hold the board before both cameras and move it for a minute: near, far, into all corners, tilted."
-_POSES = "Let the arm's own program go to thirty poses in view, and log its joint angles meanwhile (docs/arms/%s.md)."
+_POSES = (
+    "Let the arm's own program go to thirty poses in view, and log its joint angles (docs/arms/%s.md); then Ctrl-C."
+)
 
 
 def _by_loop(arm: str, board: str, look: SetupStep, written: SetupStep, options: str = "") -> tuple[SetupStep, ...]:
@@ -68,7 +70,7 @@ def _by_maker(arm: str, page: str, table: SetupStep | None, corrected: SetupStep
         ),
         SetupStep(_SHOW, f"calibrate --source {CAMERAS} --target {_CHARUCO} -o rig.json"),
         table,
-        SetupStep(_POSES % page, f"record {CAMERAS} -o poses --seconds 300"),
+        SetupStep(_POSES % page, f"record {CAMERAS} -o poses --seconds 300", endless=True),
         SetupStep("Where the board was.", "measure rig.json --target rig.board.toml --source poses -o poses.csv"),
         SetupStep(
             "What the arm really is.", f"identify --arm {used} --data poses.csv --joints joints.csv -o corrected"

@@ -7,6 +7,7 @@ import json
 import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import click
 
 from armsight.app.main import run
 from armsight.app.setup import finding
-from armsight.app.setup.steps import ARMS, CAMERAS, PORT, SetupStep
+from armsight.app.setup.steps import ARMS, CAMERAS, PLATE, PORT, SetupStep
 from armsight.errors import InputError
 from armsight.files import read_json, write_text
 
@@ -109,6 +110,10 @@ class SetupWalk:
                 continue
             say(f"\n{number} of {len(steps)}: {step.say}")
             possible = self.find(step, say)
+            if PLATE in self.typed(step) and not Path(PLATE).exists():  # outside of a checkout
+                Path(PLATE).parent.mkdir(exist_ok=True)
+                write_text(PLATE, (resources.files("armsight.app.setup") / "arm_plate.toml").read_text("utf-8"))
+                say(f"written: {PLATE}")
             row["command"] = f"armsight {self.typed(step)}"
             self.keep()
             say(f"$ {row['command']}" if possible else "left out: there is no such file")
@@ -155,7 +160,7 @@ def _asked(question: str) -> str:
 def simulated(walk: SetupWalk, cameras: str) -> Iterator[None]:
     """Let a walk go through on the emulated arm before simulated cameras, with nobody at the terminal."""
     from armsight.app.board.command import emulated_arm
-    from armsight.app.setup.steps import BOARD, PLATE
+    from armsight.app.setup.steps import BOARD
     from armsight.sim.workcell.body import body_text
     from armsight.sim.workcell.workcell import CHESSBOARD
 

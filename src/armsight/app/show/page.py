@@ -19,21 +19,26 @@ from armsight.files import replacing
 
 #: A number, with its sigma or its unit.
 _NUMBER = re.compile(r"[-+\u2212]?\d[\d.,]*(?: \u00b1 [\d.,]+)?(?: ?[%a-z\u00b0]{1,3})?")
+#: Before a sigma, and what keeps the two in one line.
+PLUS_MINUS, NEVER_APART = "\u00b1 ", "\u00b1\u00a0"
 #: Name of the page in the folder of every report.
 PAGE = "report.html"
 STYLE = """
-:root { color-scheme: light; --ink: #1f2933; --muted: #616e7c; --line: #e4e7eb; --soft: #f5f7fa;
-  --good: #2f7d4f; --fair: #b7791f; --poor: #b83232; }
+:root { color-scheme: light; --back: #fff; --ink: #1f2933; --muted: #616e7c; --line: #e4e7eb; --soft: #f5f7fa;
+  --link: #2b6cb0; --good: #2f7d4f; --fair: #b7791f; --poor: #b83232; }
+@media screen and (prefers-color-scheme: dark) { :root { color-scheme: dark; --back: #16191d; --ink: #e4e7eb;
+  --muted: #9aa5b1; --line: #323a42; --soft: #20252b; --link: #7fb2ea; --good: #58b981; --fair: #dba94a; --poor: #e57373; }
+}
 * { box-sizing: border-box; }
-body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 64rem; background: #fff; color: var(--ink);
+body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 64rem; background: var(--back); color: var(--ink);
   font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
 h1 { font-size: 1.9rem; line-height: 1.2; margin: 0 0 .3rem; }
-h2 { font-size: 1.3rem; margin: 3rem 0 .9rem; padding-top: .9rem; border-top: 1px solid var(--line); }
+h2 { font-size: 1.3rem; margin: 2.2rem 0 .7rem; padding-top: .9rem; border-top: 1px solid var(--line); }
 h3 { font-size: 1.02rem; margin: 1.7rem 0 .5rem; }
 p { margin: .5rem 0; max-width: 50rem; }
-ul { padding-left: 1.2rem; max-width: 50rem; } li { margin: .35rem 0; }
+ul { padding-left: 1.2rem; max-width: 50rem; } li { margin: .2rem 0; }
 .sub, nav { color: var(--muted); } nav { margin: .8rem 0 1.6rem; font-size: .92rem; }
-nav a { color: #2b6cb0; text-decoration: none; margin-right: 1.1rem; white-space: nowrap; }
+nav a { color: var(--link); text-decoration: none; margin-right: 1.1rem; white-space: nowrap; }
 .assessment { border-left: .4rem solid; background: var(--soft); padding: .8rem 1.2rem; margin: 1.2rem 0 1.6rem; }
 .assessment p { margin: .25rem 0; } .headline { font-size: 1.25rem; font-weight: 650; }
 .assessment.good { border-color: var(--good); } .assessment.fair { border-color: var(--fair); }
@@ -50,12 +55,13 @@ table.headline { font-weight: 400; font-size: .95rem; }
 table.prose th { font-weight: 400; } table.prose td { min-width: 18rem; }
 table.numbers tbody th { white-space: nowrap; } table.numbers thead th { overflow-wrap: normal; }
 table.numbers td { font-variant-numeric: tabular-nums; } td.number { white-space: nowrap; }
-summary { cursor: pointer; color: #2b6cb0; margin: .6rem 0; }
-figure { margin: 0 0 1rem; } figure img { width: 100%; height: auto; display: block; }
+summary { cursor: pointer; color: var(--link); margin: .6rem 0; }
+figure { margin: 0 0 1rem; } figure img { width: 100%; height: auto; display: block; background: #fff; }
 figcaption { background: var(--soft); padding: .6rem 1.1rem; margin-top: .6rem; font-size: .95rem; }
 figcaption p { margin: .3rem 0; }
 @media (max-width: 48rem) { table { display: block; overflow-x: auto; }
   th, td { overflow-wrap: break-word; } td:not(.number) { min-width: 7rem; }
+  td:last-child:not(.number):not(:empty) { min-width: 20rem; }
   table.numbers tbody th { white-space: normal; } }
 @media print { body { max-width: none; padding: 0; } nav { display: none; } figure { break-inside: avoid; } }
 """
@@ -68,7 +74,9 @@ def text(value: object) -> str:
 
 def _cell(content: str) -> str:
     """Return a cell; a number, with its sigma perhaps, stays in one line."""
-    return f'<td class="number">{content}</td>' if _NUMBER.fullmatch(content) else f"<td>{content}</td>"
+    if _NUMBER.fullmatch(content):
+        return f'<td class="number">{content}</td>'
+    return f"<td>{content.replace(PLUS_MINUS, NEVER_APART)}</td>"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:

@@ -1,11 +1,12 @@
 """Plots of reports: style, canvas, arrows; matplotlib without a display, imported only when something is plotted.
 
-Plot within :func:`drawing`, on a :func:`new_figure`; :func:`png` and :func:`svg` return the bytes of a file.
+Plot within :func:`drawing`, on a :func:`new_figure`; :func:`png`, :func:`svg`, :func:`data_csv` return a file's bytes.
 """
 
 from __future__ import annotations
 
 import contextlib
+import csv
 import importlib
 import io
 import logging
@@ -115,6 +116,64 @@ def svg(figure: Figure) -> bytes:
     data = io.BytesIO()
     figure.savefig(data, format="svg", metadata={"Date": None, "Creator": None})
     return data.getvalue()
+
+
+def data_csv(figure: Figure) -> bytes:
+    """Return what a figure shows as a CSV file: a row for each point, bar, arrow or cell, in the units of its axes.
+
+    Columns: ``panel`` (number of the axes), its ``title``, the ``series`` (label of a line, otherwise empty), the ``x`` and
+    ``y`` of the point, end of the bar or foot of the arrow, the titles of both axes, and ``value``: a point's or a cell's
+    on the colour scale, or ``u`` and ``v`` of an arrow as it is drawn.
+    """
+    output = io.StringIO()
+    writer = csv.writer(output, lineterminator="\n")
+    writer.writerow(("panel", "title", "series", "x", "y", "value", "u", "v", "x axis", "y axis"))
+    for panel, axes in enumerate(figure.axes, 1):
+        if axes.get_label() == "<colorbar>":
+            continue
+        for series, columns in _series(axes):
+            label = "" if series.startswith("_") else series
+            ends = axes.get_xlabel(), axes.get_ylabel()
+            for row in zip(*(np.asarray(c, float).ravel() for c in columns), strict=True):
+                cells = ["" if np.isnan(v) else f"{v:.8g}" for v in row]
+                writer.writerow(
+                    (panel, axes.get_title("left") or axes.get_title(), label, *cells, *[""] * (5 - len(cells)), *ends)
+                )
+    return output.getvalue().encode()
+
+
+def _series(axes: Axes) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    """Yield the label and the columns (x, y, value, u, v; the later may be missing) of all that is drawn from data."""
+    from matplotlib.collections import PathCollection
+    from matplotlib.container import BarContainer
+    from matplotlib.quiver import Quiver
+
+    for line in axes.lines:
+        if line.get_transform() == axes.transData:  # a line across the axes is no data
+            yield str(line.get_label()), tuple(line.get_data())
+    for drawn in axes.collections:
+        at: Array = np.ma.filled(np.ma.asarray(drawn.get_offsets(), float), np.nan)
+        values = drawn.get_array()
+        value = np.full(len(at), np.nan) if values is None or len(values) != len(at) else np.asarray(values)
+        if isinstance(drawn, Quiver):
+            yield str(drawn.get_label()), (*at.T, value, drawn.U, drawn.V)
+        elif isinstance(drawn, PathCollection):
+            yield str(drawn.get_label()), (*at.T, value)
+    for bars in axes.containers:
+        for bar in bars.patches if isinstance(bars, BarContainer) else ():
+            middle, end = bar.get_x() + bar.get_width() / 2, bar.get_y() + bar.get_height()
+            flat = getattr(bars, "orientation", "") == "horizontal"
+            yield "", ([middle + bar.get_width() / 2], [end - bar.get_height() / 2]) if flat else ([middle], [end])
+    for image in axes.images:
+        cells = np.asarray(image.get_array(), float)
+        if cells.ndim == 2:
+            left, right, bottom, top = image.get_extent()
+            first, last = (top, bottom) if image.origin == "upper" else (bottom, top)
+            x, y = (
+                a + (b - a) * (np.arange(n) + 0.5) / n
+                for a, b, n in ((left, right, cells.shape[1]), (first, last, cells.shape[0]))
+            )
+            yield "", (*np.meshgrid(x, y), cells)
 
 
 def plain_log(axis: Axis) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ import numpy as np
 from armsight.app.show import page
 from armsight.app.show.encode import json_of
 from armsight.app.show.messages import UNTRUSTED, Level, Note, weak
-from armsight.app.show.plotting import drawing, png, require_matplotlib, svg
+from armsight.app.show.plotting import data_csv, drawing, png, require_matplotlib, svg
 from armsight.app.show.table import TextTable, html_table, plain_text
 from armsight.data import Image
 
@@ -61,7 +61,7 @@ class Lines:
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure on the page, and as PNG beside it.
+    """A figure on the page, and as PNG and SVG beside it, with its data as CSV.
 
     Attributes:
         name: of its file, without the prefix.
@@ -95,6 +95,9 @@ class Text:
 
 
 Grade = Literal["good", "fair", "poor"]
+_COLOURS: Mapping[Grade, str] = {"good": "green", "fair": "yellow", "poor": "red"}
+#: Files that a figure is written to: picture, lines that stay sharp, and what it shows as numbers.
+FIGURE_SUFFIXES = (".png", ".svg", ".data.csv")
 Block = Fact | Lines | TextTable | Plot | Html | Text
 #: Title on the page, and what stands there.
 Section = tuple[str, Sequence[Block]]
@@ -148,8 +151,9 @@ class Report:
 
     def text(self) -> str:
         """Return what people read on a terminal."""
-        lines = [*(f"do not trust this result: {why}" for why in self.noted("untrusted")), self.headline]
-        lines += [self.assessed[1]] if self.assessed else []
+        lines = [f"do not trust this result: {why}" for why in self.noted("untrusted")]
+        lines += [click.style(self.assessed[1], fg=_COLOURS[self.assessed[0]])] if self.assessed else []
+        lines += [self.headline] if self.headline else []
         for block in self.blocks:
             match block:
                 case Fact(sentence) if sentence:
@@ -171,7 +175,7 @@ class Report:
         bodies = {
             anchor: "".join(_html(block, images) for block in blocks) for anchor, (_, blocks) in self.sections.items()
         }
-        first = next(iter(bodies))
+        first = next((anchor for anchor, body in bodies.items() if body), next(iter(bodies)))
         bodies[first] = box + page.bullets([*self.noted("weak"), *self.noted("note")]) + bodies[first]
         shown = {
             anchor: (self.sections[anchor][0], body.replace("</ul>\n<ul>", ""))
@@ -195,9 +199,7 @@ class Report:
         Raises:
             InputError: matplotlib is missing, or a file cannot be written; then none of the new ones is left.
         """
-        plots = {
-            f"{self.prefix}-{block.name}.png".lstrip("-"): block for block in self.blocks if isinstance(block, Plot)
-        }
+        plots = {f"{self.prefix}-{block.name}".lstrip("-"): block for block in self.blocks if isinstance(block, Plot)}
         if plots:
             require_matplotlib()
         folder, images, pictures = page.writable_folder(folder, "no report"), dict[str, bytes](), dict[str, bytes]()
@@ -206,13 +208,16 @@ class Report:
                 if isinstance(drawn := plot.draw(), np.ndarray):
                     import cv2
 
-                    images[plot.name] = pictures[file] = cv2.imencode(".png", drawn)[1].tobytes()
+                    images[plot.name] = pictures[f"{file}.png"] = cv2.imencode(".png", drawn)[1].tobytes()
                 elif drawn is not None:
-                    pictures[file] = png(drawn)
-                    images[plot.name] = svg(drawn) if plot.zoom and plot.caption else pictures[file]
+                    data = dict(zip(FIGURE_SUFFIXES, (png(drawn), svg(drawn), data_csv(drawn)), strict=True))
+                    pictures |= {f"{file}{suffix}": each for suffix, each in data.items()}
+                    images[plot.name] = data[".svg" if plot.zoom and plot.caption else ".png"]
         beside = {name: data.encode() if isinstance(data, str) else data for name, data in files.items()}
         page.put_files(folder, {**pictures, **beside, page.PAGE: self.page(images).encode()})
-        for file in plots.keys() - pictures.keys():
+        for file in (
+            {f"{name}{suffix}" for name in plots for suffix in FIGURE_SUFFIXES} - pictures.keys() - files.keys()
+        ):
             (folder / file).unlink(missing_ok=True)
         return folder / page.PAGE
 
@@ -230,6 +235,11 @@ class Report:
         if written is not None and not as_json:
             click.echo(f"\nwritten: {written}")
         return UNTRUSTED if self.noted("untrusted") else 0
+
+
+def figure_files(prefix: str, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of all files that the figures of a report may have."""
+    return tuple(f"{prefix}-{name}{suffix}" for name in names for suffix in FIGURE_SUFFIXES)
 
 
 def figures(

@@ -18,9 +18,11 @@ The rows are put into an order of their own first (by time, else by content), so
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +33,7 @@ from armsight.errors import CalibrationError, InputError, require
 from armsight.estimate.linear import Linear
 from armsight.estimate.solve import Solved, covariances, left_out, log_density, solve
 from armsight.estimate.variance import SPEAKS, integrate, most_probable, posterior, scores
+from armsight.files import write_text
 from armsight.geometry.pose import exp_se3, inverse, log_se3, mean_pose, transform
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.poses import (
@@ -58,6 +61,7 @@ from armsight.loop.handeye.sources import (
     over_poses,
     over_time,
 )
+from armsight.plots import new_figure
 from armsight.tables.poses import PoseTable
 
 #: Poses that the fit comes from at most, and the variances, evenly spread; half: less is known, double: twice the time.
@@ -83,6 +87,8 @@ LINK, DRIFT_SIZE, ARM_OFF = (1e-3, 1e-3), (1e-3, 1e-3), 0.5
 #: Sigma of rotations that have hardly any weight, rad; by how many sigmas, and by which factor, errors of positions left
 #: out must be lower without them. half: chance weights positions alone, double: contradictions spoil the nominal arm's use.
 HARDLY, SURELY_LOWER, CLEARLY = 0.005, 3.0, 1.1
+DECISIVE = 5.0  # times a sigma grows without one pose; half: every tenth pose of few is named, double: hardly any
+UNDETERMINED = 100.0  # times; half, double: another word from there on
 FREEDOM = 4.0  # degrees of freedom of Student's t in the robust start
 #: A scale must be off by this many sigmas to be taken, and has settled where a step is below this share of one: where the
 #: flange hardly moves it runs away.
@@ -135,6 +141,7 @@ class HandEye(Record):
     distance: Array  #: (N,) Mahalanobis distance of each pose's residual, in units of its expectation
     common: Array  #: (K,) the errors that all poses share (``Poses.common``), as found, in sigmas
     common_m: float  #: what they move the body's middle by, RMS of the distance, m
+    leverage: Array  #: (N,) by which factor a sigma grows where that pose is left out, the worst direction's; 1 unused
 
     def __repr__(self) -> str:
         """Return the error on poses left out of the fit, and both translations with one sigma, mm."""
@@ -146,8 +153,53 @@ class HandEye(Record):
             shown.append(f"{name} at {', '.join(f'{x:.2f} +- {sigma:.2f}' for x, sigma in both)} mm")
         return (
             f"HandEye({self.eye}, {int(self.used.sum())} of {len(self.used)} poses; held out {1e3 * position_m:.3f} mm "
-            f"RMS, {np.degrees(angle_rad):.3f} deg; {'; '.join(shown)})"
+            f"RMS, {np.degrees(angle_rad):.3f} deg; {'; '.join(shown)}{self.decided_by()})"
         )
+
+    def decided_by(self, names: Sequence[str] = ()) -> str:
+        """Return a remark where one pose alone determines a direction, by its name or number; empty where none does."""
+        k = int(np.argmax(self.leverage))
+        if self.leverage[k] < DECISIVE:
+            return ""
+        size = "undetermined" if self.leverage[k] > UNDETERMINED else f"{self.leverage[k]:.0f} times less certain"
+        return f"; one pose decides: without {names[k] if names else f'pose {k}'} a direction is {size}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the transforms, their covariance and the errors on poses left out, as lists and numbers, SI units."""
+        held, still = ("T_flange_rig", "T_base_body") if self.eye == "in_hand" else ("T_flange_body", "T_base_rig")
+        found: dict[str, Any] = {
+            "eye": self.eye,
+            held: self.T_flange_held.tolist(),
+            still: self.T_base_still.tolist(),
+            "cov_m_rad": self.cov.tolist(),
+            "cov_order": [f"{still}: right tangent, translation then rotation", f"{held}: the same"],
+        }
+        for name in ("held_out", "held_out_nominal", "held_out_geometry"):
+            errors: HeldOut | None = getattr(self, name)
+            found[f"{name}_rms_m"] = None if errors is None else errors.rms()[0]
+            found[f"{name}_mean_m"] = None if errors is None else errors.mean()[0]
+        return found | {"held_out_rms_rad": self.held_out.rms()[1]}
+
+    def save(self, path: str | Path) -> None:
+        """Write :meth:`to_dict` as JSON.
+
+        Raises:
+            InputError: it cannot be written; then nothing is.
+        """
+        write_text(Path(path), json.dumps(self.to_dict(), indent=1) + "\n")
+
+    def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
+        """Draw the error of every pose when it was left out of the fit, mm and degrees; return matplotlib's figure.
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
+        figure, axes = new_figure(2, 1, sharex=True)
+        axes[0].bar(range(len(self.used)), 1e3 * self.held_out.position_m)
+        axes[1].bar(range(len(self.used)), np.degrees(self.held_out.angle_rad))
+        axes[0].set(ylabel="position, mm", title="errors of poses left out of the fit")
+        axes[1].set(ylabel="angle, deg", xlabel="pose")
+        return figure
 
     T_base_rig = _transform_of("to_hand", "T_base_rig", "T_base_still", "the rig in the base")
     T_flange_body = _transform_of("to_hand", "T_flange_body", "T_flange_held", "the body on the flange")
@@ -364,6 +416,7 @@ def calibrate_poses(
         found,
         used=found.used[back],
         distance=found.distance[back],
+        leverage=found.leverage[back],
         held_out=found.held_out.rows(back),
         held_out_nominal=found.held_out_nominal.rows(back),
         held_out_geometry=None if found.held_out_geometry is None else found.held_out_geometry.rows(back),
@@ -674,9 +727,17 @@ def _weighed(
         distance=_far(whole, guess, nominal.variances, rows, nominal.linear, nominal.solved) / 6,
         common=moved.common,
         common_m=_common_m(whole.poses, moved),
+        leverage=np.ones(len(whole.poses.A)),
     )
     require_known(found, whole.poses.B, OPEN_M, OPEN_RAD)
-    return found
+    return replace(found, leverage=_leverage(found, whole.poses))
+
+
+def _leverage(found: HandEye, poses: Poses) -> Array:
+    """Return by which factor the sigma of some direction grows without each pose (N,): of the hat matrix (Belsley 1980)."""
+    J = found.whitened(poses) * found.used[:, None, None]
+    share = np.linalg.eigvalsh(J @ np.linalg.pinv(np.einsum("nij,nik->jk", J, J)) @ np.swapaxes(J, 1, 2))[:, -1]
+    return np.asarray(1 / np.sqrt(np.maximum(1 - share, UNDETERMINED**-2 / 4)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -207,6 +207,11 @@ def checked_poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, 
         bad = (off > 1e-4) | (np.linalg.det(R) < 0) if len(Ts) else np.zeros(0, bool)
         if bad.any():
             raise InputError(f"{name}: pose {int(np.argmax(bad))} is no rigid motion: its 3x3 part is no rotation")
+    if len(Ts_base_flange) and np.array_equal(Ts_base_flange, Ts_rig_body):
+        raise InputError(
+            "the robot's poses and those of what was seen are the same numbers: one is the flange in the base, by the "
+            "joints, the other the body in the camera"
+        )
     shape = (len(Ts_base_flange), 6, 6)
     cov = np.zeros(shape) if covs is None else checked(covs, shape, "covs")
     return Poses(Ts_base_flange, Ts_rig_body, cov, eye == "in_hand", checked(centre, (3,), "centre"))

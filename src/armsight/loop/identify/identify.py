@@ -18,7 +18,7 @@ from armsight.errors import CalibrationError, InputError, require
 from armsight.loop.identify.fit import Mask, Solution, covariance, fit, joint_noise, prior_sigma, with_joint_noise
 from armsight.loop.identify.measured import Measured, Read, measured_of
 from armsight.loop.identify.misread import check_plausible, without_tool
-from armsight.loop.identify.model import PLENTY, SENSOR, Model
+from armsight.loop.identify.model import PLENTY, SENSOR, Model, Parameter
 from armsight.loop.identify.observable import Observed, observed
 from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.selection import PLACEMENT, TOGETHER, SelectionStep, forward_selection, scaled_prior
@@ -62,6 +62,14 @@ class Identified(Record):
             f"{len(used)} poses used; columns() lists them, validate() evaluates them on others)"
         )
 
+    def __str__(self) -> str:
+        """Return the same, and a line for each fitted number: value, sigma and what the nominal arm has."""
+        lines = [repr(self)]
+        for k in np.flatnonzero(self.solution.free):
+            p, (value, sigma) = self.model.parameters[k], self.value(self.model.names[k])
+            lines.append(f"{p.name:<16} {value_text(p, value):>16} +- {value_text(p, sigma)}")
+        return "\n".join(lines)
+
     @property
     def left_out(self) -> NDArray[np.int64]:
         """Return the rows that were taken for mistakes."""
@@ -102,6 +110,16 @@ class Identified(Record):
         names = self.model.names
         pairs = [(names[rows[a]], names[rows[b]], float(C[a, b])) for a, b in zip(i, j, strict=True)]
         return sorted(pairs, key=lambda pair: -abs(pair[2]))
+
+
+def value_text(p: Parameter, value: float) -> str:
+    """Return a value in mm, deg, deg/m or %."""
+    shown = {
+        "m": f"{1e3 * value:.3f} mm",
+        "rad": f"{np.degrees(value):.4f} deg",
+        "rad/m": f"{np.degrees(value):.4f} deg/m",
+    }
+    return shown.get(p.unit, f"{100 * value:.4f} %")
 
 
 def identify(

@@ -49,7 +49,13 @@ def calibrate(
         InputError: a text is wrong, or images that cannot be read or differ in size.
         CalibrationError: fewer than three usable pairs, or views that do not determine the cameras.
     """
-    board = open_board(board) if isinstance(board, str) else board
+    if isinstance(board, str | Path):
+        if Path(board).is_dir():
+            raise InputError(
+                f'calibrate(board, source): board is the folder {board}; expected a board such as "chessboard:9x6:25mm": '
+                "are the two exchanged?"
+            )
+        board = open_board(board)
     pairs, sizes, problem = list[Pair](), None, "no shot is left in it: open it again, or take source[:]"
     with lent(source) as shots:
         require_arguments("calibrate(board, source)", board=board, source=shots)
