@@ -120,7 +120,7 @@ class Serving:
             self.events.append((time.monotonic(), json.loads(line)))
 
     def wait(self, event: str, after: int, limit_s: float = 90.0) -> tuple[float, dict[str, object]] | None:
-        """Return the first event of a kind from a place on; None where it does not come."""
+        """Return the first event of a kind from a position on; None where it does not come."""
         end = time.monotonic() + limit_s
         while time.monotonic() < end:
             for found in self.events[after:]:

@@ -102,10 +102,10 @@ def test_a_hand_eye_calibration_prints_its_error_and_sigma():
 def test_one_decisive_pose_is_said_and_a_calibration_is_saved_and_drawn(tmp_path):
     """All poses but the fifth rotate about one axis alone: without it the translation along that axis is open."""
     rng = np.random.default_rng(4)
-    turns = np.zeros((9, 6))
-    turns[:, :3], turns[:, 5] = rng.normal(size=(9, 3)) * 0.2, rng.normal(size=9)
-    turns[4, 3] = 0.8
-    A, cov = exp_se3(turns), np.diag([1e-4, 1e-4, 3e-4, 1e-3, 1e-3, 1e-3]) ** 2
+    rotated = np.zeros((9, 6))
+    rotated[:, :3], rotated[:, 5] = rng.normal(size=(9, 3)) * 0.2, rng.normal(size=9)
+    rotated[4, 3] = 0.8
+    A, cov = exp_se3(rotated), np.diag([1e-4, 1e-4, 3e-4, 1e-3, 1e-3, 1e-3]) ** 2
     B = A @ exp_se3(np.array([0.01, 0.02, 0.1, 0.1, 0.5, -0.3])) @ exp_se3(rng.multivariate_normal(np.zeros(6), cov, 9))
     found = armsight.handeye(A, B, np.tile(cov, (9, 1, 1)), quick=True)
     assert int(np.argmax(found.leverage)) == 4

@@ -286,9 +286,33 @@ def assess(lines: Sequence[MetricLine], outcomes: Sequence[LimitResult]) -> tupl
         lines: all metrics.
         outcomes: of those with a limit.
     """
-    worst = {name: max(each) for name in MEANINGS if (each := [value_m(m) for n, _, m in lines if n == name])}
-    first = [next((name for name in names if name in worst), "") for names in (_ACCURACY, _REPEATABILITY)]
-    said = " and ".join(f"{name} is {1e3 * worst[name]:.2f} mm" for name in first if name) + " at worst"
+    first = list(filter(None, (_worst(lines, names) for names in (_ACCURACY, _REPEATABILITY))))
+    said = " and ".join(f"{name} is {1e3 * value:.2f} mm" for name, value, _ in first) + " at worst"
+    if (compared := _against_limits(outcomes)) is not None:
+        return compared
+    if any(m.low is None for *_, found in first for m in found):
+        return "fair", f"Usable with care: {said}, the instrument's noise in it; give sigmas to know how sure that is."
+    if any(m.clean is None for *_, found in first for m in found):
+        return "fair", f"Usable as bounds: {said}, partly below the instrument's noise; more cycles lower the bounds."
+    if outcomes:
+        return "good", f"Within its limits: {said}; repeat the test when the arm has changed."
+    systematic = len(first) == 2 and first[0][1] > _SYSTEMATIC * first[1][1] and first[1][0] in ("RP", "RT")
+    after = (
+        "armsight identify corrects what is the same each time" if systematic else "--limit holds the arm to a figure"
+    )
+    return "good", f"Well resolved: {said}; {after}."
+
+
+def _worst(lines: Sequence[MetricLine], names: Sequence[str]) -> tuple[str, float, list[Metric]] | None:
+    """Return the first of the names that a test has, its largest value, m, and its metrics; None where there is none."""
+    for name in names:
+        if found := [metric for other, _, metric in lines if other == name]:
+            return name, max(map(value_m, found)), found
+    return None
+
+
+def _against_limits(outcomes: Sequence[LimitResult]) -> tuple[Grade, str] | None:
+    """Return grade and sentence where a limit is exceeded, or held by chance; None where all hold."""
     if failed := [each for each in outcomes if not each.passed]:
         e, more = max(failed, key=lambda each: each.value_m / each.limit_m), len(failed) - 1
         others = f", and {more} more above theirs" if more else ""
@@ -301,19 +325,7 @@ def assess(lines: Sequence[MetricLine], outcomes: Sequence[LimitResult]) -> tupl
             f"Within its limits, but {unsure[0].metric} of {unsure[0].of} by less than its 95 % interval: repeat the test "
             "with more cycles."
         )
-    shown = [m for name, _, m in lines if name in first]
-    if any(m.low is None for m in shown):
-        return "fair", f"Usable with care: {said}, the instrument's noise in it; give sigmas to know how sure that is."
-    if any(m.clean is None for m in shown):
-        return "fair", f"Usable as bounds: {said}, partly below the instrument's noise; more cycles lower the bounds."
-    if outcomes:
-        return "good", f"Within its limits: {said}; repeat the test when the arm has changed."
-    apart, own = (worst[name] if name else np.inf for name in first)
-    systematic = apart > _SYSTEMATIC * own and first[0] != "mean error"
-    after = (
-        "armsight identify corrects what is the same each time" if systematic else "--limit holds the arm to a figure"
-    )
-    return "good", f"Well resolved: {said}; {after}."
+    return None
 
 
 def _mm(value: float | None) -> str:
