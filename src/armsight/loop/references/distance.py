@@ -1,19 +1,27 @@
 """Distances between a point of the tool and fixed anchors: draw-wire, bar, laser, ultrasonic or ultra-wideband range.
 
-A channel is an anchor: z = scale |p - a| + offset, m. Parameters: the tool's point, then for each anchor its position, offset
-and scale. Anchors nearly in one plane leave their mirror image open, :func:`fold_sigmas` gives by how much (Moore et al.,
+A channel is an anchor: z = scale |p - a| + offset, m. Parameters: the tool's point, then each anchor's position, offset and
+scale. Anchors nearly in one plane leave their mirror image open, :func:`fold_sigmas` gives by how much (Moore et al.,
 "Robust distributed network localization with noisy range measurements", SenSys 2004: no position from a layout whose flip
 noise can produce).
+
+Path of a point by ranges to anchors, as ultra-wideband gives them: biased for seconds, now and then far too long.
+
+In: ranges, each at its own time. Out: the point's path with covariance. A range reads too long or short by a bias of each
+anchor that fades within seconds (Gauss and Markov), is noisy, and has tails, longer ones to the far side, where a wall or a
+body stands between. The greatest likelihood does not find how large these are, as a slow bias looks like motion: they are
+given. An iterated extended Kalman smoother (Bell, SIAM J. Optimization 4, 1994), weights as of Student's distribution.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from armsight.data import Array
+from armsight.data import Array, Record
 from armsight.geometry.rotation import skew
 from armsight.loop.references.reference import ExpectedReading, Reference, ToolMotion
 
@@ -92,3 +100,130 @@ def fold_sigmas(anchors: Array, p: Array, sigma_m: float) -> Array:
     mirrored = p - 2 * ((p - centre) @ normal)[:, None] * normal
     far, image = (np.linalg.norm(x[:, None] - anchors, axis=2) for x in (p, mirrored))
     return np.asarray(np.linalg.norm(far - image, axis=1) / sigma_m)
+
+
+LONG, SHORT = (
+    2.0,
+    4.0,
+)  # sigmas beyond which a range loses weight, too long and too short; half: good ranges lose theirs
+PASSES = 3  # of the smoother; half: the first linearisation stays
+START_M, START_M_S = 5.0, 1.0  # sigma of the first position and velocity; half, double: nothing after some seconds
+
+
+class RangeNoise(NamedTuple):
+    """How ranges and the body are off.
+
+    Attributes:
+        range_m: white noise of a range, m.
+        bias_m: of an anchor's bias, m.
+        fade_s: in which a bias fades, s.
+        acceleration: density of the body's acceleration, m/s2 per root of Hz.
+    """
+
+    range_m: float = 0.1
+    bias_m: float = 0.2
+    fade_s: float = 20.0
+    acceleration: float = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class RangePath(Record):
+    """A path: at the time of each range, position (N, 3), m, and its covariance (N, 3, 3)."""
+
+    t_s: Array
+    p: Array
+    cov: Array
+
+
+def follow_ranges(
+    anchors: Distance,
+    t_s: Array,
+    channel: NDArray[np.int64],
+    z: Array,
+    start: Array,
+    noise: RangeNoise | None = None,
+    upright: float = 0.1,
+) -> RangePath:
+    """Follow a point by ranges.
+
+    Args:
+        anchors: where they are, with offset and scale.
+        t_s: (N,) times, s, rising.
+        channel: (N,) the anchor of each range.
+        z: (N,) ranges, m.
+        start: (3,) about where it begins, m.
+        noise: of the sensor and the body; None: ultra-wideband on something that drives.
+        upright: acceleration along z over that in the plane; 1 for what flies.
+    """
+    smoother = _Smoother(anchors, t_s, channel, z, start, upright)
+    path, noise = None, noise or RangeNoise()
+    for _ in range(PASSES):
+        path = smoother.smoothed(noise, path)
+    assert path is not None  # for the type checker: PASSES is above zero
+    x, P = path
+    return RangePath(t_s, x[:, :3], P[:, :3, :3])
+
+
+_Path = tuple[Array, Array]
+
+
+class _Smoother:
+    """Position, velocity and biases through time."""
+
+    def __init__(
+        self, anchors: Distance, t_s: Array, channel: NDArray[np.int64], z: Array, start: Array, upright: float
+    ) -> None:
+        self._anchors, self._t, self._channel, self._z = anchors, t_s, channel, z
+        self._size, self._start = 6 + len(anchors.anchors), start
+        self._share = np.array([1.0, 1.0, upright**2])
+
+    def _transition(self, dt: float, noise: RangeNoise) -> tuple[Array, Array]:
+        n = self._size
+        F, Q = np.eye(n), np.zeros((n, n))
+        i = np.arange(3)
+        F[i, i + 3] = dt
+        q = noise.acceleration**2 * self._share
+        Q[i, i], Q[i, i + 3], Q[i + 3, i], Q[i + 3, i + 3] = q * dt**3 / 3, q * dt**2 / 2, q * dt**2 / 2, q * dt
+        kept = np.exp(-dt / noise.fade_s)
+        b = np.arange(6, n)
+        F[b, b], Q[b, b] = kept, noise.bias_m**2 * (1 - kept**2)
+        return F, Q
+
+    def _forward(
+        self, noise: RangeNoise, path: _Path | None
+    ) -> tuple[list[Array], list[Array], list[Array], list[Array]]:
+        """Return filtered and predicted states with covariances, linearised at a path where there is one."""
+        x = np.concatenate([self._start, np.zeros(self._size - 3)])
+        P = np.diag(np.repeat([START_M**2, START_M_S**2, noise.bias_m**2], [3, 3, self._size - 6]))
+        out: tuple[list[Array], list[Array], list[Array], list[Array]] = ([], [], [], [])
+        before = self._t[0]
+        for k, (t, c, z) in enumerate(zip(self._t, self._channel, self._z, strict=True)):
+            F, Q = self._transition(float(t - before), noise)
+            before, x, P = t, F @ x, F @ P @ F.T + Q
+            out[2].append(x)
+            out[3].append(P)
+            at = x if path is None else path[0][k]
+            apart = at[:3] - self._anchors.anchors[c]
+            far, scale = float(np.linalg.norm(apart)), float(self._anchors.scale[c])
+            H = np.zeros(self._size)
+            H[:3], H[6 + c] = scale * apart / far, 1.0
+            left = z - scale * far - self._anchors.offset[c] - at[6 + c]
+            e = left - H @ (x - at)
+            S = H @ P @ H + noise.range_m**2
+            off, size = (e, np.sqrt(S)) if path is None else (left, noise.range_m)
+            R = noise.range_m**2 * (1 + (off / ((LONG if off > 0 else SHORT) * size)) ** 2)
+            gain = P @ H / (S - noise.range_m**2 + R)
+            x, P = x + gain * e, P - np.outer(gain, H @ P)
+            out[0].append(x)
+            out[1].append(P)
+        return out
+
+    def smoothed(self, noise: RangeNoise, path: _Path | None) -> _Path:
+        """Return states (N, S) and covariances (N, S, S) by all ranges (Rauch, Tung and Striebel, AIAA J. 3, 1965)."""
+        x, P, ahead, P_ahead = self._forward(noise, path)
+        for k in range(len(x) - 2, -1, -1):
+            F, _ = self._transition(float(self._t[k + 1] - self._t[k]), noise)
+            gain = np.linalg.solve(P_ahead[k + 1], F @ P[k]).T
+            x[k] = x[k] + gain @ (x[k + 1] - ahead[k + 1])
+            P[k] = P[k] + gain @ (P[k + 1] - P_ahead[k + 1]) @ gain.T
+        return np.array(x), np.array(P)

@@ -1,0 +1,232 @@
+"""Distance and angle references on real recordings: a draw-wire, ultra-wideband ranges and lighthouse sweeps.
+
+Run: python benchmarks/references_beacons.py DATA [draw-wire] [lighthouse2] [uwb] with DATA the folder of the recordings.
+Each line gives the figure, the peer's on the same rows, and the goal.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import yaml
+from scipy.optimize import least_squares
+
+from armsight.data import Array
+from armsight.estimate.solve import covariances
+from armsight.geometry.rotation import exp_so3, log_so3
+from armsight.loop.identify.fit import linear_of, variances_of, with_joint_noise
+from armsight.loop.identify.identify import identify
+from armsight.loop.identify.lengths import identify_wire
+from armsight.loop.identify.model import motion, nominal_table
+from armsight.loop.identify.selection import folds_of
+from armsight.loop.references.distance import Distance, follow_ranges
+from armsight.loop.references.lighthouse import EVENT, beginning, follow, lighthouse_of, read_events, sweeps_of
+from armsight.robot.arm_file import open_arm
+
+FOLDS = 6
+
+
+def draw_wire(folder: Path) -> None:
+    """Length left out: the identified arm against plain least squares over anchor, tool point and all DH parameters."""
+    arm = open_arm("irb120")
+    rows = np.loadtxt(folder / "irb120_even.csv", delimiter=",", skiprows=1)
+    q, length = np.deg2rad(rows[:, 3:9]), rows[:, 9] * 1e-3
+    wire = identify_wire(arm, q, length, rows[:, :3] * 1e-3)
+    for lines, text in wire.blunders:
+        print(f"  lines {lines.min() + 2} to {lines.max() + 2}: {text}")
+    used = wire.used  # the peer's outliers, taken out by hand, are the same rows
+    for name, of in (("random", np.random.default_rng(0).integers(0, FOLDS, len(q))), ("clusters", folds_of(q, FOLDS))):
+        e, squares, peer = (np.zeros(len(q)) for _ in range(3))
+        for k in range(FOLDS):
+            train, test = used & (of != k), used & (of == k)
+            found, part = identify(arm, wire.measured.rows(train)), wire.measured.rows(test)
+            x, free = found.solution.x, found.solution.free
+            weighted = with_joint_noise(found.model, x, part, found.joint_sigma_rad)
+            linear = linear_of(found.model, x, weighted, found.model.feature_values(part.q, None), free, found.prior)
+            cov = covariances(linear, variances_of(linear, found.solution.noise))
+            cov = cov + linear.J @ found.solution.cov[np.ix_(free, free)] @ linear.J.swapaxes(1, 2)
+            e[test], squares[test] = linear.e[:, 0], linear.e[:, 0] ** 2 / cov[:, 0, 0]
+            peer[test] = plain_wire(nominal_table(arm), q, length, train)[test]
+        rms, theirs = (1e3 * float(np.sqrt(np.mean(v[used] ** 2))) for v in (e, peer))
+        covered = float((squares[used] < 3.84).mean())
+        print(
+            f"draw-wire, {name} folds, {used.sum()} rows: {rms:.3f} mm, plain least squares {theirs:.3f} mm, ratio "
+            f"{rms / theirs:.2f} (goal 0.90); 95 % intervals cover {100 * covered:.1f} %"
+        )
+
+
+def plain_wire(table: Array, q: Array, length: Array, train: Array) -> Array:
+    """Return residuals (N,) of plain least squares over anchor, tool point and the 24 DH parameters."""
+
+    def residuals(v: Array) -> Array:
+        moved = table.copy()
+        moved[:, :4] += v[6:].reshape(6, 4)
+        at = motion(moved, q, False, np.eye(3), np.zeros(3))
+        return np.asarray(np.linalg.norm(at.o + at.R @ v[3:6] - v[:3], axis=1) - length)
+
+    start = np.concatenate([[0.2, -0.45, 0.0], np.zeros(27)])
+    weak = 1e-6  # ties the gauge of parallel axes
+    fitted = least_squares(lambda v: np.concatenate([residuals(v)[train], weak * v]), start, x_scale="jac")
+    return residuals(fitted.x)
+
+
+def lighthouse(folder: Path, seconds: float = 60.0) -> None:
+    """Held-out takes: bundle of one take gives the beacons, the others are followed with these."""
+    moves = folder / "lh2_crossingBeam_move"
+    config = yaml.safe_load((moves / "system-config.yaml").read_text())
+    beacons = lighthouse_of(config["geos"], config["calibs"])
+    for take in range(3):
+        events = read_events(moves / f"log{take:02d}")
+        sweeps = sweeps_of(events[EVENT], len(beacons.calibration))
+        sweeps = sweeps.rows(sweeps.t_s < sweeps.t_s[0] + seconds)
+        path = follow(beacons, sweeps, *beginning(beacons, sweeps))
+        if take == 0:
+            beacons = path.reference
+            first_cov = beacons.cov
+        mocap = np.load(moves / f"mocap{take:02d}.npy")
+        mocap = mocap[~np.isnan(mocap).any(axis=1)]
+        seen = [np.sort(sweeps.t_s[sweeps.beacon == b]) for b in (0, 1)]
+        clock = clock_between(path.t_s, path.p, mocap[:, 0] * 1e-3, mocap[:, 1:])
+        ours = aligned(path.t_s, path.p, path.R, mocap, clock, seen)
+        frames, beams = events[EVENT], events["lhCrossingBeam"]
+        slope, offset = np.polyfit(frames["t_s"], frames["timestamp2FPGA"] / 24e6, 1)
+        at = slope * beams["t_s"] + offset
+        inside = at < sweeps.t_s.max()
+        crossing = np.column_stack([beams[a][inside] for a in "xyz"])
+        theirs = crossing_error(at[inside], crossing, mocap, clock)
+        own = path.reference.cov
+        spread = np.median(
+            np.sqrt(np.einsum("kii->ki", path.covariance(np.arange(40, len(path.t_s) - 40, 80)))), axis=0
+        )
+        said = "beacons from it" if take == 0 else "held out"
+        print(
+            f"lighthouse, take {take} ({said}): {1e3 * np.median(ours):.1f} mm, "
+            f"{1e3 * np.percentile(ours, 90):.1f} at 90 %, crossing beams {1e3 * np.median(theirs):.1f}, ratio "
+            f"{np.median(ours) / np.median(theirs):.2f} (goal 0.33); sweep {1e6 * path.sigma_rad:.0f} urad, "
+            f"{100 * path.used.mean():.0f} % used; sigma {1e3 * spread[:3].max():.2f} mm"
+        )
+        beacons = type(beacons)(
+            name="lighthouse",
+            cov=0 * own,
+            Ts_base_beacon=beacons.Ts_base_beacon,
+            calibration=beacons.calibration,
+            receivers=beacons.receivers,
+        )
+    for rest in range(3):
+        still = folder / "lh2_crossingBeam_jitter" / f"log{rest:02d}"
+        sweeps = sweeps_of(read_events(still)[EVENT], len(beacons.calibration))
+        path = follow(beacons, sweeps, *beginning(beacons, sweeps))
+        spread = 1e3 * np.linalg.norm(np.std(path.p[40:-40], axis=0))
+        print(f"  at rest {rest}: position {spread:.3f} mm (goal 0.1), sweep {1e6 * path.sigma_rad:.0f} urad")
+    print(f"  beacons: sigma of poses {np.sqrt(np.diag(first_cov))[:6].round(4)} m, rad")
+
+
+def uwb(folder: Path) -> None:
+    """Position in the plane: the smoother against plain least squares of each ten readings a second."""
+    for case in ("LOS", "NLOS"):
+        at = folder / case / "Trajectory_A" / "Case_1"
+        ranges = [np.loadtxt(at / f"{a}.csv", delimiter=",", skiprows=1) for a in ("A3", "A5", "A9", "A12")]
+        truth = np.loadtxt(at / "trajectory.csv", delimiter=",", skiprows=1)
+        truth[:, 0] *= 1e-9
+        anchors = np.array([r[0, 3:6] for r in ranges])
+        t, z = np.concatenate([r[:, 1] for r in ranges]) * 1e-9, np.concatenate([r[:, 6] for r in ranges])
+        channel = np.repeat(np.arange(4), [len(r) for r in ranges])
+        order = np.argsort(t)
+        order = order[(t[order] > truth[0, 0]) & (t[order] < truth[-1, 0])]
+        t, z, channel = t[order], z[order], channel[order]
+        sensor = Distance(
+            name="uwb", cov=np.eye(23), anchors=anchors, p_tool=np.zeros(3), offset=np.zeros(4), scale=np.ones(4)
+        )
+        start = np.append(truth[0, 1:3], anchors[:, 2].mean())
+        path = follow_ranges(sensor, t - t[0], channel, z, start)
+        e = (path.p - np.column_stack([np.interp(t, truth[:, 0], truth[:, c]) for c in (1, 2, 3)]))[:, :2]
+        squares = np.einsum("ni,nij,nj->n", e, np.linalg.inv(path.cov[:, :2, :2]), e)
+        even = np.arange(t[0], t[-1], 0.1)
+        each = np.column_stack([np.interp(even, t[channel == c], z[channel == c]) for c in range(4)])
+        at_even = np.column_stack([np.interp(even, truth[:, 0], truth[:, c]) for c in (1, 2)])
+        theirs, x = np.empty(len(even)), start
+        for k, r in enumerate(each):
+            fitted = least_squares(lambda v, r=r, a=anchors: np.linalg.norm(v - a, axis=1) - r, x)
+            theirs[k] = np.linalg.norm(fitted.x[:2] - at_even[k])
+            x = fitted.x if fitted.cost < 1.0 else x
+        ours = np.linalg.norm(e, axis=1)
+        rms, other = (float(np.sqrt(np.mean(v**2))) for v in (ours, theirs))
+        print(
+            f"uwb, {case}: median {np.median(ours):.2f} m, plain least squares {np.median(theirs):.2f}, ratio "
+            f"{np.median(ours) / np.median(theirs):.2f} (goal 0.70); RMS {rms:.2f} m, plain {other:.2f}; 95 % cover "
+            f"{100 * (squares < 5.99).mean():.0f} %"
+        )
+
+
+def clock_between(t: Array, p: Array, t_mocap: Array, p_mocap: Array) -> float:
+    """Return what is added to motion capture's times, by the correlation of speeds."""
+    speed = np.linalg.norm(np.diff(p, axis=0), axis=1) / np.diff(t)
+    steps = np.diff(t_mocap)
+    theirs = np.linalg.norm(np.diff(p_mocap[::5], axis=0), axis=1) / np.diff(t_mocap[::5])
+    at, good = t_mocap[::5][1:] - 0.5 * np.diff(t_mocap[::5]), np.diff(t_mocap[::5]) < 8 * np.median(steps)
+    base, best = t[0] - t_mocap[0], (-1.0, 0.0)
+    for late in np.arange(-15.0, 15.0, 0.02):
+        x = at[good] + base + late
+        inside = (x > t[1]) & (x < t[-2])
+        if inside.sum() > 500:
+            c = np.corrcoef(np.interp(x[inside], t[1:], np.minimum(speed, 4)), np.minimum(theirs[good][inside], 4))[
+                0, 1
+            ]
+            best = max(best, (float(c), float(late)))
+    return float(base + best[1])
+
+
+def aligned(t: Array, p: Array, R: Array, mocap: Array, clock: float, seen: list[Array], near: float = 0.02) -> Array:
+    """Return errors (M,), m, where both beacons are seen, after rotation, shift, lever arm and clock have been fitted."""
+    at, theirs, dt = mocap[::3, 0] * 1e-3 + clock, mocap[::3, 1:], t[1] - t[0]
+    good = (at > t[1]) & (at < t[-3])
+    for s in seen:
+        j = np.clip(np.searchsorted(s, at), 1, len(s) - 1)
+        good &= np.minimum(np.abs(s[j] - at), np.abs(s[j - 1] - at)) < near
+    at, theirs = at[good], theirs[good]
+
+    def errors(v: Array) -> Array:
+        x = at + v[9]
+        k = np.clip(((x - t[0]) / dt).astype(int), 0, len(t) - 2)
+        a = ((x - t[k]) / dt)[:, None]
+        rotated = R[k] @ exp_so3(a * log_so3(R[k].swapaxes(1, 2) @ R[k + 1]))
+        return np.asarray(
+            (p[k] * (1 - a) + p[k + 1] * a + rotated @ v[6:9]) @ exp_so3(v[:3].copy()).T + v[3:6] - theirs
+        )
+
+    k = np.clip(((at - t[0]) / dt).astype(int), 0, len(t) - 2)
+    start = np.concatenate([_shift(p[k], theirs), np.zeros(4)])
+    found = least_squares(lambda v: errors(v).ravel(), start, loss="soft_l1", f_scale=0.01, x_scale=0.01)
+    return np.asarray(np.linalg.norm(errors(found.x), axis=1))
+
+
+def _shift(a: Array, b: Array) -> Array:
+    """Return rotation vector and shift (6,) from points a to b, by medians."""
+    u, _, v = np.linalg.svd((b - np.median(b, axis=0)).T @ (a - np.median(a, axis=0)))
+    A = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+    return np.concatenate([log_so3(A[None])[0], np.median(b, axis=0) - A @ np.median(a, axis=0)])
+
+
+def crossing_error(t: Array, p: Array, mocap: Array, clock: float) -> Array:
+    """Return errors (M,), m, of crossing beams after rotation, shift and clock."""
+    at = mocap[:, 0] * 1e-3 + clock
+    j = np.clip(np.searchsorted(at, t), 1, len(at) - 1)
+    good = np.minimum(np.abs(at[j] - t), np.abs(at[j - 1] - t)) < 0.01
+
+    def errors(v: Array) -> Array:
+        theirs = np.column_stack([np.interp(t[good] + v[6], at, mocap[:, c]) for c in (1, 2, 3)])
+        return np.asarray(p[good] @ exp_so3(v[:3].copy()).T + v[3:6] - theirs)
+
+    theirs = np.column_stack([np.interp(t[good], at, mocap[:, c]) for c in (1, 2, 3)])
+    start = np.append(_shift(p[good], theirs), 0.0)
+    found = least_squares(lambda v: errors(v).ravel(), start, loss="soft_l1", f_scale=0.01, x_scale=0.01)
+    return np.asarray(np.linalg.norm(errors(found.x), axis=1))
+
+
+PARTS = {"draw-wire": draw_wire, "lighthouse2": lighthouse, "uwb": uwb}
+
+if __name__ == "__main__":
+    for part in sys.argv[2:] or PARTS:
+        PARTS[part](Path(sys.argv[1]) / part)
