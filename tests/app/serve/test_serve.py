@@ -80,6 +80,15 @@ def test_days_of_losses_leave_one_line_each(serving):
     assert len(log) <= 2200  # the log does not grow
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a disk that is full")
+def test_a_full_disk_ends_no_service_and_changes_no_exit_code(serving, tmp_path):
+    (tmp_path / "log").symlink_to("/dev/full")
+    (tmp_path / "plan").write_text("3 unplugged\n3 ends")
+    events = []
+    assert Service(ServeConfig((), tmp_path, http="", log="log"), events.append).run() == 0
+    assert [each["event"] for each in events] == ["measuring", "lost", "back", "ended"]
+
+
 def test_a_driver_that_falls_silent_is_started_again(serving):
     code, events, *_ = serving("2 silent", "1 ends", stale_s=0.2)
     assert code == 0

@@ -268,4 +268,5 @@ def _close(logger: logging.Logger) -> None:
     """Close the log."""
     for handler in logger.handlers[:]:
         logger.removeHandler(handler)
-        handler.close()
+        with suppress(OSError):  # what a full disk did not take is lost
+            handler.close()

@@ -62,8 +62,9 @@ figcaption p { margin: .3rem 0; }
 @media (max-width: 48rem) { table { display: block; overflow-x: auto; }
   th, td { overflow-wrap: break-word; } td:not(.number) { min-width: 7rem; }
   td:last-child:not(.number):not(:empty) { min-width: 20rem; }
-  table.numbers tbody th { white-space: normal; } }
-@media print { body { max-width: none; padding: 0; } nav { display: none; } figure { break-inside: avoid; } }
+  table.numbers tbody th, table.headline th { white-space: normal; } }
+@media print { body { max-width: none; padding: 0; } nav { display: none; } table { font-size: .7rem; }
+  th, td { padding: .25rem .5rem .25rem 0; } figure { break-inside: avoid; } }
 """
 
 
