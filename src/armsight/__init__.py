@@ -12,7 +12,7 @@ To open: ``open_source`` images or cameras, ``open_board`` a board, ``open_targe
 what was measured there, ``read_pose_table`` poses alone, those of ``write_csv`` too.
 To compute: ``calibrate``, ``calibrate_boards``, ``calibrate_bodies`` the pair of cameras; ``measure``, ``measure_all``,
 ``Follower`` the pose of a body; ``handeye`` where rig and body are on the arm; ``identify`` what the arm really is,
-``validate`` how far off it is on other poses.
+``validate`` how far off it is on other poses; ``budget`` what a rig would measure.
 To exchange: ``as_transform`` reads a transform of pinocchio, SciPy, spatialmath or ROS, ``ros_fields`` writes ROS' fields.
 Records: ``Shot``, ``Body``, ``PoseEstimate`` or ``Missed``, ``Pair``, ``Camera``, ``StereoRig``, ``Arm``, ``Corrected``.
 Wrong input raises ``ArmsightError``, with what was found, what was expected and what to do.
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from armsight.tables.poses import read_pose_table
     from armsight.vision.calibrate.boards import Pair, calibrate_boards
     from armsight.vision.calibrate.bodies import calibrate_bodies
+    from armsight.vision.calibrate.budget import budget
     from armsight.vision.calibrate.images import calibrate
     from armsight.vision.camera import Camera
     from armsight.vision.follow.follower import Follower
@@ -76,6 +77,7 @@ __all__ = [
     "Shot",
     "StereoRig",
     "as_transform",
+    "budget",
     "calibrate",
     "calibrate_boards",
     "calibrate_bodies",
@@ -100,6 +102,7 @@ _HOME = {
     "Arm": "armsight.robot.kinematics.arm",
     "ArmsightError": "armsight.errors",
     **dict.fromkeys(("as_transform", "ros_fields"), "armsight.geometry.convert"),
+    "budget": "armsight.vision.calibrate.budget",
     "calibrate": "armsight.vision.calibrate.images",
     **dict.fromkeys(("Pair", "calibrate_boards"), "armsight.vision.calibrate.boards"),
     "calibrate_bodies": "armsight.vision.calibrate.bodies",

@@ -25,6 +25,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "live": "Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step."
     },
     "Calibrate cameras": {
+        "budget": "Say before a rig is bought what it will measure, what limits it, and what would make it better.",
         "calibrate": "Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.",
         "cameras": "List the attached cameras and their modes.",
         "record": "Store the shots of SOURCE in a folder, with their time stamps; the folder is then a source itself.",

@@ -75,7 +75,12 @@ def look_direction(points: Array, normals: Array) -> Array:
 
 
 def view(
-    rig: StereoRig, points: Array, normals: Array, distance_m: float, rotation: tuple[float, float] = (0.0, 0.0)
+    rig: StereoRig,
+    points: Array,
+    normals: Array,
+    distance_m: float,
+    rotation: tuple[float, float] = (0.0, 0.0),
+    aside_m: tuple[float, float] = (0.0, 0.0),
 ) -> PredictedView:
     """Set a body before the cameras, its faces towards them and its middle between their axes.
 
@@ -85,13 +90,16 @@ def view(
         normals: (M, 3) out of their faces; NaN where unknown.
         distance_m: from the cameras to the body's middle.
         rotation: about the horizontal and the vertical axis of the image, rad.
+        aside_m: right and down, of the point between the cameras' axes.
     """
     towards = look_direction(points, normals)
     ahead = np.array([0.0, 0.0, distance_m, 1.0])
     middle = (ahead[:3] + (rig.T_left_right @ ahead)[:3]) / 2
     forward = middle - rig.T_left_right[:3, 3] / 2
     forward = forward / np.linalg.norm(forward)
-    R = _axes(forward, np.array([1.0, 0.0, 0.0])) @ exp_so3(np.array([*rotation, 0.0])) @ face_axes(towards).T
+    axes = _axes(forward, np.array([1.0, 0.0, 0.0]))
+    middle = middle + axes[:, :2] @ np.array(aside_m)
+    R = axes @ exp_so3(np.array([*rotation, 0.0])) @ face_axes(towards).T
     facing = normals @ towards > FACING
     used = facing | ~np.isfinite(normals).all(axis=1)
     T = pose(R, middle - R @ points[used].mean(axis=0))
@@ -133,6 +141,67 @@ def _facing(rig: StereoRig, T_left_body: Array, points: Array, normals: Array) -
     return np.stack(columns, axis=1)
 
 
+@dataclass(frozen=True, eq=False)
+class PoseDerivatives(Record):
+    """How the measured pose of a body follows from its N pixel positions, weighted alike.
+
+    Tangents are [translation m; rotation rad], perturbation on the right.
+
+    Attributes:
+        side: (N,) 0 left, 1 right.
+        point: (N,) row of the body's points.
+        uv: (N, 2) the projections, raw pixels.
+        by_uv: (6, N, 2) derivative of the pose by the pixels.
+        by_rig: (6, P) by the rig's parameters: what the pose is off by where they are.
+        by_point: (6, M, 3) by the true positions of the body's points, the body's file unchanged.
+        uv_by_pose: (N, 2, 6) derivative of the pixels by the pose.
+    """
+
+    side: Ids
+    point: Ids
+    uv: Array
+    by_uv: Array
+    by_rig: Array
+    by_point: Array
+    uv_by_pose: Array
+
+    def noise(self, sigma_px: float) -> Array:
+        """Return the covariance (6, 6) that pixels of so many px standard deviation cause."""
+        flat = sigma_px * self.by_uv.reshape(6, -1)
+        return np.asarray(flat @ flat.T)
+
+    def moved(self, late_s: Array) -> Array:
+        """Return M (6, 6): a body of velocity v (6,), its own axes, seems off by M v where pixels are late (N,), s."""
+        return np.asarray(np.einsum("knc,ncj,n->kj", self.by_uv, self.uv_by_pose, late_s))
+
+
+def pose_derivatives(rig: StereoRig, points: Array, seen: PredictedView) -> PoseDerivatives | None:
+    """Differentiate the pose that two cameras measure; None where the visible points do not determine one.
+
+    Args:
+        rig: the cameras.
+        points: (M, 3) points, m.
+        seen: the body's pose and which points are visible.
+    """
+    rows, sides = np.nonzero(seen.seen)
+    if len(seen.paired) < 3:
+        return None
+    state = BundleState(rig.cameras, rig.T_left_right, seen.T_left_body[None], np.zeros(3 * len(points)))
+    nothing = np.zeros((len(rows), 2)), np.zeros((len(rows), 2, 2))
+    observed = Observations(np.zeros(len(rows), np.int64), sides, rows, *nothing, 1)
+    every = np.eye(3 * len(points)).reshape(-1, len(points), 3)
+    uv, J_shared, J_pose = predict(BundleModel(points, every, 1.0, False), state, observed)
+    A, B = J_pose.reshape(-1, 6), J_shared.reshape(len(rows) * 2, -1)
+    information = A.T @ A
+    scale = np.sqrt(np.diag(information))
+    if not (scale > 0).all() or np.linalg.cond(information / np.outer(scale, scale)) > 1e12:
+        return None
+    gain: Array = np.linalg.solve(information, A.T).astype(np.float64)
+    by_shared, P = gain @ B, rig.parameter_count
+    by_point = by_shared[:, P:].reshape(6, len(points), 3)
+    return PoseDerivatives(sides, rows, uv, gain.reshape(6, -1, 2), -by_shared[:, :P], by_point, J_pose)
+
+
 def pose_covariance(rig: StereoRig, points: Array, seen: PredictedView, sigma_px: float) -> Array | None:
     """Predict the covariance (6, 6) of a body's pose, [translation m; rotation rad], perturbation on the right.
 
@@ -145,21 +214,8 @@ def pose_covariance(rig: StereoRig, points: Array, seen: PredictedView, sigma_px
     Returns:
         The covariance, or None where the visible points do not determine a pose.
     """
-    rows, sides = np.nonzero(seen.seen)
-    if len(seen.paired) < 3:
-        return None
-    state = BundleState(rig.cameras, rig.T_left_right, seen.T_left_body[None], np.zeros(0))
-    cov_uv = np.tile(sigma_px**2 * np.eye(2), (len(rows), 1, 1))
-    observed = Observations(np.zeros(len(rows), np.int64), sides, rows, np.zeros((len(rows), 2)), cov_uv, 1)
-    _, J_rig, J_pose = predict(BundleModel(points, np.zeros((0, len(points), 3)), 1.0, False), state, observed)
-    A, B = J_pose.reshape(-1, 6) / sigma_px, J_rig.reshape(-1, rig.parameter_count) / sigma_px
-    information = A.T @ A
-    scale = np.sqrt(np.diag(information))
-    if not (scale > 0).all() or np.linalg.cond(information / np.outer(scale, scale)) > 1e12:
-        return None
-    noise = np.linalg.inv(information)
-    gain = noise @ (A.T @ B)
-    return np.asarray(noise + gain @ rig.cov @ gain.T)
+    found = pose_derivatives(rig, points, seen)
+    return None if found is None else found.noise(sigma_px) + found.by_rig @ rig.cov @ found.by_rig.T
 
 
 def separation(

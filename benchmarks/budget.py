@@ -1,0 +1,169 @@
+"""Predicted against measured: rigs of `armsight budget`, rendered, calibrated by noisy boards, and measured by `measure`.
+
+    python benchmarks/budget.py [--groups 16] [--shots 2] [--seed 9100]
+
+Each group of shots has a calibration, a print of body and board, and a warming of its own; each shot a position, a rotation
+and a velocity. The images come from the camera's model with its readout, exposure and skew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from armsight.app.budget.chart import marker_noise
+from armsight.app.budget.plan import RigPlan, length_m
+from armsight.data import Array, PoseEstimate, Shot
+from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
+from armsight.sim.camera.pipeline import SimulatedCamera
+from armsight.sim.example_rig import board_poses
+from armsight.sim.render.render import radiance
+from armsight.sim.render.scene import PosedBody, chessboard, plate
+from armsight.sim.workcell.body import BRIGHT, DARK
+from armsight.vision.calibrate.boards import printed_board
+from armsight.vision.calibrate.budget import Budget, budget
+from armsight.vision.markers.board import open_board
+from armsight.vision.markers.targets import Composite
+from armsight.vision.pose.bundle import BundleState, Observations, minimise
+from armsight.vision.pose.measure import measure
+from armsight.vision.pose.predict import face_axes, view
+from armsight.vision.rig import StereoRig
+
+RIGS = {
+    "cheap, 60 mm": {"camera": "webcam-720p-cheap", "baseline": "60mm", "distance": "0.6m", "speed": "0.05m/s"},
+    "cheap, 120 mm": {"camera": "webcam-720p-cheap", "baseline": "120mm", "distance": "0.8m", "speed": "0.2m/s"},
+    "webcam at rest": {"camera": "webcam-720p", "baseline": "150mm", "distance": "0.7m", "speed": "0m/s"},
+    "webcam, 0.3 m/s": {"camera": "webcam-720p", "baseline": "250mm", "distance": "0.9m", "speed": "0.3m/s"},
+    "webcam, parallel": {"camera": "webcam-720p", "baseline": "80mm", "verging_deg": 0.0, "speed": "0.1m/s"},
+    "webcam, no skew": {"camera": "webcam-720p", "baseline": "300mm", "skew_ms": 0.0, "speed": "0.2m/s"},
+    "evening": {"camera": "webcam-720p-evening", "baseline": "200mm", "speed": "0.02m/s"},
+    "evening, moving": {"camera": "webcam-720p-evening", "baseline": "350mm", "distance": "1.0m", "speed": "0.15m/s"},
+    "1 MP at rest": {"camera": "global-shutter-1mp", "baseline": "200mm", "distance": "0.7m", "speed": "0m/s"},
+    "1 MP, 0.5 m/s": {"camera": "global-shutter-1mp", "baseline": "400mm", "distance": "1.0m", "speed": "0.5m/s"},
+    "2 MP": {"camera": "machine-vision-2mp", "baseline": "500mm", "distance": "1.2m", "speed": "0.3m/s"},
+    "2 MP, skew 15 ms": {"camera": "machine-vision-2mp", "baseline": "300mm", "skew_ms": 15.0, "speed": "0.1m/s"},
+}
+VOLUME, TILT_RAD = "0.1x0.08x0.1m", 0.2
+
+
+def calibrated(plan: RigPlan, rng: np.random.Generator) -> StereoRig:
+    """Return what the bundle makes of noisy corners of a bent board of another size, all else as the plan says."""
+    rig, board = plan.rig, open_board(plan.board)
+    pattern = chessboard(board.columns, board.rows, board.square_m)
+    Ts = board_poses(rng, rig, pattern, plan.pairs)
+    model, (S, M) = printed_board(board.body.points), (plan.pairs, len(board.body.points))
+    sigma_m = length_m(plan.board_bent, "bent") * np.sqrt(3 / len(model.modes))
+    model = replace(model, shape_sigma_m=sigma_m)
+    true = (1 + plan.board_print * rng.standard_normal()) * model.body(sigma_m * rng.standard_normal(len(model.modes)))
+    px = board.square_m * plan.focal_px / float(np.median(Ts[:, 2, 3]))
+    noise = marker_noise(plan.pipeline, "chessboard", min(px, 60.0))
+    p = np.einsum("sij,mj->smi", Ts[:, :3, :3], true) + Ts[:, None, :3, 3]
+    uv = np.stack([each.reshape(S, M, 2) for each in rig.project(p.reshape(-1, 3))], axis=1).reshape(-1, 2)
+    uv += noise * rng.standard_normal(uv.shape)
+    shot, side = np.repeat(np.arange(S), 2 * M), np.tile(np.repeat([0, 1], M), S)
+    seen = Observations(shot, side, np.tile(np.arange(M), 2 * S), uv, np.zeros((len(uv), 2, 2)), S)
+    state = minimise(
+        model, BundleState(rig.cameras, rig.T_left_right, Ts, np.zeros(len(model.modes))), seen, noise
+    ).state
+    return replace(rig, left=state.cameras[0], right=state.cameras[1], T_left_right=state.T_left_right)
+
+
+def warmed(plan: RigPlan, rig: StereoRig, rng: np.random.Generator) -> StereoRig:
+    """Return a rig some kelvins later."""
+    moved, n = np.zeros(rig.parameter_count), rig.left.parameters.size
+    for first, camera in ((0, rig.left), (n, rig.right)):
+        share = 1e-6 * plan.lens_ppm_per_k * plan.warming_k * rng.standard_normal()
+        moved[first : first + 2] = share * camera.intrinsics[:2]
+    moved[-6:-3] = 1e-6 * plan.mount_um_per_k * plan.warming_k * rng.standard_normal(3)
+    return rig.perturbed(moved)
+
+
+def measured(plan: RigPlan, groups: int, shots: int, seed: int) -> tuple[Array, list[Budget], int]:
+    """Return errors (N, 6) along the left camera's axes, the budget of each shot, and how many were missed."""
+    rng, given = np.random.default_rng(seed), plan.conditions()
+    discs, t = plan.layout.discs, plan.timing
+    points, normals, missed = discs.body.points, discs.normals, 0
+    errors, predicted, height = [], [], plan.rig.left.image_size_px[1]
+    shutter = plan.pipeline.shutter(height)
+    for group in range(groups):
+        rig = calibrated(plan, rng)
+        seen_by = warmed(plan, plan.rig, rng)
+        off = rng.standard_normal(points.shape) * given.body_sigma_m[0]
+        off += normals * (
+            rng.standard_normal((len(points), 1)) * given.body_sigma_m[1] - (off * normals).sum(1)[:, None]
+        )
+        printed = points * (1 + given.body_scale * rng.standard_normal()) + off
+        patterns = tuple(
+            plate(0.046, 0.046, DARK, [(0.0, 0.0, r, BRIGHT)]).on_body(pose(face_axes(n), p))
+            for p, n, r in zip(printed, normals, discs.radii_m, strict=True)
+        )
+        imagers = [SimulatedCamera(plan.pipeline, seen_by.left.image_size_px, seed=2 * group + side) for side in (0, 1)]
+        for _ in range(shots):
+            x, y, z = rng.uniform(-0.5, 0.5, 3) * plan.size_m
+            tilt = tuple(rng.uniform(-TILT_RAD, TILT_RAD, 2))
+            seen = view(plan.rig, points, normals, plan.distance_m + z, tilt, (x, y))
+            T, v = seen.T_left_body, np.append(rng.standard_normal(3) * plan.speeds[0] / np.sqrt(3), np.zeros(3))
+            late = t["skew"] + t["start"] * rng.standard_normal()
+            images = []
+            for side, (camera, imager) in enumerate(zip(seen_by.cameras, imagers, strict=True)):
+                T_side = T if side == 0 else inverse(seen_by.T_left_right) @ T @ exp_se3(late * v)
+                imager.forget()
+                light = radiance(
+                    camera,
+                    [PosedBody(patterns, T_side, v)],
+                    psf_sigma_px=plan.pipeline.psf_sigma_px,
+                    shutter=shutter if v.any() else None,
+                )
+                for _ in range(1 if v.any() else 3):
+                    image = imager.expose(light)
+                images.append(image)
+            found = measure(rig, Composite("body", (), discs), Shot("", images[0], images[1]))
+            if not isinstance(found, PoseEstimate):
+                missed += 1
+                continue
+            stamped = T @ exp_se3(t["stamp"] * rng.standard_normal() * v)
+            errors.append(np.kron(np.eye(2), T[:3, :3]) @ log_se3(inverse(stamped) @ found.T_left_body))
+            predicted.append(budget(plan.rig, points, normals, [seen], given))
+    return np.array(errors), predicted, missed
+
+
+def main() -> None:
+    """Print predicted over measured for each rig."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--groups", type=int, default=16)
+    parser.add_argument("--shots", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=9100)
+    parser.add_argument("--only", default="")
+    options = parser.parse_args()
+    good, inside = 0, []
+    print("rig                     shots missed  measured mm   deg  predicted/measured mm  deg  in 95 % ellipsoids")
+    for number, (name, given) in enumerate(RIGS.items()):
+        if options.only not in name:
+            continue
+        began = time.process_time()
+        plan = RigPlan(volume=VOLUME, **given)
+        errors, predicted, missed = measured(plan, options.groups, options.shots, options.seed + number)
+        covs = np.array([each.cov()[0] for each in predicted])
+        ratios, rms = [], []
+        for part in (slice(3), slice(3, 6)):
+            rms.append(float(np.sqrt((errors[:, part] ** 2).sum(axis=1).mean())))
+            ratios.append(float(np.sqrt(np.trace(covs[:, part, part], axis1=1, axis2=2).mean())) / rms[-1])
+        d2 = [e[:3] @ np.linalg.solve(C[:3, :3], e[:3]) for e, C in zip(errors, covs, strict=True)]
+        inside += [d < 7.815 for d in d2]
+        good += all(0.8 <= r <= 1.25 for r in ratios)
+        share = np.mean(np.array(d2) < 7.815)
+        print(
+            f"{name:24}{len(errors):5}{missed:7}{1e3 * rms[0]:13.4f}{np.degrees(rms[1]):8.4f}{ratios[0]:14.2f}"
+            f"{ratios[1]:14.2f}{100 * share:12.0f} %   {time.process_time() - began:.0f} s",
+            flush=True,
+        )
+    print(
+        f"{good} rigs with both ratios between 0.8 and 1.25; {100 * np.mean(inside):.1f} % of {len(inside)} in ellipsoids"
+    )
+
+
+if __name__ == "__main__":
+    main()

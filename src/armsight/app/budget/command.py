@@ -1,0 +1,33 @@
+"""``armsight budget``: the answer first, then the causes, then what would change it most for least money."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command("budget")
+@click.argument("path", required=False, default="", metavar="[PLAN.toml]")
+@click.option("--volume", metavar="WxHxD", help="Width, height and depth, as the cameras see it: 0.4x0.4x0.3m.")
+@click.option("--distance", metavar="LENGTH", help="From the cameras to the volume's middle: 0.8m.")
+@click.option("--speed", metavar="SPEED", help="Of the body: 0.3m/s, or 0.3m/s,20deg/s.")
+@click.option("--want", metavar="ERROR", help="What 95 % of the errors are to be within: 0.1mm, or 0.1mm,0.05deg.")
+@click.option("--camera", metavar="CLASS", help="A class of the catalogue, such as webcam-720p.")
+@click.option("--baseline", metavar="LENGTH", help="Between the cameras: 200mm.")
+@click.option("--arm", metavar="ARM", help="For the closed loop: a model's name or a file.")
+@click.option("-o", "--output", metavar="DIR", help="Write report.html, budget.json and the figures.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def command(path: str, output: str | None, as_json: bool, **given: str | None) -> int:
+    """Say before a rig is bought what it will measure, what limits it, and what would make it better.
+
+    What is left out is chosen, and said. PLAN.toml has the same keys and more: docs/howto/budget.md.
+    """
+    from armsight.app.budget.plan import RigPlan
+    from armsight.app.budget.report import budget_report
+
+    report = budget_report(RigPlan.read(path, **given))
+    written = None
+    if output is not None:
+        written = str(report.write(Path(output), {"budget.json": report.json_text()}))
+    return report.echo(as_json=as_json, written=written)

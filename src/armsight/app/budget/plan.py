@@ -1,0 +1,431 @@
+"""The plan of a rig: what is wished and what there is; it is checked, and its budget is computed.
+
+In: options or a TOML file, and the catalogue of camera classes. Out: a :class:`RigPlan`, and by :func:`planned` the
+:class:`~armsight.vision.calibrate.budget.Budget` of it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from dataclasses import dataclass, field, fields, replace
+from functools import cache, cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armsight.app.budget.chart import marker_noise
+from armsight.data import Array
+from armsight.errors import InputError
+from armsight.files import read_toml
+from armsight.geometry.pose import inverse, pose
+from armsight.geometry.rotation import exp_so3
+from armsight.robot.arm_file import open_arm
+from armsight.sim.camera.stages import CameraPipeline, Defocus
+from armsight.sim.example_rig import board_poses
+from armsight.sim.render.scene import chessboard
+from armsight.sim.workcell.body import body_target
+from armsight.vision.calibrate.budget import Budget, Conditions, budget, calibration_covariance, volume_views
+from armsight.vision.camera import Camera
+from armsight.vision.markers.board import open_board
+from armsight.vision.markers.body_layout import Layout, read_layout
+from armsight.vision.markers.chessboard import Chessboard
+from armsight.vision.rig import StereoRig
+
+#: A disc's diameter, a tag's and a square's side in the image below which detection is left to luck, px; half: half of them
+#: are lost, double: bodies twice as large are asked for.
+LEAST_DISC_PX, LEAST_TAG_PX, LEAST_SQUARE_PX = 8.0, 24.0, 8.0
+MOST_SQUARE_PX = (
+    60.0  # px; larger squares' corners are no better; half: their noise is a tenth too large, double: the same
+)
+#: Lengths that a table-top cell has, m: what lies outside is mm given as m.
+_LEAST_M, _MOST_M = 0.001, 20.0
+#: Shortest focal length that is chosen where none is given, image widths: 80 degrees; half: lenses that bend the image more
+#: than the model of five coefficients, double: ordinary volumes are rejected.
+_WIDEST = 0.6
+_UNITS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_NUMBER = r"([0-9.]+(?:e-?[0-9]+)?)"
+
+
+@dataclass(frozen=True)
+class CameraClass:
+    """A class of the catalogue; ``catalogue.toml`` says what its keys mean."""
+
+    name: str
+    text: str
+    price: int
+    preset: str
+    image_size_px: tuple[int, int]
+    focal_widths: float
+    focal_mm: float
+    f_number: float
+    focus_m: float
+    least_focus_m: float
+    bytes_px: float
+    usb: float
+
+
+@cache
+def catalogue() -> dict[str, CameraClass]:
+    """Return the classes by name."""
+    tables = read_toml(Path(__file__).with_name("catalogue.toml"))
+    return {
+        name: CameraClass(name, **values | {"image_size_px": tuple(values["image_size_px"])})
+        for name, values in tables.items()
+    }
+
+
+def length_m(text: str, what: str) -> float:
+    """Read a length with its unit: 0.8m, 300mm."""
+    found = re.fullmatch(rf"{_NUMBER}\s*(um|mm|cm|m)", text.strip())
+    if found is None:
+        raise InputError(f"{what} {text!r}: expected a length with its unit, such as 0.8m or 300mm")
+    return float(found[1]) * _UNITS[found[2]]
+
+
+@dataclass(frozen=True)
+class RigPlan:
+    """A rig that is not built yet, and what it is to measure. Lengths m, angles and shares as the names say.
+
+    Attributes:
+        volume: width x height x depth, as the cameras see it.
+        distance: from the cameras to its middle.
+        speed: of the body, and its rate of rotation: 0.3m/s or 0.3m/s,20deg/s.
+        want: what 95 % of the errors are to be within: 0.1mm or 0.1mm,0.05deg; empty: nothing is asked.
+        camera: a class of the catalogue.
+        baseline: between the cameras.
+        verging_deg: angle between their axes; by default both look at the middle of the volume.
+        focal_widths: focal length over the image's width; by default the class's.
+        body: a body file; by default the plate with wings and nine discs that `armsight demo` has.
+        body_scale: by how much that body is larger than its file; discs grow with it.
+        board: the calibration board.
+        pairs: of the board.
+        board_print: standard deviation of its size, as a share.
+        board_bent: of its corners from the drawing.
+        body_print: of the body's markers from its file along their faces.
+        body_bent: out of their faces.
+        warming_k: change of temperature since the calibration.
+        mount_um_per_k: of the cameras' distance.
+        lens_ppm_per_k: of the focal length.
+        skew_ms: by how much the right exposures are later, uncorrected; by default the preset's.
+        start_ms: how far the two exposures begin apart by chance; by default the preset's.
+        exposure_ms: by default the preset's.
+        rate_hz: by default the preset's.
+        arm: for the closed loop; empty: none.
+        backlash_deg: standard deviation of each of its joints.
+        handeye: of the hand-eye calibration: 0.1mm,0.02deg.
+    """
+
+    volume: str = "0.4x0.4x0.3m"
+    distance: str = "0.8m"
+    speed: str = "0.3m/s"
+    want: str = ""
+    camera: str = "webcam-720p"
+    baseline: str = "200mm"
+    verging_deg: float = -1.0
+    focal_widths: float = 0.0
+    body: str = ""
+    body_scale: float = 1.0
+    board: str = "chessboard:9x6:25mm"
+    pairs: int = 20
+    board_print: float = 3e-4
+    board_bent: str = "0.1mm"
+    body_print: str = "0.03mm"
+    body_bent: str = "0.05mm"
+    warming_k: float = 3.0
+    mount_um_per_k: float = 5.0
+    lens_ppm_per_k: float = 20.0
+    skew_ms: float = -1.0
+    start_ms: float = -1.0
+    exposure_ms: float = -1.0
+    rate_hz: float = -1.0
+    arm: str = ""
+    backlash_deg: float = 0.03
+    handeye: str = "0.1mm,0.02deg"
+    folder: str = field(default=".", repr=False)
+
+    @staticmethod
+    def read(path: str, **given: Any) -> RigPlan:  # noqa: ANN401
+        """Read a TOML file whose keys are the attributes; ``given`` replaces what it says.
+
+        Raises:
+            InputError: an unknown key, or a value of another type; the message names it.
+        """
+        known = {each.name: type(each.default) for each in fields(RigPlan) if each.name != "folder"}
+        values = read_toml(path) if path else {}
+        for key, value in values.items():
+            if key not in known:
+                near = difflib.get_close_matches(key, known, 1)
+                raise InputError(f"{path}: unknown key {key!r}{f': did you mean {near[0]}?' if near else ''}")
+            if not isinstance(value, (int, float) if known[key] is float else known[key]) or isinstance(value, bool):
+                raise InputError(f"{path}: {key} must be {'a number' if known[key] is not str else 'a text'}")
+        given = {key: value for key, value in given.items() if value is not None}
+        return RigPlan(**values | given, folder=str(Path(path).parent) if path else ".")
+
+    @cached_property
+    def size_m(self) -> Array:
+        """(3,) width, height, depth."""
+        found = re.fullmatch(rf"{_NUMBER}x{_NUMBER}x{_NUMBER}\s*(mm|cm|m)", self.volume.strip())
+        if found is None:
+            raise InputError(
+                f"volume {self.volume!r}: expected width x height x depth with a unit, such as 0.4x0.4x0.3m"
+            )
+        size = np.array([float(n) for n in found.groups()[:3]]) * _UNITS[found[4]]
+        if size.max() > _MOST_M:
+            raise InputError(f"volume {self.volume}: {size.max():g} m is no table-top cell: is it in mm?")
+        if size.min() < 0 or not self.distance_m - size[2] / 2 > 0:
+            raise InputError(
+                f"volume {self.volume} at {self.distance}: it reaches behind the cameras; a distance above "
+                f"{size[2] / 2:g} m is needed"
+            )
+        return size
+
+    @cached_property
+    def distance_m(self) -> float:
+        """Distance of the middle."""
+        d = length_m(self.distance, "distance")
+        if not _LEAST_M <= d <= _MOST_M:
+            raise InputError(f"distance {self.distance}: expected {_LEAST_M:g} to {_MOST_M:g} m: is the unit right?")
+        return d
+
+    @cached_property
+    def baseline_m(self) -> float:
+        """Distance of the cameras."""
+        b = length_m(self.baseline, "baseline")
+        if not _LEAST_M <= b <= _MOST_M:
+            raise InputError(f"baseline {self.baseline}: expected {_LEAST_M:g} to {_MOST_M:g} m: is the unit right?")
+        return b
+
+    def _two(self, what: str, text: str, units: tuple[str, str], form: str) -> tuple[float, float]:
+        """Read a length and an angle, rad; the second is 0 where it is left out."""
+        first, _, second = text.partition(",")
+        angle = re.fullmatch(rf"{_NUMBER}\s*deg{units[1]}", second.strip()) if second else None
+        plain = first.strip().removesuffix(units[0])
+        if (second and angle is None) or (units[0] and not first.strip().endswith(units[0])):
+            raise InputError(f"{what} {text!r}: expected {form}")
+        return length_m(plain, what), math.radians(float(angle[1])) if angle else 0.0
+
+    @cached_property
+    def speeds(self) -> tuple[float, float]:
+        """m/s and rad/s."""
+        found = self._two("speed", self.speed, ("/s", "/s"), "0.3m/s or 0.3m/s,20deg/s")
+        if found[0] > _MOST_M:
+            raise InputError(f"speed {self.speed}: faster than {_MOST_M:g} m/s: is it in mm/s?")
+        return found
+
+    @cached_property
+    def requested(self) -> tuple[float, float] | None:
+        """Metres and rad, 0 where it is not asked; None where nothing is."""
+        return self._two("want", self.want, ("", ""), "0.1mm or 0.1mm,0.05deg") if self.want else None
+
+    @cached_property
+    def cameras(self) -> CameraClass:
+        """The class."""
+        if self.camera not in catalogue():
+            near = difflib.get_close_matches(self.camera, catalogue(), 1)
+            meant = f": did you mean {near[0]}?" if near else ""
+            raise InputError(
+                f"camera {self.camera!r} is not in the catalogue{meant}; known are {', '.join(catalogue())}"
+            )
+        return catalogue()[self.camera]
+
+    @cached_property
+    def focal_px(self) -> float:
+        """Focal length; where none is given the class's, or the longest that sees the volume, down to a wide lens."""
+        width, height = self.cameras.image_size_px
+        near, body = self.distance_m - self.size_m[2] / 2, np.ptp(self.layout.body.points, axis=0).max()
+        sees = 0.97 * near * min(width / (self.size_m[0] + body), height / (self.size_m[1] + body))
+        return self.focal_widths * width or min(self.cameras.focal_widths * width, max(sees, _WIDEST * width))
+
+    @cached_property
+    def pipeline(self) -> CameraPipeline:
+        """The camera's stages, its exposure as planned."""
+        found = CameraPipeline.load(self.cameras.preset)
+        return found if self.exposure_ms < 0 else found.exposed_for(1e-3 * self.exposure_ms)
+
+    @cached_property
+    def timing(self) -> dict[str, float]:
+        """exposure, readout, skew, start, stamp, s; rate, Hz."""
+        t = self.pipeline.timing
+        assert t is not None
+        skew, start = (
+            given if given >= 0 else preset
+            for given, preset in ((self.skew_ms, t.skew_ms), (self.start_ms, t.sync_ms / math.sqrt(3.0)))
+        )
+        ms = {"exposure": t.exposure_ms, "readout": t.readout_ms, "skew": skew, "start": start, "stamp": t.jitter_ms}
+        rate = min(t.rate_hz, self._most_hz) if self.rate_hz < 0 else self.rate_hz
+        return {name: 1e-3 * value for name, value in ms.items()} | {"rate": rate}
+
+    @property
+    def _most_hz(self) -> float:
+        """Rate that one USB controller carries."""
+        width, height = self.cameras.image_size_px
+        return self.cameras.usb * 1e6 / (2 * width * height * self.cameras.bytes_px)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The body."""
+        if self.body:
+            return read_layout(Path(self.folder) / self.body)
+        discs, k = body_target().discs, self.body_scale
+        assert discs is not None
+        body = replace(discs.body, points=k * discs.body.points)
+        return Layout("tool_body", replace(discs, body=body, radii_m=k * discs.radii_m), None, None)
+
+    @cached_property
+    def rig(self) -> StereoRig:
+        """The cameras, verging symmetrically."""
+        width, height = size = self.cameras.image_size_px
+        f, half = self.focal_px, math.atan(self.baseline_m / 2 / self.distance_m)
+        half = half if self.verging_deg < 0 else math.radians(self.verging_deg) / 2
+        camera = Camera(size, "brown5", np.array([f, f, (width - 1) / 2, (height - 1) / 2]), np.zeros(5))
+        sides = [
+            pose(exp_so3(np.array([0.0, -s * half, 0.0])), np.array([s * self.baseline_m / 2, 0.0, 0.0]))
+            for s in (-1, 1)
+        ]
+        count = 2 * camera.parameters.size + 6
+        return StereoRig(camera, camera, inverse(sides[0]) @ sides[1], np.zeros((count, count)), 0.0)
+
+    def marker(self, distance_m: float) -> tuple[str, float]:
+        """Return the kind of the body's markers and their least size in the image at a distance, px."""
+        per_m = self.focal_px / distance_m
+        if self.layout.discs is not None:
+            return "disc", 2 * float(self.layout.discs.radii_m.mean()) * per_m
+        if self.layout.tags is not None:
+            return "tag", min(tag.size_m for tag in self.layout.tags.tags) * per_m
+        raise InputError(f"{self.body}: a body of discs or tags is expected; boards on a body have no budget yet")
+
+    def defocus_px(self, distance_m: float) -> float:
+        """Return the radius of the blur away from the lens's focus, px: aperture times the difference of dioptres."""
+        c = self.cameras
+        focus = c.focus_m or self.distance_m
+        aperture_m = 1e-3 * c.focal_mm / c.f_number
+        return 0.5 * aperture_m * self.focal_px * abs(1 / focus - 1 / distance_m)
+
+    def check(self) -> None:
+        """Refuse what cannot be built.
+
+        Raises:
+            InputError: one line: what was found, what was expected, and the nearest that can be had.
+        """
+        c, size, t, _, _ = self.cameras, self.size_m, self.timing, self.speeds, self.requested
+        near, far = self.distance_m - size[2] / 2, self.distance_m + size[2] / 2
+        for name in ("board_bent", "body_print", "body_bent"):
+            length_m(getattr(self, name), name)
+        if near < c.least_focus_m:
+            raise InputError(
+                f"the lens of {c.name} does not focus nearer than {c.least_focus_m:g} m, the volume begins at {near:.2g} m"
+                f": a distance of {c.least_focus_m + size[2] / 2:.2g} m can be had"
+            )
+        if t["exposure"] > 1 / t["rate"]:
+            raise InputError(
+                f"an exposure of {1e3 * t['exposure']:g} ms is longer than a frame at {t['rate']:g} Hz: at most "
+                f"{1e3 / t['rate']:.3g} ms, or {1 / t['exposure']:.3g} Hz"
+            )
+        width, height = c.image_size_px
+        if t["rate"] > 1.001 * self._most_hz:
+            raise InputError(
+                f"one USB controller carries two {c.name} at {self._most_hz:.3g} Hz at most, {t['rate']:g} Hz were asked: "
+                "a lower rate_hz, or a controller each"
+            )
+        if self.baseline_m > 3 * self.distance_m:
+            raise InputError(
+                f"a baseline of {self.baseline} at {self.distance}: the arm would cross it; at most {self.distance_m:g} m"
+            )
+        body = np.ptp(self.layout.body.points, axis=0).max()
+        for what, extent, pixels in (("wide", size[0], width), ("high", size[1], height)):
+            seen = near * pixels / self.focal_px
+            if extent + body > seen:
+                least = (extent + body) * self.focal_px / pixels + size[2] / 2
+                raise InputError(
+                    f"the field of view is {seen:.2g} m {what} at {near:.2g} m, volume and body are {extent + body:.2g} m: "
+                    f"a distance of {least:.2g} m, or focal_widths = {near / (extent + body) * pixels / width:.2g}"
+                )
+        kind, px = self.marker(far)
+        least_px = LEAST_DISC_PX if kind == "disc" else LEAST_TAG_PX
+        if px < least_px:
+            raise InputError(
+                f"a {kind} is {px:.1f} px at {far:.2g} m, at least {least_px:g} are needed: markers {least_px / px:.1f} "
+                f"times as large (body_scale = {self.body_scale * least_px / px:.2g})"
+            )
+        views = volume_views(self.rig, self.layout.body.points, self.layout.normals, self.distance_m, size)
+        lost = sum(len(one.paired) < 3 for one in views)
+        if lost:
+            raise InputError(
+                f"at {lost} of {len(views)} positions the cameras do not both see the body, they look past each other: "
+                f"verging_deg = {math.degrees(2 * math.atan(self.baseline_m / 2 / self.distance_m)):.3g} or less baseline"
+            )
+        if self.pairs < 3:
+            raise InputError(f"pairs = {self.pairs}: a calibration takes 3 pairs of the board at least")
+
+    def _noise_px(self) -> dict[str, float]:
+        """Return what pixel noise and blur add to a marker's position in the middle, and defocus at both ends, RMS."""
+        kind, px = self.marker(self.distance_m)
+        # The way in the image is the lateral part of a motion in any direction.
+        way = self.speeds[0] * math.sqrt(2 / 3) * self.timing["exposure"] * self.focal_px / self.distance_m
+        sharp, soft = marker_noise(self.pipeline, kind, px) ** 2, 0.0
+        for distance in self.distance_m + self.size_m[2] / 2 * np.array([-1.0, 1.0]):
+            if radius := 0.5 * round(2 * self.defocus_px(float(distance))):
+                blurred = replace(self.pipeline, defocus=Defocus(radius))
+                soft += max(marker_noise(blurred, kind, px) ** 2 - sharp, 0.0) / 2
+        moved = max(marker_noise(self.pipeline, kind, px, way) ** 2 - sharp, 0.0)
+        return {"pixel noise": math.sqrt(sharp), "defocus": math.sqrt(soft), "exposure blur": math.sqrt(moved)}
+
+    def conditions(self) -> Conditions:
+        """Return what is not known."""
+        t, (speed, rotation) = self.timing, self.speeds
+        arm = (0.0, 0.0)
+        if self.arm:
+            model, sigma = open_arm(self.arm), math.radians(self.backlash_deg)
+            J = model.jacobian(model.home)
+            arm = tuple(sigma * float(np.sqrt((part**2).sum() / 3)) for part in (J[:3], J[3:]))  # type: ignore[assignment]
+        return Conditions(
+            self._noise_px(),
+            _cov_calibration(replace(self, **{name: getattr(RigPlan, name) for name in _NOT_CALIBRATED})),
+            self.board_print,
+            (length_m(self.body_print, "body_print"), length_m(self.body_bent, "body_bent")),
+            self.board_print,
+            1e-6 * self.mount_um_per_k * self.warming_k,
+            0.0,
+            1e-6 * self.lens_ppm_per_k * self.warming_k,
+            t["skew"],
+            t["start"],
+            t["readout"],
+            t["stamp"],
+            speed,
+            rotation,
+            self._two("handeye", self.handeye, ("", ""), "0.1mm,0.02deg") if self.arm else (0.0, 0.0),
+            arm,
+        )
+
+
+#: What a calibration does not depend on.
+_NOT_CALIBRATED = (
+    "speed", "want", "board_print", "body_print", "body_bent", "warming_k", "mount_um_per_k", "lens_ppm_per_k", "skew_ms",
+    "start_ms", "rate_hz", "arm", "backlash_deg", "handeye",
+)  # fmt: skip
+
+
+@lru_cache(maxsize=64)
+def _cov_calibration(plan: RigPlan) -> Array:
+    """Return the covariance (P, P) of the rig's parameters."""
+    board = open_board(plan.board)
+    if not isinstance(board, Chessboard):
+        raise InputError(f"board {plan.board!r}: chessboards have a budget so far: {Chessboard.form}")
+    pattern = chessboard(board.columns, board.rows, board.square_m)
+    Ts = board_poses(np.random.default_rng(1), plan.rig, pattern, plan.pairs)
+    px = board.square_m * plan.focal_px / float(np.median(Ts[:, 2, 3]))
+    if px < LEAST_SQUARE_PX:
+        raise InputError(f"a square of {plan.board} is {px:.1f} px, at least {LEAST_SQUARE_PX:g} are needed")
+    sigma = marker_noise(plan.pipeline, "chessboard", min(px, MOST_SQUARE_PX))
+    return calibration_covariance(plan.rig, board.body.points, Ts, sigma, length_m(plan.board_bent, "board_bent"))
+
+
+def planned(plan: RigPlan) -> Budget:
+    """Return the budget of a plan that was checked."""
+    plan.check()
+    layout = plan.layout
+    views = volume_views(plan.rig, layout.body.points, layout.normals, plan.distance_m, plan.size_m)
+    return budget(plan.rig, layout.body.points, layout.normals, views, plan.conditions())

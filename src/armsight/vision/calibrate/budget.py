@@ -1,0 +1,311 @@
+"""The budget of a measured pose: what each cause costs, before or after a rig is built.
+
+In: cameras, the points of a body in a volume, and what is not known (:class:`Conditions`). Out: a :class:`Budget`, the
+pose's error by cause at every point of the volume. One computation for all causes: the derivatives of the pose that two
+cameras measure (:class:`~armsight.vision.pose.predict.PoseDerivatives`) times what each cause does to pixels, rig or body.
+What several causes share (the velocity that skew and readout multiply) adds before it is squared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.vision.calibrate.boards import printed_board, rigid_board
+from armsight.vision.pose.bundle import BundleState, Observations, minimise
+from armsight.vision.pose.predict import PredictedView, pose_derivatives, view
+from armsight.vision.rig import StereoRig
+
+#: Share of errors that a figure "at 95 %" covers.
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class CauseKind:
+    """What kind of cause it is.
+
+    Attributes:
+        moving: it costs nothing at rest.
+        common: it is the same in all shots (trueness); else it differs from shot to shot (precision).
+        loop: it is no error of what the cameras measure, but of where a closed loop brings the arm.
+    """
+
+    moving: bool = False
+    common: bool = False
+    loop: bool = False
+
+
+#: Cause -> its kind, in the order of tables.
+CAUSES: dict[str, CauseKind] = {
+    "pixel noise": CauseKind(),
+    "defocus": CauseKind(),
+    "exposure blur": CauseKind(moving=True),
+    "skew": CauseKind(moving=True),
+    "start of exposures": CauseKind(moving=True),
+    "readout": CauseKind(moving=True),
+    "time stamps": CauseKind(moving=True),
+    "calibration": CauseKind(common=True),
+    "print of the board": CauseKind(common=True),
+    "print of the body": CauseKind(common=True),
+    "warming of the mount": CauseKind(common=True),
+    "warming of the lenses": CauseKind(common=True),
+    "hand-eye": CauseKind(common=True, loop=True),
+    "steps and backlash of the arm": CauseKind(loop=True),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Conditions(Record):
+    """What is not known when a body is measured; zero where nothing is given.
+
+    Attributes:
+        noise_px: cause -> standard deviation that it adds to a marker's position, px: pixel noise, defocus, exposure blur.
+        cov_calibration: (P, P) covariance of the rig's parameters by its calibration, or (0, 0).
+        board_scale: standard deviation of the board's size, as a share.
+        body_sigma_m: of each point of the body from its file, along its face and out of it, m.
+        body_scale: of the body's size, as a share.
+        mount_m: of the right camera's position along each axis since the calibration, m.
+        mount_rad: of its rotation about each axis, rad.
+        lens_share: of each focal length since the calibration, as a share.
+        skew_s: by how much the right exposures are later, uncorrected, s.
+        start_s: standard deviation of what differs from shot to shot, s.
+        readout_s: from the first row to the last, uncorrected, s.
+        stamp_s: standard deviation of a time stamp, s.
+        speed_m_s: of the body, in any direction.
+        rotation_rad_s: its rate of rotation, about any axis.
+        handeye: standard deviations of position along each axis, m, and of rotation about each, rad.
+        arm: the same of how near the arm comes to where it is sent.
+    """
+
+    noise_px: Mapping[str, float] = field(default_factory=dict)
+    cov_calibration: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    board_scale: float = 0.0
+    body_sigma_m: tuple[float, float] = (0.0, 0.0)
+    body_scale: float = 0.0
+    mount_m: float = 0.0
+    mount_rad: float = 0.0
+    lens_share: float = 0.0
+    skew_s: float = 0.0
+    start_s: float = 0.0
+    readout_s: float = 0.0
+    stamp_s: float = 0.0
+    speed_m_s: float = 0.0
+    rotation_rad_s: float = 0.0
+    handeye: tuple[float, float] = (0.0, 0.0)
+    arm: tuple[float, float] = (0.0, 0.0)
+
+    def only(self, cause: str) -> Conditions:
+        """Return the same with one cause alone."""
+        kept: dict[str, tuple[str, ...]] = {
+            "calibration": ("cov_calibration",),
+            "print of the board": ("board_scale",),
+            "print of the body": ("body_sigma_m", "body_scale"),
+            "warming of the mount": ("mount_m", "mount_rad"),
+            "warming of the lenses": ("lens_share",),
+            "skew": ("skew_s",),
+            "start of exposures": ("start_s",),
+            "readout": ("readout_s",),
+            "time stamps": ("stamp_s",),
+            "hand-eye": ("handeye",),
+            "steps and backlash of the arm": ("arm",),
+        }
+        noise = {name: sigma for name, sigma in self.noise_px.items() if name == cause}
+        values = {name: getattr(self, name) for name in (*kept.get(cause, ()), "speed_m_s", "rotation_rad_s")}
+        return Conditions(noise, **values)
+
+
+@dataclass(frozen=True, eq=False)
+class Budget(Record):
+    """The error of a body's pose, [translation m; rotation rad] along the left camera's axes, at G points of a volume.
+
+    Attributes:
+        p_left: (G, 3) the points, m, left camera's frame.
+        forward: (3,) direction of depth.
+        factors: cause -> (G, 6, K) what its K sources of variance one do to the pose.
+        shared: causes that multiply the same sources, which add before they are squared.
+    """
+
+    p_left: Array
+    forward: Array
+    factors: Mapping[str, Array]
+    shared: tuple[str, ...] = ("skew", "readout")
+
+    def cov(self, *, moving: bool = True, loop: bool = False, of: str = "", scaled: str = "", by: float = 1.0) -> Array:
+        """Return covariances (G, 6, 6).
+
+        Args:
+            moving: with what motion costs.
+            loop: with hand-eye and arm.
+            of: one cause alone; or "precision" or "trueness".
+            scaled: a cause whose standard deviation is multiplied ``by`` so much.
+            by: how much.
+        """
+        total, together = np.zeros((len(self.p_left), 6, 6)), np.zeros((len(self.p_left), 6, 6))
+        for name, F in self.factors.items():
+            kind = CAUSES[name]
+            requested = of in ("", name, "trueness" if kind.common else "precision")
+            if requested and (moving or not kind.moving) and (loop or not kind.loop):
+                F = F * by if name == scaled else F
+                if name in self.shared:
+                    together = together + F
+                else:
+                    total = total + F @ F.transpose(0, 2, 1)
+        return np.asarray(total + together @ together.transpose(0, 2, 1))
+
+    def rms(self, cov: Array) -> tuple[float, float]:
+        """Return the RMS error over the volume: m, in space, and rad."""
+        traces = np.trace(cov[:, :3, :3], axis1=1, axis2=2), np.trace(cov[:, 3:, 3:], axis1=1, axis2=2)
+        return float(np.sqrt(traces[0].mean())), float(np.sqrt(traces[1].mean()))
+
+    def along(self, cov: Array) -> tuple[float, float]:
+        """Return the RMS over the volume of one lateral axis, and of depth, m."""
+        depth = np.einsum("i,gij,j->g", self.forward, cov[:, :3, :3], self.forward)
+        lateral = (np.trace(cov[:, :3, :3], axis1=1, axis2=2) - depth) / 2
+        return float(np.sqrt(lateral.mean())), float(np.sqrt(depth.mean()))
+
+    def at_level(self, cov: Array) -> tuple[Array, Array]:
+        """Return what 95 % of the errors are within at each point: (G,) m and (G,) rad."""
+        return radius(cov[:, :3, :3]), radius(cov[:, 3:, 3:])
+
+
+def radius(cov: Array) -> Array:
+    """Return (G,) the radius that holds 95 % of errors of covariances (G, 3, 3).
+
+    The squared length is taken as a scaled chi-square of the same mean and variance (Satterthwaite 1946): within 2 %.
+    """
+    mean, square = np.trace(cov, axis1=1, axis2=2), np.einsum("gij,gji->g", cov, cov)
+    safe = np.maximum(mean, 1e-300)
+    scale = np.maximum(square, 1e-300) / safe
+    return np.asarray(np.where(mean > 0, np.sqrt(scale * chi2.ppf(LEVEL, np.clip(safe / scale, 1.0, 3.0))), 0.0))
+
+
+def volume_views(
+    rig: StereoRig, points: Array, normals: Array, distance_m: float, size_m: Array
+) -> list[PredictedView]:
+    """Return a body at 27 positions of a volume: width, height, depth (3,), m, its middle at a distance."""
+    w, h, d = size_m / 2
+    positions = [(x, y, z) for z in (-d, 0.0, d) for y in (-h, 0.0, h) for x in (-w, 0.0, w)]
+    return [view(rig, points, normals, distance_m + z, (0.0, 0.0), (x, y)) for x, y, z in positions]
+
+
+def budget(rig: StereoRig, points: Array, normals: Array, views: list[PredictedView], given: Conditions) -> Budget:
+    """Return what each cause costs a body's pose.
+
+    Args:
+        rig: the cameras; their own covariance is not used, ``given.cov_calibration`` is.
+        points: (M, 3) points of the body, m.
+        normals: (M, 3) out of their faces; NaN where unknown.
+        views: where the body is.
+        given: what is not known.
+
+    Raises:
+        InputError: at none of the positions do both cameras see enough of the body.
+    """
+    found: list[dict[str, Array]] = []
+    at, forward = [], np.zeros(3)
+    by_rig = {
+        "calibration": _root(given.cov_calibration),
+        "print of the board": given.board_scale * _scaled_rig(rig),
+        "warming of the mount": _mount(rig, given),
+        "warming of the lenses": _lenses(rig, given.lens_share),
+    }
+    velocity = np.repeat(np.array([given.speed_m_s, given.rotation_rad_s]) / np.sqrt(3.0), 3)
+    out = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
+    flat, away = given.body_sigma_m
+    # Along a face and out of it; alike in all directions where the face is unknown.
+    spread = flat * (np.eye(3) - out[:, :, None] * out[:, None]) + away * out[:, :, None] * out[:, None]
+    for seen in views:
+        d = pose_derivatives(rig, points, seen)
+        if d is None:
+            continue
+        F = {name: d.by_uv.reshape(6, -1) * sigma for name, sigma in given.noise_px.items()}
+        F |= {name: d.by_rig @ root for name, root in by_rig.items() if root.size}
+        each = np.einsum("kmi,mij->kmj", d.by_point, spread).reshape(6, -1)
+        larger = given.body_scale * np.einsum("kmi,mi->k", d.by_point, points)
+        F["print of the body"] = np.column_stack([each, larger])
+        heights = np.array([camera.image_size_px[1] for camera in rig.cameras])[d.side]
+        late: Array = given.readout_s * (d.uv[:, 1] / (heights - 1) - 0.5)
+        F["readout"] = d.moved(late) * velocity
+        right = d.side.astype(np.float64)
+        F["skew"], F["start of exposures"] = (d.moved(s * right) * velocity for s in (given.skew_s, given.start_s))
+        F["time stamps"] = given.stamp_s * np.diag(velocity)
+        for name, (m, rad) in {"hand-eye": given.handeye, "steps and backlash of the arm": given.arm}.items():
+            F[name] = np.diag(np.repeat([m, rad], 3))
+        R = np.kron(np.eye(2), seen.T_left_body[:3, :3])
+        found.append({name: R @ each for name, each in F.items() if each.any()})
+        at.append(seen.T_left_body[:3, 3])
+        forward = forward + seen.forward
+    if not found:
+        raise InputError("both cameras together see three markers of the body nowhere in the volume")
+    # What is not seen at one position has as many sources as at the others.
+    factors = {name: _stacked([one.get(name) for one in found]) for name in CAUSES if any(name in one for one in found)}
+    return Budget(np.array(at), forward / np.linalg.norm(forward), factors)
+
+
+def _stacked(factors: list[Array | None]) -> Array:
+    """Return factors (6, K) of different K, or none, as one array (G, 6, K), filled up with zeros."""
+    most = max(F.shape[1] for F in factors if F is not None)
+    out = np.zeros((len(factors), 6, most))
+    for row, F in zip(out, factors, strict=True):
+        if F is not None:
+            row[:, : F.shape[1]] = F
+    return out
+
+
+def _root(cov: Array) -> Array:
+    """Return L (P, P) of a covariance L L^T, also where it is singular."""
+    size = np.sqrt(np.maximum(np.diag(cov), 1e-300))
+    values, vectors = np.linalg.eigh(cov / np.outer(size, size)) if len(cov) else (np.zeros(0), cov)
+    return np.asarray(size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _scaled_rig(rig: StereoRig) -> Array:
+    """Return (P, 1) how the rig's parameters change with the size of the board: only the baseline grows with it."""
+    by = np.zeros((rig.parameter_count, 1))
+    by[-6:-3, 0] = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3]
+    return by
+
+
+def _mount(rig: StereoRig, given: Conditions) -> Array:
+    """Return (P, 6) what the mount of the right camera does."""
+    by = np.zeros((rig.parameter_count, 6))
+    by[-6:] = np.diag(np.repeat([given.mount_m, given.mount_rad], 3))
+    return by
+
+
+def _lenses(rig: StereoRig, share: float) -> Array:
+    """Return (P, 2) what the two lenses do: both focal lengths of a camera together."""
+    by = np.zeros((rig.parameter_count, 2))
+    for k, (first, camera) in enumerate(zip((0, rig.left.parameters.size), rig.cameras, strict=True)):
+        by[first : first + 2, k] = share * camera.intrinsics[:2]
+    return by
+
+
+def calibration_covariance(
+    rig: StereoRig, board: Array, Ts_left_board: Array, sigma_px: float, bent_m: float = 0.0
+) -> Array:
+    """Return the covariance (P, P) of a calibration before it is made: the inverse of the bundle's own information.
+
+    Args:
+        rig: the cameras.
+        board: (M, 3) corners of the board, m.
+        Ts_left_board: (S, 4, 4) where it is to be shown, all of it in both images.
+        sigma_px: standard deviation of a corner, px.
+        bent_m: of a corner of the board from its drawing along each axis, m, smoothly; it is estimated, too.
+    """
+    model, (S, M) = rigid_board(board), (len(Ts_left_board), len(board))
+    if bent_m > 0:
+        model = printed_board(board)
+        model = replace(model, shape_sigma_m=bent_m * np.sqrt(3.0 / len(model.modes)))
+    state = BundleState(rig.cameras, rig.T_left_right, Ts_left_board, np.zeros(len(model.modes)))
+    shot, side = np.repeat(np.arange(S), 2 * M), np.tile(np.repeat([0, 1], M), S)
+    p = np.einsum("sij,mj->smi", Ts_left_board[:, :3, :3], board) + Ts_left_board[:, None, :3, 3]
+    uv = np.stack([each.reshape(S, M, 2) for each in rig.project(p.reshape(-1, 3))], axis=1).reshape(-1, 2)
+    seen = Observations(shot, side, np.tile(np.arange(M), 2 * S), uv, np.zeros((len(uv), 2, 2)), S)
+    found = minimise(model, state, seen, sigma_px, max_steps=0)
+    return np.asarray(found.cov_shared[: rig.parameter_count, : rig.parameter_count])
