@@ -121,7 +121,7 @@ def test_the_bundle_finds_the_beacons_while_the_body_moves() -> None:
     assert np.mean(np.einsum("ki,kij,kj->k", e[:, :3], np.linalg.inv(cov[:, :3, :3]), e[:, :3])) / 3 < 4
 
 
-def test_beacons_triangulate_as_the_bundle_does() -> None:
+def test_a_point_triangulated_from_beacons_has_an_honest_covariance() -> None:
     rng, sigma, p = np.random.default_rng(8), 1e-3, np.array([0.2, -0.1, 0.3])
     Ts = np.stack([_looking_at(np.array(eye), p + 0.1) for eye in ([2.0, 0, 1], [0, 2.0, 0.5], [-1.5, -1, 0.4])])
     for count in (2, 3):

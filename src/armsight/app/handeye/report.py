@@ -27,6 +27,7 @@ _MANY = 0.25  # as many blunders as this share of the poses are no calibration t
 #: Sources whose mean log density of a pose left out is within this of the best are not distinguished from them.
 DISTINGUISHED = 0.2
 ADVISED, MORE = 15, 6  # fewer poses than these are few, and so many more are advised then
+GOOD_M = 2e-3  # m; error of poses left out of a good calibration at most; half: worn arms have none, double: 4 mm is good
 _POSE = ("x, mm", "y, mm", "z, mm", "rx, deg", "ry, deg", "rz, deg")
 
 
@@ -115,6 +116,8 @@ def assess(run: HandEyeAnswer, why: list[str]) -> tuple[Grade, str]:
     said += f" {1e3 * worst_m:.2f} mm"
     if worst_m > position_m or used < ADVISED:
         return "fair", f"Usable: {said} along its worst axis; more poses lower that: --plan {MORE} chooses them."
+    if position_m > GOOD_M:
+        return "fair", f"Usable: {said}; the arm's own error is the likeliest reason: armsight identify finds it."
     return "good", f"Good: {said}; leave camera and tool as they are mounted."
 
 
