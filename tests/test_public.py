@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import pickle
 import pydoc
 import re
 import sys
@@ -115,6 +116,11 @@ def test_one_decisive_pose_is_said_and_a_calibration_is_saved_and_drawn(tmp_path
     assert kept == found.to_dict()
     np.testing.assert_array_equal(kept["T_flange_body"], found.T_flange_body)
     assert len(found.plot().axes[0].patches) == 9
+
+
+def test_public_functions_go_to_other_processes():
+    for name in ("measure", "handeye", "identify"):
+        assert pickle.loads(pickle.dumps(getattr(armsight, name))) is getattr(armsight, name)
 
 
 def test_errors_name_arguments_and_not_options(tmp_path):

@@ -134,7 +134,7 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 - a module's names are of any
         raise AttributeError(f"module 'armsight' has no attribute {name!r}; public are {', '.join(__all__)}")
     found = getattr(importlib.import_module(_HOME[name]), _THERE.get(name, name))
     if isinstance(found, types.FunctionType):
-        found = globals()[name] = _in_python(found)
+        found = globals()[name] = _in_python(found, name)
     return found
 
 
@@ -142,8 +142,8 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 - a module's names are of any
 _ARGUMENTS = {"model": "arm", "units": "unit", "seen-units": "unit", "seen-rotation": "rotation"}
 
 
-def _in_python(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a public function whose errors name arguments where the command line's name options."""
+def _in_python(function: Callable[..., Any], name: str) -> Callable[..., Any]:
+    """Return a function by its public name, whose errors name arguments where the command line's name options."""
 
     @functools.wraps(function)
     def call(*args: Any, **options: Any) -> Any:  # noqa: ANN401 - of any public function
@@ -156,6 +156,7 @@ def _in_python(function: Callable[..., Any]) -> Callable[..., Any]:
             )
             raise
 
+    call.__module__, call.__name__, call.__qualname__ = __name__, name, name  # where pickle finds it
     return call
 
 

@@ -84,6 +84,20 @@ def test_wires_bound_the_error_while_the_cameras_are_covered_and_the_covariance_
     assert low < np.sum(squares) < high, f"mean NEES {np.mean(squares):.2f}, six is right"
 
 
+def test_an_image_that_waits_is_not_dropped_for_a_fast_sensor():
+    _, q, _, looks, lengths = world(3)
+    count = 1500
+    estimator = fed(q[:count])
+    image = next(m for m in looks if m.t_s > count * TICK_S + 0.01)
+    assert estimator.vision(image) is Outcome.WAITING
+    wire, reading = lengths[0]
+    for k in range(40):
+        assert estimator.take(wire, replace(reading, t_s=image.t_s + 1e-3 * k)) is Outcome.WAITING
+    estimator.joints(states(np.arange(count, count + 100) * TICK_S, q[count : count + 100]))
+    newest_s = (count + 99) * TICK_S
+    assert estimator.estimate().vision_age_s == pytest.approx(newest_s - image.t_s, abs=2e-3)
+
+
 def test_many_readings_do_not_average_the_calibration_of_one_sensor_away():
     wire = Wire(name="wire", cov=np.diag([1e-6, 1e-6, 1e-6, 1e-6, 1e-12]), values=np.array([*ANCHORS[0], 0.0, 0.0]))
     q = np.tile(MIDDLE, (1000, 1))

@@ -59,6 +59,14 @@ def test_both_cameras_on_one_stand_that_rotates_are_the_rig(room):
     assert found.what.startswith("both cameras moved together")
 
 
+def test_a_camera_that_came_back_forbids_only_what_was_measured_meanwhile(room):
+    watch, xi = SceneWatch(room.rig), np.array([0.0, 0.0, 0.0, 0.0, 0.05 * DEG, 0.0])
+    for k in range(BEGINS + 16):
+        watch.take(room.shot(k, right=xi if BEGINS <= k < BEGINS + 4 else STILL), k / RATE_HZ)
+    (found,) = watch.findings()
+    assert (BEGINS + 4) / RATE_HZ < found.corrected_s <= (BEGINS + 15) / RATE_HZ
+
+
 def test_people_a_lamp_and_a_wandering_shadow_are_no_motion(room):
     assert not watched(room, people=True, quality=80, after={"lamp": 0.4}, looks=12).findings()
     watch = SceneWatch(room.rig)

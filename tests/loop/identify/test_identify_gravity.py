@@ -22,7 +22,7 @@ def rested(seed, rests=60):
     """A worn arm at rests; the sensor warms up meanwhile, is a little bent and rounded, all of which no model has."""
     arm, rng = worn(seed), np.random.default_rng(9000 + seed)
     q, approach = poses(arm.nominal, rests, rng, 1.5)
-    said = replace(Inertial.of("imu"), cov=np.diag(LEFT**2), sigma_delay_s=0.0)
+    said = replace(Inertial.of("imu"), cov=np.diag(LEFT**2), delay_s=0.004)  # as its calibration left it
     true = said.moved(rng.normal(size=38) * np.append(LEFT[:-2], np.radians([0.3, 0.3])))
     readings = []
     for k, T in enumerate(arm.true.forward(arm.joints(q, approach))):

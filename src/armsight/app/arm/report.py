@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
 import numpy as np
 
 from armsight.app.arm.evaluate import SURE, VERSION, ArmReport, JointFigures
@@ -231,9 +230,7 @@ def _text_page(report: Report) -> Figure:
     """Return a page of text for the PDF."""
     figure = new_figure(_PAGE)
     figure.set_layout_engine(None)
-    lines = "\n".join(
-        textwrap.fill(line, 150, subsequent_indent="  ") for line in click.unstyle(report.text()).split("\n")
-    )
+    lines = "\n".join(textwrap.fill(line, 150, subsequent_indent="  ") for line in report.text().split("\n"))
     figure.text(0.04, 0.97, report.heading, fontsize=16, va="top", weight="bold")
     figure.text(0.04, 0.945, report.sub, fontsize=9, va="top", color=MUTED)
     figure.text(0.04, 0.915, lines, fontsize=7, va="top", family="monospace", linespacing=1.35)

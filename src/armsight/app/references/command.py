@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,8 @@ UNIT = 0.2
 REST_S = 0.5
 #: Readings are averaged over so long for a calibration, s.
 AVERAGED_S = 0.05
+#: Stamps of a sensor may be so late against those of the poses, s; half: a phone's are not found, double: more is cut off.
+DELAY_S = 0.5
 
 
 @click.group("references")
@@ -98,7 +101,7 @@ def _gravity(entry: Entry, model: str, joints: Path) -> Report:
         parts = [z[part, 3:].mean(axis=0) for part in np.array_split(rows, 4)]
         noise = np.maximum(np.var(parts, axis=0, ddof=1) / 4, 1e-6)
         readings.append(Reading(float(rest), ACCELEROMETER, np.mean(parts, axis=0), np.diag(np.full(3, noise.mean()))))
-    sensor, poses = entry.reference, arm.forward(table.q)
+    sensor, poses = replace(entry.reference, delay_s=0.0), arm.forward(table.q)  # from here on a rest's time is its row
     if not entry.calibrated:
         sensor = sensor.begun(readings, lambda rest: ToolMotion(poses[int(rest)]))
     shown, found = gravity_shows(arm, sensor, table.q, readings)
@@ -222,8 +225,6 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
 
 def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]:
     """Return the report, and the references as calibrated."""
-    from dataclasses import replace
-
     from armsight.app.show.messages import Note
     from armsight.app.show.report import Fact, Report
     from armsight.app.show.table import TextTable
@@ -264,9 +265,7 @@ def _averaged(entry: Entry, path: Any) -> list[Any]:  # noqa: ANN401 - imported 
     count = len(t_s) // size
     times = t_s[: count * size].reshape(count, size).mean(axis=1)
     means = z[: count * size].reshape(count, size, 2, 3).mean(axis=1)
-    within = np.flatnonzero(
-        [path.covers(t - entry.reference.delay_s, 5 * entry.reference.sigma_delay_s) for t in times]
-    )
+    within = np.flatnonzero([path.covers(t - entry.reference.delay_s, DELAY_S) for t in times])
     if len(within) < 20:
         raise InputError(
             f"{source}: {len(within)} times of {AVERAGED_S:g} s lie within the poses; do both have one clock?"

@@ -166,7 +166,7 @@ _FEW = 0.8  # of the shots in view; half: misses are hardly noticed, 1: one miss
 
 def assess(result: RunResult, passes: tuple[PassErrors, PassErrors] | None) -> tuple[Grade, str]:
     """Return the grade of a run, and in one sentence how good it is and what to do next; ``passes``: open and closed."""
-    wrong = [each for each in result.health if each.forbids]
+    wrong = [each for each in result.health if each.forbids and each.corrected_s is None]
     if wrong:
         return "poor", f"Do not use this run: {wrong[0].line()}; mend that, and run it again."
     if result.ended_text is not None or result.handeye is None:
@@ -174,12 +174,14 @@ def assess(result: RunResult, passes: tuple[PassErrors, PassErrors] | None) -> t
         return "poor", f"Ended early ({why}): what was measured until then is kept; run it again."
     counts = result.log.counts()
     share = counts["measured"] / max(counts["measured"] + counts["missed"] + counts["rejected"], 1)
-    said, gained = f"the hand-eye calibration is off by {1e3 * result.handeye.found.held_out.rms()[0]:.2f} mm", True
+    parts, gained = list[str](), True
     for what, key in (("follows its path", "path_m"), ("rests", "rest_m")):
         alone, closed = (None, None) if passes is None else (getattr(each, key) for each in passes)
         if alone is not None and closed is not None:
-            gained = closed < alone
-            said = f"with the loop closed the tool {what} {1e3 * closed:.2f} mm off, without {1e3 * alone:.2f}"
+            gained = gained and closed < alone
+            parts.append(f"{what} {1e3 * closed:.2f} mm off, without {1e3 * alone:.2f}")
+    said = f"the hand-eye calibration is off by {1e3 * result.handeye.found.held_out.rms()[0]:.2f} mm"
+    said = f"with the loop closed the tool {' and '.join(parts)}" if parts else said
     if result.health or share < _FEW:
         why = (
             result.health[0].line()
@@ -188,7 +190,7 @@ def assess(result: RunResult, passes: tuple[PassErrors, PassErrors] | None) -> t
         )
         return "fair", f"Usable with care: {said}; {why}."
     if not gained:
-        return "fair", f"Usable, but vision gained nothing: {said}; armsight check shows where."
+        return "fair", f"Usable, but the closed loop is not better in all: {said}; armsight check shows where."
     return "good", f"Good: {said}; armsight arm report shows what the arm's error is made of."
 
 

@@ -149,10 +149,12 @@ class Report:
         """Return a file of it."""
         return json.dumps(self.json(), indent=1) + "\n"
 
-    def text(self) -> str:
-        """Return what people read on a terminal."""
+    def text(self, *, styled: bool = False) -> str:
+        """Return what people read on a terminal, with colours or without."""
         lines = [f"do not trust this result: {why}" for why in self.noted("untrusted")]
-        lines += [click.style(self.assessed[1], fg=_COLOURS[self.assessed[0]])] if self.assessed else []
+        if self.assessed:
+            grade, sentence = self.assessed
+            lines.append(click.style(sentence, fg=_COLOURS[grade]) if styled else sentence)
         lines += [self.headline] if self.headline else []
         for block in self.blocks:
             match block:
@@ -231,7 +233,7 @@ class Report:
         """
         for note in self.noted("note"):
             click.echo(f"note: {note}", err=True)
-        click.echo(json.dumps({**self.json(), **json_of(more)}) if as_json else self.text())
+        click.echo(json.dumps({**self.json(), **json_of(more)}) if as_json else self.text(styled=True))
         if written is not None and not as_json:
             click.echo(f"\nwritten: {written}")
         return UNTRUSTED if self.noted("untrusted") else 0

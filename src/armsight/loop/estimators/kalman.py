@@ -58,8 +58,9 @@ STUBBORN = 6
 FURTHEST = 8.0
 #: States kept for late measurements, s.
 HISTORY_S = 1.0
-#: Most measurements newer than the readings that are kept waiting.
-MAX_WAITING = 16
+#: Measurements newer than the joints' readings are kept waiting for so long, s; half: slow boards lose some, double: more
+#: memory where the joints' readings stop.
+WAITING_S = 0.5
 _GATE = chi_square_limit(6, CHANCE)
 #: The tool's acceleration is the difference of its twists so long before and after, s; half: noisier, double: bends cut.
 APART_S = 0.01
@@ -238,7 +239,8 @@ class KalmanEstimator:
         before = self._states[row - 1]
         seen_s = self._seen_s(measurement, before)
         if seen_s > newest:
-            self._waiting = [*self._waiting, measurement][-MAX_WAITING:]
+            kept = (each for each in self._waiting if self._seen_s(each, before) > seen_s - WAITING_S)
+            self._waiting = [*kept, measurement]
             return Outcome.WAITING
         if seen_s < oldest or (row == 1 and before.measurement is not None and self._after(before, measurement)):
             return Outcome.TOO_LATE

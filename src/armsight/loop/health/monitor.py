@@ -158,8 +158,8 @@ class HealthMonitor:
         from armsight.loop.health.scene import SceneWatch  # not above: what measures a pair does not look at it
 
         if shot.left is not None:
-            self._scene = self._scene or SceneWatch(self._cameras)
-            self._scene.take(shot, t_s, self._p_left)
+            self._scene = scene = self._scene or SceneWatch(self._cameras)
+            scene.take(shot, t_s, self._p_left)  # another thread may begin anew meanwhile
 
     @property
     def fixed_never_seen(self) -> tuple[str, ...]:

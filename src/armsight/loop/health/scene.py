@@ -11,6 +11,7 @@ more; what else moves is outvoted. A spot's depth, from the other camera, distin
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -54,8 +55,8 @@ _FLOOR_RAD = np.radians(0.001)
 _NEAREST_M, _ALIKE = 0.25, 0.8
 #: A shift and a rotation are distinguished where their chi-squares differ by this.
 _DISTINCT = 9.0
-#: Looks in a row that must agree.
-_AGAIN = 2
+#: Looks in a row that must agree, and those without a motion after which the camera is back where it was.
+_AGAIN, _BACK = 2, 10
 _LIMIT = alarm_limit(3, _LOOKS_HZ, 2)
 _SPOT = np.stack(np.meshgrid(*2 * [np.arange(-_HALF, _HALF + 1.0)]), axis=-1).reshape(-1, 2).astype(np.float32)
 
@@ -280,7 +281,7 @@ class SceneWatch:
         self._spots = tuple(_Spots(camera) for camera in rig.cameras)
         self._learning = True
         self._alarms, self._since = [0, 0], list[float | None]([None, None])
-        self._found: tuple[HealthFinding, ...] = ()
+        self._quiet, self._found = 0, tuple[HealthFinding, ...]()
 
     @property
     def spots(self) -> tuple[int, int]:
@@ -308,6 +309,9 @@ class SceneWatch:
                 self._since[side] = (t_s if self._alarms[side] == 0 else self._since[side]) if alarm else None
                 self._alarms[side] = self._alarms[side] + 1 if alarm else 0
         certain = [count >= _AGAIN for count in self._alarms]
+        self._quiet = 0 if any(self._alarms) else self._quiet + 1
+        if self._quiet == _BACK:
+            self._found = tuple(replace(each, corrected_s=each.corrected_s or t_s) for each in self._found)
         if any(certain):
             at = np.array([0.0, 0.0, 1.0]) if p_left is None else p_left
             self._found = self._said(motions, certain, at)

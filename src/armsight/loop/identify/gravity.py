@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -123,6 +124,7 @@ def gravity_shows(
     if any(reading.channel != ACCELEROMETER for reading in readings):
         raise InputError(f"{sensor.name}: rests need readings of the accelerometer only")
     carrier = ArmRests(arm, prior or Prior(), q)
+    sensor = replace(sensor, delay_s=0.0, sigma_delay_s=0.0)  # a rest's time is its row
     found = calibrate(sensor, readings, carrier)
     assert isinstance(found.carrier, ArmRests)
     before = np.sqrt(np.diag(sensor.cov)[-2:])

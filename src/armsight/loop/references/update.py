@@ -58,7 +58,7 @@ def gained(
     """
     C = {name: before.get(name, np.zeros((len(P), len(one.cov)))) for name, one in shares.items()}
     HP = H @ P + sum(one.by @ C[name].T for name, one in shares.items())
-    S = HP @ H.T + R + sum(one.by @ (C[name].T @ H.T + one.cov @ one.by.T) for name, one in shares.items())
+    S = HP @ H.T + R + sum((H @ C[name] + one.by @ one.cov) @ one.by.T for name, one in shares.items())
     K = np.asarray(np.linalg.solve(S, HP).T, np.float64)
     K[fixed] = 0.0
     after = P - K @ HP

@@ -185,7 +185,7 @@ def _padded(cameras: tuple[Camera, Camera], distortion: str) -> tuple[Camera, Ca
 def _may_gain(model: BundleModel, solution: BundleSolution, observations: Observations, distortion: str) -> bool:
     """Return whether another lens may lower the error of an adjustment by its WORTH.
 
-    A larger model lowers held-out errors by less than the fit's, and that by no more than its first step promises. What a
+    A larger model lowers held-out errors by less than the fit's, and that by about what its first step promises. What a
     fisheye lens does otherwise than a plain one, the largest plain one would take up in part.
     """
     if solution.state.cameras[0].model == "fisheye":

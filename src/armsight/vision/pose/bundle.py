@@ -424,7 +424,7 @@ def minimise(
 def promised(model: BundleModel, state: BundleState, observations: Observations, sigma_px: float) -> float:
     """Return the share of the robust cost that a Newton step from a state would remove, a score test (Rao, 1948).
 
-    At the minimum of a smaller model this bounds what a larger one with the same start can gain, without adjusting it.
+    At the minimum of a smaller model this is about what a larger one with the same start can gain, without adjusting it.
     """
     W = whiteners(observations, sigma_px)
     near, free = _near(model, state, observations, W, robust=True), free_parameters(model, state)
