@@ -42,6 +42,7 @@ FOLDER_WRITERS = {
     "replay": (".",),
     "export": (".", "--to", "csv"),
     "batch": ("measure", "f.yml"),
+    "budget": ("arm.toml",),
 }
 SUFFIXES = {
     "arm show": ".png",

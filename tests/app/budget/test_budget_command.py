@@ -71,7 +71,7 @@ def test_noise_is_what_the_detector_shows():
         ({"volume": "0.1x0.1x0.1m", "distance": "3m"}, "at least 8 are needed"),
         ({"exposure_ms": 50.0}, "longer than a frame at 30 Hz"),
         ({"camera": "machine-vision-5mp", "rate_hz": 60.0}, "one USB controller carries .* at 34.7 Hz at most"),
-        ({"volume": "0.1x0.1x0.1m", "pairs": 2}, "3 pairs"),
+        ({"volume": "0.1x0.1x0.1m", "pairs": 2}, "pairs is 2: expected 3 to 1000"),
     ],
 )
 def test_what_cannot_be_built_is_rejected_with_the_nearest(given, message):
@@ -87,3 +87,23 @@ def test_wrong_units_are_one_line(armsight):
 @pytest.mark.parametrize("name", sorted(catalogue()))
 def test_every_class_can_be_built(name):
     RigPlan(volume="0.05x0.05x0.05m", distance="0.8m", camera=name).check()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("rate_hz", "0"), ("body_scale", "0"), ("warming_k", "nan"), ("pairs", "2"), ("skew_ms", "-5")]
+)
+def test_numbers_that_no_rig_has_are_named(armsight, tmp_path, key, value):
+    (tmp_path / "plan.toml").write_text(f"{key} = {value}\n")
+    assert_rejected(armsight("budget", tmp_path / "plan.toml"), key)
+
+
+def test_a_length_with_two_points_is_named(armsight):
+    assert_rejected(armsight("budget", "--distance", "0..8m"), "0..8m")
+
+
+def test_what_was_given_is_not_said_to_be_chosen(armsight):
+    said = armsight("budget", *SMALL)
+    chosen = next(line for line in said.err.splitlines() if "chosen" in line)
+    assert "distance" not in chosen
+    assert "camera" not in chosen
+    assert "baseline 200mm" in chosen

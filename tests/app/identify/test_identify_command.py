@@ -64,13 +64,14 @@ def test_from_files_to_files(tmp_path, capsys):
     np.testing.assert_allclose(arm.forward(np.ones(6)), urdf.forward(np.ones(6)), atol=1e-9)
 
 
-def test_a_person_reads_the_held_out_line_first(tmp_path, capsys):
+def test_a_person_reads_a_sentence_and_the_held_out_line_first(tmp_path, capsys):
     data = poses_csv(tmp_path / "p.csv")
     answer = said(capsys, "--arm", "six_r", "--data", data)
     assert answer.code == 0
     lines = answer.out.splitlines()
-    assert lines[0].startswith("held-out error ")
-    assert "in five rounds" in lines[0]
+    assert lines[0].startswith(("Good: ", "Usable: "))
+    assert lines[1].startswith("held-out error ")
+    assert "in five rounds" in lines[1]
     assert len(lines) <= 25
     assert "not fitted, or not alone" not in answer.out
     assert re.search(
@@ -381,7 +382,7 @@ def test_an_arm_of_any_number_of_joints_is_reported(joints, tmp_path, capsys):
     out = tmp_path / "out"
     answer = said(capsys, "--arm", spec, "--data", tables[0], "--validate", tables[1], "-o", out)
     assert answer.code == 0, answer.err
-    assert answer.out.startswith("held-out error ")
+    assert "\nheld-out error " in answer.out
     assert (out / "report-joints.png").stat().st_size > 10_000
     assert f">{arm.joint_names[-1]}<" in (out / "report.html").read_text()
 
@@ -391,7 +392,7 @@ def test_what_was_found_is_printed_and_stored_though_the_report_cannot_be_drawn(
     monkeypatch.setattr("armsight.app.show.report.Report.write", Mock(side_effect=RuntimeError("no figure")))
     with pytest.raises(RuntimeError, match="no figure"):
         run("identify", "--arm", "six_r", "--data", data, "--validate", data, "-o", out)
-    assert capsys.readouterr().out.startswith("held-out error ")
+    assert "\nheld-out error " in capsys.readouterr().out
     assert {path.name for path in out.iterdir()} >= {"corrected.toml", "zeros.toml", "identify.json"}
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.references.file import INERTIAL_COLUMNS
@@ -149,3 +150,18 @@ def test_gravity_shows_a_tilted_base_and_says_what_is_open(capsys, tmp_path):
         tilted = found[f"base tilt about {axis}"]
         assert abs(tilted["value_rad"] - np.radians(tilt)) < 3 * tilted["sigma_rad"] < np.radians(0.6)
     assert {name for name, each in found.items() if each["open"]} >= {"zero 1", "zero 2", "zero 3", "zero 4"}
+
+
+def test_a_calibration_that_was_written_is_read_whatever_its_name_and_delay(sweep, tmp_path):
+    from armsight.loop.references.file import read_references, written
+
+    (entry,) = read_references(sweep[0] / "references.toml")
+    late = replace(entry, reference=replace(entry.reference, name="my imu", delay_s=-0.03), calibrated=True)
+    out = tmp_path / "written.toml"
+    out.write_text(written(late, tmp_path))
+    (again,) = read_references(out)
+    assert again.reference.name == "my imu"
+    assert again.reference.delay_s == -0.03
+    out.write_text(out.read_text().replace("covariance = [\n  [", 'covariance = [\n  ["x", ', 1))
+    with pytest.raises(InputError, match="must be numbers"):
+        read_references(out)

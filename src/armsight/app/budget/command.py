@@ -24,8 +24,11 @@ def command(path: str, output: str | None, as_json: bool, **given: str | None) -
     What is left out is chosen, and said. PLAN.toml has the same keys and more: docs/howto/budget.md.
     """
     from armsight.app.budget.plan import RigPlan
-    from armsight.app.budget.report import budget_report
+    from armsight.app.budget.report import REPORT_FILES, budget_report
+    from armsight.files import check_folder
 
+    if output is not None:
+        check_folder(output, holding=REPORT_FILES, apart_from=(path,) if path else ())
     report = budget_report(RigPlan.read(path, **given))
     written = None
     if output is not None:

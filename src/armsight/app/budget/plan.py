@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import Field, dataclass, field, fields, replace
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,14 @@ _LEAST_M, _MOST_M = 0.001, 20.0
 #: than the model of five coefficients, double: ordinary volumes are rejected.
 _WIDEST = 0.6
 _UNITS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
-_NUMBER = r"([0-9.]+(?:e-?[0-9]+)?)"
+_NUMBER = r"((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e-?[0-9]+)?)"
+#: Key -> least and most that a plan may say.
+_RANGES = {
+    "verging_deg": (0.0, 120.0), "focal_widths": (0.2, 20.0), "body_scale": (0.05, 20.0), "pairs": (3, 1000),
+    "board_print": (0.0, 0.1), "body_size": (0.0, 0.1), "warming_k": (0.0, 100.0), "mount_um_per_k": (0.0, 1000.0),
+    "lens_ppm_per_k": (0.0, 10000.0), "skew_ms": (0.0, 1000.0), "start_ms": (0.0, 1000.0), "exposure_ms": (0.001, 1000.0),
+    "rate_hz": (0.1, 1000.0), "backlash_deg": (0.0, 10.0),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -106,6 +113,7 @@ class RigPlan:
         board_bent: of its corners from the drawing.
         body_print: of the body's markers from its file along their faces.
         body_bent: out of their faces.
+        body_size: standard deviation of its size, as a share.
         warming_k: change of temperature since the calibration.
         mount_um_per_k: of the cameras' distance.
         lens_ppm_per_k: of the focal length.
@@ -134,6 +142,7 @@ class RigPlan:
     board_bent: str = "0.1mm"
     body_print: str = "0.03mm"
     body_bent: str = "0.05mm"
+    body_size: float = 3e-4
     warming_k: float = 3.0
     mount_um_per_k: float = 5.0
     lens_ppm_per_k: float = 20.0
@@ -145,6 +154,7 @@ class RigPlan:
     backlash_deg: float = 0.03
     handeye: str = "0.1mm,0.02deg"
     folder: str = field(default=".", repr=False)
+    named: tuple[str, ...] = field(default=(), repr=False)  #: keys that were given
 
     @staticmethod
     def read(path: str, **given: Any) -> RigPlan:  # noqa: ANN401
@@ -153,7 +163,7 @@ class RigPlan:
         Raises:
             InputError: an unknown key, or a value of another type; the message names it.
         """
-        known = {each.name: type(each.default) for each in fields(RigPlan) if each.name != "folder"}
+        known = {each.name: type(each.default) for each in RigPlan.settings()}
         values = read_toml(path) if path else {}
         for key, value in values.items():
             if key not in known:
@@ -162,7 +172,13 @@ class RigPlan:
             if not isinstance(value, (int, float) if known[key] is float else known[key]) or isinstance(value, bool):
                 raise InputError(f"{path}: {key} must be {'a number' if known[key] is not str else 'a text'}")
         given = {key: value for key, value in given.items() if value is not None}
-        return RigPlan(**values | given, folder=str(Path(path).parent) if path else ".")
+        given = values | given
+        return RigPlan(**given, folder=str(Path(path).parent) if path else ".", named=tuple(given))
+
+    @staticmethod
+    def settings() -> tuple[Field[Any], ...]:
+        """Return what a plan may say."""
+        return tuple(each for each in fields(RigPlan) if each.name not in ("folder", "named"))
 
     @cached_property
     def size_m(self) -> Array:
@@ -310,6 +326,10 @@ class RigPlan:
         Raises:
             InputError: one line: what was found, what was expected, and the nearest that can be had.
         """
+        for key, (least, most) in _RANGES.items():
+            value = getattr(self, key)
+            if value != getattr(RigPlan, key) and not least <= value <= most:
+                raise InputError(f"{key} is {value:g}: expected {least:g} to {most:g}")
         c, size, t, _, _ = self.cameras, self.size_m, self.timing, self.speeds, self.requested
         near, far = self.distance_m - size[2] / 2, self.distance_m + size[2] / 2
         for name in ("board_bent", "body_print", "body_bent"):
@@ -357,8 +377,6 @@ class RigPlan:
                 f"at {lost} of {len(views)} positions the cameras do not both see the body, they look past each other: "
                 f"verging_deg = {math.degrees(2 * math.atan(self.baseline_m / 2 / self.distance_m)):.3g} or less baseline"
             )
-        if self.pairs < 3:
-            raise InputError(f"pairs = {self.pairs}: a calibration takes 3 pairs of the board at least")
 
     def _noise_px(self) -> dict[str, float]:
         """Return what pixel noise and blur add to a marker's position in the middle, and defocus at both ends, RMS."""
@@ -386,7 +404,7 @@ class RigPlan:
             _cov_calibration(replace(self, **{name: getattr(RigPlan, name) for name in _NOT_CALIBRATED})),
             self.board_print,
             (length_m(self.body_print, "body_print"), length_m(self.body_bent, "body_bent")),
-            self.board_print,
+            self.body_size,
             1e-6 * self.mount_um_per_k * self.warming_k,
             0.0,
             1e-6 * self.lens_ppm_per_k * self.warming_k,
@@ -404,7 +422,7 @@ class RigPlan:
 #: What a calibration does not depend on.
 _NOT_CALIBRATED = (
     "speed", "want", "board_print", "body_print", "body_bent", "warming_k", "mount_um_per_k", "lens_ppm_per_k", "skew_ms",
-    "start_ms", "rate_hz", "arm", "backlash_deg", "handeye",
+    "start_ms", "rate_hz", "arm", "backlash_deg", "handeye", "body_size", "named",
 )  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -11,8 +11,9 @@ import numpy as np
 
 from armsight.app.budget.plan import RigPlan, catalogue, planned
 from armsight.app.show.messages import Note
+from armsight.app.show.page import PAGE
 from armsight.app.show.plotting import new_figure
-from armsight.app.show.report import Fact, Grade, Plot, Report, Section
+from armsight.app.show.report import Fact, Grade, Plot, Report, Section, figure_files
 from armsight.app.show.table import TextTable
 from armsight.data import Array
 from armsight.errors import InputError
@@ -33,7 +34,10 @@ _CHANGES: dict[str, tuple[int, dict[str, object]]] = {
     "a body half as large again": (1, {"body_scale": 1.5}),
     "half the exposure, twice the light": (1, {"exposure_ms": 0.5}),
     "a board printed on a stiff plate, its size measured": (1, {"board_print": 1e-4, "board_bent": "0.03mm"}),
-    "the body's markers measured after printing": (0, {"body_print": "0.01mm", "body_bent": "0.02mm"}),
+    "the body's markers measured after printing": (
+        0,
+        {"body_print": "0.01mm", "body_bent": "0.02mm", "body_size": 1e-4},
+    ),
     "calibrate again when the room is 1 K warmer": (0, {"warming_k": 1.0}),
 }
 #: Causes that have no model, each with its reason.
@@ -42,7 +46,12 @@ _UNKNOWN = (
     "smear by a camera that mixes images of a moving scene",
     "focus that breathes: an autofocus must be switched off",
     "poses of the board other than all over the images",
+    "a mount that bends, not only grows, as it warms",
 )
+
+
+#: Names of all files that a report has.
+REPORT_FILES = (PAGE, "budget.json", *figure_files("budget", ("volume",)))
 
 
 def budget_report(plan: RigPlan) -> Report:
@@ -58,7 +67,7 @@ def budget_report(plan: RigPlan) -> Report:
     shares = {name: found.rms(found.cov(of=name))[0] for name in ("precision", "trueness")}
     lateral, depth = found.along(moving)
     values = {
-        "plan": {each.name: getattr(plan, each.name) for each in fields(plan) if each.name != "folder"},
+        "plan": {each.name: getattr(plan, each.name) for each in plan.settings()},
         "focal_px": plan.focal_px,
         "results": figures,
         "precision_rms_m": shares["precision"],
@@ -194,12 +203,7 @@ def _changes(plan: RigPlan, now_m: float) -> list[tuple[str, int, float]]:
 
 def _chosen(plan: RigPlan) -> str:
     """Say what was left out."""
-    plain = RigPlan()
-    left = [
-        each.name
-        for each in fields(plan)
-        if each.name != "folder" and getattr(plan, each.name) == getattr(plain, each.name)
-    ]
+    left = [each.name for each in plan.settings() if each.name not in plan.named]
     shown = {
         "focal_widths": f"{plan.focal_px / plan.cameras.image_size_px[0]:.2f}",
         "verging_deg": f"{plan.rig.convergence_deg:.0f}",

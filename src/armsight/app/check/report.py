@@ -317,7 +317,9 @@ def _against_limits(outcomes: Sequence[LimitResult]) -> tuple[Grade, str] | None
         e, more = max(failed, key=lambda each: each.value_m / each.limit_m), len(failed) - 1
         others = f", and {more} more above theirs" if more else ""
         scatters = e.metric.startswith("R")  # repeatability
-        then = "look for what is loose or slips" if scatters else "armsight identify corrects what is the same each time"
+        then = (
+            "look for what is loose or slips" if scatters else "armsight identify corrects what is the same each time"
+        )
         return "poor", (
             f"Above its limits: {e.metric} of {e.of} is {1e3 * e.value_m:.2f} mm, limit {1e3 * e.limit_m:g}{others}; "
             f"{then}."

@@ -55,7 +55,10 @@ def calibrate(path: Path, poses: str, output: Path | None, as_json: bool) -> Non
 
     if output is not None:
         check_writable(output, apart_from=(path, poses))
-    report, entries = _calibrated(read_references(path), Path(poses))
+    entries = read_references(path)
+    if output is not None:
+        check_writable(output, apart_from=[entry.source for entry in entries])
+    report, entries = _calibrated(entries, Path(poses))
     if output is not None:
         write_text(output, "\n".join(written(entry, output.parent) for entry in entries))
     raise SystemExit(report.echo(as_json=as_json, written=None if output is None else str(output)))

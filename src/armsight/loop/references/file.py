@@ -82,7 +82,8 @@ def _entry(path: Path, name: str, table: dict[str, Any]) -> Entry:
         value = table.get(key, 1.0)
         if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
             raise InputError(f"{where}: {key} is {value!r}; expected a number")
-        if value < 0.0 or (key == "rate_hz" and value == 0.0):
+        # The poses' clock may be the later one: then a delay is below zero.
+        if value < {"rate_hz": 1e-3, "delay_s": -np.inf, "sigma_delay_s": 0.0}[key]:
             raise InputError(f"{where}: {key} is {value:g}; expected more")
     for key in ("source", "class"):
         if not isinstance(table.get(key, ""), str):
@@ -102,15 +103,19 @@ def _known(where: str, sensor: Inertial, given: object, covariance: object) -> I
     names = list(sensor.parameters)
     if not isinstance(given, dict) or list(given) != names:
         raise InputError(f"{where}: parameters are not those of an inertial unit; calibrate it again")
-    values = checked(np.array(list(given.values()), float), (len(names),), f"{where}: parameters")
-    cov = checked(np.array(covariance, float), (len(names), len(names)), f"{where}: covariance")
+    try:
+        values, cov = np.array(list(given.values()), float), np.array(covariance, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: parameters and covariance must be numbers; calibrate it again") from None
+    checked(values, (len(names),), f"{where}: parameters")
+    checked(cov, (len(names), len(names)), f"{where}: covariance")
     T = pose(exp_so3(values[:3]), values[3:6])
     return replace(sensor, T_tool_sensor=T, values=values[3:], cov=cov)
 
 
 def written(entry: Entry, folder: Path) -> str:
     """Return the table of a reference as text, for a file in a folder."""
-    sensor, lines = entry.reference, [f"[{entry.reference.name}]", f'kind = "{entry.kind}"']
+    sensor, lines = entry.reference, [f"[{json.dumps(entry.reference.name)}]", f'kind = "{entry.kind}"']
     if entry.source is not None:
         lines.append(f"source = {json.dumps(os.path.relpath(entry.source, folder))}")
     lines.append(f'class = "{entry.sensor_class}"')

@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
-from armsight.geometry.pose import exp_se3, log_se3, pose
+from armsight.geometry.pose import exp_se3, pose
 from armsight.geometry.rotation import exp_so3, log_so3, nearest_rotation, skew
 from armsight.loop.references.reference import ExpectedReading, Reference, ToolMotion
 
@@ -111,7 +111,9 @@ class Lighthouse(Reference):
         """Pose of each beacon, then calibration of each plane."""
         out: dict[str, float] = {}
         for b, (T, planes) in enumerate(zip(self.Ts_base_beacon, self.calibration, strict=True)):
-            out |= {f"beacon{b + 1}_{key}": float(v) for key, v in zip(POSE, log_se3(T), strict=True)}
+            out |= {
+                f"beacon{b + 1}_{key}": float(v) for key, v in zip(POSE, (*T[:3, 3], *log_so3(T[:3, :3])), strict=True)
+            }
             for k, values in enumerate(planes):
                 out |= {f"beacon{b + 1}_plane{k + 1}_{key}": float(v) for key, v in zip(SWEEP, values, strict=True)}
         return out
@@ -452,7 +454,10 @@ def read_events(path: str | Path) -> dict[str, dict[str, Array]]:
     Raises:
         InputError: no such log, or it ends early.
     """
-    data = Path(path).read_bytes()
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}: expected a Crazyflie log") from None
     if len(data) < 9 or data[0] != 0xBC:
         raise InputError(f"{path}: no Crazyflie log: its first byte is not 0xBC")
     version, count = struct.unpack_from("<HH", data, 1)
