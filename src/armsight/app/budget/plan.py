@@ -320,16 +320,20 @@ class RigPlan:
         aperture_m = 1e-3 * c.focal_mm / c.f_number
         return 0.5 * aperture_m * self.focal_px * abs(1 / focus - 1 / distance_m)
 
+    def _check_numbers(self) -> None:
+        """Refuse numbers that no rig has."""
+        for key, (least, most) in _RANGES.items():
+            value = getattr(self, key)
+            if value != getattr(RigPlan, key) and not least <= value <= most:
+                raise InputError(f"{key} is {value:g}: expected {least:g} to {most:g}")
+
     def check(self) -> None:
         """Refuse what cannot be built.
 
         Raises:
             InputError: one line: what was found, what was expected, and the nearest that can be had.
         """
-        for key, (least, most) in _RANGES.items():
-            value = getattr(self, key)
-            if value != getattr(RigPlan, key) and not least <= value <= most:
-                raise InputError(f"{key} is {value:g}: expected {least:g} to {most:g}")
+        self._check_numbers()
         c, size, t, _, _ = self.cameras, self.size_m, self.timing, self.speeds, self.requested
         near, far = self.distance_m - size[2] / 2, self.distance_m + size[2] / 2
         for name in ("board_bent", "body_print", "body_bent"):
