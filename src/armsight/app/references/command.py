@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from armsight.app.show.report import Report
+    from armsight.app.show.report import Grade, Report
     from armsight.loop.references.calibrate import ReferenceCalibration
     from armsight.loop.references.file import Entry
     from armsight.loop.references.inertial import Inertial
@@ -26,6 +26,10 @@ REST_S = 0.5
 AVERAGED_S = 0.05
 #: Stamps of a sensor may be so late against those of the poses, s; half: a phone's are not found, double: more is cut off.
 DELAY_S = 0.5
+#: Errors of times left out, over their sigma, up to which a calibration is good; half: chance is a fault, double: looseness
+#: is none.
+HONEST = 1.5
+UNITS = {"gyro": "rad_s", "accelerometer": "m_s2"}  # in keys of JSON
 
 
 @click.group("references")
@@ -130,7 +134,14 @@ def _gravity(entry: Entry, model: str, joints: Path) -> Report:
     blocks = [
         TextTable(f"{sensor.name}: {len(readings)} rests, {values['outliers']} outliers", ("", "deg", "sigma"), cells)
     ]
-    return Report("references gravity", "Gravity", "", "", {"gravity": ("Gravity", blocks)}, (), values)
+    closed = [each for each in shown if not each.open]
+    worst = np.degrees(max(each.sigma for each in shown[:2]))
+    said = f"the base's tilt is known to {worst:.3f} deg, and {len(closed) - 2} zeros or sums; the others are open"
+    answer: tuple[Grade, str] = ("good", f"Good: {said}.")
+    if len(closed) < 3:
+        answer = "fair", f"Usable for the tilt alone: {said}; more rests, about other joints, show more."
+    sections = {"gravity": ("Gravity", blocks)}
+    return Report("references gravity", "Gravity", "", "", sections, (), values, assessed=answer)
 
 
 def _recording(entry: Entry) -> tuple[Path, Any, Any]:
@@ -156,7 +167,13 @@ def _checked(entries: list[Entry]) -> Report:
         facts += [Fact(line) for line in lines]
     name = "references check"
     sections = {"references": ("References", facts)}
-    return Report(name, "References", "", "", sections, notes, {"references": found})
+    answer: tuple[Grade, str] = (
+        "good",
+        "Good: what was recorded is as its class is; armsight references calibrate is next.",
+    )
+    if notes:
+        answer = "fair", f"Usable with care: {notes[0].text}."
+    return Report(name, "References", "", "", sections, notes, {"references": found}, assessed=answer)
 
 
 def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
@@ -252,7 +269,13 @@ def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]
         found.append(values)
         blocks += parts
     sections = {"references": ("References", blocks)}
-    return Report("references calibrate", "References", "", "", sections, notes, {"references": found}), done
+    worst = max(found, key=lambda each: each["left_out_over_sigma"])
+    ratio = f"{worst['name']}: times left out are off by {worst['left_out_over_sigma']:.2f} of their sigma"
+    answer: tuple[Grade, str] = ("good", f"Good: {ratio}; references gravity and the filter take the file.")
+    if worst["left_out_over_sigma"] > HONEST:
+        answer = "fair", f"Usable with care: {ratio}: something moves that no parameter describes; fasten the sensor."
+    values = {"references": found}
+    return Report("references calibrate", "References", "", "", sections, notes, values, assessed=answer), done
 
 
 def _averaged(entry: Entry, path: Any) -> list[Any]:  # noqa: ANN401 - imported late
@@ -293,7 +316,7 @@ def _said(result: ReferenceCalibration[Inertial]) -> tuple[dict[str, Any], list[
     sensor, sigmas = result.reference, np.sqrt(np.diag(result.reference.cov))
     named = dict(zip(sensor.parameters, sigmas.tolist(), strict=True))
     errors = {
-        name: float(np.sqrt(np.mean(result.left_out[k::2][result.used[k::2]] ** 2)))
+        f"{name}_{UNITS[name]}": float(np.sqrt(np.mean(result.left_out[k::2][result.used[k::2]] ** 2)))
         for k, name in enumerate(sensor.channels)
     }
     values = {
@@ -314,8 +337,8 @@ def _said(result: ReferenceCalibration[Inertial]) -> tuple[dict[str, Any], list[
     )
     delay = ("delay_s", f"{sensor.delay_s:.5g}", f"{sensor.sigma_delay_s:.2g}")
     sentence = (
-        f"{sensor.name}: readings of times left out are wrong by {errors['gyro']:.3g} rad/s and "
-        f"{errors['accelerometer']:.3g} m/s2 RMS, {values['left_out_over_sigma']:.2f} sigma; "
+        f"{sensor.name}: readings of times left out are wrong by {errors['gyro_rad_s']:.3g} rad/s and "
+        f"{errors['accelerometer_m_s2']:.3g} m/s2 RMS, {values['left_out_over_sigma']:.2f} sigma; "
         f"{values['outliers']} of {len(result.used)} are outliers"
     )
     return values, [Fact(sentence), TextTable(sensor.name, ("parameter", "value", "sigma"), (*rows, delay))]
