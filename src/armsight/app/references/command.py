@@ -169,7 +169,7 @@ def _checked(entries: list[Entry]) -> Report:
     sections = {"references": ("References", facts)}
     answer: tuple[Grade, str] = (
         "good",
-        "Good: what was recorded is as its class is; armsight references calibrate is next.",
+        "Good: what was recorded is as its class is; references calibrate is next.",
     )
     if notes:
         answer = "fair", f"Usable with care: {notes[0].text}."
