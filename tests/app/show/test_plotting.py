@@ -70,3 +70,11 @@ def test_the_data_of_a_figure_are_its_points_bars_arrows_and_cells():
         ),
     ]
     assert (cells[0]["title"], cells[0]["x axis"], cells[0]["y axis"]) == ("of a test", "along, s", "across, mm")
+
+
+def test_names_along_an_axis_are_numbers_in_the_data():
+    with drawing():
+        made = new_figure(2.0)
+        made.subplots().plot(["a", "b"], [1.0, 2.0])
+        _, *rows = csv.reader(io.StringIO(data_csv(made).decode()))
+    assert [row[3:5] for row in rows] == [["0", "1"], ["1", "2"]]

@@ -150,7 +150,7 @@ def _series(axes: Axes) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
     for line in axes.lines:
         if line.get_transform() == axes.transData:  # a line across the axes is no data
-            yield str(line.get_label()), tuple(line.get_data())
+            yield str(line.get_label()), tuple(np.asarray(line.get_xydata(), float).T)  # of names: their numbers
     for drawn in axes.collections:
         at: Array = np.ma.filled(np.ma.asarray(drawn.get_offsets(), float), np.nan)
         values = drawn.get_array()

@@ -38,7 +38,7 @@ from armsight.geometry.rotation import exp_so3, log_so3, nearest_rotation, skew
 from armsight.loop.references.reference import ExpectedReading, Reference, ToolMotion
 
 SWEEP = ("phase", "tilt", "curve", "gibbous", "gibbous_phase", "ogee", "ogee_phase")  # calibration of a plane
-POSE = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")  # tangent of a beacon's pose
+POSE = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")  # a beacon's position, rotation vector
 SLANT = np.deg2rad(30.0)  # rad; of the first plane, the second has its negative
 #: Series of the curve by the elevation on the plane, highest power first: constants of the maker's model.
 _SERIES = (-8.0108022e-06, 0.0028679863, 5.3685255e-06, 0.00760697980, 0.0, 0.0)
