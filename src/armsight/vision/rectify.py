@@ -70,11 +70,9 @@ class Rectification(Record):
                     f"{side} image: {image.shape[1]}x{image.shape[0]} px, the rig was calibrated at {width}x{height}"
                 )
             raw_uv = np.nan_to_num(self.map_left if side == "left" else self.map_right, nan=-10.0)
-            out.append(
-                np.asarray(
-                    cv2.remap(image, raw_uv[..., 0], raw_uv[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
-                )
-            )
+            # OpenCV's cubic and Lanczos kernels displace what they interpolate, by up to 0.05 and 0.015 px; this one does not.
+            u, v = raw_uv[..., 0], raw_uv[..., 1]
+            out.append(np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)))
         return out[0], out[1]
 
     def seen(self, side: Side) -> NDArray[np.bool_]:
