@@ -70,7 +70,7 @@ class Rectification(Record):
                     f"{side} image: {image.shape[1]}x{image.shape[0]} px, the rig was calibrated at {width}x{height}"
                 )
             raw_uv = np.nan_to_num(self.map_left if side == "left" else self.map_right, nan=-10.0)
-            # OpenCV's cubic and Lanczos kernels displace what they interpolate, by up to 0.05 and 0.015 px; this one does not.
+            # OpenCV's cubic and Lanczos kernels displace what they interpolate, by up to 0.05 and 0.015 px.
             u, v = raw_uv[..., 0], raw_uv[..., 1]
             out.append(np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)))
         return out[0], out[1]

@@ -22,9 +22,8 @@ from armsight.vision.calibrate.budget import CAUSES, Budget
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: A change that gains less than this share is not worth a line, and two that differ by less are alike: the prediction's own
-#: uncertainty, as benchmarks/budget.py measures it.
-ALIKE = 0.1
+#: A change that gains less than this share is not worth a line; half: lines that nobody would buy, double: cheap gains lack.
+WORTH = 0.1
 #: What would make it better -> class of its price, 0 for nothing, and the plan that has it.
 _CHANGES: dict[str, tuple[int, dict[str, object]]] = {
     "start both cameras by one trigger": (2, {"skew_ms": 0.0, "start_ms": 0.05}),
@@ -81,11 +80,11 @@ def budget_report(plan: RigPlan) -> Report:
     more = TextTable(
         "what changes it most for least money, in motion",
         ("change", "price class", "95 % within"),
-        tuple((text, str(price), f"{1e3 * m:.3f} mm") for text, price, m in changes),
+        tuple((text, str(price), f"{1e3 * m:.2g} mm") for text, price, m in changes),
     )
     said = (
-        f"precision {1e3 * shares['precision']:.3f} mm, trueness {1e3 * shares['trueness']:.3f} mm; one lateral axis "
-        f"{1e3 * lateral:.3f} mm, depth {1e3 * depth:.3f} mm (RMS over the volume, in motion)"
+        f"precision {1e3 * shares['precision']:.2g} mm, trueness {1e3 * shares['trueness']:.2g} mm; one lateral axis "
+        f"{1e3 * lateral:.2g} mm, depth {1e3 * depth:.2g} mm (RMS over the volume, in motion)"
     )
     table = TextTable("causes, RMS over the volume", ("cause", "mm", "deg", "share", "halved: 95 % within"), rows)
     positions = Plot("volume", partial(_map, found), "", "Error at 95 % in the middle of the volume")
@@ -127,8 +126,8 @@ def _causes(found: Budget) -> tuple[tuple[tuple[str, ...], ...], list[dict[str, 
                 "loop": kind.loop,
             }
         )
-        shown = ("loop", "") if kind.loop else (f"{100 * share:.0f} %", f"{1e3 * halved:.3f} mm")
-        rows.append((share, m, (name, f"{1e3 * m:.4f}", f"{math.degrees(rad):.4f}", *shown)))
+        shown = ("loop", "") if kind.loop else (f"{100 * share:.0f} %", f"{1e3 * halved:.2g} mm")
+        rows.append((share, m, (name, f"{1e3 * m:.2g}", f"{math.degrees(rad):.2g}", *shown)))
     order = sorted(range(len(rows)), key=lambda k: (-rows[k][0], -rows[k][1]))
     return tuple(rows[k][2] for k in order), [listed[k] for k in order]
 
@@ -185,7 +184,7 @@ def _changes(plan: RigPlan, now_m: float) -> list[tuple[str, int, float]]:
         except InputError:  # such a rig cannot be built
             continue
         m = float(after.at_level(after.cov())[0].max())
-        if m < (1 - ALIKE) * now_m:
+        if m < (1 - WORTH) * now_m:
             found.append((text, price, m))
     for name, each in catalogue().items():
         if each.price > plan.cameras.price:
@@ -196,7 +195,7 @@ def _changes(plan: RigPlan, now_m: float) -> list[tuple[str, int, float]]:
             except InputError:
                 continue
             m = float(after.at_level(after.cov())[0].max())
-            if m < (1 - ALIKE) * now_m:
+            if m < (1 - WORTH) * now_m:
                 found.append((f"{name}: {each.text}", each.price, m))
     return sorted(found, key=lambda one: (one[1], one[2]))
 
@@ -218,7 +217,7 @@ def _chosen(plan: RigPlan) -> str:
 
 def _map(found: Budget) -> Figure:
     """Draw the error at 95 % over the volume, seen from above: near below, the worst height of each column."""
-    figure, ax = new_figure(3.2), None
+    figure = new_figure(3.2)
     ax = figure.subplots()
     level = 1e3 * found.at_level(found.cov())[0]
     across, deep = 1e3 * found.p_left[:, 0], 1e3 * (found.p_left @ found.forward)
