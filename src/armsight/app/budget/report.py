@@ -22,7 +22,7 @@ from armsight.vision.calibrate.budget import CAUSES, Budget
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: A change that gains less than this share is not worth a line; half: lines that nobody would buy, double: cheap gains lack.
+#: A change that gains less than this share is not worth a line; half: lines that nobody buys, double: cheap gains lack.
 WORTH = 0.1
 #: What would make it better -> class of its price, 0 for nothing, and the plan that has it.
 _CHANGES: dict[str, tuple[int, dict[str, object]]] = {
