@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -24,20 +25,23 @@ if TYPE_CHECKING:
 
 #: A change that gains less than this share is not worth a line; half: lines that nobody buys, double: cheap gains lack.
 WORTH = 0.1
-#: What would make it better -> class of its price, 0 for nothing, and the plan that has it.
-_CHANGES: dict[str, tuple[int, dict[str, object]]] = {
-    "start both cameras by one trigger": (2, {"skew_ms": 0.0, "start_ms": 0.05}),
-    "measure at rest": (0, {"speed": "0m/s"}),
-    "twice as many pairs of the board": (0, {"pairs": 2.0}),
-    "cameras half as far apart again": (0, {"baseline": 1.5}),
-    "a body half as large again": (1, {"body_scale": 1.5}),
-    "half the exposure, twice the light": (1, {"exposure_ms": 0.5}),
-    "a board printed on a stiff plate, its size measured": (1, {"board_print": 1e-4, "board_bent": "0.03mm"}),
+#: What would make it better -> class of its price, 0 for nothing, and what of a plan it changes.
+_CHANGES: dict[str, tuple[int, Callable[[RigPlan], dict[str, object]]]] = {
+    "start both cameras by one trigger": (2, lambda plan: {"skew_ms": 0.0, "start_ms": 0.05}),
+    "measure at rest": (0, lambda plan: {"speed": "0m/s"}),
+    "twice as many pairs of the board": (0, lambda plan: {"pairs": 2 * plan.pairs}),
+    "cameras half as far apart again": (0, lambda plan: {"baseline": f"{1.5e3 * plan.baseline_m:g}mm"}),
+    "a body half as large again": (1, lambda plan: {} if plan.body else {"body_scale": 1.5 * plan.body_scale}),
+    "half the exposure, twice the light": (1, lambda plan: {"exposure_ms": 0.5e3 * plan.timing["exposure"]}),
+    "a board printed on a stiff plate, its size measured": (
+        1,
+        lambda plan: {"board_print": 1e-4, "board_bent": "0.03mm"},
+    ),
     "the body's markers measured after printing": (
         0,
-        {"body_print": "0.01mm", "body_bent": "0.02mm", "body_size": 1e-4},
+        lambda plan: {"body_print": "0.01mm", "body_bent": "0.02mm", "body_size": 1e-4},
     ),
-    "calibrate again when the room is 1 K warmer": (0, {"warming_k": 1.0}),
+    "calibrate again when the room is 1 K warmer": (0, lambda plan: {"warming_k": 1.0}),
 }
 #: Causes that have no model, each with its reason.
 _UNKNOWN = (
@@ -159,28 +163,13 @@ def _answer(
     return grade, f"{said}; requested {asked}.{costs}.{floor}"
 
 
-def _changed(plan: RigPlan, change: dict[str, object]) -> RigPlan:
-    """Return a plan with a change: floats multiply what is there, but for shares and times that are given anew."""
-    new: dict[str, object] = dict(change)
-    if change.get("pairs"):
-        new["pairs"] = 2 * plan.pairs
-    if change.get("baseline"):
-        new["baseline"] = f"{1.5e3 * plan.baseline_m:g}mm"
-    if change.get("body_scale"):
-        new["body_scale"] = 1.5 * plan.body_scale
-    if change.get("exposure_ms"):
-        new["exposure_ms"] = 0.5e3 * plan.timing["exposure"]
-    return replace(plan, focal_widths=plan.focal_px / plan.cameras.image_size_px[0], **new)  # type: ignore[arg-type]
-
-
 def _changes(plan: RigPlan, now_m: float) -> list[tuple[str, int, float]]:
     """Return the changes that are worth it: what, class of its price, m; the best of a price first."""
     found = []
     for text, (price, change) in _CHANGES.items():
-        if plan.body and "body_scale" in change:
-            continue
+        focal_widths = plan.focal_px / plan.cameras.image_size_px[0]  # the lens stays
         try:
-            after = planned(_changed(plan, change))
+            after = planned(replace(plan, focal_widths=focal_widths, **change(plan)))  # type: ignore[arg-type]
         except InputError:  # such a rig cannot be built
             continue
         m = float(after.at_level(after.cov())[0].max())
