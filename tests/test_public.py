@@ -8,8 +8,10 @@ import re
 import sys
 
 import numpy as np
+import pinocchio
 import pyarrow
 import pytest
+from scipy.spatial.transform import RigidTransform
 
 import armsight
 from armsight import (
@@ -92,6 +94,8 @@ def test_a_hand_eye_calibration_prints_its_error_and_sigma():
     B = inverse(Z) @ A @ X @ exp_se3(rng.multivariate_normal(np.zeros(6), cov, 12))
     text = repr(armsight.handeye(A, B, np.tile(cov, (12, 1, 1)), quick=True))
     assert text.startswith("HandEye(to_hand, 12 of 12 poses; held out ")
+    flange, seen = [pinocchio.SE3(T) for T in A], RigidTransform.from_matrix(B)
+    assert repr(armsight.handeye(flange, seen, np.tile(cov, (12, 1, 1)), quick=True)) == text
     with pytest.raises(ArmsightError, match=r"Ts_base_flange is a str; expected poses .*read_pose_table"):
         armsight.handeye("robot.csv", B)
     with pytest.raises(ArmsightError, match="are the same numbers"):

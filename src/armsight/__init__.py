@@ -14,7 +14,8 @@ To compute: ``calibrate``, ``calibrate_boards``, ``calibrate_bodies`` the pair o
 ``Follower`` the pose of a body; ``handeye`` where rig and body are on the arm; ``identify`` what the arm really is,
 ``validate`` how far off it is on other poses; ``budget`` what a rig would measure.
 To exchange: ``as_transform`` reads a transform of pinocchio, SciPy, spatialmath or ROS, ``ros_fields`` writes ROS' fields.
-Records: ``Shot``, ``Body``, ``PoseEstimate`` or ``Missed``, ``Pair``, ``Camera``, ``StereoRig``, ``Arm``, ``Corrected``.
+Records: ``Shot``, ``Body``, ``PoseEstimate`` or ``Missed``, ``Pair``, ``Camera``, ``StereoRig``, ``Arm``, ``Corrected``;
+``Measured`` joint angles with what was measured there, as ``identify`` takes them from arrays.
 Wrong input raises ``ArmsightError``, with what was found, what was expected and what to do.
 
 Names are imported when they are first used, so that the command line starts at once. The stages are plain functions of
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from armsight.loop.handeye.handeye import calibrate_handeye as handeye
     from armsight.loop.identify.corrected import Corrected, open_corrected
     from armsight.loop.identify.identify import identify
+    from armsight.loop.identify.measured import Measured
     from armsight.loop.identify.read import read_poses
     from armsight.loop.identify.validate import validate
     from armsight.robot.arm_file import open_arm
@@ -71,6 +73,7 @@ __all__ = [
     "Camera",
     "Corrected",
     "Follower",
+    "Measured",
     "Missed",
     "Pair",
     "PoseEstimate",
@@ -111,6 +114,7 @@ _HOME = {
     "handeye": "armsight.loop.handeye.handeye",
     **dict.fromkeys(("Corrected", "open_corrected"), "armsight.loop.identify.corrected"),
     "identify": "armsight.loop.identify.identify",
+    "Measured": "armsight.loop.identify.measured",
     "read_poses": "armsight.loop.identify.read",
     "read_pose_table": "armsight.tables.poses",
     "validate": "armsight.loop.identify.validate",

@@ -5,10 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio
 import pytest
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from armsight import as_transform, ros_fields
 from armsight.errors import InputError
+from armsight.geometry.convert import as_transforms
 from armsight.geometry.pose import exp_se3
 
 T = exp_se3(np.array([0.1, -0.4, 0.7, 0.5, -1.1, 2.0]))
@@ -27,6 +28,7 @@ def forms():
         "matrix": T.tolist(),
         "pinocchio": pinocchio.SE3(T),
         "SciPy": RigidTransform.from_matrix(T),
+        "SciPy's rotation": (Rotation.from_matrix(T[:3, :3]), T[:3, 3]),
         "spatialmath": SimpleNamespace(A=T),
         "a measured pose": SimpleNamespace(T_left_body=T),
         "Transform": message(fields),
@@ -42,6 +44,27 @@ def test_transforms_of_others_are_read(name):
     np.testing.assert_allclose(as_transform(message(ros_fields(forms()[name]))), T, rtol=0, atol=1e-15)
 
 
+def test_a_list_of_any_of_them_or_one_object_of_many_is_read():
+    found = as_transforms(list(forms().values()))
+    np.testing.assert_allclose(found, np.tile(T, (len(forms()), 1, 1)), rtol=0, atol=1e-15)
+    Ts = exp_se3(np.random.default_rng(1).normal(size=(5, 6)))
+    rotations = Rotation.from_matrix(Ts[:, :3, :3])
+    pairs = list(zip(rotations, Ts[:, :3, 3], strict=True))
+    many = [
+        RigidTransform.from_matrix(Ts),
+        (rotations, Ts[:, :3, 3]),
+        SimpleNamespace(A=list(Ts)),
+        pairs,
+        Ts,
+        Ts.tolist(),
+    ]
+    for given in many:
+        np.testing.assert_allclose(as_transforms(given), Ts, atol=1e-14)
+    np.testing.assert_allclose(
+        as_transforms((pairs[0], pairs[1])), Ts[:2], atol=1e-14
+    )  # two of them, and no pair itself
+
+
 def test_ros_has_the_quaternion_as_x_y_z_w():
     q = ros_fields(T)["rotation"]
     np.testing.assert_allclose([q["x"], q["y"], q["z"], q["w"]], pinocchio.Quaternion(T[:3, :3]).coeffs(), atol=1e-15)
@@ -51,6 +74,8 @@ def test_ros_has_the_quaternion_as_x_y_z_w():
     ("given", "words"),
     [
         (np.eye(3), "expected a 4x4 matrix"),
+        (np.tile(np.eye(4), (3, 1, 1)), "holds 3 transforms; expected one"),
+        ((Rotation.identity(), np.zeros(2)), r"expected \(3,\), m"),
         ("pose", "expected a 4x4 matrix"),
         (np.diag([1.0, 1.0, -1.0, 1.0]), "no rigid transform"),
         (T.T, "no rigid transform"),

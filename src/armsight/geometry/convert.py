@@ -22,13 +22,15 @@ def as_transform(given: object) -> Array:
 
     Args:
         given: a 4x4 matrix; a pose that was measured; pinocchio's, SciPy's (RigidTransform) or spatialmath's transform; a
-            ROS Pose, Transform, or a message that holds one (``pose``, ``transform``, also with covariance), whose
-            quaternions are x y z w.
+            pair of SciPy's Rotation and a translation, m; a ROS Pose, Transform, or a message that holds one (``pose``,
+            ``transform``, also with covariance), whose quaternions are x y z w.
 
     Raises:
         InputError: it is none of these, or no rigid transform.
     """
     T = _matrix(given)
+    if T.ndim > 2:
+        raise InputError(f"{type(given).__name__}: holds {len(T)} transforms; expected one")
     R = T[:3, :3]
     rigid = np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < _ROUNDING and np.linalg.det(R) > 0
     if not rigid or (T[3] != [0, 0, 0, 1]).any():
@@ -38,8 +40,34 @@ def as_transform(given: object) -> Array:
     return T
 
 
+def as_transforms(given: Any) -> Array:  # noqa: ANN401 - any library's object
+    """Return the (N, 4, 4) matrices, m, of a list of what :func:`as_transform` takes, or of one object that holds N.
+
+    Raises:
+        InputError: an entry is none of these.
+    """
+    if isinstance(given, list | tuple) and not _is_pair(given):
+        return np.array([_matrix(each) for each in given])
+    return _matrix(given)
+
+
+def _is_pair(given: Any) -> bool:  # noqa: ANN401
+    """Return whether this is a rotation that knows its matrix, as SciPy's, with a translation."""
+    return (
+        isinstance(given, list | tuple)
+        and len(given) == 2
+        and hasattr(given[0], "as_matrix")
+        and np.shape(given[0].as_matrix())[-2:] == (3, 3)
+    )
+
+
 def _matrix(given: Any) -> Array:  # noqa: ANN401 - any library's object
-    """Return the matrix of a transform of another library."""
+    """Return the matrix of a transform of another library; (N, 4, 4) where it holds N."""
+    if _is_pair(given):
+        R, p = np.asarray(given[0].as_matrix()), np.asarray(given[1], np.float64)
+        if p.shape != R.shape[:-1]:
+            raise InputError(f"a rotation {R.shape} with a translation {p.shape}: expected {R.shape[:-1]}, m")
+        return pose(R, p)
     for name in ("T_left_body", "transform", "pose"):  # a pose, and what ROS wraps
         if (inner := getattr(given, name, None)) is not None:
             return _matrix(inner)
@@ -58,7 +86,7 @@ def _matrix(given: Any) -> Array:  # noqa: ANN401 - any library's object
         T = np.array(given, dtype=float)
     except (TypeError, ValueError):
         T = np.zeros(0)
-    if T.shape != (4, 4):
+    if T.shape[-2:] != (4, 4) or T.ndim > 3:
         raise InputError(
             f"{type(given).__name__}: expected a 4x4 matrix, or a transform of pinocchio, SciPy, spatialmath or ROS"
         )

@@ -376,6 +376,11 @@ def test_a_prior_of_zero_keeps_a_parameter_and_an_unknown_name_is_rejected(scene
     assert found.value("a2") == (w.nominal.a[1], pytest.approx(np.nan, nan_ok=True))
     table = found.columns()
     assert np.isnan(table["sigma"]).tolist() == (~found.solution.free).tolist()
+    drawn = {ax.get_ylabel(): ax.lines[0] for ax in found.plot().axes}
+    rows = [k for k in np.flatnonzero(found.solution.free) if found.model.parameters[k].unit == "m"]
+    rows = [k for k in rows if found.model.parameters[k].kind not in ("base", "tool")]
+    off = 1e3 * (table["value"] - table["nominal"])[rows]
+    np.testing.assert_allclose(drawn["off nominal, mm"].get_ydata(), off, rtol=0, atol=1e-12)
     with pytest.raises(InputError, match="has no parameter alpha9; it has "):
         found.value("alpha9")
     assert "prior of zero" in found.reasons["wave1_sin1"]

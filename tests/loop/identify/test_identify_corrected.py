@@ -28,6 +28,12 @@ def arm():
     return replace(Corrected.of(found), x=x)
 
 
+def test_one_reading_has_one_pose(arm):
+    q, sides = arm.model.arm.home + np.full((2, 6), [[0.1], [-0.2]]), np.ones((2, 6))
+    np.testing.assert_array_equal(arm.forward(q[1], sides[1]), arm.forward(q, sides)[1])
+    np.testing.assert_array_equal(arm.forward(q[0].tolist()), arm.forward(q)[0])
+
+
 def curves(arm):
     """The arm with the curves of its sensors alone."""
     model, x = arm.model, arm.x.copy()

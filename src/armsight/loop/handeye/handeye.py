@@ -34,6 +34,7 @@ from armsight.estimate.linear import Linear
 from armsight.estimate.solve import Solved, covariances, left_out, log_density, solve
 from armsight.estimate.variance import SPEAKS, integrate, most_probable, posterior, scores
 from armsight.files import write_text
+from armsight.geometry.convert import as_transforms
 from armsight.geometry.pose import exp_se3, inverse, log_se3, mean_pose, transform
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.poses import (
@@ -335,8 +336,8 @@ class _Problem(Record):
 
 
 def calibrate_handeye(
-    Ts_base_flange: ArrayLike | PoseTable,
-    Ts_rig_body: ArrayLike | PoseTable,
+    Ts_base_flange: ArrayLike | Sequence[object] | PoseTable,
+    Ts_rig_body: ArrayLike | Sequence[object] | PoseTable,
     covs: ArrayLike | None = None,
     *,
     eye: Eye = "to_hand",
@@ -347,8 +348,8 @@ def calibrate_handeye(
     """Calibrate the two constant transforms of rig, body and arm.
 
     Args:
-        Ts_base_flange: (N, 4, 4) the flange in the base, from the joints, m, or what ``read_pose_table`` returns; it must
-            rotate about two axes at least.
+        Ts_base_flange: (N, 4, 4) the flange in the base, from the joints, m, or a list of what ``as_transform`` takes, or
+            what ``read_pose_table`` returns; it must rotate about two axes at least.
         Ts_rig_body: the same of the body in the rig at the same instants, m (``T_left_body`` of what was measured).
         covs: (N, 6, 6) covariance of the latter, right tangent (``PoseEstimate.cov``); None: not known.
         eye: "to_hand" where the rig stands still and the arm carries the body, "in_hand" where the arm carries the rig.
@@ -361,12 +362,15 @@ def calibrate_handeye(
         InputError: wrong shapes, NaN, no rigid motions, fewer than 4 poses.
         CalibrationError: the motions leave a direction open.
     """
-    A, B = (each.Ts if isinstance(each, PoseTable) else each for each in (Ts_base_flange, Ts_rig_body))
-    for name, each in (("Ts_base_flange", A), ("Ts_rig_body", B)):
+    for name, each in (("Ts_base_flange", Ts_base_flange), ("Ts_rig_body", Ts_rig_body)):
         fits = not isinstance(each, str | Path)
         require(
             "handeye(Ts_base_flange, Ts_rig_body)", name, each, fits, 'poses (N, 4, 4): read_pose_table("robot.csv")'
         )
+    A, B = (
+        each.Ts if isinstance(each, PoseTable) else each if isinstance(each, np.ndarray) else as_transforms(each)
+        for each in (Ts_base_flange, Ts_rig_body)
+    )
     poses = checked_poses(A, B, covs, eye, np.zeros(3) if centre is None else centre)
     return calibrate_poses(poses, quick=quick, progress=progress)
 

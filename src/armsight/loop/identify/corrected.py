@@ -65,8 +65,10 @@ class Corrected(Record):
         return np.asarray(self.model.arm.direction * theta - q)
 
     def forward(self, q: Array, approach: Array | None = None) -> Array:
-        """Return T_base_body (N, 4, 4) at readings q (N, n), rad; ``approach`` (N, n) as in :class:`Measured`."""
-        return self.model.tool_in_base(self.x, q, approach)
+        """Return T_base_body (4, 4) at readings q (n,), rad; (N, 4, 4) at (N, n). ``approach`` as of :class:`Measured`."""
+        sides = None if approach is None else np.atleast_2d(approach)
+        Ts = self.model.tool_in_base(self.x, np.atleast_2d(q), sides)
+        return np.asarray(Ts[0] if np.ndim(q) == 1 else Ts)
 
     def readings(self, T_base_body: Array, near: Array, approach: Array | None = None) -> Array | None:
         """Return the readings (n,), rad, at which the body is at a pose, nearest to ``near``; None out of reach.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from armsight.loop.identify.model import PLENTY, SENSOR, Model, Parameter
 from armsight.loop.identify.observable import Observed, observed
 from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.selection import PLACEMENT, TOGETHER, SelectionStep, forward_selection, scaled_prior
+from armsight.plots import new_figure
 from armsight.robot.kinematics.arm import Arm
 
 MIN_POSES = 6  # fewest poses: what base and tool need, with some to spare
@@ -93,6 +95,32 @@ class Identified(Record):
         reasons = [self.reasons.get(name, "") for name in names]
         return {"name": names, "value": values, "nominal": self.model.nominal(), "sigma": sigmas, "reason": reasons}
 
+    def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
+        """Draw by how much each fitted number is off its nominal value, with two sigmas; return matplotlib's figure.
+
+        Base and tool, which the nominal arm does not have, are left out.
+
+        Raises:
+            InputError: matplotlib is not installed, or nothing but base and tool was fitted.
+        """
+        fitted = np.flatnonzero(self.solution.free & ~_of(self.model, PLACEMENT))
+        units = [unit for unit in SHOWN_IN if any(self.model.parameters[k].unit == unit for k in fitted)]
+        if not units:
+            raise InputError("nothing to draw: nothing but base and tool was fitted")
+        figure, axes = new_figure(len(units), 1, squeeze=False, figsize=(6.4, 2.4 * len(units) + 0.6))
+        for unit, ax in zip(units, axes[:, 0], strict=True):
+            (scale, shown), rows = SHOWN_IN[unit], [k for k in fitted if self.model.parameters[k].unit == unit]
+            off, sigma = (
+                scale * (self.solution.x - self.model.nominal())[rows],
+                scale * np.sqrt(np.diag(self.cov)[rows]),
+            )
+            ax.errorbar([self.model.names[k] for k in rows], off, 2 * sigma, fmt="o", capsize=3)
+            ax.axhline(0.0, color="gray", linewidth=0.8)
+            ax.tick_params(axis="x", rotation=90)
+            ax.set_ylabel(f"off nominal, {shown}")
+        axes[0, 0].set_title(f"{self.model.arm.name}: {len(fitted)} numbers fitted, with two sigmas")
+        return figure
+
     def correlation(self, rows: NDArray[np.int64]) -> Array:
         """Return the correlations (R, R) of fitted parameters: how badly these poses distinguish them.
 
@@ -112,14 +140,14 @@ class Identified(Record):
         return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
 
+#: Unit of a parameter -> its factor to what people read, and that.
+SHOWN_IN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "deg"), "rad/m": (180 / np.pi, "deg/m"), "rad/rad": (100.0, "%")}
+
+
 def value_text(p: Parameter, value: float) -> str:
     """Return a value in mm, deg, deg/m or %."""
-    shown = {
-        "m": f"{1e3 * value:.3f} mm",
-        "rad": f"{np.degrees(value):.4f} deg",
-        "rad/m": f"{np.degrees(value):.4f} deg/m",
-    }
-    return shown.get(p.unit, f"{100 * value:.4f} %")
+    scale, shown = SHOWN_IN[p.unit]
+    return f"{scale * value:.{3 if p.unit == 'm' else 4}f} {shown}"
 
 
 def identify(
