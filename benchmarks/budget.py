@@ -14,17 +14,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from armsight.app.budget.chart import marker_noise
-from armsight.app.budget.plan import RigPlan, length_m
 from armsight.data import Array, PoseEstimate, Shot
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
+from armsight.sim.budget.chart import marker_noise
+from armsight.sim.budget.plan import RigPlan, length_m
 from armsight.sim.camera.pipeline import SimulatedCamera
 from armsight.sim.example_rig import board_poses
 from armsight.sim.render.render import radiance
 from armsight.sim.render.scene import PosedBody, chessboard, plate
 from armsight.sim.workcell.body import BRIGHT, DARK
 from armsight.vision.calibrate.boards import printed_board
-from armsight.vision.calibrate.budget import Budget, budget
+from armsight.vision.calibrate.budget import Budget, pose_budget
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.targets import Composite
 from armsight.vision.pose.bundle import BundleState, Observations, minimise
@@ -51,7 +51,7 @@ VOLUME, TILT_RAD = "0.1x0.08x0.1m", 0.2
 
 def calibrated(plan: RigPlan, rng: np.random.Generator) -> StereoRig:
     """Return what the bundle makes of noisy corners of a bent board of another size, all else as the plan says."""
-    rig, board = plan.rig, open_board(plan.board)
+    rig, board = plan.stereo_rig, open_board(plan.board)
     pattern = chessboard(board.columns, board.rows, board.square_m)
     Ts = board_poses(rng, rig, pattern, plan.pairs)
     model, (S, M) = printed_board(board.body.points), (plan.pairs, len(board.body.points))
@@ -86,11 +86,11 @@ def measured(plan: RigPlan, groups: int, shots: int, seed: int) -> tuple[Array, 
     rng, given = np.random.default_rng(seed), plan.conditions()
     discs, t = plan.layout.discs, plan.timing
     points, normals, missed = discs.body.points, discs.normals, 0
-    errors, predicted, height = [], [], plan.rig.left.image_size_px[1]
+    errors, predicted, height = [], [], plan.stereo_rig.left.image_size_px[1]
     shutter = plan.pipeline.shutter(height)
     for group in range(groups):
         rig = calibrated(plan, rng)
-        seen_by = warmed(plan, plan.rig, rng)
+        seen_by = warmed(plan, plan.stereo_rig, rng)
         off = rng.standard_normal(points.shape) * given.body_sigma_m[0]
         off += normals * (
             rng.standard_normal((len(points), 1)) * given.body_sigma_m[1] - (off * normals).sum(1)[:, None]
@@ -104,7 +104,7 @@ def measured(plan: RigPlan, groups: int, shots: int, seed: int) -> tuple[Array, 
         for _ in range(shots):
             x, y, z = rng.uniform(-0.5, 0.5, 3) * plan.size_m
             tilt = tuple(rng.uniform(-TILT_RAD, TILT_RAD, 2))
-            seen = view(plan.rig, points, normals, plan.distance_m + z, tilt, (x, y))
+            seen = view(plan.stereo_rig, points, normals, plan.distance_m + z, tilt, (x, y))
             T, v = seen.T_left_body, np.append(rng.standard_normal(3) * plan.speeds[0] / np.sqrt(3), np.zeros(3))
             late = t["skew"] + t["start"] * rng.standard_normal()
             images = []
@@ -126,7 +126,7 @@ def measured(plan: RigPlan, groups: int, shots: int, seed: int) -> tuple[Array, 
                 continue
             stamped = T @ exp_se3(t["stamp"] * rng.standard_normal() * v)
             errors.append(np.kron(np.eye(2), T[:3, :3]) @ log_se3(inverse(stamped) @ found.T_left_body))
-            predicted.append(budget(plan.rig, points, normals, [seen], given))
+            predicted.append(pose_budget(plan.stereo_rig, points, normals, [seen], given))
     return np.array(errors), predicted, missed
 
 

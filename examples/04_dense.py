@@ -15,9 +15,9 @@ from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import example_rig
 from armsight.sim.render.mesh import box, see, with_noise
+from armsight.vision.dense import open_method
 from armsight.vision.dense.depth import depth_of
 from armsight.vision.dense.method import Search
-from armsight.vision.dense.methods import open_method
 from armsight.vision.dense.rectified import match_pair
 
 BOX_M = np.array([0.20, 0.15, 0.12])

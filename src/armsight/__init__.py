@@ -47,10 +47,10 @@ if TYPE_CHECKING:
     from armsight.loop.identify.validate import validate
     from armsight.robot.arm_file import open_arm
     from armsight.robot.kinematics.arm import Arm
+    from armsight.sim.budget.result import budget
     from armsight.tables.poses import read_pose_table
     from armsight.vision.calibrate.boards import Pair, calibrate_boards
     from armsight.vision.calibrate.bodies import calibrate_bodies
-    from armsight.vision.calibrate.budget import budget
     from armsight.vision.calibrate.images import calibrate
     from armsight.vision.camera import Camera
     from armsight.vision.follow.follower import Follower
@@ -105,7 +105,7 @@ _HOME = {
     "Arm": "armsight.robot.kinematics.arm",
     "ArmsightError": "armsight.errors",
     **dict.fromkeys(("as_transform", "ros_fields"), "armsight.geometry.convert"),
-    "budget": "armsight.vision.calibrate.budget",
+    "budget": "armsight.sim.budget.result",
     "calibrate": "armsight.vision.calibrate.images",
     **dict.fromkeys(("Pair", "calibrate_boards"), "armsight.vision.calibrate.boards"),
     "calibrate_bodies": "armsight.vision.calibrate.bodies",

@@ -11,7 +11,7 @@ from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import example_rig
 from armsight.sim.render.mesh import box, see, with_noise
-from armsight.vision.dense.methods import METHODS
+from armsight.vision.dense import METHODS
 from armsight.vision.dense.middlebury import read_pfm
 from armsight.vision.rig import StereoRig
 from cli_runs import assert_rejected, said_of

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from armsight.data import Array
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.sim.workcell.body import body_target
-from armsight.vision.calibrate.budget import Budget, Conditions, budget, calibration_covariance, radius, volume_views
+from armsight.vision.calibrate.budget import (
+    Budget,
+    Conditions,
+    calibration_covariance,
+    of_three,
+    pose_budget,
+    radius,
+    volume_views,
+)
 from armsight.vision.pose.posefit import PixelObservations, fit_pose
 from armsight.vision.pose.predict import plain_rig
 
@@ -20,7 +30,7 @@ VIEWS = volume_views(RIG, POINTS, NORMALS, 0.8, np.array([0.2, 0.1, 0.1]))
 SHOTS = 600
 
 
-def measured(given: Conditions, rng: np.random.Generator) -> Array:
+def measured(given: Conditions, rng: np.random.Generator, cameras: int = 2) -> Array:
     """Return errors (SHOTS, 6) along the left camera's axes, each shot at a position of its own, by the real fit."""
     errors = []
     for shot in range(SHOTS):
@@ -37,7 +47,7 @@ def measured(given: Conditions, rng: np.random.Generator) -> Array:
             moved[0:2] = given.lens_share * rng.standard_normal() * RIG.left.intrinsics[:2]
             moved[4:6] = given.lens_share * rng.standard_normal() * RIG.right.intrinsics[:2]
             rig = RIG.perturbed(moved)
-        side, row = (each.astype(np.int64) for each in np.nonzero(seen.seen.T))
+        side, row = (each.astype(np.int64) for each in np.nonzero(seen.seen[:, :cameras].T))
         uv = np.zeros((len(row), 2))
         start = rng.standard_normal() * given.start_s
         for k in (0, 1):
@@ -80,21 +90,52 @@ def test_a_cause_costs_what_the_fit_shows(case: str) -> None:
     # The RMS of 600 errors of three axes is known to 1 / sqrt(3600) = 1.7 %, of one dominant axis to 2.9 %; a shared
     # velocity or lens has fewer degrees of freedom than the axes: four sigmas of the latter.
     given = CASES[case]
-    found = budget(RIG, POINTS, NORMALS, VIEWS, given)
+    found = pose_budget(RIG, POINTS, NORMALS, VIEWS, given)
     errors = measured(given, np.random.default_rng(7))
     position, rotation = found.rms(found.cov())
     assert np.sqrt((errors[:, :3] ** 2).sum(axis=1).mean()) == pytest.approx(position, rel=0.12)
     assert np.sqrt((errors[:, 3:] ** 2).sum(axis=1).mean()) == pytest.approx(rotation, rel=0.12)
 
 
+@pytest.mark.parametrize("case", ["pixel noise", "print of the body"])
+def test_one_camera_is_as_good_as_its_fit_shows(case: str) -> None:
+    # Depth alone dominates: 600 errors of one axis are known to 2.9 %, four sigmas; the fit is linear to that.
+    views = [replace(each, seen=each.seen[:, :1]) for each in VIEWS]
+    found = pose_budget(RIG, POINTS, NORMALS, views, CASES[case])
+    errors = measured(CASES[case], np.random.default_rng(8), cameras=1)
+    assert np.sqrt((errors[:, :3] ** 2).sum(axis=1).mean()) == pytest.approx(found.rms(found.cov())[0], rel=0.12)
+
+
+def test_three_cameras_are_the_sum_of_what_each_knows() -> None:
+    # The oracle: three pinholes at the corners of the triangle, rows of all in one least-squares problem; the same to the
+    # finite differences' 1e-6.
+    size, given = np.array([0.2, 0.1, 0.1]), Conditions({"pixel noise": 0.1})
+    pairs = [volume_views(RIG, POINTS, NORMALS, 0.8, size, pair) for pair in range(3)]
+    found = of_three([pose_budget(RIG, POINTS, NORMALS, views, given) for views in pairs])
+    b, errors = RIG.baseline_m, []
+    for seen in pairs[0]:
+        T = seen.T_left_body
+        rows = []
+        for at in np.array([[0.0, 0.0, 0.0], [b, 0.0, 0.0], [b / 2, b * np.sqrt(3) / 2, 0.0]]):
+
+            def uv(x: Array, T: Array = T, at: Array = at) -> Array:
+                p = POINTS @ (T @ exp_se3(x))[:3, :3].T + (T @ exp_se3(x))[:3, 3] - at
+                return np.asarray((1000.0 * p[:, :2] / p[:, 2:]).ravel())
+
+            rows.append(np.column_stack([(uv(h) - uv(-h)) / 2e-5 for h in 1e-5 * np.eye(6)]))
+        A, R = np.concatenate(rows), np.kron(np.eye(2), T[:3, :3])
+        errors.append(R @ np.linalg.inv(A.T @ A) @ R.T * 0.01)
+    np.testing.assert_allclose(found.rms(found.cov()), found.rms(np.array(errors)), rtol=1e-5)
+
+
 def test_shared_velocity_adds_before_it_is_squared() -> None:
-    both = budget(RIG, POINTS, NORMALS, VIEWS, CASES["skew and readout"])
+    both = pose_budget(RIG, POINTS, NORMALS, VIEWS, CASES["skew and readout"])
     apart = both.cov(of="skew") + both.cov(of="readout")
     assert abs(np.trace(both.cov()[0]) / np.trace(apart[0]) - 1) > 0.02
 
 
 def test_a_lost_cause_is_none_at_rest() -> None:
-    found = budget(RIG, POINTS, NORMALS, VIEWS, CASES["skew"])
+    found = pose_budget(RIG, POINTS, NORMALS, VIEWS, CASES["skew"])
     assert not found.cov(moving=False).any()
 
 
@@ -120,6 +161,6 @@ def test_radius_holds_95_percent(sizes: tuple[float, float, float]) -> None:
 
 
 def test_a_budget_has_both_shares() -> None:
-    found: Budget = budget(RIG, POINTS, NORMALS, VIEWS, Conditions({"pixel noise": 0.1}, lens_share=1e-4))
+    found: Budget = pose_budget(RIG, POINTS, NORMALS, VIEWS, Conditions({"pixel noise": 0.1}, lens_share=1e-4))
     whole = found.cov(of="precision") + found.cov(of="trueness")
     np.testing.assert_allclose(whole, found.cov(), rtol=1e-12)

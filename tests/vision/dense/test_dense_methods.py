@@ -5,10 +5,10 @@ import pytest
 from dense_scenes import layers, rendered
 
 from armsight.errors import InputError
+from armsight.vision.dense import METHODS, open_method
 from armsight.vision.dense.block import Block
 from armsight.vision.dense.evaluate import evaluate_disparity
 from armsight.vision.dense.method import MEASURED, OCCLUDED, Search
-from armsight.vision.dense.methods import METHODS, open_method
 from armsight.vision.dense.opencv import OpenCV
 from armsight.vision.dense.semiglobal import Semiglobal
 

@@ -6,8 +6,8 @@ import pytest
 from dense_scenes import layers
 
 from armsight.errors import InputError
+from armsight.vision.dense import METHODS, open_method
 from armsight.vision.dense.method import Search
-from armsight.vision.dense.methods import METHODS, open_method
 from armsight.vision.dense.rectified import match_pair
 
 SEARCH = Search(0, 32)

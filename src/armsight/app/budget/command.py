@@ -15,6 +15,7 @@ import click
 @click.option("--want", metavar="ERROR", help="What 95 % of the errors are to be within: 0.1mm, or 0.1mm,0.05deg.")
 @click.option("--camera", metavar="CLASS", help="A class of the catalogue, such as webcam-720p.")
 @click.option("--baseline", metavar="LENGTH", help="Between the cameras: 200mm.")
+@click.option("--rig", metavar="RIG.json", help="The budget of a rig that there is.")
 @click.option("--arm", metavar="ARM", help="For the closed loop: a model's name or a file.")
 @click.option("-o", "--output", metavar="DIR", help="Write report.html, budget.json and the figures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
@@ -23,13 +24,13 @@ def command(path: str, output: str | None, as_json: bool, **given: str | None) -
 
     What is left out is chosen, and said. PLAN.toml has the same keys and more: docs/howto/budget.md.
     """
-    from armsight.app.budget.plan import RigPlan
     from armsight.app.budget.report import REPORT_FILES, budget_report
     from armsight.files import check_folder
+    from armsight.sim.budget.result import budget
 
     if output is not None:
         check_folder(output, holding=REPORT_FILES, apart_from=(path,) if path else ())
-    report = budget_report(RigPlan.read(path, **given))
+    report = budget_report(budget(path, **given))
     written = None
     if output is not None:
         written = str(report.write(Path(output), {"budget.json": report.json_text()}))

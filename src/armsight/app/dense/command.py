@@ -11,7 +11,7 @@ import click
 
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder
-from armsight.vision.dense.methods import METHODS, open_method
+from armsight.vision.dense import METHODS, open_method
 
 if TYPE_CHECKING:
     from armsight.app.dense.evaluate import SceneResult

@@ -14,8 +14,8 @@ import numpy as np
 from armsight.app.dense.files import make_folder, paint_disparity, paint_errors, write_png
 from armsight.app.show.encode import json_of
 from armsight.files import write_text
+from armsight.vision.dense import open_method
 from armsight.vision.dense.evaluate import DisparityErrors, evaluate_disparity
-from armsight.vision.dense.methods import open_method
 from armsight.vision.dense.middlebury import MiddleburyScene
 from armsight.vision.dense.rectified import plain_grey
 

@@ -8,7 +8,7 @@ What several causes share (the velocity that skew and readout multiply) adds bef
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from scipy.stats import chi2
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
+from armsight.geometry.rotation import exp_so3
 from armsight.vision.calibrate.boards import printed_board, rigid_board
 from armsight.vision.pose.bundle import BundleState, Observations, minimise
 from armsight.vision.pose.predict import PredictedView, pose_derivatives, view
@@ -23,6 +24,7 @@ from armsight.vision.rig import StereoRig
 
 #: Share of errors that a figure "at 95 %" covers.
 LEVEL = 0.95
+_THIRD = 2 * np.pi / 3  # rad; between the pairs of three cameras
 
 
 @dataclass(frozen=True)
@@ -33,27 +35,29 @@ class CauseKind:
         moving: it costs nothing at rest.
         common: it is the same in all shots (trueness); else it differs from shot to shot (precision).
         loop: it is no error of what the cameras measure, but of where a closed loop brings the arm.
+        camera: each camera, or each pair of them, has one of its own.
     """
 
     moving: bool = False
     common: bool = False
     loop: bool = False
+    camera: bool = False
 
 
 #: Cause -> its kind, in the order of tables.
 CAUSES: dict[str, CauseKind] = {
-    "pixel noise": CauseKind(),
-    "defocus": CauseKind(),
-    "exposure blur": CauseKind(moving=True),
-    "skew": CauseKind(moving=True),
-    "start of exposures": CauseKind(moving=True),
+    "pixel noise": CauseKind(camera=True),
+    "defocus": CauseKind(camera=True),
+    "exposure blur": CauseKind(moving=True, camera=True),
+    "skew": CauseKind(moving=True, camera=True),
+    "start of exposures": CauseKind(moving=True, camera=True),
     "readout": CauseKind(moving=True),
     "time stamps": CauseKind(moving=True),
-    "calibration": CauseKind(common=True),
+    "calibration": CauseKind(common=True, camera=True),
     "print of the board": CauseKind(common=True),
     "print of the body": CauseKind(common=True),
-    "warming of the mount": CauseKind(common=True),
-    "warming of the lenses": CauseKind(common=True),
+    "warming of the mount": CauseKind(common=True, camera=True),
+    "warming of the lenses": CauseKind(common=True, camera=True),
     "hand-eye": CauseKind(common=True, loop=True),
     "steps and backlash of the arm": CauseKind(loop=True),
 }
@@ -185,15 +189,28 @@ def radius(cov: Array) -> Array:
 
 
 def volume_views(
-    rig: StereoRig, points: Array, normals: Array, distance_m: float, size_m: Array
+    rig: StereoRig, points: Array, normals: Array, distance_m: float, size_m: Array, of_three: int | None = None
 ) -> list[PredictedView]:
-    """Return a body at 27 positions of a volume: width, height, depth (3,), m, its middle at a distance."""
+    """Return a body at 27 positions of a volume: width, height, depth (3,), m, its middle at a distance.
+
+    ``of_three``: 0, 1 or 2, for a pair of three cameras at the corners of an equilateral triangle: volume and body as that
+    pair has them, which looks past the triangle's middle. What it sees is not cut: a real camera would not be rolled.
+    """
     w, h, d = size_m / 2
     positions = [(x, y, z) for z in (-d, 0.0, d) for y in (-h, 0.0, h) for x in (-w, 0.0, w)]
-    return [view(rig, points, normals, distance_m + z, (0.0, 0.0), (x, y)) for x, y, z in positions]
+    plain = [view(rig, points, normals, distance_m + z, (0.0, 0.0), (x, y)) for x, y, z in positions]
+    if of_three is None:
+        return plain
+    roll, below = of_three * _THIRD, rig.baseline_m / (2 * np.sqrt(3.0))
+    c, s = np.cos(roll), np.sin(roll)
+    rolled = [
+        view(rig, points, normals, distance_m + z, (0.0, 0.0), (c * x - s * y, s * x + c * y + below), roll)
+        for x, y, z in positions
+    ]
+    return [replace(one, seen=seen.seen) for one, seen in zip(rolled, plain, strict=True)]
 
 
-def budget(rig: StereoRig, points: Array, normals: Array, views: list[PredictedView], given: Conditions) -> Budget:
+def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[PredictedView], given: Conditions) -> Budget:
     """Return what each cause costs a body's pose.
 
     Args:
@@ -245,6 +262,27 @@ def budget(rig: StereoRig, points: Array, normals: Array, views: list[PredictedV
     # What is not seen at one position has as many sources as at the others.
     factors = {name: _stacked([one.get(name) for one in found]) for name in CAUSES if any(name in one for one in found)}
     return Budget(np.array(at), forward / np.linalg.norm(forward), factors)
+
+
+def of_three(pairs: Sequence[Budget]) -> Budget:
+    """Return the budget of three cameras from those of their three pairs.
+
+    The least-squares pose of three cameras is the mean of the pairs' poses, weighted by their information: each camera is
+    in two of them. What is each camera's own is independent, and counts twice for that; all else is the same in all pairs.
+
+    ``pairs`` are those of :func:`volume_views`, 0, 1 and 2; axes are those of the first one's left camera.
+    """
+    first = pairs[0]
+    back = [np.kron(np.eye(2), exp_so3(-_THIRD * k * first.forward)) for k in range(3)]
+    informations = [R @ np.linalg.inv(each.cov(of="pixel noise")) @ R.T for R, each in zip(back, pairs, strict=True)]
+    whole = np.linalg.inv(np.sum(informations, axis=0))
+    weighed = [whole @ each for each in informations]
+    factors = {}
+    for name in first.factors:
+        parts = [W @ R @ each.factors[name] for W, R, each in zip(weighed, back, pairs, strict=True)]
+        own = CAUSES[name].camera
+        factors[name] = np.sqrt(2.0) * np.concatenate(parts, axis=2) if own else np.sum(parts, axis=0)
+    return replace(first, factors=factors, shared=())
 
 
 def _stacked(factors: list[Array | None]) -> Array:

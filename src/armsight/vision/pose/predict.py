@@ -40,7 +40,7 @@ class PredictedView(Record):
     Attributes:
         T_left_body: (4, 4) its pose.
         forward: (3,) unit vector from the cameras to it, left camera's frame.
-        seen: (M, 2) whether a camera sees a point: in its image, and its face not rotated away.
+        seen: (M, 2) whether a camera sees a point: in its image, and its face not rotated away; (M, 1): one camera alone.
     """
 
     T_left_body: Array
@@ -49,7 +49,7 @@ class PredictedView(Record):
 
     @property
     def paired(self) -> Ids:
-        """Rows of the points that both cameras see."""
+        """Rows of the points that all cameras see."""
         return np.flatnonzero(self.seen.all(axis=1))
 
 
@@ -81,6 +81,7 @@ def view(
     distance_m: float,
     rotation: tuple[float, float] = (0.0, 0.0),
     aside_m: tuple[float, float] = (0.0, 0.0),
+    roll: float = 0.0,
 ) -> PredictedView:
     """Set a body before the cameras, its faces towards them and its middle between their axes.
 
@@ -91,6 +92,7 @@ def view(
         distance_m: from the cameras to the body's middle.
         rotation: about the horizontal and the vertical axis of the image, rad.
         aside_m: right and down, of the point between the cameras' axes.
+        roll: of the body about the direction of view, rad.
     """
     towards = look_direction(points, normals)
     ahead = np.array([0.0, 0.0, distance_m, 1.0])
@@ -99,7 +101,7 @@ def view(
     forward = forward / np.linalg.norm(forward)
     axes = _axes(forward, np.array([1.0, 0.0, 0.0]))
     middle = middle + axes[:, :2] @ np.array(aside_m)
-    R = axes @ exp_so3(np.array([*rotation, 0.0])) @ face_axes(towards).T
+    R = axes @ exp_so3(np.array([*rotation, roll])) @ face_axes(towards).T
     facing = normals @ towards > FACING
     used = facing | ~np.isfinite(normals).all(axis=1)
     T = pose(R, middle - R @ points[used].mean(axis=0))

@@ -1,10 +1,17 @@
-"""OpenCV's video capture without its log: errors are reported by armsight, in one line, and not by OpenCV on stderr."""
+"""OpenCV's video capture without its log: errors are reported by armsight, in one line, and not by OpenCV on stderr.
+
+Of two free-running captures, a left and a right frame belong together within half a frame period: of two streams of one
+rate the nearest frames are never further apart.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
+import statistics
 import threading
+from collections import deque
 from collections.abc import Iterator, Sequence
 
 import cv2
@@ -16,6 +23,9 @@ _ENVIRONMENT = {
     "OPENCV_FFMPEG_LOGLEVEL": "-8",  # FFmpeg's level for quiet
     "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT": "2",  # s; instead of 10, so that a camera's stall is seen in time
 }
+#: Time stamps a period is taken from: long enough that a late frame does not move the median, short enough to follow
+#: a camera that lengthens its exposure in the dark.
+_STAMPS = 10
 
 
 class _Silence:
@@ -85,3 +95,25 @@ def open_capture(what: str, api: int = cv2.CAP_ANY, parameters: Sequence[int] = 
     with _silent():
         capture = cv2.VideoCapture(what, api, parameters)
         return QuietCapture(capture) if capture.isOpened() else None
+
+
+class Rhythm:
+    """The frame period of one stream, learnt from its time stamps."""
+
+    def __init__(self) -> None:
+        self._stamps: deque[float] = deque(maxlen=_STAMPS)
+
+    def tick(self, t_s: float) -> None:
+        """Take the time stamp of one more frame, s."""
+        self._stamps.append(t_s)
+
+    @property
+    def period_s(self) -> float | None:
+        """Median interval of the recent frames, s; None before the second frame."""
+        stamps = list(self._stamps)
+        return statistics.median(b - a for a, b in itertools.pairwise(stamps)) if len(stamps) > 1 else None
+
+
+def allowed_skew(left: Rhythm, right: Rhythm) -> float:
+    """Return half the period of the faster stream, s; 0 while neither period is known."""
+    return min((r.period_s for r in (left, right) if r.period_s is not None), default=0.0) / 2

@@ -27,8 +27,7 @@ import numpy as np
 from armsight.data import Image, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.vision.source import Source
-from armsight.vision.sources.capture import open_capture
-from armsight.vision.sources.timing import Rhythm, allowed_skew
+from armsight.vision.sources.capture import Rhythm, allowed_skew, open_capture
 
 TIMEOUT_S = 5.0  # without data for that long a stream has stalled
 _SETTLE_S = 1.0  # FFmpeg hands out what it collected while it looked at an RTSP stream in one burst: passed over

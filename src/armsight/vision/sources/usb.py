@@ -24,8 +24,7 @@ import numpy as np
 from armsight.data import Image, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.vision.source import Source
-from armsight.vision.sources.capture import open_capture
-from armsight.vision.sources.timing import Rhythm, allowed_skew
+from armsight.vision.sources.capture import Rhythm, allowed_skew, open_capture
 from armsight.vision.sources.v4l2 import EXPOSURE_UNIT_MS
 
 STALL_S = 5.0  # without a frame for that long a camera has stalled

@@ -16,18 +16,25 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.budget.chart import marker_noise
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import read_toml
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.arm_file import open_arm
+from armsight.sim.budget.chart import marker_noise
 from armsight.sim.camera.stages import CameraPipeline, Defocus
 from armsight.sim.example_rig import board_poses
 from armsight.sim.render.scene import chessboard
 from armsight.sim.workcell.body import body_target
-from armsight.vision.calibrate.budget import Budget, Conditions, budget, calibration_covariance, volume_views
+from armsight.vision.calibrate.budget import (
+    Budget,
+    Conditions,
+    calibration_covariance,
+    of_three,
+    pose_budget,
+    volume_views,
+)
 from armsight.vision.camera import Camera
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_layout import Layout, read_layout
@@ -102,6 +109,7 @@ class RigPlan:
         speed: of the body, and its rate of rotation: 0.3m/s or 0.3m/s,20deg/s.
         want: what 95 % of the errors are to be within: 0.1mm or 0.1mm,0.05deg; empty: nothing is asked.
         camera: a class of the catalogue.
+        rig: a rig file, for a rig that there is: its lenses, baseline, calibration and, where known, shutters.
         baseline: between the cameras.
         verging_deg: angle between their axes; by default both look at the middle of the volume.
         focal_widths: focal length over the image's width; by default the class's.
@@ -131,6 +139,7 @@ class RigPlan:
     speed: str = "0.3m/s"
     want: str = ""
     camera: str = "webcam-720p"
+    rig: str = ""
     baseline: str = "200mm"
     verging_deg: float = -1.0
     focal_widths: float = 0.0
@@ -158,21 +167,22 @@ class RigPlan:
 
     @staticmethod
     def read(path: str, **given: Any) -> RigPlan:  # noqa: ANN401
-        """Read a TOML file whose keys are the attributes; ``given`` replaces what it says.
+        """Read a TOML file whose keys are the attributes, if there is one; ``given`` replaces what it says.
 
         Raises:
             InputError: an unknown key, or a value of another type; the message names it.
         """
         known = {each.name: type(each.default) for each in RigPlan.settings()}
         values = read_toml(path) if path else {}
-        for key, value in values.items():
+        given = values | {key: value for key, value in given.items() if value is not None}
+        for key, value in given.items():
+            of = f"{path}: " if key in values else ""
             if key not in known:
                 near = difflib.get_close_matches(key, known, 1)
-                raise InputError(f"{path}: unknown key {key!r}{f': did you mean {near[0]}?' if near else ''}")
+                raise InputError(f"{of}unknown key {key!r}{f': did you mean {near[0]}?' if near else ''}")
             if not isinstance(value, (int, float) if known[key] is float else known[key]) or isinstance(value, bool):
-                raise InputError(f"{path}: {key} must be {'a number' if known[key] is not str else 'a text'}")
-        given = {key: value for key, value in given.items() if value is not None}
-        given = values | given
+                kind = {str: "a text", int: "a whole number", float: "a number"}[known[key]]
+                raise InputError(f"{of}{key} must be {kind}, got {value!r}")
         return RigPlan(**given, folder=str(Path(path).parent) if path else ".", named=tuple(given))
 
     @staticmethod
@@ -207,8 +217,20 @@ class RigPlan:
         return d
 
     @cached_property
+    def existing(self) -> StereoRig | None:
+        """The rig that there is."""
+        return StereoRig.load(Path(self.folder) / self.rig) if self.rig else None
+
+    @cached_property
+    def image_size_px(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.existing.left.image_size_px if self.existing else self.cameras.image_size_px
+
+    @cached_property
     def baseline_m(self) -> float:
         """Distance of the cameras."""
+        if self.existing:
+            return self.existing.baseline_m
         b = length_m(self.baseline, "baseline")
         if not _LEAST_M <= b <= _MOST_M:
             raise InputError(f"baseline {self.baseline}: expected {_LEAST_M:g} to {_MOST_M:g} m: is the unit right?")
@@ -250,7 +272,9 @@ class RigPlan:
     @cached_property
     def focal_px(self) -> float:
         """Focal length; where none is given the class's, or the longest that sees the volume, down to a wide lens."""
-        width, height = self.cameras.image_size_px
+        if self.existing:
+            return float(np.mean([camera.intrinsics[:2] for camera in self.existing.cameras]))
+        width, height = self.image_size_px
         near, body = self.distance_m - self.size_m[2] / 2, np.ptp(self.layout.body.points, axis=0).max()
         sees = 0.97 * near * min(width / (self.size_m[0] + body), height / (self.size_m[1] + body))
         return self.focal_widths * width or min(self.cameras.focal_widths * width, max(sees, _WIDEST * width))
@@ -270,14 +294,19 @@ class RigPlan:
             given if given >= 0 else preset
             for given, preset in ((self.skew_ms, t.skew_ms), (self.start_ms, t.sync_ms / math.sqrt(3.0)))
         )
-        ms = {"exposure": t.exposure_ms, "readout": t.readout_ms, "skew": skew, "start": start, "stamp": t.jitter_ms}
+        readout = t.readout_ms
+        if self.existing and (known := self.existing.shutters):
+            # What was measured is corrected: its uncertainty remains.
+            skew, readout = 1e3 * known.sigmas
+            start = 1e3 * known.jitter_s
+        ms = {"exposure": t.exposure_ms, "readout": readout, "skew": skew, "start": start, "stamp": t.jitter_ms}
         rate = min(t.rate_hz, self._most_hz) if self.rate_hz < 0 else self.rate_hz
         return {name: 1e-3 * value for name, value in ms.items()} | {"rate": rate}
 
     @property
     def _most_hz(self) -> float:
         """Rate that one USB controller carries."""
-        width, height = self.cameras.image_size_px
+        width, height = self.image_size_px
         return self.cameras.usb * 1e6 / (2 * width * height * self.cameras.bytes_px)
 
     @cached_property
@@ -291,9 +320,11 @@ class RigPlan:
         return Layout("tool_body", replace(discs, body=body, radii_m=k * discs.radii_m), None, None)
 
     @cached_property
-    def rig(self) -> StereoRig:
-        """The cameras, verging symmetrically."""
-        width, height = size = self.cameras.image_size_px
+    def stereo_rig(self) -> StereoRig:
+        """The cameras: those that there are, or verging symmetrically."""
+        if self.existing:
+            return self.existing
+        width, height = size = self.image_size_px
         f, half = self.focal_px, math.atan(self.baseline_m / 2 / self.distance_m)
         half = half if self.verging_deg < 0 else math.radians(self.verging_deg) / 2
         camera = Camera(size, "brown5", np.array([f, f, (width - 1) / 2, (height - 1) / 2]), np.zeros(5))
@@ -348,7 +379,7 @@ class RigPlan:
                 f"an exposure of {1e3 * t['exposure']:g} ms is longer than a frame at {t['rate']:g} Hz: at most "
                 f"{1e3 / t['rate']:.3g} ms, or {1 / t['exposure']:.3g} Hz"
             )
-        width, height = c.image_size_px
+        width, height = self.image_size_px
         if t["rate"] > 1.001 * self._most_hz:
             raise InputError(
                 f"one USB controller carries two {c.name} at {self._most_hz:.3g} Hz at most, {t['rate']:g} Hz were asked: "
@@ -374,7 +405,7 @@ class RigPlan:
                 f"a {kind} is {px:.1f} px at {far:.2g} m, at least {least_px:g} are needed: markers {least_px / px:.1f} "
                 f"times as large (body_scale = {self.body_scale * least_px / px:.2g})"
             )
-        views = volume_views(self.rig, self.layout.body.points, self.layout.normals, self.distance_m, size)
+        views = volume_views(self.stereo_rig, self.layout.body.points, self.layout.normals, self.distance_m, size)
         lost = sum(len(one.paired) < 3 for one in views)
         if lost:
             raise InputError(
@@ -433,21 +464,30 @@ _NOT_CALIBRATED = (
 @lru_cache(maxsize=64)
 def _cov_calibration(plan: RigPlan) -> Array:
     """Return the covariance (P, P) of the rig's parameters."""
+    if plan.existing:
+        return plan.existing.cov
     board = open_board(plan.board)
     if not isinstance(board, Chessboard):
         raise InputError(f"board {plan.board!r}: chessboards have a budget so far: {Chessboard.form}")
     pattern = chessboard(board.columns, board.rows, board.square_m)
-    Ts = board_poses(np.random.default_rng(1), plan.rig, pattern, plan.pairs)
+    Ts = board_poses(np.random.default_rng(1), plan.stereo_rig, pattern, plan.pairs)
     px = board.square_m * plan.focal_px / float(np.median(Ts[:, 2, 3]))
     if px < LEAST_SQUARE_PX:
         raise InputError(f"a square of {plan.board} is {px:.1f} px, at least {LEAST_SQUARE_PX:g} are needed")
     sigma = marker_noise(plan.pipeline, "chessboard", min(px, MOST_SQUARE_PX))
-    return calibration_covariance(plan.rig, board.body.points, Ts, sigma, length_m(plan.board_bent, "board_bent"))
+    return calibration_covariance(
+        plan.stereo_rig, board.body.points, Ts, sigma, length_m(plan.board_bent, "board_bent")
+    )
 
 
-def planned(plan: RigPlan) -> Budget:
-    """Return the budget of a plan that was checked."""
+def planned(plan: RigPlan, cameras: int = 2) -> Budget:
+    """Return the budget of a plan: of its two cameras, of the left one alone, or of three in an equilateral triangle."""
     plan.check()
-    layout = plan.layout
-    views = volume_views(plan.rig, layout.body.points, layout.normals, plan.distance_m, plan.size_m)
-    return budget(plan.rig, layout.body.points, layout.normals, views, plan.conditions())
+    layout, given, rig = plan.layout, plan.conditions(), plan.stereo_rig
+    points, normals = layout.body.points, layout.normals
+
+    def of(pair: int | None) -> Budget:
+        views = volume_views(rig, points, normals, plan.distance_m, plan.size_m, pair)
+        return pose_budget(rig, points, normals, [replace(one, seen=one.seen[:, :cameras]) for one in views], given)
+
+    return of_three([of(pair) for pair in range(3)]) if cameras == 3 else of(None)

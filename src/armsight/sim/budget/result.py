@@ -1,0 +1,203 @@
+"""The budget of a plan: what it will measure, what each cause costs, and what would change it. m and rad inside."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.sim.budget.plan import RigPlan, catalogue, planned
+from armsight.vision.calibrate.budget import CAUSES, Budget
+
+#: A change that gains less than this share is not worth a line; half: lines that nobody buys, double: cheap gains lack.
+WORTH = 0.1
+#: What would make it better -> class of its price, 0 for nothing, and what of a plan it changes.
+CHANGES: dict[str, tuple[int, Callable[[RigPlan], dict[str, object]]]] = {
+    "start both cameras by one trigger": (2, lambda plan: {"skew_ms": 0.0, "start_ms": 0.05}),
+    "measure at rest": (0, lambda plan: {"speed": "0m/s"}),
+    "twice as many pairs of the board": (0, lambda plan: {"pairs": 2 * plan.pairs}),
+    "cameras half as far apart again": (0, lambda plan: {"baseline": f"{1.5e3 * plan.baseline_m:g}mm"}),
+    "a body half as large again": (1, lambda plan: {} if plan.body else {"body_scale": 1.5 * plan.body_scale}),
+    "half the exposure, twice the light": (1, lambda plan: {"exposure_ms": 0.5e3 * plan.timing["exposure"]}),
+    "a board printed on a stiff plate, its size measured": (1, lambda _: {"board_print": 1e-4, "board_bent": "0.03mm"}),
+    "the body's markers measured after printing": (
+        0,
+        lambda _: {"body_print": "0.01mm", "body_bent": "0.02mm", "body_size": 1e-4},
+    ),
+    "calibrate again when the room is 1 K warmer": (0, lambda _: {"warming_k": 1.0}),
+}
+#: What another class of cameras brings along.
+OF_CAMERA: Mapping[str, Any] = {"focal_widths": 0.0, "skew_ms": -1.0, "start_ms": -1.0, "exposure_ms": -1.0}
+#: Causes that have no model, each with its reason.
+NOT_MODELLED = (
+    "the detector's failures (glints, hidden markers): the workcell has them, the budget does not",
+    "smear by a camera that mixes images of a moving scene",
+    "focus that breathes: an autofocus must be switched off",
+    "poses of the board other than all over the images",
+    "a mount that bends, not only grows, as it warms",
+)
+
+
+class Accuracy(NamedTuple):
+    """The RMS over the volume, and what 95 % of the errors are within at its worst position; m, rad."""
+
+    rms_m: float
+    rms_rad: float
+    level_m: float
+    level_rad: float
+
+    @staticmethod
+    def of(found: Budget, cov: Array) -> Accuracy:
+        """Return that of covariances (G, 6, 6)."""
+        far, rotated = found.at_level(cov)
+        return Accuracy(*found.rms(cov), float(far.max()), float(rotated.max()))
+
+    @property
+    def mm(self) -> float:
+        """What 95 % are within at the worst position."""
+        return 1e3 * self.level_m
+
+    @property
+    def deg(self) -> float:
+        """What 95 % are within at the worst position."""
+        return math.degrees(self.level_rad)
+
+    def __str__(self) -> str:
+        """Return both, for people."""
+        return f"{self.mm:.2g} mm, {self.deg:.2g} deg"
+
+
+class Cause(NamedTuple):
+    """What one cause costs: its RMS, its share of the variance of positions in motion, and what halving it leaves."""
+
+    cause: str
+    rms_m: float
+    rms_rad: float
+    share: float
+    halved_level_m: float
+    moving: bool
+    common: bool
+    loop: bool
+
+
+class Improvement(NamedTuple):
+    """What would make it better: the class of its price, 0 for nothing, and what 95 % are then within in motion, m."""
+
+    change: str
+    price: int
+    level_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class RigBudget(Record):
+    """What a plan will measure, or a rig that there is; in mm and degrees: ``mm``, ``deg``, ``at_rest.mm``.
+
+    Attributes:
+        plan: the plan.
+        found: the covariances by cause and position, m and rad.
+    """
+
+    plan: RigPlan
+    found: Budget
+
+    def __repr__(self) -> str:
+        """Return the answer in one line."""
+        return f"RigBudget({self.moving} in motion; {self.at_rest} at rest; 95 % at the worst position)"
+
+    @cached_property
+    def moving(self) -> Accuracy:
+        """In motion."""
+        return Accuracy.of(self.found, self.found.cov())
+
+    @cached_property
+    def at_rest(self) -> Accuracy:
+        """At rest."""
+        return Accuracy.of(self.found, self.found.cov(moving=False))
+
+    @cached_property
+    def states(self) -> dict[str, Accuracy]:
+        """moving, at_rest; closed_loop_at_rest where there is an arm; one_camera and three_cameras, at rest."""
+        found = {"moving": self.moving, "at_rest": self.at_rest}
+        if self.plan.arm:
+            found["closed_loop_at_rest"] = Accuracy.of(self.found, self.found.cov(moving=False, loop=True))
+        others = {"one_camera": planned(self.plan, cameras=1), "three_cameras": planned(self.plan, cameras=3)}
+        return found | {name: Accuracy.of(each, each.cov(moving=False)) for name, each in others.items()}
+
+    @property
+    def mm(self) -> float:
+        """What 95 % of the errors in motion are within at the worst position."""
+        return self.moving.mm
+
+    @property
+    def deg(self) -> float:
+        """The same of rotations."""
+        return self.moving.deg
+
+    @cached_property
+    def causes(self) -> tuple[Cause, ...]:
+        """The causes, the costliest first."""
+        total, rows = self.moving.rms_m**2, []
+        for name in self.found.factors:
+            m, rad = self.found.rms(self.found.cov(of=name, loop=True))
+            kind = CAUSES[name]
+            halved = float(self.found.at_level(self.found.cov(scaled=name, by=0.5))[0].max())
+            share = 0.0 if kind.loop else m**2 / total
+            rows.append(Cause(name, m, rad, share, halved, kind.moving, kind.common, kind.loop))
+        return tuple(sorted(rows, key=lambda row: (-row.share, -row.rms_m)))
+
+    def worst_m(self, cause: str) -> float:
+        """Return what 95 % would be within at the worst position if a cause were alone."""
+        return float(self.found.at_level(self.found.cov(of=cause))[0].max())
+
+    @cached_property
+    def changes(self) -> tuple[Improvement, ...]:
+        """What would make it better in motion, the best of a price first."""
+        plan, found = self.plan, []
+        lens = {"focal_widths": plan.focal_px / plan.image_size_px[0]}  # it stays
+        tried = [(text, price, lens | change(plan)) for text, (price, change) in CHANGES.items()]
+        for name, each in catalogue().items():
+            if each.price > plan.cameras.price and not plan.rig:
+                tried.append((f"{name}: {each.text}", each.price, {**OF_CAMERA, "camera": name}))
+        for text, price, change in tried:
+            try:
+                after = planned(replace(plan, **change))  # type: ignore[arg-type]
+            except InputError:  # such a rig cannot be built
+                continue
+            m = float(after.at_level(after.cov())[0].max())
+            if m < (1 - WORTH) * self.moving.level_m:
+                found.append(Improvement(text, price, m))
+        return tuple(sorted(found, key=lambda one: (one.price, one.level_m)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``armsight budget --json`` prints, in m and rad."""
+        lateral, depth = self.found.along(self.found.cov())
+        return {
+            "plan": {each.name: getattr(self.plan, each.name) for each in self.plan.settings()},
+            "focal_px": self.plan.focal_px,
+            "results": {name: state._asdict() for name, state in self.states.items()},
+            "precision_rms_m": self.found.rms(self.found.cov(of="precision"))[0],
+            "trueness_rms_m": self.found.rms(self.found.cov(of="trueness"))[0],
+            "lateral_rms_m": lateral,
+            "depth_rms_m": depth,
+            "causes": [cause._asdict() for cause in self.causes],
+            "changes": [change._asdict() for change in self.changes],
+            "not_modelled": list(NOT_MODELLED),
+        }
+
+
+def budget(path: str = "", **plan: Any) -> RigBudget:  # noqa: ANN401
+    """Say what a rig will measure before it is bought, what limits it, and what would change it.
+
+    Args:
+        path: a plan file, or nothing.
+        plan: keys of a plan, as its file has them (:class:`~armsight.sim.budget.plan.RigPlan`); they replace the file's.
+
+    Raises:
+        InputError: an unknown key, a value that cannot be read, or a rig that cannot be built, with the nearest that can.
+    """
+    given = RigPlan.read(path, **plan)
+    return RigBudget(given, planned(given))

@@ -1,0 +1,89 @@
+"""A plan of a rig: what it says, the noise of its markers, its budget, and what cannot be built."""
+
+import numpy as np
+import pytest
+
+import armsight
+from armsight.errors import InputError
+from armsight.sim.budget.chart import marker_noise
+from armsight.sim.budget.plan import RigPlan, catalogue, planned
+from armsight.sim.camera.stages import CameraPipeline
+from armsight.vision.rig import StereoRig
+
+
+def test_a_file_says_the_same_as_options(tmp_path):
+    path = tmp_path / "plan.toml"
+    path.write_text('volume = "100x100x100mm"\ndistance = "70cm"\ncamera = "global-shutter-1mp"\npairs = 12\n')
+    by_file, by_option = (
+        RigPlan.read(str(path)),
+        RigPlan(volume="0.1x0.1x0.1m", distance="0.7m", camera="global-shutter-1mp", pairs=12),
+    )
+    np.testing.assert_allclose(planned(by_file).cov(), planned(by_option).cov())
+    path.write_text("pair = 12\n")
+    with pytest.raises(InputError, match="did you mean pairs"):
+        RigPlan.read(str(path))
+
+
+def test_noise_is_what_the_detector_shows():
+    # White noise alone: the fit's sigma falls as the rim grows, with the root of the diameter.
+    clean = CameraPipeline.load("clean")
+    small, large = marker_noise(clean, "disc", 9.0), marker_noise(clean, "disc", 36.0)
+    assert small / large == pytest.approx(2.0, rel=0.25)
+    assert marker_noise(CameraPipeline.load("cheap-webcam"), "disc", 16.0) > 5 * marker_noise(clean, "disc", 16.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"volume": "400x400x300m"}, "is it in mm"),
+        ({"volume": "0.4x0.4"}, "width x height x depth"),
+        ({"volume": "0.2x0.2x0.8m", "distance": "0.3m"}, "behind the cameras; a distance above 0.4 m"),
+        ({"distance": "800"}, "with its unit"),
+        ({"speed": "300m/s"}, "is it in mm/s"),
+        ({"want": "0.1"}, "expected"),
+        ({"camera": "webcam-720"}, "did you mean webcam-720p"),
+        ({"volume": "0.01x0.01x0.01m", "distance": "0.2m"}, "does not focus nearer than 0.3 m"),
+        ({"volume": "1x1x0.1m"}, "the field of view is"),
+        ({"volume": "0.1x0.1x0.1m", "verging_deg": 90.0}, "look past each other"),
+        ({"volume": "0.1x0.1x0.1m", "baseline": "3m"}, "the arm would cross it"),
+        ({"volume": "0.1x0.1x0.1m", "distance": "3m"}, "at least 8 are needed"),
+        ({"exposure_ms": 50.0}, "longer than a frame at 30 Hz"),
+        ({"camera": "machine-vision-5mp", "rate_hz": 60.0}, "one USB controller carries .* at 34.7 Hz at most"),
+        ({"volume": "0.1x0.1x0.1m", "pairs": 2}, "pairs is 2: expected 3 to 1000"),
+    ],
+)
+def test_what_cannot_be_built_is_rejected_with_the_nearest(given, message):
+    with pytest.raises(InputError, match=message) as said:
+        RigPlan(**given).check()
+    assert "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize("name", sorted(catalogue()))
+def test_every_class_can_be_built(name):
+    RigPlan(volume="0.05x0.05x0.05m", distance="0.8m", camera=name).check()
+
+
+def test_python_takes_the_keys_of_a_plan_file():
+    found = armsight.budget(volume="0.1x0.1x0.1m", distance="0.7m", camera="machine-vision-2mp", speed="0.2m/s")
+    assert found.mm > found.at_rest.mm > 0
+    assert found.deg > 0
+    assert repr(found).startswith(f"RigBudget({found.mm:.2g} mm, ")
+    assert found.to_dict()["results"]["moving"]["level_m"] == pytest.approx(1e-3 * found.mm)
+    assert [cause.share for cause in found.causes] == sorted((cause.share for cause in found.causes), reverse=True)
+    for change in found.changes:
+        assert change.level_m < found.moving.level_m
+    with pytest.raises(InputError, match="did you mean speed"):
+        armsight.budget(sped="0.2m/s")
+    with pytest.raises(InputError, match="pairs must be a whole number, got '20'"):
+        armsight.budget(pairs="20")
+
+
+def test_a_rig_that_there_is_has_its_own_calibration(tmp_path):
+    plan = RigPlan(volume="0.1x0.1x0.1m", speed="0m/s")
+    cov = plan.conditions().cov_calibration
+    StereoRig(*plan.stereo_rig.cameras, plan.stereo_rig.T_left_right, 4 * cov, 0.0).save(tmp_path / "rig.json")
+    (tmp_path / "plan.toml").write_text('volume = "0.1x0.1x0.1m"\nspeed = "0m/s"\nrig = "rig.json"\n')
+    twice, once = armsight.budget(str(tmp_path / "plan.toml")), planned(plan)
+    ratio = twice.found.rms(twice.found.cov(of="calibration"))[0] / once.rms(once.cov(of="calibration"))[0]
+    assert ratio == pytest.approx(2.0, rel=1e-6)
+    np.testing.assert_allclose(twice.found.cov(of="pixel noise"), once.cov(of="pixel noise"), rtol=1e-6)
