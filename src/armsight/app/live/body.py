@@ -6,6 +6,7 @@ session. What is checked is what ``armsight body check`` checks, with the sessio
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,12 +17,14 @@ from armsight.app.body.check import assess
 from armsight.app.body.draw import draw_body, is_board_spec
 from armsight.app.body.text import body_report
 from armsight.app.live.calibration import CalibrationStep
+from armsight.app.live.capture import LiveShot
 from armsight.app.live.guide import CalibrationAim
 from armsight.app.live.measuring import MeasureStep
 from armsight.app.live.records import asked
 from armsight.app.live.step import PageStep, S, Shared
 from armsight.errors import ArmsightError, InputError
-from armsight.vision.markers.board import open_board
+from armsight.vision.image import grey
+from armsight.vision.markers.board import BOARDS, board_in_view, open_board
 from armsight.vision.markers.body_layout import read_layout
 from armsight.vision.markers.targets import open_target
 from armsight.vision.pose.predict import plain_rig
@@ -29,6 +32,7 @@ from armsight.vision.rig import StereoRig
 
 _DISTANCES_M = (0.6, 0.8, 1.2)
 _BAR_MM = 100.0  # the bar on a drawing
+_LOOK_S = 2.0  # between two searches for an unknown board; half: one core is busy with it, double: a person waits
 
 
 class _Drawn(PageStep[S]):
@@ -55,6 +59,9 @@ class BoardChoice:
     points: int = 0
     drawing: str | None = None
     measured_mm: float | None = None  # length of the bar on the print; None where nobody measured it
+    seen: str = ""  # the board that both cameras show, with usual lengths; empty where none was recognised
+    used: bool = False  # it is the one in use
+    forms: tuple[str, ...] = tuple(form for form, _ in BOARDS.values())  # how boards are named
     command: str = ""  # the command line that draws it
 
 
@@ -64,6 +71,8 @@ class BoardStep(_Drawn[BoardChoice]):
     def __init__(self, shared: Shared, spec: str, changed: Callable[[StereoRig, Path], None]) -> None:
         super().__init__(shared, BoardChoice())
         self._changed = changed
+        self._named = shared.options.calibration_board is not None or shared.simulated is not None
+        self._last, self._looked_s = "", 0.0
         self.calibration = self._begin(spec, CalibrationAim())
 
     def _begin(self, spec: str, aim: CalibrationAim) -> CalibrationStep:
@@ -81,11 +90,35 @@ class BoardStep(_Drawn[BoardChoice]):
             raise InputError(
                 f"the bar on the print is {_BAR_MM:g} mm long by the drawing; {measured_mm:g} mm cannot be right"
             )
-        before = self.calibration
-        self.calibration = self._begin(scaled_spec(spec, measured_mm / _BAR_MM) if measured_mm else spec, before.aim)
-        before.close()
+        self._named = True
+        self._use(scaled_spec(spec, measured_mm / _BAR_MM) if measured_mm else spec)
         self.show(measured_mm=measured_mm or None)
         self.say("good", f"board: {board.body.name}")
+
+    def _use(self, spec: str) -> None:
+        before = self.calibration
+        self.calibration = self._begin(spec, before.aim)
+        before.close()
+
+    def look(self, live: LiveShot) -> None:
+        """Find out which board both cameras show, and use it where nobody named one. Called from one thread."""
+        images = live.shot.left, live.shot.right
+        if images[0] is None or images[1] is None or live.arrived_s - self._looked_s < _LOOK_S:
+            return
+        found = {
+            board and board.body.name for board in (board_in_view(grey(image)) for image in images if image is not None)
+        }
+        self._looked_s = time.monotonic()
+        seen = (found.pop() if len(found) == 1 else "") or ""
+        again, self._last = seen == self._last, seen
+        if not again:
+            return
+        if seen and not self._named and not _alike(seen, self.calibration.board.body.name):
+            self._use(seen)
+            self.say(
+                "hint", f"{seen} is in view and used; its lengths cannot be seen: measure a square, and correct them"
+            )
+        self.show(seen=seen, used=_alike(seen, self.calibration.board.body.name))
 
     @asked("board")
     def draw_board(self, paper: str = "a4") -> None:
@@ -96,6 +129,12 @@ class BoardStep(_Drawn[BoardChoice]):
         """End the threads."""
         super().close()
         self.calibration.close()
+
+
+def _alike(spec: str, other: str) -> bool:
+    """Return whether two boards are of one kind and have as many points along their sides."""
+    (kind, counts), (other_kind, other_counts) = ((*each.split(":"), "")[:2] for each in (spec, other))
+    return kind == other_kind and sorted(counts.split("x")) == sorted(other_counts.split("x"))
 
 
 def scaled_spec(spec: str, factor: float) -> str:

@@ -241,7 +241,9 @@ class LiveSession:
                 if self.cameras.look(live, chosen=self._step == "cameras"):
                     self.between_shots()
                     self.cameras.look_well(live)
-                if self._step == "calibrate":
+                if self._step == "board":
+                    self.board.look(live)
+                elif self._step == "calibrate":
                     self.calibration.look(live)
                 elif not self.arm.busy and self._step in ("measure", "arm", "health"):
                     self.measuring.look(live)

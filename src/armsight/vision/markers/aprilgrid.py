@@ -8,12 +8,13 @@ part of the board is enough.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.vision.markers.aruco import cells, family_size, find_squares
@@ -24,6 +25,12 @@ from armsight.vision.markers.square import SquareFit, fit_square
 FAMILY = "tag36h11"
 #: Widths of the dark border, cells, in the order they are tried: Kalibr's own, then that of single AprilTags.
 BORDERS = (2, 1)
+#: Fewest tags of a grid of unknown size; half: four tags of several grids fit, double: small grids are not named.
+_LEAST_TAGS = 4
+#: The gap from which that of a grid of unknown size is fitted; half, double: outlines that were missed are predicted worse.
+_USUAL_SPACING = 0.3
+#: Tags of a grid lie so near to its steps, in these; half: wide lenses bend it more, double: other columns nearly fit.
+_OFF_GRID = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +59,31 @@ class AprilGrid(Record, CalibrationBoard):
         columns, rows = fields.counts(0, least=1)
         tag_m, spacing = fields.length_m(1), fields.ratio(2)
         return AprilGrid(columns, rows, tag_m, spacing, fields.first(columns * rows, FAMILY, family_size(FAMILY)))
+
+    @staticmethod
+    def in_view(image: NDArray[np.uint8], tag_m: float) -> AprilGrid | None:
+        """Return the grid that a grey image shows whole, its first tag 0; None where there is none.
+
+        Columns and gap are those with which the tags lie on a plane.
+        """
+        found = max((find_squares(image, FAMILY, border) for border in BORDERS), key=len)
+        if len(found) < _LEAST_TAGS:
+            return None
+        ids, middles = np.array([each for each, _ in found]), np.array([uv.mean(axis=0) for _, uv in found])
+        count, fitting = int(ids.max()) + 1, []
+        for columns in (c for c in range(2, count // 2 + 1) if count % c == 0):
+            steps = np.stack([ids % columns, ids // columns], axis=1).astype(float)
+            fitting.append((_off_plane(steps, middles), columns))
+        off, columns = min(fitting, default=(np.inf, 1))
+        if off > _OFF_GRID:
+            return None
+        board = AprilGrid(columns, count // columns, tag_m, _USUAL_SPACING)
+        seen = board.detect(image)
+
+        def error(spacing: float) -> float:
+            return _off_plane(replace(board, spacing=spacing).body.points[seen.ids, :2] / tag_m, seen.uv)
+
+        return replace(board, spacing=round(float(minimize_scalar(error, bounds=(0.05, 1.0)).x), 2))
 
     @property
     def y_up(self) -> bool:
@@ -137,3 +169,12 @@ class AprilGrid(Record, CalibrationBoard):
         low = 2 * row * 2 * self.columns + 2 * column
         high = low + 2 * self.columns
         return np.array([high, high + 1, low + 1, low])
+
+
+def _off_plane(xy: Array, uv: Array) -> float:
+    """Return by how much points uv (N, 2), px, are off those of a plane, xy (N, 2), RMS in its units."""
+    H, _ = cv2.findHomography(uv, xy)
+    if H is None:
+        return np.inf
+    off = cv2.perspectiveTransform(uv[None].astype(np.float64), H)[0] - xy
+    return float(np.sqrt(np.mean(off**2)))

@@ -15,6 +15,7 @@ from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.chessboard import Chessboard
 from armsight.vision.markers.circles import CircleGrid
+from armsight.vision.markers.disc.search import Grey
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.markers.spec import Fields
 
@@ -27,6 +28,16 @@ BOARDS: dict[str, tuple[str, Callable[[Fields], CalibrationBoard]]] = {
     "aprilgrid": (AprilGrid.form, AprilGrid.from_fields),
 }
 
+#: Boards in an image of which nothing is known: how each kind is looked for, tags first, since they hide in no other kind;
+#: and its side of a square or tag, or its pitch, m, which no image shows.
+IN_VIEW: tuple[tuple[Callable[[Grey, float], CalibrationBoard | None], float], ...] = (
+    (AprilGrid.in_view, 0.088),
+    (Charuco.in_view, 0.020),
+    (CircleGrid.in_view, 0.020),
+    (Chessboard.in_view, 0.020),
+)
+WHOLE = 0.8  # share of its points that a named board shows; half: a part passes for a board, double: a glint hides it
+
 #: Suffixes of Kalibr's target files.
 KALIBR = (".yaml", ".yml")
 #: Kalibr's target_type -> the kind here, and its keys: columns, rows, lengths, m.
@@ -35,6 +46,18 @@ _TARGETS: dict[str, tuple[str, tuple[str, ...]]] = {
     "checkerboard": ("chessboard", ("targetCols", "targetRows", "rowSpacingMeters", "colSpacingMeters")),
     "circlegrid": ("circles", ("targetCols", "targetRows", "spacingMeters")),
 }
+
+
+def board_in_view(image: Grey) -> CalibrationBoard | None:
+    """Return the board that a grey image (H, W) shows whole, its kind and counts; its lengths are usual ones.
+
+    What a kind takes it for is looked for as such a board; None where none is found with nearly all of its points.
+    """
+    for look, length_m in IN_VIEW:
+        board = look(image, length_m)
+        if board is not None and len(board.detect(image).ids) >= WHOLE * len(board.body.points):
+            return board
+    return None
 
 
 def kalibr_spec(path: str) -> str:

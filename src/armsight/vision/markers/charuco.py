@@ -41,6 +41,9 @@ _SIDE_SHARE, _SIDE_PX, _SIDE_OFF = 0.08, 1.5, 2.0
 #: So far outside and inside of its outline, share of its side and px, a marker's grey differs by more than this share of
 #: the range within it.
 _GAP_SHARE, _GAP_PX, _STEP = 0.04, 1.5, 0.4
+#: Families of unknown boards, by their markers' cells, each with the sizes of its dictionaries, which begin alike.
+_USUAL = {f"DICT_{cells}_": (50, 100, 250, 1000) for cells in ("4X4", "5X5", "6X6", "7X7")}
+_TO_M = 5e-4  # m; sides of unknown markers are given to this; half: digits that mean nothing, double: too coarse
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +81,31 @@ class Charuco(Record, CalibrationBoard):
             raise fields.error(f"has an {error}") from None
         first = fields.first(columns * rows // 2, family, family_size(family))
         return Charuco(columns, rows, square_m, marker_m, family, first)
+
+    @staticmethod
+    def in_view(image: NDArray[np.uint8], square_m: float) -> Charuco | None:
+        """Return the board of the usual families that a grey image shows whole, its first marker 0; None without one.
+
+        The markers' ids give the number of squares, where they lie the columns, and their sides in squares their own.
+        """
+        seen = {name: detect_markers(image, f"{name}{sizes[-2]}") for name, sizes in _USUAL.items()}
+        name = max(seen, key=lambda name: len(seen[name][0]))
+        corners, identities = np.reshape(seen[name][0], (-1, 4, 2)).astype(float), seen[name][1]
+        if len(corners) < _NEIGHBOURS:
+            return None
+        count, outlined = int(identities.max()) + 1, _outlined(image, corners)
+        family = next(f"{name}{size}" for size in _USUAL[name] if count <= size)
+        fitting: list[tuple[float, float, Charuco]] = []
+        for squares in (2 * count, 2 * count + 1):
+            for columns in (c for c in range(3, squares // 3 + 1) if squares % c == 0):
+                board = Charuco(columns, squares // columns, square_m, 0.75 * square_m, family)
+                off, side_m, _ = min(board._sides(corners, outlined, identities, legacy) for legacy in (False, True))
+                fitting.append((off, side_m, board))
+        if not fitting or min(fitting, key=lambda each: each[0])[0] > _OFF:
+            return None
+        _, side_m, board = min(fitting, key=lambda each: each[0])
+        marker_m = round(side_m / _TO_M) * _TO_M if np.isfinite(side_m) else board.marker_m
+        return replace(board, marker_m=min(marker_m, square_m - _TO_M))
 
     @property
     def codes(self) -> tuple[str, range]:

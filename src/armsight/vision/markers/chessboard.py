@@ -107,15 +107,23 @@ class Chessboard(Record, CalibrationBoard):
         kept = kept[order]
         return Detections(np.flatnonzero(kept), fits.uv[order][kept], fits.cov_uv[order][kept])
 
-    def _other_size(self, image: NDArray[np.uint8]) -> str:
-        """Return ", but corners of 8x6: ..." where an image shows a chessboard of another size or a part of one."""
+    @staticmethod
+    def in_view(image: NDArray[np.uint8], square_m: float) -> Chessboard | None:
+        """Return the chessboard that a grey image shows, or a part of it; None where there is none."""
         if min(image.shape) < IMAGE_SIDE_MIN_PX:
-            return ""
+            return None
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
         found, _, meta = cv2.findChessboardCornersSBWithMeta(_search_copy(image)[0], (3, 3), flags=flags)
-        if not found or min(meta.shape) < OTHER_SIDE_MIN or sorted(meta.shape) == sorted((self.columns, self.rows)):
+        if not found or min(meta.shape) < OTHER_SIDE_MIN:
+            return None
+        return Chessboard(max(meta.shape), min(meta.shape), square_m)
+
+    def _other_size(self, image: NDArray[np.uint8]) -> str:
+        """Return ", but corners of 8x6: ..." where an image shows a chessboard of another size or a part of one."""
+        other = self.in_view(image, self.square_m)
+        if other is None or {other.columns, other.rows} == {self.columns, self.rows}:
             return ""
-        return f", but corners of {max(meta.shape)}x{min(meta.shape)}: a board of that size, or not the whole board"
+        return f", but corners of {other.columns}x{other.rows}: a board of that size, or not the whole board"
 
     @cached_property
     def _parity(self) -> Array:

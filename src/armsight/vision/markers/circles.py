@@ -57,6 +57,11 @@ _LOST_CONTRAST, _COMPLETED = 0.4, 2
 _ODD_OUTLINE, _ODD_FIT = 1.3, 1.7
 #: How far an outline may be from where its neighbours put it, in radii.
 _DISPLACED = 0.35
+#: Halfway to the next disc a grid's grey differs from that between four by less than this share of a disc's contrast, at a
+#: chessboard's corner by half; half: blurred discs are no grid, double: chessboards are.
+_CORNER = 0.25
+#: Whether a grid is staggered -> columns and rows as OpenCV's documentation has them: the reading nearest to them is taken.
+_USUAL = {False: (7, 6), True: (4, 11)}
 #: Images from which on a row that is in none of them is said.
 _IMAGES = 3
 #: Whether discs are light -> how the spec says so.
@@ -97,6 +102,21 @@ class CircleGrid(Record, CalibrationBoard):
     def staggered_from_fields(fields: Fields) -> CircleGrid:
         """Build the staggered grid a spec names."""
         return _from_fields(fields, staggered=True)
+
+    @staticmethod
+    def in_view(image: Grey, pitch_m: float) -> CircleGrid | None:
+        """Return the grid of discs that a grey image shows whole, square or staggered; None where there is none."""
+        best: list[tuple[int, CircleGrid]] = []
+        for sign, blobs in zip((-1, 1), find_blobs(image, True, True), strict=True):
+            for grid in grow_lattices(blobs, len(blobs.theta))[:_GRIDS]:
+                size = (image.shape[1], image.shape[0])
+                cells, theta, _ = _completed(image, grid.cells, blobs.theta[grid.blobs], sign, size, rings=False)
+                if not _are_apart(image, cells, theta[:, :2]):
+                    continue
+                for staggered, like in _USUAL.items():
+                    if (shown := shown_size(cells, staggered=staggered, like=like)) is not None and min(shown) >= 3:
+                        best.append((len(cells), CircleGrid(*shown, pitch_m, staggered)))
+        return max(best, key=lambda each: each[0], default=(0, None))[1]
 
     @cached_property
     def spec(self) -> str:
@@ -276,6 +296,27 @@ def _completed(
         cells, theta = np.concatenate([cells, more[found]]), np.concatenate([theta, like[found]])
         contrast, hollow = np.concatenate([contrast, there[found]]), np.concatenate([hollow, ring[found]])
     return cells, theta, hollow
+
+
+def _are_apart(image: Grey, cells: Ids, uv: Array) -> bool:
+    """Return whether what lies at the cells (N, 2) of a lattice, at uv (N, 2), px, are discs: a chessboard's squares touch.
+
+    Halfway to the next disc a grid of discs is as between four of them; a chessboard has a corner there.
+    """
+    at = positions(cells, uv)
+    squares = [
+        (p, at[x + 1, y], at[x, y + 1], at[x + 1, y + 1])
+        for (x, y), p in at.items()
+        if {(x + 1, y), (x, y + 1), (x + 1, y + 1)} <= at.keys()
+    ]
+    if not squares:
+        return False
+    corner, beside, *_ = corners = np.array(squares).T
+    grey = [
+        float(np.median(image[np.rint(p.imag).astype(int), np.rint(p.real).astype(int)]))
+        for p in (corner, (corner + beside) / 2, np.mean(corners, axis=0))
+    ]
+    return abs(grey[1] - grey[2]) < _CORNER * abs(grey[0] - grey[2])
 
 
 def _displaced(cells: Ids, theta: Array) -> NDArray[np.bool_]:
