@@ -153,14 +153,15 @@ def test_a_calibration_that_is_good_enough_ends_once_by_itself(tmp_path, monkeyp
     step = CalibrationStep(shared, "chessboard:9x6:25mm", CalibrationAim(2e-4, 0.8))
     monkeypatch.setattr(step, "finish_calibration", lambda: (finished.append(1), step.show(running=False)))
     good = False
-    monkeypatch.setattr(step, "fit", lambda: step.show(good=good))
+    monkeypatch.setattr(step, "fit", lambda: step.show(good=good, goal_mm=0.2))
     try:
         step.start()
         step._fit()
         assert step.shown.running
         good = True
         step._fit()
-        assert (len(finished), said) == (1, ["good enough for 0.2 mm: finished; Continue takes more shots"])
+        assert (len(finished), said) == (1, ["good enough for 0.2 mm: finished; Go on takes more shots"])
+        assert (step.state.ended, step.state.instruction) == (True, "Good enough. Finish, or go on?")
         step.start()  # a person goes on
         step._fit()
         assert step.shown.running

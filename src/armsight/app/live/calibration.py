@@ -51,7 +51,7 @@ _WORTH, _OTHER_SHARE = 0.5, 0.06
 #: second another pose is chosen.
 _PATIENT_S, _PATIENT_WORTH, _OTHER_POSE_S = 3.0, 0.15, 6.0
 #: First fit, fewest shots of a calibration that is called good, and folds while shots are still taken.
-FIRST_FIT, LEAST_SHOTS, _FOLDS = 4, 8, 5
+FIRST_FIT, LEAST_SHOTS, _FOLDS = 4, 12, 5
 #: Lens models while shots are still taken: all are tried at the end.
 _QUICK_MODELS = ("brown5",)
 #: Columns and rows of the cells in which coverage is counted.
@@ -61,6 +61,7 @@ _QUICK_SIDE_PX, _QUICKER_SIDE_PX, _THOROUGH_S = 640, 360, 2.0
 _DRAWN_STILL = 0.15
 _GONE_S = 1.0
 _SHOW, _GOOD = "Hold the board so that both cameras see all of it.", "Good."
+_ASKS = "Good enough. Finish, or go on?"
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 
@@ -88,7 +89,9 @@ class CalibrationState(GuidedState):
     edge_px: float | None = None  # edge spread of the board
     coverage: tuple[tuple[tuple[int, ...], ...], ...] = ()  # each camera, rows of cells: shots with the board in it
     missing_shots: int | None = None  # predicted number of guided shots until the aim is reached
-    aim_mm: float = 0.2
+    ended: bool = False  # good enough, it ended by itself: a person says whether to go on
+    aim_mm: float = 0.0  # what was asked for; 0: as small as a point's own noise
+    goal_mm: float = 0.0  # the predicted error that is good enough; 0 before the first fit
     distance_m: float = 0.8
     advice: tuple[str, ...] = ()  # what is weak in the written calibration, and what to do about it
     rig: str | None = None  # the written file
@@ -161,7 +164,7 @@ class CalibrationStep(Guided[CalibrationState]):
 
     def start(self) -> None:
         """Take shots from now on."""
-        self.show(running=True, instruction=_SHOW)
+        self.show(running=True, ended=False, instruction=_SHOW)
 
     @asked("calibration")
     def pause_calibration(self) -> None:
@@ -177,9 +180,11 @@ class CalibrationStep(Guided[CalibrationState]):
 
     @asked("calibration")
     def set_aim(self, error_mm: float, distance_m: float) -> None:
-        """Say what the calibration is to be good for."""
-        if not (0.0 < error_mm < 1e3 and 0.05 <= distance_m <= 20.0):
-            raise InputError("the aim must be an error above 0 mm, and a distance from 0.05 to 20 m")
+        """Say what the calibration is to be good for; ``error_mm`` 0: for errors as small as a point's own noise."""
+        if not (0.0 <= error_mm < 1e3 and 0.05 <= distance_m <= 20.0):
+            raise InputError(
+                "the aim must be an error in mm, 0 for that of the images' noise, and a distance from 0.05 to 20 m"
+            )
         with self.lock:
             self.aim, self._ended = CalibrationAim(1e-3 * error_mm, distance_m), False
             if self._result is not None:
@@ -325,7 +330,7 @@ class CalibrationStep(Guided[CalibrationState]):
         """Choose the next pose; before the first fit by the cameras that a pair lets guess."""
         if self._knowledge is not None and self._rig is not None:
             self._next = self._guide.best(self._knowledge, self._rig)
-            self.show(missing_shots=self._guide.shots_missing(self._knowledge, self._rig, self.aim))
+            self.show(missing_shots=self._guide.shots_missing(self._knowledge, self._rig))
             return
         if pair is not None and self._sizes is not None:
             seen = zip((pair.left, pair.right), map(guessed_camera, self._sizes), strict=True)
@@ -356,8 +361,9 @@ class CalibrationStep(Guided[CalibrationState]):
             shown = self.shown
             if shown.good and shown.running and shown.fitting is None and not self._ended:
                 self._ended = True
-                self.say("good", f"good enough for {1e3 * self.aim.error_m:g} mm: finished; Continue takes more shots")
+                self.say("good", f"good enough for {shown.goal_mm:.2g} mm: finished; Go on takes more shots")
                 self.finish_calibration()
+                self.show(ended=True, instruction=_ASKS)
 
     def fit(self) -> None:
         """Fit the shots so far, if there are enough, and choose the next pose."""
@@ -384,18 +390,17 @@ class CalibrationStep(Guided[CalibrationState]):
             if rejected.pair not in self._left_out:
                 self.say("warn", f"shot {rejected.pair} is left out: {rejected.reason}")
                 self._left_out[rejected.pair] = rejected.reason
-        missing = self._lacking(result, error_m)
-        self.show(missing=missing, good=not missing)
+        missing = self._lacking(result, error_m, self._knowledge.goal_m)
+        self.show(missing=missing, good=not missing, goal_mm=1e3 * self._knowledge.goal_m)
 
-    def _lacking(self, result: Calibration, error_m: float) -> tuple[str, ...]:
+    def _lacking(self, result: Calibration, error_m: float, goal_m: float) -> tuple[str, ...]:
         """Return what is missing until the calibration is good enough, line by line."""
         lines = []
         if len(result.pairs) < LEAST_SHOTS:
             lines.append(f"{_more(LEAST_SHOTS - len(result.pairs))}, so that the held-out errors mean something")
-        if error_m > self.aim.error_m:
-            lines.append(
-                f"predicted error {1e3 * error_m:.2g} mm, {1e3 * self.aim.error_m:g} mm is the aim: more shots"
-            )
+        if error_m > goal_m:
+            why = "is the aim" if self.aim.error_m else "a point has by the images' noise"
+            lines.append(f"predicted error {1e3 * error_m:.2g} mm, {1e3 * goal_m:.2g} mm {why}: more shots")
         lines += [f"{row.name} {row.heldout}: {row.advice}" for row in graded_metrics(result) if row.grade == "poor"]
         return tuple(lines)
 
@@ -432,7 +437,7 @@ class CalibrationStep(Guided[CalibrationState]):
             self.shown,
             shots=tuple(self._shots),
             left_out=tuple(f"shot {name}: {reason}" for name, reason in self._left_out.items()),
-            instruction=self.shown.instruction if self.shown.running else "",
+            instruction=self.shown.instruction if self.shown.running or self.shown.ended else "",
             still=still,
             coverage=() if self._sizes is None else self._coverage(self._sizes),
             aim_mm=1e3 * self.aim.error_m,

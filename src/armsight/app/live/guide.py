@@ -44,7 +44,9 @@ _SHOTS_AHEAD = 12
 class CalibrationAim:
     """What a calibration is to be good for."""
 
-    error_m: float = 2e-4  # predicted error that it may leave in a point, RMS over the working volume
+    error_m: float = (
+        0.0  # predicted error that it may leave in a point, RMS over the working volume; 0: the point's noise
+    )
     distance_m: float = 0.8  # of the volume's middle; it reaches a quarter nearer and farther
 
 
@@ -77,6 +79,16 @@ def error_weights(rig: StereoRig, points: Array) -> Array:
     return np.asarray(flat.T @ flat / max(len(by_rig), 1))
 
 
+def noise_m(rig: StereoRig, points: Array, variance_px2: Array) -> float:
+    """Return the RMS error of points (N, 3) by the noise of one detection in each view alone, m.
+
+    A calibration that leaves less changes a measurement little; ``variance_px2`` (2,) is that of a detection, px^2.
+    """
+    cov_uv = np.broadcast_to(variance_px2[:, None, None] * np.eye(2), (len(points), 2, 2, 2))
+    cov = optimal_points(rig, np.stack(rig.project(points), axis=1), cov_uv)[1]
+    return float(np.sqrt(np.nanmean(np.trace(cov, axis1=1, axis2=2))))
+
+
 @dataclass(frozen=True, eq=False)
 class Knowledge(Record):
     """What the shots so far determine about the Q shared parameters of bundle adjustment."""
@@ -86,6 +98,7 @@ class Knowledge(Record):
     root: Array  # (Q, Q) L of the covariance L L^T
     sigma_px: float  # of a detection
     weights: Array  # (P, P) as error_weights
+    goal_m: float  # the predicted error that is good enough
 
     @staticmethod
     def of(calibration: Calibration, board: CalibrationBoard, aim: CalibrationAim) -> Knowledge:
@@ -97,10 +110,11 @@ class Knowledge(Record):
         size = np.sqrt(np.maximum(np.diag(cov), 1e-300))
         values, vectors = np.linalg.eigh(cov / size / size[:, None])
         root = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-        sigma = float(np.sqrt(corner_variance_px2(calibration).mean()))
-        weights = error_weights(calibration.rig, working_points(calibration.rig, aim.distance_m))
+        variance, points = corner_variance_px2(calibration), working_points(calibration.rig, aim.distance_m)
+        goal_m = aim.error_m or noise_m(calibration.rig, points, variance)
         bare = replace(state, Ts_left_body=np.zeros((0, 4, 4)), motions=np.zeros((0, 6)))
-        return Knowledge(model, bare, root, sigma, weights)
+        weights = error_weights(calibration.rig, points)
+        return Knowledge(model, bare, root, float(np.sqrt(variance.mean())), weights, goal_m)
 
     @property
     def error_m(self) -> float:
@@ -205,11 +219,11 @@ class Guide:
         k = int(np.nanargmin(errors))
         return NextPose(Ts[k], float(errors[k]))
 
-    def shots_missing(self, knowledge: Knowledge, rig: StereoRig, aim: CalibrationAim) -> int | None:
-        """Return how many more guided shots are predicted to reach the aim; None where more than a dozen."""
+    def shots_missing(self, knowledge: Knowledge, rig: StereoRig) -> int | None:
+        """Return how many more guided shots are predicted to reach the goal; None where more than a dozen."""
         Ts = self.candidates(rig, CANDIDATES // 4)
         for count in range(_SHOTS_AHEAD + 1):
-            if knowledge.error_m <= aim.error_m:
+            if knowledge.error_m <= knowledge.goal_m:
                 return count
             if not len(Ts):
                 break
