@@ -308,6 +308,20 @@ class SeenPose(Record):
 
 
 @dataclass(frozen=True, eq=False)
+class ExposureErrors(Record):
+    """What is not known of when a shot's N detections were exposed, where they were moved to its time.
+
+    Attributes:
+        own: (N, 2, 6, K) by how much the body is displaced at each, left and right, by one sigma of K errors that the shot
+            has of its own: right tangent [m; rad]; zero where nothing was detected.
+        cov_shared: (2, 2) covariance of skew and readout, s^2, which all shots share.
+    """
+
+    own: Array
+    cov_shared: Array
+
+
+@dataclass(frozen=True, eq=False)
 class PoseEstimate(SeenPose):
     """Where a body is.
 
@@ -322,6 +336,7 @@ class PoseEstimate(SeenPose):
             they are within chance.
         points: the triangulated points that went in.
         dropped: what was thrown away, and why.
+        exposures: what is not known of the times of its detections; None where all count as exposed at one time.
     """
 
     T_left_body: Array
@@ -332,6 +347,7 @@ class PoseEstimate(SeenPose):
     misfit: float
     points: Points
     dropped: tuple[Dropped, ...] = ()
+    exposures: ExposureErrors | None = None
 
     @property
     def cov_left(self) -> Array:

@@ -111,13 +111,15 @@ def watched_body(
     lens=None,
     shift=0.0,
     nod=None,
+    measure=None,
 ):
     """Watch a body that moves and rests; yield the monitor, the time, the true pose, and what it returned for each shot.
 
     From ``at_s`` on cameras and points of the body are displaced, the right camera exposes late by ``skew_s`` (or that of
-    the number of the shot, s) and each row of it by ``row_s`` later than the one above, and focal lengths change by a share
-    of themselves, ``focal`` of the time since then, left and right. ``nod``: of a side, its camera rotates about its own
-    axes by (side, amplitude (3,), rad, frequency, Hz).
+    the number of the shot, s) and each row of it (of both, where two are given) by ``row_s`` later than the one above,
+    and focal lengths change by a share of themselves, ``focal`` of the time since then, left and right. ``nod``: of a side,
+    its camera rotates about its own axes by (side, amplitude (3,), rad, frequency, Hz). ``measure``: returns the pose of a
+    shot at a time, s, from rig, body, pixels and the true pose as a function of time; as by simultaneous cameras if None.
     """
     rng = np.random.default_rng(seed)
     if lens is None:
@@ -154,17 +156,20 @@ def watched_body(
             frame_of = [np.eye(4), inverse(true.T_left_right)][side] @ T
             at = (there @ frame_of[:3, :3].T + frame_of[:3, 3]) @ by.T
             uv[:, side] = true.cameras[side].project(at)
-        if row_s and on:
-            for n, row in enumerate(uv[:, 1, 1] - TRUE.right.image_size_px[1] / 2):
-                rolled = body_at(t + late_s + row_s * row)
-                uv[n, 1] = both_pixels(true, (there @ rolled[:3, :3].T + rolled[:3, 3])[n : n + 1])[0, 1]
+        for side, each_s in enumerate(np.broadcast_to(row_s, 2) * ([1, 1] if np.ndim(row_s) else [0, 1]) * on):
+            for n, row in enumerate(uv[:, side, 1] + 0.5 - TRUE.right.image_size_px[1] / 2 if each_s else ()):
+                rolled = body_at(t + side * late_s + each_s * row)
+                uv[n, side] = both_pixels(true, (there @ rolled[:3, :3].T + rolled[:3, 3])[n : n + 1])[0, side]
         if focal is not None and on:
             for side, share in enumerate(focal(t - at_s)):
                 middle = TRUE.cameras[side].intrinsics[2:]
                 uv[:, side] = middle + (1.0 + share) * (uv[:, side] - middle)
         if lens is not None:
             uv = np.stack([lens(side, uv[:, side]) for side in range(2)], axis=1)
-        estimate = measured(given, body, frame @ T, uv + SIGMA_PX * rng.normal(size=uv.shape))
+        noisy = uv + SIGMA_PX * rng.normal(size=uv.shape)
+        estimate = (
+            measured(given, body, frame @ T, noisy) if measure is None else measure(given, body, t, noisy, body_at)
+        )
         yield monitor, t, frame @ T, estimate, monitor.measured(estimate, t)
 
 

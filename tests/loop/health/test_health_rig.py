@@ -8,6 +8,7 @@ import pytest
 from faults import BODY, SIGMAS, SYNC_S, TRUE, ended, ripple, watched_body
 from numpy.polynomial.chebyshev import chebval
 
+from armsight.data import ExposureErrors
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.health import HealthMonitor, Trust
 from armsight.loop.health.rig import RigWatch
@@ -136,10 +137,17 @@ def test_the_estimate_is_what_dense_least_squares_gives():
     assert found.f == pytest.approx(both[size:], rel=1e-3, abs=1e-6)
 
 
-def test_the_compiled_rows_of_a_shot_are_those_of_a_dense_elimination():
-    """Pose and own skew as parameters of the normal equations, the skew with its prior; polynomials by numpy."""
+@pytest.mark.parametrize("moved", [False, True])
+def test_the_rows_of_a_shot_are_those_of_a_dense_elimination(moved):
+    """Pose free, unknown times in the covariance of the noise; polynomials by numpy.
+
+    What is unknown is the skew, or errors of each exposure where detections were moved to one time.
+    """
     rig = replace(TRUE, cov=np.diag(SIGMAS**2), sigma_px=0.02)
     (_, t, _, before, _), (_, now_s, _, estimate, _) = list(islice(watched_body(9), 0, 6, 5))
+    own = 1e-4 * np.random.default_rng(9).normal(size=(len(BODY.points), 2, 6, 7))
+    if moved:
+        estimate = replace(estimate, exposures=ExposureErrors(own, np.zeros((2, 2))))
     watch = RigWatch(rig, replace(BODY, points=np.asfortranarray(BODY.points)), sync_s := 2e-3)
     watch.take(before, t)
     found, velocity = watch._residuals(estimate, now_s), watch._velocity(estimate.T_left_body, now_s)
@@ -151,16 +159,19 @@ def test_the_compiled_rows_of_a_shot_are_those_of_a_dense_elimination():
     dense[:, 1 : 1 + P] = B
     dense[:, 1 + P] = np.einsum("nij,nj->ni", A[:, :3].reshape(-1, 2, 3), points[seen.point]).ravel()
     dense[:, watch._size] = A @ velocity * np.repeat(seen.camera, 2)
+    heights = np.array([camera.image_size_px[1] for camera in rig.cameras])[seen.camera]
+    dense[:, watch._size - 1] = A @ velocity * np.repeat((seen.uv[:, 1] + 0.5) / heights - 0.5, 2)
     for k, (side, point) in enumerate(zip(seen.camera, seen.point, strict=True)):
         dense[2 * k : 2 * k + 2, 2 + P + 3 * point :][:, :3] = A[2 * k : 2 * k + 2, :3]
         x, y = 2.0 * (seen.uv[k] + 0.5) / rig.cameras[side].image_size_px - 1.0
         each = [chebval(x, np.eye(5)[i]) * chebval(y, np.eye(5)[j]) for i in range(5) for j in range(5 - i)]
         for axis in range(2):
             dense[2 * k : 2 * k + 2, watch._size + 1 + 15 * (2 * side + axis) :][:, :15] = np.outer(W[k, :, axis], each)
-    first = np.column_stack([A, sync_s * dense[:, watch._size]])
-    prior = np.diag([0.0] * 6 + [1.0])
-    cross = first.T @ dense
-    expected = dense.T @ dense - cross.T @ np.linalg.solve(first.T @ first + prior, cross)
+    errors = sync_s * dense[:, watch._size, None]
+    if moved:
+        errors = np.concatenate([A[2 * k : 2 * k + 2] @ own[k // 2, k % 2] for k in range(len(A) // 2)])
+    V = np.linalg.inv(np.eye(len(A)) + errors @ errors.T)
+    expected = dense.T @ (V - V @ A @ np.linalg.solve(A.T @ V @ A, A.T @ V)) @ dense
     scale = np.sqrt(np.outer(*2 * [np.diag(dense.T @ dense) + 1e-12]))
     assert found.rows.T @ found.rows / scale == pytest.approx(expected / scale, abs=1e-9)
     assert found.response == pytest.approx(-np.linalg.solve(A.T @ A, A.T @ dense[:, 1:]), rel=1e-6, abs=1e-12)

@@ -100,6 +100,19 @@ def velocity(before: Array, after: Array, seconds: float) -> Array:
     return np.asarray(np.concatenate([shift, rotation]) / seconds)
 
 
+def moved_by(A: Array, own: Array) -> Array:
+    """Return what (4 N, K) errors of exposures (N, 2, 6, K) do to residuals of derivatives A (4 N, 6) by the pose."""
+    return np.asarray(A.reshape(-1, 2, 2, 6) @ own).reshape(len(A), -1)
+
+
+def noisier(rows: Array, J: Array) -> Array:
+    """Return rows (n, M) with more errors in their noise, J (n, K) by a sigma each: (I + J J^T)^-1/2 times them."""
+    squares, axes = np.linalg.eigh(J.T @ J)
+    squares = np.maximum(squares, 1e-12)
+    J = J @ axes
+    return np.asarray(rows - J @ (((1.0 - 1.0 / np.sqrt(1.0 + squares)) / squares)[:, None] * (J.T @ rows)))
+
+
 class ExposedShot(NamedTuple):
     """By how much the times of exposure move the residuals of a shot.
 
@@ -108,15 +121,18 @@ class ExposedShot(NamedTuple):
             right one, point by point.
         roll: (n,) the row of the image, from -1 at its top to 1.
         track: times, s, and poses T_left_body (4, 4) of the newest shots up to this one.
+        own: (n, K) what is not known of these times, where the detections were moved to one, does to the residuals, by a
+            sigma each; K is 0 else.
     """
 
     A: Array
     roll: Array
     track: tuple[tuple[float, Array], ...]
+    own: Array
 
     def of(self, rows: NDArray[np.bool_]) -> ExposedShot:
         """Return that of some rows."""
-        return self._replace(A=self.A[rows], roll=self.roll[rows])
+        return self._replace(A=self.A[rows], roll=self.roll[rows], own=self.own[rows])
 
     def motion(self) -> tuple[Array, Array]:
         """Return velocity and acceleration (6,) of the body in its axes, 1/s and 1/s^2; zero where they are unknown.
@@ -144,10 +160,14 @@ class ExposedShot(NamedTuple):
         skew, bent = by_right @ along, _BENT_S * (by_right @ acceleration)
         return np.column_stack([skew, _UNKNOWN_SHARE * speeds * by_right, rolled * right, rolled * ~right, bent])
 
-    def without_pose(self) -> Array:
-        """Return the same (n, 10) with the pose eliminated."""
-        Q, moved = np.linalg.qr(self.A)[0], self.moved()
+    def without_pose(self, moved: Array) -> Array:
+        """Return what moves the residuals (n, K) with the pose eliminated."""
+        Q = np.linalg.qr(self.A)[0]
         return np.asarray(moved - Q @ (Q.T @ moved))
+
+    def whitened(self) -> Array:
+        """Return the same (n, 10) with the pose eliminated, and with what is not known of the times in the noise."""
+        return noisier(self.without_pose(self.moved()), self.without_pose(self.own))
 
     def response(self) -> Array:
         """Return what (6, 10) these do to the pose."""

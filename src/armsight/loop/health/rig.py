@@ -56,7 +56,9 @@ from armsight.loop.health.passing import (
     Times,
     apart,
     eliminate,
+    moved_by,
     nodding,
+    noisier,
     velocity,
 )
 from armsight.loop.health.shape import FURTHEST_M, SMOOTH, ResidualSums, ShapeWatch, eliminated, total
@@ -225,8 +227,8 @@ class RigWatch:
 
     Attributes:
         rig: the pair.
-        prior: (K, K) square root of the covariance of all parameters: the rig's, scale and points of the body, skew. The
-            skew's is zero: what is not known of it is one of the seven numbers.
+        prior: (K, K) square root of the covariance of all parameters: the rig's, scale and points of the body, readout and
+            skew, which are what is not known of them where detections are moved to one time, else zero.
         suspected: the change that the newest test found, where it matters and is more likely than not; it widens poses.
         alarm: whether the newest test found one that is certain.
         alarmed: whether any did.
@@ -239,11 +241,11 @@ class RigWatch:
         self.rig, self._body, self._sync_s = rig, body, sync_s
         self._points = np.unique(np.linspace(0, len(body.points) - 1, MOST_POINTS).astype(int))
         count, shape = rig.parameter_count, 3 * len(self._points)
-        self._size = count + 1 + shape + 1
+        self._size = count + 1 + shape + 2
         self.prior = np.zeros((self._size, self._size))
         values, vectors = np.linalg.eigh(rig.cov)
         self.prior[:count, :count] = vectors * np.sqrt(np.maximum(values, 0.0))
-        rest = np.arange(count, self._size - 1)
+        rest = np.arange(count, self._size - 2)
         self.prior[rest, rest] = np.append(SCALE, np.full(shape, SHAPE_M))
         self._by_fault = _fault_directions(rig, self._size)
         names = tuple(body.point_names[k] for k in self._points)
@@ -313,6 +315,8 @@ class RigWatch:
         """
         now_s, self._timed = (float(self._shots), False) if t_s is None else (t_s, True)
         self._shots += 1
+        if estimate.exposures is not None:
+            self._expose(estimate.exposures.cov_shared)
         is_new = self._is_new(estimate)
         self._track.append((now_s, estimate.T_left_body))
         if self._redundant(estimate.T_left_body, now_s):
@@ -332,6 +336,13 @@ class RigWatch:
             off = log_se3(inverse(estimate.T_left_body) @ self._linear_about(estimate)[1])
             added += np.outer(off, off)
         return added
+
+    def _expose(self, cov: Array) -> None:
+        """Take the covariance (2, 2) of skew and readout, s^2, that all shots share: as constants with a prior."""
+        values, vectors = np.linalg.eigh(cov[::-1, ::-1])
+        shared = slice(self._size - 2, self._size)
+        self.prior[shared, shared] = vectors * np.sqrt(np.maximum(values, 0.0))
+        self._scaled[:, shared] = self._with_lens[: self._size, shared] = self.prior[:, shared]
 
     def _is_new(self, estimate: PoseEstimate) -> bool:
         """Return whether a shot's detections differ from those of the shots before: the same images say nothing new."""
@@ -378,19 +389,12 @@ class RigWatch:
             self._alarms, self.alarm, self.alarmed, self.suspected = 0, False, False, None
 
     def _unrest_weighed(self, rows: Array, other: Array | None = None) -> Array:
-        """Return rows of a shot, or others (n, K) of it, with what moves to and fro in their noise.
-
-        That is (I + J V J^T)^-1/2 times them.
-        """
+        """Return rows of a shot, or others (n, K) of it, with what moves to and fro in their noise."""
         given = rows if other is None else other
         if not self._unrest.cov.any():
             return given
         values, vectors = np.linalg.eigh(self._unrest.cov)
-        J = self._moving(rows) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-        squares, axes = np.linalg.eigh(J.T @ J)
-        squares = np.maximum(squares, 1e-12)
-        J = J @ axes
-        return np.asarray(given - J @ (((1.0 - 1.0 / np.sqrt(1.0 + squares)) / squares)[:, None] * (J.T @ given)))
+        return noisier(given, self._moving(rows) @ (vectors * np.sqrt(np.maximum(values, 0.0))))
 
     def _weighed_parts(
         self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool
@@ -399,7 +403,7 @@ class RigWatch:
         parts = list[tuple[Array, Array, float]]()
         for stay in stays:
             for shot in stay:
-                rows, moved = shot.every if every else shot.rows, shot.exposed[every].without_pose()
+                rows, moved = shot.every if every else shot.rows, shot.exposed[every].whitened()
                 parts.append((self._unrest_weighed(rows), self._unrest_weighed(rows, moved), 1.0 / len(stay)))
         return parts
 
@@ -497,14 +501,15 @@ class RigWatch:
         self._noise_px = float(np.sqrt(noise_px2))
         self._used_s[self._row_of[ids[fits]]] = now_s
         roll = (uv[:, :, 1] / self._half_px[:, 1] - 1.0).repeat(2)
-        exposed = ExposedShot(A, roll, tuple(self._track))
+        own = np.zeros((len(A), 0)) if estimate.exposures is None else moved_by(A, estimate.exposures.own[rows])
+        exposed = ExposedShot(A, roll, tuple(self._track), own)
         if fits.all():
-            response = self._eliminated(A, whole)
+            response = self._eliminated(exposed, whole)
             return _ShotResiduals(now_s, whole, response, whole, response, (exposed, exposed))
         kept, every = np.repeat(fits, 4), np.repeat(fits | self._displaced(A, whole[:, 0]), 4)
         found, with_all = whole[kept], whole[every]
-        response, response_with_all = self._eliminated(A[kept], found), self._eliminated(A[every], with_all)
         both = exposed.of(kept), exposed.of(every)
+        response, response_with_all = self._eliminated(both[0], found), self._eliminated(both[1], with_all)
         return _ShotResiduals(now_s, found, response, with_all, response_with_all, both)
 
     def _linear_about(self, estimate: PoseEstimate) -> tuple[float, Array]:
@@ -522,10 +527,12 @@ class RigWatch:
         R = (U * [1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
         return size, pose(R, middle_left - size * (R @ middle_body))
 
-    def _eliminated(self, A: Array, rows: Array) -> Array:
-        """Eliminate the pose and the shot's own skew from rows (n, 1 + K + M); return the pose's response (6, K + M)."""
-        response = np.empty((6, rows.shape[1]))
-        _eliminate(A, rows, self._size, self._sync_s, response)
+    def _eliminated(self, shot: ExposedShot, rows: Array) -> Array:
+        """Eliminate pose and times of a shot's own from rows (n, 1 + K + M); return the pose's response (6, K + M)."""
+        response, known = np.empty((6, rows.shape[1])), shot.own.size > 0
+        _eliminate(shot.A, rows, self._size, 0.0 if known else self._sync_s, response)
+        if known:
+            rows[:] = noisier(rows, shot.without_pose(shot.own))
         return response[:, 1:]
 
     @staticmethod
@@ -1067,13 +1074,15 @@ def _differentiate(
             for j in range(3):
                 row[1 + P] += J[j] * p[i, j]
                 row[first + j] = J[j]
-            if c == 1:  # what the body's motion of a second does to the right image: one of a later exposure
-                for j in range(6):
-                    row[lens - 1] += J[j] * velocity[j]
-            for along in range(2):
-                begin = lens + (2 * c + along) * _POLYNOMIALS
+            along = 0.0  # what the body's motion of a second does to this row: one of a later exposure
+            for j in range(6):
+                along += J[j] * velocity[j]
+            row[lens - 2] = ((seen[i, 1] + 0.5) / (2.0 * half_px[c, 1]) - 0.5) * along
+            row[lens - 1] = c * along
+            for uv_axis in range(2):
+                begin = lens + (2 * c + uv_axis) * _POLYNOMIALS
                 for j in range(_POLYNOMIALS):
-                    row[begin + j] = W[i, axis, along] * values[j]
+                    row[begin + j] = W[i, axis, uv_axis] * values[j]
     return variance
 
 

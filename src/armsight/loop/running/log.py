@@ -207,7 +207,7 @@ class Log:
         self.shots += 1
         if isinstance(result, PoseEstimate):  # without what a wrong calibration does to its points, which is most of it
             points = replace(result.points, calibration=np.zeros((len(result.points.ids), 3, 0)))
-            result = replace(result, points=points)
+            result = replace(result, points=points, exposures=None)
         self.poses.append((name, t_s, result))
         self._waiting += 1
 

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Body, Correspondences, Ids, Missed, PoseEstimate, Record
+from armsight.data import Array, Body, Correspondences, ExposureErrors, Ids, Missed, PoseEstimate, Record
 from armsight.errors import InputError
 from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import inverse, log_se3
@@ -678,24 +678,27 @@ def _measured(
     moved = at_one_time(rig, body, seen, alignment, shutters)
     result = locate(rig, body, triangulate(rig, body, gate(rig, body, moved)))
     if isinstance(result, PoseEstimate) and alignment.motion is not None:
-        extra = _by_timing(rig, body, seen, result.T_left_body, alignment, shutters)
-        result = replace(result, cov=result.cov + extra, cov_noise=result.cov_noise + extra)
+        result = _with_timing(rig, body, seen, result, alignment, shutters)
     return result
 
 
-def _by_timing(
-    rig: StereoRig, body: Body, seen: Correspondences, T: Array, alignment: Alignment, shutters: Shutters
-) -> Array:
-    """Return the (6, 6) covariance of a pose that comes from what is not known of the exposures and of the motion."""
+def _with_timing(
+    rig: StereoRig, body: Body, seen: Correspondences, result: PoseEstimate, alignment: Alignment, shutters: Shutters
+) -> PoseEstimate:
+    """Return a pose with what is not known of the exposures and of the motion in its covariance."""
     assert alignment.motion is not None
-    o = PixelObservations.of(seen, rig.sigma_px)
+    o, motion = PixelObservations.of(seen, rig.sigma_px), alignment.motion
     dt, by = _exposed(rig, o, alignment.apart_s, np.array([shutters.skew_s, shutters.readout_s]))
-    _, A, _ = whitened(rig.cameras, rig.T_left_right, body.points, o, T)
-    gain, rates = np.linalg.pinv(A).reshape(6, len(dt), 2), A.reshape(len(dt), 2, 6)
-    by_twist = np.einsum("inj,njk,n->ik", gain, rates, dt)
-    by_theta = np.einsum("inj,njk,k,np->ip", gain, rates, alignment.motion.twist, by)
-    cov = np.array(shutters.cov)
+    _, A, _ = whitened(rig.cameras, rig.T_left_right, body.points, o, result.T_left_body)
+    gain, rates = np.linalg.pinv(A), A.reshape(len(dt), 2, 6)
+    late, cov = by[:, None, :] * motion.twist[:, None], np.array(shutters.cov)
     if shutters.jitter_s > 0:  # each shot's own skew is estimated, the mean is only its prior
         cov[0, :] = cov[:, 0] = 0.0
-        cov[0, 0] = alignment.variance
-    return np.asarray(by_theta @ cov @ by_theta.T + by_twist @ alignment.motion.cov @ by_twist.T)
+    values, axes = np.linalg.eigh(motion.cov)
+    own = np.zeros((*seen.seen.shape, 6, 7))
+    own[seen.seen, :, 0] = math.sqrt(alignment.variance) * late[:, :, 0]
+    own[seen.seen, :, 1:] = dt[:, None, None] * (axes * np.sqrt(np.maximum(values, 0.0)))
+    by_own, by_shared = (gain @ (rates @ each).reshape(len(A), -1) for each in (own[seen.seen], late))
+    extra = by_own @ by_own.T + by_shared @ cov @ by_shared.T
+    exposures = ExposureErrors(own[np.isin(seen.ids, result.points.seen.ids)], cov)
+    return replace(result, cov=result.cov + extra, cov_noise=result.cov_noise + extra, exposures=exposures)
