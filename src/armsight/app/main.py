@@ -40,6 +40,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "references": "Check and calibrate sensors beside vision: inertial units, named in a file references.toml.",
         "batch": "Measure many recordings, on all cores or on a cluster; started again it goes on where it was.",
         "serve": "Keep `armsight measure` going for days.",
+        "hub": "Show many cells on one page, first the one that needs a look; keep their events and history.",
         "dense": "Find a disparity for every pixel of a pair, or evaluate the methods on scenes with a truth.",
     },
     "Operate an arm": {

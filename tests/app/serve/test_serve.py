@@ -14,8 +14,9 @@ import pytest
 
 from armsight.app.serve import service
 from armsight.app.serve.config import ServeConfig, read_config
-from armsight.app.serve.page import METRICS, StatePage, metrics_text
+from armsight.app.serve.page import METRICS, state_pages
 from armsight.app.serve.service import Service
+from armsight.app.show.http import metrics_text
 from armsight.errors import InputError
 from cli_runs import assert_rejected
 
@@ -114,23 +115,23 @@ def fetch(port, path):
 
 def test_the_pages():
     state = {"healthy": False, "why": "camera gone"}
-    page = StatePage("127.0.0.1:0", lambda: state, lambda: {"up": 0.0, "shots_total": 12.0})
+    page = state_pages("127.0.0.1:0", lambda: state, lambda: {"up": 0.0, "shots_total": 12.0})
     try:
         assert fetch(page.port, "/healthz") == (503, json.dumps(state) + "\n")
         state["healthy"] = True
         assert fetch(page.port, "/healthz")[0] == 200
         assert fetch(page.port, "/metrics")[1].splitlines()[2] == "armsight_up 0"
         assert fetch(page.port, "/else")[0] == 404
-        with pytest.raises(InputError, match="does another service run"):
-            StatePage(f"127.0.0.1:{page.port}", lambda: state, dict)
+        with pytest.raises(InputError, match="does another one run"):
+            state_pages(f"127.0.0.1:{page.port}", lambda: state, dict)
     finally:
         page.close()
     with pytest.raises(InputError, match="expected HOST:PORT"):
-        StatePage("9110", lambda: state, dict)
+        state_pages("9110", lambda: state, dict)
 
 
 def test_metrics_are_in_prometheus_form():
-    lines = metrics_text(dict.fromkeys(METRICS, 1.5)).splitlines()
+    lines = metrics_text(METRICS, {name: {"": 1.5} for name in METRICS}).decode().splitlines()
     assert len(lines) == 3 * len(METRICS)
     for name, (kind, _) in METRICS.items():
         assert {f"# TYPE armsight_{name} {kind}", f"armsight_{name} 1.5"} <= set(lines)

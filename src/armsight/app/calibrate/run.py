@@ -6,6 +6,7 @@ import contextlib
 import importlib.metadata
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -312,6 +313,7 @@ def provenance(given: dict[str, str], calibration: Calibration) -> dict[str, Any
     h = calibration.heldout
     return {
         "made_by": f"armsight {importlib.metadata.version('armsight')} calibrate, OpenCV {cv2.__version__}",
+        "made_utc": datetime.now(UTC).isoformat(timespec="seconds"),
         **given,
         "pairs_used": len(calibration.pairs),
         "heldout_epipolar_rms_px": h.epipolar_rms_px,

@@ -12,6 +12,7 @@ import click
 
 from armsight.app.arm_option import arm_option
 from armsight.app.show.messages import require
+from armsight.app.stream_option import CELL, stream_options
 
 _HERE = ("127.0.0.1", "localhost", "::1")
 
@@ -70,9 +71,7 @@ _HERE = ("127.0.0.1", "localhost", "::1")
     help="Put the rig right during a run where its cameras, or both, moved (docs/concepts/health.md).",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the simulated workcell.")
-@click.option(
-    "--stream", "streams", multiple=True, metavar="STREAM", help="Publish every shot measured: see armsight measure -h."
-)
+@stream_options("streams")
 @click.option("--json", "as_json", is_flag=True, help="Print the address as one JSON object.")
 def command(host: str, port: int, sync_ms: float, as_json: bool, **given: Any) -> None:  # noqa: ANN401 - options' fields
     """Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.
@@ -98,7 +97,8 @@ def command(host: str, port: int, sync_ms: float, as_json: bool, **given: Any) -
         check_source(source)
     if source.startswith("usb:") and not is_one(source.removeprefix("usb:")):
         parsed_usb(source.removeprefix("usb:"))  # cameras may come later, their names may not; one alone the page says
-    open_streams(options.streams, Published(), lambda line: click.echo(line, err=True)).close()  # a mistake is said now
+    tried = [each for each in options.streams if not each.startswith(CELL)]  # a mistake is said now; a cell's was
+    open_streams(tried, Published(), lambda line: click.echo(line, err=True)).close()
     session = LiveSession(options)
     server = LiveServer(session, host, port, None if host in _HERE else secrets.token_urlsafe(18))
     try:

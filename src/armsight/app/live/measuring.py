@@ -261,7 +261,8 @@ class MeasureStep(PageStep[MeasureState]):
             return
         self._monitor = HealthMonitor(rig, body.target.body, sync_s, printed=is_print(body.target))
         try:
-            self._streams = open_streams(self.shared.options.streams, Published(rig, body.target.body), self.warn)
+            about = Published(rig, body.target.body, properties={"command": "live"}, hold=self.shared.hold)
+            self._streams = open_streams(self.shared.options.streams, about, self.warn)
         except InputError as error:
             self.say("error", str(error))
 

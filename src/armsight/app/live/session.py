@@ -74,7 +74,7 @@ class LiveSession:
     def __init__(self, options: SessionOptions) -> None:
         self.folder = check_folder(options.folder, problem="the session cannot be written here").absolute()
         self._number, self._events, self._lock = 0, deque[Event](maxlen=_EVENTS), threading.Lock()
-        self.shared = shared = Shared(options, self.folder, self.say)
+        self.shared = shared = Shared(options, self.folder, self.say, self.hold)
         self.cameras = CamerasStep(shared)
         model, simulated = open_arm(options.arm), shared.source.startswith(SIM)
         ArmStep.check_board(options.board, shared.source, model)

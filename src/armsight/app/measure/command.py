@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from armsight.app.show.messages import UNTRUSTED
+from armsight.app.stream_option import stream_options
 from armsight.errors import InputError
 
 _PATH = click.Path(path_type=Path)
@@ -72,12 +73,7 @@ class MeasureOptions:
     help="Write the rig with the skew and readout found, and the noise of a moved body's discs.",
 )
 @click.option("-o", "--output", metavar="POSES.csv", type=_PATH, help="Write the poses as CSV.")
-@click.option(
-    "--stream",
-    multiple=True,
-    metavar="STREAM",
-    help="Publish each pose: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT, igtl:PORT or ros2:PORT; may be repeated.",
-)
+@stream_options()
 @click.option("--view", "view_dir", metavar="DIR", type=_PATH, help="Write annotated pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
 def command(**given: object) -> None:

@@ -358,7 +358,9 @@ def _streams(specs: Sequence[str], rig: StereoRig, body: Body) -> Publisher:
         return Fanout()
     from armsight.app.stream.streams import open_streams
 
-    return open_streams(specs, Published(rig, body), lambda line: click.echo(line, err=True))
+    return open_streams(
+        specs, Published(rig, body, properties={"command": "measure"}), lambda line: click.echo(line, err=True)
+    )
 
 
 def _line(record: ShotPose, width: int) -> str:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from armsight.app.stream_option import stream_options
 from armsight.errors import ArmsightError
 
 if TYPE_CHECKING:
@@ -22,10 +24,17 @@ if TYPE_CHECKING:
 )
 @click.option("--shots", type=click.IntRange(min=1), help="Stop after so many shots.")
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so many seconds.")
+@stream_options()
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
 @click.pass_context
 def command(
-    ctx: click.Context, source: str, output: Path, shots: int | None, seconds: float | None, as_json: bool
+    ctx: click.Context,
+    source: str,
+    output: Path,
+    shots: int | None,
+    seconds: float | None,
+    stream: tuple[str, ...],
+    as_json: bool,
 ) -> None:
     """Store the shots of SOURCE in a folder, with their time stamps; the folder is then a source itself.
 
@@ -45,6 +54,8 @@ def command(
     from armsight.app.record.recording import record, unused_folder
     from armsight.app.stream.datum import Published
     from armsight.app.stream.mcap_file import LazyMcap, properties
+    from armsight.app.stream.streams import open_streams
+    from armsight.loop.running.data import ShotDatum
     from armsight.vision.sources import notes_of, open_source
 
     unused_folder(output)
@@ -53,13 +64,14 @@ def command(
         for note in notes_of(opened):
             click.echo(f"note: {note}", err=True)
         published = Published(properties=properties(None, None, command="record", source=source))
-        file = stack.enter_context(
-            contextlib.closing(LazyMcap(output.expanduser(), published, lambda line: click.echo(line, err=True)))
-        )
+        say = partial(click.echo, err=True)
+        file = stack.enter_context(contextlib.closing(LazyMcap(output.expanduser(), published, say)))
+        streams = stack.enter_context(contextlib.closing(open_streams(stream, published, say)))
         advance = stack.enter_context(bar("recording shots", shots))
 
         def stored_one(shot: Shot) -> None:
             file.put_shot(shot)
+            streams.put(ShotDatum(shot, None))
             advance()
 
         result = record(opened, output, shots=shots, seconds=seconds, on_shot=stored_one)

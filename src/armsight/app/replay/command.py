@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 
 from armsight.app.arm_option import arm_option
+from armsight.app.stream_option import stream_options
 
 #: Reasons of missed shots that are printed, the most frequent ones.
 _REASONS = 3
@@ -25,7 +26,7 @@ _REASONS = 3
 @click.option(
     "--rate", type=click.FloatRange(min=0), default=0.0, help="1 is real time; by default as fast as possible."
 )
-@click.option("--stream", multiple=True, metavar="STREAM", help="Publish meanwhile: see armsight measure -h.")
+@stream_options()
 @click.option(
     "--compare",
     "other",

@@ -12,6 +12,7 @@ import click
 
 from armsight.app.arm_option import arm_option
 from armsight.app.show.messages import UNTRUSTED, require
+from armsight.app.stream_option import stream_options
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
 
@@ -79,12 +80,7 @@ _POSES = "poses:"
     show_default=True,
     help="Sigma of the time between the exposures of a shot before a sweep of the arm finds it, ms; sim: knows its own.",
 )
-@click.option(
-    "--stream",
-    multiple=True,
-    metavar="STREAM",
-    help="Publish meanwhile: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT, igtl:PORT or ros2:PORT; may be repeated.",
-)
+@stream_options()
 @click.option(
     "--sync-led",
     is_flag=True,

@@ -13,6 +13,7 @@ import io
 import json
 import os
 import shutil
+import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -81,13 +82,18 @@ def run_in(
         write_text(folder / name, text)
     rig.save(folder / "rig.json")
     texts = properties(rig, files["body.toml"], setup.arm, command=command)
-    published = Published(rig, setup.target.body, setup.arm, texts)
+    published = Published(rig, setup.target.body, setup.arm, texts, _interrupt if command == "run" else None)
     with contextlib.ExitStack() as stack:
         file = stack.enter_context(contextlib.closing(LazyMcap(folder, published, say)))
         beside = stack.enter_context(contextlib.closing(open_streams(streams, published, say)))
         result = run_experiment(setup, rig, plan, targets, publisher=Fanout((file, beside)), **how)
     result.properties = {"arm": setup.arm.name, "board": setup.board.welcome.board}
     return result
+
+
+def _interrupt(_: str) -> None:
+    """Stop the arm and keep what was measured, as Ctrl-C does."""
+    os.kill(os.getpid(), signal.SIGINT)
 
 
 def finish(

@@ -23,7 +23,7 @@ from typing import Any
 
 from armsight.app.interrupts import uninterrupted
 from armsight.app.serve.config import ServeConfig
-from armsight.app.serve.page import StatePage
+from armsight.app.serve.page import state_pages
 from armsight.errors import InputError
 
 #: s; a child without a shot for so long after its start is started again; half: a slow computer never begins, double: a
@@ -73,7 +73,7 @@ class Service:
             InputError: something listens at the address of the pages, or the first start ended without a shot.
             KeyboardInterrupt: Ctrl-C or SIGTERM; the child has ended.
         """
-        page = None if not self._config.http else StatePage(self._config.http, self.state, self.values)
+        page = None if not self._config.http else state_pages(self._config.http, self.state, self.values)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
             heard.bind(("127.0.0.1", 0))
             heard.setblocking(False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -31,12 +31,14 @@ class Published(Record):
         body: what is measured; without points where nothing is.
         arm: the nominal arm; None where there is none.
         properties: texts that are stored with a recording: files, versions, options.
+        hold: brings the arm to rest, with the reason; None where nothing moves.
     """
 
     rig: StereoRig | None = None
     body: Body = field(default_factory=lambda: Body("", (), np.zeros((0, 3))))
     arm: Arm | None = None
     properties: Mapping[str, str] = field(default_factory=dict)
+    hold: Callable[[str], None] | None = None
 
 
 def json_text(content: Mapping[str, Any]) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from armsight.app.stream.cell import open_cell
 from armsight.app.stream.datum import Published
 from armsight.app.stream.igtl import open_igtl
 from armsight.app.stream.network import open_json_tcp, open_json_udp
@@ -20,6 +21,7 @@ STREAMS: dict[str, Callable[[str, Published], Sink]] = {
     "json+udp": open_json_udp,
     "igtl": open_igtl,
     "ros2": open_ros2,
+    "cell": open_cell,
 }
 
 

@@ -1,0 +1,184 @@
+"""What a hub knows of its cells: a record a cell, what is wrong with it, and the order in which somebody should look.
+
+In: what a router heard. Out: JSON for the page, numbers for metrics, rows for the store.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from armsight.app.hub.drift import CHANCE, Drift, drift
+
+#: s without a state after which a connected cell is frozen, or its network cut; half: a busy computer is red now and
+#: then, double: a cut cable shows later.
+_SILENT_S = 3.0
+#: s of a block of means, and how many blocks a drift is looked for in; half: noisier, double: later named.
+_BLOCK_S, _BLOCKS = 10.0, 60
+#: s of a bar of the sparkline, and bars of a day; half: finer, double: coarser.
+_BAR_S, _BARS = 300.0, 288
+#: s by which a cell's clock may differ from the hub's; half: a slow network is called a clock, double: times are
+#: compared wrongly.
+_CLOCK_S = 2.0
+#: share of shots without a measurement that is worth a look; half: a body that leaves the view now and then, double: a
+#: lamp is off.
+_MISSED = 0.5
+#: Numbers of a state that are stored, with what is shown of them.
+NUMBERS = ("rate_hz", "shots", "missed", "error_mm", "sigma_mm", "tilt_mdeg", "size_ppm")
+#: What drifts -> its unit and what a person calls it.
+DRIFTS = {
+    "tilt_mdeg": ("mdeg", "one camera rotates against the other"),
+    "size_ppm": ("ppm", "the body seems to change its size"),
+}
+#: How much somebody should look.
+ENDED, WELL, LOOK, DRIFTING, FINDING, LOST = range(-1, 5)
+
+
+@dataclass
+class CellView:
+    """One cell as the hub knows it."""
+
+    site: str
+    name: str
+    about: dict[str, Any] = field(default_factory=dict)
+    sessions: set[str] = field(default_factory=set)
+    state: dict[str, Any] = field(default_factory=dict)
+    state_s: float = 0.0  # arrival of the newest state, by the hub's clock
+    alive_s: float = 0.0  # since when it is connected
+    lost_s: float | None = None  # since when it is not; None while it is
+    ended: bool = True  # whether its command said that it ends
+    offset_s: float = math.nan  # its clock less the hub's
+    rejected: int = 0
+    why_rejected: str = ""
+    drifts: dict[str, Drift] = field(default_factory=dict)
+    day: dict[int, float] = field(default_factory=dict)  # number of the bar -> largest error, mm
+    _block: tuple[int, dict[str, list[float]]] = field(default_factory=lambda: (0, {}))
+    _blocks: deque[tuple[float, dict[str, float]]] = field(default_factory=lambda: deque(maxlen=_BLOCKS))
+
+    def token(self, session: str, came: bool, at_s: float) -> None:
+        """Take that a process of this cell connected, or is gone."""
+        if came:
+            self.alive_s = at_s if not self.sessions else self.alive_s
+            self.sessions.add(session)
+            self.lost_s, self.ended = None, False
+            self.state_s = max(self.state_s, at_s)
+            return
+        self.sessions.discard(session)
+        if not self.sessions:
+            self.lost_s = at_s
+
+    def take(self, state: Any, at_s: float) -> dict[str, Any] | None:  # noqa: ANN401 - whatever JSON holds
+        """Take a state; return the row to be stored, None where it is none."""
+        if not isinstance(state, dict) or not isinstance(state.get("t"), int | float) or not math.isfinite(state["t"]):
+            self.reject(state if isinstance(state, str) else "a state without a time t")
+            return None
+        self.state_s = at_s
+        row: dict[str, Any] = {"t": float(state["t"]), "arrived": at_s, "mode": str(state.get("mode", ""))[:20]}
+        for key in NUMBERS:
+            value = state.get(key)
+            known = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+            row[key] = float(value) if known else None  # type: ignore[arg-type]
+        health = state.get("health")
+        row["health"] = [str(each)[:300] for each in health[:5]] if isinstance(health, list) else []
+        self.state, self.offset_s = row, row["t"] - at_s
+        if row["error_mm"] is not None:
+            bar = int(at_s // _BAR_S)
+            self.day[bar] = max(self.day.get(bar, 0.0), row["error_mm"])
+            while len(self.day) > _BARS:
+                del self.day[min(self.day)]
+        self._add(row, at_s)
+        return row
+
+    def reject(self, why: str) -> None:
+        """Count a message that could not be read."""
+        self.rejected += 1
+        self.why_rejected = why
+
+    def _add(self, row: dict[str, Any], at_s: float) -> None:
+        """Add a state to the newest block; a complete one joins the others, and drifts are looked for once a minute."""
+        number, sums = self._block
+        if number != (now := int(at_s // _BLOCK_S)):
+            if means := {key: float(np.mean(values)) for key, values in sums.items()}:
+                self._blocks.append(((number + 0.5) * _BLOCK_S, means))
+                if number % 6 == 0:
+                    self._look()
+            self._block = now, (sums := {})
+        for key in DRIFTS:
+            if row[key] is not None:
+                sums.setdefault(key, []).append(row[key])
+
+    def _look(self) -> None:
+        self.drifts = {}
+        for key in DRIFTS:
+            rows = np.array([(t, means[key]) for t, means in self._blocks if key in means]).reshape(-1, 2)
+            found = drift(rows[:, 0], rows[:, 1])
+            if found is not None:
+                self.drifts[key] = found
+
+    def need(self, now_s: float) -> tuple[int, float, str]:
+        """Return how much somebody should look, how far beyond it is within that, and why in words."""
+        if not self.sessions:
+            if self.ended:
+                return ENDED, 0.0, "ended"
+            return (
+                LOST,
+                now_s - (self.lost_s or now_s),
+                "lost: the connection closed, and its command did not say that it ends",
+            )
+        if (silent := now_s - self.state_s) > _SILENT_S:
+            return LOST, silent, f"silent for {silent:.0f} s although connected: frozen, or the network is cut"
+        state = self.state
+        if state.get("health"):
+            return FINDING, float(len(state["health"])), state["health"][-1]
+        significant = [(each.chance, key, each) for key, each in self.drifts.items() if each.chance < CHANCE]
+        if significant:
+            chance, key, found = min(significant)
+            unit, text = DRIFTS[key]
+            return DRIFTING, -math.log(chance), f"{text}: {found.per_h:+.3g} ± {found.sigma_per_h:.2g} {unit}/h"
+        odd = self._odd()
+        return LOOK if odd else WELL, (state.get("error_mm") or 0.0) / (self.about.get("limit_mm") or 1.0), odd
+
+    def _odd(self) -> str:
+        """Return what is worth a look and forbids nothing."""
+        state, limit = self.state, self.about.get("limit_mm")
+        error, missed = state.get("error_mm"), state.get("missed")
+        if len(self.sessions) > 1:
+            return f"{len(self.sessions)} processes have this name: give each cell its own"
+        if abs(self.offset_s) > _CLOCK_S:
+            return f"its clock is {self.offset_s:+.0f} s off the hub's"
+        if error is not None and isinstance(limit, int | float) and error > limit:
+            return f"error {error:.2f} mm, more than its limit of {limit:.2f}"
+        if missed is not None and missed > _MISSED:
+            return f"{100 * missed:.0f} % of the shots miss the body"
+        if self.rejected:
+            return f"{self.rejected} messages could not be read: {self.why_rejected}"
+        return ""
+
+    def to_json(self, now_s: float) -> dict[str, Any]:
+        """Return what the page shows."""
+        level, size, why = self.need(now_s)
+        first = int(now_s // _BAR_S) - _BARS + 1
+        return {
+            "site": self.site,
+            "name": self.name,
+            "level": level,
+            "size": round(size, 3),
+            "why": why,
+            "about": self.about,
+            "state": {key: value for key, value in self.state.items() if key != "health"},
+            "health": self.state.get("health", []),
+            "alive_s": round(now_s - self.alive_s) if self.sessions else None,
+            "state_age_s": round(now_s - self.state_s, 1) if self.state_s else None,
+            "clock_s": None if math.isnan(self.offset_s) else round(self.offset_s, 3),
+            "day": [[bar - first, round(error, 4)] for bar, error in sorted(self.day.items()) if bar >= first],
+        }
+
+
+def ranked(cells: list[CellView], now_s: float) -> list[dict[str, Any]]:
+    """Return the cells as the page shows them, first the one that somebody should look at first."""
+    shown = [each.to_json(now_s) for each in cells]
+    return sorted(shown, key=lambda cell: (-cell["level"], -cell["size"], cell["site"], cell["name"]))

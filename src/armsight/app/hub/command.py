@@ -1,0 +1,141 @@
+"""``armsight hub``: many cells on one page."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+_PATH = click.Path(path_type=Path)
+_KEYS = "site-keys"
+_JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
+_KEYS_OPTION = click.option(
+    "--keys", default=_KEYS, show_default=True, metavar="DIR", type=_PATH, help="Folder of the site's keys."
+)
+
+
+@click.group("hub", invoke_without_command=True)
+@click.option(
+    "--listen",
+    default="tcp/127.0.0.1:7447",
+    show_default=True,
+    metavar="ADDRESS",
+    help="Where cells connect: tls/0.0.0.0:7447, with --keys, for other computers.",
+)
+@click.option("--http", default="127.0.0.1:8730", show_default=True, metavar="HOST:PORT", help="Where the page is.")
+@click.option("--keys", metavar="DIR", type=_PATH, help="Folder of the site's keys (armsight hub keys).")
+@click.option(
+    "-o", "--output", default="hub", show_default=True, metavar="DIR", type=_PATH, help="Folder of events and history."
+)
+@_JSON
+@click.pass_context
+def command(ctx: click.Context, listen: str, http: str, keys: Path | None, output: Path, as_json: bool) -> None:
+    """Show many cells on one page, first the one that needs a look; keep their events and history.
+
+    A cell is a command with --cell NAME: measure, run, live, record. It tells the hub who it is, its state once a
+    second and its events; without a hub it keeps its events and sends them later. Ctrl-C ends the hub, and no cell.
+
+    The hub is for this computer alone until it has the keys of a site. It stops no arm: the emergency stop is at the
+    cell.
+    """
+    if ctx.invoked_subcommand is not None:
+        return
+    import threading
+
+    from armsight.app.hub.service import Hub
+    from armsight.app.show.messages import require
+    from armsight.app.stream.cell_file import endpoint
+
+    require("a hub", "cells", "zenoh", "pyarrow")
+    hub = Hub(output, endpoint(listen, "--listen"), http, keys, lambda line: click.echo(f"note: {line}", err=True))
+    try:
+        if as_json:
+            click.echo(json.dumps({"address": hub.pages.address, "listen": listen, "directory": str(output)}))
+        else:
+            click.echo(f"open {hub.pages.address} in a browser; cells connect to {listen}; Ctrl-C ends the hub")
+        threading.Event().wait()
+    finally:
+        hub.close()
+
+
+@command.command("keys")
+@click.argument("site")
+@click.argument("cells", nargs=-1, metavar="CELL...")
+@click.option("-o", "--output", default=_KEYS, show_default=True, metavar="DIR", type=_PATH, help="Folder of the keys.")
+@click.option("--host", default="127.0.0.1", show_default=True, help="Name or address under which cells find the hub.")
+@click.option("--port", type=click.IntRange(1, 65535), default=7447, show_default=True, help="Port of the hub.")
+@_JSON
+def keys_command(site: str, cells: tuple[str, ...], output: Path, host: str, port: int, as_json: bool) -> None:
+    """Make the keys of SITE: for the hub, and a folder a CELL with the cell.toml that goes to its computer.
+
+    Typed again it adds cells and renews what ends within 30 days. Start the hub again after it. DIR/ca.key must stay
+    secret: who has it can make cells, and ask cells to hold.
+    """
+    from armsight.app.hub.keys import make_keys
+
+    made = make_keys(output, site, cells, host, port)
+    if as_json:
+        click.echo(json.dumps({"directory": str(output), "cells": [str(each) for each in made]}))
+        return
+    for each in made:
+        click.echo(f"{each.parent}: copy this folder to the cell's computer; there: --cell {each.name}")
+    click.echo(f"{output}: start the hub with armsight hub --listen tls/0.0.0.0:{port} --keys {output}")
+
+
+@command.command("hold")
+@click.argument("cell")
+@click.argument("reason")
+@_KEYS_OPTION
+@click.option(
+    "--hub", "address", default="127.0.0.1:7447", show_default=True, metavar="HOST:PORT", help="Where cells connect."
+)
+@_JSON
+def hold_command(cell: str, reason: str, keys: Path, address: str, as_json: bool) -> None:
+    """Ask CELL to bring its arm to rest and hold it. This is no emergency stop, which is at the cell.
+
+    A cell does so only where its cell.toml says holds = true, and the request is signed by the site's key. Both sides
+    keep an event. Exit code 2: it did not.
+    """
+    from armsight.app.hub.hold import hold
+    from armsight.errors import ArmsightError
+
+    answer = hold(keys, cell, reason, address)
+    if as_json:
+        click.echo(json.dumps({"cell": cell, "answer": answer}))
+    if answer != "held":
+        raise ArmsightError(f"{cell} does not hold: {answer or 'it does not answer; stop it there'}")
+    if not as_json:
+        click.echo(f"{cell} holds")
+
+
+@command.command("push")
+@click.argument("runs", type=_PATH)
+@click.argument("store")
+@click.option("--cell", "spec", required=True, metavar="NAME|cell.toml", help="Whose runs they are.")
+@click.option("--rate", type=click.FloatRange(0.01, 1e4), default=10.0, show_default=True, help="MB/s at most.")
+@_JSON
+def push_command(runs: Path, store: str, spec: str, rate: float, as_json: bool) -> None:
+    """Copy the run folders in RUNS to STORE, such as s3://bucket or a folder; started again it goes on where it was.
+
+    Each goes to STORE/SITE/DAY/CELL/RUN, with a manifest of sizes and SHA-256 written last. It begins only while no
+    command of the cell runs.
+    """
+    from dataclasses import asdict
+
+    from armsight.app.hub.push import push
+    from armsight.app.progress import steps
+    from armsight.app.show.messages import require
+    from armsight.app.stream.cell_file import read_cell
+
+    require("pushing", "cells", "fsspec")
+    cell = read_cell(spec)
+    with steps() as say:
+        done = push(cell, runs, store, rate, lambda sent: say(f"pushing: {sent / 1e6:.1f} MB"))
+    if as_json:
+        click.echo(json.dumps(asdict(done)))
+    else:
+        click.echo(
+            f"{done.runs} runs are in {store} now ({done.files} files, {done.sent_bytes / 1e6:.1f} MB); "
+            f"{done.complete_before} were before"
+        )

@@ -1,0 +1,134 @@
+"""The zenoh side of a hub: a router that cells connect to, what each of them may write, and what comes from them.
+
+With the keys of a site a cell may write below its own name alone: zenoh's access control compares the name in its
+certificate.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from armsight.app.hub.keys import site_of
+from armsight.app.stream.cell_file import require_here, zenoh_config
+from armsight.errors import InputError
+
+#: bytes of a state, or of events, that are read at most; half: long findings are rejected, double: a wrong cell costs
+#: more memory.
+_LONGEST = 65536
+#: s that an image or an answer is waited for; half: a slow network shows none, double: a click waits longer.
+_ANSWER_S = 2.0
+_ALLOWED = (
+    "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",
+    "liveliness_query", "declare_liveliness_subscriber",
+)  # fmt: skip
+#: What came from a cell: its site, its name, which of its keys, when (s), and the JSON; None of JSON: the token is
+#: gone.
+Heard = tuple[str, str, str, float, Any]
+
+
+class Router:
+    """Listens for cells.
+
+    Args:
+        listen: zenoh endpoint.
+        keys: folder of the site's keys; None: on this computer alone, without TLS.
+        heard: is given whatever comes, in threads of the library.
+        stored: stores events of a cell and returns the number up to which they are; 0 where it failed.
+
+    Raises:
+        InputError: another computer could read it, the port is in use, or a certificate has ended.
+    """
+
+    def __init__(
+        self,
+        listen: str,
+        keys: Path | None,
+        heard: Callable[[Heard], None],
+        stored: Callable[[str, str, Any], int],
+    ) -> None:
+        import zenoh
+
+        self._heard, self._stored = heard, stored
+        if keys is None:
+            require_here(listen, "--listen")
+            if listen.startswith("tls/"):
+                raise InputError(f"--listen {listen} needs the keys of a site: --keys DIR (`armsight hub keys`)")
+        elif not listen.startswith("tls/"):
+            raise InputError(f"--listen {listen}: with --keys it is tls/HOST:PORT")
+        config = zenoh_config("router", listen=listen, tls=None if keys is None else _tls(keys))
+        if keys is not None:
+            config.insert_json5("access_control", json.dumps(_access(*site_of(keys))))
+        try:
+            self._session: Any = zenoh.open(config)
+        except zenoh.ZError as error:
+            why = str(error).split(" at /")[0]
+            raise InputError(f"--listen {listen}: cannot listen there ({why}): is another hub running?") from None
+        states = self._session.declare_subscriber("armsight/*/*/state", self._state)
+        events = self._session.declare_queryable("armsight/*/*/events", self._events)
+        tokens = self._session.liveliness().declare_subscriber("armsight/*/*/alive/*", self._token, history=True)
+        self._declared = (states, events, tokens)
+
+    def ask(self, site: str, cell: str, what: str, payload: bytes = b"") -> bytes:
+        """Ask a cell for something, and return its answer; empty where it does not answer."""
+        with suppress(Exception):  # of the library: a cell that is gone
+            for reply in self._session.get(f"armsight/{site}/{cell}/{what}", payload=payload, timeout=_ANSWER_S):
+                if reply.ok is not None:
+                    return bytes(reply.ok.payload.to_bytes())
+        return b""
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._session.close()
+
+    def _state(self, sample: Any) -> None:  # noqa: ANN401 - of the library
+        _, site, cell, _ = str(sample.key_expr).split("/")
+        self._heard((site, cell, "state", time.time(), _json(sample.payload)))
+
+    def _token(self, sample: Any) -> None:  # noqa: ANN401 - of the library
+        _, site, cell, _, session = str(sample.key_expr).split("/")
+        came = "PUT" in str(sample.kind)
+        self._heard((site, cell, "alive", time.time(), (session, came)))
+
+    def _events(self, query: Any) -> None:  # noqa: ANN401 - of the library
+        _, site, cell, _ = str(query.key_expr).split("/")
+        if (n := self._stored(site, cell, _json(query.payload))) > 0:
+            query.reply(query.key_expr, str(n).encode())
+
+
+def _json(payload: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
+    """Return the JSON of a message; a text that says why where it is none, or too long."""
+    data = b"" if payload is None else payload.to_bytes()
+    if len(data) > _LONGEST:
+        return f"a message of {len(data)} bytes: at most {_LONGEST} are read"
+    try:
+        return json.loads(data)
+    except ValueError:
+        return "a message that is no JSON"
+
+
+def _tls(keys: Path) -> dict[str, Any]:
+    return {
+        "root_ca_certificate": str(keys / "ca.pem"),
+        "enable_mtls": True,
+        "listen_certificate": str(keys / "hub.pem"),
+        "listen_private_key": str(keys / "hub.key"),
+    }
+
+
+def _access(site: str, cells: Sequence[str]) -> dict[str, Any]:
+    """Return zenoh's access control: a cell below its own name, the hub's key to ask for a hold, whoever else nothing."""
+    below: dict[str, tuple[str, tuple[str, ...]]] = {name: (f"armsight/{site}/{name}/**", _ALLOWED) for name in cells}
+    below |= {"hub": (f"armsight/{site}/*/hold", ("query", "reply"))}
+    both = ["ingress", "egress"]
+    rules = [
+        {"id": name, "permission": "allow", "messages": list(messages), "flows": both, "key_exprs": [key]}
+        for name, (key, messages) in below.items()
+    ]
+    subjects = [{"id": name, "cert_common_names": [f"{site}.{name}"]} for name in below]
+    policies = [{"rules": [name], "subjects": [name]} for name in below]
+    return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies}

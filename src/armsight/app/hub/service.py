@@ -1,0 +1,201 @@
+"""A running hub: router, store and pages together, and one thread that owns what is known of the cells."""
+
+from __future__ import annotations
+
+import importlib.resources
+import json
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from armsight.app.hub.cells import CellView, ranked
+from armsight.app.hub.router import Heard, Router
+from armsight.app.hub.store import FLUSH_S, Store
+from armsight.app.show.http import Answer, Pages, metrics_text
+from armsight.app.stream.cell_file import NAME
+
+#: s that an answer of /state is served to all who ask; half: thirty tabs cost twice, double: a second of age.
+_STATE_S = 0.5
+#: messages that wait at most; half: a burst of 200 cells is dropped, double: more memory.
+_WAITING = 10_000
+#: Metric -> its kind and help; the labels are site and cell.
+METRICS = {
+    "cell_up": ("gauge", "1 while the cell is connected and sends its state"),
+    "cell_need": ("gauge", "how much to look: -1 ended, 0 well, 1 look, 2 drifting, 3 finding, 4 lost"),
+    "cell_error_millimetres": ("gauge", "distance of the points from the body, RMS"),
+    "cell_sigma_millimetres": ("gauge", "standard deviation of the position"),
+    "cell_rate_hertz": ("gauge", "shots a second"),
+    "cell_missed_ratio": ("gauge", "share of shots without a measurement"),
+    "cell_clock_seconds": ("gauge", "the cell's clock less the hub's"),
+    "hub_events_total": ("counter", "events stored"),
+    "hub_dropped_total": ("counter", "states dropped because too many waited"),
+}
+#: What a cell says of itself, and of which kind it is.
+_ABOUT: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("armsight", "host", "mode", "arm", "body", "rig_made_utc"), (str,)),
+    **dict.fromkeys(("rig_heldout_mm", "limit_mm"), (int, float)),
+    "holds": (bool,),
+}
+_OF_STATE = {
+    "cell_error_millimetres": "error_mm",
+    "cell_sigma_millimetres": "sigma_mm",
+    "cell_rate_hertz": "rate_hz",
+    "cell_missed_ratio": "missed",
+}
+
+
+class Hub:
+    """Listens to the cells of a site, keeps what they send, and shows it.
+
+    Args:
+        folder: where it is kept.
+        listen: zenoh endpoint for cells.
+        http: address of the page.
+        keys: folder of the site's keys; None on this computer alone.
+        say: is given a line for what a person should know at once.
+
+    Raises:
+        InputError: an address is in use or not safe, or nothing can be written.
+    """
+
+    def __init__(self, folder: Path, listen: str, http: str, keys: Path | None, say: Callable[[str], None]) -> None:
+        self._say, self._cells = say, dict[tuple[str, str], CellView]()
+        self._heard: queue.Queue[Heard] = queue.Queue(_WAITING)
+        self._dropped, self._problem = 0, ""
+        self._lock = threading.Lock()  # of the cells
+        self._cached: tuple[float, bytes] = (0.0, b"")
+        self._asking = ThreadPoolExecutor(4, "ask")
+        self._ended = threading.Event()
+        self._store = Store(folder)
+        try:
+            for cell in self._store.known():
+                self._cells[cell.site, cell.name] = cell
+            self._page = importlib.resources.files(__package__).joinpath("page.html").read_bytes()
+            routes = {"/": self._html, "/state": self._state, "/events": self._events, "/image": self._image}
+            self.pages = Pages(http, {**routes, "/metrics": self._metrics}, "--http")
+            self._router = Router(listen, keys, self._hear, self._stored)
+        except BaseException:
+            self._store.close()
+            raise
+        self._thread = threading.Thread(target=self._run, name="hub", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop listening, and write what waits."""
+        self._router.close()
+        self.pages.close()
+        self._ended.set()
+        self._thread.join(10.0)
+        self._asking.shutdown(wait=False, cancel_futures=True)
+        self._store.close()
+
+    def _hear(self, heard: Heard) -> None:
+        try:
+            self._heard.put_nowait(heard)
+        except queue.Full:
+            self._dropped += 1
+
+    def _stored(self, site: str, cell: str, message: Any) -> int:  # noqa: ANN401 - whatever JSON holds
+        """Store events; called in a thread of the router."""
+        if not (NAME.fullmatch(site) and NAME.fullmatch(cell)):
+            return 0
+        n = self._store.add_events(site, cell, message, time.time())
+        if n and any(each["kind"] == "ended" for each in message["events"][-1:]):
+            self._hear((site, cell, "ended", time.time(), None))
+        return n
+
+    def _run(self) -> None:
+        flushed = time.monotonic()
+        while not (self._ended.is_set() and self._heard.empty()):
+            with suppress(queue.Empty):
+                self._take(self._heard.get(timeout=0.2))
+            if time.monotonic() - flushed > FLUSH_S:
+                flushed = time.monotonic()
+                self._store.flush()
+            if self._store.problem != self._problem:
+                self._problem = self._store.problem
+                if self._problem:
+                    self._say(self._problem)
+
+    def _take(self, heard: Heard) -> None:
+        site, name, what, at_s, content = heard
+        if not (NAME.fullmatch(site) and NAME.fullmatch(name)):
+            return
+        with self._lock:
+            cell = self._cells.setdefault((site, name), CellView(site, name))
+            if what == "alive":
+                session, came = content
+                cell.token(session, came, at_s)
+                if came:
+                    self._asking.submit(self._ask_about, cell)
+            elif what == "ended":
+                cell.ended = len(cell.sessions) < 2
+            elif what == "state" and (row := cell.take(content, at_s)) is not None:
+                self._store.add_state(cell, row)
+
+    def _ask_about(self, cell: CellView) -> None:
+        """Ask a cell that has connected who it is."""
+        try:
+            about = json.loads(self._router.ask(cell.site, cell.name, "about") or b"{}")
+        except ValueError:
+            return
+        if isinstance(about, dict) and about:
+            cell.about = {key: about[key] for key, kinds in _ABOUT.items() if isinstance(about.get(key), kinds)}
+            self._store.keep_about(cell)
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return what the page shows."""
+        now = time.time()
+        with self._lock:
+            cells = ranked(list(self._cells.values()), now)
+        return {
+            "t": now,
+            "cells": cells,
+            "events": self._store.count(),
+            "dropped": self._dropped,
+            "problem": self._store.problem,
+        }
+
+    def _html(self, _: dict[str, str]) -> Answer:
+        return 200, "text/html; charset=utf-8", self._page
+
+    def _state(self, _: dict[str, str]) -> Answer:
+        made, data = self._cached
+        if time.monotonic() - made > _STATE_S:
+            data = json.dumps(self.snapshot()).encode()
+            self._cached = time.monotonic(), data
+        return 200, "application/json", data
+
+    def _events(self, query: dict[str, str]) -> Answer:
+        found = self._store.events(query.get("q", ""), query.get("site", ""), query.get("cell", ""))
+        return 200, "application/json", json.dumps(found).encode()
+
+    def _image(self, query: dict[str, str]) -> Answer:
+        site, cell = query.get("site", ""), query.get("cell", "")
+        if (site, cell) not in self._cells:
+            return 404, "text/plain", b"no such cell\n"
+        data = self._router.ask(site, cell, "image")
+        if not data.startswith(b"\xff\xd8"):
+            return 404, "text/plain", b"the cell has no image\n"
+        return 200, "image/jpeg", data
+
+    def _metrics(self, _: dict[str, str]) -> Answer:
+        found = self.snapshot()
+        rows: dict[str, dict[str, float]] = {name: {} for name in METRICS}
+        for cell in found["cells"]:
+            labels = f'{{site="{cell["site"]}",cell="{cell["name"]}"}}'
+            rows["cell_up"][labels] = float(0 <= cell["level"] < 4)
+            rows["cell_need"][labels] = cell["level"]
+            values = {name: cell["state"].get(key) for name, key in _OF_STATE.items()} | {
+                "cell_clock_seconds": cell["clock_s"]
+            }
+            for name, value in values.items():
+                if value is not None:
+                    rows[name][labels] = value
+        rows["hub_events_total"][""], rows["hub_dropped_total"][""] = found["events"], found["dropped"]
+        return 200, "text/plain; version=0.0.4", metrics_text(METRICS, rows)

@@ -1,0 +1,141 @@
+"""What a hub keeps: events in a database, each once; states as Parquet by day and cell.
+
+``DIR/events.sqlite`` has the tables ``events`` and ``cells``. ``DIR/states/day=.../cell=SITE.CELL/*.parquet`` is read
+by DuckDB in one line (docs/howto/cells.md).
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import threading
+from collections import defaultdict
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from armsight.app.hub.cells import NUMBERS, CellView
+from armsight.errors import InputError
+from armsight.files import replacing
+
+#: s between two files of states of a cell; half: twice as many files, double: a crash loses twice as much history.
+FLUSH_S = 600.0
+#: events of a search at most; half: scroll less, double: a larger page.
+_FOUND = 200
+_TABLES = (
+    "CREATE TABLE IF NOT EXISTS events (site TEXT, cell TEXT, outbox TEXT, n INTEGER, t REAL, arrived REAL, kind TEXT,"
+    " level TEXT, text TEXT, PRIMARY KEY (site, cell, outbox, n)) WITHOUT ROWID",
+    "CREATE INDEX IF NOT EXISTS by_time ON events (t)",
+    "CREATE TABLE IF NOT EXISTS cells (site TEXT, cell TEXT, about TEXT, PRIMARY KEY (site, cell))",
+)
+
+
+class Store:
+    """Keeps events and states in a folder.
+
+    Args:
+        folder: made where it is not there.
+
+    Raises:
+        InputError: nothing can be written there, or another hub uses it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._lock = folder, threading.Lock()
+        self._rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
+        self.problem = ""
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._db = sqlite3.connect(folder / "events.sqlite", timeout=0.2, check_same_thread=False)
+            self._db.execute("PRAGMA locking_mode = EXCLUSIVE")
+            for table in _TABLES:
+                self._db.execute(table)
+            self._db.execute("DELETE FROM cells WHERE site IS NULL")  # a write: it takes the lock
+            self._db.commit()
+        except (sqlite3.Error, OSError) as error:
+            why = "another hub uses it" if "locked" in str(error) else str(error)
+            raise InputError(f"{folder}: nothing can be kept here: {why}") from None
+
+    def add_events(self, site: str, cell: str, message: Any, arrived_s: float) -> int:  # noqa: ANN401 - whatever JSON holds
+        """Store events of a cell, each once; return the number up to which they are stored, 0 where none is."""
+        try:
+            outbox, rows, n = str(message["outbox"]), [], 0
+            for each in message["events"]:
+                n = int(each["n"])
+                texts = (str(each["kind"])[:20], str(each["level"])[:20], str(each["text"])[:2000])
+                rows.append((site, cell, outbox, n, float(each["t"]), arrived_s, *texts))
+        except (KeyError, TypeError, ValueError):
+            return 0
+        try:
+            with self._lock, self._db:
+                self._db.executemany("INSERT OR IGNORE INTO events VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
+        except sqlite3.Error as error:
+            self.problem = f"events are not stored, the cells keep them: {error}"
+            return 0
+        self.problem = ""
+        return n
+
+    def keep_about(self, cell: CellView) -> None:
+        """Remember who a cell is."""
+        with suppress(sqlite3.Error), self._lock, self._db:
+            row = cell.site, cell.name, json.dumps(cell.about)
+            self._db.execute("INSERT OR REPLACE INTO cells VALUES (?, ?, ?)", row)
+
+    def known(self) -> list[CellView]:
+        """Return the cells of earlier days; one whose last event is not that it ended was lost."""
+        ends = (
+            "SELECT kind FROM events e WHERE e.site = c.site AND e.cell = c.cell AND kind IN ('began', 'ended')"
+            " ORDER BY arrived DESC, n DESC LIMIT 1"
+        )
+        with self._lock:
+            rows = self._db.execute(f"SELECT site, cell, about, ({ends}) FROM cells c").fetchall()
+        return [CellView(site, cell, json.loads(about), ended=last != "began") for site, cell, about, last in rows]
+
+    def events(self, words: str = "", site: str = "", cell: str = "") -> list[dict[str, Any]]:
+        """Return the newest events that hold all words, of one cell where it is named."""
+        where, values = ["1"], list[str]()
+        for word in words.split()[:8]:
+            where.append("(text || ' ' || kind || ' ' || level || ' ' || site || ' ' || cell) LIKE ? ESCAPE '\\'")
+            values.append("%" + word.replace("\\", "\\\\").replace("%", "\\%").replace("_", "\\_") + "%")
+        for key, value in (("site", site), ("cell", cell)):
+            if value:
+                where.append(f"{key} = ?")
+                values.append(value)
+        names = ("site", "cell", "n", "t", "arrived", "kind", "level", "text")
+        query = f"SELECT {', '.join(names)} FROM events WHERE {' AND '.join(where)} ORDER BY t DESC LIMIT {_FOUND}"
+        with self._lock:
+            return [dict(zip(names, row, strict=True)) for row in self._db.execute(query, values)]
+
+    def count(self) -> int:
+        """Return how many events there are."""
+        with self._lock:
+            return int(self._db.execute("SELECT count(*) FROM events").fetchone()[0])
+
+    def add_state(self, cell: CellView, row: dict[str, Any]) -> None:
+        """Keep a state until the next :meth:`flush`."""
+        self._rows[f"{cell.site}.{cell.name}"].append(row)
+
+    def flush(self) -> None:
+        """Write the states since the last time; on a full disk they are lost, and that is said."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        rows, self._rows = self._rows, defaultdict(list)
+        numbers = [(key, pa.float64()) for key in ("t", "arrived", *NUMBERS)]
+        schema = pa.schema([*numbers, ("mode", pa.string()), ("health", pa.list_(pa.string()))])
+        for cell, states in rows.items():
+            at = datetime.fromtimestamp(states[0]["arrived"], UTC)
+            path = self._folder / "states" / f"day={at:%Y-%m-%d}" / f"cell={cell}" / f"{at:%H%M%S}.parquet"
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with replacing(path, "wb") as file:
+                    pq.write_table(pa.Table.from_pylist(states, schema), file)
+            except (OSError, InputError) as error:
+                self.problem = f"states are not stored: {error}"
+
+    def close(self) -> None:
+        """Write what waits."""
+        self.flush()
+        with self._lock:
+            self._db.close()

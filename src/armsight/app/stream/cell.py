@@ -1,0 +1,361 @@
+"""What a cell sends to the hub of its site: who it is, its state once a second, its events, an image on request.
+
+The keys are ``armsight/SITE/CELL/...`` (docs/howto/cells.md): ``alive`` a liveliness token; ``about``, ``image`` and
+``hold`` are answered; ``state`` is put; ``events`` are asked to be stored, until the hub answers up to which number
+they are. The cell never waits for the hub: all of it happens in threads of its own, and without a hub only the events
+are kept.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import math
+import socket
+import threading
+import time
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import click
+import cv2
+import numpy as np
+
+from armsight.app.stream.cell_file import Cell, read_cell, zenoh_config
+from armsight.app.stream.datum import Published, json_text
+from armsight.app.stream.outbox import Outbox, state_folder
+from armsight.app.stream.sink import Sink
+from armsight.data import Array, PoseEstimate, Shot
+from armsight.errors import InputError
+from armsight.loop.running.data import Datum, NoteDatum, ShotDatum
+from armsight.vision.image import grey
+from armsight.vision.rig import StereoRig
+
+#: s, between two states; half: twice the network, double: a loss shows a second later.
+STATE_S = 1.0
+#: s, between two looks whether events wait or a hub can be reached; half: nothing, double: events come later.
+_POST_S = 0.25
+#: s, between two shots whose geometry is looked at: 0.2 ms each; half: twice the time, double: a drift shows later.
+_LOOK_S = 0.1
+#: events sent at once; half: more round trips after a long loss, double: longer messages (20 kB).
+_BATCH = 100
+#: s that a reached hub may store nothing before that is said; half: said while a hub begins, double: said later.
+_UNHEARD_S = 10.0
+#: s; a hub has so long to store events; half: a busy disk has them sent again, double: a dead hub is noticed later.
+_STORE_S = 2.0
+#: s, from a request to hold to its arrival by the cell's clock; half: clocks must agree better, double: an old request
+#: counts longer.
+_FRESH_S = 60.0
+#: px, the longer side of an image for the hub, and its JPEG quality; half: a rough look, double: four times the bytes
+#: (15 kB).
+_SIDE_PX, _JPEG = 480, 70
+#: findings that a state names at most; half: less is seen at once, double: a state of 2 kB.
+_FINDINGS = 5
+#: A limit for the error is so many times the held-out error of the rig; half: good cells are yellow, double: bad ones
+#: are not.
+_LIMIT = 3.0
+
+
+@dataclass
+class _Window:
+    """What the shots between two states showed."""
+
+    shots: int = 0
+    missed: int = 0
+    residual_m: list[float] = field(default_factory=list)
+    sigma_m: list[float] = field(default_factory=list)
+    tilt_rad: list[float] = field(default_factory=list)
+    size: list[float] = field(default_factory=list)
+
+    def state(self) -> dict[str, float | None]:
+        """Return the numbers of a state; null where no shot showed one."""
+        return {
+            "missed": self.missed / self.shots if self.shots else None,
+            "error_mm": _mean(np.square(self.residual_m), 1e3, root=True),
+            "sigma_mm": _mean(np.square(self.sigma_m), 1e3, root=True),
+            "tilt_mdeg": _mean(np.degrees(self.tilt_rad), 1e3),
+            "size_ppm": _mean(np.array(self.size), 1e6),
+        }
+
+
+def _mean(values: Array, unit: float, *, root: bool = False) -> float | None:
+    """Return a mean, its root perhaps, in another unit; None of nothing."""
+    if not len(values):
+        return None
+    mean = float(np.mean(values))
+    return float(f"{unit * (math.sqrt(mean) if root else mean):.6g}")
+
+
+def tilt_and_size(rig: StereoRig, points: Array, pose: PoseEstimate) -> tuple[float, float]:
+    """Say what one pose shows of its rig: a rotation of one camera changes one of the two.
+
+    Args:
+        rig: the calibrated pair.
+        points: (M, 3) of the body, m.
+        pose: measured in a shot.
+
+    Returns:
+        The mean signed angle of the left rays out of the plane of baseline and right ray, rad, and the size of the
+        triangulated body over its drawing, less one.
+    """
+    seen = pose.points.seen
+    uv = seen.uv[seen.paired]
+    left, right = rig.left.unproject(uv[:, 0]), rig.right.unproject(uv[:, 1])
+    normal = np.cross(rig.T_left_right[:3, 3], right @ rig.T_left_right[:3, :3].T)
+    angles = (left * normal).sum(1) / (np.linalg.norm(normal, axis=1) * np.linalg.norm(left, axis=1))
+    found, drawn = pose.points.p_left, points[pose.points.ids]
+    spread = [float(np.linalg.norm(each - each.mean(0))) for each in (found, drawn)]
+    return float(angles.mean()), spread[0] / spread[1] - 1.0
+
+
+class CellSink(Sink):
+    """Sends what a command measures to the hub of its site.
+
+    Args:
+        cell: who it is.
+        published: what all data have in common.
+        mode: the command.
+
+    Raises:
+        InputError: zenoh is not installed, or another process of this computer is this cell.
+    """
+
+    def __init__(self, cell: Cell, published: Published, mode: str) -> None:
+        super().__init__(wakes=256, close_s=5.0)
+        tls = None if cell.ca is None else {
+            "root_ca_certificate": str(cell.ca),
+            "enable_mtls": True,
+            "connect_certificate": str(cell.certificate),
+            "connect_private_key": str(cell.key),
+        }  # fmt: skip
+        self._config = zenoh_config("client", connect=cell.router, tls=tls)
+        self._cell, self._published, self._mode = cell, published, mode
+        self._outbox = Outbox(state_folder() / "cells" / cell.site / cell.name, cell.name)
+        self._lock = threading.Lock()  # of the outbox: this thread adds, the other one sends
+        self._window, self._shots, self._findings = _Window(), 0, deque[str](maxlen=_FINDINGS)
+        self._began = self._state_at = time.monotonic()
+        self._looked = 0.0
+        self._newest: Shot | None = None
+        self._held = 0.0
+        self._session: Any = None
+        self._declared: list[Any] = []
+        self._ending = threading.Event()
+        self._post = threading.Thread(target=self._posting, name="cell", daemon=True)
+
+    def start(self) -> None:
+        """Start the threads."""
+        self._event("began", "info", f"armsight {self._mode} began")
+        self._post.start()
+        super().start()
+
+    def write(self, datum: Datum) -> None:
+        """Count a shot, or keep an event."""
+        if isinstance(datum, NoteDatum):
+            if datum.level != "info":
+                self._findings.append(datum.text)
+                self._event("health", datum.level, datum.text)
+        elif isinstance(datum, ShotDatum):
+            self._shots += 1
+            self._window.shots += 1
+            self._newest = datum.shot
+            if isinstance(datum.result, PoseEstimate):
+                self._measured(datum.result)
+            elif datum.result is not None or datum.shot.problem is not None:
+                self._window.missed += 1
+
+    def _measured(self, pose: PoseEstimate) -> None:
+        window, rig, now = self._window, self._published.rig, time.monotonic()
+        window.residual_m.append(pose.residual_rms_m)
+        window.sigma_m.append(math.sqrt(np.trace(pose.cov[:3, :3])))
+        if rig is not None and now - self._looked > _LOOK_S and pose.points.seen.paired.sum() > 1:
+            self._looked = now
+            tilt, size = tilt_and_size(rig, self._published.body.points, pose)
+            window.tilt_rad.append(tilt)
+            window.size.append(size)
+
+    def tick(self) -> None:
+        """Put the state once a second."""
+        now = time.monotonic()
+        if now - self._state_at < STATE_S:
+            return
+        window, self._window = self._window, _Window()
+        state = {
+            "t": round(time.time(), 3),
+            "mode": self._mode,
+            "rate_hz": round(window.shots / (now - self._state_at), 2),
+            "shots": self._shots,
+            **window.state(),
+            "health": list(self._findings),
+        }
+        self._state_at = now
+        if self._session is not None:
+            with suppress(Exception):  # a session that is being lost; the next state comes in a second
+                self._session.put(self._cell.topic("state"), json_text(state))
+
+    def finish(self) -> None:
+        """Say that the command ended, send what waits, and leave."""
+        self._event("ended", "info", f"armsight {self._mode} ended after {self._shots} shots")
+        self._ending.set()
+        self._post.join(_STORE_S + 1.0)
+        if self._session is not None:
+            with suppress(Exception):
+                self._session.close()
+        with self._lock:
+            self._outbox.close()
+
+    def _event(self, kind: str, level: str, text: str) -> None:
+        with self._lock:
+            self._outbox.add({"t": round(time.time(), 3), "kind": kind, "level": level, "text": text[:2000]})
+
+    def about(self) -> dict[str, Any]:
+        """Return who the cell is."""
+        rig, arm = self._published.rig, self._published.arm
+        heldout = None if rig is None else rig.provenance.get("heldout_rigid_rms_m")
+        heldout_mm = 1e3 * heldout if isinstance(heldout, int | float) else None
+        return {
+            "armsight": importlib.metadata.version("armsight"),
+            "host": socket.gethostname(),
+            "mode": self._mode,
+            "arm": None if arm is None else arm.name,
+            "body": self._published.body.name or None,
+            "rig_made_utc": None if rig is None else rig.provenance.get("made_utc"),
+            "rig_heldout_mm": None if heldout_mm is None else round(heldout_mm, 4),
+            "limit_mm": None if heldout_mm is None else round(_LIMIT * heldout_mm, 4),
+            "holds": self._cell.holds,
+            "alive_s": round(time.monotonic() - self._began, 1),
+        }
+
+    def _posting(self) -> None:
+        """Reach the hub, again and again, and have events stored; in a thread of its own."""
+        problem, reached = "", 0.0
+        while True:
+            ending = self._ending.wait(_POST_S)
+            if self._session is None:
+                try:
+                    self._open()
+                except Exception as error:  # noqa: BLE001 - of the library: whatever it is, it is tried again
+                    if (text := _reason(error)) != problem:
+                        problem = text
+                        click.echo(
+                            f"note: --cell {self._cell.name}: no hub at {self._cell.router} yet: {text}", err=True
+                        )
+                else:
+                    reached = time.monotonic()
+            if self._session is not None and not self._send_events() and time.monotonic() - reached > _UNHEARD_S:
+                reached = math.inf  # said once
+                hint = (
+                    "its certificate is of another name, or the hub's disk is full" if self._cell.ca else "is it full?"
+                )
+                click.echo(f"note: --cell {self._cell.name}: the hub stores no events of it: {hint}", err=True)
+            if ending:
+                return
+
+    def _open(self) -> None:
+        import zenoh
+
+        session = zenoh.open(self._config)
+        topic = self._cell.topic
+        self._declared = [
+            session.declare_queryable(
+                topic("about"), lambda query: query.reply(topic("about"), json_text(self.about()))
+            ),
+            session.declare_queryable(topic("image"), lambda query: query.reply(topic("image"), self._image())),
+            session.declare_queryable(topic("hold"), lambda query: query.reply(topic("hold"), self._hold(query))),
+            session.liveliness().declare_token(topic("alive", str(session.zid()))),
+        ]
+        self._session = session
+
+    def _send_events(self) -> bool:
+        """Have waiting events stored, oldest first, until none waits, or False: the hub does not answer."""
+        while True:
+            with self._lock:
+                events = self._outbox.waiting(_BATCH)
+            if not events:
+                return True
+            content = json_text({"outbox": self._outbox.name, "events": events})
+            stored = 0
+            with suppress(Exception):  # no hub, or none that answers: they are sent again
+                for reply in self._session.get(self._cell.topic("events"), payload=content, timeout=_STORE_S):
+                    stored = int(reply.ok.payload.to_string()) if reply.ok is not None else stored
+            if not stored:
+                return False
+            with self._lock:
+                self._outbox.confirm(stored)
+
+    def _image(self) -> bytes:
+        """Return the newest left image, small, as JPEG; nothing where there is none."""
+        shot = self._newest
+        if shot is None or shot.left is None:
+            return b""
+        image = shot.left if shot.left.dtype == np.uint8 else grey(shot.left)
+        scale = _SIDE_PX / max(image.shape[:2])
+        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
+        return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG])[1].tobytes()
+
+    def _hold(self, query: Any) -> bytes:  # noqa: ANN401 - of the library
+        """Answer a request to hold: done, or why not; both are events."""
+        try:
+            text = self._checked_hold(query.payload.to_bytes() if query.payload is not None else b"")
+            self._event("hold", "warning", f"the hub asked to hold: {text}")
+            assert self._published.hold is not None
+            self._published.hold(f"the hub asked to hold: {text}")
+        except InputError as error:
+            self._event("hold", "warning", f"a request to hold was rejected: {error}")
+            return f"rejected: {error}".encode()
+        return b"held"
+
+    def _checked_hold(self, payload: bytes) -> str:
+        """Return the text of a request to hold.
+
+        Raises:
+            InputError: the cell does not allow it, moves nothing, or it is not signed, or not new.
+        """
+        if not self._cell.holds or self._cell.ca is None:
+            raise InputError("this cell does not allow it: holds = true and ca in its cell.toml would")
+        if self._published.hold is None:
+            raise InputError(f"armsight {self._mode} moves no arm")
+        try:
+            request = json.loads(payload)
+            t, text, signature = float(request["t"]), str(request["text"]), bytes.fromhex(request["signature"])
+        except (ValueError, KeyError, TypeError):
+            raise InputError("it is no request to hold") from None
+        if not signed_by(self._cell.ca, signature, hold_bytes(self._cell.site, self._cell.name, t, text)):
+            raise InputError("it is not signed by the key of this site")
+        if not abs(time.time() - t) < _FRESH_S or t <= self._held:
+            raise InputError(f"it is of {t - time.time():+.0f} s by this cell's clock: it is old, or a clock is wrong")
+        self._held = t
+        return text[:200]
+
+
+def hold_bytes(site: str, cell: str, t: float, text: str) -> bytes:
+    """Return what is signed in a request to hold."""
+    return json.dumps(["armsight hold", site, cell, t, text]).encode()
+
+
+def signed_by(ca: Path, signature: bytes, data: bytes) -> bool:
+    """Whether the key of a site's certificate signed bytes."""
+    from cryptography import x509
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    public = x509.load_pem_x509_certificate(ca.read_bytes()).public_key()
+    try:
+        assert isinstance(public, ec.EllipticCurvePublicKey)
+        public.verify(signature, data, ec.ECDSA(hashes.SHA256()))
+    except InvalidSignature:
+        return False
+    return True
+
+
+def _reason(error: Exception) -> str:
+    """Return what the library says, without where in its source."""
+    return str(error).split(" at ")[0].strip().rstrip(".!") or type(error).__name__
+
+
+def open_cell(rest: str, published: Published) -> CellSink:
+    """Open ``NAME[@ROUTER]`` or a cell.toml."""
+    return CellSink(read_cell(rest), published, published.properties.get("command", "python"))

@@ -1,0 +1,154 @@
+"""Who a cell is: ``NAME[@ROUTER]`` or a cell.toml in, a :class:`Cell` out; and what zenoh sessions have in common.
+
+A cell is one rig with what it measures; a site is where one hub is. Keys are ``armsight/SITE/CELL/...``.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from armsight.errors import InputError
+from armsight.files import read_toml
+
+#: The router of a hub on this computer.
+ROUTER = "tcp/127.0.0.1:7447"
+#: Names of sites and cells: they are parts of keys, folders and certificates.
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,47}")
+_ENDPOINT = re.compile(r"(?:(tcp|tls)/)?(\[[0-9a-fA-F:]+\]|[\w.-]+):(\d{1,5})")
+_HERE = ("127.0.0.1", "localhost", "[::1]")
+_FILES = ("ca", "certificate", "key")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Who a cell is.
+
+    Attributes:
+        name: of the cell.
+        site: of the site.
+        router: zenoh endpoint of the hub, ``tls/HOST:PORT``.
+        ca: certificate of the site, PEM; None without TLS.
+        certificate: of the cell, PEM.
+        key: its private key, PEM.
+        holds: whether the hub may ask it to hold its arm.
+    """
+
+    name: str
+    site: str = "site"
+    router: str = ROUTER
+    ca: Path | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+    holds: bool = False
+
+    def topic(self, *parts: str) -> str:
+        """Return a key of the cell."""
+        return "/".join(["armsight", self.site, self.name, *parts])
+
+
+def read_cell(spec: str) -> Cell:
+    """Read ``NAME[@ROUTER]`` or the path of a cell.toml.
+
+    Raises:
+        InputError: a name that cannot be part of a key, no endpoint, a file without the keys it needs, or another
+        computer's
+            router without TLS.
+    """
+    if spec.endswith(".toml"):
+        return _from_file(Path(spec).expanduser())
+    name, _, router = spec.partition("@")
+    return _checked(Cell(name, router=endpoint(router, f"--cell {spec}") if router else ROUTER), f"--cell {spec}")
+
+
+def _from_file(path: Path) -> Cell:
+    given = read_toml(path)
+    texts = {"name", "site", "router", *_FILES}
+    if unknown := sorted(given.keys() - texts - {"holds"}):
+        raise InputError(f"{path}: unknown key {unknown[0]!r}; known are {', '.join(sorted({*texts, 'holds'}))}")
+    for key, kind in [*((key, str) for key in sorted(texts)), ("holds", bool)]:
+        if key in given and not isinstance(given[key], kind):
+            raise InputError(
+                f"{path}: {key} is {given[key]!r}: expected {'true or false' if kind is bool else 'a text'}"
+            )
+    if "name" not in given:
+        raise InputError(f"{path}: the key name is missing: what is this cell called?")
+    for key in _FILES:
+        if key in given:
+            given[key] = path.parent / given[key]
+            if not given[key].is_file():
+                raise InputError(f"{path}: {key}: {given[key]} is not there; `armsight hub keys` makes it")
+    if "router" in given:
+        given["router"] = endpoint(given["router"], str(path))
+    return _checked(Cell(**given), str(path))
+
+
+def _checked(cell: Cell, where: str) -> Cell:
+    for what, name in (("cell", cell.name), ("site", cell.site)):
+        check_name(name, f"{where}: the {what}'s name")
+    tls = cell.router.startswith("tls/")
+    if tls and None in (cell.ca, cell.certificate, cell.key):
+        raise InputError(
+            f"{where}: {cell.router} needs ca, certificate and key in a cell.toml; `armsight hub keys` makes it"
+        )
+    require_here(cell.router, where)
+    return cell
+
+
+def check_name(name: str, what: str) -> None:
+    """Raise an InputError where a name of a site or a cell cannot be part of a key."""
+    if not NAME.fullmatch(name):
+        raise InputError(f"{what} is {name!r}: expected up to 48 letters, digits, - and _, such as table-3")
+
+
+def endpoint(text: str, where: str) -> str:
+    """Return ``[tcp/|tls/]HOST:PORT`` as zenoh writes it.
+
+    Raises:
+        InputError: it is none.
+    """
+    match = _ENDPOINT.fullmatch(text)
+    if match is None or not 0 < int(match[3]) <= 65535:
+        raise InputError(f"{where}: {text!r} is no address of a hub: expected HOST:PORT or tls/HOST:PORT")
+    return f"{match[1] or 'tcp'}/{match[2]}:{match[3]}"
+
+
+def require_here(router: str, where: str) -> None:
+    """Raise an InputError where data would leave this computer without TLS."""
+    if router.startswith("tcp/") and router.removeprefix("tcp/").rpartition(":")[0] not in _HERE:
+        raise InputError(
+            f"{where}: {router} is another computer, and tcp is readable by all between: use tls/ (armsight hub keys)"
+        )
+
+
+def zenoh_config(mode: str, connect: str = "", listen: str = "", tls: dict[str, Any] | None = None) -> Any:  # noqa: ANN401
+    """Return the configuration of a zenoh session that looks for nobody by itself.
+
+    Args:
+        mode: client or router.
+        connect: endpoint to connect to, with a second to do so; empty for none.
+        listen: endpoint to listen at; empty for none.
+        tls: zenoh's ``transport/link/tls``.
+
+    Raises:
+        InputError: zenoh is not installed.
+    """
+    try:
+        import zenoh
+    except ImportError:
+        raise InputError('zenoh is not installed: pip install "armsight[cells]"') from None
+    config = zenoh.Config()
+    settings: dict[str, Any] = {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "listen/endpoints": [listen] if listen else [],
+        "connect/endpoints": [connect] if connect else [],
+        "connect/timeout_ms": 1000,
+    }
+    for key, value in {**settings, **({"transport/link/tls": tls} if tls else {})}.items():
+        config.insert_json5(key, json.dumps(value))
+    return config

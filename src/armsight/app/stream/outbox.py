@@ -1,0 +1,107 @@
+"""Events that wait on disk until a hub has stored them: numbered, and sent by one process alone.
+
+In: events, one at a time. Out: those that were not confirmed, oldest first. A storm is thinned, and what was left out
+is counted.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import sqlite3
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from armsight.errors import InputError
+
+#: events a second that are kept, and as many at once after a pause; half: a burst of findings is thinned, double:
+#: twice the disk.
+_RATE, _BURST = 10.0, 100.0
+#: events that wait at most; half: two days without a hub at an event a second become one, double: twice the disk (0.2
+#: GB).
+_MOST = 200_000
+
+
+def state_folder() -> Path:
+    """Return where programs keep their state for a user (XDG base directories)."""
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "armsight"
+
+
+class Outbox:
+    """The events of one cell; one thread at a time may use it.
+
+    Args:
+        folder: of the cell; made where it is not there.
+        cell: its name, for messages.
+
+    Attributes:
+        name: which numbering this is: a new disk begins at 1 again, under another name.
+
+    Raises:
+        InputError: another process of this computer is this cell, or nothing can be written there.
+    """
+
+    def __init__(self, folder: Path, cell: str) -> None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._db = sqlite3.connect(
+                folder / "events.sqlite", timeout=0.2, check_same_thread=False, isolation_level=None
+            )
+            self._db.execute("PRAGMA locking_mode = EXCLUSIVE")
+            self._db.execute("CREATE TABLE IF NOT EXISTS waiting (n INTEGER PRIMARY KEY AUTOINCREMENT, event TEXT)")
+            self._db.execute("CREATE TABLE IF NOT EXISTS outbox (name TEXT)")
+            found = self._db.execute("SELECT name FROM outbox").fetchone()
+            self.name = str(found[0]) if found else secrets.token_hex(8)
+            self._db.execute("DELETE FROM outbox")  # a write: it takes the lock even where nothing is new
+            self._db.execute("INSERT INTO outbox VALUES (?)", (self.name,))
+        except (sqlite3.Error, OSError) as error:
+            why = (
+                "another process on this computer is this cell: give each its own name"
+                if "locked" in str(error)
+                else error
+            )
+            raise InputError(f"--cell {cell}: {folder}: {why}") from None
+        self._left = _BURST
+        self._at = time.monotonic()
+        self.thinned = 0
+
+    def add(self, event: dict[str, Any]) -> None:
+        """Keep an event, unless too many come at once; on a full disk it is lost, and counted."""
+        now = time.monotonic()
+        self._left = min(_BURST, self._left + (now - self._at) * _RATE)
+        self._at = now
+        if self._left < 1.0:
+            self.thinned += 1
+            return
+        self._left -= 1.0
+        try:
+            if self.thinned and self._left > 1.0:
+                text = f"{self.thinned} events were left out: too many at once"
+                self._store({**event, "kind": "thinned", "level": "warning", "text": text})
+                self.thinned = 0
+            self._store(event)
+        except sqlite3.Error:
+            self.thinned += 1
+
+    def _store(self, event: dict[str, Any]) -> None:
+        self._db.execute("INSERT INTO waiting (event) VALUES (?)", (json.dumps(event),))
+        self._db.execute("DELETE FROM waiting WHERE n <= (SELECT max(n) FROM waiting) - ?", (_MOST,))
+
+    def waiting(self, most: int) -> list[dict[str, Any]]:
+        """Return the oldest events that wait, each with its number ``n``."""
+        with suppress(sqlite3.Error):
+            rows = self._db.execute("SELECT n, event FROM waiting ORDER BY n LIMIT ?", (most,))
+            return [{**json.loads(event), "n": n} for n, event in rows]
+        return []
+
+    def confirm(self, n: int) -> None:
+        """Forget the events up to a number: they are stored elsewhere."""
+        with suppress(sqlite3.Error):
+            self._db.execute("DELETE FROM waiting WHERE n <= ?", (n,))
+
+    def close(self) -> None:
+        """Leave it to the next process."""
+        self._db.close()

@@ -1,0 +1,210 @@
+"""Cells and a hub, each with its own zenoh session, over loopback."""
+
+import json
+import os
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+
+from armsight.app.hub.hold import hold
+from armsight.app.hub.keys import make_keys
+from armsight.app.hub.service import Hub
+from armsight.app.stream.cell import open_cell, tilt_and_size
+from armsight.app.stream.datum import Published
+from armsight.data import Missed, PoseEstimate, Shot
+from armsight.errors import InputError
+from armsight.loop.running.data import NoteDatum, ShotDatum
+from armsight.sim.example_rig import example_rig
+
+GREY = np.zeros((48, 64), np.uint8)
+
+
+@pytest.fixture
+def hub_at(tmp_path):
+    """Return what starts hubs that are closed at the end."""
+    hubs = []
+
+    def start(port, keys=None, folder="hub"):
+        scheme = "tcp" if keys is None else "tls"
+        hubs.append(Hub(tmp_path / folder, f"{scheme}/127.0.0.1:{port}", "127.0.0.1:0", keys, lambda line: None))
+        return hubs[-1]
+
+    yield start
+    for each in hubs:
+        each.close()
+
+
+@pytest.fixture
+def cell_at():
+    """Return what starts cells that are closed at the end."""
+    cells = []
+
+    def start(spec, mode="measure", **about):
+        cells.append(open_cell(str(spec), Published(properties={"command": mode}, **about)))
+        cells[-1].start()
+        return cells[-1]
+
+    yield start
+    for each in cells:
+        each.close()
+
+
+def shown(hub):
+    """Return the cells of a hub by name."""
+    return {cell["name"]: cell for cell in hub.snapshot()["cells"]}
+
+
+def fetched(hub, path):
+    """Return the bytes of a page."""
+    with urllib.request.urlopen(hub.pages.address + path, timeout=5) as answer:
+        return answer.read()
+
+
+def test_a_cell_that_began_before_its_hub_arrives_with_all_its_events(hub_at, cell_at, port, wait):
+    cell = cell_at(f"table-1@127.0.0.1:{port}")
+    cell.put(NoteDatum(1.0, "rig: a camera moved", "warning"))
+    hub = hub_at(port)
+    for number in range(30):
+        cell.put(ShotDatum(Shot(str(number), GREY, GREY), Missed("hidden")))
+    wait(lambda: shown(hub).get("table-1", {}).get("state", {}).get("shots") == 30)
+    found = wait(lambda: (f := shown(hub)["table-1"])["about"] and f)
+    assert found["about"]["mode"] == "measure"
+    assert (found["level"], found["why"]) == (3, "rig: a camera moved")
+    assert [each["kind"] for each in json.loads(fetched(hub, "events?q=camera+moved"))] == ["health"]
+    assert fetched(hub, "image?site=site&cell=table-1").startswith(b"\xff\xd8")
+    assert 'armsight_cell_missed_ratio{site="site",cell="table-1"}' in fetched(hub, "metrics").decode()
+    cell.close()
+    wait(lambda: shown(hub)["table-1"]["level"] == -1)
+    assert [each["kind"] for each in json.loads(fetched(hub, "events"))] == ["ended", "health", "began"]
+
+
+def test_events_arrive_once_although_the_hub_is_killed(hub_at, cell_at, port, tmp_path, wait):
+    code = (
+        "import sys, threading; from pathlib import Path; from armsight.app.hub.service import Hub;"
+        f"Hub(Path({str(tmp_path / 'kept')!r}), 'tcp/127.0.0.1:{port}', '127.0.0.1:0', None, print); print('up', flush=True);"
+        "threading.Event().wait()"
+    )
+    cell = cell_at(f"a@127.0.0.1:{port}")
+    for killed in range(2):
+        hub = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=os.environ)
+        assert hub.stdout.readline() == "up\n"
+        cell.put(NoteDatum(0.0, f"before {killed}", "warning"))
+        wait(lambda: not cell._outbox.waiting(9))
+        hub.kill()
+        hub.communicate()
+        cell.put(NoteDatum(0.0, f"while it is gone {killed}", "warning"))
+    hub = hub_at(port, folder="kept")
+    wait(lambda: len(hub._store.events()) == 5)
+    assert [each["n"] for each in hub._store.events()] == [5, 4, 3, 2, 1]
+
+
+def test_a_killed_cell_is_lost_and_one_that_ends_is_not(hub_at, port, tmp_path, wait):
+    hub = hub_at(port)
+    code = (
+        "import sys, time; from armsight.app.stream.cell import open_cell; from armsight.app.stream.datum import Published;"
+        f"c = open_cell('b@127.0.0.1:{port}', Published()); c.start(); time.sleep(60)"
+    )
+    cell = subprocess.Popen([sys.executable, "-c", code], env=os.environ)
+    wait(lambda: shown(hub).get("b", {}).get("state"))
+    cell.kill()
+    cell.wait()
+    assert wait(lambda: (f := shown(hub)["b"])["level"] == 4 and f)["why"].startswith("lost")
+    hub.close()
+    later = hub_at(port, folder="hub")
+    assert shown(later)["b"]["level"] == 4  # it is not forgotten
+
+
+def test_one_name_is_one_process(cell_at, port, hub_at, wait, monkeypatch, tmp_path):
+    cell_at(f"a@127.0.0.1:{port}")
+    with pytest.raises(InputError, match="another process on this computer is this cell"):
+        cell_at(f"a@127.0.0.1:{port}")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another computer"))
+    cell_at(f"a@127.0.0.1:{port}")
+    hub = hub_at(port)
+    assert wait(lambda: (f := shown(hub).get("a", {})).get("level") == 1 and f)["why"].startswith("2 processes")
+
+
+def with_line(path, old, new):
+    """Change a file, and return its path."""
+    path.write_text(path.read_text().replace(old, new))
+    return path
+
+
+def test_a_cell_writes_below_its_own_name_alone(hub_at, cell_at, port, tmp_path, wait):
+    make_keys(tmp_path / "keys", "lab", ["a", "b"], "127.0.0.1", port)
+    make_keys(tmp_path / "other", "lab", ["c"], "127.0.0.1", port)
+    hub = hub_at(port, tmp_path / "keys")
+    cell_at(with_line(tmp_path / "keys/cells/b/cell.toml", 'name = "b"', 'name = "x"'))
+    cell_at(tmp_path / "other/cells/c/cell.toml")
+    cell_at(tmp_path / "keys/cells/a/cell.toml")
+    wait(lambda: shown(hub).get("a", {}).get("state"))
+    assert set(shown(hub)) == {"a"}
+    assert {each["cell"] for each in hub._store.events()} == {"a"}
+
+
+def test_a_cell_holds_for_the_key_of_its_site_alone(hub_at, cell_at, port, tmp_path, wait):
+    keys = tmp_path / "keys"
+    make_keys(keys, "lab", ["arm", "shy"], "127.0.0.1", port)
+    hub, held = hub_at(port, keys), []
+    cell_at(with_line(keys / "cells/arm/cell.toml", "holds = false", "holds = true"), "run", hold=held.append)
+    cell_at(keys / "cells/shy/cell.toml", "run", hold=held.append)
+    wait(lambda: set(shown(hub)) == {"arm", "shy"} and all(cell["about"] for cell in shown(hub).values()))
+    assert hold(keys, "shy", "why", f"127.0.0.1:{port}").startswith("rejected: this cell does not allow it")
+    assert held == []
+    assert hold(keys, "arm", "smoke", f"127.0.0.1:{port}") == "held"
+    assert held == ["the hub asked to hold: smoke"]
+    request = json.dumps({"t": 0, "text": "", "signature": "00"}).encode()
+    assert hub._router.ask("lab", "arm", "hold", request).startswith(b"rejected: it is not signed")
+    with pytest.raises(InputError, match="no cell of site lab"):
+        hold(keys, "nobody", "", f"127.0.0.1:{port}")
+    assert len(held) == 1
+
+
+def test_an_address_beyond_this_computer_needs_keys(tmp_path):
+    with pytest.raises(InputError, match="is another computer"):
+        Hub(tmp_path, "tcp/0.0.0.0:7447", "127.0.0.1:0", None, print)
+    with pytest.raises(InputError, match="needs the keys of a site"):
+        Hub(tmp_path, "tls/0.0.0.0:7447", "127.0.0.1:0", None, print)
+
+
+def test_a_page_of_another_name_is_answered_nothing(hub_at, port):
+    request = urllib.request.Request(hub_at(port).pages.address + "state", headers={"Host": "elsewhere.example:80"})
+    with pytest.raises(urllib.error.HTTPError) as error:
+        urllib.request.urlopen(request, timeout=5)
+    assert error.value.code == 403
+    error.value.close()
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_rotation_of_one_camera_shows_in_tilt_or_size(axis):
+    """The oracle: projections by the true rig, the pose triangulated by the old one.
+
+    About x the rays leave their planes by the angle itself; about y the depth, and with it the size, changes by Z / b times it:
+    within 5 %, as the body is 0.1 m off the axis. About z, the optical axis, neither shows.
+    """
+    from armsight.data import Body, Correspondences
+    from armsight.vision.pose.locate import locate
+    from armsight.vision.triangulate import triangulate
+
+    rig = example_rig()
+    points = np.array([[-0.04, -0.04, 0], [0.04, -0.04, 0.01], [0.04, 0.04, 0], [-0.04, 0.04, -0.01], [0, 0, 0.02]])
+    body = Body("body", tuple("ABCDE"), points)
+    tangent = np.zeros(rig.parameter_count)
+    tangent[rig.parameter_count - 3 + axis] = np.radians(0.01)
+    found = []
+    for each in (rig, rig.perturbed(tangent)):
+        T = np.eye(4)
+        T[:3, 3] = 0.1, 0.05, 0.85
+        uv = np.stack(each.project(points @ T[:3, :3].T + T[:3, 3]), axis=1)
+        seen = Correspondences(np.arange(5), uv, np.tile(0.01 * np.eye(2), (5, 2, 1, 1)))
+        pose = locate(rig, body, triangulate(rig, body, seen))
+        assert isinstance(pose, PoseEstimate)
+        found.append(tilt_and_size(rig, points, pose))
+    assert found[0] == pytest.approx((0.0, 0.0), abs=1e-9)
+    changed, expected = np.abs(np.subtract(*found)), np.radians(0.01) * np.array([1.0, 0.85 / rig.baseline_m])
+    assert changed[axis] == pytest.approx(expected[axis], rel=0.05)
+    assert changed[1 - axis] < 0.05 * expected[1 - axis]
