@@ -10,8 +10,8 @@ import urllib.request
 import numpy as np
 import pytest
 
-from armsight.app.hub.hold import hold
 from armsight.app.hub.keys import make_keys
+from armsight.app.hub.router import hold
 from armsight.app.hub.service import Hub
 from armsight.app.stream.cell import open_cell, tilt_and_size
 from armsight.app.stream.datum import Published
@@ -85,7 +85,8 @@ def test_a_cell_that_began_before_its_hub_arrives_with_all_its_events(hub_at, ce
 def test_events_arrive_once_although_the_hub_is_killed(hub_at, cell_at, port, tmp_path, wait):
     code = (
         "import sys, threading; from pathlib import Path; from armsight.app.hub.service import Hub;"
-        f"Hub(Path({str(tmp_path / 'kept')!r}), 'tcp/127.0.0.1:{port}', '127.0.0.1:0', None, print); print('up', flush=True);"
+        f"Hub(Path({str(tmp_path / 'kept')!r}), 'tcp/127.0.0.1:{port}', '127.0.0.1:0', None, print);"
+        "print('up', flush=True);"
         "threading.Event().wait()"
     )
     cell = cell_at(f"a@127.0.0.1:{port}")
@@ -183,8 +184,8 @@ def test_a_page_of_another_name_is_answered_nothing(hub_at, port):
 def test_a_rotation_of_one_camera_shows_in_tilt_or_size(axis):
     """The oracle: projections by the true rig, the pose triangulated by the old one.
 
-    About x the rays leave their planes by the angle itself; about y the depth, and with it the size, changes by Z / b times it:
-    within 5 %, as the body is 0.1 m off the axis. About z, the optical axis, neither shows.
+    About x the rays leave their planes by the angle itself; about y the depth, and with it the size, changes by Z / b
+    times it: within 5 %, as the body is 0.1 m off the axis. About z, the optical axis, neither shows.
     """
     from armsight.data import Body, Correspondences
     from armsight.vision.pose.locate import locate

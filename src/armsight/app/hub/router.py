@@ -9,12 +9,12 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
-from armsight.app.hub.keys import site_of
-from armsight.app.stream.cell_file import require_here, zenoh_config
+from armsight.app.hub.keys import sign_hold, site_of
+from armsight.app.stream.cell_file import Cell, endpoint, require_here, zenoh_config
 from armsight.errors import InputError
 
 #: bytes of a state, or of events, that are read at most; half: long findings are rejected, double: a wrong cell costs
@@ -60,7 +60,7 @@ class Router:
                 raise InputError(f"--listen {listen} needs the keys of a site: --keys DIR (`armsight hub keys`)")
         elif not listen.startswith("tls/"):
             raise InputError(f"--listen {listen}: with --keys it is tls/HOST:PORT")
-        config = zenoh_config("router", listen=listen, tls=None if keys is None else _tls(keys))
+        config = zenoh_config("router", listen=listen, tls=None if keys is None else _tls(keys, "listen"))
         if keys is not None:
             config.insert_json5("access_control", json.dumps(_access(*site_of(keys))))
         try:
@@ -111,13 +111,10 @@ def _json(payload: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
         return "a message that is no JSON"
 
 
-def _tls(keys: Path) -> dict[str, Any]:
-    return {
-        "root_ca_certificate": str(keys / "ca.pem"),
-        "enable_mtls": True,
-        "listen_certificate": str(keys / "hub.pem"),
-        "listen_private_key": str(keys / "hub.key"),
-    }
+def _tls(keys: Path, way: str) -> dict[str, Any]:
+    """Return zenoh's settings for the hub's own certificate; ``way``: listen or connect."""
+    files = {"root_ca_certificate": "ca.pem", f"{way}_certificate": "hub.pem", f"{way}_private_key": "hub.key"}
+    return {"enable_mtls": True, **{key: str(keys / name) for key, name in files.items()}}
 
 
 def _access(site: str, cells: Sequence[str]) -> dict[str, Any]:
@@ -132,3 +129,32 @@ def _access(site: str, cells: Sequence[str]) -> dict[str, Any]:
     subjects = [{"id": name, "cert_common_names": [f"{site}.{name}"]} for name in below]
     policies = [{"rules": [name], "subjects": [name]} for name in below]
     return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies}
+
+
+def hold(keys: Path, cell: str, reason: str, address: str) -> str:
+    """Ask a cell to hold; return its answer: ``held``, why not, or nothing where it did not answer.
+
+    Args:
+        keys: folder of the site's keys.
+        cell: its name.
+        reason: kept in the events of both sides.
+        address: ``HOST:PORT`` at which cells connect to the hub.
+
+    Raises:
+        InputError: no keys, no such cell, or no hub answers there.
+    """
+    import zenoh
+
+    site, cells = site_of(keys)
+    if cell not in cells:
+        raise InputError(f"{cell!r} is no cell of site {site}; it has {', '.join(cells) or 'none'}")
+    try:
+        session = zenoh.open(zenoh_config("client", endpoint(f"tls/{address}", "--hub"), tls=_tls(keys, "connect")))
+    except zenoh.ZError:
+        raise InputError(f"--hub {address}: no hub with the keys of {keys} answers there") from None
+    with closing(session):
+        topic = Cell(cell, site).topic("hold")
+        for reply in session.get(topic, payload=sign_hold(keys, cell, reason), timeout=_ANSWER_S):
+            if reply.ok is not None:
+                return str(reply.ok.payload.to_string())
+    return ""
