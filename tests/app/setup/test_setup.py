@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+import threading
 from pathlib import Path
 
 import click
@@ -10,11 +11,14 @@ import pytest
 
 from armsight.app.main import group, run
 from armsight.app.setup import finding, walk
-from armsight.app.setup.finding import check_arm, find_left_and_right, find_port
+from armsight.app.setup.finding import check_arm, check_model, find_board, find_left_and_right, find_port
 from armsight.app.setup.steps import ARMS, PLATE
+from armsight.errors import InputError
 from armsight.robot.boards.ar4 import board as ar4
+from armsight.robot.boards.feetech import bus as feetech_bus
 from armsight.sim.boards.ar4 import Ar4Teensy
 from armsight.sim.boards.device import serve
+from armsight.sim.boards.so101 import So101Bus
 from armsight.vision.sources.v4l2 import VideoDevice
 from cli_runs import assert_rejected
 
@@ -237,6 +241,30 @@ def test_the_wrong_arm_is_named():
         pytest.raises(Exception, match="an AR4 answers, not a servo bus: armsight setup ar4"),
     ):
         check_arm(f"feetech:{port.name}")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+def test_the_arm_is_found_alone_by_a_moved_joint_or_by_its_cable():
+    said, bus, teensy = [], So101Bus.made(), Ar4Teensy()
+    with serve(bus, feetech_bus.BAUD) as servos, serve(teensy, ar4.BAUD) as other:
+        both = [servos.name, other.name]
+        assert find_board(said.append, lambda: [servos.name]) == f"feetech:{servos.name}"
+
+        def pushed(text):
+            said.append(text)
+            if "move a joint" in text:
+                threading.Timer(0.5, lambda: bus.servos.push(2, 0.3)).start()
+
+        assert find_board(pushed, lambda: both) == f"feetech:{servos.name}"
+        looks = iter([both, both])
+        assert find_board(said.append, lambda: next(looks, both[:1])) == f"ar4:{other.name}"
+        looks = iter([[], [], []])
+        assert find_board(said.append, lambda: next(looks, [other.name])) == f"ar4:{other.name}"
+    assert "2 arms answer: move a joint of yours by hand, or unplug it." in said
+    assert said[-1] == "Plug in the arm's USB cable."
+    with pytest.raises(InputError, match="/dev/x: an AR4 answers, and six_r is chosen: choose ar4"):
+        check_model("ar4:/dev/x", "six_r")
+    check_model("ar4:/dev/x", "my_ar4.urdf")
 
 
 def test_a_simulated_walk_is_no_beginning_of_a_real_one(armsight, typed, person):

@@ -38,6 +38,7 @@ from armsight.app.run.experiment import (
 from armsight.app.run.folder import finish, run_in
 from armsight.app.run.motion_file import MotionPlan, read_motions
 from armsight.app.run.tracks import require_pyarrow
+from armsight.app.setup.finding import check_arm, check_model, find_board
 from armsight.app.show.plotting import require_matplotlib
 from armsight.data import Array, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
@@ -51,7 +52,9 @@ from armsight.loop.running.setup import HostClock, Setup
 from armsight.robot.arm_file import open_arm
 from armsight.robot.board_registry import emulator_name, is_real, open_motion_board, slowed
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Fault
+from armsight.robot.boards.serial import list_ports
 from armsight.robot.kinematics.arm import Arm
+from armsight.robot.models import MODELS
 from armsight.robot.trajectories import point_to_point
 from armsight.vision.markers.targets import Composite, open_target
 from armsight.vision.rig import StereoRig
@@ -81,7 +84,10 @@ class StopAnswer:
 class ArmState:
     """What a page shows of the arm."""
 
-    arm: str = ""
+    arm: str = ""  # name or file
+    arms: tuple[str, ...] = tuple(MODELS)  # the names that there are
+    named: bool = False  # its port is known
+    finding: str = ""  # what to do while the arm's port is looked for
     board: str | None = None  # None while it is not connected
     missing: str = ""
     state: str = "not connected"  # the board's, in words
@@ -162,10 +168,8 @@ class ArmStep(PageStep[ArmState]):
         if self._board is not None or self._logged is not None:
             return
         if name is None:
-            raise InputError(
-                "no board was named: start with --board serial:/dev/ttyACM0, feetech:PORT, ar4:PORT (docs/howto/board.md), "
-                "or poses:FILE where another program moves the arm"
-            )
+            self.find_arm()
+            return
         if name.startswith(LOGGED):
             angles = read_angles(name.removeprefix(LOGGED), self.model)
             if angles.shots is None and angles.t_s is None:
@@ -178,7 +182,12 @@ class ArmStep(PageStep[ArmState]):
             self.shared.capture.pause()
             self._board = StoppableBoard(self._simulated.workcell.board)
         else:
-            board = StoppableBoard(open_motion_board(name, calibration=self.shared.options.servo_calibration))
+            check_model(name, self.shared.options.arm)
+            try:
+                board = StoppableBoard(open_motion_board(name, calibration=self.shared.options.servo_calibration))
+            except DeviceError:
+                check_arm(name)
+                raise
             try:
                 require_joints(board, name, self.model)
             except InputError:
@@ -191,6 +200,30 @@ class ArmStep(PageStep[ArmState]):
             self.say("warn", f"{error}: name a file with motions of this arm")
         self._thread = threading.Thread(target=self._work, args=(self._board,), name="arm", daemon=True)
         self._thread.start()
+
+    @asked("arm")
+    def find_arm(self) -> None:
+        """Find the arm's port, and connect: the only arm that answers, or the one whose joint or cable a person moves."""
+        if self._board is not None or self._logged is not None or self._simulated is not None:
+            raise InputError("the arm's board is known: connect it")
+        if not self.shown.finding:
+            self.show(finding="Looking at the ports.")
+            self.later("the arm was not found", self._find)
+
+    def _find(self) -> None:
+        try:
+            name = find_board(lambda text: self.show(finding=text), self._ports)
+        finally:
+            self.show(finding="")
+        self.say("good", f"the arm is at {name}")
+        self.shared.options = replace(self.shared.options, board=name)
+        self.open_arm()
+
+    def _ports(self) -> list[str]:
+        """Return the ports that there are, until the session ends."""
+        if self._closing.is_set():
+            raise DeviceError("the session has ended")
+        return list_ports()
 
     def stop(self) -> StopAnswer:
         """Stop in an emergency, and return what the board says of itself; may be called from any thread."""
@@ -296,11 +329,15 @@ class ArmStep(PageStep[ArmState]):
     def use_arm(self, arm: str) -> None:
         """Use another model of the arm: a name, a TOML or a URDF file, such as the corrected one.
 
-        The hand-eye calibration is made anew from its poses.
+        The hand-eye calibration is made anew from its poses; of an arm with other joints there are none.
         """
-        model = slowed(open_arm(arm), self.shared.options.board or "")
+        model, open_ = slowed(open_arm(arm), self.shared.options.board or ""), self._board is not None
+        if open_ or self._logged is not None:
+            check_model(self.shared.options.board or "", arm)
         if model.joints != self.model.joints:
-            raise InputError(f"{arm} has {model.joints} joints, {self.model.name} {self.model.joints}")
+            if open_ or self._logged is not None:
+                raise InputError(f"{arm} has {model.joints} joints, {self.model.name} {self.model.joints}")
+            self.handeye.clear()
         self.shared.options, self.model, self._mounting = replace(self.shared.options, arm=arm), model, None
         self.handeye.use_arm(model, arm)
         self.say("good", f"arm: {model.name} ({arm})")
@@ -589,7 +626,8 @@ class ArmStep(PageStep[ArmState]):
         vision, scene = self._vision(q)
         shown = replace(
             self.shown,
-            arm=self.model.name,
+            arm=options.arm,
+            named=options.board is not None,
             missing=self._lacking(),
             handeye=self.handeye.state,
             identify=self._identifying.state,

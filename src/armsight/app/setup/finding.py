@@ -1,15 +1,18 @@
-"""Which port is the arm's, and which cameras are left and right: by unplugging a cable and covering a lens."""
+"""Which port is the arm's, and which cameras are left and right: by moving a joint, unplugging a cable, covering a lens."""
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import cv2
 import numpy as np
 
+from armsight.data import Array
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.robot.board_registry import open_motion_board
+from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.boards.serial import list_ports
 from armsight.vision.sources.capture import open_capture
 from armsight.vision.sources.v4l2 import VideoDevice, find_cameras
@@ -19,6 +22,7 @@ _LOOK_S = 0.2
 #: A covered lens: its view is this much darker than before, and no other by so much; half: a hand before it is not enough,
 #: double: a cloud is.
 _COVERED, _NOT_COVERED = 0.45, 0.75
+_MOVED_RAD = np.radians(3.0)  # by a hand; half: play and noise pass for it, double: a stiff joint is pushed far
 _FRAMES = 8  # until a camera's exposure has settled; half: too dark an image, double: slower
 #: How boards are called -> what stands behind them, and the arm whose page has it.
 KINDS = {"feetech:": ("a servo bus", "so101"), "ar4:": ("an AR4", "ar4"), "serial:": ("armsight's firmware", "six_r")}
@@ -94,14 +98,73 @@ def find_left_and_right(
 
 def check_arm(board: str) -> None:
     """Raise an error where another kind of arm, or nothing, answers at a port such as ``feetech:/dev/ttyACM0``."""
-    kind, _, port = board.partition(":")
+    kind, _, port = board.partition(",")[0].partition(":")
     try:
         open_motion_board(board).close()
     except ArmsightError as error:
-        for other, (what, arm) in KINDS.items():
-            try:
-                open_motion_board(f"{other}{port}").close()
-            except ArmsightError:
-                continue
-            raise InputError(f"{port}: {what} answers, not {KINDS[f'{kind}:'][0]}: armsight setup {arm}") from error
+        if found := _opened(port, [other for other in KINDS if other != f"{kind}:"]):
+            name, opened = found
+            opened.close()
+            what, arm = _kind(name)
+            raise InputError(f"{port}: {what} answers, not {_kind(board)[0]}: armsight setup {arm}") from error
         raise
+
+
+def check_model(board: str, arm: str) -> None:
+    """Raise an error where a board such as ``ar4:/dev/ttyACM0`` cannot be of the arm that is called so."""
+    what, its = _kind(board)
+    if its and arm != its and arm in [each for _, each in KINDS.values()]:
+        raise InputError(f"{board.partition(':')[2]}: {what} answers, and {arm} is chosen: choose {its}")
+
+
+def _kind(board: str) -> tuple[str, str]:
+    """Return what stands behind a board's name, and the arm whose page has it; "" of what is at no port."""
+    return KINDS.get(f"{board.partition(':')[0]}:", ("", ""))
+
+
+def _opened(port: str, kinds: Iterable[str] = KINDS) -> tuple[str, MotionBoard] | None:
+    """Return the board that answers at a port, with its name; None where none does."""
+    for kind in kinds:
+        with contextlib.suppress(ArmsightError):
+            return f"{kind}{port}", open_motion_board(f"{kind}{port}")
+    return None
+
+
+def find_board(say: Callable[[str], None], ports: Callable[[], Sequence[str]] = list_ports) -> str:
+    """Return the board of the arm, such as ``feetech:/dev/ttyACM0``: the only one, or whose joint or cable a person moves.
+
+    Raises:
+        DeviceError: what was plugged in does not answer.
+    """
+    say("Looking at the ports.")
+    there = ports()
+    found = dict(each for port in there if (each := _opened(port)) is not None)
+    try:
+        if len(found) > 1:
+            say(f"{len(found)} arms answer: move a joint of yours by hand, or unplug it.")
+            return _moved(found, lambda: set(there) - set(ports()))
+    finally:
+        for board in found.values():
+            board.close()
+    if found:
+        return next(iter(found))
+    port = find_port(say, ports)
+    if (plugged := _opened(port)) is None:
+        raise DeviceError(f"{port}: nothing answers: is the arm switched on?")
+    plugged[1].close()
+    return plugged[0]
+
+
+def _moved(boards: dict[str, MotionBoard], gone: Callable[[], set[str]]) -> str:
+    """Return the name of the board of which a joint moves, or whose port is gone."""
+    first: dict[str, Array] = {}
+    while True:
+        for name, board in boards.items():
+            try:
+                q = board.receive(_LOOK_S / len(boards)).q
+            except DeviceError:
+                return name
+            if name.partition(":")[2] in gone():
+                return name
+            if len(q) and np.abs(q[-1] - first.setdefault(name, q[0])).max() > _MOVED_RAD:
+                return name
