@@ -22,7 +22,7 @@ _LOOK_S = 0.2
 #: A covered lens: its view is this much darker than before, and no other by so much; half: a hand before it is not enough,
 #: double: a cloud is.
 _COVERED, _NOT_COVERED = 0.45, 0.75
-_MOVED_RAD = np.radians(3.0)  # by a hand; half: play and noise pass for it, double: a stiff joint is pushed far
+_MOVED_RAD = np.radians(3.0)  # by a hand; half: backlash and noise pass for it, double: a stiff joint is pushed far
 _FRAMES = 8  # until a camera's exposure has settled; half: too dark an image, double: slower
 #: How boards are called -> what stands behind them, and the arm whose page has it.
 KINDS = {"feetech:": ("a servo bus", "so101"), "ar4:": ("an AR4", "ar4"), "serial:": ("armsight's firmware", "six_r")}
