@@ -2,9 +2,13 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from armsight.sim.budget import result
+from armsight.sim.workcell.body import body_target
+from armsight.vision.markers.body_layout import read_layout
+from armsight.vision.rig import StereoRig
 from cli_runs import assert_rejected
 
 #: Of the highest price: no better class is tried.
@@ -26,6 +30,23 @@ def test_answer_table_and_page(armsight, tmp_path, monkeypatch):
     assert "requested 0.5 mm" in page
     assert len(page) < 1_000_000
     assert json.loads((tmp_path / "out" / "budget.json").read_text())["causes"] == found["causes"]
+
+
+def test_the_best_of_a_class_with_what_to_build(armsight, tmp_path, monkeypatch):
+    monkeypatch.setattr(result, "CHANGES", {})
+    given = ("--volume", "0.1x0.1x0.1m", "--camera", "machine-vision-2mp", "--baseline", "150mm")
+    plain = json.loads(armsight("budget", *given, "--json").out)
+    said = armsight("budget", *given, "--best", "-o", tmp_path / "out", "--json")
+    found = json.loads(said.out)
+    (only,) = found["alternatives"]
+    assert only["baseline"] == "150mm"  # what is named stays
+    assert only["level_m"] == found["results"]["moving"]["level_m"] < plain["results"]["moving"]["level_m"]
+    rig = StereoRig.load(tmp_path / "out" / "rig.json")
+    assert rig.baseline_m == pytest.approx(0.15)
+    assert rig.left.intrinsics[0] == pytest.approx(found["focal_px"])
+    body = read_layout(tmp_path / "out" / "body.toml").body
+    np.testing.assert_allclose(body.points, body_target(only["body_scale"]).discs.body.points, atol=1e-9)
+    assert (tmp_path / "out" / "body.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_wrong_units_are_one_line(armsight):

@@ -1,10 +1,13 @@
 """A plan of a rig: what it says, the noise of its markers, its budget, and what cannot be built."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import armsight
 from armsight.errors import InputError
+from armsight.sim.budget import result
 from armsight.sim.budget.chart import marker_noise
 from armsight.sim.budget.plan import RigPlan, catalogue, planned
 from armsight.sim.camera.stages import CameraPipeline
@@ -76,6 +79,22 @@ def test_python_takes_the_keys_of_a_plan_file():
         armsight.budget(sped="0.2m/s")
     with pytest.raises(InputError, match="pairs must be a whole number, got '20'"):
         armsight.budget(pairs="20")
+
+
+def test_the_best_is_at_a_minimum_and_alternatives_are_grouped(monkeypatch):
+    two = ("global-shutter-1mp", "machine-vision-2mp")
+    monkeypatch.setattr(result, "catalogue", lambda: {name: catalogue()[name] for name in two})
+    found = result.best(RigPlan.read("", volume="0.1x0.1x0.1m", distance="0.6m", speed="0m/s", body_scale=1.0))
+    assert [one.budget.plan.camera for one in found] == list(two)
+    assert [one.price for one in found] == [3, 5]
+    near = max(one.budget.mm for one in found) < result.PREDICTED * min(one.budget.mm for one in found)
+    assert (found[0].group == found[1].group) == near
+    best = found[0].budget
+    for factor in (0.8, 1.25):  # beside the minimum of a search that ends where a step gains less than 1 %
+        other = replace(best.plan, baseline=f"{factor * best.plan.baseline_m}m")
+        assert result.RigBudget(other, planned(other)).mm > 0.98 * best.mm
+    with pytest.raises(InputError, match="is it in mm"):
+        result.best(RigPlan.read("", volume="400x400x300m"))
 
 
 def test_a_rig_that_there_is_has_its_own_calibration(tmp_path):

@@ -17,21 +17,36 @@ import click
 @click.option("--baseline", metavar="LENGTH", help="Between the cameras: 200mm.")
 @click.option("--rig", metavar="RIG.json", help="The budget of a rig that there is.")
 @click.option("--arm", metavar="ARM", help="For the closed loop: a model's name or a file.")
-@click.option("-o", "--output", metavar="DIR", help="Write report.html, budget.json and the figures.")
+@click.option(
+    "--best", "optimise", is_flag=True, help="Choose what is left out so that it measures best, for each class."
+)
+@click.option("-o", "--output", metavar="DIR", help="Write report.html, budget.json, the rig and the body to print.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def command(path: str, output: str | None, as_json: bool, **given: str | None) -> int:
+def command(path: str, optimise: bool, output: str | None, as_json: bool, **given: str | None) -> int:
     """Say before a rig is bought what it will measure, what limits it, and what would make it better.
 
     What is left out is chosen, and said. PLAN.toml has the same keys and more: docs/howto/budget.md.
     """
-    from armsight.app.budget.report import REPORT_FILES, budget_report
+    from armsight.app.body.draw import draw_body
+    from armsight.app.budget.report import REPORT_FILES, budget_report, to_build
+    from armsight.app.progress import steps
     from armsight.files import check_folder
-    from armsight.sim.budget.result import budget
+    from armsight.sim.budget.plan import RigPlan
+    from armsight.sim.budget.result import best, budget, chosen
 
     if output is not None:
-        check_folder(output, holding=REPORT_FILES, apart_from=(path,) if path else ())
-    report = budget_report(budget(path, **given))
+        check_folder(
+            output, holding=REPORT_FILES, apart_from=(path, *(given[key] for key in ("rig", "arm") if given[key]))
+        )
+    with steps() as progress:
+        alternatives = best(RigPlan.read(path, **given), progress) if optimise else ()
+        found = chosen(alternatives) if alternatives else budget(path, **given)
+        progress("what would change it")
+        report = budget_report(found, alternatives)
     written = None
     if output is not None:
-        written = str(report.write(Path(output), {"budget.json": report.json_text()}))
+        files = to_build(found)
+        written = str(report.write(Path(output), {"budget.json": report.json_text(), **files}))
+        if "body.toml" in files:
+            draw_body([Path(output) / "body.toml"], Path(output) / "body.pdf", split=True)
     return report.echo(as_json=as_json, written=written)

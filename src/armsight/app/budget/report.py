@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,19 +16,25 @@ from armsight.app.show.plotting import new_figure
 from armsight.app.show.report import Fact, Grade, Plot, Report, Section, figure_files
 from armsight.app.show.table import TextTable
 from armsight.sim.budget.plan import RigPlan
-from armsight.sim.budget.result import NOT_MODELLED, Accuracy, RigBudget
+from armsight.sim.budget.result import NOT_MODELLED, Alternative, RigBudget
+from armsight.sim.workcell.body import body_text
 from armsight.vision.calibrate.budget import Budget
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 #: Names of all files that a report has.
-REPORT_FILES = (PAGE, "budget.json", *figure_files("budget", ("volume",)))
+REPORT_FILES = (PAGE, "budget.json", "rig.json", "body.toml", "body.pdf", *figure_files("budget", ("volume",)))
 
 
-def budget_report(found: RigBudget) -> Report:
-    """Return what a plan's budget says."""
+def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = ()) -> Report:
+    """Return what a plan's budget says, the best one's beside its alternatives."""
     plan, values = found.plan, found.to_dict()
+    if alternatives:
+        values["alternatives"] = [
+            {"group": one.group, "price": one.price, **_asked(one.budget.plan), **one.budget.moving._asdict()}
+            for one in alternatives
+        ]
     parts = [f"{name} {1e3 * values[f'{name}_rms_m']:.2g} mm" for name in ("precision", "trueness", "lateral", "depth")]
     said = f"{', '.join(parts)} (RMS over the volume, in motion; lateral: one axis)"
     states = found.states
@@ -44,7 +52,7 @@ def budget_report(found: RigBudget) -> Report:
     )
     caption, title = "95 % of the errors in motion are within, mm.", "Error at 95 % over the volume, seen from above"
     sections: dict[str, Section] = {
-        "result": ("Result", [Fact(said), Fact(others), table, more]),
+        "result": ("Result", [Fact(said), Fact(others), table, more, *_compared(alternatives)]),
         "map": ("Over the volume", [Plot("volume", partial(_map, found.found), caption, title)]),
     }
     notes = [
@@ -53,6 +61,40 @@ def budget_report(found: RigBudget) -> Report:
     ]
     headline = f"{plan.cameras.text}; {plan.baseline} apart, volume {plan.volume} at {plan.distance}"
     return Report("budget", "Before you buy", plan.volume, headline, sections, notes, values, "budget", _answer(found))
+
+
+def to_build(found: RigBudget) -> dict[str, str]:
+    """Return the files of what is to be built: the nominal rig, and the default body unless the plan has one of its own."""
+    plan, source = found.plan, {"source": "armsight budget: planned, not calibrated"}
+    if plan.rig:
+        return {}
+    rig = replace(plan.stereo_rig, cov=plan.conditions().cov_calibration, provenance=source)
+    return {"rig.json": rig.to_text()} | ({} if plan.body else {"body.toml": body_text(plan.body_scale)})
+
+
+def _asked(plan: RigPlan) -> dict[str, Any]:
+    """Return what an optimised plan says, its focal length as a number."""
+    keys = ("camera", "baseline", "distance", "focal_widths", "verging_deg", "body_scale", "pairs", "exposure_ms")
+    lens = round(plan.focal_px / plan.image_size_px[0], 3)
+    return {key: getattr(plan, key) for key in keys} | {
+        "focal_widths": lens,
+        "verging_deg": round(plan.stereo_rig.convergence_deg, 1),
+        "exposure_ms": round(1e3 * plan.timing["exposure"], 3),
+    }
+
+
+def _compared(alternatives: Sequence[Alternative]) -> list[TextTable]:
+    """Return the table of alternatives; those of one group differ by less than the prediction is off."""
+    if not alternatives:
+        return []
+    asked = [_asked(one.budget.plan) for one in alternatives]
+    rows = tuple(
+        (each.pop("camera"), str(one.price), "ABCDEFGHIJ"[one.group], str(one.budget.moving), *map(str, each.values()))
+        for one, each in zip(alternatives, asked, strict=True)
+    )
+    columns = ("camera", "price class", "group", "95 % within, in motion", *asked[0])
+    title = "the best of each class; those of one group differ by less than what the prediction may be off"
+    return [TextTable(title, columns, rows)]
 
 
 def _answer(found: RigBudget) -> tuple[Grade, str]:
@@ -67,10 +109,7 @@ def _answer(found: RigBudget) -> tuple[Grade, str]:
         return "fair", f"{said}.{costs}."
     asked = f"{1e3 * requested[0]:g} mm" + (f", {math.degrees(requested[1]):g} deg" if requested[1] else "")
 
-    def reached(of: Accuracy) -> bool:
-        return of.level_m <= requested[0] and (not requested[1] or of.level_rad <= requested[1])
-
-    grade: Grade = "good" if reached(move) else "fair" if reached(rest) else "poor"
+    grade: Grade = "good" if found.reached(move) else "fair" if found.reached(rest) else "poor"
     body_m = found.worst_m("print of the body")
     floor = f" The print of the body alone costs {1e3 * body_m:.2g} mm: no camera reaches it."
     return grade, f"{said}; requested {asked}.{costs}.{floor if body_m > requested[0] else ''}"

@@ -35,8 +35,8 @@ _MOST_IMAGES, _MOST_SPOTS = 6, 200
 _SIZE_PX, _FOCAL_PX = (640, 480), 800.0
 #: Images of a still scene until what a camera mixes of earlier ones has settled.
 _SETTLED = 3
-#: Sizes are rounded to this share, movements and defocus to this, px: charts are used again.
-_STEP, _STEP_PX = 0.06, 0.25
+#: Sizes are rounded to this share, movements to this, px: charts are used again.
+_STEP, _STEP_PX = 0.2, 0.5
 #: Share of a chart's markers that must be found.
 _LEAST_FOUND = 0.5
 FAMILY = "tag36h11"
@@ -66,7 +66,8 @@ def marker_noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: 
         InputError: at this size, or so blurred, most of such markers are not found.
     """
     size = math.exp(_STEP * round(math.log(size_px) / _STEP))
-    return _noise(pipeline, kind, size, _STEP_PX * round(moved_px / _STEP_PX))
+    scale = math.sqrt(size / size_px) if kind == "disc" else 1.0  # a longer rim averages more; a corner is a corner
+    return scale * _noise(pipeline, kind, size, _STEP_PX * round(moved_px / _STEP_PX))
 
 
 @lru_cache(maxsize=512)

@@ -39,6 +39,7 @@ from armsight.vision.camera import Camera
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_layout import Layout, read_layout
 from armsight.vision.markers.chessboard import Chessboard
+from armsight.vision.pose.predict import PredictedView
 from armsight.vision.rig import StereoRig
 
 #: A disc's diameter, a tag's and a square's side in the image below which detection is left to luck, px; half: half of them
@@ -114,7 +115,7 @@ class RigPlan:
         verging_deg: angle between their axes; by default both look at the middle of the volume.
         focal_widths: focal length over the image's width; by default the class's.
         body: a body file; by default the plate with wings and nine discs that `armsight demo` has.
-        body_scale: by how much that body is larger than its file; discs grow with it.
+        body_scale: by how much the default body is larger; discs grow with it.
         board: the calibration board.
         pairs: of the board.
         board_print: standard deviation of its size, as a share.
@@ -314,10 +315,7 @@ class RigPlan:
         """The body."""
         if self.body:
             return read_layout(Path(self.folder) / self.body)
-        discs, k = body_target().discs, self.body_scale
-        assert discs is not None
-        body = replace(discs.body, points=k * discs.body.points)
-        return Layout("tool_body", replace(discs, body=body, radii_m=k * discs.radii_m), None, None)
+        return Layout("tool_body", body_target(self.body_scale).discs, None, None)
 
     @cached_property
     def stereo_rig(self) -> StereoRig:
@@ -334,6 +332,11 @@ class RigPlan:
         ]
         count = 2 * camera.parameters.size + 6
         return StereoRig(camera, camera, inverse(sides[0]) @ sides[1], np.zeros((count, count)), 0.0)
+
+    @cached_property
+    def views(self) -> list[PredictedView]:
+        """The body over the volume."""
+        return volume_views(self.stereo_rig, self.layout.body.points, self.layout.normals, self.distance_m, self.size_m)
 
     def marker(self, distance_m: float) -> tuple[str, float]:
         """Return the kind of the body's markers and their least size in the image at a distance, px."""
@@ -357,6 +360,8 @@ class RigPlan:
             value = getattr(self, key)
             if value != getattr(RigPlan, key) and not least <= value <= most:
                 raise InputError(f"{key} is {value:g}: expected {least:g} to {most:g}")
+        if self.body and self.body_scale != 1.0:
+            raise InputError(f"body_scale is {self.body_scale:g}: it is of the default body, not of {self.body}")
 
     def check(self) -> None:
         """Refuse what cannot be built.
@@ -405,12 +410,11 @@ class RigPlan:
                 f"a {kind} is {px:.1f} px at {far:.2g} m, at least {least_px:g} are needed: markers {least_px / px:.1f} "
                 f"times as large (body_scale = {self.body_scale * least_px / px:.2g})"
             )
-        views = volume_views(self.stereo_rig, self.layout.body.points, self.layout.normals, self.distance_m, size)
-        lost = sum(len(one.paired) < 3 for one in views)
+        lost = sum(len(one.paired) < 3 for one in self.views)
         if lost:
             raise InputError(
-                f"at {lost} of {len(views)} positions the cameras do not both see the body, they look past each other: "
-                f"verging_deg = {math.degrees(2 * math.atan(self.baseline_m / 2 / self.distance_m)):.3g} or less baseline"
+                f"at {lost} of {len(self.views)} positions the cameras do not both see the body, they look past each other"
+                f": verging_deg = {math.degrees(2 * math.atan(self.baseline_m / 2 / self.distance_m)):.3g} or less baseline"
             )
 
     def _noise_px(self) -> dict[str, float]:
@@ -420,7 +424,7 @@ class RigPlan:
         way = self.speeds[0] * math.sqrt(2 / 3) * self.timing["exposure"] * self.focal_px / self.distance_m
         sharp, soft = marker_noise(self.pipeline, kind, px) ** 2, 0.0
         for distance in self.distance_m + self.size_m[2] / 2 * np.array([-1.0, 1.0]):
-            if radius := 0.5 * round(2 * self.defocus_px(float(distance))):
+            if radius := round(self.defocus_px(float(distance))):
                 blurred = replace(self.pipeline, defocus=Defocus(radius))
                 soft += max(marker_noise(blurred, kind, px) ** 2 - sharp, 0.0) / 2
         moved = max(marker_noise(self.pipeline, kind, px, way) ** 2 - sharp, 0.0)
@@ -436,7 +440,7 @@ class RigPlan:
             arm = tuple(sigma * float(np.sqrt((part**2).sum() / 3)) for part in (J[:3], J[3:]))  # type: ignore[assignment]
         return Conditions(
             self._noise_px(),
-            _cov_calibration(replace(self, **{name: getattr(RigPlan, name) for name in _NOT_CALIBRATED})),
+            self._cov_calibration(),
             self.board_print,
             (length_m(self.body_print, "body_print"), length_m(self.body_bent, "body_bent")),
             self.body_size,
@@ -453,19 +457,18 @@ class RigPlan:
             arm,
         )
 
-
-#: What a calibration does not depend on.
-_NOT_CALIBRATED = (
-    "speed", "want", "board_print", "body_print", "body_bent", "warming_k", "mount_um_per_k", "lens_ppm_per_k", "skew_ms",
-    "start_ms", "rate_hz", "arm", "backlash_deg", "handeye", "body_size", "named",
-)  # fmt: skip
+    def _cov_calibration(self) -> Array:
+        """Return the covariance (P, P) of the rig's parameters."""
+        if self.existing:
+            return self.existing.cov
+        kept = {key: getattr(self, key) for key in ("camera", "baseline", "board", "pairs", "board_bent")}
+        lens, angle = self.focal_px / self.image_size_px[0], self.stereo_rig.convergence_deg
+        return _calibrated(RigPlan(focal_widths=lens, verging_deg=angle, **kept))
 
 
 @lru_cache(maxsize=64)
-def _cov_calibration(plan: RigPlan) -> Array:
-    """Return the covariance (P, P) of the rig's parameters."""
-    if plan.existing:
-        return plan.existing.cov
+def _calibrated(plan: RigPlan) -> Array:
+    """Return the covariance (P, P) of what boards that are held still determine, at the camera's own exposure."""
     board = open_board(plan.board)
     if not isinstance(board, Chessboard):
         raise InputError(f"board {plan.board!r}: chessboards have a budget so far: {Chessboard.form}")
@@ -487,7 +490,7 @@ def planned(plan: RigPlan, cameras: int = 2) -> Budget:
     points, normals = layout.body.points, layout.normals
 
     def of(pair: int | None) -> Budget:
-        views = volume_views(rig, points, normals, plan.distance_m, plan.size_m, pair)
+        views = plan.views if pair is None else volume_views(rig, points, normals, plan.distance_m, plan.size_m, pair)
         return pose_budget(rig, points, normals, [replace(one, seen=one.seen[:, :cameras]) for one in views], given)
 
     return of_three([of(pair) for pair in range(3)]) if cameras == 3 else of(None)

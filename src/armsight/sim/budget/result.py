@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import product
 from typing import Any, NamedTuple
 
 from armsight.data import Array, Record
@@ -32,6 +33,14 @@ CHANGES: dict[str, tuple[int, Callable[[RigPlan], dict[str, object]]]] = {
 }
 #: What another class of cameras brings along.
 OF_CAMERA: Mapping[str, Any] = {"focal_widths": 0.0, "skew_ms": -1.0, "start_ms": -1.0, "exposure_ms": -1.0}
+#: What ``best`` may choose where the plan does not name it: key -> least and most, m, image widths, and a factor.
+BOUNDS = {"baseline": (0.04, 1.0), "distance": (0.15, 4.0), "focal_widths": (0.6, 4.0), "body_scale": (0.4, 1.6)}
+#: Factors by which it is changed, one after the other; a last one nearer to 1: longer, and better by less than predicted.
+_FACTORS = (1.6, 1.25, 1.1)
+_ENOUGH = 0.01  # a step that gains a smaller share ends the search; half: half as long again, double: 2 % worse
+PAIRS = 40  # of the board; half: its calibration costs 1.4 times as much, double: twice the work at the board
+#: What was measured is within this factor of what was predicted (docs/measured.md): nearer alternatives are one group.
+PREDICTED = 1.25
 #: Causes that have no model, each with its reason.
 NOT_MODELLED = (
     "the detector's failures (glints, hidden markers): the workcell has them, the budget does not",
@@ -149,6 +158,11 @@ class RigBudget(Record):
             rows.append(Cause(name, m, rad, share, halved, kind.moving, kind.common, kind.loop))
         return tuple(sorted(rows, key=lambda row: (-row.share, -row.rms_m)))
 
+    def reached(self, state: Accuracy) -> bool:
+        """Return whether a state is within what was requested; true where nothing was."""
+        m, rad = self.plan.requested or (math.inf, 0.0)
+        return state.level_m <= m and (not rad or state.level_rad <= rad)
+
     def worst_m(self, cause: str) -> float:
         """Return what 95 % would be within at the worst position if a cause were alone."""
         return float(self.found.at_level(self.found.cov(of=cause))[0].max())
@@ -201,3 +215,100 @@ def budget(path: str = "", **plan: Any) -> RigBudget:  # noqa: ANN401
     """
     given = RigPlan.read(path, **plan)
     return RigBudget(given, planned(given))
+
+
+class Alternative(NamedTuple):
+    """The best plan with a class of cameras; alternatives of one group differ by less than what the prediction is off."""
+
+    budget: RigBudget
+    group: int
+
+    @property
+    def price(self) -> int:
+        """The class of its price."""
+        return self.budget.plan.cameras.price
+
+
+def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tuple[Alternative, ...]:
+    """Return the plans that measure best, one for each class of cameras, the cheapest first, then by mm.
+
+    What the plan names stays. Both cameras see the body everywhere, in focus, its markers large enough
+    (:meth:`~armsight.sim.budget.plan.RigPlan.check`).
+
+    Args:
+        plan: what is wished.
+        progress: called with each class of cameras as text.
+
+    Raises:
+        InputError: none can be built; the message is that of the plan itself.
+    """
+    found = []
+    for name in [plan.camera] if "camera" in plan.named else catalogue():
+        progress(name)
+        other = {key: value for key, value in OF_CAMERA.items() if key not in plan.named}
+        pairs = plan.pairs if "pairs" in plan.named else PAIRS
+        searched = replace(_searched(replace(plan, **other, camera=name)), pairs=pairs)
+        if math.isfinite(_loss(searched)):
+            found.append(RigBudget(searched, planned(searched)))
+    if not found:
+        plan.check()
+        raise InputError("no class of the catalogue can measure this volume with what the plan names")
+    found.sort(key=lambda one: one.mm)
+    groups, first, group = list[Alternative](), found[0], 0
+    for one in found:
+        if one.mm > PREDICTED * first.mm:
+            first, group = one, group + 1
+        groups.append(Alternative(one, group))
+    return tuple(sorted(groups, key=lambda one: (one.price, one.budget.mm)))
+
+
+@lru_cache(maxsize=512)
+def _loss(plan: RigPlan) -> float:
+    """Return what 95 % are within in motion over what was requested, or m; infinity for what cannot be built."""
+    try:
+        found = planned(plan)
+    except InputError:
+        return math.inf
+    far, rotated = (float(each.max()) for each in found.at_level(found.cov()))
+    m, rad = plan.requested or (1.0, 0.0)
+    return max(far / m, rotated / rad if rad else 0.0)
+
+
+def chosen(alternatives: tuple[Alternative, ...]) -> RigBudget:
+    """Return the cheapest alternative that reaches what was requested, else that with the least error."""
+    enough = [one.budget for one in alternatives if one.budget.plan.requested and one.budget.reached(one.budget.moving)]
+    return enough[0] if enough else min((one.budget for one in alternatives), key=lambda one: _loss(one.plan))
+
+
+def _searched(plan: RigPlan) -> RigPlan:
+    """Return a plan by a pattern search over what is free (Hooke and Jeeves 1961), of the start that can be built."""
+    fixed = {*plan.named, *(("body_scale",) if plan.body else ()), *(("focal_widths",) if plan.cameras.focus_m else ())}
+    free = [key for key in BOUNDS if key not in fixed]
+
+    def changed(now: RigPlan, key: str, by: float) -> RigPlan:
+        lens = now.focal_px / now.image_size_px[0]
+        values = dict(zip(BOUNDS, (now.baseline_m, now.distance_m, lens, now.body_scale), strict=True))
+        value = float(f"{min(max(by * values[key], BOUNDS[key][0]), BOUNDS[key][1]):.3g}")
+        new: dict[str, Any] = {key: f"{value:g}m" if key in ("baseline", "distance") else value}
+        return replace(now, **new)
+
+    def better(now: RigPlan, others: Iterable[RigPlan]) -> RigPlan:
+        for other in others:
+            now = other if _loss(other) < (1 - _ENOUGH) * _loss(now) else now
+        return now
+
+    now = better(plan, (changed(plan, "distance", by) for by in (0.6, 1.6, 2.5) if "distance" in free))
+    for factor in _FACTORS:
+        last = None
+        while now is not last:
+            last = now
+            for key, by in product(free, (factor, 1 / factor)):
+                while (other := better(now, [changed(now, key, by)])) is not now:
+                    now = other
+    ends: list[dict[str, Any]] = [{"verging_deg": 0.0}]
+    if math.isfinite(_loss(now)):
+        found = planned(now)
+        sharp, blurred = (float(found.at_level(found.cov(scaled="exposure blur", by=by))[0].max()) for by in (0.0, 1.0))
+        shorter = (2, 4) if sharp < (1 - _ENOUGH) * blurred else ()
+        ends += [{"exposure_ms": 1e3 * now.timing["exposure"] / n} for n in shorter]
+    return better(now, (replace(now, **end) for end in ends if not fixed & end.keys()))

@@ -74,6 +74,7 @@ def _covered(camera: Camera, T_camera_pattern: Array, points: Array) -> Box | No
     return None if (low >= high).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
 
 
+@lru_cache(maxsize=16)
 def outline(pattern: Pattern) -> Array:
     """Return points (4 * OUTLINE, 2) around the rectangle that a pattern's cells fill, m, pattern frame."""
     x, y = pattern.x_edges, pattern.y_edges
