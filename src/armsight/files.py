@@ -128,6 +128,22 @@ def read_json(path: str | Path, what: str = "") -> Any:  # noqa: ANN401 - whatev
     return parsed_json(read_text(path), path, what)
 
 
+def require_version(path: str | Path, what: str, version: object, newest: int) -> None:
+    """Reject what a newer armsight wrote.
+
+    Args:
+        path: the file.
+        what: it is, for the message.
+        version: as the file says; what is no number passes.
+        newest: version that this armsight knows.
+
+    Raises:
+        InputError: it is newer.
+    """
+    if isinstance(version, int | float) and version > newest:
+        raise InputError(f"{path}: {what} version {version}, this armsight reads up to {newest}: update armsight")
+
+
 def parsed_json(text: str, path: str | Path, what: str = "") -> Any:  # noqa: ANN401 - whatever JSON holds
     """Return JSON text as what it holds; errors as :func:`read_json`."""
     expected = f"; expected {what}" if what else ""

@@ -38,7 +38,7 @@ from scipy.spatial.transform import Rotation
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import read_toml
+from armsight.files import read_toml, require_version
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_quaternion_wxyz
 from armsight.robot.kinematics.arm import Arm, Convention
@@ -51,6 +51,9 @@ from armsight.robot.urdf.write import urdf_text
 _COLUMNS = {"offset": "rad", "d": "m", "a": "m", "alpha": "rad", "beta": "rad"}
 #: Attribute of an arm that identification leaves as it was -> its unit; corrected.toml has them, so that it is a whole arm.
 LIMITS = {"q_min": "rad", "q_max": "rad", "qd_max": "rad_s", "qdd_max": "rad_s2", "qddd_max": "rad_s3", "home": "rad"}
+#: Version of corrected.toml. Version 1, which said no version, had [[cause]] tables and other names of the kinds of
+#: gravity; version 2 had no ranges of the readings and no nominal table.
+VERSION = 3
 _UNITS = {"mm": 1e-3, "m": 1.0, "deg": np.pi / 180, "rad": 1.0}
 #: What a row may hold: name -> its units, and the value where it is not given.
 _NUMBERS: dict[str, tuple[tuple[str, str], float]] = {
@@ -205,6 +208,7 @@ def identified_table(path: str | Path, given: dict[str, Any]) -> tuple[Arm, Arra
     Raises:
         InputError: something is missing, or no number; the message names it.
     """
+    require_version(path, "corrected arm", given.get("version"), VERSION)
     rows = joint_rows(path, given.get("joint"))
     at = {column: joint_numbers(path, rows, f"{column}_{unit}") for column, unit in _COLUMNS.items()}
     limits = {key: joint_numbers(path, rows, f"{key}_{unit}") for key, unit in LIMITS.items()}

@@ -16,7 +16,7 @@ import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import parsed_json, read_text, write_text
+from armsight.files import parsed_json, read_text, require_version, write_text
 from armsight.geometry.check import checked
 from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.vision.camera import DISTORTION_MODELS, Camera
@@ -358,8 +358,7 @@ def _document(text: str, path: str | Path) -> dict[str, Any]:
         raise InputError(f"{path}: rig file version must be a number, got the text {json.dumps(version)}")
     if isinstance(version, bool) or not isinstance(version, int) or version < 1:
         raise InputError(f"{path}: rig file version must be a positive whole number, got {json.dumps(version)[:40]}")
-    if version > VERSION:
-        raise InputError(f"{path}: rig file version {version}, this armsight reads up to {VERSION}: update armsight")
+    require_version(path, "rig file", version, VERSION)
     return document
 
 

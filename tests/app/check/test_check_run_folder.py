@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from armsight.app.check.evaluate import evaluate, read_check
 from armsight.app.check.report import paths_figure
 from armsight.app.check.rows import read_rows
 from armsight.app.check.run_folder import _reversal_times, attained_in, is_run, joint_track, reversals_of, segments_of
+from armsight.errors import InputError
 from cli_runs import assert_rejected, said_of
 
 NOISE_M, COMMON_M, ARM_M = 4e-5, 2e-4, 1e-4
@@ -383,6 +385,13 @@ def test_a_folder_of_version_1_is_read_as_version_1_read_it():
     ]
     np.testing.assert_allclose([row.T[:3, 3] for row in attained.rows], expected, rtol=1e-12)
     assert attained.rows[0].cov[0, 0] == pytest.approx(2.0483213388858718e-11, rel=1e-12)
+
+
+def test_a_folder_of_a_newer_version_is_rejected(tmp_path):
+    shutil.copytree(VERSION_1, tmp_path / "run")
+    (tmp_path / "run/summary.json").write_text('{"version": 3}')
+    with pytest.raises(InputError, match=r"summary.json: run version 3, this armsight reads up to 2: update armsight"):
+        segments_of(tmp_path / "run", closed=False)
 
 
 def test_the_joints_of_version_1_are_read_as_version_1_read_them():

@@ -170,3 +170,33 @@ def test_a_calibration_that_is_good_enough_ends_once_by_itself(tmp_path, monkeyp
         assert len(finished) == 2
     finally:
         step.close()
+
+
+def test_settings_are_kept_by_name_and_a_newer_folder_is_rejected(tmp_path):
+    options = SessionOptions(tmp_path, "usb:0,1", calibration_board="chessboard:8x5:24mm")
+    session = LiveSession(options)
+    try:
+        session.arm.use_arm("ar4")
+        session.calibration.set_aim(0.3, 0.5)
+        session.keep_settings(" table ")
+        with pytest.raises(InputError, match="a name of 1 to 60 characters"):
+            session.keep_settings(" ")
+    finally:
+        session.close()
+    session = LiveSession(replace(options, source="usb:2,3", calibration_board=None))
+    try:
+        assert session.sections()["overview"].settings == ("table",)
+        with pytest.raises(InputError, match="no settings 'x'; there are table"):
+            session.use_settings("x")
+        session.use_settings("table")
+        assert (session.shared.source, session.calibration.spec) == ("usb:0,1", "chessboard:8x5:24mm")
+        assert (session.shared.options.arm, session.calibration.aim) == ("ar4", CalibrationAim(3e-4, 0.5))
+    finally:
+        session.close()
+    file = tmp_path / "session.json"
+    file.write_text(file.read_text().replace('"version": 1', '"version": 2'))
+    with pytest.raises(InputError, match="session version 2, this armsight reads up to 1: update armsight"):
+        LiveSession(options)
+    file.write_text("[]")
+    with pytest.raises(InputError, match="not written by `armsight live`"):
+        LiveSession(options)

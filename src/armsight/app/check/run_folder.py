@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 
 from armsight.app.check.rows import SAME_M, Attained, Reversal, Row, first_few, natural
+from armsight.app.run.report import VERSION
 from armsight.app.run.tracks import ToolTrack, read_track
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import read_toml
+from armsight.files import read_json, read_toml, require_version
 from armsight.geometry.pose import mean_pose, pose
 from armsight.loop.iso9283.paths import plane_axes
 from armsight.loop.iso9283.poses import MIN_POSES
@@ -155,6 +156,17 @@ def attained_in(folder: Path, *, closed: bool) -> Attained:
     return Attained(rows + paths, more + notes, [] if track is None else reversals_of(track, circle))
 
 
+def require_known(folder: Path) -> None:
+    """Reject a run's folder that a newer armsight wrote; one that says no version is read.
+
+    Raises:
+        InputError: it is newer.
+    """
+    summary = folder / "summary.json"
+    found = read_json(summary) if summary.is_file() else {}
+    require_version(summary, "run", found.get("version") if isinstance(found, dict) else None, VERSION)
+
+
 def is_run(folder: Path) -> bool:
     """Return whether a folder holds a run."""
     return _reference_file(folder).is_file()
@@ -172,6 +184,7 @@ def segments_of(folder: Path, closed: bool) -> list[PathSegment]:
     Raises:
         InputError: no run's folder, or a file of it cannot be read.
     """
+    require_known(folder)
     file, motions = _reference_file(folder), folder / "motion.toml"
     for name in (file.name, "vision.csv", motions.name):
         if not (folder / name).is_file():

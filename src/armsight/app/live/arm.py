@@ -147,6 +147,11 @@ class ArmStep(PageStep[ArmState]):
         """Whether a motion runs, or is about to."""
         return self.shown.running is not None or self._requested is not None
 
+    @property
+    def connected(self) -> bool:
+        """Whether a board is connected, or its joint angles come from a file."""
+        return self._board is not None or self._logged is not None
+
     @staticmethod
     def check_board(name: str | None, source: str, arm: Arm) -> None:
         """Reject the name of a board that cannot be right.
@@ -165,7 +170,7 @@ class ArmStep(PageStep[ArmState]):
     def open_arm(self) -> None:
         """Connect to the arm's board; the drives stay as they are."""
         name = self.shared.options.board
-        if self._board is not None or self._logged is not None:
+        if self.connected:
             return
         if name is None:
             self.find_arm()
@@ -204,7 +209,7 @@ class ArmStep(PageStep[ArmState]):
     @asked("arm")
     def find_arm(self) -> None:
         """Find the arm's port, and connect: the only arm that answers, or the one whose joint or cable a person moves."""
-        if self._board is not None or self._logged is not None or self._simulated is not None:
+        if self.connected or self._simulated is not None:
             raise InputError("the arm's board is known: connect it")
         if not self.shown.finding:
             self.show(finding="Looking at the ports.")
@@ -331,11 +336,11 @@ class ArmStep(PageStep[ArmState]):
 
         The hand-eye calibration is made anew from its poses; of an arm with other joints there are none.
         """
-        model, open_ = slowed(open_arm(arm), self.shared.options.board or ""), self._board is not None
-        if open_ or self._logged is not None:
+        model = slowed(open_arm(arm), self.shared.options.board or "")
+        if self.connected:
             check_model(self.shared.options.board or "", arm)
         if model.joints != self.model.joints:
-            if open_ or self._logged is not None:
+            if self.connected:
                 raise InputError(f"{arm} has {model.joints} joints, {self.model.name} {self.model.joints}")
             self.handeye.clear()
         self.shared.options, self.model, self._mounting = replace(self.shared.options, arm=arm), model, None

@@ -8,12 +8,15 @@ for another, and none of them for whoever shows the state.
 from __future__ import annotations
 
 import contextlib
+import json
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 from armsight.app.live.arm import ArmStep, StopAnswer
 from armsight.app.live.body import BoardStep, BodyStep
@@ -26,8 +29,8 @@ from armsight.app.live.simulated import SimulatedCameras
 from armsight.app.live.step import SIM, SessionOptions, Shared, why
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK
 from armsight.app.show.messages import Level, Note
-from armsight.errors import InputError
-from armsight.files import check_folder, unused, write_text
+from armsight.errors import ArmsightError, InputError
+from armsight.files import check_folder, read_json, require_version, unused, write_text
 from armsight.robot.arm_file import open_arm
 from armsight.robot.board_registry import EMULATED, slowed
 from armsight.sim.workcell.workcell import CHESSBOARD
@@ -39,6 +42,8 @@ _DEFAULT_BOARD = "chessboard:9x6:20mm"
 _EVENTS = 200
 #: All that was said, in the folder of the session.
 LOG = "session.log"
+#: What was chosen, by name, in the folder of the session; its version, and the longest name, characters.
+SETTINGS, VERSION, _NAME = "session.json", 1, 60
 _BEHIND = 1.5  # intervals between shots that a pose may take
 
 
@@ -66,6 +71,7 @@ class Overview:
     moving: bool  # the arm moves by this session
     held: str = ""  # why the arm was held, until it is moved again
     offer: str = ""  # the rig that was there, until a person has said whether to use it
+    settings: tuple[str, ...] = ()  # names of those that were kept
 
 
 class LiveSession:
@@ -73,8 +79,9 @@ class LiveSession:
 
     def __init__(self, options: SessionOptions) -> None:
         self.folder = check_folder(options.folder, problem="the session cannot be written here").absolute()
+        self._settings = self._kept()
         self._number, self._events, self._lock = 0, deque[Event](maxlen=_EVENTS), threading.Lock()
-        self.shared = shared = Shared(options, self.folder, self.say, self.hold)
+        self.shared = shared = Shared(options, self.folder, self.say, hold=self.hold)
         self.cameras = CamerasStep(shared)
         model, simulated = open_arm(options.arm), shared.source.startswith(SIM)
         ArmStep.check_board(options.board, shared.source, model)
@@ -127,6 +134,64 @@ class LiveSession:
                 self.say("warn", f"the stored rig is not used: {error}")
         if target is not None:
             self.body.use_body(target)
+
+    def _kept(self) -> dict[str, dict[str, Any]]:
+        """Return the settings that were kept in the folder, by name.
+
+        Raises:
+            InputError: a newer armsight wrote them, or their file is none of ours.
+        """
+        file = self.folder / SETTINGS
+        found = read_json(file) if file.exists() else {"settings": {}}
+        settings = found.get("settings") if isinstance(found, dict) else None
+        if not isinstance(settings, dict):
+            raise InputError(f"{file}: not written by `armsight live`: move it away")
+        require_version(file, "session", found.get("version"), VERSION)
+        return {name: dict(each) for name, each in settings.items()}
+
+    @asked("")
+    def keep_settings(self, name: str) -> None:
+        """Keep what is chosen on the page now by a name; what had this name before is replaced."""
+        if not 0 < len(name.strip()) <= _NAME:
+            raise InputError(f"a name of 1 to {_NAME} characters is needed")
+        aim, options = self.calibration.aim, self.shared.options
+        self._settings[name.strip()] = {
+            "cameras": self.shared.source,
+            "board": self.calibration.spec,
+            "error_mm": 1e3 * aim.error_m,
+            "distance_m": aim.distance_m,
+            "body": self.measuring.target_spec,
+            "arm": options.arm,
+            "arm_board": options.board,
+            "motion": str(self.shared.motion),
+        }
+        kept = {"version": VERSION, "settings": self._settings}
+        write_text(self.folder / SETTINGS, json.dumps(kept, indent=1) + "\n")
+        self.say("good", f"settings kept: {name.strip()}")
+
+    @asked("", rest=True)
+    def use_settings(self, name: str) -> None:
+        """Choose what was kept by a name; what cannot be chosen now is said, and stays as it is."""
+        if name not in self._settings:
+            raise InputError(f"no settings {name[:_NAME]!r}; there are {', '.join(self._settings) or 'none'}")
+        kept, options = self._settings[name], self.shared.options
+        if not self.arm.connected and self.shared.simulated is None:
+            self.shared.options = replace(options, board=kept.get("arm_board", options.board))
+        choose: dict[str, tuple[object, Callable[[Any], None]]] = {
+            "cameras": (self.shared.source, self.cameras.use_cameras),
+            "board": (self.calibration.spec, self.board.use_board),
+            "distance_m": (None, lambda far: self.calibration.set_aim(kept.get("error_mm", 0.0), far)),
+            "body": (self.measuring.target_spec, self.body.use_body),
+            "arm": (options.arm, self.arm.use_arm),
+            "motion": (str(self.shared.motion), self.arm.use_motion),
+        }
+        for key, (now, use) in choose.items():
+            if kept.get(key) not in (None, "", now):
+                try:
+                    use(kept[key])
+                except ArmsightError as error:
+                    self.say("warn", f"{name}: {key}: {error}")
+        self.say("good", f"settings: {name}")
 
     @asked("")
     def keep_rig(self) -> None:
@@ -264,7 +329,9 @@ class LiveSession:
         """Return the state, section by section: records of this package."""
         measure = self.measuring.state
         return {
-            "overview": Overview(self._step, STEPS, str(self.folder), self.arm.busy, self.arm.held, self._offer),
+            "overview": Overview(
+                self._step, STEPS, str(self.folder), self.arm.busy, self.arm.held, self._offer, tuple(self._settings)
+            ),
             "cameras": self.cameras.state,
             "board": self.board.state,
             "calibrate": self.calibration.state,

@@ -51,11 +51,11 @@ class Shared:
     options: SessionOptions
     folder: Path
     say: Callable[[Level, str], None]
-    hold: Callable[[str], None]  # brings the arm to rest
     source: str = ""
     capture: CameraCapture = field(init=False)
     motion: Path = DEFAULT_MOTION  # file of the motions
     simulated: SimulatedCameras | None = None
+    hold: Callable[[str], None] = lambda why: None  # brings the arm to rest
 
 
 class PageStep(Generic[S]):

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from armsight.app.check.run_folder import require_known
 from armsight.app.show.page import writable_folder
 from armsight.app.show.report import Report
 from armsight.app.show.table import TextTable
@@ -48,6 +49,7 @@ def update(run: Path, output: Path, since_s: float | None, report: Path | None) 
     for file in files.values():
         if not file.is_file():
             raise InputError(f"{file}: no such file; RUN is the folder of `armsight run` or `armsight demo`")
+    require_known(run)
     rig, body = StereoRig.load(files["rig"]), open_body(str(files["body"]))
     folder = None if report is None else writable_folder(report, "no page")
     shots = read_detections(files["detections"], body)

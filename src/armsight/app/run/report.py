@@ -78,6 +78,7 @@ _FIGURES = {
     ),
     "overview": ("studies", "", ""),
 }
+VERSION = 2  # of a run's folder; 1 named the reference track and the reference angles differently
 #: Basis of a command -> its text in run.log.
 _BASED = {
     "planned": "as planned",
@@ -106,7 +107,7 @@ def report_of(
         workcell: returns (H, W, 3) BGR, the workcell from aside; None on a real arm.
     """
     led = None if result.led is None else result.led.to_json()
-    values: dict[str, Any] = {"version": 2}  # 1 named the reference track and the reference angles differently
+    values: dict[str, Any] = {"version": VERSION}
     tables, lines = list[TextTable | None](), list[str]()
     sections: Mapping[str, Section] = {}
     passes = None

@@ -23,14 +23,11 @@ from armsight.geometry.rotation import nearest_rotation, quaternion_wxyz
 from armsight.loop.identify import model as chain
 from armsight.loop.identify.identify import Identified
 from armsight.loop.identify.model import FAST, RIPPLES, SENSOR, Feature, Model, all_features
-from armsight.robot.arm_file import LIMITS, file_transform, identified_table, joint_numbers, tilted_urdf
+from armsight.robot.arm_file import LIMITS, VERSION, file_transform, identified_table, joint_numbers, tilted_urdf
 from armsight.robot.kinematics.arm import Arm
 
 #: Newton steps to a reading, what counts as there, m and rad, and the step of differences, rad.
 STEPS, THERE, STEP_RAD = 30, 1e-9, 1e-6
-#: Version of corrected.toml. Version 1, which said no version, had [[cause]] tables and other names of the kinds of
-#: gravity; version 2 had no ranges of the readings and no nominal table.
-VERSION = 3
 _OLD_NAMES = {"slack": "gravity_backlash", "sag": "compliance"}  # names of version 1 -> names now
 #: Columns of the table -> their units; of the nominal one, which gives the levers of gravity.
 _UNITS = {"offset": "rad", "d": "m", "a": "m", "alpha": "rad", "beta": "rad"}
