@@ -150,3 +150,14 @@ def test_stamps_of_single_precision_are_smoothed():
     single = (1e8 + 1e3 * stamps).astype(np.float32).astype(float) / 1e3 - 1e5  # steps of 8 ms
     off = given(clock, single)[400:] - t_s[400:]
     assert np.std(off) < 0.3 * np.std(single[400:] - t_s[400:])
+
+
+def test_few_images_in_a_second_and_a_slow_loop_are_no_clock_of_another_rate():
+    clocks = []
+    for seed in range(20):
+        rng, clock = np.random.default_rng(seed), FrameClock()
+        for second in range(60):  # a loop of 6 ms, which is busy now and then
+            for t in 1.2 * second + 0.2 * rng.random() + PERIOD_S * np.arange(2):
+                clock.time(t, 6e-3 * np.ceil(t / 6e-3) + 0.02 * rng.choice(2, p=[0.8, 0.2]))
+        clocks.append(clock)
+    assert [each.stepped for each in clocks] == 20 * [None]

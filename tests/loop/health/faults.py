@@ -305,19 +305,21 @@ class SlippingArm:
 
 
 def watched_arm(
-    seed, motion=lambda t_s: np.zeros(6), seconds=9.0, *, slip=None, joint=0, slip_rad=0.0, more_rad=0.0, late=None
-):
+    seed, motion=lambda t_s: np.zeros(6), seconds=9.0, *, slip=None, joint=0, slip_rad=0.0, more_rad=0.0, late=None,
+    delay=(0.0, 1e-4),
+):  # fmt: skip
     """Run an arm with errors; return the estimator with its monitor, its track and the true poses.
 
     The faults, at AT_S: a motion of the rig, a slip of the body on the tool (6,), [m; rad], a slip of a joint's
-    potentiometer or more backlash of it, rad; stamps that are late, s.
+    potentiometer or more backlash of it, rad; stamps that are late, s. ``delay``: by how much the delay of the images is
+    off from the beginning, and its sigma, s.
     """
     rng = np.random.default_rng(seed)
     mount = mounts(rng)
-    estimator = KalmanEstimator(ARM, delay=Delay(0.0, 1e-4), learns_delay=False)
+    estimator = KalmanEstimator(ARM, delay=Delay(0.0, delay[1]), learns_delay=False)
     moved = Moved(estimator, mount[1].T_base_rig, motion, slip, late)
     arm = worn(rng)
     if slip_rad or more_rad:
         arm = SlippingArm(arm, joint, slip_rad, more_rad)
-    moved.tracked, moved.Ts_true = run(rng, moved, arm, legs(rng, seconds), mount=mount)
+    moved.tracked, moved.Ts_true = run(rng, moved, arm, legs(rng, seconds), mount=mount, late_s=delay[0])
     return moved

@@ -63,3 +63,9 @@ def test_stamps_that_run_fast_leave_no_error_in_what_was_learned(monkeypatch):
     off = np.linalg.inv(track.Ts_base_tool[rows]) @ fast.Ts_true[rows]
     shift, cov = off[:, :3, 3], track.covs[rows, :3, :3]
     assert np.mean(np.einsum("ni,nij,nj->n", shift, np.linalg.inv(cov), shift)) < 6.0
+
+
+@pytest.mark.parametrize("delay", [(1e-3, 5e-4), (3e-3, 2e-3)], ids=["of the arm's test", "of the clock's"])
+def test_a_delay_that_is_off_by_its_sigma_is_no_fault(delay):
+    monitor = watched_arm(7401, seconds=22.0, delay=delay).monitor
+    assert monitor.findings() == ()

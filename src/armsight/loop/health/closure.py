@@ -155,7 +155,9 @@ class ClosureWatch:
 
     def __init__(self, sigmas: Array, joints: int) -> None:
         self._parts = layout(joints)
-        self._sigmas = sigmas[: self._parts.rest]
+        # The arm's model: all that motion does not make it forget, and the delay that the sweep found, to its sigma.
+        self._model = np.append(np.arange(self._parts.rest), self._parts.delay)
+        self._sigmas = sigmas[self._model]
         self._block: _Block | None = None
         self._t: list[float] = []
         self._e: list[Array] = []
@@ -175,8 +177,8 @@ class ClosureWatch:
         self.strongest = 0.0
 
     def _clear(self) -> None:
-        rest = self._parts.rest
-        self._N, self._b, self._square, self._sums = np.eye(rest), np.zeros(rest), 0.0, _RunningSums()
+        size = len(self._model)
+        self._N, self._b, self._square, self._sums = np.eye(size), np.zeros(size), 0.0, _RunningSums()
 
     def take(self, innovation: Innovation) -> None:
         """Take what the estimator did with a measurement, in order of time; rejected ones count if later ones agree."""
@@ -247,7 +249,7 @@ class ClosureWatch:
         late = np.array(self._clock_s[blocks])[:, None] * H[:, :, self._parts.delay]
         own = self._cov / np.array(self._merged[blocks])[:, None, None]
         white = np.linalg.inv(np.linalg.cholesky(own + late[:, :, None] * late[:, None, :]))
-        model, changes = H[:, :, : self._parts.rest] * self._sigmas, changing(self._parts, H)
+        model, changes = H[:, :, self._model] * self._sigmas, changing(self._parts, H)
         return white @ model, white @ changes, (white @ e[..., None])[..., 0]
 
     def _sum(self, blocks: slice) -> None:
@@ -267,7 +269,7 @@ class ClosureWatch:
         The change that explains most is fitted as well: it must not be taken for errors. Which one that is depends on the
         errors, and these on it: it is looked for with the covariance as it was, then with the one that it leaves.
         """
-        blocks, errors = np.array(self._H)[:, :, : self._parts.rest] * self._sigmas, np.array(self._e)
+        blocks, errors = np.array(self._H)[:, :, self._model] * self._sigmas, np.array(self._e)
         for _ in range(2):
             # Akaike's criterion: by as much as it explains, less what its parameters explain by chance.
             begins = _begins(len(errors))
@@ -400,9 +402,9 @@ class ClosureWatch:
             N, b, square = N - H.T @ H, b - H.T @ e, square - float(e @ e)
         L = np.linalg.cholesky(N)
         steps, step_C, step_b, ramps, ramp_C, ramp_b = self._sums.since(begins, t[begins - 1], t[-1])
-        whole = np.moveaxis(np.concatenate([steps, ramps], axis=2), 1, 0).reshape(self._parts.rest, -1)
+        whole = np.moveaxis(np.concatenate([steps, ramps], axis=2), 1, 0).reshape(len(self._model), -1)
         solved = np.linalg.solve(L, np.column_stack([whole, b]))
-        b, white = solved[:, -1], np.moveaxis(solved[:, :-1].reshape(self._parts.rest, len(begins), -1), 1, 0)
+        b, white = solved[:, -1], np.moveaxis(solved[:, :-1].reshape(len(self._model), len(begins), -1), 1, 0)
         # What the model leaves beyond the blocks' errors widens them.
         left = square - float(b @ b)
         numbers = 6.0 * sum(self._merged)

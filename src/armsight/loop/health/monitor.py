@@ -42,8 +42,8 @@ _RIGHT_S = 3e-3
 #: While a clock that is followed is known no better than to this, s, the arm's tests wait; half: they may wait for long,
 #: double: joints are blamed for what is not known of it.
 _KNOWN_S = 6e-4
-#: A rate of a clock is said beyond so many sigmas.
-_RATE_SIGMAS = 4.0
+#: Rate and offset of a clock are said beyond so many sigmas.
+_CLOCK_SIGMAS = 4.0
 
 
 class HealthMonitor:
@@ -420,7 +420,8 @@ class HealthMonitor:
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
         self.work()
-        late = () if self._clock is None else _clock_findings(self._clock, self._newest_s)
+        sigma_s = 0.0 if self._estimator is None else self._estimator.settings[1].sigma_s
+        late = () if self._clock is None else _clock_findings(self._clock, self._newest_s, sigma_s)
         if self.stamps is not None and self.stamps.stepped is not None:
             late = (_stamps_finding(*self.stamps.stepped, self.stamps.rate),)
         now = (
@@ -457,12 +458,14 @@ def _thinned(known: Sequence[tuple[float, Remembered]], now_s: float) -> list[tu
     return kept
 
 
-def _clock_findings(clock: ClockFollower, t_s: float) -> tuple[HealthFinding, ...]:
-    """Return what is wrong with the cameras' clock at a time, s; nothing while the delay is as it was measured."""
+def _clock_findings(clock: ClockFollower, t_s: float, sigma_s: float) -> tuple[HealthFinding, ...]:
+    """Return what is wrong with the cameras' clock at a time, s; nothing while its delay is as measured, to a sigma, s."""
     if clock.since_s is None:
         return ()
     offset_s, (rate, sigma) = clock.offset_s(t_s), clock.rate
-    drifts = f", and drift by {1e6 * rate:.0f} +- {1e6 * sigma:.0f} ppm" if abs(rate) > _RATE_SIGMAS * sigma else ""
+    drifts = f", and drift by {1e6 * rate:.0f} +- {1e6 * sigma:.0f} ppm" if abs(rate) > _CLOCK_SIGMAS * sigma else ""
+    if not drifts and abs(offset_s) < _CLOCK_SIGMAS * sigma_s:  # the delay was known no better
+        return ()
     return (
         HealthFinding(
             "time",
