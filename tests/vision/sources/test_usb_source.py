@@ -1,5 +1,9 @@
 """Two USB cameras, played by a stand-in for OpenCV's capture with a queue as V4L2's and a clock of its own."""
 
+import os
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -279,6 +283,19 @@ def test_real_devices_that_are_not_there_or_no_cameras(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(DeviceError, match="cannot be opened: not a camera, or in use by another program"):
         open_source(f"usb:{tmp_path}/file,98")
+
+
+@pytest.mark.opencv
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="Linux says which process has a file open")
+def test_who_has_the_camera_is_named(tmp_path):
+    (tmp_path / "file").touch()
+    waits = "import sys; f = open(sys.argv[1]); print(1, flush=True); sys.stdin.read()"
+    command = [sys.executable, "-c", waits, str(tmp_path / "file")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        other.stdout.readline()
+        with pytest.raises(DeviceError, match=f"file: cannot be opened: in use by process {other.pid}, .*python"):
+            open_source(f"usb:{tmp_path}/file,98")
+        other.stdin.close()
 
 
 @pytest.mark.opencv

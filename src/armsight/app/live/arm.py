@@ -19,8 +19,15 @@ from pathlib import Path
 import numpy as np
 
 from armsight.app.live.board import StoppableBoard
-from armsight.app.live.handeye import HandEyeGuide, HandEyeState, go, likely_joint_errors, visit_poses
-from armsight.app.live.identification import IdentifyState, IdentifyStep
+from armsight.app.live.handeye import (
+    HandEyeGuide,
+    HandEyeState,
+    IdentifyState,
+    IdentifyStep,
+    go,
+    likely_joint_errors,
+    visit_poses,
+)
 from armsight.app.live.measuring import MeasureStep
 from armsight.app.live.records import asked
 from armsight.app.live.step import SIM, PageStep, Shared, why

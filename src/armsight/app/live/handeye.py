@@ -4,6 +4,7 @@ In: poses of the arm at rest, taken by a person or by the arm itself. Out: a :cl
 :class:`~armsight.loop.running.calibrate.HandEyeRun`, which the loop uses and ``handeye/`` of the session holds. The next
 pose is the one of the candidates after which the predicted error is least: the RMS distance by which the covariance of the
 calibration moves a measured position in the arm's base (as :mod:`~armsight.app.live.guide` does for the cameras).
+From the same poses :class:`IdentifyStep` makes a corrected arm, and the files of ``armsight identify``.
 """
 
 from __future__ import annotations
@@ -14,11 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from armsight.app.live.step import Guided, GuidedState, Shared
+from armsight.app.identify.report import identify_report, write_results
+from armsight.app.identify.run import run_identify
+from armsight.app.live.step import Guided, GuidedState, PageStep, Shared
 from armsight.app.run.folder import write_handeye
+from armsight.app.show.plotting import require_matplotlib
+from armsight.app.show.report import Report
 from armsight.data import Array, Missed
 from armsight.errors import ArmsightError, CalibrationError, InputError
-from armsight.files import write_text
+from armsight.files import unused, write_text
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.poses import Poses
@@ -26,6 +31,7 @@ from armsight.loop.identify.read import read_poses
 from armsight.loop.running.calibrate import HandEyeRun, VisitedPose, handeye_of, handeye_poses, visit
 from armsight.loop.running.log import RunSegment
 from armsight.loop.running.loop import Loop
+from armsight.robot.arm_file import open_arm
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import Trajectory, point_to_point
 from armsight.vision.rig import StereoRig
@@ -298,3 +304,49 @@ def likely_joint_errors(arm: Arm, q: Array, T_base_tool: Array) -> Array:
     J, xi = arm.jacobian(q, "tool"), log_se3(inverse(arm.forward(q)) @ T_base_tool)
     JW = J.T * weights
     return np.asarray(np.linalg.solve(JW @ J + np.eye(len(q)) / _JOINT_RAD**2, JW @ xi))
+
+
+@dataclass(frozen=True)
+class IdentifyState:
+    """What a page shows of the identification."""
+
+    working: str | None = None  # what is being done
+    headline: str = ""  # held-out errors of the nominal and of the identified arm
+    lines: tuple[str, ...] = ()  # the result as ``armsight identify`` prints it
+    corrected: str | None = None  # the corrected arm's file
+    command: str = ""  # the command line that does the same
+
+
+class IdentifyStep(PageStep[IdentifyState]):
+    """Identifies one arm at a time; results go to ``identify``, ``identify-2``, ... in the folder of the session."""
+
+    def start(self, arm_spec: str, poses: Path | None) -> None:
+        """Identify an arm from a table of poses, in the background."""
+        if poses is None:
+            raise InputError("no poses yet: make the hand-eye calibration first, its poses are used")
+        if self.shown.working is not None:
+            raise InputError("an identification runs already")
+        require_matplotlib()
+        out = unused(self.folder / "identify")
+        self.shown = IdentifyState("reading", command=f"armsight identify --arm {arm_spec} --data {poses} -o {out}")
+        self.later("no arm was identified", self._identify, arm_spec, poses, out)
+
+    def _identify(self, arm_spec: str, poses: Path, out: Path) -> None:
+        try:
+            read, arm = read_poses(poses), open_arm(arm_spec)
+            progress = lambda line: self.show(working=line)  # noqa: E731
+            run = run_identify(arm, read.measured, read.lines, None, notes=read.notes, progress=progress)
+            report = identify_report(run)
+            write_results(run, report, out)
+        finally:
+            self.show(working=None)
+        lines = (
+            *(f"note: {note}" for note in run.notes),
+            *(line for line in report.text().splitlines() if line != report.headline),
+        )
+        self.show(headline=report.headline, lines=lines, corrected=str(out / "corrected.toml"))
+        self.later("the report was not drawn", self._draw, report, out)  # what was found is shown before
+
+    def _draw(self, report: Report, out: Path) -> None:
+        report.write(out)
+        self.say("good", f"identified: {report.headline}; written to {out}")

@@ -24,7 +24,7 @@ from armsight.errors import InputError
 
 F = TypeVar("F", bound=Callable[..., None])
 #: The steps in their order, by the names that commands and states use.
-STEPS = ("cameras", "board", "calibrate", "body", "measure", "arm", "health")
+STEPS = ("cameras", "board", "calibrate", "body", "measure", "arm", "recorded", "health")
 LONGEST = 4096  # characters of a command; half: a long list of devices is rejected, double: nothing
 
 

@@ -24,6 +24,7 @@ from armsight.app.live.calibration import CalibrationStep
 from armsight.app.live.cameras import CamerasStep
 from armsight.app.live.capture import CameraCapture, LiveShot
 from armsight.app.live.measuring import MeasureState, MeasureStep
+from armsight.app.live.recorded import RecordedStep
 from armsight.app.live.records import STEPS, Event, PageCommand, asked
 from armsight.app.live.simulated import SimulatedCameras
 from armsight.app.live.step import SIM, SessionOptions, Shared, why
@@ -98,6 +99,7 @@ class LiveSession:
         self.board = BoardStep(shared, spec, self._calibrated)
         self.body = BodyStep(shared, self.measuring)
         self.arm = ArmStep(shared, self.measuring, slowed(model, shared.options.board or ""))
+        self.recorded = RecordedStep(shared)
         self._step, self._offer = "cameras", ""
         self.cameras.show(left_known=simulated)
         self._closing = threading.Event()
@@ -236,7 +238,7 @@ class LiveSession:
         self.capture.close()
         if self._eye.is_alive():
             self._eye.join(5.0)
-        for step in (self.cameras, self.board, self.measuring, self.body):
+        for step in (self.cameras, self.board, self.measuring, self.body, self.recorded):
             step.close()
         if self.shared.simulated is not None:
             self.shared.simulated.end()
@@ -338,6 +340,7 @@ class LiveSession:
             "body": self.body.state,
             "measure": measure,
             "arm": self.arm.state,
+            "recorded": self.recorded.state,
             "health": self._health(measure),
         }
 

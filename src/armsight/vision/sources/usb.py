@@ -12,10 +12,13 @@ both the pixels and the cameras' own bytes, which a recording stores unchanged.
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import os
 import re
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Protocol
 
 import cv2
@@ -60,6 +63,11 @@ class Capture(Protocol):
     def release(self) -> None:
         """Close the device."""
         ...
+
+
+_COMMAND = (
+    80  # characters of another process' command in a message; half: its configuration is cut, double: a long line
+)
 
 
 class UsbCamera:
@@ -270,5 +278,19 @@ def _v4l2(device: str) -> Capture:
         )
     capture = open_capture(device, cv2.CAP_V4L2)
     if capture is None:
-        raise DeviceError(f"{device}: cannot be opened: not a camera, or in use by another program")
+        user = user_of(device)
+        why = f"in use by {user}" if user else "not a camera, or in use by another program"
+        raise DeviceError(f"{device}: cannot be opened: {why}")
     return capture
+
+
+def user_of(device: str) -> str:
+    """Return which other process has a device open, of those whose files this user may see; "" where none is known."""
+    path = os.path.realpath(device)
+    for handle in glob.glob("/proc/[0-9]*/fd/*"):
+        process = handle.split("/")[2]
+        with contextlib.suppress(OSError):
+            if process != str(os.getpid()) and os.readlink(handle) == path:
+                words = Path(f"/proc/{process}/cmdline").read_bytes().decode(errors="replace").split("\0")
+                return f"process {process}, {' '.join(words).strip()[:_COMMAND]}"
+    return ""
