@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 SRC = ROOT / "src" / "armsight"
 #: Files of Python in the package, at most: a newcomer's first look.
-MOST_FILES = 488
+MOST_FILES = 490
 
 #: Retired word -> the field's.
 RETIRED = {

@@ -8,13 +8,14 @@ from pathlib import Path
 import click
 
 OPERATIONS = ("measure", "replay", "identify", "check")
+REPORT = "report"
 
 
 @click.command("batch")
-@click.argument("operation", type=click.Choice(OPERATIONS))
+@click.argument("operation", type=click.Choice((*OPERATIONS, REPORT)))
 @click.argument("recordings", metavar="'GLOB'...", nargs=-1, required=True)
 @click.option(
-    "-o", "--output", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Folder of the results."
+    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Folder of the results; report needs none."
 )
 @click.option("--rig", metavar="RIG.json", help="The rig, where the recordings have no camera_info, or instead of it.")
 @click.option("--target", metavar="SPEC|BODY", help="The board or body that is measured.")
@@ -26,7 +27,7 @@ OPERATIONS = ("measure", "replay", "identify", "check")
 def command(
     operation: str,
     recordings: tuple[str, ...],
-    output: Path,
+    output: Path | None,
     rig: str | None,
     target: str | None,
     arm: str | None,
@@ -40,11 +41,19 @@ def command(
     Quote the GLOB: ``'archive/**/*.mcap'``, ``'s3://bucket/**/*.bag'``. A recording that fails is a row with its
     reason, is tried again when the batch is started again, and makes the exit code 1. identify takes tables of poses
     (armsight identify -h), check folders of runs (armsight check -h), measure and replay recordings (armsight replay -h).
+
+    ``report DIR`` reads the results of a batch whose recordings lie as SITE/DAY/CELL/RUN (armsight hub push): which cells
+    differ from their siblings, and which change from day to day.
     """
     from armsight.app.batch.run import Batch, run_batch
     from armsight.app.batch.work import BatchOptions
     from armsight.errors import InputError
 
+    if operation == REPORT:
+        _report(recordings, as_json)
+        return
+    if output is None:
+        raise InputError("the results need a folder: give -o DIR")
     if workers is not None and scheduler is not None:
         raise InputError("--workers and --scheduler: a cluster has its own workers; give one of the two")
     if operation == "identify" and arm is None:
@@ -61,6 +70,19 @@ def command(
         )
     if done.failed:
         click.get_current_context().exit(1)
+
+
+def _report(folders: tuple[str, ...], as_json: bool) -> None:
+    """Print which cells of a batch differ."""
+    from armsight.app.batch.report import lines, report, to_json
+    from armsight.app.batch.run import require_dask
+    from armsight.errors import InputError
+
+    require_dask()
+    if len(folders) != 1:
+        raise InputError("batch report reads the results of one batch: give its folder")
+    rows = report(Path(folders[0]).expanduser())
+    click.echo(json.dumps(to_json(rows)) if as_json else "\n".join(lines(rows)))
 
 
 def _absolute(name: str | None) -> str | None:

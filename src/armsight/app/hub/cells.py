@@ -6,21 +6,22 @@ In: what a router heard. Out: JSON for the page, numbers for metrics, rows for t
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from armsight.app.hub.drift import CHANCE, Drift, drift
+from armsight.app.hub.drift import BLOCK_S, CHANCE, Drift, Slopes, drifts
 
 #: s without a state after which a connected cell is frozen, or its network cut; half: a busy computer is red now and
 #: then, double: a cut cable shows later.
 _SILENT_S = 3.0
-#: s of a block of means, and how many blocks a drift is looked for in; half: noisier, double: later named.
-_BLOCK_S, _BLOCKS = 10.0, 60
 #: s of a bar of the sparkline, and bars of a day; half: finer, double: coarser.
 _BAR_S, _BARS = 300.0, 288
+#: sigmas of a slope that count as much as an error at its limit, in the order of cells that are well; half: slopes
+#: first, double: errors first.
+_STEEP = 4.0
 #: s by which a cell's clock may differ from the hub's; half: a slow network is called a clock, double: times are
 #: compared wrongly.
 _CLOCK_S = 2.0
@@ -54,10 +55,10 @@ class CellView:
     offset_s: float = math.nan  # its clock less the hub's
     rejected: int = 0
     why_rejected: str = ""
+    slopes: dict[str, Slopes] = field(default_factory=lambda: {key: Slopes() for key in DRIFTS})
     drifts: dict[str, Drift] = field(default_factory=dict)
     day: dict[int, float] = field(default_factory=dict)  # number of the bar -> largest error, mm
     _block: tuple[int, dict[str, list[float]]] = field(default_factory=lambda: (0, {}))
-    _blocks: deque[tuple[float, dict[str, float]]] = field(default_factory=lambda: deque(maxlen=_BLOCKS))
 
     def token(self, session: str, came: bool, at_s: float) -> None:
         """Take that a process of this cell connected, or is gone."""
@@ -99,25 +100,15 @@ class CellView:
         self.why_rejected = why
 
     def _add(self, row: dict[str, Any], at_s: float) -> None:
-        """Add a state to the newest block; a complete one joins the others, and drifts are looked for once a minute."""
+        """Add a state to the newest block; the mean of a complete one is kept."""
         number, sums = self._block
-        if number != (now := int(at_s // _BLOCK_S)):
-            if means := {key: float(np.mean(values)) for key, values in sums.items()}:
-                self._blocks.append(((number + 0.5) * _BLOCK_S, means))
-                if number % 6 == 0:
-                    self._look()
+        if number != (now := int(at_s // BLOCK_S)):
+            for key, values in sums.items():
+                self.slopes[key].add((number + 0.5) * BLOCK_S, float(np.mean(values)))
             self._block = now, (sums := {})
         for key in DRIFTS:
             if row[key] is not None:
                 sums.setdefault(key, []).append(row[key])
-
-    def _look(self) -> None:
-        self.drifts = {}
-        for key in DRIFTS:
-            rows = np.array([(t, means[key]) for t, means in self._blocks if key in means]).reshape(-1, 2)
-            found = drift(rows[:, 0], rows[:, 1])
-            if found is not None:
-                self.drifts[key] = found
 
     def need(self, now_s: float) -> tuple[int, float, str]:
         """Return how much somebody should look, how far beyond it is within that, and why in words."""
@@ -139,8 +130,10 @@ class CellView:
             chance, key, found = min(significant)
             unit, text = DRIFTS[key]
             return DRIFTING, -math.log(chance), f"{text}: {found.per_h:+.3g} ± {found.sigma_per_h:.2g} {unit}/h"
-        odd = self._odd()
-        return LOOK if odd else WELL, (state.get("error_mm") or 0.0) / (self.about.get("limit_mm") or 1.0), odd
+        odd, limit = self._odd(), self.about.get("limit_mm") or math.inf
+        sigmas = [abs(each.per_h) / each.sigma_per_h for each in self.drifts.values() if each.sigma_per_h > 0.0]
+        size = max(max(sigmas, default=0.0) / _STEEP, (state.get("error_mm") or 0.0) / limit)
+        return LOOK if odd else WELL, size, odd
 
     def _odd(self) -> str:
         """Return what is worth a look and forbids nothing."""
@@ -176,6 +169,14 @@ class CellView:
             "clock_s": None if math.isnan(self.offset_s) else round(self.offset_s, 3),
             "day": [[bar - first, round(error, 4)] for bar, error in sorted(self.day.items()) if bar >= first],
         }
+
+
+def look_for_drifts(cells: Mapping[tuple[str, str], CellView]) -> None:
+    """Compare the slopes of cells that are connected; to be called once a minute."""
+    alive = {f"{each.site}/{each.name}": each for each in cells.values() if each.sessions}
+    for key in DRIFTS:
+        for name, found in drifts({name: each.slopes[key] for name, each in alive.items()}).items():
+            alive[name].drifts[key] = found
 
 
 def ranked(cells: list[CellView], now_s: float) -> list[dict[str, Any]]:

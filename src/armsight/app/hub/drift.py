@@ -1,39 +1,41 @@
-"""Whether a number of a cell drifts: a straight line through its recent means, against their scatter about it.
+"""Whether a number of a cell drifts: the slope of its recent means, against the slopes of its past and of its siblings.
 
-The scatter of neighbours hangs together (air, lamps, a warm board), so the sigma of the slope is widened by what the
-lag-one autocorrelation of the residuals makes of it, and the chance is Student's with as many degrees of freedom as
-are left.
+The scatter about one line does not say how steep lines are by chance: air, lamps and a warm board move means for
+minutes. The slopes of windows that do not overlap, of this cell before and of the other cells now, do. Their median
+size is the scale, so that a few cells that do drift hardly change it, and the chance is Student's with their number.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import stdtr
 
-from armsight.data import Array
-
+#: s of a block of means, and how many blocks a slope is taken over; half: noisier, double: later named.
+BLOCK_S, BLOCKS = 10.0, 60
+#: blocks that a slope needs; half: two minutes are enough and noisy, double: nothing is ranked in the first five.
+_LEAST = 15
 #: Chance of one look at one number; a look a minute at two numbers is 20,160 a week, so a false one a cell and week at
 #: most. Half: a drift is named later, double: two false alarms a week.
 CHANCE = 1 / (7 * 24 * 60 * 2)
-#: means that a line needs; half: chance has too few degrees of freedom to say anything, double: ten minutes without a
-#: word.
-_LEAST = 12
-#: highest autocorrelation that is reckoned with: beyond it the residuals are a drift themselves; half: warm air is
-#: called a drift, closer to 1: nothing is named.
-_MOST_LAG = 0.9
+#: slopes that a scale needs; half: a scale that is a third off, double: a single cell says nothing for four hours.
+_SLOPES = 8
+#: Median size of a normal variable over its sigma.
+_MEDIAN = 0.6745
 
 
 @dataclass(frozen=True)
 class Drift:
-    """A line through recent means.
+    """A slope against what slopes are by chance.
 
     Attributes:
-        per_h: its slope an hour, in the number's unit.
-        sigma_per_h: one sigma of it.
-        chance: how probable a slope as steep is where nothing drifts.
+        per_h: the slope an hour, in the number's unit.
+        sigma_per_h: one sigma of slopes by chance; NaN while that is unknown.
+        chance: how probable a slope as steep is where nothing drifts; 1 while that is unknown.
     """
 
     per_h: float
@@ -41,30 +43,52 @@ class Drift:
     chance: float
 
 
-def drift(t_s: Array, mean: Array) -> Drift | None:
-    """Fit a line.
+@dataclass
+class Slopes:
+    """The recent means of one number, their slope, and earlier slopes."""
+
+    blocks: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=BLOCKS))
+    past: deque[float] = field(default_factory=lambda: deque(maxlen=144))  # of a day, of windows that do not overlap
+    _number: int = 0
+
+    def add(self, t_s: float, mean: float) -> None:
+        """Take the mean of a block at its time, s."""
+        self.blocks.append((t_s, mean))
+        self._number += 1
+        if self._number % BLOCKS == 0 and (slope := self.per_h()) is not None:
+            self.past.append(slope)
+
+    def per_h(self) -> float | None:
+        """Return the slope of a line through the blocks, an hour; None where they are too few."""
+        if len(self.blocks) < _LEAST:
+            return None
+        t, mean = np.array(self.blocks).T
+        t = (t - t.mean()) / 3600.0
+        return float(t @ mean / (t @ t))
+
+
+def drifts(cells: Mapping[str, Slopes]) -> dict[str, Drift]:
+    """Compare the slopes of one number of all cells.
 
     Args:
-        t_s: (N,) times of the means, s.
-        mean: (N,) the means.
+        cells: name -> its means.
 
     Returns:
-        The line; None where too few means are there.
+        Name -> its drift; those of too few means are left out.
     """
-    n = len(t_s)
-    if n < _LEAST:
-        return None
-    t = (t_s - t_s.mean()) / 3600.0
-    spread = float(t @ t)
-    slope = float(t @ mean) / spread
-    r = mean - mean.mean() - slope * t
-    variance = float(r @ r) / (n - 2)
-    if not variance > 0.0:
-        return None
-    lag = float(
-        np.clip(r[1:] @ r[:-1] / (r @ r) + 4.0 / n, 0.0, _MOST_LAG)
-    )  # residuals of a line: biased down by about 4 / n
-    wider = (1.0 + lag) / (1.0 - lag)
-    sigma = math.sqrt(variance / spread * wider)
-    freedom = max(n / wider - 2.0, 1.0)
-    return Drift(slope, sigma, float(2.0 * stdtr(freedom, -abs(slope) / sigma)))
+    now = {name: slope for name, each in cells.items() if (slope := each.per_h()) is not None}
+    return {
+        name: _against(slope, cells[name].past, [other for each, other in now.items() if each != name])
+        for name, slope in now.items()
+    }
+
+
+def _against(slope: float, *sources: Sequence[float]) -> Drift:
+    """Compare a slope with others: those of the source in which slopes are larger."""
+    known = [(float(np.median(np.abs(each))) / _MEDIAN, len(each)) for each in sources if len(each) >= _SLOPES]
+    scale, count = max(known, default=(0.0, 0))
+    if not scale > 0.0:
+        return Drift(slope, math.nan, 1.0)
+    # A median of sizes has the precision of a mean square of 0.37 times as many (its efficiency for normal variables).
+    freedom = max(0.37 * count, 1.0)
+    return Drift(slope, scale, float(2.0 * stdtr(freedom, -abs(slope) / scale)))

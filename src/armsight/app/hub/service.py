@@ -9,11 +9,11 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-from armsight.app.hub.cells import CellView, ranked
+from armsight.app.hub.cells import CellView, look_for_drifts, ranked
 from armsight.app.hub.router import Heard, Router
 from armsight.app.hub.store import FLUSH_S, Store
 from armsight.app.show.http import Answer, Pages, metrics_text
@@ -21,6 +21,8 @@ from armsight.app.stream.cell_file import NAME
 
 #: s that an answer of /state is served to all who ask; half: thirty tabs cost twice, double: a second of age.
 _STATE_S = 0.5
+#: s between two looks for drifts; half: twice as many false alarms, double: named a minute later.
+_LOOK_S = 60.0
 #: messages that wait at most; half: a burst of 200 cells is dropped, double: more memory.
 _WAITING = 10_000
 #: Metric -> its kind and help; the labels are site and cell.
@@ -71,17 +73,16 @@ class Hub:
         self._cached: tuple[float, bytes] = (0.0, b"")
         self._asking = ThreadPoolExecutor(4, "ask")
         self._ended = threading.Event()
-        self._store = Store(folder)
-        try:
-            for cell in self._store.known():
-                self._cells[cell.site, cell.name] = cell
-            self._page = importlib.resources.files(__package__).joinpath("page.html").read_bytes()
-            routes = {"/": self._html, "/state": self._state, "/events": self._events, "/image": self._image}
-            self.pages = Pages(http, {**routes, "/metrics": self._metrics}, "--http")
+        self._page = importlib.resources.files(__package__).joinpath("page.html").read_bytes()
+        routes = {"/": self._html, "/state": self._state, "/events": self._events, "/image": self._image}
+        with ExitStack() as opened:
+            self._store = Store(folder)
+            opened.callback(self._store.close)
+            self._cells.update({(cell.site, cell.name): cell for cell in self._store.known()})
             self._router = Router(listen, keys, self._hear, self._stored)
-        except BaseException:
-            self._store.close()
-            raise
+            opened.callback(self._router.close)
+            self.pages = Pages(http, {**routes, "/metrics": self._metrics}, "--http")
+            opened.pop_all()
         self._thread = threading.Thread(target=self._run, name="hub", daemon=True)
         self._thread.start()
 
@@ -110,10 +111,14 @@ class Hub:
         return n
 
     def _run(self) -> None:
-        flushed = time.monotonic()
+        flushed = looked = time.monotonic()
         while not (self._ended.is_set() and self._heard.empty()):
             with suppress(queue.Empty):
                 self._take(self._heard.get(timeout=0.2))
+            if time.monotonic() - looked > _LOOK_S:
+                looked = time.monotonic()
+                with self._lock:
+                    look_for_drifts(self._cells)
             if time.monotonic() - flushed > FLUSH_S:
                 flushed = time.monotonic()
                 self._store.flush()

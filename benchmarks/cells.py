@@ -1,0 +1,271 @@
+"""Many cells and one hub, on this computer: latency, cost, losses, drifts, false alarms.
+
+    python cells.py 50 --seconds 60    latency and cost of states; then kill -9 of half, a frozen cell, a killed hub
+    python cells.py 50 --drift 5       three of them drift: where they stand in the list after 5 minutes
+    python cells.py --alarms 7         false alarms of healthy cells in so many days, without any process
+
+Cells are processes of their own with the sink that commands have; they are fed with measured poses of a simulated rig
+at 10 Hz. The hub runs in a process of its own, and is looked at through its pages, as a person and Prometheus do.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+
+#: Noise of detections, px; slow motion of the cameras' mounts that no model has: sigma, rad, and correlation time, s.
+NOISE_PX, BREATH_RAD, BREATH_S = 0.05, 3e-6, 40.0
+RATE_HZ = 10.0
+DRIFT_DEG_H = 0.05
+
+
+def measured(rig, true, rng):
+    """Return a pose that the rig measures while the cameras stand as in ``true``."""
+    from armsight.data import Body, Correspondences
+    from armsight.vision.pose.locate import locate
+    from armsight.vision.triangulate import triangulate
+
+    grid = [(x, y, 0.01 * (x > 0) * (y > 0)) for x in (-0.04, 0.0, 0.04) for y in (-0.04, 0.04)]
+    points = np.array(grid)
+    T = np.eye(4)
+    T[:3, 3] = rng.uniform([-0.15, -0.1, 0.75], [0.15, 0.1, 0.95])
+    uv = np.stack(true.project(points + T[:3, 3]), axis=1)
+    uv += NOISE_PX * rng.standard_normal(uv.shape)
+    body = Body("body", tuple("ABCDEF"), points)
+    seen = Correspondences(np.arange(6), uv, np.tile(NOISE_PX**2 * np.eye(2), (6, 2, 1, 1)))
+    return body, locate(rig, body, triangulate(rig, body, seen))
+
+
+def cell(number, spec, seed, drifts):
+    """Be a cell until the process is ended."""
+    from armsight.app.stream.cell import open_cell
+    from armsight.app.stream.datum import Published
+    from armsight.data import Shot
+    from armsight.loop.running.data import NoteDatum, ShotDatum
+    from armsight.sim.example_rig import example_rig
+
+    rng = np.random.default_rng([seed, number])
+    rig, breath, began = example_rig(), np.zeros(3), time.monotonic()
+    body, _ = measured(rig, rig, rng)
+    axis = rng.integers(0, 2)
+    sink = open_cell(spec, Published(rig, body, properties={"command": "measure"}))
+    sink.start()
+    ended = []
+    signal.signal(signal.SIGTERM, lambda *_: ended.append(True))
+    image, count, keep = np.zeros((480, 640), np.uint8), 0, np.exp(-1.0 / (RATE_HZ * BREATH_S))
+    while not ended:
+        now = time.monotonic() - began
+        breath = keep * breath + BREATH_RAD * np.sqrt(1 - keep**2) * rng.standard_normal(3)
+        tangent = np.zeros(rig.parameter_count)
+        tangent[-3:] = breath
+        if drifts:
+            tangent[-3 + axis] += np.radians(DRIFT_DEG_H) * now / 3600.0
+        _, pose = measured(rig, rig.perturbed(tangent), rng)
+        sink.put(ShotDatum(Shot(f"{now:.1f}", image, image, now), pose))
+        if not drifts and now > 5.0 * (count + 1) and not ARGUMENTS.drift:
+            count += 1
+            sink.put(NoteDatum(now, f"{number}-{count}", "warning"))
+        time.sleep(1.0 / RATE_HZ)
+    sink.close()
+    used = time.process_time()
+    print(json.dumps({"cell": number, "sink_cpu_s": sink.cpu_s, "process_cpu_s": used, "seconds": now}), flush=True)
+
+
+def hub(folder, port, http):
+    """Start a hub, and return its process."""
+    command = [
+        sys.executable,
+        "-m",
+        "armsight",
+        "hub",
+        "--listen",
+        f"tcp/127.0.0.1:{port}",
+        "--http",
+        f"127.0.0.1:{http}",
+    ]
+    process = subprocess.Popen([*command, "-o", str(folder), "--json"], stdout=subprocess.PIPE, text=True)
+    process.stdout.readline()
+    return process
+
+
+def page(http, path="state"):
+    """Return what a page of the hub says; nothing where there is none."""
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{http}/{path}", timeout=5) as answer:
+            return json.loads(answer.read())
+    except OSError:
+        return None
+
+
+def cpu_s(pid):
+    """Return the processor time of a process, and its memory, MB."""
+    stat = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    tick = os.sysconf("SC_CLK_TCK")
+    return (int(stat[11]) + int(stat[12])) / tick, int(stat[21]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def until(holds, most_s):
+    """Return after how many seconds something holds; NaN where it does not."""
+    began = time.monotonic()
+    while time.monotonic() - began < most_s:
+        if holds():
+            return time.monotonic() - began
+        time.sleep(0.02)
+    return float("nan")
+
+
+def free_port():
+    """Return a port that is free now."""
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        return found.getsockname()[1]
+
+
+def started(count, port, seed, drifting):
+    """Start cells, a few at a time."""
+    context = multiprocessing.get_context("fork")
+    cells = []
+    for number in range(count):
+        spec = f"c{number:03d}@127.0.0.1:{port}"
+        cells.append(context.Process(target=cell, args=(number, spec, seed, number in drifting), daemon=True))
+        cells[-1].start()
+        time.sleep(0.1)
+    return cells
+
+
+def levels(http):
+    """Return the level of each cell by name."""
+    return {each["name"]: each["level"] for each in (page(http) or {"cells": []})["cells"]}
+
+
+def latencies(http, seconds):
+    """Return the age of states at their arrival, s, looked at twice a second."""
+    found, seen, end = [], set(), time.monotonic() + seconds
+    while time.monotonic() < end:
+        for each in page(http)["cells"]:
+            state = each["state"]
+            if state and (each["name"], state["t"]) not in seen:
+                seen.add((each["name"], state["t"]))
+                found.append(state["arrived"] - state["t"])
+        time.sleep(0.5)
+    return np.array(found)
+
+
+def losses(cells, http, folder, port, process):
+    """Kill half of the cells, freeze one, kill the hub three times; print what followed."""
+    names = [f"c{number:03d}" for number in range(len(cells))]
+    half = len(cells) // 2
+    for each in cells[:half]:
+        os.kill(each.pid, signal.SIGKILL)
+    took = until(lambda: all(levels(http).get(name) == 4 for name in names[:half]), 20)
+    print(f"kill -9 of {half}: all red after {took:.2f} s (1 asked)")
+    os.kill(cells[half].pid, signal.SIGSTOP)
+    took = until(lambda: levels(http).get(names[half]) == 4, 20)
+    os.kill(cells[half].pid, signal.SIGCONT)
+    print(f"frozen: red after {took:.2f} s (5 asked)")
+    alive = names[half:]
+    for _ in range(3):
+        process.kill()
+        process.wait()
+        time.sleep(2.0)
+        process = hub(folder, port, http)
+        took = until(lambda: all(0 <= levels(http).get(name, 4) < 4 for name in alive), 30)
+        print(f"hub killed and started again: all {len(alive)} back after {took:.2f} s (10 asked)")
+    return process
+
+
+def counted(folder):
+    """Print how many events are missing or twice in the database of a hub that has ended."""
+    import sqlite3
+
+    rows = sqlite3.connect(folder / "events.sqlite").execute("SELECT cell, n FROM events").fetchall()
+    by = {}
+    for name, n in rows:
+        by.setdefault(name, []).append(n)
+    lost = sum(max(each) - len(set(each)) for each in by.values())
+    print(f"events: {len(rows)} stored, {lost} missing, {len(rows) - len(set(rows))} twice")
+
+
+def alarms(days, seed):
+    """Print false alarms of 20 healthy cells: white means, and slow motion beside, in some cells three times as much."""
+    from armsight.app.hub.drift import CHANCE, Slopes, drifts
+
+    kinds = (("white", 0.0, 1.0), ("moving, 40 s", 2.0, 40.0), ("moving, 5 min", 2.0, 300.0), ("1 h", 2.0, 3600.0))
+    for kind, breath, tau_s in kinds:
+        rng, keep, count = np.random.default_rng([seed, int(tau_s)]), np.exp(-10.0 / tau_s), 20
+        state, size = np.zeros(count), breath * np.exp(rng.uniform(-0.55, 0.55, count))
+        cells, alarmed, named = {str(n): Slopes() for n in range(count)}, set(), 0
+        for block in range(8640 * days):
+            state = keep * state + np.sqrt(1 - keep**2) * rng.standard_normal(count)
+            for n, mean in enumerate(rng.standard_normal(count) + size * state):
+                cells[str(n)].add(10.0 * block, mean)
+            if block % 6 == 0:
+                now = {name for name, found in drifts(cells).items() if found.chance < CHANCE}
+                named, alarmed = named + len(now - alarmed), now
+        print(
+            f"{kind}: {named} false alarms in {count * days} cell-days, {7 * named / (count * days):.2f} a cell and week"
+        )
+
+
+def main():
+    """Run what is asked for."""
+    if ARGUMENTS.alarms:
+        alarms(ARGUMENTS.alarms, ARGUMENTS.seed)
+        return
+    folder = Path(tempfile.mkdtemp())
+    os.environ["XDG_STATE_HOME"] = str(folder / "state")
+    port, http, count = free_port(), free_port(), ARGUMENTS.cells
+    drifting = set(np.random.default_rng(ARGUMENTS.seed).choice(count, 3, replace=False)) if ARGUMENTS.drift else set()
+    process = hub(folder / "hub", port, http)
+    cells = started(count, port, ARGUMENTS.seed, drifting)
+    took = until(lambda: len([n for n in levels(http).values() if n >= 0]) == count, 120)
+    print(f"{count} cells on the page {took:.1f} s after the last was started")
+    if ARGUMENTS.drift:
+        for minute in range(ARGUMENTS.drift + 2):
+            time.sleep(60)
+            first = [(each["name"], each["why"]) for each in page(http)["cells"] if each["level"] == 2]
+            print(
+                f"minute {minute + 1}: drifting are {sorted(f'c{n:03d}' for n in drifting)}; the page says {first}",
+                flush=True,
+            )
+    else:
+        before = cpu_s(process.pid)
+        began = time.monotonic()
+        age = 1e3 * latencies(http, ARGUMENTS.seconds)
+        used, memory = np.subtract(cpu_s(process.pid), before)[0] / (time.monotonic() - began), cpu_s(process.pid)[1]
+        p50, p99 = np.percentile(age, [50, 99])
+        print(f"states: {len(age)}, age at the hub p50 {p50:.1f}, p99 {p99:.1f}, most {age.max():.1f} ms (100 asked)")
+        print(
+            f"hub with a page that asks twice a second: {100 * used:.1f} % of a core, {memory:.0f} MB (25 %, 300 MB asked)"
+        )
+        if count <= 60:
+            process = losses(cells, http, folder / "hub", port, process)
+            time.sleep(8.0)
+    for each in cells:
+        each.terminate()
+    for each in cells:
+        each.join(10)
+    time.sleep(1.0)
+    process.send_signal(signal.SIGINT)
+    process.wait()
+    counted(folder / "hub")
+
+
+if __name__ == "__main__":
+    PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    PARSER.add_argument("cells", type=int, nargs="?", default=50)
+    PARSER.add_argument("--seconds", type=float, default=60.0)
+    PARSER.add_argument("--drift", type=int, default=0)
+    PARSER.add_argument("--alarms", type=int, default=0)
+    PARSER.add_argument("--seed", type=int, default=4301)
+    ARGUMENTS = PARSER.parse_args()
+    main()

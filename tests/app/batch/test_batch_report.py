@@ -1,0 +1,81 @@
+"""batch report: a cell that differs, one that changes, and none among cells of which none does."""
+
+import json
+
+import numpy as np
+import pytest
+
+from armsight.app.batch.report import report, to_json
+from armsight.errors import InputError
+from cli_runs import assert_rejected
+
+pa = pytest.importorskip("pyarrow")
+parquet = pytest.importorskip("pyarrow.parquet")
+pytest.importorskip("distributed")
+
+CELLS, RUNS, SHOTS = 12, 10, 8
+
+
+def batch(folder, seed, change=lambda cell, run: 0.0, missed=lambda cell: 0.1):
+    """Write the tables of a batch: residuals in which cells differ by 5 %, days by 3 %, shots by 20 %."""
+    rng = np.random.default_rng(seed)
+    recordings, shots = [], {"recording": [], "status": [], "residual_rms_m": []}
+    own = 0.05 * rng.standard_normal(CELLS)
+    for cell in range(CELLS):
+        for run in range(RUNS):
+            name = f"s3://bucket/lab/2026-11-{run + 1:02d}/c{cell:02d}/run/run.mcap"
+            recordings.append({"recording": name, "status": "ok", "reason": None})
+            day = 0.03 * rng.standard_normal()
+            for _ in range(SHOTS):
+                miss = rng.random() < missed(cell)
+                size = 1 + own[cell] + day + change(cell, run) + 0.2 * rng.standard_normal()
+                shots["recording"].append(name)
+                shots["status"].append("missed" if miss else "ok")
+                shots["residual_rms_m"].append(None if miss else 1e-4 * size)
+    folder.mkdir(exist_ok=True)
+    parquet.write_table(pa.Table.from_pylist(recordings), folder / "recordings.parquet")
+    columns = {
+        name: pa.array(values, pa.float64() if name.endswith("_m") else pa.string()) for name, values in shots.items()
+    }
+    parquet.write_table(pa.table(columns), folder / "shots.parquet")
+    return folder
+
+
+def named(rows):
+    return {(row.cell, row.metric) for row in rows if row.named}
+
+
+def test_a_cell_that_differs_is_named_alone(tmp_path):
+    rows = report(batch(tmp_path / "b", 1, lambda cell, run: 1.0 * (cell == 3)))
+    assert named(rows) == {("c03", "residual_mm")}
+    assert rows[0].median == pytest.approx(0.2, rel=0.2)
+    assert rows[0].siblings == pytest.approx(0.1, rel=0.1)
+
+
+def test_a_cell_that_changes_from_day_to_day_is_named(tmp_path):
+    rows = report(batch(tmp_path / "b", 2, lambda cell, run: 0.1 * run * (cell == 5)))
+    assert named(rows) == {("c05", "residual_mm")}
+    assert rows[0].per_day == pytest.approx(0.01, rel=0.4)
+
+
+def test_a_cell_that_misses_more_is_named(tmp_path):
+    rows = report(batch(tmp_path / "b", 3, missed=lambda cell: 0.7 if cell == 7 else 0.1))
+    assert ("c07", "missed") in named(rows)
+
+
+def test_where_no_cell_differs_few_reports_name_one(tmp_path):
+    """5 % of reports may; of 60 more than 7 have a chance of 1 % (binomial)."""
+    false = sum(bool(named(report(batch(tmp_path / "b", 100 + seed)))) for seed in range(60))
+    assert false <= 7
+
+
+def test_json_and_what_is_no_batch(tmp_path, armsight):
+    folder = batch(tmp_path / "b", 1, lambda cell, run: 1.0 * (cell == 3))
+    printed = armsight("batch", "report", folder, "--json")
+    assert json.loads(printed.out) == json.loads(json.dumps(to_json(report(folder))))
+    assert armsight("batch", "report", folder).out.splitlines()[1].startswith("lab/c03 residual_mm: 0.19")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no results of armsight batch"):
+        report(tmp_path / "empty")
+    assert_rejected(armsight("batch", "report", folder, tmp_path), "one batch")
+    assert_rejected(armsight("batch", "measure", "x.bag"), "give -o DIR")

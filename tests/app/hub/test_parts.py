@@ -1,0 +1,263 @@
+"""The parts of a hub by themselves: who a cell is, its outbox, its keys, drifts, the order of cells, the store, a push."""
+
+import json
+import math
+import time
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+
+from armsight.app.hub.cells import FINDING, LOOK, LOST, WELL, CellView, look_for_drifts, ranked
+from armsight.app.hub.drift import CHANCE, Slopes, drifts
+from armsight.app.hub.keys import make_keys, site_of
+from armsight.app.hub.push import push
+from armsight.app.hub.store import Store
+from armsight.app.stream.cell_file import Cell, read_cell
+from armsight.app.stream.outbox import Outbox
+from armsight.errors import InputError
+from cli_runs import assert_rejected
+
+
+def test_who_a_cell_is(tmp_path):
+    assert read_cell("table-1") == Cell("table-1")
+    assert read_cell("a@localhost:17").router == "tcp/localhost:17"
+    path = tmp_path / "cell.toml"
+    path.write_text('name = "b"\nsite = "lab"\nholds = true\n')
+    assert read_cell(str(path)) == Cell("b", "lab", holds=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a/b", "expected up to 48 letters"),
+        ("a b", "expected up to 48 letters"),
+        ("", "expected up to 48 letters"),
+        ("a@host", "is no address of a hub"),
+        ("a@host:70000", "is no address of a hub"),
+        ("a@10.0.0.7:7447", "is another computer"),
+        ("a@tls/10.0.0.7:7447", "needs ca, certificate and key"),
+        ("none.toml", "no such file"),
+    ],
+)
+def test_a_wrong_name_is_one_line(text, message, armsight, tmp_path):
+    arguments = ("measure", tmp_path / "rig.json", "--target", "x.toml", "--left", "l*.png", "--right", "r*.png")
+    assert_rejected(armsight(*arguments, "--cell", text), message)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("nmae = 1", "unknown key 'nmae'"),
+        ("name = 1", "name is 1: expected a text"),
+        ('site = "x"', "the key name is missing"),
+        ('name = "a"\nholds = "yes"', "expected true or false"),
+        ('name = "a"\nca = "none.pem"', "none.pem is not there"),
+    ],
+)
+def test_a_wrong_file_is_one_line(line, message, tmp_path):
+    path = tmp_path / "cell.toml"
+    path.write_text(line + "\n")
+    with pytest.raises(InputError, match=message):
+        read_cell(str(path))
+
+
+def test_events_wait_on_disk_until_they_are_confirmed(tmp_path):
+    box = Outbox(tmp_path, "a")
+    for k in range(5):
+        box.add({"text": str(k)})
+    box.confirm(2)
+    name = box.name
+    box.close()
+    box = Outbox(tmp_path, "a")
+    assert box.name == name
+    assert [(each["n"], each["text"]) for each in box.waiting(2)] == [(3, "2"), (4, "3")]
+    box.confirm(5)
+    box.add({"text": "next"})
+    assert [each["n"] for each in box.waiting(9)] == [6]
+    box.close()
+
+
+def test_a_storm_of_events_is_thinned_counted_and_said(tmp_path, monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    box = Outbox(tmp_path, "a")
+    for k in range(3000):
+        now[0] += 1e-3
+        box.add({"kind": "health", "level": "warning", "text": str(k)})
+    assert 100 <= len(box.waiting(9999)) <= 100 + 10 * 3 + 2
+    now[0] += 10.0
+    box.add({"kind": "health", "level": "warning", "text": "after"})
+    *_, said, last = box.waiting(9999)
+    assert (said["kind"], last["text"]) == ("thinned", "after")
+    left_out = 3000 - sum(each["kind"] == "health" for each in box.waiting(9999)) + 1
+    assert said["text"].startswith(f"{left_out} events were left out")
+    box.close()
+
+
+def test_keys_are_made_once_and_renewed_before_their_end(tmp_path, monkeypatch):
+    keys = tmp_path / "keys"
+    assert [path.parent.name for path in make_keys(keys, "lab", ["a"], "hub.local", 7447)] == ["a"]
+    assert make_keys(keys, "lab", ["a", "b"], "hub.local", 7447) == [keys / "cells/b/cell.toml"]
+    assert site_of(keys) == ("lab", ["a", "b"])
+    assert (keys / "ca.key").stat().st_mode & 0o077 == 0
+    assert read_cell(str(keys / "cells/a/cell.toml")).router == "tls/hub.local:7447"
+    with pytest.raises(InputError, match="keys of site lab, not of other"):
+        make_keys(keys, "other", [], "hub.local", 7447)
+    with pytest.raises(InputError, match="cannot be called hub"):
+        make_keys(keys, "lab", ["hub"], "hub.local", 7447)
+
+    class Later(datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return datetime.now(tz) + timedelta(days=380)
+
+    monkeypatch.setattr("armsight.app.hub.keys.datetime", Later)
+    assert len(make_keys(keys, "lab", ["a", "b"], "hub.local", 7447)) == 2
+    monkeypatch.setattr(Later, "now", classmethod(lambda cls, tz=None: datetime.now(UTC) + timedelta(days=900)))
+    with pytest.raises(InputError, match="this computer's date is"):
+        site_of(keys)
+
+
+def slopes(rng, per_h, blocks=30):
+    found = Slopes()
+    for k in range(blocks):
+        found.add(10.0 * k, per_h * k / 360.0 + 0.05 * rng.standard_normal())
+    return found
+
+
+def test_a_slope_is_that_of_numpy():
+    rng = np.random.default_rng(5)
+    found = slopes(rng, 3.0)
+    t, y = np.array(found.blocks).T
+    assert found.per_h() == pytest.approx(3600.0 * np.polyfit(t, y, 1)[0], rel=1e-9)
+
+
+def test_the_cells_that_drift_are_named_and_no_other():
+    rng = np.random.default_rng(6)
+    cells = {f"c{k}": slopes(rng, 30.0 if k in (3, 8) else 0.0) for k in range(30)}
+    found = drifts(cells)
+    assert {name for name, each in found.items() if each.chance < CHANCE} == {"c3", "c8"}
+    assert found["c3"].per_h == pytest.approx(30.0, abs=5 * found["c3"].sigma_per_h)
+    alone = drifts({"c3": cells["c3"]})["c3"]  # nothing to compare with: nothing is said
+    assert math.isnan(alone.sigma_per_h)
+    assert alone.chance == 1.0
+
+
+def state(t, **values):
+    return {"t": t, "mode": "measure", "rate_hz": 30.0, "missed": 0.0, "error_mm": 0.05, "sigma_mm": 0.03, **values}
+
+
+def connected(name, at_s, **values):
+    cell = CellView("lab", name)
+    cell.token("s", True, at_s)
+    cell.take(state(at_s, **values), at_s)
+    return cell
+
+
+def test_the_order_is_who_needs_a_look():
+    late = connected("frozen", 1000.0)
+    gone = connected("gone", 1005.0)
+    gone.token("s", False, 1005.0)
+    ill = connected("ill", 1005.0, health=["rig: a camera moved"])
+    clock = connected("clock", 1005.0)
+    clock.take(state(1005.0 + 365 * 86400.0), 1005.0)
+    many = connected("many", 1005.0)
+    many.token("t", True, 1005.0)
+    over = connected("over", 1005.0, error_mm=0.5)
+    over.about = {"limit_mm": 0.1}
+    blind = connected("blind", 1005.0, missed=0.9)
+    well = connected("well", 1005.0)
+    shown = ranked([well, blind, over, many, clock, ill, late, gone], 1006.0)
+    assert [(each["name"], each["level"]) for each in shown[:3]] == [("frozen", LOST), ("gone", LOST), ("ill", FINDING)]
+    assert {each["name"] for each in shown[3:7]} == {"over", "blind", "many", "clock"}
+    assert {each["level"] for each in shown[3:7]} == {LOOK}
+    assert (shown[-1]["name"], shown[-1]["level"]) == ("well", WELL)
+    why = {each["name"]: each["why"] for each in shown}
+    assert why["clock"] == "its clock is +31536000 s off the hub's"
+    assert why["over"] == "error 0.50 mm, more than its limit of 0.10"
+
+
+@pytest.mark.parametrize("content", [None, [], {}, {"t": math.inf}, {"t": "now"}, "a message of 9 bytes"])
+def test_what_is_no_state_is_counted(content):
+    cell = connected("a", 1000.0)
+    assert cell.take(content, 1001.0) is None
+    assert "1 messages could not be read" in cell.need(1001.0)[2]
+
+
+def test_a_state_of_another_version_is_read():
+    cell = connected("a", 1000.0)
+    assert (
+        cell.take({"t": 1001.0, "more": [1], "missed": "none", "health": 7, "error_mm": True}, 1001.0)["missed"] is None
+    )
+    assert cell.need(1001.0)[0] == WELL
+    look_for_drifts({("lab", "a"): cell})
+    assert cell.drifts == {}
+
+
+def test_the_store_keeps_each_event_once_and_finds_it(tmp_path):
+    store = Store(tmp_path)
+    event = {"kind": "health", "level": "warning", "text": "rig: 100% off_axis", "t": 5.0}
+    message = {"outbox": "x", "events": [{**event, "n": n} for n in (1, 2, 3)]}
+    assert store.add_events("lab", "a", message, 6.0) == 3
+    assert store.add_events("lab", "a", message, 7.0) == 3
+    assert store.add_events("lab", "a", {"events": []}, 7.0) == 0
+    assert store.count() == 3
+    assert len(store.events("RIG off_axis")) == 3
+    assert store.events("rig offXaxis") == store.events("'; DROP TABLE events") == []
+    with pytest.raises(InputError, match="another hub uses it"):
+        Store(tmp_path)
+    cell = connected("a", 1000.0)
+    store.add_state(cell, cell.state)
+    store.close()
+    duckdb = pytest.importorskip("duckdb")
+    query = f"SELECT cell, day, error_mm FROM read_parquet('{tmp_path}/states/*/*/*.parquet', hive_partitioning = true)"
+    assert [(str(c), str(d), e) for c, d, e in duckdb.sql(query).fetchall()] == [("lab.a", "1970-01-01", 0.05)]
+
+
+def runs(folder):
+    for name in ("one", "two"):
+        (folder / name).mkdir(parents=True)
+        (folder / name / "run.mcap").write_bytes(name.encode() * 1000)
+        (folder / name / "summary.json").write_text("{}")
+    return folder
+
+
+def test_a_push_goes_on_where_it_was(tmp_path):
+    folder, store, cell = runs(tmp_path / "runs"), tmp_path / "store", Cell("a", "lab")
+    done = push(cell, folder, str(store), 100.0, lambda sent: None)
+    assert (done.runs, done.files, done.complete_before) == (2, 4, 0)
+    there = next(store.glob("lab/*/a/one"))
+    manifest = json.loads((there / "manifest.json").read_text())
+    assert set(manifest["files"]) == {"run.mcap", "summary.json"}
+    (there / "manifest.json").unlink()
+    (there / "run.mcap").write_bytes(b"half")
+    again = push(cell, folder, str(store), 100.0, lambda sent: None)
+    assert (again.runs, again.files, again.complete_before) == (1, 1, 1)
+    assert (there / "run.mcap").read_bytes() == b"one" * 1000
+
+
+def test_a_push_waits_for_its_cell_and_says_what_is_wrong(tmp_path, armsight):
+    from armsight.app.stream.outbox import state_folder
+
+    folder = runs(tmp_path / "runs")
+    running = Outbox(state_folder() / "cells" / "site" / "a", "a")
+    assert_rejected(
+        armsight("hub", "push", folder, tmp_path / "store", "--cell", "a"), "another process on this computer"
+    )
+    running.close()
+    assert_rejected(armsight("hub", "push", tmp_path, tmp_path / "store", "--cell", "a"), "no runs are here")
+    assert_rejected(armsight("hub", "push", folder, "nowhere://x", "--cell", "a"), "nowhere")
+    assert json.loads(armsight("hub", "push", folder, tmp_path / "store", "--cell", "a", "--json").out)["runs"] == 2
+
+
+def test_the_hub_says_what_is_wrong(tmp_path, armsight):
+    assert_rejected(armsight("hub", "--listen", "0.0.0.0:7447", "-o", tmp_path / "h"), "is another computer")
+    assert_rejected(
+        armsight("hub", "--keys", tmp_path, "--listen", "tls/0.0.0.0:7", "-o", tmp_path / "h"), "no keys of a site"
+    )
+    assert_rejected(armsight("hub", "--http", "nowhere", "-o", tmp_path / "h"), "expected HOST:PORT")
+    assert_rejected(armsight("hub", "keys", "my lab", "-o", tmp_path / "k"), "expected up to 48 letters")
+    assert_rejected(armsight("hub", "hold", "a", "why", "--keys", tmp_path), "no keys of a site are here")
+    (tmp_path / "file").write_text("")
+    assert_rejected(armsight("hub", "-o", tmp_path / "file"), "nothing can be kept here")
