@@ -1,6 +1,7 @@
 """Predicted against measured: rigs of `armsight budget`, rendered, calibrated by noisy boards, and measured by `measure`.
 
     python benchmarks/budget.py [--groups 16] [--shots 2] [--seed 9100]
+    python benchmarks/budget.py page      # docs/buying.md
 
 Each group of shots has a calibration, a print of body and board, and a warming of its own; each shot a position, a rotation
 and a velocity. The images come from the camera's model with its readout, exposure and skew.
@@ -9,12 +10,16 @@ and a velocity. The images come from the camera's model with its readout, exposu
 from __future__ import annotations
 
 import argparse
+import textwrap
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+import armsight
 from armsight.data import Array, PoseEstimate, Shot
+from armsight.files import write_text
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.sim.budget.chart import marker_noise
 from armsight.sim.budget.plan import RigPlan, length_m
@@ -46,6 +51,31 @@ RIGS = {
     "2 MP": {"camera": "machine-vision-2mp", "baseline": "500mm", "distance": "1.2m", "speed": "0.3m/s"},
     "2 MP, skew 15 ms": {"camera": "machine-vision-2mp", "baseline": "300mm", "skew_ms": 15.0, "speed": "0.1m/s"},
 }
+#: Kit -> its plan, and what it does not do.
+KITS = {
+    "Two webcams": (
+        {"camera": "webcam-720p", "baseline": "200mm"},
+        "They neither start together nor expose all rows at once: the arm must stand still. Switch autofocus off.",
+    ),
+    "Two global shutters with a trigger": (
+        {"camera": "global-shutter-1mp", "baseline": "200mm"},
+        "They do not measure better than the printed board and body allow. Fasten their lenses after focusing.",
+    ),
+    "Machine vision": (
+        {"camera": "machine-vision-2mp", "baseline": "250mm"},
+        "At this distance it is no better than the global shutters: the print decides. It is for small, far discs.",
+    ),
+}
+#: Board and body, measured after printing.
+CALIPERS = {
+    "body_print": "0.01mm",
+    "body_bent": "0.02mm",
+    "body_size": 1e-4,
+    "board_print": 1e-4,
+    "board_bent": "0.03mm",
+}
+BOUGHT = {"volume": "0.2x0.2x0.2m", "distance": "0.8m", "speed": "0.1m/s"}
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "buying.md"
 VOLUME, TILT_RAD = "0.1x0.08x0.1m", 0.2
 
 
@@ -130,14 +160,49 @@ def measured(plan: RigPlan, groups: int, shots: int, seed: int) -> tuple[Array, 
     return np.array(errors), predicted, missed
 
 
+def buying_page() -> str:
+    """Return docs/buying.md: what the kits of the catalogue measure."""
+    rows, kits = list[str](), list[str]()
+    for title, (kit, limits) in KITS.items():
+        found, better = armsight.budget(**BOUGHT, **kit), armsight.budget(**BOUGHT, **kit, **CALIPERS)
+        at, cameras = found.states, found.plan.cameras
+        cells = [at["at_rest"], at["moving"], better.at_rest, at["one_camera"], at["three_cameras"]]
+        rows.append("| " + " | ".join(map(str, [title, cameras.price, *cells])) + " |")
+        text = (
+            f"The kit is {cameras.text}, {kit['baseline']} apart. In motion most is due to the {found.causes[0].cause}. "
+            f"{limits}"
+        )
+        kits += ["", f"## {title}", "", *textwrap.wrap(text, 116)]
+    intro = (
+        f"[`armsight budget`](howto/budget.md) predicts these figures for a volume of {BOUGHT['volume']} at "
+        f"{BOUGHT['distance']}: 95 % of the errors are within them at the worst position. In motion the body moves at "
+        f"{BOUGHT['speed']}. Price classes reach from 1 (tens of euros a pair) to 5 (thousands). "
+        "`python benchmarks/budget.py page` writes this page."
+    )
+    printed = (
+        "Print the board with `armsight body draw chessboard:9x6:25mm -o board.pdf` and glue it to a stiff plate. "
+        "`armsight budget -o kit` draws the body. Measure both after printing: that gains more than better cameras."
+    )
+    head = (
+        "| kit | price class | at rest | in motion | at rest, print measured | one camera, at rest | three, at rest |"
+    )
+    lines = ["# What to buy", "", *textwrap.wrap(intro, 116), "", head, "|" + "---|" * 7, *rows]
+    lines += ["", *textwrap.wrap(printed, 116)]
+    return "\n".join([*lines, *kits]) + "\n"
+
+
 def main() -> None:
     """Print predicted over measured for each rig."""
     parser = argparse.ArgumentParser()
+    parser.add_argument("what", nargs="?", default="rigs", choices=["rigs", "page"])
     parser.add_argument("--groups", type=int, default=16)
     parser.add_argument("--shots", type=int, default=2)
     parser.add_argument("--seed", type=int, default=9100)
     parser.add_argument("--only", default="")
     options = parser.parse_args()
+    if options.what == "page":
+        write_text(PAGE, buying_page())
+        return
     good, inside = 0, []
     print("rig                     shots missed  measured mm   deg  predicted/measured mm  deg  in 95 % ellipsoids")
     for number, (name, given) in enumerate(RIGS.items()):

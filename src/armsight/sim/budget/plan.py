@@ -209,13 +209,17 @@ class RigPlan:
             )
         return size
 
+    def _reach_m(self, key: str) -> float:
+        """Return a length that a cell may have."""
+        found = length_m(getattr(self, key), key)
+        if not _LEAST_M <= found <= _MOST_M:
+            raise InputError(f"{key} {getattr(self, key)}: expected {_LEAST_M:g} to {_MOST_M:g} m: is the unit right?")
+        return found
+
     @cached_property
     def distance_m(self) -> float:
         """Distance of the middle."""
-        d = length_m(self.distance, "distance")
-        if not _LEAST_M <= d <= _MOST_M:
-            raise InputError(f"distance {self.distance}: expected {_LEAST_M:g} to {_MOST_M:g} m: is the unit right?")
-        return d
+        return self._reach_m("distance")
 
     @cached_property
     def existing(self) -> StereoRig | None:
@@ -230,12 +234,7 @@ class RigPlan:
     @cached_property
     def baseline_m(self) -> float:
         """Distance of the cameras."""
-        if self.existing:
-            return self.existing.baseline_m
-        b = length_m(self.baseline, "baseline")
-        if not _LEAST_M <= b <= _MOST_M:
-            raise InputError(f"baseline {self.baseline}: expected {_LEAST_M:g} to {_MOST_M:g} m: is the unit right?")
-        return b
+        return self.existing.baseline_m if self.existing else self._reach_m("baseline")
 
     def _two(self, what: str, text: str, units: tuple[str, str], form: str) -> tuple[float, float]:
         """Read a length and an angle, rad; the second is 0 where it is left out."""

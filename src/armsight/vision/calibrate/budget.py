@@ -103,25 +103,6 @@ class Conditions(Record):
     handeye: tuple[float, float] = (0.0, 0.0)
     arm: tuple[float, float] = (0.0, 0.0)
 
-    def only(self, cause: str) -> Conditions:
-        """Return the same with one cause alone."""
-        kept: dict[str, tuple[str, ...]] = {
-            "calibration": ("cov_calibration",),
-            "print of the board": ("board_scale",),
-            "print of the body": ("body_sigma_m", "body_scale"),
-            "warming of the mount": ("mount_m", "mount_rad"),
-            "warming of the lenses": ("lens_share",),
-            "skew": ("skew_s",),
-            "start of exposures": ("start_s",),
-            "readout": ("readout_s",),
-            "time stamps": ("stamp_s",),
-            "hand-eye": ("handeye",),
-            "steps and backlash of the arm": ("arm",),
-        }
-        noise = {name: sigma for name, sigma in self.noise_px.items() if name == cause}
-        values = {name: getattr(self, name) for name in (*kept.get(cause, ()), "speed_m_s", "rotation_rad_s")}
-        return Conditions(noise, **values)
-
 
 @dataclass(frozen=True, eq=False)
 class Budget(Record):
