@@ -7,6 +7,9 @@ from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import Any, Literal
 
+import numpy as np
+
+from armsight.data import Array
 from armsight.estimate.chance import chi_square_limit
 
 #: rig: one camera against the other; body: the body, or what looks the same; fixed: the rig against the arm's base;
@@ -46,6 +49,7 @@ class HealthFinding:
         alternatives: other causes that explain it nearly as well.
         corrected_s: when it was put right, s; None where it was not.
         cost_mm: by how much it displaces the tool, or what is measured, at most so far, mm; None where that is not known.
+        pose_sigma_mm: sigma of the newest measured positions as it was before anything was found, mm; None without a pose.
     """
 
     cause: Cause
@@ -58,11 +62,12 @@ class HealthFinding:
     alternatives: tuple[Cause, ...] = ()
     corrected_s: float | None = None
     cost_mm: float | None = None
+    pose_sigma_mm: float | None = None
 
     @property
     def forbids(self) -> bool:
-        """Whether results must not be trusted because of it: not where it hardly displaces them."""
-        return self.cost_mm is None or self.cost_mm > 1e3 * COSTS_M
+        """Whether results must not be trusted because of it: not where it displaces them by less than is known of them."""
+        return self.cost_mm is None or self.cost_mm > max(1e3 * COSTS_M, self.pose_sigma_mm or 0.0)
 
     def to_json(self) -> dict[str, Any]:
         """Return the object that summary.json and ``--json`` hold."""
@@ -73,7 +78,13 @@ class HealthFinding:
         since = "" if self.since_s is None else f" since {self.since_s:.1f} s"
         right = "" if self.corrected_s is None else f", put right at {self.corrected_s:.1f} s"
         costs = "" if self.cost_mm is None else f", which displaces poses by up to {self.cost_mm:.2f} mm"
-        return f"{self.cause}: {self.what}{since}{costs}{right}; {self.advice}"
+        sigma = "" if not costs or self.pose_sigma_mm is None else f" (sigma {self.pose_sigma_mm:.2f} mm)"
+        return f"{self.cause}: {self.what}{since}{costs}{sigma}{right}; {self.advice}"
+
+
+def displacement_m(shift: Array) -> Array:
+    """Return by how much tangents (..., 6), or roots of variances, displace the tool, m: rotations at ``LEVER_M``."""
+    return np.asarray(np.linalg.norm(shift[..., :3], axis=-1) + LEVER_M * np.linalg.norm(shift[..., 3:], axis=-1))
 
 
 def health_lines(health: Sequence[HealthFinding]) -> list[str]:

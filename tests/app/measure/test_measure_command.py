@@ -434,6 +434,7 @@ def test_a_rig_whose_camera_moved_is_named_and_the_exit_code_says_so(rendered, t
     assert found["cause"] == "rig"
     assert found.keys() == {
         "cause", "what", "since_s", "size", "sigma", "unit", "advice", "alternatives", "corrected_s", "cost_mm",
+        "pose_sigma_mm",
     }  # fmt: skip
     assert found["cost_mm"] > 1.0
     assert abs(found["size"] - 0.3) < 4 * found["sigma"]

@@ -182,3 +182,17 @@ def test_a_body_file_that_is_far_off_is_a_body_of_another_size_alone(scale):
     (found,) = ended(5520, scale=scale)
     assert (found.cause, found.alternatives, found.unit) == ("body", (), "%")
     assert abs(found.size - 100.0 * (1.0 / scale - 1.0)) < 3 * found.sigma < 0.3
+
+
+@pytest.mark.parametrize("fault", [{"rotated": np.radians([0.0, 0.05, 0.0])}, {"scale": 1.01}, {"skew_s": 1.0 / 30.0}])
+def test_a_finding_says_what_it_costs_and_how_well_poses_are_known_without_it(fault):
+    off, claimed = [], []
+    for monitor, _, T, measured, _ in watched_body(7322, **fault):  # noqa: B007
+        e = log_se3(inverse(measured.T_left_body) @ T)
+        off.append(1e3 * np.linalg.norm(e[:3]) + 100.0 * np.linalg.norm(e[3:]))
+        claimed.append(1e3 * np.sqrt(np.trace(measured.cov[:3, :3])))
+    (found,) = monitor.findings()
+    assert max(off) / 2.0 < found.cost_mm < 2.0 * max(off)  # of another time in each shot it is a sigma
+    assert found.pose_sigma_mm == pytest.approx(np.median(claimed), rel=0.2)
+    assert found.forbids
+    assert f"by up to {found.cost_mm:.2f} mm (sigma {found.pose_sigma_mm:.2f} mm)" in found.line()

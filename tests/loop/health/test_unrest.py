@@ -83,8 +83,8 @@ def test_unrest_finds_a_variance_and_no_other():
 def test_what_hardly_displaces_poses_forbids_nothing():
     small = HealthFinding("rig", "x", None, 0.002, 0.001, "deg", "y", cost_mm=0.05)
     large = HealthFinding("rig", "x", None, 0.02, 0.001, "deg", "y", cost_mm=0.5)
-    assert not small.forbids
-    assert large.forbids
+    vague = HealthFinding("rig", "x", None, 0.02, 0.001, "deg", "y", cost_mm=0.5, pose_sigma_mm=0.6)
+    assert [each.forbids for each in (small, large, vague)] == [False, True, False]
     first, second = health_lines([small, large])
     assert first.startswith("note: ")
     assert second.startswith("do not trust this result: ")

@@ -16,7 +16,7 @@ import numpy as np
 from armsight.data import Array, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import adjoint, inverse
-from armsight.loop.finding import LEVER_M, Cause, HealthFinding
+from armsight.loop.finding import LEVER_M, Cause, HealthFinding, displacement_m
 
 if TYPE_CHECKING:
     from armsight.loop.estimators import PoseMeasurement
@@ -308,7 +308,10 @@ def finding(changes: Sequence[Change], names: Sequence[str], axis: Array | None 
         found = _moved_finding(best, unsure)
     else:
         found = _clock_finding(best, unsure) if best.suspect.cause == "time" else _joint_finding(best, names, unsure)
-    return replace(found, alternatives=alternatives)
+    cost_mm = found.cost_mm
+    if best.suspect.cause != "time":  # which displaces what moves alone
+        cost_mm = cost_mm or 1e3 * float(displacement_m(best.newest[0]))
+    return replace(found, alternatives=alternatives, cost_mm=cost_mm)
 
 
 def _joint_finding(change: Change, names: Sequence[str], unsure: str) -> HealthFinding:

@@ -34,7 +34,7 @@ from armsight.data import Array, Ids
 from armsight.estimate.chance import chi_square_chance
 from armsight.loop.estimators import Innovation, Outcome
 from armsight.loop.estimators.armerror import layout
-from armsight.loop.finding import COSTS_M, FALSE_ALARMS_PER_MINUTE, LEVER_M, HealthFinding, alarm_limit
+from armsight.loop.finding import COSTS_M, FALSE_ALARMS_PER_MINUTE, HealthFinding, alarm_limit, displacement_m
 from armsight.loop.health.change import RAMPS, Change, Suspect, changing, ranked, suspects
 
 #: A beginning is tried every so often, s; older than this many seconds their distances grow with their age.
@@ -350,13 +350,10 @@ class ShakeWatch:
         if self.change is None:
             return ()
         shift, angle = (float(np.sqrt(np.trace(self.change.cov[part, part]))) for part in (slice(0, 3), slice(3, 6)))
-        if shift + LEVER_M * angle < COSTS_M:
+        cost_m = float(displacement_m(np.sqrt(np.diag(self.change.cov))))
+        if cost_m < COSTS_M:
             return ()
         by = f"{1e3 * shift:.2f} mm and {np.degrees(angle):.3f} deg (RMS)"
         what = f"rig and arm shake against each other: the tool moves by {by} to and fro within a second"
         advice = "mount the rig and the arm on one stiff base, away from what vibrates; poses have this in their sigma"
-        return (
-            HealthFinding(
-                "fixed", what, None, 1e3 * shift, 0.1e3 * shift, "mm", advice, cost_mm=1e3 * (shift + LEVER_M * angle)
-            ),
-        )
+        return (HealthFinding("fixed", what, None, 1e3 * shift, 0.1e3 * shift, "mm", advice, cost_mm=1e3 * cost_m),)

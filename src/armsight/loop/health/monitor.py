@@ -10,7 +10,7 @@ import numpy as np
 
 from armsight.data import Array, Body, PoseEstimate, Shot
 from armsight.loop.estimators import Outcome
-from armsight.loop.finding import HealthFinding, Trust
+from armsight.loop.finding import HealthFinding, Trust, displacement_m
 from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health.change import Change, doubtful, finding, happened_besides, suspected
 from armsight.loop.health.fixed import FixedWatch, ShakeWatch
@@ -77,6 +77,7 @@ class HealthMonitor:
         self._poses: list[tuple[PoseEstimate, float | None]] = []
         self._innovations: list[Innovation] = []
         self._clock: ClockFollower | None = None
+        self._clock_cost_m = 0.0  # by how much a clock that went wrong displaced the tool at most
         self._names: tuple[str, ...] = ()
         self._estimator: KalmanEstimator | None = None
         self._arm: Arm | None = None
@@ -196,6 +197,8 @@ class HealthMonitor:
         if innovation.clock is None or innovation.clock.sigma_s < _KNOWN_S:
             self._innovations.append(innovation)
         self._newest_s = innovation.t_s
+        if innovation.clock is not None:
+            self._clock_cost_m = max(self._clock_cost_m, float(displacement_m(innovation.clock.in_z)))
         if innovation.outcome is Outcome.REOPENED:
             self._doubted_s = innovation.t_s
 
@@ -422,6 +425,7 @@ class HealthMonitor:
         self.work()
         sigma_s = 0.0 if self._estimator is None else self._estimator.settings[1].sigma_s
         late = () if self._clock is None else _clock_findings(self._clock, self._newest_s, sigma_s)
+        late = tuple(replace(each, cost_mm=1e3 * self._clock_cost_m or None) for each in late)
         if self.stamps is not None and self.stamps.stepped is not None:
             late = (_stamps_finding(*self.stamps.stepped, self.stamps.rate),)
         now = (
@@ -432,6 +436,8 @@ class HealthMonitor:
             *self._host.findings(),
         )
         now = _with_scene(now, () if self._scene is None else self._scene.findings())
+        sigma_m = None if self._rig is None else self._rig.pose_sigma_m
+        now = tuple(replace(each, pose_sigma_mm=None if sigma_m is None else 1e3 * sigma_m) for each in now)
         again = {_subject(each) for each in now}
         kept = (each for each in self._kept if each.corrected_s is not None or _subject(each) not in again)
         return (*kept, *now)

@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.loop.finding import HealthFinding
+from armsight.loop.finding import HealthFinding, displacement_m
 from armsight.loop.health.shape import ResidualSums, eliminated, total
 
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
@@ -405,6 +405,7 @@ class Passing:
         apart_s: standard deviation of the times in the newest test, those that its shots share included, s.
         focal_share: the focal length's change in it.
         unsure: causes that explained the newest doubtful test nearly as well as what was taken.
+        cost_m: by how much a pose was displaced at most, one sigma, m.
     """
 
     apart: tuple[tuple[float, Apart], ...] = ()
@@ -412,6 +413,7 @@ class Passing:
     apart_s: float = 0.0
     focal_share: float = 0.0
     unsure: tuple[str, ...] = ()
+    cost_m: float = 0.0
     _doubtful: list[_Doubtful] = field(default_factory=list)
     _counted: Passes | None = None
 
@@ -482,6 +484,7 @@ class Passing:
         if self.focal_share:
             spread = math.sqrt(float(np.mean(np.square([share for _, share in self.focal]))))
             added += (spread / _FOCAL) ** 2 * np.outer(by_focal, by_focal)
+        self.cost_m = max(self.cost_m, float(displacement_m(np.sqrt(np.diag(added)))))
         return added
 
     def among(self, stays: tuple[HealthFinding, ...], *, timed: bool) -> tuple[HealthFinding, ...]:
@@ -493,6 +496,7 @@ class Passing:
         same = [each for each in stays if each.cause == found.cause]
         if found.cause == "lens":  # one that stays is sized better
             found = next(iter(same), found)
+        found = replace(found, cost_mm=found.cost_mm or 1e3 * self.cost_m or None)
         begins = [each.since_s for each in (found, *same) if each.since_s is not None]
         since_s = min(begins, default=0.0)
         # What is left of it looks like what stays: that cannot be excluded, but what was found before.

@@ -44,7 +44,7 @@ from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import adjoint, inverse, log_se3, pose
 from armsight.kernels import kernel
-from armsight.loop.finding import COSTS_M, LEVER_M, HealthFinding, alarm_limit
+from armsight.loop.finding import COSTS_M, HealthFinding, alarm_limit, displacement_m
 from armsight.loop.health.fixed import Unrest
 from armsight.loop.health.passing import (
     TOGETHER,
@@ -851,8 +851,13 @@ class RigWatch:
 
     def _cost_m(self, by: Array) -> float:
         """Return by how much a change of the parameters (K + M,) displaces one of the newest poses at most, m."""
-        shifts = np.array([response for response, _ in self._effects]) @ by
-        return float(np.max(np.linalg.norm(shifts[:, :3], axis=1) + LEVER_M * np.linalg.norm(shifts[:, 3:], axis=1)))
+        return float(displacement_m(np.array([response for response, _ in self._effects]) @ by).max())
+
+    @property
+    def pose_sigma_m(self) -> float | None:
+        """Standard deviation of the newest measured positions, median, m; None without any."""
+        covs = [cov for _, cov in self._effects]
+        return float(np.median(np.sqrt(np.trace(np.array(covs)[:, :3, :3], axis1=1, axis2=2)))) if covs else None
 
     def _of_part(self, change: RigChange, part: slice) -> Array:
         """Return the change of the parameters (K + M,) that a part of the seven numbers makes."""
@@ -946,7 +951,7 @@ class RigWatch:
         if not cov.any() or not newest:
             return ()
         covs = self._nodding(newest[0][0], self._last[1])
-        cost_m = float(np.sqrt(np.trace(covs[:3, :3]))) + LEVER_M * float(np.sqrt(np.trace(covs[3:, 3:])))
+        cost_m = float(displacement_m(np.sqrt(np.diag(covs))))
         if cost_m < COSTS_M:
             return ()
         # The one that displaces points in the images by more.
