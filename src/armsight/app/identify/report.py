@@ -49,7 +49,7 @@ def _shown(run: Identification) -> tuple[Array, Array, Array, Array]:
 def map_figure(run: Identification) -> Figure:
     """Plot the held-out errors over the workspace, from above and from the side, before and after."""
     at, _, before, after = _shown(run)
-    figure = new_figure(5.2)
+    figure = new_figure(4.6)
     axes = figure.subplots(2, 2)
     views = ((at[:, 0], at[:, 1], "x", "y"), (np.hypot(at[:, 0], at[:, 1]), at[:, 2], "distance from axis 1", "z"))
     top = max(float(np.quantile(before, 0.98)), 1e-6)
@@ -71,7 +71,7 @@ def map_figure(run: Identification) -> Figure:
 def joints_figure(run: Identification) -> Figure:
     """Plot the held-out error over each joint's angle, before and after, with the mean in bins."""
     _, q, before, after = _shown(run)
-    figure = new_figure(5.0)
+    figure = new_figure(4.4)
     axes = panels(figure, run.arm.joints, sharey=True)
     for i, ax in enumerate(axes):
         degrees = np.degrees(q[:, i])

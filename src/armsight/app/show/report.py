@@ -42,6 +42,9 @@ class Fact:
     values: Mapping[str, Any] = field(default_factory=dict)
 
 
+ON_PAGE = 6  # lines under a title that a page shows unfolded; half: a reader unfolds all, double: long pages
+
+
 @dataclass(frozen=True)
 class Lines:
     """Lines that belong together.
@@ -49,7 +52,7 @@ class Lines:
     Attributes:
         lines: plain text.
         title: stands above them on the terminal, where they are indented; empty: they are not.
-        most: so many are printed, and how many more there are; 0: none; the page has them all.
+        most: so many are printed, and how many more there are; 0: none; the page folds those beyond ON_PAGE.
         none: what is said instead where there are none.
     """
 
@@ -295,6 +298,9 @@ def _html(block: Block, images: Mapping[str, bytes]) -> str:
         case Fact(sentence) if sentence:
             return page.bullets([sentence])
         case Lines() if block.lines or block.none:
-            title = f"<p>{page.text(block.title)}</p>\n" if block.title and block.lines else ""
-            return title + page.bullets(block.lines or [block.none])
+            if not block.title or not block.lines:
+                return page.bullets(block.lines or [block.none])
+            first, more = block.lines[:ON_PAGE], block.lines[ON_PAGE:]
+            rest = page.folded(f"and {len(more)} more", page.bullets(more))
+            return f"<p>{page.text(block.title)}</p>\n{page.bullets(first)}{rest}"
     return ""
