@@ -232,9 +232,10 @@ def main():
     if ARGUMENTS.drift:
         for minute in range(ARGUMENTS.drift + 2):
             time.sleep(60)
-            first = [(each["name"], each["why"]) for each in page(http)["cells"] if each["level"] == 2]
+            shown = page(http)["cells"]
+            first = [(each["name"], each["why"] or each["drifts"]) for each in shown[:5]]
             print(
-                f"minute {minute + 1}: drifting are {sorted(f'c{n:03d}' for n in drifting)}; the page says {first}",
+                f"minute {minute + 1}: drifting are {sorted(f'c{n:03d}' for n in drifting)}; first on the page {first}",
                 flush=True,
             )
     else:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -164,6 +164,7 @@ class CellView:
             "about": self.about,
             "state": {key: value for key, value in self.state.items() if key != "health"},
             "health": self.state.get("health", []),
+            "drifts": {key: asdict(each) for key, each in self.drifts.items() if each.sigma_per_h > 0.0},
             "alive_s": round(now_s - self.alive_s) if self.sessions else None,
             "state_age_s": round(now_s - self.state_s, 1) if self.state_s else None,
             "clock_s": None if math.isnan(self.offset_s) else round(self.offset_s, 3),

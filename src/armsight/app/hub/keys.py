@@ -11,8 +11,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from armsight.app.stream.cell import hold_bytes
-from armsight.app.stream.cell_file import check_name
+from armsight.app.stream.cell_file import check_name, hold_bytes
 from armsight.errors import InputError
 from armsight.files import read_bytes, replacing, write_text
 

@@ -24,7 +24,7 @@ import click
 import cv2
 import numpy as np
 
-from armsight.app.stream.cell_file import Cell, read_cell, zenoh_config
+from armsight.app.stream.cell_file import Cell, hold_bytes, read_cell, zenoh_config
 from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.outbox import Outbox, state_folder
 from armsight.app.stream.sink import Sink
@@ -328,11 +328,6 @@ class CellSink(Sink):
             raise InputError(f"it is of {t - time.time():+.0f} s by this cell's clock: it is old, or a clock is wrong")
         self._held = t
         return text[:200]
-
-
-def hold_bytes(site: str, cell: str, t: float, text: str) -> bytes:
-    """Return what is signed in a request to hold."""
-    return json.dumps(["armsight hold", site, cell, t, text]).encode()
 
 
 def signed_by(ca: Path, signature: bytes, data: bytes) -> bool:

@@ -124,6 +124,11 @@ def require_here(router: str, where: str) -> None:
         )
 
 
+def hold_bytes(site: str, cell: str, t: float, text: str) -> bytes:
+    """Return what is signed in a request to hold."""
+    return json.dumps(["armsight hold", site, cell, t, text]).encode()
+
+
 def zenoh_config(mode: str, connect: str = "", listen: str = "", tls: dict[str, Any] | None = None) -> Any:  # noqa: ANN401
     """Return the configuration of a zenoh session that looks for nobody by itself.
 
