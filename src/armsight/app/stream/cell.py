@@ -192,6 +192,7 @@ class CellSink(Sink):
         }
         self._state_at = now
         if self._session is not None:
+            # No declared publisher: with access control it would drop all (zenoh 1.10; findings/zenoh_acl_subscriber.sh).
             with suppress(Exception):  # a session that is being lost; the next state comes in a second
                 self._session.put(self._cell.topic("state"), json_text(state))
 
