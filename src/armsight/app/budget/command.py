@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from armsight.errors import InputError
+
 
 @click.command("budget")
 @click.argument("path", required=False, default="", metavar="[PLAN.toml]")
@@ -16,33 +18,38 @@ import click
 @click.option("--camera", metavar="CLASS", help="A class of the catalogue, such as webcam-720p.")
 @click.option("--baseline", metavar="LENGTH", help="Between the cameras: 200mm.")
 @click.option("--rig", metavar="RIG.json", help="The budget of a rig that there is.")
+@click.option("--run", "run", metavar="FOLDER", help="The budget of a run's rig, beside what the run measured.")
 @click.option("--arm", metavar="ARM", help="For the closed loop: a model's name or a file.")
 @click.option(
     "--best", "optimise", is_flag=True, help="Choose what is left out so that it measures best, for each class."
 )
 @click.option("-o", "--output", metavar="DIR", help="Write report.html, budget.json, the rig and the body to print.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def command(path: str, optimise: bool, output: str | None, as_json: bool, **given: str | None) -> int:
+def command(path: str, run: str | None, optimise: bool, output: str | None, as_json: bool, **given: str | None) -> int:
     """Say before a rig is bought what it will measure, what limits it, and what would make it better.
 
     What is left out is chosen, and said. PLAN.toml has the same keys and more: docs/howto/budget.md.
     """
     from armsight.app.body.draw import draw_body
     from armsight.app.budget.report import REPORT_FILES, budget_report, to_build
+    from armsight.app.budget.run import run_plan
     from armsight.app.progress import steps
     from armsight.files import check_folder
-    from armsight.sim.budget.plan import RigPlan
-    from armsight.sim.budget.result import best, budget, chosen
+    from armsight.sim.budget.plan import RigPlan, planned
+    from armsight.sim.budget.result import RigBudget, best, chosen
 
     if output is not None:
         check_folder(
             output, holding=REPORT_FILES, apart_from=(path, *(given[key] for key in ("rig", "arm") if given[key]))
         )
+    if run is not None and (optimise or given["rig"]):
+        raise InputError("--run has a rig of its own: give neither --rig nor --best beside it")
     with steps() as progress:
-        alternatives = best(RigPlan.read(path, **given), progress) if optimise else ()
-        found = chosen(alternatives) if alternatives else budget(path, **given)
+        plan = RigPlan.read(path, **given) if run is None else run_plan(Path(run), path, **given)
+        alternatives = best(plan, progress) if optimise else ()
+        found = chosen(alternatives) if alternatives else RigBudget(plan, planned(plan))
         progress("what would change it")
-        report = budget_report(found, alternatives)
+        report = budget_report(found, alternatives, Path(run) if run else None)
     written = None
     if output is not None:
         files = to_build(found)

@@ -6,10 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from armsight.app.budget.run import against_run
 from armsight.app.show.messages import Note
 from armsight.app.show.page import PAGE
 from armsight.app.show.plotting import new_figure
@@ -27,8 +29,8 @@ if TYPE_CHECKING:
 REPORT_FILES = (PAGE, "budget.json", "rig.json", "body.toml", "body.pdf", *figure_files("budget", ("volume",)))
 
 
-def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = ()) -> Report:
-    """Return what a plan's budget says, the best one's beside its alternatives."""
+def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), run: Path | None = None) -> Report:
+    """Return what a plan's budget says, the best one's beside its alternatives, that of a run beside what it measured."""
     plan, values = found.plan, found.to_dict()
     if alternatives:
         values["alternatives"] = [
@@ -37,6 +39,10 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = ()) ->
         ]
     parts = [f"{name} {1e3 * values[f'{name}_rms_m']:.2g} mm" for name in ("precision", "trueness", "lateral", "depth")]
     said = f"{', '.join(parts)} (RMS over the volume, in motion; lateral: one axis)"
+    beside = []
+    if run:
+        table, values["run"] = against_run(run, plan)
+        beside.append(table)
     states = found.states
     others = f"one camera at rest {states['one_camera']}; two {states['at_rest']}; three {states['three_cameras']}"
     rows = tuple(
@@ -52,7 +58,7 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = ()) ->
     )
     caption, title = "95 % of the errors in motion are within, mm.", "Error at 95 % over the volume, seen from above"
     sections: dict[str, Section] = {
-        "result": ("Result", [Fact(said), Fact(others), table, more, *_compared(alternatives)]),
+        "result": ("Result", [Fact(said), Fact(others), table, more, *_compared(alternatives), *beside]),
         "map": ("Over the volume", [Plot("volume", partial(_map, found.found), caption, title)]),
     }
     notes = [

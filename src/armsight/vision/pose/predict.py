@@ -6,6 +6,7 @@ covariance of the pose is its inverse (the Cramer-Rao bound), to which the share
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,8 +105,14 @@ def view(
     R = axes @ exp_so3(np.array([*rotation, roll])) @ face_axes(towards).T
     facing = normals @ towards > FACING
     used = facing | ~np.isfinite(normals).all(axis=1)
-    T = pose(R, middle - R @ points[used].mean(axis=0))
-    return PredictedView(T, forward, _seen(rig, T, points, normals))
+    return view_at(rig, points, normals, pose(R, middle - R @ points[used].mean(axis=0)), forward)
+
+
+def view_at(
+    rig: StereoRig, points: Array, normals: Array, T_left_body: Array, forward: Sequence[float] | Array = (0, 0, 1)
+) -> PredictedView:
+    """Return a body, points and normals (M, 3), m, at a pose (4, 4) before the cameras, ``forward`` of them."""
+    return PredictedView(T_left_body, np.array(forward), _seen(rig, T_left_body, points, normals))
 
 
 def face_axes(normal: Array) -> Array:
