@@ -83,6 +83,11 @@ def test_perturbed_moves_along_the_parameter_vector():
     assert_jacobian(np.eye(n), vector, np.zeros(n), 1e-3, rtol=1e-6)
 
 
+def test_points_are_triangulated_where_both_cameras_see_them():
+    rig, p = ordinary_rig(), np.array([[0.02, -0.03, 0.8], [-0.05, 0.04, 1.1]])
+    np.testing.assert_allclose(rig.triangulate(*rig.project(p)), p, atol=1e-9)
+
+
 def test_a_newer_version_asks_for_an_update(tmp_path):
     path = saved(tmp_path, version=VERSION + 1)
     with pytest.raises(InputError, match=rf"rig\.json: .*version {VERSION + 1}.*update armsight"):

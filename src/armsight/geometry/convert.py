@@ -43,9 +43,12 @@ def as_transform(given: object) -> Array:
 def as_transforms(given: Any) -> Array:  # noqa: ANN401 - any library's object
     """Return the (N, 4, 4) matrices, m, of a list of what :func:`as_transform` takes, or of one object that holds N.
 
+    Such are SciPy's RigidTransform, a table of ``measure_all`` and ROS' PoseArray.
+
     Raises:
         InputError: an entry is none of these.
     """
+    given = getattr(given, "poses", given)
     if isinstance(given, list | tuple) and not _is_pair(given):
         return np.array([_matrix(each) for each in given])
     return _matrix(given)

@@ -234,6 +234,16 @@ class StereoRig(Record):
             T_left_right=self.T_left_right @ exp_se3(delta[n:]),
         )
 
+    def triangulate(self, uv_left: Array, uv_right: Array) -> Array:
+        """Return the points (N, 3), m, left camera's frame, that both cameras see at raw pixels (N, 2) each.
+
+        NaN where two rays do not meet before both cameras.
+        """
+        from armsight.vision.triangulate import optimal_points
+
+        uv = np.stack([uv_left, uv_right], axis=1).astype(float)
+        return optimal_points(self, uv, np.tile(np.eye(2), (len(uv), 2, 1, 1)))[0]
+
     def rectify(self) -> Rectification:
         """Return the rectification of the rig's images; see :func:`~armsight.vision.rectify.rectify`."""
         from armsight.vision.rectify import rectify

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from armsight.geometry.pose import exp_se3
+from armsight.geometry.pose import exp_se3, pose
 from armsight.robot.kinematics.structure import NEITHER, PARALLEL, SPHERICAL
 from armsight.robot.kinematics.table import KIND
 from armsight.robot.models import MODELS
@@ -309,3 +309,16 @@ def test_a_rotation_slightly_off_is_put_right():
     answer = UR5.inverse(T, near=UR5.home)
     assert (answer.residual_rad < 1e-12).all()
     assert np.abs(answer.best - UR5.home).max() < 1e-5
+
+
+def test_solutions_print_their_angles_in_degrees():
+    arm = MODELS["ur5e"]
+    found = arm.inverse(arm.forward(arm.home))
+    first, *rows = repr(found).splitlines()
+    assert first.startswith(f"Solutions({len(found)} solutions")
+    np.testing.assert_allclose(
+        [[float(x) for x in row.strip(" )").split()] for row in rows], np.degrees(found.q), atol=1e-3
+    )
+    assert repr(arm.inverse(pose(np.eye(3), np.array([9.0, 0.0, 0.0])))).startswith(
+        "Solutions(0 solutions; unreachable"
+    )

@@ -8,6 +8,7 @@ import pytest
 from disc_painter import grey, light_of, pair_of
 
 from armsight.data import Missed, PoseEstimate, Record, Shot
+from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.sim.example_rig import example_rig
 from armsight.sim.workcell.body import body_target
@@ -224,7 +225,7 @@ def test_what_can_be_followed():
     assert not follows(Composite("two", (), discs_of([[0, 0, 0], [0.1, 0, 0]])))
     bent = discs_of([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], normal=None)
     assert not follows(Composite("bent", (), bent))
-    with pytest.raises(ValueError, match="cannot be followed"):
+    with pytest.raises(InputError, match="cannot be followed"):
         Follower(RIG, Composite("bent", (), bent))
 
 

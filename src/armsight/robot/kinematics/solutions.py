@@ -71,6 +71,14 @@ class Solutions:
         """Where no solution is within limits, the closest pose that is; found when first asked for, in milliseconds."""
         return self.find_nearest() if self.find_nearest else None
 
+    def __repr__(self) -> str:
+        """Return how many there are, and the joint angles of each, degrees."""
+        said = [f"{len(self)} solutions", *([self.reason] if self.reason else [])]
+        rows = ["  ".join(f"{angle:8.3f}" for angle in np.degrees(q)) for q in self.q]
+        return (
+            f"Solutions({'; '.join(said)}{'; q in degrees:' if rows else ''}{''.join(f'{chr(10)}  {r}' for r in rows)})"
+        )
+
     def __len__(self) -> int:
         """Return how many there are."""
         return len(self.rows)

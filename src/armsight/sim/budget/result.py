@@ -208,7 +208,8 @@ def budget(path: str = "", **plan: Any) -> RigBudget:  # noqa: ANN401
 
     Args:
         path: a plan file, or nothing.
-        plan: keys of a plan, as its file has them (:class:`~armsight.sim.budget.plan.RigPlan`); they replace the file's.
+        plan: keys of a plan, as its file has them (:class:`~armsight.sim.budget.plan.RigPlan`), such as ``rig="rig.json"``,
+            ``body="plate.toml"``, ``camera="webcam-720p"``, ``distance="0.8m"``; they replace the file's.
 
     Raises:
         InputError: an unknown key, a value that cannot be read, or a rig that cannot be built, with the nearest that can.

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import SIDES, Array, Correspondences, Dropped, Missed, Points, PoseEstimate, Record, Shot
+from armsight.errors import InputError
 from armsight.geometry.pose import inverse, log_se3
 from armsight.vision.discs.bias import bias_normals
 from armsight.vision.follow.kernel import (
@@ -134,7 +135,7 @@ class Follower:
         self._track: BodyTrack | None = None
         self._count = self._vain = 0
         if not follows(target):
-            raise ValueError(
+            raise InputError(
                 f"{target.body.name} cannot be followed: it needs three discs or more with known normals, and no "
                 "coded markers"
             )
