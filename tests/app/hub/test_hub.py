@@ -66,7 +66,7 @@ def fetched(hub, path):
 
 def test_a_cell_that_began_before_its_hub_arrives_with_all_its_events(hub_at, cell_at, port, wait):
     cell = cell_at(f"table-1@127.0.0.1:{port}")
-    cell.put(NoteDatum(1.0, "rig: a camera moved", "warning"))
+    cell.put(NoteDatum(1.0, "rig: a camera moved", "warning", ("rig: a camera moved",)))
     hub = hub_at(port)
     for number in range(30):
         cell.put(ShotDatum(Shot(str(number), GREY, GREY), Missed("hidden")))
@@ -77,9 +77,11 @@ def test_a_cell_that_began_before_its_hub_arrives_with_all_its_events(hub_at, ce
     assert [each["kind"] for each in json.loads(fetched(hub, "events?q=camera+moved"))] == ["health"]
     assert fetched(hub, "image?site=site&cell=table-1").startswith(b"\xff\xd8")
     assert 'armsight_cell_missed_ratio{site="site",cell="table-1"}' in fetched(hub, "metrics").decode()
+    cell.put(NoteDatum(2.0, "no longer found: rig: a camera moved", "info", ()))
+    wait(lambda: shown(hub)["table-1"]["level"] != 3)
     cell.close()
     wait(lambda: shown(hub)["table-1"]["level"] == -1)
-    assert [each["kind"] for each in json.loads(fetched(hub, "events"))] == ["ended", "health", "began"]
+    assert [each["kind"] for each in json.loads(fetched(hub, "events"))] == ["ended", "health", "health", "began"]
 
 
 def test_events_arrive_once_although_the_hub_is_killed(hub_at, cell_at, port, tmp_path, wait):

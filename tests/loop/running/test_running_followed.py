@@ -25,7 +25,7 @@ from armsight.loop.health import base_motion, closure, fixed, monitor, rig, shap
 from armsight.loop.health.follow import RigFollower
 from armsight.loop.running import log
 from armsight.loop.running.calibrate import find_delay
-from armsight.loop.running.data import EventDatum, Fanout, estimator_event
+from armsight.loop.running.data import EventDatum, NoteDatum, Fanout, estimator_event
 from armsight.loop.running.log import Log, RunSegment
 from armsight.loop.running.loop import Loop
 from armsight.loop.running.setup import Setup
@@ -144,6 +144,9 @@ def test_a_camera_that_rotates_is_put_right_in_the_loop_and_replay_agrees():
     assert ("rig", correction.at_s) in [(each.cause, each.corrected_s) for each in found]
     off = inverse(loop.estimator.estimate().T_base_tool) @ board.tool(board.t_s)
     assert np.linalg.norm(off[:3, 3]) < 5e-4
+    notes = [each for each in data if isinstance(each, NoteDatum)]
+    assert notes[0].text.startswith("rig: ")  # published while the loop runs, and not in what is replayed
+    data = [each for each in data if not isinstance(each, NoteDatum)]
     texts = [json_text(each.content if isinstance(each, EventDatum) else each.to_json(faults.BODY)) for each in data]
     recorded = tuple(RecordedDatum(type(each), json.loads(text)) for each, text in zip(data, texts, strict=True))
     run = RecordedRun(Path("run.mcap"), {}, recorded)

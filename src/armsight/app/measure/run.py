@@ -24,7 +24,7 @@ from armsight.data import Body, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_writable, write_text
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines, unseen_lines
-from armsight.loop.running.data import Fanout, NoteDatum, Publisher, ShotDatum
+from armsight.loop.running.data import Fanout, HealthNotes, Publisher, ShotDatum
 from armsight.vision.follow.follower import measurer
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_fixed
@@ -139,7 +139,7 @@ class MeasureRun:
 
     def measure(self, results: Iterator[Result], publisher: Publisher) -> None:
         """Measure every shot, print its line, keep its record and draw it; of live cameras also warn at once."""
-        warned, looked_s, width, headed = set[str](), 0.0, 0, False
+        notes, looked_s, width, headed = HealthNotes(), 0.0, 0, False
         with bar("measuring", self.shots.total) as advance:
             for shot, measured, followed, shutters in results:
                 result = self.monitor.measured(measured, shot.t_s) if isinstance(measured, PoseEstimate) else measured
@@ -152,11 +152,9 @@ class MeasureRun:
                 publisher.put(ShotDatum(shot, result, arrival_s))
                 if arrival_s is not None and arrival_s - looked_s > _HEALTH_S:
                     looked_s = arrival_s
-                    for found in self.monitor.findings():
-                        if found.cause not in warned:
-                            warned.add(found.cause)
-                            _warn(found.line())
-                            publisher.put(NoteDatum(arrival_s, found.line(), "warning"))
+                    for note in notes.of(arrival_s, self.monitor.findings()):
+                        _warn(note.text)
+                        publisher.put(note)
                 if self.options.as_json:
                     click.echo(json.dumps(record.to_json()))
                 else:

@@ -14,7 +14,6 @@ import math
 import socket
 import threading
 import time
-from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -135,7 +134,7 @@ class CellSink(Sink):
         self._cell, self._published, self._mode = cell, published, mode
         self._outbox = Outbox(state_folder() / "cells" / cell.site / cell.name, cell.name)
         self._lock = threading.Lock()  # of the outbox: this thread adds, the other one sends
-        self._window, self._shots, self._findings = _Window(), 0, deque[str](maxlen=_FINDINGS)
+        self._window, self._shots, self._findings = _Window(), 0, tuple[str, ...]()
         self._began = self._state_at = time.monotonic()
         self._looked = 0.0
         self._newest: Shot | None = None
@@ -154,8 +153,9 @@ class CellSink(Sink):
     def write(self, datum: Datum) -> None:
         """Count a shot, or keep an event."""
         if isinstance(datum, NoteDatum):
-            if datum.level != "info":
-                self._findings.append(datum.text)
+            if datum.findings is not None:
+                self._findings = datum.findings
+            if datum.level != "info" or datum.findings is not None:
                 self._event("health", datum.level, datum.text)
         elif isinstance(datum, ShotDatum):
             self._shots += 1
@@ -188,7 +188,7 @@ class CellSink(Sink):
             "rate_hz": round(window.shots / (now - self._state_at), 2),
             "shots": self._shots,
             **window.state(),
-            "health": list(self._findings),
+            "health": [each[:300] for each in self._findings[:_FINDINGS]],
         }
         self._state_at = now
         if self._session is not None:

@@ -6,7 +6,7 @@ docs/reference/data.md lists the names of their JSON. Numbers are SI.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partialmethod
 from typing import TYPE_CHECKING, Any, Protocol
@@ -19,6 +19,7 @@ from armsight.vision.pose.shot_pose import shot_pose
 
 if TYPE_CHECKING:
     from armsight.loop.estimators import KalmanEstimator, Mounting, Remembered
+    from armsight.loop.finding import HealthFinding
 
 #: The points of a pose that was recorded without them.
 NO_POINTS = Points(
@@ -114,6 +115,9 @@ class NoteDatum:
     time_s: float  #: when, s
     text: str  #: the line
     level: str = "info"  #: info, warning or error
+    findings: tuple[str, ...] | None = (
+        None  #: of a health monitor, those that hold now; None where it says nothing of them
+    )
 
 
 @dataclass(frozen=True)
@@ -182,6 +186,23 @@ def remeasured_event(poses: Sequence[tuple[float, PoseEstimate | Missed]]) -> di
 
 
 Datum = ShotDatum | JointsDatum | NoteDatum | EventDatum
+
+
+class HealthNotes:
+    """Makes a note of each cause that a health monitor finds, and of each that it takes back."""
+
+    def __init__(self) -> None:
+        self._before: dict[str, HealthFinding] = {}
+
+    def of(self, time_s: float, findings: Sequence[HealthFinding]) -> Iterator[NoteDatum]:
+        """Yield what is new at a time, s: a warning where results must not be trusted because of it."""
+        now: dict[str, HealthFinding] = {each.cause: each for each in findings}
+        before, self._before = self._before, now
+        lines = tuple(each.line() for each in findings if each.forbids)
+        for each in (now[cause] for cause in now.keys() - before.keys()):
+            yield NoteDatum(time_s, each.line(), "warning" if each.forbids else "info", lines)
+        for each in (before[cause] for cause in before.keys() - now.keys()):
+            yield NoteDatum(time_s, f"no longer found: {each.line()}", "info", lines)
 
 
 class Publisher(Protocol):

@@ -33,6 +33,7 @@ from armsight.loop.running.controllers import PERIOD_S, Controller, Planned, Sti
 from armsight.loop.running.data import (
     EventDatum,
     Fanout,
+    HealthNotes,
     JointsDatum,
     Publisher,
     ShotDatum,
@@ -148,6 +149,7 @@ _STOP_S = 0.3  # in which an interrupted motion comes to rest
 _FIXED_EVERY_S = 0.2  # in which fixed bodies are measured, and the background is looked at
 #: Where a rig is followed: how often it is looked whether it can be put right, s.
 _RIG_EVERY_S = 0.25
+_HEALTH_EVERY_S = 1.0  # in which findings are published; half: nothing, double: a person sees them later
 _LEAST_WAIT_S = 0.001  # for the board, even when the loop is late: a lost board is detected by a timeout
 
 
@@ -189,7 +191,8 @@ class Loop:
         self._led_work: Future[None] | None = None
         self._fixed_pool = ThreadPoolExecutor(1)
         self._fixed_work: Future[None] | None = None
-        self._fixed_s = -np.inf
+        self._fixed_s = self._health_s = -np.inf
+        self._health_notes = HealthNotes()
         # Of the fused track: the time up to which its intervals are noted, the time up to which it is computed, the noted
         # intervals that are not computed yet, and the times of the readings that are not all noted.
         self._noted_s = self._written_s = -np.inf
@@ -471,12 +474,20 @@ class Loop:
                     self._look_at_fixed(shot)
                     self._look_at_led(shot)
                     self.health.work()
+                    self._note_health()
                     self._follow_rig()
                 if self._noted_s - self._written_s >= _WRITE_EVERY_S:
                     self._write()
         finally:
             self.publisher.resume()
             self.log.segments.append(replace(segment, begin_s=begin_s, end_s=self.t_s))
+
+    def _note_health(self) -> None:
+        """Publish what the health monitor finds, and what it takes back, if it is time."""
+        if self.t_s - self._health_s >= _HEALTH_EVERY_S:
+            self._health_s = self.t_s
+            for note in self._health_notes.of(self.t_s, self.health.findings()):
+                self.publisher.put(note)
 
     def _look_at_fixed(self, shot: Shot) -> None:
         """Look at the background and measure the fixed bodies in a shot, if it is time; on hardware in a thread."""
