@@ -25,7 +25,7 @@ from armsight.loop.health import base_motion, closure, fixed, monitor, rig, shap
 from armsight.loop.health.follow import RigFollower
 from armsight.loop.running import log
 from armsight.loop.running.calibrate import find_delay
-from armsight.loop.running.data import EventDatum, NoteDatum, Fanout, estimator_event
+from armsight.loop.running.data import EventDatum, Fanout, NoteDatum, estimator_event
 from armsight.loop.running.log import Log, RunSegment
 from armsight.loop.running.loop import Loop
 from armsight.loop.running.setup import Setup
