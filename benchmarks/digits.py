@@ -72,14 +72,14 @@ def items(run: dict[str, Any], stored: dict[str, float]) -> list[str]:
         value = stored.get(f"{run['name']}: {name}")
         if value is None:
             continue
-        name, value = (f"{name}m", 1e3 * value) if name.endswith(", m") else (name, value)
         whose, _, kind = name.partition(", ")
         if (
             sum(other.endswith(f", {kind}") for other in run["figures"]) < 2 or len(kind) <= 2
         ):  # of one alone, or a unit
             whose, kind = "", name
+        kind, value = (f"{kind}m", 1e3 * value) if kind.endswith(", m") else (kind, value)
         kinds.setdefault(kind, []).append(f"{whose} {value:.4g}".strip())
-    return [f"- {kind}: {'; '.join(known)}" for kind, known in kinds.items()] or ["- not measured yet"]
+    return [f"- {kind}: {'; '.join(known)}" for kind, known in kinds.items()]
 
 
 def page(written: str, runs: list[dict[str, Any]], stored: dict[str, float]) -> str:
@@ -91,7 +91,8 @@ def page(written: str, runs: list[dict[str, Any]], stored: dict[str, float]) -> 
         "`{data}` is ARMSIGHT_DATA, `{work}` a temporary folder. Tolerances: `benchmarks/digits.toml`.",
     ]
     for run in runs:
-        lines += ["", f"### {run['name']}", "", f"`{run['command']}`", "", *items(run, stored)]
+        if known := items(run, stored):
+            lines += ["", f"### {run['name']}", "", f"`{run['command']}`", "", *known]
     return written.rstrip() + "\n\n" + "\n".join(lines) + "\n"
 
 
