@@ -79,7 +79,9 @@ def keys_command(site: str, cells: tuple[str, ...], output: Path, host: str, por
         click.echo(json.dumps({"directory": str(output), "cells": [str(each) for each in made]}))
         return
     for each in made:
-        click.echo(f"{each.parent}: copy this folder to the cell's computer; there: --cell {each.name}")
+        click.echo(
+            f"{each.parent}: copy this folder to the cell's computer; there: --cell {each.parent.name}/cell.toml"
+        )
     click.echo(f"{output}: start the hub with armsight hub --listen tls/0.0.0.0:{port} --keys {output}")
 
 

@@ -178,19 +178,21 @@ class CellSink(Sink):
 
     def tick(self) -> None:
         """Put the state once a second."""
-        now = time.monotonic()
-        if now - self._state_at < STATE_S:
-            return
-        window, self._window = self._window, _Window()
+        if time.monotonic() - self._state_at >= STATE_S:
+            self._put_state()
+
+    def _put_state(self) -> None:
+        """Put what the shots since the last time showed."""
+        now, window = time.monotonic(), self._window
         state = {
             "t": round(time.time(), 3),
             "mode": self._mode,
-            "rate_hz": round(window.shots / (now - self._state_at), 2),
+            "rate_hz": round(window.shots / max(now - self._state_at, 1e-3), 2),
             "shots": self._shots,
             **window.state(),
             "health": [each[:300] for each in self._findings[:_FINDINGS]],
         }
-        self._state_at = now
+        self._window, self._state_at = _Window(), now
         if self._session is not None:
             # No declared publisher: with access control it would drop all (zenoh 1.10; findings/zenoh_acl_subscriber.sh).
             with suppress(Exception):  # a session that is being lost; the next state comes in a second
@@ -201,6 +203,7 @@ class CellSink(Sink):
         self._event("ended", "info", f"armsight {self._mode} ended after {self._shots} shots")
         self._ending.set()
         self._post.join(_STORE_S + 1.0)
+        self._put_state()
         if self._session is not None:
             with suppress(Exception):
                 self._session.close()
@@ -231,17 +234,18 @@ class CellSink(Sink):
 
     def _posting(self) -> None:
         """Reach the hub, again and again, and have events stored; in a thread of its own."""
-        problem, reached = "", 0.0
+        said, reached = False, 0.0
         while True:
             ending = self._ending.wait(_POST_S)
             if self._session is None:
                 try:
                     self._open()
-                except Exception as error:  # noqa: BLE001 - of the library: whatever it is, it is tried again
-                    if (text := _reason(error)) != problem:
-                        problem = text
+                except Exception:  # noqa: BLE001 - of the library: whatever it is, it is tried again
+                    if not said:
+                        said = True
+                        kept = "its events are kept and sent later"
                         click.echo(
-                            f"note: --cell {self._cell.name}: no hub at {self._cell.router} yet: {text}", err=True
+                            f"note: --cell {self._cell.name}: no hub answers at {self._cell.router}; {kept}", err=True
                         )
                 else:
                     reached = time.monotonic()
@@ -345,11 +349,6 @@ def signed_by(ca: Path, signature: bytes, data: bytes) -> bool:
     except InvalidSignature:
         return False
     return True
-
-
-def _reason(error: Exception) -> str:
-    """Return what the library says, without where in its source."""
-    return str(error).split(" at ")[0].strip().rstrip(".!") or type(error).__name__
 
 
 def open_cell(rest: str, published: Published) -> CellSink:
