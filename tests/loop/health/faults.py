@@ -185,12 +185,15 @@ def bending(rad, along=(0.0, 0.0, 1.0)):
 
 
 LEARNED_S, AT_S = 5.0, 6.5
+#: From the rig of ``arm_rig``, whose axes are any, to cameras that look at the arm.
+LOOKS = pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 
 
 class Moved:
     """An estimator whose cameras move at a time, which it does not know; it is watched once it has learned the arm."""
 
-    def __init__(self, estimator, T_base_rig, motion, slip=None, late=None, follows=False):
+    def __init__(self, estimator, T_base_rig, motion, slip=None, late=None, follows=False, zoom=None):
+        self.zoom = zoom  # by which share both focal lengths are longer, at seconds after AT_S
         self.estimator, self.motion, self.T_base_rig = estimator, motion, T_base_rig
         self.slip = slip  # of the body on the tool (6,), [m; rad], or a function of the tool's rotation that returns it
         self.late = late  # by how much the stamps are late, s, at seconds after AT_S
@@ -200,6 +203,13 @@ class Moved:
         self.follower = RigFollower(example_rig(), body_target().body) if follows else None
         self.mounting = Mounting(T_base_rig, np.eye(4), np.zeros((12, 12)))
         self.corrections, self.looked_s = [], 0.0
+
+    @staticmethod
+    def zoomed(T_left_body, by):
+        """The pose of the body as images show it that are larger by a factor."""
+        uv = both_pixels(TRUE, BODY.points @ T_left_body[:3, :3].T + T_left_body[:3, 3])
+        middles = np.array([camera.intrinsics[2:] for camera in TRUE.cameras])
+        return measured(TRUE, BODY, T_left_body, middles + by * (uv - middles)).T_left_body
 
     def joints(self, states):
         self.estimator.joints(states)
@@ -216,10 +226,13 @@ class Moved:
     def vision(self, measurement):
         t_s, T = measurement.t_s, self.T_base_rig
         if t_s >= LEARNED_S and self.estimator.on_innovation is None:
-            self.monitor.follow(self.estimator, ARM, T[:3, 2])
+            self.monitor.follow(self.estimator, ARM, replace(self.mounting, T_base_rig=T @ LOOKS))
         if t_s >= AT_S:
             D = T @ np.linalg.inv(small(self.motion(t_s - AT_S))) @ np.linalg.inv(T)
             measurement = replace(measurement, T_base_tool=D @ measurement.T_base_tool)
+            if self.zoom is not None:
+                zoomed = self.zoomed(inverse(T @ LOOKS) @ measurement.T_base_tool, 1.0 + self.zoom(t_s - AT_S))
+                measurement = replace(measurement, T_base_tool=T @ LOOKS @ zoomed)
             if self.slip is not None:
                 slip = self.slip(measurement.T_base_tool[:3, :3]) if callable(self.slip) else self.slip
                 measurement = replace(measurement, T_base_tool=measurement.T_base_tool @ small(slip))
@@ -306,18 +319,18 @@ class SlippingArm:
 
 def watched_arm(
     seed, motion=lambda t_s: np.zeros(6), seconds=9.0, *, slip=None, joint=0, slip_rad=0.0, more_rad=0.0, late=None,
-    delay=(0.0, 1e-4),
+    delay=(0.0, 1e-4), zoom=None,
 ):  # fmt: skip
     """Run an arm with errors; return the estimator with its monitor, its track and the true poses.
 
     The faults, at AT_S: a motion of the rig, a slip of the body on the tool (6,), [m; rad], a slip of a joint's
     potentiometer or more backlash of it, rad; stamps that are late, s. ``delay``: by how much the delay of the images is
-    off from the beginning, and its sigma, s.
+    off from the beginning, and its sigma, s; ``zoom``: by which share both focal lengths are longer, seconds after AT_S.
     """
     rng = np.random.default_rng(seed)
     mount = mounts(rng)
     estimator = KalmanEstimator(ARM, delay=Delay(0.0, delay[1]), learns_delay=False)
-    moved = Moved(estimator, mount[1].T_base_rig, motion, slip, late)
+    moved = Moved(estimator, mount[1].T_base_rig, motion, slip, late, zoom=zoom)
     arm = worn(rng)
     if slip_rad or more_rad:
         arm = SlippingArm(arm, joint, slip_rad, more_rad)

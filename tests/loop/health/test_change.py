@@ -125,18 +125,3 @@ def test_one_record_names_all_that_cannot_be_distinguished(given, cause, alterna
     assert (found.cause, found.alternatives) == (cause, alternatives)
     assert found.what.count("cannot be excluded") == (len(changes) > 1 and bool(alternatives))
     assert doubtful(changes) == ("fixed" in (cause, *alternatives))
-
-
-def test_a_rig_that_moved_along_the_optical_axis_may_be_a_lens():
-    """Both focal lengths longer by the same share look the same to the pair; a rotation or a motion across it does not."""
-    axis = np.array([0.6, 0.0, -0.8])
-    along = np.append(1e-3 * axis, np.zeros(3))
-    found = finding([change("rig", size=along)], ARM.joint_names, axis)
-    assert (found.cause, found.alternatives) == ("fixed", ("lens",))
-    assert "both focal lengths" in found.what
-    across = np.append(1e-3 * np.array([0.8, 0.0, 0.6]), np.zeros(3))
-    rotated = along + np.append(np.zeros(3), [0.0, 1e-3, 0.0])
-    for motion in (across, along + across, rotated, 0.1 * along):  # the last is within its sigma of nothing
-        assert finding([change("rig", size=motion)], ARM.joint_names, axis).alternatives == ()
-    assert finding([change("rig", size=along)], ARM.joint_names).alternatives == ()
-    assert finding([change("body", size=along)], ARM.joint_names, axis).alternatives == ()

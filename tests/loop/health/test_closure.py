@@ -8,10 +8,12 @@ import pytest
 from arm_rig import ARM
 from scipy.special import chdtri
 
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import exp_so3
 from armsight.loop.estimators import Innovation, Outcome, Prior
 from armsight.loop.estimators.armerror import layout
 from armsight.loop.estimators.errormodel import ErrorModel
-from armsight.loop.health.change import finding
+from armsight.loop.health.change import ToolView, finding
 from armsight.loop.health.closure import ClosureWatch
 from armsight.loop.servo import Mode
 
@@ -150,3 +152,26 @@ def test_a_bumped_rig_is_put_right_within_ten_seconds(seed, monkeypatch):
     assert made[0].at_s - faults.AT_S < 10.0
     for each in made:
         assert abs(each.tool_m[0] - 0.002) < 3.0 * each.tool_m[1]
+
+
+@pytest.mark.parametrize(("seed", "share"), [(7411, 1e-3), (7412, 2e-3)])
+def test_focal_lengths_that_changed_alike_are_named(seed, share, monkeypatch):
+    monkeypatch.setattr(faults, "AT_S", 10.0)
+    moved = faults.watched_arm(seed, seconds=30.0, zoom=lambda t_s: share)
+    (found,) = moved.monitor.findings()
+    assert "lens" in (found.cause, *found.alternatives)
+    (zoom,) = (each for each in moved.monitor.changes if each.suspect.kind == "zoom")
+    assert abs(zoom.size[0] - share) < 4 * np.sqrt(zoom.cov[0, 0]) < share
+    rows = np.flatnonzero(moved.tracked.t_s > moved.found_s + 1.0)[::50]
+    off = faults.log_se3(faults.inverse(moved.tracked.Ts_base_tool[rows]) @ moved.Ts_true[rows])
+    assert np.mean(np.einsum("ni,ni->n", off, np.linalg.solve(moved.tracked.covs[rows], off[..., None])[..., 0])) < 12.0
+
+
+def test_what_a_zoom_does_to_a_pose_is_what_larger_images_show():
+    """Against poses fitted to pixels, which weigh depth less than the rigid fit of points: to a quarter of the rotation."""
+    seen, rng = ToolView(np.eye(4), faults.BODY.points), np.random.default_rng(7413)
+    for _ in range(5):
+        T = pose(exp_so3(rng.uniform(-0.6, 0.6, 3)), np.array([0.1, 0.0, 0.9]) + rng.uniform(-0.1, 0.1, 3))
+        shown = faults.log_se3(faults.inverse(T) @ faults.Moved.zoomed(T, 1.001))
+        (expected,) = seen.zoomed(T[None, :3, :3], T[None, :3, 3]) * 1e-3
+        assert (np.abs(expected - shown) < np.repeat([5e-5, 3e-4], 3)).all()

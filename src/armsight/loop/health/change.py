@@ -37,7 +37,7 @@ _ALONG = chi_square_limit(5, 0.01)
 #: What the pair alone cannot distinguish from that.
 FOCAL = "; both focal lengths that changed alike look the same to the pair"
 
-Kind = Literal["rig", "drift", "body", "bend", "joint", "backlash", "time", "rate", "shake"]
+Kind = Literal["rig", "drift", "body", "bend", "joint", "backlash", "time", "rate", "zoom", "shake"]
 _CAUSES: dict[Kind, Cause] = {
     "rig": "fixed",
     "drift": "fixed",
@@ -47,15 +47,47 @@ _CAUSES: dict[Kind, Cause] = {
     "backlash": "joint",
     "time": "time",
     "rate": "time",
+    "zoom": "lens",
     "shake": "fixed",
 }
 
 
-def changing(parts: ErrorLayout, H: Array) -> Array:
-    """Return the columns (..., 6, 17 + 2 n - 1) of what may change, of derivatives (..., 6, K) of the tool's pose.
+@dataclass(frozen=True, eq=False)
+class ToolView(Record):
+    """Who sees the tool.
+
+    Attributes:
+        T_base_rig: (4, 4) the rig in the base, m.
+        points: (N, 3) those of the body, in the tool's frame, m.
+    """
+
+    T_base_rig: Array
+    points: Array
+
+    def zoomed(self, R: Array, p: Array) -> Array:
+        """Return what (..., 6) a unit share of both focal lengths does to the tool, right tangent.
+
+        Points appear nearer along the optical axis by that share of their depth; the body is fitted to them. With A the
+        scatter of its points and a the axis, it rotates by -(tr A - A)^-1 (A a x a) about their mean.
+
+        Args:
+            R: (..., 3, 3) rotation of the tool in the base.
+            p: (..., 3) its position, m.
+        """
+        origin, axis, middle = self.T_base_rig[:3, 3], self.T_base_rig[:3, 2], self.points.mean(axis=0)
+        A = (self.points - middle).T @ (self.points - middle)
+        a = np.swapaxes(R, -1, -2) @ axis
+        w = -np.cross(a @ A, a) @ np.linalg.inv(np.trace(A) * np.eye(3) - A)
+        depth = (p - origin) @ axis + a @ middle
+        return np.concatenate([-a * depth[..., None] - np.cross(w, middle), w], axis=-1)
+
+
+def changing(parts: ErrorLayout, H: Array, seen: ToolView | None = None) -> Array:
+    """Return the columns (..., 6, 18 + 2 n - 1) of what may change, of derivatives (..., 6, K) of the tool's pose.
 
     Base (6) and delay (1), which may change slowly, too; tool (6), zeros of the joints after the first (its own is a
-    rotation of the base), widths of the backlash; what bends under gravity (4).
+    rotation of the base), widths of the backlash; what bends under gravity (4); both focal lengths, as a share of them
+    (0 where it is not known who sees the tool).
     """
     # Of a gear that grew looser half is taken for each of the two that decide on the side: mostly they agree.
     n, tool = parts.joints, 6 * parts.joints
@@ -63,7 +95,13 @@ def changing(parts: ErrorLayout, H: Array) -> Array:
     delay = H[..., parts.delay : parts.delay + 1]
     # The base's translations are carried to the tool's axes: the last one is upwards.
     columns = [H[..., :6], delay, H[..., tool : tool + 6], H[..., parts.zeros[1:]], widths, bending(-H[..., :3, 2])]
-    return np.concatenate(columns, axis=-1)
+    zoom = np.zeros((*H.shape[:-1], 1))
+    if seen is not None:
+        # Rotations of the base move the tool by its position: -[p]x in the base's axes.
+        R = np.swapaxes(H[..., :3, :3], -1, -2)
+        crossed = -R @ H[..., :3, 3:6]
+        zoom[..., 0] = seen.zoomed(R, np.stack([crossed[..., 2, 1], crossed[..., 0, 2], crossed[..., 1, 0]], axis=-1))
+    return np.concatenate([*columns, zoom], axis=-1)
 
 
 def bending(down: Array) -> Array:
@@ -89,8 +127,8 @@ class Suspect:
 
     Attributes:
         kind: rig: it jumped; drift: it drifts; body: it slipped on the tool; bend: it bends under gravity; joint: its zero
-            jumped; backlash: it grew; time: the camera's clock jumped; rate: it runs at another rate; shake: rig and arm
-            move to and fro.
+            jumped; backlash: it grew; time: the camera's clock jumped; rate: it runs at another rate; zoom: both focal
+            lengths changed alike; shake: rig and arm move to and fro.
         joint: row of the joint; -1 for what is not of one.
         columns: its parameters among those that may change.
     """
@@ -112,7 +150,15 @@ class Suspect:
     @property
     def moves(self) -> bool:
         """Whether it makes measured poses wrong, beyond what a clock that is followed does."""
-        return self.kind in ("rig", "drift", "body", "bend")
+        return self.kind in ("rig", "drift", "body", "bend", "zoom")
+
+    @property
+    def freedom(self) -> int:
+        """How many numbers it counts as.
+
+        A zoom, and a shift by gravity, as many as a motion of the rig: they look like one, and are rarer.
+        """
+        return 6 if self.kind in ("zoom", "bend") else self.columns.stop - self.columns.start
 
 
 def suspects(joints: int) -> tuple[Suspect, ...]:
@@ -123,6 +169,7 @@ def suspects(joints: int) -> tuple[Suspect, ...]:
         Suspect("drift", -1, slice(0, 6)),
         Suspect("body", -1, tool),
         Suspect("bend", -1, slice(bend, bend + 4)),
+        Suspect("zoom", -1, slice(bend + 4, bend + 5)),
         Suspect("time", -1, slice(6, 7)),
         Suspect("rate", -1, slice(6, 7)),
         Suspect("joint", 0, slice(5, 6)),
@@ -147,6 +194,7 @@ class Change(Record):
         T_base_tool: (4, 4) that pose.
         until_s: when it was put right, s.
         besides: whether it is taken to have happened besides the best one, at another time.
+        seen: who sees the tool; None where that is not known.
     """
 
     suspect: Suspect
@@ -160,12 +208,15 @@ class Change(Record):
     T_base_tool: Array
     until_s: float = np.inf
     besides: bool = False
+    seen: ToolView | None = None
 
     def displacement(self, T_base_tool: Array, t_s: float) -> tuple[Array, Array]:
         """Return what it does to a measured pose of the tool (4, 4) at a time, s: right tangent (6,), covariance."""
         by = self.effect
         if self.suspect.kind == "bend":
             by = bending(-T_base_tool[2, :3])
+        elif self.suspect.kind == "zoom" and self.seen is not None:
+            by = self.seen.zoomed(T_base_tool[:3, :3], T_base_tool[:3, 3])[:, None]
         elif self.suspect.kind != "body":  # the base moves the tool by the lever to it
             by = adjoint(inverse(T_base_tool) @ self.T_base_tool) @ by
         if self.suspect.slow:
@@ -260,6 +311,7 @@ _OTHER: dict[Kind, str] = {
     "backlash": "more backlash of {name}",
     "time": "a clock that jumped",
     "rate": "a clock of another rate",
+    "zoom": "both focal lengths that changed alike",
 }
 
 
@@ -281,13 +333,12 @@ def along_axis(motion: Array, cov: Array, axis: Array) -> bool:
     return chi_square < _ALONG and along**2 > 4.0 * float(axis @ cov[:3, :3] @ axis)
 
 
-def finding(changes: Sequence[Change], names: Sequence[str], axis: Array | None = None) -> HealthFinding:
+def finding(changes: Sequence[Change], names: Sequence[str]) -> HealthFinding:
     """Return the finding of hypotheses that cannot be distinguished, the best first.
 
     Args:
         changes: they.
         names: of the joints.
-        axis: (3,) optical axis of the left camera, unit vector in the base's frame; None where that is not known.
     """
     best, kind, joint = changes[0], changes[0].suspect.kind, changes[0].suspect.joint
     others = [each for each in changes[1:] if {each.suspect.kind, kind} not in ({"rig", "drift"}, {"time", "rate"})]
@@ -299,10 +350,6 @@ def finding(changes: Sequence[Change], names: Sequence[str], axis: Array | None 
     causes = [each.suspect.cause for each in others]
     if (kind, joint) == ("joint", 0):
         causes.append("fixed")
-    in_tool = None if axis is None else best.T_base_tool[:3, :3].T @ axis
-    if best.suspect.cause == "fixed" and in_tool is not None and along_axis(*best.newest, in_tool):
-        causes.append("lens")
-        unsure += FOCAL
     alternatives = tuple(cause for cause in dict.fromkeys(causes) if cause != best.suspect.cause)
     if best.suspect.moves:
         found = _moved_finding(best, unsure)
@@ -353,6 +400,11 @@ def _moved_finding(change: Change, unsure: str) -> HealthFinding:
     by = f"displaced by {1e3 * size:.2f} mm and {np.degrees(np.linalg.norm(shift[3:])):.3f} deg{so_far}{unsure}"
     if change.suspect.kind == "bend":
         return _bend_finding(change, unsure)
+    if change.suspect.kind == "zoom":
+        share, share_sigma = 100.0 * float(change.size[0]), 100.0 * float(np.sqrt(change.cov[0, 0]))
+        what = f"both focal lengths changed alike by {share:.3f} %: the tool appears {by}"
+        advice = "switch autofocus off, fasten focus and zoom of both lenses, calibrate the rig again"
+        return HealthFinding("lens", what, change.begin_s, share, share_sigma, "%", advice)
     if change.suspect.kind == "body":
         what, advice = "the body slipped on the tool: it is ", "fasten the body on the tool, and run again"
     else:

@@ -1,8 +1,8 @@
 """What changed since the arm was first watched: rig, body on the tool, a joint; by closure over a whole run.
 
 In: what the estimator did with each pose measurement. Out: the change that explains the measurements best. It is one of
-these: the rig jumped or drifts against the arm's base, the body slipped on the tool, the zero of a joint's potentiometer
-jumped, the backlash of a joint grew.
+these: the rig jumped or drifts against the arm's base, both focal lengths changed alike, the body slipped on the tool, the
+zero of a joint's potentiometer jumped, the backlash of a joint grew.
 
 A filter follows what changes slowly. Here nothing is followed: the errors x of the arm's model are constants of the run.
 The residuals e are those of the measurements against the model as it was at the beginning,
@@ -29,7 +29,17 @@ from armsight.data import Array
 from armsight.loop.estimators import Innovation, Outcome
 from armsight.loop.estimators.armerror import layout
 from armsight.loop.finding import LEVER_M, alarm_limit
-from armsight.loop.health.change import MARGIN, RAMPS, Change, Suspect, changing, happened_besides, ranked, suspects
+from armsight.loop.health.change import (
+    MARGIN,
+    RAMPS,
+    Change,
+    ToolView,
+    Suspect,
+    changing,
+    happened_besides,
+    ranked,
+    suspects,
+)
 
 #: A block lasts so long, s, and until all joints together have travelled so far, rad, but at most so long, s: an arm that
 #: stands says the same thing again and again.
@@ -146,6 +156,7 @@ class ClosureWatch:
     Args:
         sigmas: (K,) standard deviations of the filter's state before anything was measured.
         joints: how many the arm has.
+        seen: who sees the tool; None where that is not known.
 
     Attributes:
         changes: the hypotheses that explain best what was found, the best first; empty while all is well.
@@ -153,8 +164,8 @@ class ClosureWatch:
         strongest: of all tests the largest chi-square over its limit.
     """
 
-    def __init__(self, sigmas: Array, joints: int) -> None:
-        self._parts = layout(joints)
+    def __init__(self, sigmas: Array, joints: int, seen: ToolView | None = None) -> None:
+        self._parts, self._seen = layout(joints), seen
         # The arm's model: all that motion does not make it forget, and the delay that the sweep found, to its sigma.
         self._model = np.append(np.arange(self._parts.rest), self._parts.delay)
         self._sigmas = sigmas[self._model]
@@ -165,8 +176,8 @@ class ClosureWatch:
         self._clock_s: list[float] = []
         self._merged: list[int] = []  # how many blocks each one is of
         self._newest: Innovation | None = None
-        self._wide = np.full(RAMPS + 9 + 2 * joints, _WIDE_RAD)
-        self._wide[-1] = _WIDE[0]
+        self._wide = np.full(RAMPS + 10 + 2 * joints, _WIDE_RAD)
+        self._wide[-2:] = _WIDE[0]
         self._wide[:6] = self._wide[RAMPS : RAMPS + 6] = _WIDE
         self._wide[6] = _WIDE_S
         self._rejected: list[Innovation] = []
@@ -249,7 +260,7 @@ class ClosureWatch:
         late = np.array(self._clock_s[blocks])[:, None] * H[:, :, self._parts.delay]
         own = self._cov / np.array(self._merged[blocks])[:, None, None]
         white = np.linalg.inv(np.linalg.cholesky(own + late[:, :, None] * late[:, None, :]))
-        model, changes = H[:, :, self._model] * self._sigmas, changing(self._parts, H)
+        model, changes = H[:, :, self._model] * self._sigmas, changing(self._parts, H, self._seen)
         return white @ model, white @ changes, (white @ e[..., None])[..., 0]
 
     def _sum(self, blocks: slice) -> None:
@@ -306,7 +317,7 @@ class ClosureWatch:
         returned where no hypothesis comes near.
         """
         limits = _limits(self._parts.joints)
-        near = [each for each in found if each.above > -_NEAR * limits[len(each.size)]]
+        near = [each for each in found if each.above > -_NEAR * limits[each.suspect.freedom]]
         if not near:
             return []
         rows = {int(np.searchsorted(begins, each.begin)) for each in near}
@@ -327,7 +338,7 @@ class ClosureWatch:
         after = (t > begin_s).astype(float)
         if found.suspect.slow:
             after *= (t - begin_s) / (t[-1] - begin_s)
-        columns = changing(self._parts, np.array(self._H))[:, :, part]
+        columns = changing(self._parts, np.array(self._H), self._seen)[:, :, part]
         return np.asarray(columns * self._wide[part] * after[:, None, None])
 
     def _decide(self) -> None:
@@ -336,7 +347,7 @@ class ClosureWatch:
         found = self._tested(begins, suspects(self._parts.joints))
         limits = _limits(self._parts.joints)
         at_first = {n: limits[n] + more for n, more in self._unsure.items()}
-        self.strongest = max(self.strongest, *(each.chi_square / at_first[len(each.size)] for each in found))
+        self.strongest = max(self.strongest, *(each.chi_square / at_first[each.suspect.freedom] for each in found))
         finest = self._closest(begins, found)
         if not finest:
             return
@@ -344,11 +355,11 @@ class ClosureWatch:
         best = max(finest, key=lambda each: each.above)
         # Where none is above its limit with all blocks, the block that is left out is six more numbers that explain.
         clear = max(each.above for each in found) > 0.0
-        if best.above <= (0.0 if clear else limits[len(best.size) + 6] - limits[len(best.size)]):
+        if best.above <= (0.0 if clear else limits[best.suspect.freedom + 6] - limits[best.suspect.freedom]):
             return
         changes = self.explained = ranked([self._change(each, best.left) for each in finest])
         # Once something was reported, what explains it best replaces it, also where it is smaller than is reported first.
-        if self.changes or (best.above > self._unsure[len(best.size)] and _matters(changes[0])):
+        if self.changes or (best.above > self._unsure[best.suspect.freedom] and _matters(changes[0])):
             # What was reported before is not undone by something else that began later.
             self.changes = (*changes, *happened_besides(self._reported(), changes[0]))
 
@@ -376,12 +387,13 @@ class ClosureWatch:
         assert self._newest is not None
         assert self._newest.reference is not None
         # What the sizes were estimated with: the filter's own state may have followed the change, base against zeros.
-        effect = changing(self._parts, self._newest.reference()[1])[:, found.suspect.columns]
+        effect = changing(self._parts, self._newest.reference()[1], self._seen)[:, found.suspect.columns]
         begin_s = (self._t[found.begin - 1] + self._t[found.begin]) / 2
         end_s, T = self._t[-1], self._newest.T_base_tool
-        limit = _limits(self._parts.joints)[len(found.size)]
+        limit = _limits(self._parts.joints)[found.suspect.freedom]
         score, chi_square = (found.above + limit) / left - limit, found.chi_square / left
-        return Change(found.suspect, begin_s, end_s, found.size, left * found.cov, chi_square, score, effect, T)
+        size, cov = found.size, left * found.cov
+        return Change(found.suspect, begin_s, end_s, size, cov, chi_square, score, effect, T, seen=self._seen)
 
     def _tested(
         self, begins: Array, hypotheses: Sequence[Suspect], without: tuple[int, float] | None = None
@@ -432,7 +444,7 @@ class ClosureWatch:
                 cov = np.linalg.inv(inner[n]) * (by[:, None] * by)
             size = cov @ (right[n, part] / by)
             chi_square = float(right[n, part] @ (size / by))
-            above = chi_square + gained - limits[len(by)] - (_RARER if each.slow else 0.0)
+            above = chi_square + gained - limits[each.freedom] - (_RARER if each.slow else 0.0)
             rest = (left / excess - chi_square) / numbers
             share = max(rest, 1.0 / excess)  # the errors are no smaller than the blocks'
             found.append(_Tested(each, int(begins[n]), size, cov, chi_square, above, share))

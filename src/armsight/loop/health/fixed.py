@@ -81,7 +81,7 @@ class FixedWatch:
         wide[:3] = wide[RAMPS : RAMPS + 3] = _WIDE_M
         wide[6] = _WIDE_S
         self._wide, self._columns = np.append(wide, wide[:RAMPS]), len(rows) + RAMPS
-        self._suspects = tuple(each for each in suspects(at.joints) if each.kind not in ("backlash", "bend"))
+        self._suspects = tuple(each for each in suspects(at.joints) if each.kind not in ("backlash", "bend", "zoom"))
         self._begins = np.zeros(0)
         # In single precision, which is enough and takes half the time: it is by far the largest array.
         self._F = np.zeros((at.size, 0, self._columns), np.float32)

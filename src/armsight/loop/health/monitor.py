@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from armsight.data import Array, Body, PoseEstimate, Shot
+from armsight.geometry.pose import transform
 from armsight.loop.estimators import Outcome
 from armsight.loop.finding import HealthFinding, Trust, displacement_m
 from armsight.loop.frame_clock import FrameClock
-from armsight.loop.health.change import Change, doubtful, finding, happened_besides, suspected
+from armsight.loop.health.change import Change, ToolView, doubtful, finding, happened_besides, suspected
 from armsight.loop.health.fixed import FixedWatch, ShakeWatch
 from armsight.loop.health.host import HostWatch
 from armsight.loop.health.landmarks import LandmarkWatch
@@ -20,7 +21,7 @@ from armsight.loop.health.rig import TEST_S, RigWatch
 from armsight.vision.rig import StereoRig
 
 if TYPE_CHECKING:
-    from armsight.loop.estimators import Innovation, KalmanEstimator, PoseMeasurement, Remembered
+    from armsight.loop.estimators import Innovation, KalmanEstimator, Mounting, PoseMeasurement, Remembered
     from armsight.loop.estimators.clock import ClockFollower
     from armsight.loop.health.base_motion import BaseMotion, KeptMeasurement, Measurements
     from armsight.loop.health.closure import ClosureWatch
@@ -81,7 +82,7 @@ class HealthMonitor:
         self._names: tuple[str, ...] = ()
         self._estimator: KalmanEstimator | None = None
         self._arm: Arm | None = None
-        self._axis: Array | None = None  # optical axis of the left camera (3,), in the base's frame
+        self._seen: ToolView | None = None
         self._cameras_s = np.inf  # since when the cameras are found to have moved, s
         self._known: list[tuple[float, Remembered]] = []
         self._measurements: Measurements | None = None
@@ -167,17 +168,19 @@ class HealthMonitor:
         """Names of the fixed bodies that were seen too rarely to say anything."""
         return () if self._landmarks is None else self._landmarks.never_seen
 
-    def follow(self, estimator: KalmanEstimator, arm: Arm, axis: Array | None = None) -> None:
+    def follow(self, estimator: KalmanEstimator, arm: Arm, mounting: Mounting | None = None) -> None:
         """Watch from now on, by what an estimator makes of the poses, whether rig, body and joints stay as they are.
 
         Args:
             estimator: it.
             arm: the arm.
-            axis: (3,) optical axis of the left camera, unit vector in the base's frame; None where that is not known.
+            mounting: of rig and body; None where it is not known.
         """
         from armsight.loop.health.base_motion import Measurements  # not above: what measures a pair needs no filter
 
-        self._estimator, self._arm, self._axis = estimator, arm, axis
+        self._estimator, self._arm = estimator, arm
+        if mounting is not None:
+            self._seen = ToolView(mounting.T_base_rig, transform(mounting.T_tool_body, self._body.points))
         self._known.clear()
         self._measurements = Measurements()
         estimator.keep_reference()
@@ -188,7 +191,7 @@ class HealthMonitor:
         from armsight.loop.health.closure import ClosureWatch
 
         self._fixed = FixedWatch(arm.joints)
-        self._closure = ClosureWatch(estimator.sigmas, arm.joints)
+        self._closure = ClosureWatch(estimator.sigmas, arm.joints, self._seen)
         self._innovations, self._clock, self._names = [], estimator.clock, arm.joint_names
         estimator.on_innovation = self._note
 
@@ -383,7 +386,7 @@ class HealthMonitor:
         """Return what the estimator saw of a change: its hypotheses, or that it dropped what it had learned."""
         changes = self._every_change
         if changes:
-            return () if self._clocks(changes) else (finding(changes, self._names, self._axis),)
+            return () if self._clocks(changes) else (finding(changes, self._names),)
         return () if self._fixed is None else self._fixed.findings()
 
     def _moved(self) -> tuple[HealthFinding, ...]:

@@ -241,7 +241,7 @@ class Loop:
         self._write()
         self.estimator = estimator  # its memory covers what is not recorded yet
         self.log.settle()
-        self.health.follow(estimator, self.setup.arm, mounting.T_base_rig[:3, 2])
+        self.health.follow(estimator, self.setup.arm, mounting)
 
     def compute(self, work: Callable[[], _Result]) -> _Result:
         """Return the result of a long computation, which uses nothing that the loop changes.
