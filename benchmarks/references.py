@@ -23,9 +23,8 @@ from armsight.app.run.metrics import track_metrics
 from armsight.app.run.tracks import Tracks
 from armsight.geometry.rotation import from_quaternion_wxyz
 from armsight.loop.identify.gravity import gravity_shows
-from armsight.loop.references.calibrate import calibrate
+from armsight.loop.references.calibrate import PosePath, calibrate
 from armsight.loop.references.inertial import ACCELEROMETER, GYRO, Inertial
-from armsight.loop.references.path import PosePath
 from armsight.loop.references.reference import STANDARD_GRAVITY_M_S2, Reading, ToolMotion
 from armsight.sim.workcell.workcell import Workcell
 

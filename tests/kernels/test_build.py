@@ -210,7 +210,7 @@ def from_image_to_command(rng):
     seen = Mounting(exp_se3(1e-3 * np.ones(6)), np.eye(4), 1e-3 * np.eye(12)).pose_measurement(seen, 0.02)
     at, chi_square = model.predicted(state, step, joints, seen, 1e-2)
     done = {f"predicted {name}": value.copy() for name, value in at._asdict().items()} | {"chi_square": chi_square}
-    gain = model.updated(at, joints, seen, 1e-2, learns_delay=False)
+    gain, _, _ = model.updated(at, joints, seen, 1e-2, learns_delay=False)
     clock = ClockFollower(n, n - 1, 1e-3)
     for t_s in (0.0, 0.1):
         clock.take(Innovation(t_s, T, at.z, at.S, at.H, step.kept[0], gain, Outcome.USED))

@@ -10,9 +10,9 @@ import pytest
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.geometry.rotation import quaternion_wxyz
+from armsight.loop.references.calibrate import PosePath
 from armsight.loop.references.file import INERTIAL_COLUMNS
 from armsight.loop.references.inertial import Inertial
-from armsight.loop.references.path import PosePath
 from armsight.loop.references.reference import ToolMotion
 from armsight.robot.arm_file import open_arm
 from cli_runs import hold_keys, run, said_of

@@ -1,6 +1,7 @@
 """armsight replay and export on a short recording; the estimators of a run are replayed to the last digit."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -125,6 +126,35 @@ def test_another_arm_or_estimator_changes_the_answers_and_compare_shows_it(armsi
     assert live["position_rms_m"] > 0
     assert live["rows"] == 120
     assert armsight("replay", run, "--arm", "ur5").code == 0
+
+
+def test_an_inertial_unit_is_fused_and_said_to_agree_or_not(armsight, run, tmp_path):
+    from armsight.loop.references.file import INERTIAL_COLUMNS, Entry, written
+    from armsight.loop.references.inertial import Inertial
+    from armsight.sim.references.inertial import InertialErrors, record
+
+    t_s = 1e-3 * np.arange(1, 700)
+    Ts = ARM.forward(ARM.home + 0.3 * np.sin(t_s)[:, None] * np.linspace(0.5, 1, 6))
+    errors = InertialErrors(rate_hz=1000.0, bandwidth_hz=400.0, noise=np.full(6, 1e-5), step=np.full(6, 1e-6))
+    stamps, z = record(t_s, Ts, errors, np.random.default_rng(1))
+    known = Inertial.of("imu", "icm-42688").moved(np.zeros(38))
+    known = replace(known, cov=np.diag(np.full(38, 1e-8)), sigma_delay_s=1e-3)
+    table, file = tmp_path / "imu.csv", tmp_path / "references.toml"
+    file.write_text(written(Entry(known, "inertial", "icm-42688", table, None, True), tmp_path))
+    for sign, agrees in ((1.0, True), (-1.0, False)):
+        rows = np.column_stack([stamps, z * np.repeat([sign, 1.0], 3)])
+        np.savetxt(table, rows, delimiter=",", header=",".join(["t_s", *INERTIAL_COLUMNS]), comments="")
+        said = armsight("replay", run, "--references", file, "--json")
+        assert said.code == 0, said
+        (answer,) = said.lines
+        assert answer["reference"]["agrees"] is agrees
+        assert answer["reference"]["windows"] > 10
+        assert answer["differences"] is None
+    assert "disagrees with joints and vision" in armsight("replay", run, "--references", file).out
+    file.write_text('[imu]\nkind = "inertial"\nsource = "imu.csv"\n')
+    assert_rejected(armsight("replay", run, "--references", file), "imu", "has no parameters", "references calibrate")
+    said = armsight("replay", run, "--references", file, "--estimator", "latest")
+    assert_rejected(said, "--references", "leave out --arm and --estimator")
 
 
 def test_what_a_run_does_not_hold_is_named(armsight, run, tmp_path):

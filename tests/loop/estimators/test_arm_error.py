@@ -169,7 +169,7 @@ def test_a_measurement_changes_state_and_covariance_as_the_textbook_has_it(learn
     assert chi == pytest.approx(at.z @ np.linalg.solve(S, at.z), rel=1e-9)
     expected = np.linalg.solve(S, H @ P).T
     expected[-1] *= learns_delay
-    gain = model.updated(at, joints, seen, 1e-4, learns_delay=learns_delay)
+    gain, _, _ = model.updated(at, joints, seen, 1e-4, learns_delay=learns_delay)
     np.testing.assert_allclose(gain, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
     np.testing.assert_allclose(at.x, kept @ state.x + expected @ at.z, rtol=0, atol=1e-14)
     left = np.eye(SIZE) - expected @ H

@@ -5,7 +5,7 @@ import pytest
 from test_inertial import motion, pose
 
 from armsight.errors import InputError
-from armsight.loop.references.path import PosePath
+from armsight.loop.references.calibrate import PosePath
 
 
 def test_pose_twist_and_acceleration_are_those_of_the_path():

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from armsight.geometry.pose import exp_se3
-from armsight.loop.references.calibrate import calibrate
+from armsight.loop.references.calibrate import PosePath, calibrate
 from armsight.loop.references.inertial import Inertial
-from armsight.loop.references.path import PosePath
 from armsight.loop.references.reference import Reading
 from armsight.loop.references.stream import check_stream
 from armsight.sim.references.inertial import InertialErrors, record

@@ -249,8 +249,8 @@ def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]
     from armsight.app.show.report import Fact, Report
     from armsight.app.show.table import TextTable
     from armsight.errors import InputError
+    from armsight.loop.references.calibrate import PosePath
     from armsight.loop.references.calibrate import calibrate as fit
-    from armsight.loop.references.path import PosePath
     from armsight.tables.poses import read_pose_table
 
     table = read_pose_table(poses)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -24,6 +25,9 @@ _REASONS = 3
 @arm_option("--arm", metavar="ARM", help="Another arm model.")
 @click.option("--estimator", type=click.Choice(["kalman", "latest"]), default="kalman", show_default=True)
 @click.option(
+    "--references", metavar="REFERENCES.toml", type=click.Path(path_type=Path), help="Fuse an inertial unit, too."
+)
+@click.option(
     "--rate", type=click.FloatRange(min=0), default=0.0, help="1 is real time; by default as fast as possible."
 )
 @stream_options()
@@ -42,6 +46,7 @@ def command(
     target: str | None,
     arm: str | None,
     estimator: str,
+    references: Path | None,
     rate: float,
     stream: tuple[str, ...],
     other: Path | None,
@@ -59,7 +64,7 @@ def command(
 
     if output is not None:
         check_folder(output, holding=(POSES, LIVE), apart_from=(other and other / POSES, other and other / LIVE))
-    request = Request(recording, rig, target, arm, estimator, rate, stream)
+    request = Request(recording, rig, target, arm, estimator, rate, references, stream)
     replayed = replay(request, lambda line: click.echo(line, err=True))
     measured = sum(pose.ok for pose in replayed.poses)
     reasons = Counter(pose.reason for pose in replayed.poses if not pose.ok)
@@ -83,6 +88,9 @@ def command(
             else "the estimates differ from those of the run by at most "
             + ", ".join(f"{name} {value:.3g}" for name, value in replayed.differences.items())
         )
+    if (row := replayed.beside) is not None:
+        answer["reference"] = asdict(row)
+        lines.append(row.line)
     if output is not None:
         write_tables(output.expanduser(), replayed)
         lines.append(f"written to {output}")

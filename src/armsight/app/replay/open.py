@@ -15,6 +15,7 @@ from armsight.app.stream.mcap_file import ARM, BODY, arm_of
 from armsight.app.stream.streams import open_streams
 from armsight.data import Body
 from armsight.errors import InputError
+from armsight.loop.running.references import Fused
 from armsight.robot.arm_file import open_arm
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_target
@@ -39,6 +40,7 @@ class Request:
     arm: str | None = None  #: arm model
     estimator: str = "kalman"  #: a name of ESTIMATORS
     rate: float = 0.0  #: seconds of the recording a second; 0 as fast as possible
+    references: Path | None = None  #: file of references that are fused with a run
     streams: tuple[str, ...] = ()  #: what to publish to
 
 
@@ -73,6 +75,9 @@ def _of_run(request: Request, recorded: RecordedRun, say: Callable[[str], None])
     body = _body_of(recorded)
     rig = StereoRig.from_text(recorded.properties["rig.json"], f"{recorded.path}: rig.json")
     changed = request.arm is not None or request.estimator != "kalman"
+    if request.references is not None and changed:
+        raise InputError("--references goes with the run's own arm and estimator; leave out --arm and --estimator")
+    beside = None if request.references is None else Fused.of(request.references)
     with contextlib.closing(open_streams(request.streams, Published(rig, body, arm), say)) as publisher:
         return replay_run(
             recorded,
@@ -82,6 +87,7 @@ def _of_run(request: Request, recorded: RecordedRun, say: Callable[[str], None])
             pace=Pace(request.rate),
             publisher=publisher,
             changed=changed,
+            beside=beside,
         )
 
 
@@ -101,6 +107,8 @@ def _of_source(request: Request, recorded: RecordedRun | None, say: Callable[[st
         (folder / INDEX).is_file() or not any(each.suffix in SUFFIXES for each in folder.iterdir())
     )
     bag = None if of_images else Bag(path if recorded is None else recorded.path)
+    if request.references is not None:
+        raise InputError(f"{request.recording}: --references needs a run with its joints; this holds none")
     if request.target is None:
         raise InputError(f"{request.recording}: what is to be measured in it? give --target, a board or a body file")
     if bag is None:

@@ -29,6 +29,7 @@ from armsight.loop.estimators import (
     Remembered,
 )
 from armsight.loop.running.data import EventDatum, JointsDatum, Publisher, ShotDatum
+from armsight.loop.running.references import Fused
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.detections import SeenShot
 from armsight.vision.follow.follower import Follower, follows
@@ -45,6 +46,31 @@ ESTIMATORS: dict[str, Callable[..., Estimator]] = {"kalman": KalmanEstimator, "l
 
 
 @dataclass(frozen=True)
+class FusedRow:
+    """What a reference beside vision did to the estimates of a run."""
+
+    name: str  #: of the reference
+    windows: int  #: of its readings that were used or rejected
+    outliers: int  #: of them rejected
+    residual_over_sigma: float  #: root mean square; 1 is right
+    agrees: bool  #: whether it agrees with joints and vision
+    moved_rms_m: float  #: distance of the estimates from those without it, m
+    sigma_rms_m: float  #: of the position with it, root of the trace, m
+    sigma_without_rms_m: float  #: and without, m
+
+    @property
+    def line(self) -> str:
+        """It as a line for people."""
+        moved, sigma, without = (1e3 * x for x in (self.moved_rms_m, self.sigma_rms_m, self.sigma_without_rms_m))
+        found = "agrees" if self.agrees else "disagrees"
+        return (
+            f"with {self.name}: the estimates move by {moved:.3f} mm RMS, sigma {sigma:.3f} mm, without {without:.3f}; it "
+            f"{found} with joints and vision: residuals {self.residual_over_sigma:.2f} of their sigma, {self.outliers} of "
+            f"{self.windows} windows are outliers"
+        )
+
+
+@dataclass(frozen=True)
 class Replayed:
     """What came out."""
 
@@ -54,6 +80,7 @@ class Replayed:
     joints: JointStream | None = None  #: the joint readings that a bag holds; None without
     #: largest absolute difference of the estimates to those recorded, by name; none where not comparable.
     differences: dict[str, float] | None = None
+    beside: FusedRow | None = None  #: what a reference beside vision did; None without
 
 
 class Pace:
@@ -74,16 +101,25 @@ class Pace:
 
 
 def replay_run(
-    recorded: RecordedRun, arm: Arm, body: Body, *, estimator: str, pace: Pace, publisher: Publisher, changed: bool
+    recorded: RecordedRun,
+    arm: Arm,
+    body: Body,
+    *,
+    estimator: str,
+    pace: Pace,
+    publisher: Publisher,
+    changed: bool,
+    beside: Fused | None = None,
 ) -> Replayed:
     """Run the estimators of a run again, with an arm and a body; the publisher is given what comes out.
 
-    ``changed``: whether arm or estimator are others, whose estimates are not compared with the recorded ones.
+    ``changed``: whether arm or estimator are others, whose estimates are not compared with the recorded ones; ``beside``: a
+    reference whose readings are fused.
 
     Raises:
         InputError: they are, and the rig was put right during the run.
     """
-    state = _RunAgain(arm, estimator, changed)
+    state = _RunAgain(arm, estimator, changed, beside)
     poses, live, before = list[ShotPose](), list[JointsDatum](), list[RecordedDatum]()
     for each in recorded.data:
         if each.kind is EventDatum:
@@ -101,14 +137,31 @@ def replay_run(
             poses.append(shot_pose(name, t_s, body, result))
             shot = Shot(name, None, None, t_s)
             publisher.put(ShotDatum(shot, result, each.content["arrival_s"], each.content["sigma_t_s"], outcome))
-    return Replayed(body, tuple(poses), tuple(live), None, None if changed else _differences(before, live, body))
+    same = None if changed or beside is not None else _differences(before, live, body)
+    return Replayed(
+        body, tuple(poses), tuple(live), None, same, None if beside is None else _row(beside, before, live, body)
+    )
+
+
+def _row(beside: Fused, before: list[RecordedDatum], live: list[JointsDatum], body: Body) -> FusedRow:
+    """Return what a reference did to the estimates since the first of its windows."""
+    rows = [(was, now) for was, now in zip(before, live, strict=True) if now.states.t_s[-1] >= beside.begin_s]
+    if not rows:
+        raise InputError(f"[{beside.sensor.name}]: no reading is of the run's times; do both have one clock?")
+    p_was, cov_was = (np.array([was.content[key] for was, _ in rows]) for key in ("tool_position_m", "tool_covariance"))
+    fused = [now.to_json(body) for _, now in rows]
+    p, cov = (np.array([each[key] for each in fused]) for key in ("tool_position_m", "tool_covariance"))
+    sigma, sigma_was = (float(np.sqrt(np.einsum("nii->ni", one)[:, :3].sum(axis=1).mean())) for one in (cov, cov_was))
+    moved = float(np.sqrt(((p - p_was) ** 2).sum(axis=1).mean()))
+    said = beside.windows, beside.outliers, beside.ratio, beside.agrees
+    return FusedRow(beside.sensor.name, *said, moved, sigma, sigma_was)
 
 
 class _RunAgain:
     """The estimator of a run, and what was given to it."""
 
-    def __init__(self, arm: Arm, name: str, changed: bool) -> None:
-        self._arm, self._name, self._changed = arm, name, changed
+    def __init__(self, arm: Arm, name: str, changed: bool, beside: Fused | None = None) -> None:
+        self._arm, self._name, self._changed, self._beside = arm, name, changed, beside
         self._estimator: Estimator | None = None
         self._mounting: Mounting | None = None
         self._batches: list[JointStates] = []
@@ -157,6 +210,8 @@ class _RunAgain:
         if self._estimator is None:
             return None
         self._estimator.joints(states)
+        if self._beside is not None and self._mounting is not None and isinstance(self._estimator, KalmanEstimator):
+            self._beside.give(self._estimator, float(states.t_s[-1]))
         return self._estimator.estimate()
 
     def vision(self, result: PoseEstimate | Missed, t_s: float | None, content: dict[str, Any]) -> str | None:

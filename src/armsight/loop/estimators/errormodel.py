@@ -22,6 +22,7 @@ from armsight.loop.estimators.armerror import Prior, layout, pose_and_derivative
 from armsight.loop.estimators.estimator import PoseMeasurement
 from armsight.loop.estimators.readings import Smoothed
 from armsight.loop.references.reference import Reading, Reference
+from armsight.loop.references.strapdown import Navigated
 from armsight.loop.references.update import Considered
 from armsight.robot.kinematics.arm import Arm
 
@@ -59,12 +60,19 @@ class Taken(NamedTuple):
         return self.reading.t_s - self.reference.delay_s
 
 
+class Until(NamedTuple):
+    """The end of a window of an inertial unit, s."""
+
+    t_s: float
+
+
 class ErrorState(NamedTuple):
     """The filter right after a pose measurement, or before the first.
 
     ``x`` (size,) and ``P`` (size, size): the arm's error and its covariance; ``t_s``: when that was; ``joints``: how the
     readings smoothed them then, N = 1; ``pose_measurement``: what went in last of vision. Where a reading of a reference
-    went in last: ``taken``, that, and ``vision_s``, when vision's was; ``considered``: see :mod:`..references.update`.
+    went in last: ``taken``, that, and ``vision_s``, when vision's was; ``considered``: see :mod:`..references.update`;
+    ``beside``: what an inertial unit adds to the state, None without one.
     """
 
     t_s: float
@@ -72,12 +80,13 @@ class ErrorState(NamedTuple):
     P: Array
     joints: Smoothed
     pose_measurement: PoseMeasurement | None
-    taken: Taken | None = None
+    taken: Taken | Until | None = None
     vision_s: float | None = None
     considered: Considered = NONE_CONSIDERED
+    beside: Navigated | None = None
 
     @property
-    def measurement(self) -> PoseMeasurement | Taken | None:
+    def measurement(self) -> PoseMeasurement | Taken | Until | None:
         """What went in last."""
         return self.pose_measurement if self.taken is None else self.taken
 
@@ -272,10 +281,11 @@ class ErrorModel:
 
     def updated(
         self, at: Predicted, joints: Smoothed, pose_measurement: PoseMeasurement, jitter_s: float, *, learns_delay: bool
-    ) -> Array:
-        """Use a measurement: overwrite ``at.x`` and ``at.P`` by state and covariance after it; return the gain (size, 6).
+    ) -> tuple[Array, Array, Array]:
+        """Use a measurement: overwrite ``at.x`` and ``at.P`` by state and covariance after it, and ``at.HP``.
 
-        The iterated update (Bell and Cathey, 1993). Other arguments as for :meth:`innovation`.
+        Return the gain (size, 6), innovation (6,) and derivative (6, size) of the last linearization; ``at.HP`` is of it,
+        too. The iterated update (Bell and Cathey, 1993). Other arguments as for :meth:`innovation`.
 
         Args:
             at: the state before.
@@ -284,11 +294,11 @@ class ErrorModel:
             jitter_s: standard deviation of its time, s.
             learns_delay: whether the delay is corrected; if not, it stays as it is, and so does its variance.
         """
-        K = np.empty((self.layout.size, 6))
+        K, z, H = np.empty((self.layout.size, 6)), at.z.copy(), at.H.copy()
         now = joints.q[0], joints.qd[0], joints.unseen[0]
         seen = pose_measurement.T_base_tool, pose_measurement.cov_noise, jitter_s
-        _updated(self._table, *now, *seen, learns_delay, at.x, at.P, at.z, at.H, at.R, at.HP, K)
-        return K
+        _updated(self._table, *now, *seen, learns_delay, at.x, at.P, z, H, at.R, at.HP, K)
+        return K, z, H
 
 
 @kernel("f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1]")
@@ -553,16 +563,16 @@ def _updated(
     learns_delay: bool,
     x: Array,
     P: Array,
-    z_at: Array,
-    H_at: Array,
+    z: Array,
+    H: Array,
     R_at: Array,
     HP: Array,
     K: Array,
 ) -> None:
-    """Overwrite x and P by those after a measurement, write the gain to K (size, 6); HP is used up."""
+    """Overwrite x and P by those after a measurement, write the gain to K (size, 6); z, H and HP become the last ones."""
     size = x.shape[0]
     delay = size - 1
-    z, H, R, there = z_at.copy(), H_at.copy(), R_at.copy(), x.copy()
+    R, there = R_at.copy(), x.copy()
     change, last = np.zeros(size), np.zeros(size)
     for left in range(ITERATIONS, 0, -1):
         _add_times(HP, H, R)

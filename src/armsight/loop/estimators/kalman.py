@@ -35,6 +35,7 @@ from armsight.loop.estimators.errormodel import (
     Predicted,
     Propagation,
     Taken,
+    Until,
     chi_square,
     opened,
     smoothed_anew,
@@ -44,7 +45,9 @@ from armsight.loop.estimators.estimator import ArmEstimate, Delay, Innovation, L
 from armsight.loop.estimators.parabola import SPAN_S
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
 from armsight.loop.estimators.smoothing import Interval, blended, by_state, intervals
+from armsight.loop.references.inertial import Inertial
 from armsight.loop.references.reference import Reading, Reference, ToolMotion
+from armsight.loop.references.strapdown import Samples, Strapdown
 from armsight.loop.references.update import Considered, Shares, gained, passed
 from armsight.robot.kinematics.arm import Arm
 
@@ -64,6 +67,15 @@ WAITING_S = 0.5
 _GATE = chi_square_limit(6, CHANCE)
 #: The tool's acceleration is the difference of its twists so long before and after, s; half: noisier, double: bends cut.
 APART_S = 0.01
+#: Windows of an inertial unit, s; half: twice the cost, double: estimates between them lean on the joints.
+WINDOW_S = 0.01
+#: While windows are used, a link is loose against its potentiometer by one sigma of so many rad, which lasts so long, s:
+#: in its backlash it keeps its speed when the shaft stops, and stands when that begins. Half: joints overrule what was
+#: felt, double: they bound it later.
+LOOSE_RAD, LOOSE_S = 1.5e-3, 0.3
+#: Images in a row whose errors are alike, as markers fall on pixels alike: while windows are used, so many count as one.
+#: Half: attitudes are claimed twice as well as they are, double: speeds are learned later.
+ALIKE = 5.0
 
 
 def _carried(considered: Considered, step: Propagation) -> dict[str, Array]:
@@ -111,7 +123,7 @@ class KalmanEstimator:
         # readings' noise and the pose, which stand side by side.
         whole = np.eye(at.size)
         self._widths = whole[at.backlash : at.floats] + whole[at.floats : at.compliance]
-        self._forgets = slice(at.rest, at.delay)
+        self._forgets, self._loose = slice(at.rest, at.delay), slice(at.rest, at.reading)
         self._opened, self._tight = opened(joints), np.zeros(joints, np.bool_)
         furthest = FURTHEST * np.sqrt(self._model.sigmas**2 + self._opened)
         self._furthest = np.where(self._opened > 0.0, furthest, np.inf)
@@ -120,7 +132,8 @@ class KalmanEstimator:
         self.on_reading: Callable[[str, Innovation], None] | None = None
         self.clock = None if learns_delay else ClockFollower(at.size, at.delay, delay.sigma_s)
         self._reference: Array | None = None
-        self._waiting: list[PoseMeasurement | Taken] = []
+        self._waiting: list[PoseMeasurement | Taken | Until] = []
+        self._unit: Strapdown | None = None
         self._outliers: list[Array] = []
         self._backlash_set = True  # whether the readings have the newest estimate of the backlash
         # At the newest reading, until something is heard: the state, the joints and what came of the state, and the tool.
@@ -187,7 +200,7 @@ class KalmanEstimator:
         (x, P), newest = self.known_again(state), self._states[-1]
         if self.clock is not None:
             self.clock.restore(state.clock, self._forgets)
-        self._states = [newest._replace(x=x, P=P, taken=None, considered=NONE_CONSIDERED)]
+        self._states = [newest._replace(x=x, P=P, taken=None, considered=NONE_CONSIDERED, beside=None)]
         self._outliers, self._newest, self._here = [], None, None
         self._waiting, self._backlash_set = [], False
 
@@ -209,27 +222,48 @@ class KalmanEstimator:
             waiting, self._waiting = self._waiting, []
             for measurement in waiting:
                 self._hear(measurement)
+        self._go_on()
 
     def vision(self, pose_measurement: PoseMeasurement) -> Outcome:
         """Take a pose measurement, in any order of time; return what became of it."""
+        if self._unit is not None:
+            pose_measurement = replace(pose_measurement, cov_noise=ALIKE * pose_measurement.cov_noise)
         return self._hear(pose_measurement)
 
-    def take(self, reference: Reference, reading: Reading) -> Outcome:
+    def take(self, reference: Reference, reading: Reading | Samples) -> Outcome:
         """Take a reading of a reference beside vision, in any order of time; return what became of it.
 
         The reference's parameters and delay are considered by their covariance, not estimated. An outlier is never used,
-        however often it comes back: which of reference and vision is wrong is not the filter's to say.
+        however often it comes back: which of reference and vision is wrong is not the filter's to say. Samples of an
+        inertial unit come in order of time; its parameters and delay are estimated.
 
         Raises:
-            InputError: the reference has no such channel.
+            InputError: the reference has no such channel, or samples are not of an inertial unit, or not in order.
         """
+        if isinstance(reading, Samples):
+            if not isinstance(reference, Inertial):
+                raise InputError(f"{reference.name}: samples are of inertial units; give its readings one by one")
+            if self._unit is None or self._unit.sensor is not reference:
+                self._unit = Strapdown(reference)
+            self._unit.add(reading)
+            self._newest = self._here = None
+            return self._go_on()
         if not 0 <= reading.channel < len(reference.channels):
             raise InputError(
                 f"{reference.name}: channel {reading.channel} of {len(reference.channels)}: {', '.join(reference.channels)}"
             )
         return self._hear(Taken(reference, reading))
 
-    def _hear(self, measurement: PoseMeasurement | Taken) -> Outcome:
+    def _go_on(self) -> Outcome:
+        """Use windows of the inertial unit as far as its samples and the joints have come; waiting where they have not."""
+        if self._unit is None or not np.isfinite(begin := self._states[-1].t_s):
+            return Outcome.WAITING
+        end = min(self._unit.newest_s, self.span_s[1])
+        for t_s in begin + WINDOW_S * np.arange(1, int((end - begin) / WINDOW_S) + 1):
+            self._hear(Until(float(t_s)))
+        return Outcome.USED if end - begin >= WINDOW_S else Outcome.WAITING
+
+    def _hear(self, measurement: PoseMeasurement | Taken | Until) -> Outcome:
         """Use a measurement after those before it in time, and use those after it again."""
         self._newest = self._here = None
         oldest, newest = self.span_s
@@ -259,9 +293,13 @@ class KalmanEstimator:
         return outcome
 
     def _used(
-        self, before: ErrorState, measurement: PoseMeasurement | Taken, *, report: bool = False
+        self, before: ErrorState, measurement: PoseMeasurement | Taken | Until, *, report: bool = False
     ) -> tuple[ErrorState | None, Outcome]:
         """Return the state after a measurement, None where it is an outlier."""
+        if isinstance(measurement, Until):
+            after = self._felt(before, measurement.t_s, report=report)
+            after = self._alone(before, measurement.t_s) if after is before else after
+            return after._replace(taken=measurement), Outcome.USED
         if isinstance(measurement, Taken):
             return self._take_reading(before, measurement, report=report)
         return self._take(before, measurement, self._report if report else None)
@@ -280,7 +318,9 @@ class KalmanEstimator:
     def _now(self) -> tuple[ErrorState, Smoothed, Propagation]:
         """Return the state after the newest measurement, the joints at the newest reading, and the propagation to it."""
         if self._here is None:
-            self._here = self._since(np.array([self.span_s[1]]))
+            newest = np.array([self.span_s[1]])
+            state, joints = self._anew(self._felt(self._states[-1], self.span_s[1]), newest)
+            self._here = state, joints, self._model.moved(state, joints, newest)
         return self._here
 
     def _since(self, t_s: Array) -> tuple[ErrorState, Smoothed, Propagation]:
@@ -345,16 +385,16 @@ class KalmanEstimator:
         known = 1 - np.diag(self._widths @ state.P @ self._widths.T) / (self._widths @ self._model.sigmas**2)
         return np.asarray(known * (self._widths @ state.x) + (1 - known) * GAP_RAD)
 
-    def _after(self, state: ErrorState, measurement: PoseMeasurement | Taken) -> bool:
+    def _after(self, state: ErrorState, measurement: PoseMeasurement | Taken | Until) -> bool:
         """Return whether a state has used a measurement newer than this one."""
         used = state.measurement
-        if isinstance(used, Taken) or isinstance(measurement, Taken):  # their stamps are of several clocks
-            return used is not None and state.t_s > self._seen_s(measurement, state)
-        return used is not None and used.t_s > measurement.t_s
+        if isinstance(used, PoseMeasurement) and isinstance(measurement, PoseMeasurement):
+            return used.t_s > measurement.t_s
+        return used is not None and state.t_s > self._seen_s(measurement, state)  # their stamps are of several clocks
 
-    def _seen_s(self, pose_measurement: PoseMeasurement | Taken, state: ErrorState) -> float:
+    def _seen_s(self, pose_measurement: PoseMeasurement | Taken | Until, state: ErrorState) -> float:
         """Return the time of a measurement, s, by a state's estimate of the delay."""
-        if isinstance(pose_measurement, Taken):
+        if not isinstance(pose_measurement, PoseMeasurement):
             return pose_measurement.t_s
         return pose_measurement.t_s - self._delay_s(pose_measurement.t_s - self._delay.delay_s, state.x)
 
@@ -383,7 +423,7 @@ class KalmanEstimator:
         """Return the state after a measurement, None where it is an outlier; report how it came about."""
         t_s = max(self._seen_s(pose_measurement, before), before.t_s)
         times, jitter_s = np.array([t_s]), self._delay.jitter_s
-        before, joints = self._anew(before, times)
+        before, joints = self._anew(self._felt(before, t_s), times)
         step = self._model.moved(before, joints, times, learning=LEARNING)
         at, chi = self._model.predicted(before, step, joints, pose_measurement, jitter_s)
         outcome = self._gate(at, chi)
@@ -395,8 +435,11 @@ class KalmanEstimator:
         if outcome is Outcome.REOPENED:
             at.P[np.diag_indices(self._at.size)] += self._opened
             at.HP[:] += at.H * self._opened
-        K = self._model.updated(at, joints, pose_measurement, jitter_s, learns_delay=self._learns_delay)
-        x, P = at.x, at.P
+        K, z, H = self._model.updated(at, joints, pose_measurement, jitter_s, learns_delay=self._learns_delay)
+        x, P, beside = at.x, at.P, before.beside
+        if beside is not None:
+            noise = pose_measurement.cov_noise + jitter_s**2 * np.outer(H[:, self._at.delay], H[:, self._at.delay])
+            beside = beside.measured(step.kept[0], H, at.HP, z, noise + at.HP @ H.T)
         if not (np.abs(x) < self._furthest).all():  # NaN neither
             return None, Outcome.OUTLIER
         if report is not None:
@@ -406,16 +449,63 @@ class KalmanEstimator:
                 by_delay = P[:, self._at.delay] / P[self._at.delay, self._at.delay]
                 P += (self.clock.sigma_s**2 - P[self._at.delay, self._at.delay]) * np.outer(by_delay, by_delay)
         considered = passed(_carried(before.considered, step), K, at.H) if before.considered else NONE_CONSIDERED
-        return ErrorState(t_s, x, P, joints, pose_measurement, considered=considered), outcome
+        return ErrorState(t_s, x, P, joints, pose_measurement, considered=considered, beside=beside), outcome
+
+    def _alone(self, before: ErrorState, t_s: float) -> ErrorState:
+        """Return the state at a time by the joints alone."""
+        before, joints = self._anew(before, np.array([t_s]))
+        step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
+        x, P = self._propagated(before, step)
+        beside, considered = before.beside, _carried(before.considered, step)
+        if beside is not None:
+            beside = beside._replace(C=beside.C * step.kept[0][:, None])
+        return ErrorState(t_s, x, P, joints, before.pose_measurement, None, before.seen_s, considered, beside)
+
+    @staticmethod
+    def _propagated(before: ErrorState, step: Propagation) -> tuple[Array, Array]:
+        """Return what motion makes of the arm's error (K,) and its covariance (K, K)."""
+        P = before.P * np.outer(step.kept[0], step.kept[0])
+        P[np.diag_indices(len(P))] += step.added[0]
+        return before.x * step.kept[0], P
+
+    def _felt(self, before: ErrorState, t_s: float, *, report: bool = False) -> ErrorState:
+        """Return the state at a time by the joints and what an inertial unit felt; as it is where that is not known."""
+        window = None if self._unit is None else self._unit.window(before.t_s, t_s)
+        if self._unit is None or window is None:
+            return before
+        before, joints = self._anew(before, np.array([t_s]))
+        step, loose = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING), self._loose
+        share = float(np.exp(-window.length_s / LOOSE_S))
+        step.kept[:, loose] *= share
+        step.added[:, loose] += LOOSE_RAD**2 * (1.0 - share**2)
+        kept, added = step.kept[0], step.added[0]
+        q, unseen = (
+            np.concatenate([getattr(end, part) for end in (before.joints, joints)]) for part in ("q", "unseen")
+        )
+        Ts, Hs = self._model.poses(np.stack([before.x, before.x * kept]), q, unseen)
+        beside = before.beside
+        if beside is None or beside.t_s != before.t_s:
+            twist = Hs[0][:, self._at.zeros] * self._arm.direction @ before.joints.qd[0]
+            beside = self._unit.started(beside, before.t_s, Ts[0], twist, len(before.x))
+        fixed = None if self._learns_delay else self._at.delay
+        got = self._unit.advanced(window, beside, (before.x, before.P), (kept, added), (Ts, Hs), fixed)
+        outcome = Outcome.USED if chi_square(np.ascontiguousarray(got.S), got.z) < _GATE else Outcome.OUTLIER
+        if report and self.on_reading is not None:
+            said = got.z, got.S, got.by, kept, got.gain, outcome
+            self.on_reading(self._unit.sensor.name, Innovation(t_s, Ts[1], *said, added=added))
+        if outcome is Outcome.OUTLIER or not (np.abs(got.x) < self._furthest).all():
+            return self._alone(before, t_s)
+        considered = {name: C * kept[:, None] - got.gain @ (got.by @ C) for name, C in before.considered.items()}
+        last = before.pose_measurement, None, before.seen_s, considered, got.beside._replace(t_s=t_s)
+        return ErrorState(t_s, got.x, got.P, joints, *last)
 
     def _take_reading(self, before: ErrorState, taken: Taken, *, report: bool) -> tuple[ErrorState | None, Outcome]:
         """Return the state after a reading of a reference, None where it is an outlier; report it."""
         (reference, reading), t_s = taken, max(taken.t_s, before.t_s)
-        before, joints = self._anew(before, np.array([t_s]))
+        before, joints = self._anew(self._felt(before, t_s), np.array([t_s]))
         step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
         kept, added = step.kept[0], step.added[0]
-        x, P = before.x * kept, before.P * np.outer(kept, kept)
-        P[np.diag_indices(len(P))] += added
+        x, P = self._propagated(before, step)
         (T,), (by_state,) = self._model.poses(x, joints.q, joints.unseen)
         motion, cov_twist, cov_acceleration = self._motion(x, T, by_state, joints, t_s, reference.inertial)
         expected = reference.expected(motion, reading.channel)
@@ -442,7 +532,10 @@ class KalmanEstimator:
             self.on_reading(reference.name, Innovation(t_s, T, z, got.S, H, kept, gain, outcome, None, None, added, R))
         if outcome is Outcome.OUTLIER:
             return None, outcome
-        used = before.pose_measurement, taken, before.seen_s, got.considered
+        beside = before.beside
+        if beside is not None:
+            beside = beside.measured(kept, H, H @ P, z, got.S)
+        used = before.pose_measurement, taken, before.seen_s, got.considered, beside
         return ErrorState(t_s, x, got.P, joints, *used), outcome
 
     def _motion(

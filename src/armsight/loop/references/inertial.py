@@ -37,6 +37,8 @@ _ROTATION, _LEVER, _GYRO_BIAS, _BIAS, _M_A, _M_G, _G, _TILT = (
     slice(a, b) for a, b in ((0, 3), (3, 6), (6, 9), (9, 12), (12, 18), (18, 27), (27, 36), (36, 38))
 )
 _PARAMETERS = 38
+#: Of them the mounting's rotation and lever and the base's tilt; and the biases.
+MOUNTING, BIASES = (_ROTATION, _LEVER, _TILT), slice(_GYRO_BIAS.start, _BIAS.stop)
 #: Units that are read for others: how many times larger the numbers then are, within _NEAR.
 _MISREAD = {GYRO: ("rad/s", {"deg/s": 180.0 / np.pi}), ACCELEROMETER: ("m/s2", {"g": 1 / STANDARD_GRAVITY_M_S2})}
 _NEAR = 0.2  # relative; half: a poor chip is not recognised, double: 25 % of scale error count as a unit
@@ -132,6 +134,32 @@ class Inertial(Reference):
     def _part(self, rows: slice) -> Array:
         return self.values[rows.start - _LEVER.start : rows.stop - _LEVER.start]
 
+    @property
+    def tilt(self) -> Array:
+        """(2,) rotation vector, about x and y, of what is up in the base, rad."""
+        return self._part(_TILT)
+
+    def _matrices(self) -> tuple[Array, Array]:
+        """Return I + M_g and I + M_a (3, 3)."""
+        gyro, force = np.eye(3) + self._part(_M_G).reshape(3, 3), np.eye(3)
+        force[_UPPER] += self._part(_M_A)
+        return gyro, force
+
+    def felt(self, z: Array) -> Array:
+        """Return angular velocities, rad/s, and specific forces, m/s2, (N, 6) in the sensor's axes, of readings (N, 6)."""
+        gyro, force = self._matrices()
+        f = (z[:, 3:] - self._part(_BIAS)) @ np.linalg.inv(force).T
+        w = z[:, :3] - self._part(_GYRO_BIAS) - f @ self._part(_G).reshape(3, 3).T
+        return np.hstack([w @ np.linalg.inv(gyro).T, f])
+
+    def felt_by(self, felt: Array) -> Array:
+        """Return the derivative (6, P) of what :meth:`felt` returns (6,) of a reading by the parameters; to first order."""
+        by = np.zeros((6, _PARAMETERS))
+        by[:, BIASES] = np.eye(6)
+        by[:3, _M_G], by[:3, _G] = np.kron(np.eye(3), felt[:3]), np.kron(np.eye(3), felt[3:])
+        by[3 + _UPPER[0], np.arange(_M_A.start, _M_A.stop)] = felt[3 + _UPPER[1]]
+        return -by
+
     def expected(self, motion: ToolMotion, channel: int) -> ExpectedReading:
         """Return angular velocity (3,), rad/s, or specific force (3,), m/s2, as the sensor reads it."""
         R, r = self.T_tool_sensor[:3, :3].T, self.T_tool_sensor[:3, 3]
@@ -149,9 +177,8 @@ class Inertial(Reference):
         by = np.zeros((3, _PARAMETERS))
         by[:, _ROTATION], by[:, _LEVER] = skew(f), R @ (skew(dw) + W @ W)
         by[:, _TILT] = (-STANDARD_GRAVITY_M_S2 * R @ R_tool_base @ skew(up) @ left_jacobian(tilt))[:, :2]
-        M = np.eye(3) + (self._part(_M_G).reshape(3, 3) if channel == GYRO else 0.0)
+        M = self._matrices()[channel]
         if channel == ACCELEROMETER:
-            M[_UPPER] += self._part(_M_A)
             by = M @ by
             by[_UPPER[0], np.arange(_M_A.start, _M_A.stop)] = f[_UPPER[1]]
             by[:, _BIAS] = np.eye(3)

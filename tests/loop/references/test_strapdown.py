@@ -1,0 +1,170 @@
+"""An inertial unit in the filter: preintegration, derivatives, what windows add, and whether the covariance knows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm_rig import ARM, TICK_S, legs, measured, mounts, off, sampled, seen, states
+from scipy.stats import chi2
+
+from armsight.errors import InputError
+from armsight.geometry.pose import exp_se3, pose
+from armsight.geometry.rotation import exp_so3
+from armsight.loop.estimators import Delay, KalmanEstimator, Prior
+from armsight.loop.references.inertial import INERTIAL_CLASSES, Inertial
+from armsight.loop.references.strapdown import Samples, Strapdown
+from armsight.sim.references.inertial import InertialErrors, record
+from asserts import numeric_jacobian
+
+MOUNT = pose(exp_so3(np.array([0.4, -0.3, 1.0])), np.array([0.02, -0.01, 0.03]))
+CLASS = INERTIAL_CLASSES["icm-42688"]
+DENSITY = np.repeat([CLASS.gyro_noise, CLASS.noise], 3)
+#: What a calibration leaves: rotation, lever, biases, M_a, M_g, G, tilt.
+LEFT = np.repeat([5e-4, 5e-4, 2e-4, 5e-3, 3e-4, 3e-4, 1e-5, 3e-4], [3, 3, 3, 3, 6, 9, 9, 2])
+CHANCE = 1e-4
+
+
+def unit(left=LEFT, **more):
+    plain = Inertial.of("imu", "icm-42688", MOUNT)
+    return replace(plain, cov=np.diag(left**2), sigma_delay_s=1e-4, **more)
+
+
+def world(seed, seconds, blind_s):
+    """An arm's noisy readings, its true poses, what vision measured until it is blind, and a unit's samples."""
+    rng = np.random.default_rng(seed)
+    shaft, (true, mounting) = legs(rng, seconds), mounts(rng)
+    Ts = sampled(rng).tool(shaft)
+    q = shaft + rng.normal(size=shaft.shape) * Prior().reading_rad
+    looks = [measured(mounting, seen(rng, Ts[k], true), k * TICK_S) for k in range(20, int(blind_s / TICK_S), 16)]
+    said = unit()
+    there = said.moved(rng.normal(size=38) * LEFT)
+    errors = InertialErrors(
+        noise=DENSITY,
+        rate_hz=1000.0,
+        bandwidth_hz=400.0,
+        bias=there.values[3:9],
+        step=np.full(6, 1e-6),
+        largest=np.full(6, 1e6),
+    )
+    t_s, z = record(np.arange(len(Ts)) * TICK_S, Ts @ there.T_tool_sensor, errors, rng)
+    return q, Ts, looks, said, t_s + np.sqrt(2.0) / (2 * np.pi * 400.0), z
+
+
+def go(q, looks, said=None, t_s=None, z=None, late=0):
+    """Give everything in order of time, 10 ms at a time, images so many ticks late; return the estimator."""
+    estimator, looks = KalmanEstimator(ARM, delay=Delay(0.0, 2e-4)), list(looks)
+    sensor = None if said is None else replace(said, delay_s=np.sqrt(2.0) / (2 * np.pi * 400.0))
+    for begin in range(0, len(q), 10):
+        end = min(begin + 10, len(q))
+        estimator.joints(states(np.arange(begin, end) * TICK_S, q[begin:end]))
+        if sensor is not None:
+            rows = (t_s > (begin - 1) * TICK_S) & (t_s <= (end - 1) * TICK_S)
+            estimator.take(sensor, Samples(t_s[rows], z[rows], DENSITY))
+        while looks and looks[0].t_s <= (end - 1 - late) * TICK_S:
+            estimator.vision(looks.pop(0))
+    return estimator
+
+
+def test_preintegration_is_that_of_a_hundred_times_finer_steps():
+    w, f = np.array([1.2, -0.7, 2.0]), np.array([3.0, -2.0, 9.0])
+    t = np.arange(0.0, 0.04, 1e-3)
+    strapdown = Strapdown(unit())
+    at = lambda s: np.hstack([w * (1 + 5 * s), f * (1 - 8 * s)])  # noqa: E731
+    strapdown.add(Samples(t, np.array([at(s) for s in t]), DENSITY))
+    begin, end = 0.0034, 0.0217
+    got = strapdown.window(begin, end)
+    R, v, p, n = np.eye(3), np.zeros(3), np.zeros(3), 2000
+    h = (end - begin) / n
+    for s in begin + h * (np.arange(n) + 0.5):
+        both = at(s)
+        push = R @ exp_so3(both[:3] * h / 2) @ both[3:]
+        p, v, R = p + v * h + push * h * h / 2, v + push * h, R @ exp_so3(both[:3] * h)
+    # A force that changes by 72 m/s3 is taken as its mean over a step: 72 h^3 / 12 a step are 6 nm, for 18 of them.
+    np.testing.assert_allclose(got.R, R, atol=1e-9)
+    np.testing.assert_allclose(got.dv, v, atol=2e-7)
+    np.testing.assert_allclose(got.dp, p, atol=1.5e-7)
+    assert strapdown.window(-0.001, 0.01) is None
+    assert strapdown.window(0.03, 0.06) is None
+
+
+def test_the_derivatives_are_those_of_finite_differences():
+    rng = np.random.default_rng(3)
+    Ts = np.array([exp_se3(rng.normal(size=6)), np.eye(4)])
+    Ts[1] = Ts[0] @ exp_se3(0.01 * rng.normal(size=6))
+    t = np.arange(0.0, 0.03, 1e-3)
+    z = np.hstack([np.tile([0.3, -0.5, 0.8], (30, 1)), np.tile([1.0, -4.0, 9.0], (30, 1))]) * (1 + 3 * t[:, None])
+    y = np.concatenate([rng.normal(size=3), np.zeros(39)])
+
+    def of(xi, y, sensor=None, late=0.0):
+        strapdown = Strapdown(sensor or unit())
+        strapdown.add(Samples(t + late, z, DENSITY))
+        window = strapdown.window(0.005, 0.015)
+        return strapdown._constraint(window, Ts @ exp_se3(xi.reshape(2, 6)), y)
+
+    _, by_tool, by_y = of(np.zeros(12), y)
+    found = numeric_jacobian(lambda xi: of(xi, y)[0], np.zeros(12), 1e-4)
+    # The rotation's residual is some 0.025: its logarithm is taken to first order, which leaves half of that.
+    np.testing.assert_allclose(by_tool, found, atol=0.0125)
+    np.testing.assert_allclose(by_tool[3:], found[3:], atol=1e-7)
+    found = numeric_jacobian(lambda v: of(np.zeros(12), np.append(v, np.zeros(39)))[0], y[:3], 1e-3)
+    np.testing.assert_allclose(by_y[:, :3], found, atol=1e-9)
+    # Parameters: those of a unit that has them, weighed by what a calibration leaves of each; what they do to rotations
+    # within the window is left out of their derivatives.
+    found = numeric_jacobian(lambda step: of(np.zeros(12), y, unit().moved(step))[0], np.zeros(38), 1e-4)
+    found, by = found * LEFT, by_y[:, 4:] * LEFT
+
+    assert (np.abs(by - found) < 0.02 * np.abs(found).max(axis=1, keepdims=True)).all()
+    # A unit whose delay is larger by so much: its samples, stamped alike, are earlier.
+    found = (of(np.zeros(12), y, late=-1e-4)[0] - of(np.zeros(12), y, late=1e-4)[0]) / 2e-4
+    assert np.abs(by_y[:, 3] - found).max() < 0.02 * np.abs(found).max()
+
+
+def test_hidden_for_half_a_second_the_unit_halves_the_error_and_the_covariance_knows():
+    errors, squares, alone = [], [], []
+    for seed in range(10):
+        q, Ts, looks, *imu = world(200 + seed, 4.0, 3.5)
+        now = go(q, looks, *imu).estimate()
+        e = off(now.T_base_tool, Ts[-1])
+        errors.append(e[:3])
+        squares.append(e @ np.linalg.solve(now.cov, e))
+        alone.append(off(go(q, looks).estimate().T_base_tool, Ts[-1])[:3])
+    assert np.sqrt(np.mean(np.square(errors))) < 0.5 * np.sqrt(np.mean(np.square(alone)))
+    assert np.sum(squares) < chi2.ppf(1 - CHANCE, 6 * len(squares)), f"mean NEES {np.mean(squares):.2f}"
+
+
+def test_late_images_give_what_images_in_time_give():
+    q, _, looks, *imu = world(230, 2.0, 1.9)
+    in_time, late = go(q, looks, *imu).estimate(), go(q, looks, *imu, late=40).estimate()
+    # Meanwhile more readings of the joints have come about each window's ends: their noise differs, not what is known.
+    sigma = np.sqrt(np.diag(in_time.cov)[:3].sum())
+    assert np.linalg.norm(off(in_time.T_base_tool, late.T_base_tool)[:3]) < 0.3 * sigma
+    np.testing.assert_allclose(np.diag(late.cov), np.diag(in_time.cov), rtol=0.25)
+
+
+def test_a_unit_rotated_on_its_mount_shows_in_the_residuals_and_a_good_one_does_not():
+    ratios = []
+    for angle_deg in (0.0, 3.0):
+        q, _, looks, said, t_s, z = world(240, 3.0, 3.0)
+        R, found = exp_so3(np.radians([angle_deg, 0.0, 0.0])), []
+        z = np.hstack([z[:, :3] @ R, z[:, 3:] @ R])
+        estimator = KalmanEstimator(ARM, delay=Delay(0.0, 2e-4))
+        estimator.on_reading = lambda name, i, found=found: found.append(i.z @ np.linalg.solve(i.cov, i.z) / 6)
+        estimator.joints(
+            states(np.arange(len(q)) * TICK_S, q)[:0] if False else states(np.arange(1500) * TICK_S, q[:1500])
+        )
+        for look in looks[:80]:
+            estimator.vision(look)
+        for k in range(1500, len(q), 10):
+            estimator.joints(states(np.arange(k, k + 10) * TICK_S, q[k : k + 10]))
+            rows = (t_s > (k - 20) * TICK_S) & (t_s <= (k - 10) * TICK_S)
+            estimator.take(said, Samples(t_s[rows], z[rows], DENSITY))
+        ratios.append(float(np.sqrt(np.median(found))))
+    assert ratios[0] < 1.3
+    assert ratios[1] > 1.5 * ratios[0]
+
+
+def test_samples_that_are_none_are_rejected():
+    strapdown, z = Strapdown(unit()), np.zeros((3, 6))
+    for t_s, given in ((np.array([0.0, 0.0, 1.0]), z), (np.arange(3.0), z[:, :5]), (np.arange(3.0), z + np.nan)):
+        with pytest.raises(InputError, match="imu: expected samples"):
+            strapdown.add(Samples(t_s, given, DENSITY))
