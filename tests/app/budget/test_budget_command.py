@@ -49,6 +49,18 @@ def test_the_best_of_a_class_with_what_to_build(armsight, tmp_path, monkeypatch)
     assert (tmp_path / "out" / "body.pdf").read_bytes().startswith(b"%PDF")
 
 
+def test_a_motion_file_gives_volume_and_speed(armsight, tmp_path, monkeypatch):
+    monkeypatch.setattr(result, "CHANGES", {})
+    lines = [f"[[motion]]\nkind = 'line'\nby_mm = {by}\n" for by in ([0.0, -80.0, -30.0], [0.0, 80.0, 30.0])]
+    start = "start_deg = [34.0, -46.6, 74.2, -14.7, -134.4, 20.2]\n"
+    (tmp_path / "motion.toml").write_text(start + "".join(lines))
+    given = ("--volume", tmp_path / "motion.toml", "--distance", "0.7m", "--camera", "machine-vision-2mp")
+    assert_rejected(armsight("budget", *given), "--arm")
+    found = json.loads(armsight("budget", *given, "--arm", "six_r", "--json").out)
+    assert found["plan"]["volume"] == "0.080x0.030x0.001m"  # across, up, and deep at least a millimetre
+    assert 0.02 < float(found["plan"]["speed"].removesuffix("m/s")) < 1.0
+
+
 def test_wrong_units_are_one_line(armsight):
     assert_rejected(armsight("budget", "--volume", "400x400x300m"), "is it in mm")
 

@@ -11,7 +11,7 @@ from armsight.errors import InputError
 
 @click.command("budget")
 @click.argument("path", required=False, default="", metavar="[PLAN.toml]")
-@click.option("--volume", metavar="WxHxD", help="Width, height and depth, as the cameras see it: 0.4x0.4x0.3m.")
+@click.option("--volume", metavar="WxHxD|MOTION.toml", help="Seen by the cameras: 0.4x0.4x0.3m; or a motion file.")
 @click.option("--distance", metavar="LENGTH", help="From the cameras to the volume's middle: 0.8m.")
 @click.option("--speed", metavar="SPEED", help="Of the body: 0.3m/s, or 0.3m/s,20deg/s.")
 @click.option("--want", metavar="ERROR", help="What 95 % of the errors are to be within: 0.1mm, or 0.1mm,0.05deg.")
@@ -32,7 +32,7 @@ def command(path: str, run: str | None, optimise: bool, output: str | None, as_j
     """
     from armsight.app.body.draw import draw_body
     from armsight.app.budget.report import REPORT_FILES, budget_report, to_build
-    from armsight.app.budget.run import run_plan
+    from armsight.app.budget.run import motion_volume, run_plan
     from armsight.app.progress import steps
     from armsight.files import check_folder
     from armsight.sim.budget.plan import RigPlan, planned
@@ -44,6 +44,10 @@ def command(path: str, run: str | None, optimise: bool, output: str | None, as_j
         )
     if run is not None and (optimise or given["rig"]):
         raise InputError("--run has a rig of its own: give neither --rig nor --best beside it")
+    if (motion := given["volume"] or "").endswith(".toml"):
+        if not given["arm"]:
+            raise InputError(f"volume {motion}: the arm that moves so is needed, too: --arm ar4")
+        given |= motion_volume(Path(motion), given["arm"]) | ({"speed": given["speed"]} if given["speed"] else {})
     with steps() as progress:
         plan = RigPlan.read(path, **given) if run is None else run_plan(Path(run), path, **given)
         alternatives = best(plan, progress) if optimise else ()

@@ -95,11 +95,18 @@ def _compared(alternatives: Sequence[Alternative]) -> list[TextTable]:
         return []
     asked = [_asked(one.budget.plan) for one in alternatives]
     rows = tuple(
-        (each.pop("camera"), str(one.price), "ABCDEFGHIJ"[one.group], str(one.budget.moving), *map(str, each.values()))
+        (
+            each.pop("camera"),
+            str(one.price),
+            "ABCDEFGHIJ"[one.group],
+            f"{one.budget.mm:.2g}",
+            f"{one.budget.deg:.2g}",
+            *map(str, each.values()),
+        )
         for one, each in zip(alternatives, asked, strict=True)
     )
-    columns = ("camera", "price class", "group", "95 % within, in motion", *asked[0])
-    title = "the best of each class; those of one group differ by less than what the prediction may be off"
+    columns = ("camera", "price class", "group", "mm", "deg", *asked[0])
+    title = "the best of each class, 95 % in motion; those of one group differ by less than predictions are off"
     return [TextTable(title, columns, rows)]
 
 

@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from armsight.app.run.motion_file import read_motions
 from armsight.app.run.tracks import read_track
 from armsight.app.show.table import TextTable
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import parsed_json, read_text
 from armsight.geometry.pose import inverse, log_se3
+from armsight.robot.arm_file import open_arm
 from armsight.sim.budget.plan import RigPlan
 from armsight.sim.budget.result import PREDICTED
 from armsight.vision.calibrate.budget import CAUSES, Budget, pose_budget
@@ -70,14 +72,26 @@ def run_plan(folder: Path, path: str = "", **given: Any) -> RigPlan:  # noqa: AN
     T, before, _, after, _ = _poses(folder)
     rig = StereoRig.load(folder / "rig.json")
     across = view(rig, np.eye(3), np.full((3, 3), np.nan), 1.0).forward
-    deep, size = T[:, :3, 3] @ across, np.ptp(np.percentile(T[:, :3, 3], (5, 95), axis=0), axis=0)
+    deep, size = T[:, :3, 3] @ across, np.ptp(np.percentile(T[:, :3, 3], (20, 80), axis=0), axis=0)
     speed = float(np.sqrt(((after - before)[:, :3, 3] ** 2).sum(axis=1).mean())) / (2 * _STEP_S)
     measured = {
-        "volume": "x".join(f"{max(each, 1e-3):.3f}" for each in (*size[:2], np.ptp(np.percentile(deep, (5, 95))))) + "m",
+        "volume": "x".join(f"{max(each, 1e-3):.3f}" for each in (*size[:2], np.ptp(np.percentile(deep, (20, 80))))) + "m",
         "distance": f"{float(np.median(deep)):.3f}m", "speed": f"{speed:.3f}m/s",
     }  # fmt: skip
     files = {"rig": str((folder / "rig.json").resolve()), "body": str((folder / "body.toml").resolve())}
     return RigPlan.read(path, **measured | files | {key: value for key, value in given.items() if value is not None})
+
+
+def motion_volume(path: Path, model: str) -> dict[str, str]:
+    """Return the volume that a motion file's tool moves in, its wider horizontal side across, and its largest speed."""
+    arm = open_arm(model)
+    tracks = [
+        arm.forward(motion.trajectory.at(np.arange(0.0, motion.trajectory.duration_s, _STEP_S)).q)[:, :3, 3]
+        for motion in read_motions(arm, path).motions
+    ]
+    x, y, z = np.maximum(np.ptp(np.concatenate(tracks), axis=0), 1e-3)
+    speed = max(float(np.linalg.norm(np.diff(p, axis=0), axis=1).max(initial=0.0)) for p in tracks) / _STEP_S
+    return {"volume": f"{max(x, y):.3f}x{z:.3f}x{min(x, y):.3f}m", "speed": f"{speed:.3f}m/s"}
 
 
 def _poses(folder: Path) -> tuple[Array, Array, Array, Array, bool]:
@@ -110,7 +124,7 @@ def _rows_of(found: Budget, kinds: dict[str, tuple[Array, Array, str]]) -> tuple
         for cause in (c for c in found.factors if CAUSES[c].common == (share == "trueness")):
             for factor in _FACTORS:
                 C = found.cov(of=share, scaled=cause, by=factor)[which, :3, :3] + 1e-14 * np.eye(3)
-                d2 = np.einsum("ni,ni->n", e, np.linalg.solve(C, e[:, :, None])[:, :, 0])
+                d2 = np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e)
                 likely[cause, factor] = -float((d2 + np.linalg.slogdet(C)[1]).mean())
         cause, factor = max(likely, key=lambda key: likely[key])
         low, high = _FITS[share]

@@ -50,6 +50,7 @@ MOST_SQUARE_PX = (
 )
 #: Lengths that a table-top cell has, m: what lies outside is mm given as m.
 _LEAST_M, _MOST_M = 0.001, 20.0
+_MOST_OFF_M = 0.01  # m; what a print may be off; half: sagging boards are rejected, double: mm meant as um pass
 #: Shortest focal length that is chosen where none is given, image widths: 80 degrees; half: lenses that bend the image more
 #: than the model of five coefficients, double: ordinary volumes are rejected.
 _WIDEST = 0.6
@@ -238,12 +239,10 @@ class RigPlan:
 
     def _two(self, what: str, text: str, units: tuple[str, str], form: str) -> tuple[float, float]:
         """Read a length and an angle, rad; the second is 0 where it is left out."""
-        first, _, second = text.partition(",")
-        angle = re.fullmatch(rf"{_NUMBER}\s*deg{units[1]}", second.strip()) if second else None
-        plain = first.strip().removesuffix(units[0])
-        if (second and angle is None) or (units[0] and not first.strip().endswith(units[0])):
+        found = re.fullmatch(rf"{_NUMBER}\s*(um|mm|cm|m){units[0]}(?:\s*,\s*{_NUMBER}\s*deg{units[1]})?", text.strip())
+        if found is None:
             raise InputError(f"{what} {text!r}: expected {form}")
-        return length_m(plain, what), math.radians(float(angle[1])) if angle else 0.0
+        return float(found[1]) * _UNITS[found[2]], math.radians(float(found[3] or 0.0))
 
     @cached_property
     def speeds(self) -> tuple[float, float]:
@@ -254,16 +253,25 @@ class RigPlan:
         return found
 
     @cached_property
+    def handeye_errors(self) -> tuple[float, float]:
+        """Metres and rad."""
+        return self._two("handeye", self.handeye, ("", ""), "0.1mm,0.02deg")
+
+    @cached_property
     def requested(self) -> tuple[float, float] | None:
         """Metres and rad, 0 where it is not asked; None where nothing is."""
-        return self._two("want", self.want, ("", ""), "0.1mm or 0.1mm,0.05deg") if self.want else None
+        form = "0.1mm or 0.1mm,0.05deg"
+        found = self._two("want", self.want, ("", ""), form) if self.want else None
+        if found and not found[0]:
+            raise InputError(f"want {self.want!r}: no rig measures without error: expected {form}")
+        return found
 
     @cached_property
     def cameras(self) -> CameraClass:
         """The class."""
         if self.camera not in catalogue():
             near = difflib.get_close_matches(self.camera, catalogue(), 1)
-            meant = f": did you mean {near[0]}?" if near else ""
+            meant = f" (did you mean {near[0]}?)" if near else ""
             raise InputError(
                 f"camera {self.camera!r} is not in the catalogue{meant}; known are {', '.join(catalogue())}"
             )
@@ -369,10 +377,13 @@ class RigPlan:
             InputError: one line: what was found, what was expected, and the nearest that can be had.
         """
         self._check_numbers()
-        c, size, t, _, _ = self.cameras, self.size_m, self.timing, self.speeds, self.requested
+        c, size, t, _, _, _ = self.cameras, self.size_m, self.timing, self.speeds, self.requested, self.handeye_errors
         near, far = self.distance_m - size[2] / 2, self.distance_m + size[2] / 2
         for name in ("board_bent", "body_print", "body_bent"):
-            length_m(getattr(self, name), name)
+            if length_m(getattr(self, name), name) > _MOST_OFF_M:
+                raise InputError(
+                    f"{name} is {getattr(self, name)}: no print is off by more than {1e3 * _MOST_OFF_M:g} mm"
+                )
         if near < c.least_focus_m:
             raise InputError(
                 f"the lens of {c.name} does not focus nearer than {c.least_focus_m:g} m, the volume begins at {near:.2g} m"
@@ -389,12 +400,10 @@ class RigPlan:
                 f"one USB controller carries two {c.name} at {self._most_hz:.3g} Hz at most, {t['rate']:g} Hz were asked: "
                 "a lower rate_hz, or a controller each"
             )
-        if self.baseline_m > 3 * self.distance_m:
-            raise InputError(
-                f"a baseline of {self.baseline} at {self.distance}: the arm would cross it; at most {self.distance_m:g} m"
-            )
+        if self.baseline_m > (most := 2 * self.distance_m):
+            raise InputError(f"a baseline of {self.baseline_m:g} m: the arm would cross it; at most {most:g} m")
         body = np.ptp(self.layout.body.points, axis=0).max()
-        for what, extent, pixels in (("wide", size[0], width), ("high", size[1], height)):
+        for what, extent, pixels in () if self.existing else (("wide", size[0], width), ("high", size[1], height)):
             seen = near * pixels / self.focal_px
             if extent + body > seen:
                 least = (extent + body) * self.focal_px / pixels + size[2] / 2
@@ -452,7 +461,7 @@ class RigPlan:
             t["stamp"],
             speed,
             rotation,
-            self._two("handeye", self.handeye, ("", ""), "0.1mm,0.02deg") if self.arm else (0.0, 0.0),
+            self.handeye_errors if self.arm else (0.0, 0.0),
             arm,
         )
 
