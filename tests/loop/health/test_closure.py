@@ -168,10 +168,11 @@ def test_focal_lengths_that_changed_alike_are_named(seed, share, monkeypatch):
 
 
 def test_what_a_zoom_does_to_a_pose_is_what_larger_images_show():
-    """Against poses fitted to pixels, which weigh depth less than the rigid fit of points: to a quarter of the rotation."""
+    """Against poses fitted to pixels, which weigh depth less than points do and so rotate less: to 8 % of the shift."""
     seen, rng = ToolView(np.eye(4), faults.BODY.points), np.random.default_rng(7413)
     for _ in range(5):
         T = pose(exp_so3(rng.uniform(-0.6, 0.6, 3)), np.array([0.1, 0.0, 0.9]) + rng.uniform(-0.1, 0.1, 3))
         shown = faults.log_se3(faults.inverse(T) @ faults.Moved.zoomed(T, 1.001))
         (expected,) = seen.zoomed(T[None, :3, :3], T[None, :3, 3]) * 1e-3
-        assert (np.abs(expected - shown) < np.repeat([5e-5, 3e-4], 3)).all()
+        assert np.linalg.norm((expected - shown)[:3]) < 0.08 * np.linalg.norm(shown[:3])
+        assert np.linalg.norm((expected - shown)[3:]) < 5e-4
