@@ -261,3 +261,12 @@ def test_the_hub_says_what_is_wrong(tmp_path, armsight):
     assert_rejected(armsight("hub", "hold", "a", "why", "--keys", tmp_path), "no keys of a site are here")
     (tmp_path / "file").write_text("")
     assert_rejected(armsight("hub", "-o", tmp_path / "file"), "nothing can be kept here")
+
+
+def test_a_clock_that_runs_fast_is_shown_with_its_rate():
+    cell = connected("a", 1000.0)
+    for k in range(1, 400):
+        cell.take(state(1000.0 + k * 1.0001 + 0.5), 1000.0 + k)
+    shown = cell.to_json(1400.0)
+    assert shown["clock_s"] == pytest.approx(0.54, abs=0.001)
+    assert shown["clock_s_per_h"] == pytest.approx(0.36, rel=0.01)

@@ -103,7 +103,7 @@ def found_recordings(patterns: Sequence[str]) -> dict[str, str]:
         try:
             fs, path = fsspec.core.url_to_fs(os.path.expanduser(pattern))
             names: dict[str, dict[str, Any]] = fs.glob(path, detail=True)
-        except (OSError, ValueError, ImportError) as error:
+        except Exception as error:  # noqa: BLE001 - a store's library has errors of its own
             raise InputError(f"{pattern}: cannot be searched: {error}") from None
         if not names:
             raise InputError(f"{pattern}: no such recording; quote the pattern to keep the shell off it")

@@ -35,6 +35,8 @@ DRIFTS = {
     "tilt_mdeg": ("mdeg", "one camera rotates against the other"),
     "size_ppm": ("ppm", "the body seems to change its size"),
 }
+#: What the slopes of a cell's clock are kept as.
+_CLOCK = "clock_s"
 #: How much somebody should look.
 ENDED, WELL, LOOK, DRIFTING, FINDING, LOST = range(-1, 5)
 
@@ -55,7 +57,7 @@ class CellView:
     offset_s: float = math.nan  # its clock less the hub's
     rejected: int = 0
     why_rejected: str = ""
-    slopes: dict[str, Slopes] = field(default_factory=lambda: {key: Slopes() for key in DRIFTS})
+    slopes: dict[str, Slopes] = field(default_factory=lambda: {key: Slopes() for key in (*DRIFTS, _CLOCK)})
     drifts: dict[str, Drift] = field(default_factory=dict)
     day: dict[int, float] = field(default_factory=dict)  # number of the bar -> largest error, mm
     _block: tuple[int, dict[str, list[float]]] = field(default_factory=lambda: (0, {}))
@@ -106,9 +108,9 @@ class CellView:
             for key, values in sums.items():
                 self.slopes[key].add((number + 0.5) * BLOCK_S, float(np.mean(values)))
             self._block = now, (sums := {})
-        for key in DRIFTS:
-            if row[key] is not None:
-                sums.setdefault(key, []).append(row[key])
+        for key, value in [(_CLOCK, self.offset_s), *((key, row[key]) for key in DRIFTS)]:
+            if value is not None:
+                sums.setdefault(key, []).append(value)
 
     def need(self, now_s: float) -> tuple[int, float, str]:
         """Return how much somebody should look, how far beyond it is within that, and why in words."""
@@ -168,6 +170,7 @@ class CellView:
             "alive_s": round(now_s - self.alive_s) if self.sessions else None,
             "state_age_s": round(now_s - self.state_s, 1) if self.state_s else None,
             "clock_s": None if math.isnan(self.offset_s) else round(self.offset_s, 3),
+            "clock_s_per_h": self.slopes[_CLOCK].per_h(),
             "day": [[bar - first, round(error, 4)] for bar, error in sorted(self.day.items()) if bar >= first],
         }
 

@@ -67,8 +67,9 @@ def push(cell: Cell, folder: Path, store: str, rate_mb_s: float, advance: Callab
         return done
     except (ImportError, ValueError) as error:
         raise InputError(f"{store}: {error}") from None
-    except OSError as error:
-        raise ArmsightError(f"{store}: {error.strerror or error}; started again it goes on where it was") from None
+    except Exception as error:  # noqa: BLE001 - a store's library has errors of its own; our own code has its tests
+        why = error.strerror if isinstance(error, OSError) else None
+        raise ArmsightError(f"{store}: {why or error}; started again it goes on where it was") from None
     finally:
         resting.close()
 
