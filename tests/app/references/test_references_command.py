@@ -67,6 +67,8 @@ def test_check_says_rate_gap_and_noise_beside_that_of_the_class(sweep, capsys):
     assert found["rest_s"] == pytest.approx(3.0, abs=0.5)
     # 0.02 m/s2 at 50 Hz is 0.0028 m/s2/sqrt(Hz); 0.0039 is usual.
     assert found["accelerometer"]["noise_over_class"] == pytest.approx(0.72, rel=0.25)
+    assert np.mean(found["accelerometer"]["random_walk_m_s_per_sqrt_s"]) == pytest.approx(0.0028, rel=0.25)
+    assert found["settling"] is None
     run("references", "check", folder / "references.toml")
     assert capsys.readouterr().out.startswith("Good: what was recorded is as its class is")
 

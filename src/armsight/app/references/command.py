@@ -29,6 +29,11 @@ DELAY_S = 0.5
 #: Errors of times left out, over their sigma, up to which a calibration is good; half: chance is a fault, double: looseness
 #: is none.
 HONEST = 1.5
+#: Units of the Allan deviation's coefficients, in keys of JSON.
+ALLAN = {
+    "gyro": ("rad", "rad_per_sqrt_s", "rad_s", "rad_s_per_sqrt_s", "rad_s2"),
+    "accelerometer": ("m_s", "m_s_per_sqrt_s", "m_s2", "m_s2_per_sqrt_s", "m_s3"),
+}
 UNITS = {"gyro": "rad_s", "accelerometer": "m_s2"}  # in keys of JSON
 
 
@@ -183,7 +188,7 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     from armsight.errors import InputError
     from armsight.loop.references.inertial import INERTIAL_CLASSES
     from armsight.loop.references.reference import STANDARD_GRAVITY_M_S2
-    from armsight.loop.references.stream import allan, check_stream, coefficients
+    from armsight.loop.references.stream import allan, check_stream, coefficients, settling
 
     source, t_s, z = _recording(entry)
     name, stream = entry.reference.name, check_stream(t_s, z, str(source))
@@ -221,6 +226,14 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     if abs(force / STANDARD_GRAVITY_M_S2 - 1.0) > UNIT:
         weak.append(f"{name}: gravity is {force:.3g} m/s2 at rest")
     values["gravity_m_s2"] = force
+    settled = settling(t_s, z[:, 3:], stream.rests)
+    values["settling"] = None if settled is None else settled._asdict()
+    if settled is not None:
+        lines.append(
+            f"{name}: after {settled.stops} stops the tool vibrates by {1e3 * settled.amplitude_m:.2g} mm at "
+            f"{settled.frequency_hz:.3g} Hz, damped by {settled.damping:.2g} of critical, and settles in "
+            f"{settled.time_s:.2f} s"
+        )
     tau, variance, freedom = allan(rest, 1.0 / stream.rate_hz)
     c = INERTIAL_CLASSES[entry.sensor_class]
     for sensor, rows, usual, unit in (
@@ -228,8 +241,9 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
         ("accelerometer", slice(3, 6), c.noise, "m/s2"),
     ):
         each = [coefficients(tau, column, freedom) for column in variance[:, rows].T]
-        values[sensor] = {key: [one[key] for one in each] for key in each[0]}
-        density = float(np.sqrt(np.mean(np.square(values[sensor]["random_walk"]))))
+        units = dict(zip(each[0], ALLAN[sensor], strict=True))
+        values[sensor] = {f"{key}_{units[key]}": [one[key] for one in each] for key in units}
+        density = float(np.sqrt(np.mean([one["random_walk"] ** 2 for one in each])))
         ratio = density / usual
         values[sensor]["noise_over_class"] = ratio
         lines.append(

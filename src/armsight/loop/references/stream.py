@@ -1,17 +1,19 @@
 """A sensor's stream before anything is calibrated: its clock, its gaps, values that are stuck, and its noise at rest.
 
-In: times and values of a recording. Out: what is wrong with them, and the Allan deviation with its five coefficients (IEEE
-Std 952-1997, annex C; overlapping estimate: Riley, NIST SP 1065, 2008).
+In: times and values of a recording. Out: what is wrong with them, the Allan deviation with its five coefficients (IEEE Std
+952-1997, annex C; overlapping estimate: Riley, NIST SP 1065, 2008), and how a tool settles after it has stopped: a decaying
+vibration of all axes of the accelerometer, its linear part eliminated (Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
+from scipy.optimize import least_squares, nnls
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
@@ -26,6 +28,14 @@ SATURATED = 5
 BLOCK_S, QUIET, REST_S = 0.25, 2.0, 1.0
 #: Means of neighbouring blocks of a rest differ by at most so many sigmas of chance.
 STEADY = 6.0
+#: A stop is looked for so long before a rest, s, in such steps, s; half: slow vibration is missed, double: slower.
+STOP_S, STEP_S = 1.5, 0.005
+#: A vibration leaves so much of itself at most, or so many times the noise; half: a second mode hides the first.
+LEAVES, NOISE = 0.08, 1.5
+#: What is damped more than this, of critical, is no vibration but how a motion ends.
+MOST_DAMPED = 0.3
+#: A tool has settled where the vibration's amplitude is below this, m.
+SETTLED_M = 2e-5
 #: Averaging times of the Allan deviation, a decade, and the share of the recording that is the longest.
 A_DECADE, LONGEST = 8, 0.2
 #: The coefficients: name -> its share of the Allan variance at an averaging time.
@@ -49,8 +59,8 @@ class StreamCheck(Record):
         longest_gap_s: the longest pause, s.
         doubled: share of the rows that repeat the row before.
         frozen_s: the longest time in which no column changed, s.
-        saturated: columns that stand at their greatest or least value for a while.
-        rest: rows of the longest rest; empty where there is none.
+        saturated: columns that stand at their greatest or least value for a while, and no coarse step apart from the next.
+        rests: rows of the rests; empty where there are none.
     """
 
     rate_hz: float
@@ -60,7 +70,30 @@ class StreamCheck(Record):
     doubled: float
     frozen_s: float
     saturated: tuple[int, ...]
-    rest: slice
+    rests: tuple[slice, ...]
+
+    @property
+    def rest(self) -> slice:
+        """Rows of the longest rest; none where there are none."""
+        return max(self.rests, key=lambda rows: rows.stop - rows.start, default=slice(0, 0))
+
+
+class Settling(NamedTuple):
+    """How a tool settles after its stops, the median of them.
+
+    Attributes:
+        stops: after which a vibration was seen.
+        frequency_hz: of it.
+        damping: of critical.
+        amplitude_m: of the displacement right after the stop.
+        time_s: from the stop until the amplitude is below ``SETTLED_M``.
+    """
+
+    stops: int
+    frequency_hz: float
+    damping: float
+    amplitude_m: float
+    time_s: float
 
 
 def check_stream(t_s: Array, z: Array, source: str) -> StreamCheck:
@@ -90,8 +123,7 @@ def check_stream(t_s: Array, z: Array, source: str) -> StreamCheck:
     if period <= 0.0:
         raise InputError(f"{source}: all readings have the time {t_s[0]:.3f} s")
     same = (np.diff(z, axis=0) == 0.0).all(axis=1)
-    ends = [max(_longest(column == column.max()), _longest(column == column.min())) for column in z.T]
-    saturated = tuple(k for k, run in enumerate(ends) if run >= SATURATED and np.ptp(z[:, k]) > 0.0)
+    saturated = tuple(k for k, column in enumerate(z.T) if _saturated(column))
     low, high = np.quantile(steps, [0.16, 0.84])
     pauses = steps > GAP * period
     frozen = _longest(same)
@@ -103,8 +135,20 @@ def check_stream(t_s: Array, z: Array, source: str) -> StreamCheck:
         float(same.mean()),
         frozen * period if frozen >= FROZEN else 0.0,
         saturated,
-        _rest(z, period),
+        _rests(z, period),
     )
+
+
+def _saturated(column: Array) -> bool:
+    """Return whether a column (N,) stands at its greatest or least value more often than next to it: its range ends there.
+
+    Of a coarse column at rest the values next to the last one are as frequent.
+    """
+    values, counts = np.unique(column, return_counts=True)
+    if len(values) < 4:
+        return False
+    ends = ((values[0], counts[0], counts[1:3]), (values[-1], counts[-1], counts[-3:-1]))
+    return any(count > beside.sum() and _longest(column == value) >= SATURATED for value, count, beside in ends)
 
 
 def _longest(flags: NDArray[np.bool_]) -> int:
@@ -113,18 +157,18 @@ def _longest(flags: NDArray[np.bool_]) -> int:
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
-def _rest(z: Array, period: float) -> slice:
-    """Return the rows of the longest rest."""
+def _rests(z: Array, period: float) -> tuple[slice, ...]:
+    """Return the rows of the rests."""
     size = max(round(BLOCK_S / period), 4)
     count = len(z) // size
     if count < 2:
-        return slice(0, 0)
+        return ()
     blocks = z[: count * size].reshape(count, size, -1)
     spread, means = blocks.std(axis=1), blocks.mean(axis=1)
     typical = np.maximum(np.quantile(spread, 0.2, axis=0), 1e-12)
     quiet = (spread <= QUIET * typical).all(axis=1)
     steady = (np.abs(np.diff(means, axis=0)) <= STEADY * typical * np.sqrt(2.0 / size)).all(axis=1)
-    runs, begin = [(0, 0)], None
+    runs, begin = list[tuple[int, int]](), None
     for k in range(count + 1):
         if k < count and quiet[k] and (begin is None or steady[k - 1]):
             begin = k if begin is None else begin
@@ -132,8 +176,68 @@ def _rest(z: Array, period: float) -> slice:
         if begin is not None:
             runs.append((begin, k))
         begin = k if k < count and quiet[k] else None
-    first, end = max(runs, key=lambda run: run[1] - run[0])
-    return slice(first * size, end * size) if (end - first) * size * period >= REST_S else slice(0, 0)
+    return tuple(slice(a * size, b * size) for a, b in runs if (b - a) * size * period >= REST_S)
+
+
+def settling(t_s: Array, force: Array, rests: Sequence[slice]) -> Settling | None:
+    """Return how a tool settles by specific forces (N, 3), m/s2, at times (N,), s, before rests; None: nothing is seen."""
+    found = [one for rest in rests if rest.start and (one := _stop(t_s, force, rest)) is not None]
+    if not found:
+        return None
+    frequency, damping, amplitude, time = np.median(np.array(found), axis=0)
+    return Settling(len(found), float(frequency), float(damping), float(amplitude), float(time))
+
+
+def _stop(t_s: Array, force: Array, rest: slice) -> tuple[float, float, float, float] | None:
+    """Return frequency, Hz, damping, amplitude, m, and settling time, s, of a vibration before a rest; None without one."""
+    noise = force[rest].std(axis=0, ddof=1)
+    step = max(round(STEP_S * (rest.stop - rest.start) / (t_s[rest.stop - 1] - t_s[rest.start])), 1)
+    end = min(rest.start + 50 * step, rest.stop)
+    first = max(rest.start - round(STOP_S / STEP_S) * step, 0)
+    best, start = None, None
+    for begin in range(rest.start - 2 * step, first, -step):
+        t, f = t_s[begin:end] - t_s[begin], force[begin:end]
+        one = _vibration(t, f, start)
+        if one is None:
+            break
+        found, amplitude, left = one
+        start = found if np.linalg.norm(amplitude) > STEADY * noise.max() else None
+        if (left > np.maximum(NOISE * noise, LEAVES * np.linalg.norm(amplitude))).any():
+            break
+        best = found, float(np.linalg.norm(amplitude))
+    if best is None or start is None:
+        return None
+    (speed, decay), amplitude_m_s2 = best
+    natural = float(np.hypot(speed, decay))
+    amplitude_m = amplitude_m_s2 / natural**2
+    return natural / (2 * np.pi), decay / natural, amplitude_m, max(float(np.log(amplitude_m / SETTLED_M)) / decay, 0.0)
+
+
+def _vibration(
+    t: Array, f: Array, start: tuple[float, float] | None
+) -> tuple[tuple[float, float], Array, Array] | None:
+    """Return rad/s and decay, 1/s, of a vibration in columns (N, 3), amplitudes at its begin and what it leaves (3,)."""
+    if start is None:
+        power = (np.abs(np.fft.rfft((f - f.mean(axis=0)) * np.hanning(len(t))[:, None], axis=0)) ** 2).sum(axis=1)
+        k = int(power[1:].argmax()) + 1
+        start = 2 * np.pi * k / (t[-1] - t[0]), 0.3 * k / (t[-1] - t[0])
+
+    def parts(p: Array) -> tuple[Array, Array]:
+        speed, decay = np.exp(p)
+        fall = np.exp(-decay * t)
+        by = np.column_stack([fall * np.cos(speed * t), fall * np.sin(speed * t), np.ones_like(t)])
+        factors, *_ = np.linalg.lstsq(by, f, rcond=None)
+        return f - by @ factors, factors
+
+    def residuals(p: Array) -> Array:
+        return parts(p)[0].ravel()
+
+    got = least_squares(residuals, np.log(start), max_nfev=30).x
+    speed, decay = map(float, np.exp(got))
+    if decay > MOST_DAMPED * speed or not 2 * np.pi < speed * t[-1] < np.pi * (len(t) - 1):  # a period at least
+        return None
+    left, factors = parts(got)
+    return (speed, decay), np.hypot(factors[0], factors[1]), left.std(axis=0)
 
 
 def allan(z: Array, period_s: float) -> tuple[Array, Array, Array]:
