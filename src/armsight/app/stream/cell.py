@@ -234,27 +234,26 @@ class CellSink(Sink):
 
     def _posting(self) -> None:
         """Reach the hub, again and again, and have events stored; in a thread of its own."""
-        said, reached = False, 0.0
+        unheard_s, notes = math.inf, set[str]()
+
+        def note(text: str) -> None:
+            if text not in notes:
+                notes.add(text)
+                click.echo(f"note: --cell {self._cell.name}: {text}; its events are kept and sent later", err=True)
+
         while True:
             ending = self._ending.wait(_POST_S)
             if self._session is None:
                 try:
                     self._open()
                 except Exception:  # noqa: BLE001 - of the library: whatever it is, it is tried again
-                    if not said:
-                        said = True
-                        kept = "its events are kept and sent later"
-                        click.echo(
-                            f"note: --cell {self._cell.name}: no hub answers at {self._cell.router}; {kept}", err=True
-                        )
-                else:
-                    reached = time.monotonic()
-            if self._session is not None and not self._send_events() and time.monotonic() - reached > _UNHEARD_S:
-                reached = math.inf  # said once
-                hint = (
-                    "its certificate is of another name, or the hub's disk is full" if self._cell.ca else "is it full?"
-                )
-                click.echo(f"note: --cell {self._cell.name}: the hub stores no events of it: {hint}", err=True)
+                    note(f"no hub answers at {self._cell.router}")
+            if self._session is not None:
+                heard = self._send_events() or not self._session.info.routers_zid()
+                unheard_s = math.inf if heard else min(unheard_s, time.monotonic())
+                if time.monotonic() - unheard_s > _UNHEARD_S:
+                    why = "" if self._cell.ca is None else "its certificate is of another name, or "
+                    note(f"the hub stores no events of it: {why}the hub's disk is full")
             if ending:
                 return
 
