@@ -10,9 +10,10 @@ from scipy.special import chdtri
 
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
-from armsight.loop.estimators import Innovation, Outcome, Prior
+from armsight.loop.estimators import Innovation, Outcome, PoseMeasurement, Prior
 from armsight.loop.estimators.armerror import layout
 from armsight.loop.estimators.errormodel import ErrorModel
+from armsight.loop.health import HealthMonitor
 from armsight.loop.health.change import ToolView, finding
 from armsight.loop.health.closure import ClosureWatch
 from armsight.loop.servo import Mode
@@ -176,3 +177,17 @@ def test_what_a_zoom_does_to_a_pose_is_what_larger_images_show():
         (expected,) = seen.zoomed(T[None, :3, :3], T[None, :3, 3]) * 1e-3
         assert np.linalg.norm((expected - shown)[:3]) < 0.08 * np.linalg.norm(shown[:3])
         assert np.linalg.norm((expected - shown)[3:]) < 5e-4
+
+
+def test_a_change_that_is_certain_but_too_small_to_be_reported_widens_poses():
+    watch, monitor = (
+        watched(11, "bend", np.radians([0.04, 0.0, 0.0, 0.0])),
+        HealthMonitor(faults.TRUE, faults.BODY, 0.0),
+    )
+    pose_seen = PoseMeasurement(44.0, ARM.forward(ARM.home), 1e-10 * np.eye(6), np.zeros((6, 6)))
+    assert monitor.suspected(pose_seen) is None
+    monitor._closure = watch
+    assert (watch.changes, monitor.findings()) == ((), ())
+    down = ARM.forward(ARM.home)[:3, :3].T @ [0.0, 0.0, -1.0]
+    off = np.append(np.zeros(3), np.radians(0.04) * np.cross([1.0, 0.0, 0.0], down))
+    assert 0.1 < off @ np.linalg.solve(monitor.suspected(pose_seen), off) < 12.0

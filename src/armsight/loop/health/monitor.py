@@ -420,8 +420,10 @@ class HealthMonitor:
 
     @property
     def _widening(self) -> tuple[Change, ...]:
-        """What widens poses now."""
-        return self.changes if self._shakes.change is None else (*self.changes, self._shakes.change)
+        """What widens poses now: what is certain, also where it is smaller than is reported."""
+        small = () if self._closure is None or self._clocks(self._closure.explained) else self._closure.explained
+        changes = self.changes or small
+        return changes if self._shakes.change is None else (*changes, self._shakes.change)
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
