@@ -128,6 +128,7 @@ def test_what_failed_is_tried_again_and_makes_the_exit_code_1(armsight, tmp_path
         done = armsight(*arguments)
         assert done.code == 1, done.err
         assert "2 recordings: 0 done, 0 of them before, 2 failed" in done.out
+        assert "  failed 2 times: " in done.out
         assert list((tmp_path / "out" / "parts").iterdir()) == []
     assert (tmp_path / "out" / "recordings.parquet").is_file()
 

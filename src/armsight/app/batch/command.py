@@ -9,6 +9,7 @@ import click
 
 OPERATIONS = ("measure", "replay", "identify", "check")
 REPORT = "report"
+_REASONS = 3  # why recordings failed, on the terminal; half: a second mistake is not seen, double: a long list
 
 
 @click.command("batch")
@@ -65,9 +66,13 @@ def command(
         click.echo(json.dumps(done.to_json()))
     else:
         click.echo(
-            f"{done.recordings} recordings: {done.ok} done, {done.before} of them before, {done.failed} failed (their rows "
-            f"have the reasons; started again they are tried again); {done.shots} shots; written to {output}"
+            f"{done.recordings} recordings: {done.ok} done, {done.before} of them before, {done.failed} failed; "
+            f"{done.shots} shots; written to {output}"
         )
+        for reason, count in list(done.reasons.items())[:_REASONS]:
+            click.echo(f"  failed {count} times: {reason}")
+        if done.failed:
+            click.echo(f"  {output}/recordings.parquet has every reason; started again, the batch tries these again")
     if done.failed:
         click.get_current_context().exit(1)
 

@@ -13,6 +13,7 @@ import hashlib
 import json
 import logging
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -64,6 +65,7 @@ class BatchDone:
         failed: how many failed.
         before: how many were done before the batch was started again.
         shots: how many shots they have.
+        reasons: why recordings failed, and how many each, the most frequent first.
     """
 
     recordings: int
@@ -71,8 +73,9 @@ class BatchDone:
     failed: int
     before: int
     shots: int
+    reasons: dict[str, int]
 
-    def to_json(self) -> dict[str, int]:
+    def to_json(self) -> dict[str, Any]:
         """Return it as JSON."""
         return asdict(self)
 
@@ -168,7 +171,9 @@ def run_batch(batch: Batch, say: Callable[[str], None]) -> BatchDone:
                 advance()
     recordings, shots = _write(batch.output, [failed.get(path, parts / keys[path]) for path in paths])
     ok = sum(row["status"] == "ok" for row in recordings)
-    return BatchDone(len(paths), ok, len(paths) - ok, len(paths) - len(left), shots)
+    why = (str(row["reason"]).removeprefix(f"{row['recording']}: ") for row in recordings if row["status"] != "ok")
+    reasons = Counter(why)
+    return BatchDone(len(paths), ok, len(paths) - ok, len(paths) - len(left), shots, dict(reasons.most_common()))
 
 
 def _opened_target(spec: str) -> object:
