@@ -256,8 +256,11 @@ def test_the_arm_is_found_alone_by_a_moved_joint_or_by_its_cable():
                 threading.Timer(0.5, lambda: bus.servos.push(2, 0.3)).start()
 
         assert find_board(pushed, lambda: both) == f"feetech:{servos.name}"
-        looks = iter([both, both])
-        assert find_board(said.append, lambda: next(looks, both[:1])) == f"ar4:{other.name}"
+        looks = iter(
+            [both, both, *[both[:1]] * 3]
+        )  # the second arm is unplugged while they are watched, and comes back
+        assert find_board(said.append, lambda: next(looks, both)) == f"ar4:{other.name}"
+        assert said[-1] == "Plug the arm's USB cable in again."
         looks = iter([[], [], []])
         assert find_board(said.append, lambda: next(looks, [other.name])) == f"ar4:{other.name}"
     assert "2 arms answer: move a joint of yours by hand, or unplug it." in said

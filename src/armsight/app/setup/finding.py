@@ -142,7 +142,7 @@ def find_board(say: Callable[[str], None], ports: Callable[[], Sequence[str]] = 
     try:
         if len(found) > 1:
             say(f"{len(found)} arms answer: move a joint of yours by hand, or unplug it.")
-            return _moved(found, lambda: set(there) - set(ports()))
+            return _back(_moved(found, lambda: set(there) - set(ports())), say, ports)
     finally:
         for board in found.values():
             board.close()
@@ -153,6 +153,16 @@ def find_board(say: Callable[[str], None], ports: Callable[[], Sequence[str]] = 
         raise DeviceError(f"{port}: nothing answers: is the arm switched on?")
     plugged[1].close()
     return plugged[0]
+
+
+def _back(name: str, say: Callable[[str], None], ports: Callable[[], Sequence[str]]) -> str:
+    """Return the name of a board once it is plugged in, with the port that it then has."""
+    kind, _, port = name.partition(":")
+    there = set(ports())
+    if port not in there:
+        say("Plug the arm's USB cable in again.")
+        port = (_other(there, ports, gone=False) - there).pop()
+    return f"{kind}:{port}"
 
 
 def _moved(boards: dict[str, MotionBoard], gone: Callable[[], set[str]]) -> str:
