@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from armsight.app.live.quality import (
+from armsight.app.live.cameras import (
     FlickerWatch,
     ImageQuality,
     edge_spread_px,

@@ -19,9 +19,9 @@ import numpy as np
 
 from armsight.app.calibrate.assessment import advice, assess, graded_metrics
 from armsight.app.calibrate.run import provenance
+from armsight.app.live.cameras import SHARP_PX, edge_spread_px
 from armsight.app.live.capture import LiveShot
 from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, NextPose, guessed_camera, guessed_rig
-from armsight.app.live.quality import SHARP_PX, edge_spread_px
 from armsight.app.live.records import Drawn, asked, dots, polyline
 from armsight.app.live.step import Guided, GuidedState, Shared
 from armsight.app.record.recording import ShotFolder
