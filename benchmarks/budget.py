@@ -4,6 +4,7 @@
     python benchmarks/budget.py page      # docs/buying.md
     python benchmarks/budget.py changes   # the first and second thing to improve, done: gain promised and measured
     python benchmarks/budget.py best      # the optimised rig against the default one, and against scipy's optimiser
+    python benchmarks/budget.py real      # real sets: a held-out board, from class, board and number of pairs
     python benchmarks/budget.py peers     # the makers' formula and a plain Monte Carlo beside the budget
 
 Each group of shots has a calibration, a print of body and board, and a warming of its own; each shot a position, a rotation
@@ -25,9 +26,10 @@ import armsight
 from armsight.data import Array, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.files import write_text
-from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
+from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
+from armsight.geometry.rigid import fit_rigid
 from armsight.sim.budget.chart import marker_noise
-from armsight.sim.budget.plan import RigPlan, length_m, planned
+from armsight.sim.budget.plan import MOST_SQUARE_PX, RigPlan, catalogue, length_m, planned
 from armsight.sim.budget.result import BOUNDS, CHANGES, RigBudget, best
 from armsight.sim.camera.pipeline import SimulatedCamera
 from armsight.sim.example_rig import board_poses
@@ -43,6 +45,7 @@ from armsight.vision.pose.measure import measure
 from armsight.vision.pose.posefit import PixelObservations, fit_pose
 from armsight.vision.pose.predict import face_axes, view
 from armsight.vision.rig import StereoRig
+from armsight.vision.triangulate import optimal_points
 
 RIGS = {
     "cheap, 60 mm": {"camera": "webcam-720p-cheap", "baseline": "60mm", "distance": "0.6m", "speed": "0.05m/s"},
@@ -307,6 +310,42 @@ def drawn(plan: RigPlan, count: int, rng: np.random.Generator) -> Array:
     return np.array(errors)
 
 
+#: Real set -> class of its cameras, image, board, pairs that are fitted, held-out rigid RMS of `calibration.py 1`, mm.
+SETS = {
+    "webcams-360p": ("webcam-720p", (640, 360), "chessboard:9x6:24.23mm", 15, 0.465),
+    "opencv-480p": ("global-shutter-1mp", (640, 480), "chessboard:9x6:25mm", 7, 0.215),
+    "stereopi-240p": ("webcam-720p", (320, 240), "chessboard:9x6:25mm", 15, 0.622),
+}
+
+
+def real(options: argparse.Namespace) -> None:
+    """Print the rigid RMS of a held-out board, predicted from class, board and number of pairs, over the measured."""
+    rng = np.random.default_rng(options.seed)
+    for name, (kind, size, spec, pairs, measured_mm) in SETS.items():
+        catalogue()[name] = replace(catalogue()[kind], image_size_px=size)
+        plan = RigPlan(volume="0.01x0.01x0.01m", distance="0.5m", camera=name, baseline="94mm", board=spec, pairs=pairs,
+                       body_scale=4.0, focal_widths=catalogue()[kind].focal_widths)  # fmt: skip
+        rig, board = plan.stereo_rig, open_board(spec)
+        drawing, cov = board.body.points, plan.conditions().cov_calibration
+        Ts = board_poses(rng, rig, chessboard(board.columns, board.rows, board.square_m), 20)
+        px = board.square_m * plan.focal_px / float(np.median(Ts[:, 2, 3]))
+        noise = marker_noise(plan.pipeline, "chessboard", min(px, MOST_SQUARE_PX))
+        model, square = printed_board(drawing), []
+        for T in Ts:
+            wrong = rig.perturbed(rng.multivariate_normal(np.zeros(len(cov)), cov))
+            bent = model.body(
+                length_m(plan.board_bent, "bent")
+                * np.sqrt(3 / len(model.modes))
+                * rng.standard_normal(len(model.modes))
+            )
+            uv = np.stack(rig.project(bent @ T[:3, :3].T + T[:3, 3]), axis=1)
+            uv += noise * rng.standard_normal(uv.shape)
+            p, _, _ = optimal_points(wrong, uv, np.tile(noise**2 * np.eye(2), (len(uv), 2, 1, 1)))
+            square.append(((p - transform(fit_rigid(drawing, p), drawing)) ** 2).sum(axis=1).mean())
+        rms = 1e3 * float(np.sqrt(np.mean(square)))
+        print(f"{name:16} corners {noise:.3f} px: {rms:.3f} mm, measured {measured_mm} mm: {rms / measured_mm:.2f}")
+
+
 def peers(options: argparse.Namespace) -> None:
     """Print the makers' formula, half a pixel times D^2 / (b f), and a plain Monte Carlo over the budget's RMS."""
     far, near = 0, []
@@ -330,7 +369,7 @@ def peers(options: argparse.Namespace) -> None:
 def main() -> None:
     """Print predicted over measured for each rig."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", nargs="?", default="rigs", choices=["rigs", "page", "changes", "best", "peers"])
+    parser.add_argument("what", nargs="?", default="rigs", choices=["rigs", "page", "changes", "best", "peers", "real"])
     parser.add_argument("--groups", type=int, default=16)
     parser.add_argument("--shots", type=int, default=2)
     parser.add_argument("--seed", type=int, default=9100)
@@ -340,7 +379,7 @@ def main() -> None:
         write_text(PAGE, buying_page())
         return
     if options.what != "rigs":
-        {"changes": changes_done, "best": best_done, "peers": peers}[options.what](options)
+        {"changes": changes_done, "best": best_done, "peers": peers, "real": real}[options.what](options)
         return
     good, inside = 0, []
     print("rig                     shots missed  measured mm   deg  predicted/measured mm  deg  in 95 % ellipsoids")
