@@ -76,7 +76,7 @@ _HERE = ("127.0.0.1", "localhost", "::1")
 def command(host: str, port: int, sync_ms: float, as_json: bool, **given: Any) -> None:  # noqa: ANN401 - options' fields
     """Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.
 
-    The steps: cameras, board, calibration, body, measuring, arm, health; each shows the command line that does the same.
+    The steps: cameras, board, calibration, body, measuring, arm, recorded, health; each shows its command line.
 
     The page is for this computer alone. With --host it is opened from another one, by the address with the token that is
     printed. The button on the page and the space key stop the arm; the wired stop is the safety device.
