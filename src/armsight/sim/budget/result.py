@@ -281,9 +281,14 @@ def chosen(alternatives: tuple[Alternative, ...]) -> RigBudget:
     return enough[0] if enough else min((one.budget for one in alternatives), key=lambda one: _loss(one.plan))
 
 
+def _fixed(plan: RigPlan) -> set[str]:
+    """Return what the search leaves: what is named, a body of its own, and a lens that came with the camera."""
+    return {*plan.named, *(("body_scale",) if plan.body else ()), *(("focal_widths",) if plan.cameras.focus_m else ())}
+
+
 def _searched(plan: RigPlan) -> RigPlan:
     """Return a plan by a pattern search over what is free (Hooke and Jeeves 1961), of the start that can be built."""
-    fixed = {*plan.named, *(("body_scale",) if plan.body else ()), *(("focal_widths",) if plan.cameras.focus_m else ())}
+    fixed = _fixed(plan)
     free = [key for key in BOUNDS if key not in fixed]
 
     def changed(now: RigPlan, key: str, by: float) -> RigPlan:
