@@ -1,6 +1,7 @@
 """References beside vision: what they are worth, in the simulated workcell and on public recordings.
 
 python references.py hidden [N]     body hidden for 0.5, 2, 5 s on the circle, N worn arms (10), joints alone: a minute each
+python references.py fused [N]      the same with an inertial unit, as replay --references fuses it, seeds from 4 on (4)
 python references.py tilt [N]       base's tilt and the zeros that gravity shows, N simulated worn arms (40): a minute
 python references.py gravity        direction of gravity at rest, arm-imu, each rest left out of the fit: two minutes
 
@@ -11,21 +12,26 @@ import os
 import sys
 import tempfile
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from armsight.app.demo import demo
+from armsight.app.demo.studies import true_track
+from armsight.app.replay.open import Request, replay
 from armsight.app.run.experiment import run_experiment
 from armsight.app.run.metrics import track_metrics
 from armsight.app.run.tracks import Tracks
-from armsight.geometry.rotation import from_quaternion_wxyz
+from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
+from armsight.geometry.rotation import exp_so3, from_quaternion_wxyz
 from armsight.loop.identify.gravity import gravity_shows
 from armsight.loop.references.calibrate import PosePath, calibrate
-from armsight.loop.references.inertial import ACCELEROMETER, GYRO, Inertial
+from armsight.loop.references.file import INERTIAL_COLUMNS, Entry, written
+from armsight.loop.references.inertial import ACCELEROMETER, GYRO, INERTIAL_CLASSES, Inertial
 from armsight.loop.references.reference import STANDARD_GRAVITY_M_S2, Reading, ToolMotion
+from armsight.sim.references.inertial import InertialErrors, record
 from armsight.sim.workcell.workcell import Workcell
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "loop"))
@@ -39,6 +45,16 @@ DATA = Path(os.environ.get("ARMSIGHT_DATA", Path(__file__).resolve().parents[1] 
 LEFT = np.full(38, 1e-9)
 LEFT[:3], LEFT[9:12], LEFT[12:18], LEFT[36:] = np.radians(0.05), 0.01, 5e-4, np.radians(5.0)
 RESTS = 120
+#: What a sweep leaves of a unit's parameters: rotation, lever, biases, M_a, M_g, G, the base's tilt; and its delay, s.
+SWEPT = np.repeat([8e-4, 5e-4, 2e-4, 5e-3, 5e-4, 5e-4, 2e-5, 3e-4], [3, 3, 3, 3, 6, 9, 9, 2])
+SWEPT_S, MOUNT = 2e-4, exp_se3(np.array([0.02, -0.015, -0.03, 0.3, -0.2, 1.0]))
+#: How the file may be wrong beyond its covariance: a step of the parameters, and of the delay, s.
+WRONG = {
+    "": (np.zeros(38), 0.0),
+    "mount off by 0.5 deg": (np.append(np.radians([0.5, 0, 0]), np.zeros(35)), 0.0),
+    "clock off by 2 ms": (np.zeros(38), 2e-3),
+    "scale off by 1 %": (np.isin(np.arange(38), [12, 15, 17, 18, 22, 26]) * 0.01, 0.0),
+}
 
 
 def circles(path: Path) -> Path:
@@ -50,8 +66,8 @@ def circles(path: Path) -> Path:
     return path
 
 
-def hidden_run(seed: int, folder: Path) -> dict[str, tuple[float, float]]:
-    """Run a worn arm; return RMS and largest error, mm, of the estimates while the body was hidden."""
+def hidden_run(seed: int, folder: Path) -> tuple[dict[str, tuple[float, float]], list[tuple[float, float]]]:
+    """Run a worn arm; return RMS and largest error, mm, of the estimates while the body was hidden, and when that was."""
     found: dict[str, tuple[float, float]] = {}
     spans: list[tuple[float, float]] = []
 
@@ -76,7 +92,7 @@ def hidden_run(seed: int, folder: Path) -> dict[str, tuple[float, float]]:
     demo.finish = finish
     demo.run_experiment = lambda *given, **named: run_experiment(*given, **named, close_loop=False)
     demo.run_demo(demo.Demo(folder / "run", seed=seed, quick=True))
-    return found
+    return found, spans
 
 
 def hidden(count: int) -> None:
@@ -85,7 +101,7 @@ def hidden(count: int) -> None:
     for seed in range(count):
         demo._MOTIONS = motions
         with tempfile.TemporaryDirectory() as folder:
-            found.append(hidden_run(seed, Path(folder)))
+            found.append(hidden_run(seed, Path(folder))[0])
         print(f"seed {seed}: {found[-1]}", file=sys.stderr, flush=True)
     for name in found[0]:
         values = np.array([each[name] for each in found])
@@ -93,6 +109,90 @@ def hidden(count: int) -> None:
             f"{name:12s} RMS {np.sqrt(np.mean(values[:, 0] ** 2)):.3f} mm (worst arm {values[:, 0].max():.3f}), "
             f"largest: median {np.median(values[:, 1]):.3f}, worst {values[:, 1].max():.3f} mm"
         )
+
+
+def said_and_read(kind: str, seed: int, truth: dict[str, np.ndarray], folder: Path, wrong: str) -> Path:
+    """Write a recording of a unit on the tool, and the file that a calibration would leave; return that."""
+    rng, c = np.random.default_rng([seed, 77]), INERTIAL_CLASSES[kind]
+    noise, rate_hz = np.repeat([c.gyro_noise, c.noise], 3), 200.0 if kind == "phone" else 1000.0
+    good = kind == "icm-42688"
+    errors = InertialErrors(
+        noise, np.repeat([c.gyro_bias, c.bias], 3) * rng.normal(size=6), noise / 10,
+        np.repeat([2e-4 if good else 1e-3, 0.02], 3) * rng.normal(size=6), 200.0, rng.normal(size=(6, 3)) * c.scale / 2,
+        rng.normal(size=(3, 3)) * c.g_sensitivity / 2, step=np.repeat([7e-5 if good else 2.7e-4, 1.2e-3], 3),
+        bandwidth_hz=rate_hz / 4, rate_hz=rate_hz, lost=0.002, hum=np.repeat([1e-3, 0.02], 3), hum_hz=97.0,
+    )  # fmt: skip
+    t_s, z = record(truth["t"], truth["Ts"] @ MOUNT, errors, rng)
+    np.savetxt(
+        folder / "imu.csv",
+        np.column_stack([t_s, z]),
+        "%.9g",
+        ",",
+        header=",".join(["t_s", *INERTIAL_COLUMNS]),
+        comments="",
+    )
+    # In the estimator's tool and base: the accelerometer's matrix is upper triangular in axes that are rotated a little.
+    R = exp_so3(np.array([errors.scale[5, 1], -errors.scale[5, 0], errors.scale[4, 0]]))
+    T = inverse(truth["B"]) @ MOUNT @ pose(R.T, np.zeros(3))
+    up = truth["A"][:3, 2]
+    M_a, M_g = (np.eye(3) + errors.scale[3:]) @ R.T - np.eye(3), (np.eye(3) + errors.scale[:3]) @ R.T - np.eye(3)
+    warm = errors.bias + errors.warming * (1 - np.exp(-25.0 / errors.warming_s))
+    G = (errors.g_sensitivity @ R.T).ravel()
+    values = np.concatenate([T[:3, 3], warm, M_a[np.triu_indices(3)], M_g.ravel(), G, [-up[1], up[0]]])
+    true = replace(Inertial.of("imu", kind, T), values=values)
+    step, late_s = WRONG[wrong]
+    sensor = true.moved(rng.normal(size=38) * SWEPT + step)
+    late_s += np.sqrt(2.0) / (2 * np.pi * errors.bandwidth_hz) + rng.normal() * SWEPT_S
+    sensor = replace(sensor, cov=np.diag(SWEPT**2), delay_s=late_s, sigma_delay_s=SWEPT_S)
+    file = folder / "references.toml"
+    file.write_text(written(Entry(sensor, "inertial", kind, folder / "imu.csv", rate_hz, True), folder))
+    return file
+
+
+def fused(count: int) -> None:
+    """Print errors of the estimates while the body was hidden, and in motion while it was not, without a unit and with."""
+    cases = [None, *((kind, "") for kind in INERTIAL_CLASSES), *(("icm-42688", wrong) for wrong in WRONG if wrong)]
+    found: dict[str, list[np.ndarray]] = {}
+    motions = dict(demo._MOTIONS)
+    for seed in range(4, 4 + count):
+        with tempfile.TemporaryDirectory() as name:
+            folder, truth = Path(name), dict[str, np.ndarray]()
+            demo._MOTIONS = motions
+            demo.true_track = partial(known_truth, truth)
+            spans = hidden_run(seed, folder)[1]
+            for case in cases:
+                file = None if case is None else said_and_read(case[0], seed, truth, folder, case[1])
+                live = replay(Request(str(folder / "run"), references=file), lambda line: None).live
+                title = "joints and vision" if case is None else f"with {case[0]} {case[1]}"
+                found.setdefault(title, []).append(judged(live, truth, spans))
+        print(f"seed {seed} done", file=sys.stderr, flush=True)
+    names = [*(f"{length:g} s hidden" for length, _ in HIDDEN), "seen, moving"]
+    for title, rows in found.items():
+        each = np.array(rows)
+        rms, most, nees = np.sqrt((each[..., 0] ** 2).mean(axis=0)), each[..., 1].max(axis=0), each[..., 2].mean(axis=0)
+        for k, name in enumerate(names):
+            print(f"{title:36s} {name:14s} RMS {rms[k]:.3f} mm, largest {most[k]:.2f} mm, NEES a freedom {nees[k]:.2f}")
+
+
+def known_truth(truth: dict[str, np.ndarray], workcell: Workcell, mounting: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the true track, and keep it, the simulated poses, and what lies between the two bases (A) and tools (B)."""
+    world, track = workcell.truth, true_track(workcell, mounting)
+    A, B = mounting.T_base_rig @ inverse(world.T_base_rig), world.T_tool_body @ inverse(mounting.T_tool_body)
+    truth.update(t=track[0], T=track[1], Ts=world.T_base_tool, A=A, B=B)
+    return track
+
+
+def judged(live: tuple[Any, ...], truth: dict[str, np.ndarray], spans: list[tuple[float, float]]) -> np.ndarray:
+    """Return RMS and largest error of the position, mm, and NEES per freedom, of each hidden span and of what is seen."""
+    t = np.array([each.states.t_s[-1] for each in live])
+    T, cov = np.array([each.T_base_tool for each in live]), np.array([each.cov for each in live])
+    T_true = truth["T"][np.minimum(np.searchsorted(truth["t"], t - 1e-9), len(truth["t"]) - 1)]
+    e = log_se3(inverse(T) @ T_true)
+    nees, mm = np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov), e) / 6, 1e3 * np.linalg.norm(e[:, :3], axis=1)
+    rows = [(t > begin - 0.01) & (t < end + 0.05) for begin, end in spans]
+    speed = np.append(0.0, np.linalg.norm(np.diff(T_true[:, :3, 3], axis=0), axis=1) / np.diff(t))
+    rows.append((t > spans[0][0] - 4.5) & (speed > 0.02) & ~np.any(rows, axis=0))
+    return np.array([(np.sqrt(np.mean(mm[at] ** 2)), mm[at].max(), nees[at].mean()) for at in rows])
 
 
 def tilt(count: int) -> None:
@@ -187,6 +287,8 @@ if __name__ == "__main__":
     what, count = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else None
     if what == "hidden":
         hidden(count or 10)
+    elif what == "fused":
+        fused(count or 4)
     elif what == "tilt":
         tilt(count or 40)
     else:

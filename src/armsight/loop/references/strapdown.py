@@ -291,14 +291,20 @@ class Strapdown:
         W = DP @ D.T + DC @ by_y.T + self._noise(window, poses[0][0])
         W[:6, :6] += (ends * added) @ ends.T
         # The state at the end: the arm's errors, the new velocity and the parameters, before the constraints.
-        P, C, Y, y = P * kept * kept[:, None], C * kept[:, None], Y.copy(), y.copy()
-        P[np.diag_indices(len(P))] += added
+        C, Y, y = C * kept[:, None], Y.copy(), y.copy()
         C[:, _V], Y[_V], Y[:, _V], Y[_V, _V], y[_V] = (DP[6:] * kept).T, DC[6:], DC[6:].T, W[6:, 6:], r[6:]
         Y[_BIASES, _BIASES] += (window.density / CORNER_S) ** 2 * window.length_s
         by_x, by_beside = DP[:6] * kept + ends * added, DC[:6]
         by_beside[:, _V] = W[:6, 6:]
         S, z = W[:6, :6], -r[:6]
         gain, gain_y = np.linalg.solve(S, by_x).T, np.linalg.solve(S, by_beside).T
+        forgets = np.flatnonzero(kept != 1.0)
+        P = P.copy()
+        if len(forgets):  # they stand side by side
+            rows = slice(forgets[0], forgets[-1] + 1)
+            P[rows] *= kept[rows, None]
+            P[:, rows] *= kept[rows]
+        P.flat[:: len(P) + 1] += added
         P -= gain @ by_x
         if fixed is not None:
             P[fixed, fixed] += gain[fixed] @ by_x[:, fixed]
@@ -306,7 +312,7 @@ class Strapdown:
         C -= by_x.T @ gain_y.T
         Y -= gain_y @ by_beside
         after = Navigated(beside.t_s + window.length_s, y + gain_y @ z, C, (Y + Y.T) / 2)
-        return Advanced(x * kept + gain @ z, (P + P.T) / 2, after, gain, D[:6], z, S)
+        return Advanced(x * kept + gain @ z, P, after, gain, D[:6], z, S)
 
     def _constraint(self, window: Window, Ts: Array, y: Array) -> tuple[Array, Array, Array]:
         """Return residual and velocity at the end (9,); derivatives by the tool's tangents (9, 12) and by y (9, B)."""

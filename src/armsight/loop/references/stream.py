@@ -234,7 +234,7 @@ def _vibration(
 
     got = least_squares(residuals, np.log(start), max_nfev=30).x
     speed, decay = map(float, np.exp(got))
-    if decay > MOST_DAMPED * speed or not 2 * np.pi < speed * t[-1] < np.pi * (len(t) - 1):  # a period at least
+    if decay > MOST_DAMPED * speed or not 2 * np.pi < speed * t[-1] < 0.8 * np.pi * len(t):  # a period at least
         return None
     left, factors = parts(got)
     return (speed, decay), np.hypot(factors[0], factors[1]), left.std(axis=0)
