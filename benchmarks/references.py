@@ -164,7 +164,7 @@ def fused(count: int) -> None:
                 file = None if case is None else said_and_read(case[0], seed, truth, folder, case[1])
                 live = replay(Request(str(folder / "run"), references=file), lambda line: None).live
                 title = "joints and vision" if case is None else f"with {case[0]} {case[1]}"
-                found.setdefault(title, []).append(judged(live, truth, spans))
+                found.setdefault(title, []).append(evaluated(live, truth, spans))
         print(f"seed {seed} done", file=sys.stderr, flush=True)
     names = [*(f"{length:g} s hidden" for length, _ in HIDDEN), "seen, moving"]
     for title, rows in found.items():
@@ -182,7 +182,7 @@ def known_truth(truth: dict[str, np.ndarray], workcell: Workcell, mounting: Any)
     return track
 
 
-def judged(live: tuple[Any, ...], truth: dict[str, np.ndarray], spans: list[tuple[float, float]]) -> np.ndarray:
+def evaluated(live: tuple[Any, ...], truth: dict[str, np.ndarray], spans: list[tuple[float, float]]) -> np.ndarray:
     """Return RMS and largest error of the position, mm, and NEES per freedom, of each hidden span and of what is seen."""
     t = np.array([each.states.t_s[-1] for each in live])
     T, cov = np.array([each.T_base_tool for each in live]), np.array([each.cov for each in live])

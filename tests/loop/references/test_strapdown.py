@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.loop.estimators import Delay, KalmanEstimator, Prior
+from armsight.loop.estimators import Delay, KalmanEstimator, Outcome, Prior
 from armsight.loop.references.inertial import INERTIAL_CLASSES, Inertial
 from armsight.loop.references.strapdown import Samples, Strapdown
 from armsight.sim.references.inertial import InertialErrors, record
@@ -161,6 +161,24 @@ def test_a_unit_rotated_on_its_mount_shows_in_the_residuals_and_a_good_one_does_
         ratios.append(float(np.sqrt(np.median(found))))
     assert ratios[0] < 1.3
     assert ratios[1] > 1.5 * ratios[0]
+
+
+def test_a_unit_that_images_contradict_is_used_no_more():
+    q, Ts, looks, said, t_s, z = world(241, 3.0, 3.0)
+    R = exp_so3(np.radians([20.0, 0.0, 0.0]))
+    looks, estimator = list(looks), KalmanEstimator(ARM, delay=Delay(0.0, 2e-4))
+    for k in range(0, len(q), 10):
+        estimator.joints(states(np.arange(k, k + 10) * TICK_S, q[k : k + 10]))
+        rows = (t_s > (k - 10) * TICK_S) & (t_s <= k * TICK_S)
+        if k > 1000:
+            heard = estimator.take(said, Samples(t_s[rows], np.hstack([z[rows, :3] @ R, z[rows, 3:] @ R]), DENSITY))
+        while looks and looks[0].t_s <= (k + 9) * TICK_S:
+            estimator.vision(looks.pop(0))
+    assert heard is Outcome.OUTLIER
+    alone = go(q, world(241, 3.0, 3.0)[2]).estimate()
+    now = estimator.estimate()
+    # What is known of the arm is that of the first second and of what came after: near what is known without a unit.
+    assert np.linalg.norm(off(now.T_base_tool, Ts[-1])[:3]) < 4 * np.sqrt(np.trace(alone.cov[:3, :3]))
 
 
 def test_samples_that_are_none_are_rejected():

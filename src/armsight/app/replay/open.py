@@ -9,13 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from armsight.app.replay.recorded import RecordedRun, read_run, run_file
-from armsight.app.replay.run import Pace, Replayed, replay_run, replay_source, replay_tags
+from armsight.app.replay.run import Fused, Pace, Replayed, replay_run, replay_source, replay_tags
 from armsight.app.stream.datum import Published
 from armsight.app.stream.mcap_file import ARM, BODY, arm_of
 from armsight.app.stream.streams import open_streams
 from armsight.data import Body
 from armsight.errors import InputError
-from armsight.loop.running.references import Fused
 from armsight.robot.arm_file import open_arm
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_target

@@ -11,6 +11,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,14 +23,18 @@ from armsight.loop.estimators import (
     ArmEstimate,
     Delay,
     Estimator,
+    Innovation,
     KalmanEstimator,
     LatestEstimator,
     Mounting,
+    Outcome,
     Prior,
     Remembered,
 )
+from armsight.loop.references.file import Entry, read_recording, read_references
+from armsight.loop.references.inertial import INERTIAL_CLASSES
+from armsight.loop.references.strapdown import Samples
 from armsight.loop.running.data import EventDatum, JointsDatum, Publisher, ShotDatum
-from armsight.loop.running.references import Fused
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.detections import SeenShot
 from armsight.vision.follow.follower import Follower, follows
@@ -43,6 +48,12 @@ from armsight.vision.sources.bag.states import JointStream
 _Seen = TypeVar("_Seen", Shot, SeenShot)
 #: Every estimator; each takes the arm, and by name ``prior`` and ``delay``.
 ESTIMATORS: dict[str, Callable[..., Estimator]] = {"kalman": KalmanEstimator, "latest": LatestEstimator}
+
+#: Residuals over their sigma up to which a unit agrees (as links count as loose, 1/3 is usual), and the share of outliers;
+#: half: chance is a fault, double: a loose mount agrees.
+HONEST, OUTLIERS = 1.0, 0.01
+#: Samples that are given at once at most: older ones are of before the estimator began.
+MOST = 1000
 
 
 @dataclass(frozen=True)
@@ -98,6 +109,78 @@ class Pace:
         if self._began is None or t_s < self._began[1]:
             self._began = (now, t_s)
         time.sleep(max(0.0, self._began[0] + (t_s - self._began[1]) / self._rate - now))
+
+
+class Fused:
+    """A recorded unit in an estimator.
+
+    Args:
+        entry: calibrated, with its recording.
+
+    Attributes:
+        windows: used so far, outliers included.
+        outliers: of them.
+        begin_s: time of the first window, s.
+        rejected: whether images contradicted it so that it was used no more.
+
+    Raises:
+        InputError: it is not calibrated, or its recording cannot be read.
+    """
+
+    def __init__(self, entry: Entry) -> None:
+        self.sensor, name = entry.reference, entry.reference.name
+        if not entry.calibrated or entry.source is None:
+            lacks = "source" if entry.calibrated else "parameters"
+            raise InputError(f"[{name}]: has no {lacks}; armsight references calibrate writes a file that has them")
+        self._t_s, self._z = read_recording(entry.source)
+        kind = INERTIAL_CLASSES[entry.sensor_class]
+        self._density = np.repeat([kind.gyro_noise, kind.noise], 3)
+        self._next, self._squares = 0, 0.0
+        self.windows, self.outliers, self.rejected = 0, 0, False
+        self.begin_s = np.inf
+
+    @staticmethod
+    def of(path: Path) -> Fused:
+        """Return the one of a file.
+
+        Raises:
+            InputError: the file has several.
+        """
+        first, *others = read_references(path)
+        if others:
+            raise InputError(
+                f"{path}: [{others[0].reference.name}]: one inertial unit is fused; leave one table in the file"
+            )
+        return Fused(first)
+
+    def give(self, estimator: KalmanEstimator, end_s: float) -> None:
+        """Give an estimator the samples up to a time, s, as the unit stamps them."""
+        end = int(np.searchsorted(self._t_s, end_s, side="right"))
+        first, self._next = max(self._next, end - MOST), end
+        if end > first:
+            estimator.on_reading = self._heard
+            outcome = estimator.take(self.sensor, Samples(self._t_s[first:end], self._z[first:end], self._density))
+            self.rejected = self.rejected or outcome is Outcome.OUTLIER
+
+    def _heard(self, name: str, innovation: Innovation) -> None:
+        """Take a window's residual."""
+        z, self.begin_s = innovation.z, min(self.begin_s, innovation.t_s)
+        self.windows += 1
+        self.outliers += innovation.outcome is Outcome.OUTLIER
+        if innovation.outcome is not Outcome.OUTLIER:
+            self._squares += float(z @ np.linalg.solve(innovation.cov, z)) / len(z)
+
+    @property
+    def ratio(self) -> float:
+        """Root mean square of the residuals that were used, over their sigma; 1 is right."""
+        return float(np.sqrt(self._squares / max(self.windows - self.outliers, 1)))
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the residuals are as small as the filter expects."""
+        return (
+            self.windows > 0 and not self.rejected and self.ratio < HONEST and self.outliers < OUTLIERS * self.windows
+        )
 
 
 def replay_run(

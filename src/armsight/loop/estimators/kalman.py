@@ -133,7 +133,11 @@ class KalmanEstimator:
         self.clock = None if learns_delay else ClockFollower(at.size, at.delay, delay.sigma_s)
         self._reference: Array | None = None
         self._waiting: list[PoseMeasurement | Taken | Until] = []
+        # The inertial unit, what was known without it, images in a row against it, and the one that they have rejected.
+        no_reference: Reference | None = None
         self._unit: Strapdown | None = None
+        self._without: Remembered | None = None
+        self._against, self._rejected = 0, no_reference
         self._outliers: list[Array] = []
         self._backlash_set = True  # whether the readings have the newest estimate of the backlash
         # At the newest reading, until something is heard: the state, the joints and what came of the state, and the tool.
@@ -228,14 +232,21 @@ class KalmanEstimator:
         """Take a pose measurement, in any order of time; return what became of it."""
         if self._unit is not None:
             pose_measurement = replace(pose_measurement, cov_noise=ALIKE * pose_measurement.cov_noise)
-        return self._hear(pose_measurement)
+        outcome = self._hear(pose_measurement)
+        if self._unit is not None and outcome is not Outcome.WAITING:
+            self._against = 0 if outcome is Outcome.USED else self._against + 1
+            if self._against >= STUBBORN and self._without is not None:
+                self._rejected, self._unit = self._unit.sensor, None
+                self.restore(self._without)
+        return outcome
 
     def take(self, reference: Reference, reading: Reading | Samples) -> Outcome:
         """Take a reading of a reference beside vision, in any order of time; return what became of it.
 
         The reference's parameters and delay are considered by their covariance, not estimated. An outlier is never used,
         however often it comes back: which of reference and vision is wrong is not the filter's to say. Samples of an
-        inertial unit come in order of time; its parameters and delay are estimated.
+        inertial unit come in order of time; its parameters and delay are estimated. A unit that so many images in a row
+        contradict as reopen a filter is used no more, and what was learned with it is forgotten: they are outliers then.
 
         Raises:
             InputError: the reference has no such channel, or samples are not of an inertial unit, or not in order.
@@ -243,8 +254,10 @@ class KalmanEstimator:
         if isinstance(reading, Samples):
             if not isinstance(reference, Inertial):
                 raise InputError(f"{reference.name}: samples are of inertial units; give its readings one by one")
+            if reference is self._rejected:
+                return Outcome.OUTLIER
             if self._unit is None or self._unit.sensor is not reference:
-                self._unit = Strapdown(reference)
+                self._unit, self._without = Strapdown(reference), self.remembered()
             self._unit.add(reading)
             self._newest = self._here = None
             return self._go_on()
